@@ -187,4 +187,6 @@ def _explain(error: msgspec.ValidationError, stated: dict[str, Any], known: dict
     about = known[key].description if key in known else ""
     if message.startswith("Invalid enum value"):
         message = f"not one of {known[key].kind.removeprefix('Literal').strip('[]')}"
+    if "matching regex" in message:
+        message = "no such choice"
     return SettingError(f"{key} = {value!r}: {message[:1].lower()}{message[1:]} ({about})")

@@ -383,13 +383,14 @@ def single_frames(shots: int) -> BracketMeasurement:
 
 @dataclass(frozen=True)
 class ChartReference:
-    """Patch colors of a color chart, from its maker."""
+    """Patch colors of a color chart, from its maker or measured."""
 
     name: str
     rec709: Floats  # (24, 3) linear Rec.709/D65 reflectance, row by row from dark skin
     size_m: tuple[float, float] | None  # width, height between the outer patch corners; None: unknown
     patches: tuple[str, ...] = ()  # (24,) their names
     editions: tuple["ChartReference", ...] = ()  # versions of the chart from other years
+    is_block: bool = False  # part of a larger chart, which cannot be searched for
 
 
 @dataclass(frozen=True)
@@ -400,6 +401,7 @@ class ChartLight:
     normal: Floats  # (3,) unit, towards the camera
     flash: Floats  # (3,) position right of and above the lens; exponent of the cosine of its angular falloff
     covariance: Floats  # (5, 5) of these three and of the chart's rotations about x and y [rad]
+    uneven: float = 0.0  # relative 1σ of the light's level from a slope of the light that the flash does not cause
 
     @property
     def tilt(self) -> float:
@@ -565,6 +567,7 @@ class Cues:
     mask: NDArray[np.bool_]  # (H, W)
     quality: Bits  # (H, W)
     view: View
+    scale_sigma: float | None = None  # relative 1σ of the light on the chart against that on the object; None: no chart
     body: Floats | None = None  # (H, W, 3) radiance of the diffuse reflection only, from a crossed shot
     body_known: NDArray[np.bool_] | None = None  # (H, W) where the crossed shot is valid
 
@@ -599,6 +602,7 @@ class SurfaceMaps:
     mask: NDArray[np.bool_]  # (H, W)
     view: View
     estimator: str
+    albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown, albedos are relative
 
 
 @dataclass(frozen=True)
@@ -629,6 +633,7 @@ class Asset:
     specular_color: NDArray[np.uint8]  # (H, W, 3) sRGB, to be multiplied by the factor
     specular_factor: tuple[float, float, float]  # KHR_materials_specular specularColorFactor
     ior: float
+    albedo_sigma: float | None = None  # as in `SurfaceMaps`
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,19 @@ def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
     return ChartRequest("corners", corners=np.reshape(corners, (4, 2)))
 
 
+def measured_chart(config: Path | None, assignments: list[str] | None) -> str | None:
+    """The setting whitebalance.chart, which may name a file; None if it is not stated or --config is no TOML."""
+    from polcap.formats import text_file
+
+    stated = [text.partition("=")[2].strip() for text in assignments or () if text.startswith("whitebalance.chart=")]
+    if not stated and config is not None:
+        try:
+            stated = [str(text_file.read_toml(config)["whitebalance"]["chart"])]
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+    return stated[-1] if stated else None
+
+
 def user_mask(file: Path) -> Any:
     """Read the picture of --mask as (H, W) bool: true where it is lighter than half of white."""
     from polcap.formats.maps import png

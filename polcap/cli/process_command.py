@@ -45,7 +45,8 @@ def process(
     request = None
     if not (until or force or dry_run or watch):
         asked = {name: value for name, value in stated.items() if name not in _NO_EFFECT}
-        files = [Path(name) for name in (config, mask, model, chart) if name is not None and Path(name).is_file()]
+        named = (config, mask, model, chart, options.measured_chart(config, assignments))
+        files = [Path(name) for name in named if name is not None and Path(name).is_file()]
         request = unchanged.request(asked, capture, target, files)
     if (finished := unchanged.find(target, request)) is not None:
         terminal.print_progress(f"{finished.table}\nNothing has changed since the last run.")

@@ -13,7 +13,7 @@ import msgspec
 
 from polcap.config import Config
 from polcap.errors import ChartError, DecodeError, InputError
-from polcap.images import Capture, ChartRequest, Network
+from polcap.images import Capture, ChartRequest, ColorCalibration, Network
 from polcap.pipeline import models, small_capture
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import AUTO, UserInput, path, results_of
@@ -64,7 +64,7 @@ def inspect(
         try:
             small = small_capture.reduce(capture, config.hdr.clip, pool)
             supplied = UserInput(_moved(chart, small.step), None, *networks(), small.decode)
-            lines = tuple(_judged(small, supplied, config))
+            lines = tuple(_judged(capture, small, supplied, config))
         finally:
             pool.shutdown(cancel_futures=True)
     bad = [line for line in lines if line.state == "fail"]
@@ -75,14 +75,14 @@ def inspect(
     return Verdict(not bad, shots, lines, capture.name, seconds, "--no-chart" if missing else "")
 
 
-def _judged(small: SmallCapture, supplied: UserInput, config: Config) -> list[Gate]:
+def _judged(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config) -> list[Gate]:
     """Judge the reduced capture by the gates, in the order of the path.
 
     Where a stage fails, its error is the last one.
     """
     cache, failure, chart_missing = MemoryCache(until="infer"), None, ""
     try:
-        chart_missing = _run_path(small, supplied, _settings(config, small.step), cache)
+        chart_missing = _run_path(capture, small, supplied, config, cache)
     except DecodeError:
         raise
     except InputError as error:
@@ -108,19 +108,30 @@ def _judged(small: SmallCapture, supplied: UserInput, config: Config) -> list[Ga
     return lines
 
 
-def _run_path(small: SmallCapture, supplied: UserInput, settings: Config, cache: MemoryCache) -> str:
-    """Run the path on the reduced capture into the cache.
+def _run_path(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config, cache: MemoryCache) -> str:
+    """Run the path into the cache; without a chart if `process` would find none, and then the reason, otherwise "".
 
-    If no chart is detected, it runs without one and returns the reason, else "".
+    A chart that is not found in the small pictures is searched at full size, as `process` does.
     """
+    missing, settings = "", _settings(config, small.step)
     try:
         path(small.capture, supplied, settings, cache)
-    except ChartError as error:
+    except ChartError:
         if supplied.chart.mode != "auto":
             raise
-        path(small.capture, replace(supplied, chart=ChartRequest("none")), settings, cache)
-        return str(error).partition(" (")[2].partition(")")[0] or str(error)
-    return ""
+        request = ChartRequest("none")
+        try:
+            request = ChartRequest("profile", profile=_colors_at_full_size(capture, config))
+        except ChartError as error:
+            missing = str(error).partition(" (")[2].partition(")")[0] or str(error)
+        path(small.capture, replace(supplied, chart=request), settings, cache)
+    return missing
+
+
+def _colors_at_full_size(capture: Capture, config: Config) -> ColorCalibration:
+    """The color calibration that `process` makes from the reference shot. Raises ChartError."""
+    alone = MemoryCache(until="whitebalance")
+    return path(replace(capture, shots=capture.shots[:1], crossed=None), UserInput(), config, alone).color
 
 
 def _settings(config: Config, step: int) -> Config:

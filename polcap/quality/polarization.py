@@ -70,6 +70,9 @@ def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     yield _with_ring(of_shots, found.selfcal, limits)
     yield _light_of_body(body, found, limits)
     side = seen.side
+    if found.object_.border > limits.max_mask_border:
+        yield Gate("other light", "not measured", None, limits.max_side_light, "The picture cuts the outline off")
+        return
     k = int(np.argmax(side))
     message = f"The {found.names[k]} shot is {100 * side[k]:.1f} % brighter on one side than the others"
     remedy = "Darken the room and take that shot again: another light was on"
@@ -260,9 +263,6 @@ def _reduced(image: StokesImage, angle: Floats) -> tuple[Floats, rim.Bools, rim.
     step = int(np.ceil(np.sqrt(max(image.mask.size / _MOST_PIXELS, 1))))
     doubtful = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
     usable = (image.quality & int(doubtful)) == 0
-    light = total(image.stokes)
-    mask = image.mask
-    if step > 1:
-        light = np.stack([block_means(part, step) for part in light])
-        mask, usable = (block_means(part, step) > 0.99 for part in (mask, usable))
+    light = np.stack([block_means(part, step) for part in total(image.stokes)])
+    mask, usable = (block_means(part.astype(np.float32), step) > 0.99 for part in (image.mask, usable))
     return np.einsum("kj,jhw->khw", mueller.analyzer(angle), light), mask, usable

@@ -20,7 +20,7 @@ LABELS: dict[str, tuple[str, str]] = {
     "chart.left_out": ("Patches not used", ""),
     "chart.detector_cost": ("Cost of the chart's detection, 0 is best", ""),
     "chart.metres_per_px": ("Size of a pixel at the chart", "mm"),
-    "chart.scale_doubt": ("Common error of all albedos, 1σ, from the unknown distance of chart and flash", "%"),
+    "chart.scale_doubt": ("Common error of all albedos, 1σ; without a chart they are relative", "%"),
     "chart.matrix": ("Camera channels to linear Rec.709", ""),
     "alignment.shift_px": ("Shift of each shot, right and down", "px"),
     "alignment.turn_deg": ("Rotation of each shot", "°"),

@@ -25,6 +25,7 @@ from polcap.formats.export import encoders, glb_geometry, texture_set
 from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.glb_geometry import Blob, Geometry
 from polcap.formats.export.texture_set import Texture
+from polcap.formats.maps import maps_folder
 from polcap.images import Asset, Floats
 
 _LINEAR, _LINEAR_MIPMAP, _CLAMP = 9729, 9987, 33071
@@ -90,6 +91,7 @@ def encode(
             "generator": f"polcap {__version__}",
             "extras": {
                 "unit": "metre" if asset.mesh.metric else "relative",
+                "albedo": maps_folder.albedo_scale(asset.albedo_sigma),
                 "origin_in_camera": origin.tolist(),
                 "pieces": asset.mesh.pieces,
                 "cuts": asset.mesh.cuts,

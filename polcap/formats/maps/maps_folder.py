@@ -45,6 +45,10 @@ class _Depth(Struct, frozen=True):
     unit: Literal["m", "relative"]
 
 
+class _Albedo(Struct, frozen=True):
+    uncertainty_percent: Annotated[float, Meta(ge=0)] | None = None
+
+
 class _Description(Struct, frozen=True):
     """The keys of maps.json (crop, size, camera, depth unit…) that `read` needs."""
 
@@ -54,6 +58,7 @@ class _Description(Struct, frozen=True):
     camera: _Camera
     depth: _Depth
     estimator: str
+    albedo: _Albedo = _Albedo()
 
 
 @dataclass(frozen=True)
@@ -105,6 +110,7 @@ def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
         mask=inside,
         view=maps.view,
         estimator=maps.estimator,
+        albedo_sigma=None if maps.albedo_sigma is None else round(maps.albedo_sigma, 3),
     )
 
 
@@ -131,6 +137,7 @@ def read(folder: Path) -> StoredMaps:
         raise DecodeError(f"{folder} has no maps.json ({error.strerror}); give a result's folder") from error
     except ValueError as error:
         raise DecodeError(f"{folder / 'maps.json'} is not a maps.json of polcap ({error}); process again") from error
+    percent = about.albedo.uncertainty_percent
     origin = (about.crop[0] / about.scale, about.crop[1] / about.scale)
     view = View(about.camera.focal_px, about.camera.center_px, about.scale, origin, about.camera.focal_known)
     mask = png.read(folder / "mask.png")
@@ -142,8 +149,9 @@ def read(folder: Path) -> StoredMaps:
     )
     roughness, confidence = (_read_map(folder, name, "Y", about.size) for name in ("roughness", "confidence"))
     maps = SurfaceMaps(
-        normal, diffuse, specular, roughness, None, confidence, mask=inside, view=view, estimator=about.estimator
-    )
+        normal, diffuse, specular, roughness, None, confidence, mask=inside, view=view, estimator=about.estimator,
+        albedo_sigma=None if percent is None else round(percent / 100, 3),
+    )  # fmt: skip
     depth = np.where(inside, _read_map(folder, "depth", "Z", about.size), np.nan).astype(np.float32)
     return StoredMaps(maps, depth, metric=about.depth.unit == "m")
 
@@ -201,6 +209,7 @@ def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[st
         },
         "depth": dict(depth),
         "estimator": maps.estimator,
+        "albedo": albedo_scale(maps.albedo_sigma),
         "conventions": CONVENTIONS,
         "maps": {
             "normal.exr": "unit vectors: R x, G y, B z; float",
@@ -221,6 +230,14 @@ def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[st
             "with a cross-polarized shot the two parts of S0 as photograph.png has it, linear: scattered.R, .G, .B and "
             "mirrored.R, .G, .B; half",
         },
+    }
+
+
+def albedo_scale(sigma: float | None) -> dict[str, Any]:
+    """Whether the scale of all albedos is known, and its 1σ, for maps.json and the GLB; None: no chart."""
+    return {
+        "scale": "relative" if sigma is None else "known",
+        "uncertainty_percent": None if sigma is None else round(100 * sigma, 1),
     }
 
 

@@ -61,6 +61,7 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
         specular_color=specular_color,
         specular_factor=(top / float(fresnel.normal_reflectance(settings.ior)),) * 3,
         ior=settings.ior,
+        albedo_sigma=maps.albedo_sigma,
     )
 
 

@@ -15,7 +15,7 @@ from polcap.optics.projection import back_project
 
 _BULGE = 0.5  # radii; mean distance of the visible surface in front of the center: 1/3 for a cone, 2/3 for a ball
 _BULGE_SPREAD = 0.4  # radii; its 1σ over 204 views of training meshes and random shapes (decision 8)
-_CHART_SPREAD = 3**-0.5  # radii: 1σ of the depth of a chart anywhere between the object's front and back
+_CHART_SPREAD = 0.3  # radii: 1σ of the depth of a chart next to the middle of the object
 _LARGEST_RADIUS = 0.5  # of an object, over its distance; for larger ones the far-field law does not hold
 _STEP = 1e-4
 
@@ -47,7 +47,7 @@ def sigma(stokes: StokesImage, color: ColorCalibration) -> float | None:
     light, middle = color.light, _middle(stokes, ahead)
     here = _log_factor(light, middle)
     slope = np.array([_log_factor(_changed(light, step), middle) - here for step in _STEP * np.eye(5)]) / _STEP
-    return hypot(depth, sqrt(slope @ light.covariance @ slope))
+    return hypot(depth, light.uneven, sqrt(slope @ light.covariance @ slope))
 
 
 def _log_factor(light: ChartLight, middle: Floats) -> float:

@@ -153,7 +153,8 @@ def _compare_frame(
         for number, samples in zip((reference, e), noise.sample_pair(still, found, ratio)):
             source.learn(number, samples)
     misfit = np.zeros_like(ratio)
-    frame = RegisteredFrame(found, ratio, source.line(e), misfit, motion, gain, exposure.curvature(*tiles))
+    shaded, curvature = exposure.vignetting(still, found, ratio), exposure.curvature(*tiles)
+    frame = RegisteredFrame(found, ratio, source.line(e), misfit, motion, gain, shaded, curvature)
     lines = source.line(reference), frame.noise
     return replace(frame, misfit=noise.misfit(still, found, ratio, lines, frame.mean_gain))
 

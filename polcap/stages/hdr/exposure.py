@@ -15,6 +15,7 @@ _TONE_RANGE, _TONE_BINS, _TONE_SPAN = (0.01, 0.9), 8, 0.7
 TILE = 16  # px
 _LEAST_TILES = 30
 _SURE, _LEAST_SURE = 0.01, 0.03  # largest relative 1σ of a ratio: of one channel, of all channels together
+_LEAST_VIGNETTING = 0.01  # smaller changes of the ratio over the picture are left to the limit of ghosts
 _DIM, _DIMMEST = 4e-3, 4e-4  # of the sensor's range: darker tiles suffer from errors of the black level
 
 
@@ -50,6 +51,37 @@ def common_tiles(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
     inside = block_means(reference.usable & other.usable, TILE) == 1
     a, b = (tile_means(picture, TILE)[inside].astype(np.float64) for picture in (reference, other))
     return a, b
+
+
+def vignetting(reference: Signals, other: Signals, ratio: Floats) -> Floats | None:
+    """Smooth factor (H, W) float32 on the exposure ratio (C,) of two frames, a quadratic in place; None below 1 %.
+
+    Apertures differ in vignetting, so corners of a bracket by aperture are darker in its wide frames.
+    """
+    _, height, width = reference.shape
+    a, b = tile_means(reference, TILE).sum(-1), (tile_means(other, TILE) / ratio).sum(-1)
+    clear = block_means((reference.usable & other.usable).astype(np.float32), TILE) > 0.999
+    bright = clear & (a > 3 * _DIM) & (b > 3 * _DIM)
+    if bright.sum() < 2 * _LEAST_TILES:
+        return None
+    row, column = np.nonzero(bright)
+    change = np.log(b[bright] / a[bright])
+    basis = _quadratic((column + 0.5) / a.shape[1], (row + 0.5) / a.shape[0])
+    weight = np.ones(len(change))
+    for _ in range(6):  # tiles where something moved lose their weight
+        found = np.linalg.lstsq(basis * weight[:, None], change * weight, rcond=None)[0]
+        rest = np.abs(change - basis @ found)
+        weight = np.sqrt(1 / (1 + (rest / (2 * MAD_TO_SIGMA * np.median(rest) + 1e-4)) ** 2))
+    if np.abs(basis @ found).max() < _LEAST_VIGNETTING:
+        return None
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    flat = _quadratic((x.ravel() + 0.5) / (a.shape[1] * TILE), (y.ravel() + 0.5) / (a.shape[0] * TILE)) @ found
+    return np.asarray(np.exp(flat).reshape(height, width), np.float32)
+
+
+def _quadratic(x: Floats, y: Floats) -> Floats:
+    """Columns 1, x, y, x², xy, y² of points (N,)."""
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
 def measured_or_stated(name: str, measured: Ratio | None, channels: int, frame: Frame, reference: Frame) -> Floats:

@@ -21,10 +21,11 @@ Bools = NDArray[np.bool_]
 
 _WINDOW = 5  # px, side of the window for comparison and smoothing
 _EVEN = np.full(_WINDOW, 1 / _WINDOW, np.float32)
-# A window is a ghost if its frames differ by more than the sum of these three:
+# A window is a ghost if its frames differ by more than the sum of these four:
 _SIGMA = 6.0  # standard deviations of noise
 _MISFIT = 3.0  # standard deviations of the registration error at edges
-_SHARE = 0.02  # of the radiance: flare and shading differ by as much between exposures
+_SHARE = 0.02  # of the radiance: flare differs by as much between exposures
+_BLACK = 2e-4  # of the sensor's range, at each frame's exposure: error of the black level, 3 of 15,000 counts
 _CORRELATED = 1.5  # variance of a window's mean over that of independent pixels: neighbors share some noise
 
 
@@ -38,6 +39,7 @@ class RegisteredFrame:
     misfit: Floats  # (C,) float32 px²; variance per squared gradient, from registration errors and aliasing
     motion: Floats | None = None  # (3, 3) reference px → frame px; None: no motion
     gain: Floats | None = None  # (H, W) factor on the noise variance by resampling; None: not resampled
+    vignetting: Floats | None = None  # (H, W) float32 factor on the ratio, as wide apertures darken corners; None: 1
     curvature: float = 0.0  # of `exposure.curvature`; 0: linear, NaN: unknown
 
     @property
@@ -91,8 +93,11 @@ class Anchor:
                 if frame.misfit[c]:
                     edge = np.maximum(box(squared_gradient(anchor[c])) - own, 0)
                     limit += np.sqrt(edge * np.float32(_MISFIT**2 * frame.misfit[c]))
-                limit += _SHARE * np.abs(level)
-                off |= np.abs(box(value[c]) / frame.ratio[c] - level) > limit
+                limit += _SHARE * np.abs(level) + np.float32(_BLACK * (1 + 1 / float(frame.ratio[c])))
+                scaled = box(value[c]) / frame.ratio[c]
+                if frame.vignetting is not None:
+                    scaled /= frame.vignetting[rows]
+                off |= np.abs(scaled - level) > limit
             found[target] = (off & _all_around(known[rows], _WINDOW // 2))[inner]
 
         parallel.results(partial(compare, *block) for block in blocks(height, _WINDOW // 2 + 1))

@@ -6,6 +6,7 @@ highlight, and turns the diffuse reflection there into an albedo.
 """
 
 from dataclasses import replace
+from math import hypot, log
 
 import cv2
 import numpy as np
@@ -23,6 +24,10 @@ _LEAST_PX = 2.0
 _LEAST_COSINE = 0.2  # of the shading that divides
 _LEAST_MATTE = 1e-3  # share of matte pixels in a neighborhood
 _FLOOR = 1e-3  # albedo
+_MAPS_SIGMA = 0.05  # of the estimators' own albedos, with a correct scale (docs/benchmarks/gates.md)
+_COMMON_F0 = 0.05  # median of an object; an index of 1.58
+_F0_RESPONSE = 0.3  # change of ln F0 per change of ln scale: the network expects common values (20 captures)
+_COMMON_WHITE, _WHITE_RANGE = 0.9, 0.14  # 95th percentile of the albedo: usual limit; excess that doubts a factor of e
 
 
 def fill_highlights(image: Floats, cues: Cues) -> Floats:
@@ -84,3 +89,16 @@ def specular_share(cues: Cues) -> Floats:
     assert cues.body is not None and cues.body_known is not None
     share = np.clip(1 - cues.body.sum(-1) / np.maximum(cues.radiance.sum(-1), 1e-6), 0, 1)
     return np.where(cues.body_known & cues.mask, share, 0).astype(np.float32)
+
+
+def albedo_sigma(maps: SurfaceMaps, of_chart: float | None) -> float | None:
+    """Relative 1σ of the scale of all albedos; `of_chart` is that of the light on the chart, None without a chart.
+
+    A chart behind the object, or in a shadow, gets less light than the object. The picture of the chart does not show
+    this, but then colors approach 1, and F0 exceeds that of common dielectrics.
+    """
+    if of_chart is None or not maps.mask.any():
+        return None
+    gloss = log(max(float(np.median(maps.specular[maps.mask].mean(-1))) / _COMMON_F0, 1.0)) / _F0_RESPONSE
+    white = max(float(np.percentile(maps.diffuse[maps.mask].max(-1), 95)) - _COMMON_WHITE, 0.0) / _WHITE_RANGE
+    return hypot(of_chart, _MAPS_SIGMA, max(gloss, white))

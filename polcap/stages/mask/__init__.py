@@ -32,6 +32,7 @@ class MaskSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(ge=0, le=1, description="border added around the object's box [share of its longer side]")
     ] = 0.04
     min_area: Annotated[float, Meta(gt=0, le=1, description="least part of the picture that an object covers")] = 0.002
+    part: Annotated[int, Meta(ge=0, le=9, description="process this part of the mask, 1 being the largest; 0: all")] = 0
     chart_margin: Annotated[
         float,
         Meta(ge=0, le=2, description="border around the chart without object, if there is no network [patch widths]"),
@@ -90,8 +91,11 @@ def segment(
 def _object(
     mask: Bools, source: Literal["automatic", "user"], doubt: float | None, settings: MaskSettings
 ) -> ObjectMask:
+    if settings.part:
+        mask = regions.nth_part(mask, settings.part)
     crop = regions.box_around(mask, settings.margin, least=4)
-    assert crop is not None
+    if crop is None:
+        raise ObjectError(f"the mask has fewer than mask.part = {settings.part} parts; choose a smaller number")
     return ObjectMask(mask, crop, source, doubt, *regions.measure_shape(mask))
 
 

@@ -81,6 +81,13 @@ def measure_shape(mask: Bools) -> tuple[float, float, float]:
     return float(1 - largest / area), float((whole.sum() - area) / area), float(edge.mean())
 
 
+def nth_part(mask: Bools, number: int) -> Bools:
+    """The part of a mask (H, W) that is `number` in the order of area, 1 being the largest; empty if there is none."""
+    _, label, parts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    order = 1 + np.argsort(-parts[1:, cv2.CC_STAT_AREA], kind="stable")
+    return label == order[number - 1] if number <= len(order) else np.zeros_like(mask)
+
+
 def box_around(mask: Bools, margin: float, least: int) -> Box | None:
     """Bounding box of a mask (H, W); `margin` is a share of its longer side, at least `least` px. None if empty."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))

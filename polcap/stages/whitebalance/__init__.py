@@ -10,7 +10,7 @@ McCamy, Marcus, Davidson, A Color-Rendition Chart, J. Applied Photographic Engin
 """
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -43,10 +43,12 @@ class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     """Settings of the stage `whitebalance`, the section `whitebalance` of a settings file."""
 
     chart: Annotated[
-        Literal["classic", "classic_before_2014", "classic_srgb", "sg"],
+        str,
         Meta(
-            description="kind of chart; classic: the edition since 2014 unless another fits its colors much better; "
-            "of a (Digital) SG the block E2 to J5, whose corners --chart states"
+            pattern=r"^(classic|classic_before_2014|classic_srgb|sg)$|[./\\]",
+            description="classic, classic_before_2014, classic_srgb, sg, or a file of measured colors (CSV or CGATS); "
+            "classic: the edition since 2014 unless another fits its colors much better; of a (Digital) SG the block "
+            "E2 to J5, whose corners --chart states",
         ),
     ] = "classic"
     chart_width_m: (
@@ -63,7 +65,7 @@ class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     patch_share: Annotated[float, Meta(ge=0.2, le=0.95, description="sampled share of each patch's side")] = 0.6
 
 
-@stage(version=9)
+@stage(version=10)
 def measure(
     radiance: AngleStack, reference: ChartReference, request: ChartRequest, settings: WhitebalanceSettings
 ) -> ColorCalibration:
@@ -88,7 +90,7 @@ def measure(
         return replace(request.profile, source="profile", place=None)
     if request.mode == "corners":
         found = _at_corners(radiance, reference, request.corners, settings)
-    elif settings.chart == "sg":
+    elif reference.is_block:
         raise ChartError(
             "polcap cannot search for a ColorChecker SG; give the outer corners of patches E2, J2, J5, E5 with --chart"
         )
