@@ -204,7 +204,9 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
         matrix=inputs["matrix"],
         place=images.ChartPlace(inputs["quads"], inputs["corners"]),
         source="chart",
-        light=images.ChartLight(*(inputs[f"light.{name}"] for name in ("white", "normal", "flash", "covariance"))),
+        light=images.ChartLight(
+            inputs["light.white"], inputs["light.normal"], inputs["light.flash"], inputs["light.covariance"]
+        ),
     )
     registered = replace(scenes.still(), transform=inputs["transform"])
     x0, y0, x1, y1 = (int(edge) for edge in inputs["crop"])

@@ -31,7 +31,7 @@ _FIXED_TIME = 473_385_600  # s, 1985: times of the files in a USDZ, so that the 
 
 
 def require() -> None:
-    """Raise a SettingError where usd-core is not installed."""
+    """Raise a SettingError if the package usd-core is not installed."""
     try:
         from pxr import Usd  # noqa: F401
     except ModuleNotFoundError:
@@ -41,7 +41,7 @@ def require() -> None:
 
 
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], facts: Mapping[str, str]) -> None:
-    """Write a USD layer (.usdc or .usda); its textures `files` are in the same folder.
+    """Write an asset as a USD layer (.usdc or .usda); its textures `files` are in the same folder.
 
     `facts` go into the layer's custom data.
 
@@ -135,7 +135,7 @@ def _add_openpbr(stage: Any, material: Any, asset: Asset, files: Mapping[Key, st
 
 
 def _openpbr(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str]) -> Any:
-    """The nodes of the MaterialX document as shaders; returns the surface's output."""
+    """Add the OpenPBR material (the nodes of the MaterialX document) as USD shaders; returns the surface output."""
     from pxr import Sdf, UsdShade
 
     kinds = Sdf.ValueTypeNames
@@ -169,7 +169,10 @@ def _openpbr(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str]) -> A
 
 
 def _preview(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tint: bool) -> Any:
-    """UsdPreviewSurface with F0 from a texture; with `tint` F0 over that of the index, not in the specular workflow."""
+    """Add a UsdPreviewSurface material.
+
+    F0 comes from a texture; with `tint`, as F0 divided by the F0 of the index (metallic workflow).
+    """
     from pxr import Sdf, UsdShade
 
     kinds = Sdf.ValueTypeNames
