@@ -63,7 +63,7 @@ def process(
 
 
 def _inputs(stated: dict[str, Any]) -> tuple[Any, Any, Any]:
-    """The capture, the user's other inputs and the settings. Models are opened while photographs are read."""
+    """Read the capture, the user's other inputs and the settings. Models are opened while photographs are read."""
     from concurrent.futures import ThreadPoolExecutor
 
     from polcap import config as settings
@@ -83,7 +83,7 @@ def _inputs(stated: dict[str, Any]) -> tuple[Any, Any, Any]:
 
 
 def _plan(stated: dict[str, Any], target: Path) -> None:
-    """Print how the capture is understood and which stages would run."""
+    """Option --dry-run: print how the capture is understood and which stages would run."""
     from polcap import report
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import run as pipeline
@@ -96,7 +96,7 @@ def _plan(stated: dict[str, Any], target: Path) -> None:
 
 
 def _process(stated: dict[str, Any], target: Path, request: str | None) -> None:
-    """Write the result folder; print the path of the asset and the verdict."""
+    """Process the capture and write the result folder; print the path of the asset and the verdict."""
     from dataclasses import replace
 
     from polcap.formats.capture import reader as captures

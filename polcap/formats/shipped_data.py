@@ -42,7 +42,7 @@ def data_path(name: str) -> Path:
 
 
 def model_files(name: str = "") -> list[Path]:
-    """The shipped models with names that begin with `name`, the newest last."""
+    """Paths of the shipped network files with names that begin with `name`, the newest last."""
     return sorted(data_path("colorchecker").parent.glob(f"models/{name}*.onnx"))
 
 

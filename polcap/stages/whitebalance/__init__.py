@@ -40,7 +40,7 @@ _REMEDY = "give its corners with --chart x0,y0,…,x3,y3, a profile with --chart
 
 
 class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The section `whitebalance` of a settings file."""
+    """Settings of the stage `whitebalance`, the section `whitebalance` of a settings file."""
 
     chart: Annotated[
         str,
@@ -128,7 +128,7 @@ class _Find:
 
 
 def _search(radiance: AngleStack, reference: ChartReference, settings: WhitebalanceSettings) -> _Find:
-    """Search the chart: the first candidate with half the permitted color residual, else the one with the least."""
+    """Search the chart in the reference shot: the first candidate with a small color residual, else the best one."""
     finds: list[_Find] = []
     cheapest, small_px = np.inf, 0.0
     exposed: ChartError | None = None
@@ -215,7 +215,10 @@ def _find(
     settings: WhitebalanceSettings,
     cost: float = float("nan"),
 ) -> _Find:
-    """The colors of a chart at a place of the reference shot; the detector's cost is NaN at corners from the user."""
+    """Sample and fit the colors of a chart at a place of the reference shot.
+
+    The detector's cost is NaN at corners from the user.
+    """
     samples = patches.sample(radiance.value[0], radiance.quality[0], place, settings.patch_share)
     return _Find(place, patches.fit(samples, reference), cost)
 
@@ -248,7 +251,7 @@ def _from_camera(radiance: AngleStack) -> ColorCalibration:
 
 
 def _scale(place: Placement, view: View, width_m: float | None) -> float | None:
-    """Metres per pixel (Z/f) in the plane through the chart's center, perpendicular to the optical axis.
+    """Metres per pixel (Z/f) in the plane through the chart's center, perpendicular to the axis.
 
     With K the camera and H the homography from metres along the chart's width, K⁻¹H ∝ (r₁, r₂, t) with
     |r₁| = 1 (Zhang, IEEE PAMI 2000). So neither the chart's height nor its tilt is needed.
