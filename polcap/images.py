@@ -245,6 +245,17 @@ class Shot:
 
 
 @dataclass(frozen=True)
+class CatalogEntry:
+    """Facts for the catalog of a collection, as the user states them; an empty text is not stated."""
+
+    title: str = ""  # of the object
+    creator: str = ""  # person or institution that made the photographs
+    rights: str = ""  # copyright notice
+    license: str = ""  # address or name of the license
+    object_number: str = ""  # inventory number of the object
+
+
+@dataclass(frozen=True)
 class Capture:
     """A capture: all photographs of one object, and the camera's geometry. Every stage begins from it."""
 
@@ -263,6 +274,7 @@ class Capture:
     )  # ln of least, largest focal length / focal_px
     calibration: Calibration | None = None  # of this camera, lens and filter, if measured
     crossed: Shot | None = None  # under a polarized flash; its angle is that of the lens's polarizer
+    catalog: CatalogEntry = field(default=CatalogEntry(), metadata=NOT_IN_KEY)
 
     @property
     def all_shots(self) -> tuple[Shot, ...]:
