@@ -70,12 +70,10 @@ def tone(found: Evidence, limits: GateLimits) -> Gate:
     worst, reason = within, "The ratio of two exposures changes from shadows to highlights"
     power = _power(radiance)
     if radiance.equipment.light == "steady" and abs(power - 1) > worst:
-        worst, reason = (
-            abs(power - 1),
-            f"Exposures follow the stated ones to the power {power:.2f}, not 1",
-        )
-    slope = found.selfcal.gains.grey_slope if found.color.place is not None else float("nan")
-    if np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens greys too
+        worst, reason = abs(power - 1), f"Exposures follow the stated ones to the power {power:.2f}, not 1"
+    slope, chart_light = found.selfcal.gains.grey_slope, found.color.light
+    evenly = found.color.place is not None and (chart_light is None or chart_light.uneven < limits.max_scale_doubt / 2)
+    if evenly and np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens greys too
         worst, reason = (
             abs(slope - 1) / 2,
             f"The chart's greys follow their reflectance to the power {slope:.2f}, not 1",
