@@ -35,7 +35,7 @@ class Quality(IntFlag):
 
 @dataclass(frozen=True)
 class Exif:
-    """Metadata of one photograph; None where the file has no value. One flat list, as the tags are."""
+    """Metadata of one photograph (EXIF); None where the file has no value. One flat list, as the tags are."""
 
     make: str = ""
     model: str = ""
@@ -75,7 +75,7 @@ class SensorImage:
 
     @property
     def superpixel(self) -> int:
-        """Side of the smallest square with all colors, photosites: 2 Bayer, 3 X-Trans, 1 no mosaic."""
+        """Side of the smallest square of photosites with all colors: 2 Bayer, 3 X-Trans, 1 no mosaic."""
         return 1 if self.cfa is None else 2 if self.cfa.shape == (2, 2) else 3
 
     @property
@@ -105,7 +105,7 @@ class NoiseLine:
 
 @dataclass(frozen=True)
 class Levels:
-    """Black and white of a sensor, counts."""
+    """Black and white level of a sensor, in counts."""
 
     black: tuple[float, ...]  # per phase of the mosaic, row by row
     black_sigma: tuple[float, ...]
@@ -116,7 +116,7 @@ class Levels:
 
 @dataclass(frozen=True)
 class Linearity:
-    """Signal against exposure time."""
+    """Linearity of a sensor: signal against exposure time."""
 
     greatest_deviation: float  # from a straight line through 0, relative
     power: float  # exponent of the exposure time; 1 is linear
@@ -266,17 +266,17 @@ class Capture:
 
     @property
     def all_shots(self) -> tuple[Shot, ...]:
-        """The shots, and the crossed shot if there is one."""
+        """The capture's shots, and the cross-polarized shot if there is one."""
         return self.shots if self.crossed is None else (*self.shots, self.crossed)
 
     @property
     def angle(self) -> Floats:
-        """(K,) rad, polarizer axes: as stated, or corrected by the ring's calibration."""
+        """Polarizer axes (K,) rad of the shots: as stated, or corrected by the ring's calibration."""
         return self._turned(np.array([shot.angle for shot in self.shots]))
 
     @property
     def crossed_angle(self) -> float:
-        """The same for the crossed shot; NaN without one."""
+        """Polarizer axis [rad] of the cross-polarized shot; NaN without one."""
         return float("nan") if self.crossed is None else float(self._turned(np.array(self.crossed.angle)))
 
     def _turned(self, stated: Floats) -> Floats:
@@ -286,7 +286,7 @@ class Capture:
 
 @dataclass(frozen=True)
 class View:
-    """A pinhole camera on one pixel grid."""
+    """A pinhole camera on one pixel grid: focal length, principal point, scale."""
 
     focal: float  # px of this grid
     center: tuple[float, float]  # (x, y) px of this grid
@@ -371,7 +371,7 @@ class AngleStack:
     crossed: CrossedShot | None = None  # None: not taken
 
     def shot(self, k: int) -> MaskedImage:
-        """Shot k, (H, W, 3)."""
+        """Radiance, variance and quality of shot k, (H, W, 3)."""
         return MaskedImage(self.value[k], self.variance[k], self.quality[k])
 
 
@@ -383,13 +383,14 @@ def single_frames(shots: int) -> BracketMeasurement:
 
 @dataclass(frozen=True)
 class ChartReference:
-    """Patch colors of a color chart, from its maker."""
+    """Patch colors of a color chart, from its maker or measured."""
 
     name: str
     rec709: Floats  # (24, 3) linear Rec.709/D65 reflectance, row by row from dark skin
     size_m: tuple[float, float] | None  # width, height between the outer patch corners; None: unknown
     patches: tuple[str, ...] = ()  # (24,) their names
     editions: tuple["ChartReference", ...] = ()  # versions of the chart from other years
+    is_block: bool = False  # part of a larger chart, which cannot be searched for
 
 
 @dataclass(frozen=True)
@@ -418,7 +419,7 @@ class ChartPlace:
 
 @dataclass(frozen=True)
 class PatchColors:
-    """The fit of a chart's patches to its maker's colors."""
+    """Residuals of a chart's patches after the fit to the maker's colors."""
 
     delta_e: Floats  # (24,) CIEDE2000 residual; NaN for patches left out
     use: Bits | None = None  # (24,) `whitebalance.patches.PatchUse`: 0 used, otherwise the reason; None: unknown
@@ -510,7 +511,7 @@ class OutlineCheck:
 
 @dataclass(frozen=True)
 class TurnedShot:
-    """A shot with an angle that contradicts the others; needs more than three shots."""
+    """A shot with a polarizer angle that contradicts the others; can be found with more than three shots."""
 
     shots: tuple[int, ...] = ()  # all shots that could explain the contradiction, largest angle first; empty: all agree
     angle: float = 0.0  # rad, true minus stated angle of the first of them
@@ -554,7 +555,7 @@ class StokesImage:
 
 @dataclass(frozen=True)
 class Cues:
-    """Inputs of the estimators on the crop's grid; stages/cues has each formula and selects by name."""
+    """Inputs of the normal estimators on the crop's grid; stages/cues has each formula."""
 
     radiance: Floats  # (H, W, 3) S0 in linear Rec.709, chart white = its reflectance
     ratio: Floats  # (2, H, W) S1/S0 and S2/S0 over all channels

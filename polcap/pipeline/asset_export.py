@@ -53,7 +53,7 @@ class ExportSource:
 
 @dataclass(frozen=True)
 class DetailLevel:
-    """An asset, and how its mesh was decimated, if it was."""
+    """One level of detail of an asset, and how its mesh was decimated, if it was."""
 
     asset: Asset
     decimated: surface.DecimatedMesh | None = None
@@ -68,7 +68,7 @@ def check(wanted: ExportRequest) -> None:
 
 
 def read(folder: Path, config: Config) -> ExportSource:
-    """The maps in a folder, and the full asset made from them.
+    """Read the maps of a result and build the full mesh and asset from them.
 
     Raises
     ------
@@ -180,7 +180,7 @@ def effective(wanted: ExportRequest) -> ExportPreset:
 
 
 def _one(write_file: Callable[..., None], file: Path, *content: Any) -> list[Path]:
-    """Write one file of an export; returns it."""
+    """Write one file of an export by the function `write_file`; returns the file in a list."""
     write_file(file, *content)
     return [file]
 

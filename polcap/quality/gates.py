@@ -19,7 +19,7 @@ __all__ = ["Evidence", "Gate", "State", "Unit", "judge", "verdict"]
 
 
 def judge(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iterator[Gate]:
-    """The gates, in the order of the path.
+    """Judge a capture: yield all quality gates, in the order of the path.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def judge(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iterator
 
 
 def verdict(gates: Iterable[Gate]) -> State:
-    """The worst of the states."""
+    """Verdict of a capture: the worst state of its gates."""
     states = {gate.state for gate in gates}
     return "fail" if "fail" in states else "warn" if "warn" in states else "pass"
 
@@ -69,7 +69,7 @@ def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iter
 
 
 def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Gate:
-    """Median expected error of the normals, with the costs of the other gates."""
+    """Gate on the median expected error of the normals, with the costs of the other gates."""
     own = _own_error(found.maps)
     expected = min(float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in judged))), MOST_DEG)
     because = ", ".join(gate.name for gate in judged if gate.cost_deg > 0.5 * own)
@@ -88,6 +88,6 @@ def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Ga
 
 
 def _own_error(maps: SurfaceMaps) -> float:
-    """Median expected error of the estimator, degrees."""
+    """Median expected normal error [degrees] by the estimator alone."""
     inside = maps.confidence[maps.mask]
     return float(np.median(inside)) if inside.size else float("nan")

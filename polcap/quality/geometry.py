@@ -23,7 +23,7 @@ _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/ha
 
 
 def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate:
-    """Movement of the camera or the object between shots, in px of the processed picture, and its error."""
+    """Gate on movement of camera or object between shots, in px of the processed picture, and its error."""
     measured, names = found.alignment, found.names
     height, width = found.radiance.value.shape[1:3]
     corners = picture_corners(width, height)
@@ -90,7 +90,7 @@ def _motion(found: Evidence) -> object_motion.ObjectMotion:
 
 
 def mask(found: Evidence, limits: GateLimits) -> Gate:
-    """Doubt of the object's mask: a chart in it, an uncertain outline, an unusual shape."""
+    """Gate on the object's mask: a chart in it, an uncertain outline, an unusual shape."""
     object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
     charted = 0.0
@@ -130,7 +130,7 @@ def _charted(found: Evidence) -> float:
 
 
 def mesh(of: Mesh, limits: GateLimits) -> Gate:
-    """Pieces, cuts and jagged boundary of the mesh.
+    """Gate on the mesh: number of pieces, cuts, jagged boundary.
 
     The surface is cut where one part hides another, and where the normals are wrong.
     """
@@ -160,7 +160,7 @@ def mesh(of: Mesh, limits: GateLimits) -> Gate:
 
 
 def sharpness(found: Evidence, limits: GateLimits) -> Gate:
-    """Blur of each frame relative to the sharpest frame of the same exposure."""
+    """Gate on the blur of each frame relative to the sharpest frame of the same exposure."""
     blur, limit = found.blur_px, limits.max_blur_px
     moved = float(np.abs(found.alignment.transform[:, :2, 2]).max()) * found.grid_px
     if np.isnan(blur).all():
@@ -204,7 +204,7 @@ def _edge_blur(found: Evidence) -> float:
 
 
 def focal_length(found: Evidence) -> Gate:
-    """Whether the focal length is known; a wrong one tilts the view rays, and the normals with them."""
+    """Gate on the focal length: an unknown or wrong one tilts view rays and normals."""
     least, most = found.focal_doubt
     if not most - least:
         return Gate("focal length", "pass", "known", "known", "The focal length is known", unit="")
@@ -216,7 +216,7 @@ def focal_length(found: Evidence) -> Gate:
 
 
 def inward_outline(found: Evidence, limits: GateLimits) -> Gate:
-    """Share of the outline's normals that point into the object; those of a closed surface point out of it."""
+    """Gate on the share of normals at the outline that point into the object; on a closed surface they point out."""
     share = _inward_share(found.maps)
     message = f"{100 * share:.0f} % of the normals at the outline point into the object"
     if share > limits.max_inward_outline:
@@ -229,7 +229,10 @@ def inward_outline(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def _inward_share(maps: SurfaceMaps) -> float:
-    """Share of a band inside the outline in which normals lean into the object, on at most _LONGEST px a side."""
+    """Share of normals in a band inside the outline that point into the object.
+
+    The maps are reduced to _LONGEST px a side.
+    """
     across = frames.to_ray_frame(maps.normal, frames.rays(maps.view, *maps.mask.shape))[..., :2]
     shrink = max(1.0, max(maps.mask.shape) / _LONGEST)
     shape = tuple(round(side / shrink) for side in maps.mask.shape)
@@ -244,7 +247,7 @@ def _inward_share(maps: SurfaceMaps) -> float:
 
 
 def _lean(maps: SurfaceMaps, least: float, most: float) -> float:
-    """Change of the view rays' tilt under the doubt of the focal length, median over the object, degrees."""
+    """Change of the view rays' tilt, degrees, if the focal length is at its limits; median over the object."""
     y, x = np.nonzero(maps.mask)
     off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
     lean, more, less = (np.arctan(off * factor) for factor in (1.0, np.exp(-least), np.exp(-most)))

@@ -31,7 +31,7 @@ _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light p
 
 
 def bracket(found: Evidence) -> Gate:
-    """Exposure steps of the bracket, measured from pixels, compared with the camera's."""
+    """Gate on the bracket: exposure steps measured in the pixels, compared with the camera's."""
     radiance = found.radiance
     ratio = np.sort(radiance.bracket.exposure_ratio.mean((0, 2)))  # (E,)
     if len(ratio) == 1:
@@ -57,7 +57,7 @@ def bracket(found: Evidence) -> Gate:
 
 
 def tone(found: Evidence, limits: GateLimits) -> Gate:
-    """Linearity: a tone curve makes the ratio of two exposures depend on brightness."""
+    """Gate on linearity: a tone curve makes the ratio of two exposures depend on brightness."""
     radiance = found.radiance
     limit = limits.max_tone_curvature
     curved = np.abs(radiance.bracket.curvature)
@@ -79,7 +79,7 @@ def tone(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def source(found: Evidence) -> Gate:
-    """Whether the pictures are the sensor's own counts."""
+    """Gate on the kind of files: whether the pictures are the sensor's unprocessed counts."""
     if not found.radiance.sensor.lossy:
         return Gate("source", "pass", "linear counts", "linear counts", "The pictures are linear", unit="")
     message = "The pictures have 8 bits or a display encoding: rounding and tone curve add false polarization"
@@ -88,7 +88,7 @@ def source(found: Evidence) -> Gate:
 
 
 def noise(found: Evidence, limits: GateLimits) -> Gate:
-    """False polarization from noise in the object's median pixel."""
+    """Gate on noise: false polarization that noise causes in the object's median pixel."""
     figure, limit = _noise(found.stokes), limits.max_dolp_noise
     message = f"Noise adds about {100 * figure:.1f} % false polarization"
     remedy = "Use more light, a wider aperture, a longer exposure or more frames"
@@ -117,7 +117,7 @@ def stillness(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def chart(found: Evidence, limits: GateLimits) -> Gate:
-    """Color error of the chart."""
+    """Gate on the color error of the chart."""
     limit = limits.max_delta_e
     if found.chart_missing:
         remedy = (
@@ -162,7 +162,7 @@ def albedo_scale(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def clipping(found: Evidence, limits: GateLimits) -> Gate:
-    """Share of the object that is clipped in the shortest exposure."""
+    """Gate on the share of the object that is clipped in the shortest exposure."""
     # of the darkest frame
     clipped, limit = found.clipped[:, :, found.object_.mask].mean(2).min(1), limits.max_clipped
     k = int(np.argmax(clipped))
@@ -180,7 +180,7 @@ def clipping(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
-    """Flash energy of each shot and frame relative to the others, and the doubt of it."""
+    """Gates on the flash energy of each shot and frame relative to the others, and on its uncertainty."""
     measured, radiance, names = found.selfcal.gains, found.radiance, found.names
     shot = measured.gain.mean(1)
     light = shot[:, None] * radiance.bracket.exposure_ratio.mean(2)  # (K, E)
@@ -209,7 +209,7 @@ def _compared(change: float) -> str:
 
 
 def _gain_doubt(found: Evidence, limits: GateLimits) -> Gate:
-    """Uncertainty of the gains."""
+    """Gate on the uncertainty of the shots' gains."""
     measured, limit = found.selfcal.gains, limits.max_gain_doubt
     if measured.source == "one exposure":
         return Gate("gain doubt", "pass", 0.0, limit, "All angles come from one exposure")
@@ -243,7 +243,7 @@ def _grade(cost_deg: float) -> State:
 
 
 def crossed(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
-    """Whether the cross-polarized shot is darker than S0, and not clipped where S0 is."""
+    """Gates on the cross-polarized shot: it must be darker than S0, and not clipped where S0 is."""
     if found.radiance.crossed is None:
         return
     limit = limits.max_crossed_misfit
@@ -265,7 +265,10 @@ def crossed(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
 
 
 def _crossed(image: StokesImage) -> dict[str, Any]:
-    """Shares: clipped highlights that stay clipped, pixels brighter than S0, light that is missing."""
+    """Shares of pixels in the cross-polarized shot.
+
+    Highlights that stay clipped, brighter than S0, light that is missing.
+    """
     assert image.body is not None
     known = image.mask & (image.body.quality == 0)
     sound = known & ((image.quality & int(Quality.CLIPPED)) == 0)
@@ -281,7 +284,7 @@ def _crossed(image: StokesImage) -> dict[str, Any]:
 
 
 def ambient(found: Evidence, limits: GateLimits) -> Gate:
-    """Share of ambient light, where it was photographed."""
+    """Gate on the share of ambient light, if frames without flash were taken."""
     share = found.radiance.bracket.ambient_share
     limit = limits.max_ambient
     if not np.isfinite(share).any():
@@ -349,13 +352,13 @@ def _surroundings_dolp(found: Evidence) -> float:
 
 
 def _promised_steps(radiance: AngleStack) -> float:
-    """Smallest step of the bracket by its metadata; NaN without them."""
+    """Smallest exposure step of the bracket by metadata; NaN without them."""
     stated = np.sort(radiance.bracket.exif_ratio[0])
     return float((stated[1:] / stated[:-1]).min()) if np.isfinite(stated).all() and len(stated) > 1 else float("nan")
 
 
 def _power(radiance: AngleStack) -> float:
-    """Slope of ln measured over ln stated exposure; 1 without metadata or steps."""
+    """Slope of ln measured exposure over ln stated exposure; 1 without metadata or steps."""
     ratio = radiance.bracket.exif_ratio[0]
     stated: Floats = np.log(ratio) if np.isfinite(ratio).all() else np.zeros(1)
     seen = np.log(np.maximum(radiance.bracket.exposure_ratio.mean((0, 2)), 1e-6))

@@ -7,7 +7,10 @@ from msgspec import Meta
 
 
 class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Beyond a limit `check` asks to reshoot, and `process` writes the asset and ends with exit code 3."""
+    """Limits of the quality gates.
+
+    Beyond one, `check` asks to reshoot, and `process` writes the asset and ends with exit code 3.
+    """
 
     max_delta_e: Annotated[float, Meta(gt=0, description="mean color error of the chart's patches [CIEDE2000]")] = 5.0
     max_scale_doubt: Annotated[float, Meta(gt=0, le=1, description="1σ of the scale of all albedos [1]")] = 0.2

@@ -16,7 +16,7 @@ _FLAGS = (Quality.CLIPPED, Quality.DARK, Quality.ILL_POSED, Quality.METAL, Quali
 
 
 def measured(results: Results) -> dict[str, dict[str, Any]]:
-    """All figures by subject; `labels.LABELS` describes each of them."""
+    """All figures of a result by subject, for report.json; `labels.LABELS` describes each of them."""
     bracket, moved, gains = results.radiance.bracket, results.alignment, results.selfcal.gains
     ring, outline = results.selfcal.ring, results.selfcal.outline
     return {
@@ -135,12 +135,12 @@ def _mesh(mesh: Mesh) -> dict[str, Any]:
 
 
 def _percentile(value: Floats, image: StokesImage, percentile: float) -> Any:
-    """Percentile of a map over the object; None without an object."""
+    """A percentile of a map over the object's pixels; None without an object."""
     return _plain(np.percentile(value[image.mask], percentile)) if image.mask.any() else None
 
 
 def _plain(value: Any, digits: int = 6) -> Any:
-    """Rounded Python numbers, as nested lists for an array; None where a number is missing or not finite."""
+    """Convert numbers to rounded Python numbers, arrays to nested lists; None for missing or infinite numbers."""
     if np.ndim(value):
         return [_plain(one, digits) for one in value]
     return round(float(value), digits) if value is not None and math.isfinite(value) else None

@@ -44,12 +44,12 @@ class SimulatedCamera:
         self.frame_bytes = 2 * self._shoot.width * self._shoot.height
 
     def bracket(self, flash: bool) -> tuple[Exposure, ...]:
-        """Steps of exposure time: its lamp is steady."""
+        """Default exposures: steps of exposure time, because the simulated lamp is steady."""
         stops = [self._shoot.step ** (frame - self._shoot.exposures // 2) for frame in range(self._shoot.exposures)]
         return tuple(Exposure(time_s=MIDDLE_S * stop, f_number=11.0, iso=100.0) for stop in stops)
 
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
-        """Choose the seed of noise and time stamp as `synth.write` does."""
+        """Set the seed of noise and the time stamp of the next frame, as `synth.write` does."""
         angles = self._shoot.angles_deg
         wanted = 0.0 if angle_deg is None else angle_deg
         shot = angles.index(wanted) if wanted in angles else len(angles) + round(10 * wanted) % 900
@@ -93,7 +93,7 @@ def exposure_factor(exposure: Exposure) -> float:
 
 
 def parse_query(query: str) -> SimulatedCameraSettings:
-    """Settings of a URL's query; unknown ones raise SettingError."""
+    """Parse the settings in the URL of a simulated camera; unknown ones raise SettingError."""
     assignments = [f"{name}={value}" for name, value in parse_qsl(query, keep_blank_values=True)]
     defaults = {"width": 768, "height": 576, "nudge_px": 0.0, "nudge_deg": 0.0, "angle_error_deg": 0.0}
     try:

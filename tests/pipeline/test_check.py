@@ -98,6 +98,24 @@ def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> N
     assert asked.needs == "" and next(line for line in asked.lines if line.name == "chart").state == "not measured"
 
 
+@pytest.mark.parametrize("width", [200, 512])
+def test_a_small_chart_is_judged_as_process_judges_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, width: int
+) -> None:
+    """Its size in RAW pixels is that of the photographs; the smaller pictures of `check` do not matter."""
+    monkeypatch.setattr("polcap.pipeline.small_capture._MOST_PIXELS", 2e4)
+    faulty.shoot(tmp_path / "small", 1, "", width)
+    capture = captures.read(tmp_path / "small")
+    merged = hdr.merge(capture, frame_decoder.decode, Config().hdr)
+    reason = ""
+    try:
+        whitebalance.measure(merged, shipped_data.colorchecker(), AUTO, Config().whitebalance)
+    except ChartError as error:
+        reason = str(error).partition("(")[2].partition(")")[0]
+    line = next(line for line in verdict(tmp_path / "small").lines if line.name == "chart")
+    assert reason in line.message and (line.state == "warn") is bool(reason) is (width == 200)
+
+
 def test_missing_frame_is_bad_input(tmp_path: Path) -> None:
     faulty.shoot(tmp_path / "bad", 1, "missing", 128)
     with pytest.raises(CaptureError, match=r"2 frames where .* has 3"):

@@ -73,7 +73,7 @@ def encode(
     provenance: Mapping[str, str] | None = None,
     encoder: TextureEncoder | None = None,
 ) -> bytes:
-    """The bytes of the GLB that `write` writes."""
+    """Encode an asset as the bytes of a GLB; parameters as for `write`."""
     blob, images = Blob(), options.images
     origin = center(asset.mesh.vertices) if options.origin is None else options.origin
     primitive, transform = glb_geometry.add(blob, asset.mesh, origin, options.geometry)
@@ -126,7 +126,7 @@ def encode(
 
 
 def textures(asset: Asset) -> dict[str, Texture]:
-    """The embedded textures, by the end of their names, in the order of the material."""
+    """The textures that a GLB embeds, by name suffix, in the order of the glTF material."""
     return {
         "basecolor": texture_set.base_color(asset),
         "orm": texture_set.packed(asset),
@@ -157,7 +157,7 @@ def _material(asset: Asset, name: str) -> dict[str, Any]:
 
 
 def _packet(name: str, provenance: Mapping[str, str]) -> dict[str, Any]:
-    """Title and provenance in Dublin Core and polcap's own terms, as JSON-LD."""
+    """Title and origin of an asset as an XMP packet in JSON-LD (Dublin Core, and polcap's terms)."""
     return {
         "@context": _CONTEXT,
         "@id": "",
@@ -177,7 +177,7 @@ def center(vertices: Floats) -> Floats:
 
 
 def is_open(faces: NDArray[np.int32]) -> bool:
-    """Whether some edge of faces (F, 3) belongs to one triangle only, so that the back of the surface is visible."""
+    """Whether a mesh has a border: an edge of faces (F, 3) that only one triangle has, so that its back can be seen."""
     start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1)
     _, triangles = np.unique(np.minimum(start, end) << 32 | np.maximum(start, end), return_counts=True)
     return bool((triangles == 1).any())

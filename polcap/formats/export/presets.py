@@ -1,4 +1,4 @@
-"""Presets of `polcap export`: formats, file names, packing and direction of normals for a program or purpose."""
+"""Presets of `polcap export`: file formats, file names, channel packing and normal-map direction for a program."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ FORMATS: tuple[Format, ...] = ("gltf", "obj", "usd", "materialx", "exr")
 
 @dataclass(frozen=True)
 class ExportPreset:
-    """The files of one export; `{}` in a name is the asset's name."""
+    """The files that one export writes for one program; in file names, {} is replaced by the asset's name."""
 
     formats: tuple[Format, ...]
     description: str

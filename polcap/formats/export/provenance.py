@@ -27,7 +27,7 @@ def versions() -> dict[str, str]:
 
 
 def record(about: Mapping[str, Any]) -> dict[str, Any]:
-    """The origin of a result, from the content of its report.json."""
+    """The origin of a result (photographs, versions, settings), from the content of its report.json."""
     capture, model = about["capture"], about["model"]
     return {
         "format": "polcap provenance 1",
@@ -47,12 +47,12 @@ def record(about: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def words(facts: Mapping[str, Any]) -> dict[str, str]:
-    """The record as texts, for formats that hold only texts."""
+    """The origin of a result as texts by key, for file formats that store only texts."""
     return {key: value if isinstance(value, str) else _plain(value) for key, value in facts.items()}
 
 
 def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:
-    """Write the sidecar: the record, and the digest of every file of the export.
+    """Write the sidecar file of an export: its origin (`facts`) and the digest of each exported file.
 
     The sidecar of an earlier export with the same record also listed its files; those that exist stay in the list.
 
@@ -70,7 +70,7 @@ def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> N
 
 
 def digest(file: Path) -> str:
-    """The digest of a file, as in the sidecar."""
+    """SHA-256 of an exported file, as in the sidecar file."""
     return file_bytes.digest(file.read_bytes())
 
 

@@ -50,7 +50,7 @@ class _Albedo(Struct, frozen=True):
 
 
 class _Description(Struct, frozen=True):
-    """The keys of maps.json that `read` needs."""
+    """The keys of maps.json (crop, size, camera, depth unit…) that `read` needs."""
 
     crop: tuple[_Place, _Place, _Place, _Place]
     size: tuple[_Side, _Side]
@@ -63,7 +63,7 @@ class _Description(Struct, frozen=True):
 
 @dataclass(frozen=True)
 class StoredMaps:
-    """The maps of a result as read from its files."""
+    """The maps of a result as read from its folder maps/, with the depth (H, W) and whether it is metric."""
 
     maps: SurfaceMaps
     depth: Floats  # (H, W) NaN outside the mask
@@ -71,7 +71,7 @@ class StoredMaps:
 
 
 def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues) -> None:
-    """Write every map as EXR, the main ones as PNG too, and maps.json last; the same values give the same bytes.
+    """Write the folder maps/ of a result: every map as EXR, the main ones as PNG too, and maps.json.
 
     Of the mesh its depth (H, W) is written. All images are on the crop (H, W) of `maps`. Files are encoded on
     threads. The folder is replaced as a whole: if one file fails, the folder of an earlier run stays.
@@ -90,7 +90,7 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues
 
 
 def _write(file: Path, content: Callable[[], Any]) -> None:
-    """Write one file: an .exr of channels, or a .png of pixels."""
+    """Write one file of the folder maps/: an .exr of channels, or a .png of pixels."""
     if file.suffix == ".exr":
         exr.write(file, content(), half=file.stem not in map_files.FLOAT_FILES)
     else:
@@ -115,18 +115,18 @@ def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
 
 
 def stored_depth(maps: SurfaceMaps, mesh: Mesh) -> Floats:
-    """The depth (H, W) as `read` returns it after `write`; NaN outside the mask."""
+    """The mesh's depth (H, W) as `read` returns it after `write`; NaN outside the mask."""
     return np.where(map_files.inside(maps), map_files.object_depth(maps, mesh), np.nan).astype(np.float32)
 
 
 def _masked_half(values: Floats, inside: NDArray[np.bool_]) -> Floats:
-    """`map_files.masked`, clipped and rounded to half."""
+    """A map with 0 outside the object, clipped to the range of half floats and rounded to half."""
     limit = np.finfo(np.float16).max
     return np.clip(map_files.masked(values, inside), -limit, limit).astype(np.float16).astype(np.float32)
 
 
 def read(folder: Path) -> StoredMaps:
-    """Read the folder that `write` wrote: EXRs, mask.png and maps.json.
+    """Read the folder maps/ of a result that `write` wrote: EXRs, mask.png and maps.json.
 
     Raises DecodeError: a file is missing, damaged, or not of the size in maps.json.
     """
@@ -157,7 +157,7 @@ def read(folder: Path) -> StoredMaps:
 
 
 def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
-    """Note in maps.json the content of the export in the result's folder `where`, merged with earlier notes on it.
+    """Add a record `about` an export to maps.json, merged with earlier records of the folder `where`.
 
     Raises StorageError: the file cannot be written.
     """
@@ -178,7 +178,7 @@ def _write_json(file: Path, content: Mapping[str, Any]) -> None:
 
 
 def _read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Floats:
-    """The channels `letters` of a map's EXR, (H, W, C), or (H, W) of one."""
+    """Read the channels `letters` of one map's EXR as an array (H, W, C), or (H, W) for one channel."""
     file = folder / f"{name}.exr"
     found, _ = exr.read(file)
     planes = [found[letter] for letter in letters if letter in found]
@@ -191,7 +191,7 @@ def _read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> F
 
 
 def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[str, Any]:
-    """maps.json."""
+    """The content of maps.json."""
     view = maps.view
     height, width = maps.mask.shape
     unit = depth["unit"]

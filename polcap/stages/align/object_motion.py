@@ -1,4 +1,4 @@
-"""Movement of the object against its surroundings, which one transform for the whole picture hides.
+"""Detects motion of the object relative to its surroundings, which one transform of the whole picture would hide.
 
 A similarity's zoom and roll can stand for an object that was pushed while chart and backdrop stayed. So object and
 surroundings are registered separately, and the two motions are compared in the middle of the object.
@@ -71,7 +71,10 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
 
 
 def _registered(region: Pyramid, shot: Pyramid, start: Floats) -> tuple[Registration, float]:
-    """Motion of a region, begun from the whole picture's motion and without it, and the better correlation."""
+    """Motion of a region of the picture, and its correlation.
+
+    The search starts from the whole picture's motion and from none; the better result counts.
+    """
     found = [registration.register(region, shot, "similarity")]
     corners = picture_corners(region.shape[1], region.shape[0])
     if np.abs(transform_points(start, corners) - corners).max() > _SAME_PX:

@@ -28,7 +28,9 @@ class Ratio:
 
 
 def of_tiles(a: Floats, b: Floats) -> Ratio | None:
-    """Exposure ratio b / a (C,) from tiles (T, C) of both frames, see `common_tiles`; None if they do not suffice.
+    """Exposure ratio b / a (C,) measured in tiles (T, C) of two frames, see `common_tiles`.
+
+    None if they do not suffice.
 
     It is the quotient of sums over tiles: the maximum-likelihood estimate for Poisson counts, without the bias of a
     mean of quotients or of logarithms. Tiles that disagree, because something moved, are dropped. A channel with an
@@ -45,7 +47,7 @@ def of_tiles(a: Floats, b: Floats) -> Ratio | None:
 
 
 def common_tiles(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
-    """Means (T, C) in both frames of the tiles that are fully usable in both."""
+    """Means (T, C) of tiles in both frames, for the tiles that are fully usable in both."""
     inside = block_means(reference.usable & other.usable, TILE) == 1
     a, b = (tile_means(picture, TILE)[inside].astype(np.float64) for picture in (reference, other))
     return a, b
@@ -83,7 +85,7 @@ def _quadratic(x: Floats, y: Floats) -> Floats:
 
 
 def measured_or_stated(name: str, measured: Ratio | None, channels: int, frame: Frame, reference: Frame) -> Floats:
-    """Exposure (C,) float32 relative to the reference frame: the measured one, else that of the metadata.
+    """Exposure ratio (C,) float32 to the reference frame: the measured one, else that of the metadata.
 
     Raises
     ------
@@ -106,14 +108,14 @@ def measured_or_stated(name: str, measured: Ratio | None, channels: int, frame: 
 
 
 def stated(frame: Frame, reference: Frame) -> float:
-    """Exposure relative to the reference frame, by capture.toml or the camera's settings; NaN if unknown."""
+    """Exposure ratio to the reference frame by capture.toml or camera settings; NaN if unknown."""
     if frame.exposure and reference.exposure:
         return frame.exposure / reference.exposure
     return _by_settings(frame, reference)
 
 
 def of_ambient(frame: Frame, reference: Frame) -> float:
-    """Exposure to ambient light relative to the reference frame, by the camera's settings; 1 if unknown."""
+    """Ambient exposure ratio to the reference frame by camera settings; 1 if unknown."""
     settings = _by_settings(frame, reference)
     return settings if np.isfinite(settings) else 1.0
 
@@ -124,7 +126,9 @@ def _by_settings(frame: Frame, reference: Frame) -> float:
 
 
 def curvature(a: Floats, b: Floats) -> float:
-    """Change of the exposure ratio with brightness, d ln(b/a) / d ln √(a b), from tiles (T, C) of `common_tiles`.
+    """Nonlinearity of two frames: change of the exposure ratio with brightness, d ln(b/a) / d ln √(a b).
+
+    From tiles (T, C) of `common_tiles`.
 
     It is 0 for linear files. A tone curve makes the ratio differ between shadows and highlights; a change of the light
     does not. NaN if the tiles span too little brightness.
@@ -142,7 +146,7 @@ def curvature(a: Floats, b: Floats) -> float:
 
 
 def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:
-    """Σb / Σa over the tiles (T,) that agree, and its relative 1σ; None for too few tiles."""
+    """Exposure ratio Σb / Σa over the tiles (T,) that agree, and its relative 1σ; None for too few tiles."""
     for dim in (_DIM, _DIMMEST):
         bright = (a > dim) & (b > dim)
         if bright.sum() >= _LEAST_TILES:

@@ -24,7 +24,7 @@ from polcap.stages.infer import analytic, highlights, learned
 
 
 class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The section `infer` of a settings file."""
+    """Settings of the stage `infer`, the section `infer` of a settings file."""
 
     ior: Annotated[float, Meta(ge=1.2, le=2.5, description="refractive index assumed by the analytic estimator")] = 1.5
     symmetries: Annotated[
@@ -36,7 +36,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @stage(version=19)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
-    """Normal, diffuse, specular, roughness and expected error; without a network by inversion.
+    """Estimate normal, diffuse, specular, roughness and expected error from cues; without a network by inversion.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Highlights: filled where they are clipped, and their albedo from a crossed shot.
+"""Highlights: clipped pixels are filled, and albedo under highlights comes from a cross-polarized shot, if any.
 
 A crossed shot shows the diffuse reflection under a highlight. Around the highlight, the estimator's albedo over the
 diffuse reflection gives the shading that it assumed. The ratio to the shading of the normals is continued into the
@@ -31,7 +31,7 @@ _COMMON_WHITE, _WHITE_RANGE = 0.9, 0.14  # 95th percentile of the albedo: usual 
 
 
 def fill_highlights(image: Floats, cues: Cues) -> Floats:
-    """An image (H, W, 3) with means of the pixels around in highlights that saturate the shortest exposure."""
+    """Fill highlights that clip in the shortest exposure: image (H, W, 3) with means of the pixels around."""
     clipped = cues.mask & ((cues.quality & Quality.CLIPPED) > 0)
     hole = cues.mask & (cv2.dilate(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     known = cues.mask & ~hole
@@ -46,7 +46,7 @@ def fill_highlights(image: Floats, cues: Cues) -> Floats:
 def mean_around(
     image: Floats, known: NDArray[np.bool_], wanted: NDArray[np.bool_], blur: float, least: float
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Means (H, W, 3) of the known pixels about each wanted one (H, W), and the wanted ones without a mean (H, W).
+    """Means (H, W, 3) of known pixels about each wanted pixel (H, W), and the wanted pixels without a mean (H, W).
 
     The Gaussian weights start at 1σ = `blur` px and double until known pixels have a share of `least`.
     """
@@ -63,7 +63,7 @@ def mean_around(
 
 
 def correct_highlights(maps: SurfaceMaps, cues: Cues, ior: float) -> SurfaceMaps:
-    """The maps (H, W, …) with the albedo of highlights from the crossed shot (`cues.body`); unchanged without one."""
+    """Correct the albedo in highlights by the cross-polarized shot (`cues.body`); maps (H, W, …)."""
     if cues.body is None or cues.body_known is None:
         return maps
     low, high = _GLOSS
@@ -82,7 +82,10 @@ def correct_highlights(maps: SurfaceMaps, cues: Cues, ior: float) -> SurfaceMaps
 
 
 def specular_share(cues: Cues) -> Floats:
-    """Specular share of S0, (H, W); 0 where the crossed shot shows nothing. Clipped light counts as specular."""
+    """Specular share of S0, (H, W), from the cross-polarized shot; 0 where it shows nothing.
+
+    Clipped light is specular.
+    """
     assert cues.body is not None and cues.body_known is not None
     share = np.clip(1 - cues.body.sum(-1) / np.maximum(cues.radiance.sum(-1), 1e-6), 0, 1)
     return np.where(cues.body_known & cues.mask, share, 0).astype(np.float32)

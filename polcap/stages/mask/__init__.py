@@ -1,4 +1,4 @@
-"""Stage 4: segmentation of the object, with the expected error of its mask.
+"""Stage 4: segmentation of the object in the picture, with the expected error of its mask.
 
 1. A network gives each pixel a probability of being the object (`network`, with the input of `mask_channels`).
 2. Pixels of high probability become a mask without specks (`regions`).
@@ -26,7 +26,7 @@ from polcap.stages.mask.regions import Bools
 
 
 class MaskSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The section `mask` of a settings file."""
+    """Settings of the stage `mask`, the section `mask` of a settings file."""
 
     margin: Annotated[
         float, Meta(ge=0, le=1, description="border added around the object's box [share of its longer side]")
@@ -49,7 +49,7 @@ def segment(
     run: RunNetwork,
     settings: MaskSettings,
 ) -> ObjectMask:
-    """The object's mask (H, W) on the reference grid, and a crop around it.
+    """Segment the object: its mask (H, W) on the reference grid, and a crop around it.
 
     `user_mask` (H, W) replaces the search. Without a network the object is found by its difference from the backdrop.
 
@@ -100,13 +100,16 @@ def _object(
 
 
 def _mean_picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> Floats:
-    """Mean of the registered shots in linear Rec.709, (H, W, 3)."""
+    """Mean picture of the registered shots in linear Rec.709, (H, W, 3)."""
     total = sum(warp(radiance.value[k], alignment.transform[k], order=1) for k in range(len(radiance.angle)))
     return np.asarray(cv2.transform(total, 2 / len(radiance.angle) * color.matrix), np.float32)
 
 
 def _chart_zone(radiance: AngleStack, color: ColorCalibration, margin: float) -> Bits:
-    """(H, W) 1 on the chart's patches and up to `margin` patch widths around them."""
+    """Zone (H, W) that the object cannot be in.
+
+    1 on the chart's patches and up to `margin` patch widths around them.
+    """
     zone = np.zeros(radiance.value.shape[1:3], np.uint8)
     if color.place is not None:
         corners = np.asarray(color.place.corners, np.float64)

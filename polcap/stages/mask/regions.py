@@ -1,4 +1,4 @@
-"""Connected regions of a mask: removes specks, fills holes, and measures the result."""
+"""Connected regions of the object's mask: removes specks, fills holes, and measures the result."""
 
 import cv2
 import numpy as np
@@ -29,7 +29,7 @@ def clean(mask: Bools, probability: Floats) -> Bools:
 
 
 def choose(colored: Bools, learned: Bools, probability: Floats) -> Bools:
-    """Choose the mask by colors, or the network's if its probabilities contradict the colors; (H, W) each.
+    """Choose between two masks (H, W): by colors, or the network's if its probabilities contradict the colors.
 
     The outline by colors is sharper, but wrong where object and backdrop have the same color, such as white on white.
     """
@@ -61,13 +61,13 @@ def fill_holes(mask: Bits, least: float, probability: Floats | None = None) -> B
 
 
 def expected_error(mask: Bools, probability: Floats) -> float:
-    """1 − expected intersection over expected union with the true mask, by probabilities (H, W)."""
+    """Expected error of a mask from probabilities (H, W): 1 − expected intersection over expected union."""
     inside, outside = float(probability[mask].sum()), float(probability[~mask].sum())
     return 1 - inside / max(float(mask.sum()) + outside, 1e-9)
 
 
 def measure_shape(mask: Bools) -> tuple[float, float, float]:
-    """Three shares of a mask (H, W), all small for a whole object inside the picture.
+    """Measure three shares of a mask (H, W) that are small for a whole object inside the picture.
 
     Share of the mask outside its largest region; area of the holes over that of the mask; share of the picture's edge
     that the mask covers.

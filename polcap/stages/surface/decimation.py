@@ -1,4 +1,4 @@
-"""Mesh decimation: the same surface in fewer triangles, and its distance from the first.
+"""Mesh decimation: the same surface with fewer triangles, and its distance from the full mesh.
 
 References
 ----------
@@ -20,7 +20,7 @@ _MEASURED = 20_000  # vertices, at most, of which the distance is measured
 
 @dataclass(frozen=True)
 class DecimatedMesh:
-    """A mesh in fewer triangles, and how far it is from the first."""
+    """A mesh with fewer triangles, and its distance from the full mesh."""
 
     mesh: Mesh
     error: float  # 99th percentile of the first mesh's vertices from this surface, in the mesh's unit of length
@@ -28,7 +28,7 @@ class DecimatedMesh:
 
 
 def decimate(mesh: Mesh, view: View, count: int, back: Back) -> DecimatedMesh:
-    """The mesh in about `count` triangles; textures stay where they are, as the camera sees them.
+    """Reduce a mesh to about `count` triangles; texture coordinates are those of the camera's view.
 
     `back` is the setting the mesh was made with: triangles that turn away from the camera are left out of an open one.
 
@@ -66,7 +66,10 @@ def decimate(mesh: Mesh, view: View, count: int, back: Back) -> DecimatedMesh:
 
 
 def _distance(first: Mesh, coarser: Mesh) -> float:
-    """99th percentile of the first mesh's vertices from the planes of the nearest triangles of the coarser one."""
+    """Distance of a decimated mesh from the full one: 99th percentile over the full mesh's vertices.
+
+    Measured to the plane of the nearest triangle.
+    """
     from scipy.spatial import cKDTree  # here: importing it costs .1 s of every start
 
     corner = coarser.vertices[coarser.faces].astype(np.float64)  # (F, 3, 3)

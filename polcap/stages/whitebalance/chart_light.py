@@ -40,7 +40,7 @@ _STRAIGHT = np.linalg.pinv(
 
 
 def measure(place: Placement, view: View, slope: Floats, delta_e: float) -> ChartLight:
-    """The chart's plane, the most probable position of the flash and falloff of light, and their covariance.
+    """Estimate the chart's plane, the most probable flash position and light falloff, and their covariance.
 
     slope (2,) is the relative change of the light per patch, towards the chart's right and down, at the white patch.
     delta_e, the mean residual of the patches, determines its error.
@@ -70,7 +70,7 @@ class _ChartPlane:
     normal: Floats  # (3,)
 
     def turned(self, turn: Floats) -> "_ChartPlane":
-        """The plane after a small rotation (2,) about x and y [rad] through its center."""
+        """The chart's plane after a small rotation (2,) about x and y [rad] through its center."""
         from scipy.spatial.transform import Rotation  # here: importing it costs .2 s of every start
 
         rotation, middle = Rotation.from_rotvec([*turn, 0.0]), self.point.mean(axis=0)
@@ -85,7 +85,7 @@ def _slope(outlined: _ChartPlane, state: Floats) -> Floats:
 
 
 def _plane(place: Placement, view: View) -> tuple[Floats, Floats]:
-    """Patch centers (24, 3) in units of the distance of the chart's center, and normal (3,), in the camera frame."""
+    """Chart plane in the camera frame: patch centers (24, 3) in units of the chart's distance, and normal (3,)."""
     camera = np.array([[view.focal, 0, view.center[0]], [0, view.focal, view.center[1]], [0, 0, 1]])
     pose = np.diag([1.0, -1.0, -1.0]) @ np.linalg.solve(camera, place.homography)
     pose = -pose / (pose[2] @ [chart.COLUMNS / 2, chart.ROWS / 2, 1])
