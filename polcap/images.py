@@ -7,7 +7,7 @@ one.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import IntFlag
 from typing import Any, Literal
 
@@ -654,3 +654,22 @@ class GBuffer:
     mask: NDArray[np.bool_]  # (H, W)
     position: Floats  # (H, W, 3) in the object's own frame, for solid textures; 0 outside
     view: View
+
+
+def _repr(value: Any) -> str:
+    """Short text of a value: shape and type of each array, and at most 60 characters of each other field."""
+    listed = ", ".join(f"{one.name}={_short(getattr(value, one.name))}" for one in fields(value))
+    return f"{type(value).__name__}({listed})"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray) and value.size > 9:
+        return f"{value.dtype} {value.shape}"
+    if is_dataclass(value):
+        return f"{type(value).__name__}(…)"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}…"
+
+
+for _value in [one for one in vars().values() if isinstance(one, type) and is_dataclass(one)]:
+    _value.__repr__ = _repr  # type: ignore[method-assign]  # arrays are not printed in full

@@ -14,7 +14,7 @@ from polcap import parallel
 from polcap.config import Config
 from polcap.errors import SettingError
 from polcap.formats import atomic
-from polcap.formats.export import exr_layers, glb_geometry, gltf, materialx, obj, provenance, texture_set, usd
+from polcap.formats.export import exr_layers, glb_geometry, gltf, materialx, obj, provenance, texture_set, usd, web_page
 from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.presets import PRESETS, ExportPreset, Format
@@ -38,6 +38,7 @@ class ExportRequest:
     triangles: int | None = None  # at most; by default the preset's, or those of the full mesh
     color: str = exr_layers.LINEAR_REC709  # color space or role of the colors in the layered EXR
     texture_size: int | None = None  # px of the longer side; by default the maps'
+    page: Path | None = None  # file with model-viewer's script, for a web page that shows the GLB
     lod: int = 0  # number of further GLBs, each with a quarter of the triangles of the previous one
 
 
@@ -62,9 +63,15 @@ class DetailLevel:
 def check(wanted: ExportRequest) -> None:
     """Raise a SettingError for an unknown preset or a missing package, before anything is computed."""
     preset = effective(wanted)
-    if "usd" in preset.formats:
+    if not {"usd", "usdz"}.isdisjoint(preset.formats):
         usd.require()
     glb_geometry.require(preset.geometry)
+    if wanted.page is not None:
+        web_page.read_script(wanted.page)
+        if "gltf" not in preset.formats or preset.geometry == "draco":
+            raise SettingError(
+                "--page shows a GLB without Draco, whose decoder is not in the page; choose --preset web"
+            )
 
 
 def read(folder: Path, config: Config) -> ExportSource:
@@ -137,6 +144,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
         "gltf": partial(_write_glb, folder / f"{stem}.glb", whole, options, words, encoder),
         "obj": partial(obj.write, folder / f"{stem}.obj", whole, stem, shared, comment),
         "usd": partial(_one, usd.write, folder / f"{stem}.usdc", whole, stem, shared, words),
+        "usdz": partial(_write_usdz, folder / f"{stem}.usdz", whole, words, encoder),
         "materialx": partial(_one, materialx.write, folder / f"{stem}.mtlx", whole, stem, shared, comment),
         "exr": partial(_one, exr_layers.write, layered, out / "maps", wanted.color, words),
     }
@@ -145,6 +153,10 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     tasks += [partial(_write_glb, file, level.asset, options, words, encoder) for file, level in coarser.items()]
     tasks += [partial(_write_texture, folder / file, texture, encoder) for file, texture in loose.items()]
     written = [file for files in parallel.results(tasks) for file in files]  # pictures are encoded on threads
+    if wanted.page is not None:
+        page, glb = folder / f"{stem}.html", folder / f"{stem}.glb"
+        web_page.write(page, glb, web_page.read_script(wanted.page), stem)
+        written.append(page)
     sidecar = folder / f"{stem}.provenance.json"
     provenance.write(sidecar, record, {file.name: provenance.digest(file) for file in written})
     embedded = gltf.textures(whole) if "gltf" in preset.formats else {}
@@ -189,6 +201,12 @@ def _write_glb(
     file: Path, content: Asset, options: gltf.GlbOptions, words: Mapping[str, str], encoder: TextureEncoder
 ) -> list[Path]:
     gltf.write(file, content, file.stem, options, words, encoder)
+    return [file]
+
+
+def _write_usdz(file: Path, content: Asset, words: Mapping[str, str], encoder: TextureEncoder) -> list[Path]:
+    textures = {key: encoder(make(content), "png") for key, make in texture_set.LOOSE.items()}
+    usd.package(file, content, file.stem, textures, words)
     return [file]
 
 
