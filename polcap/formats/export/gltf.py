@@ -55,7 +55,7 @@ _CATALOG: Mapping[str, tuple[str, Callable[[str], Any]]] = {  # fields of `Catal
 
 @dataclass(frozen=True)
 class GlbOptions:
-    """Storage of a GLB's pictures and mesh."""
+    """Options of a GLB: format of its pictures, storage of its mesh."""
 
     images: Kind = "png"
     geometry: Geometry = "float"
