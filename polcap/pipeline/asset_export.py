@@ -90,7 +90,7 @@ def read(folder: Path, config: Config) -> ExportSource:
 
 
 def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
-    """The asset with at most the triangles and the texture size of an export, then its levels of detail.
+    """Build an export's levels of detail: first the asset with at most the requested triangles and texture size.
 
     Raises
     ------
@@ -176,7 +176,10 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
 
 
 def effective(wanted: ExportRequest) -> ExportPreset:
-    """The preset of a request, or its formats, with the request's own options in place of the preset's."""
+    """The preset that an export uses.
+
+    That of the request, with the request's other options in place of the preset's.
+    """
     if wanted.preset is None:
         preset = ExportPreset(wanted.formats, "normals +Y")
     elif wanted.preset in PRESETS:

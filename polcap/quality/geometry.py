@@ -56,7 +56,10 @@ def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate
 
 
 def _object_moved(found: Evidence, limits: GateLimits) -> Gate:
-    """Movement of the object against its surroundings, and its cost, which grows with the share of its size."""
+    """Gate on movement of the object relative to its surroundings.
+
+    The cost grows with the share of the object's size.
+    """
     motion, names = _motion(found), found.names
     pushed, inside = (np.nan_to_num(one, posinf=np.inf) * found.grid_px for one in (motion.pushed, motion.inside))
     radius = max(outline.disc_radius(found.object_.mask) * found.grid_px, 1.0)
@@ -178,7 +181,7 @@ def sharpness(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def focus(found: Evidence, limits: GateLimits) -> Gate:
-    """Blur of the sharpest edges on the object and its outline, in px of the merged picture."""
+    """Gate on focus: blur of the sharpest edges on the object and its outline, in px of the merged picture."""
     blur, limit = _edge_blur(found), limits.max_edge_blur_px
     message = f"The sharpest edges of the object are blurred by {blur:.1f} px (1σ)"
     if blur > limit:
@@ -188,7 +191,7 @@ def focus(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def _edge_blur(found: Evidence) -> float:
-    """1σ of the blur of the sharpest edges [px]: a step of height h, blurred by σ, has the slope h/(σ√2π).
+    """Blur (1σ) of the object's sharpest edges [px]: a step of height h, blurred by σ, has the slope h/(σ√2π).
 
     Edges are the tenth of the object with most contrast within 7 px; the sharpest are the twentieth of these.
     """

@@ -102,7 +102,7 @@ def _noise(image: StokesImage) -> float:
 
 
 def stillness(found: Evidence, limits: GateLimits) -> Gate:
-    """Share of the object that differs between the exposures of a shot."""
+    """Gate on motion within a bracket: share of the object that differs between the exposures of a shot."""
     ghost = (found.radiance.quality & int(Quality.GHOST)) > 0
     fraction = ghost[:, found.object_.mask].mean(1) if found.object_.mask.any() else np.zeros(len(ghost))
     k = int(np.argmax(fraction))
@@ -144,7 +144,10 @@ def chart(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def albedo_scale(found: Evidence, limits: GateLimits) -> Gate:
-    """Whether the scale of all albedos is known, and its uncertainty; without a chart albedos are relative."""
+    """Gate on the scale of all albedos: whether it is known, and its uncertainty.
+
+    Without a chart albedos are relative.
+    """
     sigma, limit, source = found.maps.albedo_sigma, limits.max_scale_doubt, found.color.source
     remedy = "Put a ColorChecker next to the middle of the object, facing the lens, where only the flash lights it"
     if sigma is None:
@@ -297,7 +300,7 @@ def ambient(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def lighting(found: Evidence, limits: GateLimits) -> Gate:
-    """Common polarization of the object's brightest parts, relative to their albedo.
+    """Gate on light from two sides: common polarization of the object's brightest parts, relative to albedo.
 
     Under a flash at the lens these face the camera, so their polarization points all ways. Two flashes or softboxes at
     the sides put highlights where reflection polarizes, both in the same direction.
@@ -322,7 +325,10 @@ def _highlight_dolp(found: Evidence) -> float:
 
 
 def room(found: Evidence, limits: GateLimits) -> Gate:
-    """Polarization of the surroundings, which the flash leaves unpolarized and a window or a glossy lamp does not."""
+    """Gate on room light: polarization of the surroundings.
+
+    A flash leaves them unpolarized, a window or a glossy lamp does not.
+    """
     share, limit = _surroundings_dolp(found), limits.max_room_dolp
     message = f"The surroundings are polarized by {100 * share:.1f} %"
     if share > limit:

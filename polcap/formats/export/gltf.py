@@ -40,7 +40,7 @@ _CONTEXT = {
 
 @dataclass(frozen=True)
 class GlbOptions:
-    """Storage of a GLB's pictures and mesh."""
+    """Options of a GLB: format of its pictures, storage of its mesh."""
 
     images: Kind = "png"
     geometry: Geometry = "float"
