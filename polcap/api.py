@@ -19,7 +19,7 @@ from polcap.pipeline.path import AUTO, UserInput
 
 @dataclass(frozen=True)
 class Result:
-    """The output of a run."""
+    """Result of `polcap.process`: the result folder, and the content of its report.json."""
 
     folder: Path  # maps/, asset/, report.html
     report: dict[str, Any]  # report.json's content

@@ -44,6 +44,12 @@ def export(
         Path | None,
         Option(metavar="JS", help="Web page that shows the GLB with this model-viewer.min.js, without a network."),
     ] = None,
+    about: Annotated[
+        list[str] | None,
+        Option(
+            metavar="K=V", help="A fact for catalogs: title, creator, rights, license or object_number; repeatable."
+        ),
+    ] = None,
     lod: Annotated[int, Option(min=0, max=6, help="Further GLBs, each with a quarter of the triangles.")] = 0,
     json: Json = False,
 ) -> None:
@@ -64,6 +70,7 @@ def export(
         color=color,
         texture_size=texture_size,
         page=page,
+        catalog=options.catalog_fields(about or []),
         lod=lod,
     )
     wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]

@@ -5,7 +5,7 @@ same bytes, with any number of threads.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ class ExportRequest:
     color: str = exr_layers.LINEAR_REC709  # color space or role of the colors in the layered EXR
     texture_size: int | None = None  # px of the longer side; by default the maps'
     page: Path | None = None  # file with model-viewer's script, for a web page that shows the GLB
+    catalog: Mapping[str, str] = field(default_factory=dict)  # fields of `CatalogEntry` in place of the capture's
     lod: int = 0  # number of further GLBs, each with a quarter of the triangles of the previous one
 
 
@@ -90,7 +91,7 @@ def read(folder: Path, config: Config) -> ExportSource:
 
 
 def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
-    """The asset with at most the triangles and the texture size of an export, then its levels of detail.
+    """Build an export's levels of detail: first the asset with at most the requested triangles and texture size.
 
     Raises
     ------
@@ -136,7 +137,11 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
         loose |= {file: texture_set.LOOSE[key](whole) for key, file in shared.items()}
     folder = out / "asset" / (wanted.preset or "")
     options = gltf.GlbOptions(preset.images, preset.geometry, gltf.center(mesh.vertices))
-    unit, record, encoder = "m" if mesh.metric else "relative", provenance.record(about), TextureEncoder()
+    unit, record, encoder = (
+        "m" if mesh.metric else "relative",
+        provenance.record(about, wanted.catalog),
+        TextureEncoder(),
+    )
     words = {"unit": unit, "normals": "+Y (OpenGL)", **provenance.words(record)}
     comment = f"polcap; unit of length: {unit}; normals +Y (OpenGL); made from: {stem}.provenance.json"
     layered = folder / f"{stem}_layers.exr"
@@ -155,7 +160,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     written = [file for files in parallel.results(tasks) for file in files]  # pictures are encoded on threads
     if wanted.page is not None:
         page, glb = folder / f"{stem}.html", folder / f"{stem}.glb"
-        web_page.write(page, glb, web_page.read_script(wanted.page), stem)
+        web_page.write(page, glb, web_page.read_script(wanted.page), words.get("title", stem))
         written.append(page)
     sidecar = folder / f"{stem}.provenance.json"
     provenance.write(sidecar, record, {file.name: provenance.digest(file) for file in written})
@@ -176,7 +181,10 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
 
 
 def effective(wanted: ExportRequest) -> ExportPreset:
-    """The preset of a request, or its formats, with the request's own options in place of the preset's."""
+    """The preset that an export uses.
+
+    That of the request, with the request's other options in place of the preset's.
+    """
     if wanted.preset is None:
         preset = ExportPreset(wanted.formats, "normals +Y")
     elif wanted.preset in PRESETS:

@@ -185,7 +185,7 @@ def training_meshes(data: Path) -> list[Path]:
 
 
 def read_mesh(path: Path) -> Triangles:
-    """Read a mesh file and add shading normals."""
+    """Read a training mesh and add shading normals."""
     return smooth(*scene_files.read_mesh(path))
 
 
