@@ -36,7 +36,7 @@ class AssetSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @stage(version=3, keep=False)
 def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings, bits: Bits = 8) -> Asset:
-    """Build the object's glTF textures on the crop's grid, filled outwards so that no seam shows.
+    """Build the object's glTF textures (H, W, 3) on the crop's grid, filled outwards so that no seam shows.
 
     Our material has a diffuse term behind two Fresnel transmissions, glTF's has base·(1 − F). With base =
     ρ_d T₊(0)²/(1 − F0) both agree for a frontal surface. F0 is the index's own × factor × texture, and the factor holds
