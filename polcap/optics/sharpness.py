@@ -45,7 +45,8 @@ def places(image: SensorImage, clip: float) -> NDArray[np.int64]:
 def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
     """Cut tiles out of one decoded photograph and judge whether they are usable.
 
-    `corners` (T, 2) are (row, column) in binned px, as of `places`. Photosites are clipped from `clip` [white level] on.
+    `corners` (T, 2) are (row, column) in binned px, as of `places`.
+    From `clip` [white level] on photosites are clipped.
     """
     step = image.superpixel
     margin = 1 if image.cfa is None else len(image.cfa)  # a clipped photosite makes its neighbors unusable
