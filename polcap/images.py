@@ -315,6 +315,14 @@ class MaskedImage:
 
 
 @dataclass(frozen=True)
+class Mosaic:
+    """A merged shot on its photosites, each of one color."""
+
+    value: Floats  # (2 H, 2 W) float16, sensor white at the reference exposure = 1
+    cfa: Bits  # (2, 2) of 0 R, 1 G, 2 B
+
+
+@dataclass(frozen=True)
 class CrossedShot:
     """A shot with perpendicular polarizers at flash and lens, which block specular reflection."""
 
@@ -369,6 +377,7 @@ class AngleStack:
     equipment: Equipment = Equipment()
     offset_px: Floats | None = None  # (K, 2) x, y on this grid: shot px = reference px − offset; None: to be measured
     crossed: CrossedShot | None = None  # None: not taken
+    mosaic: Mosaic | None = None  # of the first shot; None: not a binned Bayer sensor
 
     def shot(self, k: int) -> MaskedImage:
         """Shot k, (H, W, 3)."""
@@ -540,6 +549,7 @@ class StokesImage:
     view: View  # of the crop
     residual: Floats | None  # (H, W) |measured − fitted| / S0 where K > 3
     body: MaskedImage | None = None  # S0 of the diffuse reflection only, from a crossed shot
+    detail: Floats | None = None  # (2 H, 2 W) float16, ln of the light of RAW pixels over these pixels, enlarged
 
 
 @dataclass(frozen=True)
@@ -558,6 +568,7 @@ class Cues:
     view: View
     body: Floats | None = None  # (H, W, 3) radiance of the diffuse reflection only, from a crossed shot
     body_known: NDArray[np.bool_] | None = None  # (H, W) where the crossed shot is valid
+    detail: Floats | None = None  # (2 H, 2 W) float16, ln of the light of RAW pixels over these pixels, enlarged
 
 
 @dataclass(frozen=True)
@@ -590,6 +601,7 @@ class SurfaceMaps:
     mask: NDArray[np.bool_]  # (H, W)
     view: View
     estimator: str
+    detail: Floats | None = None  # (2 H, 2 W) float16, ln of the albedo of RAW pixels over `diffuse`, enlarged
 
 
 @dataclass(frozen=True)
@@ -614,7 +626,7 @@ class Asset:
     """A mesh with its glTF textures and factors."""
 
     mesh: Mesh
-    base_color: NDArray[np.uint8]  # (H, W, 3) sRGB
+    base_color: NDArray[np.uint8]  # (H, W, 3) sRGB; (2 H, 2 W, 3) with the detail of RAW pixels
     occlusion_roughness_metallic: NDArray[np.uint8]  # (H, W, 3) linear
     normal: NDArray[np.uint8]  # (H, W, 3) tangent space, +Y
     specular_color: NDArray[np.uint8]  # (H, W, 3) sRGB, to be multiplied by the factor

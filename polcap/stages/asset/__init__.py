@@ -29,9 +29,12 @@ class AssetSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ior: Annotated[
         float, Meta(ge=1.1, le=2.5, description="refractive index written to the asset; F0 does not depend on it [1]")
     ] = 1.5
+    raw_pixels: Annotated[
+        bool, Meta(description="base color at the RAW's pixels where they show printed detail, for Bayer cameras")
+    ] = True
 
 
-@stage(version=3, keep=False)
+@stage(version=4, keep=False)
 def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
     """The glTF textures on the crop's grid, filled outwards from the object so that no seam shows.
 
@@ -39,29 +42,39 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
     ρ_d T₊(0)²/(1 − F0) both agree for a frontal surface. F0 is the index's own × factor × texture, and the factor holds
     the map's greatest value.
 
-    The outermost pixels of the object, which mix with the backdrop, are filled from further inside.
+    The outermost pixels of the object, which mix with the backdrop, are filled from further inside. With the maps'
+    detail, the base color has twice their size; the other textures do not need it.
     """
     specular = np.clip(maps.specular, 0.0, 1.0)
     greatest = specular.max(axis=-1)
     top = float(greatest[maps.mask].max(initial=0.0))
     entry, _ = fresnel.transmission(np.float64(1.0), settings.ior)
-    roughness = _eight_bits(maps.roughness)
-    textures = [
-        color.srgb_eight_bits(maps.diffuse * np.float32(entry**2) / (1 - np.minimum(greatest, 0.99))[..., None]),
+    roughness, known = _eight_bits(maps.roughness), _without_outline(maps.mask)
+    base = maps.diffuse * np.float32(entry**2) / (1 - np.minimum(greatest, 0.99))[..., None]
+    base = fill_outward(base.astype(np.float32), known)
+    detailed = maps.detail is not None and settings.raw_pixels
+    others = [
         np.stack([np.full_like(roughness, 255), roughness, np.zeros_like(roughness)], axis=-1),
         color.srgb_eight_bits(specular / max(top, 1e-9)),
     ]
-    filled = fill_outward(np.concatenate(textures, axis=-1), _without_outline(maps.mask))  # at once: half the time
-    base_color, packed, specular_color = (np.ascontiguousarray(filled[..., k : k + 3]) for k in (0, 3, 6))
+    filled = fill_outward(np.concatenate(others, axis=-1), known)
+    packed, specular_color = (np.ascontiguousarray(filled[..., k : k + 3]) for k in (0, 3))
     return Asset(
         mesh=mesh,
-        base_color=base_color,
+        base_color=_with_detail(base, maps.detail) if detailed else color.srgb_eight_bits(base),
         occlusion_roughness_metallic=packed,
         normal=_eight_bits(tangent_space(maps, mesh) / 2 + 0.5),
         specular_color=specular_color,
         specular_factor=(top / float(fresnel.normal_reflectance(settings.ior)),) * 3,
         ior=settings.ior,
     )
+
+
+def _with_detail(albedo: Floats, detail: Floats) -> NDArray[np.uint8]:
+    """An albedo (H, W, 3), enlarged linearly, times the exponential of its detail (2 H, 2 W); 8-bit sRGB."""
+    factor = np.exp(detail, dtype=np.float32)
+    planes = [color.srgb_eight_bits(cv2.resize(plane, detail.shape[::-1]) * factor) for plane in cv2.split(albedo)]
+    return np.asarray(cv2.merge(planes))
 
 
 def with_mesh(asset: Asset, maps: SurfaceMaps, mesh: Mesh) -> Asset:

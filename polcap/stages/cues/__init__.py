@@ -25,7 +25,7 @@ CHANNELS = (
 FLOOR = 0.02  # added to a radiance before its logarithm, in the channels and in their inverse
 
 
-@stage(version=3, keep=False)
+@stage(version=4, keep=False)
 def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
     """All cues of a crop (H, W).
 
@@ -62,6 +62,7 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
         view=stokes.view,
         body=body,
         body_known=body_known,
+        detail=stokes.detail,
     )
 
 

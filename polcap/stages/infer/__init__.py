@@ -10,8 +10,10 @@ the camera frame.
         zenith         by the object's law of diffuse polarization
     half_turns     the side of the ray to which a normal leans, for both estimators
     highlights     filled, and their albedo from a crossed shot
+    albedo_detail  detail of the photograph that is finer than a superpixel and not shading
 """
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import msgspec
@@ -19,7 +21,7 @@ from msgspec import Meta
 
 from polcap.images import Cues, Network, RunNetwork, SurfaceMaps
 from polcap.stages import stage
-from polcap.stages.infer import analytic, highlights, learned
+from polcap.stages.infer import albedo_detail, analytic, highlights, learned
 
 
 class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -33,7 +35,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fine: Annotated[bool, Meta(description="a second network adds relief finer than the pixels of the first")] = True
 
 
-@stage(version=18)
+@stage(version=19)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Normal, diffuse, specular, roughness and expected error; without a network by inversion.
 
@@ -46,4 +48,5 @@ def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: Inf
         maps = analytic.estimate(cues, settings.ior)
     else:
         maps = learned.estimate(cues, network, run, settings.ior, settings.symmetries, fine_pass=settings.fine)
-    return highlights.correct_highlights(maps, cues, settings.ior)
+    maps = highlights.correct_highlights(maps, cues, settings.ior)
+    return replace(maps, detail=None if cues.detail is None else albedo_detail.select(cues.detail, cues, maps))
