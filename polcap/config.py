@@ -1,4 +1,4 @@
-"""Settings of a run: read from defaults, a TOML file and `--set` assignments, later ones first.
+"""Settings of a run: from defaults, a TOML file and `--set` assignments; later ones override earlier ones.
 
 Each stage declares its own settings; `Config` has one section per stage. An unknown key or a value out of range is an
 error that names the key, the value and the limit.
@@ -89,7 +89,7 @@ def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
 
 
 def restored(about: Mapping[str, Any], file: Path) -> Config:
-    """Settings stored in `about`, the content of a file of an earlier run.
+    """Settings of an earlier run, from `about`, the content of its file.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def restored(about: Mapping[str, Any], file: Path) -> Config:
 
 
 def fill(kind: type[S], stated: dict[str, Any], assignments: Sequence[str]) -> S:
-    """A struct from values and name=value assignments, checked as strictly as by `load`.
+    """Fill a settings struct from values and name=value assignments, checked as strictly as by `load`.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def _parse(text: str) -> Any:
-    """A TOML value; also accepted are words without quotes, lists without brackets (0,60,120) and .5 for 0.5."""
+    """Parse a setting's value as TOML; also words without quotes, lists without brackets (0,60,120) and .5 for 0.5."""
     for written in (text, f"[{text}]" if "," in text else text, _BARE_POINT.sub("0.", text)):
         try:
             return tomllib.loads(f"value = {written}")["value"]
@@ -187,4 +187,6 @@ def _explain(error: msgspec.ValidationError, stated: dict[str, Any], known: dict
     about = known[key].description if key in known else ""
     if message.startswith("Invalid enum value"):
         message = f"not one of {known[key].kind.removeprefix('Literal').strip('[]')}"
+    if "matching regex" in message:
+        message = "no such choice"
     return SettingError(f"{key} = {value!r}: {message[:1].lower()}{message[1:]} ({about})")

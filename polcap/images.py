@@ -6,7 +6,7 @@ variance, so that sums over channels have their true variance. Arrays may be rea
 one.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntFlag
 from typing import Any, Literal
@@ -35,7 +35,7 @@ class Quality(IntFlag):
 
 @dataclass(frozen=True)
 class Exif:
-    """Metadata of one photograph; None where the file has no value. One flat list, as the tags are."""
+    """Metadata of one photograph (EXIF); None where the file has no value. One flat list, as the tags are."""
 
     make: str = ""
     model: str = ""
@@ -75,7 +75,7 @@ class SensorImage:
 
     @property
     def superpixel(self) -> int:
-        """Side of the smallest square with all colors, photosites: 2 Bayer, 3 X-Trans, 1 no mosaic."""
+        """Side of the smallest square of photosites with all colors: 2 Bayer, 3 X-Trans, 1 no mosaic."""
         return 1 if self.cfa is None else 2 if self.cfa.shape == (2, 2) else 3
 
     @property
@@ -105,7 +105,7 @@ class NoiseLine:
 
 @dataclass(frozen=True)
 class Levels:
-    """Black and white of a sensor, counts."""
+    """Black and white level of a sensor, in counts."""
 
     black: tuple[float, ...]  # per phase of the mosaic, row by row
     black_sigma: tuple[float, ...]
@@ -116,7 +116,7 @@ class Levels:
 
 @dataclass(frozen=True)
 class Linearity:
-    """Signal against exposure time."""
+    """Linearity of a sensor: signal against exposure time."""
 
     greatest_deviation: float  # from a straight line through 0, relative
     power: float  # exponent of the exposure time; 1 is linear
@@ -266,17 +266,17 @@ class Capture:
 
     @property
     def all_shots(self) -> tuple[Shot, ...]:
-        """The shots, and the crossed shot if there is one."""
+        """The capture's shots, and the cross-polarized shot if there is one."""
         return self.shots if self.crossed is None else (*self.shots, self.crossed)
 
     @property
     def angle(self) -> Floats:
-        """(K,) rad, polarizer axes: as stated, or corrected by the ring's calibration."""
+        """Polarizer axes (K,) rad of the shots: as stated, or corrected by the ring's calibration."""
         return self._turned(np.array([shot.angle for shot in self.shots]))
 
     @property
     def crossed_angle(self) -> float:
-        """The same for the crossed shot; NaN without one."""
+        """Polarizer axis [rad] of the cross-polarized shot; NaN without one."""
         return float("nan") if self.crossed is None else float(self._turned(np.array(self.crossed.angle)))
 
     def _turned(self, stated: Floats) -> Floats:
@@ -286,7 +286,7 @@ class Capture:
 
 @dataclass(frozen=True)
 class View:
-    """A pinhole camera on one pixel grid."""
+    """A pinhole camera on one pixel grid: focal length, principal point, scale."""
 
     focal: float  # px of this grid
     center: tuple[float, float]  # (x, y) px of this grid
@@ -380,7 +380,7 @@ class AngleStack:
     mosaic: Mosaic | None = None  # of the first shot; None: not a binned Bayer sensor
 
     def shot(self, k: int) -> MaskedImage:
-        """Shot k, (H, W, 3)."""
+        """Radiance, variance and quality of shot k, (H, W, 3)."""
         return MaskedImage(self.value[k], self.variance[k], self.quality[k])
 
 
@@ -392,13 +392,14 @@ def single_frames(shots: int) -> BracketMeasurement:
 
 @dataclass(frozen=True)
 class ChartReference:
-    """Patch colors of a color chart, from its maker."""
+    """Patch colors of a color chart, from its maker or measured."""
 
     name: str
     rec709: Floats  # (24, 3) linear Rec.709/D65 reflectance, row by row from dark skin
     size_m: tuple[float, float] | None  # width, height between the outer patch corners; None: unknown
     patches: tuple[str, ...] = ()  # (24,) their names
     editions: tuple["ChartReference", ...] = ()  # versions of the chart from other years
+    is_block: bool = False  # part of a larger chart, which cannot be searched for
 
 
 @dataclass(frozen=True)
@@ -409,6 +410,7 @@ class ChartLight:
     normal: Floats  # (3,) unit, towards the camera
     flash: Floats  # (3,) position right of and above the lens; exponent of the cosine of its angular falloff
     covariance: Floats  # (5, 5) of these three and of the chart's rotations about x and y [rad]
+    uneven: float = 0.0  # relative 1σ of the light's level from a slope of the light that the flash does not cause
 
     @property
     def tilt(self) -> float:
@@ -426,7 +428,7 @@ class ChartPlace:
 
 @dataclass(frozen=True)
 class PatchColors:
-    """The fit of a chart's patches to its maker's colors."""
+    """Residuals of a chart's patches after the fit to the maker's colors."""
 
     delta_e: Floats  # (24,) CIEDE2000 residual; NaN for patches left out
     use: Bits | None = None  # (24,) `whitebalance.patches.PatchUse`: 0 used, otherwise the reason; None: unknown
@@ -492,6 +494,15 @@ class ShotOrder:
     shots: tuple[int, ...]  # (K,) index of the stated angle of each shot
     mirrored: bool = False  # angles count clockwise
 
+    def remedy(self, names: Sequence[str]) -> str:
+        """The correction that turns the stated angles into this order and sense; names (K,) are the stated angles."""
+        moved = [(names[k], names[at]) for k, at in enumerate(self.shots) if k != at]
+        renames = " and ".join(f"{old} to {new}" for old, new in moved)
+        sense = "add --clockwise, or clockwise = true in capture.toml" if self.mirrored else ""
+        return ", and ".join(
+            filter(None, (f"rename the folder{'s' * (len(moved) > 1)} {renames}" * bool(moved), sense))
+        )
+
 
 @dataclass(frozen=True)
 class OutlineCheck:
@@ -509,7 +520,7 @@ class OutlineCheck:
 
 @dataclass(frozen=True)
 class TurnedShot:
-    """A shot with an angle that contradicts the others; needs more than three shots."""
+    """A shot with a polarizer angle that contradicts the others; can be found with more than three shots."""
 
     shots: tuple[int, ...] = ()  # all shots that could explain the contradiction, largest angle first; empty: all agree
     angle: float = 0.0  # rad, true minus stated angle of the first of them
@@ -554,7 +565,7 @@ class StokesImage:
 
 @dataclass(frozen=True)
 class Cues:
-    """Inputs of the estimators on the crop's grid; stages/cues has each formula and selects by name."""
+    """Inputs of the normal estimators on the crop's grid; stages/cues has each formula."""
 
     radiance: Floats  # (H, W, 3) S0 in linear Rec.709, chart white = its reflectance
     ratio: Floats  # (2, H, W) S1/S0 and S2/S0 over all channels
@@ -566,6 +577,7 @@ class Cues:
     mask: NDArray[np.bool_]  # (H, W)
     quality: Bits  # (H, W)
     view: View
+    scale_sigma: float | None = None  # relative 1σ of the light on the chart against that on the object; None: no chart
     body: Floats | None = None  # (H, W, 3) radiance of the diffuse reflection only, from a crossed shot
     body_known: NDArray[np.bool_] | None = None  # (H, W) where the crossed shot is valid
     detail: Floats | None = None  # (2 H, 2 W) float16, ln of the light of RAW pixels over these pixels, enlarged
@@ -601,6 +613,7 @@ class SurfaceMaps:
     mask: NDArray[np.bool_]  # (H, W)
     view: View
     estimator: str
+    albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown, albedos are relative
     detail: Floats | None = None  # (2 H, 2 W) float16, ln of the albedo of RAW pixels over `diffuse`, enlarged
 
 
@@ -632,6 +645,7 @@ class Asset:
     specular_color: NDArray[np.uint8]  # (H, W, 3) sRGB, to be multiplied by the factor
     specular_factor: tuple[float, float, float]  # KHR_materials_specular specularColorFactor
     ior: float
+    albedo_sigma: float | None = None  # as in `SurfaceMaps`
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ def is_shortfall(error: BaseException | None) -> bool:
 
 
 def shortfall(error: BaseException, stage: str, pixels: int) -> SettingError:
-    """The error to raise when a stage runs out of memory: memory used and requested, estimate for the run, remedy.
+    """The error for a stage that runs out of memory: memory used and requested, estimate for the run, remedy.
 
     `pixels` is the number of pixels of a RAW frame.
     """

@@ -19,7 +19,7 @@ from polcap.images import (
 
 
 class NotReached(AttributeError):
-    """A result was requested from a stage that did not run."""
+    """Error: a result was requested from a stage that did not run."""
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _explained(error: BaseException, debug: bool, resumable: bool) -> tuple[str, int]:
-    """Message and exit code of an error."""
+    """Message and exit code for an error of a command."""
     if isinstance(error, KeyboardInterrupt):
         return f"interrupted; run the same command again{' with --resume' if resumable else ''} to go on", 130
     if isinstance(error, PolcapError):
@@ -81,7 +81,7 @@ def print_error_document(options: dict[str, Any], error: BaseException, text: st
 
 
 def line(error: BaseException) -> str:
-    """An error's text on one line of at most 600 characters."""
+    """Text of an error on one line of at most 600 characters."""
     text = " ".join(str(error).split())
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 100]} … {text[-100:]}"
 
@@ -191,7 +191,7 @@ class Bar(Steps):
 
 @contextmanager
 def progress(total: int) -> Iterator[Steps]:
-    """A bar on a terminal, else a line per finished stage."""
+    """Progress display of a command: a bar on a terminal, else a line per finished stage."""
     if _verbosity or not sys.stderr.isatty():
         yield Steps()
         return

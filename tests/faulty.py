@@ -15,6 +15,7 @@ from polcap.synth.shooting import Shoot, Studio, Take, random_scene
 FAULTS = {  # what went wrong: the lines of `polcap check` that tell it; none: the folder cannot be read
     "clipped": ("clipping",),
     "swapped": ("order", "angles"),
+    "clockwise": ("order",),
     "defocus": ("sharpness",),
     "shaken": ("sharpness",),
     "moved": ("alignment",),
@@ -50,6 +51,8 @@ def shoot(folder: Path, seed: int, fault: str, width: int) -> str:
         other = (victim + 1) % 3
         names[victim], names[other] = other, victim
         done = f"shots {victim} and {other}"
+    elif fault == "clockwise":
+        actual, done = -actual, "all angles"
     elif fault == "defocus":
         sigma = random.uniform(1.8, 3)
         change = lambda light, k, e: gaussian_filter(light, sigma, axes=(0, 1)) if k == victim else light  # noqa: E731

@@ -35,7 +35,7 @@ class BatchPlan:
 
 
 def find(root: Path, out: Path | None = None) -> list[Unit]:
-    """The captures below a folder, sorted by name; the folder may itself be one capture.
+    """Find the captures below a folder, sorted by name; the folder may itself be one capture.
 
     Raises CaptureError: there is no capture.
     """
@@ -49,7 +49,7 @@ def find(root: Path, out: Path | None = None) -> list[Unit]:
 
 
 def reopen(place: Path) -> list[Unit]:
-    """The captures of an earlier batch; `place` was its root or its --out."""
+    """The captures of an earlier batch. `place` was its root folder or its --out folder."""
     try:
         about = json.loads((place / FOLDER / "batch.json").read_text(encoding="utf-8"))
         return find(Path(about["root"]), None if about["out"] is None else Path(about["out"]))
@@ -113,12 +113,12 @@ def _process(
 
 
 def status(found: Sequence[Unit]) -> dict[str, Any]:
-    """Summary of all captures by their records; nothing is processed."""
+    """Summary of all captures of a batch from their record files; nothing is processed."""
     return contact_sheet.summary([units.read_record(unit) for unit in found])
 
 
 def table(summary: dict[str, Any]) -> str:
-    """One line per capture, then the counts."""
+    """Summary of a batch as text: one line per capture, then the counts."""
     rows = [
         f"{row['state']:12}{row['seconds']:8.1f} s  {row['name']}  {row['says']}".rstrip() for row in summary["rows"]
     ]

@@ -27,7 +27,7 @@ def run(
     retries: int,
     print_line: Callable[[str], None],
 ) -> Iterator[UnitRecord]:
-    """Records of the units, in the order in which they end.
+    """Process captures on a Dask cluster; yields their records in the order in which they end.
 
     `address` names a running scheduler, for example tcp://host:8786, and its workers must see the same folders;
     `local` starts one with `workers` processes on this machine. With device cuda a unit requests the resource GPU.

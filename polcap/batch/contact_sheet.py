@@ -24,7 +24,7 @@ table { border-collapse: collapse } td, th { text-align: left; padding: .2em .8e
 
 
 def summary(records: Sequence[UnitRecord]) -> dict[str, Any]:
-    """Content of summary.json: counts, and one row per capture."""
+    """Content of a batch's summary.json: counts, and one row per capture."""
     counts = Counter(record.state for record in records)
     return {
         "captures": len(records),
@@ -36,7 +36,7 @@ def summary(records: Sequence[UnitRecord]) -> dict[str, Any]:
 
 
 def write(batch_folder: Path, units: Sequence[Unit], records: Sequence[UnitRecord]) -> None:
-    """Write the three files into the batch's folder. Raises StorageError."""
+    """Write summary.html, summary.csv and summary.json into the batch's folder. Raises StorageError."""
     totals = summary(records)
     text = io.StringIO()
     table = csv.DictWriter(text, ["name", "state", "seconds", "attempts", "says"], extrasaction="ignore")

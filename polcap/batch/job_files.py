@@ -51,16 +51,16 @@ class BatchJob:
 
     @property
     def name(self) -> str:
-        """Letters, digits and dashes, which every scheduler accepts."""
+        """Name of the job: letters, digits and dashes, which every scheduler accepts."""
         return "polcap-" + (re.sub(r"[^a-z0-9]+", "-", self.root.name.lower()).strip("-")[:40] or "batch")
 
     def shell(self, shard: str = "") -> str:
-        """Command for /bin/sh; `shard` is K/N, or empty where environment variables carry it."""
+        """Shell command (/bin/sh) of one shard. `shard` is K/N, or empty where environment variables give it."""
         return f"{shlex.join(self.command)}{shard and ' --shard ' + shard} || test $? -eq 3"
 
 
 def batch_command(root: Path, options: Mapping[str, Any]) -> tuple[str, ...]:
-    """`polcap batch ROOT …` with its options, named as in `cli.batch_command`."""
+    """The command line `polcap batch ROOT …` with its options, named as in `cli.batch_command`."""
     words = ["polcap", "batch", str(root.resolve())]
     for name, value in options.items():
         if name == "keep_going":
@@ -80,12 +80,12 @@ def batch_command(root: Path, options: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def submit_hint(scheduler: Scheduler, file: Path) -> str:
-    """Instruction to submit the job file."""
+    """A sentence that explains how to submit the job file to the scheduler."""
     return _SUBMIT[scheduler].format(file=shlex.quote(str(file)), literal=repr(str(file)))
 
 
 def write(scheduler: Scheduler, job: BatchJob, folder: Path) -> Path:
-    """Fill the scheduler's template; returns the path of the job file. Raises StorageError."""
+    """Write a job file from the scheduler's template; returns its path. Raises StorageError."""
     template = files("polcap.batch").joinpath("templates", _FILES[scheduler]).read_text(encoding="utf-8")
     text = Template(template).substitute(_fields(scheduler, job, folder))
     atomic.write(folder / _FILES[scheduler], text)
@@ -93,7 +93,7 @@ def write(scheduler: Scheduler, job: BatchJob, folder: Path) -> Path:
 
 
 def _fields(scheduler: Scheduler, job: BatchJob, folder: Path) -> dict[str, Any]:
-    """Values of the placeholders, escaped for the template's language."""
+    """Values of the job template's placeholders, escaped for the template's language."""
     return {
         "name": job.name,
         "shards": job.shards,
@@ -112,7 +112,7 @@ def _fields(scheduler: Scheduler, job: BatchJob, folder: Path) -> dict[str, Any]
 
 
 def _command(scheduler: Scheduler, job: BatchJob) -> str:
-    """The shard's shell command, as the template's language spells it."""
+    """The shell command of a shard, escaped for the template's language."""
     if scheduler == "openjd":
         return _json(job.shell("{{Task.Param.Shard}}/" + str(job.shards)))
     if scheduler == "opencue":  # it replaces #IFRAME# by the frame number, here the shard
@@ -124,7 +124,7 @@ def _command(scheduler: Scheduler, job: BatchJob) -> str:
 
 
 def _json(text: str) -> str:
-    """Text between the quotes of a JSON string; Python's string literals read it the same way."""
+    """Text escaped as inside a JSON string, without quotes; Python's string literals read it the same way."""
     return json.dumps(text, ensure_ascii=False)[1:-1]
 
 

@@ -20,7 +20,7 @@ _DIED = (
 
 
 class _BatchProcess:
-    """A child process, its pipe and its current unit."""
+    """A child process of a batch, its pipe and the capture that it processes."""
 
     def __init__(self, options: ProcessOptions) -> None:
         self.pipe, there = _SPAWN.Pipe()
@@ -34,7 +34,7 @@ class _BatchProcess:
         self.pipe.send((unit, attempt))
 
     def receive(self) -> UnitRecord | None:
-        """The record of the current unit; None if the process died."""
+        """Wait for the record of the capture being processed; None if the process died."""
         try:
             return self.pipe.recv() if self.pipe.poll() else None
         except (EOFError, OSError):
@@ -48,7 +48,10 @@ class _BatchProcess:
 
 
 def run(wanted: Sequence[Unit], options: ProcessOptions, workers: int, retries: int) -> Iterator[UnitRecord]:
-    """Records of the units, in the order in which they end; if its process dies, a unit is retried `retries` times."""
+    """Process captures in several child processes; yields records in the order in which they end.
+
+    If its process dies, a capture is retried `retries` times.
+    """
     queue = deque((unit, 1) for unit in wanted)
     children = [_BatchProcess(options) for _ in range(min(workers, len(wanted)))]
     try:
@@ -79,7 +82,7 @@ def run(wanted: Sequence[Unit], options: ProcessOptions, workers: int, retries: 
 
 
 def _serve(pipe: connection.Connection, options: ProcessOptions) -> None:
-    """Main function of a child: process units until the pipe closes."""
+    """Main function of a child process of a batch: process captures until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     prepare(options)
     while True:
@@ -91,6 +94,6 @@ def _serve(pipe: connection.Connection, options: ProcessOptions) -> None:
 
 
 def prepare(options: ProcessOptions) -> None:
-    """Limit the threads and the memory of this process."""
+    """Limit the threads and the memory of a process as the options of the batch ask."""
     resource_limits.set_threads(options.threads)
     resource_limits.set_memory(options.memory_gb)

@@ -19,7 +19,7 @@ _SCHEDULERS = (
 
 
 class Shard(NamedTuple):
-    """One of `total` equal parts of a list."""
+    """Part `place` of `total` equal parts of a list of captures."""
 
     place: int  # from 0
     total: int
@@ -28,7 +28,7 @@ class Shard(NamedTuple):
         return f"{self.place + 1}/{self.total}"
 
     def of(self, items: Sequence[T]) -> list[T]:
-        """Every `total`-th item, so that large captures spread over all parts."""
+        """The items of this shard: every `total`-th item, so that large captures spread over all shards."""
         return list(items[self.place :: self.total])
 
 
@@ -36,7 +36,7 @@ WHOLE = Shard(0, 1)
 
 
 def parse(text: str) -> Shard:
-    """Read K/N; K counts from 1. Raises SettingError."""
+    """Parse a shard from text K/N; K counts from 1. Raises SettingError."""
     found = re.fullmatch(r"(\d+)/(\d+)", text)
     if not found or not 1 <= int(found[1]) <= int(found[2]):
         raise SettingError(f"--shard {text}: give K/N with K from 1 to N, as 3/16")

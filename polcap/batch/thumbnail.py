@@ -13,14 +13,14 @@ _SIDE = 128  # px, of each of the two pictures in a thumbnail
 
 
 def write(file: Path, result: Path) -> None:
-    """Write the normal and the diffuse albedo of a result folder, side by side, as a JPEG."""
+    """Write a JPEG thumbnail of a result folder: normal map and diffuse albedo, side by side."""
     pictures = [_small(result / "maps" / name) for name in ("normal.png", "diffuse.png")]
     _, encoded = cv2.imencode(".jpg", np.hstack(pictures), [cv2.IMWRITE_JPEG_QUALITY, 85])
     atomic.write(file, encoded.tobytes())
 
 
 def _small(file: Path) -> Any:
-    """A map's PNG reduced to (SIDE, SIDE, 3), with a black border."""
+    """Read a map's PNG and reduce it to (SIDE, SIDE, 3), with a black border to make it square."""
     out = np.zeros((_SIDE, _SIDE, 3), np.uint8)
     picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
     if picture is not None:

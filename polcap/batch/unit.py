@@ -38,7 +38,7 @@ FOLDER = own_folders.BATCH  # in ROOT or --out: records, thumbnails, summary, jo
 
 @dataclass(frozen=True)
 class Unit:
-    """A capture and its result folder."""
+    """A capture of a batch: its folder, its result folder and the batch's folder."""
 
     name: str  # relative to the root, "/" between folders
     capture: str
@@ -47,7 +47,7 @@ class Unit:
 
     @property
     def slug(self) -> str:
-        """File name that is unique for every capture."""
+        """File name of the capture's record; unique in the batch."""
         digest = hashlib.blake2b(os.fsencode(self.name), digest_size=4).hexdigest()  # names of folders are bytes
         return f"{atomic.safe_name(Path(self.capture).name)}-{digest}"
 
@@ -75,7 +75,7 @@ class ProcessOptions:
 
 
 class UnitRecord(msgspec.Struct, frozen=True):
-    """State and result of a unit, as stored in its JSON file."""
+    """State and result of one capture of a batch, as stored in its JSON file."""
 
     name: str
     state: State = "todo"
@@ -87,7 +87,7 @@ class UnitRecord(msgspec.Struct, frozen=True):
 
 
 def run(unit: Unit, options: ProcessOptions, attempt: int = 1) -> UnitRecord:
-    """Process one capture. Errors are not raised, but written into the record."""
+    """Process one capture of a batch. Errors are not raised, but written into the record."""
     start = time.perf_counter()
     record = UnitRecord(unit.name, "running", "", 0.0, socket.gethostname(), os.getpid(), attempt)
     try:
@@ -132,7 +132,7 @@ def _networks(estimator: Any, model: str | None, device: Any, threads: int) -> t
 
 
 def request(unit: Unit, options: ProcessOptions) -> str | None:
-    """Digest of everything that decides the result, for `pipeline/unchanged.py`; None: unknown."""
+    """Digest of the options and files that decide a capture's result, for `pipeline/unchanged.py`; None: unknown."""
     stated = {
         **dataclasses.asdict(dataclasses.replace(options, threads=0, memory_gb=0.0)),
         "chart": fingerprint(options.chart),
@@ -142,7 +142,7 @@ def request(unit: Unit, options: ProcessOptions) -> str | None:
 
 
 def finished(unit: Unit, options: ProcessOptions) -> UnitRecord | None:
-    """The record of an earlier run, if its result still exists and nothing has changed; otherwise None."""
+    """The record of a capture's earlier run, if its result still exists and nothing has changed; otherwise None."""
     record = read_record(unit)
     if record.state not in FINISHED or unchanged.find(Path(unit.out), request(unit, options)) is None:
         return None
@@ -150,7 +150,10 @@ def finished(unit: Unit, options: ProcessOptions) -> UnitRecord | None:
 
 
 def read_record(unit: Unit) -> UnitRecord:
-    """The stored record; "running" becomes "interrupted" if the process no longer exists on this machine."""
+    """Read the stored record of a capture.
+
+    The state "running" becomes "interrupted" if the process no longer exists on this machine.
+    """
     try:
         record = msgspec.convert(json.loads(unit.record_file.read_text(encoding="utf-8")), UnitRecord)
     except (OSError, ValueError, msgspec.ValidationError):
@@ -165,7 +168,7 @@ def write_record(unit: Unit, record: UnitRecord) -> None:
 
 
 def crashed(unit: Unit, message: str, attempt: int) -> UnitRecord:
-    """Write and return the record of a unit after its process died."""
+    """Write and return a record for a capture after the process that handled it died."""
     record = UnitRecord(unit.name, "crashed", message, 0.0, socket.gethostname(), 0, attempt)
     write_record(unit, record)
     return record
@@ -185,7 +188,10 @@ def _alive(pid: int) -> bool:
 
 
 def _write_traceback(unit: Unit) -> str:
-    """Write the traceback of the present exception; returns where it is, or why it could not be written."""
+    """Write the traceback of the current exception to a file.
+
+    Returns the file's path, or why it could not be written.
+    """
     file, text = unit.record_file.with_suffix(".txt"), traceback.format_exc()
     try:
         atomic.write(file, text)

@@ -1,4 +1,4 @@
-"""Calibration of camera, lens, polarizer and flash from photographs of known things.
+"""Calibration of camera, lens, polarizer and flash from photographs of known targets.
 
 ::
 
@@ -37,7 +37,7 @@ _FOLDERS = ("dark", "flat", "bracket", "flash", "lens", "polarizer")
 def measure(
     folder: Path, made: str, lens_filter: str = "", axis_deg: float = 0.0, squares: tuple[int, int] = (9, 6)
 ) -> Calibration:
-    """Everything that the folder's photographs show.
+    """Measure every calibration quantity that the folder's photographs show.
 
     made : date and time, ISO 8601. lens_filter : the polarizer's name. axis_deg : axis of the light in
     `polarizer/pol…` if no `axis…` folder states it, from image x towards image up. squares : inner corners of the
@@ -76,14 +76,14 @@ def measure(
 
 
 def _noise(flat: list[Photograph], dark: list[Photograph], brackets: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
-    """From flat frames; from brackets at an ISO without flat frames."""
+    """Noise line of each ISO from flat frames; from exposure brackets at an ISO without flat frames."""
     lines = {line.iso: line for line in bracket_noise.measure(brackets)} if brackets else {}
     lines |= {line.iso: line for line in photon_transfer.measure(flat, dark)}
     return tuple(lines[iso] for iso in sorted(lines))
 
 
 def _polarizer_shots(folder: Path, axis_deg: float) -> list[polarizer_ring.PolarizerShot]:
-    """The photographs of `polarizer/` with the light's axis and the ring's angle."""
+    """The calibration photographs of `polarizer/`, each with the axis of the light and the angle of the ring."""
     shots = [
         polarizer_ring.PolarizerShot(axis, ring, photograph)
         for axis, axis_folder in angle_folders(folder, "axis") or [(axis_deg, folder)]

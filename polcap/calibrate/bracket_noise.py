@@ -34,7 +34,7 @@ _MOST_SHIFT_PX = 40.0  # more: the frames show different scenes
 
 @dataclass(frozen=True)
 class BracketTiles:
-    """T tiles of a pair of frames."""
+    """Signal and noise variance of T tiles in a pair of frames of one bracket."""
 
     level: Floats  # (T, C) signal
     variance: Floats  # (T, C) at that signal
@@ -43,7 +43,7 @@ class BracketTiles:
 
 
 def brackets(folder: Path) -> list[list[Photograph]]:
-    """The photographs of every bracket, darkest first: of `bracket/` itself and of each of its sub-folders.
+    """Photographs of every calibration bracket, darkest first: `bracket/` itself and each of its sub-folders.
 
     Raises CaptureError if there is none.
     """
@@ -57,7 +57,7 @@ def brackets(folder: Path) -> list[list[Photograph]]:
 
 
 def measure(brackets: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
-    """Noise line of every ISO with two exposures of one bracket.
+    """Noise line (variance over signal) of every ISO with two exposures of one bracket.
 
     Raises CaptureError if no two frames of a bracket share an ISO, if they moved, or the scene has one brightness.
     """
@@ -89,7 +89,10 @@ def measure(brackets: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
 
 
 def _pair(a: Signals, b: Signals) -> BracketTiles | None:
-    """Tiles of two frames, darker and brighter; None if their exposures are too similar."""
+    """Signal and variance of tiles of two frames, darker `a` and brighter `b`.
+
+    None if their exposures are too similar.
+    """
     found = exposure.of_tiles(*exposure.common_tiles(a, b))
     if found is None or not np.all(np.maximum(found.value, 1 / found.value) > _LEAST_RATIO):
         return None
@@ -122,7 +125,10 @@ def _line(iso: float, pairs: list[BracketTiles], sites: Floats, folder: Path) ->
 
 
 def _fit(level: Floats, variance: Floats, edges: Floats, part: NDArray[np.int_]) -> tuple[Floats, Floats]:
-    """Slope and floor (2,) of one channel, and their 1σ from the scatter of the picture's parts."""
+    """Fit one channel's noise line.
+
+    Slope and floor (2,), and their 1σ from the scatter between parts of the picture.
+    """
     least = 0.05 * float(np.median(variance))
 
     def line(chosen: NDArray[np.bool_]) -> Floats:

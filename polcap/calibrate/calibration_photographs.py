@@ -20,19 +20,19 @@ _ANGLE = re.compile(r"(\d{1,3}(?:\.\d+)?)")
 
 @dataclass(frozen=True)
 class Photograph:
-    """One RAW file."""
+    """One RAW file of a calibration with its EXIF."""
 
     path: Path
     exif: Exif
     digest: str
 
     def image(self) -> SensorImage:
-        """Decoded. Raises DecodeError."""
+        """Decode the photograph. Raises DecodeError."""
         return raw.read(self.path, self.digest)
 
     @property
     def setting(self) -> tuple[float, float, float]:
-        """ISO, exposure time [s], f-number; 0 if the file does not state it."""
+        """Exposure setting of the photograph: ISO, exposure time [s], f-number; 0 if the file does not state it."""
         return self.exif.iso or 0.0, self.exif.exposure_time or 0.0, self.exif.f_number or 0.0
 
 
@@ -52,19 +52,19 @@ def photographs_in(folder: Path) -> list[Photograph]:
 
 
 def angle_folders(folder: Path, prefix: str) -> list[tuple[float, Path]]:
-    """Angle [degrees] and path of folders such as pol022.5, by angle."""
+    """Sub-folders named by an angle, such as pol022.5, in order: angle [degrees] and path."""
     folders = [(angle_of(path.name, prefix), path) for path in layouts.children(folder) if path.is_dir()]
     return sorted((angle, path) for angle, path in folders if angle is not None)
 
 
 def angle_of(name: str, prefix: str) -> float | None:
-    """Degrees in `pol045` or `axis22.5`; None for another name."""
+    """Angle [degrees] in a folder name such as `pol045` or `axis22.5`; None for another name."""
     match = _ANGLE.fullmatch(name.removeprefix(prefix)) if name.startswith(prefix) else None
     return None if match is None else float(match.group(1))
 
 
 def by_setting(photographs: Iterable[Photograph]) -> dict[tuple[float, float, float], list[Photograph]]:
-    """Photographs of equal ISO, exposure time and f-number, darkest first."""
+    """Group photographs of equal ISO, exposure time and f-number; groups are sorted from dark to bright."""
     groups: dict[tuple[float, float, float], list[Photograph]] = {}
     for one in photographs:
         groups.setdefault(one.setting, []).append(one)

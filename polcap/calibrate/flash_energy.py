@@ -1,4 +1,4 @@
-"""Flash energy: its spread and drift from pop to pop, from photographs of one thing."""
+"""Variation of the flash energy: random spread and drift between flashes, from photographs of one motionless scene."""
 
 import numpy as np
 
@@ -11,7 +11,9 @@ _CLIPPED = 0.01
 
 
 def measure(photographs: list[Photograph]) -> FlashEnergy:
-    """1σ of the energy relative to its mean, and the drift; from the largest series of one exposure setting.
+    """Spread (1σ relative to the mean) and drift of the flash energy.
+
+    The largest series with one exposure setting is used.
 
     Raises CaptureError for fewer than four frames of one setting, or over-exposed ones.
     """

@@ -16,7 +16,9 @@ _FAINT = 0.02  # of white; below, noise and the error of black matter
 
 
 def measure(flat: list[Photograph]) -> Falloff:
-    """1 + a r² + b r⁴ + c r⁶ per channel, r = 1 in the corners, from the brightest setting that does not clip.
+    """Light falloff of the lens, 1 + a r² + b r⁴ + c r⁶ per channel, r = 1 in the corners.
+
+    The brightest setting that does not clip is used.
 
     Raises CaptureError if every flat frame is clipped or dark.
     """
@@ -43,7 +45,7 @@ def _exposure(group: list[Photograph]) -> float:
 
 
 def _fit(picture: Floats) -> tuple[Floats, Floats]:
-    """(C, 3) coefficients and their 1σ."""
+    """Fit the falloff of a flat frame: coefficients (C, 3) and their 1σ."""
     h, w = picture.shape[:2]
     width, height = (max(4, round(_CELLS * side / max(h, w))) for side in (w, h))
     cells = area_mean(np.asarray(picture, np.float32), (height, width)).reshape(height * width, -1)

@@ -48,7 +48,7 @@ _ALIKE = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FI
 
 @dataclass(frozen=True)
 class BoardView:
-    """Points of a board in one photograph."""
+    """Points of a calibration board in one photograph: on the flat board, and in the picture."""
 
     flat: Floats  # (N, 3) float32 on the board, in squares or patches; z = 0
     seen: Floats  # (N, 2) float32 RAW px
@@ -56,7 +56,9 @@ class BoardView:
 
 
 def measure(photographs: list[Photograph], squares: tuple[int, int]) -> LensGeometry:
-    """Focal length, principal point, k₁ and k₂ with their 1σ; `squares` are the inner corners across and down.
+    """Focal length, principal point, distortion k₁ and k₂ of a lens, with 1σ.
+
+    `squares` are the inner corners of the checkerboard, across and down.
 
     Raises CaptureError if too few photographs show a board, all have one tilt, or the corners do not fit a flat board.
     """
@@ -120,7 +122,10 @@ def _fit_lens(boards: list[BoardView], size: tuple[int, int], first: Photograph,
 def _bundle_adjustment(
     boards: list[BoardView], size: tuple[int, int], flags: int
 ) -> tuple[float, Floats, Floats, Floats]:
-    """Rms residual [px], camera (3, 3), k₁ k₂ …, and 1σ of fx fy cx cy k₁ k₂ (…)."""
+    """Fit the camera to the board's points.
+
+    Returns rms residual [px], camera matrix (3, 3), k₁ k₂ …, and 1σ of fx fy cx cy k₁ k₂ (…).
+    """
     width, height = size
     guess = np.array([[1.4 * width, 0, (width - 1) / 2], [0, 1.4 * width, (height - 1) / 2], [0, 0, 1]])
     answer: Any = cv2.calibrateCameraExtended(
@@ -137,7 +142,10 @@ def _bundle_adjustment(
 
 
 def _checkerboard(image: SensorImage, squares: tuple[int, int]) -> BoardView | None:
-    """Inner corners, row by row, refined in linear light: gamma moves edges."""
+    """Detect a checkerboard's inner corners, row by row.
+
+    They are refined in linear light, because gamma moves edges.
+    """
     found, corners = cv2.findChessboardCornersSB(_gray(image), squares, flags=cv2.CALIB_CB_ACCURACY)
     if not found:
         return None
@@ -165,7 +173,7 @@ def _green(image: SensorImage) -> Floats:
 
 
 def _color_checker(image: SensorImage) -> BoardView | None:
-    """Centers of the patches that are brighter than the card."""
+    """Detect a ColorChecker: centers of the patches that are brighter than the card."""
     value = sensor.signal(image)
     if value.shape[-1] != 3:
         return None
@@ -216,7 +224,7 @@ def _patch_center(light: Floats, place: Floats, center: Floats) -> Floats | None
 
 
 def _as_stack(value: Floats, image: SensorImage) -> AngleStack:
-    """One picture (H, W, 3) as input of the chart stage."""
+    """Wrap one picture (H, W, 3) as the input type of the chart detection in `stages/whitebalance`."""
     height, width = value.shape[:2]
     return AngleStack(
         value=value[None],
@@ -230,6 +238,6 @@ def _as_stack(value: Floats, image: SensorImage) -> AngleStack:
 
 
 def _on_raw(points: Floats, image: SensorImage) -> Floats:
-    """Points (N, 2) from binned px to visible RAW px, float32 for cv2."""
+    """Convert points (N, 2) from binned px to visible RAW px, float32 for cv2."""
     side = image.superpixel
     return np.asarray(side * points + (side - 1) / 2, np.float32)

@@ -10,7 +10,9 @@ _LEAST = 0.02  # of white; below, the error of black matters more than a curve
 
 
 def measure(flat: list[Photograph]) -> Linearity | None:
-    """Linearity at the ISO and aperture with most exposure times; None with fewer than three.
+    """Deviation of the sensor from linearity, at the ISO and aperture with most exposure times.
+
+    None with fewer than three.
 
     Shutter times are true to one or two percent; larger deviations come from the sensor.
     """

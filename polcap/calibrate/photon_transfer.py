@@ -23,7 +23,7 @@ _LEAST_RANGE = 2.0  # brightest over darkest tile: a line needs two ends
 
 
 def measure(flat: list[Photograph], dark: list[Photograph]) -> tuple[NoiseLine, ...]:
-    """Noise line of every ISO with a pair of flat frames.
+    """Noise line (variance over signal) of every ISO with a pair of flat frames.
 
     Raises CaptureError if no two flat frames have the same setting, or all have one brightness.
     """
@@ -42,7 +42,7 @@ def measure(flat: list[Photograph], dark: list[Photograph]) -> tuple[NoiseLine, 
 
 
 def _points(photographs: list[Photograph]) -> Iterator[tuple[Floats, Floats, Floats]]:
-    """For every pair: signal and variance of its tiles (T, C), and photosites per pixel (C,)."""
+    """Signal and noise variance of the tiles (T, C) of every pair of equal frames, and photosites per pixel (C,)."""
     for group in by_setting(photographs).values():
         for first, second in zip(group[::2], group[1::2]):
             one, two = first.image(), second.image()
@@ -58,7 +58,7 @@ def _points(photographs: list[Photograph]) -> Iterator[tuple[Floats, Floats, Flo
 
 
 def _tiles(a: Floats, b: Floats, usable: NDArray[np.bool_], ratio: float) -> tuple[Floats, Floats]:
-    """Signal (b + r² a) / (1 + r²) and variance var(b − r a) / (1 + r²) of the tiles, (T, C) each."""
+    """Noise of two frames per tile: signal (b + r² a) / (1 + r²) and variance var(b − r a) / (1 + r²), (T, C) each."""
     rows, columns = a.shape[0] // _TILE, a.shape[1] // _TILE
     shape = rows, _TILE, columns, _TILE
     cut = slice(rows * _TILE), slice(columns * _TILE)
@@ -72,7 +72,7 @@ def _tiles(a: Floats, b: Floats, usable: NDArray[np.bool_], ratio: float) -> tup
 
 
 def photosites(image: SensorImage, channels: int) -> Floats:
-    """Photosites of the mosaic per pixel of each channel, (C,)."""
+    """Number of photosites of the mosaic that one pixel of each channel averages, (C,)."""
     if image.cfa is None:
         return np.ones(channels)
     count = np.bincount(image.cfa.ravel(), minlength=3)
@@ -98,7 +98,10 @@ def _line(iso: float, points: list[tuple[Floats, Floats, Floats]], where: Photog
 def noise_line(
     iso: float, slope: tuple[Floats, Floats], floor: tuple[Floats, Floats], sites: Floats, source: str
 ) -> NoiseLine:
-    """Noise line from slope and floor (C,) with their 1σ, and its electrons for one of the `sites` (C,) per pixel."""
+    """Noise line from slope and floor (C,) with their 1σ.
+
+    Its electrons are those of one of the photosites, `sites` (C,) per pixel.
+    """
     electrons = 1 / (slope[0] * sites)
     height = np.maximum(floor[0], 0.0)
     read = np.sqrt(height * sites) * electrons

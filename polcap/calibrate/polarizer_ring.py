@@ -26,7 +26,7 @@ _LEAST_DIFFERENCE_DEG = 10.0  # between two axes, and between their mirror image
 
 @dataclass(frozen=True)
 class PolarizerShot:
-    """One photograph of `polarizer/`."""
+    """One photograph of `polarizer/`: axis of the light, angle of the ring."""
 
     axis_deg: float  # of the light
     ring_deg: float  # as stated
@@ -35,7 +35,7 @@ class PolarizerShot:
 
 @dataclass(frozen=True)
 class _MalusFit:
-    """cos² curve of the light of one axis."""
+    """Malus curve (cos²) fitted to the photographs in light of one axis: phase and contrast with 1σ."""
 
     axis_deg: float
     phase_deg: float  # ring angle of most light
@@ -45,7 +45,7 @@ class _MalusFit:
 
 
 def measure(turned: list[PolarizerShot]) -> Polarizer:
-    """Extinction, zero and sense from the light of all axes.
+    """Extinction ratio, zero and sense of a polarizer on its ring, from light of all known axes.
 
     Raises CaptureError for too few angles, unequal exposures, or light that is not polarized.
     """
@@ -101,7 +101,7 @@ def _fit_axis(shots: list[PolarizerShot]) -> _MalusFit:
 
 
 def _fit_wave(ring: Floats, light: Floats) -> tuple[Floats, Floats]:
-    """(3,) a, a c cos 2φ, a c sin 2φ and their covariance, scaled to the scatter of the frames."""
+    """Fit a Malus curve: (3,) a, a c cos 2φ, a c sin 2φ and their covariance, scaled to the scatter of the frames."""
     matrix = np.stack([np.ones_like(ring), np.cos(2 * ring), np.sin(2 * ring)], axis=1)
     weight = np.ones_like(light)
     for _ in range(6):
@@ -116,7 +116,7 @@ def _fit_wave(ring: Floats, light: Floats) -> tuple[Floats, Floats]:
 
 
 def _shows_sense(curves: list[_MalusFit]) -> bool:
-    """Whether the two senses predict different phases for two of the axes."""
+    """Whether the light's axes can show the sense of the ring: the two senses predict different phases."""
     return any(
         _LEAST_DIFFERENCE_DEG < (one.axis_deg - other.axis_deg) % 90 < 90 - _LEAST_DIFFERENCE_DEG
         for one in curves
@@ -125,7 +125,7 @@ def _shows_sense(curves: list[_MalusFit]) -> bool:
 
 
 def _zero(curves: list[_MalusFit], sense: int) -> tuple[float, float, float]:
-    """z = α − s ψ of all axes, −90…90°, its 1σ, and the rms difference between the axes."""
+    """Zero of the ring z = α − s ψ from all axes, −90…90°, its 1σ, and the rms difference between the axes."""
     zeros = np.array([curve.axis_deg - sense * curve.phase_deg for curve in curves])
     weight = np.array([1 / curve.phase_sigma_deg**2 for curve in curves])
     vector = np.sum(weight * np.exp(2j * np.radians(zeros))) / weight.sum()

@@ -11,7 +11,7 @@ _DARK = 0.05  # of white; a frame above is not dark
 
 
 def measure(dark: list[Photograph], bright: list[Photograph]) -> Levels:
-    """Black of each photosite of the mosaic's pattern, and the count at which frames saturate, if some do.
+    """Black level of each photosite of the mosaic's pattern, and the count at which frames saturate, if some do.
 
     Raises CaptureError if a dark frame is not dark.
     """

@@ -43,10 +43,10 @@ _ANYWHERE = ("--debug", "-q", "--quiet", "-v", "--verbose")  # flags that may fo
 
 
 class OneLine(TyperGroup):
-    """Command group that reports a wrong command line in one line, as every other error."""
+    """Command group that reports a wrong command line in one line, as all other errors."""
 
     def main(self, args: Sequence[str] | None = None, *rest: Any, standalone_mode: bool = True, **extra: Any) -> Any:
-        """Parse and run; end with the exit code unless `standalone_mode` is false."""
+        """Parse the command line and run the command; exits with its code unless `standalone_mode` is false."""
         stated = list(sys.argv[1:] if args is None else args)
         words = [word for word in stated if word in _ANYWHERE] + [word for word in stated if word not in _ANYWHERE]
         if "help" in words[:1]:  # polcap help COMMAND
@@ -69,7 +69,7 @@ class OneLine(TyperGroup):
 
 
 def _one_line(error: TyperException) -> str:
-    """The error of a command line with a hint to --help; a page of help stays as it is."""
+    """Message for a wrong command line, with a hint to --help; a page of help is returned unchanged."""
     text = error.format_message()
     if "\n" in text:
         return text
@@ -108,7 +108,7 @@ def main() -> None:
 
 
 def _version(asked: bool) -> None:
-    """Print the version and end."""
+    """Option --version: print the version and exit."""
     if asked:
         print(__version__)
         raise typer.Exit

@@ -82,7 +82,7 @@ def batch(
 
 
 def _check_model(estimator: Literal["network", "analytic"] | None, model: Path | None) -> None:
-    """Refuse an unusable model once, before any capture; ModelError, SettingError.
+    """Refuse an unusable model once, before any capture is processed; ModelError, SettingError.
 
     On the CPU: this machine may lack the workers' GPU.
     """

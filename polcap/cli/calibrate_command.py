@@ -1,4 +1,4 @@
-"""`polcap calibrate`: measure camera, lens, polarizer and flash from photographs of known things."""
+"""`polcap calibrate`: measure camera, lens, polarizer and flash from calibration photographs."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -42,7 +42,7 @@ def calibrate(
 
 
 def squares(board: str) -> tuple[int, int]:
-    """`9x6` as two numbers. Raises SettingError."""
+    """Parse the size of a checkerboard, such as `9x6`, as two numbers. Raises SettingError."""
     across, _, down = board.partition("x")
     if not (across.isdecimal() and down.isdecimal() and 3 <= int(across) <= 99 and 3 <= int(down) <= 99):
         from polcap.errors import SettingError
@@ -52,7 +52,7 @@ def squares(board: str) -> tuple[int, int]:
 
 
 def lines(found: "Calibration") -> list[str]:
-    """The measurements as lines of text."""
+    """A calibration's measurements as lines of text."""
     rows = [" · ".join(part for part in (found.camera, found.lens, found.filter) if part)]
     for line in found.noise:
         doubt = 100 * max(sigma / slope for sigma, slope in zip(line.slope_sigma, line.slope, strict=True))

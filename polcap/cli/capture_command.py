@@ -65,7 +65,7 @@ def capture(
 
 
 def _verdict(folder: Path) -> dict[str, Any] | None:
-    """Verdict of `polcap check`, also printed; None where the capture cannot be judged."""
+    """Judge the finished capture as `polcap check` does, and print the verdict; None if it cannot be judged."""
     from polcap.config import Config
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import check as checks

@@ -41,7 +41,10 @@ def doctor(
 
 
 def _may_write(stated: bool | None, ports: list[str]) -> bool:
-    """Whether serial ports may be written to: other devices may misread a motor's command."""
+    """Whether `polcap doctor` may write to serial ports, by option or question.
+
+    Other devices may misread a motor's command.
+    """
     if stated is not None or not sys.stdin.isatty():
         return bool(stated)
     return confirm(f"Write to {', '.join(ports)} to find motors?", err=True)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def result_folder(named: Path | None) -> Path | None:
-    """The result folder; of a capture folder, the result in it."""
+    """The result folder that an argument names: itself, or for a capture folder the result in it."""
     if named is None or any((named / name).exists() for name in ("work", "report.json", "maps")):
         return named
     inside = named / "polcap"
@@ -23,7 +23,7 @@ def result_folder(named: Path | None) -> Path | None:
 
 
 def choice(meaning: str) -> Any:
-    """An option with a list of values in any case."""
+    """A command-line option with a fixed list of values; upper and lower case are equal."""
     return Option(case_sensitive=False, help=meaning)
 
 
@@ -53,12 +53,12 @@ Memory = Annotated[float, Option(min=0, help="Most memory to take, GB; 0 is no l
 
 
 def angles_deg(text: str | None) -> tuple[float, ...] | None:
-    """--angles in degrees; None without it."""
+    """Parse --angles, in degrees; None without it."""
     return None if text is None else numbers("--angles", text)
 
 
 def numbers(flag: str, text: str) -> tuple[float, ...]:
-    """Finite numbers between commas."""
+    """Parse a comma-separated list of finite numbers of an option `flag`."""
     try:
         found = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -69,7 +69,7 @@ def numbers(flag: str, text: str) -> tuple[float, ...]:
 
 
 def check_stages(named: Mapping[str, str | None]) -> None:
-    """Refuse a stage that does not exist, by its flag."""
+    """Raise a SettingError if an option names a stage that does not exist; the message names the option."""
     from polcap.pipeline.path import STAGES
 
     for flag, stage in named.items():
@@ -78,7 +78,7 @@ def check_stages(named: Mapping[str, str | None]) -> None:
 
 
 def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
-    """--chart and --no-chart: corners, a profile or no chart; by default the chart is searched for."""
+    """Parse --chart and --no-chart: corners, a profile or no chart; by default the chart is searched for."""
     import numpy as np
 
     from polcap.formats import calibrations
@@ -96,8 +96,21 @@ def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
     return ChartRequest("corners", corners=np.reshape(corners, (4, 2)))
 
 
+def measured_chart(config: Path | None, assignments: list[str] | None) -> str | None:
+    """The setting whitebalance.chart, which may name a file; None if it is not stated or --config is no TOML."""
+    from polcap.formats import text_file
+
+    stated = [text.partition("=")[2].strip() for text in assignments or () if text.startswith("whitebalance.chart=")]
+    if not stated and config is not None:
+        try:
+            stated = [str(text_file.read_toml(config)["whitebalance"]["chart"])]
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+    return stated[-1] if stated else None
+
+
 def user_mask(file: Path) -> Any:
-    """--mask: (H, W) bool, true where the picture is lighter than half of white."""
+    """Read the picture of --mask as (H, W) bool: true where it is lighter than half of white."""
     from polcap.formats.maps import png
 
     picture = png.read(file)
@@ -106,7 +119,7 @@ def user_mask(file: Path) -> Any:
 
 
 def training(module: str) -> Any:
-    """A module of polcap.training. Raises SettingError where torch is not installed."""
+    """Import a module of polcap.training. Raises SettingError where torch is not installed."""
     try:
         return import_module(f"polcap.training.{module}")
     except ModuleNotFoundError as error:

@@ -45,7 +45,8 @@ def process(
     request = None
     if not (until or force or dry_run or watch):
         asked = {name: value for name, value in stated.items() if name not in _NO_EFFECT}
-        files = [Path(name) for name in (config, mask, model, chart) if name is not None and Path(name).is_file()]
+        named = (config, mask, model, chart, options.measured_chart(config, assignments))
+        files = [Path(name) for name in named if name is not None and Path(name).is_file()]
         request = unchanged.request(asked, capture, target, files)
     if (finished := unchanged.find(target, request)) is not None:
         terminal.print_progress(f"{finished.table}\nNothing has changed since the last run.")
@@ -62,7 +63,7 @@ def process(
 
 
 def _inputs(stated: dict[str, Any]) -> tuple[Any, Any, Any]:
-    """The capture, the user's other inputs and the settings. Models are opened while photographs are read."""
+    """Read the capture, the user's other inputs and the settings. Models are opened while photographs are read."""
     from concurrent.futures import ThreadPoolExecutor
 
     from polcap import config as settings
@@ -82,7 +83,7 @@ def _inputs(stated: dict[str, Any]) -> tuple[Any, Any, Any]:
 
 
 def _plan(stated: dict[str, Any], target: Path) -> None:
-    """Print how the capture is understood and which stages would run."""
+    """Option --dry-run: print how the capture is understood and which stages would run."""
     from polcap import report
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import run as pipeline
@@ -95,7 +96,7 @@ def _plan(stated: dict[str, Any], target: Path) -> None:
 
 
 def _process(stated: dict[str, Any], target: Path, request: str | None) -> None:
-    """Write the result folder; print the path of the asset and the verdict."""
+    """Process the capture and write the result folder; print the path of the asset and the verdict."""
     from dataclasses import replace
 
     from polcap.formats.capture import reader as captures

@@ -1,5 +1,6 @@
 """`polcap export`, `show`, `status` and `report`: commands on a result folder."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,7 +11,7 @@ from polcap.cli import options
 from polcap.cli.options import Json, Result, choice
 from polcap.errors import SettingError
 
-Preset = Literal["blender", "unreal", "unity", "web", "archive"]
+PRESETS = ("blender", "unreal", "unity", "web", "archive")  # those of formats.export.presets, not imported at start
 
 
 def export(
@@ -21,8 +22,16 @@ def export(
     usd: Annotated[bool, Option("--usd", help="asset/NAME.usdc and textures (extra [usd])")] = False,
     materialx: Annotated[bool, Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
     exr: Annotated[bool, Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
-    preset: Annotated[Preset | None, choice("Program that reads asset/NAME/; archive needs the extra [usd].")] = None,
+    preset: Annotated[
+        list[str] | None,
+        Option(metavar="NAME", help=f"Files for one program in asset/NAME/: {', '.join(PRESETS)}; repeatable."),
+    ] = None,
     images: Annotated[Literal["png", "jpeg", "webp", "ktx2"] | None, choice("Picture format in the GLB.")] = None,
+    geometry: Annotated[
+        Literal["float", "quantized", "draco"] | None,
+        choice("Mesh in the GLB: 32-bit floats, integers, or Draco (extra [draco])."),
+    ] = None,
+    triangles: Annotated[int | None, Option(min=16, help="Most triangles of the mesh; web has 50,000.")] = None,
     color: Annotated[
         str, Option(metavar="SPACE", help="Color space or OCIO role of the colors in the EXR, such as ACEScg.")
     ] = "lin_rec709",
@@ -40,10 +49,19 @@ def export(
 
     flags = {"gltf": gltf, "obj": obj, "usd": usd, "materialx": materialx, "exr": exr}
     formats = tuple(name for name in presets.FORMATS if flags[name])
-    if preset is not None and formats:
-        raise SettingError(f"--preset {preset} brings its formats; leave out --{formats[0]}")
-    wanted = ExportRequest(formats or ("gltf", "obj"), preset, images, color, texture_size, lod)
-    written = [str(file) for file in pipeline.export(result, wanted)]
+    if preset and formats:
+        raise SettingError(f"--preset {preset[0]} brings its formats; leave out --{formats[0]}")
+    plain = ExportRequest(
+        formats=formats or ("gltf", "obj"),
+        images=images,
+        geometry=geometry,
+        triangles=triangles,
+        color=color,
+        texture_size=texture_size,
+        lod=lod,
+    )
+    wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
+    written = [str(file) for file in pipeline.export(result, *wanted)]
     terminal.print_data({"written": written} if json else "\n".join(written))
 
 

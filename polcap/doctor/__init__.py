@@ -1,4 +1,4 @@
-"""`polcap doctor`: checks everything that polcap uses on this machine: ok, warning or fault, with a remedy.
+"""`polcap doctor`: checks software, models, devices and disk of this machine: ok, warning or fault, with a remedy.
 
 Only a fault keeps `polcap process` from working.
 """
@@ -37,7 +37,7 @@ class Finding(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Rig:
-    """Functions that ask for devices; each may raise a PolcapError."""
+    """Functions that look for devices (serial ports, cameras); each may raise a PolcapError."""
 
     ports: Callable[[], list[tuple[str, str]]]  # device and description of every serial port
     may_write: Callable[[list[str]], bool]  # whether polcap may write to these ports
@@ -63,7 +63,7 @@ def examine(rig: Rig, folder: Path) -> tuple[Finding, ...]:
 
 
 def table(found: Iterable[Finding]) -> str:
-    """The findings as text."""
+    """The findings of `polcap doctor` as a text table."""
     rows = []
     for one in found:
         rows.append(f"{one.state:9}{one.name:16}{one.message}")
@@ -73,13 +73,13 @@ def table(found: Iterable[Finding]) -> str:
 
 
 def shown(found: Iterable[Finding]) -> dict[str, object]:
-    """The findings for JSON."""
+    """The findings of `polcap doctor` as data for JSON."""
     works = all(one.state != "fault" for one in found)
     return {"polcap": __version__, "process_works": works, "findings": msgspec.to_builtins(found)}
 
 
 def _decoder() -> Finding:
-    """LibRaw's version, and whether it decodes a RAW file written for this test."""
+    """Check LibRaw: its version, and whether it decodes a RAW file written for this test."""
     counts = np.arange(_EDGE_PX**2, dtype=np.uint16).reshape(_EDGE_PX, _EDGE_PX)
     exif, cfa = Exif(make="Polcap", model="Doctor"), np.array([[0, 1], [1, 2]], np.uint8)
     colors = {"color_matrix": np.eye(3), "as_shot_neutral": np.ones(3)}
@@ -113,7 +113,7 @@ def _model(file: Path | None) -> Finding:
 
 
 def _providers(model: Path) -> Iterator[Finding]:
-    """Each provider of onnxruntime, with the shipped model really run on it."""
+    """Check each execution provider of onnxruntime by running the shipped model on it."""
     try:
         found = onnx.providers(model)
     except ImportError as error:

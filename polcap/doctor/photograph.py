@@ -1,4 +1,7 @@
-"""`polcap doctor FILE`: whether polcap can use a photograph; kind, metadata, mosaic pattern and levels."""
+"""`polcap doctor FILE`: checks whether polcap can use a photograph.
+
+Reports kind, metadata, mosaic pattern and levels.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +20,7 @@ _CLIP = hdr.HdrSettings().clip
 
 
 def examine_file(path: Path) -> Iterator[Finding]:
-    """Findings on kind, metadata, pixels and levels of one file."""
+    """Check one photograph's kind, metadata, pixels and levels; yields the findings."""
     if path.is_dir():
         remedy = "give one photograph; `polcap process FOLDER --dry-run` lists a folder"
         yield Finding("file", "fault", f"{path} is a folder", remedy)

@@ -1,4 +1,4 @@
-"""Writes a file or folder complete or not at all; makes names that every file system accepts.
+"""Writes a file or folder completely or not at all (temporary name, then rename); turns any text into a safe file name.
 
 It is written under a temporary name, synced to the disk and renamed, so the final name always leads to a complete
 file. The new name reaches the disk with the system's next journal write; after a power cut the old file may be back.
@@ -33,13 +33,16 @@ REASONS = {
 
 
 def failure(target: Path, error: OSError) -> StorageError:
-    """The error for a write that the system refused."""
+    """The StorageError, with path, reason and remedy, for an OSError of writing the file `target`."""
     reason = REASONS.get(error.errno or 0, error.strerror or str(error))
     return StorageError(f"cannot write {target}: {reason}")
 
 
 def write(final: str | Path, content: str | bytes, synced: bool = True) -> None:
-    """Write a file complete or not at all, text as UTF-8, as `path` does. Raises StorageError."""
+    """Write `content` into the file `final`, completely or not at all; text is encoded as UTF-8.
+
+    Options and StorageError as for `path`.
+    """
     if isinstance(content, str):
         content = content.encode("utf-8", "backslashreplace")  # the name of a file may not be text
     with path(final, synced) as temporary:
@@ -48,7 +51,7 @@ def write(final: str | Path, content: str | bytes, synced: bool = True) -> None:
 
 @contextmanager
 def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
-    """A temporary path for writing, renamed to `final` when the block ends well.
+    """Context manager: a temporary path to write to, renamed to `final` when the block ends without an exception.
 
     Parent folders are made. The temporary name has the same suffix, for writers that choose a format by it. On any
     exception it is removed, and an old file under `final` is untouched. Without `synced` the file may be incomplete
@@ -72,7 +75,7 @@ def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def folder(final: str | Path, synced: bool = True) -> Iterator[Path]:
-    """`path` for a folder; an old folder under `final` is replaced as a whole.
+    """Context manager: a temporary folder to fill, renamed to `final` at the end; an old folder `final` is replaced.
 
     Raises StorageError: any OSError of making, writing, syncing or renaming, inside the block too.
     """
@@ -101,7 +104,7 @@ def folder(final: str | Path, synced: bool = True) -> Iterator[Path]:
 
 
 def sync(target: Path) -> None:
-    """Write a file's bytes, or a folder's names, to the disk."""
+    """Force the content of a file, or the list of names in a folder, from memory onto the disk (fsync)."""
     if os.name == "nt" and target.is_dir():  # Windows cannot sync a folder
         return
     handle = os.open(target, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
@@ -121,7 +124,10 @@ def discard(target: Path) -> None:
 
 
 def safe_name(text: str) -> str:
-    """A name for a file from any text: forbidden characters become _; never empty, hidden or a device's name."""
+    """Turn any text into a valid file name: forbidden characters become _.
+
+    Never empty, hidden or a reserved device name.
+    """
     name = "".join("_" if c in _FORBIDDEN or not c.isprintable() else c for c in text)
     name = name.encode("utf-8", "replace")[:_NAME_BYTES].decode("utf-8", "ignore")
     name = name.strip(". ") or "capture"

@@ -1,4 +1,4 @@
-"""Measurements of the user: calibrations of camera, lens and filter, and color profiles of a chart (TOML).
+"""Reads, writes and chooses the user's calibrations of camera, lens and filter (TOML), and color profiles of a chart.
 
 `polcap calibrate` writes dated files into the user's folder, $POLCAP_CALIB or the system's folder for settings; a
 capture uses the newest that fits it. Each result keeps its color profile for captures without a chart.
@@ -34,7 +34,10 @@ _HEAD = """\
 
 
 def write(place: Path, found: Calibration) -> Path:
-    """Write a dated file into the folder `place` and return its path; StorageError."""
+    """Write a calibration as a dated TOML file into the folder `place` and return the file's path.
+
+    Raises StorageError.
+    """
     parts = [found.made[:19].replace(":", ""), found.camera, found.lens, found.filter]
     path = place / (atomic.safe_name(" ".join(part for part in parts if part)) + ".toml")
     atomic.write(path, text(found))
@@ -42,12 +45,12 @@ def write(place: Path, found: Calibration) -> Path:
 
 
 def text(found: Calibration) -> str:
-    """The content of the file that `write` writes."""
+    """TOML text of a calibration, as `write` puts it into the file."""
     return _HEAD + tomli_w.dumps(_plain(msgspec.to_builtins(found)))
 
 
 def read(path: Path) -> Calibration:
-    """Read a file that `write` wrote.
+    """Read a calibration file that `write` wrote.
 
     Raises CaptureError: it is not such a file, or cannot be read.
     """
@@ -63,7 +66,7 @@ def read(path: Path) -> Calibration:
 
 
 def choose(exif: Exif, lens_filter: str | None, focal_length_mm: float | None) -> tuple[Calibration | None, list[str]]:
-    """The newest calibration of this camera, lens and filter, with notes on its use.
+    """The newest stored calibration that fits this camera, lens and polarizing filter, and notes on its use.
 
     Parts that were measured at another aperture or focal length are left out. Without `lens_filter`, the filter is
     the only one in the calibrations of this camera and lens; with several, none is used.
@@ -103,7 +106,7 @@ def choose(exif: Exif, lens_filter: str | None, focal_length_mm: float | None) -
 
 
 def _alike(*pairs: tuple[float | None, float | None]) -> bool:
-    """Whether two settings of a lens are equal, as far as both are known."""
+    """Whether two lens settings (aperture or focal length) are equal in each pair; an unknown value equals any."""
     return all(not one or not other or abs(one / other - 1) < _SAME_SETTING for one, other in pairs)
 
 
@@ -143,7 +146,7 @@ def _impossible_parts(found: Calibration) -> list[str]:
 
 
 def _possible_lens(lens: LensGeometry) -> bool:
-    """A principal point inside the picture, and a distortion that does not fold it over itself."""
+    """Whether a lens calibration is plausible: principal point inside the picture, distortion without folds."""
     inside = all(0 < c < side <= _MAX_SIDE for c, side in zip(lens.principal_px, lens.size_px))
     small = lens.focal_px >= 1 and max(abs(lens.k1), abs(lens.k2)) <= _MAX_DISTORTION
     known = Distortion(lens.focal_px, lens.principal_px, lens.k1, lens.k2)
@@ -151,12 +154,12 @@ def _possible_lens(lens: LensGeometry) -> bool:
 
 
 def _lights_corners(law: tuple[float, float, float]) -> bool:
-    """Whether 1 + a r² + b r⁴ + c r⁶ stays positive up to the corners."""
+    """Whether the lens falloff 1 + a r² + b r⁴ + c r⁶ stays positive up to the corners of the picture."""
     return bool(np.min(np.polyval([*reversed(law), 1], np.linspace(0, 1, 17))) > _LEAST_LIGHT)
 
 
 def _plain(tree: Any) -> Any:
-    """Data for TOML, which knows no None and no array; numbers of nine digits."""
+    """Convert a calibration to types that TOML has: None is left out, arrays become lists, numbers get nine digits."""
     if isinstance(tree, dict):
         return {key: _plain(value) for key, value in tree.items() if value is not None}
     if isinstance(tree, np.ndarray):
@@ -173,7 +176,7 @@ _Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
 
 
 class _Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The keys of a color profile, as of `ColorCalibration`."""
+    """Keys of a color profile file; the fields are those of `ColorCalibration`."""
 
     matrix: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
     source: Literal["chart", "corners", "profile", "camera", "none"]
@@ -189,7 +192,10 @@ class _Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def write_profile(path: Path, color: ColorCalibration) -> None:
-    """Write a color profile for other captures of the same camera, light and exposure; StorageError."""
+    """Write a color matrix as a profile file for other captures of the same camera, light and exposure.
+
+    Raises StorageError.
+    """
     place, patches = color.place, color.patches
     document: dict[str, Any] = {
         "matrix": color.matrix,
@@ -215,7 +221,7 @@ def write_profile(path: Path, color: ColorCalibration) -> None:
 
 
 def read_profile(path: Path) -> ColorCalibration:
-    """Read a file that `write_profile` wrote.
+    """Read a color profile that `write_profile` wrote.
 
     Raises ChartError: the file is missing, not a profile, or its matrix cannot be inverted.
     """

@@ -1,4 +1,4 @@
-"""Stores a value of images.py as plain JSON and an .npy per array in one folder, and reads it back.
+"""Stores a dataclass of images.py as JSON and one .npy file per array in a folder, and reads it back.
 
 The JSON holds the scalars and the names of the array files. A value that does not fit the expected type is a
 `StorageError`.
@@ -23,7 +23,10 @@ _MAPPED = 1 << 16  # bytes; smaller files are read at once, as a map costs a pag
 
 
 def encode(value: Any, name: str, arrays: Arrays) -> Any:
-    """JSON for a value; its arrays go into `arrays` under dotted names. Raises TypeError for other types."""
+    """Convert a value to JSON data; its arrays are added to `arrays` under dotted names.
+
+    Raises TypeError for unknown types.
+    """
     if isinstance(value, np.ndarray):
         if value.dtype.hasobject:
             raise TypeError(f"{name}: an array of Python objects cannot be stored")
@@ -47,7 +50,7 @@ def encode(value: Any, name: str, arrays: Arrays) -> Any:
 
 
 def decode(tree: Any, hint: Any, folder: Path) -> Any:
-    """The value of type `hint` from the JSON of `encode`; arrays are read from `folder`.
+    """Rebuild a value of type `hint` from JSON data that `encode` made; arrays are read from `folder`.
 
     Raises StorageError: the tree is not of that type, or an array file cannot be read.
     """
@@ -107,7 +110,10 @@ def _expect(holds: bool, tree: Any, wanted: str, folder: Path) -> None:
 
 
 def save(file: Path, array: NDArray[Any]) -> list[Any]:
-    """Write an array of any shape as .npy; returns its `checksum`. Unlike numpy.save it reports why a write failed."""
+    """Write an array of any shape as an .npy file and return its `checksum`.
+
+    Unlike numpy.save, an error states its cause.
+    """
     array = np.asarray(array, order="C")
     head = io.BytesIO()
     np.lib.format.write_array_header_2_0(head, np.lib.format.header_data_from_array_1_0(array))
@@ -120,7 +126,7 @@ def save(file: Path, array: NDArray[Any]) -> list[Any]:
 
 
 def load(file: Path) -> NDArray[Any]:
-    """An array of any shape: a read-only memory map, or in memory where it is small.
+    """Open an .npy file, an array of any shape: as a read-only memory map if large, else read into memory.
 
     Raises StorageError: the file is missing or no .npy.
     """
@@ -135,13 +141,13 @@ def load(file: Path) -> NDArray[Any]:
 
 
 def checksum(file: Path) -> list[Any]:
-    """Size in bytes and SHA-256 digest of a file."""
+    """Size in bytes and SHA-256 digest of a file, to detect damage."""
     with file.open("rb") as stream:
         return [file.stat().st_size, file_digest(stream, "sha256").hexdigest()]
 
 
 def freeze(value: Any) -> None:
-    """Make the arrays of a value that was not stored read-only, as those that were."""
+    """Make all arrays of a value read-only, as arrays read from the stage cache are."""
     if isinstance(value, np.ndarray):
         value.flags.writeable = False
     elif is_dataclass(value) and not isinstance(value, type):

@@ -43,7 +43,7 @@ _MAX_NUMBER = 1 << 16  # px; of a size in the metadata
 
 
 def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: str = ENCODING) -> Network:
-    """Open a model; one that polcap does not ship first runs in a child process.
+    """Open an ONNX network; a model that polcap does not ship is first tried in a child process.
 
     `device` cuda fails where CUDA is missing or does not start; auto uses it where it starts. `threads` 0 is as many
     as polcap may use. `encoding` is the version of the channels that the model must take.
@@ -66,12 +66,12 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: s
 
 
 def digest(data: bytes) -> str:
-    """The digest of a model's bytes, part of every cache key that depends on it."""
+    """SHA-256 of a model file's bytes; enters the cache key of every stage that uses the model."""
     return blake2b(data, digest_size=16).hexdigest()
 
 
 def run(network: Network, inputs: Floats) -> dict[str, Floats]:
-    """Run a network on channels (1, N, H, W): maps by name, (1, n, H, W) each.
+    """Run a network on input channels (1, N, H, W); returns maps by name, (1, n, H, W) each.
 
     Raises ModelError: it fails on this input, does not end, returns something else, or its file has changed.
     """
@@ -80,7 +80,10 @@ def run(network: Network, inputs: Floats) -> dict[str, Floats]:
 
 
 def run_session(session: Any, path: Path, inputs: Floats, limit_s: float = _RUN_S) -> dict[str, Floats]:
-    """`run` of an open session on (1, N, H, W); `path` is for messages. Raises ModelError."""
+    """Run an open onnxruntime session on channels (1, N, H, W) within a time limit; `path` is only for messages.
+
+    Raises ModelError.
+    """
     entry = session.get_inputs()[0]
     dtype = np.float16 if entry.type == "tensor(float16)" else np.float32
     names = [output.name for output in session.get_outputs()]
@@ -108,7 +111,7 @@ def run_session(session: Any, path: Path, inputs: Floats, limit_s: float = _RUN_
 
 @lru_cache(_OPEN_SESSIONS)
 def _session(path: str, expected: str, device: Device, threads: int) -> Any:
-    """The open session of a file with this digest."""
+    """Open an onnxruntime session for a model file; ModelError if its digest is not the expected one."""
     data = _bytes(Path(path))
     if digest(data) != expected:
         raise ModelError(f"{path}: changed while polcap was using it; leave the file alone and run again")
@@ -122,7 +125,7 @@ def _session(path: str, expected: str, device: Device, threads: int) -> Any:
 
 
 def trial(path: str, expected: str, encoding: str) -> worker.Answer:
-    """Load a model and run it on a small picture of noise; ModelError as `load`. In the child process."""
+    """Load a model and run it on a small picture of noise, in the child process; raises ModelError as `load` does."""
     session = _session(path, expected, "cpu", 1)
     channels, metadata = _check(Path(path), session, encoding)
     side = max(_TRIAL_PX, int(metadata["size_multiple"]))
@@ -139,7 +142,7 @@ def _bytes(path: Path) -> bytes:
 
 
 def providers(path: Path) -> dict[str, str]:
-    """Every provider of this onnxruntime, with the reason why it does not run the model, or ""."""
+    """The execution providers of this onnxruntime (CPU, CUDA…), each with the reason why it fails, or ""."""
     found = {}
     for name in _onnxruntime().get_available_providers():
         if name == _REMOTE:
@@ -171,7 +174,7 @@ def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
 
 
 def _check(path: Path, session: Any, encoding: str) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Names of the channels that the model takes, and its metadata; ModelError where they are not complete."""
+    """Names of the model's input channels, and its metadata. Raises ModelError if required metadata are missing."""
     try:
         metadata = {str(k): str(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
     except UnicodeError as error:
@@ -196,7 +199,7 @@ def _check(path: Path, session: Any, encoding: str) -> tuple[tuple[str, ...], di
 
 
 def _onnxruntime() -> Any:
-    """The library, without its telemetry: a device id in the home folder, and events sent to its maker.
+    """Import onnxruntime with its telemetry (a device id in the home folder, events sent to its maker) turned off.
 
     It reads the variable when it is first imported; child processes inherit it.
     """
@@ -207,7 +210,7 @@ def _onnxruntime() -> Any:
 
 
 def _failures() -> tuple[type[Exception], ...]:
-    """onnxruntime's exceptions have no common base of their own."""
+    """The exception types that onnxruntime raises; they have no common base class."""
     state = vars(_onnxruntime().capi.onnxruntime_pybind11_state)
     own = [kind for kind in state.values() if isinstance(kind, type) and issubclass(kind, Exception)]
     return (*own, ValueError, RuntimeError)

@@ -1,4 +1,4 @@
-"""Folders of polcap: for results among photographs, and for the user's calibrations.
+"""Paths of polcap's folders: results among photographs, and the user's calibrations.
 
 Imports no library: a run that finds nothing changed needs only these names.
 """
@@ -13,7 +13,7 @@ OURS = (OUTPUT, BATCH)  # these folders hold no photographs
 
 
 def calibrations() -> Path:
-    """The folder of the user's calibrations; it may not exist."""
+    """Path of the folder with the user's calibrations; it may not exist."""
     if stated := os.environ.get("POLCAP_CALIB"):
         return Path(stated)
     home = Path(os.path.expanduser("~"))  # unlike Path.home(), raises for no account

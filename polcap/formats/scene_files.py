@@ -13,7 +13,7 @@ from polcap.optics.resize import area_mean
 
 
 def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int64]]:
-    """Vertices (V, 3), in the file's own unit and axes, and faces (F, 3).
+    """Read a triangle mesh: vertices (V, 3), in the file's unit and axes, and faces (F, 3).
 
     An .npz holds `vq` uint16 (V, 3), position = vq/65535·vscale + vmin, and `faces`. Of a scene of
     several meshes all are read, each in its place.
@@ -44,7 +44,7 @@ def _any(path: Path) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def read_textures(folder: Path, side: int = 256) -> Floats:
-    """Linear albedo, roughness and the relief's slopes along columns and rows, (6, side, side).
+    """Read a texture set: linear albedo (3), roughness, and relief slopes along columns and rows, (6, side, side).
 
     albedo.jpg (sRGB) and roughness.jpg must be there; normal.jpg (tangent space, green down as in DirectX) or
     height.jpg may be.

@@ -6,9 +6,9 @@ import msgspec
 import numpy as np
 
 from polcap.errors import StorageError
-from polcap.formats import text_file
+from polcap.formats import chart_file, text_file
 from polcap.images import ChartReference
-from polcap.optics.color import REC709_TO_XYZ, decode_srgb
+from polcap.optics.color import decode_srgb
 
 _NAMES = {
     "classic": "ColorChecker Classic (since November 2014)",
@@ -22,7 +22,6 @@ _TABLES = {  # of colour-science
     "sg": "ColorCheckerSG - After November 2014",
 }
 _EDITIONS = ("classic_before_2014", "classic_srgb")  # of a Classic, tried as well
-_SG_BLOCK = tuple(f"{column}{row}" for row in (2, 3, 4, 5) for column in "EFGHIJ")
 # Between the outer corners of the patches of the full-size card (279 × 216 mm): nominal patches of 40 mm, and a
 # pitch of 40 mm / 0.874, the ratio found in photographs of five such cards (0.873–0.876). About 1 %.
 _CLASSIC_SIZE_M = (0.269, 0.177)
@@ -43,7 +42,7 @@ def data_path(name: str) -> Path:
 
 
 def model_files(name: str = "") -> list[Path]:
-    """The shipped models with names that begin with `name`, the newest last."""
+    """Paths of the shipped network files with names that begin with `name`, the newest last."""
     return sorted(data_path("colorchecker").parent.glob(f"models/{name}*.onnx"))
 
 
@@ -52,11 +51,13 @@ class _SrgbChart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def colorchecker(kind: str = "classic") -> ChartReference:
-    """Reference colors of a kind of ColorChecker: classic, classic_before_2014, classic_srgb or sg.
+    """Reference colors of a ColorChecker: classic, classic_before_2014, classic_srgb, sg, or a file of measurements.
 
     The maker's measurements under D50 as tabulated by colour-science, adapted to D65 (Bradford). classic_srgb is
     the maker's sRGB table, a file of ours. Of an SG it is the block E2 to J5, which repeats the Classic's colors.
     """
+    if kind not in _NAMES:
+        return chart_file.read(Path(kind))
     from polcap.optics.colour_science import colour
 
     classic = colour.CCS_COLOURCHECKERS[_TABLES["classic"]].data
@@ -65,17 +66,12 @@ def colorchecker(kind: str = "classic") -> ChartReference:
         file = msgspec.convert(text_file.read_toml(data_path("colorchecker/classic_srgb.toml")), _SrgbChart)
         return ChartReference(_NAMES[kind], decode_srgb(np.array(file.srgb) / 255), None, names)
     table = colour.CCS_COLOURCHECKERS[_TABLES[kind]]
-    keys = _SG_BLOCK if kind == "sg" else tuple(table.data)
-    xyz = colour.chromatic_adaptation(
-        colour.xyY_to_XYZ([table.data[key] for key in keys]),
-        colour.xy_to_XYZ(table.illuminant),
-        colour.xy_to_XYZ(colour.RGB_COLOURSPACES["sRGB"].whitepoint),
-        transform="Bradford",
-    )
+    keys = chart_file.SG_BLOCK if kind == "sg" else tuple(table.data)
     return ChartReference(
         name=_NAMES[kind],
-        rec709=xyz @ np.linalg.inv(REC709_TO_XYZ).T,
+        rec709=chart_file.adapted(colour.xyY_to_XYZ([table.data[key] for key in keys]), table.illuminant),
         size_m=_CLASSIC_SIZE_M if kind == "classic" else None,
         patches=tuple(f"{key} {name}" for key, name in zip(keys, names, strict=True)) if kind == "sg" else names,
+        is_block=kind == "sg",
         editions=tuple(map(colorchecker, _EDITIONS)) if kind == "classic" else (),
     )

@@ -1,4 +1,4 @@
-"""Reads TOML and JSON from files that anybody may have written, and explains the fault of a key.
+"""Reads TOML and JSON files from untrusted sources, and explains errors in their keys.
 
 Files are UTF-8, with or without a byte order mark. The reader gets plain data, or an `OSError` or `ValueError` of one
 line: a pipe, a huge file, deep nesting and infinite numbers are refused.
@@ -25,7 +25,7 @@ _Type = TypeVar("_Type", bound=inspect.Type)
 
 
 def opened(path: str | Path) -> BinaryIO:
-    """A regular file, open for reading; a pipe or a device is refused at once. Raises OSError."""
+    """Open a regular file for reading; a pipe or a device is refused. Raises OSError."""
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
@@ -53,7 +53,7 @@ def read_json(path: str | Path) -> Any:
 
 
 def parse_toml(text: str, finite: bool = True) -> dict[str, Any]:
-    """TOML text as plain data; ValueError where it is not TOML, or with `finite` holds an infinite number."""
+    """Parse TOML text; ValueError if it is not TOML, or if it contains NaN or infinity and `finite` is set."""
     try:
         found = tomllib.loads(text)
     except RecursionError:
@@ -64,7 +64,7 @@ def parse_toml(text: str, finite: bool = True) -> dict[str, Any]:
 
 
 def parse_json(text: str) -> Any:
-    """JSON text as plain data; ValueError where it is not JSON, or a number in it is not finite."""
+    """Parse JSON text; ValueError if it is not JSON, or if a number in it is not finite."""
     try:
         return json.loads(text, parse_constant=_refuse, parse_float=_finite)
     except RecursionError:
@@ -93,7 +93,7 @@ def _refuse(text: str) -> NoReturn:
 
 
 def fault(error: msgspec.ValidationError, data: Any, kind: type[msgspec.Struct]) -> str:
-    """msgspec's error about `data` in plain words: the key and its value, then its limit or the most similar key."""
+    """Explain msgspec's validation error about `data`: key, value, and limit or the most similar valid key."""
     message, _, path = str(error).partition(" - at `$")
     value, form = data, inspect.type_info(kind)
     for name, place in _STEP.findall(path):
@@ -113,7 +113,7 @@ def fault(error: msgspec.ValidationError, data: Any, kind: type[msgspec.Struct])
 
 
 def _inner(form: inspect.Type, name: str) -> inspect.Type:
-    """The type at a key of a table, or at a position of a list."""
+    """msgspec's type description of a table's key or of a list's element."""
     if name:
         return next(field.type for field in _of(form, inspect.StructType).fields if field.encode_name == name)
     for kind in (inspect.VarTupleType, inspect.ListType):
@@ -129,7 +129,7 @@ def _of(form: inspect.Type, kind: type[_Type]) -> _Type:
 
 
 def _found(form: inspect.Type, kind: type[_Type]) -> _Type | None:
-    """The member of a union that is of this kind, or the form itself; None where there is none."""
+    """The member of a union type description that is of class `kind`, or the type itself; None if there is none."""
     members = form.types if isinstance(form, inspect.UnionType) else (form,)
     for member in members:
         while isinstance(member, inspect.Metadata):

@@ -1,1 +1,1 @@
-"""Physics and image mathematics used by two rooms or more; NumPy or torch arrays alike where noted."""
+"""Physics and image mathematics that several packages use; NumPy or torch arrays alike where stated."""

@@ -1,4 +1,4 @@
-"""Diffuse reflection of rough bodies: its intensity and polarization, through visible GGX facets.
+"""Diffuse reflection of rough surfaces: intensity and polarization, from the visible GGX microfacets.
 
 Each facet is a smooth Fresnel interface. Below the surface light is unpolarized. The camera at zenith angle θ sees the
 distribution of visible normals m about the ray v. So S0 ∝ ⟨T₊(v·m)⟩, and S1 along the projected normal is
@@ -36,14 +36,17 @@ _SEEN = 0.25  # least cosine at which the shading is fitted: zenith angles up to
 
 @dataclass(frozen=True)
 class Law:
-    """Parameters of the diffuse reflection of each pixel; fields broadcast to the pixels."""
+    """Parameters of the diffuse reflection of each pixel.
+
+    Rough or smooth interface, spread of light inside, factor on the DoLP.
+    """
 
     rough: Any = 0.0  # α for diffuse reflection over α of the gloss; 0: a smooth interface
     local: Any = 0.0  # 0…1: share of light that leaves through the facet by which it entered
     dolp_factor: Any = 1.0  # factor on S1 and S2, for depolarization by depth, fibers and dust
 
     def at(self, which: Any) -> "Law":
-        """The law of the pixels that an index or mask selects."""
+        """The parameters of the pixels that an index or mask selects."""
         return Law(*(x if isinstance(x, float) else x[which] for x in (self.rough, self.local, self.dolp_factor)))
 
 
@@ -51,7 +54,9 @@ SMOOTH = Law()
 
 
 def leaving(c: Any, alpha: Any, ior: Any, local: Any = 0.0) -> tuple[Any, Any]:
-    """Mean transmittance T₊ of the visible facets, and its part that is polarized along the projected normal.
+    """Diffuse light through visible facets.
+
+    Mean transmittance T₊, and its part polarized along the projected normal.
 
     c (...,) is the cosine of the zenith angle, alpha the GGX α 0…1, ior the refractive index, local `Law.local`; all
     broadcast.
@@ -63,13 +68,15 @@ def leaving(c: Any, alpha: Any, ior: Any, local: Any = 0.0) -> tuple[Any, Any]:
 
 
 def dolp(c: Any, alpha: Any, ior: Any, local: Any = 0.0) -> Any:
-    """Degree of linear polarization (...,) of diffuse reflection; arguments of `leaving`."""
+    """Degree of linear polarization (...,) of diffuse reflection; arguments as for `leaving`."""
     plus, minus = leaving(c, alpha, ior, local)
     return minus / plus
 
 
 def flattening(cos_i: Any, cos_o: Any, between: Any, alpha: Any) -> Any:
-    """Factor (...,) on Lambert's shading of a rough body with `local` 1; it is 1 where the surface faces the camera.
+    """Factor (...,) on Lambert's shading of a rough surface with `local` 1.
+
+    It is 1 where the surface faces the camera.
 
     Facets that face a light near the camera brighten the occluding contour: 1 + B(α) sin θᵢ sin θₒ max(0, cos Δφ) /
     (g (1 + g)), g = max(cos θᵢ, cos θₒ), close to Oren & Nayar's form; B is fitted to the facets. With the flash at
@@ -86,13 +93,13 @@ def flattening(cos_i: Any, cos_o: Any, between: Any, alpha: Any) -> Any:
 
 
 def make_tables() -> None:
-    """Compute the tables of `leaving` and `flattening` now: 0.3 s that the first call would take otherwise."""
+    """Compute the tables of `leaving` and `flattening` in advance; it takes 0.3 s."""
     _table()
     _strengths()
 
 
 def _interpolate_table(c: Any, alpha: Any, ior: Any) -> tuple[Any, Any, Any]:
-    """Trilinear interpolation of `_table`, three values (...,)."""
+    """Trilinear interpolation of `_table` at cosine, α and index: three values (...,)."""
     xp = array_namespace(c)
     table = xp.asarray(_table().reshape(-1, 3), dtype=c.dtype, device=device(c))
     zero = 0 * c
@@ -122,7 +129,10 @@ def _step(xp: Any, x: Any, nodes: Floats) -> tuple[Any, Any]:
 
 @lru_cache(maxsize=1)
 def _table() -> Floats:
-    """By index, α and cosine (3, 21, 49, 3): ⟨T₊⟩ − T₊; DoLP over the smooth interface's, for `local` 0 and 1."""
+    """Table of diffuse reflection by refractive index, α and cosine, (3, 21, 49, 3).
+
+    The values are ⟨T₊⟩ − T₊, and the DoLP relative to that of the smooth interface, for `local` 0 and 1.
+    """
     out = np.zeros((len(_INDICES), len(_ALPHAS), len(_COSINES), 3))
     out[..., 1:] = 1.0
     cosine = np.maximum(_COSINES, _LEAST_COSINE)
@@ -144,7 +154,7 @@ def _table() -> Floats:
 
 @lru_cache(maxsize=1)
 def _strengths() -> Floats:
-    """B of `flattening` at each α (21,), index 1.5, least squares over zeniths up to 75°."""
+    """The coefficient B of `flattening` at each α (21,), for index 1.5, by least squares over zeniths up to 75°."""
     cosine = np.linspace(_SEEN, 1, 40)
     term = 1 / cosine - 1
     out = np.zeros(len(_ALPHAS))
@@ -158,7 +168,7 @@ def _strengths() -> Floats:
 
 
 def facets(cosine: Floats, alpha: float) -> tuple[Floats, Floats, Floats]:
-    """Visible facets of surfaces seen at cosines (N,): v·m, cos 2φ_m and weight (N, M); weights sum to 1.
+    """Visible facets of surfaces seen at cosines (N,): v·m, cos 2φ_m and weight, (N, M) each; weights sum to 1.
 
     In slopes tan θ_m = α √u/(1 − s), u = 1 − (1 − s)², even steps of s and azimuth: a facet's projected area over
     cos θ_m, cos θ + sin θ tan θ_m cos φ, times 1 − s stays finite where slopes do not.

@@ -10,17 +10,17 @@ from typing import Any
 
 
 def ggx_distribution(cos_h: Any, alpha: Any) -> Any:
-    """D(h) [1/sr], for cos_h = n·h > 0."""
+    """GGX density D(h) [1/sr] of facet normals, from cos_h = n·h > 0 and α."""
     a2 = alpha * alpha
     return a2 / (pi * ((a2 - 1) * cos_h * cos_h + 1) ** 2)
 
 
 def smith_masking(cos_i: Any, cos_o: Any, alpha: Any) -> Any:
-    """G = G₁(i) G₁(o), separable."""
+    """Smith's masking and shadowing factor G = G₁(i) G₁(o) of GGX facets, separable form."""
     return _g1(cos_i, alpha) * _g1(cos_o, alpha)
 
 
 def _g1(c: Any, alpha: Any) -> Any:
-    """G₁ = 2c/(c + √(α² + (1 − α²) c²))."""
+    """Smith's masking G₁ = 2c/(c + √(α² + (1 − α²) c²)) of one direction with cosine c."""
     a2 = alpha * alpha
     return 2 * c / (c + (a2 + (1 - a2) * c * c) ** 0.5)

@@ -24,7 +24,7 @@ _LEVELS = 65535  # of linear light; one is 1/20 of an 8-bit step where the curve
 
 
 def encode_srgb(linear: Any) -> Any:
-    """Linear Rec.709 → sRGB; an odd function, so negative values stay negative; 1 → 1.
+    """Encode linear Rec.709 as sRGB. An odd function, so negative values stay negative; 1 → 1.
 
     References
     ----------
@@ -37,14 +37,14 @@ def encode_srgb(linear: Any) -> Any:
 
 
 def decode_srgb(encoded: Any) -> Any:
-    """sRGB → linear Rec.709, the inverse of `encode_srgb`."""
+    """Decode sRGB to linear Rec.709: the inverse of `encode_srgb`."""
     xp = array_namespace(encoded)
     size = xp.abs(encoded)
     return xp.sign(encoded) * xp.where(size > 0.04045, ((size + 0.055) / 1.055) ** 2.4, size / 12.92)
 
 
 def srgb_eight_bits(linear: Floats) -> NDArray[np.uint8]:
-    """Linear Rec.709 0…1, (..., 3) or (...,), as 8-bit sRGB, clipped; NaN becomes 0."""
+    """Encode linear Rec.709 0…1, (..., 3) or (...,), as 8-bit sRGB, clipped; NaN becomes 0."""
     level = np.asarray(linear, np.float32) * np.float32(_LEVELS)
     level += np.float32(0.5)
     np.fmin(np.fmax(level, 0, out=level), _LEVELS, out=level)
@@ -53,12 +53,12 @@ def srgb_eight_bits(linear: Floats) -> NDArray[np.uint8]:
 
 @cache
 def _curve() -> NDArray[np.uint8]:
-    """sRGB of each linear level of `srgb_eight_bits`: a look-up is ten times as fast as the power function."""
+    """Look-up table of 8-bit sRGB for linear levels, for `srgb_eight_bits`; ten times as fast as the power function."""
     return np.asarray(np.rint(255 * encode_srgb(np.arange(_LEVELS + 1) / _LEVELS)), np.uint8)
 
 
 def luminance(rgb: Any) -> Any:
-    """Y of linear Rec.709 (..., 3) → (...,)."""
+    """Luminance Y (...,) of linear Rec.709 colors (..., 3)."""
     return LUMINANCE[0] * rgb[..., 0] + LUMINANCE[1] * rgb[..., 1] + LUMINANCE[2] * rgb[..., 2]
 
 
@@ -157,7 +157,10 @@ def trimmed_residuals(
 def _fit_weighted(
     color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], rounds: int
 ) -> tuple[Floats, Floats, Floats]:
-    """M (…, 3, 3), e (…, 2) and b (…,) by least squares with Huber weights, from the `usable` patches (…, N)."""
+    """Fit color matrices.
+
+    M (…, 3, 3), e (…, 2) and b (…,) by least squares with Huber weights, from `usable` patches (…, N).
+    """
     exposure = float(np.mean(color[usable.reshape(-1, len(color)).any(axis=0)])) + 1e-12
     color, base = color / exposure, np.where(usable, _base(reference), 0.0)
     system, weight = _ChartEquations(color, reference, position), base
@@ -184,13 +187,13 @@ def _reflectance(color: Floats, position: Floats, matrix: Floats, slope: Floats,
 
 
 def _base(reference: Floats) -> Floats:
-    """Weights (N,) of patches: the slope of L*, doubled for neutral patches."""
+    """Weights (N,) of chart patches in the matrix fit: the slope of L*, doubled for neutral patches."""
     chroma = reference.max(axis=1) - reference.min(axis=1)
     return np.asarray((1 + (chroma < 0.1 * reference.max(axis=1))) / np.maximum(luminance(reference), 0.02) ** (2 / 3))
 
 
 class _ChartEquations:
-    """Linear equations of N patches × 3 channels for M, e and b, solved for any weights of the patches."""
+    """Linear equations of N chart patches × 3 channels for color matrix M, light slope e and glare b."""
 
     def __init__(self, color: Floats, reference: Floats, position: Floats) -> None:
         self._color, self._reference, self._position = color, reference, position
@@ -203,7 +206,7 @@ class _ChartEquations:
         self._right = np.einsum("cni,nc->ni", rows, reference)
 
     def solve(self, weight: Floats) -> tuple[Floats, Floats, Floats]:
-        """M (…, 3, 3), e (…, 2) and b (…,) for weights (…, N)."""
+        """Solve for M (…, 3, 3), e (…, 2) and b (…,) with weights (…, N) of the patches."""
         square = weight**2
         normal = (square @ self._products).reshape(*weight.shape[:-1], 12, 12)
         scale = 1 / np.sqrt(np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), 1e-30))

@@ -1,4 +1,4 @@
-"""Cross-polarization: diffuse reflection behind a polarizer that is crossed to one on the flash.
+"""Cross-polarization: separates diffuse reflection by a polarizer on the lens crossed to one on the flash.
 
 The flash is polarized along β, the axis of the lens's polarizer is α = β + 90°. Mirror reflection keeps its axis of
 polarization and is blocked. Light that enters a body (transmittances T₊ ± T₋, azimuth φ), loses its polarization inside
@@ -20,11 +20,14 @@ from polcap.images import Floats
 
 
 def polarization_along(s1: Floats, s2: Floats, angle: float) -> Floats:
-    """p = S1 cos 2α + S2 sin 2α (H, W, C), with α [rad] the axis of the lens's polarizer."""
+    """Polarized part p = S1 cos 2α + S2 sin 2α (H, W, C) along the axis α [rad] of the lens's polarizer."""
     return np.asarray(s1 * np.cos(2 * angle) + s2 * np.sin(2 * angle))
 
 
 def diffuse_light(crossed: Floats, p: Floats) -> Floats:
-    """D = ½ (I + √(I² + 4 p²)), which solves I = D − p²/D; all (H, W, C). Negative I, from noise, counts as 0."""
+    """Diffuse light D = ½ (I + √(I² + 4 p²)) from the cross-polarized intensity I: solves I = D − p²/D.
+
+    All are (H, W, C). Negative I, from noise, counts as 0.
+    """
     light = np.maximum(crossed, 0)
     return np.asarray((light + np.sqrt(light * light + 4 * p * p)) / 2)

@@ -15,7 +15,7 @@ from polcap.images import Bits, Floats
 
 
 def superpixel(mosaic: Any, cfa: Bits) -> Floats:
-    """Each 2×2 quad, or 3×3 block of X-Trans, as one pixel of color means, (H, W) → (3, H//n, W//n) float32.
+    """Bin a mosaic: each 2×2 quad, or 3×3 block of X-Trans, is one pixel of color means, (H, W) → (3, H//n, W//n).
 
     Rows and columns after the last whole block are dropped.
     """
@@ -44,7 +44,7 @@ def x_trans_corner(cfa: Bits) -> tuple[int, int] | None:
 
 
 def interpolate(mosaic: Floats, cfa: Bits) -> Floats:
-    """All three colors at every photosite, (H, W) → (H, W, 3) float32.
+    """Demosaic to all three colors at every photosite, (H, W) → (H, W, 3) float32.
 
     Green is the mean of its four neighbors, corrected by the curvature of the color measured there. Red and blue are
     interpolated bilinearly as differences from green. Measured values stay unchanged.
@@ -73,7 +73,7 @@ def interpolate(mosaic: Floats, cfa: Bits) -> Floats:
 
 
 def variance_gain(cfa: Bits) -> Floats:
-    """Noise propagation of `interpolate`, (2, 2, 3, 3) = [row phase, column phase, output color, input color].
+    """Noise gain of `interpolate`, (2, 2, 3, 3) = [row phase, column phase, output color, input color].
 
     Variance of an output color = Σ over input colors of gain · variance of one such photosite.
     """
@@ -94,6 +94,6 @@ def _variance_gain(colors: tuple[int, ...]) -> Floats:
 
 
 def _at(padded: Floats, margin: int, dy: int, dx: int) -> Floats:
-    """The unpadded picture, shifted: pixel (y, x) shows the value at (y + dy, x + dx)."""
+    """A padded picture shifted and cropped: pixel (y, x) shows the value at (y + dy, x + dx)."""
     h, w = padded.shape[0] - 2 * margin, padded.shape[1] - 2 * margin
     return padded[margin + dy : margin + dy + h, margin + dx : margin + dx + w]

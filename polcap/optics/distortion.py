@@ -16,7 +16,7 @@ _STEPS = 12  # of Newton's method; four are enough for any lens but a fisheye
 
 
 def distort(lens: Distortion, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Pixels of the photograph for pinhole pixels x, y of shapes that broadcast, such as (W,) and (H, 1); float64."""
+    """Distort: pixels of the photograph for pinhole pixels x, y of shapes that broadcast, (W,) and (H, 1); float64."""
     u, v = (x - lens.center[0]) / lens.focal, (y - lens.center[1]) / lens.focal
     r2 = u * u + v * v
     stretch = r2 * (lens.k1 + r2 * lens.k2) * lens.focal
@@ -24,7 +24,7 @@ def distort(lens: Distortion, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def undistort(lens: Distortion, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Pinhole pixels for pixels x, y (H, W) or (N,) of the photograph: inverts `distort` by Newton's method."""
+    """Undistort: pinhole pixels for pixels x, y (H, W) or (N,) of the photograph, by Newton's method."""
     u, v = (x - lens.center[0]) / lens.focal, (y - lens.center[1]) / lens.focal
     seen = np.hypot(u, v)
     r = seen
@@ -36,7 +36,7 @@ def undistort(lens: Distortion, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def folds(lens: Distortion, width: float, height: float) -> bool:
-    """Whether two rays fall on one pixel within a picture of this size [px]: then the parameters belong to no lens."""
+    """Whether a distortion is impossible: two rays fall on one pixel within a picture of this size [px]."""
     x, y = (max(c, side - c) for c, side in zip(lens.center, (width, height)))
     far = np.hypot(x, y) / lens.focal
     r2 = np.linspace(0, 1.3 * far, 64) ** 2
@@ -44,7 +44,10 @@ def folds(lens: Distortion, width: float, height: float) -> bool:
 
 
 def pinhole_box(lens: Distortion, box: tuple[int, int, int, int], size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """The box x0, y0, x1, y1 (end exclusive) of pinhole pixels that contains a box of the photograph; within (w, h)."""
+    """Box x0, y0, x1, y1 (end exclusive) of pinhole pixels that contains a box of the photograph.
+
+    It is clipped to `size` (w, h).
+    """
     x0, y0, x1, y1 = box
     across, down = np.arange(x0 - 0.5, x1), np.arange(y0 - 0.5, y1)
     x = np.concatenate([across, across, np.full(len(down), x0 - 0.5), np.full(len(down), x1 - 0.5)])

@@ -15,18 +15,18 @@ from polcap.optics.projection import back_project
 
 
 def rays(view: View, height: int, width: int) -> Floats:
-    """Unit vectors (H, W, 3) from the surface to a pinhole camera, for each pixel."""
+    """View rays: unit vectors (H, W, 3) from the surface to a pinhole camera, for each pixel."""
     return rays_at(view, *np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)))
 
 
 def rays_at(view: View, x: Floats, y: Floats) -> Floats:
-    """Unit vectors (..., 3) from the surface to a pinhole camera, for pixel positions x, y (...,)."""
+    """View rays: unit vectors (..., 3) from the surface to a pinhole camera, at pixel positions x, y (...,)."""
     towards = -back_project(view, x, y)
     return np.asarray(towards / (dot(towards, towards) ** 0.5)[..., None])
 
 
 def basis(v: Any) -> tuple[Any, Any]:
-    """(e_x, e_y) of the frame on each ray, a unit vector v (..., 3): e_x = x − (x·v) v made unit, e_y = v × e_x."""
+    """The axes (e_x, e_y) of each ray's frame, v (..., 3) unit: e_x = x − (x·v) v made unit, e_y = v × e_x."""
     xp = array_namespace(v)
     vx, vy, vz = v[..., 0], v[..., 1], v[..., 2]
     length = _x_length(vx)
@@ -40,14 +40,14 @@ def _x_length(vx: Any) -> Any:
 
 
 def cross(a: Any, b: Any) -> Any:
-    """a × b of vectors (..., 3)."""
+    """Cross product a × b of vectors (..., 3)."""
     xp = array_namespace(a)
     ax, ay, az, bx, by, bz = a[..., 0], a[..., 1], a[..., 2], b[..., 0], b[..., 1], b[..., 2]
     return xp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
 def dot(a: Any, b: Any) -> Any:
-    """a · b of vectors (..., 3), four times as fast as a sum over the last axis."""
+    """Dot product a · b of vectors (..., 3), four times as fast as a sum over the last axis."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
@@ -62,7 +62,7 @@ def unit(a: Floats) -> Floats:
 
 
 def to_ray_frame(n: Any, v: Any) -> Any:
-    """Vectors n (..., 3), from the camera frame to the frames of the rays v (..., 3); see `basis`."""
+    """Convert vectors n (..., 3) from the camera frame to the frames of the rays v (..., 3); see `basis`."""
     xp = array_namespace(n)
     vx, length, along = v[..., 0], _x_length(v[..., 0]), dot(n, v)
     across = n[..., 1] * v[..., 2] - n[..., 2] * v[..., 1]
@@ -70,7 +70,7 @@ def to_ray_frame(n: Any, v: Any) -> Any:
 
 
 def from_ray_frame(m: Any, v: Any) -> Any:
-    """Vectors m (..., 3), from the frames of the rays v (..., 3) to the camera frame."""
+    """Convert vectors m (..., 3) from the frames of the rays v (..., 3) to the camera frame."""
     xp = array_namespace(m)
     vx, vy, vz = v[..., 0], v[..., 1], v[..., 2]
     length = _x_length(vx)
@@ -80,7 +80,7 @@ def from_ray_frame(m: Any, v: Any) -> Any:
 
 
 def lifted(m: Any) -> Any:
-    """Unit vectors (..., 3) in the frames of rays, turned so that all face the camera.
+    """Turn unit vectors (..., 3) in ray frames so that all face the camera.
 
     z below 0.02 becomes 0.02, then vectors are normalized again.
     """
@@ -90,7 +90,9 @@ def lifted(m: Any) -> Any:
 
 
 def axis_across(angle: Any, v: Any) -> tuple[Any, Any]:
-    """Direction (x, y), of any length, in (e_x, e_y) of each ray v (..., 3), of an axis in the image plane.
+    """Direction (x, y) in the frame (e_x, e_y) of each ray v (..., 3) of an axis in the image plane.
+
+    Its length is arbitrary.
 
     The axis a = (cos θ, sin θ, 0), θ = `angle` [rad], is projected across the ray, a − (a·v)v; see `basis`.
     """
@@ -100,6 +102,6 @@ def axis_across(angle: Any, v: Any) -> tuple[Any, Any]:
 
 
 def axis_on_ray(angle: Any, v: Any) -> Any:
-    """Angle of `axis_across` from e_x, rad."""
+    """Angle [rad] from e_x of an axis in the image plane, in the frame of each ray v; see `axis_across`."""
     x, y = axis_across(angle, v)
     return array_namespace(v).atan2(y, x)

@@ -15,7 +15,10 @@ from polcap.optics.namespace import array_namespace
 
 
 def transmission(c: Any, ior: Any) -> tuple[Any, Any]:
-    """T₊, T₋ = (T_p ± T_s)/2 ≥ 0; the same in both directions through the surface. Broadcasts c and ior."""
+    """Fresnel transmittances T₊, T₋ = (T_p ± T_s)/2 ≥ 0.
+
+    The same in both directions through the surface; c and ior broadcast.
+    """
     g = _refracted(c, ior)
     n2 = ior * ior
     t_s = 4 * c * g / (c + g) ** 2
@@ -24,7 +27,7 @@ def transmission(c: Any, ior: Any) -> tuple[Any, Any]:
 
 
 def reflection(c: Any, ior: Any) -> tuple[Any, Any]:
-    """R₊, R₋ = (R_s ± R_p)/2 ≥ 0. Broadcasts c and ior."""
+    """Fresnel reflectances R₊, R₋ = (R_s ± R_p)/2 ≥ 0; c and ior broadcast."""
     g = _refracted(c, ior)
     n2 = ior * ior
     r_s = ((c - g) / (c + g)) ** 2
@@ -33,7 +36,7 @@ def reflection(c: Any, ior: Any) -> tuple[Any, Any]:
 
 
 def normal_reflectance(ior: Any) -> Any:
-    """F0 = ((n − 1)/(n + 1))²."""
+    """Reflectance at normal incidence, F0 = ((n − 1)/(n + 1))²."""
     return ((ior - 1) / (ior + 1)) ** 2
 
 
@@ -49,7 +52,9 @@ def greatest_diffuse_dolp(ior: float) -> float:
 
 
 def cos_zenith_from_dolp(dolp: Any, ior: float) -> Any:
-    """Exact inverse of `diffuse_dolp`: cos θ = (n − S)/√(S((1 + n²)S − 2n)), S = √((1 + ρ)/(1 − ρ)); (...,) in 0…1.
+    """Cosine of the zenith angle from the DoLP of diffuse reflection.
+
+    Exact inverse of `diffuse_dolp`. cos θ = (n − S)/√(S((1 + n²)S − 2n)), S = √((1 + ρ)/(1 − ρ)), (...,) in 0…1.
 
     dolp (...,) is clipped to the range of the material.
     """
@@ -60,5 +65,5 @@ def cos_zenith_from_dolp(dolp: Any, ior: float) -> Any:
 
 
 def _refracted(c: Any, ior: Any) -> Any:
-    """g = √(n² − sin²θ) = n cos θ_t."""
+    """The term g = √(n² − sin²θ) = n cos θ_t of Fresnel's equations."""
     return (ior * ior - 1 + c * c) ** 0.5

@@ -1,4 +1,4 @@
-"""Mueller calculus: the weights with which a linear polarizer passes the Stokes parameters.
+"""Mueller calculus of a linear polarizer: how much of each Stokes parameter it transmits.
 
 Signs: angles run from image x towards image up, counter-clockwise in the picture. So S1 > 0 is horizontal and
 S2 > 0 is 45° up-right. Works on NumPy and torch.
@@ -10,7 +10,7 @@ from polcap.optics.namespace import array_namespace
 
 
 def analyzer(angle: Any, extinction_ratio: float = float("inf")) -> Any:
-    """Intensity weights of linear polarizers on (S0, S1, S2).
+    """Weights with which a linear polarizer transmits (S0, S1, S2): intensity = weights · Stokes parameters.
 
     Rows ½ (1, c cos 2θ, c sin 2θ), (..., 3), for axes θ (...,) rad; c = (E − 1)/(E + 1) for an
     extinction ratio E, and 1 for an ideal polarizer. This is the first row of the Mueller matrix over the

@@ -20,7 +20,7 @@ DOLP_CAP = 0.4  # largest weight: the DoLP of a smooth body of index 1.5 is 0.38
 
 @dataclass(frozen=True)
 class OutlineBand:
-    """The pixels just inside the outline."""
+    """Light, outward azimuth and sector of the pixels just inside the object's outline."""
 
     light: Floats  # (K, N) registered shots, divided by their gains
     azimuth: Floats  # (N,) rad, outward direction of the outline, from image x towards image up
@@ -33,12 +33,12 @@ def disc_radius(mask: NDArray[np.bool_]) -> float:
 
 
 def depth(mask: NDArray[np.bool_]) -> Floats:
-    """Distance of each pixel of the mask to the outline (H, W), px; the picture's edge counts as one."""
+    """Distance [px] of each object pixel to the outline (H, W); the picture's edge counts as outline."""
     return np.asarray(cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 5)[1:-1, 1:-1])
 
 
 def outward(inside: Floats, blur_px: float) -> tuple[Floats, Floats]:
-    """Outward unit vectors (2, H, W), x right, y up, and the slope (H, W) that they come from.
+    """Outward direction of the outline: unit vectors (2, H, W), x right, y up, and the gradient's length (H, W).
 
     `inside` (H, W) is a mask as floats, for directions near the outline only, or its `depth`, for directions
     everywhere. It is blurred by a Gaussian of `blur_px` (1σ) first. The slope is 8 times that per px (Sobel's weights);
@@ -51,20 +51,20 @@ def outward(inside: Floats, blur_px: float) -> tuple[Floats, Floats]:
 
 
 def sectors(band: NDArray[np.bool_]) -> NDArray[np.int_]:
-    """The sector 0…23 of each pixel of the band (H, W), (N,)."""
+    """Sector 0…23 of the outline, by direction from the object's center, of each pixel of the band (H, W); (N,)."""
     y, x = np.nonzero(band)
     around = np.arctan2(y - y.mean(), x - x.mean()) if len(y) else np.zeros(0)
     return np.floor((around + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
 
 
 def polarization(band: OutlineBand, angle: Floats) -> NDArray[Any]:
-    """(S1 + i S2)/S0 of the band, (N,), from polarizer angles (K,) rad."""
+    """Complex polarization (S1 + i S2)/S0 of the outline's pixels, (N,), from polarizer angles (K,) rad."""
     s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(angle), band.light, rcond=None)[0]
     return np.asarray((s1 + 1j * s2) / np.maximum(s0, 1e-9))
 
 
 def phasor(band: OutlineBand, angle: Floats) -> tuple[NDArray[Any], Floats]:
-    """Polarization relative to the contour, by sector: Σ w e^{2i(φ − φ_contour)} (24,) and Σ w (24,).
+    """Polarization relative to the contour, summed by sector: Σ w e^{2i(φ − φ_contour)} (24,) and Σ w (24,).
 
     φ is the AoLP from polarizer angles (K,) rad, φ_contour the outward direction, w the DoLP up to DOLP_CAP. The sum is
     real and positive for diffuse reflection, which is polarized across the contour.
@@ -77,7 +77,10 @@ def phasor(band: OutlineBand, angle: Floats) -> tuple[NDArray[Any], Floats]:
 
 
 def mean_and_sigma(total: NDArray[Any], weight: Floats) -> tuple[complex, float]:
-    """Mean of `phasor`'s sums, (24,) each, and 1σ [rad] of half its argument, the common turn of all angles."""
+    """Mean polarization of the outline from the sums of `phasor`, (24,) each, and 1σ [rad] of its angle.
+
+    The angle, half the argument of the mean, is a common error of all polarizer angles.
+    """
     mean = complex(total.sum() / max(float(weight.sum()), 1e-9))
     used = weight > 0
     across = (total[used] / weight[used] * np.exp(-1j * np.angle(mean))).imag

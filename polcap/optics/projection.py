@@ -9,12 +9,12 @@ from polcap.images import Floats, View
 
 
 def transform_points(matrix: Floats, point: Floats) -> Floats:
-    """Images (…, 2) of points x, y (…, 2) under a homography (3, 3)."""
+    """Apply a homography (3, 3) to points x, y (…, 2)."""
     return np.stack(coordinates(matrix, point[..., 0], point[..., 1]), axis=-1)
 
 
 def coordinates(matrix: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """`transform_points` for separate x, y of any shapes that broadcast; float64."""
+    """Apply a homography to separate x, y of any shapes that broadcast, as `transform_points`; float64."""
     h = np.asarray(matrix, np.float64)
     u, v = (h[k, 0] * x + (h[k, 1] * y + h[k, 2]) for k in (0, 1))
     if abs(h[2, 0]) + abs(h[2, 1]) > 0 or h[2, 2] != 1:
@@ -29,20 +29,20 @@ def picture_corners(width: int, height: int) -> Floats:
 
 
 def project(view: View, point: Floats) -> Floats:
-    """Pixels x, y (…, 2) of points (…, 3) in the camera frame (x right, y up, z towards the camera)."""
+    """Project points (…, 3) of the camera frame (x right, y up, z towards the camera) to pixels x, y (…, 2)."""
     x = view.center[0] - view.focal * point[..., 0] / point[..., 2]
     y = view.center[1] + view.focal * point[..., 1] / point[..., 2]
     return np.stack([x, y], axis=-1)
 
 
 def back_project(view: View, x: Floats, y: Floats) -> Floats:
-    """Points (…, 3) in the camera frame at depth 1 (z = −1) that project onto pixels x, y (…,)."""
+    """Points (…, 3) of the camera frame at depth 1 (z = −1) for pixels x, y (…,)."""
     across, up = ray_slopes(view, x, y)
     return np.stack([across, up, -np.ones_like(across)], axis=-1)
 
 
 def ray_slopes(view: View, x: NDArray[Any], y: NDArray[Any]) -> tuple[Floats, Floats]:
-    """x/−z and y/−z (…,) in the camera frame of the points that project onto pixels x, y (…,)."""
+    """Slopes x/−z and y/−z (…,) in the camera frame of the view rays of pixels x, y (…,)."""
     return (x - view.center[0]) / view.focal, (view.center[1] - y) / view.focal
 
 

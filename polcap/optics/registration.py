@@ -51,7 +51,7 @@ _STEPS, _COARSE_STEPS = 6, 4
 
 @dataclass(frozen=True)
 class Registration:
-    """A motion and its error."""
+    """Result of a registration: the motion as a matrix, its error, and the number of tiles that agree."""
 
     matrix: Floats  # (3, 3) reference px (x, y, 1) → px of the other picture
     shift_px: float  # rms displacement of the matched tiles
@@ -61,7 +61,7 @@ class Registration:
     shape: tuple[int, int]  # (H, W) of the reference
 
     def sigma_at(self, point: Floats) -> float:
-        """1σ [px] per axis of the image of a point x, y (2,); it grows with the distance from the tiles."""
+        """Registration error: 1σ [px] per axis at a point x, y (2,); it grows with the distance from the tiles."""
         if not self.tiles:
             return np.inf
         lever = _design(_normalized(point[None], self.shape))[0, :, : len(self.covariance)]
@@ -70,7 +70,7 @@ class Registration:
 
 @dataclass(frozen=True)
 class Level:
-    """One scale of a pyramid; its tiles and spline are computed at first use."""
+    """One scale of a picture's pyramid; its tiles and spline are computed at first use."""
 
     picture: Floats  # (H, W)
     usable: Bools  # (H, W)
@@ -112,7 +112,7 @@ class Pyramid:
 
 @dataclass(frozen=True)
 class _Matches:
-    """Residual shifts of tiles under a motion."""
+    """Residual shifts of tiles between two pictures under a motion."""
 
     point: Floats  # (T, 2) tile centres x, y in the reference
     shift: Floats  # (T, 2) px
@@ -121,7 +121,7 @@ class _Matches:
 
 
 def register(reference: Pyramid, other: Pyramid, model: Model = "simplest") -> Registration:
-    """The motion from a reference to another picture.
+    """Estimate the motion from a reference picture to another picture of the same scene.
 
     The search starts from the identity, then from a phase correlation. Where no tiles match or agree, the result is the
     identity with `tiles` 0.
@@ -139,7 +139,7 @@ def register(reference: Pyramid, other: Pyramid, model: Model = "simplest") -> R
 
 
 def refine(reference: Pyramid, other: Pyramid, model: Model, start: Floats) -> Registration:
-    """The motion from a first guess (3, 3); the guess itself where no tiles match."""
+    """Refine a first guess (3, 3) of the motion between two pictures; returns the guess where no tiles match."""
     scales = reference.scales
     found, _, _ = _refine(reference, other, model, scales, scaled(start, 1 / 2 ** (scales - 1)))
     return found if found.tiles else replace(found, matrix=start)
@@ -160,7 +160,7 @@ def correlation(reference: Pyramid, other: Pyramid, matrix: Floats) -> float:
 
 
 def scaled(matrix: Floats, step: float) -> Floats:
-    """Convert a motion (3, 3) from a grid averaged down by `step` to the full grid; with 1/step, back."""
+    """Convert a motion (3, 3) from a grid that is averaged down by `step` to the full grid; with 1/step, back."""
     up = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2], [0, 0, 1.0]])
     return np.asarray(up @ matrix @ np.linalg.inv(up))
 
@@ -178,7 +178,7 @@ def squared_gradient(picture: Floats) -> Floats:
 
 
 def _phase_correlation(reference: Level, other: Level) -> Floats:
-    """Whole-pixel shift (3, 3) of pixels usable in both; the identity unless the shift is clearly better."""
+    """Whole-pixel shift between two pictures as a matrix (3, 3); the identity unless the shift is clearly better."""
     a, b, both = reference.picture, other.picture, reference.usable & other.usable
     window = np.outer(np.hanning(a.shape[0]), np.hanning(a.shape[1]))
     if both.mean() < 0.05:
@@ -199,7 +199,7 @@ def _phase_correlation(reference: Level, other: Level) -> Floats:
 def _refine(
     reference: Pyramid, other: Pyramid, model: Model, scales: int, matrix: Floats
 ) -> tuple[Registration, int, float]:
-    """Refine a first guess from the coarsest of some scales to the full size.
+    """Refine a first guess of the motion from the coarsest of some scales to the full size.
 
     Returns the registration, the number of tiles that agree with it, and their share of the tiles usable in both.
     """
@@ -232,7 +232,10 @@ def _refine(
 
 
 def _match(reference: Level, other: Level, corner: Indices, matrix: Floats) -> _Matches:
-    """Residual shifts of tiles by one Gauss-Newton step: reference(x) = gain · (other(x') + ∇·δ) + offset for δ."""
+    """Residual shifts of tiles by one Gauss-Newton step.
+
+    It solves reference(x) = gain · (other(x') + ∇·δ) + offset for the shift δ of each tile.
+    """
     parts = [
         _match_some(reference, other, part, matrix)
         for part in np.split(corner, range(_TILES_AT_ONCE, len(corner), _TILES_AT_ONCE))
@@ -242,7 +245,7 @@ def _match(reference: Level, other: Level, corner: Indices, matrix: Floats) -> _
 
 
 def _match_some(reference: Level, other: Level, corner: Indices, matrix: Floats) -> tuple[Floats, Floats, Floats, int]:
-    """Centers, shifts and information of the tiles that match, and the number of tiles usable in both pictures."""
+    """Match some tiles: their centers, shifts and information, and the number of tiles usable in both pictures."""
     height, width = other.picture.shape
     each = np.arange(float(_TILE))
     u, v = coordinates(matrix, corner[:, 1, None, None] + each, corner[:, 0, None, None] + each[:, None])
@@ -278,7 +281,7 @@ def _match_some(reference: Level, other: Level, corner: Indices, matrix: Floats)
 
 
 def _without_noise(shift: Floats, normal: Floats, count: Floats, variance: Floats) -> tuple[Floats, Floats]:
-    """Shifts (T, 2) and their information (T, 2, 2), corrected for gradient noise, which makes shifts too small.
+    """Tile shifts (T, 2) and information (T, 2, 2), corrected for gradient noise, which makes shifts too small.
 
     The normal matrix (T, 4, 4), with gain and offset eliminated, is the sum of the scene's gradients and the noise's:
     half the variance (T,) of each of `count` (T,) pixels. Directions dominated by noise are left out.
@@ -294,13 +297,16 @@ def _without_noise(shift: Floats, normal: Floats, count: Floats, variance: Float
 
 
 def _windows(picture: NDArray[Any], corner: Indices, size: int) -> NDArray[Any]:
-    """Squares (T, size, size) of a picture (H, W), from their corners (T, 2) = (row, column)."""
+    """Cut squares (T, size, size) out of a picture (H, W), at corners (T, 2) = (row, column)."""
     windows = np.lib.stride_tricks.sliding_window_view(picture, (size, size))
     return np.asarray(windows[corner[:, 0], corner[:, 1]])
 
 
 def _fit(matches: _Matches, shape: tuple[int, ...], model: Model) -> tuple[Floats, Floats, float]:
-    """Motion (3, 3) fitted to the tiles' shifts, covariance (P, P) of its parameters, rms 1σ of the shifts [px]."""
+    """Fit one motion (3, 3) to the shifts of all tiles.
+
+    Returns also the covariance (P, P) of its parameters, and the rms 1σ of the shifts [px].
+    """
     design = _design(_normalized(matches.point, shape))
     # interpolation limits the tiles with most detail
     power, axes = np.linalg.eigh(matches.information)
@@ -335,7 +341,7 @@ def _design(u: Floats) -> Floats:
 
 
 def _motion(parameters: Floats, shape: tuple[int, ...]) -> Floats:
-    """Homography (3, 3) in px from parameters of `_design`."""
+    """Homography (3, 3) in px from motion parameters as of `_design`."""
     h, w = shape
     scale = max(h, w) / 2
     p = np.zeros(8)

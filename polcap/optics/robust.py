@@ -19,7 +19,7 @@ def spread(residual: Floats) -> float:
 
 
 def biweight(residual: Floats, sigma: float) -> Floats:
-    """Weights (1 − (r/4.685σ)²)² of residuals (N,), or of any shape; 0 beyond 4.685σ (Tukey)."""
+    """Tukey's biweight (1 − (r/4.685σ)²)² of residuals of any shape; 0 beyond 4.685σ."""
     return np.asarray(np.maximum(0, 1 - (residual / (BIWEIGHT * sigma)) ** 2) ** 2)
 
 
@@ -40,7 +40,7 @@ def jackknife(without: Floats, about: Floats | float | None = None) -> Floats:
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """Variance = slope · signal + floor; NaN where all signals are alike."""
+    """A fitted noise line, variance = slope · signal + floor; NaN where all signals are alike."""
 
     slope: float
     floor: float
@@ -57,7 +57,7 @@ def fit_noise_line(
     least_floor: float = -np.inf,
     outliers: bool = False,
 ) -> NoiseFit:
-    """A sensor's noise line by iterated least squares of relative errors.
+    """Fit a sensor's noise line (variance over signal) by iterated least squares of relative errors.
 
     A variance (N,) of n differences (`freedom`) is known to √(2/n) of itself, so each weighs n/2 over the square of
     the line there, but at most as at a variance of `least`. `edges` (N,) is a second cause of variance that is

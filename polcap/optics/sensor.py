@@ -13,7 +13,9 @@ Bools = NDArray[np.bool_]
 
 
 def signal(image: SensorImage, full: bool = False) -> Floats:
-    """Linear signal (H, W, C) float32, black = 0 and white = 1; negative noise is kept.
+    """Convert sensor counts to a linear signal (H, W, C) float32, black = 0 and white = 1.
+
+    Negative noise is preserved.
 
     A mosaic is binned by superpixels, or interpolated if `full`. C = 1 for a monochrome sensor, whose file
     has three equal channels and no mosaic.
@@ -55,7 +57,7 @@ def monochrome(image: SensorImage) -> bool:
 
 
 def usable(image: SensorImage, clip: float, full: bool = False) -> Bools:
-    """Pixels (H, W) of `signal` with no clipped photosite in them or in their eight neighbors.
+    """Mask (H, W) of pixels of `signal` without a clipped photosite in them or in their eight neighbors.
 
     Raw counts of whole superpixels are compared, so all colors of a pixel are treated alike. One clipped photosite
     excludes its surroundings, so pixels near the limit are not selected by their noise.
@@ -64,7 +66,7 @@ def usable(image: SensorImage, clip: float, full: bool = False) -> Bools:
 
 
 def below(image: SensorImage, level: float, full: bool = False) -> Bools:
-    """Pixels (H, W) of `signal` with no count of `level` or more in them or in their eight neighbors."""
+    """Mask (H, W) of pixels of `signal` without a count of `level` or more in them or in their eight neighbors."""
     value = image.value
     over = _at_least(value, level)
     if image.cfa is None:
@@ -81,7 +83,7 @@ def below(image: SensorImage, level: float, full: bool = False) -> Bools:
 
 
 def _at_least(value: Floats | NDArray[np.uint16], level: float) -> Bools:
-    """value ≥ level; integer counts are compared as integers."""
+    """Compare value ≥ level; integer counts are compared as integers."""
     if value.dtype == np.uint16:
         least = math.ceil(level)
         return np.zeros(value.shape, bool) if least > 65535 else np.asarray(value >= np.uint16(least))
@@ -97,11 +99,11 @@ def saturation(image: SensorImage) -> float:
 
 
 def rounding_variance(image: SensorImage) -> float:
-    """Variance from rounding to whole counts, in units of `signal`; nearly 0 for floating-point images."""
+    """Noise variance from rounding to integer counts, in units of `signal`; nearly 0 for floating-point images."""
     step = 1.0 if np.issubdtype(image.value.dtype, np.integer) else 1e-3
     return float(step**2 / 12 / (image.white - float(image.black.mean())) ** 2)
 
 
 def _grown(mask: Bools) -> Bools:
-    """The mask grown by one pixel in all eight directions."""
+    """Dilate a mask by one pixel in all eight directions."""
     return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((3, 3), np.uint8))).view(bool)

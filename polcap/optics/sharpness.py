@@ -31,19 +31,19 @@ _DETAIL = -0.5  # largest log of fine over coarse energy of a tile with detail; 
 
 @dataclass(frozen=True)
 class Tiles:
-    """Tiles of one photograph, at the places that were chosen for all."""
+    """Small tiles of one photograph, at places that are the same in all photographs."""
 
     light: Floats  # (T, TILE, TILE) mean of its photosites
     usable: NDArray[np.bool_]  # (T,) unclipped and bright enough
 
 
 def places(image: SensorImage, clip: float) -> NDArray[np.int64]:
-    """Corners (T, 2) of the tiles to compare, chosen in one decoded photograph of the capture."""
+    """Choose the tiles to compare in one decoded photograph of a capture: corners (T, 2)."""
     return choose_tiles(_whole_light(image), sensor.usable(image, clip))
 
 
 def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
-    """The tiles of one decoded photograph at corners (T, 2) px; nothing else is binned."""
+    """Cut the tiles at corners (T, 2) px out of one decoded photograph."""
     step = image.superpixel
     margin = 1 if image.cfa is None else len(image.cfa)  # a clipped photosite makes its neighbors unusable
     side, spare = TILE * step, margin // step
@@ -65,7 +65,9 @@ def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
 
 
 def frames_blur(shots: Sequence[Sequence[Tiles]], px: float) -> Floats:
-    """Extra blur (K, E) of each frame, 1σ [RAW px], against the sharpest of the same exposure; NaN: not measurable.
+    """Extra blur (K, E) of each frame, 1σ [RAW px], relative to the sharpest of the same exposure; NaN.
+
+    Not measurable.
 
     shots: K brackets of E photographs; px: RAW px per px of the tiles.
     """
@@ -77,7 +79,10 @@ def frames_blur(shots: Sequence[Sequence[Tiles]], px: float) -> Floats:
 
 
 def _whole_light(image: SensorImage) -> Floats:
-    """`_light` of a photograph; for Bayer mosaics directly from the counts, ten times as fast as from channels."""
+    """Mean of the colors of a photograph, as `_light`.
+
+    For Bayer mosaics it is computed directly from the counts, ten times as fast as from channels.
+    """
     if image.cfa is None or image.superpixel != 2:
         return _light(sensor.signal(image))
     black = float(image.black.mean())
@@ -85,7 +90,7 @@ def _whole_light(image: SensorImage) -> Floats:
 
 
 def _light(signal: Floats) -> Floats:
-    """Mean of the photosites (H, W) of a signal (H, W, C)."""
+    """Mean over the photosites of each pixel, (H, W), of a signal (H, W, C)."""
     return signal[..., 0] if signal.shape[2] == 1 else cv2.transform(signal, np.array([[0.25, 0.5, 0.25]]))
 
 
@@ -104,7 +109,7 @@ def choose_tiles(light: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def extra_blur(tiles: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Extra Gaussian blur (K,) of each photograph, 1σ [px], against the sharpest; NaN: not measurable.
+    """Extra Gaussian blur (K,) of each photograph, 1σ [px], relative to the sharpest one; NaN: not measurable.
 
     tiles (K, T, n, n) are from K photographs of equal exposure; usable (K, T). A blur within the scatter of the tiles
     counts as 0. The scatter is that of the photograph where it is least: blur itself adds scatter, because tiles with
@@ -132,12 +137,12 @@ def extra_blur(tiles: Floats, usable: NDArray[np.bool_]) -> Floats:
 
 
 def _fineness(tiles: Floats) -> Floats:
-    """Logarithm (4, T) of fine over coarse energy, in four directions."""
+    """Logarithm (4, T) of fine over coarse detail of tiles, in four directions; blur lowers it."""
     return np.stack([np.log(_energy(tiles, way, _FINE) / _energy(tiles, way, _COARSE)) for way in _WAYS])
 
 
 def _energy(tiles: Floats, way: tuple[int, int], lag: int) -> Floats:
-    """Mean squared difference (T,) of pixels `lag` px from each other in a direction."""
+    """Mean squared difference (T,) of pixels `lag` px apart in a direction, as a measure of detail."""
     down, across = way[0] * lag, abs(way[1]) * lag
     flipped = tiles[:, :, ::-1] if way[1] < 0 else tiles
     n = tiles.shape[-1]

@@ -36,7 +36,9 @@ def warp(
     order: Literal[1, 3] = 3,
     lens: Distortion | None = None,
 ) -> Floats:
-    """Resample an image over `box`, float32: output px go through `lens`, then `transform`, to image px.
+    """Resample an image through a homography and a lens's distortion.
+
+    Output px go through `lens`, then `transform`, to image px. The result is float32 and covers `box`.
 
     Parameters
     ----------
@@ -87,7 +89,7 @@ class Taps:
 
 
 def _taps(at: Floats, last: int) -> tuple[Floats, Floats, Floats]:
-    """The two look-ups along one axis, and the weight of the second, float32."""
+    """The two look-ups of a cubic B-spline along one axis, and the weight of the second, float32."""
     at = np.clip(at, 0, last)
     whole = np.floor(at)
     f = (at - whole).astype(np.float32)
@@ -105,14 +107,14 @@ def _taps(at: Floats, last: int) -> tuple[Floats, Floats, Floats]:
 
 
 class Spline:
-    """An image (H, W) as coefficients of cubic B-splines."""
+    """An image (H, W) as coefficients of cubic B-splines, for interpolation."""
 
     def __init__(self, image: Floats) -> None:
         around = cv2.copyMakeBorder(image, _EDGE, _EDGE, _EDGE, _EDGE, cv2.BORDER_REPLICATE)
         self._of = cv2.sepFilter2D(around, cv2.CV_32F, _PREFILTER, _PREFILTER, borderType=cv2.BORDER_REPLICATE)
 
     def at(self, taps: Taps) -> Floats:
-        """Interpolated values (h, w)."""
+        """Interpolated values (h, w) of the image at the positions of `taps`."""
         upper, lower = (_mix(self._read(taps.x0, y), self._read(taps.x1, y), taps.right) for y in (taps.y0, taps.y1))
         return _mix(upper, lower, taps.down)
 
@@ -121,7 +123,7 @@ class Spline:
 
 
 def _mix(a: Floats, b: Floats, share: Floats) -> Floats:
-    """a + share · (b − a), computed in b's memory."""
+    """Linear interpolation a + share · (b − a), computed in b's memory."""
     b -= a
     b *= share
     b += a
@@ -129,7 +131,7 @@ def _mix(a: Floats, b: Floats, share: Floats) -> Floats:
 
 
 def source_box(shape: tuple[int, ...], transform: Floats, box: Box, lens: Distortion | None = None) -> Box:
-    """The box of an image of `shape` (H, W) whose pixels affect its warp over `box`."""
+    """Box of an image of `shape` (H, W) that a warp over `box` reads."""
     x0, y0, x1, y1 = box
     x: Floats = np.array([x0, x1, x0, x1]) - 0.5
     y: Floats = np.array([y0, y0, y1, y1]) - 0.5
@@ -150,7 +152,7 @@ def source_box(shape: tuple[int, ...], transform: Floats, box: Box, lens: Distor
 def covered(
     shape: tuple[int, int], transform: Floats, box: Box, margin: float = 1.0, lens: Distortion | None = None
 ) -> Bools:
-    """Pixels (y1 − y0, x1 − x0) of a box for which `warp` reads inside the image, `margin` px or more from its edge.
+    """Mask (y1 − y0, x1 − x0) of output pixels for which `warp` reads inside the image, `margin` px from its edge.
 
     `shape` (H, W) is the image's; transform, box and lens as in `warp`.
     """

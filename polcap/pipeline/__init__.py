@@ -1,1 +1,1 @@
-"""One run: the path, its cache, the result folder around it."""
+"""Runs the path of stages for one capture: order of the stages, stage cache, result folder, exports and checks."""

@@ -14,12 +14,13 @@ from polcap import parallel
 from polcap.config import Config
 from polcap.errors import SettingError
 from polcap.formats import atomic
-from polcap.formats.export import exr_layers, gltf, materialx, obj, provenance, texture_set, usd
+from polcap.formats.export import exr_layers, glb_geometry, gltf, materialx, obj, provenance, texture_set, usd
 from polcap.formats.export.encoders import Kind, TextureEncoder
+from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.presets import PRESETS, ExportPreset, Format
 from polcap.formats.export.texture_set import Key, Texture
 from polcap.formats.maps import maps_folder
-from polcap.images import Asset
+from polcap.images import Asset, Mesh
 from polcap.stages import asset, surface
 
 _Writer = Callable[[], list[Path]]  # returns the files that it has written
@@ -33,27 +34,41 @@ class ExportRequest:
     formats: tuple[Format, ...] = ("gltf", "obj")
     preset: str | None = None
     images: Kind | None = None  # inside the GLB; by default the preset's, or PNG
+    geometry: Geometry | None = None  # inside the GLB; by default the preset's, or floats
+    triangles: int | None = None  # at most; by default the preset's, or those of the full mesh
     color: str = exr_layers.LINEAR_REC709  # color space or role of the colors in the layered EXR
-    texture_size: int | None = None  # px of the longer side; by default the maps'
+    texture_size: int | None = None  # px of the longer side; by default each texture's own
     lod: int = 0  # number of further GLBs, each with a quarter of the triangles of the previous one
 
 
 @dataclass(frozen=True)
+class ExportSource:
+    """The maps of a result, with the full mesh and asset made from them."""
+
+    stored: maps_folder.StoredMaps
+    mesh: Mesh
+    asset: Asset
+    back: surface.Back  # the setting of the mesh
+
+
+@dataclass(frozen=True)
 class DetailLevel:
-    """A coarser asset, and the distance of its surface from the full one."""
+    """One level of detail of an asset, and how its mesh was decimated, if it was."""
 
     asset: Asset
-    decimated: surface.DecimatedMesh
+    decimated: surface.DecimatedMesh | None = None
 
 
 def check(wanted: ExportRequest) -> None:
     """Raise a SettingError for an unknown preset or a missing package, before anything is computed."""
-    if "usd" in _preset(wanted).formats:
+    preset = effective(wanted)
+    if "usd" in preset.formats:
         usd.require()
+    glb_geometry.require(preset.geometry)
 
 
-def from_maps(folder: Path, config: Config, wanted: ExportRequest) -> tuple[Asset, list[DetailLevel]]:
-    """The asset of the maps in a folder, and its levels of detail.
+def read(folder: Path, config: Config) -> ExportSource:
+    """Read the maps of a result and build the full mesh and asset from them.
 
     Raises
     ------
@@ -64,25 +79,38 @@ def from_maps(folder: Path, config: Config, wanted: ExportRequest) -> tuple[Asse
     """
     stored = maps_folder.read(folder)
     mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, config.surface)
-    whole = asset.build(stored.maps, mesh, config.asset)
-    levels = []
-    for k in range(1, wanted.lod + 1):
-        decimated = surface.decimate(mesh, stored.maps.view, 0.25**k, config.surface.back)
-        levels.append(DetailLevel(asset.with_mesh(whole, stored.maps, decimated.mesh), decimated))
-    if wanted.texture_size is None:
-        return whole, levels
+    return ExportSource(stored, mesh, asset.build(stored.maps, mesh, config.asset), config.surface.back)
+
+
+def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
+    """The asset with at most the triangles and the texture size of an export, then its levels of detail.
+
+    Raises
+    ------
+    ObjectError
+        A level has too few triangles.
+    """
+    full = len(source.mesh.faces)
+    most = min(effective(wanted).triangles or full, full)
+    found = [DetailLevel(source.asset) if most == full else _decimated(source, most)]
+    found += [_decimated(source, round(most * 0.25**k)) for k in range(1, wanted.lod + 1)]
     size = wanted.texture_size
-    return asset.resize_textures(whole, size), [
-        replace(level, asset=asset.resize_textures(level.asset, size)) for level in levels
-    ]
+    if size is None:
+        return found
+    return [replace(level, asset=asset.resize_textures(level.asset, size)) for level in found]
 
 
-def write(
-    out: Path, about: Mapping[str, Any], wanted: ExportRequest, whole: Asset, levels: Sequence[DetailLevel] = ()
-) -> list[Path]:
+def _decimated(source: ExportSource, triangles: int) -> DetailLevel:
+    maps = source.stored.maps
+    decimated = surface.decimate(source.mesh, maps.view, triangles, source.back)
+    return DetailLevel(asset.with_mesh(source.asset, maps, decimated.mesh), decimated)
+
+
+def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Sequence[DetailLevel]) -> list[Path]:
     """Write an asset and its levels of detail into a result folder; returns the files, the record of provenance last.
 
-    Without a preset the files go to asset/, with one to asset/PRESET/. `about` is report.json's content.
+    Without a preset the files go to asset/, with one to asset/PRESET/. `about` is report.json's content. All GLBs have
+    the origin of the first level. The records of an earlier export of the same maps into the same folder are merged.
 
     Raises
     ------
@@ -91,28 +119,30 @@ def write(
     StorageError
         A file cannot be written.
     """
-    preset, mesh = _preset(wanted), whole.mesh
+    whole = found[0].asset
+    preset, mesh = effective(wanted), whole.mesh
     name = atomic.safe_name(str(about["capture"].get("name")))  # files stay in the folder, whatever name the report has
     stem = preset.name.format(obj.stem(name) if preset.textures else name)
     shared: dict[Key, str] = {key: f"{obj.stem(stem)}_{key}.png" for key in texture_set.LOOSE}
     loose = {f"{pattern.format(obj.stem(name))}.png": make(whole) for pattern, make in preset.textures.items()}
     if _SHARING.intersection(preset.formats):
         loose |= {file: texture_set.LOOSE[key](whole) for key, file in shared.items()}
-    folder, images = out / "asset" / (wanted.preset or ""), wanted.images or preset.images
+    folder = out / "asset" / (wanted.preset or "")
+    options = gltf.GlbOptions(preset.images, preset.geometry, gltf.center(mesh.vertices))
     unit, record, encoder = "m" if mesh.metric else "relative", provenance.record(about), TextureEncoder()
     words = {"unit": unit, "normals": "+Y (OpenGL)", **provenance.words(record)}
     comment = f"polcap; unit of length: {unit}; normals +Y (OpenGL); made from: {stem}.provenance.json"
     layered = folder / f"{stem}_layers.exr"
     writers: dict[Format, _Writer] = {
-        "gltf": partial(_write_glb, folder / f"{stem}.glb", whole, images, words, encoder),
+        "gltf": partial(_write_glb, folder / f"{stem}.glb", whole, options, words, encoder),
         "obj": partial(obj.write, folder / f"{stem}.obj", whole, stem, shared, comment),
         "usd": partial(_one, usd.write, folder / f"{stem}.usdc", whole, stem, shared, words),
         "materialx": partial(_one, materialx.write, folder / f"{stem}.mtlx", whole, stem, shared, comment),
         "exr": partial(_one, exr_layers.write, layered, out / "maps", wanted.color, words),
     }
-    coarser = {folder / f"{stem}_lod{k}.glb": level for k, level in enumerate(levels, 1)}
+    coarser = {folder / f"{stem}_lod{k}.glb": level for k, level in enumerate(found[1:], 1)}
     tasks = [writers[one] for one in preset.formats]
-    tasks += [partial(_write_glb, file, level.asset, images, words, encoder) for file, level in coarser.items()]
+    tasks += [partial(_write_glb, file, level.asset, options, words, encoder) for file, level in coarser.items()]
     tasks += [partial(_write_texture, folder / file, texture, encoder) for file, texture in loose.items()]
     written = [file for files in parallel.results(tasks) for file in files]  # pictures are encoded on threads
     sidecar = folder / f"{stem}.provenance.json"
@@ -121,32 +151,44 @@ def write(
     description = {
         "for": preset.description,
         "unit": unit,
-        "glb": {f"{stem}_{key}": f"{texture.meaning}; {images}" for key, texture in embedded.items()},
-        "lods": {file.name: _deviation(level.decimated) for file, level in coarser.items()},
+        "glb": {f"{stem}_{key}": _described(texture, options.images) for key, texture in embedded.items()},
+        "mesh": {"triangles": len(mesh.faces), **_deviation(found[0])},
+        "lods": {
+            file.name: {"triangles": len(level.asset.mesh.faces), **_deviation(level)}
+            for file, level in coarser.items()
+        },
         "textures": {file: texture.meaning for file, texture in sorted(loose.items())},
     }
     maps_folder.note_export(out / "maps", folder.relative_to(out).as_posix(), description)
     return [*written, sidecar]
 
 
-def _preset(wanted: ExportRequest) -> ExportPreset:
+def effective(wanted: ExportRequest) -> ExportPreset:
+    """The preset of a request, or its formats, with the request's own options in place of the preset's."""
     if wanted.preset is None:
-        return ExportPreset(wanted.formats, "normals +Y")
-    if wanted.preset not in PRESETS:
+        preset = ExportPreset(wanted.formats, "normals +Y")
+    elif wanted.preset in PRESETS:
+        preset = PRESETS[wanted.preset]
+    else:
         raise SettingError(f"--preset {wanted.preset} is none of {', '.join(PRESETS)}")
-    return PRESETS[wanted.preset]
+    return replace(
+        preset,
+        images=wanted.images or preset.images,
+        geometry=wanted.geometry or preset.geometry,
+        triangles=wanted.triangles or preset.triangles,
+    )
 
 
 def _one(write_file: Callable[..., None], file: Path, *content: Any) -> list[Path]:
-    """Write one file of an export; returns it."""
+    """Write one file of an export by the function `write_file`; returns the file in a list."""
     write_file(file, *content)
     return [file]
 
 
 def _write_glb(
-    file: Path, content: Asset, images: Kind, words: Mapping[str, str], encoder: TextureEncoder
+    file: Path, content: Asset, options: gltf.GlbOptions, words: Mapping[str, str], encoder: TextureEncoder
 ) -> list[Path]:
-    gltf.write(file, content, file.stem, images, words, encoder)
+    gltf.write(file, content, file.stem, options, words, encoder)
     return [file]
 
 
@@ -156,7 +198,15 @@ def _write_texture(file: Path, texture: Texture, encoder: TextureEncoder) -> lis
     return [file]
 
 
-def _deviation(coarse: surface.DecimatedMesh) -> dict[str, Any]:
-    """Size of a coarser mesh, and its distance from the full one, for maps.json."""
-    error = f"{1000 * coarse.error:.4g} mm" if coarse.mesh.metric else f"{coarse.error_px:.3g} px"
-    return {"triangles": len(coarse.mesh.faces), "error": error}
+def _described(texture: Texture, images: Kind) -> str:
+    """Meaning, size and file format of an embedded texture, for maps.json."""
+    height, width = texture.pixels.shape[:2]
+    return f"{texture.meaning}; {width} × {height} px; {images}"
+
+
+def _deviation(level: DetailLevel) -> dict[str, str]:
+    """Distance of a decimated mesh from the full one, for maps.json."""
+    coarse = level.decimated
+    if coarse is None:
+        return {}
+    return {"error": f"{1000 * coarse.error:.4g} mm" if coarse.mesh.metric else f"{coarse.error_px:.3g} px"}

@@ -1,4 +1,4 @@
-"""The stage cache: the result of each stage in a folder of its own, `work/NN-name/`, found again by its key.
+"""The stage cache: the result of each stage in its folder `work/NN-name/`, reused while its key is the same.
 
 A key is a digest of the stage's name and version, its settings and the keys of its inputs, back to the bytes of the
 RAW files and of the model file. Where files lie is not part of it: a capture may be moved. A folder holds an `.npy`
@@ -33,16 +33,16 @@ Progress = Callable[[str, float | None, bool], None]  # stage, seconds (None: it
 
 
 def silent(stage: str, seconds: float | None, cached: bool) -> None:
-    """A progress that shows nothing."""
+    """Progress callback that shows nothing."""
 
 
 class StageReached(Exception):
-    """The path has come to the stage at which it was to stop."""
+    """Raised to end the path early: the last stage that was asked for has run."""
 
 
 @dataclass(frozen=True)
 class StageResult(Generic[T]):
-    """A value of the path and its key."""
+    """Result of a stage of the path and its cache key."""
 
     key: str
     value: T
@@ -63,7 +63,7 @@ class MemoryCache:
         self._held: dict[str, Any] = {}  # by key
 
     def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
-        """The result of a stage: found, else computed. Inputs: other results, plain values, functions (`decode`).
+        """The result of a stage: cached, else computed. Inputs: other results, plain values, functions (`decode`).
 
         Raises
         ------
@@ -78,22 +78,25 @@ class MemoryCache:
         return self.results[stage.name]
 
     def derive(self, function: Callable[..., T], *inputs: Any) -> StageResult[T]:
-        """A value that is cheap to compute from results; never stored. Its key names the function."""
+        """A value that is cheap to compute from stage results and never stored.
+
+        Its key contains the function's name.
+        """
         return StageResult(_derived_key(function, inputs), function(*map(value_of, inputs)))
 
     def begin(self, stage: str) -> None:
-        """Work on a stage begins."""
+        """Called when work on a stage begins."""
         self.stage, self._began = stage, time.perf_counter()
         self.progress(stage, None, False)
 
     def end(self) -> None:
-        """Work on the stage begun last has ended."""
+        """Called when work on the current stage ends."""
         self.progress(self.stage, time.perf_counter() - self._began, False)
 
     def _value(
         self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None, about: dict[str, Any]
     ) -> Any:
-        """The value of a stage, found or computed."""
+        """The result of a stage, read from the cache or computed."""
         value = None if self._forced else self._find(stage, about["key"])
         if value is not None:
             if stage.keep:
@@ -124,7 +127,7 @@ class StageCache(MemoryCache):
         self.work = folder / "work"
 
     def place(self, stage: Stage[..., Any]) -> Path:
-        """Folder of the next stage of the path."""
+        """Folder in which the result of the next stage of the path is stored."""
         return self.work / f"{len(self.results) + 1:02d}-{stage.name}"
 
     def _find(self, stage: Stage[..., T], key: str) -> T | None:
@@ -137,7 +140,7 @@ class StageCache(MemoryCache):
             return None
 
     def _store(self, stage: Stage[..., T], value: T, about: dict[str, Any], seconds: float) -> T:
-        """Write a result into its folder, whole or not at all; returns it as memory maps."""
+        """Store the result of a stage in its folder, completely or not at all; returns it as memory maps."""
         if not stage.keep:
             npy_folder.freeze(value)
             return value
@@ -154,14 +157,14 @@ class StageCache(MemoryCache):
 
 
 class DryRunCache(StageCache):
-    """Which stages of a path are in the cache, by their keys alone: nothing is read or computed."""
+    """Cache for a dry run: finds out by keys alone which stages are cached; nothing is read or computed."""
 
     def __init__(self, folder: Path, force: str | None = None) -> None:
         super().__init__(folder, force=force)
         self.states: dict[str, str] = {}  # of every stage: cached, compute, or on demand where it is never stored
 
     def derive(self, function: Callable[..., T], *inputs: Any) -> StageResult[T]:
-        """The key of a derived value, without the value."""
+        """The key of a derived value; the value is not computed."""
         return StageResult[Any](_derived_key(function, inputs), None)
 
     def _value(
@@ -172,10 +175,10 @@ class DryRunCache(StageCache):
 
 
 class ArchiveCache(StageCache):
-    """The cache of an earlier run, without its photographs: stored results are taken whatever their keys."""
+    """Cache of an earlier run whose photographs are missing: stored results are used whatever their keys."""
 
     def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
-        """The stored result; one that is never stored is computed.
+        """The stored result of a stage; a result that is never stored is computed.
 
         Raises
         ------
@@ -192,7 +195,7 @@ class ArchiveCache(StageCache):
 
 
 def _about(stage: Stage[..., Any], inputs: tuple[Any, ...], config: msgspec.Struct | None) -> dict[str, Any]:
-    """The facts that decide a stage's result, and the key made of them."""
+    """The data that determine a stage's result (name, version, settings, input keys), and the key made of them."""
     about = {
         "format": FORMAT,
         "stage": stage.name,
@@ -208,7 +211,7 @@ def _derived_key(function: Callable[..., Any], inputs: tuple[Any, ...]) -> str:
 
 
 def manifest(place: Path) -> dict[str, Any]:
-    """The manifest of a stored result; empty where there is none, or it is damaged."""
+    """Read the manifest of a stored stage result; empty if there is none or it is damaged."""
     try:
         about = json.loads((place / "manifest.json").read_text(encoding="utf-8"))
         whole = isinstance(about, dict) and about.get("format") == FORMAT and about.get("digest") == seal(about)
@@ -218,12 +221,12 @@ def manifest(place: Path) -> dict[str, Any]:
 
 
 def seal(about: Mapping[str, Any]) -> str:
-    """Digest of a manifest's own content, by which a later edit shows."""
+    """Digest of a manifest's content, so that a later edit is detected."""
     return digest({name: value for name, value in about.items() if name not in _NOT_SEALED})
 
 
 def read(place: Path, stage: Stage[..., T], check: bool = True) -> T:
-    """The result of a stage in its folder, its arrays as read-only memory maps; `check` compares digests.
+    """Read a stored stage result, its arrays as read-only memory maps; `check` compares digests.
 
     Raises
     ------
@@ -244,7 +247,7 @@ def read(place: Path, stage: Stage[..., T], check: bool = True) -> T:
 
 
 def _checksum(file: Path) -> list[Any] | None:
-    """As `npy_folder.checksum`; None where the file cannot be read."""
+    """Size and digest of a file as of `npy_folder.checksum`; None if the file cannot be read."""
     try:
         return npy_folder.checksum(file)
     except OSError:
@@ -252,22 +255,22 @@ def _checksum(file: Path) -> list[Any] | None:
 
 
 def digest(value: Any) -> str:
-    """Key of plain, nested data."""
+    """Digest of plain, nested data; used as a cache key."""
     return blake2b(json.dumps(value, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def value_of(value: Any) -> Any:
-    """The value of an input, which may be a result."""
+    """The value of a stage's input: of a `StageResult` its value, else the input itself."""
     return value.value if isinstance(value, StageResult) else value
 
 
 def key_of(value: Any) -> str:
-    """The key of an input, which may be a result."""
+    """The cache key of a stage's input: of a `StageResult` its key, else a digest of the input."""
     return value.key if isinstance(value, StageResult) else digest(fingerprint(value))
 
 
 def fingerprint(value: Any) -> Any:
-    """Plain data that is equal for two inputs exactly when no stage could distinguish them."""
+    """Plain data for a cache key: equal for two inputs exactly when no stage can distinguish them."""
     if isinstance(value, np.ndarray):
         solid = np.ascontiguousarray(value)
         summed = sha256(solid.data.cast("B") if solid.size else b"")
@@ -289,7 +292,7 @@ def fingerprint(value: Any) -> Any:
 
 
 def contents(folder: Path) -> list[dict[str, Any]]:
-    """The manifests in a result folder in the order of the stages, each with its size in bytes."""
+    """Manifests of all stored stage results of a result folder, in the order of the stages, with sizes in bytes."""
     found = []
     for place in sorted((folder / "work").glob("[0-9][0-9]-*")):
         if about := manifest(place):

@@ -1,4 +1,4 @@
-"""Judge a capture seconds after its last frame: keep or reshoot, and why.
+"""`polcap check`: decides seconds after the last frame whether to keep a capture or reshoot, and why.
 
 The path runs on pictures averaged down to at most 0.6 MP, with a cache in memory: nothing is written. Facts that
 averaging hides (clipping, sharpness) are measured at full size while frames are decoded.
@@ -13,7 +13,7 @@ import msgspec
 
 from polcap.config import Config
 from polcap.errors import ChartError, DecodeError, InputError
-from polcap.images import Capture, ChartRequest, Network
+from polcap.images import Capture, ChartRequest, ColorCalibration, Network
 from polcap.pipeline import models, small_capture
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import AUTO, UserInput, path, results_of
@@ -28,7 +28,7 @@ _ERROR_COST_DEG = 45.0  # of a stage that gives up: nothing is known of the norm
 
 
 class Verdict(msgspec.Struct, frozen=True):
-    """Whether to keep the capture."""
+    """Result of `polcap check`: whether to keep the capture, the judged gates, and shots to repeat."""
 
     keep: bool
     shots: tuple[str, ...]  # to be taken again, as far as single ones are to blame
@@ -39,7 +39,7 @@ class Verdict(msgspec.Struct, frozen=True):
 
 
 def shipped_networks() -> tuple[Network | None, Network | None]:
-    """The shipped networks of estimator and mask."""
+    """Open the shipped networks of the normal estimator and of the mask; None for a missing one."""
     return models.load_network(None, None), models.load_mask_network()
 
 
@@ -64,7 +64,7 @@ def inspect(
         try:
             small = small_capture.reduce(capture, config.hdr.clip, pool)
             supplied = UserInput(_moved(chart, small.step), None, *networks(), small.decode)
-            lines = tuple(_judged(small, supplied, config))
+            lines = tuple(_judged(capture, small, supplied, config))
         finally:
             pool.shutdown(cancel_futures=True)
     bad = [line for line in lines if line.state == "fail"]
@@ -75,11 +75,14 @@ def inspect(
     return Verdict(not bad, shots, lines, capture.name, seconds, "--no-chart" if missing else "")
 
 
-def _judged(small: SmallCapture, supplied: UserInput, config: Config) -> list[Gate]:
-    """The gates in the order of the path; where a stage gives up, its error is the last of them."""
+def _judged(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config) -> list[Gate]:
+    """Judge the reduced capture by the gates, in the order of the path.
+
+    Where a stage fails, its error is the last one.
+    """
     cache, failure, chart_missing = MemoryCache(until="infer"), None, ""
     try:
-        chart_missing = _run_path(small, supplied, _settings(config, small.step), cache)
+        chart_missing = _run_path(capture, small, supplied, config, cache)
     except DecodeError:
         raise
     except InputError as error:
@@ -105,20 +108,37 @@ def _judged(small: SmallCapture, supplied: UserInput, config: Config) -> list[Ga
     return lines
 
 
-def _run_path(small: SmallCapture, supplied: UserInput, settings: Config, cache: MemoryCache) -> str:
-    """Run the path into the cache; without a chart where none is found, and then the reason, else ""."""
+def _run_path(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config, cache: MemoryCache) -> str:
+    """Run the path into the cache; without a chart if `process` would find none, and then the reason, otherwise "".
+
+    A chart that is not found in the small pictures is searched at full size, as `process` does.
+    """
+    missing, settings = "", _settings(config, small.step)
     try:
         path(small.capture, supplied, settings, cache)
-    except ChartError as error:
+    except ChartError:
         if supplied.chart.mode != "auto":
             raise
-        path(small.capture, replace(supplied, chart=ChartRequest("none")), settings, cache)
-        return str(error).partition(" (")[2].partition(")")[0] or str(error)
-    return ""
+        request = ChartRequest("none")
+        try:
+            request = ChartRequest("profile", profile=_colors_at_full_size(capture, config))
+        except ChartError as error:
+            missing = str(error).partition(" (")[2].partition(")")[0] or str(error)
+        path(small.capture, replace(supplied, chart=request), settings, cache)
+    return missing
+
+
+def _colors_at_full_size(capture: Capture, config: Config) -> ColorCalibration:
+    """The color calibration that `process` makes from the reference shot. Raises ChartError."""
+    alone = MemoryCache(until="whitebalance")
+    return path(replace(capture, shots=capture.shots[:1], crossed=None), UserInput(), config, alone).color
 
 
 def _settings(config: Config, step: int) -> Config:
-    """Settings of the path on the small pictures; the stages' own limits are left to the gates."""
+    """Settings of the path for the reduced pictures.
+
+    The stages' own limits are disabled, because the gates judge instead.
+    """
     changed = msgspec.structs.replace
     return changed(
         config,
@@ -130,12 +150,15 @@ def _settings(config: Config, step: int) -> Config:
 
 
 def _moved(chart: ChartRequest, step: int) -> ChartRequest:
-    """The chart's corners on the small pictures, where a pixel covers `step` × `step` RAW pixels."""
+    """The chart's corners as given by the user, converted to the reduced pictures.
+
+    A reduced pixel covers `step` × `step` RAW pixels.
+    """
     return chart if chart.corners is None else replace(chart, corners=(chart.corners - (step - 1) / 2) / step)
 
 
 def table(verdict: Verdict) -> str:
-    """The verdict for a person, in one screen."""
+    """The verdict as text for a person, in one screen."""
     head = "keep" if verdict.keep else f"reshoot {', '.join(verdict.shots)}".rstrip()
     if verdict.keep and verdict.needs:
         head += f", and process it with {verdict.needs}"
@@ -153,5 +176,5 @@ def table(verdict: Verdict) -> str:
 
 
 def shown(verdict: Verdict) -> dict[str, object]:
-    """The verdict for a program."""
+    """The verdict as data for JSON."""
     return {"verdict": "keep" if verdict.keep else "reshoot", **msgspec.to_builtins(verdict)}

@@ -1,4 +1,4 @@
-"""Opens the networks of the path: the model that the user names, else those that polcap ships."""
+"""Opens the network files of the path: the model that the user names, else the shipped ones."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,9 @@ from polcap.stages.mask import mask_channels
 def load_network(
     estimator: Literal["network", "analytic"] | None, model: Path | None, device: Device = "cpu", threads: int = 0
 ) -> Network | None:
-    """The estimator's network: the named model, else the shipped one; None is the analytic estimator.
+    """Open the network of the normal estimator: the named model, else the shipped one.
+
+    None is the analytic estimator.
 
     `device` and `threads` as of `onnx.load`.
 
@@ -38,7 +40,7 @@ def load_network(
 
 
 def open_network(path: Path, device: Device = "cpu", threads: int = 0) -> Network:
-    """An estimator's network; the shipped one comes with its refinement network, which was trained with it only."""
+    """Open an estimator's network. The shipped one comes with its refinement network, which was trained for it only."""
     network = onnx.load(path, device, threads)
     own, relief = _newest("polcap"), _newest("fine")
     if own is None or relief is None or (path != own and network.digest != onnx.digest(own.read_bytes())):
@@ -47,11 +49,11 @@ def open_network(path: Path, device: Device = "cpu", threads: int = 0) -> Networ
 
 
 def load_mask_network(threads: int = 0) -> Network | None:
-    """The shipped network that segments the object; None where this polcap ships none."""
+    """Open the shipped network that segments the object; None if none is shipped."""
     found = _newest("mask")
     return onnx.load(found, "cpu", threads, mask_channels.ENCODING) if found else None
 
 
 def _newest(name: str) -> Path | None:
-    """The newest shipped model of a name."""
+    """Path of the newest shipped model whose file name begins with `name`."""
     return max(shipped_data.model_files(name), default=None)

@@ -44,7 +44,7 @@ STAGES = tuple(_FIELD)
 
 @dataclass(frozen=True)
 class UserInput:
-    """Inputs of the path besides the list of photographs."""
+    """Inputs of the path besides the photographs: chart, mask, networks, decoder."""
 
     chart: ChartRequest = AUTO
     mask: NDArray[np.bool_] | None = None  # on the RAW pixels or on the grid of the merged picture
@@ -54,7 +54,7 @@ class UserInput:
 
 
 def path(capture: Capture | None, supplied: UserInput, config: Config, cache: MemoryCache) -> Results:
-    """The results of all stages, or of the first ones where the cache stops the path."""
+    """Run the stages in order; returns the results of all stages, or of those before the cache stops the path."""
     with suppress(StageReached), ThreadPoolExecutor(1) as background:
         colors = background.submit(shipped_data.colorchecker, config.whitebalance.chart)  # imports a large library
         radiance = cache.run(hdr.merge, capture, supplied.decode, config=config.hdr)
@@ -77,13 +77,13 @@ def path(capture: Capture | None, supplied: UserInput, config: Config, cache: Me
 
 
 def results_of(made: Mapping[str, StageResult[Any]]) -> Results:
-    """The results of the stages that have run."""
+    """Collect the results of the stages that have run as `Results`."""
     keys = {stage: result.key for stage, result in made.items()}
     return Results.partial(keys=keys, **{_FIELD[stage]: result.value for stage, result in made.items()})
 
 
 def on_grid(drawn: NDArray[np.bool_] | None, radiance: AngleStack) -> NDArray[np.bool_] | None:
-    """The user's mask (H, W) on the grid of the merged picture.
+    """Convert the user's mask (H, W) to the grid of the merged picture.
 
     It may be drawn there, or on the pixels of the RAW or of the mosaic.
 
@@ -106,10 +106,10 @@ def on_grid(drawn: NDArray[np.bool_] | None, radiance: AngleStack) -> NDArray[np
 
 
 def distance_m(color: ColorCalibration, radiance: AngleStack) -> float | None:
-    """Distance of the chart, and so about that of the object [m]; None without a chart of known size."""
+    """Distance of the chart [m], also taken as the object's; None without a chart of known size."""
     return None if color.metres_per_px is None else color.metres_per_px * radiance.view.focal
 
 
 def remeshed(stored: SurfaceMaps, mesh: Mesh, settings: surface.SurfaceSettings) -> Mesh:
-    """The mesh of the stored maps and of the depth that maps/ holds."""
+    """Rebuild the mesh from the maps and depth as stored in maps/."""
     return surface.triangulate(maps_folder.stored_depth(stored, mesh), stored, mesh.metric, settings)

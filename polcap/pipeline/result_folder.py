@@ -37,7 +37,7 @@ def check(out: Path, photographs: Path) -> None:
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Work in a result folder: other processes stay out, and a killed run's temporary files are removed.
+    """Context manager that locks a result folder for this process and removes temporary files of a killed run.
 
     The system drops the lock when its owner dies, however it dies: there are no stale locks.
 
@@ -68,7 +68,7 @@ def locked(out: Path) -> Iterator[None]:
 
 
 def write_run(out: Path, about: Mapping[str, Any]) -> None:
-    """work/run.json: facts of a run that `show` and `report` need when the photographs are gone.
+    """Write work/run.json: facts of a run that `show` and `report` need when the photographs are missing.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def write_run(out: Path, about: Mapping[str, Any]) -> None:
 
 
 def read_run(out: Path) -> dict[str, Any]:
-    """The content of work/run.json.
+    """Read work/run.json of a result folder.
 
     Raises
     ------

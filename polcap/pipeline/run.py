@@ -1,4 +1,4 @@
-"""Process a capture: run the path, write maps and asset, judge, report; and open a finished result again.
+"""Processes a capture: runs the path, writes maps and asset, judges, reports; also opens a finished result again.
 
 The order of the stages is in `path.py`.
 """
@@ -20,7 +20,7 @@ from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
 from polcap.images import Capture, Decode, Frame, SensorImage
 from polcap.pipeline import asset_export, result_folder
-from polcap.pipeline.asset_export import ExportRequest
+from polcap.pipeline.asset_export import DetailLevel, ExportRequest
 from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, contents, silent
 from polcap.pipeline.path import STAGES, UserInput, path
 from polcap.report import animation
@@ -39,7 +39,7 @@ def process(
     force: str | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any] | None:
-    """Run the path and write the result folder; returns report.json's content, None with `until`.
+    """Process a capture into the result folder `out`; returns the content of report.json, or None with `until`.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def process(
 
 
 def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -> dict[str, Any]:
-    """Write maps, asset, color profile and report; returns report.json's content.
+    """Write maps, asset, color profile and report of a finished path; returns the content of report.json.
 
     Files are encoded while figures are measured and the page is drawn: encoders alone do not fill two cores.
     """
@@ -81,7 +81,7 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
     )
     parallel.both(
         partial(report.write, out, about, results),
-        partial(asset_export.write, out, about, ExportRequest(), results.asset),
+        partial(asset_export.write, out, about, ExportRequest(), [DetailLevel(results.asset)]),
     )
     if results.color.source in ("chart", "corners"):
         calibrations.write_profile(out / PROFILE, results.color)
@@ -91,7 +91,10 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
 
 
 def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
-    """A decode function that calls `frame_read` with the number of decoded photographs, and of all."""
+    """A decode function that reports progress.
+
+    It calls `frame_read` with the numbers of decoded and of all photographs.
+    """
     brackets = capture.all_shots
     total, number = sum(len(shot.frames) for shot in brackets), count(1)
 
@@ -104,29 +107,31 @@ def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
 
 
 def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force: str | None = None) -> dict[str, str]:
-    """The state of each stage before a run of `process`: cached, compute, or on demand. Nothing is computed."""
+    """Dry run: the state of each stage before `process`: cached, compute, or on demand. Nothing is computed."""
     cache = DryRunCache(out, force)
     path(capture, supplied, config, cache)
     return cache.states
 
 
-def export(out: Path, wanted: ExportRequest) -> list[Path]:
-    """Write the asset again, from maps/ and report.json alone; returns the files.
+def export(out: Path, *wanted: ExportRequest) -> list[Path]:
+    """Write the asset of a finished result again for each request, from maps/ and report.json; returns the files.
 
     Raises
     ------
     SettingError
         A preset or color space does not exist, or a package or encoder is missing.
     """
-    asset_export.check(wanted)
+    for one in wanted:
+        asset_export.check(one)
     about = report.read(out)
     with result_folder.locked(out):
-        whole, levels = asset_export.from_maps(out / "maps", restored(about, out / "report.json"), wanted)
-        return asset_export.write(out, about, wanted, whole, levels)
+        source = asset_export.read(out / "maps", restored(about, out / "report.json"))
+        exports = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in wanted)
+        return [file for files in exports for file in files]
 
 
 def reopen(out: Path, until: str = "surface") -> tuple[Results, dict[str, Any]]:
-    """The results of an earlier run up to a stage, without its photographs, and the facts in work/run.json.
+    """Read the results of an earlier run up to a stage, without its photographs, and the facts in work/run.json.
 
     Raises
     ------
@@ -139,7 +144,7 @@ def reopen(out: Path, until: str = "surface") -> tuple[Results, dict[str, Any]]:
 
 
 def show(out: Path, stages: Sequence[str]) -> list[Path]:
-    """Draw the results of stages; returns the PNGs' paths."""
+    """Write pictures of the results of these stages; returns the PNGs' paths."""
     for stage in stages:
         if stage not in STAGES:
             raise SettingError(f"{stage!r} is no stage; choose one of {', '.join(STAGES)}")
@@ -152,7 +157,10 @@ def show(out: Path, stages: Sequence[str]) -> list[Path]:
 
 
 def animate(out: Path, motion: animation.Motion) -> list[Path]:
-    """Move the light or the object; returns the paths of the WebP and, where FFmpeg is present, the MP4."""
+    """Write an animation with a moving light or object.
+
+    Returns the paths of the WebP and, if FFmpeg is installed, of the MP4.
+    """
     results, about = reopen(out)
     ior = float(about["settings"]["infer"]["ior"])
     turning = motion == "turntable"
@@ -166,7 +174,7 @@ def animate(out: Path, motion: animation.Motion) -> list[Path]:
 
 
 def judge_again(out: Path) -> dict[str, Any]:
-    """Write report.json and report.html again, from the stage cache."""
+    """Judge a finished result again from the stage cache: writes report.json and report.html."""
     results, facts = reopen(out)
     with result_folder.locked(out):
         about = report.document(facts, results, restored(facts, out / "work" / "run.json"), timings(out))
@@ -177,5 +185,5 @@ def judge_again(out: Path) -> dict[str, Any]:
 
 
 def timings(out: Path) -> dict[str, float]:
-    """Seconds that each stored stage took when it was computed."""
+    """Computing time [s] of each stored stage, from when it was computed."""
     return {about["stage"]: about["seconds"] for about in contents(out)}

@@ -1,4 +1,4 @@
-"""Reduces a capture to at most 0.6 MP for `polcap check`, and measures clipping and sharpness at full size.
+"""Reduces a capture to at most 0.6 MP for `polcap check`. Clipping and sharpness are measured at full size.
 
 Frames are reduced in the decoding child process, which imports this module; only small arrays are sent back.
 """
@@ -23,7 +23,7 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class ReducedFrame:
-    """A reduced frame."""
+    """One reduced frame: picture, share of clipped pixels, tiles for the measurement of sharpness."""
 
     picture: SensorImage  # (h, w, 3) means of blocks, black 0, white 1; 1 for partly clipped blocks
     clipped: Floats  # (h, w) share of each block that is clipped
@@ -45,21 +45,21 @@ class SmallCapture:
 
     @cached_property
     def clipped(self) -> Floats:
-        """(K, E, h, w) share of each pixel that is clipped."""
+        """Share of clipped RAW pixels in each reduced pixel, (K, E, h, w)."""
         return np.stack([[one.clipped for one in shot] for shot in self._shots()])
 
     @cached_property
     def blur_px(self) -> Floats:
-        """(K, E) extra blur of each frame against the sharpest of its exposure, 1σ [visible RAW px]."""
+        """Extra blur (K, E) of each frame relative to the sharpest of the same exposure, 1σ [visible RAW px]."""
         return sharpness.frames_blur([[one.tiles for one in shot] for shot in self._shots()], self.merged_px)
 
     def _shots(self) -> list[list[ReducedFrame]]:
-        """The capture's frames as K shots of E frames."""
+        """The reduced frames, grouped as K shots of E frames."""
         return [[self.reduced[frame].result() for frame in shot.frames] for shot in self.capture.shots]
 
 
 def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapture:
-    """Decode every frame once, on the threads of the pool, and average it down.
+    """Start to decode and reduce every frame of a capture once, on the threads of the pool.
 
     The reference frame is first: it determines the reduction, and the tiles in which sharpness is measured. The others
     follow in the order of the merge. Counts from `clip` [white level] on are clipped.
@@ -94,7 +94,7 @@ def _decode_reduced(frame: Frame, clip: float, times: int, corners: list[list[in
 
 
 def _joined(meta: dict[str, Any], arrays: Arrays) -> ReducedFrame:
-    """The `ReducedFrame` of the answer from the child process."""
+    """Build a `ReducedFrame` from the answer of the child process."""
     picture = SensorImage(
         value=arrays["value"],
         black=np.zeros((1, 1)),
@@ -108,7 +108,9 @@ def _joined(meta: dict[str, Any], arrays: Arrays) -> ReducedFrame:
 
 
 def reduce_first(image: SensorImage, clip: float, most_pixels: float) -> tuple[dict[str, Any], Arrays]:
-    """`reduce_frame` of the reference frame, and the reduction of the capture. In the child process.
+    """In the child process.
+
+    Reduce the reference frame as `reduce_frame`, and choose the reduction of the whole capture.
 
     `times` is the number of merged pixels along a block, `superpixel` that of RAW pixels along a merged pixel;
     `corners` (T, 2) px are those of the tiles.
@@ -123,7 +125,10 @@ def reduce_first(image: SensorImage, clip: float, most_pixels: float) -> tuple[d
 def reduce_frame(
     image: SensorImage, clip: float, times: int, corners: list[list[int]]
 ) -> tuple[dict[str, Any], Arrays]:
-    """Means over blocks of `times` merged pixels a side, and tiles at `corners` (T, 2) px. In the child process."""
+    """In the child process: reduce a frame to means over blocks of `times` merged pixels a side.
+
+    Tiles at `corners` (T, 2) px are returned at full size.
+    """
     clipped = block_means(~sensor.usable(image, clip), times)
     value = _means(image, times)
     value[clipped > 0] = 1  # so that the stages exclude partly clipped pixels
@@ -136,7 +141,7 @@ def reduce_frame(
 
 
 def _means(image: SensorImage, times: int) -> Floats:
-    """Signal (h, w, 3) over blocks of times × times merged pixels."""
+    """Mean signal (h, w, 3) of a frame over blocks of times × times merged pixels."""
     if image.cfa is None or image.cfa.shape != (2, 2):
         signal = sensor.signal(image)
         return block_means(np.repeat(signal, 3, axis=2) if signal.shape[2] == 1 else signal, times)

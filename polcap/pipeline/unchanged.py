@@ -1,4 +1,4 @@
-"""Whether a result folder already answers a request: same options, same files, and nothing touched since.
+"""Detects that a result folder is already up to date: same options, same files, nothing changed since.
 
 Compares sizes and times, as build tools do, before anything heavy is imported or hashed: a run that has nothing to do
 costs milliseconds. Where anything differs, the keys of the stage cache decide which stages are computed again.
@@ -25,14 +25,16 @@ Stat = list[int]  # size, time of the content, time of the last change of any ki
 
 
 class Finished(NamedTuple):
-    """A finished run."""
+    """An earlier run that is still up to date: its printed table and its report."""
 
     table: str  # of the capture, as it was understood
     report: dict[str, Any]
 
 
 def request(options: Mapping[str, Any], capture: Path, out: Path, files: Iterable[Path] = ()) -> str | None:
-    """Digest of options, program, photographs and other input files by size and time; None where these do not decide.
+    """Digest of the options, program, photographs and other input files (by size and time) of a run.
+
+    None where these do not determine the result.
 
     `options` is plain data; the user's calibrations are among the files.
     """
@@ -48,7 +50,7 @@ def request(options: Mapping[str, Any], capture: Path, out: Path, files: Iterabl
 
 
 def find(out: Path, asked: str | None) -> Finished | None:
-    """The run that answered this request, if nothing in its result folder was changed since."""
+    """The earlier run with this request digest, if nothing in its result folder has changed since; else None."""
     try:
         known = text_file.read_json(out / "work" / _FILE)
         if asked is None or known["request"] != asked or known["result"] != _result(out):
@@ -59,7 +61,7 @@ def find(out: Path, asked: str | None) -> Finished | None:
 
 
 def remember(out: Path, asked: str | None, table: str = "") -> None:
-    """Record that the result folder now answers this request; nothing where the request is None.
+    """Record the request digest that the result folder now answers; does nothing if it is None.
 
     Raises
     ------
@@ -74,7 +76,7 @@ def remember(out: Path, asked: str | None, table: str = "") -> None:
 
 @cache
 def _program() -> str:
-    """Digest of the program by its files' sizes and times, and of the packages that decide on pixels."""
+    """Digest of the program: sizes and times of its files, and versions of the packages that affect pixels."""
     return _digest([sys.version, provenance.versions(), _stats(_PACKAGE), _stats(_PACKAGE.parent / "calib")])
 
 
@@ -88,7 +90,7 @@ def _result(out: Path) -> dict[str, Stat]:
 
 
 def _stats(folder: Path, except_: str = "") -> dict[str, Stat]:
-    """Size and times of every file below a folder, except those in the folder `except_`; empty where there is none.
+    """Size and times of every file below a folder, except those in the folder `except_`; empty if it is missing.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""Gates: judgements of a capture, each with limit, cost and remedy."""
+"""Quality gates: checks of a capture, each with limit, cost in degrees of normal error, and remedy."""

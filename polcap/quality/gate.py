@@ -18,7 +18,7 @@ DEGREES_PER_GAIN = 600.0  # 1 % of a shot's light tilts facing pixels by about 6
 
 
 class Gate(msgspec.Struct, frozen=True):
-    """One value against its limit."""
+    """A quality gate: a measured value against its limit, with finding, cost and remedy."""
 
     name: str
     state: State
@@ -91,5 +91,5 @@ def at_most(
 
 
 def blamed(names: list[str], bad: NDArray[np.bool_]) -> tuple[str, ...]:
-    """Names where `bad` (K,) is true."""
+    """Names of the shots where `bad` (K,) is true."""
     return tuple(name for name, one in zip(names, bad) if one)

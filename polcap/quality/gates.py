@@ -19,7 +19,7 @@ __all__ = ["Evidence", "Gate", "State", "Unit", "judge", "verdict"]
 
 
 def judge(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iterator[Gate]:
-    """The gates, in the order of the path.
+    """Judge a capture: yield all quality gates, in the order of the path.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def judge(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iterator
 
 
 def verdict(gates: Iterable[Gate]) -> State:
-    """The worst of the states."""
+    """Verdict of a capture: the worst state of its gates."""
     states = {gate.state for gate in gates}
     return "fail" if "fail" in states else "warn" if "warn" in states else "pass"
 
@@ -47,25 +47,29 @@ def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iter
     yield light.bracket(found)
     yield light.tone(found, limits)
     yield light.source(found)
-    yield light.stillness(found, limits)
     yield light.chart(found, limits)
     yield geometry.alignment(found, limits, align)
     yield geometry.mask(found, limits)
+    yield light.stillness(found, limits)
     yield light.clipping(found, limits)
     yield geometry.sharpness(found, limits)
+    yield geometry.focus(found, limits)
     yield from light.gains(found, limits)
     yield polarization.order(found)
     yield from polarization.of_outline(found, limits)
     yield light.noise(found, limits)
     yield light.ambient(found, limits)
+    yield light.room(found, limits)
+    yield light.lighting(found, limits)
     yield from light.crossed(found, limits)
     yield polarization.ill_posed(found, limits)
     yield geometry.inward_outline(found, limits)
+    yield light.albedo_scale(found, limits)
     yield geometry.focal_length(found)
 
 
 def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Gate:
-    """Median expected error of the normals, with the costs of the other gates."""
+    """Gate on the median expected error of the normals, with the costs of the other gates."""
     own = _own_error(found.maps)
     expected = min(float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in judged))), MOST_DEG)
     because = ", ".join(gate.name for gate in judged if gate.cost_deg > 0.5 * own)
@@ -84,6 +88,6 @@ def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Ga
 
 
 def _own_error(maps: SurfaceMaps) -> float:
-    """Median expected error of the estimator, degrees."""
+    """Median expected normal error [degrees] by the estimator alone."""
     inside = maps.confidence[maps.mask]
     return float(np.median(inside)) if inside.size else float("nan")

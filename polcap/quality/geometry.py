@@ -1,11 +1,13 @@
 """Gates of geometry: alignment, mask, mesh, outline, sharpness, focal length."""
 
+import cv2
 import numpy as np
 
 from polcap.formats import shipped_data
-from polcap.images import Floats, Mesh, SurfaceMaps
+from polcap.images import Mesh, SurfaceMaps
 from polcap.optics import frames, outline
 from polcap.optics.projection import picture_corners, transform_points
+from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean
 from polcap.optics.sharpness import TILE
 from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, blamed
@@ -14,12 +16,14 @@ from polcap.stages.align import AlignSettings, object_motion
 from polcap.stages.whitebalance import chart_in_mask
 
 _LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ
+_DEGREES_PER_PUSH, _DEGREES_PER_TURN = 200.0, 350.0  # error of the normals per movement by the object's radius
+_STILL_PX = 0.1  # displacement of inner detail that polarization alone feigns
 _INWARD = 0.2  # sine of the zenith from which a normal leans inward
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
 
 
 def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate:
-    """Movement of the camera or the object between shots, in px of the processed picture, and its error."""
+    """Gate on movement of camera or object between shots, in px of the processed picture, and its error."""
     measured, names = found.alignment, found.names
     height, width = found.radiance.value.shape[1:3]
     corners = picture_corners(width, height)
@@ -43,35 +47,50 @@ def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate
         figure, limit = float(doubt[worst]), limits.max_align_residual_px * max(found.grid_px, 1)
     value = round(figure, 3) if np.isfinite(figure) else None
     if not bad.any():
-        pushed = _pushed(found, limits)
-        return pushed or Gate("alignment", "pass", value, limit, message, unit="px")
+        of_object = _object_moved(found, limits)
+        if of_object.state != "pass":
+            return of_object
+        return Gate("alignment", "pass", value, limit, message, cost_deg=of_object.cost_deg, unit="px")
     remedy = "Lock the camera, do not touch the object, and take that shot again"
     return Gate("alignment", "fail", value, limit, message, remedy, 10.0, blamed(names, bad), unit)
 
 
-def _pushed(found: Evidence, limits: GateLimits) -> Gate | None:
-    """Movement of the object against its surroundings."""
-    displacement = _displacement(found) * found.grid_px
-    limit = limits.max_object_shift_px
-    bad = np.nan_to_num(displacement, posinf=np.inf) > limit
-    if not bad.any():
-        return None
-    worst = int(np.nanargmax(displacement))
-    message = f"The object moved by {displacement[worst]:.1f} px against its surroundings in {found.names[worst]}"
-    figure: float | None = round(float(displacement[worst]), 3)
-    if np.isinf(displacement[worst]):
-        figure, message = None, f"The {found.names[worst]} shot shows another object in the same surroundings"
+def _object_moved(found: Evidence, limits: GateLimits) -> Gate:
+    """Movement of the object against its surroundings, and its cost, which grows with the share of its size."""
+    motion, names = _motion(found), found.names
+    pushed, inside = (np.nan_to_num(one, posinf=np.inf) * found.grid_px for one in (motion.pushed, motion.inside))
+    radius = max(outline.disc_radius(found.object_.mask) * found.grid_px, 1.0)
+    least = limits.min_object_shift * radius
+    cost = float(max(_DEGREES_PER_PUSH * pushed.max(), _DEGREES_PER_TURN * max(inside.max() - _STILL_PX, 0.0)) / radius)
     remedy = "Fix the object, do not touch it between shots, and take that shot again"
-    cost = 45.0 if figure is None else 5.0
-    return Gate("alignment", "fail", figure, limit, message, remedy, cost, blamed(found.names, bad), "px")
+    k = int(np.argmax(pushed))
+    limit = limits.max_object_shift_px
+    bad = blamed(names, pushed > limit)
+    message = f"The object moved by {pushed[k]:.1f} px against its surroundings in {names[k]}"
+    if np.isinf(pushed[k]):
+        message = f"The {names[k]} shot shows another object in the same surroundings"
+        return Gate("alignment", "fail", None, limit, message, remedy, 45.0, bad, "px")
+    figure = round(float(pushed[k]), 3)
+    if bad:
+        return Gate("alignment", "fail", figure, limit, message, remedy, max(cost, 5.0), bad, "px")
+    if pushed[k] > least:
+        return Gate("alignment", "warn", figure, least, message, remedy, cost, blamed(names, pushed > least), "px")
+    turned = inside - _STILL_PX > least
+    if turned.any():
+        k = int(np.argmax(inside))
+        message = f"Detail inside the object moved by {inside[k]:.1f} px in {names[k]}: the object turned"
+        return Gate(
+            "alignment", "warn", round(float(inside[k]), 3), least, message, remedy, cost, blamed(names, turned), "px"
+        )
+    return Gate("alignment", "pass", figure, least, message, cost_deg=cost, unit="px")
 
 
-def _displacement(found: Evidence) -> Floats:
+def _motion(found: Evidence) -> object_motion.ObjectMotion:
     return object_motion.measure(found.radiance, found.alignment, found.object_)
 
 
 def mask(found: Evidence, limits: GateLimits) -> Gate:
-    """Doubt of the object's mask: a chart in it, an uncertain outline, an unusual shape."""
+    """Gate on the object's mask: a chart in it, an uncertain outline, an unusual shape."""
     object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
     charted = 0.0
@@ -85,7 +104,8 @@ def mask(found: Evidence, limits: GateLimits) -> Gate:
     for message, figure, most in (
         ("The object touches {:.0%} of the picture's border, where it has no outline",
          object_.border, limits.max_mask_border),
-        ("{:.0%} of the object's mask is separate from its largest part", object_.islands, limits.max_mask_islands),
+        ("{:.0%} of the mask is separate from its largest part; one asset holds all",
+         object_.islands, limits.max_mask_islands),
         ("The object's mask has holes of {:.0%} of its area", object_.holes, limits.max_mask_holes),
     ):  # fmt: skip
         if figure > most:
@@ -98,6 +118,8 @@ def mask(found: Evidence, limits: GateLimits) -> Gate:
         return Gate("mask", "pass" if known else "not measured", None, limit, message)
     state: State = "fail" if charted or doubted else "warn"
     remedy = "Look at mask.png; where it is wrong, draw one and use --mask PNG, or show backdrop all around the object"
+    if object_.islands > limits.max_mask_islands:
+        remedy = f"Which object is it? --set mask.part=1 takes the largest, mask.part=2 the next. {remedy}"
     cost = 10 * object_.border if state == "warn" else 5.0
     _, value, most = faults[0]
     return Gate("mask", state, round(value, 5), most, "; ".join(fault[0] for fault in faults), remedy, cost)
@@ -108,7 +130,7 @@ def _charted(found: Evidence) -> float:
 
 
 def mesh(of: Mesh, limits: GateLimits) -> Gate:
-    """Pieces, cuts and jagged boundary of the mesh.
+    """Gate on the mesh: number of pieces, cuts, jagged boundary.
 
     The surface is cut where one part hides another, and where the normals are wrong.
     """
@@ -138,7 +160,7 @@ def mesh(of: Mesh, limits: GateLimits) -> Gate:
 
 
 def sharpness(found: Evidence, limits: GateLimits) -> Gate:
-    """Blur of each frame relative to the sharpest frame of the same exposure."""
+    """Gate on the blur of each frame relative to the sharpest frame of the same exposure."""
     blur, limit = found.blur_px, limits.max_blur_px
     moved = float(np.abs(found.alignment.transform[:, :2, 2]).max()) * found.grid_px
     if np.isnan(blur).all():
@@ -149,11 +171,40 @@ def sharpness(found: Evidence, limits: GateLimits) -> Gate:
     message = f"Frame {e + 1} of the {found.names[k]} shot is blurred by {blur[k, e]:.1f} px more than the sharpest"
     bad = blamed(found.names, np.nanmax(np.nan_to_num(blur), axis=1) > limit)
     remedy = "Focus by hand and tape the ring, use a remote release, and take it again"
-    return at_most("sharpness", float(blur[k, e]), limit, message, remedy, bad, 3, "px")
+    of_shot = float(np.nan_to_num(blur).mean(axis=1).max())  # a single frame is only a part of its shot
+    state: State = "fail" if of_shot > limit else "warn"
+    return at_most("sharpness", float(blur[k, e]), limit, message, remedy, bad, 2 * of_shot, "px", state)
+
+
+def focus(found: Evidence, limits: GateLimits) -> Gate:
+    """Blur of the sharpest edges on the object and its outline, in px of the merged picture."""
+    blur, limit = _edge_blur(found), limits.max_edge_blur_px
+    message = f"The sharpest edges of the object are blurred by {blur:.1f} px (1σ)"
+    if blur > limit:
+        message += ": all shots are out of focus, which costs about 0.04 of roughness"
+    remedy = "Focus by hand on the front of the object, with f/8 to f/11"
+    return at_most("focus", blur, limit, message, remedy, cost_deg=1.0, unit="px", beyond="warn")
+
+
+def _edge_blur(found: Evidence) -> float:
+    """1σ of the blur of the sharpest edges [px]: a step of height h, blurred by σ, has the slope h/(σ√2π).
+
+    Edges are the tenth of the object with most contrast within 7 px; the sharpest are the twentieth of these.
+    """
+    light = found.radiance.value[0].sum(-1)
+    near = cv2.dilate(found.object_.mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    if not near.any():
+        return float("nan")
+    window = np.ones((7, 7), np.uint8)
+    height = (cv2.dilate(light, window) - cv2.erode(light, window))[near]
+    slope = np.sqrt(squared_gradient(light))[near]
+    edge = height >= np.percentile(height, 90)
+    sharpest = np.percentile(slope[edge] / np.maximum(height[edge], 1e-9), 95)
+    return float(1 / (np.sqrt(2 * np.pi) * max(float(sharpest), 1e-3)))
 
 
 def focal_length(found: Evidence) -> Gate:
-    """Whether the focal length is known; a wrong one tilts the view rays, and the normals with them."""
+    """Gate on the focal length: an unknown or wrong one tilts view rays and normals."""
     least, most = found.focal_doubt
     if not most - least:
         return Gate("focal length", "pass", "known", "known", "The focal length is known", unit="")
@@ -165,7 +216,7 @@ def focal_length(found: Evidence) -> Gate:
 
 
 def inward_outline(found: Evidence, limits: GateLimits) -> Gate:
-    """Share of the outline's normals that point into the object; those of a closed surface point out of it."""
+    """Gate on the share of normals at the outline that point into the object; on a closed surface they point out."""
     share = _inward_share(found.maps)
     message = f"{100 * share:.0f} % of the normals at the outline point into the object"
     if share > limits.max_inward_outline:
@@ -178,7 +229,10 @@ def inward_outline(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def _inward_share(maps: SurfaceMaps) -> float:
-    """Share of a band inside the outline in which normals lean into the object, on at most _LONGEST px a side."""
+    """Share of normals in a band inside the outline that point into the object.
+
+    The maps are reduced to _LONGEST px a side.
+    """
     across = frames.to_ray_frame(maps.normal, frames.rays(maps.view, *maps.mask.shape))[..., :2]
     shrink = max(1.0, max(maps.mask.shape) / _LONGEST)
     shape = tuple(round(side / shrink) for side in maps.mask.shape)
@@ -193,7 +247,7 @@ def _inward_share(maps: SurfaceMaps) -> float:
 
 
 def _lean(maps: SurfaceMaps, least: float, most: float) -> float:
-    """Change of the view rays' tilt under the doubt of the focal length, median over the object, degrees."""
+    """Change of the view rays' tilt, degrees, if the focal length is at its limits; median over the object."""
     y, x = np.nonzero(maps.mask)
     off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
     lean, more, less = (np.arctan(off * factor) for factor in (1.0, np.exp(-least), np.exp(-most)))

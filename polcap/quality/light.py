@@ -4,9 +4,11 @@ from collections.abc import Iterator
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 
 from polcap.images import AngleStack, Floats, Quality, StokesImage
+from polcap.optics import mueller
 from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, blamed
 from polcap.quality.limits import GateLimits
 from polcap.stages.whitebalance import patches
@@ -19,11 +21,17 @@ _BRIGHTER = 1.08  # times S0: the greatest that scale and registration explain; 
 _EDGE_PX = 2.0  # 1σ over which two shots are compared: edges of a print need not meet
 _STILL_CLIPPED = 0.5  # share of highlights that a crossed filter should have stopped
 _FEW = 20  # px
+_DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame that was subtracted: 1 to 2° at 15 %
+_LEAST_ALBEDO = 0.02  # sum of the channels
+_DEGREES_PER_HIGHLIGHT_DOLP = 100.0  # of the normals: 1 to 2° at 1 %, 2 to 11° at 3 to 15 %
+_ROOM_TILE, _LEAST_ROOM_TILES = 16, 20  # px; tiles
+_WITH_FRAME = 1.5  # size of a chart with its frame over the size of its patches
+_DEGREES_PER_ROOM_DOLP = 50.0  # of the normals: 1.3 to 2.6° at 5.5 % (docs/benchmarks/gates.md)
 _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light patches
 
 
 def bracket(found: Evidence) -> Gate:
-    """Exposure steps of the bracket, measured from pixels, compared with the camera's."""
+    """Gate on the bracket: exposure steps measured in the pixels, compared with the camera's."""
     radiance = found.radiance
     ratio = np.sort(radiance.bracket.exposure_ratio.mean((0, 2)))  # (E,)
     if len(ratio) == 1:
@@ -54,7 +62,7 @@ def bracket(found: Evidence) -> Gate:
 
 
 def tone(found: Evidence, limits: GateLimits) -> Gate:
-    """Linearity: a tone curve makes the ratio of two exposures depend on brightness."""
+    """Gate on linearity: a tone curve makes the ratio of two exposures depend on brightness."""
     radiance = found.radiance
     limit = limits.max_tone_curvature
     curved = np.abs(radiance.bracket.curvature)
@@ -78,7 +86,7 @@ def tone(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def source(found: Evidence) -> Gate:
-    """Whether the pictures are the sensor's own counts."""
+    """Gate on the kind of files: whether the pictures are the sensor's unprocessed counts."""
     if not found.radiance.sensor.lossy:
         return Gate("source", "pass", "linear counts", "linear counts", "The pictures are linear", unit="")
     message = "The pictures have 8 bits or a display encoding: rounding and tone curve add false polarization"
@@ -87,7 +95,7 @@ def source(found: Evidence) -> Gate:
 
 
 def noise(found: Evidence, limits: GateLimits) -> Gate:
-    """False polarization from noise in the object's median pixel."""
+    """Gate on noise: false polarization that noise causes in the object's median pixel."""
     figure, limit = _noise(found.stokes), limits.max_dolp_noise
     message = f"Noise adds about {100 * figure:.1f} % false polarization"
     remedy = "Use more light, a wider aperture, a longer exposure or more frames"
@@ -101,17 +109,22 @@ def _noise(image: StokesImage) -> float:
 
 
 def stillness(found: Evidence, limits: GateLimits) -> Gate:
-    """Share of a shot that differs between its exposures."""
-    fraction = found.radiance.bracket.ghost_fraction
+    """Share of the object that differs between the exposures of a shot."""
+    ghost = (found.radiance.quality & int(Quality.GHOST)) > 0
+    fraction = ghost[:, found.object_.mask].mean(1) if found.object_.mask.any() else np.zeros(len(ghost))
     k = int(np.argmax(fraction))
-    message = f"{100 * fraction[k]:.2f} % of the {found.names[k]} shot differs between its exposures"
+    message = f"{100 * fraction[k]:.2f} % of the object differs between the exposures of the {found.names[k]} shot"
     remedy = "Take the bracket again: something moved, or the light changed"
     bad = blamed(found.names, fraction > limits.max_ghost)
-    return at_most("stillness", float(fraction[k]), limits.max_ghost, message, remedy, bad, cost_deg=5)
+    blurred = np.nan_to_num(found.blur_px).max() > limits.max_blur_px  # `sharpness` judges this
+    state: State = "warn" if blurred else "fail"
+    return at_most(
+        "stillness", float(fraction[k]), limits.max_ghost, message, remedy, bad, 1 if blurred else 5, beyond=state
+    )
 
 
 def chart(found: Evidence, limits: GateLimits) -> Gate:
-    """Color error of the chart."""
+    """Gate on the color error of the chart."""
     limit = limits.max_delta_e
     if found.chart_missing:
         remedy = (
@@ -137,8 +150,26 @@ def chart(found: Evidence, limits: GateLimits) -> Gate:
     return at_most("chart", mean, limit, message, remedy, unit="ΔE2000")
 
 
+def albedo_scale(found: Evidence, limits: GateLimits) -> Gate:
+    """Whether the scale of all albedos is known, and its uncertainty; without a chart albedos are relative."""
+    sigma, limit, source = found.maps.albedo_sigma, limits.max_scale_doubt, found.color.source
+    remedy = "Put a ColorChecker next to the middle of the object, facing the lens, where only the flash lights it"
+    if sigma is None:
+        message = "The albedos are relative: without a chart in the picture their scale is unknown"
+        if source == "profile":
+            message = "The albedos are relative: a color profile holds their scale only under the light of its capture"
+        return Gate("albedo scale", "warn", "relative", "known", message, remedy, unit="")
+    message = f"All albedos share an error of scale of {100 * sigma:.0f} % (1σ)"
+    light = found.color.light
+    if sigma > limit and light is not None and light.uneven > limit / 2:
+        message += ": the chart is lit unevenly, by another lamp or through a lens that darkens the corners"
+    elif sigma > limit:
+        message += ": they or the gloss are higher than usual, so the chart may get less light than the object"
+    return at_most("albedo scale", sigma, limit, message, remedy, beyond="warn")
+
+
 def clipping(found: Evidence, limits: GateLimits) -> Gate:
-    """Share of the object that is clipped in the shortest exposure."""
+    """Gate on the share of the object that is clipped in the shortest exposure."""
     # of the darkest frame
     clipped, limit = found.clipped[:, :, found.object_.mask].mean(2).min(1), limits.max_clipped
     k = int(np.argmax(clipped))
@@ -156,7 +187,7 @@ def clipping(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
-    """Flash energy of each shot and frame relative to the others, and the doubt of it."""
+    """Gates on the flash energy of each shot and frame relative to the others, and on its uncertainty."""
     measured, radiance, names = found.selfcal.gains, found.radiance, found.names
     shot = measured.gain.mean(1)
     light = shot[:, None] * radiance.bracket.exposure_ratio.mean(2)  # (K, E)
@@ -185,7 +216,7 @@ def _compared(change: float) -> str:
 
 
 def _gain_doubt(found: Evidence, limits: GateLimits) -> Gate:
-    """Uncertainty of the gains."""
+    """Gate on the uncertainty of the shots' gains."""
     measured = found.selfcal.gains
     limit = limits.max_gain_doubt
     if measured.source == "one exposure":
@@ -225,7 +256,7 @@ def _grade(cost_deg: float) -> State:
 
 
 def crossed(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
-    """Whether the cross-polarized shot is darker than S0, and not clipped where S0 is."""
+    """Gates on the cross-polarized shot: it must be darker than S0, and not clipped where S0 is."""
     if found.radiance.crossed is None:
         return
     limit = limits.max_crossed_misfit
@@ -247,7 +278,10 @@ def crossed(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
 
 
 def _crossed(image: StokesImage) -> dict[str, Any]:
-    """Shares: clipped highlights that stay clipped, pixels brighter than S0, light that is missing."""
+    """Shares of pixels in the cross-polarized shot.
+
+    Highlights that stay clipped, brighter than S0, light that is missing.
+    """
     assert image.body is not None
     known = image.mask & (image.body.quality == 0)
     sound = known & ((image.quality & int(Quality.CLIPPED)) == 0)
@@ -263,25 +297,81 @@ def _crossed(image: StokesImage) -> dict[str, Any]:
 
 
 def ambient(found: Evidence, limits: GateLimits) -> Gate:
-    """Share of ambient light, where it was photographed."""
+    """Gate on the share of ambient light, if frames without flash were taken."""
     share = found.radiance.bracket.ambient_share
     limit = limits.max_ambient
     if not np.isfinite(share).any():
         return Gate("ambient", "not measured", None, limit, "No frame was taken without the flash")
     worst = float(np.nanmax(share))
-    message = f"{100 * worst:.1f} % of the light does not come from the flash"
-    remedy = "Darken the room: ambient light changes the polarization"
-    return at_most("ambient", worst, limit, message, remedy, cost_deg=60 * worst)
+    message = f"{100 * worst:.1f} % of the light does not come from the flash; the ambient frames are subtracted"
+    remedy = "Darken the room: the noise and changes of so much ambient light remain"
+    gate = at_most("ambient", worst, limit, message, remedy)
+    return msgspec.structs.replace(gate, cost_deg=round(_DEGREES_PER_AMBIENT * worst, 1))
+
+
+def lighting(found: Evidence, limits: GateLimits) -> Gate:
+    """Common polarization of the object's brightest parts, relative to their albedo.
+
+    Under a flash at the lens these face the camera, so their polarization points all ways. Two flashes or softboxes at
+    the sides put highlights where reflection polarizes, both in the same direction.
+    """
+    share, limit = _highlight_dolp(found), limits.max_highlight_dolp
+    message = f"The brightest parts of the object share a polarization of {100 * share:.1f} %"
+    if share > limit:
+        message += ": light from the sides (two flashes, softboxes, a window), which bends normals and roughness"
+    remedy = "Use one flash next to the lens, and darken the room"
+    cost = _DEGREES_PER_HIGHLIGHT_DOLP * share
+    return at_most("lighting", share, limit, message, remedy, cost_deg=cost, beyond=_grade(cost))
+
+
+def _highlight_dolp(found: Evidence) -> float:
+    """Median polarization of the 2 % of the object with most light over albedo; NaN without an object."""
+    inside = found.maps.mask & found.cues.mask
+    if not inside.any():
+        return float("nan")
+    light = found.cues.radiance[inside].sum(-1) / np.maximum(found.maps.diffuse[inside].sum(-1), _LEAST_ALBEDO)
+    bright = light >= np.percentile(light, 98)
+    return float(np.hypot(*np.median(found.cues.ratio[:, inside][:, bright], axis=1)))
+
+
+def room(found: Evidence, limits: GateLimits) -> Gate:
+    """Polarization of the surroundings, which the flash leaves unpolarized and a window or a glossy lamp does not."""
+    share, limit = _surroundings_dolp(found), limits.max_room_dolp
+    message = f"The surroundings are polarized by {100 * share:.1f} %"
+    if share > limit:
+        message += ": polarized light from the room, or glossy surroundings"
+    remedy = "Darken the room, or take one ambient frame per angle: subtracting them is exact"
+    cost = _DEGREES_PER_ROOM_DOLP * share
+    return at_most("room light", share, limit, message, remedy, cost_deg=cost, beyond="warn")
+
+
+def _surroundings_dolp(found: Evidence) -> float:
+    """Common polarization of the surroundings, outside object and chart, median of tiles; NaN for too few tiles."""
+    radiance = found.radiance
+    outside = (radiance.quality & int(Quality.CLIPPED) == 0).all(0) & ~found.object_.mask
+    if found.color.place is not None:
+        middle = found.color.place.corners.mean(0)
+        frame = middle + _WITH_FRAME * (found.color.place.corners - middle)
+        outside &= cv2.fillConvexPoly(np.zeros(outside.shape, np.uint8), frame.astype(np.int32), 1) == 0
+    size = (outside.shape[1] // _ROOM_TILE, outside.shape[0] // _ROOM_TILE)
+    cut = np.s_[: size[1] * _ROOM_TILE, : size[0] * _ROOM_TILE]
+    clear = cv2.resize(outside[cut].astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+    if clear.sum() < _LEAST_ROOM_TILES:
+        return float("nan")
+    shots = zip(radiance.value, found.selfcal.gains.gain)
+    light = [cv2.resize((shot / gain).sum(-1)[cut], size, interpolation=cv2.INTER_AREA)[clear] for shot, gain in shots]
+    s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(found.selfcal.angle), np.stack(light), rcond=None)[0]
+    return float(np.hypot(np.median(s1 / np.maximum(s0, 1e-9)), np.median(s2 / np.maximum(s0, 1e-9))))
 
 
 def _promised_steps(radiance: AngleStack) -> float:
-    """Smallest step of the bracket by its metadata; NaN without them."""
+    """Smallest exposure step of the bracket by metadata; NaN without them."""
     stated = np.sort(radiance.bracket.exif_ratio[0])
     return float((stated[1:] / stated[:-1]).min()) if np.isfinite(stated).all() and len(stated) > 1 else float("nan")
 
 
 def _power(radiance: AngleStack) -> float:
-    """Slope of ln measured over ln stated exposure; 1 without metadata or steps."""
+    """Slope of ln measured exposure over ln stated exposure; 1 without metadata or steps."""
     ratio = radiance.bracket.exif_ratio[0]
     stated: Floats = np.log(ratio) if np.isfinite(ratio).all() else np.zeros(1)
     seen = np.log(np.maximum(radiance.bracket.exposure_ratio.mean((0, 2)), 1e-6))

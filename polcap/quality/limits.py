@@ -7,9 +7,13 @@ from msgspec import Meta
 
 
 class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Beyond a limit `check` asks to reshoot, and `process` writes the asset and ends with exit code 3."""
+    """Limits of the quality gates.
+
+    Beyond one, `check` asks to reshoot, and `process` writes the asset and ends with exit code 3.
+    """
 
     max_delta_e: Annotated[float, Meta(gt=0, description="mean color error of the chart's patches [CIEDE2000]")] = 5.0
+    max_scale_doubt: Annotated[float, Meta(gt=0, le=1, description="1σ of the scale of all albedos [1]")] = 0.2
     max_tone_curvature: Annotated[
         float, Meta(gt=0, le=1, description="slope of ln exposure ratio over ln brightness; 0 is linear [1]")
     ] = 0.1
@@ -29,6 +33,9 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_align_residual_px: Annotated[
         float, Meta(gt=0, description="1σ error of a shot's registration [px of the merged picture]")
     ] = 0.15
+    min_object_shift: Annotated[
+        float, Meta(gt=0, le=1, description="movement of the object that is reported [radius of the object]")
+    ] = 0.01
     max_object_shift_px: Annotated[
         float,
         Meta(gt=0, description="movement of the object against its surroundings [px of the merged picture]"),
@@ -48,6 +55,9 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float,
         Meta(gt=0, le=20, description="1σ of a frame's blur beyond the sharpest frame [RAW px]"),
     ] = 1.2
+    max_edge_blur_px: Annotated[
+        float, Meta(gt=0, le=20, description="1σ blur of the object's sharpest edges [px of the merged picture]")
+    ] = 1.65
     max_turn_deg: Annotated[
         float,
         Meta(ge=3, le=45, description="error of an angle, measured from the outline [degrees]"),
@@ -80,7 +90,13 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_dolp_noise: Annotated[
         float, Meta(gt=0, le=1, description="false polarization from noise, median over the object [1]")
     ] = 0.04
-    max_ambient: Annotated[float, Meta(gt=0, le=1, description="share of ambient light [1]")] = 0.1
+    max_ambient: Annotated[float, Meta(gt=0, le=1, description="share of ambient light, which is subtracted [1]")] = 0.3
+    max_highlight_dolp: Annotated[
+        float, Meta(gt=0, le=1, description="polarization that the brightest parts of the object share [1]")
+    ] = 0.006
+    max_room_dolp: Annotated[
+        float, Meta(gt=0, le=1, description="polarization of the surroundings, common to all of them [1]")
+    ] = 0.015
     max_crossed_misfit: Annotated[
         float,
         Meta(gt=0, le=1, description="share of the object that is brighter in the cross-polarized shot than in S0 [1]"),
@@ -89,7 +105,8 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(ge=0, le=1, description="share of the object with a DoLP above that of any dielectric [1]")
     ] = 0.05
     max_ghost: Annotated[
-        float, Meta(ge=0, le=1, description="share of a shot with exposures that disagree beyond noise [1]")
+        float,
+        Meta(ge=0, le=1, description="share of the object where exposures of a shot disagree beyond noise [1]"),
     ] = 0.02
     max_normal_error_deg: Annotated[
         float, Meta(gt=0, le=90, description="median expected error of the normals [degrees]")

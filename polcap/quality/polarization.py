@@ -31,7 +31,7 @@ _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
 def order(found: Evidence) -> Gate:
-    """Whether the outline supports the stated order and sense of the angles."""
+    """Gate on the order of the polarizer angles: whether the outline supports the stated order and sense."""
     outline, names = found.selfcal.outline, found.names
     if outline.as_stated and outline.rival is not None:
         other = _named(outline.rival, names)
@@ -44,7 +44,8 @@ def order(found: Evidence) -> Gate:
         return Gate("order", "pass", "as stated", "as stated", message, unit="")
     best = _named(outline.best, names)
     message = f"The outline fits the order {best} better than the stated one"
-    remedy = "Name the shots by their true angles (folders, or --angles), or take them again in order"
+    steps = outline.best.remedy(names)
+    remedy = f"{steps[:1].upper()}{steps[1:]}; or take the shots again in order"
     return Gate("order", "fail", best, "as stated", message, remedy, 45.0, unit="")
 
 
@@ -53,7 +54,7 @@ def _named(order: ShotOrder, names: list[str]) -> str:
 
 
 def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
-    """Angles, material and other light, as the outline shows them."""
+    """Gates on angles, material and other light, as the polarization along the outline shows them."""
     angle, limit = found.selfcal.angle - found.selfcal.ring.correction, limits.max_turn_deg
     seen = _outline(found, limit, angle)
     if seen is None:
@@ -69,6 +70,9 @@ def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     yield _with_ring(of_shots, found.selfcal, limits)
     yield _light_of_body(body, found, limits)
     side = seen.side
+    if found.object_.border > limits.max_mask_border:
+        yield Gate("other light", "not measured", None, limits.max_side_light, "The picture cuts the outline off")
+        return
     k = int(np.argmax(side))
     message = f"The {found.names[k]} shot is {100 * side[k]:.1f} % brighter on one side than the others"
     remedy = "Darken the room and take that shot again: another light was on"
@@ -77,7 +81,7 @@ def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
 
 @dataclass(frozen=True)
 class OutlineFigures:
-    """Measurements along the object's outline."""
+    """Measurements of polarization and brightness along the object's outline."""
 
     body: rim.RimFigures
     turn: rim.AngleError
@@ -85,7 +89,10 @@ class OutlineFigures:
 
 
 def _outline(found: Evidence, limit_deg: float, angle: Floats) -> OutlineFigures | None:
-    """Measurements at angles (K,) rad; turns below the limit are not tried. None: the outline is too short."""
+    """Measure the outline's polarization for angles (K,) rad; None if it is too short.
+
+    Angle errors below the limit are not tried.
+    """
     band = rim.sample(*_reduced(found.stokes, angle))
     if len(band.azimuth) < _LEAST_RIM:
         return None
@@ -94,7 +101,7 @@ def _outline(found: Evidence, limit_deg: float, angle: Floats) -> OutlineFigures
 
 
 def ill_posed(found: Evidence, limits: GateLimits) -> Gate:
-    """Share of the object with a polarization that no dielectric has."""
+    """Gate on the share of the object with a polarization that no dielectric has."""
     share = _ill_posed(found)
     message = "No part looks like metal or a mirror reflection"
     if share >= 0.0005:
@@ -117,7 +124,7 @@ def _angles(
     names: list[str],
     limits: GateLimits,
 ) -> Gate:
-    """A wrong angle of one shot, or of all, beyond the error of its estimate."""
+    """Gate on polarizer angles: a wrong angle of one shot, or of all, beyond the error of its estimate."""
     limit = limits.max_turn_deg
     known = selfcal.gains.source in ("grey patches", "one exposure")
     common = -float(np.degrees(body.turned))  # an AoLP too small is an angle stated too small
@@ -151,7 +158,7 @@ def _angles(
 
 
 def _not_closing(turned: TurnedShot, names: list[str], limit: float) -> Gate:
-    """One of more than three angles that contradicts the others."""
+    """Gate on one angle, of more than three, that contradicts the others."""
     degrees, doubt = np.degrees([turned.angle, turned.sigma])
     shots = tuple(names[k] for k in turned.shots)
     which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])}, by as much or less)"
@@ -161,7 +168,7 @@ def _not_closing(turned: TurnedShot, names: list[str], limit: float) -> Gate:
 
 
 def _with_ring(gate: Gate, selfcal: SelfCalibration, limits: GateLimits) -> Gate:
-    """The gate of the angles, with the turn of the whole ring, which is corrected where it is sure.
+    """Add to the gate of the angles the zero error of the whole ring, which is corrected where it is certain.
 
     With three angles, one turned shot looks like a smaller turn of all.
     """
@@ -189,7 +196,7 @@ def _with_ring(gate: Gate, selfcal: SelfCalibration, limits: GateLimits) -> Gate
 
 
 def _light_of_body(body: rim.RimFigures, found: Evidence, limits: GateLimits) -> Gate:
-    """Whether the outline is polarized as a dielectric under a flash at the lens: across the contour, and enough.
+    """Gate on diffuse polarization: the outline of a dielectric under a flash is polarized across the contour.
 
     Rough and translucent objects polarize equally little. The estimators allow for roughness, so a rough object keeps a
     shape as round as its shading; any other loss of polarization flattens the shape.
@@ -237,14 +244,14 @@ def _light_of_body(body: rim.RimFigures, found: Evidence, limits: GateLimits) ->
 
 
 def _lopsided(body: rim.RimFigures) -> float:
-    """Factor on the limit of uneven light; light from the side lowers the polarization of the side it falls on."""
+    """Factor on the limit of uneven light, since light from one side lowers the polarization of that side."""
     if body.concentration <= _CLEAR or body.dolp_lit < _WEAK_DOLP:
         return 1.0
     return _LOPSIDED if body.dolp_lit < _LIT_DOLP else np.inf
 
 
 def _median_shape(maps: SurfaceMaps) -> tuple[float, float]:
-    """Median angle of the normals from the view ray, degrees, and median roughness."""
+    """Median angle of the normals from their view rays, degrees, and median roughness."""
     if not maps.mask.any():
         return 0.0, 0.0
     facing = dot(maps.normal, rays(maps.view, *maps.mask.shape))[maps.mask]
@@ -252,13 +259,10 @@ def _median_shape(maps: SurfaceMaps) -> tuple[float, float]:
 
 
 def _reduced(image: StokesImage, angle: Floats) -> tuple[Floats, rim.Bools, rim.Bools]:
-    """Light of the shots (K, h, w) from the solved Stokes parameters, object and valid pixels, reduced."""
+    """Light of the shots (K, h, w) recomputed from the Stokes parameters, object and valid pixels, all reduced."""
     step = int(np.ceil(np.sqrt(max(image.mask.size / _MOST_PIXELS, 1))))
     doubtful = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
     usable = (image.quality & int(doubtful)) == 0
-    light = total(image.stokes)
-    mask = image.mask
-    if step > 1:
-        light = np.stack([block_means(part, step) for part in light])
-        mask, usable = (block_means(part, step) > 0.99 for part in (mask, usable))
+    light = np.stack([block_means(part, step) for part in total(image.stokes)])
+    mask, usable = (block_means(part.astype(np.float32), step) > 0.99 for part in (image.mask, usable))
     return np.einsum("kj,jhw->khw", mueller.analyzer(angle), light), mask, usable

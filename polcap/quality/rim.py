@@ -33,7 +33,7 @@ class Rim(outline.OutlineBand):
 
 @dataclass(frozen=True)
 class AngleError:
-    """The angle error of one shot, or of all, that fits the rim best."""
+    """The error of one shot's polarizer angle, or of all angles, that fits the outline best."""
 
     shot: int | None  # None: all shots share the error
     angle: float  # rad, true minus stated angle
@@ -43,7 +43,7 @@ class AngleError:
 
 @dataclass(frozen=True)
 class RimFigures:
-    """Polarization and brightness of the whole rim."""
+    """Polarization and brightness of the whole outline."""
 
     dolp: float  # median degree of linear polarization
     dolp_lit: float  # median of the brighter half
@@ -56,7 +56,10 @@ class RimFigures:
 
 
 def sample(light: Floats, mask: Bools, usable: Bools) -> Rim:
-    """The rim of registered shots (K, H, W) with equal gains; usable (H, W): pixels with valid values."""
+    """Sample the band inside the outline of registered shots (K, H, W) with equal gains; usable (H, W).
+
+    Valid pixels.
+    """
     ok = (mask & usable).astype(np.float32)
     weight = cv2.GaussianBlur(ok, (0, 0), _SMOOTH_PX) + 1e-6
     smooth = np.stack([cv2.GaussianBlur(shot.astype(np.float32) * ok, (0, 0), _SMOOTH_PX) / weight for shot in light])
@@ -78,7 +81,7 @@ def sample(light: Floats, mask: Bools, usable: Bools) -> Rim:
 
 
 def fit_angle_error(at: Rim, angle: Floats, least: float) -> AngleError:
-    """The best angle error of one shot, or of all, of at least `least` rad; angle (K,) rad as stated."""
+    """Fit an angle error of at least `least` rad, of one shot or of all, to the outline; angle (K,) rad as stated."""
     middle = float(np.median(_misfit(at, angle))) + 1e-9
     best = AngleError(None, 0.0, 1.0, 0.0)
     steps = np.radians(np.arange(_STEP_DEG, _MOST_DEG + 1, _STEP_DEG))
@@ -91,12 +94,12 @@ def fit_angle_error(at: Rim, angle: Floats, least: float) -> AngleError:
 
 
 def _turns(shot: int | None, angle: Floats) -> Floats:
-    """(K,) 1 for the shot with the error, 0 for the others; None: 1 for all."""
+    """Pattern (K,) of an angle error: 1 for the shot with the error, 0 for the others; None: 1 for all."""
     return np.ones(len(angle)) if shot is None else (np.arange(len(angle)) == shot).astype(float)
 
 
 def _misfit(at: Rim, angle: Floats) -> Floats:
-    """Residual (N,) of the shots' light after a fit of 1 and cos 2(θ − φ)."""
+    """Residual (N,) of the shots' light along the outline after a fit of 1 and cos 2(θ − φ)."""
     wave = np.cos(2 * (angle[:, None] - at.azimuth))
     wave = wave - wave.mean(0)
     light = at.light - at.light.mean(0)
@@ -105,7 +108,7 @@ def _misfit(at: Rim, angle: Floats) -> Floats:
 
 
 def _sigmas(at: Rim, angle: Floats, way: Floats) -> float:
-    """Best angle error in the direction `way` (K,), over its jackknife error when sectors are left out.
+    """Significance of an angle error in the direction `way` (K,): its best value over its jackknife error.
 
     The fit is linear and signed: errors of the outline turn some sectors one way and some the other.
     """
@@ -124,7 +127,7 @@ def _sigmas(at: Rim, angle: Floats, way: Floats) -> float:
 
 
 def summarize(at: Rim, angle: Floats) -> RimFigures:
-    """Polarization and brightness of the rim; angle (K,) rad."""
+    """Summarize polarization and brightness of the outline; angle (K,) rad."""
     mean, turned_sigma = outline.mean_and_sigma(*outline.phasor(at, angle))
     dolp = np.abs(outline.polarization(at, angle))
     basis = np.stack([np.ones_like(at.azimuth), np.cos(at.azimuth), np.sin(at.azimuth)], axis=1)
@@ -142,7 +145,7 @@ def summarize(at: Rim, angle: Floats) -> RimFigures:
 
 
 def side_light(at: Rim) -> Floats:
-    """Relative brightness difference between two sides of the rim in each shot, compared with all shots, (K,).
+    """Relative brightness difference between two sides of the outline in each shot, compared with all shots, (K,).
 
     This is the amplitude of the first harmonic in φ. Polarization changes opposite sides equally, a lamp does not.
     """

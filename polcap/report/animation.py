@@ -1,4 +1,4 @@
-"""Animations of a result: the object under a light that moves around it, or turning on a turntable."""
+"""Animations of a result: the object under a moving light, or rotating on a turntable."""
 
 from typing import Literal
 
@@ -23,7 +23,7 @@ _BACKGROUND = 0.012  # linear
 
 
 def light(maps: SurfaceMaps, ior: float) -> list[Picture]:
-    """The maps under a distant light that moves once around the optical axis."""
+    """Frames of the object lit by a distant light that moves once around the optical axis."""
     small = ObjectReduction(maps.mask, _SIDE).maps(maps)
     ray = frames.rays(small.view, *small.mask.shape)
     drawn = []
@@ -35,7 +35,7 @@ def light(maps: SurfaceMaps, ior: float) -> list[Picture]:
 
 
 def turntable(maps: SurfaceMaps, mesh: Mesh, ior: float) -> list[Picture]:
-    """The surface turned to both sides and back, under a fixed light near the camera."""
+    """Frames of the surface rotated to both sides and back, under a fixed light near the camera."""
     reduction = ObjectReduction(maps.mask & np.isfinite(mesh.depth), _OVERSAMPLING * _SIDE)
     small, depth = reduction.maps(maps), reduction.mean(mesh.depth)
     inside = small.mask & (depth > 0)
@@ -54,7 +54,7 @@ def turntable(maps: SurfaceMaps, mesh: Mesh, ior: float) -> list[Picture]:
 
 
 def _shade(maps: SurfaceMaps, normal: Floats, ray: Floats, to_light: Floats, ior: float) -> Floats:
-    """S0 (H, W, 3) of normals (H, W, 3) under a light from `to_light` (3,), all in the camera frame."""
+    """Render S0 (H, W, 3) from normals (H, W, 3) under a light from `to_light` (3,), all in the camera frame."""
     to_light = to_light / np.linalg.norm(to_light)
     local = frames.to_ray_frame(np.broadcast_to(to_light, ray.shape), ray)
     facing = frames.to_ray_frame(normal, ray)
@@ -63,7 +63,7 @@ def _shade(maps: SurfaceMaps, normal: Floats, ray: Floats, to_light: Floats, ior
 
 
 def _draw_points(points: Floats, value: Floats, view: View, shape: tuple[int, int]) -> Floats:
-    """A picture (H, W, 3) of points (N, 3): each pixel shows the nearest point; small holes are filled."""
+    """Draw points (N, 3) as a picture (H, W, 3): each pixel shows the nearest point; small holes are filled."""
     height, width = shape[0] // _OVERSAMPLING, shape[1] // _OVERSAMPLING
     column, row = np.rint(projection.project(view, points) / _OVERSAMPLING).astype(int).T
     order = np.argsort(points[:, 2])  # the nearest last
@@ -79,6 +79,6 @@ def _draw_points(points: Floats, value: Floats, view: View, shape: tuple[int, in
 
 
 def _to_srgb(drawn: list[Floats]) -> list[Picture]:
-    """Linear frames as sRGB, all with one exposure."""
+    """Convert linear frames to sRGB, all with one exposure."""
     top = max(float(np.quantile(np.stack(drawn[:: FRAMES // 6])[..., 1], _WHITE_QUANTILE)), 1e-6)
     return [color.srgb_eight_bits(0.9 * frame / top) for frame in drawn]

@@ -18,14 +18,14 @@ Row = tuple[str, Any, Any]  # name, value in the first result, value in the seco
 
 
 def rows(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Row]:
-    """Figures and settings that differ between two reports, named part.section.name."""
+    """Figures and settings that differ between two reports, each named part.section.name with both values."""
     first, second = _flat(one), _flat(other)
     names = dict.fromkeys([*first, *second])
     return [(name, first.get(name), second.get(name)) for name in names if first.get(name) != second.get(name)]
 
 
 def labelled(row: Row) -> tuple[str, str, str]:
-    """A row with label, numbers and units in words."""
+    """A differing figure for a page: label, and both values with units, as text."""
     kind, _, name = row[0].partition(".")
     title = f"{labels.part(name.partition('.')[0])}: {labels.label(name)}" if kind == "figures" else name
     return title, labels.text(name, row[1]), labels.text(name, row[2])
@@ -65,7 +65,7 @@ def write(file: Path, folders: tuple[Path, Path], abouts: tuple[Mapping[str, Any
 
 
 def _names(folders: tuple[Path, Path]) -> tuple[str, str]:
-    """The shortest ends of two paths that differ."""
+    """Short names of two result folders: the shortest ends of their paths that differ."""
     parts = [folder.resolve().parts for folder in folders]
     for count in range(1, max(map(len, parts)) + 1):
         one, other = ("/".join(path[-count:]) for path in parts)
@@ -75,7 +75,7 @@ def _names(folders: tuple[Path, Path]) -> tuple[str, str]:
 
 
 def _maps(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
-    """Figures of the maps by title, with differences where the crops have the same size."""
+    """Figures of the maps of two results by title, with difference maps where the crops have the same size."""
     try:
         stored = [maps_folder.read(folder / "maps").maps for folder in folders]
     except DecodeError as error:
@@ -112,7 +112,7 @@ def _maps(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
 
 
 def _flat(about: Mapping[str, Any]) -> dict[str, Any]:
-    """Figures and settings of a report by full name."""
+    """Figures and settings of a report in one dictionary by full name (part.section.name)."""
     return {
         f"{part}.{section}.{name}": value
         for part in ("figures", "settings")

@@ -9,7 +9,6 @@ from polcap.formats.maps import maps_folder
 from polcap.images import ColorCalibration, Floats, Mesh, Quality, StokesImage
 from polcap.report import page_data
 from polcap.results import Results
-from polcap.stages.cues import scale
 from polcap.stages.whitebalance import patches
 
 _COMPARED_PX = 512  # longest side on which photographs and their re-rendering are compared
@@ -17,7 +16,7 @@ _FLAGS = (Quality.CLIPPED, Quality.DARK, Quality.ILL_POSED, Quality.METAL, Quali
 
 
 def measured(results: Results) -> dict[str, dict[str, Any]]:
-    """All figures by subject; `labels.LABELS` describes each of them."""
+    """All figures of a result by subject, for report.json; `labels.LABELS` describes each of them."""
     bracket, moved, gains = results.radiance.bracket, results.alignment, results.selfcal.gains
     ring, outline = results.selfcal.ring, results.selfcal.outline
     return {
@@ -27,7 +26,7 @@ def measured(results: Results) -> dict[str, dict[str, Any]]:
             "ghost_fraction": _plain(bracket.ghost_fraction, 5),
             "lossy_source": results.radiance.sensor.lossy,
         },
-        "chart": _colors(results.color, results.stokes),
+        "chart": _colors(results.color, results.maps.albedo_sigma),
         "alignment": {
             "shift_px": _plain(moved.transform[:, :2, 2], 3),
             "turn_deg": _plain(np.degrees(np.arctan2(moved.transform[:, 1, 0], moved.transform[:, 0, 0])), 4),
@@ -63,7 +62,7 @@ def rerendering(results: Results, ior: float) -> dict[str, Any]:
     return {"rms": [_plain(one) for one in rendered.rms(small.maps.mask)], "scale": _plain(rendered.scale)}
 
 
-def _colors(color: ColorCalibration, image: StokesImage) -> dict[str, Any]:
+def _colors(color: ColorCalibration, albedo_sigma: float | None) -> dict[str, Any]:
     fit, light = color.patches, color.light
     delta_e, predicted = (None, None) if fit is None else (fit.delta_e, fit.predicted)
     return {
@@ -79,7 +78,7 @@ def _colors(color: ColorCalibration, image: StokesImage) -> dict[str, Any]:
         "left_out": None if fit is None or fit.use is None else patches.left_out(fit.use),
         "detector_cost": _plain(color.cost),
         "metres_per_px": color.metres_per_px,
-        "scale_doubt": scale.sigma(image, color),
+        "scale_doubt": albedo_sigma,
         "matrix": _plain(color.matrix, 5),
     }
 
@@ -136,12 +135,12 @@ def _mesh(mesh: Mesh) -> dict[str, Any]:
 
 
 def _percentile(value: Floats, image: StokesImage, percentile: float) -> Any:
-    """Percentile of a map over the object; None without an object."""
+    """A percentile of a map over the object's pixels; None without an object."""
     return _plain(np.percentile(value[image.mask], percentile)) if image.mask.any() else None
 
 
 def _plain(value: Any, digits: int = 6) -> Any:
-    """Rounded Python numbers, as nested lists for an array; None where a number is missing or not finite."""
+    """Convert numbers to rounded Python numbers, arrays to nested lists; None for missing or infinite numbers."""
     if np.ndim(value):
         return [_plain(one, digits) for one in value]
     return round(float(value), digits) if value is not None and math.isfinite(value) else None

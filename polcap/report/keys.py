@@ -1,4 +1,4 @@
-"""Color keys: how the numbers of a map become colors, and colors numbers again.
+"""Color keys of maps: how values become colors in a picture, and how colors are read back as values.
 
 Each pixel of a map's picture has one of 255 levels; level 0 is outside the object. No two levels share a color, so
 a program can read the numbers back from the picture.
@@ -20,7 +20,7 @@ _STEPS = np.linspace(0, 1, LEVELS)
 
 @dataclass(frozen=True)
 class ColorKey:
-    """Range, unit and palette of one map."""
+    """Color key of one map: range of values, unit and palette."""
 
     low: float
     high: float
@@ -31,7 +31,10 @@ class ColorKey:
     digits: int = 2  # behind the decimal point
 
     def level(self, value: Floats, inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """Levels 1…255 for low…high, clipped; 0 outside the object and where the number is not finite."""
+        """Convert values to levels 1…255 for low…high, clipped.
+
+        0 outside the object and where the value is not finite.
+        """
         known = inside & np.isfinite(value)
         share = (np.where(known, value, self.low) - self.low) / (self.high - self.low)
         if self.palette == "wheel":
@@ -41,11 +44,11 @@ class ColorKey:
         return np.where(known, steps + 1, 0).astype(np.uint8)
 
     def place(self, value: float) -> float:
-        """Position of a number on the bar, 0…1."""
+        """Position of a value on the color bar, 0…1."""
         return float(np.clip((value - self.low) / (self.high - self.low), 0, 1) ** (1 / self.power))
 
     def picture(self, value: Floats, inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """Colors (H, W, 3), black outside the object."""
+        """Convert values to colors (H, W, 3), black outside the object."""
         return np.concatenate([np.zeros((1, 3), np.uint8), colors(self.palette)])[self.level(value, inside)]
 
     def bar(self, width: int, height: int) -> NDArray[np.uint8]:
@@ -55,7 +58,7 @@ class ColorKey:
 
 
 def colors(palette: Palette) -> NDArray[np.uint8]:
-    """Colors (255, 3) of levels 1…255, sRGB, all different."""
+    """sRGB colors (255, 3) of the levels 1…255 of a palette, all different."""
     if palette == "wheel":  # one turn of hue, red at both ends
         hsv = np.stack([360 * np.arange(LEVELS) / LEVELS, np.full(LEVELS, 0.78), np.ones(LEVELS)], axis=-1)
         rgb: Any = cv2.cvtColor(hsv[None].astype(np.float32), cv2.COLOR_HSV2RGB)[0]
@@ -70,7 +73,7 @@ def colors(palette: Palette) -> NDArray[np.uint8]:
 
 
 def _distinct(rgb: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """The colors, with repeated ones shifted by one step of blue so that each has one level."""
+    """Make all colors of a palette different: repeated ones are shifted by one step of blue."""
     seen: set[tuple[int, ...]] = set()
     out = rgb.copy()
     for color in out:
@@ -91,7 +94,10 @@ SIGMA = ColorKey(0, 0.01, "", (0, 0.0025, 0.005, 0.01), "inferno", digits=4)
 
 
 def depth(values: Floats, metric: bool) -> ColorKey:
-    """Key from the nearest to the farthest point of the object, in mm where the scale is known."""
+    """Color key of a depth map, from the nearest to the farthest point of the object.
+
+    In mm where the scale is known.
+    """
     low, high = (float(edge) for edge in np.percentile(values, [0.5, 99.5])) if values.size else (0.0, 1.0)
     if high - low < 1e-9:
         high = low + 1.0

@@ -20,7 +20,7 @@ LABELS: dict[str, tuple[str, str]] = {
     "chart.left_out": ("Patches not used", ""),
     "chart.detector_cost": ("Cost of the chart's detection, 0 is best", ""),
     "chart.metres_per_px": ("Size of a pixel at the chart", "mm"),
-    "chart.scale_doubt": ("Common error of all albedos, 1σ, from the unknown distance of chart and flash", "%"),
+    "chart.scale_doubt": ("Common error of all albedos, 1σ; without a chart they are relative", "%"),
     "chart.matrix": ("Camera channels to linear Rec.709", ""),
     "alignment.shift_px": ("Shift of each shot, right and down", "px"),
     "alignment.turn_deg": ("Rotation of each shot", "°"),
@@ -87,25 +87,25 @@ _FACTORS = {"%": 100.0, "mm": 1000.0}  # from shares and metres
 
 
 def units(metric: bool) -> dict[str, str]:
-    """Units of the numbers in report.json; "1" is a share or a factor."""
+    """Units of the figures in report.json by name; "1" is a share or a factor."""
     found = {name: _STORED.get(unit, unit) for name, (_, unit) in LABELS.items() if unit}
     raw = {"capture.focal_px": "RAW px", "capture.size_px": "RAW px", "capture.focal_doubt": "1"}
     return {**found, **raw, "mesh.extent": "m" if metric else "relative", "timings": "s"}
 
 
 def part(name: str) -> str:
-    """Heading of a part of the figures."""
+    """Heading of a group of figures in the report."""
     return PARTS.get(name, _words(name))
 
 
 def label(name: str) -> str:
-    """Label of `part.figure` or `section.setting`."""
+    """Label of a figure or setting, from its full name `part.figure` or `section.setting`."""
     known = LABELS.get(name)
     return known[0] if known else _words(name.partition(".")[2] or name)
 
 
 def text(name: str, value: Any) -> str:
-    """Value of a figure with its unit; lists of lists row by row."""
+    """Value of a figure as text with its unit; lists of lists row by row."""
     unit = LABELS.get(name, ("", ""))[1]
     words = _plain(value, _FACTORS.get(unit, 1.0))
     if value is None or isinstance(value, (str, bool)) or not unit:

@@ -1,4 +1,4 @@
-"""Figures of maps for report.html: picture, color scale and caption; the pointer shows the values."""
+"""Map figures of report.html: picture, color scale and caption; the pointer shows the values."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ class MapFigure:
 
 
 def of_result(small: PageMaps, metric: bool) -> list[MapFigure]:
-    """Figures of all maps of a result."""
+    """Figures of all maps of a result, for report.html."""
     found, inside = small.maps, small.maps.mask
     depth = small.depth * (1000.0 if metric else 1.0)
     depth_key = keys.depth(depth[inside & np.isfinite(depth)], metric)
@@ -57,7 +57,7 @@ def of_result(small: PageMaps, metric: bool) -> list[MapFigure]:
 
 
 def differences(small: PageMaps, rendering: Rerendering, rms: Sequence[float | None]) -> list[MapFigure]:
-    """A figure per angle: photograph minus re-rendering; `rms` are their differences relative to white."""
+    """One figure per polarizer angle: photograph minus re-rendering. `rms` are the differences relative to white."""
     shots = zip(small.angle, rendering.measured, rendering.predicted, rms)
     return [
         scalar(
@@ -73,7 +73,7 @@ def differences(small: PageMaps, rendering: Rerendering, rms: Sequence[float | N
 
 
 def scalar(name: str, title: str, note: str, value: Floats, inside: NDArray[np.bool_], key: ColorKey) -> MapFigure:
-    """Figure of a map of numbers."""
+    """Figure of a map with one number per pixel."""
     probe = {name: getattr(key, name) for name in ("low", "high", "power", "palette", "unit", "digits")}
     palette = keys.colors(key.palette)
     image = html.indexed(key.level(value, inside), palette)
@@ -86,7 +86,7 @@ def scalar(name: str, title: str, note: str, value: Floats, inside: NDArray[np.b
 
 
 def normal(name: str, title: str, vectors: Floats, inside: NDArray[np.bool_]) -> MapFigure:
-    """Figure of a map of normals."""
+    """Figure of a normal map."""
     y, x = np.mgrid[1:-1:96j, -1:1:96j]
     z2 = 1 - x * x - y * y
     ball = np.dstack([_normal_colors(np.stack([x, y, np.sqrt(np.maximum(z2, 0))], -1)), np.uint8(255) * (z2 > 0)])
@@ -101,12 +101,12 @@ def normal(name: str, title: str, vectors: Floats, inside: NDArray[np.bool_]) ->
 
 
 def css_colors(rgb: NDArray[np.uint8]) -> tuple[str, ...]:
-    """8-bit sRGB colors (N, 3) as CSS colors."""
+    """Convert 8-bit sRGB colors (N, 3) to CSS colors."""
     return tuple(f"#{bytes(color).hex()}" for color in rgb)
 
 
 def _albedo(name: str, title: str, note: str, linear: Floats, inside: NDArray[np.bool_], top: float) -> MapFigure:
-    """Figure of a color map from 0 to `top`."""
+    """Figure of a color map with values from 0 to `top`."""
     image = html.jpeg(_extend(srgb_eight_bits(linear / top), inside), whole_color=True)
     bar = srgb_eight_bits(np.linspace(0, 1, 17))[:, None].repeat(3, axis=1)
     ticks = tuple((share, number(top * share)) for share in (0, 0.25, 0.5, 0.75, 1))
@@ -119,7 +119,7 @@ def _normal_colors(vectors: Floats) -> NDArray[np.uint8]:
 
 
 def _extend(picture: NDArray[np.uint8], inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Continue a picture a few pixels beyond the object; black farther out."""
+    """Continue a picture a few pixels beyond the object's outline, for smooth scaling; black farther out."""
     if not inside.any():
         return np.zeros_like(picture)
     outside = np.where(inside, np.uint8(0), np.uint8(1))

@@ -59,7 +59,7 @@ def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
 def render(
     template: str, file: Path, title: str, content: Mapping[str, Any], data: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a page from one of the templates; `data` is for the scripts of the page.
+    """Write a page from one of the HTML templates; `data` is for the scripts of the page.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def render(
 
 
 def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
-    """Headline of a result, and a sentence about the expected error of its normals."""
+    """Headline of a result's verdict, and a sentence about the expected error of its normals."""
     gates = about["gates"]
     failed = [gate for gate in gates if gate["state"] == "fail"]
     headline = _HEADLINE[about["verdict"]]
@@ -93,12 +93,15 @@ def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def checks(gates: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """The gates in words for a table, failed ones first."""
+    """The quality gates as texts for a table, failed ones first."""
     return [check(gate) for gate in sorted(gates, key=lambda gate: _ORDER.index(gate["state"]))]
 
 
 def check(gate: Mapping[str, Any]) -> dict[str, str]:
-    """A gate in words; its cost is the normal error that it causes, empty below one degree."""
+    """One quality gate as texts: finding, value, limit, cost and remedy.
+
+    The cost is the normal error that the defect causes, empty below one degree.
+    """
     return {
         "title": gate["name"].capitalize(),
         "state": gate["state"],
@@ -111,7 +114,7 @@ def check(gate: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _gate_number(gate: Mapping[str, Any], name: str) -> str:
-    """Value or limit of a gate with its unit."""
+    """Value or limit of a quality gate, with its unit."""
     value, unit = gate[name], gate.get("unit", "")
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         shown = labels.number(100 * value if unit == "%" else value)
@@ -122,7 +125,7 @@ def _gate_number(gate: Mapping[str, Any], name: str) -> str:
 
 
 def _maps(about: Mapping[str, Any], results: Results) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Figures drawn from the maps, and the camera of the interactive pictures."""
+    """Map figures of the report, and the camera data of its interactive pictures."""
     maps, ior = results.maps, float(about["settings"]["infer"]["ior"])
     small = page_data.reduce(maps, results.mesh, results.cues, results.radiance.angle, _LONGEST)
     rendered = page_data.rerender(small, ior)
@@ -147,7 +150,9 @@ def _maps(about: Mapping[str, Any], results: Results) -> tuple[dict[str, Any], d
 
 
 def _mesh_preview(results: Results, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The surface with few vertices: base64 texts of 16-bit positions and texture coordinates, and of face indices.
+    """A reduced mesh for the interactive view.
+
+    Base64 texts of 16-bit positions and texture coordinates, and face indices.
 
     Positions are shares of the box `low`, `extent`; a share of 1 is stored as 65535. Faces are differences of indices.
     """
@@ -170,7 +175,7 @@ def _sixteen_bits(share: Floats) -> NDArray[np.uint16]:
 
 
 def _plots(about: Mapping[str, Any], results: Results) -> dict[str, Any]:
-    """Plots of the measurements; no chart plot without a chart."""
+    """Plots of the measurements of a result; without a chart, no plot of chart colors."""
     names = [f"{angle:g}°" for angle in np.degrees(results.radiance.angle)]
     merge, fit = about["figures"]["merge"], results.color.patches
     chart, measured = None, page_data.patches(results.radiance, results.color)
@@ -188,7 +193,7 @@ def _plots(about: Mapping[str, Any], results: Results) -> dict[str, Any]:
 
 
 def _pictures(results: Results) -> Iterator[tuple[str, str, str]]:
-    """Title, note and data URL of the photographs."""
+    """Title, caption and data URL of the photographs that the report shows."""
     radiance, color = results.radiance, results.color
     outline = pictures.outline(radiance, color, results.object_, _WIDEST)
     yield "Reference shot", "with the detected chart", html.jpeg(pictures.chart(radiance, color, _WIDEST))
@@ -198,7 +203,7 @@ def _pictures(results: Results) -> Iterator[tuple[str, str, str]]:
 
 
 def _tables(about: Mapping[str, Any]) -> dict[str, Any]:
-    """Rows of the tables: figures by subject, photographs and settings."""
+    """Rows of the report's tables: figures by subject, photographs and settings."""
     rows = {part: _rows({part: values}) for part, values in about["figures"].items()}
     return {
         "figures": [
@@ -219,7 +224,7 @@ def _tables(about: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _rows(sections: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """Full name and value in words of all entries."""
+    """Full name, and value as text, of all figures or settings in these sections."""
     names = [(f"{section}.{name}", value) for section, values in sections.items() for name, value in values.items()]
     return [(name, labels.text(name, value)) for name, value in names]
 

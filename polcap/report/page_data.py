@@ -1,4 +1,4 @@
-"""Data of the report page: maps, photographs and re-rendering of the object, reduced to the size of a screen."""
+"""Data of report.html: maps, photographs and re-rendering of the object, reduced to the size of a screen."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ _WHITE_QUANTILE = 0.995  # of the object's light; it becomes white
 
 @dataclass(frozen=True)
 class PageMaps:
-    """Maps and cues of the object on one reduced grid."""
+    """Maps and cues of the object on one reduced grid, for report.html."""
 
     maps: SurfaceMaps
     depth: Floats  # (H, W) of the mesh; NaN outside
@@ -29,7 +29,7 @@ class PageMaps:
 
 
 def reduce(maps: SurfaceMaps, mesh: Mesh, cues: Cues, angle: Floats, longest: int) -> PageMaps:
-    """The results with at most `longest` pixels a side; means are taken over the object only."""
+    """Reduce the maps of a result to at most `longest` pixels a side; means are taken over the object only."""
     reduction = ObjectReduction(np.asarray(maps.mask & cues.mask, bool), longest)
     light = np.maximum(frames.total(cues.radiance), 1e-6)
     weight = np.maximum(reduction.mean(light), 1e-9)
@@ -49,7 +49,7 @@ def reduce(maps: SurfaceMaps, mesh: Mesh, cues: Cues, angle: Floats, longest: in
 
 @dataclass(frozen=True)
 class Rerendering:
-    """Gray photographs of each angle, and the maps rendered under the same light and polarizer angle."""
+    """Gray photographs of each polarizer angle, and the maps rendered under the same light and angle."""
 
     measured: Floats  # (K, H, W) S0 + S1 cos 2θ + S2 sin 2θ; 1 is white, brighter values are clipped
     predicted: Floats  # (K, H, W) the same, rendered from the maps under a flash at the lens
@@ -57,12 +57,12 @@ class Rerendering:
     scale: float  # brightness of the photographs over that of the re-rendering, median of the pixels
 
     def rms(self, inside: NDArray[np.bool_]) -> list[float]:
-        """Root mean square difference at each angle, relative to white."""
+        """Root mean square difference between photograph and re-rendering at each angle, relative to white."""
         return [float(np.sqrt(np.mean((m - p)[inside] ** 2))) for m, p in zip(self.measured, self.predicted)]
 
 
 def rerender(small: PageMaps, ior: float) -> Rerendering:
-    """Render the maps under the light and polarizer angles of the photographs."""
+    """Render the maps as the camera saw the object: flash, and polarizer at each angle of the photographs."""
     maps = small.maps
     ray = frames.rays(maps.view, *maps.mask.shape)
     normal = frames.to_ray_frame(maps.normal, ray)
@@ -86,7 +86,7 @@ def rerender(small: PageMaps, ior: float) -> Rerendering:
 
 
 def exposure(small: PageMaps) -> float:
-    """Factor on S0 that puts the brightest parts of the object just below white."""
+    """Factor on S0 for display: the brightest parts of the object become just below white."""
     inside = small.radiance[small.maps.mask]
     return 0.9 / max(float(np.quantile(inside.max(axis=-1), _WHITE_QUANTILE)), 1e-6) if inside.size else 1.0
 

@@ -29,7 +29,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class RowPlot:
-    """Named rows of marks over one axis."""
+    """A plot with named rows of marks over one common axis."""
 
     title: str
     note: str
@@ -39,7 +39,7 @@ class RowPlot:
 
 
 def exposures(measured: list[list[float]], stated: list[list[float | None]], names: Sequence[str]) -> RowPlot:
-    """Exposure of each frame in stops: measured in the pixels (dot) and stated by the camera (ring)."""
+    """Plot of the exposure of each frame in stops: measured in the pixels (dot), stated by the camera (ring)."""
     known = np.log2([value for rows in (measured, stated) for row in rows for value in row if value])
     low, high = np.floor(known.min() - 0.3), np.ceil(known.max() + 0.3)
     rows: list[tuple[str, list[Mark]]] = []
@@ -60,7 +60,10 @@ def exposures(measured: list[list[float]], stated: list[list[float | None]], nam
 
 
 def gains(found: Gains, names: Sequence[str]) -> RowPlot:
-    """Light of each shot relative to the first, per channel with 1σ; crosses: from pixels that face the camera."""
+    """Plot of the light of each shot relative to the first, per channel with 1σ.
+
+    Crosses: from pixels that face the camera.
+    """
     far = np.concatenate([(found.gain - 1).ravel(), np.nan_to_num(found.anchor - 1).ravel()])
     span = max(0.005, 1.15 * float(np.abs(far).max()))
     rows: list[tuple[str, list[Mark]]] = []
@@ -81,14 +84,14 @@ def gains(found: Gains, names: Sequence[str]) -> RowPlot:
 
 
 def timings(seconds: Mapping[str, float]) -> RowPlot:
-    """Computing time: one bar per stage."""
+    """Plot of computing times: one bar per stage."""
     most = max([*seconds.values(), 1e-3])
     rows = [(name, [Mark(spent / most, f"{spent:.2f} s", "bar")]) for name, spent in seconds.items()]
     return RowPlot("Time", "computing time of each stage", [], rows, 22)
 
 
 def shifts(found: Alignment, names: Sequence[str]) -> dict[str, Any]:
-    """Shift of each shot relative to the first: a line per shot, its 1σ as a circle."""
+    """Plot of the image shift of each shot relative to the first: a line per shot, 1σ as a circle."""
     moved = found.transform[:, :2, 2]
     span = max(0.5, 1.2 * float(np.abs(moved).max() + found.residual_px.max()))
     shots = [
@@ -107,7 +110,10 @@ def shifts(found: Alignment, names: Sequence[str]) -> dict[str, Any]:
 
 
 def chart(reference: ChartReference, measured: Floats, fit: PatchColors, figures: Mapping[str, Any]) -> dict[str, Any]:
-    """24 patches with the maker's color, the photographed color `measured` (24, 3) in linear Rec.709, and ΔE."""
+    """Plot of the 24 chart patches: the maker's color, the photographed color, and ΔE.
+
+    `measured` (24, 3) is in linear Rec.709.
+    """
     note = "outside: the maker's color; inside: the photographed color; below: ΔE2000, mean "
     note += number(figures["delta_e_mean"], 2)
     if figures["predicted_mean"] is not None:

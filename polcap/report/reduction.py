@@ -20,12 +20,12 @@ class ObjectReduction:
         self.share = area_mean(inside, self.shape)  # of each reduced pixel, covered by the object
 
     def mean(self, image: Floats) -> Floats:
-        """Means of (H, W) or (H, W, C) over the object's pixels; 0 outside the object."""
+        """Reduce an image (H, W) or (H, W, C) by means over the object's pixels; 0 outside the object."""
         inside = self.inside[(..., *[None] * (image.ndim - 2))]
         return weighted_area_mean(np.where(inside, image, 0), self.inside, self.shape)
 
     def maps(self, maps: SurfaceMaps) -> SurfaceMaps:
-        """All maps, without the coarse depth."""
+        """Reduce all maps of a result; the network's coarse depth is left out."""
         normal = self.mean(maps.normal)
         x, y = ((edge + 0.5) * self.factor - 0.5 for edge in maps.view.center)
         left, top = (edge * self.factor for edge in maps.view.origin)

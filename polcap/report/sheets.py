@@ -1,4 +1,4 @@
-"""Sheets: several captioned pictures with their color keys in one picture."""
+"""Draws sheets: several pictures with captions and color keys in one picture."""
 
 from dataclasses import dataclass
 
@@ -27,7 +27,7 @@ class Tile:
 
 
 def sheet(tiles: list[Tile]) -> Picture:
-    """Tiles three in a row, each with its caption above and its key below."""
+    """Arrange tiles in one picture, three in a row, each with its caption above and its color key below."""
     framed = [_framed(tile) for tile in tiles]
     rows = []
     for start in range(0, len(framed), 3):
@@ -42,12 +42,12 @@ def sheet(tiles: list[Tile]) -> Picture:
 
 
 def write(picture: Picture, words: str, at: tuple[int, int], paint: tuple[int, int, int], size: int = 20) -> None:
-    """Write words on a picture; (x, y) is the left end of the baseline."""
+    """Write text on a picture; `at` (x, y) is the left end of the baseline."""
     cv2.putText(picture, words, at, paint, _LETTERS, size, 400)
 
 
 def _framed(tile: Tile) -> Picture:
-    """A tile with its caption, and with the ticked bar of its key or its note."""
+    """Draw a tile: picture, caption, and the color bar with ticks or the note."""
     height = max(1, round(tile.picture.shape[0] * WIDTH / tile.picture.shape[1]))
     framed = np.full((_HEAD + height + _FOOT, WIDTH, 3), _GROUND, np.uint8)
     write(framed, tile.caption, (2, 30), _INK, 22)

@@ -35,7 +35,7 @@ from polcap.results import Results
 
 
 def of_stage(results: Results, stage: str) -> Picture:
-    """Picture of the result of a stage."""
+    """Picture of one stage's result, for people to check."""
     paint: dict[str, Callable[[], Picture | list[Tile]]] = {
         "hdr": lambda: _merged(results.radiance),
         "whitebalance": lambda: chart(results.radiance, results.color),
@@ -60,7 +60,7 @@ def reference(radiance: AngleStack, color: ColorCalibration, widest: int | None 
 
 
 def chart(radiance: AngleStack, color: ColorCalibration, widest: int | None = None) -> Picture:
-    """The reference shot with the detected chart patches."""
+    """Picture of the reference shot with the outlines of the detected chart patches."""
     picture = reference(radiance, color, widest)
     times = max(1, round(2 * WIDTH / picture.shape[1]))
     picture = np.asarray(picture.repeat(times, 0).repeat(times, 1), np.uint8)
@@ -74,7 +74,7 @@ def chart(radiance: AngleStack, color: ColorCalibration, widest: int | None = No
 
 
 def registered(radiance: AngleStack, found: Alignment) -> list[Tile]:
-    """Each registered shot (green) over the reference (magenta): gray where both agree."""
+    """Pictures of each registered shot (green) over the reference shot (magenta); gray where both agree."""
     first = _gray(shrink(radiance.value[0], 2 * WIDTH))
     zoom = np.diag([*np.divide(first.shape[::-1], radiance.value.shape[2:0:-1]), 1.0])
     zoom[:2, 2] = (zoom.diagonal()[:2] - 1) / 2  # pixel centers are whole numbers
@@ -90,7 +90,7 @@ def registered(radiance: AngleStack, found: Alignment) -> list[Tile]:
 
 
 def outline(radiance: AngleStack, color: ColorCalibration, object_: ObjectMask, widest: int | None = None) -> Picture:
-    """The reference shot, darkened outside the mask, with the box of the crop."""
+    """Picture of the reference shot, darkened outside the mask, with the box of the crop."""
     picture = reference(radiance, color, widest)
     outside = area_mean(object_.mask, picture.shape) < 0.5
     picture[outside] = picture[outside] // 3
@@ -100,12 +100,12 @@ def outline(radiance: AngleStack, color: ColorCalibration, object_: ObjectMask, 
 
 
 def normal(found: SurfaceMaps) -> Picture:
-    """Normals as colors, black outside the object."""
+    """Picture of a normal map as colors, black outside the object."""
     return _eight_bits((found.normal / 2 + 0.5) * found.mask[..., None])
 
 
 def shaded(mesh: Mesh, found: SurfaceMaps) -> Picture:
-    """The shape without colors: the normals of the depth map under a light from the upper left."""
+    """Picture of the shape without colors: the normals of the depth map under a light from the upper left."""
     inside = np.isfinite(mesh.depth)
     depth = np.where(inside, mesh.depth, np.nan)
     footprint = np.nanmedian(depth) / found.view.focal if inside.any() else 1.0  # size of a pixel there
@@ -118,22 +118,22 @@ def shaded(mesh: Mesh, found: SurfaceMaps) -> Picture:
 
 
 def display(linear: Floats, top: float | None = None) -> Picture:
-    """Linear light as sRGB; `top` becomes white, by default the 99.5th percentile."""
+    """Convert linear light to sRGB for display; `top` becomes white, by default the 99.5th percentile."""
     return color.srgb_eight_bits(np.asarray(linear, np.float32) / np.float32(top or _top(linear)))
 
 
 def scale(value: Floats, low: float, high: float, inside: NDArray[np.bool_]) -> Picture:
-    """Numbers as colors from dark to bright, black outside."""
+    """Convert values low…high to colors from dark to bright, black outside the object."""
     return keys.ColorKey(low, max(high, low + 1e-12), "", (), "inferno").picture(value, inside)
 
 
 def hue(aolp: Floats, inside: NDArray[np.bool_]) -> Picture:
-    """An angle mod π as a hue."""
+    """Convert an angle of polarization (modulo π) to a hue."""
     return keys.AOLP.picture(np.degrees(aolp) % 180, inside)
 
 
 def shrink(picture: NDArray[Any], width: int) -> NDArray[Any]:
-    """A picture (H, W, …) averaged down to at most `width` pixels wide."""
+    """Reduce a picture (H, W, …) by averaging to at most `width` pixels wide."""
     tall, wide = picture.shape[:2]
     if wide <= width:
         return picture
@@ -141,7 +141,7 @@ def shrink(picture: NDArray[Any], width: int) -> NDArray[Any]:
 
 
 def _merged(radiance: AngleStack) -> list[Tile]:
-    """Every merged shot; clipped pixels red, moved pixels magenta."""
+    """Pictures of every merged shot; clipped pixels red, pixels with motion magenta."""
     top = _top(radiance.value[0])
     tiles = []
     for value, quality, angle in zip(radiance.value, radiance.quality, np.degrees(radiance.angle)):
@@ -153,7 +153,7 @@ def _merged(radiance: AngleStack) -> list[Tile]:
 
 
 def _gains(found: Gains, angle: Floats) -> Picture:
-    """Gains of the shots with 1σ; crosses are the gains from pixels that face the camera."""
+    """Plot of the shots' gains with 1σ, as a picture. Crosses are the gains from pixels that face the camera."""
     height, left = 60 * len(found.gain) + 40, 120
     picture = np.full((height, WIDTH, 3), 255, np.uint8)
     span = max(0.02, 1.2 * float(np.abs(np.stack([found.gain, found.anchor]) - 1).max()))
@@ -177,7 +177,7 @@ def _gains(found: Gains, angle: Floats) -> Picture:
 
 
 def _stokes(image: StokesImage) -> list[Tile]:
-    """S0 in camera channels, DoLP and AoLP."""
+    """Pictures of S0 in camera channels, DoLP and AoLP."""
     s0, s1, s2 = frames.total(image.stokes)
     dolp = np.hypot(s1, s2) / np.maximum(s0, 1e-6)
     tile = Tile(display(image.stokes[0]), "S0", note="camera channels, brightest parts white")
@@ -185,7 +185,7 @@ def _stokes(image: StokesImage) -> list[Tile]:
 
 
 def _cues(found: Cues) -> list[Tile]:
-    """Inputs of the estimators: S0, DoLP, AoLP, normalized Stokes parameters, diffuse color and noise."""
+    """Pictures of the inputs of the estimators: S0, DoLP, AoLP, normalized Stokes parameters, diffuse color, noise."""
     cos, sin = found.normalized_stokes
     inside = found.mask[..., None]
     normalized = _eight_bits(np.stack([np.full_like(cos, 0.5), cos / 2 + 0.5, sin / 2 + 0.5], -1) * inside)
@@ -217,7 +217,7 @@ def _maps(found: SurfaceMaps) -> list[Tile]:
 
 
 def _surface(mesh: Mesh, found: SurfaceMaps) -> list[Tile]:
-    """The depth map and its shape."""
+    """Pictures of the depth map and of its shaded shape."""
     inside = np.isfinite(mesh.depth)
     depth = mesh.depth * (1000.0 if mesh.metric else 1.0)
     key = keys.depth(depth[inside], mesh.metric)
@@ -226,7 +226,7 @@ def _surface(mesh: Mesh, found: SurfaceMaps) -> list[Tile]:
 
 
 def _textures(built: Asset) -> list[Tile]:
-    """The textures as stored in the file."""
+    """Pictures of the textures as stored in the glTF file."""
     specular_note = f"white is {max(built.specular_factor):.3g} × F0 of the index"
     return [
         Tile(built.base_color, "Base color", note="sRGB"),

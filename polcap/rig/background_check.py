@@ -1,4 +1,4 @@
-"""Saves and checks the camera's photographs in a thread of its own, while the rig takes the next ones."""
+"""Saves and checks each photograph in a separate thread, while the rig takes the next ones."""
 
 from collections import Counter
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -19,7 +19,7 @@ _BRACKET_ROLES = ("shot", "repeat")
 
 
 class BackgroundCheck:
-    """Saves each photograph, then accepts or rejects it, in the order of taking."""
+    """Thread that saves each photograph, then accepts or rejects it, in the order of taking."""
 
     def __init__(self, record: CaptureRecord, tries: int, log: Log) -> None:
         self.small: dict[str, Floats] = {}  # accepted frames of this run by slot, small and grey
@@ -33,21 +33,24 @@ class BackgroundCheck:
 
     @property
     def pending(self) -> list[Slot]:
-        """Slots with a photograph that is not yet checked."""
+        """Frames of the plan that are photographed but not yet checked."""
         return list(self._pending)
 
     def submit(self, slot: Slot, read_deg: float | None, photograph: CameraFile) -> None:
         self._pending[slot] = self._thread.submit(self._save_and_check, slot, read_deg, photograph)
 
     def collect(self, block: bool) -> None:
-        """Remove checked frames from the pending ones; with `block` wait for one. Raises a check's error."""
+        """Remove checked frames from the pending ones; with `block` wait for one.
+
+        Raises the error of a failed check.
+        """
         if block and self._pending:
             wait(self._pending.values(), return_when=FIRST_COMPLETED)
         for slot in [slot for slot, future in self._pending.items() if future.done()]:
             self._pending.pop(slot).result()
 
     def close(self) -> None:
-        """Finish the submitted checks."""
+        """Wait until all submitted photographs are checked, then end the thread."""
         self._thread.shutdown(wait=True)
 
     def _save_and_check(self, slot: Slot, read_deg: float | None, photograph: CameraFile) -> None:

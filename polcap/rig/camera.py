@@ -33,7 +33,7 @@ class CameraFile:
 
     @property
     def suffix(self) -> str:
-        """File name suffix by content; the camera's own if the content is not recognized."""
+        """File name suffix by the file's content; the camera's suffix if the content is not recognized."""
         for offset, signature, suffix in _SIGNATURES:
             if self.data.startswith(signature, offset):
                 return suffix
@@ -46,7 +46,7 @@ class CameraFile:
 
 
 class Camera(Protocol):
-    """A camera driver."""
+    """Protocol that every camera driver implements."""
 
     model: str
     frame_bytes: int  # about; to check the free disk space
@@ -54,7 +54,10 @@ class Camera(Protocol):
     polarizes_flash: bool  # can put the flash's filter on by itself
 
     def bracket(self, flash: bool) -> tuple[Exposure, ...]:
-        """Default exposures; under a flash they differ in ISO, for the shutter changes nothing there."""
+        """Default exposures of the camera.
+
+        Under a flash they differ in ISO, because the shutter has no effect on a flash.
+        """
         ...
 
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
@@ -66,5 +69,5 @@ class Camera(Protocol):
         ...
 
     def close(self) -> None:
-        """Disconnect; never raises."""
+        """Disconnect from the camera; never raises."""
         ...

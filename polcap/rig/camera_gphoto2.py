@@ -67,17 +67,17 @@ class Gphoto2Camera:
         self.switches_flash = self._flash_off is not None
 
     def bracket(self, flash: bool) -> tuple[Exposure, ...]:
-        """Two stops below and above the camera's shutter speed; under a flash steps of ISO."""
+        """Default exposures: two stops around the camera's shutter speed; under a flash, steps of ISO."""
         name = self._widget("iso" if flash else "time_s")
         if flash:
             return bracket_by_iso([value for text in self._choices[name] if (value := _number(text))] if name else [])
         return bracket_by_shutter(_number(self._ask(f"value {name}", lambda: self._value(name))) if name else None)
 
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
-        """There is nothing to prepare."""
+        """Nothing to do before a frame."""
 
     def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
-        """Reconnects once if the camera fails, but not if it hangs."""
+        """Take one photograph. Reconnects once if the camera fails, but not if it hangs."""
         try:
             return self._shoot(exposure, flash)
         except CallTimeout:
@@ -118,7 +118,7 @@ class Gphoto2Camera:
         return camera
 
     def _set(self, field: str, wanted: float | None) -> float | None:
-        """Set a dial to the value nearest in stops; returns it, or None if the dial was not changed."""
+        """Set a camera setting to the value nearest in stops. Returns it, or None if the setting was not changed."""
         name = self._widget(field)
         if wanted is None or name is None:
             return None
@@ -131,7 +131,7 @@ class Gphoto2Camera:
         return next((name for name in _WIDGETS[field][0] if self._choices[name]), None)
 
     def _list_choices(self, name: str) -> list[str]:
-        """Choices of a setting; none if the camera lacks it or it is read-only."""
+        """Values that a camera setting offers; none if the camera lacks the setting or it is read-only."""
         gp = self._gp
         try:
             widget = self._camera.get_single_config(name)
@@ -154,7 +154,7 @@ class Gphoto2Camera:
         self._ask(f"{name} = {text}", turn)
 
     def _capture(self) -> tuple[bytes, str]:
-        """Release, and fetch the RAW; the JPEG only if the camera writes no RAW."""
+        """Release the shutter and fetch the RAW file; a JPEG only if the camera writes no RAW."""
         place = self._camera.capture(self._gp.GP_CAPTURE_IMAGE)
         data = self._fetch(place)
         while data.startswith(_JPEG):
@@ -170,7 +170,7 @@ class Gphoto2Camera:
         return bytes(memoryview(file.get_data_and_size()))
 
     def _ask(self, request: str, call: Callable[[], T], extra_s: float = 0.0) -> T:
-        """One call of libgphoto2: logged, limited in time, its failure a HardwareError of one line."""
+        """Call a function of libgphoto2: logged, limited in time, any failure raised as a HardwareError of one line."""
         self._log.write("camera", ">", request)
         try:
             answer = call_within(self._timeout_s + extra_s, f"{self.model}: {request}", call)
@@ -221,7 +221,7 @@ def _gphoto2() -> Any:
 
 
 def _number(text: str) -> float | None:
-    """A dial's value: 1/200, 0.0050s, f/11, 100; None for Auto, bulb and the like."""
+    """Parse the text of a camera setting (1/200, 0.0050s, f/11, 100); None for Auto, bulb and the like."""
     match = _VALUE.fullmatch(text.strip().replace(",", "."))
     if match is None or not float(match["value"]):
         return None

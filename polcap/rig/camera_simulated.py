@@ -12,8 +12,9 @@ from polcap.rig.camera import CameraFile
 from polcap.rig.device_log import Log
 from polcap.rig.exposure_bracket import Exposure
 from polcap.rig.motor_simulated import RING
-from polcap.synth.shooting import MIDDLE_S, Kind, Shoot, Studio, Take, random_scene
+from polcap.synth.shooting import MIDDLE_S, Dials, Kind, Shoot, Studio, Take, random_scene
 
+FLASH_SYNC_S = 1 / 160  # shutter time under the flash
 _NUMBER_OF_ROLE = {"shot": 0, "repeat": 1000, "ambient": 2000, "chart": 3000, "cross": 4000}
 
 
@@ -24,7 +25,10 @@ class SimulatedCameraSettings(Shoot, frozen=True, forbid_unknown_fields=True):
 
 
 class SimulatedCamera:
-    """`simulated?seed=1&width=384`: takes the settings of `polcap synth`, and `scene`. It does not move."""
+    """`simulated?seed=1&width=384`: takes the settings of `polcap synth`, and `scene`. It does not move.
+
+    It takes every bracket of `--bracket`: shutter times, apertures, ISO values and flash powers.
+    """
 
     model = "Polcap Synthetic"
     switches_flash = polarizes_flash = True
@@ -40,12 +44,12 @@ class SimulatedCamera:
         self.frame_bytes = 2 * self._shoot.width * self._shoot.height
 
     def bracket(self, flash: bool) -> tuple[Exposure, ...]:
-        """Steps of exposure time: its lamp is steady."""
+        """Default exposures: steps of exposure time, because the simulated lamp is steady."""
         stops = [self._shoot.step ** (frame - self._shoot.exposures // 2) for frame in range(self._shoot.exposures)]
         return tuple(Exposure(time_s=MIDDLE_S * stop, f_number=11.0, iso=100.0) for stop in stops)
 
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
-        """Choose the seed of noise and time stamp as `synth.write` does."""
+        """Set the seed of noise and the time stamp of the next frame, as `synth.write` does."""
         angles = self._shoot.angles_deg
         wanted = 0.0 if angle_deg is None else angle_deg
         shot = angles.index(wanted) if wanted in angles else len(angles) + round(10 * wanted) % 900
@@ -53,14 +57,14 @@ class SimulatedCamera:
         self._next = shot + _NUMBER_OF_ROLE[role], step, wanted if RING.true_deg is None else RING.true_deg
 
     def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
-        if exposure.flash or exposure.iso not in (None, 100.0) or exposure.f_number not in (None, 11.0):
-            raise SettingError(f"the simulated camera has f/11, ISO 100 and no flash power, not {exposure}; give times")
         self._studio = self._studio or Studio(random_scene(self._shoot.seed, self._shoot.scene), self._shoot)
         shot, step, angle = self._next
         if (angle, self._crossed) not in self._rendered:
             self._rendered = {(angle, self._crossed): self._studio.through(angle, self._crossed)}
-        time_s = exposure.time_s or MIDDLE_S
-        take = Take(shot, step, time_s / MIDDLE_S, self._taken[shot, step, flash], flash)
+        is_flash = exposure.time_s is None or exposure.flash is not None
+        time_s = exposure.time_s or FLASH_SYNC_S
+        dials = Dials(time_s, exposure.f_number or 11.0, exposure.iso or 100.0, is_flash)
+        take = Take(shot, step, exposure_factor(exposure), self._taken[shot, step, flash], flash, dials)
         self._taken[shot, step, flash] += 1
         self._log.write("camera", ">", f"{exposure}, {'lit' if flash else 'dark'}, polarizer at {angle:.4f}°")
         with tempfile.TemporaryDirectory() as place:
@@ -68,14 +72,28 @@ class SimulatedCamera:
             self._studio.photograph(file, self._rendered[angle, self._crossed], take)
             data = file.read_bytes()
         self._log.write("camera", "<", f"{len(data)} bytes")
-        return CameraFile(data, file.name, Exposure(time_s=time_s, f_number=11.0, iso=100.0))
+        return CameraFile(data, file.name, Exposure(dials.time_s, dials.f_number, dials.iso, exposure.flash))
 
     def close(self) -> None:
         self._rendered = {}
 
 
+def exposure_factor(exposure: Exposure) -> float:
+    """Exposure relative to the middle frame of a bracket.
+
+    The light is a flash if its power is stated or no time is; otherwise a steady lamp. Exposed as the middle frame:
+    the lamp at 1/50 s, f/11 and ISO 100; the flash at power 1/16, f/11 and ISO 100, or at f/11 and ISO 400.
+    """
+    aperture, iso = (11.0 / (exposure.f_number or 11.0)) ** 2, exposure.iso or 100.0
+    if exposure.flash:
+        return aperture * 16 * exposure.flash * iso / 100
+    if exposure.time_s is None:
+        return aperture * (exposure.iso or 400.0) / 400
+    return aperture * exposure.time_s / MIDDLE_S * iso / 100
+
+
 def parse_query(query: str) -> SimulatedCameraSettings:
-    """Settings of a URL's query; unknown ones raise SettingError."""
+    """Parse the settings in the URL of a simulated camera; unknown ones raise SettingError."""
     assignments = [f"{name}={value}" for name, value in parse_qsl(query, keep_blank_values=True)]
     defaults = {"width": 768, "height": 576, "nudge_px": 0.0, "nudge_deg": 0.0, "angle_error_deg": 0.0}
     try:

@@ -35,7 +35,7 @@ _QUESTIONS: list[tuple[int, str, float, tuple[Callable[[str], str | None], ...]]
 
 
 def open_rotator(url: str, log: Log) -> PolarizerRotator:
-    """Open `KIND:PORT?setting=value&…`, `simulated?…` or `manual`.
+    """Open the rotator of a URL: `KIND:PORT?setting=value&…`, `simulated?…` or `manual`.
 
     Raises SettingError for a wrong URL, HardwareError if the port cannot be opened or another device answers.
     """
@@ -65,7 +65,7 @@ def open_rotator(url: str, log: Log) -> PolarizerRotator:
 
 
 def open_camera(name: str, log: Log) -> Camera:
-    """Open `gphoto2`, `gphoto2:MODEL or PORT`, `folder:PATH` or `simulated?width=768`.
+    """Open the camera of a name: `gphoto2`, `gphoto2:MODEL or PORT`, `folder:PATH` or `simulated?width=768`.
 
     Raises SettingError for an unknown camera or setting, HardwareError if the camera does not answer.
     """
@@ -82,7 +82,7 @@ def open_camera(name: str, log: Log) -> Camera:
 
 
 def probe(port_url: str) -> str | None:
-    """The name of the rotator on a serial port, within four seconds; nothing moves.
+    """Name of the rotator on a serial port, asked within four seconds; None without one; nothing moves.
 
     Opening the port restarts many Arduinos, which then send their name unasked.
 
@@ -102,7 +102,7 @@ def probe(port_url: str) -> str | None:
 
 
 def _settings(url: str, query: str, settings_class: type[msgspec.Struct]) -> Any:
-    """The settings in a rotator's URL. Raises SettingError."""
+    """Parse the settings in a device URL. Raises SettingError."""
     names = settings_class.__struct_fields__
     try:
         pairs = parse_qsl(query.replace("+", "%2B"), keep_blank_values=True, strict_parsing=bool(query))

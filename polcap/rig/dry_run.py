@@ -1,4 +1,4 @@
-"""Times of a shooting plan: for `polcap capture --dry-run`, and for the time that is left."""
+"""Estimates the time that a shooting plan takes, for `polcap capture --dry-run` and the remaining time."""
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -22,14 +22,14 @@ _USUAL_S = 0.02  # shutter time in the middle of a bracket
 
 @dataclass(frozen=True)
 class Pace:
-    """Speed of rotator and camera."""
+    """Speed of the rotator [°/s], settling time and time per frame of the camera [s]."""
 
     speed_deg_s: float
     settle_s: float
     overhead_s: float  # per frame, without the exposure
 
     def steps(self, slots: Iterable[Slot], at_deg: float) -> list[tuple[Slot, float, float]]:
-        """The frames in the order of taking, each with the time of the turn before it and of the frame itself [s]."""
+        """Frames in the order of taking, each with the time of the rotation before it and of the frame itself [s]."""
         steps = []
         for slot in schedule(slots, at_deg):
             turn_s = 0.0
@@ -40,7 +40,7 @@ class Pace:
         return steps
 
     def left(self, slots: Iterable[Slot], at_deg: float) -> str:
-        """Time for the rest of a capture from the present angle on, such as 1:40."""
+        """Remaining time of a capture from the current angle on, as text such as 1:40."""
         seconds = round(FINISH_S + sum(turn_s + frame_s for _, turn_s, frame_s in self.steps(slots, at_deg)))
         return f"{seconds // 60}:{seconds % 60:02}"
 
@@ -51,7 +51,7 @@ def overhead_s(camera: str) -> float:
 
 
 def dry_run(order: CaptureOrder) -> dict[str, Any]:
-    """The plan with nominal times [s]; no device is opened.
+    """The shooting plan with nominal times [s] as data for JSON; no device is opened.
 
     The default bracket is ISO 100 to 1600 under a flash, else three shutter times around 1/50 s.
     """
@@ -89,7 +89,7 @@ def _by_kind(option: str, url: str, values: dict[str, float]) -> float:
 
 
 def _parts(steps: list[tuple[Slot, float, float]], home_s: float) -> list[dict[str, Any]]:
-    """Homing, turns, groups of frames and the end, each with its time [s]."""
+    """Parts of the plan with their times [s]: homing, rotations, groups of frames, end."""
     parts: list[dict[str, Any]] = [{"part": "home", "frames": 0, "seconds": home_s}]
     for slot, turn_s, frame_s in steps:
         angle = "" if slot.angle_deg is None else f" {slot.angle_deg:g}°"
@@ -104,7 +104,7 @@ def _parts(steps: list[tuple[Slot, float, float]], home_s: float) -> list[dict[s
 
 
 def table(plan: dict[str, Any]) -> str:
-    """The plan as text."""
+    """The shooting plan as text."""
     lines = [f"{'part':28}{'frames':>7}{'seconds':>9}  exposures"]
     for part in plan["parts"]:
         exposures = ", ".join(part.get("exposures", ()))

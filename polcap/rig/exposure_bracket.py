@@ -1,4 +1,4 @@
-"""Exposures of a bracket: as the photographer writes them, by default, and nearest to the camera's dials."""
+"""Exposures of a bracket: parses `--bracket`, makes default brackets, chooses the camera's nearest values."""
 
 import re
 from math import log2
@@ -26,7 +26,7 @@ class Exposure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     flash: Positive | None = None  # power, full = 1
 
     def __str__(self) -> str:
-        """As in `--bracket`."""
+        """The exposure as text in the form of `--bracket`."""
         words = [f"1/{1 / self.time_s:.4g}s" if self.time_s < 0.3 else f"{self.time_s:.3g}s"] if self.time_s else []
         words += [f"f/{self.f_number:g}"] if self.f_number else []
         words += [f"iso{self.iso:g}"] if self.iso else []
@@ -35,7 +35,7 @@ class Exposure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def parse_bracket(text: str) -> tuple[Exposure, ...]:
-    """Exposures of `1/200,1/50,1/13`, or with all words `1/160 f/11 iso100 flash1/64, flash1/16, flash1/4`.
+    """Parse exposures `1/200,1/50,1/13`, or in full `1/160 f/11 iso100 flash1/64, flash1/16, flash1/4`.
 
     Values that a frame does not name are those of the frame before. Raises SettingError.
     """
@@ -54,20 +54,20 @@ def parse_bracket(text: str) -> tuple[Exposure, ...]:
 
 
 def relative_exposure(exposure: Exposure) -> float:
-    """Time × ISO × flash power / f-number²."""
+    """Relative exposure: time × ISO × flash power / f-number²."""
     light = (exposure.time_s or 1.0) * (exposure.flash or 1.0) / (exposure.f_number or 1.0) ** 2
     return light * (exposure.iso or 100.0)
 
 
 def bracket_by_shutter(middle_s: float | None) -> tuple[Exposure, ...]:
-    """Three frames in steps of two stops of time, around the camera's own setting."""
+    """Default bracket without flash: three frames in steps of two stops of time around the camera's setting."""
     if not middle_s:
         raise SettingError("the camera states no shutter speed; give the exposures with --bracket")
     return tuple(Exposure(time_s=middle_s * factor) for factor in (0.25, 1.0, 4.0))
 
 
 def bracket_by_iso(offered: list[float]) -> tuple[Exposure, ...]:
-    """Three frames in steps of two stops of ISO, from the camera's lowest of at least 100: for a flash."""
+    """Default bracket under a flash: three frames in steps of two stops of ISO, from the lowest of at least 100."""
     lowest = min((iso for iso in offered if iso >= _BASE_ISO), default=None)
     if lowest is None:
         raise SettingError("the camera's ISO cannot be set; give the exposures with --bracket: flash power or aperture")
@@ -75,7 +75,10 @@ def bracket_by_iso(offered: list[float]) -> tuple[Exposure, ...]:
 
 
 def nearest(name: str, wanted: float, offered: list[float], power: float = 1.0) -> float:
-    """The offered value nearest in stops; `power` is 2 for f-numbers. SettingError beyond half a stop."""
+    """The value that the camera offers nearest to `wanted`, in stops; SettingError beyond half a stop.
+
+    `power` is 2 for f-numbers.
+    """
     best = min(offered, key=lambda value: abs(log2(value / wanted)))
     if power * abs(log2(best / wanted)) > _NEAREST_STOPS:
         listed = ", ".join(f"{value:g}" for value in sorted(offered))

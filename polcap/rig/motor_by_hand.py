@@ -1,4 +1,4 @@
-"""Motor driver for `manual`: a person at the terminal turns the ring and may type the angle it is at."""
+"""Motor driver for `manual`: a person at the terminal turns the polarizer and may type the angle reached."""
 
 import math
 
@@ -11,7 +11,7 @@ SETTINGS = RotatorSettings(settle=0.0, tolerance=180.0)  # any angle typed is ac
 
 
 class MotorByHand:
-    """Asks for every angle; the ring's own scale is the zero."""
+    """Asks a person for every angle; the scale on the polarizer's ring defines zero."""
 
     model = "by hand"
     speed_deg_s = 9.0  # a quarter turn in ten seconds, for the plan

@@ -54,7 +54,7 @@ class ElliptecSettings(RotatorSettings, frozen=True):
 
 
 class ElliptecMotor:
-    """One Elliptec rotation mount on a bus."""
+    """Driver of one Elliptec rotation mount on a serial bus."""
 
     baud = 9600
     wraps = True
@@ -97,7 +97,7 @@ class ElliptecMotor:
         self._ask("st", "GS")  # without movement the piezo has no current
 
     def _move(self, command: str) -> None:
-        """Send a movement and wait for its end: a position, or status ok if the position was lost."""
+        """Send a movement command and wait for its end: the mount answers with its position, or with status ok."""
         end = time.monotonic() + self._settings.timeout
         self._port.send(self._address + command)
         while time.monotonic() < end:
@@ -118,7 +118,10 @@ class ElliptecMotor:
         )
 
     def _ask(self, command: str, expected: str) -> str:
-        """Data of the answer of kind `expected`; a busy device is asked again. Raises NoAnswer, HardwareError."""
+        """Send a command and return the data of its answer; a busy device is asked again.
+
+        `expected` is the kind of answer. Raises NoAnswer, HardwareError.
+        """
         end = time.monotonic() + self._settings.timeout
         while time.monotonic() < end:
             self._port.send(self._address + command)
@@ -136,7 +139,10 @@ class ElliptecMotor:
             raise self._fault(status)
 
     def _answers(self) -> Iterator[tuple[str, str]]:
-        """Kind and data of this device's answers; other addresses of the bus are skipped. Raises NoAnswer."""
+        """Yield kind and data of this device's answers; answers from other bus addresses are skipped.
+
+        Raises NoAnswer.
+        """
         for line in self._port.read_lines():
             match = _ANSWER.fullmatch(line)
             if match is None or len(match[3]) != _DIGITS[match[2]]:
@@ -149,11 +155,11 @@ class ElliptecMotor:
         return HardwareError(f"{self.model} on {self._port.url}: {text}")
 
     def _hexadecimal(self, angle_deg: float) -> str:
-        """Pulses of an angle as 32 bits."""
+        """Convert an angle to encoder pulses as a 32-bit hexadecimal number."""
         return f"{round(angle_deg / 360.0 * self._pulses) & 0xFFFFFFFF:08X}"
 
 
 def recognize(line: str) -> str | None:
-    """The name of an Elliptec that sent this line as its identity."""
+    """Name of an Elliptec mount if this line is its identity; else None."""
     match = _ANSWER.fullmatch(line)
     return f"Elliptec ELL{int(match[3][:2], 16)} at address {match[1]}" if match and match[2] == "IN" else None

@@ -57,7 +57,7 @@ class GrblSettings(RotatorSettings, frozen=True):
 
 
 class GrblMotor:
-    """One axis of a GRBL board."""
+    """Driver of one axis of a GRBL board."""
 
     baud = 115200
     wraps = False
@@ -78,7 +78,7 @@ class GrblMotor:
         self.speed_deg_s = units_per_minute / 60.0 / self._units_per_degree
 
     def home(self) -> None:
-        """Reset, which ends an alarm; then search the switch or ask a person."""
+        """Home the axis: reset the board, which ends an alarm; then search the switch or ask a person."""
         self._reset()
         if self._settings.home == "switch":
             self._wait_for_ok("$H", quiet_s=inf)  # GRBL reports no state while it homes
@@ -96,7 +96,7 @@ class GrblMotor:
         return (self._machine_position() - self._zero) / self._units_per_degree
 
     def halt(self) -> None:
-        """Feed hold, reset when the motor has stopped, sleep: no current in the coils."""
+        """Stop the motor and switch its current off: feed hold, reset, sleep."""
         try:
             self._port.send("!")
             end = time.monotonic() + _HOLD_S
@@ -119,7 +119,7 @@ class GrblMotor:
         raise NoAnswer(f"no GRBL 1.1 answers on {self._port.url}; check the cable, the power and the firmware")
 
     def _command(self, text: str) -> list[str]:
-        """Send a line; returns the lines before its ok. Raises NoAnswer, HardwareError."""
+        """Send a line; returns the lines received before its ok. Raises NoAnswer, HardwareError."""
         self._port.send(f"{text}\n")
         answer: list[str] = []
         lines = self._port.read_lines()
@@ -128,7 +128,7 @@ class GrblMotor:
         return answer
 
     def _wait_for_ok(self, text: str, quiet_s: float) -> None:
-        """Send a line that is answered when the motor has stopped, and wait for the answer.
+        """Send a line that GRBL answers when the motor has stopped, and wait for the answer.
 
         After a second without a line GRBL is asked for its state; without any line for `quiet_s` it is lost.
 
@@ -154,7 +154,7 @@ class GrblMotor:
         raise self._too_slow(text)
 
     def _machine_position(self) -> float:
-        """Position of the axis in machine units, when it has stopped: the last ok may have been an older one."""
+        """Position of the axis in machine units, read when the axis has stopped."""
         end = time.monotonic() + self._settings.timeout
         while time.monotonic() < end:
             state, position = self._state()
@@ -166,7 +166,7 @@ class GrblMotor:
         raise self._too_slow("the last movement")
 
     def _state(self) -> tuple[str, float]:
-        """State and machine position of the axis."""
+        """State of the board (Idle, Run, Alarm…) and machine position of the axis."""
         self._port.send("?")
         lines = self._port.read_lines()
         while (match := _STATUS.fullmatch(line := next(lines))) is None:
@@ -176,7 +176,10 @@ class GrblMotor:
         return match[1], float(match[2 + self._axis])
 
     def _is_ok(self, line: str) -> bool:
-        """Whether a line ends a command; reports and messages do not. Raises NoAnswer, HardwareError."""
+        """Whether a received line ends a command; status reports and messages do not.
+
+        Raises NoAnswer, HardwareError.
+        """
         if re.fullmatch(r"(error|ALARM):\d+", line):
             raise self._failed(f"answers {line}: {MEANING.get(line, 'see the list of codes of GRBL')}")
         if _BANNER.fullmatch(line):
@@ -194,7 +197,7 @@ class GrblMotor:
 
 
 def recognize(line: str) -> str | None:
-    """The name of a GRBL board that sent this line."""
+    """Name of a GRBL board if this line is its greeting; else None."""
     if match := _BANNER.fullmatch(line):
         return f"GRBL {match[1]}"
     return "GRBL" if _STATUS.fullmatch(line) else None

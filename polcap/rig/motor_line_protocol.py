@@ -36,7 +36,7 @@ class LineSettings(RotatorSettings, frozen=True):
 
 
 class LineMotor:
-    """A board that speaks the line protocol."""
+    """Driver of a board that speaks polcap's line protocol."""
 
     baud = 115200
     wraps = False
@@ -75,7 +75,7 @@ class LineMotor:
         )
 
     def _command(self, command: str) -> float:
-        """Send a command, wait for its end, return the position."""
+        """Send a command, wait for its end, return the position [degrees]."""
         self._port.send(f"{command}\n")
         end = time.monotonic() + self._settings.timeout
         while time.monotonic() < end:
@@ -99,6 +99,6 @@ class LineMotor:
 
 
 def recognize(line: str) -> str | None:
-    """The board's name if it sent this line."""
+    """Name of a line-protocol board if this line is its greeting; else None."""
     match = _HELLO.fullmatch(line)
     return match and f"polcap-rotator {match[1]}"

@@ -1,4 +1,4 @@
-"""Motor driver for `simulated`: a ring with play; its true angle differs a little from the reported one.
+"""Motor driver for `simulated`: a ring with backlash; its true angle differs a little from the reported one.
 
 The simulated camera reads the true angle.
 """
@@ -24,7 +24,7 @@ class SimulatedMotorSettings(RotatorSettings, frozen=True):
 
 
 class SimulatedRing:
-    """The polarizer between the simulated camera and its scene."""
+    """True angle of the simulated polarizer, shared by the simulated motor and camera."""
 
     true_deg: float | None = None  # None: no simulated motor turns it
 
@@ -33,7 +33,7 @@ RING = SimulatedRing()
 
 
 class SimulatedMotor:
-    """Turns `RING`; the same position has the same error every time."""
+    """Simulated motor that turns the shared `RING`; the same position has the same error every time."""
 
     model = "Polcap Synthetic rotator"
     wraps = False

@@ -1,4 +1,4 @@
-"""Options and record of a capture: those of the begun capture with `--resume`, else new ones."""
+"""Resumes an interrupted capture: its options and its record; for a new capture the options given."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from polcap.rig.shooting_plan import CaptureOrder
 
 
 def complete_order(folder: Path, options: dict[str, Any], resume: bool) -> CaptureOrder:
-    """Options of a capture: the stated ones; the others from the begun capture with `resume`, else defaults.
+    """Complete the options of a capture: those given, then those of the capture to `resume`, then defaults.
 
     Raises SettingError if rotator or camera is missing, or the angles make no capture; CaptureError if the capture was
     begun with other options.
@@ -55,7 +55,7 @@ def open_folder(folder: Path, resume: bool) -> RigFile | None:
 
 
 def _check_same(folder: Path, stated: dict[str, Any], begun: dict[str, Any]) -> None:
-    """Refuse other options than those of the begun capture; ports may differ after a cable was plugged in again."""
+    """Refuse options that differ from those of the capture to resume; ports may differ."""
     for name, value in stated.items():
         device = name in ("rotator", "camera")
         if (_without_port(value) != _without_port(begun[name])) if device else value != begun[name]:

@@ -1,4 +1,6 @@
-"""Which frame is retaken: damaged, repeated, wrongly exposed, clipped, unsharp, or taken with another lens or camera.
+"""Decides which frame is retaken.
+
+Damaged, repeated, wrongly exposed, clipped, unsharp, or with another lens or camera.
 
 Frames are measured in the decoder's process: a damaged file does no harm, and the camera goes on meanwhile.
 """
@@ -36,7 +38,7 @@ class FrameFacts(msgspec.Struct, frozen=True):
 
 
 def inspect(path: Path) -> tuple[FrameFacts, Floats]:
-    """Facts of a frame, and the frame small and grey (h, w) with black = 0 and saturation = 1.
+    """Measure a frame: facts for the retake criteria, and a small gray picture (h, w), black = 0, saturation = 1.
 
     Raises DecodeError if the file is not a RAW, or is damaged.
     """
@@ -48,7 +50,7 @@ def inspect(path: Path) -> tuple[FrameFacts, Floats]:
 
 
 def measure(path: str) -> worker.Answer:
-    """Clipped share, sharpness and small picture of one RAW file; runs in the decoder's process."""
+    """In the child process: clipped share, sharpness and small picture of one RAW file."""
     meta, arrays = raw.decode(path)
     value, white = arrays["value"], meta["white"]
     black = float(np.mean(meta["black"]))
@@ -62,7 +64,10 @@ def measure(path: str) -> worker.Answer:
 
 
 def _sharpness(light: Floats) -> float:
-    """Contrast within 1 px over contrast within 4 px; exposure and subject cancel, blur remains."""
+    """Sharpness of a picture: contrast within 1 px over contrast within 4 px.
+
+    Exposure and subject cancel, blur remains.
+    """
     near, far = (cv2.GaussianBlur(np.asarray(light, np.float32), (0, 0), sigma) for sigma in (1.0, 4.0))
     coarse = float(np.std(near - far))
     return float(np.std(light - near)) / coarse if coarse > 0 else 0.0
@@ -93,7 +98,10 @@ def retake_reason(
 
 
 def is_blurred(sharpness: float, sharpest: float) -> bool:
-    """Whether a frame is less sharp than the sharpest of the same exposure by more than the polarizer explains."""
+    """Whether a frame is less sharp than the sharpest of the same exposure.
+
+    Differences that the polarizer explains are allowed.
+    """
     return sharpness < _LEAST_SHARPNESS * sharpest
 
 

@@ -1,4 +1,4 @@
-"""The rotator: a motor with zero offset, sense of turning, one-sided approach and read-back of every angle."""
+"""The rotator of the polarizer: a motor with zero offset, direction, one-sided approach and read-back."""
 
 import time
 from contextlib import suppress
@@ -14,23 +14,23 @@ _APPROACHES = 2  # a wrong position is approached once more
 
 
 class Motor(Protocol):
-    """A driver of one motor, in the motor's own degrees."""
+    """Protocol of a motor driver; angles are the motor's, in degrees."""
 
     model: str
     speed_deg_s: float
     wraps: bool  # positions are modulo 360
 
     def home(self) -> None:
-        """Search the zero position."""
+        """Search the motor's zero position."""
 
     def go(self, angle_deg: float) -> None:
-        """Turn to an angle; returns when the motor has stopped."""
+        """Turn the motor to an angle; returns when it has stopped."""
 
     def position(self) -> float:
         """The angle that the device reports."""
 
     def halt(self) -> None:
-        """Stop turning and switch the current off."""
+        """Stop the motor and switch its current off."""
 
 
 Backlash = Annotated[float, Meta(ge=0, le=45)]  # degrees; every angle is reached upwards, over at least this far
@@ -102,7 +102,7 @@ class PolarizerRotator:
             self._port.close()
 
     def _was_moved(self) -> bool:
-        """Whether the motor is no longer where it stopped: it restarted, is locked, or was turned by hand."""
+        """Whether the motor is no longer where it stopped, because it restarted, is locked, or was moved by hand."""
         if self._stopped_at is None:
             return False
         try:
@@ -118,7 +118,7 @@ class PolarizerRotator:
         return True
 
     def _approach(self, target: float) -> None:
-        """Turn the motor to `target` degrees, upwards at the end, so that play of the gear causes no error."""
+        """Turn the motor to `target` degrees, always upwards at the end, so that gear backlash causes no error."""
         previous, self._stopped_at = self._stopped_at, None
         backlash = self._settings.backlash
         if backlash and (previous is None or target < previous):

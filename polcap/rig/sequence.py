@@ -1,4 +1,4 @@
-"""The sequence of a capture: turn the polarizer, take the frames that are missing, check each in the background.
+"""Shoots a capture: turns the polarizer, takes the frames that are missing, checks each in the background.
 
 A rejected frame leaves its slot empty. So retaking and resuming are the same loop: take the missing frames.
 """
@@ -39,7 +39,7 @@ def shoot(
     tries: int = 2,
     report: Report = lambda line: None,
 ) -> dict[str, Any]:
-    """Shoot the capture that was ordered into `folder`; with `resume` the frames that the folder lacks.
+    """Shoot a capture into `folder`, or with `resume` the frames that it lacks; returns a summary.
 
     Returns a summary.
 
@@ -82,7 +82,7 @@ def shoot(
 def _take_missing(
     url: str, record: CaptureRecord, check: BackgroundCheck, camera: Camera, log: Log, report: Report
 ) -> None:
-    """Run the rotator; however the run ends, the motor is stopped and released."""
+    """Run the rotator and take the missing frames. However this ends, the motor is stopped and released."""
     with closing(check), closing(device_urls.open_rotator(url, log)) as rotator:
         try:
             record.content.rotator = rotator.model
@@ -148,7 +148,7 @@ class CaptureLoop:
             self.report(f"{name} is taken again: the ring came back to {self.read_deg:.2f}°")
 
     def _photograph(self, slot: Slot) -> CameraFile:
-        """Take one frame; a person handles the chart, and the flash and its filter if the camera cannot."""
+        """Take one frame. If needed, a person is asked to place the chart, or to switch the flash or its filter."""
         crossed = slot.role == "cross"
         if crossed != self.filter_on_flash and not self.camera.polarizes_flash:
             on = "put the second polarizer on the flash and turn it until the highlights vanish"
@@ -171,7 +171,7 @@ class CaptureLoop:
 
 
 def _finish(record: CaptureRecord, check: BackgroundCheck) -> dict[str, Any]:
-    """Draw the preview, read the capture as `polcap process` will, and summarize it."""
+    """Finish a capture: draw the preview, read the folder as `polcap process` will, return a summary."""
     middle = len(record.content.order.bracket) // 2
     accepted = record.accepted()
     shots = {name: frame for name, frame in accepted.items() if frame.role == "shot" and frame.step == middle}
@@ -205,7 +205,7 @@ def _check_disk(folder: Path, needed: float) -> None:
 
 
 def _check_person(missing: list[Slot], camera: Camera) -> None:
-    """Fail before the first frame if a person is needed later and there is no terminal."""
+    """Fail before the first frame if a later frame needs a person and there is no terminal."""
     questions = {
         "--chart": any(slot.role == "chart" for slot in missing),
         "--ambient": not camera.switches_flash and any(not slot.flash for slot in missing),
@@ -217,7 +217,7 @@ def _check_person(missing: list[Slot], camera: Camera) -> None:
 
 
 def _locked(folder: Path) -> AbstractContextManager[Any]:
-    """Keep a second polcap out of the folder; the system drops the lock when the process dies."""
+    """Lock the capture folder against another polcap; the system releases the lock when the process dies."""
     try:
         return FileLock(folder / ".lock", timeout=0).acquire()
     except Timeout as error:
@@ -226,7 +226,7 @@ def _locked(folder: Path) -> AbstractContextManager[Any]:
 
 @contextmanager
 def _signals_as_ctrl_c() -> Iterator[None]:
-    """SIGTERM and SIGHUP end a run as Ctrl-C does, so that the motor stops."""
+    """Make SIGTERM and SIGHUP end a run as Ctrl-C does, so that the motor stops."""
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     if threading.current_thread() is not threading.main_thread():
         numbers = []

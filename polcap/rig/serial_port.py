@@ -36,11 +36,11 @@ _CANNOT_OPEN = {
 
 
 class NoAnswer(HardwareError):
-    """No answer, half of one, or an unknown one; asking again may help."""
+    """Error: a device gave no answer, half an answer or an unknown one; asking again may help."""
 
 
 class Unplugged(HardwareError):
-    """The port has disappeared."""
+    """Error: the serial port has disappeared."""
 
 
 def retry(ask: Callable[[], T]) -> T:
@@ -124,7 +124,7 @@ class Port:
             self._serial.close()
 
     def unknown_answer(self, line: str) -> NoAnswer:
-        """The error for a line that is no answer of the protocol."""
+        """Make the error for a received line that is not an answer of the protocol."""
         return self._no_answer(f"'{line:.40}', an unknown answer; check the cable and that the URL names this device")
 
     def _no_answer(self, text: str) -> NoAnswer:
@@ -142,5 +142,5 @@ class Port:
 
 
 def _printable(data: bytes) -> str:
-    """Bytes for the log and for messages: without the line end, control characters escaped."""
+    """Bytes as text for the log and for messages: without the line end, control characters escaped."""
     return repr(data.strip(b"\r\n"))[2:-1]

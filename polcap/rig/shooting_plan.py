@@ -24,7 +24,7 @@ class CaptureOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     camera: str = ""
 
     def __post_init__(self) -> None:
-        """Raises SettingError for angles that make no capture."""
+        """Raises SettingError if the angles cannot form a capture."""
         listed = ",".join(f"{angle:g}" for angle in self.angles_deg)
         if not all(0 <= angle < 360 for angle in self.angles_deg):
             raise SettingError(f"--angles {listed}: not all in 0 to 360 degrees; give angles modulo 360")
@@ -38,7 +38,7 @@ class CaptureOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Slot:
-    """One frame of a shooting plan."""
+    """One frame of a shooting plan: role, polarizer angle, place in the bracket, exposure, flash."""
 
     role: Role
     angle_deg: float | None  # None: at any angle
@@ -48,7 +48,7 @@ class Slot:
 
     @property
     def name(self) -> str:
-        """Path in the capture, without suffix."""
+        """Path of the frame's file in the capture folder, without suffix."""
         at = "" if self.angle_deg is None else f"pol{layouts.degrees(self.angle_deg)}"
         frame = f"frame_{self.step + 1}"
         names = {"shot": f"{at}/{frame}", "repeat": f"repeat/{at}_{frame}", "cross": f"cross/{frame}"}
@@ -56,7 +56,7 @@ class Slot:
 
 
 def plan_slots(order: CaptureOrder, switches_flash: bool) -> tuple[Slot, ...]:
-    """Every frame, in the order of capture.toml: the angles, then repeats, ambient, chart, cross.
+    """Every frame of a capture, in the order of capture.toml: the angles, then repeats, ambient, chart, cross.
 
     If a person has to switch the flash, there is one ambient frame for all angles.
     """
@@ -91,7 +91,7 @@ def next_slot(missing: Sequence[Slot], at_deg: float) -> Slot:
 
 
 def schedule(slots: Iterable[Slot], at_deg: float = 0.0) -> list[Slot]:
-    """All frames in the order of taking, from the present angle on."""
+    """Sort frames into the order of taking, starting at the current angle."""
     left, ordered = list(slots), []
     while left:
         slot = next_slot(left, at_deg)
@@ -102,12 +102,15 @@ def schedule(slots: Iterable[Slot], at_deg: float = 0.0) -> list[Slot]:
 
 
 def uses_flash(order: CaptureOrder) -> bool:
-    """Whether the light is a flash: the order names its power, frames without it, or a filter on it."""
+    """Whether the light of a capture is a flash.
+
+    The options show it: flash power, frames without flash, or a filter on the flash.
+    """
     return order.ambient or order.cross or any(one.flash for one in order.bracket)
 
 
 def steps_shutter(bracket: Sequence[Exposure]) -> bool:
-    """Whether the frames differ in shutter time alone, which changes nothing under a flash."""
+    """Whether a bracket's frames differ in shutter time alone, which has no effect under a flash."""
     others = {(one.f_number, one.iso, one.flash) for one in bracket}
     return len(others) == 1 and len({one.time_s for one in bracket}) > 1
 

@@ -38,10 +38,10 @@ class Stage(Generic[P, T]):
         return self.function.__module__.rpartition(".")[2]
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call the function."""
+        """Run the stage's function."""
         return self.function(*args, **kwargs)
 
 
 def stage(*, version: int, keep: bool = True) -> Callable[[Callable[P, T]], Stage[P, T]]:
-    """Mark the one public function of a stage's module."""
+    """Decorator that makes the one public function of a stage's module a `Stage`."""
     return lambda function: Stage(function, version, keep)

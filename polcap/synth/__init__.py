@@ -1,1 +1,4 @@
-"""The camera run backwards: shapes, materials, light and a sensor, written as a real capture is."""
+"""Synthetic captures.
+
+Renders random shapes, materials and light through a simulated camera, and writes a capture folder.
+"""

@@ -30,7 +30,10 @@ _MOST_TILT_DEG = 35.0
 
 
 class CalibrationShoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The simulated equipment and the photographs to take. One flat list, because users set the fields by name."""
+    """The simulated equipment and the calibration photographs to take.
+
+    One flat list, because users set the fields by name.
+    """
 
     seed: Annotated[int, Meta(ge=0)] = 0
     width: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 384  # visible RAW px
@@ -89,7 +92,7 @@ def write(folder: Path, shoot: CalibrationShoot) -> None:
 
 
 def _photographs(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, float]]:
-    """Folder, light (H, W, 3) at ISO 100, ISO and exposure time [s] of each photograph."""
+    """The simulated calibration photographs: folder, light (H, W, 3) at ISO 100, ISO and exposure time [s] of each."""
     random = np.random.default_rng([shoot.seed, 7])
     light = _surface(shoot)
     for iso in shoot.isos:
@@ -114,7 +117,7 @@ def _photographs(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, 
 
 
 def _surface(shoot: CalibrationShoot) -> Floats:
-    """Light of an almost evenly lit surface, (H, W, 3); 1 for green in the middle."""
+    """Simulated light from an almost evenly lit surface (a flat frame), (H, W, 3); 1 for green in the middle."""
     y, x = np.mgrid[0 : shoot.height, 0 : shoot.width].astype(float)
     x, y = x - (shoot.width - 1) / 2, y - (shoot.height - 1) / 2
     half = np.hypot(shoot.width, shoot.height) / 2
@@ -148,7 +151,7 @@ def _boards(shoot: CalibrationShoot) -> Iterator[Floats]:
 
 
 def _albedo(ray: Floats, board: Chart, kind: str) -> Floats:
-    """Albedo (P, 3) at the end of rays (P, 3), which point from the surface to the lens."""
+    """Albedo (P, 3) of the board or wall that rays (P, 3) hit; rays point from the surface to the lens."""
     out = np.full((len(ray), 3), _WALL)
     if kind == "chart":
         at, _, albedo = color_checker.intersect(board, ray)

@@ -21,7 +21,7 @@ class Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Width and height between the outer corners of the patches."""
+        """Width and height [m] of the chart between the outer corners of its patches."""
         return self.pitch * (5 + _PATCH), self.pitch * (3 + _PATCH)
 
     @property
@@ -32,19 +32,22 @@ class Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def corners(chart: Chart) -> Floats:
-    """Outer corners of the patches (4, 3) [m, camera frame], dark skin first, clockwise."""
+    """Outer corners of the chart's patch field (4, 3) [m, camera frame], dark skin first, clockwise."""
     return _points(chart, np.array([[0, 0], [5 + _PATCH, 0], [5 + _PATCH, 3 + _PATCH], [0, 3 + _PATCH]]))
 
 
 def patches(chart: Chart, margin: float = 0.0) -> Floats:
-    """Corners of every patch (24, 4, 3) [m, camera frame], each side moved inwards by `margin` of the patch's side."""
+    """Corners of every chart patch (24, 4, 3) [m, camera frame], moved inwards by `margin` of the patch's side."""
     origin = np.stack(np.meshgrid(np.arange(6), np.arange(4)), axis=-1).reshape(24, 1, 2)
     near, far = _PATCH * margin, _PATCH * (1 - margin)
     return _points(chart, origin + np.array([[near, near], [far, near], [far, far], [near, far]]))
 
 
 def intersect(chart: Chart, v: Floats) -> tuple[NDArray[np.integer], Floats, Floats]:
-    """Indices (N,) of the rays v (P, 3) that meet the chart, their lengths (N,) [m] and the albedo (N, 3)."""
+    """Intersect rays with the chart.
+
+    Indices (N,) of the rays v (P, 3) that hit it, lengths (N,) [m] and albedo (N, 3).
+    """
     center = np.array(chart.center)
     near = np.flatnonzero(-(v @ center) > np.linalg.norm(center) * np.cos(5 * chart.pitch / np.linalg.norm(center)))
     distance, column, row = meet_plane(chart, v[near])
@@ -57,7 +60,10 @@ def intersect(chart: Chart, v: Floats) -> tuple[NDArray[np.integer], Floats, Flo
 
 
 def meet_plane(chart: Chart, v: Floats) -> tuple[Floats, Floats, Floats]:
-    """Lengths (P,) [m] of rays v (P, 3) to the chart's plane, and columns and rows (P,) from the chart's middle."""
+    """Intersect rays v (P, 3) with the chart's plane.
+
+    Lengths (P,) [m], and columns and rows (P,) from the chart's middle, in patches.
+    """
     facing, across, down = chart.axes
     distance = -(np.array(chart.center) @ facing) / (v @ facing)
     point = -v * distance[:, None] - chart.center
@@ -65,6 +71,6 @@ def meet_plane(chart: Chart, v: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _points(chart: Chart, column_row: Floats) -> Floats:
-    """Points (..., 3) of the chart's plane at (..., 2) columns and rows from its first patch corner."""
+    """Points (..., 3) in the chart's plane for (column, row) coordinates (..., 2) from its first patch corner."""
     _, across, down = chart.axes
     return np.array(chart.center) + (column_row - _MIDDLE) @ (chart.pitch * np.stack([across, down]))

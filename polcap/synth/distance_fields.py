@@ -21,7 +21,7 @@ Wave = tuple[float, float, float, float, float]  # amplitude, wave vector x y z 
 
 
 class Cluster(msgspec.Struct, frozen=True, tag="cluster", forbid_unknown_fields=True):
-    """Several balls that overlap."""
+    """Shape of several overlapping balls, as a distance field."""
 
     balls: tuple[tuple[float, float, float, float], ...]  # center x y z, radius [m]
 
@@ -34,7 +34,7 @@ class Cluster(msgspec.Struct, frozen=True, tag="cluster", forbid_unknown_fields=
 
 
 class Bumps(msgspec.Struct, frozen=True, tag="bumps", forbid_unknown_fields=True):
-    """An ellipsoid with smooth waves on its surface."""
+    """Shape of an ellipsoid with smooth waves on its surface, as a distance field."""
 
     size: tuple[float, float, float]  # semi-axes [m]
     waves: tuple[Wave, ...]  # amplitude relative to the semi-axis, over the unit sphere
@@ -52,7 +52,7 @@ class Bumps(msgspec.Struct, frozen=True, tag="bumps", forbid_unknown_fields=True
 
 
 class Vase(msgspec.Struct, frozen=True, tag="vase", forbid_unknown_fields=True):
-    """A body of revolution about y, with vertical lobes and small waves on its wall."""
+    """Shape of a solid of revolution about y, with vertical lobes and small waves on its wall, as a distance field."""
 
     height: float  # m
     profile: tuple[tuple[float, float], ...]  # height 0…1 from foot to lip, radius [m]; joined smoothly
@@ -81,7 +81,7 @@ class Vase(msgspec.Struct, frozen=True, tag="vase", forbid_unknown_fields=True):
 
 
 class Model(msgspec.Struct, frozen=True, tag="model", forbid_unknown_fields=True):
-    """A mesh file, centered at the origin. It has no distance field; `mesh_tracer.py` traces it."""
+    """Shape from a mesh file, centered at the origin. It has no distance field; `mesh_tracer.py` traces it."""
 
     file: str
     radius: float  # m, of the smallest sphere about the origin that contains it
@@ -92,7 +92,7 @@ Shape = Cluster | Bumps | Vase
 
 @lru_cache
 def _turned(profile: tuple[tuple[float, float], ...]) -> tuple[CubicSpline, float]:
-    """Radius of a vase's wall over height 0…1, and its steepest slope [m per height]."""
+    """Radius of a vase's wall as a spline over height 0…1, and the wall's steepest slope [m per height]."""
     at, radius = np.array(profile).T
     curve = CubicSpline(at, radius, bc_type="natural")
     return curve, float(np.abs(curve(np.linspace(0, 1, 257), 1)).max())

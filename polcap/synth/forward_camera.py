@@ -26,7 +26,7 @@ COLOR_MATRIX = (0.87, -0.27, -0.075, -0.44, 1.23, 0.235, -0.09, 0.19, 0.69)  # X
 
 
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Photosite of the simulated sensor at base sensitivity."""
+    """Properties of one photosite of the simulated sensor at base ISO: full well, read noise, black, white."""
 
     full_well: Annotated[float, Meta(gt=0, le=1e9)] = 30000.0  # e⁻ at the white level
     read_noise: Annotated[float, Meta(ge=0, le=1e6)] = 3.0  # e⁻, 1σ
@@ -35,12 +35,14 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def pinhole(focal_mm: float, width: int, height: int) -> View:
-    """View of a camera without distortion, over its own RAW pixels."""
+    """View (focal length, principal point) of a camera without distortion, on its own RAW pixels."""
     return View(focal_mm / SENSOR_WIDTH_MM * width, ((width - 1) / 2, (height - 1) / 2), scale=1)
 
 
 def undistort(view: View, bend: tuple[float, float], x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Pixels of the pinhole camera `view` that see the same points as pixels x, y of a lens with k₁, k₂.
+    """Convert pixels x, y of a distorting lens to pixels of the pinhole camera `view` that see the same points.
+
+    The distortion is k₁, k₂.
 
     A ray at an angle of tangent t to the optical axis reaches the sensor at the radius f · (t + k₁ t³ + k₂ t⁵). The
     inverse is interpolated in a fine table of this radius.
@@ -58,13 +60,16 @@ def undistort(view: View, bend: tuple[float, float], x: Floats, y: Floats) -> tu
 
 
 def rec709_to_camera(color_matrix: Sequence[float]) -> Floats:
-    """Linear Rec.709 → camera channels (3, 3), scaled so that green of white is 1; color_matrix: XYZ → camera."""
+    """Matrix (3, 3) from linear Rec.709 to camera channels, scaled so that green of white is 1. color_matrix.
+
+    XYZ → camera.
+    """
     matrix = np.reshape(color_matrix, (3, 3)) @ REC709_TO_XYZ
     return np.asarray(matrix / matrix[1].sum())
 
 
 def mosaic(image: Floats, cfa: Bits) -> Floats:
-    """The channel of each pixel's color filter, (H, W), of an image (H, W, 3); cfa (n, n) of 0 R, 1 G, 2 B."""
+    """Sample an image (H, W, 3) through a color filter array cfa (n, n) of 0 R, 1 G, 2 B; returns (H, W)."""
     out = np.empty(image.shape[:2], image.dtype)
     period = len(cfa)
     for row, column in np.ndindex(period, period):
@@ -73,7 +78,7 @@ def mosaic(image: Floats, cfa: Bits) -> Floats:
 
 
 def expose(radiance: Floats, sensor: Sensor, amplification: float, random: np.random.Generator) -> NDArray[np.uint16]:
-    """Counts of a mosaic (H, W); a radiance of 1 fills the well.
+    """Simulate the sensor: noisy counts of a mosaic (H, W) of radiance; a radiance of 1 fills the well.
 
     Photon noise is Poisson, read noise is Gaussian. The well saturates; counts are rounded and clipped to 0…white.
     `amplification` is ISO/100.
@@ -87,7 +92,7 @@ def expose(radiance: Floats, sensor: Sensor, amplification: float, random: np.ra
 def write_dng(
     path: Path, counts: NDArray[np.uint16], sensor: Sensor, cfa: Bits, color_matrix: Sequence[float], exif: Exif
 ) -> None:
-    """Write the counts of one photograph. Raises StorageError."""
+    """Write the counts of one simulated photograph as a DNG. Raises StorageError."""
     dng.write(
         path,
         counts,

@@ -1,4 +1,4 @@
-"""Light between the parts of a mesh: one diffuse bounce, computed at the vertices.
+"""Interreflection between the parts of a mesh in synthetic captures: one diffuse bounce, computed at the vertices.
 
 All shots use the same interpolated values, so sampling noise adds no false polarization. Neglected: specular
 reflection, and the slight polarization of the bounced light. There are two other simulations of this light:
@@ -22,7 +22,7 @@ Lit = Callable[[Floats, Floats, Floats], Floats]
 
 
 def received(tracer: Tracer, lit: Lit, camera: Floats, ior: float) -> Floats:
-    """Light that enters the surface at each vertex, (V, 3), relative to the light from a white plane.
+    """Interreflected light that enters the surface at each vertex, (V, 3), relative to the light from a white plane.
 
     lit(point, normal, towards) gives the diffusely reflected S0 (N, 3) of points in the mesh's own frame in the
     direction `towards`. camera (3,) is in the same frame; open surfaces are taken to face it.

@@ -29,7 +29,7 @@ class Triangles:
 
 
 def smooth(vertices: Floats, faces: NDArray[np.integer], crease: float = 0.75) -> Triangles:
-    """A mesh with angle-weighted normals, smooth across edges with an angle below `crease` rad.
+    """Mesh with shading normals, angle-weighted, smooth across edges with an angle below `crease` rad.
 
     Vertices at the same position count as one, so that seams of a texture atlas stay invisible.
     """
@@ -63,7 +63,7 @@ def union(parts: Sequence[Triangles]) -> Triangles:
 
 
 def centred(mesh: Triangles) -> Triangles:
-    """The mesh with its middle at the origin and its longest side 1. Raises InputError if it has no extent."""
+    """Mesh moved and scaled: middle at the origin, longest side 1. Raises InputError if it has no extent."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     longest = (high - low).max()
     if not 0 < longest < np.inf:
@@ -73,7 +73,7 @@ def centred(mesh: Triangles) -> Triangles:
 
 @dataclass(frozen=True)
 class MeshHits:
-    """First intersections of rays with a mesh, sorted by the ray's index; the mesh's own frame."""
+    """First intersections of rays with a mesh, sorted by the ray's index; coordinates in the mesh's frame."""
 
     index: NDArray[np.intp]  # (N,) of the ray
     position: Floats  # (N, 3)
@@ -125,7 +125,10 @@ class Tracer:
         return MeshHits(index, position, normal, face, weight)
 
     def facing(self, origin: Floats, direction: Floats) -> tuple[Floats, Floats]:
-        """Distances (M,) to the first hits of rays, infinite for none, and normals of the triangles facing the rays."""
+        """Distances (M,) to the first hits of rays, and normals of the triangles, turned to face the rays.
+
+        The distance is infinite without a hit.
+        """
         start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
         hit = self._scene.run(start, way, query="INTERSECT", output=True)
         struck = hit["primID"] >= 0
@@ -154,7 +157,10 @@ def tracer(file: str, radius: float) -> Tracer:
 
 
 def face_camera(normal: Floats, v: Floats) -> Floats:
-    """Flip normals of back faces; tilt normals that smoothing turned slightly away back towards the camera."""
+    """Normals flipped where they face away from the camera.
+
+    Normals that smoothing turned slightly away are tilted back.
+    """
     facing = np.sum(normal * v, axis=-1, keepdims=True)
     normal = np.where(facing < -0.3, -normal, normal)
     facing = np.where(facing < -0.3, -facing, facing)

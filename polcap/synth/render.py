@@ -86,7 +86,10 @@ def gbuffer(scene: Scene, view: View, height: int, width: int) -> ObjectBuffer:
 
 
 def guide(buffer: GBuffer) -> Floats:
-    """Distance (H, W) [m] up to which rays near each pixel meet nothing; infinite where they miss the object."""
+    """Distance (H, W) [m] at which tracing of rays near each pixel may start.
+
+    Nearer there is no surface; infinite where they miss the object.
+    """
     height, width = buffer.mask.shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
     distance = buffer.depth / frames.rays_at(buffer.view, x, y)[..., 2]
@@ -102,7 +105,7 @@ def white_level(scene: Scene) -> float:
 
 
 def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits, Floats]:
-    """Visible hits on the object, and S0 (P, 3) of chart and backdrop, which are matt and unpolarized."""
+    """Visible hits of rays on the object, and S0 (P, 3) of the matt, unpolarized chart and backdrop behind."""
     distance = scene.backdrop / v[:, 2]
     wall = scene.backdrop_albedo * _unshadowed_irradiance(scene, -v * distance[:, None], np.array([0.0, 0.0, 1.0]))
     out = np.repeat(wall[:, None], 3, axis=1)
@@ -115,7 +118,10 @@ def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits
 
 
 def _unshadowed_irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:
-    """Irradiance (N,) as of `_irradiance`; 0 in the object's cast shadow, if the scene has cast shadows."""
+    """Irradiance (N,) by the flash as of `_irradiance`.
+
+    0 in the object's cast shadow, if the scene has cast shadows.
+    """
     light = _irradiance(scene, point, normal)
     if scene.cast_shadows:
         light[trace.in_shadow(scene.shape, scene.position, scene.turn, point, scene.light)] = 0.0
@@ -123,7 +129,7 @@ def _unshadowed_irradiance(scene: Scene, point: Floats, normal: Floats) -> Float
 
 
 def _irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:
-    """Irradiance (N,) of points (N, 3) with `normal`: 1 facing the flash at the object's distance."""
+    """Irradiance (N,) by the flash at points (N, 3) with `normal`; 1 facing the flash at the object's distance."""
     to_light = np.array(scene.light) - point
     squared = np.einsum("ni,ni->n", to_light, to_light)
     reference = np.sum((np.array(scene.light) - np.array(scene.position)) ** 2)
@@ -160,7 +166,10 @@ def _shade(scene: Scene, ray: Floats, hits: Hits, flash_axis: float | None = Non
 
 
 def _normals(scene: Scene, hits: Hits) -> tuple[Floats, Floats]:
-    """Normals (N, 3) without relief in the object's frame, and with relief in the camera's frame, facing the lens."""
+    """Surface normals (N, 3) at hits.
+
+    Without relief in the object's frame, and with relief in the camera's frame, facing the lens.
+    """
     facing = scene.turn.inv().apply(hits.normal)
     bent = scene_materials.add_relief(scene.coat, hits.local, facing)
     if bent is facing:
@@ -170,7 +179,7 @@ def _normals(scene: Scene, hits: Hits) -> tuple[Floats, Floats]:
 
 @lru_cache(maxsize=2)
 def _bounced(scene: Scene) -> Floats:
-    """Bounced light (F, 3, 3) that the corners of each face receive from other parts of the mesh."""
+    """Interreflected light (F, 3, 3) at the three corners of each face of the scene's mesh."""
     if not isinstance(scene.shape, Model):
         raise SettingError("interreflection needs triangles; give the object as a mesh")
     tracer = mesh_tracer.tracer(scene.shape.file, scene.shape.radius)

@@ -46,7 +46,9 @@ class Coat(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def evaluate(coat: Coat, position: Floats, facing: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Diffuse albedo (..., 3), specular F0 (..., 3), roughness (...,) and index (...,) at positions (..., 3) [m].
+    """Material at positions (..., 3) [m].
+
+    Diffuse albedo (..., 3), specular F0 (..., 3), roughness (...,), index (...,).
 
     facing (..., 3): normals without relief, object's own frame.
     """
@@ -56,7 +58,7 @@ def evaluate(coat: Coat, position: Floats, facing: Floats) -> tuple[Floats, Floa
 
 
 def add_relief(coat: Coat, position: Floats, facing: Floats) -> Floats:
-    """Normals with the relief of the texture sets; without a texture set `facing` itself."""
+    """Normals tilted by the relief of the texture sets; without a texture set `facing` itself."""
     if all(material.texture is UNSET for material in coat.materials):
         return facing
     slope = _choose(coat, position, [_slope(material, position, facing) for material in coat.materials])
@@ -99,7 +101,7 @@ def _evaluate_one(material: Material, position: Floats, facing: Floats) -> tuple
 
 
 def _slope(material: Material, position: Floats, facing: Floats) -> Floats:
-    """Slope of a texture set's relief along the object's axes, (..., 3); 0 without a texture set."""
+    """Slope of a texture set's relief along the object's axes, (..., 3), at positions; 0 without a texture set."""
     out = np.zeros_like(facing)
     if material.texture is not UNSET:
         picture, axis, sign = _project(material, position, facing)
@@ -109,7 +111,10 @@ def _slope(material: Material, position: Floats, facing: Floats) -> Floats:
 
 
 def _project(material: Material, position: Floats, facing: Floats) -> tuple[Floats, Any, Floats]:
-    """Texture values (..., 6), axis of projection (..., 1), and signs of u and v, −1 where mirrored (..., 2)."""
+    """Look up a texture set at positions.
+
+    Values (..., 6), axis of projection (..., 1), and signs of u and v, −1 where mirrored (..., 2).
+    """
     texture = _texture(str(material.texture))
     axis = np.abs(facing).argmax(axis=-1)[..., None]
     across = np.concatenate([np.take_along_axis(position, (axis + k) % 3, axis=-1) for k in (1, 2)], axis=-1)

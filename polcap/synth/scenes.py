@@ -18,7 +18,7 @@ Kind = Literal["bumps", "clusters", "vase"]
 
 
 def random_scene(seed: int, kind: Kind) -> Scene:
-    """An object 0.1 to 0.17 m wide at 0.7 m, next to a chart, under a flash 4 to 7 cm above the lens.
+    """A random scene: object 0.1 to 0.17 m wide at 0.7 m, next to a chart, under a flash 4 to 7 cm above the lens.
 
     Its one or two materials are dielectrics of roughness 0.3–0.6 and refractive index 1.4–1.6.
 
@@ -45,7 +45,7 @@ def random_scene(seed: int, kind: Kind) -> Scene:
 
 
 def with_model(scene: Scene, file: Path, seed: int) -> Scene:
-    """The scene with a mesh as its object, in a random orientation, with cast shadows."""
+    """A copy of the scene with a mesh as its object, in a random orientation, with cast shadows."""
     turn = np.random.default_rng([seed, 0x3E54]).normal(size=4)
     vector = _vector(Rotation.from_quat(turn).as_rotvec(degrees=True))
     model = Model(str(file), radius=0.08)
@@ -53,7 +53,7 @@ def with_model(scene: Scene, file: Path, seed: int) -> Scene:
 
 
 def with_textures(scene: Scene, folder: Path) -> Scene:
-    """The scene with a texture set as the only material."""
+    """A copy of the scene with a texture set as its only material."""
     material = scene.coat.materials[0]
     laid = msgspec.structs.replace(
         material, first=(1.0, 1.0, 1.0), second=(1.0, 1.0, 1.0), size=0.1, roughness=(0.0, 1.0), texture=str(folder)

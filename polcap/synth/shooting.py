@@ -31,7 +31,7 @@ from polcap.synth.forward_camera import COLOR_MATRIX, SENSOR_WIDTH_MM, Bend, Sen
 from polcap.synth.render import Scene
 from polcap.synth.scenes import Kind, random_scene
 
-__all__ = ["MIDDLE_S", "Kind", "Scene", "Shoot", "Studio", "Take", "random_scene", "transform", "write"]
+__all__ = ["MIDDLE_S", "Dials", "Kind", "Scene", "Shoot", "Studio", "Take", "random_scene", "transform", "write"]
 
 Angle = Annotated[float, Meta(ge=0, le=360)]  # degrees, as in folder names
 MIDDLE_S = 0.02  # s, exposure time of the middle frame of a time bracket
@@ -117,17 +117,28 @@ def write(folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int
 
 @dataclass(frozen=True)
 class Take:
-    """One photograph of a capture; each has its own noise and time stamp."""
+    """One simulated photograph of a capture; each has its own noise and time stamp."""
 
     shot: int
     frame: int  # within the bracket
     stops: float  # exposure relative to the middle frame, as a factor
     again: int = 0  # number of earlier tries
     lit: bool = True  # False: the light is off
+    dials: "Dials | None" = None  # None: as the bracket of `Shoot`
+
+
+@dataclass(frozen=True)
+class Dials:
+    """Camera settings of one photograph, as EXIF states them."""
+
+    time_s: float
+    f_number: float
+    iso: float
+    flash: bool
 
 
 class Studio:
-    """A lit scene in front of a camera."""
+    """A lit scene in front of the simulated camera, ready to be photographed."""
 
     def __init__(self, scene: Scene, shoot: Shoot) -> None:
         self.scene, self.shoot = scene, shoot
@@ -137,11 +148,11 @@ class Studio:
         self.middle = _middle_exposure(scene, shoot, self.buffer, self.reference[0] @ self.to_camera.T)
 
     def through(self, angle_deg: float, crossed: bool = False) -> Floats:
-        """`radiance` behind the polarizer at this angle, for a camera that does not move."""
+        """Light through the polarizer at this angle, as of `radiance`, for a camera that does not move."""
         return self.radiance({"actual_deg": angle_deg, "rot_deg": 0.0, "transform": np.eye(3)}, crossed)
 
     def radiance(self, pose: dict[str, Any], crossed: bool = False) -> Floats:
-        """Light behind polarizer and lens in a `pose`, (H, W, 3) camera channels.
+        """Light after polarizer and lens, (H, W, 3) camera channels, for a camera movement and angle `pose`.
 
         A camera that rolls turns its polarizer too. `crossed`: the flash is polarized at right angles to the first
         angle; its polarizer takes half the light.
@@ -181,7 +192,7 @@ class Studio:
 
 
 def transform(shoot: Shoot, shift_px: tuple[float, float], rot_deg: float) -> Floats:
-    """Homography (3, 3) from reference RAW px to RAW px of a shot.
+    """Homography (3, 3) that a simulated camera movement causes, from reference RAW px to RAW px of a shot.
 
     The picture is rotated by `rot_deg` about the principal point, counter-clockwise as displayed, and shifted by
     `shift_px` (right, down).
@@ -208,7 +219,7 @@ def _pose(shoot: Shoot, shot: int) -> dict[str, Any]:
 
 
 def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats, flash_axis: float | None = None) -> Floats:
-    """Stokes parameters (3, H, W, 3) of a shot, averaged over each pixel's area.
+    """Stokes parameters (3, H, W, 3) of the scene as a shot sees it, averaged over each pixel's area.
 
     `back` (3, 3) maps the shot's pixels to those of the reference shot.
     """
@@ -228,7 +239,7 @@ def _reference_px(shoot: Shoot, back: Floats, x: Floats, y: Floats) -> tuple[Flo
 
 
 def _blur(shoot: Shoot, image: Floats) -> Floats:
-    """Blur of the lens on (..., H, W, C)."""
+    """Apply the blur of the simulated lens to an image (..., H, W, C)."""
     return np.asarray(gaussian_filter(image, shoot.blur_px, axes=(-3, -2))) if shoot.blur_px else image
 
 
@@ -250,7 +261,7 @@ def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) ->
 
 
 def _exposure(shoot: Shoot, take: Take, middle: float) -> tuple[Exif, float, float]:
-    """EXIF data, light and amplification of a photograph."""
+    """EXIF data of a simulated photograph, the light it receives, and its amplification."""
     stops, number = take.stops, take.shot * shoot.exposures + take.frame
     taken = datetime(2026, 3, 14, 12) + timedelta(seconds=4.25 * number + 20 * (number // shoot.exposures))
     exif = Exif(
@@ -259,6 +270,11 @@ def _exposure(shoot: Shoot, take: Take, middle: float) -> tuple[Exif, float, flo
         pixel_pitch_um=1000 * SENSOR_WIDTH_MM / shoot.width, taken=taken.isoformat(timespec="milliseconds"),
         flash_fired=shoot.bracket != "time" and take.lit,
     )  # fmt: skip
+    if take.dials is not None:
+        dials, amplification = take.dials, take.dials.iso / 100.0
+        exif = replace(exif, exposure_time=dials.time_s, f_number=dials.f_number, iso=dials.iso)
+        exif = replace(exif, flash_fired=dials.flash and take.lit)
+        return exif, middle * stops / amplification, amplification
     if shoot.bracket == "iso":
         amplification = shoot.step**take.frame
         light = middle / shoot.step ** (shoot.exposures // 2)

@@ -79,7 +79,7 @@ def in_shadow(shape: Shape | Model, position: Vector, turn: Rotation, point: Flo
 
 
 def _march(shape: Shape, origin: Floats, direction: Floats, start: Floats | float) -> tuple[Indices, Floats]:
-    """Sphere tracing: indices of the rays (P, 3) that meet the shape, and their lengths [m]."""
+    """Sphere tracing: indices of the rays (P, 3) that hit the shape, and their lengths [m]."""
     middle = -np.einsum("pi,pi->p", origin, direction)
     missed = np.einsum("pi,pi->p", origin, origin) - middle**2
     half = np.sqrt(np.maximum(shape.radius**2 - missed, 0.0))

@@ -1,4 +1,4 @@
-"""Patterns of backdrops in the mask's training: albedo of cloth, paper, wood, stone and prints."""
+"""Random patterns of backdrops for training the mask network: albedo of cloth, paper, wood, stone and prints."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from polcap.images import Floats
 
 
 def draw_pattern(position: Floats, rng: np.random.Generator) -> Floats:
-    """Albedo (M, 3) of a random pattern in two to six colors, at points (M, 3) in longest sides of the object."""
+    """Albedo (M, 3) of a random pattern in two to six colors at points (M, 3); unit: the object's longest side."""
     u, w = _plane_coordinates(position, rng)
     size = float(np.exp(rng.uniform(np.log(0.05), np.log(0.9))))
     if rng.random() < 0.4:  # uneven cloth
@@ -18,7 +18,10 @@ def draw_pattern(position: Floats, rng: np.random.Generator) -> Floats:
 
 
 def draw_print(position: Floats, rng: np.random.Generator) -> Floats:
-    """Albedo (M, 3) of checks, stripes, dots or markers in two colors, at points (M, 3) as in `draw_pattern`."""
+    """Albedo (M, 3) of a printed pattern in two colors (checks, stripes, dots, markers).
+
+    Points (M, 3) as in `draw_pattern`.
+    """
     u, w = _plane_coordinates(position, rng)
     size = float(np.exp(rng.uniform(np.log(0.04), np.log(0.5))))
     u, w = u / size, w / size
@@ -37,13 +40,13 @@ def draw_print(position: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _plane_coordinates(position: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Coordinates (M,), (M,) of points (M, 3) along two random perpendicular axes."""
+    """Project points (M, 3) onto two random perpendicular axes; returns two coordinates (M,)."""
     u, w = (position @ axis for axis in np.linalg.qr(rng.normal(size=(3, 3)))[0][:2])
     return u, w
 
 
 def _color(level: Floats, rng: np.random.Generator) -> Floats:
-    """Colors (M, 3) for levels (M,) 0…1: steps of a few colors, or a gradient between them."""
+    """Map pattern levels 0…1 (M,) to colors (M, 3): a few discrete colors, or a gradient between them."""
     count = int(rng.integers(2, 7))
     middle = np.exp(rng.uniform(np.log(0.015), np.log(0.9)))
     contrast, hue = rng.uniform(0.15, 1.3), rng.choice([0.05, 0.2, 0.5])
@@ -58,7 +61,7 @@ def _color(level: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _waves(u: Floats, w: Floats, rng: np.random.Generator, octaves: int = 3) -> Floats:
-    """Smooth noise (M,) of standard deviation about 1, at coordinates (M,), (M,) in periods."""
+    """Smooth random noise (M,) of standard deviation about 1, at plane coordinates u, w (M,) in periods."""
     out = np.zeros_like(u)
     for octave in range(octaves):
         for _ in range(5):

@@ -1,4 +1,4 @@
-"""One bounce of light between parts of the object, for training: traced once per view, computed at every step.
+"""Interreflection within an object, for training: rays are traced once per view, light is computed per step.
 
 The flash is next to the lens, so the camera sees the places that the flash lights: bounced light comes from pixels of
 the same picture. `trace_visibility` traces a few rays from every second pixel of every second row and stores the pixels
@@ -76,7 +76,10 @@ def trace_visibility(
 
 
 def _draw_directions(normal: Floats, rng: np.random.Generator) -> Floats:
-    """Random directions (M, RAYS, 3) about normals (M, 3), in the frames of view rays; `_density` is their density."""
+    """Random ray directions (M, RAYS, 3) about normals (M, 3), in ray frames.
+
+    `_density` is their probability density.
+    """
     turn, shift = rng.uniform(0, 1, (2, len(normal)))
     ways = []
     for number, alpha in ((_COSINE_RAYS, None), *_LOBES):
@@ -92,7 +95,7 @@ def _draw_directions(normal: Floats, rng: np.random.Generator) -> Floats:
 def _find_pixels(
     place: Floats, origin: Indices, buffer: GBuffer, pose: light_transport.Pose, size: float
 ) -> NDArray[np.uint16]:
-    """Flat index of the pixel in which the camera sees each place (N, 3).
+    """Flat index of the pixel in which the camera sees each place (N, 3) that a bounce ray hits.
 
     NOWHERE if the camera does not see the place, or sees it next to the pixel `origin` (N, 2) that the ray came from,
     because the grid is too coarse for the direction between neighbors.
@@ -108,7 +111,9 @@ def _find_pixels(
 
 
 def bounced_stokes(pixels: Any, normal: Tensor, surface: Surface, body: Tensor) -> Tensor:
-    """Stokes parameters (3, M, 3) of flash light that reaches each pixel by one bounce on the object, before smoothing.
+    """Stokes parameters (3, M, 3) of flash light that reaches each pixel by one bounce on the object.
+
+    Not yet smoothed.
 
     pixels: `simulator.ObjectPixels`; normal (M, 3) with bumps, in the frames of the rays; body (M, 3) diffuse S0 under
     the flash alone. All rays are used for diffuse and mirrored light, weighted by the balance heuristic.
@@ -131,7 +136,7 @@ def bounced_stokes(pixels: Any, normal: Tensor, surface: Surface, body: Tensor) 
 
 
 def mirrored_surroundings(pixels: Any, flash: Tensor, normal: Tensor, surface: Surface, strength: Tensor) -> Tensor:
-    """Stokes parameters (3, M, 3) of the mirror image of backdrop and ground in the surface.
+    """Stokes parameters (3, M, 3) of the specular reflection of backdrop and ground in the object's surface.
 
     Near the outline this is most of the light: reflectance tends to 1 there, and the mirrored ray points away from the
     camera. Each pixel has one ray, about its own normal, weighted by the share of the sharpest rays that leave the
@@ -180,7 +185,7 @@ def _density(normal: Tensor, way: Tensor) -> Tensor:
 
 
 def smooth(stokes: Tensor, mask: Tensor) -> Tensor:
-    """Stokes parameters (3, B, H, W, 3) averaged over 3 × 3 pixels of the object (B, H, W)."""
+    """Smooth bounced Stokes parameters (3, B, H, W, 3): mean over the object's pixels (B, H, W) among each 3 × 3."""
     count, height, width = mask.shape
     flat = stokes.permute(1, 0, 4, 2, 3).reshape(count, 9, height, width)
     inside = mask[:, None].to(stokes.dtype)

@@ -1,4 +1,4 @@
-"""Camera noise and errors in training: Stokes parameters -> measurements by three imperfect photographs.
+"""Camera noise and errors in training: true Stokes parameters -> those of three imperfect photographs.
 
 Drawn per object: shot and read noise of a merged bracket, residual errors of flash energy and polarizer angle,
 misregistration, blur, stray light, depolarization, saturation.
@@ -59,7 +59,7 @@ class CameraErrors:
 
     @staticmethod
     def none(count: int, device: torch.device) -> "CameraErrors":
-        """Camera without errors, except for a trace of shot noise."""
+        """Parameters of a camera without errors, except for a trace of shot noise."""
         one, zero = torch.ones(count, device=device), torch.zeros(count, device=device)
         three = torch.zeros(3, count, device=device)
         return CameraErrors(
@@ -69,7 +69,7 @@ class CameraErrors:
 
     @staticmethod
     def stated(count: int, device: torch.device) -> "CameraErrors":
-        """Errors of the evaluation: 20 ke⁻, 5 e⁻, three exposures at ratios of 4, gain 0.3 %, angle 0.5°."""
+        """The camera errors of the evaluation: 20 ke⁻, 5 e⁻, three exposures at ratios of 4, gain 0.3 %, angle 0.5°."""
         return replace(
             CameraErrors.none(count, device),
             full_well=2e4 * torch.ones(count, device=device),
@@ -83,7 +83,9 @@ class CameraErrors:
 def photograph(
     stokes: Tensor, diffuse: Tensor, mask: Tensor, rays: Tensor, at: Tensor, errors: CameraErrors
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Measured Stokes parameters (3, M, 3), their covariance (6, M, 3) and clipped pixels (M,) at pixels `at`.
+    """Simulate photographs of true Stokes parameters, and measure the Stokes parameters from them.
+
+    Returns measured Stokes parameters (3, M, 3), their covariance (6, M, 3) and clipped pixels (M,) at pixels `at`.
 
     stokes (3, B, H, W, 3) in the frame of each ray; diffuse (B, H, W, 3); mask (B, H, W); rays (B, H, W, 3); at (M,)
     indices into B·H·W. The solution uses nominal angles in the image, as `stages/stokes` does.
@@ -116,7 +118,7 @@ def photograph(
 
 
 def _double_axis(angle: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """cos and sin of twice `frames.axis_on_ray`, without trigonometric functions."""
+    """cos 2ψ and sin 2ψ of a polarizer's axis ψ on each ray (`frames.axis_on_ray`), without trigonometric functions."""
     x, y = frames.axis_across(angle, rays)
     length = x * x + y * y
     return (x * x - y * y) / length, 2 * x * y / length

@@ -113,12 +113,12 @@ def _write_sample(
 
 
 def encode(radiance: Floats) -> Floats:
-    """Linear radiance → 0…1: ln(1 + x/k)/ln(1 + m/k), m = 16, k = 0.01; clipped."""
+    """Encode linear radiance for a picture file as 0…1: ln(1 + x/k)/ln(1 + m/k), m = 16, k = 0.01; clipped."""
     return np.asarray(np.log1p(np.clip(radiance, 0, _LARGEST) / _KNEE) / log1p(_LARGEST / _KNEE))
 
 
 def decode(code: Floats) -> Floats:
-    """Linear radiance of a code 0…1, the inverse of `encode`; code = value / 65535."""
+    """Decode a picture file's value 0…1 (integer / 65535) to linear radiance: the inverse of `encode`."""
     return np.asarray(_KNEE * np.expm1(code * log1p(_LARGEST / _KNEE)))
 
 
@@ -130,7 +130,7 @@ def _open_library(material: str) -> materials.MaterialLibrary:
 
 
 def _list_meshes(mesh: str) -> list[Path]:
-    """Mesh files that the setting `mesh` names; none means random shapes."""
+    """Mesh files that the setting `mesh` names; an empty list means random shapes."""
     if not mesh:
         return []
     place = Path(mesh)
@@ -141,7 +141,7 @@ def _list_meshes(mesh: str) -> list[Path]:
 
 
 def _photograph(light: Floats, rays: Floats, noise: float, rng: np.random.Generator) -> Floats:
-    """Light behind the polarizer at each angle, (4, M, 3), with noise."""
+    """Simulate photographs (4, M, 3) of Stokes parameters through a polarizer at 0, 45, 90 and 135°, with noise."""
     passed = []
     for angle in np.radians(ANGLES_DEG):
         weights = mueller.analyzer(frames.axis_on_ray(np.asarray(angle), rays), np.inf)
@@ -151,7 +151,7 @@ def _photograph(light: Floats, rays: Floats, noise: float, rng: np.random.Genera
 
 
 def _describe(out: Path, recipe: DatasetRecipe) -> None:
-    """Write dataset.json. Raises InputError if the folder has samples of other settings, or other files."""
+    """Write dataset.json. Raises InputError if the folder already holds samples of other settings, or other files."""
     asked, file = msgspec.to_builtins(recipe), out / "dataset.json"
     if file.exists():
         there = json.loads(file.read_text(encoding="utf-8"))["recipe"]

@@ -54,7 +54,10 @@ class EvaluationOptions:
 
 
 def main(options: EvaluationOptions) -> dict[str, Score]:
-    """Evaluate the model and all baselines; writes evaluation.json, evaluation.md and panel.png to `out`."""
+    """Evaluate the model and all baselines on the evaluation pictures.
+
+    Writes evaluation.json, evaluation.md and panel.png to `out`.
+    """
     torch.set_num_threads(1)
     network = models.open_network(options.model)
     made = Protocol(options.data, options.size, options.protocol)
@@ -72,7 +75,7 @@ def main(options: EvaluationOptions) -> dict[str, Score]:
 
 
 def _head(options: EvaluationOptions, network: Network) -> dict[str, Any]:
-    """Inputs of an evaluation: if one changes, earlier results cannot be used again."""
+    """The settings and digests that identify an evaluation: if one changes, earlier results are not used again."""
     digest = hashlib.sha256()
     tests = [(options.data / "meshes" / "test").glob("*.npz"), (options.data / "materials" / "test").glob("*/*")]
     for file in sorted(file for files in tests for file in files):
@@ -89,12 +92,12 @@ def _head(options: EvaluationOptions, network: Network) -> dict[str, Any]:
 
 
 def _estimate(seen: Cues, network: Network | None) -> SurfaceMaps:
-    """Maps by the inference stage; without a network by the analytic estimate alone."""
+    """Estimate the maps of one picture by the stage `infer`; without a network by the analytic estimator alone."""
     return infer.estimate(seen, network, onnx.run, infer.InferSettings())
 
 
 def _evaluate_pictures(options: EvaluationOptions, means: Means, head: dict[str, Any]) -> list[Row]:
-    """Results of all evaluation pictures; those of an earlier run with the same inputs are used again."""
+    """Results of all evaluation pictures; stored ones of an earlier run with the same inputs are used again."""
     path = options.out / "pictures.jsonl"
     rows = _read_results(path, head)
     with atomic.path(path) as temporary:
@@ -117,7 +120,7 @@ def _evaluate_pictures(options: EvaluationOptions, means: Means, head: dict[str,
 
 
 def _read_results(path: Path, head: dict[str, Any]) -> list[Row]:
-    """Results of pictures in pictures.jsonl of an earlier run with the same inputs, without an unfinished last line."""
+    """Read results from pictures.jsonl of an earlier run with the same inputs; an unfinished last line is dropped."""
     lines = path.read_text().splitlines(keepends=True) if path.exists() else []
     if not lines or lines[0] != json.dumps(head) + "\n":
         return []
@@ -125,7 +128,7 @@ def _read_results(path: Path, head: dict[str, Any]) -> list[Row]:
 
 
 def _evaluate_range(options: EvaluationOptions, means: Means, numbers: range) -> Iterator[Row]:
-    """Results of the pictures `numbers` in order; one process per core if there are enough pictures."""
+    """Evaluate the pictures `numbers` in order, in one process per core if there are enough pictures."""
     workers = min(os.cpu_count() or 1, len(numbers) // _MIN_SHARE)
     row = partial(evaluate_picture, options, means)
     if workers < 2:
@@ -194,6 +197,6 @@ def _summary(head: dict[str, Any], rows: list[Row]) -> dict[str, Any]:
 
 
 def _mean(rows: list[Score]) -> Score:
-    """Mean of each figure over the pictures that have it."""
+    """Mean of each error figure over the pictures that have it."""
     keys = dict.fromkeys(key for row in rows for key in row)
     return {key: float(np.mean([row[key] for row in rows if key in row])) for key in keys}

@@ -22,7 +22,7 @@ _MEAN_SIZE = 96  # px, of the pictures for the mean maps
 
 
 def frontal(seen: Cues) -> SurfaceMaps:
-    """All normals towards the camera, the radiance as albedo, the gloss of a common dielectric."""
+    """Baseline maps: all normals towards the camera, the radiance as albedo, the gloss of a common dielectric."""
     shape = seen.mask.shape
     return SurfaceMaps(
         normal=seen.rays, diffuse=np.clip(seen.radiance, 0, 1), specular=np.full((*shape, 3), 0.04, np.float32),
@@ -32,7 +32,10 @@ def frontal(seen: Cues) -> SurfaceMaps:
 
 
 def inflated(seen: Cues) -> SurfaceMaps:
-    """Normals of an inflated silhouette: zenith by the distance to the outline, azimuth towards the outline."""
+    """Baseline maps with the normals of an inflated silhouette.
+
+    Zenith by the distance to the outline, azimuth towards it.
+    """
     distance = cv2.distanceTransform(seen.mask.astype(np.uint8), cv2.DIST_L2, 5)
     reach = max(float(distance.max()), 1.0)
     height = np.sqrt(np.maximum(reach**2 - (reach - distance) ** 2, 0))
@@ -48,7 +51,7 @@ def inflated(seen: Cues) -> SurfaceMaps:
 
 
 def mean_maps(protocol: Protocol, count: int) -> Means:
-    """Mean of each map over all pictures of the evaluation, with equal weights: the best constants."""
+    """Mean value of each true map over all evaluation pictures, with equal weights: the best constant estimate."""
     rows = []
     for number in range(count):
         truth = protocol.truth(number, min(_MEAN_SIZE, protocol.size))
@@ -60,7 +63,7 @@ def mean_maps(protocol: Protocol, count: int) -> Means:
 
 
 def constant(seen: Cues, values: Means) -> SurfaceMaps:
-    """Baseline maps with the same values at all pixels."""
+    """Baseline maps with the same values (from `mean_maps`) at all pixels."""
     normal, diffuse, specular, roughness = (np.broadcast_to(v, (*seen.mask.shape, len(v))) for v in values)
     return replace(
         frontal(seen), normal=np.asarray(frames.from_ray_frame(normal, seen.rays)), diffuse=diffuse, specular=specular,
@@ -69,7 +72,7 @@ def constant(seen: Cues, values: Means) -> SurfaceMaps:
 
 
 def find_checkpoints(folder: Path | None) -> dict[str, Path]:
-    """Checkpoints folder/NAME/last.pt by name. Raises InputError if the folder has none."""
+    """Checkpoints folder/NAME/last.pt of ablations, by name. Raises InputError if the folder has none."""
     found = {path.parent.name: path for path in sorted(folder.glob("*/last.pt"))} if folder else {}
     if folder and not found:
         raise InputError(f"{folder} holds no NAME/last.pt; first train with `polcap train DATA --out {folder}/NAME`")
@@ -77,7 +80,10 @@ def find_checkpoints(folder: Path | None) -> dict[str, Path]:
 
 
 def network_alone(checkpoint: Path) -> Estimator:
-    """Estimates by the averaged weights of a checkpoint alone, on the picture binned to about the size of training."""
+    """Estimator that runs only the network of a checkpoint, with averaged weights.
+
+    The picture is reduced to about the size of training.
+    """
     network, _ = train.load_average(checkpoint)
 
     def estimate(case: Case) -> SurfaceMaps:

@@ -69,7 +69,7 @@ def test_materials(folder: Path, *, everyday: bool = False) -> list[TestMaterial
 
 
 def _levels(number: int, everyday: bool) -> tuple[np.random.Generator, float, float]:
-    """Random generator, refractive index and mean F0 of a material."""
+    """Random generator, refractive index and mean F0 of the test material with this number."""
     rng = np.random.default_rng([_SEED, number])
     ior = 1.4 + 0.2 * ((7 * number) % 30) / 29
     if everyday:
@@ -113,7 +113,7 @@ def _textured(folder: Path, number: int, everyday: bool) -> TestMaterial:
 
 
 def _sampled(image: Floats, u: Floats, v: Floats) -> Floats:
-    """Image (H, W, 6) at coordinates u, v (M,), bilinear, (M, 6)."""
+    """Sample an image (H, W, 6) bilinearly at coordinates u, v (M,); returns (M, 6)."""
     side = 2**14  # remap is limited to pictures under 2^15 px a side
     wide = (len(u) // side + 1) * side
     x, y = (np.pad(a, (0, wide - len(u))).astype(np.float32).reshape(-1, side) for a in (u, v))
@@ -172,7 +172,7 @@ def _color(rng: np.random.Generator) -> Floats:
 
 
 def _waves(rng: np.random.Generator, low: float, high: float, count: int = 10) -> Callable[[Floats], Floats]:
-    """Smooth random field with a standard deviation of about 1: sines of `low` to `high` cycles over the object."""
+    """A smooth random field of standard deviation about 1. A sum of sines of `low` to `high` cycles over the object."""
     cycles = np.exp(np.linspace(np.log(low), np.log(high), count))
     way = rng.normal(size=(3, count))
     way *= 2 * np.pi * cycles / np.linalg.norm(way, axis=0)
@@ -212,7 +212,7 @@ def _marble(rng: np.random.Generator) -> Field:
 
 
 def _scattered(rng: np.random.Generator, side: int) -> Floats:
-    """side³ points over the object and around it, one in each cell of a grid."""
+    """Random points, side³ of them, over the object and around it: one in each cell of a grid."""
     cells = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     return (cells + rng.uniform(0.05, 0.95, cells.shape)) / side * 2 - 1
 

@@ -1,4 +1,4 @@
-"""Page of the evaluation's figures, with the published ones, evaluation.md; picture of its first cases, panel.png."""
+"""Writes the evaluation's result as a page (evaluation.md, with published figures) and a picture (panel.png)."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -28,7 +28,7 @@ PUBLISHED_ABLATIONS = _PAPER | {
 
 
 def _row_names() -> dict[str, str]:
-    """Names of the table's rows by the name of their figure."""
+    """Names of the result table's rows, by the key of their figure."""
     names: dict[str, str] = {}
     for end, core in (("", ""), ("_core", ", eroded mask")):
         names |= {f"normal_{kind}{end}": f"normal, {kind}{core} [°]" for kind in ("mean", "median")}
@@ -68,7 +68,7 @@ _LIGHT = np.array([-0.6, 0.5, 0.62])
 
 
 def make_page(result: Mapping[str, Any]) -> str:
-    """Markdown of evaluation.json's content."""
+    """Markdown page with the figures of evaluation.json."""
     conditions = result["conditions"]
     ratios = [f"{name} {value:.2f}" for name, value in result["of_mean_maps"].items()]
     parts = [
@@ -115,12 +115,15 @@ def _cell(key: str, value: float | None) -> str:
 
 
 def grid(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """Markdown table."""
+    """Markdown table from a header row and body rows."""
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body))
 
 
 def make_row(case: Case, maps: SurfaceMaps) -> Picture:
-    """Picture of one case: truth above, estimate below; in the last column the error above the predicted error."""
+    """Picture of one evaluation case: true maps above, estimated maps below.
+
+    In the last column, the normal error above the predicted error.
+    """
     seen, mask, both = case.cues, case.truth.mask, (case.truth, maps)
     s1, s2 = seen.ratio
     depth = [case.depth, case.depth * 0 if maps.depth_prior is None else maps.depth_prior]
@@ -147,7 +150,7 @@ def make_row(case: Case, maps: SurfaceMaps) -> Picture:
 
 
 def make_sheet(rows: list[Picture]) -> Picture:
-    """Picture of all cases, below the names of the columns."""
+    """Picture of all evaluation cases in rows, below the names of the map columns."""
     head = np.zeros((_HEAD, rows[0].shape[1], 3), np.uint8)
     for k, name in enumerate(COLUMNS):
         _write(head, name, k * _TILE + 4)
@@ -159,7 +162,7 @@ def _render(case: Case, maps: SurfaceMaps, light: Floats) -> Floats:
 
 
 def _box(mask: Bools) -> tuple[slice, ...]:
-    """Square crop around the object, as slices of rows and columns."""
+    """Square crop around the object's mask, as slices of rows and columns."""
     y, x = np.nonzero(mask)
     side = int(min(max(np.ptp(x), np.ptp(y)) + 5, min(mask.shape)))
     starts = (int(np.clip((a.min() + a.max() - side) // 2, 0, n - side)) for a, n in zip((y, x), mask.shape))

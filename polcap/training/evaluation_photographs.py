@@ -34,7 +34,7 @@ _MIN_DOLP, _MIN_TILT = 0.03, 0.3  # for the comparison of AoLP and azimuth; tilt
 
 
 def main(folder: Path, model: Path, out: Path) -> dict[str, Score]:
-    """Evaluate every picture with and without the network; writes real.json and real.md to `out`.
+    """Evaluate every photograph set with and without the network; writes real.json and real.md to `out`.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def _list_pictures(folder: Path) -> tuple[list[str], list[str]]:
 
 
 def score(folder: Path, angles: list[str], name: str, network: Network | None) -> Score:
-    """Run the path on one picture; returns the angles between estimated and measured normals [°], and shares 0…1."""
+    """Process one object's photographs; returns normal errors against the measured normals [°], and shares 0…1."""
     picture, vector = png.read(folder / "mask" / name), png.read(folder / "normal" / name)
     mask = np.asarray(picture > 0 if picture.ndim == 2 else (picture[..., :3] > 0).any(axis=-1))
     truth = vector[..., :3].astype(np.float64) / np.iinfo(vector.dtype).max * 2 - 1
@@ -100,7 +100,7 @@ def score(folder: Path, angles: list[str], name: str, network: Network | None) -
 
 
 def as_a_body(cues: Cues, normal: Floats) -> float:
-    """Mean cos 2(AoLP − azimuth) where DoLP and tilt are large enough: 1 for diffuse, −1 for mirrored light."""
+    """Mean cos 2(AoLP − azimuth) over pixels with enough DoLP and tilt: 1 for diffuse, −1 for specular reflection."""
     use = cues.mask & (cues.dolp > _MIN_DOLP) & (np.hypot(normal[..., 0], normal[..., 1]) > _MIN_TILT)
     turned = 2 * np.arctan2(normal[..., 1], normal[..., 0])[use]
     cos, sin = cues.normalized_stokes[:, use]

@@ -55,7 +55,7 @@ class Case:
 
 @dataclass(frozen=True)
 class _Subject:
-    """Geometry and material of an evaluation picture, before light is simulated."""
+    """Geometry and material of one evaluation picture, before light is simulated."""
 
     pose: light_transport.Pose
     places: light_transport.SurfacePoints
@@ -79,7 +79,7 @@ class Protocol:
         self.materials = evaluation_materials.test_materials(data / "materials" / "test", everyday=protocol == 2)
 
     def case(self, number: int) -> Case:
-        """Simulate picture `number`."""
+        """Simulate the evaluation picture with this number."""
         subject, (mesh, material) = self._subject(number, self.size), combination(number)
         rng = np.random.default_rng([_SEED, number, 1])
         light = light_transport.stokes(self.tracers[mesh], subject.places, subject.pose, subject.albedo, rng)
@@ -99,7 +99,7 @@ class Protocol:
         )
 
     def truth(self, number: int, size: int) -> SurfaceMaps:
-        """True maps of a picture, without simulating light."""
+        """True maps of an evaluation picture, without simulating light."""
         return self._subject(number, size).truth
 
     def _subject(self, number: int, size: int) -> _Subject:
@@ -145,14 +145,17 @@ class Protocol:
 
 
 def combination(number: int) -> tuple[int, int]:
-    """Mesh and material of a picture. 30 pictures show each material once and each mesh 5 times; 180 show all pairs."""
+    """Indices of mesh and material of an evaluation picture.
+
+    30 pictures show each material once and each mesh 5 times; 180 show all pairs.
+    """
     order = np.random.default_rng(_SEED).permutation(evaluation_materials.TEXTURES + evaluation_materials.PATTERNS)
     mesh = number % MESHES
     return mesh, int(order[(number // MESHES + 5 * mesh) % len(order)])
 
 
 def body_law(number: int) -> Law:
-    """Polarization of diffuse light in a picture of protocol 2.
+    """Parameters of diffuse polarization in a picture of protocol 2.
 
     Facets have equal weights in even pictures, and are weighted by the flash's light in odd ones. The factor on the
     polarization is 0.8–1, in every tenth picture 0.4–0.8.
@@ -163,7 +166,7 @@ def body_law(number: int) -> Law:
 
 
 def render_lights() -> Floats:
-    """Directions to the 20 lights of the rendering error (20, 3): evenly over 60° about the direction to the camera."""
+    """Directions to the 20 lights of the re-rendering error (20, 3). Evenly within 60° of the camera."""
     k = np.arange(LIGHTS) + 0.5
     z, azimuth = 1 - k / LIGHTS * (1 - np.cos(np.radians(60))), np.pi * (3 - np.sqrt(5)) * k
     across = np.sqrt(1 - z**2)
@@ -173,7 +176,7 @@ def render_lights() -> Floats:
 def stokes_image(
     measured: tuple[Tensor, Tensor, Tensor], at: NDArray[np.integer[Any]], mask: NDArray[np.bool_], view: View
 ) -> StokesImage:
-    """Stokes parameters, covariance and clipped pixels of the pixels `at` as a `StokesImage`."""
+    """Build a `StokesImage` from Stokes parameters, covariance and clipped flags measured at the pixels `at`."""
 
     def image(flat: Tensor) -> Floats:
         out = np.zeros((flat.shape[0], mask.size, 3), dtype=np.float32)
@@ -207,7 +210,7 @@ def _photograph(light: Floats, places: light_transport.SurfacePoints, view: View
 
 
 def _bin(image: StokesImage, by: int) -> StokesImage:
-    """Picture with fewer pixels: means over by × by pixels. A new pixel is on the object if half of its pixels are."""
+    """Reduce a Stokes image: means over by × by pixels. A new pixel is on the object if half of its pixels are."""
     inside = image.mask.astype(np.float32)
     share = resize.block_means(inside, by)
     mask, least = share >= 0.5, np.maximum(share, 1 / by**2)[..., None]
@@ -226,5 +229,5 @@ def _bin(image: StokesImage, by: int) -> StokesImage:
 
 
 def white() -> ColorCalibration:
-    """Color calibration that changes nothing."""
+    """A color calibration that changes nothing (identity matrix)."""
     return ColorCalibration(np.eye(3, dtype=np.float32), "profile")

@@ -60,7 +60,10 @@ def main(data: Path, model: Path, out: Path, minutes: float) -> None:
 
 
 def make_picture(simulator: Simulator, network: Network, number: int) -> NDArray[np.float16]:
-    """Photograph a view with random relief; returns the layers of a picture file, cropped to the object."""
+    """Simulate a photograph of a traced view with random relief.
+
+    Returns the layers of a picture file, cropped to the object.
+    """
     rng = np.random.default_rng([_RECIPE.seed, number])
     view = number % len(simulator.camera)
     focal, x, y, middle = (float(value) for value in simulator.camera[view, :4])
@@ -89,7 +92,7 @@ def make_picture(simulator: Simulator, network: Network, number: int) -> NDArray
 
 
 class FineTraining(loop.PictureTraining):
-    """The refinement network in training."""
+    """Training of the refinement network: weights, optimizers and pictures."""
 
     hold, warm_up, averaging = 0.35, 30, 0.995
     held_out, per_step = 24, 4
@@ -103,7 +106,7 @@ class FineTraining(loop.PictureTraining):
         super().__init__(unet.fine_network(), rate, files)
 
     def advance(self, batch: list[Path], progress: float) -> dict[str, float]:
-        """Do one step on some tiles of each picture; returns the loss."""
+        """One training step on some tiles of each picture file of the batch; returns the loss."""
         tiles = [cut_tile(load_example(file), self.random) for file in batch for _ in range(_TILES)]
         relief, target, known = _predict(self.network, np.stack(tiles))
         square = (relief - target).square().sum(dim=1, keepdim=True)
@@ -128,7 +131,10 @@ class FineTraining(loop.PictureTraining):
 
 @cache
 def load_example(file: Path) -> NDArray[np.float16]:
-    """Read a picture file: the network's input channels, the target relief (3), the mask of known relief (1)."""
+    """Read a training picture of the refinement network.
+
+    Input channels, target relief (3), mask of known relief (1).
+    """
     picture = np.load(file)
     channels = picture[:_COUNT].astype(np.float32)
     truth, known = picture[_COUNT : _COUNT + 3].astype(np.float32), picture[-1] > 0
@@ -138,7 +144,7 @@ def load_example(file: Path) -> NDArray[np.float16]:
 
 
 def cut_tile(picture: NDArray[np.float16], rng: np.random.Generator) -> Floats:
-    """Cut a training tile (C, 96, 96) about a random pixel of the object, rotated and mirrored at random."""
+    """Cut a training tile (C, 96, 96) about a random object pixel, rotated and mirrored at random."""
     inside = np.flatnonzero(picture[-1])
     y, x = divmod(int(inside[rng.integers(len(inside))]), picture.shape[2])
     half = _TILE // 2
@@ -150,7 +156,7 @@ def cut_tile(picture: NDArray[np.float16], rng: np.random.Generator) -> Floats:
 
 
 def rotate(picture: Floats, quarters: int, mirror: bool) -> Floats:
-    """Mirror a scene left to right, then turn it counter-clockwise by quarter turns.
+    """Mirror a training picture (C, H, W) left to right, then rotate it counter-clockwise by quarter turns.
 
     Pixels (C, H, W) move, and so do the vectors and doubled angles in the channels.
     """
@@ -167,7 +173,10 @@ def rotate(picture: Floats, quarters: int, mirror: bool) -> Floats:
 
 
 def _predict(network: nn.Module, pictures: Floats) -> tuple[Tensor, Tensor, Tensor]:
-    """Estimated relief, target relief and mask of known relief of pictures (B, N + 4, H, W)."""
+    """Run the refinement network on pictures (B, N + 4, H, W).
+
+    Returns estimated and target relief, and the mask of known relief.
+    """
     batch = torch.from_numpy(pictures.astype(np.float32))
     channels = batch[:, :_COUNT].contiguous(memory_format=torch.channels_last)
     return network(channels), batch[:, _COUNT : _COUNT + 3], batch[:, _COUNT + 3 :]

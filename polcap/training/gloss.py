@@ -67,7 +67,10 @@ def dark_albedo(shape: tuple[int, ...], device: torch.device) -> Tensor:
 
 
 def draw_gloss(all_dark: Tensor, shape: tuple[int, ...]) -> Gloss:
-    """Draw a family for each surface, and its gloss; `all_dark` (bool, broadcast to the shape) forces dark gloss."""
+    """Draw a random gloss family for each surface and values from it.
+
+    `all_dark` (bool, broadcast to the shape) forces dark gloss.
+    """
     device = all_dark.device
     share = torch.tensor([family.share for family in FAMILIES.values()], device=device)
     which = torch.multinomial(share, torch.Size(shape).numel(), replacement=True).reshape(shape)
@@ -93,7 +96,7 @@ def draw_gloss(all_dark: Tensor, shape: tuple[int, ...]) -> Gloss:
 
 
 def draw_laws(count: int, device: torch.device, smooth_share: float = SMOOTH_SHARE) -> Law:
-    """Draw the polarization of diffuse light for `count` objects, fields (B,): a smooth interface or rough facets.
+    """Draw the parameters of diffuse polarization for `count` objects, (B,): a smooth interface or rough facets.
 
     The path of light inside a body is not known. So rough interfaces have either weighting of facets or one between
     them, and a factor of 0.8–1 on the polarization, less for translucent ones.

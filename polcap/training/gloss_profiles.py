@@ -25,7 +25,7 @@ _BLOCK = 64  # divides the number of places of every picture: every second one, 
 
 @dataclass(frozen=True)
 class GlossEvidence:
-    """Inputs of the gloss estimate at each place, (B, ·, H, W)."""
+    """Inputs of the network's gloss estimate at each pixel, (B, ·, H, W)."""
 
     figures: Tensor  # 5 channels of `figures_of`
     cosine: Tensor  # of the zenith
@@ -45,7 +45,10 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
         nn.init.zeros_(self.part[-1].bias)
 
     def forward(self, coarse: Tensor, fine: Tensor, seen: GlossEvidence) -> Tensor:
-        """Features sort the places: coarse ones (B, ·, H/2, W/2) by region, fine ones (B, ·, H, W) within it."""
+        """Estimate gloss from features that group pixels.
+
+        Coarse features (B, ·, H/2, W/2) group by region, fine ones (B, ·, H, W) within it.
+        """
         color = torch.log(seen.diffuse + 0.02)
         weight = seen.usable + 1e-4
         deviation = color - (color * weight).sum(dim=(2, 3), keepdim=True) / weight.sum(dim=(2, 3), keepdim=True)
@@ -58,7 +61,7 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
 
 
 def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) -> Tensor:
-    """The five quantities (B, 5, H, W) that gloss profiles average.
+    """The five quantities (B, 5, H, W) that the gloss profiles average in bins of zenith angle.
 
     Log of light / shading; log of light / diffuse light; its square; its square as a factor; missing share of the DoLP
     of diffuse light.
@@ -77,7 +80,9 @@ def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) ->
 
 
 def profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
-    """Profiles (B, groups, bins · 6) of groups with weights (B, groups, N), of figures (B, 5, N) and cosines (B, 1, N).
+    """Average quantities in bins of zenith, per group of pixels: profiles (B, groups, bins · 6).
+
+    Inputs: weights (B, groups, N), figures (B, 5, N), cosines of zenith (B, 1, N).
 
     Each bin has the log share of its group, then the means of the figures; 0 where it is empty.
     """
@@ -97,7 +102,7 @@ def profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
 
 
 def summed(weight: Tensor, values: Tensor) -> Tensor:
-    """weight (B, G, N) @ values (B, N, K), in blocks of N that are added in a fixed order.
+    """Matrix product of weight (B, G, N) and values (B, N, K), in blocks of N that are added in a fixed order.
 
     onnxruntime 1.32 divides a long sum by its number of threads, so that the last bits of one product would depend on
     it.

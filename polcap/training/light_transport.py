@@ -59,7 +59,10 @@ class SurfacePoints:
 
 
 def flash_light(tracer: Tracer, place: Floats, flat: Floats, pose: Pose) -> tuple[Floats, Floats]:
-    """Unit vectors to the flash (M, 3), mesh frame, and S0 of a white plane that faces it (M,), 0 in shadow."""
+    """Direct flash light at points of a mesh: unit vectors to the flash (M, 3), and irradiance (M,), 0 in shadow.
+
+    Mesh frame; the irradiance is S0 of a white plane that faces the flash.
+    """
     flash = (pose.flash - pose.translation) @ pose.rotation
     far = np.linalg.norm(flash - place, axis=1)
     to_flash, lift = (flash - place) / far[:, None], LIFT * tracer.size
@@ -91,7 +94,10 @@ class IndirectLight:
         self.tracer, self.places, self.pose, self.albedo = tracer, places, pose, albedo
 
     def diffuse(self, rng: np.random.Generator) -> Floats:
-        """Bounced light that is reflected diffusely (3, M, 3), from rays over the hemisphere, cosine-distributed."""
+        """Diffuse reflection (3, M, 3) of one-bounce light at visible points.
+
+        Rays are cosine-distributed over the hemisphere.
+        """
         places, count = self.places, len(self.places.normal)
         turn = rng.uniform(0, 1, (count, 2))
         received: Floats = np.zeros((count, 3))
@@ -107,7 +113,9 @@ class IndirectLight:
         return _shade(places, places.diffuse * received, 0 * places.specular, places.ior, places.normal, one)
 
     def mirrored(self, rng: np.random.Generator) -> Floats:
-        """Bounced light that is mirrored (3, M, 3), by facets drawn from the GGX distribution.
+        """Specular reflection (3, M, 3) of one-bounce light at visible points.
+
+        Facets are drawn from the GGX distribution.
 
         Facets have an index of their own, `facet_ior`, for the F0 of the material. A scaled Fresnel curve of the body's
         index would reflect more than 100 % at grazing angles.
@@ -131,7 +139,10 @@ class IndirectLight:
         return np.stack([self.smooth(part) for part in total])
 
     def light(self, way: Floats, which: Indices) -> tuple[Indices, Floats]:
-        """Places among `which` that see the mesh along `way` (M, 3; rays' frames), and S0 (·, 3) of the seen point."""
+        """Trace rays from points `which` along `way` (M, 3.
+
+        Ray frames): the points whose ray hits the mesh, and S0 (·, 3) of the hit.
+        """
         tracer, places, pose = self.tracer, self.places, self.pose
         direction = frames.from_ray_frame(way[which], places.rays[which]) @ pose.rotation
         origin = (places.position + LIFT * tracer.size * places.flat)[which]
@@ -146,7 +157,7 @@ class IndirectLight:
         return which[met], self.albedo(there, flat) * (irradiance * cos_i * into * out)[:, None]
 
     def smooth(self, value: Floats) -> Floats:
-        """Values (M, C) averaged over nearby pixels of the object."""
+        """Smooth bounced light (M, C) by means over nearby pixels of the object."""
         mask = self.places.mask
         sigma = _SMOOTH * max(mask.shape)
         image = np.zeros((*mask.shape, value.shape[1]), np.float32)
@@ -156,7 +167,7 @@ class IndirectLight:
 
 
 def directions_about(normal: Floats, cosine: Floats, azimuth: Floats) -> Floats:
-    """Directions (M, 3) about normals (M, 3), by the cosine of the angle (M,) and the azimuth (M,)."""
+    """Unit directions (M, 3) about normals (M, 3), at angles with this cosine (M,) and azimuth (M,)."""
     e_x, e_y = frames.basis(normal)
     sine = np.sqrt(np.maximum(1 - cosine**2, 0))
     x, y = (a[:, None] for a in (sine * np.cos(azimuth), sine * np.sin(azimuth)))
@@ -164,7 +175,7 @@ def directions_about(normal: Floats, cosine: Floats, azimuth: Floats) -> Floats:
 
 
 def facet_ior(f0: Any, ior: Any) -> Any:
-    """Refractive index (M,) that gives F0 (M,), at least the body's `ior` (M,)."""
+    """Refractive index (M,) of specular facets that gives F0 (M,); at least the material's `ior` (M,)."""
     xp = array_namespace(f0)
     root = xp.sqrt(xp.maximum(f0, fresnel.normal_reflectance(ior)))
     return (1 + root) / (1 - root)

@@ -38,7 +38,7 @@ class Budget:
     samples: int | None = None
 
     def spent(self, samples: int, elapsed: float) -> float:
-        """Spent share of the budget after `samples` pictures and `elapsed` seconds."""
+        """Share 0…1 of the training budget spent after `samples` pictures and `elapsed` seconds."""
         return samples / self.samples if self.samples else elapsed / (60 * self.minutes)
 
 
@@ -58,14 +58,14 @@ class Trainee(ABC):
 
     @abstractmethod
     def advance(self, batch: Any, progress: float) -> dict[str, float]:
-        """Do one step and return its losses. `progress` is the spent share of the budget, 0…1."""
+        """One training step on a batch; returns its losses. `progress` is the spent share of the budget, 0…1."""
 
     @abstractmethod
     def validate(self, out: Path) -> dict[str, float]:
-        """Errors of the averaged weights on held-out pictures; may write example pictures to `out`."""
+        """Errors of the averaged weights on held-out pictures; may also write example pictures to `out`."""
 
     def facts(self) -> dict[str, Any]:
-        """Further entries of the checkpoint file."""
+        """Further entries that a subclass adds to the checkpoint file."""
         return {}
 
     def update(self, progress: float) -> float:
@@ -117,7 +117,7 @@ class PictureTraining(Trainee):
         self.random = np.random.default_rng([1, 0])
 
     def train(self, minutes: float, out: Path) -> None:
-        """Continue from out/last.pt if it exists, and train until `minutes` are spent, earlier parts included.
+        """Train until `minutes` are spent, earlier parts of a continued run included; continues from out/last.pt.
 
         Raises
         ------
@@ -143,7 +143,7 @@ class PictureTraining(Trainee):
 
 
 def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path) -> None:
-    """Train until the budget is spent. Writes last.pt, metrics.csv and watch.csv to `out`."""
+    """Train a network until the budget is spent. Writes last.pt, metrics.csv and watch.csv to `out`."""
     saved = validated = trainee.elapsed
     before, losses = time.monotonic(), []
     progress = budget.spent(trainee.samples, trainee.elapsed)
@@ -166,7 +166,10 @@ def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path) ->
 
 
 def make_optimizers(network: nn.Module, rate: float) -> list[torch.optim.Optimizer]:
-    """Muon for hidden layers; AdamW for layers next to the pixels, biases and the knots of curves."""
+    """The optimizers of a network: Muon for hidden layers.
+
+    AdamW for first and last layers, biases and knots of curves.
+    """
     hidden: list[Tensor] = []
     outer: list[Tensor] = []
     plain: list[Tensor] = []
@@ -186,7 +189,7 @@ def make_optimizers(network: nn.Module, rate: float) -> list[torch.optim.Optimiz
 
 
 def _append(path: Path, trainee: Trainee, figures: Mapping[str, float]) -> None:
-    """Append a row of figures to a CSV file."""
+    """Append training progress and figures as one row to a CSV file."""
     row = {"step": trainee.step, "samples": trainee.samples, "seconds": round(trainee.elapsed, 1), **figures}
     fresh = not path.exists()
     with path.open("a", newline="") as file:

@@ -25,7 +25,10 @@ _FLAT = 0.2  # mean tangential part of the normals below which a region has no c
 def total(
     maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None, *, polarized: bool = True
 ) -> tuple[Tensor, dict[str, float]]:
-    """Loss of estimated maps (B, ·, H, W), and its parts as numbers. `random` draws the lights of renderings."""
+    """Training loss of estimated maps (B, ·, H, W), and its parts as numbers.
+
+    `random` draws the lights of the re-rendering loss.
+    """
     mask = truth.mask
     inside = mask[:, None].float()
     area = inside.sum().clamp(min=1)
@@ -53,7 +56,7 @@ def total(
 
 
 def _region(estimate: Tensor, truth: Tensor, inside: Tensor) -> Tensor:
-    """Loss of regions with a common error of azimuth; a loss per pixel counts it like scattered errors.
+    """Loss of regions with a common azimuth error; a loss per pixel would not count it more than scattered errors.
 
     For blocks of 8, 16 and 32 px: 1 − cosine between the mean tangential parts of estimate and truth, times the length
     of the truth's. Parts shorter than `_FLAT` are not scaled to unit length, so that the estimate can turn through 0.
@@ -70,12 +73,15 @@ def _region(estimate: Tensor, truth: Tensor, inside: Tensor) -> Tensor:
 
 
 def centered(depth: Tensor, inside: Tensor) -> Tensor:
-    """Depth (B, 1, H, W) minus its mean over `inside` (B, 1, H, W; 0 or 1)."""
+    """Subtract from depth (B, 1, H, W) its mean over the pixels `inside` (B, 1, H, W; 0 or 1)."""
     return depth - (depth * inside).sum(dim=(2, 3), keepdim=True) / inside.sum(dim=(2, 3), keepdim=True).clamp(min=1)
 
 
 def _rendered(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None, polarized: bool) -> Tensor:
-    """Polarized rendering loss at every second pixel of every second row, with a light and a side for each pixel."""
+    """Loss of pictures rendered from the estimated maps, with polarization, under a random light and view per pixel.
+
+    Every second pixel of every second row is used.
+    """
     at = truth.mask[:, ::2, ::2].reshape(-1).nonzero()[:, 0]
 
     def flat(image: Tensor) -> Tensor:
@@ -102,7 +108,7 @@ def _rendered(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | N
 
 
 def _small_rotations(count: int, device: torch.device, random: torch.Generator | None) -> Tensor:
-    """Rotations (M, 3, 3) by up to 0.5 rad about random axes perpendicular to z."""
+    """Random rotations (M, 3, 3) of the view by up to 0.5 rad about axes perpendicular to z."""
     way = 2 * torch.pi * torch.rand(count, device=device, generator=random)
     c, s = torch.cos(way), torch.sin(way)
     tilt = 0.5 * torch.rand(count, device=device, generator=random)

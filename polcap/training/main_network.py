@@ -58,7 +58,7 @@ LARGE = NetworkShape(
 
 
 class MainNetwork(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Channels (B, 14, H, W) -> maps (B, ·, H, W) by name; H and W multiples of 32.
+    """Main network: cue channels (B, 14, H, W) -> maps (B, ·, H, W) by name; H and W are multiples of 32.
 
     normal: unit, in the frame of each pixel's ray. depth: growing away from the camera, mean about 0, in units of
     `traced_views.depth_unit`. diffuse, specular: ρ_d and F0, linear. roughness: perceptual. sigma: expected angle
@@ -121,7 +121,7 @@ class MainNetwork(nn.Module):  # type: ignore[misc]  # torch comes without types
 
 
 def run(network: nn.Module, channels: Tensor) -> dict[str, Tensor]:
-    """Run the main network on channels (B, N, H, W) in the machine's fastest number type."""
+    """Run the main network on channels (B, N, H, W) in the number type that is fastest on this machine."""
     kind = channels.device.type
     half = muon.compute_type(channels.device) == torch.bfloat16
     with torch.autocast(kind, torch.bfloat16, enabled=half, cache_enabled=False):  # threads would share the cache
@@ -134,7 +134,7 @@ def _residuals(width: int, count: int) -> nn.Sequential:
 
 
 class Context(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Attention of each cell of the coarsest level to all cells of the object, and their mean."""
+    """Network layer: attention of each cell of the coarsest level to all cells of the object, and their mean."""
 
     def __init__(self, width: int, heads: int = 4) -> None:
         super().__init__()
@@ -158,7 +158,9 @@ class Context(nn.Module):  # type: ignore[misc]  # torch comes without types her
 
 
 class LinearAttention(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Soft groups of places, each place receiving the means of its groups; the cost is linear in area.
+    """Network layer that groups pixels softly and returns each pixel the means of its groups.
+
+    The cost is linear in the number of pixels.
 
     References
     ----------

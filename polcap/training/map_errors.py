@@ -1,4 +1,4 @@
-"""Errors of the estimated maps of one picture, over the true mask."""
+"""Errors of the estimated maps of one evaluation picture, over the true mask."""
 
 from dataclasses import replace
 
@@ -33,7 +33,9 @@ class Judge:
         self.rendered = self._render(case.truth)
 
     def score(self, maps: SurfaceMaps) -> Score:
-        """Errors of all maps: RMSE unless the name differs; degrees; shares 0…1. `·_core`: mask eroded by 2 px.
+        """Errors of all maps of a picture: RMSE unless the name differs; degrees; shares 0…1.
+
+        `·_core`: mask eroded by 2 px.
 
         `·_picture`: over the whole square picture, with zero error outside the object. depth: both centred in the mask,
         in units of the truth's range; `depth_fitted`: after the best scale and shift. diffuse_clipped: where all
@@ -73,13 +75,16 @@ class Judge:
         return {"depth_integrated": _depth(depth / unit, self.case.depth[thin][mask])["depth"]}
 
     def _render(self, maps: SurfaceMaps) -> Floats:
-        """S0 (20, M, 3) under 20 lights, clipped to 0…1; 1: 99th percentile of the truth under the flash."""
+        """S0 (20, M, 3) rendered from maps under the 20 test lights, clipped to 0…1.
+
+        1 is the 99th percentile of the truth under the flash.
+        """
         images = [render_intensity(maps, self.case, self.rendered_mask, light) for light in render_lights()]
         return np.asarray(np.clip(np.stack(images) / self.white, 0, 1))
 
 
 def angle(maps: SurfaceMaps, case: Case) -> Floats:
-    """Degrees between estimated and true normal, (H, W)."""
+    """Angle [°] between estimated and true normal at each pixel, (H, W)."""
     half = np.linalg.norm(maps.normal.astype(np.float64) - case.truth.normal, axis=-1) / 2
     return np.asarray(np.degrees(2 * np.arcsin(np.clip(half, 0, 1))))
 
@@ -91,7 +96,7 @@ def deciles(predicted: Floats, actual: Floats) -> list[dict[str, float]]:
 
 
 def render_intensity(maps: SurfaceMaps, case: Case, mask: Bools, light: Floats) -> Floats:
-    """S0 (M, 3) of the masked pixels under a distant light (3,), camera frame, without shadows."""
+    """Render S0 (M, 3) of the masked pixels under a distant light (3,). Camera frame, no shadows."""
     rays = case.cues.rays[mask].astype(np.float32)
     normal = frames.to_ray_frame(maps.normal[mask], rays).astype(np.float32)
     toward = frames.to_ray_frame(np.broadcast_to(light.astype(np.float32), rays.shape), rays)

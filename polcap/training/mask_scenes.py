@@ -1,4 +1,4 @@
-"""Pictures for the mask's training: traced views with materials, light and a chart, measured with camera errors.
+"""Simulated pictures for training the mask network: traced views with materials, light, a chart and camera errors.
 
 Cases in which objects are hard to find are drawn often: black gloss on black cloth, white on white, an object in the
 backdrop's color, deep shadow, printed backdrops, a chart that touches the object. Backdrops polarize too: cloth and
@@ -33,7 +33,7 @@ _PITCH = 16  # px per patch in the picture of the chart
 
 @dataclass(frozen=True)
 class MaskScene:
-    """Light at the camera, before noise, and the truth."""
+    """Noise-free picture for training the mask network, with the true mask and the chart."""
 
     stokes: Floats  # (3, H, W, 3) S0, S1, S2 in linear Rec.709
     chart: Bools  # (H, W) the chart, where it is found
@@ -45,7 +45,7 @@ def make_scene(
     view: MaskView, library: materials.MaterialLibrary, mode: Mode, rng: np.random.Generator, charted: float = 0.75,
     touching: float = 0.4,
 ) -> MaskScene:  # fmt: skip
-    """Draw materials and light for a view, from `rng` and from torch's global random state.
+    """Draw materials and light for a traced view, from `rng` and from torch's global random state.
 
     charted, touching: probability of a chart, and that it is placed as near to the object as possible.
     """
@@ -82,7 +82,10 @@ def make_scene(
 
 
 def simulate_measurement(color: Floats, sums: Floats, chart: Bools, rng: np.random.Generator) -> ReducedPicture:
-    """Add noise and errors of gain and alignment to S0 (H, W, 3) and to the sums over colors (3, H, W)."""
+    """Add noise and errors of gain and alignment to a simulated picture.
+
+    It consists of S0 (H, W, 3) and the Stokes parameters summed over colors (3, H, W).
+    """
     bright = float(np.percentile(color.mean(-1), 98)) + 1e-9
     color, sums = color / bright, sums / bright
     noise = float(np.exp(rng.uniform(np.log(3e-4), np.log(6e-3))))
@@ -102,7 +105,7 @@ def simulate_measurement(color: Floats, sums: Floats, chart: Bools, rng: np.rand
 def _change_materials(
     surface: Surface, position: Floats, number: NDArray[np.intp], mode: Mode, rng: np.random.Generator
 ) -> tuple[Surface, Tensor]:
-    """Surface changed by `mode`, and a factor on the polarization of each pixel (M,).
+    """Materials changed to a difficult case `mode`, and a factor on each pixel's polarization (M,).
 
     number (M,): −1 for the object, 0 for the plane below or behind it, 1 for the wall behind that plane.
     """
@@ -149,7 +152,10 @@ def _log_uniform(low: float, high: float, rng: np.random.Generator) -> float:
 
 
 def _recolor(diffuse: Floats, where: Bools, level: float, contrast: float, rng: np.random.Generator) -> None:
-    """Set the mean albedo to `level`, nearly gray in half of the cases, and scale the pattern's contrast; in place."""
+    """Change the albedo of part of a picture, in place.
+
+    Mean `level`, nearly gray in half of the cases, and contrast of its pattern.
+    """
     pattern = diffuse[where] / max(diffuse[where].mean(), 1e-3)
     hue = np.exp(rng.normal(0, rng.choice([0.03, 0.3]), 3))
     diffuse[where] = np.clip(level * hue * (1 - contrast + contrast * pattern), 0.002, 0.95)
@@ -159,7 +165,7 @@ def _light(
     view: MaskView, surface: Surface, v: Floats, place: Floats, lit: Floats, polarizing: Tensor,
     rng: np.random.Generator,
 ) -> Floats:  # fmt: skip
-    """Stokes parameters (3, M, 3) under the flash and the weak light from the walls of the room."""
+    """Stokes parameters (3, M, 3) of a view under the flash and weak light from the walls of the room."""
     rays, to_flash = (torch.from_numpy(a).float() for a in (v, view.flash - place))
     normal, diffuse, specular = materials.reflect(surface, rays, to_flash, torch.from_numpy(lit) * view.distance**2)
     stokes = diffuse + specular
@@ -169,7 +175,9 @@ def _light(
 
 
 def _add_chart(image: Floats, mask: Bools, touching: float, rng: np.random.Generator) -> tuple[Bools, Floats | None]:
-    """Draw a ColorChecker next to or behind the object into S0; returns its found area (H, W) and corners (4, 2).
+    """Paint a ColorChecker next to or behind the object into S0.
+
+    Returns its detected area (H, W) and corners (4, 2); one in fourteen counts as not detected.
 
     One in fourteen is not found.
     """
@@ -198,7 +206,10 @@ def _add_chart(image: Floats, mask: Bools, touching: float, rng: np.random.Gener
 
 
 def _place_chart(mask: Bools, ratio: float, near: bool, rng: np.random.Generator) -> Floats | None:
-    """Corners (4, 2) of the best of 14 random places: `near` the object, else any; None if none is free."""
+    """Corners (4, 2) of a place for the chart, the best of 14 random ones (`near` the object, or anywhere).
+
+    None if none is free.
+    """
     size = np.array(mask.shape[::-1])
     found: list[tuple[float, Floats]] = []
     distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)
@@ -218,12 +229,12 @@ def _place_chart(mask: Bools, ratio: float, near: bool, rng: np.random.Generator
 
 
 def _fill(quad: Floats, shape: tuple[int, ...]) -> Bools:
-    """Pixels (H, W) inside a quadrangle (4, 2)."""
+    """Mask (H, W) of the pixels inside a quadrangle (4, 2)."""
     return np.asarray(cv2.fillConvexPoly(np.zeros(shape, np.uint8), np.round(quad).astype(np.int32), 1) > 0)
 
 
 def _chart_picture(frame: float) -> Floats:
-    """A chart seen from the front, (h, w, 3), with a black frame `frame` patches wide."""
+    """Picture (h, w, 3) of a ColorChecker seen from the front, with a black frame `frame` patches wide."""
     patch = np.pad(np.ones((_PITCH - 2, _PITCH - 2, 1), np.float32), ((1, 1), (1, 1), (0, 0)))
     colors = shipped_data.colorchecker().rec709.reshape(4, 6, 3)
     picture = np.maximum(np.kron(colors, patch), 0.03).astype(np.float32)

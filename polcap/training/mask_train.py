@@ -1,4 +1,4 @@
-"""Training of the mask's network: `python -m polcap.training.mask_train DATA OUT MINUTES`.
+"""Training of the mask network: `python -m polcap.training.mask_train DATA OUT MINUTES`.
 
 Pictures are made first; each follows from its number. Each step reads some with random light, noise and crop, and has
 two passes: over whole pictures at a reduced size, then over parts of them, with the first result as a hint. A stopped
@@ -37,7 +37,7 @@ _INSERTED = 0.12  # share of pictures into which the object of another one is in
 
 
 def main(data: Path, out: Path, minutes: float) -> None:
-    """Train the mask's network: make the missing pictures, train for `minutes`, export."""
+    """Train the mask network: make the missing pictures, train for `minutes`, export."""
     torch.set_num_threads(1)
     make_pictures(out / "pictures", data, _PICTURES)
     torch.manual_seed(1)
@@ -47,7 +47,7 @@ def main(data: Path, out: Path, minutes: float) -> None:
 
 
 def make_pictures(out: Path, data: Path, count: int) -> None:
-    """Make those of pictures 0…count − 1 that the folder lacks, from the training meshes and materials."""
+    """Make the training pictures 0…count − 1 that the folder lacks, from the training meshes and materials."""
     files = traced_views.training_meshes(data)
     library = materials.MaterialLibrary(data / "materials" / "train", torch.device("cpu"))
     each = _VIEWS * _SCENES
@@ -61,7 +61,7 @@ def make_pictures(out: Path, data: Path, count: int) -> None:
 
 
 def _make_group(files: list[Path], library: materials.MaterialLibrary, group: int) -> Iterator[Floats]:
-    """The pictures of one object, or of two or three side by side."""
+    """Simulated pictures of one object, or of two or three objects side by side."""
     rng = np.random.default_rng([5, group])
     torch.manual_seed(int(rng.integers(1 << 62)))
     if rng.random() < 0.75:
@@ -80,7 +80,7 @@ def _make_group(files: list[Path], library: materials.MaterialLibrary, group: in
 
 
 def _draw_mesh(files: list[Path], rng: np.random.Generator) -> Triangles:
-    """A scanned mesh, or a random shape, with branches or without."""
+    """A random mesh for a training picture: a scanned mesh, or a random shape with or without branches."""
     kind = rng.random()
     if kind < 0.4:
         return centred(traced_views.read_mesh(files[rng.integers(len(files))]))
@@ -88,7 +88,10 @@ def _draw_mesh(files: list[Path], rng: np.random.Generator) -> Triangles:
 
 
 def pack(picture: mask_scenes.MaskScene) -> Floats:
-    """Layers (H/2, W/2, 7) of a file: means of 2 × 2 pixels; radiance in units of its 95th percentile."""
+    """Layers (H/2, W/2, 7) of a training picture file.
+
+    Means of 2 × 2 pixels; radiance in units of its 95th percentile.
+    """
     stokes = picture.stokes / max(float(np.percentile(picture.stokes[0].mean(-1), 95)), 1e-9)
     sums = np.moveaxis(stokes[1:].sum(-1), 0, -1)
     whole = np.concatenate([stokes[0], sums, picture.mask[..., None], picture.chart[..., None]], axis=-1)
@@ -96,7 +99,9 @@ def pack(picture: mask_scenes.MaskScene) -> Floats:
 
 
 def load_varied(file: Path, rng: np.random.Generator, other: Path | None = None) -> tuple[ReducedPicture, Floats]:
-    """Read a picture with random light, crop, mirroring and noise; returns it and its truth (H, W).
+    """Read a training picture with random light, crop, mirroring and noise.
+
+    Returns the picture and its true mask (H, W).
 
     other: file of another picture; its object is inserted into this one.
     """
@@ -125,7 +130,10 @@ def load_varied(file: Path, rng: np.random.Generator, other: Path | None = None)
 
 
 def _crop(layers: Floats, rng: np.random.Generator) -> Floats:
-    """The picture (H, W, 7), or in half of the cases a part with enough of the object, enlarged to the same size."""
+    """Random crop of a picture (H, W, 7), in half of the cases.
+
+    The part has enough of the object and is enlarged to the same size.
+    """
     height, width = layers.shape[:2]
     for _ in range(4 if rng.random() < 0.5 else 0):
         share = rng.uniform(0.6, 0.95)
@@ -138,7 +146,7 @@ def _crop(layers: Floats, rng: np.random.Generator) -> Floats:
 
 
 class MaskTraining(loop.PictureTraining):
-    """The mask's network in training."""
+    """Training of the mask network: weights, optimizers and pictures."""
 
     hold, warm_up, averaging = 0.35, 50, 0.998
     held_out, per_step = 40, 8
@@ -152,7 +160,7 @@ class MaskTraining(loop.PictureTraining):
         super().__init__(unet.mask_network(), rate, files)
 
     def advance(self, batch: list[Path], progress: float) -> dict[str, float]:
-        """Do one training step; returns the losses of both passes."""
+        """One training step on picture files; returns the losses of both passes (whole picture, then parts)."""
         rng = self.random
         others = [batch[n - 1] if rng.random() < _INSERTED else None for n in range(len(batch))]
         examples = [load_varied(file, rng, other) for file, other in zip(batch, others)]
@@ -176,7 +184,10 @@ class MaskTraining(loop.PictureTraining):
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def validate(self, out: Path) -> dict[str, float]:
-        """IoU of both passes on held-out pictures; here the second pass sees the whole picture."""
+        """Intersection over union (IoU) of the masks of both passes on held-out pictures.
+
+        Here the second pass sees the whole picture.
+        """
         rows = []
         for number, file in enumerate(self.files[: self.held_out]):
             picture, truth = load_varied(file, np.random.default_rng(number))
@@ -190,7 +201,7 @@ class MaskTraining(loop.PictureTraining):
 
 
 def mask_loss(logits: Tensor, truth: Tensor) -> Tensor:
-    """Cross entropy plus 0.3 (1 − soft IoU), the mean of the pictures; truth (B, 1, H, W) 0…1.
+    """Loss of mask logits: cross entropy plus 0.3 (1 − soft IoU), mean over the pictures; truth (B, 1, H, W) 0…1.
 
     Cross entropy makes the probabilities honest.
     """
@@ -202,7 +213,7 @@ def mask_loss(logits: Tensor, truth: Tensor) -> Tensor:
 
 
 def _encode_reduced(picture: ReducedPicture, width: int) -> Floats:
-    """Channels (N, h, width) of the whole picture, reduced."""
+    """Input channels (N, h, width) of the mask network for the whole picture, reduced to `width`."""
     smaller = _map_layers(picture, lambda image: _reduce(image, width))
     return encode(smaller, brightness(smaller.color))
 
@@ -210,7 +221,9 @@ def _encode_reduced(picture: ReducedPicture, width: int) -> Floats:
 def _cut_part(
     picture: ReducedPicture, truth: Floats, chance: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Channels and truth of a rectangle near the outline; the hint is `chance` (h, w), the result of the first pass.
+    """Input channels and true mask of a rectangle near the outline.
+
+    The hint channel is `chance` (h, w), the result of the first pass.
 
     Four in ten are placed where the first pass is wrong.
     """
@@ -235,19 +248,19 @@ def _cut_part(
 
 
 def _map_layers(picture: ReducedPicture, change: Callable[[Floats], Floats]) -> ReducedPicture:
-    """The picture with `change` applied to each image."""
+    """A reduced picture with the function `change` applied to each of its images."""
     chart = change(picture.chart.astype(np.float32)) > 0.5
     stokes, place = (np.stack([change(layer) for layer in layers]) for layers in (picture.stokes, picture.place))
     return ReducedPicture(change(picture.color), stokes, chart, place)
 
 
 def _reduce(image: Floats, width: int) -> Floats:
-    """Area means of an image (H, W, ·) at `width` pixels across."""
+    """Reduce an image (H, W, ·) to `width` pixels across by area means."""
     return area_mean(np.asarray(image, np.float32), (round(image.shape[0] * width / image.shape[1]), width))
 
 
 def _stack_channels(channels: list[Floats]) -> Tensor:
-    """Batch of channels (N, H, W) of one size; the edge is repeated up to a size that the network takes."""
+    """Stack channels (N, H, W) into a batch; the edge is repeated up to a size that the network accepts."""
     more = [(0, -side % SIZE_MULTIPLE) for side in channels[0].shape[1:]]
     padded = np.pad(np.stack(channels), [(0, 0), (0, 0), *more], mode="edge")
     return torch.from_numpy(padded).contiguous(memory_format=torch.channels_last)

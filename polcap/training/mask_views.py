@@ -31,7 +31,7 @@ _FRAMINGS: dict[Framing, tuple[float, float, float, float]] = {
 
 @dataclass(frozen=True)
 class ViewKind:
-    """Composition of a view."""
+    """Composition of a traced view: framing, kind of backdrop, position of the flash."""
 
     framing: Framing
     backdrop: Backdrop
@@ -51,14 +51,14 @@ class MaskView:
 
 
 def draw_kind(rng: np.random.Generator) -> ViewKind:
-    """Draw a composition; difficult ones more often than in photographs."""
+    """Draw a random composition; difficult ones are more frequent than in photographs."""
     framing: Framing = rng.choice(list(_FRAMINGS), p=[kind[0] for kind in _FRAMINGS.values()])
     backdrop: Backdrop = rng.choice(["wall", "table", "cloth"], p=[0.4, 0.4, 0.2])
     return ViewKind(framing, backdrop, (0.2, 0.7) if rng.random() < 0.3 else (0.0, 0.15))
 
 
 def side_by_side(meshes: list[Triangles], rng: np.random.Generator) -> Triangles:
-    """Meshes of longest side 1 in one mesh, side by side with small gaps or overlaps."""
+    """Join meshes of longest side 1 into one mesh, side by side with small gaps or overlaps."""
     parts, edge = [], 0.0
     for mesh in meshes:
         turn = random_shapes.rotation(rng)
@@ -70,7 +70,7 @@ def side_by_side(meshes: list[Triangles], rng: np.random.Generator) -> Triangles
 
 
 def trace_view(tracer: Tracer, kind: ViewKind, size: tuple[int, int], rng: np.random.Generator) -> MaskView | None:
-    """Trace the object from a random side; None if it cannot be framed as asked."""
+    """Trace the object from a random side; None if it cannot be framed in this composition."""
     _, _, _, max_cover = _FRAMINGS[kind.framing]
     for _ in range(_TRIES):
         turn = random_shapes.rotation(rng)
@@ -98,7 +98,10 @@ def trace_view(tracer: Tracer, kind: ViewKind, size: tuple[int, int], rng: np.ra
 
 
 def meet_planes(planes: Floats, v: Floats) -> tuple[Floats, Floats, NDArray[np.intp]]:
-    """Distance (N,) along rays −v (N, 3) to the nearest plane, infinite for none; its normal (N, 3) and number (N,)."""
+    """Intersect rays −v (N, 3) with the backdrop's planes.
+
+    Distance (N,) to the nearest plane, infinite without one; its normal (N, 3) and number (N,).
+    """
     facing = v @ planes[:, :3].T  # (N, P)
     distance = np.where(facing > 1e-3, -planes[:, 3] / np.maximum(facing, 1e-3), np.inf)
     distance = np.where(distance > 0, distance, np.inf)
@@ -107,7 +110,7 @@ def meet_planes(planes: Floats, v: Floats) -> tuple[Floats, Floats, NDArray[np.i
 
 
 def _frame(turned: Floats, framing: Framing, size: tuple[int, int], rng: np.random.Generator) -> tuple[View, Floats]:
-    """View of a 35–100 mm lens on a 36 mm sensor, and position (3,) of the object's origin; vertices (V, 3) turned."""
+    """Camera view (35–100 mm lens, 36 mm sensor) and object position (3,) that frame rotated vertices (V, 3)."""
     side = np.array(size[::-1])  # width, height
     focal = side.max() * float(np.exp(rng.uniform(np.log(35), np.log(100)))) / 36
     low, high = turned.min(axis=0), turned.max(axis=0)
@@ -139,6 +142,6 @@ def _draw_planes(place: Floats, backdrop: Backdrop, rng: np.random.Generator) ->
 
 
 def _behind(place: Floats, normal: Floats, gap: float) -> Floats:
-    """Plane that the object touches, or at a distance `gap` behind it."""
+    """Plane with this normal behind the object's vertices: touching the object, or at a distance `gap`."""
     normal = normal / np.linalg.norm(normal)
     return np.array([*normal, (place @ normal).min() - gap])

@@ -66,7 +66,10 @@ class MaterialLibrary:
         self.noise = _noise_volume(seed).to(device)  # (1, 7, D, D, D)
 
     def sample_textures(self, which: Tensor, u: Tensor, v: Tensor) -> Tensor:
-        """(M, 6): albedo, roughness, slope along u and v; mirrored at integer u, v."""
+        """Sample texture sets at coordinates u, v, (M, 6): albedo, roughness, slope along u and v.
+
+        Mirrored at integer u, v.
+        """
         count = self.texture.shape[2]
         slot = which.float() * (2.0 / max(count - 1, 1)) - 1.0
         grid = torch.stack([_mirror(u), _mirror(v), slot], dim=-1)[None, None, None]
@@ -74,7 +77,10 @@ class MaterialLibrary:
         return sampled[0, :, 0, 0].T
 
     def sample_noise(self, position: Tensor) -> Tensor:
-        """(M, 7): four noises of standard deviation 1, then the gradient of the fourth."""
+        """Sample the noise volume at positions, (M, 7).
+
+        Four noises of standard deviation 1, then the gradient of the fourth.
+        """
         grid = _mirror(position)[None, None, None]
         return F.grid_sample(self.noise, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0, 0].T
 
@@ -131,7 +137,7 @@ def draw_surface(
 def _albedo(
     own: dict[str, Tensor], fine: Tensor, printed: Tensor, picture: Tensor, lightness: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Pattern (M,) 0…1 that mixes two surfaces, and diffuse albedo (M, 3).
+    """Pattern (M,) 0…1 that mixes two surfaces, and diffuse albedo (M, 3), of a drawn material.
 
     The pattern is that of the relief, or a print, or the lightness of the texture.
     """
@@ -147,7 +153,7 @@ def _albedo(
 def _reflection(
     own: dict[str, Tensor], fine: Tensor, picture: Tensor, pattern: Tensor, diffuse: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Roughness (M,) and F0 (M, 3): levels of the material that follow its pattern, lightness and speckles."""
+    """Roughness (M,) and F0 (M, 3) of a drawn material: its levels, varied with pattern, lightness and speckles."""
     lightness = diffuse.mean(dim=1) ** 0.45
     deviation = (lightness - own["mid"]) * own["follow"] + 0.5 * own["speckle"] * fine[:, 1]
     from_texture = picture[:, 3] * own["rough_gain"] + own["rough_shift"]
@@ -159,7 +165,7 @@ def _reflection(
 
 
 def _draw_levels(library: MaterialLibrary, count: int, device: torch.device) -> dict[str, Tensor]:
-    """Levels of each material slot, (B, 3, ·)."""
+    """Draw the parameters of each material of each object, by name, (B, 3, ·)."""
     shape = (count, _MATERIALS)
 
     def u(low: float, high: float) -> Tensor:
@@ -208,7 +214,7 @@ def _draw_levels(library: MaterialLibrary, count: int, device: torch.device) -> 
 
 
 def _colors(shape: tuple[int, int], device: torch.device) -> Tensor:
-    """Reflectances (B, 3, 3), gray to saturated, dark to light.
+    """Draw random reflectances (B, 3, 3), gray to saturated, dark to light.
 
     Every second one is mixed as on a display, so that vivid colors have one dark channel, as in paints and plastics.
     """
@@ -222,7 +228,7 @@ def _colors(shape: tuple[int, int], device: torch.device) -> Tensor:
 
 
 def _noise_volume(seed: int) -> Tensor:
-    """Four multi-octave noises and the gradient of the last, (1, 7, D, D, D)."""
+    """Volume (1, 7, D, D, D) of four multi-octave noises and the gradient of the last."""
     generator = torch.Generator().manual_seed(seed)
     volume = torch.zeros(1, 4, _SIDE, _SIDE, _SIDE)
     for cells, weight in ((4, 1.0), (8, 0.55), (16, 0.3), (24, 0.15)):
@@ -235,7 +241,7 @@ def _noise_volume(seed: int) -> Tensor:
 
 
 def _mirror(x: Tensor) -> Tensor:
-    """Fold numbers into −1…1, mirrored at odd integers."""
+    """Fold texture coordinates into −1…1, mirrored at odd integers."""
     return (torch.remainder(x + 1, 4) - 2).abs() - 1
 
 

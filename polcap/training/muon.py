@@ -27,7 +27,7 @@ def compute_type(device: torch.device) -> torch.dtype:
 
 
 class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without types here
-    """Optimizer of convolutions, as matrices (out, in·kh·kw), and of linear layers."""
+    """The Muon optimizer, for weights of convolutions, as matrices (out, in·kh·kw), and of linear layers."""
 
     def __init__(self, weights: list[Tensor], rate: float, momentum: float = 0.95, decay: float = 0.1) -> None:
         super().__init__(weights, {"lr": rate, "momentum": momentum, "decay": decay})
@@ -50,7 +50,9 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without 
 
 
 def orthogonal(matrix: Tensor) -> Tensor:
-    """Approximate U Vᵀ of the singular value decompositions U S Vᵀ of (N, rows, columns), by 5 Newton–Schulz steps.
+    """Approximate U Vᵀ of the singular value decompositions U S Vᵀ of matrices (N, rows, columns).
+
+    Uses 5 Newton–Schulz steps.
 
     Singular values end between 0.7 and 1.2. More steps would bring them to 1; training does not need it.
     """
@@ -63,7 +65,7 @@ def orthogonal(matrix: Tensor) -> Tensor:
 
 
 def _matrix(weight: Tensor) -> Tensor:
-    """Weights of a layer as a matrix (out, in) or (out, kh·kw·in), of the same memory."""
+    """A layer's weights as a matrix (out, in) or (out, kh·kw·in) that shares their memory."""
     return weight if weight.ndim == 2 else weight.permute(0, 2, 3, 1).view(len(weight), -1)
 
 

@@ -59,7 +59,7 @@ def export_network(network: nn.Module, path: Path, outputs: tuple[str, ...], met
 
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Weights of a model written by `export_main`, as the network's state, and its metadata.
+    """Read the weights and metadata of a model that `export_main` wrote; weights by name, as the network's state.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 class _OrderedOutputs(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """The network's maps as a tuple, in the order of OUTPUTS."""
+    """Wrapper that returns the network's maps as a tuple, in the order of OUTPUTS (ONNX needs an order)."""
 
     def __init__(self, network: main_network.MainNetwork) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ class _OrderedOutputs(nn.Module):  # type: ignore[misc]  # torch comes without t
 
 
 def _halve(graph: Any) -> None:
-    """Store each large fp32 initializer as fp16 behind a Cast."""
+    """Store each large fp32 weight tensor of an ONNX graph as fp16 behind a Cast node."""
     casts = []
     for tensor in graph.graph.initializer:
         if tensor.data_type != TensorProto.FLOAT or np.prod(tensor.dims) < 256:

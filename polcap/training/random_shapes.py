@@ -1,4 +1,4 @@
-"""Random closed meshes to train on: one to seven simple bodies in one, some with arms, legs or branches."""
+"""Random closed meshes for training: one to seven simple bodies joined, some with arms, legs or branches."""
 
 from collections.abc import Callable
 
@@ -16,7 +16,7 @@ Faces = NDArray[np.int32]  # (F, 3)
 
 
 def compose(rng: np.random.Generator) -> Triangles:
-    """A random object of one to seven parts, longest side 1, centred."""
+    """A random mesh joined from one to seven parts, longest side 1, centered."""
     count = 1 if rng.random() < 0.35 else int(rng.integers(2, 8))
     parts = []
     centre = np.zeros(3)
@@ -31,7 +31,7 @@ def compose(rng: np.random.Generator) -> Triangles:
 
 
 def compose_with_branches(rng: np.random.Generator) -> Triangles:
-    """A random object with 2–14 thin branches, mirrored left to right in half of the cases; longest side 1, centred."""
+    """A random mesh with 2–14 thin branches, mirrored left to right in half of the cases; longest side 1, centered."""
     body = compose(rng)
     parts = [body]
     size, twins = rng.uniform(0.012, 0.05), rng.random() < 0.5
@@ -46,12 +46,12 @@ def compose_with_branches(rng: np.random.Generator) -> Triangles:
 
 
 def rotation(rng: np.random.Generator) -> Floats:
-    """A uniformly random rotation, (3, 3)."""
+    """A uniformly random rotation matrix, (3, 3)."""
     return np.asarray(Rotation.from_quat(np.roll(rng.normal(size=4), -1)).as_matrix())  # scalar last
 
 
 def _displaced(rng: np.random.Generator) -> tuple[Floats, Faces]:
-    """An ellipsoid with waves on it."""
+    """Random mesh of an ellipsoid with waves on its surface: vertices and faces."""
     unit, faces = _sphere(_RINGS, _SECTORS)
     field = np.zeros(len(unit))
     for _ in range(int(rng.integers(2, 9))):
@@ -63,7 +63,7 @@ def _displaced(rng: np.random.Generator) -> tuple[Floats, Faces]:
 
 
 def _dented(rng: np.random.Generator) -> tuple[Floats, Faces]:
-    """An ellipsoid with hollows and bosses, some with a flat floor, and often a patch of fine relief.
+    """Random mesh of an ellipsoid with hollows and bosses, some with a flat floor, and often fine relief.
 
     A hollow and a boss polarize light in the same way. Only outline, shadow and neighbors distinguish them.
     """
@@ -86,7 +86,7 @@ def _dented(rng: np.random.Generator) -> tuple[Floats, Faces]:
 
 
 def _superquadric(rng: np.random.Generator) -> tuple[Floats, Faces]:
-    """Superquadric: box, cylinder, ellipsoid, star and shapes between them."""
+    """Random mesh of a superquadric: box, cylinder, ellipsoid, star and shapes between them."""
     unit, faces = _sphere(_RINGS, _SECTORS)
     east, north = np.exp(rng.uniform(np.log(0.12), np.log(2.2), 2))
     longitude = np.arctan2(unit[:, 1], unit[:, 0])
@@ -97,7 +97,7 @@ def _superquadric(rng: np.random.Generator) -> tuple[Floats, Faces]:
 
 
 def _lathed(rng: np.random.Generator) -> tuple[Floats, Faces]:
-    """Solid of revolution, sometimes with lobes or a twist."""
+    """Random mesh of a solid of revolution, sometimes with lobes or a twist."""
     height = np.linspace(1, -1, _RINGS)
     profile = np.full(_RINGS, rng.uniform(0.3, 0.6))
     for k in range(1, 7):
@@ -111,7 +111,7 @@ def _lathed(rng: np.random.Generator) -> tuple[Floats, Faces]:
 
 
 def _vessel(rng: np.random.Generator) -> tuple[Floats, Faces]:
-    """Plate, bowl, cup or vase: an open solid of revolution with a wall and a rim."""
+    """Random mesh of a plate, bowl, cup or vase: an open solid of revolution with a wall and a rim."""
     rise = np.linspace(0, 1, _RINGS // 2)  # from the foot up
     mouth, waist = rng.uniform(0.25, 0.6), rng.normal() * 0.12
     radius = mouth * rise ** rng.uniform(0.15, 0.9) + waist * np.sin(np.pi * rise) * rise
@@ -126,7 +126,7 @@ def _vessel(rng: np.random.Generator) -> tuple[Floats, Faces]:
 
 
 def _tube(rng: np.random.Generator) -> tuple[Floats, Faces]:
-    """Tube along a closed random curve: handle, knot or ring."""
+    """Random mesh of a tube along a closed curve: handle, knot or ring."""
     t = np.linspace(0, 2 * np.pi, 160, endpoint=False)
     curve = np.zeros((len(t), 3))
     for k in range(1, int(rng.integers(2, 5))):
@@ -140,7 +140,7 @@ def _tube(rng: np.random.Generator) -> tuple[Floats, Faces]:
 def _branch(
     start: Floats, radius: float, length: float, squash: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Faces]:
-    """A bent, tapering tube that starts inside the body and leaves it at `start` (3,)."""
+    """Mesh of a bent, tapering tube that starts inside an ellipsoidal body and leaves it at `start` (3,)."""
     t = np.linspace(0, 1, _BRANCH_RINGS)
     out = start / max(float(np.linalg.norm(start)), 1e-6)
     bend, wave = (rng.normal(size=3) * length * k for k in (0.5, 0.12))
@@ -189,7 +189,9 @@ def _sweep(curve: Floats, tangent: Floats, axis: Floats, radius: Floats, sectors
 
 
 def _faces(rings: int, sectors: int, *, closed: bool) -> Faces:
-    """Triangles between rings of vertices, counter-clockwise from outside if rings are counter-clockwise from above.
+    """Triangles that connect successive rings of vertices.
+
+    They are counter-clockwise from outside if rings are counter-clockwise from above.
 
     closed: the last ring meets the first.
     """

@@ -50,7 +50,9 @@ class Recolor(nn.Module):  # type: ignore[misc]  # torch comes without types her
     def forward(
         self, diffuse: Tensor, doubt: Tensor, cosine: Tensor, inside: Tensor, clipped: Tensor
     ) -> tuple[Tensor, Tensor, ColorMixture]:
-        """Albedo (B, 3, H, W), each place's share in the colors (B, COLORS, H, W), and the colors.
+        """Correct uncertain albedo by the recurring colors of the picture.
+
+        Returns albedo (B, 3, H, W), each pixel's share in the colors (B, COLORS, H, W), and the colors.
 
         doubt (B, 2, H, W) is added to the log of 1σ by zenith, for lightness and for hue; cosine of the zenith, inside
         and clipped (B, 1, H, W).
@@ -74,7 +76,7 @@ def _opponent(diffuse: Tensor) -> Tensor:
 
 
 def _interpolation_weights(cosine: Tensor) -> Tensor:
-    """Weights (B, N, knots) of linear interpolation between the knots at cosines (B, 1, N)."""
+    """Weights (B, N, knots) that interpolate a curve, given by values at knots, at cosines (B, 1, N)."""
     knots = cosine.new_tensor(_KNOTS_DEG)
     angle = (torch.acos(cosine.clamp(0, 1 - 1e-6)) * (180 / pi)).transpose(1, 2)
     steps = ((angle - knots[:-1]) / (knots[1:] - knots[:-1])).clamp(0, 1)  # 0…1 from each knot to the next
@@ -112,7 +114,10 @@ def fit_mixture(color: Tensor, weight: Tensor) -> ColorMixture:
 
 
 def _correct(color: Tensor, spread: Tensor, colors: ColorMixture) -> tuple[Tensor, Tensor]:
-    """Expected true colors (B, 3, N) of measured ones with variances `spread`, and membership (B, COLORS, N)."""
+    """Expected true colors (B, 3, N) of measured colors with variances `spread`.
+
+    Also their membership (B, COLORS, N) in the mixture.
+    """
     difference = color[:, None] - colors.center[..., None]  # (B, COLORS, 3, N)
     wide = spread[:, None] + colors.variance[..., None]
     pull = difference / wide
@@ -134,7 +139,7 @@ class ColorGloss(nn.Module):  # type: ignore[misc]  # torch comes without types 
         nn.init.zeros_(self.read[-1].bias)
 
     def forward(self, seen: GlossEvidence, first: Tensor, member: Tensor, colors: ColorMixture) -> Tensor:
-        """first (B, outputs, H, W): the estimate to correct, before its sigmoids."""
+        """Correct a gloss estimate by recurring colors. first (B, outputs, H, W): the estimate before its sigmoids."""
         outputs = self.read(describe_colors(seen, first, member, colors))  # (B, COLORS, outputs)
         batch, _, height, width = member.shape
         return (outputs.transpose(1, 2) @ member.flatten(2)).reshape(batch, -1, height, width)

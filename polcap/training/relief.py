@@ -17,7 +17,7 @@ _NONE = 0.2  # share of objects without relief
 
 
 def random_slopes(position: Floats, px: float, rng: np.random.Generator) -> Floats:
-    """Gradients (M, 3) of a random relief at positions (M, 3), in the same frame; px: length shown by a pixel."""
+    """Gradients (M, 3) of a random relief at positions (M, 3), in the same frame; px: length that a pixel covers."""
     if rng.random() < _NONE:
         return np.zeros_like(position)
     wavelength = px * _SHORTEST * (_LONGEST / _SHORTEST) ** rng.random()
@@ -40,13 +40,16 @@ def random_slopes(position: Floats, px: float, rng: np.random.Generator) -> Floa
 
 
 def tilt_normals(normal: Floats, slope: Floats) -> Floats:
-    """Unit normals (M, 3) after adding a height field with gradients `slope` (M, 3); both in one frame."""
+    """Unit normals (M, 3) of a surface after adding a height field with gradients `slope` (M, 3); both in one frame."""
     out = normal - slope + np.sum(slope * normal, axis=1, keepdims=True) * normal
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True), np.float32)
 
 
 def _waves(position: Floats, wavelength: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Height (M,), of standard deviation 1, and gradient (M, 3) of a sum of plane waves of similar length."""
+    """A random wave relief: height (M,) and gradient (M, 3).
+
+    A sum of plane waves of similar length with standard deviation 1.
+    """
     way = rng.normal(size=(_WAVES, 3))
     way *= (2 * pi / wavelength * rng.uniform(0.5, 1.3, _WAVES) / np.linalg.norm(way, axis=1))[:, None]
     phase: NDArray[np.float64] = position @ way.T + rng.uniform(0, 2 * pi, _WAVES)

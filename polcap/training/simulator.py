@@ -39,7 +39,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class SimulatedPhotographs:
-    """Measurements at the M pixels `at` of the input mask, and the truth at every pixel."""
+    """Stokes parameters measured at the M pixels `at` of the input mask, and true maps at every pixel."""
 
     stokes: Tensor  # (3, M, 3)
     covariance: Tensor  # (6, M, 3)
@@ -102,7 +102,7 @@ class Simulator:
         return to_batch(self.photograph(views, strength, CameraErrors.draw(count, self.device), jitter))
 
     def gather(self, pick: NDArray[np.integer[Any]], size: int, *, flip: bool) -> ViewBatch:
-        """Read the traced views `pick`, thinned to size² pixels and, with `flip`, mirrored at random."""
+        """Read cached traced views by index, subsampled to size² pixels. With `flip`, they are mirrored at random."""
         full, area = self.size, size * size
         mirrored, change = _mirror(np.arange(area).reshape(size, size), flip)
         order = mirrored.reshape(-1)  # thinned pixels in their mirrored places
@@ -145,7 +145,9 @@ class Simulator:
     def _seen_pixels(
         self, view: Indices, y: Indices, x: Indices, order: Indices, mask: NDArray[np.bool_], owner: Indices
     ) -> tuple[Indices, NDArray[np.float32]]:
-        """Fields `met` and `open` of `ObjectPixels`, of pixels (y, x) of the cached views `view`.
+        """Targets of bounce rays for pixels (y, x) of the cached views `view`.
+
+        They are the fields `met` and `open` of `ObjectPixels`.
 
         The thinned pixels of a view are in `order`, their masks are (B, H·W).
         """
@@ -164,7 +166,7 @@ class Simulator:
     def photograph(
         self, views: ViewBatch, strength: Tensor, errors: CameraErrors, jitter: Tensor | None = None
     ) -> SimulatedPhotographs:
-        """Draw materials, simulate the light of the flash and measure it with a camera.
+        """Draw materials for traced views, simulate the flash light and measure it with a camera.
 
         strength (B,): S0 of a white plane that faces the flash at the object's distance. jitter (B,) 0…1: thins or
         widens the input mask.
@@ -199,7 +201,7 @@ class Simulator:
 
 
 def to_batch(photo: SimulatedPhotographs) -> Batch:
-    """Training batch of the main network from simulated photographs."""
+    """Convert simulated photographs to a training batch (channels and true maps) of the main network."""
     return Batch(
         channels=channels(photo),
         mask=photo.input_mask & photo.mask,
@@ -208,7 +210,10 @@ def to_batch(photo: SimulatedPhotographs) -> Batch:
 
 
 def channels(photo: SimulatedPhotographs) -> Tensor:
-    """Cue channels (B, N, H, W) by `stages/cues`, 0 outside the input mask; channels last in memory."""
+    """Cue channels (B, N, H, W) of simulated photographs by `stages/cues`, 0 outside the input mask.
+
+    Channels are last in memory.
+    """
     count, height, width = photo.rays.shape[:3]
     ratio, sigma, dolp, normalized = cues.polarization(photo.stokes, photo.covariance)
     clipped, at = photo.clipped, photo.at
@@ -223,7 +228,10 @@ def channels(photo: SimulatedPhotographs) -> Tensor:
 
 
 def _mirror(pixels: Indices, flip: bool) -> tuple[Indices, NDArray[np.float32]]:
-    """Pixels (H, W) mirrored at random in x, in y and at the diagonal, and the matrix (3, 3) that mirrors vectors."""
+    """Pixel indices (H, W) mirrored at random, and the matrix (3, 3) that mirrors vectors.
+
+    Mirror axes are x, y and the diagonal.
+    """
     change = np.eye(3, dtype=np.float32)
     for axis in range(3):
         if not flip or torch.rand(()) < 0.5:
@@ -236,7 +244,7 @@ def _mirror(pixels: Indices, flip: bool) -> tuple[Indices, NDArray[np.float32]]:
 
 
 def _jitter_mask(mask: Tensor, jitter: Tensor) -> Tensor:
-    """Masks (B, H, W), a third of them one pixel wider, a third one pixel thinner."""
+    """Vary masks (B, H, W): a third become one pixel wider, a third one pixel thinner."""
     solid = mask[:, None].float()
     wider = F.max_pool2d(solid, 3, 1, 1)[:, 0] > 0.5
     thinner = -F.max_pool2d(-solid, 3, 1, 1)[:, 0] > 0.5

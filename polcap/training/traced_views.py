@@ -1,4 +1,6 @@
-"""Cache of traced views of training meshes, without materials: geometry, places lit by the flash, rays between places.
+"""Cache of traced views of training meshes, without materials.
+
+Geometry, flash visibility, and rays between surface points.
 
 Views are square, fp16, one array per quantity, readable as memory maps. All follows from the seed.
 """
@@ -120,10 +122,10 @@ def fill(mask: NDArray[np.bool_], values: Floats) -> Floats:
 
 
 def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[float, float]:
-    """Middle depth of the object and the unit of relative depth.
+    """Mean depth of the object, and the unit of the network's relative depth.
 
-    The unit is the radius of the disc with the area of the mask, at the middle depth: √(area/π) · depth / focal. In
-    use, a photograph's mask gives it up to the distance.
+    The unit is the radius of the disc with the area of the mask, at the mean depth: √(area/π) · depth / focal. For a
+    photograph, the mask gives the unit up to the unknown distance.
     """
     middle = float(depth[mask].mean(dtype=np.float64))
     return middle, float(np.sqrt(mask.sum() / np.pi) * middle / focal)
@@ -132,7 +134,7 @@ def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[fl
 def _trace_all(
     meshes: list[Path], recipe: ViewsRecipe
 ) -> Iterator[tuple[GBuffer, light_transport.Pose, NDArray[np.bool_], NDArray[np.uint16]]]:
-    """Each view, the places of mesh and flash, and the result of `trace_visibility`."""
+    """Trace all views of a recipe: G-buffer, pose of mesh and flash, and the result of `trace_visibility` for each."""
     for number in range(len(meshes) + recipe.procedural):
         if number < len(meshes):
             path = meshes[number]
@@ -153,7 +155,7 @@ def _trace_all(
 
 
 def trace_random_view(name: str, tracer: Tracer, size: int, rng: np.random.Generator) -> tuple[GBuffer, Floats, Floats]:
-    """View of the mesh from a random side, and that side's rotation (3, 3) and translation (3,).
+    """Trace the mesh from a random side: G-buffer, rotation (3, 3) and translation (3,).
 
     Raises
     ------
@@ -171,7 +173,7 @@ def trace_random_view(name: str, tracer: Tracer, size: int, rng: np.random.Gener
 
 
 def random_pose(mesh: Triangles, size: int, rng: np.random.Generator) -> tuple[Floats, Floats, View]:
-    """Random rotation, translation and crop: field of view 5–35°, up to 12° off axis, 60–95 % filled."""
+    """Random pose of a mesh and crop of the picture: field of view 5–35°, up to 12° off axis, 60–95 % filled."""
     while True:
         rotation = random_shapes.rotation(rng)
         turned = mesh.vertices @ rotation.T
@@ -187,7 +189,7 @@ def random_pose(mesh: Triangles, size: int, rng: np.random.Generator) -> tuple[F
 
 
 def _frame_crop(place: Floats, fill: float, size: int, rng: np.random.Generator) -> View:
-    """Crop in which points (V, 3) of the camera frame fill the share `fill` of its side."""
+    """Square crop in which projected points (V, 3) of the camera frame fill the share `fill` of its side."""
     x, y = place[:, 0] / -place[:, 2], place[:, 1] / place[:, 2]
     focal = fill * size / max(np.ptp(x), np.ptp(y))
     slack = (1 - fill) * size / 2

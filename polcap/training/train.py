@@ -46,7 +46,7 @@ class TrainingOptions:
 
 @dataclass(frozen=True)
 class TrainingPreset:
-    """Size of the network, of its training views and of a batch."""
+    """Size of the network, of its traced training views and of a batch."""
 
     shape: main_network.NetworkShape
     views: int  # per training mesh
@@ -147,7 +147,7 @@ def _run_ahead(batches: Iterator[Batch]) -> Generator[Batch, None, None]:
 
 
 class NetworkTraining(loop.Trainee):
-    """The main network in training.
+    """Training of the main network: weights, optimizers and parallel learners.
 
     Each learner is a thread that computes the gradient of one batch; a step uses their mean. Threads that wait for each
     other once per step use a busy machine better than threads that share each operation.
@@ -170,7 +170,7 @@ class NetworkTraining(loop.Trainee):
         self.held_out: HeldOutPictures | None = None
 
     def advance(self, batch: list[Batch], progress: float) -> dict[str, float]:
-        """Do one training step on one batch per learner; returns the mean losses."""
+        """One training step on one batch per learner; returns the mean losses."""
         self.network.train()
         gradients, figures = zip(*self.pool.map(self._gradient, batch, self.lights))
         for weight, parts in zip(self.weights, zip(*gradients)):
@@ -180,7 +180,7 @@ class NetworkTraining(loop.Trainee):
         return {name: float(np.mean([f[name] for f in figures])) for name in figures[0]} | {"gradient": norm}
 
     def _gradient(self, batch: Batch, lights: torch.Generator) -> tuple[tuple[Tensor, ...], dict[str, float]]:
-        """Gradient of the loss of one batch, and the parts of that loss."""
+        """Gradient of the loss of one batch with respect to the weights, and the parts of that loss."""
         maps = main_network.run(self.network, batch.channels)
         polarized = VARIANTS[self.network.variant].polarized_loss
         value, figures = loss.total(maps, batch, lights, polarized=polarized)
@@ -194,7 +194,7 @@ class NetworkTraining(loop.Trainee):
         return errors
 
     def facts(self) -> dict[str, Any]:
-        """Shape and variant of the network, and the origin of its first weights."""
+        """Entries of the checkpoint: shape and variant of the network, and the origin of its first weights."""
         shape, variant = asdict(self.network.shape), self.network.variant
         return {"shape": shape, "variant": variant, "begun": self.begun, "done": self.done}
 
@@ -219,7 +219,7 @@ class NetworkTraining(loop.Trainee):
         self.samples = self.done = done
 
     def load(self, path: Path) -> None:
-        """Continue from a checkpoint. Raises InputError if it is one of another preset or variant."""
+        """Continue from a checkpoint. Raises InputError if it belongs to another preset or variant."""
         state = torch.load(path, map_location=self.device, weights_only=True)
         if (state["shape"], state["variant"]) != (asdict(self.network.shape), self.network.variant):
             began = f"{path} was started with another preset or variant ({state['variant']!r})"
@@ -230,7 +230,7 @@ class NetworkTraining(loop.Trainee):
             generator.manual_seed(1000 * self.step + k)
 
     def export(self, path: Path, version: str) -> None:
-        """Write the averaged weights, with the facts of their training, as an ONNX model."""
+        """Write the averaged weights as an ONNX model, with metadata on their training."""
         training = f"{self.samples - self.done} samples in {self.step} steps, {self.elapsed / 60:.0f} minutes"
         training += f", after {self.begun}" if self.begun else ""
         facts = {"version": version, "licence": "Apache-2.0", "variant": self.network.variant, "training": training}

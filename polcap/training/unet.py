@@ -11,7 +11,7 @@ from polcap.stages.mask import mask_channels
 
 
 class UNet(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Maps (B, outputs, H, W) from channels (B, inputs, H, W); H and W multiples of 2 ** len(widths).
+    """U-Net: maps (B, outputs, H, W) from channels (B, inputs, H, W); H and W are multiples of 2 ** len(widths).
 
     Levels of `widths` channels from half resolution down. There is no normalization: absolute levels carry
     information. With `context` the mean and the maximum over the whole picture are added at the coarsest level.
@@ -20,7 +20,7 @@ class UNet(nn.Module):  # type: ignore[misc]  # torch comes without types here
     def __init__(
         self, inputs: int, outputs: int, widths: tuple[int, ...], *, upsampled: int, full: int, context: bool
     ) -> None:
-        """upsampled: channels that reach full resolution; full: width of the layer there."""
+        """upsampled: channels that reach full resolution from below; full: width of the layer at full resolution."""
         super().__init__()
         self.stem = nn.Conv2d(4 * inputs, widths[0], 3, padding=1)
         self.levels = nn.ModuleList(ResidualBlock(width) for width in widths)
@@ -50,7 +50,7 @@ class UNet(nn.Module):  # type: ignore[misc]  # torch comes without types here
 
 
 class ResidualBlock(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Two convolutions, added to their input; they add nothing at first."""
+    """Two convolutions added to their input; initially they add nothing."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class ResidualBlock(nn.Module):  # type: ignore[misc]  # torch comes without typ
 
 
 def mask_network() -> UNet:
-    """Logit of the object, from the channels of `stages/mask/mask_channels.py`.
+    """The mask network: logit of the object at each pixel, from the channels of `stages/mask/mask_channels.py`.
 
     It sees the whole picture at a reduced size first, then, with the same weights, the object with the first result
     as a hint.
@@ -73,7 +73,7 @@ def mask_network() -> UNet:
 
 
 def fine_network() -> UNet:
-    """Correction of the normals, from the channels of `stages/infer/fine.py`.
+    """The refinement network: correction of the normals, from the channels of `stages/infer/fine.py`.
 
     It sees 62 px far and never the whole object, so that tiles give the same result as the whole picture.
     """

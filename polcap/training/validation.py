@@ -1,4 +1,4 @@
-"""Errors on held-out pictures during training; nothing is chosen by them."""
+"""Errors of the main network on held-out pictures during training; they do not influence the training."""
 
 from pathlib import Path
 
@@ -43,7 +43,10 @@ class HeldOutPictures:
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def picture(self, network: nn.Module) -> Picture:
-        """Eight pictures in rows: S0, then truth and estimate of normal, diffuse, F0, roughness and depth."""
+        """Picture of eight held-out cases in rows.
+
+        S0, then truth and estimate of normal, diffuse, F0, roughness and depth.
+        """
         batch = self.batches[0]
         sides = [_draw(maps, batch.mask) for maps in (vars(batch), main_network.run(network, batch.channels))]
         light = (torch.exp(batch.channels[:, main_network.COLOR].float()) - FLOOR) * batch.mask[:, None]
@@ -53,7 +56,7 @@ class HeldOutPictures:
 
 
 def _draw(maps: dict[str, Tensor], mask: Tensor) -> list[list[Picture]]:
-    """Images of normal (in each ray's frame), diffuse, F0 0…0.3, roughness and depth of all pictures."""
+    """Images of the maps of all pictures: normal (in each ray's frame), diffuse, F0 0…0.3, roughness and depth."""
     inside = mask.cpu().numpy()
     normal, diffuse, specular, roughness, depth = (
         _arrays(maps[name] * mask[:, None]) for name in ("normal", "diffuse", "specular", "roughness", "depth")
@@ -68,7 +71,7 @@ def _draw(maps: dict[str, Tensor], mask: Tensor) -> list[list[Picture]]:
 
 
 def _arrays(images: Tensor) -> Floats:
-    """(B, ·, H, W) -> (B, H, W, ·)."""
+    """Tensor of images (B, ·, H, W) as an array (B, H, W, ·)."""
     return np.asarray(images.float().permute(0, 2, 3, 1).cpu().numpy())
 
 

@@ -23,7 +23,7 @@ _UNPOLARIZED = ("log_r", "log_g", "log_b", "mask", "clipped", "ray_x", "ray_y")
 
 @dataclass(frozen=True)
 class Variant:
-    """One ablation of the main network."""
+    """One ablation of the main network: its input channels, and the parts that it lacks."""
 
     inputs: Callable[[Tensor], Tensor] = lambda x: x  # channels (B, N, H, W) -> inputs of the same shape
     sees_dolp: bool = True  # in the gloss profiles
@@ -32,13 +32,15 @@ class Variant:
 
 
 def _unpolarized(x: Tensor) -> Tensor:
-    """Channels of one unpolarized flash photograph: radiance, mask, saturation and rays."""
+    """Input of an ablation: the channels of one unpolarized flash photograph (radiance, mask, saturation and rays)."""
     keep = x.new_tensor([float(name in _UNPOLARIZED) for name in CHANNELS])
     return x * keep.view(1, -1, 1, 1)
 
 
 def _published(x: Tensor) -> Tensor:
-    """The paper's five inputs: pictures at 0°, 45° and 90°, normalized Stokes map, diffuse color; linear.
+    """Input of an ablation: the published method's five pictures, linear.
+
+    These are pictures at 0°, 45° and 90°, normalized Stokes map, diffuse color.
 
     The polarization of the pictures is the mean over the color channels, which differ by noise only.
     """

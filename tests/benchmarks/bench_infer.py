@@ -72,13 +72,15 @@ def _enlarged(seen: Cues, times: int) -> Cues:
     x, y = seen.view.center
     centre = ((x + 0.5) * times - 0.5, (y + 0.5) * times - 0.5)
     view = dataclasses.replace(seen.view, focal=seen.view.focal * times, center=centre)
-    single = ("radiance", "ratio_sigma", "dolp", "diffuse_color", "quality")
-    double = ("ratio", "normalized_stokes")
-    return dataclasses.replace(
-        seen, mask=larger(seen.mask.astype(np.uint8)) > 0, view=view, rays=frames.rays(view, side, side),
-        **{name: larger(getattr(seen, name)) for name in single},
-        **{name: np.stack([larger(part) for part in getattr(seen, name)]) for name in double},
-    )  # fmt: skip
+    changed: dict[str, Any] = {
+        **{
+            name: larger(getattr(seen, name))
+            for name in ("radiance", "ratio_sigma", "dolp", "diffuse_color", "quality")
+        },
+        **{name: np.stack([larger(part) for part in getattr(seen, name)]) for name in ("ratio", "normalized_stokes")},
+    }
+    mask = larger(seen.mask.astype(np.uint8)) > 0
+    return dataclasses.replace(seen, mask=mask, view=view, rays=frames.rays(view, side, side), **changed)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Blender loads GLB, OBJ and USD: what it samples is what the maps say, upright and of the right size."""
 
+import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,12 +8,14 @@ import numpy as np
 import pytest
 
 from polcap.formats.export import encoders, gltf, obj, texture_set, usd
+from polcap.formats.export.glb_geometry import Geometry
 from polcap.images import Floats, Mesh, SurfaceMaps
 from tests import surfaces
 from tests.blender import session
 from tests.conftest import ROOT
 
-CASES = ("glb", "obj", "usdc")
+PACKED: tuple[Geometry, ...] = ("quantized", "draco") if importlib.util.find_spec("DracoPy") else ("quantized",)
+CASES = (".glb", ".obj", ".usdc", *(f"_{geometry}.glb" for geometry in PACKED))
 SIZE = (surfaces.WIDTH, surfaces.HEIGHT)
 
 Answers = dict[str, dict[str, Floats]]
@@ -45,9 +48,11 @@ def answers(maps: SurfaceMaps, mesh: Mesh, tmp_path_factory: pytest.TempPathFact
     for key, file in files.items():
         (folder / file).write_bytes(encoders.encode(texture_set.LOOSE[key](built), "png"))
     gltf.write(folder / "ball.glb", built, "ball")
+    for geometry in PACKED:
+        gltf.write(folder / f"ball_{geometry}.glb", built, "ball", gltf.GlbOptions(geometry=geometry))
     obj.write(folder / "ball.obj", built, "ball", files)
     usd.write(folder / "ball.usdc", built, "ball", files, {})
-    found = session.ask(folder, [folder / f"ball.{suffix}" for suffix in CASES], bake=SIZE)
+    found = session.ask(folder, [folder / f"ball{ending}" for ending in CASES], bake=SIZE)
     return dict(zip(CASES, found))
 
 

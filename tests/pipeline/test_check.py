@@ -1,6 +1,7 @@
 """`polcap check` keeps what is good, and of what is not it names the fault and the shot."""
 
 import json
+import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -53,6 +54,28 @@ def test_one_turned_shot_of_three_is_told_with_the_ring_that_it_looks_like(tmp_p
     assert "ring's zero" in line.message and "single shot" in line.message and "take it again" in line.remedy
 
 
+def test_a_clockwise_ring_gets_a_remedy_that_works(tmp_path: Path) -> None:
+    faulty.shoot(tmp_path / "bad", 1, "clockwise", WIDTH)
+    line = next(line for line in verdict(tmp_path / "bad").lines if line.name == "order")
+    assert line.state == "fail" and "dd --clockwise, or clockwise = true in capture.toml" in line.remedy
+    (tmp_path / "bad" / "capture.toml").write_text("clockwise = true\n")
+    found = verdict(tmp_path / "bad")
+    assert found.keep, check.table(found)
+
+
+def test_swapped_folders_get_a_remedy_that_works(tmp_path: Path) -> None:
+    faulty.shoot(tmp_path / "bad", 1, "swapped", WIDTH)
+    remedy = next(line for line in verdict(tmp_path / "bad").lines if line.name == "order").remedy
+    pairs = re.findall(r"(\d+)° to (\d+)°", remedy)
+    assert len(pairs) == 2 and "Rename the folders" in remedy
+    for old, new in pairs:
+        (tmp_path / "bad" / f"pol{int(old):03d}").rename(tmp_path / "bad" / f"new{int(new):03d}")
+    for _, new in pairs:
+        (tmp_path / "bad" / f"new{int(new):03d}").rename(tmp_path / "bad" / f"pol{int(new):03d}")
+    found = verdict(tmp_path / "bad")
+    assert found.keep, check.table(found)
+
+
 def test_process_measures_the_blur_that_check_measures(tmp_path: Path) -> None:
     faulty.shoot(tmp_path / "bad", 1, "defocus", 256)
     capture = captures.read(tmp_path / "bad")
@@ -73,6 +96,24 @@ def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> N
         whitebalance.measure(merged, shipped_data.colorchecker(), AUTO, Config().whitebalance)
     asked = check.inspect(capture, Config(), ChartRequest("none"), lambda: (None, None))
     assert asked.needs == "" and next(line for line in asked.lines if line.name == "chart").state == "not measured"
+
+
+@pytest.mark.parametrize("width", [200, 512])
+def test_a_small_chart_is_judged_as_process_judges_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, width: int
+) -> None:
+    """Its size in RAW pixels is that of the photographs; the smaller pictures of `check` do not matter."""
+    monkeypatch.setattr("polcap.pipeline.small_capture._MOST_PIXELS", 2e4)
+    faulty.shoot(tmp_path / "small", 1, "", width)
+    capture = captures.read(tmp_path / "small")
+    merged = hdr.merge(capture, frame_decoder.decode, Config().hdr)
+    reason = ""
+    try:
+        whitebalance.measure(merged, shipped_data.colorchecker(), AUTO, Config().whitebalance)
+    except ChartError as error:
+        reason = str(error).partition("(")[2].partition(")")[0]
+    line = next(line for line in verdict(tmp_path / "small").lines if line.name == "chart")
+    assert reason in line.message and (line.state == "warn") is bool(reason) is (width == 200)
 
 
 def test_missing_frame_is_bad_input(tmp_path: Path) -> None:

@@ -115,7 +115,7 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, own: P
 @pytest.mark.parametrize(
     ("flags", "says"),
     [
-        (["--preset", "maya"], f"'maya' is not one of {', '.join(map(repr, PRESETS))}"),
+        (["--preset", "maya"], f"--preset maya is none of {', '.join(PRESETS)}"),
         (["--preset", "web", "--obj"], "leave out --obj"),
         (["--exr", "--color", "ACEScq"], "--color ACEScq is not a color space or role"),
     ],
@@ -192,3 +192,32 @@ def test_texture_size_and_levels_of_detail(own: Path) -> None:
         counts.append(glb["accessors"][glb["meshes"][0]["primitives"][0]["indices"]]["count"] // 3)
         assert counts[-1] == told["triangles"] and told["error"].split()[1] in ("mm", "px")
     assert len(counts) == 2 and counts[0] == pytest.approx(4 * counts[1], rel=0.1)
+    origins = [document(file.read_bytes())["asset"]["extras"] for file in (own / "asset").glob("*.glb")]
+    assert len({tuple(one["origin_in_camera"]) for one in origins}) == 1 and len(origins) == 3
+
+
+def test_presets_of_one_command_each_get_their_folder(own: Path, polcap: Command) -> None:
+    assert polcap("export", own, "--preset", "web", "--preset", "unreal", "--triangles", 3000).returncode == 0
+    said = json.loads((own / "maps" / "maps.json").read_text())["exports"]
+    for preset in ("web", "unreal"):
+        assert said[f"asset/{preset}"]["mesh"]["triangles"] == pytest.approx(3000, rel=0.01)
+    assert "KHR_mesh_quantization" in document((own / "asset/web/capture.glb").read_bytes())["extensionsRequired"]
+
+
+def test_a_second_export_adds_to_the_records_of_the_first(own: Path) -> None:
+    """`process` wrote GLB and OBJ; the sidecar and maps.json list them after an export of the EXR too."""
+    sidecar = own / "asset" / "capture.provenance.json"
+    before = json.loads(sidecar.read_text())["files"]
+    pipeline.export(own, ExportRequest(formats=("exr",)))
+    after = json.loads(sidecar.read_text())["files"]
+    assert set(after) == {*before, "capture_layers.exr"} and after["capture.obj"] == before["capture.obj"]
+    said = json.loads((own / "maps" / "maps.json").read_text())["exports"]["asset"]
+    assert {"capture_basecolor", "capture_normal"} <= set(said["glb"]) and "capture_roughness.png" in said["textures"]
+
+
+def test_a_sidecar_of_other_maps_is_replaced(own: Path) -> None:
+    sidecar = own / "asset" / "capture.provenance.json"
+    told = json.loads(sidecar.read_text())
+    sidecar.write_text(json.dumps({**told, "stages": {}}))
+    pipeline.export(own, ExportRequest(formats=("exr",)))
+    assert set(json.loads(sidecar.read_text())["files"]) == {"capture_layers.exr"}

@@ -19,6 +19,7 @@ from polcap.images import (
     AngleStack,
     OutlineCheck,
     PatchColors,
+    Quality,
     RingZero,
     ShotOrder,
     TurnedShot,
@@ -26,6 +27,7 @@ from polcap.images import (
 from polcap.quality import gate as gate_module
 from polcap.quality import gates, geometry, light, polarization, rim
 from polcap.quality.gate import Evidence, Gate
+from polcap.stages.align.object_motion import ObjectMotion
 from tests import scenes
 
 MODULES: tuple[ModuleType, ...] = (gates, gate_module, light, geometry, polarization)
@@ -37,12 +39,15 @@ BODY = {
 }  # fmt: skip
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 FIGURES = {
-    "inward_outline": 0.0,
-    "object_motion": np.array([0.0, 0.1, 0.1]), "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "shape": [45.0, 0.2],
+    "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
+    "object_motion": ObjectMotion(np.array([0.0, 0.1, 0.1]), np.array([0.0, 0.1, 0.1])), "edge_blur": 0.8,
+    "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "shape": [45.0, 0.2],
     "normal_error": 4.0, "lean": 2.0, "crossed": {"left": 0.0, "clipped": 0, "over": 0.0, "mirrored": 0.1},
 }  # fmt: skip
 MEASURES = {  # the function that measures each figure
-    "object_motion": (geometry, "_displacement"), "charted": (geometry, "_charted"), "lean": (geometry, "_lean"),
+    "surroundings": (light, "_surroundings_dolp"), "highlight": (light, "_highlight_dolp"),
+    "object_motion": (geometry, "_motion"), "edge_blur": (geometry, "_edge_blur"),
+    "charted": (geometry, "_charted"), "lean": (geometry, "_lean"),
     "noise": (light, "_noise"), "crossed": (light, "_crossed"), "ill_posed": (polarization, "_ill_posed"),
     "shape": (polarization, "_median_shape"), "outline": (polarization, "_outline"),
     "normal_error": (gates, "_own_error"), "inward_outline": (geometry, "_inward_share"),
@@ -88,6 +93,13 @@ def clipped(second_shot: float = 0.0) -> Any:
     return share
 
 
+def ghosts() -> Any:
+    """(K, H, W): quality of three shots, the second one a ghost all over."""
+    quality = np.zeros((3, *scenes.ball_object().mask.shape), np.uint8)
+    quality[1] = int(Quality.GHOST)
+    return quality
+
+
 CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields that lead to it
     ("exposures", "pass", {}),
     ("exposures", "warn", {"bracket": exposures(1.0)}),
@@ -99,7 +111,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("source", "pass", {}),
     ("source", "warn", {"sensor": {"lossy": True}}),
     ("stillness", "pass", {}),
-    ("stillness", "fail", {"bracket": {"ghost_fraction": np.array([0.0, 0.05, 0.0])}}),
+    ("stillness", "fail", {"radiance": {"quality": ghosts()}}),
     ("chart", "pass", {"color": {"patches": PatchColors(np.full(24, 1.0))}}),
     ("chart", "fail", {"color": {"patches": PatchColors(np.full(24, 9.0))}}),
     ("chart", "warn", {"chart_missing": "nothing like one"}),
@@ -109,8 +121,10 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("alignment", "fail", {"alignment": {"correlation": np.array([1.0, 0.1, 1.0])}}),
     ("alignment", "fail", {"alignment": {"residual_px": np.array([0.0, 0.5, 0.0])}}),
     ("alignment", "fail", {"alignment": {"transform": np.full((3, 3, 3), NAN)}}),
-    ("alignment", "fail", {"figures": {"object_motion": np.array([0.0, 5.0, 0.0])}}),
-    ("alignment", "fail", {"figures": {"object_motion": np.array([0.0, np.inf, 0.0])}}),
+    ("alignment", "warn", {"figures": {"object_motion": ObjectMotion(np.array([0.0, 1.2, 0.0]), np.zeros(3))}}),
+    ("alignment", "warn", {"figures": {"object_motion": ObjectMotion(np.zeros(3), np.array([0.0, 5.0, 0.0]))}}),
+    ("alignment", "fail", {"figures": {"object_motion": ObjectMotion(np.array([0.0, 5.0, 0.0]), np.zeros(3))}}),
+    ("alignment", "fail", {"figures": {"object_motion": ObjectMotion(np.array([0.0, np.inf, 0.0]), np.zeros(3))}}),
     ("mask", "pass", {}),
     ("mask", "pass", {"object_": {"doubt": None}}),
     ("mask", "not measured", {"object_": {"doubt": None, "source": "automatic"}}),
@@ -120,10 +134,13 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("clipping", "pass", {}),
     ("clipping", "fail", {"clipped": clipped(0.3)}),
     ("sharpness", "pass", {"blur_px": np.array([[0.0, 0.1]] * 3)}),
-    ("sharpness", "fail", {"blur_px": np.array([[0.0, 2.0]] * 3)}),
+    ("sharpness", "warn", {"blur_px": np.array([[0.0, 2.0]] * 3)}),
+    ("sharpness", "fail", {"blur_px": np.array([[2.0, 2.0]] * 3)}),
     ("sharpness", "not measured", {}),
     ("sharpness", "not measured",
      {"blur_px": np.array([[0.0, 0.1]] * 3), "alignment": {"transform": FAR}}),
+    ("focus", "pass", {}),
+    ("focus", "warn", {"figures": {"edge_blur": 2.5}}),
     ("gains", "pass", {}),
     ("gains", "fail", gains(gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3]))),
     ("energy", "pass", {}),
@@ -161,7 +178,12 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("noise", "fail", {"figures": {"noise": 0.1}}),
     ("noise", "not measured", {"figures": {"noise": NAN}}),
     ("ambient", "pass", {"bracket": {"ambient_share": np.full(3, 0.001)}}),
-    ("ambient", "fail", {"bracket": {"ambient_share": np.full(3, 0.3)}}),
+    ("ambient", "fail", {"bracket": {"ambient_share": np.full(3, 0.4)}}),
+    ("lighting", "pass", {}),
+    ("lighting", "warn", {"figures": {"highlight": 0.05}}),
+    ("lighting", "fail", {"figures": {"highlight": 0.3}}),
+    ("room light", "pass", {}),
+    ("room light", "warn", {"figures": {"surroundings": 0.05}}),
     ("ambient", "not measured", {}),
     ("crossed", "pass", {"radiance": {"crossed": True}}),
     ("crossed", "warn", {"radiance": {"crossed": True}, "stokes": SimpleNamespace(body=None)}),
@@ -173,6 +195,9 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("ill-posed", "fail", {"figures": {"ill_posed": 0.5}}),
     ("outline", "pass", {}),
     ("outline", "fail", {"figures": {"inward_outline": 0.3}}),
+    ("albedo scale", "pass", {}),
+    ("albedo scale", "warn", {"maps": SimpleNamespace(albedo_sigma=0.5)}),
+    ("albedo scale", "warn", {"maps": SimpleNamespace(albedo_sigma=None)}),
     ("focal length", "pass", {}),
     ("focal length", "warn", {"focal_doubt": (-0.7, 0.7)}),
     ("normal error", "pass", {}),
@@ -206,7 +231,8 @@ def good() -> dict[str, Any]:
         "radiance": with_field(scenes.stack(), "bracket", exposures(1.0, 4.0)),
         "color": scenes.no_color(), "alignment": scenes.still(), "object_": replace(scenes.ball_object(), doubt=0.01),
         "selfcal": replace(scenes.equal(), gains=GAINS, outline=OutlineCheck(STATED, 0.95)),
-        "stokes": SimpleNamespace(body=True), "maps": None, "mesh": SimpleNamespace(**MESH),
+        "stokes": SimpleNamespace(body=True), "maps": SimpleNamespace(albedo_sigma=0.1),
+        "mesh": SimpleNamespace(**MESH),
         "figures": FIGURES | outline(),
     }  # fmt: skip
 

@@ -4,11 +4,14 @@ The ball's top-left quarter is red. Orientation, texture flip and normal directi
 against the maps, not against what the writer believes.
 """
 
+import importlib.util
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from polcap.formats.export import encoders, gltf, obj, texture_set
+from polcap.formats.export.glb_geometry import Geometry
 from polcap.images import Floats, SurfaceMaps
 from tests import surfaces
 from tests.render import browser
@@ -19,7 +22,9 @@ LIGHTS: dict[str, tuple[float, float, float] | None] = {
     "right": (1.0, 0.0, 0.4),
 }
 RIPPLED = surfaces.maps(ripple=0.15)
+PACKED: tuple[Geometry, ...] = ("quantized", "draco") if importlib.util.find_spec("DracoPy") else ("quantized",)
 CASES = [f"{shape}.{suffix}" for shape in ("ball", "plane") for suffix in ("glb", "obj")]
+CASES += [f"{shape}_{geometry}.glb" for shape in ("ball", "plane") for geometry in PACKED]
 
 Pictures = dict[str, dict[str, Floats]]
 
@@ -37,8 +42,9 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Pictures:
         obj.write(folder / f"{shape}.obj", asset, shape, files)
         for key, file in files.items():
             (folder / file).write_bytes(encoders.encode(texture_set.LOOSE[key](asset), "png"))
-        for suffix in ("glb", "obj"):
-            model = folder / f"{shape}.{suffix}"
+        for geometry in PACKED:
+            gltf.write(folder / f"{shape}_{geometry}.glb", asset, shape, gltf.GlbOptions(geometry=geometry))
+        for model in (folder / case for case in CASES if case.startswith(shape)):
             jobs.append(browser.Job(model.name, model, mesh, RIPPLED.view, tuple(LIGHTS.values())))
     answer = browser.render(folder, jobs)
     return {job.name: dict(zip(LIGHTS, answer[job.name])) for job in jobs}

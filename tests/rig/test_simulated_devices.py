@@ -2,14 +2,16 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
 
 from polcap.errors import SettingError
+from polcap.formats.raw import libraw, probe
 from polcap.rig import sequence
 from polcap.rig.device_log import Log
 from polcap.rig.device_urls import open_camera, open_rotator
-from polcap.rig.exposure_bracket import Exposure
+from polcap.rig.exposure_bracket import Exposure, parse_bracket
 from polcap.rig.motor_simulated import RING, SimulatedMotor, SimulatedMotorSettings
 from polcap.rig.shooting_plan import CaptureOrder
 from polcap.synth import shooting as synthetic
@@ -69,8 +71,28 @@ def test_an_unknown_setting_of_the_simulated_camera_is_named(query: str, words: 
         open_camera(f"simulated?{query}", Log(None))
 
 
-def test_the_simulated_camera_has_no_flash_power_and_no_other_name() -> None:
-    with pytest.raises(SettingError, match="give times"):
-        open_camera(f"simulated?{SMALL}", Log(None)).shoot(Exposure(flash=0.5), flash=True)
+@pytest.mark.parametrize(
+    "bracket",
+    ["1/200,1/50,1/13", "iso100,iso400,iso1600", "f/22,f/11,f/5.6", "1/160 f/11 iso100 flash1/64, flash1/16, flash1/4"],
+)
+def test_the_simulated_camera_takes_the_brackets_of_the_pages(bracket: str, tmp_path: Path) -> None:
+    camera = open_camera(f"simulated?{SMALL}&gain_jitter=0", Log(None))
+    light = []
+    for step, exposure in enumerate(parse_bracket(bracket)):
+        camera.prepare(0.0, "shot", step)
+        taken = camera.shoot(exposure, flash=True)
+        file = tmp_path / f"{step}.dng"
+        file.write_bytes(taken.data)
+        image = libraw.read(file)
+        light.append((image.value - float(np.mean(image.black))) / (image.white - float(np.mean(image.black))))
+        exif = probe.read(file).exif
+        assert (exif.iso, exif.f_number) == (exposure.iso or 100, exposure.f_number or 11)
+        assert exif.flash_fired is (not bracket.endswith("1/13"))
+    sound = (light[2] > 0.2) & (light[2] < 0.9)  # above the noise, not clipped
+    first, middle, last = (float(frame[sound].sum()) for frame in light)
+    assert middle / first == pytest.approx(4, rel=0.06) and last / middle == pytest.approx(4, rel=0.06)
+
+
+def test_an_unknown_camera_is_named() -> None:
     with pytest.raises(SettingError, match="--camera webcam: no such camera"):
         open_camera("webcam", Log(None))

@@ -11,7 +11,7 @@ FileStates = dict[str, tuple[int, int]]  # size and time of change by path
 
 
 def settled(folder: Path, ignored: Path, still_s: float = 2.0, edited: Sequence[Path] = ()) -> Iterator[None]:
-    """Yield at once, then each time files were added, removed or changed and nothing moved for `still_s` seconds.
+    """Watch a folder: yield at once, then each time files changed and nothing has changed for `still_s` seconds since.
 
     The folder `ignored` (of results) and names that begin with a dot are not watched. The files `edited` are saved in
     one step, as by an editor: they count as at rest at the next poll.
@@ -33,7 +33,7 @@ def settled(folder: Path, ignored: Path, still_s: float = 2.0, edited: Sequence[
 
 
 def _seen(folder: Path, ignored: Path) -> FileStates:
-    """All files below the folder that still exist."""
+    """Size and modification time of all files below a watched folder."""
     found: FileStates = {}
     for root, folders, files in os.walk(folder):
         here = Path(root)
@@ -43,7 +43,7 @@ def _seen(folder: Path, ignored: Path) -> FileStates:
 
 
 def _stats(files: Iterable[Path]) -> FileStates:
-    """Size and time of change of the files that exist."""
+    """Size and modification time of those of the files that exist."""
     found: FileStates = {}
     for file in files:
         try:

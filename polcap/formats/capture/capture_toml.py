@@ -16,7 +16,7 @@ Positive = Annotated[float, Meta(gt=0)]
 
 
 class FrameEntry(Struct, frozen=True, forbid_unknown_fields=True):
-    """One photograph: its file, relative to the folder, and its role."""
+    """One photograph as listed in capture.toml: file (relative to the folder), role, angle [°], exposure [s]."""
 
     file: str
     angle: Annotated[float, Meta(ge=-360, le=360)] | None = None  # degrees; of shots and repeats
@@ -26,14 +26,14 @@ class FrameEntry(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Rotator(Struct, frozen=True, forbid_unknown_fields=True):
-    """The device that turned the polarizer; for the notes only."""
+    """The device that turned the polarizer, as stated in capture.toml; only shown in the notes."""
 
     model: str = ""
     log: str = ""  # file of the angles reached, in the same folder
 
 
 class CaptureFile(Struct, frozen=True, forbid_unknown_fields=True):
-    """All of capture.toml; every key is optional."""
+    """The content of capture.toml; every key is optional."""
 
     name: Annotated[str, Meta(pattern=r"^[^/\\]+$")] = ""
     focal_length_mm: Positive | None = None
@@ -49,7 +49,7 @@ class CaptureFile(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def load(folder: Path) -> CaptureFile:
-    """The folder's capture.toml, or an empty one. Raises CaptureError."""
+    """Read capture.toml of a capture folder; empty values if there is no such file. Raises CaptureError."""
     path = folder / NAME
     if not os.path.lexists(path):
         return CaptureFile()

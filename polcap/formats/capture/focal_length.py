@@ -17,7 +17,7 @@ NORMAL_MM = 50.0  # full-frame equivalent, assumed where nothing is known
 
 
 class FocalLength(NamedTuple):
-    """A focal length and its source."""
+    """Focal length in pixels, the range (least, greatest) in which it may lie, and a sentence on its source."""
 
     px: float  # visible RAW pixels
     doubt: tuple[float, float]  # ln of the least and the greatest possible value over px; 0, 0: known
@@ -29,7 +29,7 @@ class FocalLength(NamedTuple):
 
 
 def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> FocalLength:
-    """Focal length in visible RAW pixels; the user's statement overrides EXIF."""
+    """Focal length in visible RAW pixels from EXIF, or from the user's statement, which overrides EXIF."""
     width, height = exif.width or 0, exif.height or 0
     diagonal = math.hypot(width, height)
     equivalent = exif.focal_length_35mm  # by its definition of equal diagonals, in whole millimetres
@@ -59,13 +59,13 @@ def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> 
 
 
 def calibrated(geometry: LensGeometry) -> FocalLength:
-    """The focal length that `polcap calibrate` measured."""
+    """Focal length in pixels as measured by `polcap calibrate`."""
     note = f"{geometry.focal_px:.0f} px ± {geometry.focal_sigma_px:.1f} (calibrated)"
     return FocalLength(geometry.focal_px, _KNOWN, note)
 
 
 @cache
 def sensor_widths() -> dict[str, float]:
-    """Width of the imaging area [mm] by EXIF model, of the cameras in calib/cameras/sensors.toml."""
+    """Sensor width [mm] by EXIF camera model, from the table calib/cameras/sensors.toml."""
     table = tomllib.loads(shipped_data.data_path("cameras/sensors.toml").read_text(encoding="utf-8"))
     return {model: float(width) for model, width in table["width_mm"].items()}

@@ -1,4 +1,4 @@
-"""Finds which photograph of a folder was taken at which angle, by one of four layouts.
+"""Assigns each photograph of a capture folder to a polarizer angle, by one of four folder layouts.
 
 Folders pol000, pol045, …; capture.toml; one flat folder; frames of a polarization sensor. No pixel is decoded;
 `reader` checks the plan and builds the `Capture`.
@@ -35,7 +35,7 @@ _LOSSY_SUFFIXES = {".heic", ".heif", ".hif", ".avif", ".webp"}  # of phones and 
 
 @dataclass(frozen=True)
 class Source:
-    """One photograph and its role in the capture."""
+    """One photograph of a capture folder with its role, polarizer angle, exposure [s] and flash energy."""
 
     path: Path
     probe: Probe
@@ -51,7 +51,7 @@ _Order = Sequence[float] | None  # of the angles, degrees; None: as found
 
 @dataclass(frozen=True)
 class Plan:
-    """The shots of a capture, and its other photographs."""
+    """Photographs of a capture folder by polarizer angle, its other photographs (chart…), and notes."""
 
     layout: Literal["folders", "toml", "flat", "sensor"]
     shots: Shots
@@ -60,7 +60,7 @@ class Plan:
 
 
 def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
-    """Plan the shots of a folder with its capture.toml.
+    """Assign the photographs of a capture folder to polarizer angles, by its layout and its capture.toml.
 
     `angles_deg` is the order of a flat folder; where folders, names or capture.toml state the angles, it picks from
     them, the first being the reference.
@@ -90,7 +90,7 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
 
 
 def _hint(folder: Path) -> str:
-    """The likely mistake of a user who gave a folder without photographs."""
+    """A sentence on the likely mistake of a user who named a folder without photographs."""
     inside = [path for path in children(folder) if path.is_dir()]
     named = _listed([path.name for path in inside])
     if remedy := _lossy_or_packed(folder):
@@ -127,7 +127,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[str]) -> bool:
-    """Whether a folder of these sub-folders and files is one capture, by names and the first bytes of files.
+    """Whether a folder with these sub-folders `inside` and `files` is one capture, judged by names and first bytes.
 
     Photographs in a folder that has sub-folders are taken for notes, unless there is a capture.toml.
     """
@@ -203,14 +203,14 @@ def _folders(folder: Path, sub_folders: dict[float, Path], crossed: Path | None,
 
 
 def numbered(folder: Path) -> list[str]:
-    """Sub-folders with a number in their names that are not read as an angle: 045, angle45."""
+    """Sub-folders with a number in their names that is not read as a polarizer angle."""
     inside = [path.name for path in children(folder) if path.is_dir() and path.name not in OURS]
     read = _degrees_by_name(inside)
     return [name for name in inside if name not in read and not is_angle_folder(name) and _NUMBER.search(name)]
 
 
 def degrees(angle_deg: float) -> str:
-    """An angle 0…360 as in the names of shot folders: 045, 022.5; to a thousandth."""
+    """Text of a polarizer angle 0…360° as used in names of shot folders: 045, 022.5; rounded to a thousandth."""
     whole, _, rest = f"{angle_deg:.3f}".partition(".")
     return f"{int(whole):03d}" + (f".{rest.rstrip('0')}" if rest.strip("0") else "")
 
@@ -243,7 +243,7 @@ def _degrees_by_name(names: Iterable[str]) -> dict[str, float]:
 
 
 def _angle_folders(folder: Path) -> tuple[dict[float, Path], Path | None]:
-    """The folders pol000, pol045, … by angle [degrees], and cross or cross045, the angle of the lens's filter."""
+    """Folders pol000, pol045, … by angle [degrees], and the folder of the cross-polarized shot, if any."""
     inside = [path for path in children(folder) if path.is_dir()]
     crossed = [path for path in inside if (match := _FOLDER.fullmatch(path.name)) and not match["pol"]]
     if len(crossed) > 1:
@@ -263,13 +263,13 @@ def _angle_folders(folder: Path) -> tuple[dict[float, Path], Path | None]:
 
 
 def _degrees_of_cross(path: Path) -> float | None:
-    """Angle of the lens's filter, degrees, in the name cross045; None for cross."""
+    """Angle [degrees] of the lens's polarizer in a folder name such as cross045; None for cross."""
     match = _FOLDER.fullmatch(path.name)
     return float(match["cross"]) if match and match["cross"] else None
 
 
 def _is_sensor(pictures: list[Source], angles_deg: _Order) -> bool:
-    """One or two grey pictures: three angles can only be a polarization sensor's."""
+    """Whether the pictures come from a polarization sensor: one or two monochrome files for three angles or more."""
     grey = [source.probe.kind == "photo" and source.probe.channels == 1 for source in pictures]
     return len(grey) <= 2 and not angles_deg and all(grey)
 
@@ -280,7 +280,12 @@ def _sensor_shots(sources: Sequence[Source], angles_deg: _Order) -> Shots:
 
 
 def _by_name(pictures: list[Source]) -> dict[float, list[Source]]:
-    """Finished pictures by the angle in their names; empty unless one number differs that can be an angle."""
+    """Pictures other than RAW, grouped by the polarizer angle in their names.
+
+    Empty unless exactly one number in the names differs and can be an angle.
+
+    Empty unless exactly one number in the names differs and can be an angle.
+    """
     stems = [source.path.stem for source in pictures]
     raw = any(source.probe.kind == "raw" for source in pictures)  # numbers of a camera's counter
     if raw or len({_NUMBER.sub("#", stem) for stem in stems}) != 1:
@@ -295,7 +300,10 @@ def _by_name(pictures: list[Source]) -> dict[float, list[Source]]:
 
 
 def _by_time(folder: Path, pictures: list[Source], angles_deg: Sequence[float]) -> tuple[Shots, str]:
-    """K equal brackets one after the other, and a note on their order."""
+    """Split a flat folder into K brackets of equal length in order of time, one per polarizer angle.
+
+    Also a note on the order.
+    """
     timed = all(source.probe.exif.taken for source in pictures)
     order = sorted(pictures, key=lambda one: (one.probe.exif.taken if timed else "", natural(one.path.name)))
     count, shots = len(order), len(angles_deg)
@@ -321,7 +329,7 @@ def _by_time(folder: Path, pictures: list[Source], angles_deg: Sequence[float]) 
 
 
 def equal(value: float | None, reference: float | None) -> bool:
-    """Whether two exposures are the same, as precisely as the camera states them."""
+    """Whether two relative exposures (time, aperture and ISO) are the same within the rounding of cameras."""
     if not value or not reference:
         return value == reference
     return max(value / reference, reference / value) < 2**EQUAL_STOPS
@@ -337,14 +345,14 @@ def _select(folder: Path, groups: dict[float, list[Source]], angles_deg: _Order)
 
 
 def different(angles_deg: Iterable[float]) -> int:
-    """The number of different polarizer axes, modulo 180 degrees."""
+    """Number of different polarizer axes among the angles; angles 180° apart are the same axis."""
     axes = sorted(angle % 180 for angle in angles_deg)
     gaps = [b - a for a, b in pairwise([*axes, axes[0] + 180])] if axes else []
     return max(sum(gap >= SEPARATION_DEG for gap in gaps), 1 if axes else 0)
 
 
 def _list(folder: Path, remedy: str = "") -> tuple[list[Source], list[str]]:
-    """The photographs of one folder, and notes; finished pictures are left out where there is a RAW.
+    """The photographs of one folder, and notes; JPEGs and the like are left out if there are RAW files.
 
     With a `remedy`, a folder without photographs is a CaptureError.
     """
@@ -367,7 +375,7 @@ def _list(folder: Path, remedy: str = "") -> tuple[list[Source], list[str]]:
 
 
 def _probe(path: Path) -> Probe:
-    """The facts of a file; CaptureError where no decoder can read it."""
+    """Metadata of a photograph. Raises CaptureError if no decoder can read it."""
     found = probe.read(path)
     if found.kind == "unknown":
         raise CaptureError(f"{path}: not a picture, a RAW that LibRaw knows, or text; restore the file, or remove it")
@@ -375,7 +383,10 @@ def _probe(path: Path) -> Probe:
 
 
 def children(folder: Path) -> list[Path]:
-    """The files and folders in a folder, by name, without hidden ones (.DS_Store, ._DSC0001.NEF); CaptureError."""
+    """Files and folders in a folder, sorted by name, without hidden ones (.DS_Store, ._DSC0001.NEF).
+
+    Raises CaptureError.
+    """
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError as error:
@@ -383,5 +394,5 @@ def children(folder: Path) -> list[Path]:
 
 
 def natural(name: str) -> tuple[tuple[int, str], ...]:
-    """Sorting key that puts frame 9 before frame 10."""
+    """Sorting key for file names with numbers: frame 9 before frame 10."""
     return tuple((int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name))

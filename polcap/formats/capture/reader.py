@@ -91,7 +91,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
 
 
 def _photographs(folder: Path, plan: layouts.Plan) -> dict[Path, Source]:
-    """Every photograph of a plan, each named once."""
+    """All photographs of a plan; a file that the plan lists twice appears once."""
     listed = [source for _, bracket in plan.shots for source in bracket]
     if plan.layout == "sensor":  # a frame holds all angles
         listed = list({source.path: source for source in listed}.values())
@@ -102,7 +102,7 @@ def _photographs(folder: Path, plan: layouts.Plan) -> dict[Path, Source]:
 
 
 def table(capture: Capture) -> str:
-    """The capture as text: one line per frame, then camera, lens, focal length and notes."""
+    """The capture as a text table: one line per photograph, then camera, lens, focal length and notes."""
     rows = [["angle", "file", "role", "exposure", "ISO", "f/", "flash", "taken"]]
     for shot in capture.shots:
         for frame in (*shot.frames, *shot.ambient):
@@ -152,7 +152,10 @@ def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Se
 
 
 def _crossed(folder: Path, plan: layouts.Plan, stated: CaptureFile) -> Shot | None:
-    """The shot under the polarized flash; at the first shot's angle where the filter's is not stated."""
+    """The cross-polarized shot (a polarizer on the flash too), if any.
+
+    Its angle is the stated one, else that of the first shot.
+    """
     sources = [source for source in plan.others if source.role == "cross"]
     if not sources:
         return None

@@ -1,6 +1,7 @@
 """Assets for other programs.
 
 gltf          GLB with mesh, material and textures
+glb_geometry  the mesh of a GLB: floats, integers or Draco
 obj           OBJ, MTL and EXR textures
 usd           USD with OpenPBR and UsdPreviewSurface
 materialx     MaterialX 1.39, and the OpenPBR node graph

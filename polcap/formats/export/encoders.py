@@ -37,7 +37,7 @@ _QUALITY = {"jpeg": (95, 92), "webp": (101, 90)}  # data, color; WebP over 100 i
 
 
 class TextureEncoder:
-    """Encodes each texture of an export once, also when several files hold it and threads write them."""
+    """Encodes each texture of an export once, even if several files contain it; safe with threads."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -45,7 +45,7 @@ class TextureEncoder:
         self._made: dict[tuple[int, Kind, bool], tuple[Pixels, Future[bytes]]] = {}
 
     def __call__(self, texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
-        """As `encode`; with `text` a PNG holds the texture's meaning in a tEXt chunk, for files next to the asset."""
+        """The bytes of one texture as for `encode`; with `text`, a PNG also states its meaning in a tEXt chunk."""
         key = (id(texture.pixels), kind, texture.color)
         with self._lock:
             first = key not in self._made
@@ -59,13 +59,15 @@ class TextureEncoder:
         return png.described(data, {"Description": texture.meaning}) if text and kind == "png" else data
 
     def all(self, textures: Mapping[str, Texture], kind: Kind) -> dict[str, bytes]:
-        """The bytes of each texture, encoded on threads; SettingError as `encode`."""
+        """Encode several textures on threads; returns bytes by texture name. Raises SettingError as `encode` does."""
         with ThreadPoolExecutor(min(len(textures), os.cpu_count() or 1) or 1) as pool:
             return dict(zip(textures, pool.map(partial(self, kind=kind), textures.values())))
 
 
 def encode(texture: Texture, kind: Kind) -> bytes:
-    """The bytes of one texture; JPEG and WebP hold 8 bits, PNG the bits of the texture.
+    """Encode one texture as PNG, JPEG, WebP or KTX2.
+
+    JPEG and WebP have 8 bits per channel, PNG 8 or 16 as the texture.
 
     Raises SettingError: the kind cannot hold the picture's channels, or its encoder is not installed.
     Raises StorageError: the encoder failed.
@@ -90,7 +92,7 @@ def encode(texture: Texture, kind: Kind) -> bytes:
 
 
 def ktx2_encoder() -> str | None:
-    """The path of `ktx` or `toktx` of Khronos' KTX software, if it is installed."""
+    """Path of an installed KTX2 encoder (Khronos' `ktx` or `toktx`), or None."""
     return next((found for name in _KTX2 if (found := shutil.which(name))), None)
 
 
@@ -136,12 +138,12 @@ def webp(path: Path, frames: Frames, seconds: float) -> None:
 
 
 def ffmpeg() -> str | None:
-    """The path of FFmpeg, if it is installed."""
+    """Path of an installed FFmpeg, or None."""
     return shutil.which("ffmpeg")
 
 
 def mp4(path: Path, frames: Frames, seconds: float) -> None:
-    """Write frames (H, W, 3) as H.264, by FFmpeg.
+    """Write 8-bit sRGB frames (H, W, 3) as an MP4 video (H.264) that lasts `seconds`, by FFmpeg.
 
     Raises StorageError: FFmpeg is missing, or fails.
     """

@@ -37,7 +37,7 @@ MEANINGS = {
 
 @dataclass(frozen=True)
 class ColorSpace:
-    """A color space of the OpenColorIO configuration."""
+    """A color space of the OpenColorIO configuration: name, interoperability identifier and primaries."""
 
     name: str
     interop_id: str | None  # Color Interop Forum's name, where the configuration has it
@@ -45,7 +45,9 @@ class ColorSpace:
 
 
 def write(path: Path, maps: Path, color: str, header: Mapping[str, str]) -> None:
-    """Write the maps of a result's folder `maps` as layers, their colors in the space or role `color`.
+    """Write the maps of the result folder `maps` as layers of one EXR.
+
+    Colors are converted to the color space or role `color`.
 
     Raises SettingError: there is no such space.
     Raises DecodeError: a map is missing or damaged.
@@ -80,7 +82,7 @@ def _attributes(space: ColorSpace, header: Mapping[str, str]) -> dict[str, exr.A
 
 
 def find_space(wanted: str) -> ColorSpace:
-    """The color space with this role, name or alias.
+    """Look up a color space of the OpenColorIO configuration by role, name or alias.
 
     Raises SettingError: the configuration has no such space, or it is data or a display.
     """
@@ -103,7 +105,7 @@ def find_space(wanted: str) -> ColorSpace:
 
 
 def convert(rgb: Floats, space: ColorSpace) -> Floats:
-    """Convert linear Rec.709 (H, W, 3) to the space.
+    """Convert an image (H, W, 3) from linear Rec.709 to another color space.
 
     Raises SettingError: the configuration cannot convert from linear Rec.709.
     """

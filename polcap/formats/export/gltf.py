@@ -12,6 +12,7 @@ KHR_texture_basisu.
 import json
 import struct
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,13 @@ from numpy.typing import NDArray
 
 from polcap import __version__
 from polcap.formats import atomic
-from polcap.formats.export import encoders, texture_set
+from polcap.formats.export import encoders, glb_geometry, texture_set
 from polcap.formats.export.encoders import Kind, TextureEncoder
+from polcap.formats.export.glb_geometry import Blob, Geometry
 from polcap.formats.export.texture_set import Texture
-from polcap.images import Asset, Floats, Mesh
+from polcap.formats.maps import maps_folder
+from polcap.images import Asset, Floats
 
-_FLOAT, _UINT32 = 5126, 5125
-_ARRAY, _ELEMENTS = 34962, 34963  # bufferView.target
 _LINEAR, _LINEAR_MIPMAP, _CLAMP = 9729, 9987, 33071
 _IMAGE_EXTENSION: dict[Kind, str] = {"webp": "EXT_texture_webp", "ktx2": "KHR_texture_basisu"}
 _CONTEXT = {
@@ -37,11 +38,20 @@ _CONTEXT = {
 }
 
 
+@dataclass(frozen=True)
+class GlbOptions:
+    """Storage of a GLB's pictures and mesh."""
+
+    images: Kind = "png"
+    geometry: Geometry = "float"
+    origin: Floats | None = None  # (3,) camera frame; by default the middle of the mesh
+
+
 def write(
     path: Path,
     asset: Asset,
     name: str,
-    images: Kind = "png",
+    options: GlbOptions = GlbOptions(),
     provenance: Mapping[str, str] | None = None,
     encoder: TextureEncoder | None = None,
 ) -> None:
@@ -50,36 +60,39 @@ def write(
     `name` is that of scene, node, mesh and material; `provenance` goes into the XMP packet (KHR_xmp_json_ld); an
     `encoder` that is shared by the files of an export encodes no texture twice.
 
-    Raises SettingError: there is no encoder for this kind of images.
+    Raises SettingError: there is no encoder for this kind of images or geometry.
     Raises StorageError: the file cannot be written.
     """
-    atomic.write(path, encode(asset, name, images, provenance, encoder))
+    atomic.write(path, encode(asset, name, options, provenance, encoder))
 
 
 def encode(
     asset: Asset,
     name: str,
-    images: Kind = "png",
+    options: GlbOptions = GlbOptions(),
     provenance: Mapping[str, str] | None = None,
     encoder: TextureEncoder | None = None,
 ) -> bytes:
-    """The bytes of the GLB that `write` writes."""
-    blob = _Blob()
-    primitive = _primitive(asset.mesh, blob)
+    """Encode an asset as the bytes of a GLB; parameters as for `write`."""
+    blob, images = Blob(), options.images
+    origin = center(asset.mesh.vertices) if options.origin is None else options.origin
+    primitive, transform = glb_geometry.add(blob, asset.mesh, origin, options.geometry)
     held = textures(asset)
     pictures = [
-        blob.image(f"{name}_{key}", data, encoders.MIME[images])
+        {"name": f"{name}_{key}", "bufferView": blob.view(data), "mimeType": encoders.MIME[images]}
         for key, data in (encoder or TextureEncoder()).all(held, images).items()
     ]
     used = ["KHR_materials_specular", "KHR_materials_ior", "KHR_xmp_json_ld"]
-    required = [_IMAGE_EXTENSION[images]] if images in _IMAGE_EXTENSION else []
+    picture = _IMAGE_EXTENSION.get(images)
+    required = [*([picture] if picture else []), *glb_geometry.EXTENSIONS[options.geometry]]
     document = {
         "asset": {
             "version": "2.0",
             "generator": f"polcap {__version__}",
             "extras": {
                 "unit": "metre" if asset.mesh.metric else "relative",
-                "origin_in_camera": center(asset.mesh.vertices).tolist(),
+                "albedo": maps_folder.albedo_scale(asset.albedo_sigma),
+                "origin_in_camera": origin.tolist(),
                 "pieces": asset.mesh.pieces,
                 "cuts": asset.mesh.cuts,
                 "cut_px": asset.mesh.cut_px,
@@ -93,11 +106,11 @@ def encode(
         "extensions": {"KHR_xmp_json_ld": {"packets": [_packet(name, provenance or {})]}},
         "scene": 0,
         "scenes": [{"name": name, "nodes": [0]}],
-        "nodes": [{"name": name, "mesh": 0}],
-        "meshes": [{"name": name, "primitives": [primitive]}],
+        "nodes": [{"name": name, "mesh": 0, **transform}],
+        "meshes": [{"name": name, "primitives": [{**primitive, "material": 0}]}],
         "materials": [_material(asset, name)],
         "textures": [
-            {"sampler": 0, "extensions": {required[0]: {"source": k}}} if required else {"sampler": 0, "source": k}
+            {"sampler": 0, "extensions": {picture: {"source": k}}} if picture else {"sampler": 0, "source": k}
             for k in range(len(pictures))
         ],
         "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP, "wrapS": _CLAMP, "wrapT": _CLAMP}],
@@ -113,25 +126,12 @@ def encode(
 
 
 def textures(asset: Asset) -> dict[str, Texture]:
-    """The embedded textures, by the end of their names, in the order of the material."""
+    """The textures that a GLB embeds, by name suffix, in the order of the glTF material."""
     return {
         "basecolor": texture_set.base_color(asset),
         "orm": texture_set.packed(asset),
         "normal": texture_set.normal(asset),
         "specular": texture_set.relative_specular(asset),
-    }
-
-
-def _primitive(mesh: Mesh, blob: "_Blob") -> dict[str, Any]:
-    return {
-        "attributes": {
-            "POSITION": blob.accessor((mesh.vertices - center(mesh.vertices)).astype(np.float32), "VEC3", bounds=True),
-            "NORMAL": blob.accessor(mesh.normals, "VEC3"),
-            "TANGENT": blob.accessor(mesh.tangents, "VEC4"),
-            "TEXCOORD_0": blob.accessor(mesh.uv, "VEC2"),
-        },
-        "indices": blob.accessor(mesh.faces.reshape(-1).astype(np.uint32), "SCALAR"),
-        "material": 0,
     }
 
 
@@ -157,7 +157,7 @@ def _material(asset: Asset, name: str) -> dict[str, Any]:
 
 
 def _packet(name: str, provenance: Mapping[str, str]) -> dict[str, Any]:
-    """Title and provenance in Dublin Core and polcap's own terms, as JSON-LD."""
+    """Title and origin of an asset as an XMP packet in JSON-LD (Dublin Core, and polcap's terms)."""
     return {
         "@context": _CONTEXT,
         "@id": "",
@@ -177,39 +177,7 @@ def center(vertices: Floats) -> Floats:
 
 
 def is_open(faces: NDArray[np.int32]) -> bool:
-    """Whether some edge of faces (F, 3) belongs to one triangle only, so that the back of the surface is visible."""
+    """Whether a mesh has a border: an edge of faces (F, 3) that only one triangle has, so that its back can be seen."""
     start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1)
     _, triangles = np.unique(np.minimum(start, end) << 32 | np.maximum(start, end), return_counts=True)
     return bool((triangles == 1).any())
-
-
-class _Blob:
-    """The binary chunk; each part starts at a multiple of four bytes."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
-
-    def accessor(self, array: Any, kind: str, bounds: bool = False) -> int:
-        floating = array.dtype == np.float32
-        view = self._view(np.ascontiguousarray(array).tobytes(), target=_ARRAY if floating else _ELEMENTS)
-        entry: dict[str, Any] = {
-            "bufferView": view,
-            "componentType": _FLOAT if floating else _UINT32,
-            "count": len(array),
-            "type": kind,
-        }
-        if bounds:
-            entry |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
-        self.accessors.append(entry)
-        return len(self.accessors) - 1
-
-    def image(self, name: str, data: bytes, mime: str) -> dict[str, Any]:
-        return {"name": name, "bufferView": self._view(data), "mimeType": mime}
-
-    def _view(self, data: bytes, **fields: int) -> int:
-        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data), **fields})
-        self.data += data
-        self.data += bytes(-len(self.data) % 4)
-        return len(self.views) - 1

@@ -1,4 +1,4 @@
-"""Writes the material as MaterialX 1.39 with OpenPBR, from the template `openpbr.mtlx`.
+"""Writes an asset's material as a MaterialX 1.39 document with OpenPBR, from the template `openpbr.mtlx`.
 
 In the document every node comes after the nodes that it takes inputs from. The specular texture holds F0/0.08 in
 color: its luminance becomes specular_weight, F0 over the F0 of the asset's index; the color divided by its luminance

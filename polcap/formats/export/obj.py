@@ -22,12 +22,14 @@ from polcap.images import Asset
 
 
 def stem(name: str) -> str:
-    """A name without spaces: OBJ and MTL have no quotes."""
+    """File name without spaces, because OBJ and MTL cannot quote names."""
     return re.sub(r"\s+", "_", name)
 
 
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], comment: str = "") -> list[Path]:
-    """Write `path` (.obj), its .mtl and two EXRs, and return their paths; `files` name the PNGs in the same folder.
+    """Write a mesh as `path` (.obj), its .mtl and two EXR textures; returns the paths.
+
+    `files`: PNGs in the same folder.
 
     Raises StorageError: a file cannot be written.
     """
@@ -46,12 +48,12 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], comment
 
 
 def _data(file: Path, channels: Mapping[str, NDArray[Any]]) -> None:
-    """Write integers as the share of their greatest value, in half."""
+    """Write integer texture channels as an EXR of half floats: each value divided by the greatest value of its type."""
     exr.write(file, {name: one / np.float32(np.iinfo(one.dtype).max) for name, one in channels.items()}, half=True)
 
 
 def _geometry(file: IO[bytes], asset: Asset, material: str, library: str) -> None:
-    """Write the lines of the mesh; in faces, vertex, texture corner and normal share a number, from 1."""
+    """Write the mesh of an OBJ file: vertices, texture coordinates, normals, and faces with one index for all."""
     mesh = asset.mesh
     file.write(f"mtllib {library}\no {material}\n".encode())
     np.savetxt(file, mesh.vertices - gltf.center(mesh.vertices), "v %.8f %.8f %.8f")
@@ -62,7 +64,7 @@ def _geometry(file: IO[bytes], asset: Asset, material: str, library: str) -> Non
 
 
 def _material(asset: Asset, material: str, files: Mapping[Key, str], data: Mapping[Key, str]) -> str:
-    """The .mtl; Ns is the Blinn exponent 2/α² − 2 of the median roughness, Ks · map_Ks is F0."""
+    """Text of the .mtl. Ns is the Blinn exponent 2/α² − 2 of the median roughness; Ks · map_Ks is F0."""
     packed = asset.occlusion_roughness_metallic
     alpha = float(np.median(packed[..., 1]) / np.iinfo(packed.dtype).max) ** 2
     exponent = min(max(2 / max(alpha, 1e-3) ** 2 - 2, 0.0), 1000.0)

@@ -1,4 +1,4 @@
-"""Presets of `polcap export`: formats, file names, packing and direction of normals for a program or purpose."""
+"""Presets of `polcap export`: file formats, file names, channel packing and normal-map direction for a program."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -7,6 +7,7 @@ from typing import Literal
 
 from polcap.formats.export import texture_set
 from polcap.formats.export.encoders import Kind
+from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.texture_set import Texture
 from polcap.images import Asset
 
@@ -16,12 +17,14 @@ FORMATS: tuple[Format, ...] = ("gltf", "obj", "usd", "materialx", "exr")
 
 @dataclass(frozen=True)
 class ExportPreset:
-    """The files of one export; `{}` in a name is the asset's name."""
+    """The files that one export writes for one program; in file names, {} is replaced by the asset's name."""
 
     formats: tuple[Format, ...]
     description: str
     name: str = "{}"  # of the asset itself
     images: Kind = "png"  # inside the GLB
+    geometry: Geometry = "float"  # inside the GLB
+    triangles: int | None = None  # at most; by default those of the full mesh
     textures: Mapping[str, Callable[[Asset], Texture]] = field(default_factory=dict)  # PNG files next to the asset
 
 
@@ -53,8 +56,10 @@ PRESETS: Mapping[str, ExportPreset] = {
     ),
     "web": ExportPreset(
         formats=("gltf",),
-        description="one small GLB; colours lossy, data lossless WebP (EXT_texture_webp); normals +Y",
+        description="one small GLB: quantized mesh; colours lossy, data lossless WebP (EXT_texture_webp); normals +Y",
         images="webp",
+        geometry="quantized",
+        triangles=50_000,
     ),
     "archive": ExportPreset(
         formats=FORMATS,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from polcap import __version__
-from polcap.formats import atomic
+from polcap.formats import atomic, text_file
 from polcap.formats.raw import file_bytes
 
 _PARTS = (
@@ -27,7 +27,7 @@ def versions() -> dict[str, str]:
 
 
 def record(about: Mapping[str, Any]) -> dict[str, Any]:
-    """The origin of a result, from the content of its report.json."""
+    """The origin of a result (photographs, versions, settings), from the content of its report.json."""
     capture, model = about["capture"], about["model"]
     return {
         "format": "polcap provenance 1",
@@ -47,18 +47,30 @@ def record(about: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def words(facts: Mapping[str, Any]) -> dict[str, str]:
-    """The record as texts, for formats that hold only texts."""
+    """The origin of a result as texts by key, for file formats that store only texts."""
     return {key: value if isinstance(value, str) else _plain(value) for key, value in facts.items()}
 
 
 def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:
-    """Write the sidecar: the record, and the digest of every file of the export; StorageError."""
-    text = json.dumps({**facts, "files": dict(sorted(digests.items()))}, indent=1, ensure_ascii=False)
+    """Write the sidecar file of an export: its origin (`facts`) and the digest of each exported file.
+
+    The sidecar of an earlier export with the same record also listed its files; those that exist stay in the list.
+
+    Raises StorageError: the file cannot be written.
+    """
+    earlier: dict[str, Any] = {}
+    with suppress(OSError, ValueError):
+        earlier = text_file.read_json(path)
+    files = earlier.pop("files", {})
+    if earlier != json.loads(json.dumps(facts)):
+        files = {}
+    files = {name: known for name, known in files.items() if (path.parent / name).exists()} | dict(digests)
+    text = json.dumps({**facts, "files": dict(sorted(files.items()))}, indent=1, ensure_ascii=False)
     atomic.write(path, text + "\n")
 
 
 def digest(file: Path) -> str:
-    """The digest of a file, as in the sidecar."""
+    """SHA-256 of an exported file, as in the sidecar file."""
     return file_bytes.digest(file.read_bytes())
 
 

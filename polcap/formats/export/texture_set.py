@@ -1,4 +1,4 @@
-"""The textures of an asset, packed as each kind of program needs them.
+"""Makes the textures of an asset, with channels packed as each kind of program expects.
 
 Each has a sentence on the meaning of its channels, which goes into the file, into maps.json and into the material.
 """
@@ -21,7 +21,7 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 @dataclass(frozen=True)
 class Texture:
-    """A picture and its meaning."""
+    """A texture image, whether it is color or data, and a sentence on the meaning of its channels."""
 
     pixels: Pixels  # (H, W), (H, W, 3) or (H, W, 4)
     color: bool  # sRGB-encoded color; else numbers
@@ -29,7 +29,7 @@ class Texture:
 
 
 def base_color(asset: Asset) -> Texture:
-    """Diffuse color, or albedo as glTF defines it."""
+    """Base color texture: diffuse color as glTF defines it."""
     return Texture(asset.base_color, True, "base colour, sRGB-encoded Rec.709")
 
 
@@ -43,25 +43,25 @@ def normal(asset: Asset, *, up: bool = True) -> Texture:
 
 
 def roughness(asset: Asset) -> Texture:
-    """The roughness channel of the packed texture."""
+    """Roughness texture in one channel, taken from the packed texture."""
     meaning = "perceptual roughness (GGX alpha = roughness squared), linear"
     return Texture(np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1]), False, meaning)
 
 
 def packed(asset: Asset) -> Texture:
-    """Occlusion, roughness and metallic in one picture, as in glTF."""
+    """Texture of occlusion (R), roughness (G) and metallic (B), as glTF packs them."""
     meaning = "R occlusion (1: none measured), G perceptual roughness, B metallic (0); linear"
     return Texture(asset.occlusion_roughness_metallic, False, meaning)
 
 
 def relative_specular(asset: Asset) -> Texture:
-    """F0 as KHR_materials_specular needs it, to be multiplied by the asset's factor."""
+    """Specular color texture for KHR_materials_specular: F0 divided by the asset's specular factor."""
     meaning = f"F0 over {asset.specular_factor[0] * _index_reflectance(asset):.5g}, sRGB-encoded"
     return Texture(asset.specular_color, True, meaning)
 
 
 def specular(asset: Asset) -> Texture:
-    """F0 on a fixed scale, in color."""
+    """Color texture of F0 (reflectance at normal incidence) on a fixed scale, the same for all assets."""
     meaning = f"F0 / {SPECULAR_RANGE:g}, sRGB-encoded; F0 beyond {SPECULAR_RANGE:g} is clipped"
     values = np.arange(np.iinfo(asset.specular_color.dtype).max + 1, dtype=asset.specular_color.dtype)
     table = replace(asset, specular_color=np.repeat(values[:, None], 3, axis=1))  # all values of a channel
@@ -71,13 +71,13 @@ def specular(asset: Asset) -> Texture:
 
 
 def specular_level(asset: Asset) -> Texture:
-    """The luminance of F0 on a fixed scale."""
+    """Gray texture of the luminance of F0 on a fixed scale, the same for all assets."""
     meaning = f"specular level: F0 / {SPECULAR_RANGE:g}, linear; F0 beyond {SPECULAR_RANGE:g} is clipped"
     return Texture(_quantized(color.luminance(_level(asset)), asset.specular_color), False, meaning)
 
 
 def unity_mask(asset: Asset) -> Texture:
-    """HDRP's mask map."""
+    """Mask map of Unity's HDRP: metallic, occlusion, detail mask and smoothness."""
     orm = asset.occlusion_roughness_metallic
     top = np.iinfo(orm.dtype).max
     channels = [orm[..., 2], orm[..., 0], np.zeros_like(orm[..., 0]), top - orm[..., 1]]
@@ -86,7 +86,7 @@ def unity_mask(asset: Asset) -> Texture:
 
 
 def unity_specular(asset: Asset) -> Texture:
-    """Specular map of the Standard, URP and HDRP specular set-ups."""
+    """Specular map for Unity's specular workflow (Standard, URP, HDRP): F0 in RGB, smoothness in alpha."""
     rough = asset.occlusion_roughness_metallic[..., 1:2]
     smooth = 1 - rough / np.float64(np.iinfo(rough.dtype).max)
     reflected = color.encode_srgb(np.clip(_reflectance(asset), 0.0, 1.0))
@@ -103,18 +103,18 @@ LOOSE: Mapping[Key, Callable[[Asset], Texture]] = {
 
 
 def _reflectance(asset: Asset) -> Floats:
-    """F0 (H, W, 3), linear."""
+    """F0 (reflectance at normal incidence) of each texel, (H, W, 3), linear."""
     relative = color.decode_srgb(asset.specular_color / np.float64(np.iinfo(asset.specular_color.dtype).max))
     return np.asarray(relative * np.array(asset.specular_factor) * _index_reflectance(asset))
 
 
 def _index_reflectance(asset: Asset) -> float:
-    """F0 of the asset's refractive index."""
+    """F0 that follows from the asset's refractive index."""
     return float(fresnel.normal_reflectance(asset.ior))
 
 
 def _level(asset: Asset) -> Floats:
-    """F0 on the fixed scale of the loose textures, 0…1."""
+    """F0 of each texel divided by a fixed full-scale value, 0…1, (H, W, 3)."""
     return np.asarray(np.clip(_reflectance(asset) / SPECULAR_RANGE, 0.0, 1.0))
 
 

@@ -26,7 +26,7 @@ from polcap.optics import fresnel
 
 
 def require() -> None:
-    """Raise a SettingError where usd-core is not installed."""
+    """Raise a SettingError if the package usd-core is not installed."""
     try:
         from pxr import Usd  # noqa: F401
     except ModuleNotFoundError:
@@ -36,7 +36,7 @@ def require() -> None:
 
 
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], facts: Mapping[str, str]) -> None:
-    """Write a USD layer (.usdc or .usda); its textures `files` are in the same folder.
+    """Write an asset as a USD layer (.usdc or .usda); its textures `files` are in the same folder.
 
     `facts` go into the layer's custom data.
 
@@ -98,7 +98,7 @@ def _material(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tin
 
 
 def _openpbr(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str]) -> Any:
-    """The nodes of the MaterialX document as shaders; returns the surface's output."""
+    """Add the OpenPBR material (the nodes of the MaterialX document) as USD shaders; returns the surface output."""
     from pxr import Sdf, UsdShade
 
     kinds = Sdf.ValueTypeNames
@@ -132,7 +132,10 @@ def _openpbr(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str]) -> A
 
 
 def _preview(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tint: bool) -> Any:
-    """UsdPreviewSurface with F0 from a texture; with `tint` F0 over that of the index, not in the specular workflow."""
+    """Add a UsdPreviewSurface material.
+
+    F0 comes from a texture; with `tint`, as F0 divided by the F0 of the index (metallic workflow).
+    """
     from pxr import Sdf, UsdShade
 
     kinds = Sdf.ValueTypeNames

@@ -48,7 +48,7 @@ def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, 
 
 
 def jpeg(picture: NDArray[np.uint8], whole_color: bool = False) -> str:
-    """A picture (H, W, 3) sRGB as a data URL; `whole_color` stores colors at full resolution."""
+    """Encode a picture (H, W, 3) sRGB as a data URL of a JPEG; `whole_color` stores chroma at full resolution."""
     ratio = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444 if whole_color else cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420
     options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY + 6 * whole_color, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, ratio]
     _, encoded = cv2.imencode(".jpg", picture[..., ::-1], options)
@@ -56,23 +56,23 @@ def jpeg(picture: NDArray[np.uint8], whole_color: bool = False) -> str:
 
 
 def lossless(picture: NDArray[np.uint8]) -> str:
-    """A picture (H, W, 3) or (H, W, 4) as the data URL of a PNG."""
+    """Encode a picture (H, W, 3) or (H, W, 4) as a data URL of a PNG."""
     return _address("image/png", png.encode(picture))
 
 
 def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> str:
-    """Levels (H, W) in their colors (255, 3) as the data URL of a PNG; level 0 is transparent."""
+    """Encode levels (H, W) with a palette (255, 3) as a data URL of a PNG; level 0 is transparent."""
     return _address("image/png", png.indexed(level, colors))
 
 
 def packed(array: NDArray[Any]) -> str:
-    """The little-endian bytes of an array of any shape, gzipped, as base64."""
+    """Encode an array of any shape as base64 text of its gzipped little-endian bytes, for a page's scripts."""
     solid = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
     return text(gzip.compress(solid.tobytes(), 6, mtime=0))
 
 
 def text(content: bytes) -> str:
-    """Bytes as base64."""
+    """Encode bytes as base64 text."""
     return b64encode(content).decode()
 
 
@@ -81,5 +81,5 @@ def _address(kind: str, content: bytes) -> str:
 
 
 def _json(data: Mapping[str, Any]) -> str:
-    """JSON that is safe inside a script element."""
+    """Encode data as JSON that can stand inside an HTML script element: < and the like are escaped."""
     return json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

@@ -21,7 +21,9 @@ def write(
     *,
     half: bool | Collection[str] = False,
 ) -> None:
-    """Write channels (H, W) by name ("R", "normal.x", "S0.R"), ZIP; the same input gives the same bytes.
+    """Write named channels (H, W) ("R", "normal.x", "S0.R") as an EXR, ZIP-compressed.
+
+    The same input gives the same bytes.
 
     `half` makes all channels, or those named, 16 bits instead of 32; values beyond the range of half are clipped to it.
 
@@ -58,7 +60,7 @@ def write(
 
 
 def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
-    """Channels by name, each (H, W) float32, and the file's attributes.
+    """Read an EXR: its channels by name, each (H, W) float32, and its attributes.
 
     Raises DecodeError: the file is missing, cut short, not an OpenEXR file, or larger than any picture.
     """
@@ -67,7 +69,7 @@ def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
 
 
 def decode(path: str) -> worker.Answer:
-    """`read`, in the child process; DecodeError."""
+    """Read an EXR in the child process; result and DecodeError as for `read`."""
     data = file_bytes.load(path)
     if data[:4] != _MAGIC:
         raise DecodeError(f"{path} is not an OpenEXR file; write it again")

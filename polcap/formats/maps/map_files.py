@@ -1,4 +1,4 @@
-"""The content of each file of maps/: channels of an .exr, or pixels of a .png."""
+"""Content of each file of a result's folder maps/: the channels of an .exr, or the pixels of a .png."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
@@ -14,12 +14,12 @@ Source = Literal["maps", "mesh", "stokes", "cues"]
 
 
 def object_depth(maps: SurfaceMaps, mesh: Mesh) -> Floats:
-    """Depth (H, W) on the object, 0 outside."""
+    """Depth map (H, W) of the mesh on the object's pixels, 0 outside."""
     return np.where(inside(maps) & np.isfinite(mesh.depth), mesh.depth, 0.0).astype(np.float32)
 
 
 def depth_range(maps: SurfaceMaps, mesh: Mesh) -> tuple[float, float, float]:
-    """Least, median and greatest depth on the object."""
+    """Least, median and greatest depth of the mesh on the object."""
     depth = object_depth(maps, mesh)
     seen = depth[depth > 0]
     near, median, far = (float(q) for q in np.quantile(seen, (0, 0.5, 1))) if seen.size else (0.0, 0.5, 1.0)
@@ -38,17 +38,17 @@ def _normal_picture(maps: SurfaceMaps) -> NDArray[np.uint16]:
 
 
 def inside(maps: SurfaceMaps) -> NDArray[np.bool_]:
-    """Which pixels (H, W) the object covers."""
+    """Mask (H, W) of the pixels that the object covers."""
     return np.asarray(maps.mask, dtype=bool)
 
 
 def on_object(maps: SurfaceMaps, values: Floats) -> Floats:
-    """A map (H, W[, C]) on the object, 0 outside."""
+    """A copy of a map (H, W[, C]) with 0 outside the object."""
     return masked(values, inside(maps))
 
 
 def masked(values: Floats, inside: NDArray[np.bool_]) -> Floats:
-    """Values (H, W[, C]) inside, 0 outside."""
+    """A copy of an image (H, W[, C]) with 0 outside the mask `inside`."""
     return np.where(inside if values.ndim == 2 else inside[..., None], values, 0).astype(np.float32)
 
 
@@ -73,7 +73,7 @@ def _cue_channels(cues: Cues) -> dict[str, Floats]:
 
 
 def _separated(cues: Cues) -> dict[str, Floats]:
-    """The two parts of S0, where a crossed shot separates them."""
+    """Diffuse and specular part of S0 as maps, if a cross-polarized shot separates them; otherwise none."""
     if cues.body is None or cues.body_known is None:
         return {}
     body = masked(cues.body, cues.body_known)

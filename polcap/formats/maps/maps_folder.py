@@ -49,8 +49,12 @@ class _Depth(Struct, frozen=True):
     unit: Literal["m", "relative"]
 
 
+class _Albedo(Struct, frozen=True):
+    uncertainty_percent: Annotated[float, Meta(ge=0)] | None = None
+
+
 class _Description(Struct, frozen=True):
-    """The keys of maps.json that `read` needs."""
+    """The keys of maps.json (crop, size, camera, depth unit…) that `read` needs."""
 
     crop: tuple[_Place, _Place, _Place, _Place]
     size: tuple[_Side, _Side]
@@ -58,12 +62,13 @@ class _Description(Struct, frozen=True):
     camera: _Camera
     depth: _Depth
     estimator: str
+    albedo: _Albedo = _Albedo()
     sizes: dict[str, tuple[_Side, _Side]] = {}
 
 
 @dataclass(frozen=True)
 class StoredMaps:
-    """The maps of a result as read from its files."""
+    """The maps of a result as read from its folder maps/, with the depth (H, W) and whether it is metric."""
 
     maps: SurfaceMaps
     depth: Floats  # (H, W) NaN outside the mask
@@ -71,7 +76,7 @@ class StoredMaps:
 
 
 def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues) -> None:
-    """Write every map as EXR, the main ones as PNG too, and maps.json last; the same values give the same bytes.
+    """Write the folder maps/ of a result: every map as EXR, the main ones as PNG too, and maps.json.
 
     Of the mesh its depth (H, W) is written. All images are on the crop (H, W) of `maps`. Files are encoded on
     threads. The folder is replaced as a whole: if one file fails, the folder of an earlier run stays.
@@ -91,7 +96,7 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues
 
 
 def _write(file: Path, content: Callable[[], Any]) -> None:
-    """Write one file: an .exr of channels, or a .png of pixels."""
+    """Write one file of the folder maps/: an .exr of channels, or a .png of pixels."""
     if file.suffix == ".exr":
         exr.write(file, content(), half=file.stem not in map_files.FLOAT_FILES)
     else:
@@ -111,23 +116,24 @@ def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
         mask=inside,
         view=maps.view,
         estimator=maps.estimator,
+        albedo_sigma=None if maps.albedo_sigma is None else round(maps.albedo_sigma, 3),
         detail=None if maps.detail is None else map_files.detail_of(map_files.detail_levels(maps.detail)),
     )
 
 
 def stored_depth(maps: SurfaceMaps, mesh: Mesh) -> Floats:
-    """The depth (H, W) as `read` returns it after `write`; NaN outside the mask."""
+    """The mesh's depth (H, W) as `read` returns it after `write`; NaN outside the mask."""
     return np.where(map_files.inside(maps), map_files.object_depth(maps, mesh), np.nan).astype(np.float32)
 
 
 def _masked_half(values: Floats, inside: NDArray[np.bool_]) -> Floats:
-    """`map_files.masked`, clipped and rounded to half."""
+    """A map with 0 outside the object, clipped to the range of half floats and rounded to half."""
     limit = np.finfo(np.float16).max
     return np.clip(map_files.masked(values, inside), -limit, limit).astype(np.float16).astype(np.float32)
 
 
 def read(folder: Path) -> StoredMaps:
-    """Read the folder that `write` wrote: EXRs, mask.png and maps.json.
+    """Read the folder maps/ of a result that `write` wrote: EXRs, mask.png and maps.json.
 
     Raises DecodeError: a file is missing, damaged, or not of the size in maps.json.
     """
@@ -138,6 +144,7 @@ def read(folder: Path) -> StoredMaps:
         raise DecodeError(f"{folder} has no maps.json ({error.strerror}); give a result's folder") from error
     except ValueError as error:
         raise DecodeError(f"{folder / 'maps.json'} is not a maps.json of polcap ({error}); process again") from error
+    percent = about.albedo.uncertainty_percent
     origin = (about.crop[0] / about.scale, about.crop[1] / about.scale)
     view = View(about.camera.focal_px, about.camera.center_px, about.scale, origin, about.camera.focal_known)
     mask = png.read(folder / "mask.png")
@@ -158,6 +165,7 @@ def read(folder: Path) -> StoredMaps:
         mask=inside,
         view=view,
         estimator=about.estimator,
+        albedo_sigma=None if percent is None else round(percent / 100, 3),
         detail=_read_detail(folder, about.size) if map_files.DETAIL in about.sizes else None,
     )
     depth = np.where(inside, _read_map(folder, "depth", "Z", about.size), np.nan).astype(np.float32)
@@ -169,18 +177,23 @@ def _read_detail(folder: Path, size: tuple[int, int]) -> Floats:
     levels = png.read(folder / map_files.DETAIL)
     if levels.dtype != np.uint8 or levels.shape != (2 * size[1], 2 * size[0]):
         raise DecodeError(f"{folder / map_files.DETAIL} is not {2 * size[0]} × {2 * size[1]} of 8 bits; process again")
-    return map_files.detail_of(levels)
+    return map_files.detail_of(np.asarray(levels, np.uint8))
 
 
 def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
-    """Note in maps.json the content of the export in the result's folder `where`.
+    """Add a record `about` an export to maps.json, merged with earlier records of the folder `where`.
 
     Raises StorageError: the file cannot be written.
     """
     file = folder / "maps.json"
     known = text_file.read_json(file)
-    earlier = known.get("exports")
-    known["exports"] = dict(sorted({**(earlier if isinstance(earlier, dict) else {}), where: about}.items()))
+    exports = known.get("exports", {})
+    earlier = exports.get(where, {})
+    note = {
+        key: {**earlier.get(key, {}), **value} if isinstance(value, dict) and key != "mesh" else value
+        for key, value in about.items()
+    }
+    known["exports"] = dict(sorted({**exports, where: note}.items()))
     _write_json(file, known)
 
 
@@ -189,7 +202,7 @@ def _write_json(file: Path, content: Mapping[str, Any]) -> None:
 
 
 def _read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Floats:
-    """The channels `letters` of a map's EXR, (H, W, C), or (H, W) of one."""
+    """Read the channels `letters` of one map's EXR as an array (H, W, C), or (H, W) for one channel."""
     file = folder / f"{name}.exr"
     found, _ = exr.read(file)
     planes = [found[letter] for letter in letters if letter in found]
@@ -202,7 +215,7 @@ def _read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> F
 
 
 def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[str, Any]:
-    """maps.json."""
+    """The content of maps.json."""
     view = maps.view
     height, width = maps.mask.shape
     unit = depth["unit"]
@@ -221,6 +234,7 @@ def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[st
         },
         "depth": dict(depth),
         "estimator": maps.estimator,
+        "albedo": albedo_scale(maps.albedo_sigma),
         "conventions": CONVENTIONS,
         "maps": {
             "normal.exr": "unit vectors: R x, G y, B z; float",
@@ -242,6 +256,14 @@ def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[st
             "with a cross-polarized shot the two parts of S0 as photograph.png has it, linear: scattered.R, .G, .B and "
             "mirrored.R, .G, .B; half",
         },
+    }
+
+
+def albedo_scale(sigma: float | None) -> dict[str, Any]:
+    """Whether the scale of all albedos is known, and its 1σ, for maps.json and the GLB; None: no chart."""
+    return {
+        "scale": "relative" if sigma is None else "known",
+        "uncertainty_percent": None if sigma is None else round(100 * sigma, 1),
     }
 
 

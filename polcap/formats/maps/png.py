@@ -28,7 +28,9 @@ _HEADER = 33  # bytes of the signature and IHDR, which comes first
 
 
 def write(path: Path, array: Pixels) -> None:
-    """Write (H, W), (H, W, 3) RGB or (H, W, 4) RGBA, uint8 or uint16; the same array gives the same bytes.
+    """Write a uint8 or uint16 image (H, W), (H, W, 3) RGB or (H, W, 4) RGBA as PNG; same array, same bytes.
+
+    RGBA, uint8 or uint16, as PNG; the same array gives the same bytes.
 
     Raises StorageError: the file cannot be written.
     """
@@ -36,7 +38,7 @@ def write(path: Path, array: Pixels) -> None:
 
 
 def encode(array: Pixels) -> bytes:
-    """The bytes of a PNG, of an array as in `write`: (H, W[, C]).
+    """Encode an image (H, W[, C]), uint8 or uint16, as the bytes of a PNG.
 
     Raises TypeError: the values are neither uint8 nor uint16.
     Raises StorageError: OpenCV cannot encode them.
@@ -50,7 +52,7 @@ def encode(array: Pixels) -> bytes:
 
 
 def described(data: bytes, text: Mapping[str, str]) -> bytes:
-    """A PNG with `text` in tEXt chunks under its keywords (Latin-1, as PNG has it)."""
+    """Add texts to the bytes of a PNG: one tEXt chunk (Latin-1) per keyword of `text`."""
     return b"".join([data[:_HEADER], *(_chunk(b"tEXt", _text(*item)) for item in text.items()), data[_HEADER:]])
 
 
@@ -83,7 +85,7 @@ def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> bytes:
 
 
 def read(path: Path) -> Pixels:
-    """Read a PNG; channels in RGB(A) order.
+    """Read a PNG as an array (H, W) or (H, W, C), channels in RGB(A) order.
 
     Raises DecodeError: the file is missing, cut short, not a PNG, or larger than any picture.
     """
@@ -91,7 +93,7 @@ def read(path: Path) -> Pixels:
 
 
 def decode(path: str) -> worker.Answer:
-    """`read`, in the child process; DecodeError."""
+    """Read a PNG in the child process; result and DecodeError as for `read`."""
     data = file_bytes.load(path)
     if data[:8] != _MAGIC:
         raise DecodeError(f"{path} is not a PNG; write it again")
@@ -101,19 +103,19 @@ def decode(path: str) -> worker.Answer:
 
 
 def fitted(picture: Pixels, width: int) -> NDArray[np.uint8]:
-    """An 8-bit picture (H, W, 3) reduced to at most `width` px, with an even number of rows."""
+    """Reduce an 8-bit picture (H, W, 3) to at most `width` px, with an even number of rows (video encoders need it)."""
     width = min(width, picture.shape[1])
     height = max(2, 2 * round(picture.shape[0] * width / picture.shape[1] / 2))
     return np.asarray(area_mean(picture, (height, width)), np.uint8)
 
 
 def sixteen_bits(value: Floats) -> NDArray[np.uint16]:
-    """Values 0…1 of any shape as 0…65535, clipped."""
+    """Convert values 0…1 (any shape) to integers 0…65535; values outside are clipped."""
     return np.asarray(np.rint(np.clip(np.asarray(value, dtype=np.float64), 0.0, 1.0) * 65535), dtype=np.uint16)
 
 
 def swapped(array: Any) -> Any:
-    """RGB(A) ↔ BGR(A), contiguous; a grey picture (H, W) as it is."""
+    """Swap the channels RGB(A) ↔ BGR(A); returns a contiguous copy. A grey picture (H, W) is returned unchanged."""
     if array.ndim == 2 or array.shape[-1] not in _SWAPS:
         return np.ascontiguousarray(array)
     return cv2.cvtColor(np.ascontiguousarray(array), _SWAPS[array.shape[-1]])

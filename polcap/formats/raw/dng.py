@@ -36,7 +36,7 @@ def write(
     color_matrix: Floats,
     as_shot_neutral: Floats,
 ) -> None:
-    """Write a mosaic (H, W) of even sides bit for bit; on a failure there is no file.
+    """Write a mosaic (H, W) of even sides as a DNG, every count unchanged; after a failure no file is left.
 
     The many parameters are the facts that a DNG has to state.
 
@@ -70,7 +70,7 @@ def write(
 
 
 def _layout_tags(width: int, height: int) -> list[_Entry]:
-    """Tags of one strip of 16 bits per pixel, without masked borders."""
+    """TIFF tags for an image in one strip of 16 bits per pixel, without masked borders."""
     return [
         (254, _LONG, 0),  # the full image
         (256, _LONG, width),
@@ -130,7 +130,10 @@ def _stamp(exif: Exif, form: str) -> str | None:
 
 
 def _ifd(entries: list[_Entry], offset: int) -> bytes:
-    """The bytes of a directory placed at `offset`, its long values after it; entries without a value are left out."""
+    """Encode a TIFF directory placed at byte `offset`, followed by its long values.
+
+    Entries without a value are left out.
+    """
     valued = sorted((entry for entry in entries if entry[2] is not None), key=itemgetter(0))
     encoded = [(tag, kind, *_encode(kind, value)) for tag, kind, value in valued]
     present = [entry for entry in encoded if entry[3] != b"\0" or entry[1] != _ASCII]

@@ -34,7 +34,7 @@ logging.getLogger("exifread").setLevel(logging.CRITICAL)  # its warnings are abo
 
 
 class _Tags:
-    """The tags of a file by name, from its EXIF directory or else from its first one."""
+    """EXIF tags of a file by name, from its EXIF directory or else from the first directory."""
 
     def __init__(self, data: bytes) -> None:
         import exifread
@@ -71,7 +71,7 @@ class _Tags:
 
 
 def _parts(data: bytes) -> Iterator[tuple[str, bytes]]:
-    """Name of the directory, and bytes that exifread understands, of each part of a file that holds EXIF."""
+    """The parts of a photograph that hold EXIF: name of the directory, and bytes that exifread can parse."""
     starts = (match.start() for match in _HEADER.finditer(data[:_SEARCH_BYTES]))
     if data[4:12] == b"ftypcrx ":  # Canon CR3: the camera's and the shot's directories are TIFFs of their own
         yield from ((name, data[at:]) for name, at in zip(("Image ", "EXIF "), starts))
@@ -82,7 +82,7 @@ def _parts(data: bytes) -> Iterator[tuple[str, bytes]]:
 
 
 def tags(data: bytes) -> Exif:
-    """The settings that the tags state, with their own image width; an empty Exif without EXIF."""
+    """Camera settings from EXIF tags, with the image width that the tags state; empty values without EXIF."""
     found = _Tags(data)
     width = found.number("Tag 0xC791") or found.number("ExifImageWidth")
     time, speed = found.number("ExposureTime"), found.number("ShutterSpeedValue")
@@ -110,7 +110,7 @@ def tags(data: bytes) -> Exif:
 
 
 def sized(stated: Exif, width: int, height: int) -> Exif:
-    """The same with the decoder's size in visible RAW pixels, and the pitch of those pixels."""
+    """Camera settings with the size replaced by the decoder's (visible RAW pixels), and the pixel pitch."""
     pitch = stated.pixel_pitch_um
     if pitch is not None:
         ratio = (stated.width or width) / width
@@ -133,7 +133,7 @@ def _taken(found: _Tags) -> str:
 
 
 def _color_matrix(found: _Tags) -> tuple[float, ...] | None:
-    """DNG ColorMatrix of the illuminant nearest to D65."""
+    """The DNG ColorMatrix tag for the illuminant nearest to D65; None without one."""
     choices = {}
     for matrix, illuminant in (("Tag 0xC621", "Tag 0xC65A"), ("Tag 0xC622", "Tag 0xC65B")):
         numbers = found.numbers(matrix)

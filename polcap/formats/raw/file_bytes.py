@@ -16,7 +16,7 @@ from polcap.formats import text_file
 
 @contextmanager
 def opened(path: str) -> Iterator[BinaryIO]:
-    """The file, open for reading; a `DecodeError` where it cannot be read."""
+    """A photograph's file, open for reading. Raises DecodeError if it cannot be read."""
     try:
         with text_file.opened(path) as file:
             yield file
@@ -25,7 +25,7 @@ def opened(path: str) -> Iterator[BinaryIO]:
 
 
 def digest(data: bytes) -> str:
-    """The digest of a photograph's bytes, part of every cache key that depends on it."""
+    """SHA-256 of a photograph's bytes; enters every cache key that depends on the photograph."""
     return sha256(data).hexdigest()
 
 
@@ -43,7 +43,7 @@ def load(path: str, expected: str | None = None) -> bytes:
 
 @contextmanager
 def named(data: bytes) -> Iterator[str]:
-    """A file name under which a library can read these bytes: in memory under Linux, else a temporary file."""
+    """A file name under which a library can open these bytes: an in-memory file on Linux, else a temporary file."""
     if hasattr(os, "memfd_create"):
         handle = os.memfd_create("polcap")
         try:

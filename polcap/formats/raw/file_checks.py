@@ -1,4 +1,4 @@
-"""Refuses a photograph with an error that names the reason: cut, stripped, wrong levels, or a form decoders get wrong.
+"""Refuses photographs that are cut short, incomplete, have wrong levels, or are of a kind that decoders misread.
 
 Decoders return pixels from such files too: black, grey, or whatever was in memory. Runs in the child process.
 """
@@ -66,7 +66,7 @@ def check_png(path: str, data: bytes) -> None:
 
 
 def check_structure(path: str, structure: TiffStructure, data: bytes) -> None:
-    """Refuse a RAW that LibRaw decodes wrongly, and a DNG without its image data: DecodeError."""
+    """Refuse a RAW of a kind that LibRaw decodes wrongly, and a DNG without its image data. Raises DecodeError."""
     images = [one for one in structure.directories if _is_sensor(one)]
     for directory in images:
         refused = _REFUSED_COMPRESSION.get(first(directory, file_kind.COMPRESSION), "")
@@ -84,7 +84,7 @@ def check_structure(path: str, structure: TiffStructure, data: bytes) -> None:
 
 
 def is_lossy(structure: TiffStructure) -> bool:
-    """Whether the sensor image is that of a lossy DNG."""
+    """Whether the sensor image in this TIFF structure is lossily compressed (a lossy DNG)."""
     return any(_is_sensor(one) and first(one, file_kind.COMPRESSION) == _LOSSY for one in structure.directories)
 
 
@@ -93,7 +93,7 @@ def _is_sensor(directory: Directory) -> bool:
 
 
 def _check_strips(path: str, directory: Directory, dng: bool) -> None:
-    """Refuse a DNG with strips shorter than its pixels need."""
+    """Refuse a DNG with image strips that have fewer bytes than their pixels need."""
     held = sum(length for _, length in file_kind.strips(directory))
     width, height = first(directory, file_kind.WIDTH), first(directory, file_kind.LENGTH)
     check_size(path, max(width, 1), max(height, 1))
@@ -126,7 +126,7 @@ def check_jpeg(path: str, data: bytes, start: int = 0) -> None:
 
 
 def check_levels(path: str, value: NDArray[Any], black: float, white: float, lossy: bool) -> None:
-    """Refuse counts (H, W) or (H, W, C) that contradict the stated levels.
+    """Refuse decoded counts (H, W) or (H, W, C) that contradict the stated black and white levels.
 
     Raises DecodeError: counts far beyond the white level, rows that were never written, or nothing but zeros.
     """

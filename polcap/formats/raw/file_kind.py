@@ -1,4 +1,4 @@
-"""Kind of a file, judged by its content and never by its name; the image directories of a TIFF.
+"""Detects the kind of a file (RAW, picture, other) from its content, not its name; parses the directories of a TIFF.
 
 All of it runs in the child process of `worker`.
 """
@@ -38,17 +38,17 @@ class TiffStructure(NamedTuple):
 
     @property
     def dng(self) -> bool:
-        """Some directory carries a DNG version."""
+        """Whether a directory of the TIFF has the DNG version tag."""
         return any(DNG_VERSION in directory for directory in self.directories)
 
     @property
     def truncated(self) -> bool:
-        """Some strip or tile lies beyond the end of the file."""
+        """Whether an image strip or tile extends beyond the end of the file, so that the file is cut short."""
         return any(a + b > self.size for directory in self.directories for a, b in strips(directory))
 
 
 def strips(directory: Directory) -> list[tuple[int, int]]:
-    """Offset and length of each strip and tile."""
+    """Byte offset and length of each image strip or tile of a TIFF directory."""
     return [
         pair
         for starts, counts in ((STRIP_OFFSETS, STRIP_BYTES), (TILE_OFFSETS, TILE_BYTES))
@@ -57,12 +57,12 @@ def strips(directory: Directory) -> list[tuple[int, int]]:
 
 
 def first(directory: Directory, tag: int, default: int = 0) -> int:
-    """The first value of a tag; the default where it is absent, empty or not a whole number."""
+    """First value of a tag in a TIFF directory; `default` if the tag is absent, empty or not an integer."""
     return next(iter(directory.get(tag, ())), default)
 
 
 def kind(file: BinaryIO, suffix: str) -> Kind:
-    """A RAW, a finished picture, some other known file, or unknown bytes."""
+    """Kind of a file by its first bytes: RAW, finished picture, other known file, or unknown."""
     head = file.read(512)
     if head[:3] == b"\xff\xd8\xff" or head[:8] == b"\x89PNG\r\n\x1a\n" or head[:4] == b"\x76\x2f\x31\x01":
         return "photo"
@@ -76,7 +76,7 @@ def kind(file: BinaryIO, suffix: str) -> Kind:
 
 
 def _is_text(file: BinaryIO) -> bool:
-    """No byte at the beginning, in the middle or at the end that no text has."""
+    """Whether a file is text: its beginning, middle and end contain no byte that text never has."""
     size = file.seek(0, 2)
     pieces = []
     for at in (0, size // 2, size - _TEXT_BYTES):
@@ -86,7 +86,7 @@ def _is_text(file: BinaryIO) -> bool:
 
 
 def _is_raw_magic(head: bytes) -> bool:
-    """The first bytes are those of a RAW format that is not an ordinary TIFF."""
+    """Whether a file's first bytes mark a RAW format that is not an ordinary TIFF."""
     return (
         head[:15] == b"FUJIFILMCCD-RAW"
         or head[4:12] == b"ftypcrx "  # Canon CR3
@@ -107,7 +107,7 @@ def _is_raw(tiff: TiffStructure) -> bool:
 
 
 def structure(data: bytes) -> TiffStructure:
-    """The image directories of a TIFF, as far as they can be read; none where the file is not a TIFF."""
+    """Parse the image directories of a TIFF, as far as they are readable; none if the bytes are not a TIFF."""
     directories: list[Directory] = []
     if data[:4] in _TIFF_MAGIC and len(data) >= 8:
         order = "<" if data[:2] == b"II" else ">"
@@ -130,7 +130,7 @@ def structure(data: bytes) -> TiffStructure:
 
 
 def _entries(data: bytes, order: str, places: range, most: int) -> Iterator[tuple[int, tuple[int, ...]]]:
-    """Tag and values of the directory entries at `places`; at most `most` values."""
+    """Tag and values of the TIFF directory entries at the byte offsets `places`; at most `most` values each."""
     for at in places:
         tag, form, count = struct.unpack_from(order + "HHI", data, at)
         if tag not in _TAGS_READ or count > most:

@@ -9,7 +9,7 @@ from polcap.images import Frame, SensorImage
 
 
 def decode(frame: Frame) -> SensorImage:
-    """The pixels of a frame.
+    """Decode the pixels of one photograph of a capture.
 
     Raises DecodeError: the file is damaged, has changed since it was probed, or is in color where the sensor is
     monochrome.
@@ -23,7 +23,9 @@ def decode(frame: Frame) -> SensorImage:
 
 
 def apply(frame: Frame, function: Callable[..., worker.Answer], **options: Any) -> worker.Answer:
-    """`function(image, **options)` of a frame's pixels; of a RAW in the child process, which returns only the answer.
+    """Evaluate `function(image, **options)` on a photograph's pixels.
+
+    For a RAW in the child process, which returns only the result.
 
     The function is a module's, the options plain JSON values. Raises DecodeError as `decode`.
     """
@@ -34,7 +36,7 @@ def apply(frame: Frame, function: Callable[..., worker.Answer], **options: Any) 
 
 
 def apply_to_raw(path: str, digest: str | None, module: str, name: str, options: dict[str, Any]) -> worker.Answer:
-    """`apply`, in the child process; the function is `name` in `module`."""
+    """In the child process: decode a RAW and evaluate the function `name` of `module` on it."""
     function: Callable[..., worker.Answer] = getattr(importlib.import_module(module), name)
     return function(libraw.image(*libraw.decode(path, digest)), **options)
 

@@ -25,7 +25,7 @@ _MAX_CONDITION = 1e4  # of a color matrix; above, its inverse is meaningless. Se
 
 
 def read(path: str | Path, digest: str | None = None) -> SensorImage:
-    """Decode one RAW file, nothing subtracted, without the masked border.
+    """Decode one RAW file to sensor counts: black level not subtracted, masked border removed.
 
     A Bayer file gives its mosaic (H, W) with `black` (2, 2) and `cfa` in the phase of its
     first visible pixel; an X-Trans file from its first whole 3×3 block on, (6, 6) both. A file of
@@ -41,7 +41,7 @@ def read(path: str | Path, digest: str | None = None) -> SensorImage:
 
 
 def image(meta: dict[str, Any], arrays: worker.Arrays) -> SensorImage:
-    """The photograph from the answer of `decode`."""
+    """Build a SensorImage from the answer of `decode`."""
     balance = None if meta["balance"] is None else np.array(meta["balance"])
     xyz_to_camera = meta["xyz_to_camera"]
     return SensorImage(
@@ -56,7 +56,9 @@ def image(meta: dict[str, Any], arrays: worker.Arrays) -> SensorImage:
 
 
 def camera_matrix(xyz_to_camera: Floats, balance: Floats | None) -> Floats | None:
-    """Camera RGB → linear Rec.709 (3, 3), with the white balance (3,) in it; daylight's where None.
+    """Color matrix (3, 3) from camera RGB to linear Rec.709, including the white balance (3,).
+
+    Daylight if `balance` is None.
 
     None where the matrix cannot be inverted.
 
@@ -78,7 +80,7 @@ def camera_matrix(xyz_to_camera: Floats, balance: Floats | None) -> Floats | Non
 
 @contextmanager
 def _opened(path: str, data: bytes) -> Iterator[Any]:
-    """The bytes as an open RAW of LibRaw, of a possible size; its errors become a DecodeError."""
+    """Context manager: the bytes opened as a RAW by LibRaw, size checked; LibRaw's errors become DecodeError."""
     import rawpy
 
     try:
@@ -102,14 +104,14 @@ def _opened(path: str, data: bytes) -> Iterator[Any]:
 
 
 def size(path: str, data: bytes, unpack: bool) -> dict[str, Any]:
-    """Size in visible pixels, and with `unpack` LibRaw's own reading of the metadata. In the child process."""
+    """In the child process: size of a RAW in visible pixels; with `unpack` also the metadata as LibRaw reads them."""
     with _opened(path, data) as raw:
         meta: dict[str, Any] = {"width": raw.sizes.width, "height": raw.sizes.height}
         return meta | ({"exif": _settings(raw.other, raw.lens)} if unpack else {})
 
 
 def _settings(other: Any, lens: Any) -> dict[str, Any]:
-    """LibRaw's own reading of the metadata: the fields of an `Exif` that it knows."""
+    """Camera settings as LibRaw reads them, as fields of `Exif`."""
     stamp = other.timestamp
     known = Exif(
         lens=(lens.model or "").strip(),
@@ -130,7 +132,7 @@ def version() -> str:
 
 
 def decode(path: str, digest: str | None = None) -> worker.Answer:
-    """`read`, in the child process: the counts (H, W) or (H, W, 3), their levels and colors; DecodeError."""
+    """In the child process: decode a RAW file to counts (H, W) or (H, W, 3), levels and colors. Raises DecodeError."""
     data = file_bytes.load(path, digest)
     if data[:4] == b"FOVb":  # Sigma's X3F
         raise DecodeError(f"{path}: {unsupported(None)}")
@@ -148,7 +150,7 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
 
 
 def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
-    """The visible counts as stored in the file, their levels and colors."""
+    """Visible sensor counts as stored in the RAW file, with their levels and colors."""
     value: NDArray[Any] = raw.raw_image_visible
     balance, matrix = raw.camera_whitebalance[:3], raw.rgb_xyz_matrix[:3]
     meta: dict[str, Any] = {
@@ -177,7 +179,7 @@ def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
 
 
 def unsupported(shape: tuple[int, ...] | None, rotated: bool = False) -> str:
-    """Reason why a color filter of this period (rows, columns) cannot be used, and the remedy; None: a Foveon sensor.
+    """Message why a color filter array with this period (rows, columns) cannot be used; None means a Foveon sensor.
 
     rotated : its rows and columns run at 45° to the picture's.
     """
@@ -191,7 +193,7 @@ def unsupported(shape: tuple[int, ...] | None, rotated: bool = False) -> str:
 
 
 def _mosaic(raw: Any, path: str) -> tuple[Bits, list[list[float]]]:
-    """The colors and black levels of one period, (2, 2) or (6, 6), from the first visible pixel on."""
+    """Colors and black levels of one period of the color filter array, (2, 2) or (6, 6)."""
     pattern = raw.raw_pattern
     if pattern is None or pattern.shape not in ((2, 2), (6, 6)):
         rotated = raw.sizes.width * raw.sizes.height > raw.sizes.raw_width * raw.sizes.raw_height
@@ -210,7 +212,7 @@ def _mosaic(raw: Any, path: str) -> tuple[Bits, list[list[float]]]:
 
 
 def _white(raw: Any, black: float) -> float:
-    """Saturation: LibRaw's maximum, or the lower level that the camera states."""
+    """White level (saturated count): LibRaw's maximum, or the camera's stated level if lower."""
     stated = [level for level in raw.camera_white_level_per_channel or () if level > black]
     lowest = min([raw.white_level, *stated])
     return float(lowest if lowest > raw.white_level / 2 else raw.white_level)

@@ -35,7 +35,7 @@ def read(
     black: float = 0.0,
     digest: str | None = None,
 ) -> SensorImage:
-    """A picture as (H, W, 3), grey repeated in all three channels.
+    """Decode a finished picture as linear values (H, W, 3); a grey picture is repeated in all three channels.
 
     Linear integers stay counts; floating point has white 1. An sRGB-encoded picture becomes linear 0…1 and
     `lossy`, as every 8-bit one is. By default `encoding` is sRGB for 8 bits, else linear; `white` the greatest value
@@ -94,18 +94,18 @@ def read_mosaic(
 
 
 def place_px(angle_deg: float) -> tuple[float, float]:
-    """x, y of the first pixel of an angle in the 2×2 cell, in pixels of `read_mosaic`'s picture: 0 or ½."""
+    """Position (x, y) of an angle's pixels in the polarization sensor's 2×2 cell: 0 or ½ px of `read_mosaic`."""
     y, x = dict(SENSOR_DEG)[angle_deg]
     return x / 2, y / 2
 
 
 def encoding_of(bits: int, stated: Encoding | None) -> Encoding:
-    """The encoding that `read` assumes for a picture of so many bits per channel."""
+    """The encoding (linear or sRGB) of a picture with this number of bits per channel, unless the caller states one."""
     return stated or ("srgb" if bits == 8 else "linear")
 
 
 def size(path: str, data: bytes) -> dict[str, int]:
-    """Size, channels and bits of a picture, without its pixels. In the child process."""
+    """In the child process: size, number of channels and bits of a picture, without decoding its pixels."""
     with opened(path, data) as file:
         spec = file.spec()
         count, bits = len(_channels(path, spec)), 8 * spec.format.size()
@@ -113,7 +113,7 @@ def size(path: str, data: bytes) -> dict[str, int]:
 
 
 def decode(path: str, digest: str | None = None) -> worker.Answer:
-    """The stored values (H, W, 1 or 3) in their stored type; DecodeError. In the child process."""
+    """In the child process: the stored values of a picture (H, W, 1 or 3) in their stored type. Raises DecodeError."""
     with opened(path, file_bytes.load(path, digest)) as file:
         channels = _channels(path, file.spec())
         pixels = every_channel(path, file)[..., channels]
@@ -147,14 +147,17 @@ def reason(source: Any) -> str:
 
 
 def _pixels(path: str | Path, digest: str | None) -> tuple[NDArray[Any], float]:
-    """The stored values of a picture, and the greatest of their type; 1 in floating point."""
+    """Stored values of a picture, and the greatest value of their type (1 for floating point)."""
     pixels = worker.call(decode, path, digest=digest)[1]["pixels"]
     return pixels, 1.0 if pixels.dtype.kind == "f" else float(np.iinfo(pixels.dtype).max)
 
 
 @contextmanager
 def opened(path: str, data: bytes) -> Iterator[Any]:
-    """The bytes as an open file of OpenImageIO, which reads by name only. DecodeError."""
+    """Context manager: the bytes of a picture opened by OpenImageIO, which opens files by name only.
+
+    Raises DecodeError.
+    """
     import OpenImageIO as oiio
 
     if data[:3] == b"\xff\xd8\xff":
@@ -178,7 +181,7 @@ def opened(path: str, data: bytes) -> Iterator[Any]:
 
 
 def _channels(path: str, spec: Any) -> list[int]:
-    """Indices of the channels R, G and B, or of the grey one."""
+    """Indices of the picture's channels R, G and B, or of its single grey channel."""
     names = [name.rpartition(".")[2].upper() for name in spec.channelnames]
     if sum(name in ("R", "G", "B") for name in names) == 3:
         return [names.index(name) for name in "RGB"]
@@ -193,7 +196,7 @@ def _counts(pixels: NDArray[Any]) -> Any:
 
 
 def _check_monochrome(path: str | Path, mosaic: NDArray[Any]) -> None:
-    """Refuse a color polarization sensor, where neighbouring 2×2 cells have different filters."""
+    """Refuse the frame of a color polarization sensor: neighboring 2×2 cells with different color filters."""
     height, width = (size // 4 * 4 for size in mosaic.shape)
     cells = mosaic[:height, :width].reshape(height // 4, 2, 2, width // 4, 2, 2)
     levels = cells.mean(axis=(0, 2, 3, 5), dtype=np.float64)  # (2, 2)

@@ -17,7 +17,7 @@ _LIMIT_S = 30.0  # a sound file takes milliseconds
 
 @dataclass(frozen=True)
 class Probe:
-    """The facts of one file."""
+    """Facts of one photograph's file: kind, digest, EXIF, channels, bits, and whether it is lossily compressed."""
 
     kind: file_kind.Kind
     digest: str = ""  # of the bytes of a photograph
@@ -43,19 +43,22 @@ def read(path: str | Path) -> Probe:
 
 
 def kind(path: str | Path) -> file_kind.Kind:
-    """The kind only, by the first bytes. Raises DecodeError where the file cannot be read."""
+    """Kind of a file by its first bytes. Raises DecodeError if the file cannot be read."""
     found: file_kind.Kind = worker.call(examine_kind, path, limit_s=_LIMIT_S)[0]["kind"]
     return found
 
 
 def examine_kind(path: str) -> worker.Answer:
-    """`kind`, in the child process."""
+    """In the child process: detect the kind of a file, as `kind` does."""
     with file_bytes.opened(path) as file:
         return {"kind": file_kind.kind(file, Path(path).suffix)}, {}
 
 
 def examine(path: str) -> worker.Answer:
-    """`read`, in the child process, and whether only decoding can show that the file is whole. DecodeError."""
+    """In the child process: probe a file as `read` does, and report whether only decoding can show that it is complete.
+
+    Raises DecodeError.
+    """
     with file_bytes.opened(path) as file:
         found = file_kind.kind(file, Path(path).suffix)
         if found == "other":

@@ -43,7 +43,10 @@ _CHILD = (
 
 
 class ChildBug(RuntimeError):
-    """A defect of polcap's own code that runs in the child; exit code 1. Its note is the child's traceback."""
+    """Error for a defect in polcap's code that runs in the child process; exit code 1.
+
+    Its note is the child's traceback.
+    """
 
 
 class Worker:
@@ -94,7 +97,7 @@ class Worker:
         return head["meta"], arrays
 
     def _exchange(self, name: str, request: list[Any], limit_s: float) -> Answer:
-        """Send the request, wait until the child is ready, then for its answer."""
+        """Send a request to the child process, wait until it is ready, and return its answer."""
         child = self._child if self._child and self._child.poll() is None else self._spawn()
         pipe = cast(IO[bytes], child.stdout)
         overdue = started = False
@@ -123,7 +126,12 @@ class Worker:
             timer.cancel()
 
     def _answer(self, pipe: IO[bytes]) -> Answer:
-        """Read the child's answer; ValueError where it is larger than allowed or holds no numbers."""
+        """Read the child process's answer from the pipe: JSON, then arrays.
+
+        ValueError if it is too large or an array is not numeric.
+
+        ValueError if it is too large or contains anything but numbers.
+        """
         head = json.loads(_receive(pipe, _HEAD_BYTES))
         if not head.keys() & {"meta", "error", "bug"}:
             raise ValueError("it is empty")
@@ -160,7 +168,7 @@ class Worker:
         return self._child
 
     def close(self) -> None:
-        """End the child; the next call starts one."""
+        """End the child process; the next call starts another one."""
         if self._child:
             self._child.kill()
             self._child.wait()
@@ -193,7 +201,7 @@ if hasattr(os, "register_at_fork"):  # a fork must not share the pipes
 def call(
     function: Callable[..., Answer], path: str | os.PathLike[str], *, limit_s: float | None = None, **options: Any
 ) -> Answer:
-    """`Worker.call` on an idle child, or on a new one: there are as many as threads call at a time."""
+    """Run a function on an untrusted file in a child process: an idle one, or a new one for each thread."""
     with _hold:
         worker = _idle.pop() if _idle else Worker()
     try:
@@ -205,13 +213,13 @@ def call(
 
 @atexit.register
 def end_idle() -> None:
-    """End the idle children; the next call starts one."""
+    """End all idle child processes; the next call starts another one."""
     for worker in _idle:
         worker.close()
 
 
 def serve(memory_gib: float) -> None:
-    """Answer requests on stdin until it closes. Runs in the child only."""
+    """Main loop of the child process: answer requests from stdin until it is closed."""
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # a library's output must not mix with the answers
     _limit_memory(memory_gib)
@@ -235,7 +243,7 @@ def serve(memory_gib: float) -> None:
 
 
 def _run(module: str, name: str, path: str, options: dict[str, Any], memory_gib: float) -> Answer:
-    """The answer to one request: a result, an error or a bug."""
+    """In the child process: run one request; the answer is a result, an error or a bug report."""
     try:
         meta, arrays = getattr(importlib.import_module(module), name)(path, **options)
     except errors.InputError as error:

@@ -25,7 +25,7 @@ _FLOOR_PX = 0.02  # error that aliasing leaves whatever the noise: the bundled c
 
 
 class AlignSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The section `align` of a settings file."""
+    """Settings of the stage `align`, the section `align` of a settings file."""
 
     model: Annotated[
         Literal["none", "translation", "similarity", "homography"],
@@ -45,7 +45,7 @@ class AlignSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @stage(version=9)
 def register(radiance: AngleStack, color: ColorCalibration, settings: AlignSettings) -> Alignment:
-    """Transforms (K, 3, 3) from the reference grid to each shot's, px.
+    """Register every shot with the reference shot: transforms (K, 3, 3) from the reference grid to each shot's, px.
 
     Raises AlignmentError, which names the shot: it moved too far, or shows another scene.
     """
@@ -70,7 +70,7 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: AlignSetti
 
 
 def _of_mosaic(offset_px: Floats) -> Alignment:
-    """Shots cut from one polarizer mosaic: their places (K, 2) px are known."""
+    """Alignment of shots cut from one polarization-sensor frame: their offsets (K, 2) px are known."""
     transform = np.tile(np.eye(3), (len(offset_px), 1, 1))
     transform[:, :2, 2] = -offset_px
     return Alignment(transform, np.zeros(len(offset_px)), np.ones(len(offset_px)))
@@ -79,7 +79,10 @@ def _of_mosaic(offset_px: Floats) -> Alignment:
 def _register_shot(
     name: str, reference: Pyramid, shot: Pyramid, step: int, settings: AlignSettings
 ) -> tuple[Floats, float, float]:
-    """Transform (3, 3) of a shot and its 1σ, full-grid px, and the correlation of detail. Raises AlignmentError."""
+    """Register one shot: transform (3, 3) and its 1σ in full-grid px, and the correlation of detail.
+
+    Raises AlignmentError.
+    """
     if not (shows_detail(reference) and shows_detail(shot)):
         raise AlignmentError(
             f"{name} has no unclipped detail in common with the first shot: over-exposed, black, or even all over; "
@@ -104,7 +107,7 @@ def _register_shot(
 
 
 def _best_match(reference: Pyramid, shot: Pyramid, settings: AlignSettings) -> tuple[registration.Registration, float]:
-    """The motion under which the detail of two shots correlates best, or else their edges; and that correlation.
+    """The motion under which two shots correlate best in their detail, or else in their edges; and the correlation.
 
     Strong polarization may change which side of an edge is brighter, but not where the edge is.
     """

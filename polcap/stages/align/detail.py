@@ -19,7 +19,9 @@ def averaging_step(shape: tuple[int, ...], most_pixels: float) -> int:
 
 
 def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
-    """Log radiance of a shot, averaged by `step`, less everything coarser than a Gaussian of `detail_px` [averaged px].
+    """Fine detail of a shot: log radiance, averaged by `step`, less all coarser than a Gaussian of `detail_px`.
+
+    `detail_px` is in averaged px.
 
     Multiplied by d² / (d² + σ²), d the typical detail and σ the relative noise, as a Wiener filter does.
     """
@@ -43,17 +45,17 @@ def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
 
 
 def edge_strength(shot: Pyramid) -> Pyramid:
-    """Where edges are and how strong, whichever side is brighter: the root of the gradient."""
+    """Strength of edges in a shot, independent of which side is brighter: root of the gradient."""
     strength = np.sqrt(cv2.GaussianBlur(np.sqrt(squared_gradient(shot[0].picture)), (0, 0), 1.0))
     return Pyramid(np.asarray(strength), shot[0].usable)
 
 
 def shows_detail(shot: Pyramid) -> bool:
-    """Whether there is anything to compare."""
+    """Whether a picture has enough detail to be registered."""
     seen = shot[0].picture[shot[0].usable]
     return len(seen) > _LEAST_PIXELS and bool(np.ptp(seen) > 0)
 
 
 def _sum_of_channels(picture: Floats) -> Floats:
-    """(H, W, 3) → (H, W)."""
+    """Sum of the channels of a picture, (H, W, 3) → (H, W)."""
     return np.asarray(cv2.transform(np.asarray(picture, np.float32), np.ones((1, 3), np.float32)))

@@ -1,8 +1,10 @@
-"""Movement of the object against its surroundings, which one transform for the whole picture hides.
+"""Detects motion of the object relative to its surroundings, which one transform of the whole picture would hide.
 
 A similarity's zoom and roll can stand for an object that was pushed while chart and backdrop stayed. So object and
 surroundings are registered separately, and the two motions are compared in the middle of the object.
 """
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,47 +18,63 @@ from polcap.stages.align.detail import averaging_step, detail
 
 _DETAIL_PX = 4.0  # as `align.detail_px`
 _MOST_PIXELS = 0.8e6  # a larger picture is averaged down first
-_RIM_PX = 6  # around the object, which its outline needs
+_RIM_PX = 6  # around the object, which its outline needs; half of it is left out inside
+_EVERY = 50  # px of the object; at these its inner motion is compared
 _SURE_CORRELATION = 0.6  # of detail: from here on a region was found in the shot
 _OTHER_CORRELATION = 0.4  # of the object: below, it is another or too far away; noise has less
 _SIGMAS = 3.0  # of both places: a chart in a corner hardly tells where the object's middle should be
 _SAME_PX = 0.5  # two starts that differ by less lead to one place
 
 
-def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> Floats:
-    """Shift of the object against its surroundings, (K,) grid px; 0 within three errors of both places.
+@dataclass(frozen=True)
+class ObjectMotion:
+    """Motion of the object against its surroundings in each shot, (K,) grid px; NaN: too little detail."""
 
-    NaN where either shows too little detail; infinite where the surroundings are the same and the object is not.
-    """
+    pushed: Floats  # shift of the object's middle, outline included; 0 within three errors; infinite: another object
+    inside: Floats  # rms displacement of its inner detail, which moves when the object turns
+
+
+def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> ObjectMotion:
+    """Motion of the object, with its outline and inside it, against the motion of chart and backdrop."""
     shots = len(radiance.angle)
     if radiance.offset_px is not None:  # shots cut from one mosaic
-        return np.zeros(shots)
-    shift = np.full(shots, np.nan)
-    shift[0] = 0.0
+        return ObjectMotion(np.zeros(shots), np.zeros(shots))
+    pushed, inside = np.full((2, shots), np.nan)
+    pushed[0] = inside[0] = 0.0
     if not object_.mask.any():
-        return shift
+        return ObjectMotion(pushed, inside)
     step = averaging_step(object_.mask.shape, _MOST_PIXELS)
     reference = detail(radiance.shot(0), _DETAIL_PX, step)[0]
     small = area_mean(object_.mask.astype(np.uint8), reference.picture.shape)
     near = cv2.dilate(small, np.ones((2 * _RIM_PX + 1,) * 2, np.uint8)) > 0
-    regions = [Pyramid(reference.picture, reference.usable & region) for region in (near, ~near)]
+    core = cv2.erode(small, np.ones((_RIM_PX + 1,) * 2, np.uint8)) > 0
+    regions = [Pyramid(reference.picture, reference.usable & region) for region in (near, ~near, core)]
+    points = np.argwhere(core)[::_EVERY, ::-1].astype(np.float64)
     middle = np.argwhere(small).mean(axis=0)[::-1] if small.any() else np.array(small.shape[::-1]) / 2
     for k in range(1, shots):
         shot = detail(radiance.shot(k), _DETAIL_PX, step)
         start = registration.scaled(alignment.transform[k], 1 / step)
-        (inner, of_object), (outer, around) = (_registered(region, shot, start) for region in regions)
+        (whole, of_object), (outer, around) = (_registered(region, shot, start) for region in regions[:2])
+        inner = registration.refine(regions[2], shot, "similarity", start)
+        if inner.tiles and len(points):
+            camera = outer.matrix if around > _SURE_CORRELATION else start
+            moved = transform_points(inner.matrix, points) - transform_points(camera, points)
+            inside[k] = step * float(np.sqrt((moved**2).sum(axis=1).mean()))
         if around > _SURE_CORRELATION and of_object < _OTHER_CORRELATION:
-            shift[k] = np.inf
+            pushed[k] = np.inf
         elif min(of_object, around) > _SURE_CORRELATION:
-            places = [transform_points(found.matrix, middle) for found in (inner, outer)]
-            error = float(np.hypot(inner.sigma_at(middle), outer.sigma_at(middle)))
+            places = [transform_points(found.matrix, middle) for found in (whole, outer)]
+            error = float(np.hypot(whole.sigma_at(middle), outer.sigma_at(middle)))
             apart = float(np.hypot(*(places[0] - places[1])))
-            shift[k] = step * apart if apart > _SIGMAS * error else 0.0
-    return shift
+            pushed[k] = step * apart if apart > _SIGMAS * error else 0.0
+    return ObjectMotion(pushed, inside)
 
 
 def _registered(region: Pyramid, shot: Pyramid, start: Floats) -> tuple[Registration, float]:
-    """Motion of a region, begun from the whole picture's motion and without it, and the better correlation."""
+    """Motion of a region of the picture, and its correlation.
+
+    The search starts from the whole picture's motion and from none; the better result counts.
+    """
     found = [registration.register(region, shot, "similarity")]
     corners = picture_corners(region.shape[1], region.shape[0])
     if np.abs(transform_points(start, corners) - corners).max() > _SAME_PX:

@@ -24,7 +24,7 @@ _LEAST_Z = 0.05  # of a tangent-space normal, which must leave the surface (glTF
 
 
 class AssetSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The section `asset` of a settings file."""
+    """Settings of the stage `asset`, the section `asset` of a settings file."""
 
     ior: Annotated[
         float, Meta(ge=1.1, le=2.5, description="refractive index written to the asset; F0 does not depend on it [1]")
@@ -36,7 +36,7 @@ class AssetSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @stage(version=4, keep=False)
 def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
-    """The glTF textures on the crop's grid, filled outwards from the object so that no seam shows.
+    """Build the object's glTF textures on the crop's grid, filled outwards so that no seam shows.
 
     Our material has a diffuse term behind two Fresnel transmissions, glTF's has base·(1 − F). With base =
     ρ_d T₊(0)²/(1 − F0) both agree for a frontal surface. F0 is the index's own × factor × texture, and the factor holds
@@ -52,7 +52,7 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
     roughness, known = _eight_bits(maps.roughness), _without_outline(maps.mask)
     base = maps.diffuse * np.float32(entry**2) / (1 - np.minimum(greatest, 0.99))[..., None]
     base = fill_outward(base.astype(np.float32), known)
-    detailed = maps.detail is not None and settings.raw_pixels
+    detail = maps.detail if settings.raw_pixels else None
     others = [
         np.stack([np.full_like(roughness, 255), roughness, np.zeros_like(roughness)], axis=-1),
         color.srgb_eight_bits(specular / max(top, 1e-9)),
@@ -61,12 +61,13 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
     packed, specular_color = (np.ascontiguousarray(filled[..., k : k + 3]) for k in (0, 3))
     return Asset(
         mesh=mesh,
-        base_color=_with_detail(base, maps.detail) if detailed else color.srgb_eight_bits(base),
+        base_color=color.srgb_eight_bits(base) if detail is None else _with_detail(base, detail),
         occlusion_roughness_metallic=packed,
         normal=_eight_bits(tangent_space(maps, mesh) / 2 + 0.5),
         specular_color=specular_color,
         specular_factor=(top / float(fresnel.normal_reflectance(settings.ior)),) * 3,
         ior=settings.ior,
+        albedo_sigma=maps.albedo_sigma,
     )
 
 
@@ -78,12 +79,14 @@ def _with_detail(albedo: Floats, detail: Floats) -> NDArray[np.uint8]:
 
 
 def with_mesh(asset: Asset, maps: SurfaceMaps, mesh: Mesh) -> Asset:
-    """The asset on another mesh of the same maps, with the normal texture of that mesh."""
+    """A copy of the asset with another mesh of the same maps, and the normal texture that fits this mesh."""
     return replace(asset, mesh=mesh, normal=_eight_bits(tangent_space(maps, mesh) / 2 + 0.5))
 
 
 def resize_textures(asset: Asset, size: int) -> Asset:
-    """The asset with textures of `size` px on the longer side, and the next power of two on the other that holds it.
+    """A copy of the asset with textures of `size` px on the longer side.
+
+    The other side becomes the next power of two that holds it.
 
     Smaller ones are area means; larger ones are interpolated and hold no more detail.
     """
@@ -107,14 +110,14 @@ def _resize(texture: NDArray[np.uint8], shape: tuple[int, int]) -> Floats:
 
 
 def _without_outline(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The mask without its outermost pixels, except for parts that would vanish."""
+    """Erode a mask by its outermost pixels, except for parts that would vanish."""
     inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     near = cv2.dilate(inner, np.ones((5, 5), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return np.asarray((inner > 0) | (mask & (near == 0)))
 
 
 def fill_outward(value: Any, known: NDArray[np.bool_]) -> Any:
-    """Fill an image (H, W, C) where it is unknown with the value of a nearest known pixel."""
+    """Fill unknown pixels of an image (H, W, C) with the value of the nearest known pixel."""
     if known.all() or not known.any():
         return value
     label = cv2.distanceTransformWithLabels(
@@ -129,7 +132,7 @@ def fill_outward(value: Any, known: NDArray[np.bool_]) -> Any:
 
 
 def tangent_space(maps: SurfaceMaps, mesh: Mesh) -> Floats:
-    """The maps' normals in the mesh's interpolated frames: x, y, z of x t + y b + z n, (H, W, 3) unit, z > 0.
+    """Tangent-space normals, (H, W, 3) unit, z > 0: the maps' normals in the mesh's frames, x t + y b + z n.
 
     The mesh shades with its own normals, so the texture holds the difference to the maps' only.
     """

@@ -9,7 +9,9 @@ _SLACK = 1e-4  # px and barycentric coordinates by which a pixel may miss a tria
 
 
 def rasterize_frames(mesh: Mesh, height: int, width: int) -> tuple[Floats, NDArray[np.bool_]]:
-    """Normals and tangents (N, 7) at the N covered pixels, row by row, and the covered pixels (H, W).
+    """Interpolate a mesh's normals and tangents at pixels.
+
+    (N, 7) at the N covered pixels, and the covered mask (H, W).
 
     Only triangles that face the camera count: walls and back have no part of the texture. Where several cover a pixel
     the last one counts.

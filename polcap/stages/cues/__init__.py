@@ -25,9 +25,9 @@ CHANNELS = (
 FLOOR = 0.02  # added to a radiance before its logarithm, in the channels and in their inverse
 
 
-@stage(version=4, keep=False)
+@stage(version=5, keep=False)
 def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
-    """All cues of a crop (H, W).
+    """Compute all cues (radiance, DoLP, AoLP, diffuse color…) of a crop (H, W) from its Stokes parameters.
 
     The color matrix is applied to S0 only. DoLP and AoLP are computed in camera channels, which are summed before any
     ratio. The visible surface of the object is nearer to the flash than the chart, and gets more light: `scale`
@@ -60,6 +60,7 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
         mask=stokes.mask,
         quality=stokes.quality,
         view=stokes.view,
+        scale_sigma=scale.sigma(stokes, color),
         body=body,
         body_known=body_known,
         detail=stokes.detail,
@@ -67,7 +68,9 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
 
 
 def polarization(stokes: Any, covariance: Any) -> tuple[Any, Any, Any, Any]:
-    """S1/S0 and S2/S0 (2, ...), their 1σ (...), DoLP without its noise bias (...), normalized Stokes map (2, ...).
+    """Normalized polarization: S1/S0 and S2/S0, their 1σ, DoLP without noise bias, normalized Stokes map.
+
+    Shapes (2, ...), (...), (...), (2, ...).
 
     stokes (3, ..., 3) and covariance (6, ..., 3) are in camera channels. Noise increases the DoLP,
     E[ρ̂²] = ρ² + 2σ²; √(ρ̂² − σ²) has the least bias where ρ > σ (Wardle & Kronberg, ApJ 1974).
@@ -84,7 +87,7 @@ def polarization(stokes: Any, covariance: Any) -> tuple[Any, Any, Any, Any]:
 
 
 def least_intensity_color(stokes: Any, matrix: Any) -> Any:
-    """Color of the light at the polarizer angle of least intensity, ½(S0 − √(S1² + S2²)); unit length, 0 if dark."""
+    """Color of the light at the polarizer angle of least intensity, ½(S0 − √(S1² + S2²)). Unit length, 0 if dark."""
     xp = array_namespace(stokes)
     least = (stokes[0] - (stokes[1] ** 2 + stokes[2] ** 2) ** 0.5) / 2
     color = xp.clip(least @ matrix.T, 0.0, None)
@@ -99,7 +102,7 @@ def zenith(dolp: Any, ior: float = NOMINAL_IOR) -> Any:
 
 
 def channels(cues: Any) -> Any:
-    """Network input (..., N, H, W) float32, in the order of CHANNELS; 0 outside the mask.
+    """Network input channels (..., N, H, W) float32 from cues, in the order of CHANNELS; 0 outside the mask.
 
     `cues` has the fields of `Cues`; in training these are torch tensors, with a leading batch axis
     on each pixel map ((B, H, W), (B, H, W, 3), (2, B, H, W)).

@@ -15,13 +15,13 @@ from polcap.optics.projection import back_project
 
 _BULGE = 0.5  # radii; mean distance of the visible surface in front of the center: 1/3 for a cone, 2/3 for a ball
 _BULGE_SPREAD = 0.4  # radii; its 1σ over 204 views of training meshes and random shapes (decision 8)
-_CHART_SPREAD = 3**-0.5  # radii: 1σ of the depth of a chart anywhere between the object's front and back
+_CHART_SPREAD = 0.3  # radii: 1σ of the depth of a chart next to the middle of the object
 _LARGEST_RADIUS = 0.5  # of an object, over its distance; for larger ones the far-field law does not hold
 _STEP = 1e-4
 
 
 def factor(stokes: StokesImage, color: ColorCalibration) -> float:
-    """Factor on the radiance after which 1 is a white plane that faces the flash, on the axis at the object's distance.
+    """Factor that scales radiance: 1 becomes a white plane facing the flash, on the axis at the object's distance.
 
     The falloff of light over the object, with distance and to the sides, remains, as in the training pictures.
     """
@@ -32,7 +32,7 @@ def factor(stokes: StokesImage, color: ColorCalibration) -> float:
 
 
 def sigma(stokes: StokesImage, color: ColorCalibration) -> float | None:
-    """Relative 1σ of the scale of all albedos; None without a chart in the picture.
+    """Relative error (1σ) of the scale of all albedos; None without a chart in the picture.
 
     Light falls with the square of the distance: a chart at the object's front makes the albedo too dark, a chart
     behind the object too bright. The position of the flash comes from the slope of the light across the chart.
@@ -47,11 +47,11 @@ def sigma(stokes: StokesImage, color: ColorCalibration) -> float | None:
     light, middle = color.light, _middle(stokes, ahead)
     here = _log_factor(light, middle)
     slope = np.array([_log_factor(_changed(light, step), middle) - here for step in _STEP * np.eye(5)]) / _STEP
-    return hypot(depth, sqrt(slope @ light.covariance @ slope))
+    return hypot(depth, light.uneven, sqrt(slope @ light.covariance @ slope))
 
 
 def _log_factor(light: ChartLight, middle: Floats) -> float:
-    """ln of the chart's irradiance over the object's, relative to the same ratio for a flash at the lens."""
+    """Logarithm of chart irradiance over object irradiance, relative to the same ratio for a flash at the lens."""
     flash, power = light.flash[:2], float(light.flash[2])
     chart = point_light.irradiance(light.white, flash, power, light.normal)
     object_ = point_light.irradiance(middle, flash, power)
@@ -60,7 +60,10 @@ def _log_factor(light: ChartLight, middle: Floats) -> float:
 
 
 def _changed(light: ChartLight, step: Floats) -> ChartLight:
-    """The light with flash position and falloff changed by step[:3], and the chart turned about x and y by step[3:]."""
+    """The chart's light with flash position and falloff changed by step[:3], and the chart rotated by step[3:].
+
+    The rotation is about x and y.
+    """
     from scipy.spatial.transform import Rotation  # here: the import takes 0.2 s
 
     turned = Rotation.from_rotvec([*step[3:], 0.0]).apply(np.array(light.normal))  # SciPy takes no read-only array
@@ -68,11 +71,11 @@ def _changed(light: ChartLight, step: Floats) -> ChartLight:
 
 
 def _middle(stokes: StokesImage, distance: float) -> Floats:
-    """Center (3,) of the object's pixels in the camera frame, at a depth along the optical axis."""
+    """Center (3,) of the object's pixels in the camera frame, at a given depth along the optical axis."""
     row, column = (axis.mean() for axis in np.nonzero(stokes.mask)) if stokes.mask.any() else (0.0, 0.0)
     return distance * back_project(stokes.view, np.array(column), np.array(row))
 
 
 def _radius(stokes: StokesImage) -> float:
-    """Radius of a disc with as many pixels as the object, over the object's distance."""
+    """Radius of the object relative to its distance: that of a disc with as many pixels."""
     return min(sqrt(stokes.mask.sum() / pi) / stokes.view.focal, _LARGEST_RADIUS)

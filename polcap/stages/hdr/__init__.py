@@ -51,7 +51,7 @@ _LEAST_PX = 48  # least side of a merged picture: noise and motion are measured 
 
 
 class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How brackets are merged."""
+    """Settings of the stage `hdr`, the section `hdr` of a settings file: how brackets are merged."""
 
     clip: Annotated[float, Meta(ge=0.5, le=1.0, description="clipping threshold [white level]")] = 0.98
     demosaic: Annotated[
@@ -66,9 +66,9 @@ class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=13)
+@stage(version=14)
 def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack:
-    """Radiance (K, H, W, 3) of every shot, on the scale of its reference frame.
+    """Merge every bracket: radiance (K, H, W, 3) of all shots, on the scale of each shot's reference frame.
 
     The reference frame is the frame of middle brightness in the first shot, and the frame of the same index in the
     other shots. So a shot has the flash energy of its reference frame. Pixels clipped in every frame are taken from the
@@ -165,14 +165,14 @@ def _check_counts(shots: tuple[Shot, ...]) -> None:
 
 
 def _memory_plan(capture: Capture, image: SensorImage, settings: HdrSettings) -> planes.MemoryPlan:
-    """Memory that the merge may use, by the size of the first frame; binning leaves a quarter of the pixels."""
+    """Memory that the merge may use, from the size of the first frame; binning leaves a quarter of the pixels."""
     height, width = image.value.shape[:2]
     pixels = height * width // (4 if image.cfa is not None and settings.demosaic == "superpixel" else 1)
     return planes.plan_memory(len(capture.shots), len(capture.shots[0].frames), pixels, image.value.nbytes)
 
 
 def _by_brightness(shot: Shot, read: Reader) -> tuple[int, ...]:
-    """Indices of the frames, darkest first, by their pixels."""
+    """Indices of a shot's frames, darkest first, by the brightness of their pixels."""
 
     def level(frame: Frame) -> float:
         image = read(frame)
@@ -187,7 +187,7 @@ def _by_brightness(shot: Shot, read: Reader) -> tuple[int, ...]:
 
 
 def _middle(order: tuple[int, ...]) -> int:
-    """Index of the frame of middle brightness."""
+    """Index of the frame of middle brightness, which is the bracket's reference frame."""
     return order[(len(order) - 1) // 2]
 
 
@@ -212,7 +212,7 @@ def _sensor(capture: Capture, image: SensorImage, settings: HdrSettings) -> Colo
 
 
 def _view(capture: Capture, image: SensorImage, settings: HdrSettings) -> View:
-    """The pinhole camera of the merged picture, in which pixel (0, 0) is the center of a superpixel."""
+    """The pinhole camera (`View`) of the merged picture; its pixel (0, 0) is the center of a superpixel."""
     scale = 1.0 if settings.demosaic == "full" else float(image.superpixel)
     x, y = capture.principal_px
     center = (x - (scale - 1) / 2) / scale, (y - (scale - 1) / 2) / scale
@@ -220,14 +220,14 @@ def _view(capture: Capture, image: SensorImage, settings: HdrSettings) -> View:
 
 
 def _empty(shots: int, shape: tuple[int, int, int]) -> MaskedImage:
-    """Unfilled memory (K, H, W, 3) for all shots, of shape (C, H, W) each."""
+    """Uninitialized memory (K, H, W, 3) for the merged shots, of shape (C, H, W) each."""
     _, height, width = shape
     value, variance = (np.empty((shots, height, width, 3), np.float32) for _ in range(2))
     return MaskedImage(value, variance, np.empty((shots, height, width), np.uint8))
 
 
 def _equipment(capture: Capture, view: View) -> Equipment:
-    """Light, lens and polarizer of a capture, with the lens's distortion in pixels of `view`."""
+    """Light, lens distortion (in pixels of `view`) and polarizer of a capture, from metadata and calibration."""
     light, known = _light(capture), capture.calibration
     if known is None:
         return Equipment(light)
@@ -242,7 +242,7 @@ def _equipment(capture: Capture, view: View) -> Equipment:
 
 
 def _light(capture: Capture) -> Literal["flash", "steady", "one exposure", "unknown"]:
-    """Kind of light, from the metadata."""
+    """Kind of light of a capture (flash, steady…), from the metadata."""
     if capture.layout == "sensor":
         return "one exposure"
     fired = {frame.exif.flash_fired for shot in capture.shots for frame in shot.frames}
@@ -250,5 +250,5 @@ def _light(capture: Capture) -> Literal["flash", "steady", "one exposure", "unkn
 
 
 def _offsets(shots: tuple[Shot, ...]) -> Floats:
-    """Offsets (K, 2) px of the planes of a polarization mosaic from the first plane."""
+    """Pixel offsets (K, 2) of the angles' planes of a polarization sensor, relative to the first plane."""
     return np.asarray([np.subtract(shot.place_px, shots[0].place_px) for shot in shots])

@@ -23,7 +23,7 @@ _MOTION_SIGMAS = 3.0  # nor are frames that moved by less than this many of its 
 
 @dataclass(frozen=True)
 class Bracket:
-    """A shot, the order in which its frames are compared, and its reference frame."""
+    """One shot with the order in which its frames are compared, and its reference frame."""
 
     shot: Shot
     order: tuple[int, ...]  # of the frames, darkest first
@@ -37,7 +37,7 @@ class Bracket:
 
 @dataclass(frozen=True)
 class AmbientLight:
-    """Light without the flash, for the exposure of the reference frame."""
+    """Ambient light (without the flash) and its variance, for the exposure of the reference frame."""
 
     value: Floats  # (C, H, W)
     variance: Floats  # (C, H, W)
@@ -45,7 +45,7 @@ class AmbientLight:
 
 @dataclass(frozen=True)
 class ComparedBracket:
-    """Everything that the comparison measured in a bracket, on the binned grid."""
+    """Result of the comparison of a bracket's frames, on the binned grid."""
 
     frames: list[RegisteredFrame]  # (E,) less the ambient light, with the sensor's noise
     ghost: Bools  # (H, W)
@@ -54,7 +54,7 @@ class ComparedBracket:
 
 
 def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float) -> ComparedBracket:
-    """Compare every frame with the reference frame, and add to `lines` the noise of their ISO.
+    """Compare every frame of a bracket with its reference frame; the noise of their ISO is added to `lines`.
 
     Raises
     ------
@@ -104,7 +104,7 @@ class _BracketSignals:
         self.ambient = ambient_light(bracket, lines, read)
 
     def signals(self, e: int) -> Signals:
-        """Signals of frame e, with its ambient light subtracted."""
+        """Signals of frame e of the bracket, with its ambient light subtracted."""
         found = self._read.signals(self._shot, e)
         if self.ambient is None:
             return found
@@ -113,7 +113,7 @@ class _BracketSignals:
         return in_memory(found.rows(slice(None)) - self._ambient_exposure(e) * self.ambient.value, found.usable)
 
     def line(self, e: int) -> noise.Noise:
-        """Noise of frame e, with the noise of the ambient light that was subtracted."""
+        """Noise line of frame e, including the noise of the ambient light that was subtracted."""
         if self.ambient is None:
             return self.sensor_line(e)
         return self.sensor_line(e).with_ambient(self._ambient_exposure(e) * self.ambient.value.mean(axis=(1, 2)))
@@ -122,7 +122,7 @@ class _BracketSignals:
         return self._lines.line(self._iso[e], self._rounding)
 
     def settled(self, *frames: int) -> bool:
-        """Whether the noise of these frames' ISO is settled."""
+        """Whether the noise lines for the ISO of these frames are final."""
         return all(self._lines.knows(self._iso[e]) for e in frames)
 
     def learn(self, e: int, samples: noise.Samples) -> None:
@@ -135,7 +135,7 @@ class _BracketSignals:
 def _compare_frame(
     source: _BracketSignals, e: int, still: Signals, pyramid: Pyramid, limit_px: float
 ) -> RegisteredFrame:
-    """Motion, exposure ratio, noise and misfit of frame e against the reference frame's signals."""
+    """Measure motion, exposure ratio, noise and misfit of frame e relative to the reference frame."""
     reference, name = source.reference, f"frame {e + 1} of {source.name}"
     found, gain = source.signals(e), None
     same_size(name, found.shape, still.shape)
@@ -153,13 +153,17 @@ def _compare_frame(
         for number, samples in zip((reference, e), noise.sample_pair(still, found, ratio)):
             source.learn(number, samples)
     misfit = np.zeros_like(ratio)
-    frame = RegisteredFrame(found, ratio, source.line(e), misfit, motion, gain, exposure.curvature(*tiles))
+    shaded, curvature = exposure.vignetting(still, found, ratio), exposure.curvature(*tiles)
+    frame = RegisteredFrame(found, ratio, source.line(e), misfit, motion, gain, shaded, curvature)
     lines = source.line(reference), frame.noise
     return replace(frame, misfit=noise.misfit(still, found, ratio, lines, frame.mean_gain))
 
 
 def brightness_pyramid(frame: Signals) -> Pyramid:
-    """Pyramid of the square root of all channels' sum, lightly smoothed; its noise is nearly uniform."""
+    """Pyramid of a frame's brightness for registration: square root of the channels' sum, smoothed.
+
+    Its noise is nearly uniform.
+    """
     _, height, width = frame.shape
     out = np.empty((height, width), np.float32)
     for rows, inner, target in blocks(height, _SMOOTH.size // 2):
@@ -174,7 +178,9 @@ def brightness_pyramid(frame: Signals) -> Pyramid:
 
 
 def measure_motion(name: str, still: Pyramid, other: Pyramid, limit_px: float) -> Floats | None:
-    """Motion (3, 3), reference px → frame px; None for a frame that did not move measurably.
+    """Measure the motion of a frame relative to the reference frame: (3, 3), reference px → frame px.
+
+    None if the frame did not move measurably.
 
     Raises
     ------
@@ -191,7 +197,9 @@ def measure_motion(name: str, still: Pyramid, other: Pyramid, limit_px: float) -
 
 
 def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool = False) -> AmbientLight | None:
-    """Mean of a bracket's ambient frames, on the full grid with `full`; None without ambient frames.
+    """Mean of a bracket's ambient frames (taken without flash); None if there are none.
+
+    With `full`, on the full grid.
 
     Raises
     ------
@@ -223,7 +231,10 @@ def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool
 
 
 def _ambient_share(ambient: AmbientLight, flash: Floats) -> float:
-    """Share of ambient light in all light, in the brighter half of the picture; `flash` (C, H, W) is the flash's."""
+    """Share of ambient light in all light, in the brighter half of the picture.
+
+    `flash` (C, H, W) is the flash light.
+    """
     without, lit = (picture[:, ::4, ::4].sum(0) for picture in (ambient.value, flash))
     bright = lit + without >= np.median(lit + without)
     return float(without[bright].sum() / max(float((lit + without)[bright].sum()), 1e-9))

@@ -15,6 +15,7 @@ _TONE_RANGE, _TONE_BINS, _TONE_SPAN = (0.01, 0.9), 8, 0.7
 TILE = 16  # px
 _LEAST_TILES = 30
 _SURE, _LEAST_SURE = 0.01, 0.03  # largest relative 1σ of a ratio: of one channel, of all channels together
+_LEAST_VIGNETTING = 0.01  # smaller changes of the ratio over the picture are left to the limit of ghosts
 _DIM, _DIMMEST = 4e-3, 4e-4  # of the sensor's range: darker tiles suffer from errors of the black level
 
 
@@ -27,7 +28,9 @@ class Ratio:
 
 
 def of_tiles(a: Floats, b: Floats) -> Ratio | None:
-    """Exposure ratio b / a (C,) from tiles (T, C) of both frames, see `common_tiles`; None if they do not suffice.
+    """Exposure ratio b / a (C,) measured in tiles (T, C) of two frames, see `common_tiles`.
+
+    None if they do not suffice.
 
     It is the quotient of sums over tiles: the maximum-likelihood estimate for Poisson counts, without the bias of a
     mean of quotients or of logarithms. Tiles that disagree, because something moved, are dropped. A channel with an
@@ -44,14 +47,45 @@ def of_tiles(a: Floats, b: Floats) -> Ratio | None:
 
 
 def common_tiles(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
-    """Means (T, C) in both frames of the tiles that are fully usable in both."""
+    """Means (T, C) of tiles in both frames, for the tiles that are fully usable in both."""
     inside = block_means(reference.usable & other.usable, TILE) == 1
     a, b = (tile_means(picture, TILE)[inside].astype(np.float64) for picture in (reference, other))
     return a, b
 
 
+def vignetting(reference: Signals, other: Signals, ratio: Floats) -> Floats | None:
+    """Smooth factor (H, W) float32 on the exposure ratio (C,) of two frames, a quadratic in place; None below 1 %.
+
+    Apertures differ in vignetting, so corners of a bracket by aperture are darker in its wide frames.
+    """
+    _, height, width = reference.shape
+    a, b = tile_means(reference, TILE).sum(-1), (tile_means(other, TILE) / ratio).sum(-1)
+    clear = block_means((reference.usable & other.usable).astype(np.float32), TILE) > 0.999
+    bright = clear & (a > 3 * _DIM) & (b > 3 * _DIM)
+    if bright.sum() < 2 * _LEAST_TILES:
+        return None
+    row, column = np.nonzero(bright)
+    change = np.log(b[bright] / a[bright])
+    basis = _quadratic((column + 0.5) / a.shape[1], (row + 0.5) / a.shape[0])
+    weight = np.ones(len(change))
+    for _ in range(6):  # tiles where something moved lose their weight
+        found = np.linalg.lstsq(basis * weight[:, None], change * weight, rcond=None)[0]
+        rest = np.abs(change - basis @ found)
+        weight = np.sqrt(1 / (1 + (rest / (2 * MAD_TO_SIGMA * np.median(rest) + 1e-4)) ** 2))
+    if np.abs(basis @ found).max() < _LEAST_VIGNETTING:
+        return None
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    flat = _quadratic((x.ravel() + 0.5) / (a.shape[1] * TILE), (y.ravel() + 0.5) / (a.shape[0] * TILE)) @ found
+    return np.asarray(np.exp(flat).reshape(height, width), np.float32)
+
+
+def _quadratic(x: Floats, y: Floats) -> Floats:
+    """Columns 1, x, y, x², xy, y² of points (N,)."""
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+
 def measured_or_stated(name: str, measured: Ratio | None, channels: int, frame: Frame, reference: Frame) -> Floats:
-    """Exposure (C,) float32 relative to the reference frame: the measured one, else that of the metadata.
+    """Exposure ratio (C,) float32 to the reference frame: the measured one, else that of the metadata.
 
     Raises
     ------
@@ -74,14 +108,14 @@ def measured_or_stated(name: str, measured: Ratio | None, channels: int, frame: 
 
 
 def stated(frame: Frame, reference: Frame) -> float:
-    """Exposure relative to the reference frame, by capture.toml or the camera's settings; NaN if unknown."""
+    """Exposure ratio to the reference frame by capture.toml or camera settings; NaN if unknown."""
     if frame.exposure and reference.exposure:
         return frame.exposure / reference.exposure
     return _by_settings(frame, reference)
 
 
 def of_ambient(frame: Frame, reference: Frame) -> float:
-    """Exposure to ambient light relative to the reference frame, by the camera's settings; 1 if unknown."""
+    """Ambient exposure ratio to the reference frame by camera settings; 1 if unknown."""
     settings = _by_settings(frame, reference)
     return settings if np.isfinite(settings) else 1.0
 
@@ -92,7 +126,9 @@ def _by_settings(frame: Frame, reference: Frame) -> float:
 
 
 def curvature(a: Floats, b: Floats) -> float:
-    """Change of the exposure ratio with brightness, d ln(b/a) / d ln √(a b), from tiles (T, C) of `common_tiles`.
+    """Nonlinearity of two frames: change of the exposure ratio with brightness, d ln(b/a) / d ln √(a b).
+
+    From tiles (T, C) of `common_tiles`.
 
     It is 0 for linear files. A tone curve makes the ratio differ between shadows and highlights; a change of the light
     does not. NaN if the tiles span too little brightness.
@@ -110,7 +146,7 @@ def curvature(a: Floats, b: Floats) -> float:
 
 
 def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:
-    """Σb / Σa over the tiles (T,) that agree, and its relative 1σ; None for too few tiles."""
+    """Exposure ratio Σb / Σa over the tiles (T,) that agree, and its relative 1σ; None for too few tiles."""
     for dim in (_DIM, _DIMMEST):
         bright = (a > dim) & (b > dim)
         if bright.sum() >= _LEAST_TILES:

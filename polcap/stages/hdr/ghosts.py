@@ -21,10 +21,11 @@ Bools = NDArray[np.bool_]
 
 _WINDOW = 5  # px, side of the window for comparison and smoothing
 _EVEN = np.full(_WINDOW, 1 / _WINDOW, np.float32)
-# A window is a ghost if its frames differ by more than the sum of these three:
+# A window is a ghost if its frames differ by more than the sum of these four:
 _SIGMA = 6.0  # standard deviations of noise
 _MISFIT = 3.0  # standard deviations of the registration error at edges
-_SHARE = 0.02  # of the radiance: flare and shading differ by as much between exposures
+_SHARE = 0.02  # of the radiance: flare differs by as much between exposures
+_BLACK = 2e-4  # of the sensor's range, at each frame's exposure: error of the black level, 3 of 15,000 counts
 _CORRELATED = 1.5  # variance of a window's mean over that of independent pixels: neighbors share some noise
 
 
@@ -38,6 +39,7 @@ class RegisteredFrame:
     misfit: Floats  # (C,) float32 px²; variance per squared gradient, from registration errors and aliasing
     motion: Floats | None = None  # (3, 3) reference px → frame px; None: no motion
     gain: Floats | None = None  # (H, W) factor on the noise variance by resampling; None: not resampled
+    vignetting: Floats | None = None  # (H, W) float32 factor on the ratio, as wide apertures darken corners; None: 1
     curvature: float = 0.0  # of `exposure.curvature`; 0: linear, NaN: unknown
 
     @property
@@ -47,33 +49,33 @@ class RegisteredFrame:
 
 @dataclass(frozen=True)
 class Anchor:
-    """Radiance that other frames are compared with: the reference frame, or the darkest where the reference clips."""
+    """Radiance to compare frames with: the reference frame, or the darkest frame where the reference clips."""
 
     reference: RegisteredFrame
     darkest: RegisteredFrame | None = None
 
     @property
     def known(self) -> Bools:
-        """Pixels (H, W) with a usable frame."""
+        """Mask (H, W) of pixels where the anchor has a usable frame."""
         own = self.reference.signals.usable
         return own if self.darkest is None else own | self.darkest.signals.usable
 
     def rows(self, rows: slice) -> Floats:
-        """Radiance (C, h, W) of some rows."""
+        """Radiance (C, h, W) of the anchor in some rows."""
         value, own = self.reference.signals.rows(rows), self.reference.signals.usable[rows]
         if self.darkest is None or own.all():
             return value
         return np.where(own, value, self.darkest.signals.rows(rows) / self.darkest.ratio[:, None, None])
 
     def variance(self, level: Floats, channel: int, rows: slice) -> Floats:
-        """Noise variance (h, W) in some rows of a channel, for an expected radiance `level` (h, W)."""
+        """Noise variance (h, W) of the anchor in some rows of a channel, for an expected radiance `level` (h, W)."""
         variance, own = self.reference.noise.of_channel(channel, level), self.reference.signals.usable[rows]
         if self.darkest is None or own.all():
             return variance
         return np.where(own, variance, self.darkest.noise.of_radiance(self.darkest.ratio).of_channel(channel, level))
 
     def ghosts(self, frame: RegisteredFrame) -> Bools:
-        """Pixels (H, W) around which the mean of a window differs by more than noise, registration error and flare.
+        """Ghost mask (H, W): pixels around which a frame differs by more than noise, registration error and flare.
 
         Isolated windows are dropped, the others are grown by a window.
         """
@@ -91,8 +93,11 @@ class Anchor:
                 if frame.misfit[c]:
                     edge = np.maximum(box(squared_gradient(anchor[c])) - own, 0)
                     limit += np.sqrt(edge * np.float32(_MISFIT**2 * frame.misfit[c]))
-                limit += _SHARE * np.abs(level)
-                off |= np.abs(box(value[c]) / frame.ratio[c] - level) > limit
+                limit += _SHARE * np.abs(level) + np.float32(_BLACK * (1 + 1 / float(frame.ratio[c])))
+                scaled = box(value[c]) / frame.ratio[c]
+                if frame.vignetting is not None:
+                    scaled /= frame.vignetting[rows]
+                off |= np.abs(scaled - level) > limit
             found[target] = (off & _all_around(known[rows], _WINDOW // 2))[inner]
 
         parallel.results(partial(compare, *block) for block in blocks(height, _WINDOW // 2 + 1))
@@ -100,7 +105,7 @@ class Anchor:
 
 
 def first_estimate(parts: list[tuple[RegisteredFrame, Bools]], otherwise: Signals | Anchor, ghost: Bools) -> Floats:
-    """First estimate of the radiance, X₀ = Σ Y/a / Σ e/a, (C, H, W), after a local Wiener filter.
+    """First estimate of a bracket's radiance, X₀ = Σ Y/a / Σ e/a, (C, H, W), after a local Wiener filter.
 
     `parts` are frames, each with the pixels (H, W) for which it is used. `otherwise` is used where no frame is, and at
     ghosts. The filter (Lee, IEEE PAMI 1980) moves each pixel towards the mean of its window, by the share of the
@@ -136,12 +141,15 @@ def first_estimate(parts: list[tuple[RegisteredFrame, Bools]], otherwise: Signal
 
 
 def _weight(serves: Bools) -> Floats | np.float32:
-    """1 where a frame is used and 0 elsewhere, (h, w); the number 1 where it is used everywhere."""
+    """Weight of a frame per pixel: 1 where it is used, else 0, (h, w); the number 1 if it is used everywhere."""
     return np.float32(1) if serves.all() else serves.astype(np.float32)
 
 
 def _wiener(x: Floats, electrons: Floats | np.float32, floor: Floats | np.float32) -> Floats:
-    """Wiener-filtered x (h, w), with `electrons` per unit of x and `floor` the variance of read noise [electrons²]."""
+    """Wiener-filter a picture x (h, w) with known noise.
+
+    `electrons` per unit of x; `floor`: variance of read noise [electrons²].
+    """
     mean = box(x)
     distance = x - mean
     noise = np.float32(1.5) * (np.maximum(mean, 0) / electrons + floor / (electrons * electrons))
@@ -149,18 +157,18 @@ def _wiener(x: Floats, electrons: Floats | np.float32, floor: Floats | np.float3
 
 
 def box(picture: Floats) -> Floats:
-    """Mean (h, w) over the window around each pixel of a picture (h, w); border pixels are repeated."""
+    """Box filter: mean (h, w) over the window around each pixel of a picture (h, w); border pixels are repeated."""
     # twice as fast as cv2.blur, which sums in float64
     return np.asarray(cv2.sepFilter2D(picture, -1, _EVEN, _EVEN, borderType=cv2.BORDER_REPLICATE))
 
 
 def _any_around(mask: Bools, reach: int) -> Bools:
-    """The mask grown by `reach` px in all eight directions."""
+    """Dilate a mask by `reach` px in all eight directions."""
     kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return np.asarray(cv2.dilate(mask.view(np.uint8), kernel)).view(bool)
 
 
 def _all_around(mask: Bools, reach: int) -> Bools:
-    """The mask shrunk by `reach` px in all eight directions, except from the picture's border."""
+    """Erode a mask by `reach` px in all eight directions, except from the picture's border."""
     kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return np.asarray(cv2.erode(mask.view(np.uint8), kernel)).view(bool)

@@ -31,7 +31,7 @@ _SANE_ELECTRONS = (100.0, 1e6)  # range of a plausible full well
 
 @dataclass(frozen=True)
 class Noise:
-    """Variance of one pixel = slope · signal + floor, per channel."""
+    """Noise line of one pixel per channel: variance = slope · signal + floor."""
 
     slope: Floats  # (C,) 1/e⁻
     floor: Floats  # (C,)
@@ -45,7 +45,10 @@ class Noise:
         return np.asarray(np.maximum(signal, 0) * self.slope[channel] + self.floor[channel])
 
     def of_radiance(self, ratio: Floats, gain: float = 1.0) -> "Noise":
-        """The noise line of radiance: signals over their exposure ratio (C,), with `gain` on the variance."""
+        """The noise line of radiance, that is of signals divided by their exposure ratio (C,).
+
+        `gain` multiplies the variance.
+        """
         return Noise(self.slope * np.float32(gain) / ratio, self.floor * np.float32(gain) / ratio**2)
 
     def with_ambient(self, level: Floats) -> "Noise":
@@ -54,7 +57,10 @@ class Noise:
 
 
 def of_pixels(light: Floats, line: Noise, cfa: Bits | None) -> Floats:
-    """Variance (C, h, w) for expected signals (C, h, w); `cfa` for pixels interpolated from it, None if binned."""
+    """Noise variance (C, h, w) for expected signals (C, h, w).
+
+    `cfa` is given for interpolated pixels, None for binned ones.
+    """
     expected = np.stack([line.of_channel(c, plane) for c, plane in enumerate(light)])
     if cfa is None:
         return expected
@@ -75,7 +81,9 @@ class Samples:
 
 
 def roughness(picture: Floats) -> Floats:
-    """Second differences along both axes, (C, H, W) → (C, H−2, W−2); the variance of white noise is unchanged.
+    """High-pass filter for noise: second differences along both axes, (C, H, W) → (C, H−2, W−2).
+
+    The variance of white noise is unchanged.
 
     The filter [1, −2, 1] ⊗ [1, −2, 1] / 6 does not respond to a ramp.
     """
@@ -83,7 +91,10 @@ def roughness(picture: Floats) -> Floats:
 
 
 def strips(height: int, width: int, most: float = 0.75e6) -> list[slice]:
-    """Evenly spaced strips of rows: whole rows of tiles, plus 2 px for `roughness`; at most about `most` px in all."""
+    """Choose evenly spaced strips of rows for the noise measurement, at most about `most` px in all.
+
+    A strip is a row of tiles plus 2 px for `roughness`.
+    """
     rows = max((height - 2) // TILE, 0)
     wanted = max(1, min(rows, int(most / (TILE * max(width, 1)))))
     first = np.unique(np.linspace(0, rows - 1, wanted).astype(int)) if rows else np.zeros(0, int)
@@ -93,7 +104,7 @@ def strips(height: int, width: int, most: float = 0.75e6) -> list[slice]:
 def tile_columns(
     frames: tuple[Signals, ...], maps: Callable[..., tuple[Floats, ...]], most: float = 0.75e6
 ) -> list[Floats]:
-    """Tile means (T, C) of each of the maps that `maps` computes from the frames' strips (C, h, w).
+    """Means over tiles (T, C) of each map that `maps` computes from the frames' strips (C, h, w).
 
     NaN for tiles that are not fully usable in all frames. The maps are 1 px smaller on each side than the strips.
     """
@@ -106,13 +117,13 @@ def tile_columns(
 
 
 def sample_frame(picture: Signals) -> Samples:
-    """Signal and variance in tiles of a single frame."""
+    """Sample signal and noise variance in tiles of a single frame."""
     signal, variance = tile_columns((picture,), lambda part: (inner(part), roughness(part) ** 2))
     return Samples(signal, variance, flat=True)
 
 
 def sample_pair(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples, Samples]:
-    """Signal and variance in tiles of two registered frames, second = ratio (C,) · first except for noise.
+    """Sample signal and noise variance in tiles of two registered frames, second = ratio (C,) · first + noise.
 
     With h₁ = t + n₁ and h₂ = r t + n₂, the scene's detail t cancels in ⟨h₁ (h₁ − h₂/r)⟩ = var n₁ and
     ⟨h₂ (h₂ − r h₁)⟩ = var n₂.
@@ -129,7 +140,7 @@ def sample_pair(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples
 
 
 def inner(picture: Floats) -> Floats:
-    """A picture (C, h, w) without its outermost pixels."""
+    """Crop a picture (C, h, w) by its outermost pixels."""
     return picture[:, 1:-1, 1:-1]
 
 
@@ -171,7 +182,7 @@ def misfit(first: Signals, second: Signals, ratio: Floats, lines: tuple[Noise, N
 
 
 def _per_edge(expected: Floats, seen: Floats, edge: Floats) -> float:
-    """Fit k in seen = expected + k · edge by relative least squares, without the worst 3 % of the tiles."""
+    """Fit k in seen = expected + k · edge (tile variances) by relative least squares, without the worst 3 %."""
     good = np.isfinite(seen) & (edge > 0.5 * expected)
     if good.sum() < _LEAST_TILES:
         return 0.0
@@ -188,7 +199,7 @@ def _per_edge(expected: Floats, seen: Floats, edge: Floats) -> float:
 
 
 class Lines:
-    """The noise lines of a capture by ISO: calibrated, or measured in the first shot of that ISO."""
+    """Noise lines of a capture by ISO: from calibration, or measured in the first shot of that ISO."""
 
     def __init__(self, calibrated: Iterable[NoiseLine] = ()) -> None:
         self._samples: dict[object, list[Samples]] = {}
@@ -198,7 +209,7 @@ class Lines:
         self._settled: set[object] = set(self._known)
 
     def learn(self, iso: object, samples: Samples) -> None:
-        """Add the tiles of a frame, unless the line of its ISO is final."""
+        """Add the noise samples of a frame, unless the noise line of its ISO is final."""
         if iso not in self._settled:
             self._samples.setdefault(iso, []).append(samples)
             self._known.pop(iso, None)
@@ -211,11 +222,11 @@ class Lines:
         return self._known[iso]
 
     def knows(self, iso: object) -> bool:
-        """Whether the line of an ISO is final."""
+        """Whether the noise line of an ISO is final."""
         return iso in self._settled
 
     def settle(self) -> None:
-        """Make the present lines final: later shots use them."""
+        """Make the current noise lines final: later shots use them."""
         self._settled = set(self._known)
         self._samples.clear()
 
@@ -248,7 +259,7 @@ def _line(samples: list[Samples], channel: int, iso: float | None, least: float)
 
 
 def _quotient(relative: Floats, flat: bool) -> float:
-    """Mean of a bin's relative tile variances (n,): their median, or from the 15 % quantile for `flat` samples."""
+    """Mean of a bin's relative tile variances (n,): median, or from the 15 % quantile for `flat` samples."""
     if not flat:
         return float(np.median(relative))
     spread = 2 / (9 * FREEDOM)  # of a χ² law by Wilson and Hilferty
@@ -256,7 +267,7 @@ def _quotient(relative: Floats, flat: bool) -> float:
 
 
 def usable_tiles(usable: Bools) -> Bools:
-    """Whether each tile (T,) of a strip (h, W) of `strips` has only usable pixels, also around it."""
+    """Mask (T,) of a strip's tiles that have only usable pixels, also around them. `usable` (h, W) is the strip."""
     bad = np.asarray(~usable.all(axis=0))  # (W,)
     before = np.concatenate([[0], np.cumsum(bad)])
     first = TILE * np.arange((usable.shape[1] - 2) // TILE)

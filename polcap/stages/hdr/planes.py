@@ -1,4 +1,4 @@
-"""Reads frames as planes of linear signals: decoding ahead, binning, resampling, limits of memory.
+"""Reads frames as linear signals, channel by channel: decoding in advance, binning, resampling, memory limits.
 
 A limit on memory (`--memory`, `ulimit -d`) decides how much stays in memory. With little room, frames are decoded
 again for every pass, and planes are computed block by block. The pixels are the same.
@@ -42,13 +42,13 @@ class Signals:
 
 
 def in_memory(value: Floats, usable: Bools) -> Signals:
-    """Signals (C, H, W) float32 that are held in memory."""
+    """Wrap an array (C, H, W) float32 as `Signals` that are held in memory."""
     channels, height, width = value.shape
     return Signals((channels, height, width), usable, lambda rows: value[:, rows])
 
 
 def signals(image: SensorImage, clip: float, full: bool = False, planes_bytes: float = math.inf) -> Signals:
-    """Signals of a decoded frame; pixels with counts from `clip` [white level] on are not usable.
+    """Linear signals of a decoded frame; pixels with counts from `clip` [white level] on are not usable.
 
     A mosaic is binned by superpixels, or interpolated with `full`. Binned signals of more than `planes_bytes` are
     computed from the counts whenever rows are read, in a third of the memory.
@@ -70,12 +70,15 @@ def signals(image: SensorImage, clip: float, full: bool = False, planes_bytes: f
 
 
 def planar(picture: Floats) -> Floats:
-    """(H, W, C) → (C, H, W), contiguous."""
+    """Reorder a picture to planes: (H, W, C) → (C, H, W), contiguous."""
     return np.ascontiguousarray(np.moveaxis(picture, -1, 0))
 
 
 def blocks(height: int, halo: int = 0, rows: int = _ROWS) -> Iterator[tuple[slice, slice, slice]]:
-    """Blocks of rows: the rows to read, with a halo; their part without the halo; the picture's rows of that part."""
+    """Divide a picture into blocks of rows.
+
+    Rows to read with a halo, the part without halo, its rows in the picture.
+    """
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         start = max(top - halo, 0)
@@ -115,7 +118,7 @@ def resample(signals: Signals, matrix: Floats) -> tuple[Signals, Floats]:
 
 @lru_cache(maxsize=1)
 def _kernel_gain() -> Floats:
-    """Sums (33,) of the squared weights of cv2's Lanczos kernel at fractions 0, 1/32 … 1 of a pixel."""
+    """Noise gain of Lanczos resampling: sums (33,) of squared kernel weights at fractions 0, 1/32 … 1 of a pixel."""
     impulse = np.zeros((17, 33), np.float32)
     impulse[:, 16] = 1
     x = np.arange(33, dtype=np.float32)[None] + np.arange(33, dtype=np.float32)[:, None] / 32
@@ -132,7 +135,9 @@ class MemoryPlan:
 
 
 def plan_memory(shots: int, frames: int, pixels: int, frame_bytes: int) -> MemoryPlan:
-    """Divide the memory under the limit: for `shots` of `frames` each, `frame_bytes` decoded, `pixels` merged.
+    """Divide the memory limit between signals and decoded frames of the merge.
+
+    `shots` of `frames` each, `frame_bytes` decoded, `pixels` merged.
 
     Raises
     ------
@@ -170,7 +175,7 @@ def process_memory() -> tuple[int, int | None]:
 
 
 class Reader:
-    """Decodes frames: the last few stay in memory, the next few are decoded ahead."""
+    """Decodes frames in advance; the last few frames stay in memory."""
 
     def __init__(self, coming: Iterable[Frame], decode: Decode, clip: float) -> None:
         """Frames in the order in which they will be read; counts from `clip` [white level] on are clipped."""
@@ -185,7 +190,7 @@ class Reader:
         self._decoding: dict[int, Future[SensorImage]] = {}
 
     def __call__(self, frame: Frame) -> SensorImage:
-        """The decoded frame; raises DecodeError."""
+        """Decode a frame, or return it from memory; raises DecodeError."""
         if id(frame) not in self._held:
             decoding = self._decoding.pop(id(frame), None) or self._pool.submit(self._decode, frame)
             image = decoding.result()
@@ -200,7 +205,7 @@ class Reader:
         return image
 
     def signals(self, shot: Shot, e: int, full: bool = False) -> Signals:
-        """Signals of frame e of a bracket, with the channels of the first frame read."""
+        """Linear signals of frame e of a bracket, with the same channels as the first frame read."""
         found = signals(self(shot.frames[e]), self.clip, full, self.plan.planes / len(shot.frames))
         self._channels = self._channels or found.shape[0]
         if found.shape[0] == self._channels:
@@ -218,11 +223,11 @@ class Reader:
         self._look_ahead(None, len(self._held) + 2 * _AHEAD)
 
     def close(self) -> None:
-        """Stop decoding ahead."""
+        """Stop decoding in advance."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _look_ahead(self, now: Frame | None, room: int) -> None:
-        """Start to decode the next frames while they and those in memory fit."""
+        """Start to decode the next frames in advance, as many as fit in memory."""
         self._coming = deque(frame for frame in self._coming if frame is not now)
         while self._coming and len(self._decoding) < _AHEAD and len(self._held) + len(self._decoding) < room:
             following = self._coming.popleft()

@@ -32,7 +32,7 @@ _DARK_SIGMAS = np.float32(2)  # pixels below this many standard deviations are f
 
 @dataclass(frozen=True)
 class WeightedFrame:
-    """One frame on the grid of the merge, with its ambient light."""
+    """One frame of a bracket on the grid of the merge, with its ambient light."""
 
     frame: RegisteredFrame
     serves: Bools  # (H, W) pixels for which the frame is used
@@ -44,7 +44,7 @@ class WeightedFrame:
 
 @dataclass(frozen=True)
 class WeightedBracket:
-    """The frames of a bracket with everything that their weights need."""
+    """The frames of a bracket, with the data that their weights in the merge need."""
 
     frames: list[WeightedFrame]
     estimate: Floats  # (C, H, W) the smoothed first estimate
@@ -58,7 +58,10 @@ class WeightedBracket:
         return self.frames[0].frame.signals.shape
 
     def merge_into(self, out: MaskedImage) -> None:
-        """Write the weighted mean to `out`; a single channel is copied to all three, with 3 times its variance."""
+        """Write the weighted mean of the frames to `out`.
+
+        A single channel is copied to all three, with 3 times its variance.
+        """
         _, height, width = self.shape
         rows_of_block = max(_BLOCK_PX // width, 1)
         parallel.results(partial(self._block, out, rows) for rows, _, _ in blocks(height, rows=rows_of_block))
@@ -75,7 +78,7 @@ class WeightedBracket:
         cv2.merge(list(variance), out.variance[rows])
 
     def _rows(self, rows: slice) -> tuple[Floats, Floats]:
-        """Weighted mean and its variance in some rows, (C, h, W).
+        """Weighted mean of the frames and its variance in some rows, (C, h, W).
 
         With weights w = trust / v and v the variance of a frame's radiance, Σ w² v = Σ trust · w. The sums use
         w / ratio, so that signals need not be converted to radiance.
@@ -103,7 +106,7 @@ class WeightedBracket:
         return number, variance
 
     def _trust(self, one: WeightedFrame, estimate: Floats, rows: slice) -> Floats | np.float32:
-        """Factor on a frame's weight, (h, W) or one number.
+        """Factor on a frame's weight near saturation, (h, W) or one number.
 
         It falls smoothly from 1 to _LEAST at saturation, so that weights have no step, and is least where the frame is
         not used.
@@ -117,7 +120,7 @@ class WeightedBracket:
         return np.asarray(trust * np.clip(ramp, np.float32(_LEAST), 1))
 
     def _noise(self, one: WeightedFrame, rows: slice, light: Floats, steep: Floats | None) -> Floats:
-        """Expected variance of a frame's radiance `light` (C, h, W), times its exposure ratio."""
+        """Expected noise variance of a frame's radiance `light` (C, h, W), times its exposure ratio."""
         frame, ratio = one.frame, one.frame.ratio[:, None, None]
         if self.ambient is not None:
             light = light + one.ambient / ratio * np.maximum(self.ambient.value[:, rows], 0)
@@ -134,7 +137,10 @@ class WeightedBracket:
 def prepare(
     bracket: Bracket, compared: ComparedBracket, lines: noise.Lines, read: Reader, full: bool
 ) -> WeightedBracket:
-    """The registered frames of a compared bracket, on the full grid with `full`, and the pixels each is used for."""
+    """Prepare a compared bracket for the merge: registered frames, and the pixels for which each is used.
+
+    With `full`, on the full grid.
+    """
     ambient = ambient_light(bracket, lines, read, full)
     ghost, estimate = compared.ghost, compared.estimate
     if full:
@@ -168,7 +174,10 @@ def prepare(
 
 
 def _read_again(shot: Shot, e: int, frame: RegisteredFrame, read: Reader, full: bool) -> RegisteredFrame:
-    """Frame e with its ambient light, on the full grid with `full`, which has half the pixel pitch."""
+    """Read frame e again for the merge, with its ambient light.
+
+    With `full`, on the full grid, which has half the pixel pitch.
+    """
     signals, gain = read.signals(shot, e, full), None
     if frame.motion is not None:
         signals, gain = resample(signals, scaled(frame.motion, 2) if full else frame.motion)
@@ -176,19 +185,19 @@ def _read_again(shot: Shot, e: int, frame: RegisteredFrame, read: Reader, full: 
 
 
 def _flagged(where: Bools, flag: Quality) -> Bits:
-    """The flag's bit where a mask holds, else 0."""
+    """Quality bits with `flag` set where a mask is true, else 0."""
     return np.asarray(where.view(np.uint8) * np.uint8(flag))
 
 
 def _edges(estimate: Floats, rows: slice) -> Floats:
-    """Squared gradient (C, h, W) of some rows of an estimate (C, H, W)."""
+    """Squared gradient (C, h, W) of an estimate (C, H, W) in some rows."""
     top = max(rows.start - 1, 0)
     found = np.stack([squared_gradient(plane[top : rows.stop + 1]) for plane in estimate])
     return np.asarray(found[:, rows.start - top :][:, : rows.stop - rows.start])
 
 
 def _twice(picture: Floats) -> Floats:
-    """A binned picture (C, H, W) enlarged to the full grid; cv2.resize respects the half-pixel offset."""
+    """Enlarge a binned picture (C, H, W) to the full grid; cv2.resize respects the half-pixel offset."""
     _, h, w = picture.shape
     return np.stack([cv2.resize(plane, (2 * w, 2 * h)) for plane in picture])
 

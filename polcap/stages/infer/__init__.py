@@ -9,7 +9,7 @@ the camera frame.
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
         zenith         by the object's law of diffuse polarization
     half_turns     the side of the ray to which a normal leans, for both estimators
-    highlights     filled, and their albedo from a crossed shot
+    highlights     filled, and their albedo from a crossed shot; uncertainty of the scale of all albedos
     albedo_detail  detail of the photograph that is finer than a superpixel and not shading
 """
 
@@ -25,7 +25,7 @@ from polcap.stages.infer import albedo_detail, analytic, highlights, learned
 
 
 class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The section `infer` of a settings file."""
+    """Settings of the stage `infer`, the section `infer` of a settings file."""
 
     ior: Annotated[float, Meta(ge=1.2, le=2.5, description="refractive index assumed by the analytic estimator")] = 1.5
     symmetries: Annotated[
@@ -35,9 +35,9 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fine: Annotated[bool, Meta(description="a second network adds relief finer than the pixels of the first")] = True
 
 
-@stage(version=19)
+@stage(version=20)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
-    """Normal, diffuse, specular, roughness and expected error; without a network by inversion.
+    """Estimate normal, diffuse, specular, roughness and expected error from cues; without a network by inversion.
 
     Raises
     ------
@@ -49,4 +49,8 @@ def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: Inf
     else:
         maps = learned.estimate(cues, network, run, settings.ior, settings.symmetries, fine_pass=settings.fine)
     maps = highlights.correct_highlights(maps, cues, settings.ior)
-    return replace(maps, detail=None if cues.detail is None else albedo_detail.select(cues.detail, cues, maps))
+    return replace(
+        maps,
+        albedo_sigma=highlights.albedo_sigma(maps, cues.scale_sigma),
+        detail=None if cues.detail is None else albedo_detail.select(cues.detail, cues, maps),
+    )

@@ -21,7 +21,10 @@ _LEAST_COSINE = 0.2  # of the shading that divides
 
 
 def estimate(cues: Cues, ior: float) -> SurfaceMaps:
-    """Maps of the object without a network: normals by inversion of the DoLP, albedo and gloss by the highlights."""
+    """Estimate the object's maps without a network.
+
+    Normals by inversion of the DoLP, albedo and gloss by highlights.
+    """
     normal, error, cos_zenith = invert(cues, ior)
     diffuse, highlight = _albedo(cues, cos_zenith, ior)
     roughness, specular = _gloss(highlight, cos_zenith, cues)
@@ -40,7 +43,7 @@ def estimate(cues: Cues, ior: float) -> SurfaceMaps:
 
 
 def invert(cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -> tuple[Floats, Floats, Floats]:
-    """Invert polarization: normals (H, W, 3), their expected error (H, W) in degrees, cosines of the zenith (H, W).
+    """Normals (H, W, 3) from DoLP and AoLP, their expected error (H, W) in degrees, cosines of the zenith (H, W).
 
     `guide` are the normals (H, W, 3) of another estimator in the frame of each ray, and their expected error (H, W) in
     degrees. They choose the half-turn of the azimuth; without a guide, `half_turns` chooses it.
@@ -65,7 +68,7 @@ def invert(cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -
 
 
 def _adaptive_mean(cues: Cues) -> tuple[Floats, Floats]:
-    """Denoise S1/S0 and S2/S0 (2, H, W): means over areas in which they are constant within noise; and 1σ (H, W).
+    """Denoise S1/S0 and S2/S0 (2, H, W) by means over areas where they are constant within noise; also 1σ (H, W).
 
     Each pixel takes the widest Gaussian mean that differs from no narrower one by more than noise explains (Lepski's
     rule), so creases stay and noise in flat parts goes. S1, S2 and S0 are averaged, never the angle. A Gaussian of
@@ -93,7 +96,9 @@ def _adaptive_mean(cues: Cues) -> tuple[Floats, Floats]:
 
 
 def _azimuth_by_guide(axis: Floats, rays: Floats, normal: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-    """Azimuths φ (H, W) rad of axes (cos 2φ, sin 2φ), each on the side of a guide's normal, and the certainty of it.
+    """Azimuths φ (H, W) rad from axes (cos 2φ, sin 2φ), with the 180° ambiguity solved by a guide's normals.
+
+    Also the certainty of the choice, (H, W).
 
     The normal's error is Gaussian across the axis; the certainty is P(right side) − P(wrong side).
     """
@@ -107,14 +112,14 @@ def _azimuth_by_guide(axis: Floats, rays: Floats, normal: Floats, sigma: Floats)
 
 
 def _local(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:
-    """Unit normals (H, W, 3) in the frames of the view rays, from zenith and azimuth (H, W)."""
+    """Unit normals (H, W, 3) in ray frames from zenith and azimuth φ (H, W)."""
     x, y = frames.axis_across(phi, rays)
     share = np.sqrt(np.maximum(1 - cos_zenith**2, 0) / (x * x + y * y))
     return np.stack([share * x, share * y, cos_zenith], axis=-1)
 
 
 def _expected_error(zenith: ZenithEstimate, dolp: Floats, sigma: Floats, certainty: Floats, cues: Cues) -> Floats:
-    """Expected normal error (H, W), degrees: noise, the doubt of half-turn and law, and that of the model.
+    """Expected normal error (H, W), degrees: noise, 180° ambiguity, choice of the diffuse law, model error.
 
     A wrong half-turn costs 2θ and happens with probability (1 − certainty)/2.
     """
@@ -130,7 +135,7 @@ def _expected_error(zenith: ZenithEstimate, dolp: Floats, sigma: Floats, certain
 
 
 def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]:
-    """Diffuse albedo (H, W, 3) and the highlight's radiance (H, W).
+    """Separate diffuse albedo (H, W, 3) and the radiance of the highlight (H, W).
 
     A highlight is white, small, and faces the camera: the part of the darkest channel that a grey-scale opening
     removes, where the zenith is under 35°. The rest of the radiance over cos θ T₊(θ) T₊(0) is the albedo. The cosine is
@@ -150,7 +155,7 @@ def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]
 
 
 def _gloss(highlight: Floats, cos_zenith: Floats, cues: Cues) -> tuple[float, float]:
-    """One roughness and one F0 for the object: the GGX lobe that best fits the highlight (H, W) against the zenith.
+    """One roughness and one F0 for the object: GGX lobe that fits the highlight (H, W) over the zenith best.
 
     Without a clear highlight, those of a common dielectric (0.5, 0.04).
     """

@@ -24,7 +24,7 @@ _NEAREST = 0.05  # least distance between unit vectors, about 3°: nearer ones w
 
 
 def predict(cues: Cues, network: Network, run: RunNetwork, symmetries: int) -> dict[str, Floats]:
-    """The network's maps (H, W[, 3]) over 1, 2, 4 or 8 positions; normals in the camera frame.
+    """The network's maps (H, W[, 3]), averaged over 1, 2, 4 or 8 rotated and mirrored copies of the picture.
 
     The normal is the median direction, weighed by the stated errors: where positions differ it is often by half a turn,
     and the mean of two half-turns is neither. `opposed` (H, W) is the share of positions in which the normal leans to
@@ -46,7 +46,7 @@ def predict(cues: Cues, network: Network, run: RunNetwork, symmetries: int) -> d
 def _predict_turned(
     picture: Floats, rays: Floats, network: Network, run: RunNetwork, quarters: int, mirror: bool
 ) -> dict[str, Floats]:
-    """Maps of the network for a turned or mirrored picture (H, W, N), turned back."""
+    """Run the network on a rotated or mirrored picture (H, W, N), and transform its maps back."""
     turned = _turn_channels(_turn(picture, quarters, mirror), quarters, mirror)
     maps = run_network(np.moveaxis(turned, -1, 0), network, run, CHANNELS, OUTPUTS)
     own = np.array(_turn(rays, quarters, mirror))
@@ -63,7 +63,9 @@ def _predict_turned(
 
 
 def _median_direction(normals: Floats, errors: Floats) -> Floats:
-    """Direction (H, W, 3) with the least sum of distances from K normals (K, H, W, 3), each over its error (K, H, W).
+    """Median direction (H, W, 3) of K normals (K, H, W, 3), weighted by their errors (K, H, W).
+
+    Least sum of distances.
 
     Weiszfeld's iteration: a mean weighed by the reciprocal of the distances from the previous one. Its length is at
     most 1, and less where the directions differ.
@@ -79,19 +81,19 @@ def _median_direction(normals: Floats, errors: Floats) -> Floats:
 
 
 def _turn(image: Floats, quarters: int, mirror: bool) -> Floats:
-    """Pixels (H, W, …) mirrored left to right, then turned counter-clockwise."""
+    """Mirror an image (H, W, …) left to right, then rotate it counter-clockwise by quarter turns."""
     return np.asarray(np.rot90(image[:, ::-1] if mirror else image, quarters))
 
 
 def _turn_vectors(vector: Floats, quarters: int, mirror: bool) -> Floats:
-    """Vectors (..., 2), y up, mirrored left to right, then turned counter-clockwise by quarters."""
+    """Mirror vectors (..., 2), y up, left to right, then rotate them counter-clockwise by quarter turns."""
     direction = vector[..., 0] + 1j * vector[..., 1]
     turned = 1j**quarters * (-direction.conj() if mirror else direction)
     return np.stack([turned.real, turned.imag], axis=-1)
 
 
 def _turn_channels(picture: Floats, quarters: int, mirror: bool) -> Floats:
-    """Channels (H, W, N) of turned pixels with their directions turned too."""
+    """Network channels (H, W, N) of a rotated or mirrored picture, with the directions in them changed too."""
     out = np.array(picture)
     for first in ("s1", "zenith_x", "cos_2phi"):  # twice the angle: a quarter negates, a mirror conjugates
         at = CHANNELS.index(first)
@@ -105,7 +107,7 @@ def _turn_channels(picture: Floats, quarters: int, mirror: bool) -> Floats:
 def run_network(
     picture: Floats, network: Network, run: RunNetwork, names: tuple[str, ...], outputs: dict[str, int]
 ) -> dict[str, Floats]:
-    """Output maps (H, W[, C]) of a network for input channels (N, H, W), padded to a multiple of the network's size.
+    """Run a network on channels (N, H, W), padded to a multiple of its size; returns maps (H, W[, C]) by name.
 
     `names` are those of the channels, `outputs` the numbers C by name of the map.
 

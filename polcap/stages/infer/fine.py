@@ -1,4 +1,4 @@
-"""Refinement of the normals: relief finer than the main network's pixels, by a second, small network.
+"""Refinement of the normals: a second, small network adds relief finer than the main network resolves.
 
 It sees tiles of the crop at full resolution with the estimate so far, and returns a deviation of the normals. Only the
 part of it that is finer than the main network's pixels counts, so the shape stays. Training (`training/fine_*.py`)
@@ -48,7 +48,7 @@ class CoarseEstimate:
 
 
 def encode(cues: Cues, estimate: CoarseEstimate) -> Floats:
-    """The refinement network's input, CHANNELS in order, (N, H, W) float32, 0 outside the mask."""
+    """Input channels of the refinement network, in the order of CHANNELS, (N, H, W) float32, 0 outside the mask."""
     channels = [
         *np.moveaxis(frames.to_ray_frame(estimate.normal, cues.rays), -1, 0),
         *np.moveaxis(frames.to_ray_frame(estimate.smooth, cues.rays), -1, 0),
@@ -58,7 +58,7 @@ def encode(cues: Cues, estimate: CoarseEstimate) -> Floats:
 
 
 def refine(cues: Cues, estimate: CoarseEstimate, network: Network, run: RunNetwork) -> Floats:
-    """Normals (H, W, 3), camera frame, with the relief of the refinement network.
+    """Normals (H, W, 3), camera frame, with fine relief added by the refinement network.
 
     Raises
     ------
@@ -76,7 +76,10 @@ def refine(cues: Cues, estimate: CoarseEstimate, network: Network, run: RunNetwo
 
 
 def _tiles(mask: NDArray[np.bool_]) -> Iterator[tuple[Window, Window]]:
-    """Tiles that show the object: each without and with its margin, cut at the picture's edge."""
+    """Tiles that cover the object for the refinement network: each without and with its margin.
+
+    Margins are cut at the picture's edge.
+    """
     height, width = mask.shape
     for y in range(0, height, _TILE):
         for x in range(0, width, _TILE):
@@ -99,7 +102,7 @@ def _window(cues: Cues, estimate: CoarseEstimate, window: Window) -> tuple[Cues,
 def _tile_relief(
     cues: Cues, estimate: CoarseEstimate, inner: Window, outer: Window, network: Network, run: RunNetwork
 ) -> Floats:
-    """Relief of the normals (h, w, 3) in the tile `inner`, ray frame, by the refinement network's view of `outer`."""
+    """Run the refinement network on the window `outer`; returns the relief (h, w, 3) of the tile `inner`, ray frame."""
     relief = run_network(encode(*_window(cues, estimate, outer)), network, run, CHANNELS, {"relief": 3})["relief"]
     y, x = (within.start - around.start for within, around in zip(inner, outer))
     high, wide = (within.stop - within.start for within in inner)
@@ -107,12 +110,12 @@ def _tile_relief(
 
 
 def high_pass(image: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
-    """The part of an image (H, W, 3) that is finer than the main network resolves, 0 outside the mask (H, W)."""
+    """High-pass part of an image (H, W, 3), finer than the main network resolves; 0 outside the mask (H, W)."""
     return np.asarray((image - low_pass(image, mask, shrink)) * mask.astype(np.float32)[..., None])
 
 
 def low_pass(image: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
-    """The part of an image (H, W, 3) inside the mask (H, W) that the main network resolves.
+    """Low-pass part of an image (H, W, 3), as the main network resolves it, inside the mask (H, W).
 
     Averaged down by `shrink`, blurred, and interpolated back.
     """

@@ -1,4 +1,4 @@
-"""Half-turns: the side of the view ray to which each normal leans, and how sure it is.
+"""180° ambiguity of the azimuth: decides to which side of the view ray each normal points, and how sure this is.
 
 Polarization shows the plane through a normal n and the view ray r, not the side: n and n′ = 2 (n·r) r − n give the same
 Stokes parameters. The network sometimes takes a whole region for its half-turn, most often on black gloss; the
@@ -52,7 +52,7 @@ _AROUND = 8.0  # cells, 1σ
 
 @dataclass(frozen=True)
 class NetworkDoubt:
-    """Doubt of the normals, as the network states it."""
+    """Uncertainty of the normals as the network predicts it."""
 
     sigma: Floats  # (H, W) expected error, degrees
     opposed: Floats  # (H, W) share of its positions in which the normal leans to the other side
@@ -60,7 +60,7 @@ class NetworkDoubt:
 
 @dataclass(frozen=True)
 class HalfTurns:
-    """Choice between each normal of a map and its half-turn about the view ray."""
+    """Decision between each normal and its half-turn (azimuth + 180°), with the probability that it is wrong."""
 
     turned: Bools  # (H, W) the half-turn of the normal is the better one
     doubt: Floats  # (H, W) probability that the chosen side is wrong
@@ -68,14 +68,14 @@ class HalfTurns:
 
 @dataclass(frozen=True)
 class Grid:
-    """Normal map on a coarse grid of cells."""
+    """Normal map averaged to a coarse grid of cells."""
 
     mask: Bools  # (h, w)
     lean: Floats  # (2, h, w) across the ray, x right, y up, length sin θ
 
 
 def resolve(normal: Floats, mask: Bools, network: NetworkDoubt | None = None) -> HalfTurns:
-    """Choose the side of the ray for a map of unit normals (H, W, 3), in the frame of each ray, in a mask (H, W).
+    """Solve the 180° ambiguity of the azimuths of a normal map (H, W, 3), ray frames, in a mask (H, W).
 
     `network` is the doubt of the network that made the normals. Without it they are the inversion's, with arbitrary
     sides.
@@ -97,12 +97,15 @@ def resolve(normal: Floats, mask: Bools, network: NetworkDoubt | None = None) ->
 
 
 def error_with_doubt(error: Floats, doubt: Floats, cos_zenith: Floats) -> Floats:
-    """Expected error (H, W), degrees, of normals that are on the wrong side with some probability: 2 θ off there."""
+    """Expected normal error (H, W), degrees, including the probability of a wrong azimuth side: 2 θ off there."""
     return np.asarray((1 - doubt) * error + doubt * 2 * np.degrees(np.arccos(np.clip(cos_zenith, 0, 1))))
 
 
 def coarse(normal: Floats, mask: Bools) -> Grid:
-    """Average normals (H, W, 3) over cells: mean double azimuth and zenith, and the side of the mean vector."""
+    """Average normals (H, W, 3) over the cells of a coarse grid.
+
+    Mean double azimuth and zenith, and the mean's side.
+    """
     shrink = max(1.0, max(mask.shape) / _LONGEST)
     shape = tuple(max(8, round(side / shrink)) for side in mask.shape)
     x, y = normal[..., 0] * mask, normal[..., 1] * mask
@@ -116,7 +119,10 @@ def coarse(normal: Floats, mask: Bools) -> Grid:
 
 
 def sides(grid: Grid) -> tuple[Bools, Floats]:
-    """Cells (h, w) of the inversion's normals that turn, and evidence of a wrong side: terms (h, w, 4) of `_CELL`."""
+    """Cells (h, w) where the inversion's normals take the other azimuth side.
+
+    Also the evidence (h, w, 4) that a side is wrong, in the terms of `_CELL`.
+    """
     outwards = _outwards(grid)
     cost = (_OUTLINE * _outline_evidence(grid) + _INSIDE * outwards)[grid.mask]  # of turning less that of keeping
     first, second, alike = _links(grid)
@@ -141,7 +147,7 @@ def sides(grid: Grid) -> tuple[Bools, Floats]:
 
 
 def proposals(grid: Grid, sigma: Floats, opposed: Floats) -> tuple[NDArray[np.int32], Floats]:
-    """Regions that the cut turns in a grid of the network's normals, and the evidence for turning each of them.
+    """Regions of the network's normals that the minimum cut turns by 180° in azimuth, and the evidence for each.
 
     `sigma` and `opposed` (h, w) are those of `NetworkDoubt`. Returns the number (h, w) of each cell's region, 0 for
     cells that do not turn, and terms (R, 5) of the regions' odds, see `_REGION`.
@@ -166,7 +172,7 @@ def proposals(grid: Grid, sigma: Floats, opposed: Floats) -> tuple[NDArray[np.in
 
 
 def _chance(odds: Floats) -> Floats:
-    """Probability that belongs to a logarithm of odds (logistic function)."""
+    """Probability from a logarithm of odds (logistic function)."""
     return np.asarray(1 / (1 + np.exp(-odds)))
 
 
@@ -175,7 +181,7 @@ def _enlarged(cells: Floats | Bools, shape: tuple[int, ...]) -> Floats:
 
 
 def _outline_evidence(grid: Grid) -> Floats:
-    """Evidence (h, w) that normals point out of the object: sin θ (object behind t − object ahead of it).
+    """Evidence (h, w) that normals point out of the object: sin θ (object share behind t − share ahead of it).
 
     Where the grid ends the object may go on: no evidence.
     """
@@ -194,13 +200,13 @@ def _outline_evidence(grid: Grid) -> Floats:
 
 
 def _outwards(grid: Grid) -> Floats:
-    """Lean (h, w) of the normals away from the object's inside, −1…1."""
+    """Component −1…1 (h, w) of the normals away from the object's inside."""
     away, _ = outline.outward(outline.depth(grid.mask), _BLUR)
     return np.asarray((grid.lean * away).sum(axis=0))
 
 
 def _links(grid: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
-    """Pairs of neighboring cells, numbered within the mask, (M,) and (M,), and the similarity of their axes (M,), −2…2.
+    """Pairs of neighboring cells, as indices (M,) and (M,), and the similarity (M,) of their azimuth axes, −2…2.
 
     Flat neighbors and axes that cross weigh little.
     """
@@ -219,7 +225,9 @@ def _links(grid: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
 
 
 def _cut(mask: Bools, cost: Floats, first: NDArray[np.intp], second: NDArray[np.intp], alike: Floats) -> Bools:
-    """Minimum cut: cells (h, w) with x = 1 in the least Σ cost · x + Σ alike · (x ≠ x′); undecided cells have x = 0.
+    """Solve the minimum cut: cells (h, w) with x = 1 in the least Σ cost · x + Σ alike · (x ≠ x′).
+
+    Undecided cells have x = 0.
 
     `cost` (N,) is of the mask's cells, `alike` (M,) of the links between its cells `first` and `second`.
 

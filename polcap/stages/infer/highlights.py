@@ -1,4 +1,4 @@
-"""Highlights: filled where they are clipped, and their albedo from a crossed shot.
+"""Highlights: clipped pixels are filled, and albedo under highlights comes from a cross-polarized shot, if any.
 
 A crossed shot shows the diffuse reflection under a highlight. Around the highlight, the estimator's albedo over the
 diffuse reflection gives the shading that it assumed. The ratio to the shading of the normals is continued into the
@@ -6,6 +6,7 @@ highlight, and turns the diffuse reflection there into an albedo.
 """
 
 from dataclasses import replace
+from math import hypot, log
 
 import cv2
 import numpy as np
@@ -23,10 +24,14 @@ _LEAST_PX = 2.0
 _LEAST_COSINE = 0.2  # of the shading that divides
 _LEAST_MATTE = 1e-3  # share of matte pixels in a neighborhood
 _FLOOR = 1e-3  # albedo
+_MAPS_SIGMA = 0.05  # of the estimators' own albedos, with a correct scale (docs/benchmarks/gates.md)
+_COMMON_F0 = 0.05  # median of an object; an index of 1.58
+_F0_RESPONSE = 0.3  # change of ln F0 per change of ln scale: the network expects common values (20 captures)
+_COMMON_WHITE, _WHITE_RANGE = 0.9, 0.14  # 95th percentile of the albedo: usual limit; excess that doubts a factor of e
 
 
 def fill_highlights(image: Floats, cues: Cues) -> Floats:
-    """An image (H, W, 3) with means of the pixels around in highlights that saturate the shortest exposure."""
+    """Fill highlights that clip in the shortest exposure: image (H, W, 3) with means of the pixels around."""
     clipped = cues.mask & ((cues.quality & Quality.CLIPPED) > 0)
     hole = cues.mask & (cv2.dilate(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     known = cues.mask & ~hole
@@ -41,7 +46,7 @@ def fill_highlights(image: Floats, cues: Cues) -> Floats:
 def mean_around(
     image: Floats, known: NDArray[np.bool_], wanted: NDArray[np.bool_], blur: float, least: float
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Means (H, W, 3) of the known pixels about each wanted one (H, W), and the wanted ones without a mean (H, W).
+    """Means (H, W, 3) of known pixels about each wanted pixel (H, W), and the wanted pixels without a mean (H, W).
 
     The Gaussian weights start at 1σ = `blur` px and double until known pixels have a share of `least`.
     """
@@ -58,7 +63,7 @@ def mean_around(
 
 
 def correct_highlights(maps: SurfaceMaps, cues: Cues, ior: float) -> SurfaceMaps:
-    """The maps (H, W, …) with the albedo of highlights from the crossed shot (`cues.body`); unchanged without one."""
+    """Correct the albedo in highlights by the cross-polarized shot (`cues.body`); maps (H, W, …)."""
     if cues.body is None or cues.body_known is None:
         return maps
     low, high = _GLOSS
@@ -77,7 +82,23 @@ def correct_highlights(maps: SurfaceMaps, cues: Cues, ior: float) -> SurfaceMaps
 
 
 def specular_share(cues: Cues) -> Floats:
-    """Specular share of S0, (H, W); 0 where the crossed shot shows nothing. Clipped light counts as specular."""
+    """Specular share of S0, (H, W), from the cross-polarized shot; 0 where it shows nothing.
+
+    Clipped light is specular.
+    """
     assert cues.body is not None and cues.body_known is not None
     share = np.clip(1 - cues.body.sum(-1) / np.maximum(cues.radiance.sum(-1), 1e-6), 0, 1)
     return np.where(cues.body_known & cues.mask, share, 0).astype(np.float32)
+
+
+def albedo_sigma(maps: SurfaceMaps, of_chart: float | None) -> float | None:
+    """Relative 1σ of the scale of all albedos; `of_chart` is that of the light on the chart, None without a chart.
+
+    A chart behind the object, or in a shadow, gets less light than the object. The picture of the chart does not show
+    this, but then colors approach 1, and F0 exceeds that of common dielectrics.
+    """
+    if of_chart is None or not maps.mask.any():
+        return None
+    gloss = log(max(float(np.median(maps.specular[maps.mask].mean(-1))) / _COMMON_F0, 1.0)) / _F0_RESPONSE
+    white = max(float(np.percentile(maps.diffuse[maps.mask].max(-1), 95)) - _COMMON_WHITE, 0.0) / _WHITE_RANGE
+    return hypot(of_chart, _MAPS_SIGMA, max(gloss, white))

@@ -1,4 +1,4 @@
-"""Learned estimator: the network's maps of the whole object, joined with the detail of the inversion.
+"""Learned estimator: the network's maps of the whole object, combined with fine detail of the analytic inversion.
 
 1. The cues are reduced to the size for which the network was made.
 2. The network predicts normals, material, depth and error; half-turns of whole regions are corrected.
@@ -32,7 +32,7 @@ _BRIGHTEST = 2.0  # greatest S0 of diffuse reflection; white paper that faces th
 def estimate(
     cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int, *, fine_pass: bool
 ) -> SurfaceMaps:
-    """Maps of an object's crop (H, W) by the network, in 1, 2, 4 or 8 turned and mirrored positions, and the inversion.
+    """Estimate the maps of an object's crop (H, W) by network and inversion, over 1, 2, 4 or 8 symmetric positions.
 
     `network` takes the channels of `stages.cues`; `run` runs a network; `ior` is the refractive index of the inversion;
     `fine_pass` adds relief by the refinement network, if there is one.
@@ -91,7 +91,7 @@ def estimate_coarse(
 
 
 def _limit_radiance(cues: Cues) -> Cues:
-    """Cues in which light that no diffuse reflection reaches counts as clipped, as in the training pictures."""
+    """Mark radiance that no diffuse reflection reaches as clipped, as in the training pictures."""
     beyond = (cues.radiance > _BRIGHTEST).any(axis=-1)
     quality = np.where(beyond, cues.quality | np.uint8(Quality.CLIPPED), cues.quality)
     return replace(cues, radiance=np.minimum(cues.radiance, _BRIGHTEST), quality=quality)
@@ -132,7 +132,9 @@ def _reduce(cues: Cues, scale: float) -> Cues:
 
 
 def _without_grid(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
-    """Normals (H, W, 3) without the network's 2 px grid: the common deviation of pixels at one place of its cells.
+    """Remove the network's 2 px grid artifact from normals (H, W, 3).
+
+    The common deviation of each place in its cells.
 
     Relief does not repeat with the cells, so it remains.
     """
@@ -148,7 +150,10 @@ def _without_grid(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
 
 
 def _correct_half_turns(normal: Floats, seen: Cues, sigma: Floats, opposed: Floats) -> tuple[Floats, Floats]:
-    """Normals (H, W, 3) with wrong regions turned to the other side of the ray, and the doubt of the side (H, W)."""
+    """Correct regions with a wrong azimuth side (180° ambiguity) in normals (H, W, 3).
+
+    Also the probability (H, W) that the side is wrong.
+    """
     found = half_turns.resolve(
         frames.to_ray_frame(frames.unit(normal), seen.rays), seen.mask, half_turns.NetworkDoubt(sigma, opposed)
     )
@@ -157,7 +162,7 @@ def _correct_half_turns(normal: Floats, seen: Cues, sigma: Floats, opposed: Floa
 
 
 def _log_factor(light: Floats, seen: Cues) -> Floats:
-    """Logarithm of predicted light (albedo times shading) over S0, (H, W, 3), without the network's 2 px grid.
+    """Logarithm of predicted light (albedo times shading) over S0, (H, W, 3), without the 2 px grid artifact.
 
     Outside the object and in clipped highlights it is continued from the pixels around, for the enlargement.
     """
@@ -171,7 +176,7 @@ def _log_factor(light: Floats, seen: Cues) -> Floats:
 
 
 def _smooth_gloss(image: Floats, mask: NDArray[np.bool_]) -> Floats:
-    """A map (H, W[, 3]) without the network's grid of one or two pixels; unchanged outside the mask."""
+    """Remove the network's grid artifact of one or two pixels from a map (H, W[, 3]) inside the mask."""
     smooth = _masked_filter(image, mask, _BINOMIAL, REACHED)
     return np.where(mask if image.ndim == 2 else mask[..., None], smooth, image)
 
@@ -179,7 +184,10 @@ def _smooth_gloss(image: Floats, mask: NDArray[np.bool_]) -> Floats:
 def _masked_filter(
     image: Floats, mask: NDArray[np.bool_], kernel: Floats, least: float, border: int = cv2.BORDER_DEFAULT
 ) -> Floats:
-    """Separable filter of an image (H, W[, 3]) by the pixels in the mask (H, W) alone, over their share or `least`."""
+    """Separable filter of an image (H, W[, 3]) that uses only pixels in the mask (H, W), divided by their weight.
+
+    The divisor is at least `least`.
+    """
     inside = mask.astype(np.float32)
     extra = (None,) * (image.ndim - 2)
     total, share = (
@@ -198,7 +206,7 @@ def _add_detail(coarse: Floats, by_pixel: Floats, mask: NDArray[np.bool_], shrin
 
 
 def _join(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
-    """Mean direction of several normals (H, W, 3), weighted by 1/σ² of their expected errors (H, W), and its error.
+    """Weighted mean direction (1/σ²) of several normal maps (H, W, 3) with expected errors (H, W), and its error.
 
     If the estimates agree, the error is that of independent ones; if they differ, their distance adds to it.
     """
@@ -209,7 +217,7 @@ def _join(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
 
 
 def _shading(normal: Floats, rays: Floats) -> Floats:
-    """Shading (H, W, 1) by the normals: √cos θ, limited.
+    """Shading (H, W, 1) that the albedo estimate assumes for normals and rays: √cos θ, limited.
 
     The square root of Lambert's law left the least error of the albedo, on pictures of both protocols, engraved or
     not, and on path-traced captures: normals err, and light from around brightens surfaces that turn away.

@@ -58,7 +58,7 @@ class ZenithEstimate:
     _weights: Floats  # (C,)
 
     def at(self, dolp: Floats) -> Floats:
-        """Zeniths [rad] of other DoLPs of any shape, averaged over the laws."""
+        """Zeniths [rad] for DoLPs of any shape, averaged over the candidate laws."""
         return _mean_zenith(dolp, self._dolps, self._weights)[0]
 
 
@@ -116,7 +116,7 @@ def candidate_laws(ior: float) -> DiffuseLaws:
 
 
 def _even_albedo(angles: Floats, light: Floats, laws: DiffuseLaws) -> Floats:
-    """Log likelihood (C,): the albedo is the same where zeniths are small and where they are large.
+    """Log likelihood (C,) of each diffuse law from constant albedo: the same at small and at large zeniths.
 
     The pixels are sorted by DoLP into the same ten parts for all candidates. The error of a part's mean albedo is its
     scatter over the root of its number of patches. Rough bodies shade flatter than smooth ones; the amount is
@@ -140,7 +140,7 @@ def _even_albedo(angles: Floats, light: Floats, laws: DiffuseLaws) -> Floats:
 
 
 def _round_outline(dolp: Floats, cues: Cues, laws: DiffuseLaws) -> Floats:
-    """Log likelihood (C,): inside its outline a round object turns away as a ball does, cos θ = √(2x − x²).
+    """Log likelihood (C,) of each diffuse law from the outline, where a round object has cos θ = √(2x − x²).
 
     x is the distance from the outline over a radius, about that of a disc with the object's area, and the same for all
     rings. If at least half of a ring has the DoLP of a sharp edge, the outline favors no law.
@@ -163,7 +163,7 @@ def _round_outline(dolp: Floats, cues: Cues, laws: DiffuseLaws) -> Floats:
 
 
 def _mean_zenith(dolp: Floats, dolps: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Mean and deviation (...,) of the zeniths of a DoLP under laws with DoLPs (C, Z) and weights (C,), rad."""
+    """Mean and deviation (...,) of the zenith [rad] for a DoLP, over laws with DoLPs (C, Z) and weights (C,)."""
     grid = np.linspace(0, float(dolps.max()), 600)
     zenith = np.stack([np.interp(grid, row, _ZENITHS) for row in dolps])
     mean = weights @ zenith

@@ -1,4 +1,4 @@
-"""Stage 4: segmentation of the object, with the expected error of its mask.
+"""Stage 4: segmentation of the object in the picture, with the expected error of its mask.
 
 1. A network gives each pixel a probability of being the object (`network`, with the input of `mask_channels`).
 2. Pixels of high probability become a mask without specks (`regions`).
@@ -26,12 +26,13 @@ from polcap.stages.mask.regions import Bools
 
 
 class MaskSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The section `mask` of a settings file."""
+    """Settings of the stage `mask`, the section `mask` of a settings file."""
 
     margin: Annotated[
         float, Meta(ge=0, le=1, description="border added around the object's box [share of its longer side]")
     ] = 0.04
     min_area: Annotated[float, Meta(gt=0, le=1, description="least part of the picture that an object covers")] = 0.002
+    part: Annotated[int, Meta(ge=0, le=9, description="process this part of the mask, 1 being the largest; 0: all")] = 0
     chart_margin: Annotated[
         float,
         Meta(ge=0, le=2, description="border around the chart without object, if there is no network [patch widths]"),
@@ -48,7 +49,7 @@ def segment(
     run: RunNetwork,
     settings: MaskSettings,
 ) -> ObjectMask:
-    """The object's mask (H, W) on the reference grid, and a crop around it.
+    """Segment the object: its mask (H, W) on the reference grid, and a crop around it.
 
     `user_mask` (H, W) replaces the search. Without a network the object is found by its difference from the backdrop.
 
@@ -90,19 +91,25 @@ def segment(
 def _object(
     mask: Bools, source: Literal["automatic", "user"], doubt: float | None, settings: MaskSettings
 ) -> ObjectMask:
+    if settings.part:
+        mask = regions.nth_part(mask, settings.part)
     crop = regions.box_around(mask, settings.margin, least=4)
-    assert crop is not None
+    if crop is None:
+        raise ObjectError(f"the mask has fewer than mask.part = {settings.part} parts; choose a smaller number")
     return ObjectMask(mask, crop, source, doubt, *regions.measure_shape(mask))
 
 
 def _mean_picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> Floats:
-    """Mean of the registered shots in linear Rec.709, (H, W, 3)."""
+    """Mean picture of the registered shots in linear Rec.709, (H, W, 3)."""
     total = sum(warp(radiance.value[k], alignment.transform[k], order=1) for k in range(len(radiance.angle)))
     return np.asarray(cv2.transform(total, 2 / len(radiance.angle) * color.matrix), np.float32)
 
 
 def _chart_zone(radiance: AngleStack, color: ColorCalibration, margin: float) -> Bits:
-    """(H, W) 1 on the chart's patches and up to `margin` patch widths around them."""
+    """Zone (H, W) that the object cannot be in.
+
+    1 on the chart's patches and up to `margin` patch widths around them.
+    """
     zone = np.zeros(radiance.value.shape[1:3], np.uint8)
     if color.place is not None:
         corners = np.asarray(color.place.corners, np.float64)

@@ -24,12 +24,12 @@ _ALONG_EDGE = 0.1  # share of a region's outline along the picture's edge; with 
 
 
 def brightness(color: Floats) -> float:
-    """Level of a whole picture's S0 (H, W, 3) that counts as 1: its 95th percentile."""
+    """Brightness scale of a whole picture: the 95th percentile of its S0 (H, W, 3)."""
     return max(float(np.percentile(color.mean(-1), _BRIGHT)), 1e-9)
 
 
 def probability(color: Floats, chart: Bools) -> Floats:
-    """Probability (H, W) of being the object: clearly brighter than the picture's border, or of another color.
+    """Probability (H, W) of being the object, from brightness and color relative to the picture's border.
 
     `color` is linear Rec.709 (H, W, 3) of a whole picture, on any scale. The result is 0 on the `chart` (H, W). It is
     also an input of the mask's network.
@@ -54,7 +54,9 @@ def probability(color: Floats, chart: Bools) -> Floats:
 
 
 def find_object(picture: Floats, chart: Bits, min_area: float) -> Bools:
-    """Mask (H, W) of the object in a picture (H, W, 3) in linear Rec.709, outside the chart's zone (H, W).
+    """Segment the object without a network.
+
+    Mask (H, W) from a linear Rec.709 picture (H, W, 3), outside the chart (H, W).
 
     Raises
     ------
@@ -75,7 +77,10 @@ def find_object(picture: Floats, chart: Bits, min_area: float) -> Bools:
 
 
 def _object_regions(mask: Bits, min_area: float) -> Bits:
-    """The large regions, without those along the picture's edge (a wall, a table) if there are others."""
+    """The large regions of a mask.
+
+    Regions along the picture's edge (a wall, a table) are dropped if there are others.
+    """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     if count < 2:
         return mask

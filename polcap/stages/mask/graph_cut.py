@@ -19,7 +19,7 @@ _SURE = 0.996  # probability of object or backdrop; above it colors are not cons
 
 
 def sharpen(picture: Floats, mask: Bools, chart: Bits, probability: Floats) -> Bools:
-    """The mask (H, W) with its outline at the picture's color edges; colors decide where probabilities are uncertain.
+    """Move the outline of a mask (H, W) to color edges. Colors decide where the probabilities are uncertain.
 
     picture (H, W, 3) is linear Rec.709, chart (H, W) 1 on the chart, probability (H, W) 0…1 that of being the object.
     The mask must be right to a few pixels, or where its probabilities are near 0 or 1.
@@ -30,7 +30,7 @@ def sharpen(picture: Floats, mask: Bools, chart: Bits, probability: Floats) -> B
 
 
 def reduce_picture(picture: Floats, chart: Bits) -> tuple[Floats, Bools]:
-    """Picture (h, w, 3) and chart (h, w), reduced for the graph cut."""
+    """Reduce picture and chart zone for the graph cut, to (h, w, 3) and (h, w)."""
     height, width = chart.shape
     shrink = max(1.0, float(np.sqrt(height * width / _WORK_PIXELS)))
     size = (round(width / shrink), round(height / shrink))
@@ -60,6 +60,6 @@ def cut(picture: Floats, seed: Bits, outside: Bools, probability: Floats | None 
 
 
 def enlarge(mask: Bools, chart: Bits) -> Bools:
-    """The mask (h, w) enlarged to the size of the chart's zone (H, W), without that zone."""
+    """Enlarge a mask (h, w) to the size of the chart zone (H, W), and remove that zone."""
     large = cv2.resize(mask.astype(np.float32), chart.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray((large > 0.5) & (chart == 0))

@@ -1,4 +1,4 @@
-"""Input channels of the mask's network: log radiance, color, polarization, chart, previous estimate, position.
+"""Input channels of the mask network: log radiance, color, polarization, chart, previous estimate, position.
 
 Radiance is relative to the picture's bright parts, so the input does not depend on exposure and light. Polarization
 distinguishes black gloss from black cloth.
@@ -22,7 +22,7 @@ SIZE_MULTIPLE = 16  # the network's height and width are multiples of this
 
 @dataclass(frozen=True)
 class ReducedPicture:
-    """A picture or a part of it, averaged down."""
+    """A picture, or a part of it, averaged down for the mask network."""
 
     color: Floats  # (H, W, 3) S0 in linear Rec.709, any scale
     stokes: Floats  # (3, H, W) S0, S1, S2 summed over the camera's channels
@@ -37,7 +37,9 @@ def grid(height: int, width: int) -> Floats:
 
 
 def encode(picture: ReducedPicture, bright: float, estimate: Floats | None = None) -> Floats:
-    """The channels (11, H, W) float32 of a picture and a previous estimate (H, W) of the object's probability.
+    """Compute the mask network's channels (11, H, W) float32.
+
+    Inputs are a picture and a previous estimate (H, W) of the object's probability.
 
     Without an estimate, the picture must be whole; its difference from the backdrop is then the estimate. `bright` is
     the `brightness` of the whole picture.
@@ -68,7 +70,7 @@ def encode(picture: ReducedPicture, bright: float, estimate: Floats | None = Non
 
 
 def mirror(channels: Floats, axes: tuple[int, ...]) -> Floats:
-    """Channels (11, H, W) of the scene mirrored along axes of the picture: 0 y, 1 x."""
+    """Mirror the mask network's channels (11, H, W) along axes of the picture: 0 y, 1 x."""
     out: Floats = np.flip(channels, tuple(1 + axis for axis in axes)).copy()
     for axis in axes:
         out[[CHANNELS.index("s2"), CHANNELS.index("yx"[axis])]] *= -1
@@ -76,5 +78,5 @@ def mirror(channels: Floats, axes: tuple[int, ...]) -> Floats:
 
 
 def _bright_s0(picture: ReducedPicture, bright: float) -> float:
-    """S0 summed over the camera's channels where the picture is bright."""
+    """Scale of S0 summed over the camera's channels: its value in bright parts of the picture."""
     return bright * float(picture.stokes[0].clip(0).sum() / max(picture.color.clip(0).mean(-1).sum(), 1e-9))

@@ -1,4 +1,4 @@
-"""Object probability by the mask's network: on the whole picture, then twice on the part that contains the object.
+"""Object probability by the mask network: on the whole picture, then twice on the part with the object.
 
 Pictures are averaged down before registration, so the time does not grow with the sensor's size.
 """
@@ -77,13 +77,13 @@ def reduced_picture(
 
 
 def _run(network: Network, run: RunNetwork, channels: Floats) -> Floats:
-    """Probability (H, W) from channels (11, H, W): the mean logit of the picture and its mirror images."""
+    """Run the mask network on channels (11, H, W) and their mirror images: probability (H, W) of the mean logit."""
     logits = parallel.results([partial(_logit, network, run, channels, axes) for axes in _MIRRORS], network.at_once)
     return np.asarray(1 / (1 + np.exp(-np.mean(logits, axis=0))), np.float32)
 
 
 def _logit(network: Network, run: RunNetwork, channels: Floats, axes: tuple[int, ...]) -> Floats:
-    """The network's logit (H, W) for the picture mirrored along these axes, mirrored back."""
+    """The mask network's logit (H, W) for the picture mirrored along these axes, mirrored back."""
     height, width = channels.shape[1:]
     more = [(0, -n % SIZE_MULTIPLE) for n in (height, width)]
     shown = np.pad(mirror(channels, axes), [(0, 0), *more], mode="edge")

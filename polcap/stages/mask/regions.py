@@ -1,4 +1,4 @@
-"""Connected regions of a mask: removes specks, fills holes, and measures the result."""
+"""Connected regions of the object's mask: removes specks, fills holes, and measures the result."""
 
 import cv2
 import numpy as np
@@ -29,7 +29,7 @@ def clean(mask: Bools, probability: Floats) -> Bools:
 
 
 def choose(colored: Bools, learned: Bools, probability: Floats) -> Bools:
-    """Choose the mask by colors, or the network's if its probabilities contradict the colors; (H, W) each.
+    """Choose between two masks (H, W): by colors, or the network's if its probabilities contradict the colors.
 
     The outline by colors is sharper, but wrong where object and backdrop have the same color, such as white on white.
     """
@@ -61,13 +61,13 @@ def fill_holes(mask: Bits, least: float, probability: Floats | None = None) -> B
 
 
 def expected_error(mask: Bools, probability: Floats) -> float:
-    """1 − expected intersection over expected union with the true mask, by probabilities (H, W)."""
+    """Expected error of a mask from probabilities (H, W): 1 − expected intersection over expected union."""
     inside, outside = float(probability[mask].sum()), float(probability[~mask].sum())
     return 1 - inside / max(float(mask.sum()) + outside, 1e-9)
 
 
 def measure_shape(mask: Bools) -> tuple[float, float, float]:
-    """Three shares of a mask (H, W), all small for a whole object inside the picture.
+    """Measure three shares of a mask (H, W) that are small for a whole object inside the picture.
 
     Share of the mask outside its largest region; area of the holes over that of the mask; share of the picture's edge
     that the mask covers.
@@ -79,6 +79,13 @@ def measure_shape(mask: Bools) -> tuple[float, float, float]:
     whole = cv2.drawContours(np.zeros(mask.shape, np.uint8), lines, -1, 1, cv2.FILLED)
     edge = np.concatenate([mask[[0, -1]].ravel(), mask[1:-1, [0, -1]].ravel()])
     return float(1 - largest / area), float((whole.sum() - area) / area), float(edge.mean())
+
+
+def nth_part(mask: Bools, number: int) -> Bools:
+    """The part of a mask (H, W) that is `number` in the order of area, 1 being the largest; empty if there is none."""
+    _, label, parts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    order = 1 + np.argsort(-parts[1:, cv2.CC_STAT_AREA], kind="stable")
+    return label == order[number - 1] if number <= len(order) else np.zeros_like(mask)
 
 
 def box_around(mask: Bools, margin: float, least: int) -> Box | None:

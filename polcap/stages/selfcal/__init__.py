@@ -39,7 +39,7 @@ _MOST_GAIN = 0.005  # largest 1σ of a shot's light with which unknown angles ca
 
 
 class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The section `selfcal` of a settings file."""
+    """Settings of the stage `selfcal`, the section `selfcal` of a settings file."""
 
     unknown_angles: Annotated[
         bool,
@@ -81,7 +81,7 @@ def solve(
     color: ColorCalibration,
     settings: SelfcalSettings,
 ) -> SelfCalibration:
-    """Gains (K, 3) of all shots and channels, and the checked and corrected polarizer angles (K,).
+    """Self-calibrate: gains (K, 3) of all shots and channels, and checked and corrected polarizer angles (K,).
 
     The shots (K, H, W, 3) are compared in the object's crop and on the chart's grey patches, if any.
 
@@ -137,7 +137,10 @@ def solve(
 def _believed(
     radiance: AngleStack, greys: GreyPatches | None, by_object: GainEstimate
 ) -> tuple[Floats, Floats, Literal["grey patches", "object", "one exposure", "none"]]:
-    """Gains (K, 3) of the shots, their 1σ, and their source: one exposure, grey patches, or else the object."""
+    """Gains (K, 3) of the shots from the best source, their 1σ, and the source.
+
+    The sources are one exposure, grey patches, or else the object.
+    """
     shape = len(radiance.angle), 3
     if radiance.equipment.light == "one exposure":
         return np.ones(shape), np.zeros(shape), "one exposure"
@@ -149,7 +152,7 @@ def _believed(
 
 
 def _gains(radiance: AngleStack, greys: GreyPatches | None, anchor: GainEstimate) -> Gains:
-    """Gains (K, 3) by the best available source, with those of the object (`anchor`) as a cross-check."""
+    """Gains (K, 3) of the shots from the best source. Those from the object (`anchor`) are a cross-check."""
     gain, sigma, source = _believed(radiance, greys, anchor)
     both = np.hypot(anchor.sigma, sigma.mean(1))
     difference = np.abs(gain.mean(1) / anchor.gain - 1)
@@ -165,7 +168,7 @@ def _gains(radiance: AngleStack, greys: GreyPatches | None, anchor: GainEstimate
 
 
 def _prior(radiance: AngleStack) -> float:
-    """Prior relative 1σ of a shot's light, by the kind of lamp or from a calibration."""
+    """Prior 1σ of a shot's light, relative, by the kind of lamp or from a calibration."""
     if radiance.equipment.light == "flash" and radiance.equipment.flash_spread is not None:
         return max(2**0.5 * radiance.equipment.flash_spread, _LEAST_PRIOR)  # difference of two flashes
     return _PRIOR[radiance.equipment.light]
@@ -200,18 +203,18 @@ def _find_angles(
 
 def _wrong_order(found: angles.OrderFit, angle: Floats) -> str:
     """Error message for shots with angles (K,) rad that contradict the polarization at the object's outline."""
-    stated = ", ".join(f"{np.degrees(a):g}°" for a in angle)
-    best = ", ".join(f"{np.degrees(angle[i]):g}°" for i in found.check.best.shots)
-    mirrored = " counted the other way (the ring turned clockwise)" if found.check.best.mirrored else ""
+    names = [f"{np.degrees(a):g}°" for a in angle]
+    stated, best = ", ".join(names), ", ".join(names[i] for i in found.check.best.shots)
+    mirrored = " counted clockwise" if found.check.best.mirrored else ""
     return (
         f"the angles {stated} contradict the polarization at the object's outline (fit {found.score:.2f}); "
-        f"{best}{mirrored} fit better ({found.best_score:.2f}): correct the folders or --angles, shoot without "
-        "ambient light (reflections turn polarization by 90°), or --set selfcal.check_order=false"
+        f"{best}{mirrored} fit better ({found.best_score:.2f}): {found.check.best.remedy(names)}; "
+        "or shoot in a dark room (reflections turn polarization by 90°), or --set selfcal.check_order=false"
     )
 
 
 def _ring(even: ObjectShots, angle: Floats, gains: GainEstimate, leaves_picture: bool) -> RingZero:
-    """Measure the error of the polarizer ring's zero by the object's outline and slopes; without a correction."""
+    """Measure the zero error of the polarizer's ring by the object's outline and slopes; nothing is corrected."""
     gain_sigma = float(gains.sigma.max())
     total = frames.total(even.value) / gains.gain[:, None, None]
     return ring_zero.combined(

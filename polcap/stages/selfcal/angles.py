@@ -61,7 +61,7 @@ _FLOOR = np.radians(0.3)  # least 1σ (200 simulated cases)
 
 
 def rim(shots: ObjectShots) -> OutlineBand:
-    """The band of pixels just inside the object's outline, without those at the picture's edge."""
+    """Band of pixels just inside the object's outline, without those at the picture's edge."""
     mask, (x0, y0, x1, y1) = shots.mask, shots.crop
     depth = outline.depth(mask)
     outward, slope = outline.outward(mask.astype(np.float32), 3.0)
@@ -132,7 +132,10 @@ def hypotheses(angle: Floats) -> dict[ShotOrder, Floats]:
 
 
 def _misfit(band: OutlineBand, angle: Floats) -> float:
-    """Misfit of shots to polarizer angles: median relative residual; 1 for three shots, which always fit."""
+    """Misfit of the outline's light to polarizer angles: median relative residual.
+
+    1 for three shots, which always fit.
+    """
     if len(angle) < 4:
         return 1.0
     weights = mueller.analyzer(angle)
@@ -142,7 +145,10 @@ def _misfit(band: OutlineBand, angle: Floats) -> float:
 
 
 def _sigma_of_difference(one: Floats, one_weight: Floats, other: Floats, other_weight: Floats) -> float:
-    """1σ of the difference of two scores, Σone/Σone_weight − Σother/Σother_weight over sectors (24,), by jackknife."""
+    """1σ of the difference of two order scores, by jackknife over sectors (24,).
+
+    The scores are Σone/Σone_weight and Σother/Σother_weight.
+    """
     used = np.flatnonzero(one_weight + other_weight)
     if len(used) < 2:
         return 1.0
@@ -198,7 +204,7 @@ class _TurnFit:
 
 
 def _median_residual(light: Floats, angle: Floats) -> float:
-    """Median misfit of light (K, P) to polarizer angles (K,): its distance from the column space of A(θ)."""
+    """Median misfit of light (K, P) to polarizer angles (K,): distance from the column space of A(θ)."""
     return float(np.median(np.linalg.norm(_complement(angle) @ light, axis=0)))
 
 
@@ -214,7 +220,7 @@ def _change_per_rad(light: Floats, angle: Floats) -> Floats:
 
 
 def _fit_turn(k: int, start: float, light: Floats, angle: Floats, part: NDArray[np.intp], prior: Floats) -> _TurnFit:
-    """Fit the turn of the polarizer in shot k, and the gains, from a start in rad, by least squares with biweights."""
+    """Fit the angle error of shot k [rad], and the gains, from a start, by least squares with biweights."""
     angle = angle + start * np.eye(len(angle))[k]
     free = _complement(angle)
     residual = free @ light  # (K − 3, P)
@@ -244,7 +250,7 @@ def _fit_turn(k: int, start: float, light: Floats, angle: Floats, part: NDArray[
 
 
 def find(band: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> tuple[Floats, float]:
-    """Polarizer angles (K,) in 0…π of four or more shots, and their 1σ, rad: by the object's outline and inside.
+    """Find the polarizer angles (K,) in 0…π of four or more shots, and their 1σ, rad, from outline and inside.
 
     1σ is π/2 if nothing is known. The shots are divided by their gains. cells (K, P) are means of small blocks of the
     inside, row (P,) the row of each block; neighbors have common errors. The outline is summed over bins of φ, and the
@@ -276,7 +282,7 @@ def find(band: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> tuple[Float
 
 
 def _by_direction(band: OutlineBand) -> tuple[Floats, Floats]:
-    """Light of the outline summed over bins of its direction (B, K), and the mean directions (B,) rad."""
+    """Light of the outline averaged in bins of its direction, (B, K), and the mean directions (B,) rad."""
     number = np.floor(band.azimuth / (2 * np.pi) * _BINS).astype(int) % _BINS
     light = np.stack([np.bincount(number, shot, _BINS) for shot in band.light], axis=1).astype(np.float64)
     weight = band.light.sum(axis=0)
@@ -285,7 +291,7 @@ def _by_direction(band: OutlineBand) -> tuple[Floats, Floats]:
 
 
 def _condensed(cells: Floats) -> Floats:
-    """A matrix (K, K) with the same sum of squared distances from any subspace as the cells (K, P).
+    """Condense cells (K, P) to a matrix (K, K) with the same sum of squared distances from any subspace.
 
     Each cell is relative to its light. The mean over the cells is subtracted, because errors of the gains affect it.
     """
@@ -298,7 +304,10 @@ def _condensed(cells: Floats) -> Floats:
 def _solve(
     around: Floats, part: Floats, inside: Floats, start: Floats, until: float, law: float = _LAW
 ) -> tuple[float, Floats]:
-    """Fit polarizer angles (K,) from a start: misfit and angles; of two, 90° from each other, the diffuse one."""
+    """Fit polarizer angles (K,) from a start; returns misfit and angles.
+
+    Of two solutions 90° apart, the one for diffuse reflection is taken.
+    """
     relative = around / around.mean(axis=1, keepdims=True)
     from scipy.optimize import least_squares  # here: the import takes 0.3 s
 
@@ -310,7 +319,10 @@ def _solve(
 
 
 def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats, law: float) -> Floats:
-    """Residuals of polarizer angles over their 1σ: of outline and span of 1, cos 2(φ − θ), of inside and A(θ)."""
+    """Residuals of polarizer angles over their 1σ.
+
+    Of the outline from the span of 1, cos 2(φ − θ), of the inside from A(θ).
+    """
     ones = np.ones(len(angle)) / np.sqrt(len(angle))
     wave = np.cos(2 * (part[:, None] - angle))
     wave = wave - (wave @ ones)[:, None] * ones
@@ -324,5 +336,5 @@ def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats, law
 
 
 def _difference(a: Floats, b: Floats) -> Floats:
-    """Angles from axes b to axes a, −π/2…π/2 rad; axes have no direction."""
+    """Angle from axis b to axis a, −π/2…π/2 rad; axes have no direction."""
     return np.asarray((a - b + np.pi / 2) % np.pi - np.pi / 2)

@@ -1,4 +1,4 @@
-"""Calibrates the factor from the cross-polarized shot's light to S0, by the chart or by the object.
+"""Factor from the light of the cross-polarized shot to S0, measured on the chart or on the object.
 
 The flash behind a polarizer has another energy, and the polarizer at the lens halves diffuse light once more. So the
 factor is measured without mirror reflection: on a chart's matt grey patches, or on the object where the ratio of S0 to
@@ -57,7 +57,7 @@ def measure(
 
 
 def _closest(ratio: Floats) -> NDArray[np.intp]:
-    """Indices of the ratios (N,) in the shortest interval that contains the share `_SHORTEST` of them."""
+    """Indices of the ratios (N,) in the shortest interval that contains the share `_SHORTEST` of them (their mode)."""
     order = np.argsort(ratio)
     count = max(int(_SHORTEST * len(ratio)), 2)
     width = ratio[order[count - 1 :]] - ratio[order[: len(ratio) - count + 1]]

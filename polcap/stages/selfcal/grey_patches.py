@@ -23,7 +23,7 @@ _SURE = 4.0  # least significance of gloss, σ
 
 @dataclass(frozen=True)
 class GreyPatches:
-    """Gains from the grey patches, with the linearity and gloss of the chart."""
+    """Gains of the shots from the chart's grey patches, with their linearity and gloss."""
 
     gain: Floats  # (K, 3)
     sigma: Floats  # (K, 3) 1σ
@@ -69,7 +69,7 @@ def crossed_factor(radiance: AngleStack, alignment: Alignment, color: ColorCalib
 
 
 def _means(picture: MaskedImage, transform: Floats, color: ColorCalibration) -> Floats:
-    """Mean light of each grey patch in a shot, and the variances of the means: (2, 6, 3); NaN for unusable patches.
+    """Mean light of each grey patch in a shot, and variances of the means: (2, 6, 3); NaN for unusable patches.
 
     A patch cannot be used if white balance excluded it, if it is clipped in this shot, or if fewer than nine of its
     pixels are half a pixel or more from its edge. `transform` maps px of the reference grid to px of the shot.
@@ -87,7 +87,7 @@ def _means(picture: MaskedImage, transform: Floats, color: ColorCalibration) -> 
 
 
 def _gloss(light: Floats, variance: Floats) -> float:
-    """Largest part of a ratio of shots on the lightest patch that is gloss, minus 4σ; light and variance (K, P)."""
+    """Largest share of gloss in a ratio of shots on the lightest patch, minus 4σ; light and variance are (K, P)."""
     if light.shape[1] < 4:
         return 0.0
     ratio = light / light[0]
@@ -102,7 +102,7 @@ def _gloss(light: Floats, variance: Floats) -> float:
 
 
 def _one_for_all_channels(gain: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-    """One gain for all channels of a shot if they agree within 3σ: the color of most flashes does not change."""
+    """Replace the gains of a shot's channels by one if they agree within 3σ. Most flashes do not change color."""
     weight = 1 / np.maximum(sigma, 1e-6) ** 2
     mean = (gain * weight).sum(1, keepdims=True) / weight.sum(1, keepdims=True)
     agree = (np.abs(gain - mean) <= 3 * np.maximum(sigma, 1e-6)).all(1, keepdims=True)

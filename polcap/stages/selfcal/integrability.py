@@ -47,7 +47,7 @@ _TIMES = 2.0  # error over the scatter of the parts (decision 6)
 
 
 def gains(light: Floats, usable: Bools, angle: Floats, start: Floats) -> GainEstimate:
-    """Gains (K,) of three shots for which the slopes from polarization are those of a surface; unknown unless K = 3.
+    """Gains (K,) of three shots from integrability of the slopes; unknown unless K = 3.
 
     light (K, H, W) is registered and slightly blurred, usable (H, W) are the object's unflagged pixels, angle (K,) rad,
     start (K,) first guesses. With more than three shots, use `object_gains.closure`.
@@ -76,14 +76,17 @@ def gains(light: Floats, usable: Bools, angle: Floats, start: Floats) -> GainEst
 
 @dataclass(frozen=True)
 class SlopeField:
-    """The shots averaged down to about 110 px a side, and the pixels with derivatives."""
+    """Shots averaged down to about 110 px a side, from which slopes and their derivatives are computed."""
 
     light: Floats  # (K, h, w)
     inside: Bools  # (h, w)
     angle: Floats  # (K,) rad
 
     def at(self, unknowns: Floats) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """w_ζ² w*, w and w_ζ (N,) for unknowns (K,): gains after the first, and the common turn of the angles [rad]."""
+        """Slope terms w_ζ² w*, w and w_ζ (N,) for gains and angle error `unknowns` (K,).
+
+        The unknowns are the gains after the first, and the common angle error [rad].
+        """
         gain = np.concatenate([[1.0], unknowns[:-1]])
         solve = np.linalg.pinv(mueller.analyzer(self.angle))
         s0, s1, s2 = np.einsum("jk,khw->jhw", solve, self.light / gain[:, None, None])
@@ -96,7 +99,7 @@ class SlopeField:
 
 @dataclass(frozen=True)
 class Equations:
-    """Im(w_ζ² w*) = 0, linearized about a guess, in units of its noise."""
+    """Integrability equations Im(w_ζ² w*) = 0, linearized about a guess, in units of their noise."""
 
     residual: Floats  # (N,)
     rows: Floats  # (N, K) derivatives by the unknowns
@@ -104,14 +107,17 @@ class Equations:
     product: NDArray[Any]  # (N,) w_ζ² w*
 
     def step(self, weight: Floats, prior: Floats | float = 0.0, moved: Floats | float = 0.0) -> Floats:
-        """The least-squares step (K,); `prior` (K,) are weights that pull unknowns back by `moved` (K,)."""
+        """Least-squares step (K,) of gains and angle.
+
+        `prior` (K,) are weights that pull unknowns back by `moved` (K,).
+        """
         square = self.rows.T @ (self.rows * weight[:, None]) + prior * np.eye(self.rows.shape[1])
         damped = square + (1e-9 * np.trace(square) + 1e-12) * np.eye(len(square))
         return np.asarray(np.linalg.solve(damped, -self.rows.T @ (self.residual * weight) - prior * moved))
 
     @property
     def coherence(self) -> float:
-        """Share of w_ζ² w* that is positive, −1…1: 1 for diffuse reflection, negative for mirror reflection."""
+        """Balance −1…1 of the sign of w_ζ² w*: 1 for diffuse reflection, negative for specular reflection."""
         size = float((self.weight * np.abs(self.product)).sum())
         return float((self.weight * self.product.real).sum() / max(size, 1e-30))
 
@@ -132,7 +138,7 @@ def reduced_slopes(light: Floats, usable: Bools, angle: Floats) -> SlopeField | 
 
 
 def linearize(slopes: SlopeField, unknowns: Floats, near: float) -> Equations:
-    """Linearize Im(w_ζ² w*) = 0 about gains and turn `unknowns` (K,), for pixels with |w| < near."""
+    """Linearize Im(w_ζ² w*) = 0 about gains and angle error `unknowns` (K,), for pixels with |w| < near."""
     product, w, slope = slopes.at(unknowns)
     length, size = np.abs(slope), np.abs(w)
     scale = 1e-12 + np.hypot(2 * length * size * _SLOPE_NOISE * np.median(length), length**2 * (_NOISE + _LAW * size))
@@ -144,14 +150,14 @@ def linearize(slopes: SlopeField, unknowns: Floats, near: float) -> Equations:
 
 
 def part_of(inside: Bools) -> NDArray[np.int_]:
-    """Index 0…15 of the part of the object, of 4 × 4, for each pixel inside (N,)."""
+    """Divide the object into 4 × 4 parts: part 0…15 of each pixel inside, (N,)."""
     y, x = np.nonzero(inside)
     rows, columns = ((axis - axis.min()) * _PARTS // (np.ptp(axis) + 1) for axis in (y, x))
     return np.asarray(rows * _PARTS + columns)
 
 
 def _derivative(w: NDArray[Any]) -> NDArray[Any]:
-    """½(∂x − i∂y) w, x right, y up, by the derivative of a Gaussian."""
+    """Complex derivative ½(∂x − i∂y) w of a map, x right, y up, by the derivative of a Gaussian."""
     at = np.arange(-int(2 * BLUR), int(2 * BLUR) + 1)
     bell = cv2.getGaussianKernel(len(at), BLUR)[:, 0]
     rise = at * bell / (at**2 * bell).sum()
@@ -163,7 +169,7 @@ def _derivative(w: NDArray[Any]) -> NDArray[Any]:
 
 
 def _slopes_of_dolp() -> tuple[Floats, Floats]:
-    """DoLP of diffuse reflection, and tan²θ over it; constant beyond _STEEPEST."""
+    """Table of DoLP of diffuse reflection against tan²θ over DoLP; constant beyond _STEEPEST."""
     dolp = np.linspace(1e-4, _STEEPEST, 200)
     cosine = np.asarray(fresnel.cos_zenith_from_dolp(dolp, _IOR))
     return dolp, (1 / cosine**2 - 1) / dolp

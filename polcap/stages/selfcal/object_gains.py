@@ -60,7 +60,7 @@ class GainEstimate:
 
 @dataclass(frozen=True)
 class ObjectShots:
-    """The shots on the crop around the object, registered by linear interpolation: enough for means."""
+    """All shots on the crop around the object, registered by linear interpolation, which suffices for means."""
 
     value: Floats  # (K, h, w, 3)
     light: Floats  # (K, h, w) sum over channels, blurred by 2 px
@@ -86,12 +86,12 @@ def register(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) ->
 
 
 def unknown(shots: int) -> GainEstimate:
-    """Unknown gains of the shots: 1, with infinite 1σ."""
+    """Gains of the shots when nothing is known: 1, with infinite 1σ."""
     return GainEstimate(np.ones(shots), np.where(np.arange(shots) > 0, np.inf, 0.0))
 
 
 def combined(estimates: list[GainEstimate]) -> GainEstimate:
-    """Mean of several estimates of the gains; unknown gains do not count."""
+    """Weighted mean of several estimates of the shots' gains; unknown gains do not count."""
     mean, sigma = weighted_mean(*(np.stack([getattr(one, name) for one in estimates]) for name in ("gain", "sigma")))
     known = np.isfinite(sigma)
     return GainEstimate(np.where(known, mean, 1.0), np.where(np.arange(len(sigma)) > 0, sigma, 0.0))
@@ -128,7 +128,10 @@ def with_prior(measured: GainEstimate, prior: float) -> GainEstimate:
 
 
 def closure(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
-    """Gains (K,) with which more than three shots (K, H, W) are consistent; unknown for K = 3."""
+    """Gains (K,) with which more than three shots (K, H, W) are consistent with three Stokes parameters.
+
+    Unknown for K = 3.
+    """
     shots = len(angle)
     if shots < 4:
         return unknown(shots)
@@ -146,7 +149,7 @@ def closure(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
 
 
 def outline(rim: OutlineBand, angle: Floats) -> GainEstimate:
-    """Gains (K,) with which polarization at the outline is across the contour; `rim.light` includes the gains."""
+    """Gains (K,) with which the outline is polarized across the contour; `rim.light` includes the gains."""
     shots = len(angle)
     parts = np.unique(rim.sector)
     if len(rim.azimuth) < _LEAST_RIM or len(parts) < _PARTS // 2:
@@ -167,7 +170,9 @@ def outline(rim: OutlineBand, angle: Floats) -> GainEstimate:
 
 
 def facing(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
-    """Gains (K,) at the densest ratios of the shots (K, H, W); the angles (K,) rad affect only the error.
+    """Gains (K,) from pixels that face the camera, at the densest ratios of the shots (K, H, W).
+
+    The angles (K,) rad affect only the error.
 
     On a rounded object the density of (S1, S2)/S0 grows as 1/θ² towards 0, independent of the albedo. Mean shift with a
     shrinking kernel finds peaks from several starts, and the peak with most pixels is taken. Other peaks with nearly as
@@ -205,7 +210,7 @@ def _one_sided(ratio: Floats, angle: Floats) -> float:
 
 
 def _climb(ratio: Floats, start: Floats) -> list[Floats]:
-    """Mean shift over ratios (K, N) from a start (K,): the end point for each kernel width."""
+    """Mean shift over shot ratios (K, N) from a start (K,): the end point for each kernel width."""
     at, found = start, []
     for width in _KERNELS:
         for _ in range(50):
@@ -220,7 +225,7 @@ def _climb(ratio: Floats, start: Floats) -> list[Floats]:
 
 
 def cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
-    """Means (K, P) of blocks that are entirely inside the object, and the block row (P,) of each."""
+    """Means (K, P) of pixel blocks that are entirely inside the object, and the block row (P,) of each."""
     height, width = (size // _CELL_PX for size in usable.shape)
     cut = np.s_[..., : height * _CELL_PX, : width * _CELL_PX]
     shape = (height, _CELL_PX, width, _CELL_PX)
@@ -233,7 +238,7 @@ def cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
 def _null_vector(
     equations: Callable[[Floats], Floats], angle: Floats, part: NDArray[np.int_], floor: float, times: float = 1.0
 ) -> GainEstimate:
-    """Gains 1/h from the h with h₀ = 1 that minimizes rows (P, C, K) · h, by biweights.
+    """Gains 1/h, with h₀ = 1, from the h that minimizes rows (P, C, K) · h, with biweights.
 
     The error combines `times` the jackknife over parts, the effect of an error of each angle, and `floor`.
     """
@@ -261,7 +266,7 @@ def _squares(rows: Floats, weight: Floats) -> Floats:
 
 
 def _least(square: Floats) -> Floats:
-    """Vector h (K,) with h₀ = 1 that minimizes hᵀQh for a matrix Q (K, K)."""
+    """Minimize hᵀQh for a matrix Q (K, K) under h₀ = 1; returns h (K,)."""
     size = len(square) - 1
     inner = square[1:, 1:] + 1e-9 * (np.trace(square) + 1e-12) * np.eye(size)
     return np.concatenate([[1.0], np.linalg.solve(inner, -square[1:, 0])])

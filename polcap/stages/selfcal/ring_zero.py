@@ -1,4 +1,4 @@
-"""Error of the zero of the polarizer's ring, from the object's outline and from the slopes inside it.
+"""Zero error of the polarizer's ring, measured from the object's outline and from the slopes inside it.
 
 Diffuse reflection is polarized along the slope g = tan θ (cos φ, sin φ) of the surface. A slope has no curl: along a
 closed curve inside the outline, ∮ g·t = 0 on any smooth surface, symmetrical or not. A ring with a zero off by δ
@@ -101,14 +101,14 @@ def by_outline(
 
 
 def _smoothed(light: Floats, used: Bools) -> Floats:
-    """Shots (K, H, W), blurred over the used pixels only."""
+    """Blur shots (K, H, W) over the used pixels only."""
     ok = used.astype(np.float32)
     share = cv2.GaussianBlur(ok, (0, 0), _SMOOTH_PX) + 1e-6
     return np.stack([cv2.GaussianBlur((shot * ok).astype(np.float32), (0, 0), _SMOOTH_PX) / share for shot in light])
 
 
 def _outward(inside: Floats | Bools, sigma: float) -> Complexes:
-    """Outward gradient (H, W) as x + iy, y up, of a picture blurred by `sigma` px; a large blur on a coarser grid."""
+    """Outward gradient (H, W), as x + iy, y up, of a mask blurred by `sigma` px; a large blur uses a coarser grid."""
     step = max(1, int(sigma / _FINE_PX))
     height, width = inside.shape
     small = area_mean(inside.astype(np.float32), (-(-height // step), -(-width // step)))
@@ -118,7 +118,10 @@ def _outward(inside: Floats | Bools, sigma: float) -> Complexes:
 
 
 def _turn(slope: Complexes, outward: Complexes) -> float:
-    """Mean angle [rad] from outward directions to slopes; of the two slopes of an AoLP, the outward one is used."""
+    """Mean angle [rad] from the outward direction to the slope from polarization.
+
+    Of the two slopes of an AoLP, the outward one is used.
+    """
     across = slope * np.conj(outward)
     real, imaginary = np.ascontiguousarray(across.real), np.ascontiguousarray(across.imag)
     turn = 0.0
@@ -154,7 +157,7 @@ def by_slopes(light: Floats, usable: Bools, angle: Floats, gain_sigma: float) ->
 
 
 def _step(found: integrability.Equations, weight: Floats, moved: Floats, gain_sigma: float) -> Floats:
-    """Step (K,) of gains and turn; `moved` is the change of the gains so far, limited by their 1σ."""
+    """Least-squares step (K,) of gains and angle error; `moved` is the change of the gains so far, limited by 1σ."""
     noise = float((weight * found.residual**2).sum() / max(float(weight.sum()), 1e-9))
     prior = np.append(np.full(len(moved) - 1, 1 / max(gain_sigma, 1e-4) ** 2), 0.0) * noise * _CORRELATED
     return found.step(weight, prior, moved)

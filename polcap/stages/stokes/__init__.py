@@ -44,7 +44,7 @@ Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px of the reference grid
 
 
 class StokesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The section `stokes` of a settings file."""
+    """Settings of the stage `stokes`, the section `stokes` of a settings file."""
 
     greatest_ior: Annotated[
         float,
@@ -123,7 +123,7 @@ def _check_condition(analyzers: Floats, angle: Floats) -> None:
 
 @dataclass(frozen=True)
 class _Shots:
-    """The shots, their gains, and the mapping from the reference grid to each."""
+    """All shots with their gains and the mapping from the reference grid to each."""
 
     radiance: AngleStack
     transform: Floats  # (K, 3, 3)
@@ -134,7 +134,10 @@ class _Shots:
 def _solve_in_blocks(
     shots: _Shots, analyzers: Floats, crop: Box, settings: StokesSettings
 ) -> tuple[Floats, Floats, Bits, Floats | None]:
-    """Stokes parameters (3, h, w, 3), covariance (6, h, w, 3), quality (h, w) and, for K > 3, residual (h, w)."""
+    """Solve the Stokes parameters (3, h, w, 3) block by block.
+
+    Also covariance (6, h, w, 3), quality (h, w) and, for K > 3, residual (h, w).
+    """
     x0, y0, x1, y1 = crop
     size, count = (y1 - y0, x1 - x0), len(analyzers)
     stokes, covariance = np.empty((3, *size, 3), np.float32), np.empty((6, *size, 3), np.float32)
@@ -161,7 +164,7 @@ def _solve_in_blocks(
 def _body(
     shots: _Shots, transform: Floats | None, factor: Floats | None, stokes: Floats, seen: Bits, crop: Box
 ) -> MaskedImage | None:
-    """S0 of diffuse reflection (h, w, 3): the cross-polarized shot, registered and multiplied by its factor (3,)."""
+    """Diffuse reflection S0 (h, w, 3) from the cross-polarized shot, registered and multiplied by its factor (3,)."""
     crossed = shots.radiance.crossed
     if crossed is None or transform is None or factor is None:
         return None
@@ -176,7 +179,7 @@ def _body(
 
 
 def _flagged(quality: Bits) -> list[tuple[Quality, Bits]]:
-    """The quality bits of a shot (H, W) that are resampled and occur, each with its plane."""
+    """Quality bits of a shot (H, W) that occur and have to be resampled, each with its plane."""
     planes = [(bit, quality & np.uint8(bit)) for bit in (Quality.CLIPPED, Quality.GHOST)]
     return [(bit, plane) for bit, plane in planes if plane.any()]
 
@@ -195,7 +198,7 @@ def _defects(
 
 
 def _register(shots: _Shots, flags: list[list[tuple[Quality, Bits]]], box: Box) -> tuple[Floats, Floats, Bits]:
-    """All shots resampled on a box of the reference grid, divided by their gains.
+    """Resample all shots on a box of the reference grid, divided by their gains.
 
     Returns values and variances (K, h, w, 3), and the quality (h, w).
     """
@@ -220,12 +223,12 @@ def _register(shots: _Shots, flags: list[list[tuple[Quality, Bits]]], box: Box) 
 
 
 def _rows(picture: Floats) -> Floats:
-    """A picture (h, w, 3) as (h, 3 w) in the same memory: NumPy's inner loops are faster over long rows."""
+    """View a picture (h, w, 3) as (h, 3 w) in the same memory, because NumPy is faster over long rows."""
     return picture.reshape(len(picture), -1)
 
 
 def _resampled(shots: _Shots, picture: Floats, transform: Floats, box: Box) -> Floats:
-    """A shot (H, W, 3) resampled on a box (h, w, 3) of the reference grid, each channel from its own photosites."""
+    """Resample a shot (H, W, 3) on a box (h, w, 3) of the reference grid, each channel from its own photosites."""
     site_px = shots.radiance.sensor.site_px
     if site_px is None or not site_px.any():
         return warp(picture, transform, box, lens=shots.lens)
@@ -237,7 +240,7 @@ def _resampled(shots: _Shots, picture: Floats, transform: Floats, box: Box) -> F
 
 
 def _exact(analyzers: Floats, value: Floats, variance: Floats, solved: Floats, doubt: Floats) -> None:
-    """Solve three angles, which need no weights: s = A⁻¹ I, with covariance A⁻¹ diag(var) A⁻ᵀ."""
+    """Solve Stokes parameters from three angles exactly: s = A⁻¹ I, with covariance A⁻¹ diag(var) A⁻ᵀ."""
     inverse = np.linalg.inv(analyzers)  # (3, K)
     squares = np.stack([inverse[i] * inverse[j] for i, j in _PAIRS])  # (6, K)
     np.matmul(inverse.astype(np.float32), value.reshape(3, -1), out=solved.reshape(3, -1))
@@ -245,7 +248,7 @@ def _exact(analyzers: Floats, value: Floats, variance: Floats, solved: Floats, d
 
 
 def _weighted_least_squares(analyzers: Floats, value: Floats, variance: Floats, solved: Floats, doubt: Floats) -> None:
-    """Write Stokes parameters (3, h, w, C) and covariance (6, h, w, C) from values and variances (K, h, w, C)."""
+    """Solve Stokes parameters (3, h, w, C) and covariance (6, h, w, C) from shots and variances (K, h, w, C)."""
     w = 1.0 / variance.astype(np.float64).reshape(len(value), -1)
     products = np.stack([analyzers[:, i] * analyzers[:, j] for i, j in _PAIRS])
     m00, m01, m02, m11, m12, m22 = products @ w  # the symmetric AᵀWA of every pixel
@@ -261,7 +264,7 @@ def _weighted_least_squares(analyzers: Floats, value: Floats, variance: Floats, 
 
 
 def _correct_extinction(stokes: Floats, covariance: Floats, extinction: Floats) -> None:
-    """Divide S1 and S2 by the polarizer's contrast (E − 1)/(E + 1), for extinction ratios E (C,), in place."""
+    """Correct the polarizer's finite extinction: divide S1 and S2 by (E − 1)/(E + 1), E (C,), in place."""
     ratio = np.asarray(extinction, np.float64)
     contrast = (1 - 1 / ratio) / (1 + 1 / ratio)
     up = (1 / np.stack([np.ones_like(contrast), contrast, contrast])).astype(np.float32)  # (3, C)
@@ -270,7 +273,7 @@ def _correct_extinction(stokes: Floats, covariance: Floats, extinction: Floats) 
 
 
 def _with_solution_flags(stokes: Floats, covariance: Floats, quality: Bits, settings: StokesSettings) -> Bits:
-    """Quality bits (h, w) with those from the solution added: ILL_POSED, DARK, METAL."""
+    """Add quality bits (h, w) that follow from the Stokes parameters: ILL_POSED, DARK, METAL."""
     s0, s1, s2 = (_total(plane) for plane in stokes)
     sigma0 = np.sqrt(_total(covariance[0]))
     sigma = np.sqrt((_total(covariance[3]) + _total(covariance[5])) / 2)
@@ -283,12 +286,12 @@ def _with_solution_flags(stokes: Floats, covariance: Floats, quality: Bits, sett
 
 
 def _total(picture: Floats) -> Floats:
-    """Sum (h, w) over the channels of a picture (h, w, 3)."""
+    """Sum over the channels of a picture (h, w, 3): (h, w)."""
     return np.asarray(cv2.transform(picture, np.ones((1, 3), np.float32)))
 
 
 def _metal(stokes: Floats, covariance: Floats) -> Bools:
-    """Pixels (H, W) in which the AoLPs of red and blue differ by more than those of a dielectric can, at 5σ.
+    """Detect metal: pixels (H, W) where the AoLPs of red and blue differ more than in a dielectric, at 5σ.
 
     In a dielectric all channels have the same AoLP, and a highlight only lowers the DoLP. In a metal the complex
     refractive index changes with wavelength, and the AoLP with it.
@@ -301,7 +304,7 @@ def _metal(stokes: Floats, covariance: Floats) -> Bools:
 
 
 def _polarization(stokes: Floats, covariance: Floats, channel: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """S1/S0, S2/S0, the sum of their squares, and their variance in one channel, each (H, W)."""
+    """Polarization of one channel: S1/S0, S2/S0, the sum of their squares, and their variance, each (H, W)."""
     s0, s1, s2, v1, v2 = (
         np.asarray(cv2.extractChannel(plane, channel)) for plane in (*stokes, covariance[3], covariance[5])
     )

@@ -29,7 +29,7 @@ __all__ = ["Back", "DecimatedMesh", "SurfaceSettings", "decimate", "integrate", 
 
 
 class SurfaceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The section `surface` of a settings file."""
+    """Settings of the stage `surface`, the section `surface` of a settings file."""
 
     stiffness: Annotated[
         float,
@@ -62,9 +62,9 @@ class SurfaceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = "open"
 
 
-@stage(version=12)
+@stage(version=13)
 def integrate(maps: SurfaceMaps, distance_m: float | None, settings: SurfaceSettings) -> Mesh:
-    """The visible surface of the object, from its normals.
+    """Integrate normals to the visible surface of the object: depth and mesh.
 
     The median depth is `distance_m`, the object's distance along the optical axis [m], or 1 where it is unknown.
 
@@ -85,7 +85,7 @@ def integrate(maps: SurfaceMaps, distance_m: float | None, settings: SurfaceSett
 
 
 def triangulate(depth: Floats, maps: SurfaceMaps, metric: bool, settings: SurfaceSettings) -> Mesh:
-    """The mesh of a depth map (H, W), in metres or relative; also for an export from stored maps.
+    """Make the mesh of a depth map (H, W), in metres or relative; also for an export from stored maps.
 
     Raises
     ------

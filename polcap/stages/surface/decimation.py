@@ -1,4 +1,4 @@
-"""Mesh decimation: the same surface in fewer triangles, and its distance from the first.
+"""Mesh decimation: the same surface with fewer triangles, and its distance from the full mesh.
 
 References
 ----------
@@ -20,15 +20,15 @@ _MEASURED = 20_000  # vertices, at most, of which the distance is measured
 
 @dataclass(frozen=True)
 class DecimatedMesh:
-    """A mesh in fewer triangles, and how far it is from the first."""
+    """A mesh with fewer triangles, and its distance from the full mesh."""
 
     mesh: Mesh
     error: float  # 99th percentile of the first mesh's vertices from this surface, in the mesh's unit of length
     error_px: float  # the same in px of the maps, at the object's median depth
 
 
-def decimate(mesh: Mesh, view: View, share: float, back: Back) -> DecimatedMesh:
-    """The mesh in about `share` of its triangles; textures stay where they are, as the camera sees them.
+def decimate(mesh: Mesh, view: View, count: int, back: Back) -> DecimatedMesh:
+    """Reduce a mesh to about `count` triangles; texture coordinates are those of the camera's view.
 
     `back` is the setting the mesh was made with: triangles that turn away from the camera are left out of an open one.
 
@@ -39,11 +39,8 @@ def decimate(mesh: Mesh, view: View, share: float, back: Back) -> DecimatedMesh:
     """
     import fast_simplification  # here: its 0.25 s are for exports with levels of detail alone
 
-    count = round(share * len(mesh.faces))
     if count < _FEWEST:
-        raise ObjectError(
-            f"{len(mesh.faces)} triangles × {share:g} leave {count}, under {_FEWEST}; ask for fewer levels"
-        )
+        raise ObjectError(f"a mesh of {count} triangles is under {_FEWEST}; ask for more triangles or fewer levels")
     points, faces = fast_simplification.simplify(  # which takes no read-only arrays
         np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.int32), target_count=count
     )
@@ -53,6 +50,8 @@ def decimate(mesh: Mesh, view: View, share: float, back: Back) -> DecimatedMesh:
     faces = np.asarray(faces, dtype=np.int32)
     if back == "open":
         faces = faces[face_areas(uv, faces) > 0]  # the others were folded over by a collapse
+    used, faces = np.unique(faces, return_inverse=True)
+    vertices, uv, faces = vertices[used], uv[used], faces.reshape(-1, 3).astype(np.int32)
     normals, tangents = vertex_frames(vertices, uv, faces)
     coarser = replace(
         mesh,
@@ -67,7 +66,10 @@ def decimate(mesh: Mesh, view: View, share: float, back: Back) -> DecimatedMesh:
 
 
 def _distance(first: Mesh, coarser: Mesh) -> float:
-    """99th percentile of the first mesh's vertices from the planes of the nearest triangles of the coarser one."""
+    """Distance of a decimated mesh from the full one: 99th percentile over the full mesh's vertices.
+
+    Measured to the plane of the nearest triangle.
+    """
     from scipy.spatial import cKDTree  # here: importing it costs .1 s of every start
 
     corner = coarser.vertices[coarser.faces].astype(np.float64)  # (F, 3, 3)

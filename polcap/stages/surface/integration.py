@@ -10,6 +10,10 @@ where noise is small against the bending of the surface, whatever the resolution
 5. Cuts that do not lower the residual around them are removed.
 6. Parts that touch are joined.
 
+Normals with a median error below `_PRECISE_DEG` are limited by the size of a pixel, not by noise. Step 4 then weights
+a link by the variance of the chord between its ends, times the trust of both ends in this link. An estimated gap
+behind a contour counts with its own error, which is as large as the gap. Step 5 is left out: noise makes no cuts.
+
 On each finer grid only pixels near these cuts choose between neighbors. So a finer picture refines the contours and
 cannot tear the surface.
 
@@ -36,10 +40,12 @@ _DECISION_PIXELS = 80_000  # at most, of the grid that decides on cuts (docs/ben
 _DECISION_SOLVES, _FINER_SOLVES = 4, 2  # solutions with choosing pixels, on that grid and on each finer one
 _SOFT, _GROWTH = 0.25, 1.2  # first stiffness, over the setting, and its growth: early errors make few cuts
 _UNDECIDED_PULL = 0.1  # of the prior's pull during the decision: a prior that strains the normals would cut them
+_PRECISE_DEG, _PRECISE_SOLVES = 2.0, 8  # median error of normals below which chords are weighted, and solutions then
 _REACH = 2  # px around a cut within which pixels choose, also on the next finer grid
 _PRECISION = 1e-3  # of each linear solution, relative
 _SLOW = 12  # iterations of a linear solution that call for a new hierarchy, which costs as much as 28
 _PROXIMITY = 1e-8  # pull towards the last estimate: fixes the offset of each separate part
+_LEAST_TRUST = 1e-9  # of a link's ends in it: keeps the equations solvable
 _LEAST_FACING = 0.05  # cosine: flatter views give no slope
 _BEND = 1 / 12  # variance of a step anywhere between its ends' slopes, over their difference squared
 
@@ -54,7 +60,7 @@ _STRAIN, _STRAIN_RATIO = 1.0, 1.4  # excess of the residual that condemns a cut:
 
 
 def log_depth(field: NormalField, stiffness: float, iterations: int, tolerance: float, jump: float) -> Floats:
-    """Scaled log depth z of the object's pixels (N,) [px].
+    """Integrate a normal field: scaled log depth z of the object's pixels (N,) [px].
 
     Parameters
     ----------
@@ -81,7 +87,7 @@ def log_depth(field: NormalField, stiffness: float, iterations: int, tolerance: 
 
 @dataclass(frozen=True)
 class ContourLinks:
-    """M links across occluding contours: their depth step is unknown, and a weak prior sets it."""
+    """M pixel links across occluding contours: their depth step is unknown, and a weak prior sets it."""
 
     link: NDArray[np.intp]  # (M,) numbers of the links
     gap: Floats  # (M,) expected depth behind the contour [px], positive where it grows to the right or down
@@ -96,7 +102,7 @@ _NO_CONTOURS = ContourLinks(np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0)
 
 
 class PyramidLevel:
-    """One grid of the pyramid: its equations, and the state of their solution.
+    """One grid of the integration's pyramid: its equations, and the state of their solution.
 
     Attributes
     ----------
@@ -108,6 +114,8 @@ class PyramidLevel:
         (N,) pixels at which a finer grid may be cut.
     contours
         Links without slope.
+    chords
+        Whether choosing pixels weight the chord of a link instead of the slopes at its two ends.
     solver
         Preconditioner of the last matrix, which also serves similar ones.
     """
@@ -135,15 +143,17 @@ class PyramidLevel:
         self.choosing: Bools = np.zeros(grid.size, dtype=bool)
         self.cuttable: Bools = np.ones(grid.size, dtype=bool)
         self.contours = _NO_CONTOURS
+        self.precise = field.sigma < np.radians(_PRECISE_DEG)
+        self.chords = False
         self.solver: Any = None
 
     def _slope_at(self, ends: NDArray[np.intp]) -> Floats:
-        """Slope (L,) along each link, at one of its ends."""
+        """Slope (L,) along each link between pixels, from the normal at one of its ends."""
         turn = self.grid.turn
         return np.concatenate([self.slope[0][ends[:turn]], self.slope[1][ends[turn:]]])
 
     def decide(self, iterations: int, tolerance: float) -> None:
-        """Find z and the cuts without a coarser grid (steps 1–6 of the module)."""
+        """Solve z and decide the cuts on the coarsest grid (steps 1–6 of the module)."""
         if self.stiffness > 0:
             self.cut_contours()
         self.integrate_bilaterally(iterations, tolerance)
@@ -152,14 +162,17 @@ class PyramidLevel:
         self.choosing = ~dilate(found.torn, _REACH)[self.field.mask] & (self.stiffness > 0) & found.any()
         if not self.choosing.any():
             self.z = np.zeros_like(self.z)  # no cuts: plain least squares, to the last bit
+        self.chords = self.precise
         self.solve()
-        self.remove_useless_cuts()
+        if not self.precise:
+            self.remove_useless_cuts()
         self.join_contacts()
 
     def refine(self, coarse: Floats, near_cuts: Bools, solver: Any) -> None:
-        """Find z from that of the n blocks (n,) at half the resolution; only pixels near their cuts (n,) choose."""
+        """Solve z from the solution (n,) of the grid at half the resolution; only pixels near its cuts (n,) choose."""
         block = block_numbers(self.field.mask)
         self.z = self._interpolated(coarse, block)
+        self.chords = self.precise
         self.choosing = self.cuttable = near_cuts[block] & (self.stiffness > 0)
         for _ in range(_FINER_SOLVES if self.choosing.any() else 1):
             matrix, right, _ = self.equations(self.stiffness, self.field.pull)
@@ -167,18 +180,18 @@ class PyramidLevel:
             self.z, _ = conjugate_gradients(matrix, right, self.z, self.solver, _PRECISION, 20)
 
     def _interpolated(self, coarse: Floats, block: NDArray[np.intp]) -> Floats:
-        """z (N,) from that of 2×2 blocks, each tilted by the slopes of its pixels."""
+        """Interpolate z (N,) from 2×2 blocks, each tilted by the slopes of its pixels."""
         steep = np.maximum(self.facing, 0.1)
         row, column = self.grid.row % 2 - 0.5, self.grid.column % 2 - 0.5
         tilt = (column * self.side[0] + row * self.side[1]) / steep
         return np.asarray(2 * coarse[block] + tilt)
 
     def near_cuts(self) -> Bools:
-        """Pixels (N,) near the cuts."""
+        """Mask (N,) of the pixels near the cuts of the surface."""
         return self.occlusions().near(_REACH)[self.field.mask] & self.cuttable
 
     def cut_contours(self) -> None:
-        """Drop the slopes of links across the occluding contours that the normals show."""
+        """Cut the surface at the occluding contours that the normals show: links across them lose their slope terms."""
         sure = self.field.weight > _SURE
         lean = [np.where(sure, np.arctan2(side, np.maximum(self.facing, 1e-6)), np.nan) for side in self.side]
         found = occlusion.occluding_contours((self.grid.image(lean[0]), self.grid.image(lean[1])), self.field.mask)
@@ -189,7 +202,10 @@ class PyramidLevel:
         self.contours = ContourLinks(link, gap, gap + np.where(gap > 0, first, second))
 
     def integrate_bilaterally(self, iterations: int, tolerance: float) -> None:
-        """Find z with all pixels choosing; the stiffness grows from `_SOFT` times the setting."""
+        """Bilateral integration: solve z with all pixels choosing between neighbors.
+
+        The stiffness grows from `_SOFT` times the setting.
+        """
         self.choosing = np.full(self.grid.size, True)
         before, taken, solver = np.inf, 0, None
         for count in range(iterations if self.stiffness > 0 else 0):
@@ -214,16 +230,16 @@ class PyramidLevel:
         self.contours = self.contours.select(np.isin(contour, separate))
 
     def solve(self) -> None:
-        """Find z with the pixels that may choose, from the present z and solver."""
+        """Solve z, with those pixels choosing that may, from the current z and solver."""
         taken = 0
-        for _ in range(_DECISION_SOLVES if self.choosing.any() else 1):
+        for _ in range((_PRECISE_SOLVES if self.chords else _DECISION_SOLVES) if self.choosing.any() else 1):
             matrix, right, _ = self.equations(self.stiffness, self.field.pull)
             if self.solver is None or taken > _SLOW:
                 self.solver = Multigrid(matrix, self.grid.pixel)
             self.z, taken = conjugate_gradients(matrix, right, self.z, self.solver, _PRECISION, 30)
 
     def remove_useless_cuts(self) -> None:
-        """Close the cuts around which z fits the slopes worse than on a surface without cuts.
+        """Remove cuts around which z fits the slopes worse than on a surface without cuts.
 
         A true occlusion relieves the surface around it: slopes no longer have to bridge its step.
         """
@@ -242,7 +258,7 @@ class PyramidLevel:
                 return
 
     def _useless_cuts(self, found: OcclusionMap, uncut: "PyramidLevel") -> Bools:
-        """Pixels (N,) near the cuts around which the links are strained more than without any cut."""
+        """Mask (N,) of pixels near cuts where the slope residuals are larger than without any cut."""
         mask, p = self.field.mask, self.grid.p
         cut = self.grid.links(found.right, found.down)
         contour = label_contours(found.near(0))
@@ -258,12 +274,12 @@ class PyramidLevel:
         return np.asarray(useless[mask])
 
     def strain(self) -> Floats:
-        """Squared residual of each link's slope (L,), in variances of the median normal."""
+        """Squared slope residual of each link (L,), in units of the variance of the median normal."""
         change = self.z[self.grid.q] - self.z[self.grid.p]
         return np.asarray(self.weight * (change - self.step) ** 2 / self.field.sigma**2)
 
     def join_contacts(self) -> None:
-        """Close the cuts where two separated parts touch."""
+        """Remove cuts between parts of the surface that touch."""
         found = self.occlusions()
         if not found.any() or not self.choosing.any():
             return
@@ -281,13 +297,16 @@ class PyramidLevel:
             self._become(self.without_cuts())
 
     def _close(self, pixels: Bools) -> None:
-        """Pixels (N,) no longer choose, and their links have slopes again; z is solved again."""
+        """Remove the cuts at these pixels (N,).
+
+        They no longer choose, their links have slopes again. z is solved again.
+        """
         self.choosing = self.choosing & ~pixels
         self.contours = self.contours.select(~pixels[self.grid.p[self.contours.link]])
         self.solve()
 
     def without_cuts(self) -> "PyramidLevel":
-        """The same equations solved by plain least squares."""
+        """A copy of this grid solved by plain least squares, without cuts."""
         level = copy(self)
         level.contours, level.choosing = _NO_CONTOURS, np.zeros(self.grid.size, dtype=bool)
         level.z, level.solver = np.zeros_like(self.z), None
@@ -299,12 +318,12 @@ class PyramidLevel:
         self.contours, self.solver = other.contours, other.solver
 
     def occlusions(self) -> OcclusionMap:
-        """Where z steps by more than the normals explain."""
+        """Find occlusions: places where z steps by more than the normals explain."""
         right, down = (self.grid.image(slope, 0.0) for slope in self.slope)
         return occlusion.depth_steps(self.grid.image(self.z, 0.0), (right, down), self.field.mask, self.least_step)
 
     def equations(self, stiffness: float, pull: float) -> tuple[Any, Floats, float]:
-        """Matrix (N, N) and right side (N,) of the weighted least squares about the present z; its bilateral energy."""
+        """Normal equations of the weighted least squares at the current z: matrix (N, N), right side (N,), energy."""
         grid = self.grid
         weight, flux = self.weight.copy(), self.weight * self.step
         change = self.z[grid.q] - self.z[grid.p]
@@ -312,7 +331,8 @@ class PyramidLevel:
         if self.choosing.any():
             for part, side in zip((slice(None, grid.turn), slice(grid.turn, None)), self.side):
                 energy += self._weigh_neighbors(part, side, change, stiffness, weight, flux)
-        weight[self.contours.link] = little = _GAP_WEIGHT / max(len(self.contours.link), 1)
+        certainty = (self.field.sigma / (_GAP * disc_radius(self.field.mask))) ** 2 if self.chords else _GAP_WEIGHT
+        weight[self.contours.link] = little = certainty / max(len(self.contours.link), 1)
         flux[self.contours.link] = little * self.contours.step
         diagonal, right = np.full(grid.size, _PROXIMITY), _PROXIMITY * self.z + grid.divergence(flux)
         if self.field.prior is not None:
@@ -323,10 +343,12 @@ class PyramidLevel:
     def _weigh_neighbors(
         self, part: slice, side: Floats, change: Floats, stiffness: float, weight: Floats, flux: Floats
     ) -> float:
-        """Write weight and flux (L,) of the links between choosing pixels of one axis; returns their energy.
+        """Write the bilateral weight and flux (L,) of links between choosing pixels of one axis.
+
+        Returns their energy.
 
         With m ∂z on either side of a pixel, the weight of the side ahead is σ(k (behind² − ahead²)), k the stiffness
-        and σ the sigmoid (Cao et al.).
+        and σ the sigmoid (Cao et al.). Of chords, the energy is not computed.
         """
         facing, grid = self.facing, self.grid
         chosen, both = self._choosing_links(part)
@@ -337,21 +359,25 @@ class PyramidLevel:
         forward, backward = (
             _sigmoid(stiffness * (a[e] ** 2 - b[e] ** 2)) for a, b, e in ((behind, ahead, p), (ahead, behind, q))
         )
+        at = chosen[both]
+        if self.chords:  # a chord holds only where both ends belong to one sheet
+            weight[at] *= np.maximum(4 * (forward * backward)[both], _LEAST_TRUST)
+            flux[at] = weight[at] * self.step[at]
+            return 0.0
         forward *= self.field.weight[p]
         backward *= self.field.weight[q]
         energy = float(forward @ (ahead - side)[p] ** 2 + backward @ (behind - side)[q] ** 2)
         forward *= first
         backward *= second
-        at = chosen if both is None else chosen[both]
-        inside = slice(None) if both is None else both
-        weight[at] = (forward * first + backward * second)[inside]
-        flux[at] = (forward * side[p] + backward * side[q])[inside]
+        weight[at] = (forward * first + backward * second)[both]
+        flux[at] = (forward * side[p] + backward * side[q])[both]
         return energy
 
-    def _choosing_links(self, part: slice) -> tuple[Any, Bools | None]:
-        """Links of one axis with an end that chooses, and which of them have both; None where all pixels choose."""
-        if self.choosing.all():
-            return part, None
+    def _choosing_links(self, part: slice) -> tuple[NDArray[np.intp], Bools]:
+        """Links of one axis with an end that chooses, and which have both ends choosing.
+
+        None where all pixels choose.
+        """
         p, q = self.choosing[self.grid.p[part]], self.choosing[self.grid.q[part]]
         chosen = np.flatnonzero(p | q)
         return chosen + (part.start or 0), (p & q)[chosen]

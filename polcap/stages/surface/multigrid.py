@@ -43,7 +43,7 @@ class PixelGrid:
 
     @property
     def size(self) -> int:
-        """N."""
+        """Number N of the mask's pixels."""
         return len(self.row)
 
     @property
@@ -52,7 +52,7 @@ class PixelGrid:
         return np.stack([self.row, self.column], axis=-1)
 
     def _lay_out(self, right: Any, down: Any) -> None:
-        """The sparsity pattern: up, left, itself, right and down of each pixel, which is the order of the columns."""
+        """Compute the sparsity pattern of matrices on this grid: up, left, center, right and down of each pixel."""
         size, count = self.size, len(self.p)
         place = np.full((size, 5), -1, dtype=np.int32)  # which link or pixel each stored value belongs to
         link = np.arange(count, dtype=np.int32)
@@ -71,7 +71,7 @@ class PixelGrid:
         self._starts = np.concatenate([[0], np.cumsum(there.sum(axis=1))]).astype(np.int32)
 
     def laplacian(self, link: Floats, diagonal: Floats) -> Any:
-        """CSR matrix (N, N) of link weights (L,) plus a diagonal (N,)."""
+        """Weighted Laplacian as a CSR matrix (N, N), from link weights (L,), plus a diagonal (N,)."""
         from scipy import sparse  # here: a start that integrates nothing does without SciPy
 
         total = diagonal + np.bincount(self.p, link, self.size) + np.bincount(self.q, link, self.size)
@@ -79,18 +79,18 @@ class PixelGrid:
         return sparse.csr_matrix((values, self._indices, self._starts), (self.size, self.size))
 
     def divergence(self, flux: Floats) -> Floats:
-        """Sum into each pixel (N,) of a flux (L,) from p to q."""
+        """Divergence (N,) at each pixel of a flux (L,) along the links from p to q."""
         into = np.asarray(np.bincount(self.q, flux, self.size), dtype=np.float64)
         return np.asarray(into - np.bincount(self.p, flux, self.size))
 
     def image(self, values: NDArray[Any], outside: float = np.nan) -> NDArray[Any]:
-        """Values (N,) at their pixels, (H, W)."""
+        """Place values (N,) at their pixels in an image (H, W)."""
         full = np.full(self.mask.shape, outside, dtype=values.dtype)
         full[self.mask] = values
         return full
 
     def links(self, right: NDArray[Any], down: NDArray[Any]) -> NDArray[Any]:
-        """Values (L,) from images of the links to the right (H, W−1) and down (H−1, W)."""
+        """Collect values (L,) of the links from images of the links to the right (H, W−1) and down (H−1, W)."""
         mask = self.mask
         return np.concatenate([right[mask[:, :-1] & mask[:, 1:]], down[mask[:-1] & mask[1:]]])
 
@@ -101,46 +101,24 @@ def _links(first: NDArray[np.int32], second: NDArray[np.int32]) -> tuple[Any, An
 
 
 def conjugate_gradients(
-    matrix: Any, right: Floats, start: Floats, precondition: Any, tolerance: float, most: int
+    matrix: Any, right: Floats, start: Floats, precondition: Callable[[Floats], Floats], tolerance: float, most: int
 ) -> tuple[Floats, int]:
-    """Solve A x = b by preconditioned conjugate gradients; returns x (N,) and the iterations.
+    """Solve A x = b for a symmetric, positive definite A by conjugate gradients; returns x (N,) and the iterations.
 
-    Parameters
-    ----------
-    matrix
-        A (N, N), symmetric and positive definite; anything with `@`.
-    right, start
-        b and the first x, (N,).
-    precondition
-        From a residual (N,) to an estimate of A⁻¹ times it.
-    tolerance
-        Ends at |b − A x| ≤ tolerance |b|, or after `most` iterations.
-
-    References
-    ----------
-    Saad, Iterative Methods for Sparse Linear Systems, 2003, algorithm 9.1.
+    `precondition` maps a residual (N,) to an estimate of A⁻¹ times the residual. The iterations end at
+    |b − A x| ≤ tolerance |b|, or after `most`.
     """
-    x = start
-    residual = right - matrix @ x
-    goal = tolerance * float(np.linalg.norm(right))
-    direction = preconditioned = precondition(residual)
-    product = float(residual @ preconditioned)
-    for count in range(most):
-        if float(np.linalg.norm(residual)) <= goal or product <= 0:
-            return x, count
-        image = matrix @ direction
-        length = product / float(direction @ image)
-        x = x + length * direction
-        residual = residual - length * image
-        preconditioned = precondition(residual)
-        product, before = float(residual @ preconditioned), product
-        direction = preconditioned + product / before * direction
-    return x, most
+    from scipy.sparse.linalg import LinearOperator, cg
+
+    operator = LinearOperator(matrix.shape, precondition, dtype=np.float64)
+    steps: list[None] = []
+    x, _ = cg(matrix, right, start, rtol=tolerance, maxiter=most, M=operator, callback=lambda _: steps.append(None))
+    return np.asarray(x), len(steps)
 
 
 @dataclass(frozen=True)
 class MultigridLevel:
-    """One level of the hierarchy: N unknowns, n on the next level."""
+    """One level of the multigrid hierarchy: N unknowns, n on the next level."""
 
     matrix: Any  # (N, N) CSR
     step: Floats  # (N,) of a damped Jacobi iteration
@@ -178,7 +156,7 @@ class Multigrid:
         self.coarsest = splu(matrix.tocsc())
 
     def __call__(self, right: Floats) -> Floats:
-        """One cycle from zero: about A⁻¹ times a residual (N,)."""
+        """One V-cycle from zero: approximates A⁻¹ times a residual (N,)."""
         return self._cycle(0, right)
 
     def _cycle(self, depth: int, right: Floats) -> Floats:
@@ -194,7 +172,10 @@ class Multigrid:
 
 
 def _aggregate(matrix: Any, cell: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Group number of each unknown, and their count: parts of a cell that strong links join."""
+    """Aggregate unknowns for the next coarser level: group number of each, and their count.
+
+    A group is a part of a cell that strong links join.
+    """
     from scipy import sparse
     from scipy.sparse.csgraph import connected_components
 
@@ -212,7 +193,7 @@ def _aggregate(matrix: Any, cell: NDArray[np.int64]) -> tuple[NDArray[np.int64],
 
 
 def _prolongation(matrix: Any, group: NDArray[np.int64], count: int) -> Any:
-    """Piecewise constant over the groups, then smoothed by one damped Jacobi step."""
+    """Prolongation matrix: constant over each group, then smoothed by one damped Jacobi step."""
     from scipy import sparse
 
     size = matrix.shape[0]
@@ -243,10 +224,10 @@ class TwoGrid:
         self.count = int(block.max()) + 1
 
     def __call__(self, right: Floats) -> Floats:
-        """Smooth, correct on the blocks, smooth: about A⁻¹ times a residual (N,)."""
+        """One two-grid cycle (smooth, correct on the blocks, smooth): approximates A⁻¹ times a residual (N,)."""
         right = right.astype(np.float32)
         step = _DAMPING * self.inverse_diagonal
         x = step * right
         left = np.asarray(np.bincount(self.block, right - self.matrix @ x, self.count), dtype=np.float64)
         x = x + self.coarse(left).astype(np.float32)[self.block]
-        return np.asarray(x + step * (right - self.matrix @ x))
+        return np.asarray(x + step * (right - self.matrix @ x), dtype=np.float64)

@@ -97,11 +97,11 @@ class OcclusionMap:
     torn: Bools  # (H, W) a long, high step without an edge-on side: the normals fit no surface there
 
     def any(self) -> bool:
-        """Whether there is an occlusion."""
+        """Whether the surface has any occlusion."""
         return bool(self.right.any() or self.down.any())
 
     def near(self, reach: int) -> Bools:
-        """Pixels (H, W) within `reach` px of an occlusion."""
+        """Mask (H, W) of pixels within `reach` px of an occlusion."""
         at = np.zeros(self.torn.shape, dtype=bool)
         at[:, :-1] |= self.right
         at[:, 1:] |= self.right
@@ -116,7 +116,7 @@ def least_step(mask: Bools, share: float) -> float:
 
 
 def depth_steps(z: Floats, slope: tuple[Floats, Floats], mask: Bools, least: float) -> OcclusionMap:
-    """Occlusions of an integrated depth.
+    """Find the occlusions of an integrated depth.
 
     Parameters
     ----------
@@ -157,7 +157,10 @@ def _excess(z: Floats, slope: Floats, mask: Bools, axis: int) -> Floats:
 
 
 def _nearer_lean(on: Bools, beyond: tuple[Floats, ...], slope: tuple[Floats, Floats], least: float) -> Floats:
-    """Lean (H, W) of the nearer side towards the farther, mean over the steps about each pixel [rad]."""
+    """Slope angle (H, W) [rad] of the nearer side of depth steps, falling towards the farther side.
+
+    It is the mean over the steps about each pixel.
+    """
     total, links = np.zeros(on.shape, dtype=np.float32), np.full(on.shape, 1e-6, dtype=np.float32)
     for axis, excess, of in zip((1, 0), beyond, slope):
         first, second = _ends(axis)
@@ -229,11 +232,11 @@ def label_contours(at: Bools) -> NDArray[np.int32]:
 
 
 def dilate(at: Bools, reach: int) -> Bools:
-    """Pixels (H, W) within `reach` px, along rows and columns, of the marked ones."""
+    """Dilate a mask (H, W) by `reach` px along rows and columns."""
     return np.asarray(cv2.dilate(at.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0)
 
 
 def _ends(axis: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Slices of the first and the second pixel of all links along the last axis (1) or the first (0)."""
+    """Slices of the first and second pixel of all links along the last axis (1) or the first (0) of an image."""
     every, but_last, but_first = slice(None), slice(None, -1), slice(1, None)
     return ((every, but_last), (every, but_first)) if axis else ((but_last, every), (but_first, every))

@@ -20,7 +20,7 @@ _LEAST_DEPTH = 0.05  # of the prior, over the object's distance
 
 @dataclass(frozen=True)
 class NormalField:
-    """Normals of the N pixels of a mask, on one grid of the pyramid."""
+    """Normals, weights and prior of the N pixels of a mask, on one grid of the pyramid."""
 
     mask: Bools  # (H, W)
     view: View
@@ -32,7 +32,7 @@ class NormalField:
 
 
 def normal_field(maps: SurfaceMaps, steepest: float, prior_weight: float) -> NormalField:
-    """The maps' normals on their own grid, at most `steepest` rad from their rays.
+    """Normal field from maps, on their grid; normals are at most `steepest` rad from their view rays.
 
     Pixels without a normal get the zero vector, and the integration bridges them.
     """
@@ -58,7 +58,7 @@ def normal_field(maps: SurfaceMaps, steepest: float, prior_weight: float) -> Nor
 
 
 def _limit_lean(normal: Floats, mask: Bools, view: View, steepest: float) -> Floats:
-    """Normals turned towards the camera until they are no more than `steepest` rad from their rays."""
+    """Turn normals towards the camera until they are at most `steepest` rad from their view rays."""
     a, b = _ray_slopes(mask, view)
     facing = (normal[:, 2] - a * normal[:, 0] - b * normal[:, 1]) / np.sqrt(1 + a * a + b * b)
     over = np.flatnonzero(facing < np.cos(steepest) * np.sqrt(dot(normal, normal)))
@@ -72,14 +72,17 @@ def _limit_lean(normal: Floats, mask: Bools, view: View, steepest: float) -> Flo
 
 
 def slope_terms(field: NormalField) -> tuple[Floats, Floats, Floats]:
-    """m, n_x and −n_y of the equations m ∂z/∂i = n_x, m ∂z/∂j = −n_y (i to the right, j down): (N,) each."""
+    """Coefficients m, n_x and −n_y of the slope equations, (N,) each.
+
+    The equations are m ∂z/∂i = n_x and m ∂z/∂j = −n_y, i to the right, j down.
+    """
     a, b = _ray_slopes(field.mask, field.view)
     n = field.normal
     return n[:, 2] - a * n[:, 0] - b * n[:, 1], n[:, 0], -n[:, 1]
 
 
 def halve(field: NormalField) -> NormalField:
-    """The field at half the resolution: weighted means over the masked pixels of each 2×2 block."""
+    """Normal field at half the resolution: weighted means over the masked pixels of each 2×2 block."""
     block = block_numbers(field.mask)
     count = np.bincount(block).astype(np.float64)
     weight = np.bincount(block, field.weight)
@@ -111,6 +114,6 @@ def _any_of_blocks(mask: Bools) -> Bools:
 
 
 def _ray_slopes(mask: Bools, view: View) -> tuple[Floats, Floats]:
-    """a, b of the masked pixels, (N,) each."""
+    """Slopes a, b of the view rays of the masked pixels, (N,) each."""
     row, column = np.nonzero(mask)
     return ray_slopes(view, column, row)

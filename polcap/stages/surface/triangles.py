@@ -1,4 +1,4 @@
-"""Triangles over a depth map: cut where the depth steps, smooth along the boundary, with a back and texture frames."""
+"""Triangle mesh over a depth map: cut at depth steps, smooth along the boundary, with a back and texture frames."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -38,7 +38,7 @@ def unbroken_links(z: Floats, field: NormalField, jump: float) -> tuple[Bools, B
 
 
 def grid_triangles(z: Floats, links: tuple[Bools, Bools], step: int) -> tuple[NDArray[np.int64], Faces]:
-    """Triangles on the grid of every `step` px: their vertices' pixels x, y (V, 2), and the faces (F, 3).
+    """Triangles of the mesh on a grid of every `step` px: pixels x, y (V, 2) of the vertices, and faces (F, 3).
 
     Counter-clockwise as the camera sees them. A square of the grid with four unbroken sides is parted along the
     diagonal of less depth; one with two adjacent unbroken sides gives one triangle.
@@ -66,7 +66,7 @@ def grid_triangles(z: Floats, links: tuple[Bools, Bools], step: int) -> tuple[ND
 
 
 def _unbroken_runs(links: Bools, step: int, axis: int) -> Bools:
-    """Whether all links of each run of `step` links between the grid's lines are unbroken."""
+    """Whether all links of each run of `step` links between the grid's lines cross no occlusion."""
     if step == 1:
         return links
     whole = links.shape[axis] // step * step
@@ -77,7 +77,7 @@ def _unbroken_runs(links: Bools, step: int, axis: int) -> Bools:
 
 @dataclass(frozen=True)
 class BoundaryFigures:
-    """Pieces, cuts and raggedness of a mesh: large where it is torn."""
+    """Measures of how torn a mesh is: pieces, cuts and raggedness of its boundary."""
 
     pieces: int  # without specks
     cuts: float  # length of the boundary inside the mask, both sides, over that along its outline
@@ -86,7 +86,7 @@ class BoundaryFigures:
 
 
 def measure_boundary(place: NDArray[np.int64], faces: Faces, mask: Bools, step: int) -> BoundaryFigures:
-    """Figures of a mesh before its boundary is smoothed; vertices at x, y px (V, 2) of the grid of every `step` px."""
+    """Measure how torn a mesh is, before smoothing; vertices at x, y px (V, 2) of the grid of every `step` px."""
     edge = boundary_edges(faces)
     size = np.ones((4 * step + 1, 4 * step + 1), np.uint8)
     inner = cv2.erode(np.pad(mask.astype(np.uint8), 1), size, borderValue=0)[1:-1, 1:-1] > 0
@@ -115,7 +115,7 @@ def _count_pieces(faces: Faces, count: int) -> int:
 
 
 def smooth_boundary(place: Floats, z: Floats, faces: Faces, step: int) -> tuple[Floats, Floats]:
-    """Vertices x, y (V, 2) px and scaled log depth z (V,), smoothed along the mesh's boundary, z more strongly.
+    """Smooth the mesh's boundary: vertices x, y (V, 2) px, and scaled log depth z (V,) more strongly.
 
     The boundary follows the stairs of the pixels before, and the curve that they sample after.
     """
@@ -148,7 +148,7 @@ def boundary_edges(faces: Faces) -> NDArray[np.int64]:
 
 
 def _average_along(values: Floats, edge: NDArray[np.int64], rounds: int) -> Floats:
-    """Values (V, C) with each boundary vertex moved, in each round, half-way to the mean of its two neighbors.
+    """Smooth values (V, C) of boundary vertices: each round moves them half-way to the mean of their two neighbors.
 
     A vertex where the boundary touches itself stays.
     """
@@ -177,7 +177,7 @@ def face_areas(place: Floats, faces: Faces) -> Floats:
 
 
 def vertex_frames(vertices: Floats, uv: Floats, faces: Faces) -> tuple[Floats, Floats]:
-    """Unit normals (V, 3) and tangents (V, 4), means over the triangles around, weighted by area.
+    """Normals (V, 3) and tangents (V, 4) of mesh vertices: unit, area-weighted means over the triangles around.
 
     A tangent is ∂P/∂u made square to the normal. v runs down the picture and the normal texture's +Y runs up, so the
     handedness w of glTF's bitangent w (n × t) is 1.
@@ -203,7 +203,7 @@ def _unit(vector: Floats) -> Floats:
 
 
 def add_back(front: Mesh, back: Back) -> Mesh:
-    """The mesh with walls from its boundary straight back to a plane ("skirt"), or walls and that plane ("closed").
+    """Add a back to a mesh: walls straight back to a plane ("skirt"), or walls and that plane ("closed").
 
     The added vertices repeat the texture of those in front of them; nothing of the back was photographed.
     """
@@ -229,7 +229,10 @@ def add_back(front: Mesh, back: Back) -> Mesh:
 
 
 def to_float32(mesh: Mesh) -> Mesh:
-    """The mesh in float32; vertices are multiples of 2⁻²³ of the greatest coordinate, so they can be moved and back."""
+    """Convert a mesh to float32.
+
+    Vertices are multiples of 2⁻²³ of the greatest coordinate, so that moving them and back is exact.
+    """
     grid = 2.0 ** (np.ceil(np.log2(np.abs(mesh.vertices).max())) - 23)
     return replace(
         mesh,

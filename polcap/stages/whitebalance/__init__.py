@@ -10,7 +10,7 @@ McCamy, Marcus, Davidson, A Color-Rendition Chart, J. Applied Photographic Engin
 """
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -40,13 +40,15 @@ _REMEDY = "give its corners with --chart x0,y0,…,x3,y3, a profile with --chart
 
 
 class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The section `whitebalance` of a settings file."""
+    """Settings of the stage `whitebalance`, the section `whitebalance` of a settings file."""
 
     chart: Annotated[
-        Literal["classic", "classic_before_2014", "classic_srgb", "sg"],
+        str,
         Meta(
-            description="kind of chart; classic: the edition since 2014 unless another fits its colors much better; "
-            "of a (Digital) SG the block E2 to J5, whose corners --chart states"
+            pattern=r"^(classic|classic_before_2014|classic_srgb|sg)$|[./\\]",
+            description="classic, classic_before_2014, classic_srgb, sg, or a file of measured colors (CSV or CGATS); "
+            "classic: the edition since 2014 unless another fits its colors much better; of a (Digital) SG the block "
+            "E2 to J5, whose corners --chart states",
         ),
     ] = "classic"
     chart_width_m: (
@@ -63,7 +65,7 @@ class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     patch_share: Annotated[float, Meta(ge=0.2, le=0.95, description="sampled share of each patch's side")] = 0.6
 
 
-@stage(version=9)
+@stage(version=10)
 def measure(
     radiance: AngleStack, reference: ChartReference, request: ChartRequest, settings: WhitebalanceSettings
 ) -> ColorCalibration:
@@ -88,7 +90,7 @@ def measure(
         return replace(request.profile, source="profile", place=None)
     if request.mode == "corners":
         found = _at_corners(radiance, reference, request.corners, settings)
-    elif settings.chart == "sg":
+    elif reference.is_block:
         raise ChartError(
             "polcap cannot search for a ColorChecker SG; give the outer corners of patches E2, J2, J5, E5 with --chart"
         )
@@ -126,7 +128,7 @@ class _Find:
 
 
 def _search(radiance: AngleStack, reference: ChartReference, settings: WhitebalanceSettings) -> _Find:
-    """Search the chart: the first candidate with half the permitted color residual, else the one with the least."""
+    """Search the chart in the reference shot: the first candidate with a small color residual, else the best one."""
     finds: list[_Find] = []
     cheapest, small_px = np.inf, 0.0
     exposed: ChartError | None = None
@@ -213,7 +215,10 @@ def _find(
     settings: WhitebalanceSettings,
     cost: float = float("nan"),
 ) -> _Find:
-    """The colors of a chart at a place of the reference shot; the detector's cost is NaN at corners from the user."""
+    """Sample and fit the colors of a chart at a place of the reference shot.
+
+    The detector's cost is NaN at corners from the user.
+    """
     samples = patches.sample(radiance.value[0], radiance.quality[0], place, settings.patch_share)
     return _Find(place, patches.fit(samples, reference), cost)
 
@@ -246,7 +251,7 @@ def _from_camera(radiance: AngleStack) -> ColorCalibration:
 
 
 def _scale(place: Placement, view: View, width_m: float | None) -> float | None:
-    """Metres per pixel (Z/f) in the plane through the chart's center, perpendicular to the optical axis.
+    """Metres per pixel (Z/f) in the plane through the chart's center, perpendicular to the axis.
 
     With K the camera and H the homography from metres along the chart's width, K⁻¹H ∝ (r₁, r₂, t) with
     |r₁| = 1 (Zhang, IEEE PAMI 2000). So neither the chart's height nor its tilt is needed.

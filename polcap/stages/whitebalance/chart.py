@@ -41,7 +41,7 @@ _SQUARE = np.array([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1]])
 
 @dataclass(frozen=True)
 class Placement:
-    """Location of a chart in an image."""
+    """Location of a ColorChecker in an image: homography, patch side, quality of the fit."""
 
     homography: Floats  # (3, 3) chart (u, v, 1) → image px (x, y, 1)
     patch: float = USUAL_PATCH  # side of a patch / pitch
@@ -49,29 +49,29 @@ class Placement:
 
     @property
     def pitch_px(self) -> float:
-        """Mean distance of neighboring patches, px."""
+        """Mean distance of neighboring chart patches, px."""
         area = cv2.contourArea(transform_points(self.homography, _outer(1.0)).astype(np.float32))
         return float(np.sqrt(area / (ROWS * COLUMNS)))
 
     def quads(self, share: float = 1.0) -> Floats:
-        """(24, 4, 2) corners of each patch, shrunk to `share` of its side; px, from dark skin, row by row."""
+        """Corners (24, 4, 2) px of each chart patch, shrunk to `share` of its side; from dark skin, row by row."""
         return transform_points(self.homography, centers()[:, None] + share * self.patch / 2 * _SQUARE)
 
     def corners(self) -> Floats:
-        """(4, 2) outer corners of the outer patches, dark skin first, clockwise on the chart; px."""
+        """Outer corners (4, 2) px of the chart's corner patches, dark skin first, clockwise on the chart."""
         return transform_points(self.homography, _outer(self.patch))
 
     def turned(self) -> "Placement":
-        """The location of the same chart, read upside down."""
+        """Location of the same chart read upside down."""
         return replace(self, homography=self.homography @ [[-1.0, 0, COLUMNS], [0, -1.0, ROWS], [0, 0, 1]])
 
     def moved(self, transform: Floats) -> "Placement":
-        """The location in another image; transform (3, 3) maps px of this image to px of the other."""
+        """Location of the chart in another image; transform (3, 3) maps px of this image to px of the other."""
         return replace(self, homography=transform @ self.homography)
 
 
 def centers() -> Floats:
-    """(24, 2) patch centers in chart coordinates."""
+    """Patch centers (24, 2) of a ColorChecker in chart coordinates."""
     v, u = np.mgrid[0:ROWS, 0:COLUMNS] + 0.5
     return np.stack([u.ravel(), v.ravel()], axis=-1)
 
@@ -128,13 +128,13 @@ def resize(picture: Floats, factor: float) -> Floats:
 
 
 def scaling(small: tuple[int, ...], large: tuple[int, ...]) -> Floats:
-    """Transform (3, 3) from px of a large picture to px of a small one, with pixel centers at integers."""
+    """Transform (3, 3) from px of a large picture to px of its reduced copy, with pixel centers at integers."""
     x, y = small[1] / large[1], small[0] / large[0]
     return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
 
 
 def _fit(image: Floats, start: Placement) -> Placement:
-    """Fit the drawing of a chart to an image (H, W, 3) with white about 1.
+    """Fit a drawing of the chart (homography, patch side, blur) to an image (H, W, 3) with white about 1.
 
     Light mixes linearly at an edge; residuals are computed after a gamma of 2.2, so that dark patches count too.
     """
@@ -198,14 +198,14 @@ def _cover(point: Floats, unknowns: Floats) -> tuple[Floats, NDArray[np.intp], N
 
 
 def _colors(value: Floats, cover: Floats, cell: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Color of each patch (24, 3) and of the card (3,): medians of the pixels (N, 3)."""
+    """Color of each chart patch (24, 3) and of the card (3,): medians of the pixels (N, 3)."""
     card = np.median(value[cover < max(0.1, float(np.percentile(cover, 2)))], axis=0)
     full = [value[(cell == index) & (cover > 0.9)] for index in range(ROWS * COLUMNS)]
     return np.array([np.median(inside, axis=0) if len(inside) else card for inside in full]), card
 
 
 def _outer(patch: float) -> Floats:
-    """Outer corners (4, 2) of the corner patches in chart coordinates, dark skin first, clockwise."""
+    """Outer corners (4, 2) of the chart's corner patches in chart coordinates, dark skin first, clockwise."""
     gap = (1 - patch) / 2
     return np.array([[gap, gap], [COLUMNS - gap, gap], [COLUMNS - gap, ROWS - gap], [gap, ROWS - gap]])
 

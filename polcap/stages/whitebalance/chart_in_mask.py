@@ -1,4 +1,4 @@
-"""Detects a ColorChecker in the object's mask that the chart search did not find."""
+"""Detects a ColorChecker that was taken for part of the object, when the chart search did not find it."""
 
 import cv2
 import numpy as np

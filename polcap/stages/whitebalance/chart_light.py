@@ -2,8 +2,9 @@
 
 A flash at L lights points P of a chart with normal n as n·(L − P)/|L − P|³. Across the chart n·(L − P) is constant.
 So the slope of the light gives the flash's position over the chart's plane: per patch it is 3 pitches over the
-distance, times the sine of the angle from the normal to the flash. The chart's orientation comes from its outline: the
-first two columns of its homography point along rows and columns.
+distance, times the sine of the angle from the normal to the flash. A lamp near the chart or a lens's vignetting adds a
+slope of its own, with unknown effect on the level. The chart's orientation comes from its outline: the first two
+columns of its homography point along rows and columns.
 
 References
 ----------
@@ -28,6 +29,9 @@ _TURN_SIGMA, _FOCAL_SPREAD = 0.03, 0.3
 _FARTHEST = 0.3  # largest distance of the flash from the lens [chart distances]
 _LIGHT_PER_DELTA_E = 0.02  # relative error of Y per ΔE2000; about half of a ΔE is lightness
 _LEAST_PATCH_ERROR = 0.005
+# A slope that the flash does not cause: 1σ before the measurement [per patch], and the error of the level per unit of
+# it [patches]. On 40 charts lit by a lamp of their own or darkened by vignetting the level was off by 3 to 10 patches.
+_OTHER_SLOPE, _OTHER_REACH = 0.012, 6.0
 _STEP = 1e-4
 _ROUNDS = 4
 _STRAIGHT = np.linalg.pinv(
@@ -36,7 +40,7 @@ _STRAIGHT = np.linalg.pinv(
 
 
 def measure(place: Placement, view: View, slope: Floats, delta_e: float) -> ChartLight:
-    """The chart's plane, the most probable position of the flash and falloff of light, and their covariance.
+    """Estimate the chart's plane, the most probable flash position and light falloff, and their covariance.
 
     slope (2,) is the relative change of the light per patch, towards the chart's right and down, at the white patch.
     delta_e, the mean residual of the patches, determines its error.
@@ -44,19 +48,20 @@ def measure(place: Placement, view: View, slope: Floats, delta_e: float) -> Char
     outlined = _ChartPlane(*_plane(place, view))
     aslant = np.hypot(*outlined.normal[:2]) / outlined.normal[2]  # tangent of the tilt from the image plane
     turn = _TURN_SIGMA if view.known else float(np.hypot(_TURN_SIGMA, _FOCAL_SPREAD * min(aslant, 1.0)))
-    prior = np.diag(1 / np.array([*_PRIOR, turn, turn]) ** 2)
+    prior = np.diag(1 / np.array([*_PRIOR, turn, turn, _OTHER_SLOPE, _OTHER_SLOPE]) ** 2)
     error = max(_LEAST_PATCH_ERROR, _LIGHT_PER_DELTA_E * delta_e)
     known = np.linalg.inv(error**2 * (_STRAIGHT @ _STRAIGHT.T)[1:, 1:])
 
-    state = np.zeros(5)
+    state = np.zeros(7)  # flash (2,), falloff, turn (2,), other slope (2,)
     for _ in range(_ROUNDS):
         here = _slope(outlined, state)
-        by_state = np.stack([(_slope(outlined, state + step) - here) / _STEP for step in _STEP * np.eye(5)], axis=1)
+        by_state = np.stack([(_slope(outlined, state + step) - here) / _STEP for step in _STEP * np.eye(7)], axis=1)
         covariance = np.linalg.inv(prior + by_state.T @ known @ by_state)
         state = covariance @ by_state.T @ known @ (slope - here + by_state @ state)
         state[:2] = np.clip(state[:2], -_FARTHEST, _FARTHEST)
-    found = outlined.turned(state[3:])
-    return ChartLight(found.point[patches.WHITE], found.normal, state[:3], covariance)
+    found = outlined.turned(state[3:5])
+    uneven = float(_OTHER_REACH * np.hypot(*state[5:]))
+    return ChartLight(found.point[patches.WHITE], found.normal, state[:3], covariance[:5, :5], uneven)
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,7 @@ class _ChartPlane:
     normal: Floats  # (3,)
 
     def turned(self, turn: Floats) -> "_ChartPlane":
-        """The plane after a small rotation (2,) about x and y [rad] through its center."""
+        """The chart's plane after a small rotation (2,) about x and y [rad] through its center."""
         from scipy.spatial.transform import Rotation  # here: importing it costs .2 s of every start
 
         rotation, middle = Rotation.from_rotvec([*turn, 0.0]), self.point.mean(axis=0)
@@ -73,14 +78,14 @@ class _ChartPlane:
 
 
 def _slope(outlined: _ChartPlane, state: Floats) -> Floats:
-    """Relative change (2,) of the light per patch for a state (5,), by a linear fit over the patches."""
-    plane = outlined.turned(state[3:])
+    """Relative change (2,) of the light per patch for a state (7,), by a linear fit over the patches."""
+    plane = outlined.turned(state[3:5])
     level, *slope = _STRAIGHT @ point_light.irradiance(plane.point, state[:2], state[2], plane.normal)
-    return np.asarray(np.array(slope) / level)
+    return np.asarray(np.array(slope) / level + state[5:])
 
 
 def _plane(place: Placement, view: View) -> tuple[Floats, Floats]:
-    """Patch centers (24, 3) in units of the distance of the chart's center, and normal (3,), in the camera frame."""
+    """Chart plane in the camera frame: patch centers (24, 3) in units of the chart's distance, and normal (3,)."""
     camera = np.array([[view.focal, 0, view.center[0]], [0, view.focal, view.center[1]], [0, 0, 1]])
     pose = np.diag([1.0, -1.0, -1.0]) @ np.linalg.solve(camera, place.homography)
     pose = -pose / (pose[2] @ [chart.COLUMNS / 2, chart.ROWS / 2, 1])

@@ -16,7 +16,7 @@ _CANDIDATES = 3  # per picture, because the detector may prefer a texture to the
 
 
 def candidates(value: Floats) -> Iterator[tuple[Floats, float]]:
-    """Patch centers (24, 2) px and detector cost of possible charts in a picture (H, W, 3)."""
+    """Possible charts in a picture (H, W, 3): patch centers (24, 2) px and detector cost of each."""
     detector: Any = cv2.mcc.CCheckerDetector.create()
     detector.setColorChartType(cv2.mcc.MCC24)
     for picture, transform in _pictures(value):
@@ -27,7 +27,7 @@ def candidates(value: Floats) -> Iterator[tuple[Floats, float]]:
 
 
 def _pictures(value: Floats) -> Iterator[tuple[NDArray[np.uint8], Floats]]:
-    """8-bit BGR pictures to search, the most promising first, each with the transform radiance px → picture px.
+    """Pictures (8-bit BGR) to search for a chart, best first, each with the transform radiance px → picture px.
 
     First the whole frame at several scales and exposures, with channels balanced or not. Last, for small charts, the
     enlarged frame, or enlarged and overlapping tiles of a large frame, because the detector reduces large pictures.
@@ -57,6 +57,6 @@ def _pictures(value: Floats) -> Iterator[tuple[NDArray[np.uint8], Floats]]:
 
 
 def _eight_bits(value: Floats, level: Floats) -> NDArray[np.uint8]:
-    """Gamma-encoded 8-bit BGR picture, 255 at `level`."""
+    """Encode radiance as a gamma-encoded 8-bit BGR picture, 255 at `level`."""
     encoded = 255 * np.clip(value / level, 0, 1) ** (1 / 2.2)
     return np.ascontiguousarray(encoded[..., ::-1].astype(np.uint8))

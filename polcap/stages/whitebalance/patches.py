@@ -25,7 +25,7 @@ _MOST_COUNTED = 30.0  # largest ΔE of an excluded patch in the mean that decide
 
 
 class PatchUse(IntEnum):
-    """Whether a patch was used, or the reason that it was not."""
+    """Whether a chart patch was used for the color matrix, or the reason why not."""
 
     USED = 0
     CLIPPED = 1
@@ -52,7 +52,7 @@ class PatchSamples:
     use: Bits  # (24,) PatchUse
 
     def turned(self) -> "PatchSamples":
-        """Colors of the patches of the same chart, read upside down."""
+        """The patch colors of the same chart read upside down."""
         return PatchSamples(self.color[::-1], self.use[::-1])
 
 
@@ -84,7 +84,7 @@ def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
 
 
 def cross_validate(found: ChartFit, reference: ChartReference) -> Floats | None:
-    """ΔE2000 (24,) of each patch under the matrix fitted to all others; None for too few patches."""
+    """Color error ΔE2000 (24,) of each patch under the matrix fitted to all others; None for too few patches."""
     used = found.use == PatchUse.USED
     return color.cross_validate(found.color, reference.rec709, position(), used) if used.sum() > _LEAST else None
 
@@ -96,12 +96,12 @@ def residual(found: ChartFit, reference: ChartReference) -> float:
 
 
 def position() -> Floats:
-    """Positions (24, 2) of the patches relative to the white one, in pitches."""
+    """Positions (24, 2) of the chart's patches relative to the white one, in patch pitches."""
     return np.asarray(chart.centers() - chart.centers()[WHITE])
 
 
 def sample(value: Floats, quality: Bits, place: Placement, share: float) -> PatchSamples:
-    """S0 of each patch in a shot (H, W, 3) with quality (H, W): twice the trimmed mean over its inner part.
+    """Sample S0 of each patch in a shot (H, W, 3) with quality (H, W): twice the trimmed mean over its inner part.
 
     `share` of each patch's side is sampled.
     """
@@ -125,7 +125,7 @@ def sample(value: Floats, quality: Bits, place: Placement, share: float) -> Patc
 
 
 def left_out(use: Bits) -> str:
-    """Text that lists the patches that were not used and why, from their use (24,); empty if all were used."""
+    """Text that lists the chart patches not used and why, from their use (24,); empty if all were used."""
     words = {
         PatchUse.CLIPPED: "over-exposed",
         PatchUse.OUTSIDE: "outside the picture",

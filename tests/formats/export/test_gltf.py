@@ -4,6 +4,7 @@ import json
 import shutil
 import struct
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from polcap.formats.export import gltf
+from polcap.errors import SettingError
+from polcap.formats.export import glb_geometry, gltf
 from polcap.formats.export.encoders import Kind
+from polcap.formats.export.glb_geometry import Geometry
 from polcap.images import Asset
 from tests import surfaces
 
@@ -33,12 +36,14 @@ def document(data: bytes) -> dict[str, Any]:
     return dict(json.loads(data[20 : 20 + length]))
 
 
-@pytest.mark.parametrize("images", ["png", "jpeg", "webp"])
-def test_khronos_validator_finds_nothing(asset: Asset, tmp_path: Path, images: Kind) -> None:
+@pytest.mark.parametrize(
+    ("images", "geometry"), [("png", "float"), ("jpeg", "float"), ("webp", "quantized"), ("png", "quantized")]
+)
+def test_khronos_validator_finds_nothing(asset: Asset, tmp_path: Path, images: Kind, geometry: Geometry) -> None:
     node = shutil.which("node")
     if node is None or not (NODE / "node_modules" / "gltf-validator").is_dir():
         pytest.skip("needs node, and `npm ci` in tests/gltf")
-    gltf.write(tmp_path / "ball.glb", asset, "ball", images, {"unit": "m"})
+    gltf.write(tmp_path / "ball.glb", asset, "ball", gltf.GlbOptions(images, geometry), {"unit": "m"})
     done = subprocess.run(
         [node, str(NODE / "validate.js"), str(tmp_path / "ball.glb")],
         capture_output=True, check=True, timeout=300,
@@ -97,3 +102,23 @@ def test_a_lost_triangle_opens_a_closed_surface_wherever_its_vertices_are_listed
     ball = np.asarray(trimesh.creation.icosphere(4).faces, np.int32)  # 2,562 vertices
     ball = ball[np.argsort(ball.min(axis=1))] + 7  # no triangle at the first vertices
     assert not gltf.is_open(ball) and gltf.is_open(np.delete(ball, lost, axis=0))
+
+
+def test_draco_needs_its_package_and_says_so(asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "DracoPy", None)
+    with pytest.raises(SettingError, match=r"pip install 'polcap\[draco\]'"):
+        gltf.encode(asset, "ball", gltf.GlbOptions(geometry="draco"))
+
+
+@pytest.mark.parametrize(("geometry", "share"), [("quantized", 0.65), ("draco", 0.2)])
+def test_packed_mesh_is_smaller_and_names_its_extension(asset: Asset, geometry: Geometry, share: float) -> None:
+    """Its content is tested with the readers three.js and Blender (tests/render, tests/blender)."""
+    if geometry == "draco":
+        pytest.importorskip("DracoPy")
+    held = {}
+    for one in (geometry, "float"):
+        data = gltf.encode(asset, "ball", gltf.GlbOptions(geometry=one))
+        said = document(data)
+        held[one] = len(data) - sum(said["bufferViews"][image["bufferView"]]["byteLength"] for image in said["images"])
+        assert set(glb_geometry.EXTENSIONS[one]) == set(said.get("extensionsRequired", []))
+    assert held[geometry] < share * held["float"]

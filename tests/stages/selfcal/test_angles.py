@@ -1,5 +1,6 @@
 """Order, sense and single turns of the angles are checked; angles that nobody noted are found."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -38,15 +39,19 @@ def test_swapped_shots_are_refused_with_the_order_that_fits(order):
     radiance = scenes.stack(noise=0.002)
     swapped = replace(radiance, value=radiance.value[list(order)])
     names = ", ".join(f"{np.degrees(radiance.angle[i]):g}°" for i in order)
-    with pytest.raises(CaptureError, match=f"; {names} fit better"):
+    with pytest.raises(CaptureError, match=f"; {names} fit better") as caught:
         solve(swapped)
+    renamed = re.findall(r"(\d+)° to (\d+)°", str(caught.value))
+    assert "rename the folders" in str(caught.value) and "--clockwise" not in str(caught.value)
+    assert renamed == [(f"{45 * k}", f"{45 * at}") for k, at in enumerate(order) if k != at]
     assert solve(swapped, check_order=False).outline.best == ShotOrder(order)
 
 
 def test_angles_counted_clockwise_are_refused():
     radiance = scenes.stack(noise=0.002, angles=np.radians([0.0, 60.0, 120.0]))
-    with pytest.raises(CaptureError, match="counted the other way"):
+    with pytest.raises(CaptureError, match=r"counted clockwise fit better .*: add --clockwise, or clockwise = true"):
         solve(replace(radiance, angle=-radiance.angle))
+    assert solve(radiance).outline.as_stated  # as --clockwise corrects it
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

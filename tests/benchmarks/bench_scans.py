@@ -1,0 +1,123 @@
+"""Depth of scanned objects from their scanned normals: plain least squares, the stage, bilateral integration.
+
+python tests/benchmarks/bench_scans.py     (POLCAP_DATA/real/scanned_normals)
+
+Prints a row for each object: mean absolute depth error [mm] after the median scale, and CPU seconds. The expected
+error of the normals is 1°. `bilateral` is the method of Cao et al. with sparse matrices of SciPy and conjugate
+gradients with a diagonal preconditioner.
+
+References
+----------
+Cao, Santo, Shi, Okura & Matsushita, Bilateral normal integration, ECCV 2022.
+"""
+
+import os
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import cg
+
+from polcap.images import Floats, Mesh, SurfaceMaps, View
+from polcap.stages import surface
+from polcap.stages.surface.slope_equations import normal_field, slope_terms
+
+STIFFNESS = 2.0
+ITERATIONS, TOLERANCE = 150, 1e-4
+
+
+def main() -> None:
+    print("| object | least squares: mm | s | polcap: mm | s | bilateral: mm | s |\n" + "| --- " * 7 + "|")
+    for folder in sorted((Path(os.environ["POLCAP_DATA"]) / "real/scanned_normals").iterdir()):
+        maps, truth = scan(folder)
+        plain, ours = surface.SurfaceSettings(stiffness=0.0), surface.SurfaceSettings()
+        works = (
+            partial(surface.integrate, maps, None, plain),
+            partial(surface.integrate, maps, None, ours),
+            partial(bilateral, maps),
+        )
+        figures = [timed_error(work, truth) for work in works]
+        print(f"| {folder.name} | " + " | ".join(f"{error:.3f} | {seconds:.2f}" for error, seconds in figures) + " |")
+
+
+def scan(folder: Path) -> tuple[SurfaceMaps, Floats]:
+    """Maps of an object, and its true depth (H, W) [mm]."""
+    mask = np.asarray(cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE)) > 0
+    normal = np.asarray(cv2.imread(str(folder / "normal_map.png"), cv2.IMREAD_UNCHANGED))[..., ::-1] / 65535 * 2 - 1
+    camera = np.loadtxt(folder / "K.txt")
+    flat = np.ones(mask.shape, dtype=np.float32)
+    maps = SurfaceMaps(
+        normal=np.where(mask[..., None], normal, 0).astype(np.float32),
+        diffuse=flat[..., None].repeat(3, axis=-1) / 2,
+        specular=flat[..., None].repeat(3, axis=-1) / 25,
+        roughness=flat / 2,
+        depth_prior=None,
+        confidence=flat,
+        mask=mask,
+        view=View(float(camera[0, 0]), (float(camera[0, 2]), float(camera[1, 2])), 1.0),
+        estimator="scan",
+    )
+    with np.load(folder / "depth_gt.npz") as stored:
+        return maps, np.where(mask, stored["depth_gt"].astype(np.float64), np.nan)
+
+
+def timed_error(work: Callable[[], Mesh | Floats], truth: Floats) -> tuple[float, float]:
+    """Mean absolute error after the median scale [mm], and CPU seconds."""
+    start = time.process_time()
+    result = work()
+    seconds = time.process_time() - start
+    depth = result.depth if isinstance(result, Mesh) else result
+    return mean_error(depth, truth), seconds
+
+
+def mean_error(depth: Floats, truth: Floats) -> float:
+    """Mean absolute depth error after the median scale [mm]."""
+    inside = np.isfinite(truth) & np.isfinite(depth)
+    scale = np.median(truth[inside] / depth[inside])
+    return float(np.abs(scale * depth - truth)[inside].mean())
+
+
+def bilateral(maps: SurfaceMaps) -> Floats:
+    """Depth (H, W) by bilateral normal integration."""
+    field = normal_field(maps, np.radians(89.9), 0.0)
+    facing, right, down = slope_terms(field)
+    count = len(facing)
+    number = np.full(np.add(maps.mask.shape, 2), -1)
+    number[1:-1, 1:-1][maps.mask] = np.arange(count)
+    row, column = np.nonzero(np.pad(maps.mask, 1))
+
+    def one_sided(rows: int, columns: int) -> sparse.csr_matrix:
+        """Matrix (N, N) of facing times the difference towards the neighbor; 0 without a neighbor."""
+        other = number[row + rows, column + columns]
+        at = np.flatnonzero(other >= 0)
+        value = (rows + columns) * facing[at]
+        place = (np.concatenate([at, at]), np.concatenate([at, other[at]]))
+        return sparse.csr_matrix((np.concatenate([-value, value]), place), (count, count))
+
+    sides = [one_sided(*towards) for towards in ((0, 1), (0, -1), (1, 0), (-1, 0))]
+    matrix, target = sparse.vstack(sides).tocsr(), np.concatenate([right, right, down, down])
+    weight, z, before = np.full(4 * count, 0.5), np.zeros(count), np.inf
+    for _ in range(ITERATIONS):
+        weighted = matrix.T @ sparse.diags(weight)
+        square = (weighted @ matrix).tocsr()
+        inverse = sparse.diags(1 / np.maximum(square.diagonal(), 1e-5))
+        z, _ = cg(square, weighted @ target, z, rtol=1e-3, maxiter=5000, M=inverse)
+        ahead, behind, below, above = (np.square(side @ z) for side in sides)
+        across = 1 / (1 + np.exp(np.clip(STIFFNESS * (ahead - behind), -60, 60)))
+        along = 1 / (1 + np.exp(np.clip(STIFFNESS * (below - above), -60, 60)))
+        weight = np.concatenate([across, 1 - across, along, 1 - along])
+        energy = float(weight @ (matrix @ z - target) ** 2)
+        if abs(before - energy) < TOLERANCE * before:
+            break
+        before = energy
+    depth = np.full(maps.mask.shape, np.nan)
+    depth[maps.mask] = np.exp((z - np.median(z)) / maps.view.focal)
+    return depth
+
+
+if __name__ == "__main__":
+    main()
