@@ -37,7 +37,7 @@ def export(
     ] = "lin_rec709",
     texture_size: Annotated[
         int | None,
-        Option(min=16, max=16384, help="Longer side of the textures, px; by default that of the maps."),
+        Option(min=16, max=16384, help="Longer side of the textures, px; by default each keeps its own size."),
     ] = None,
     lod: Annotated[int, Option(min=0, max=6, help="Further GLBs, each with a quarter of the triangles.")] = 0,
     json: Json = False,

@@ -20,11 +20,9 @@ def merge(bracket: Bracket, weighted: WeightedBracket, read: Reader) -> Mosaic:
     the colors.
     """
     numbers = [bracket.reference, *bracket.others]
-    parts = [
-        (read(bracket.shot.frames[e]), one.serves, one.frame.ratio)
-        for e, one in zip(numbers, weighted.frames, strict=True)
-        if one.frame.motion is None
-    ]
+    frames = [(read(bracket.shot.frames[e]), one) for e, one in zip(numbers, weighted.frames, strict=True)]
+    still = [(image, one) for image, one in frames if one.frame.motion is None and image.cfa is not None]
+    parts = [(image, one.serves, one.frame.ratio) for image, one in still]
     _, height, width = weighted.shape
     value = np.empty((2 * height, 2 * width), np.float16)
     parallel.results(partial(_merge_rows, parts, value, rows) for rows, _, _ in blocks(height))
