@@ -27,7 +27,8 @@ from polcap.stages import cues, infer, surface
 
 COLUMNS = (
     "capture", "normal mean", "median", "chart px", "align px", "gain %", "ratio %",
-    "diffuse", "roughness", "F0", "depth", "diffuse at RAW px", "with detail", "its fine part", "with detail", "truth's",
+    "diffuse", "roughness", "F0", "depth", "diffuse at RAW px", "with detail",
+    "its fine part", "with detail", "truth's",
 )  # fmt: skip
 
 

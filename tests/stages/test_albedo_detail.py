@@ -92,7 +92,6 @@ def test_print_finer_than_a_superpixel_comes_back() -> None:
         found = fine(np.log(np.maximum(ball.base_color(raw_pixels), 1e-3)))[ball.inside]
         correlation[raw_pixels] = np.corrcoef(found, truth)[0, 1]
         share[raw_pixels] = found @ truth / (truth @ truth)
-    print(correlation, share)
     assert correlation[True] > 0.9 and share[True] > 0.6
     assert share[False] < 0.2
 
@@ -105,7 +104,6 @@ def test_neither_shading_of_fine_relief_nor_noise_enters_the_albedo(slope: Float
     ball = photograph(np.full_like(X, GREY), slope, noise)
     assert ball.stokes.detail is not None and ball.maps.detail is not None
     photographed, ours = (part[ball.inside].astype(float).std() for part in (ball.stokes.detail, ball.maps.detail))
-    print(photographed, ours)
     assert ours < 0.3 * photographed
 
 

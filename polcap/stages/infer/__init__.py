@@ -9,8 +9,7 @@ the camera frame.
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
         zenith         by the object's law of diffuse polarization
     half_turns     the side of the ray to which a normal leans, for both estimators
-    highlights     filled, and their albedo from a crossed shot; uncertainty of the scale of all albedos
-    albedo_detail  detail of the photograph that is finer than a superpixel and not shading
+    albedo         in highlights, its uncertain scale, and its detail finer than a superpixel
 """
 
 from dataclasses import replace
@@ -21,7 +20,7 @@ from msgspec import Meta
 
 from polcap.images import Cues, Network, RunNetwork, SurfaceMaps
 from polcap.stages import stage
-from polcap.stages.infer import albedo_detail, analytic, highlights, learned
+from polcap.stages.infer import albedo, analytic, learned
 
 
 class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,9 +47,9 @@ def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: Inf
         maps = analytic.estimate(cues, settings.ior)
     else:
         maps = learned.estimate(cues, network, run, settings.ior, settings.symmetries, fine_pass=settings.fine)
-    maps = highlights.correct_highlights(maps, cues, settings.ior)
+    maps = albedo.correct_highlights(maps, cues, settings.ior)
     return replace(
         maps,
-        albedo_sigma=highlights.albedo_sigma(maps, cues.scale_sigma),
-        detail=None if cues.detail is None else albedo_detail.select(cues.detail, cues, maps),
+        albedo_sigma=albedo.albedo_sigma(maps, cues.scale_sigma),
+        detail=None if cues.detail is None else albedo.select_detail(cues.detail, cues, maps),
     )

@@ -74,10 +74,10 @@ def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
 
 
 def test_detail_of_raw_pixels_comes_back_and_maps_json_states_its_size(result: Result, tmp_path: Path) -> None:
-    of, *others = result
+    of, mesh, image, seen = result
     size = (2 * surfaces.HEIGHT, 2 * surfaces.WIDTH)
     detailed = replace(of, detail=np.random.default_rng(2).normal(0, 0.5, size).astype(np.float16))
-    maps.write(tmp_path / "maps", detailed, *others)
+    maps.write(tmp_path / "maps", detailed, mesh, image, seen)
     stated = json.loads((tmp_path / "maps" / "maps.json").read_text("utf-8"))
     assert stated["sizes"] == {"detail.png": [size[1], size[0]]} and "detail.png" in stated["maps"]
     read, stored = maps.read(tmp_path / "maps").maps.detail, maps.as_stored(detailed).detail
