@@ -64,7 +64,7 @@ def api_page() -> str:
     lines = [
         "# From Python", "", _MADE, "",
         "```python", "import polcap", "", 'result = polcap.process("CAPTURE")', "print(result.verdict)",
-        'maps = polcap.read_maps(result.folder / "maps").maps', "```", "",
+        "maps = polcap.read_maps(result.folder)", "print(maps.normal.shape, maps.depth.shape)", "```", "",
         "`examples/from_python.py` is a complete program. Names are imported at their first use. The package is typed.",
     ]  # fmt: skip
     for name in sorted(polcap.__all__, key=lambda name: (name[0].isupper(), name)):

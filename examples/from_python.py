@@ -11,7 +11,9 @@ import polcap
 
 source, out = sys.argv[1:3]
 result = polcap.process(source, out, config=polcap.load_config(assignments=["infer.symmetries=1"]))
-found = polcap.read_maps(result.folder / "maps").maps
+found = polcap.read_maps(result.folder)
 print(result.verdict, "gates:", ", ".join(f"{gate['name']} {gate['state']}" for gate in result.report["gates"]))
 print("mean normal:", np.round(found.normal[found.mask].mean(0), 3))
+print("depth, median:", f"{np.nanmedian(found.depth):.3f}", "m" if found.metric else "(relative)")
+print("DoLP, median:", f"{np.median(polcap.read_cues(result.folder)['dolp'][found.mask]):.3f}")
 print("expected error, median:", f"{np.median(found.confidence[found.mask]):.1f}°")

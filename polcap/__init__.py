@@ -5,7 +5,7 @@ The Python form of `polcap process`::
     import polcap
 
     result = polcap.process("CAPTURE")                  # the folder's photographs -> maps, asset, report
-    maps = polcap.read_maps(result.folder / "maps").maps
+    maps = polcap.read_maps(result.folder)              # maps.normal, maps.diffuse, …, maps.depth
 
 Names are imported when they are first used.
 """
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from polcap.config import load as load_config
     from polcap.errors import PolcapError
     from polcap.formats.capture.reader import read as read_capture
-    from polcap.formats.maps.maps_folder import read as read_maps
+    from polcap.formats.maps.result_maps import ResultMaps, read_cues, read_stokes
+    from polcap.formats.maps.result_maps import read as read_maps
     from polcap.images import Asset, Capture, ChartRequest, Cues, Frame, Mesh, Shot, StokesImage, SurfaceMaps, View
 
 __version__ = "0.1.0"
@@ -33,6 +34,7 @@ __all__ = [
     "Mesh",
     "PolcapError",
     "Result",
+    "ResultMaps",
     "Shot",
     "StokesImage",
     "SurfaceMaps",
@@ -40,7 +42,9 @@ __all__ = [
     "load_config",
     "process",
     "read_capture",
+    "read_cues",
     "read_maps",
+    "read_stokes",
 ]
 _HOME = {  # public name → module and its name there; the others are values of `polcap.images`
     "process": ("polcap.api", "process"),
@@ -49,7 +53,10 @@ _HOME = {  # public name → module and its name there; the others are values of
     "load_config": ("polcap.config", "load"),
     "PolcapError": ("polcap.errors", "PolcapError"),
     "read_capture": ("polcap.formats.capture.reader", "read"),
-    "read_maps": ("polcap.formats.maps.maps_folder", "read"),
+    "ResultMaps": ("polcap.formats.maps.result_maps", "ResultMaps"),
+    "read_cues": ("polcap.formats.maps.result_maps", "read_cues"),
+    "read_maps": ("polcap.formats.maps.result_maps", "read"),
+    "read_stokes": ("polcap.formats.maps.result_maps", "read_stokes"),
 }
 
 

@@ -7,9 +7,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap import resource_limits
 from polcap.config import Config
 from polcap.formats.capture import reader as captures
-from polcap.images import ChartRequest
+from polcap.images import ChartRequest, Device
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.cache import Progress, silent
@@ -18,10 +19,13 @@ from polcap.pipeline.path import AUTO, UserInput
 
 @dataclass(frozen=True)
 class Result:
-    """The output of a run."""
+    """Result of `polcap.process`: the result folder, and the content of its report.json."""
 
     folder: Path  # maps/, asset/, report.html
     report: dict[str, Any]  # report.json's content
+
+    def __repr__(self) -> str:
+        return f"Result({str(self.folder)!r}, verdict {self.verdict})"
 
     @property
     def verdict(self) -> str:
@@ -35,10 +39,14 @@ def process(
     *,
     config: Config | None = None,
     angles_deg: tuple[float, ...] | None = None,
+    clockwise: bool = False,
     chart: ChartRequest = AUTO,
     mask: NDArray[np.bool_] | None = None,
     estimator: Literal["network", "analytic"] | None = None,
     model: str | Path | None = None,
+    device: Device = "cpu",
+    threads: int = 0,
+    memory: float = 0.0,
     progress: Progress = silent,
 ) -> Result:
     """Turn the photographs of an object into maps and a 3-D asset. One argument per option of the command.
@@ -53,6 +61,8 @@ def process(
         Settings; by default those of `docs/reference/settings.md`. `polcap.load_config` reads a file.
     angles_deg
         Polarizer angles of the shots in order, degrees; by default from the names of folders or files.
+    clockwise
+        Whether the polarizer was turned clockwise as seen in the picture.
     chart
         Source of the color calibration; by default a ColorChecker in the reference shot.
     mask
@@ -61,6 +71,12 @@ def process(
         "network" or "analytic", which inverts the equations; by default the shipped network.
     model
         ONNX file to use instead of the shipped one.
+    device
+        Where the network runs: "cpu", "cuda" or "auto".
+    threads
+        Threads to use; 0 is all. It applies to this Python process and stays set.
+    memory
+        Most memory to take, GB; 0 is no limit. It applies to this Python process and stays set.
     progress
         Called at the begin and the end of each stage, with its name, seconds (None at the begin) and whether it was
         cached.
@@ -72,9 +88,12 @@ def process(
     """
     folder = Path(capture)
     target = folder / "polcap" if out is None else Path(out)
-    network = models.load_network(estimator, None if model is None else Path(model))
-    supplied = UserInput(chart=chart, mask=mask, network=network, mask_network=models.load_mask_network())
-    found = captures.read(folder, angles_deg)
+    resource_limits.set_threads(threads)
+    resource_limits.set_memory(memory)
+    network = models.load_network(estimator, None if model is None else Path(model), device, threads)
+    mask_network = models.load_mask_network(threads)
+    supplied = UserInput(chart=chart, mask=mask, network=network, mask_network=mask_network)
+    found = captures.read(folder, angles_deg, clockwise)
     about = pipeline.process(found, supplied, config or Config(), target, progress=progress)
     assert about is not None  # only `until` leaves it out
     return Result(target, about)

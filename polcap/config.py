@@ -48,7 +48,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Setting(NamedTuple):
-    """One row of the settings reference."""
+    """One row of the settings reference: key, type, default, limits and meaning."""
 
     key: str
     kind: str

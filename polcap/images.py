@@ -7,7 +7,7 @@ one.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import IntFlag
 from typing import Any, Literal
 
@@ -232,7 +232,7 @@ Decode = Callable[[Frame], SensorImage]  # as `formats.raw.frame_decoder.decode`
 
 @dataclass(frozen=True)
 class Shot:
-    """The bracket taken at one polarizer angle."""
+    """All photographs of one polarizer angle: a bracket of exposures, and ambient frames."""
 
     angle: float  # rad, from image x towards image up
     frames: tuple[Frame, ...]  # (E,), darkest first by their metadata
@@ -242,6 +242,17 @@ class Shot:
     @property
     def name(self) -> str:
         return f"{np.degrees(self.angle):g}°"
+
+
+@dataclass(frozen=True)
+class CatalogEntry:
+    """Facts for the catalog of a collection, as the user states them; an empty text is not stated."""
+
+    title: str = ""  # of the object
+    creator: str = ""  # person or institution that made the photographs
+    rights: str = ""  # copyright notice
+    license: str = ""  # address or name of the license
+    object_number: str = ""  # inventory number of the object
 
 
 @dataclass(frozen=True)
@@ -263,6 +274,7 @@ class Capture:
     )  # ln of least, largest focal length / focal_px
     calibration: Calibration | None = None  # of this camera, lens and filter, if measured
     crossed: Shot | None = None  # under a polarized flash; its angle is that of the lens's polarizer
+    catalog: CatalogEntry = field(default=CatalogEntry(), metadata=NOT_IN_KEY)
 
     @property
     def all_shots(self) -> tuple[Shot, ...]:
@@ -297,7 +309,7 @@ class View:
 
 @dataclass(frozen=True)
 class Distortion:
-    """Lens distortion on one pixel grid; see optics/distortion.py."""
+    """Radial lens distortion (k₁, k₂) on one pixel grid; see optics/distortion.py."""
 
     focal: float  # px of this grid
     center: tuple[float, float]  # (x, y) px of this grid, the principal point
@@ -307,7 +319,7 @@ class Distortion:
 
 @dataclass(frozen=True)
 class MaskedImage:
-    """Radiance with its variance and defects."""
+    """An image with radiance, variance and quality bits of each pixel."""
 
     value: Floats  # (H, W, 3) sensor white at the reference exposure = 1; may be negative
     variance: Floats  # (H, W, 3)
@@ -463,7 +475,7 @@ class Alignment:
 
 @dataclass(frozen=True)
 class ObjectMask:
-    """Pixels of the object on the full-frame grid."""
+    """Mask of the object's pixels on the full-frame grid, the crop around them, and figures on the mask's quality."""
 
     mask: NDArray[np.bool_]  # (H, W) full-frame grid
     crop: tuple[int, int, int, int]  # x0, y0, x1, y1 full-frame grid px, end exclusive
@@ -489,7 +501,7 @@ class Gains:
 
 @dataclass(frozen=True)
 class ShotOrder:
-    """Order and sense of the polarizer's angles."""
+    """Hypothesis on the polarizer's angles: order of the shots and sense of rotation."""
 
     shots: tuple[int, ...]  # (K,) index of the stated angle of each shot
     mirrored: bool = False  # angles count clockwise
@@ -514,7 +526,7 @@ class OutlineCheck:
 
     @property
     def as_stated(self) -> bool:
-        """True if the stated order and sense fit best."""
+        """Whether the stated order and sense of the polarizer angles fit the outline best."""
         return self.best == ShotOrder(tuple(range(len(self.best.shots))))
 
 
@@ -636,7 +648,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Asset:
-    """A mesh with its glTF textures and factors."""
+    """A 3-D asset: mesh with glTF textures and material factors."""
 
     mesh: Mesh
     base_color: NDArray[np.uint8]  # (H, W, 3) sRGB; (2 H, 2 W, 3) with the detail of RAW pixels
@@ -666,3 +678,22 @@ class GBuffer:
     mask: NDArray[np.bool_]  # (H, W)
     position: Floats  # (H, W, 3) in the object's own frame, for solid textures; 0 outside
     view: View
+
+
+def _repr(value: Any) -> str:
+    """Short text of a value: shape and type of each array, and at most 60 characters of each other field."""
+    listed = ", ".join(f"{one.name}={_short(getattr(value, one.name))}" for one in fields(value))
+    return f"{type(value).__name__}({listed})"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray) and value.size > 9:
+        return f"{value.dtype} {value.shape}"
+    if is_dataclass(value):
+        return f"{type(value).__name__}(…)"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}…"
+
+
+for _value in [one for one in vars().values() if isinstance(one, type) and is_dataclass(one)]:
+    _value.__repr__ = _repr  # type: ignore[method-assign]  # arrays are not printed in full

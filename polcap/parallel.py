@@ -35,7 +35,7 @@ def results(functions: Iterable[Callable[[], T]], most: int | None = None) -> li
 
 
 def both(first: Callable[[], A], second: Callable[[], B], most: int | None = None) -> tuple[A, B]:
-    """Results of two calls at once; see `results`."""
+    """Run two functions at the same time on threads and return both results; see `results`."""
     calls: list[Callable[[], Any]] = [first, second]
     one, other = results(calls, most)
     return cast(A, one), cast(B, other)

@@ -2,11 +2,15 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 import polcap
-from polcap.formats.maps import maps_folder as maps
+from polcap.api import Result
+from polcap.formats.maps import result_maps as maps
+from polcap.images import MaskedImage
 from polcap.pipeline import models
 
 
@@ -37,7 +41,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 
 def test_readers_are_those_of_the_house() -> None:
-    assert polcap.read_maps is maps.read
+    assert polcap.read_maps is maps.read and polcap.read_cues is maps.read_cues
 
 
 def test_python_takes_the_network_as_the_command_line_does(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -50,4 +54,15 @@ def test_python_takes_the_network_as_the_command_line_does(monkeypatch: pytest.M
     monkeypatch.setattr(models, "load_network", load)
     with pytest.raises(polcap.PolcapError, match="far enough"):
         polcap.process("nowhere")
-    assert asked == [(None, None)]  # what `polcap process` without flags asks for
+    assert asked == [(None, None, "cpu", 0)]  # what `polcap process` without flags asks for
+
+
+def test_results_and_values_have_a_short_repr(tmp_path: Path) -> None:
+    made = Result(tmp_path / "polcap", {"verdict": "pass", "gates": [{}] * 99})
+    assert repr(made) == f"Result({str(tmp_path / 'polcap')!r}, verdict pass)"
+    mask = np.ones((400, 300), bool)
+    picture = MaskedImage(np.ones((400, 300, 3)), np.ones((400, 300, 3)), mask.astype(np.uint8))
+    assert (
+        repr(picture)
+        == "MaskedImage(value=float64 (400, 300, 3), variance=float64 (400, 300, 3), quality=uint8 (400, 300))"
+    )

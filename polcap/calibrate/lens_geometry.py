@@ -167,7 +167,7 @@ def _gray(image: SensorImage) -> NDArray[np.uint8]:
 
 
 def _green(image: SensorImage) -> Floats:
-    """Linear green (H, W), or the only channel."""
+    """The linear green channel (H, W) of a photograph, or its only channel."""
     value = sensor.signal(image)
     return np.ascontiguousarray(value[..., min(1, value.shape[-1] - 1)], np.float32)
 

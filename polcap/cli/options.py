@@ -1,7 +1,8 @@
 """Options that several commands share, and the values they stand for."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -65,6 +66,18 @@ def numbers(flag: str, text: str) -> tuple[float, ...]:
         raise SettingError(f"{flag} {text}: not numbers separated by commas") from None
     if not all(map(math.isfinite, found)):
         raise SettingError(f"{flag} {text}: every number must be finite")
+    return found
+
+
+def catalog_fields(stated: Sequence[str]) -> dict[str, str]:
+    """--about: fields of `CatalogEntry`; SettingError for another one."""
+    from polcap.images import CatalogEntry
+
+    known = [field.name for field in fields(CatalogEntry)]
+    found = dict(text.partition("=")[::2] for text in stated)
+    for key in found:
+        if key not in known:
+            raise SettingError(f"--about {key}: there is no such fact; there are {', '.join(known)}")
     return found
 
 

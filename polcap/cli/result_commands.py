@@ -20,6 +20,7 @@ def export(
     gltf: Annotated[bool, Option("--gltf", help="asset/NAME.glb")] = False,
     obj: Annotated[bool, Option("--obj", help="asset/NAME.obj, .mtl and textures")] = False,
     usd: Annotated[bool, Option("--usd", help="asset/NAME.usdc and textures (extra [usd])")] = False,
+    usdz: Annotated[bool, Option("--usdz", help="asset/NAME.usdz, one file for phones (extra [usd])")] = False,
     materialx: Annotated[bool, Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
     exr: Annotated[bool, Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
     preset: Annotated[
@@ -39,6 +40,16 @@ def export(
         int | None,
         Option(min=16, max=16384, help="Longer side of the textures, px; by default each keeps its own size."),
     ] = None,
+    page: Annotated[
+        Path | None,
+        Option(metavar="JS", help="Web page that shows the GLB with this model-viewer.min.js, without a network."),
+    ] = None,
+    about: Annotated[
+        list[str] | None,
+        Option(
+            metavar="K=V", help="A fact for catalogs: title, creator, rights, license or object_number; repeatable."
+        ),
+    ] = None,
     lod: Annotated[int, Option(min=0, max=6, help="Further GLBs, each with a quarter of the triangles.")] = 0,
     json: Json = False,
 ) -> None:
@@ -47,7 +58,7 @@ def export(
     from polcap.pipeline import run as pipeline
     from polcap.pipeline.asset_export import ExportRequest
 
-    flags = {"gltf": gltf, "obj": obj, "usd": usd, "materialx": materialx, "exr": exr}
+    flags = {"gltf": gltf, "obj": obj, "usd": usd, "usdz": usdz, "materialx": materialx, "exr": exr}
     formats = tuple(name for name in presets.FORMATS if flags[name])
     if preset and formats:
         raise SettingError(f"--preset {preset[0]} brings its formats; leave out --{formats[0]}")
@@ -58,6 +69,8 @@ def export(
         triangles=triangles,
         color=color,
         texture_size=texture_size,
+        page=page,
+        catalog=options.catalog_fields(about or []),
         lod=lod,
     )
     wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]

@@ -31,11 +31,12 @@ def train(
     seed: Annotated[int, Option(min=0, help="Of views, batches and first weights.")] = 1,
 ) -> None:
     """Train the network (extra [train])."""
+    terminal.print_progress("loading PyTorch, meshes and materials")
     trainer = options.training("train")
     stated = {"preset": preset, "data": data, "out": out, "minutes": minutes, "samples": samples, "variant": variant}
     stated |= {"resume": resume, "start": start, "done": done, "rate": rate, "views": views}
     stated |= {"procedural": procedural, "threads": threads, "seed": seed}
-    terminal.print_data(str(trainer.main(trainer.TrainingOptions(**stated))))
+    terminal.print_data(str(trainer.main(trainer.TrainingOptions(**stated), terminal.print_progress)))
 
 
 def evaluate(

@@ -27,7 +27,7 @@ _EDGE_PX = 64  # of the RAW that is written and decoded as a trial
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """One thing that `polcap doctor` checked, and the remedy if it is not ok."""
+    """Result of one check of `polcap doctor`: state, message and remedy."""
 
     name: str
     state: Literal["ok", "warning", "fault"]

@@ -43,12 +43,15 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
 
 
 def read_toml(path: str | Path, finite: bool = True) -> dict[str, Any]:
-    """A TOML document; unless `finite`, its numbers may be NaN. Raises OSError or ValueError."""
+    """Read a TOML file from an untrusted source as plain data. Unless `finite`, its numbers may be NaN.
+
+    Raises OSError or ValueError.
+    """
     return parse_toml(read_bytes(path, TEXT_BYTES).decode("utf-8-sig"), finite)
 
 
 def read_json(path: str | Path) -> Any:
-    """A JSON document. Raises OSError or ValueError."""
+    """Read a JSON file from an untrusted source as plain data. Raises OSError or ValueError."""
     return parse_json(read_bytes(path, TEXT_BYTES).decode("utf-8-sig"))
 
 

@@ -157,7 +157,9 @@ def trimmed_residuals(
 def _fit_weighted(
     color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], rounds: int
 ) -> tuple[Floats, Floats, Floats]:
-    """Fit color matrices.
+    """Fit color matrices by least squares with Huber weights, from the `usable` patches (…, N).
+
+    Returns M (…, 3, 3), e (…, 2) and b (…,).
 
     M (…, 3, 3), e (…, 2) and b (…,) by least squares with Huber weights, from `usable` patches (…, N).
     """

@@ -5,7 +5,7 @@ same bytes, with any number of threads.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from polcap import parallel
 from polcap.config import Config
 from polcap.errors import SettingError
 from polcap.formats import atomic
-from polcap.formats.export import exr_layers, glb_geometry, gltf, materialx, obj, provenance, texture_set, usd
+from polcap.formats.export import exr_layers, glb_geometry, gltf, materialx, obj, provenance, texture_set, usd, web_page
 from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.presets import PRESETS, ExportPreset, Format
@@ -38,6 +38,8 @@ class ExportRequest:
     triangles: int | None = None  # at most; by default the preset's, or those of the full mesh
     color: str = exr_layers.LINEAR_REC709  # color space or role of the colors in the layered EXR
     texture_size: int | None = None  # px of the longer side; by default each texture's own
+    page: Path | None = None  # file with model-viewer's script, for a web page that shows the GLB
+    catalog: Mapping[str, str] = field(default_factory=dict)  # fields of `CatalogEntry` in place of the capture's
     lod: int = 0  # number of further GLBs, each with a quarter of the triangles of the previous one
 
 
@@ -62,9 +64,15 @@ class DetailLevel:
 def check(wanted: ExportRequest) -> None:
     """Raise a SettingError for an unknown preset or a missing package, before anything is computed."""
     preset = effective(wanted)
-    if "usd" in preset.formats:
+    if not {"usd", "usdz"}.isdisjoint(preset.formats):
         usd.require()
     glb_geometry.require(preset.geometry)
+    if wanted.page is not None:
+        web_page.read_script(wanted.page)
+        if "gltf" not in preset.formats or preset.geometry == "draco":
+            raise SettingError(
+                "--page shows a GLB without Draco, whose decoder is not in the page; choose --preset web"
+            )
 
 
 def read(folder: Path, config: Config) -> ExportSource:
@@ -83,7 +91,7 @@ def read(folder: Path, config: Config) -> ExportSource:
 
 
 def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
-    """The asset with at most the triangles and the texture size of an export, then its levels of detail.
+    """Build an export's levels of detail: first the asset with at most the requested triangles and texture size.
 
     Raises
     ------
@@ -129,7 +137,11 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
         loose |= {file: texture_set.LOOSE[key](whole) for key, file in shared.items()}
     folder = out / "asset" / (wanted.preset or "")
     options = gltf.GlbOptions(preset.images, preset.geometry, gltf.center(mesh.vertices))
-    unit, record, encoder = "m" if mesh.metric else "relative", provenance.record(about), TextureEncoder()
+    unit, record, encoder = (
+        "m" if mesh.metric else "relative",
+        provenance.record(about, wanted.catalog),
+        TextureEncoder(),
+    )
     words = {"unit": unit, "normals": "+Y (OpenGL)", **provenance.words(record)}
     comment = f"polcap; unit of length: {unit}; normals +Y (OpenGL); made from: {stem}.provenance.json"
     layered = folder / f"{stem}_layers.exr"
@@ -137,6 +149,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
         "gltf": partial(_write_glb, folder / f"{stem}.glb", whole, options, words, encoder),
         "obj": partial(obj.write, folder / f"{stem}.obj", whole, stem, shared, comment),
         "usd": partial(_one, usd.write, folder / f"{stem}.usdc", whole, stem, shared, words),
+        "usdz": partial(_write_usdz, folder / f"{stem}.usdz", whole, words, encoder),
         "materialx": partial(_one, materialx.write, folder / f"{stem}.mtlx", whole, stem, shared, comment),
         "exr": partial(_one, exr_layers.write, layered, out / "maps", wanted.color, words),
     }
@@ -145,6 +158,10 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     tasks += [partial(_write_glb, file, level.asset, options, words, encoder) for file, level in coarser.items()]
     tasks += [partial(_write_texture, folder / file, texture, encoder) for file, texture in loose.items()]
     written = [file for files in parallel.results(tasks) for file in files]  # pictures are encoded on threads
+    if wanted.page is not None:
+        page, glb = folder / f"{stem}.html", folder / f"{stem}.glb"
+        web_page.write(page, glb, web_page.read_script(wanted.page), words.get("title", stem))
+        written.append(page)
     sidecar = folder / f"{stem}.provenance.json"
     provenance.write(sidecar, record, {file.name: provenance.digest(file) for file in written})
     embedded = gltf.textures(whole) if "gltf" in preset.formats else {}
@@ -164,7 +181,10 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
 
 
 def effective(wanted: ExportRequest) -> ExportPreset:
-    """The preset of a request, or its formats, with the request's own options in place of the preset's."""
+    """The preset that an export uses.
+
+    That of the request, with the request's other options in place of the preset's.
+    """
     if wanted.preset is None:
         preset = ExportPreset(wanted.formats, "normals +Y")
     elif wanted.preset in PRESETS:
@@ -189,6 +209,12 @@ def _write_glb(
     file: Path, content: Asset, options: gltf.GlbOptions, words: Mapping[str, str], encoder: TextureEncoder
 ) -> list[Path]:
     gltf.write(file, content, file.stem, options, words, encoder)
+    return [file]
+
+
+def _write_usdz(file: Path, content: Asset, words: Mapping[str, str], encoder: TextureEncoder) -> list[Path]:
+    textures = {key: encoder(make(content), "png") for key, make in texture_set.LOOSE.items()}
+    usd.package(file, content, file.stem, textures, words)
     return [file]
 
 

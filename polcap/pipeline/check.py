@@ -49,7 +49,7 @@ def inspect(
     chart: ChartRequest = AUTO,
     networks: Callable[[], tuple[Network | None, Network | None]] = shipped_networks,
 ) -> Verdict:
-    """Judge a capture by the gates of `process`.
+    """Judge a capture for `polcap check`, by the same gates as `process`.
 
     `networks` opens those of estimator and mask while frames are decoded. Without the first, the errors of the
     analytic estimator are expected; without the second, the object is found by its contrast to the backdrop.
@@ -109,7 +109,9 @@ def _judged(capture: Capture, small: SmallCapture, supplied: UserInput, config: 
 
 
 def _run_path(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config, cache: MemoryCache) -> str:
-    """Run the path into the cache; without a chart if `process` would find none, and then the reason, otherwise "".
+    """Run the path on the reduced capture into the cache.
+
+    Without a chart if `process` would find none: returns the reason, otherwise "".
 
     A chart that is not found in the small pictures is searched at full size, as `process` does.
     """
@@ -129,7 +131,7 @@ def _run_path(capture: Capture, small: SmallCapture, supplied: UserInput, config
 
 
 def _colors_at_full_size(capture: Capture, config: Config) -> ColorCalibration:
-    """The color calibration that `process` makes from the reference shot. Raises ChartError."""
+    """The color calibration of the reference shot at full size, as `process` makes it. Raises ChartError."""
     alone = MemoryCache(until="whitebalance")
     return path(replace(capture, shots=capture.shots[:1], crossed=None), UserInput(), config, alone).color
 

@@ -31,7 +31,7 @@ def check(out: Path, photographs: Path) -> None:
     inside = here.relative_to(there).parts if here.is_relative_to(there) else ("elsewhere",)
     if not inside:
         raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")
-    if any(layouts.is_angle_folder(name) for name in inside):
+    if any(layouts.is_angle_folder(name) for name in inside) or inside[0] in layouts.angle_folder_names(there):
         raise SettingError(f"--out {out} lies among the capture's shots; choose {photographs / own_folders.OUTPUT}")
 
 

@@ -108,7 +108,9 @@ def _joined(meta: dict[str, Any], arrays: Arrays) -> ReducedFrame:
 
 
 def reduce_first(image: SensorImage, clip: float, most_pixels: float) -> tuple[dict[str, Any], Arrays]:
-    """In the child process.
+    """Reduce the reference frame as `reduce_frame` does, and choose the reduction for the whole capture.
+
+    Runs in the child process.
 
     Reduce the reference frame as `reduce_frame`, and choose the reduction of the whole capture.
 
@@ -125,7 +127,9 @@ def reduce_first(image: SensorImage, clip: float, most_pixels: float) -> tuple[d
 def reduce_frame(
     image: SensorImage, clip: float, times: int, corners: list[list[int]]
 ) -> tuple[dict[str, Any], Arrays]:
-    """In the child process: reduce a frame to means over blocks of `times` merged pixels a side.
+    """Reduce a frame to means over blocks of `times` merged pixels a side.
+
+    Runs in the child process. Tiles at `corners` (T, 2) px are returned at full size.
 
     Tiles at `corners` (T, 2) px are returned at full size.
     """

@@ -17,7 +17,7 @@ from polcap.stages.whitebalance import chart_in_mask
 
 _LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ
 _DEGREES_PER_PUSH, _DEGREES_PER_TURN = 200.0, 350.0  # error of the normals per movement by the object's radius
-_STILL_PX = 0.1  # displacement of inner detail that polarization alone feigns
+_STILL_PX = 0.2  # displacement of inner detail that polarization alone feigns, in three of four captures
 _INWARD = 0.2  # sine of the zenith from which a normal leans inward
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
 
@@ -56,7 +56,10 @@ def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate
 
 
 def _object_moved(found: Evidence, limits: GateLimits) -> Gate:
-    """Movement of the object against its surroundings, and its cost, which grows with the share of its size."""
+    """Gate on movement of the object relative to its surroundings.
+
+    The cost grows with the share of the object's size.
+    """
     motion, names = _motion(found), found.names
     pushed, inside = (np.nan_to_num(one, posinf=np.inf) * found.grid_px for one in (motion.pushed, motion.inside))
     radius = max(outline.disc_radius(found.object_.mask) * found.grid_px, 1.0)
@@ -75,6 +78,7 @@ def _object_moved(found: Evidence, limits: GateLimits) -> Gate:
         return Gate("alignment", "fail", figure, limit, message, remedy, max(cost, 5.0), bad, "px")
     if pushed[k] > least:
         return Gate("alignment", "warn", figure, least, message, remedy, cost, blamed(names, pushed > least), "px")
+    least *= 2  # polarization feigns a displacement of inner detail
     turned = inside - _STILL_PX > least
     if turned.any():
         k = int(np.argmax(inside))
@@ -177,7 +181,7 @@ def sharpness(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def focus(found: Evidence, limits: GateLimits) -> Gate:
-    """Blur of the sharpest edges on the object and its outline, in px of the merged picture."""
+    """Gate on focus: blur of the sharpest edges on the object and its outline, in px of the merged picture."""
     blur, limit = _edge_blur(found), limits.max_edge_blur_px
     message = f"The sharpest edges of the object are blurred by {blur:.1f} px (1σ)"
     if blur > limit:
@@ -187,7 +191,7 @@ def focus(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def _edge_blur(found: Evidence) -> float:
-    """1σ of the blur of the sharpest edges [px]: a step of height h, blurred by σ, has the slope h/(σ√2π).
+    """Blur (1σ) of the object's sharpest edges [px]: a step of height h, blurred by σ, has the slope h/(σ√2π).
 
     Edges are the tenth of the object with most contrast within 7 px; the sharpest are the twentieth of these.
     """

@@ -35,30 +35,25 @@ def bracket(found: Evidence) -> Gate:
     radiance = found.radiance
     ratio = np.sort(radiance.bracket.exposure_ratio.mean((0, 2)))  # (E,)
     if len(ratio) == 1:
-        message = "One exposure per shot"
         remedy = "Shoot a bracket: it holds highlights and shadows at once"
-        return Gate("exposures", "warn", 1.0, None, message, remedy, unit="×")
-    steps = ratio[1:] / ratio[:-1]
+        return Gate("exposures", "warn", 1.0, None, "One exposure per shot", remedy, unit="×")
+    steps, promised, (least, most) = ratio[1:] / ratio[:-1], _promised_steps(radiance), _EVEN_STEPS
+    smallest, largest = float(steps.min()), float(steps.max())
     message = f"{len(ratio)} exposures per shot, {ratio[0]:.3g} to {ratio[-1]:.3g} times the reference"
-    least, most = _EVEN_STEPS
-    promised = _promised_steps(radiance)
-    if steps.min() < _ALIKE and promised > _PROMISED:
+    if smallest < _ALIKE and promised > _PROMISED:
         message = f"The frames of a bracket are equal, but the camera states steps of {promised:.2g} times"
         remedy = "Bracket by flash power, aperture or ISO: shutter time does not change a flash exposure"
         if radiance.equipment.light == "steady":
-            remedy = (
-                "Was a flash on? Shutter time does not change its exposure: bracket by flash power, aperture or ISO"
-            )
-        return Gate("exposures", "warn", round(float(steps.min()), 3), least, message, remedy, unit="×")
-    if steps.min() < least:
+            remedy = f"Was a flash on? {remedy}"
+    elif smallest < least:
         message += "; two of them are nearly equal"
         remedy = "Change flash power, aperture or ISO; under a steady lamp, the shutter time"
-        return Gate("exposures", "warn", round(float(steps.min()), 3), least, message, remedy, unit="×")
-    if steps.max() > most:
+    elif largest > most:
         message += "; the step between two of them is too large"
-        remedy = "Shoot an exposure in between"
-        return Gate("exposures", "warn", round(float(steps.max()), 3), most, message, remedy, unit="×")
-    return Gate("exposures", "pass", round(float(steps.max()), 3), most, message, unit="×")
+        return Gate("exposures", "warn", round(largest, 3), most, message, "Shoot an exposure in between", unit="×")
+    else:
+        return Gate("exposures", "pass", round(largest, 3), most, message, unit="×")
+    return Gate("exposures", "warn", round(smallest, 3), least, message, remedy, unit="×")
 
 
 def tone(found: Evidence, limits: GateLimits) -> Gate:
@@ -70,12 +65,10 @@ def tone(found: Evidence, limits: GateLimits) -> Gate:
     worst, reason = within, "The ratio of two exposures changes from shadows to highlights"
     power = _power(radiance)
     if radiance.equipment.light == "steady" and abs(power - 1) > worst:
-        worst, reason = (
-            abs(power - 1),
-            f"Exposures follow the stated ones to the power {power:.2f}, not 1",
-        )
-    slope = found.selfcal.gains.grey_slope if found.color.place is not None else float("nan")
-    if np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens greys too
+        worst, reason = abs(power - 1), f"Exposures follow the stated ones to the power {power:.2f}, not 1"
+    slope, chart_light = found.selfcal.gains.grey_slope, found.color.light
+    evenly = found.color.place is not None and (chart_light is None or chart_light.uneven < limits.max_scale_doubt / 2)
+    if evenly and np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens greys too
         worst, reason = (
             abs(slope - 1) / 2,
             f"The chart's greys follow their reflectance to the power {slope:.2f}, not 1",
@@ -109,7 +102,7 @@ def _noise(image: StokesImage) -> float:
 
 
 def stillness(found: Evidence, limits: GateLimits) -> Gate:
-    """Share of the object that differs between the exposures of a shot."""
+    """Gate on motion within a bracket: share of the object that differs between the exposures of a shot."""
     ghost = (found.radiance.quality & int(Quality.GHOST)) > 0
     fraction = ghost[:, found.object_.mask].mean(1) if found.object_.mask.any() else np.zeros(len(ghost))
     k = int(np.argmax(fraction))
@@ -151,7 +144,10 @@ def chart(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def albedo_scale(found: Evidence, limits: GateLimits) -> Gate:
-    """Whether the scale of all albedos is known, and its uncertainty; without a chart albedos are relative."""
+    """Gate on the scale of all albedos: whether it is known, and its uncertainty.
+
+    Without a chart albedos are relative.
+    """
     sigma, limit, source = found.maps.albedo_sigma, limits.max_scale_doubt, found.color.source
     remedy = "Put a ColorChecker next to the middle of the object, facing the lens, where only the flash lights it"
     if sigma is None:
@@ -217,37 +213,31 @@ def _compared(change: float) -> str:
 
 def _gain_doubt(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on the uncertainty of the shots' gains."""
-    measured = found.selfcal.gains
-    limit = limits.max_gain_doubt
+    measured, limit = found.selfcal.gains, limits.max_gain_doubt
     if measured.source == "one exposure":
         return Gate("gain doubt", "pass", 0.0, limit, "All angles come from one exposure")
     doubt = float(measured.sigma.mean(1).max())
-    if measured.source == "grey patches":
-        gloss = _GLOSS_PART * measured.chart_gloss
-        if gloss > limit:
-            message = f"The chart is glossy: its gloss changes the gains by up to {100 * gloss:.1f} %"
-            remedy = "Turn the chart until it mirrors neither flash nor window, or use a matte one"
-            cost = DEGREES_PER_GAIN * gloss
-            return at_most("gain doubt", gloss, limit, message, remedy, cost_deg=cost, beyond=_grade(cost))
-        if doubt > limit:
-            message = f"The chart's grey patches give the light of each shot only within {100 * doubt:.1f} % (1σ)"
-            remedy = "Show the whole grey row of the chart, evenly lit, or use --no-chart"
-            cost = DEGREES_PER_GAIN * doubt
-            return at_most("gain doubt", doubt, limit, message, remedy, cost_deg=cost, beyond=_grade(cost))
+    if measured.source == "grey patches" and max(doubt, gloss := _GLOSS_PART * measured.chart_gloss) <= limit:
         gap, limit = measured.disagreement, limits.max_gain_disagreement
         message = f"Grey patches and object agree on the light of each shot (1σ {100 * doubt:.2f} %)"
         if gap > limit:
             message = f"Grey patches and object disagree by {100 * gap:.1f} % on a shot's light, beyond their errors"
         remedy = "Turn the chart to the camera, and light it as the object"
         return at_most("gain doubt", gap, limit, message, remedy, cost_deg=DEGREES_PER_GAIN * gap)
+    if measured.source == "grey patches" and gloss > limit:
+        doubt, message = gloss, f"The chart is glossy: its gloss changes the gains by up to {100 * gloss:.1f} %"
+        remedy = "Turn the chart until it mirrors neither flash nor window, or use a matte one"
+    elif measured.source == "grey patches":
+        message = f"The chart's grey patches give the light of each shot only within {100 * doubt:.1f} % (1σ)"
+        remedy = "Show the whole grey row of the chart, evenly lit, or use --no-chart"
+    else:
+        message = f"Without grey patches the light of each shot is known within {100 * doubt:.1f} % (1σ)"
+        if measured.source == "none":
+            message = f"The light of each shot is unknown; it is assumed equal within {100 * doubt:.1f} % (1σ)"
+        remedy = "Put a ColorChecker next to the object"
+        remedy += "" if found.radiance.equipment.light == "steady" else ", or use a steady lamp"
+        remedy += "" if len(found.names) > 3 else ", or shoot four angles"
     cost = DEGREES_PER_GAIN * doubt
-    message = f"Without grey patches the light of each shot is known within {100 * doubt:.1f} % (1σ)"
-    if measured.source == "none":
-        message = f"The light of each shot could not be measured; it is assumed equal within {100 * doubt:.1f} % (1σ)"
-    ways = ["put a ColorChecker next to the object"]
-    ways += [] if found.radiance.equipment.light == "steady" else ["use a steady lamp"]
-    ways += [] if len(found.names) > 3 else ["shoot four angles"]
-    remedy = " or ".join(ways).capitalize().replace("colorchecker", "ColorChecker")
     return at_most("gain doubt", doubt, limit, message, remedy, cost_deg=cost, beyond=_grade(cost))
 
 
@@ -310,7 +300,7 @@ def ambient(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def lighting(found: Evidence, limits: GateLimits) -> Gate:
-    """Common polarization of the object's brightest parts, relative to their albedo.
+    """Gate on light from two sides: common polarization of the object's brightest parts, relative to albedo.
 
     Under a flash at the lens these face the camera, so their polarization points all ways. Two flashes or softboxes at
     the sides put highlights where reflection polarizes, both in the same direction.
@@ -335,7 +325,10 @@ def _highlight_dolp(found: Evidence) -> float:
 
 
 def room(found: Evidence, limits: GateLimits) -> Gate:
-    """Polarization of the surroundings, which the flash leaves unpolarized and a window or a glossy lamp does not."""
+    """Gate on room light: polarization of the surroundings.
+
+    A flash leaves them unpolarized, a window or a glossy lamp does not.
+    """
     share, limit = _surroundings_dolp(found), limits.max_room_dolp
     message = f"The surroundings are polarized by {100 * share:.1f} %"
     if share > limit:

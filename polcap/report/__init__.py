@@ -6,6 +6,7 @@ assumption. A gate that had nothing to measure is marked "not measured".
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,6 +38,7 @@ class _CaptureFacts(msgspec.Struct, frozen=True):
     name: str
     camera: str
     shots: list[_ShotFacts]
+    catalog: dict[str, str] = {}
 
 
 class _ReportFile(msgspec.Struct, frozen=True):
@@ -73,6 +75,7 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
         "focal_doubt": list(capture.focal_doubt),
         "shots": shots,
         "notes": list(capture.notes),
+        "catalog": {key: text for key, text in asdict(capture.catalog).items() if text},
     }
 
 

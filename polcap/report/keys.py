@@ -52,7 +52,7 @@ class ColorKey:
         return np.concatenate([np.zeros((1, 3), np.uint8), colors(self.palette)])[self.level(value, inside)]
 
     def bar(self, width: int, height: int) -> NDArray[np.uint8]:
-        """Color bar from low to high, (height, width, 3)."""
+        """Picture of the color bar from low to high, (height, width, 3)."""
         steps = np.rint(np.linspace(0, LEVELS - 1, width)).astype(int)
         return np.broadcast_to(colors(self.palette)[steps], (height, width, 3)).copy()
 

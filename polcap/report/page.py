@@ -30,7 +30,7 @@ _ORDER = ("fail", "warn", "pass", "not measured")  # of the checks in their tabl
 
 
 def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
-    """Write report.html into a result folder.
+    """Write report.html, the page of a result for people, into a result folder.
 
     Raises
     ------

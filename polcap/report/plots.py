@@ -17,7 +17,7 @@ _BLUE = _CHANNELS["blue"]
 
 @dataclass(frozen=True)
 class Mark:
-    """A value on the axis of a `RowPlot`."""
+    """One mark (dot, ring, cross or bar) at a value on the axis of a `RowPlot`."""
 
     place: float  # 0…1 along the axis
     title: str  # shown under the pointer, or next to a bar

@@ -25,7 +25,7 @@ _SIGNATURES = (
 
 @dataclass(frozen=True)
 class CameraFile:
-    """One photograph as the camera wrote it."""
+    """One photograph as received from the camera: bytes, file name, exposure."""
 
     data: bytes
     name: str  # the camera's own

@@ -74,7 +74,7 @@ class WatchFolderCamera:
         )
 
     def close(self) -> None:
-        """There is nothing to disconnect."""
+        """Nothing to disconnect from."""
 
     def _files(self) -> list[Path]:
         try:

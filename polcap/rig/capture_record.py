@@ -26,7 +26,7 @@ _SAME_DEG = 0.1  # the frames of a bracket are at one angle up to this
 
 
 class AcceptedFrame(msgspec.Struct, frozen=True):
-    """A frame of the capture."""
+    """An accepted photograph of a capture, as recorded in rig.json."""
 
     file: str
     role: Role
@@ -40,7 +40,7 @@ class AcceptedFrame(msgspec.Struct, frozen=True):
 
 
 class RejectedFrame(msgspec.Struct, frozen=True):
-    """A frame in the folder `rejected`."""
+    """A photograph that was rejected and moved to the folder `rejected`, as recorded in rig.json."""
 
     file: str
     slot: str
@@ -49,7 +49,7 @@ class RejectedFrame(msgspec.Struct, frozen=True):
 
 
 class RigFile(msgspec.Struct):
-    """Content of rig.json."""
+    """Content of rig.json: options of the capture, devices, accepted and rejected photographs."""
 
     order: CaptureOrder
     rotator: str = ""  # model
@@ -68,7 +68,7 @@ class CaptureRecord:
         self._lock = threading.RLock()
 
     def missing(self, pending: Iterable[Slot] = ()) -> list[Slot]:
-        """Slots that have no accepted frame and no frame under check."""
+        """Frames of the plan that have no accepted photograph and none under check."""
         return [slot for slot in self.slots if slot.name not in self.content.frames and slot not in pending]
 
     def accepted(self) -> dict[str, AcceptedFrame]:

@@ -27,7 +27,7 @@ class Motor(Protocol):
         """Turn the motor to an angle; returns when it has stopped."""
 
     def position(self) -> float:
-        """The angle that the device reports."""
+        """The angle [degrees] that the motor reports."""
 
     def halt(self) -> None:
         """Stop the motor and switch its current off."""

@@ -21,6 +21,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, ParamSpec, TypeVar
 
+import polcap.optics  # noqa: F401  refuses another OpenCV before a stage imports it
+
 P = ParamSpec("P")
 T = TypeVar("T")
 

@@ -53,7 +53,7 @@ def smooth(vertices: Floats, faces: NDArray[np.integer], crease: float = 0.75) -
 
 
 def union(parts: Sequence[Triangles]) -> Triangles:
-    """Several meshes joined into one."""
+    """Join several meshes into one."""
     offset = np.cumsum([0] + [len(p.vertices) for p in parts[:-1]])
     return Triangles(
         np.concatenate([p.vertices for p in parts]),

@@ -234,7 +234,7 @@ def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats, flash_axis
 
 
 def _reference_px(shoot: Shoot, back: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Undistorted pixels of the reference shot that see the same points as pixels x, y of a moved shot."""
+    """Undistorted pixels of the reference shot that show the same points as pixels x, y of a moved shot."""
     return projection.coordinates(back, *forward_camera.undistort(shoot.view, shoot.distortion, x, y))
 
 

@@ -10,6 +10,7 @@ Training of the main network, in the order in which a picture passes:
     simulator         all of these -> a batch: network channels and truth
     main_network      channels -> maps; its parts `gloss_profiles` and `recurring_colors`, its ablations `variants`
     loss              estimated maps against truth
+    progress          lines of text while tracing and training
     loop              optimizers (`muon`), learning rate, averaged weights, checkpoints
     train             the main network in that loop
     validation        errors on held-out pictures during training
@@ -23,5 +24,6 @@ Evaluation: `evaluate` measures the error of every map (`map_errors`) on fixed p
 `evaluation_materials` in `light_transport`) against `evaluation_baselines`; `evaluation_page` shows the result.
 `evaluation_photographs` measures normals on photographs that come with measured ones.
 
+`import_data` converts meshes and textures of other people.
 `dataset_files` writes the simulated pictures and their truth as files.
 """

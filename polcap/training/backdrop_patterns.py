@@ -71,12 +71,12 @@ def _waves(u: Floats, w: Floats, rng: np.random.Generator, octaves: int = 3) -> 
 
 
 def _blotches(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
-    """Pattern levels (M,) of camouflage, stains or clouds."""
+    """Pattern levels (M,) of a backdrop with camouflage, stains or clouds."""
     return 0.5 + 0.3 * _waves(u, w, rng, int(rng.integers(1, 5)))
 
 
 def _bands(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
-    """Pattern levels (M,) of wood, marble or folds."""
+    """Pattern levels (M,) of a backdrop like wood, marble or folds."""
     return 0.5 + 0.5 * np.sin(6.28 * u + rng.uniform(0, 3) * _waves(u, w, rng))
 
 
@@ -87,7 +87,7 @@ def _woven(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _cells(u: Floats, w: Floats, rng: np.random.Generator) -> Floats:
-    """Pattern levels (M,) of Voronoi cells, in a tile of two periods: stones, leaves or patchwork."""
+    """Pattern levels (M,) of a backdrop of Voronoi cells: stones, leaves or patchwork. A tile has two periods."""
     seeds, tile = rng.uniform(0, 2, (14, 2)), rng.random(14)
     at = np.stack([u, w], axis=1) % 2
     away = np.abs(at[:, None] - seeds[None])

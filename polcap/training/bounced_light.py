@@ -43,7 +43,9 @@ Indices = NDArray[np.integer[Any]]
 def trace_visibility(
     tracer: Tracer, buffer: GBuffer, pose: light_transport.Pose, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint16]]:
-    """Pixels (H, W) that the flash reaches, and the flat indices (H/2, W/2, RAYS) of the pixels that rays meet.
+    """Trace one view.
+
+    Pixels (H, W) that the flash reaches, and flat indices (H/2, W/2, RAYS) of pixels that rays hit.
 
     An index is ESCAPED or NOWHERE for rays that meet no pixel.
     """

@@ -31,7 +31,7 @@ Field = Callable[[Floats], tuple[Floats, Floats]]  # (M, 3) -> tone 0…1, depth
 
 @dataclass(frozen=True)
 class MaterialSample:
-    """Appearance of a test material at M positions."""
+    """Diffuse albedo, F0 and roughness of a test material at M positions."""
 
     diffuse: Floats  # (M, 3)
     specular: Floats  # (M, 3) F0

@@ -39,7 +39,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Surface at the M visible pixels of a picture."""
+    """Positions, normals and material of a mesh at the M visible pixels of a picture."""
 
     mask: NDArray[np.bool_]  # (H, W)
     position: Floats  # (M, 3) mesh frame

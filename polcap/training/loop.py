@@ -22,12 +22,14 @@ from polcap.errors import InputError
 from polcap.formats import atomic
 from polcap.training import onnx_export
 from polcap.training.muon import Muon
+from polcap.training.progress import Report, silent
 
 _OUTER_LAYERS = ("stem", "raw", "out", "hint.0")  # next to the pixels: AdamW trains them, Muon all others
 _OUTER_RATE = 0.5  # AdamW's rate relative to Muon's
 _MAX_GRADIENT_NORM = 1.0  # longer gradients are scaled down to it
 _METRICS_STEPS = 50  # from one row of metrics.csv to the next
 _VALIDATION_S, _CHECKPOINT_S = 240, 60  # s between two validations, two checkpoints
+_REPORT_S = 10  # s of training between two lines of progress
 
 
 @dataclass(frozen=True)
@@ -142,9 +144,13 @@ class PictureTraining(Trainee):
         onnx_export.export_network(self.average, path, (self.output,), metadata)
 
 
-def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path) -> None:
-    """Train a network until the budget is spent. Writes last.pt, metrics.csv and watch.csv to `out`."""
+def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path, report: Report = silent) -> None:
+    """Train a network until the budget is spent. Writes last.pt, metrics.csv and watch.csv to `out`.
+
+    `report` is called with a line of text after the first step and every ten seconds.
+    """
     saved = validated = trainee.elapsed
+    reported = -math.inf
     before, losses = time.monotonic(), []
     progress = budget.spent(trainee.samples, trainee.elapsed)
     while progress < 1:
@@ -152,6 +158,11 @@ def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path) ->
         now = time.monotonic()
         trainee.elapsed, before = trainee.elapsed + now - before, now
         progress = budget.spent(trainee.samples, trainee.elapsed)
+        if trainee.elapsed - reported > _REPORT_S or progress >= 1:
+            reported = trainee.elapsed
+            left = trainee.elapsed * (1 / progress - 1) / 60
+            done = f"{100 * min(progress, 1):.0f} %, step {trainee.step}, {trainee.samples} pictures"
+            report(f"{done}, loss {losses[-1].get('loss', math.nan):.3g}, {max(left, 0):.0f} min left")
         if trainee.step % _METRICS_STEPS == 0 or trainee.step == 10 or progress >= 1:
             _append(out / "metrics.csv", trainee, {k: float(np.mean([part[k] for part in losses])) for k in losses[0]})
             losses = []

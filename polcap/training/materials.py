@@ -28,7 +28,7 @@ _TEXELS = 256  # side of a texture
 
 @dataclass(frozen=True)
 class Surface:
-    """Surface at M pixels; camera frame."""
+    """Normals and material of an object's surface at M pixels; camera frame."""
 
     normal: Tensor  # (M, 3) with bumps
     diffuse: Tensor  # (M, 3)

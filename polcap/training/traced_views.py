@@ -6,20 +6,23 @@ Views are square, fp16, one array per quantity, readable as memory maps. All fol
 """
 
 import json
+import shutil
+import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.errors import InputError
-from polcap.formats import atomic, scene_files
+from polcap.errors import InputError, StorageError
+from polcap.formats import atomic, scene_files, text_file
 from polcap.images import Floats, GBuffer, View
 from polcap.synth.mesh_tracer import Tracer, Triangles, scatter, smooth
 from polcap.training import bounced_light, light_transport, random_shapes
+from polcap.training.progress import Report, silent
 
 ARRAYS = {  # step in pixels, channels, type
     "normal": (1, 3, np.float16), "depth": (1, 1, np.float16), "position": (1, 3, np.float16),
@@ -33,6 +36,8 @@ WITHHELD = frozenset((  # meshes that training must not use: new objects for eva
     "gz_trash_can", "poly_sugar_cup", "statue_maria", "ycb_dice", "ycb_fork", "ycb_nine_hole_peg_test", "ycb_orange",
     "ycb_tomato_soup_can",
 ))  # fmt: skip
+_PROGRESS = "tracing.json"  # of an interrupted cache
+_REPORT_S, _SAVE_S = 10.0, 30.0  # between two lines of progress, between two records of it
 _TRIES = 200  # random sides before a mesh is rejected
 _MAX_OFFSET = 0.1  # of the distance, between lens and a random flash
 
@@ -49,12 +54,16 @@ class ViewsRecipe:
     flash: tuple[float, float] | None = None  # right of the lens and above it, in object distances; None: at random
 
 
-def open_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe) -> dict[str, NDArray[Any]]:
+def open_cache(
+    folder: Path, meshes: list[Path], recipe: ViewsRecipe, report: Report = silent
+) -> dict[str, NDArray[Any]]:
     """Open a cache of traced views; trace the views first if the folder has no complete cache.
+
+    `report` is called with lines of text: size and number of the views before tracing, then progress.
 
     Returns the arrays of ARRAYS (N, S, S, ·) as memory maps, and camera (N, 16): focal length, center x, y [px]; middle
     depth [m]; depth unit [m]; rotation from object to camera (9); flash to the right of the lens and above it [middle
-    depths]. index.json is written last, so that an interrupted cache is recognized.
+    depths]. index.json is written last, so that an interrupted cache is recognized, and continued.
 
     Raises
     ------
@@ -64,9 +73,10 @@ def open_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe) -> dict[st
     index = folder / "index.json"
     inputs = json.dumps(asdict(recipe) | {"meshes": [mesh.stem for mesh in meshes]})
     if not index.exists():
-        _build_cache(folder, meshes, recipe)
+        _build_cache(folder, meshes, recipe, inputs, report)
         with atomic.path(index) as temporary:
             temporary.write_text(inputs)
+        (folder / _PROGRESS).unlink()
     elif index.read_text() != inputs:
         raise InputError(
             f"{folder} holds views of other meshes or of another preset; remove it, or choose another --out"
@@ -75,35 +85,98 @@ def open_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe) -> dict[st
     return arrays | {"camera": np.load(folder / "camera.npy")}
 
 
-def _build_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe) -> None:
-    """Trace all views of a recipe and write their arrays."""
+def cache_bytes(views: int, size: int) -> int:
+    """Size of a cache of traced views on disk."""
+    of_view = sum((size // by) ** 2 * channels * np.dtype(kind).itemsize for by, channels, kind in ARRAYS.values())
+    return views * (of_view + 16 * 4)
+
+
+def _build_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe, inputs: str, report: Report) -> None:
+    """Trace all views of a recipe and write their arrays; an interrupted cache continues after its last mesh.
+
+    Raises
+    ------
+    StorageError
+        The disk has too little space.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    size = recipe.size
-    total = recipe.views * len(meshes) + recipe.per_shape * recipe.procedural
-    out = {
-        name: np.lib.format.open_memmap(folder / f"{name}.npy", "w+", kind, (total, size // by, size // by, channels))
-        for name, (by, channels, kind) in ARRAYS.items()
+    shapes, size = len(meshes) + recipe.procedural, recipe.size
+    total = _first_view(shapes, meshes, recipe)
+    begun = _traced_meshes(folder, inputs)
+    first = _first_view(begun, meshes, recipe)
+    gigabytes = cache_bytes(total, size) / 1e9
+    free = shutil.disk_usage(folder).free / 1e9
+    if not begun and gigabytes > free:
+        raise StorageError(
+            f"{folder}: {total} traced views need {gigabytes:.1f} GB, {free:.1f} GB are free; "
+            "take fewer with --views and --procedural, or another --out"
+        )
+    there = f"; {first} of them are there" if first else ""
+    of_shapes = f"{len(meshes)} meshes and {recipe.procedural} random shapes"
+    report(f"tracing {total} views of {of_shapes}, {gigabytes:.2g} GB in {folder}{there}")
+    made = {**ARRAYS, "camera": (size, 16, np.float32)}  # a row per view
+    arrays: dict[str, NDArray[Any]] = {}
+    for name, (by, channels, kind) in made.items():
+        shape = (total, channels) if name == "camera" else (total, size // by, size // by, channels)
+        mode: Literal["r+", "w+"] = "r+" if begun else "w+"
+        arrays[name] = np.lib.format.open_memmap(folder / f"{name}.npy", mode, kind, shape)
+    start = said = saved = time.monotonic()
+    for number in range(begun, shapes):
+        views = _trace_shape(number, meshes, recipe)
+        for index, view in enumerate(views, _first_view(number, meshes, recipe)):
+            _store(arrays, index, *view)
+            now = time.monotonic()
+            if index == first or now - said > _REPORT_S:
+                said = now
+                minutes = (now - start) / (index + 1 - first) * (total - index - 1) / 60
+                report(f"{index + 1} of {total} views, {minutes:.0f} min left")
+        if time.monotonic() - saved > _SAVE_S or number == shapes - 1:
+            saved = time.monotonic()
+            for array in arrays.values():
+                assert isinstance(array, np.memmap)
+                array.flush()
+            atomic.write(folder / _PROGRESS, json.dumps({"inputs": inputs, "meshes": number + 1}))
+
+
+def _first_view(number: int, meshes: list[Path], recipe: ViewsRecipe) -> int:
+    """Index of the first view of a mesh or random shape."""
+    return min(number, len(meshes)) * recipe.views + max(number - len(meshes), 0) * recipe.per_shape
+
+
+def _traced_meshes(folder: Path, inputs: str) -> int:
+    """Number of meshes and random shapes that an interrupted cache of the same inputs holds."""
+    try:
+        known = text_file.read_json(folder / _PROGRESS)
+        whole = all((folder / f"{name}.npy").exists() for name in (*ARRAYS, "camera"))
+        return int(known["meshes"]) if whole and known["inputs"] == inputs else 0
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0
+
+
+def _store(
+    arrays: Mapping[str, NDArray[Any]],
+    index: int,
+    buffer: GBuffer,
+    pose: light_transport.Pose,
+    lit: NDArray[np.bool_],
+    met: NDArray[np.uint16],
+) -> None:
+    """Write one view into the arrays of a cache."""
+    inside = buffer.mask
+    middle, unit = depth_unit(inside, buffer.depth, buffer.view.focal)
+    depth = np.where(inside, (buffer.depth - middle) / unit, 0.0)
+    view = {
+        "normal": buffer.normal,
+        "depth": depth,
+        "position": buffer.position,
+        "mask": inside,
+        "lit": lit,
+        "met": met,
     }
-    cameras = np.zeros((total, 16), dtype=np.float32)
-    for index, (buffer, pose, lit, met) in enumerate(_trace_all(meshes, recipe)):
-        inside = buffer.mask
-        middle, unit = depth_unit(inside, buffer.depth, buffer.view.focal)
-        depth = np.where(inside, (buffer.depth - middle) / unit, 0.0)
-        view = {
-            "normal": buffer.normal,
-            "depth": depth,
-            "position": buffer.position,
-            "mask": inside,
-            "lit": lit,
-            "met": met,
-        }
-        for name, value in view.items():
-            out[name][index] = value.reshape(out[name][index].shape)
-        offset = pose.flash[:2] / middle
-        cameras[index] = [buffer.view.focal, *buffer.view.center, middle, unit, *pose.rotation.reshape(-1), *offset]
-    for array in out.values():
-        array.flush()
-    np.save(folder / "camera.npy", cameras)
+    for name, value in view.items():
+        arrays[name][index] = value.reshape(arrays[name][index].shape)
+    camera = [buffer.view.focal, *buffer.view.center, middle, unit, *pose.rotation.reshape(-1)]
+    arrays["camera"][index] = [*camera, *pose.flash[:2] / middle]
 
 
 def training_meshes(data: Path) -> list[Path]:
@@ -112,7 +185,7 @@ def training_meshes(data: Path) -> list[Path]:
 
 
 def read_mesh(path: Path) -> Triangles:
-    """Read a mesh file and add shading normals."""
+    """Read a training mesh and add shading normals."""
     return smooth(*scene_files.read_mesh(path))
 
 
@@ -131,27 +204,26 @@ def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[fl
     return middle, float(np.sqrt(mask.sum() / np.pi) * middle / focal)
 
 
-def _trace_all(
-    meshes: list[Path], recipe: ViewsRecipe
+def _trace_shape(
+    number: int, meshes: list[Path], recipe: ViewsRecipe
 ) -> Iterator[tuple[GBuffer, light_transport.Pose, NDArray[np.bool_], NDArray[np.uint16]]]:
-    """Trace all views of a recipe: G-buffer, pose of mesh and flash, and the result of `trace_visibility` for each."""
-    for number in range(len(meshes) + recipe.procedural):
-        if number < len(meshes):
-            path = meshes[number]
-            rng = np.random.default_rng([recipe.seed, zlib.crc32(path.stem.encode())])
-            name, mesh, count = str(path), read_mesh(path), recipe.views
-        else:
-            shape = number - len(meshes)
-            rng = np.random.default_rng([recipe.seed, 7, shape])
-            name, mesh, count = f"random shape {shape}", random_shapes.compose(rng), recipe.per_shape
-        tracer = Tracer(mesh)
-        for _ in range(count):
-            buffer, rotation, translation = trace_random_view(name, tracer, recipe.size, rng)
-            way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, _MAX_OFFSET)
-            offset = (off * np.cos(way), off * np.sin(way)) if recipe.flash is None else recipe.flash
-            middle = float(buffer.depth[buffer.mask].mean(dtype=np.float64))
-            pose = light_transport.Pose(rotation, translation, middle * np.array([*offset, 0.0]), middle**2)
-            yield buffer, pose, *bounced_light.trace_visibility(tracer, buffer, pose, rng)
+    """Each view of a mesh or random shape, the places of mesh and flash, and the result of `trace_visibility`."""
+    if number < len(meshes):
+        path = meshes[number]
+        rng = np.random.default_rng([recipe.seed, zlib.crc32(path.stem.encode())])
+        name, mesh, count = str(path), read_mesh(path), recipe.views
+    else:
+        shape = number - len(meshes)
+        rng = np.random.default_rng([recipe.seed, 7, shape])
+        name, mesh, count = f"random shape {shape}", random_shapes.compose(rng), recipe.per_shape
+    tracer = Tracer(mesh)
+    for _ in range(count):
+        buffer, rotation, translation = trace_random_view(name, tracer, recipe.size, rng)
+        way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, _MAX_OFFSET)
+        offset = (off * np.cos(way), off * np.sin(way)) if recipe.flash is None else recipe.flash
+        middle = float(buffer.depth[buffer.mask].mean(dtype=np.float64))
+        pose = light_transport.Pose(rotation, translation, middle * np.array([*offset, 0.0]), middle**2)
+        yield buffer, pose, *bounced_light.trace_visibility(tracer, buffer, pose, rng)
 
 
 def trace_random_view(name: str, tracer: Tracer, size: int, rng: np.random.Generator) -> tuple[GBuffer, Floats, Floats]:

@@ -17,6 +17,7 @@ from torch import Tensor
 from polcap.errors import InputError
 from polcap.formats.maps import png
 from polcap.training import loop, loss, main_network, materials, onnx_export, traced_views
+from polcap.training.progress import Report, silent
 from polcap.training.simulator import Batch, Simulator
 from polcap.training.validation import HeldOutPictures
 from polcap.training.variants import VARIANTS
@@ -70,8 +71,10 @@ PRESETS = {
 }  # fmt: skip
 
 
-def main(options: TrainingOptions) -> Path:
+def main(options: TrainingOptions, report: Report = silent) -> Path:
     """Train and return the path of model.onnx; its folder also gets last.pt, metrics.csv, watch.csv and watch.png.
+
+    `report` is called with lines of text about the progress.
 
     Raises
     ------
@@ -92,20 +95,25 @@ def main(options: TrainingOptions) -> Path:
     views = preset.views if options.views is None else options.views
     procedural = preset.procedural if options.procedural is None else options.procedural
     recipe = traced_views.ViewsRecipe(views=views, procedural=procedural, size=preset.size, seed=13)
-    cache = traced_views.open_cache(options.out / "views", traced_views.training_meshes(options.data), recipe)
+    cache = traced_views.open_cache(options.out / "views", traced_views.training_meshes(options.data), recipe, report)
     library = materials.MaterialLibrary(options.data / "materials" / "train", device)
-    network.held_out = HeldOutPictures(options.data, options.out / "watch", device)
+    network.held_out = HeldOutPictures(options.data, options.out / "watch", device, report)
     torch.set_num_threads(1)
     budget = loop.Budget(options.minutes, options.samples)
     made = _make_batches(Simulator(cache, library, device), preset, network, budget, options.seed + network.step)
     batches = _run_ahead(made)
-    loop.run(network, lambda: [next(batches) for _ in range(learners)], budget, options.out)
+    loop.run(network, lambda: [next(batches) for _ in range(learners)], budget, options.out, report)
     batches.close()
     network.export(options.out / "model.onnx", version=options.out.resolve().name)
     return options.out / "model.onnx"
 
 
 def _check(options: TrainingOptions) -> None:
+    if (options.data / "dataset.json").exists():
+        raise InputError(
+            f"{options.data} is a data set of `polcap synth --dataset`, which holds pictures; `polcap train` renders "
+            "its own pictures: give a folder with meshes/ and materials/"
+        )
     for name, value, known in (("preset", options.preset, PRESETS), ("variant", options.variant, VARIANTS)):
         if value not in known:
             raise InputError(f"{name} {value!r} is not one of {', '.join(known)}")
@@ -117,7 +125,10 @@ def _check(options: TrainingOptions) -> None:
     if last.exists() and not options.resume:
         raise InputError(f"{last} exists already; continue from it with --resume, or choose another --out")
     if not any(test_meshes.glob("*.npz")):
-        raise InputError(f"{test_meshes} holds no mesh; put at least one there, for validation")
+        raise InputError(
+            f"{test_meshes} holds no mesh; "
+            f"`python -m polcap.training.import_data SOURCE {options.data}` converts OBJ, GLB and PLY"
+        )
 
 
 def _make_batches(

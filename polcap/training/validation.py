@@ -12,6 +12,7 @@ from polcap.report.stage_pictures import Picture
 from polcap.stages.cues import FLOOR
 from polcap.training import evaluation_protocol, loss, main_network, materials, traced_views
 from polcap.training.camera_errors import CameraErrors
+from polcap.training.progress import Report, silent
 from polcap.training.simulator import Batch, Simulator, to_batch
 
 _COUNT, _SIZE = 48, 128  # pictures, px
@@ -21,8 +22,8 @@ _RECIPE = traced_views.ViewsRecipe(20, procedural=0, size=_SIZE, seed=99, flash=
 class HeldOutPictures:
     """Fixed pictures of test meshes and test materials, with the camera and flash of the evaluation."""
 
-    def __init__(self, data: Path, folder: Path, device: torch.device) -> None:
-        cache = traced_views.open_cache(folder, sorted((data / "meshes" / "test").glob("*.npz")), _RECIPE)
+    def __init__(self, data: Path, folder: Path, device: torch.device, report: Report = silent) -> None:
+        cache = traced_views.open_cache(folder, sorted((data / "meshes" / "test").glob("*.npz")), _RECIPE, report)
         library = materials.MaterialLibrary(data / "materials" / "test", device, seed=4)
         simulator = Simulator(cache, library, device)
         order = np.random.default_rng(5).permutation(len(simulator.camera))[:_COUNT]

@@ -1,4 +1,4 @@
-"""Rendered captures in, polcap's error against their truth out: the yardstick of the whole path.
+"""Benchmark of the whole path: errors of all maps of rendered captures against their true maps.
 
     python tests/benchmarks/bench_captures.py $POLCAP_DATA/rendered [--estimator analytic] [--model ONNX] [--rough]
 

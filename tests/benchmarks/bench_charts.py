@@ -1,4 +1,4 @@
-"""Charts found, and no chart seen where there is none: polcap beside plain `cv2.mcc`.
+"""Benchmark of the chart detection: charts found and false detections, compared with OpenCV's `cv2.mcc` alone.
 
     python tests/benchmarks/bench_charts.py [PICTURES [FIRST]]
 

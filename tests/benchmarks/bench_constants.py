@@ -1,4 +1,4 @@
-"""What the numbers inside the stages are worth: each halved and doubled, and what becomes of a capture.
+"""Benchmark of constants in the stages: effect on one capture's errors if each is halved and doubled.
 
     python tests/benchmarks/bench_constants.py RESULT TRUTH.npz [align selfcal analytic network]
 

@@ -1,4 +1,4 @@
-"""What a cross-polarized shot is worth: the albedo's error where highlights clip, with it and without.
+"""Benchmark of the cross-polarized shot: error of the albedo in clipped highlights, with the shot and without.
 
 python -m tests.benchmarks.bench_crossed [--captures 12] [--width 512] [--estimator analytic] [--no-chart]
 

@@ -1,4 +1,6 @@
-"""How much fine relief the normals keep, with and without the fine pass: pictures of the evaluation at 1,024².
+"""Benchmark of fine relief: normal error by band of detail, with and without the refinement network.
+
+Pictures of the evaluation at 1,024².
 
     python -m tests.benchmarks.bench_detail DATA [--pictures 6] [--size 1024] [--protocol 1] [--store DIR] [--look PNG]
 

@@ -1,4 +1,4 @@
-"""How long an export takes against encoding the same files alone.
+"""Benchmark of export time: a whole export against encoding the same files alone.
 
 python tests/benchmarks/bench_export.py FOLDER [SIDE]     (usd-core for `archive`)
 

@@ -1,4 +1,4 @@
-"""Size of the GLB of a result in each geometry, and what that costs its normals.
+"""Benchmark of GLB size: bytes of a result with each kind of geometry, and the normal error that it causes.
 
 python tests/benchmarks/bench_glb.py RESULT     (DracoPy for `draco`)
 

@@ -1,4 +1,4 @@
-"""The merge against HDRutils on the same simulated brackets: error over brightness, and time.
+"""Benchmark of the merge: error over brightness and time, against HDRutils on the same simulated brackets.
 
     pip install --no-deps --target DIR HDRutils
     python tests/benchmarks/bench_hdr.py DIR

@@ -1,4 +1,4 @@
-"""Seconds and memory of the inference stage on crops of 512² and 2048², beside the network alone.
+"""Benchmark of the stage `infer`: seconds and memory on crops of 512² and 2048², against the network alone.
 
     python tests/benchmarks/bench_infer.py DATA [--model MODEL.onnx] [--turns N]
 

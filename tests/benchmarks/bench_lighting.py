@@ -1,4 +1,4 @@
-"""Which light polcap can work under, and whether its gates know: simulated objects under a flash, off-axis or around.
+"""Benchmark of unsuitable light: errors of simulated objects under several lights, and whether the gates warn.
 
 python -m tests.benchmarks.bench_lighting [--cases 100] [--first-seed 0] [--picture FILE.png]
 

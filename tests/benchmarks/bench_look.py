@@ -1,4 +1,4 @@
-"""The same asset in Cycles, in three.js and in polcap's own renderer, under three lights.
+"""Benchmark of exports: the same asset rendered by Cycles, three.js and polcap under three lights.
 
 python tests/benchmarks/bench_look.py FOLDER     (needs $POLCAP_BPY, a Chromium, `npm ci` in tests/gltf, usd-core)
 

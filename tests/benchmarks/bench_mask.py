@@ -1,4 +1,4 @@
-"""The mask on 60 scenes of meshes never trained on: ten difficulties, six objects.
+"""Benchmark of the object's mask: overlap with the true mask on 60 scenes of meshes not used in training.
 
     python -m tests.benchmarks.bench_mask OUT calib/models/mask.onnx
 

@@ -1,4 +1,4 @@
-"""Is the mesh cut where parts hide each other, and nowhere else? Against scenes whose parts are known.
+"""Benchmark of the mesh's cuts at occlusions: traced objects with known parts, against plain least squares.
 
 python tests/benchmarks/bench_mesh.py FOLDER [--only NAME…] [--noise]     (POLCAP_DATA for the meshes)
 

@@ -1,4 +1,4 @@
-"""Is the mesh of a capture, RAW to asset, cut where parts hide each other, and nowhere else?
+"""Benchmark of the mesh's cuts at occlusions in simulated captures, processed from RAW to asset.
 
 python tests/benchmarks/bench_mesh_raw.py FOLDER [--only NAME…] [--first-seed N]     (POLCAP_DATA for the meshes)
 

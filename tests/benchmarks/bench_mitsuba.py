@@ -1,4 +1,4 @@
-"""Errors of every map on the scenes of `make_mitsuba.py`: the stages `cues` and `infer`, by scene and by material.
+"""Benchmark of the stages `cues` and `infer`: errors of all maps on the path-traced scenes of `make_mitsuba.py`.
 
     python tests/benchmarks/bench_mitsuba.py FOLDER [--model ONNX] [--analytic] [--clean] [--rough]
 

@@ -1,4 +1,4 @@
-"""polcap's steps beside other programs' on the same pixels, in one run: CPU seconds, ratios, errors.
+"""Benchmark against other programs: CPU seconds and errors of single steps on the same pixels.
 
     python tests/benchmarks/bench_peers.py FOLDER [--megapixels 6] [--out peers.json]
 

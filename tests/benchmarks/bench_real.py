@@ -1,4 +1,4 @@
-"""Real and third-party polarizer photographs in, what the Stokes parameters say of them out.
+"""Consistency of Stokes parameters from real and third-party photographs through a polarizer.
 
     python tests/benchmarks/bench_real.py $POLCAP_DATA/real
 

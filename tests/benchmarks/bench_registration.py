@@ -1,4 +1,6 @@
-"""Errors of the one registration: frames of a bracket in photon noise, shots of the rendered captures.
+"""Benchmark of the registration.
+
+Errors for frames of a bracket under photon noise and for shots of rendered captures.
 
 python -m tests.benchmarks.bench_registration          with $POLCAP_DATA for the rendered captures
 """

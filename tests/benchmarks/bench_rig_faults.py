@@ -1,4 +1,4 @@
-"""A hundred captures with one random fault each, resumed: did anything hang, get lost, or come out otherwise?
+"""Test of the rig: a hundred simulated captures with one random device fault each, then resumed.
 
 python tests/benchmarks/bench_rig_faults.py [COUNT]
 

@@ -1,4 +1,4 @@
-"""Depth of scanned objects from their scanned normals: plain least squares, the stage, bilateral integration.
+"""Benchmark of depth from scanned normals: plain least squares, the stage `surface`, bilateral integration.
 
 python tests/benchmarks/bench_scans.py     (POLCAP_DATA/real/scanned_normals)
 

@@ -1,4 +1,4 @@
-"""How far polcap is from what its libraries must cost: each stage and the whole, in CPU seconds, beside a floor.
+"""Benchmark of speed: CPU seconds of each stage and of whole runs, against the unavoidable time of the libraries.
 
     python tests/benchmarks/bench_speed.py FOLDER [--megapixels 6,24] [--out speed.json]
 

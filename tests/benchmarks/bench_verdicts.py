@@ -1,4 +1,4 @@
-"""How often `check` and `process` are right, and agree, on simulated captures good and with one planted fault.
+"""Benchmark of the gates: how often `check` and `process` judge simulated good and faulty captures correctly.
 
 python tests/benchmarks/bench_verdicts.py FOLDER [--captures 49] [--first-seed 300] [--only KIND] [--width PX]
 python tests/benchmarks/bench_verdicts.py FOLDER --seeds 301,307

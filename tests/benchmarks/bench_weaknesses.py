@@ -121,7 +121,7 @@ def outcome(row: Row, usual: Row | None) -> str:
     """The column of the table; `usual` is the same capture without the weakness."""
     if row["verdict"] == "crash":
         return "crash"
-    spoke = set(row["gates"])
+    spoke = {name for name, what in row["gates"].items() if what[0] in ("warn", "fail")}
     named = bool(spoke & set(plant_weaknesses.KINDS[row["kind"]]))
     if row.get("normal_mean") is None:
         return "reported" if row["verdict"] in ("refused", "fail") else "silent"
@@ -150,8 +150,8 @@ def table(rows: list[Row]) -> str:
             float(np.median([abs(row[name]) for row in whole])) if whole else float("nan")
             for name in ("normal_mean", "roughness", "scale")
         )
-        gates_ = Counter(f"{name} {what[0]}" for row in of_kind for name, what in row["gates"].items())
-        spoke = ", ".join(f"{name} {count}" for name, count in gates_.most_common(5))
+        states = Counter(f"{name} {what[0]}" for row in of_kind for name, what in row["gates"].items())
+        spoke = ", ".join(f"{name} {count}" for name, count in states.most_common(6) if "not measured" not in name)
         medians = [f"{normals:.1f}°", f"{rough:.3f}", f"{dim:.2f}"]
         cells = [kind, len(of_kind), *(counts[name] for name in OUTCOMES), *medians, spoke]
         lines.append("| " + " | ".join(map(str, cells)) + " |")

@@ -1,4 +1,4 @@
-"""Objects with known normals in, `_REGION` and `_CELL` of `infer/half_turns.py` out.
+"""Fits `_REGION` and `_CELL` of `infer/half_turns.py` (odds of a wrong azimuth side) on objects with known normals.
 
     python tests/benchmarks/fit_half_turns.py DATA SCENES … [--sixths 27] [--model ONNX]
 

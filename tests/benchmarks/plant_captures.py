@@ -1,4 +1,4 @@
-"""A seed and a kind of fault -> a simulated capture of another angle set, light, chart, look and law each, on disk.
+"""Simulates a good or faulty capture from a seed, with random angles, light, chart, object and polarization law.
 
 Kind "" is a good capture: ordinary jitter of light and angles, ordinary nudges. The truth (normals, mask) lies beside.
 """

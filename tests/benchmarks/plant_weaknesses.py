@@ -1,4 +1,4 @@
-"""A seed and a kind of weakness -> a simulated capture on disk, for the gates.
+"""Simulates a capture with one kind of weakness from a seed, to test the gates.
 
 Captures have three angles, 640 × 480 RAW px, the chart next to the object, and both laws of polarization. The kind
 "none" is the same capture without the weakness.

@@ -1,4 +1,4 @@
-"""What comparisons with Mitsuba 3 share: film, camera, polarized plastic, its Stokes parameters in our frame."""
+"""Shared parts of comparisons with Mitsuba 3: film, camera, polarized plastic, Stokes parameters in polcap's frame."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""In: a capture of Bayer DNGs. Out: the same at another size, in uncompressed DNGs: what no camera at hand takes.
+"""Makes a copy of a capture of Bayer DNGs at another size, as uncompressed DNGs, for benchmarks of time and memory.
 
     python tests/benchmarks/resized_capture.py CAPTURE OUT MEGAPIXELS
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from polcap import images
-from polcap.errors import StorageError
+from polcap.errors import SettingError, StorageError
 from polcap.formats.npy_folder import checksum, decode, encode, save
 from polcap.pipeline import result_folder
 from polcap.pipeline.cache import (
@@ -392,3 +392,15 @@ def test_an_alias_of_an_array_type_is_read_as_the_array(tmp_path: Path) -> None:
     hint = types.GenericAlias(Alias, (float,))
     assert get_origin(hint) is Alias
     assert np.array_equal(npy_folder.decode({"array": "value.npy"}, hint, tmp_path), np.arange(3.0))
+
+
+@pytest.mark.parametrize("listed", [("pol000", "pol045", "pol090"), ("0 Grad", "45 Grad", "90 Grad")])
+def test_a_result_folder_is_refused_inside_every_kind_of_angle_folder(tmp_path: Path, listed: tuple[str, ...]) -> None:
+    for name in listed:
+        (tmp_path / name).mkdir()
+    with pytest.raises(SettingError, match="lies among the capture's shots"):
+        result_folder.check(tmp_path / listed[1] / "out", tmp_path)
+    result_folder.check(tmp_path / "out", tmp_path)
+    result_folder.check(
+        tmp_path / "new" / "out", tmp_path / "new"
+    )  # a capture that does not exist is refused elsewhere

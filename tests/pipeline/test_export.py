@@ -117,6 +117,8 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, own: P
     [
         (["--preset", "maya"], f"--preset maya is none of {', '.join(PRESETS)}"),
         (["--preset", "web", "--obj"], "leave out --obj"),
+        (["--about", "author=me"], "--about author: there is no such fact; there are title, creator"),
+        (["--obj", "--page", ROOT / "README.md"], "README.md is not model-viewer"),
         (["--exr", "--color", "ACEScq"], "--color ACEScq is not a color space or role"),
     ],
 )

@@ -122,6 +122,9 @@ def test_the_template_and_the_card_for_shooting_by_hand_are_understood(tmp_path:
     assert {"shot", "repeat", "ambient", "chart"} == set(roles)
     assert {entry.angle for entry in stated.frame if entry.role == "shot"} == {0.0, 45.0, 90.0}
     keys = {line.lstrip("# ").partition(" ")[0] for line in template.read_text().splitlines() if " = " in line}
-    assert set(capture_toml.CaptureFile.__struct_fields__) - {"frame", "rotator"} <= keys  # every key is explained
+    assert (
+        set(capture_toml.CaptureFile.__struct_fields__) - {"frame", "rotator", "catalog"} <= keys
+    )  # every key is explained
+    assert set(capture_toml.Catalog.__struct_fields__) <= keys
     card = (ROOT / "examples" / "shooting-card.html").read_text()
     assert all(folder in card for folder in ("pol000", "pol045", "pol090"))

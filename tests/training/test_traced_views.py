@@ -1,5 +1,6 @@
 """The cache of views: whole, reproducible, and true to its own conventions."""
 
+from collections import namedtuple
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from polcap.errors import InputError
+from polcap.errors import InputError, StorageError
 from polcap.synth.mesh_tracer import Tracer, Triangles
 from polcap.training import traced_views
 from tests.training.conftest import RECIPE
@@ -30,6 +31,43 @@ def test_an_interrupted_cache_is_traced_again_and_the_same_seed_gives_the_same_v
     again = traced_views.open_cache(tmp_path, meshes, RECIPE)
     for name in cache:
         np.testing.assert_array_equal(cache[name], again[name])
+
+
+def test_interrupted_tracing_continues_after_its_last_mesh(
+    meshes: list[Path], cache: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(traced_views, "_SAVE_S", 0.0)
+    lines: list[str] = []
+
+    def stop_after_first(text: str) -> None:
+        lines.append(text)
+        if text.startswith("9 of"):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(traced_views, "_REPORT_S", 0.0)
+    with pytest.raises(KeyboardInterrupt):
+        traced_views.open_cache(tmp_path, meshes, RECIPE, stop_after_first)
+    assert lines[0].startswith("tracing 12 views of 1 meshes and 2 random shapes") and "GB in" in lines[0]
+    assert lines[1].startswith("1 of 12 views") and lines[1].endswith("min left")
+    lines.clear()
+    again = traced_views.open_cache(tmp_path, meshes, RECIPE, lines.append)
+    assert lines[0].endswith("; 6 of them are there") and lines[1].startswith("7 of 12")
+    for name in cache:
+        np.testing.assert_array_equal(cache[name], again[name])
+
+
+def test_a_cache_larger_than_the_disk_is_refused_before_tracing(
+    meshes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr("shutil.disk_usage", lambda _: usage(10**9, 10**9 - 1000, 1000))
+    with pytest.raises(StorageError, match=r"12 traced views need .* GB are free; take fewer with --views"):
+        traced_views.open_cache(tmp_path / "views", meshes, RECIPE)
+
+
+def test_the_stated_size_is_that_of_the_files(views: Path, cache: dict[str, Any]) -> None:
+    stored = sum(file.stat().st_size for file in views.glob("*.npy"))
+    assert traced_views.cache_bytes(len(cache["camera"]), RECIPE.size) == pytest.approx(stored, rel=0.01)
 
 
 def test_depth_is_centered_and_in_units_of_the_equivalent_disc(cache: dict[str, Any]) -> None:

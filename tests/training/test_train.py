@@ -40,7 +40,10 @@ class Clock:
 
 def test_run_stops_in_time_and_resumes(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "time", Clock())
-    made = train.main(train.TrainingOptions(data=data, out=tmp_path, minutes=0.07, threads=1))
+    lines: list[str] = []
+    made = train.main(train.TrainingOptions(data=data, out=tmp_path, minutes=0.07, threads=1), lines.append)
+    assert lines[0].startswith("tracing ") and lines[-1].startswith("100 %, step ") and lines[-1].endswith("0 min left")
+    assert any(line.startswith("30 %") or "step 1," in line for line in lines)  # after the first step
     first, facts = train.load_average(tmp_path / "last.pt")
     weights, metadata = onnx_export.read_weights(made)
     assert metadata["training"].startswith(f"{facts['samples']} samples") and metadata["version"] == tmp_path.name
@@ -113,6 +116,12 @@ def test_impossible_options_are_refused_before_anything_is_made(
     with pytest.raises(InputError, match=message):
         train.main(train.TrainingOptions(**{"data": data, "out": tmp_path / "out", **options}))  # type: ignore[arg-type]
     assert not (tmp_path / "out").exists()
+
+
+def test_a_data_set_of_pictures_is_refused_with_the_reason(tmp_path: Path) -> None:
+    (tmp_path / "dataset.json").write_text("{}")
+    with pytest.raises(InputError, match=r"data set of `polcap synth --dataset`.*give a folder with meshes"):
+        train.main(train.TrainingOptions(data=tmp_path, out=tmp_path / "out"))
 
 
 def test_a_run_is_not_overwritten_and_resumes_only_with_its_own_preset_and_variant(data: Path, tmp_path: Path) -> None:

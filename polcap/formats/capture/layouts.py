@@ -215,6 +215,11 @@ def degrees(angle_deg: float) -> str:
     return f"{int(whole):03d}" + (f".{rest.rstrip('0')}" if rest.strip("0") else "")
 
 
+def angle_folder_names(folder: Path) -> set[str]:
+    """Names of the sub-folders that hold the shots of one angle each: pol000, or 0, 45, 90."""
+    return set(_degrees_by_name(path.name for path in children(folder) if path.is_dir())) if folder.is_dir() else set()
+
+
 def is_angle_folder(name: str) -> bool:
     """Whether a folder of this name inside a capture holds the shots of one angle, or the crossed one."""
     return _FOLDER.fullmatch(name) is not None

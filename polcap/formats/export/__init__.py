@@ -3,7 +3,8 @@
 gltf          GLB with mesh, material and textures
 glb_geometry  the mesh of a GLB: floats, integers or Draco
 obj           OBJ, MTL and EXR textures
-usd           USD with OpenPBR and UsdPreviewSurface
+usd           USD with OpenPBR and UsdPreviewSurface; USDZ
+web_page      a page that shows the GLB without a network
 materialx     MaterialX 1.39, and the OpenPBR node graph
 exr_layers    all maps as layers of one EXR, in a chosen color space
 texture_set   the textures, packed for each kind of program

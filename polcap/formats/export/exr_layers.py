@@ -73,6 +73,8 @@ def write(path: Path, maps: Path, color: str, header: Mapping[str, str]) -> None
 def _attributes(space: ColorSpace, header: Mapping[str, str]) -> dict[str, exr.Attribute]:
     attributes: dict[str, exr.Attribute] = {f"polcap:{key}": value for key, value in header.items()}
     attributes |= {f"polcap:layer {key}": value for key, value in MEANINGS.items()}
+    if "rights" in header:
+        attributes["Copyright"] = header["rights"]
     attributes["polcap:colors"] = f"{', '.join(_COLORS)} in {space.name}"
     if space.interop_id is not None:
         attributes["colorInteropID"] = space.interop_id

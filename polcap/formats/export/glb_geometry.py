@@ -56,7 +56,10 @@ class Blob:
         return self.accessor(numbers, self.view(numbers.tobytes(), target=_ELEMENTS))
 
     def accessor(self, array: NDArray[Any], view: int | None, *, bounds: bool = False) -> int:
-        """Describe an array (N, C) that a view holds, or, without a view, an extension."""
+        """Add an accessor for an array (N, C) that a view holds, or, without a view, an extension.
+
+        It describes the array.
+        """
         entry: dict[str, Any] = {} if view is None else {"bufferView": view}
         entry |= {
             "componentType": _COMPONENT[array.dtype.name],
@@ -71,7 +74,7 @@ class Blob:
         return len(self.accessors) - 1
 
     def view(self, data: bytes, **fields: int) -> int:
-        """Add bytes."""
+        """Add bytes to the binary chunk of a GLB as a buffer view; returns the view's index."""
         self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data), **fields})
         self.data += data
         self.data += bytes(-len(self.data) % 4)
@@ -114,7 +117,7 @@ def add(blob: Blob, mesh: Mesh, origin: Floats, geometry: Geometry) -> tuple[dic
 
 
 def _integers(value: Floats, kind: str) -> NDArray[Any]:
-    """Values -1…1 or 0…1 as integers over their type's largest value, as glTF normalizes them."""
+    """Convert values -1…1 or 0…1 to integers relative to their type's largest value, as glTF normalizes them."""
     top = np.iinfo(kind).max
     return np.rint(np.clip(value, -1.0 if np.iinfo(kind).min else 0.0, 1.0) * top).astype(kind)
 

@@ -11,7 +11,7 @@ KHR_texture_basisu.
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,13 +34,28 @@ _CONTEXT = {
     "rdf": "http://www.w3.org/1999/02/22-rdf-syntax-ns#",
     "dc": "http://purl.org/dc/elements/1.1/",
     "xmp": "http://ns.adobe.com/xap/1.0/",
+    "xmpRights": "http://ns.adobe.com/xap/1.0/rights/",
     "polcap": "urn:polcap:provenance:1",
+}
+
+
+def _alternatives(text: str) -> dict[str, Any]:
+    """A text of XMP in its default language."""
+    return {"@type": "rdf:Alt", "rdf:_1": {"@language": "x-default", "@value": text}}
+
+
+_CATALOG: Mapping[str, tuple[str, Callable[[str], Any]]] = {  # fields of `CatalogEntry` as XMP terms
+    "title": ("dc:title", _alternatives),
+    "creator": ("dc:creator", lambda text: {"@list": [text]}),
+    "rights": ("dc:rights", _alternatives),
+    "license": ("xmpRights:WebStatement", str),
+    "object_number": ("dc:identifier", str),
 }
 
 
 @dataclass(frozen=True)
 class GlbOptions:
-    """Storage of a GLB's pictures and mesh."""
+    """Options of a GLB: format of its pictures, storage of its mesh."""
 
     images: Kind = "png"
     geometry: Geometry = "float"
@@ -74,7 +89,7 @@ def encode(
     encoder: TextureEncoder | None = None,
 ) -> bytes:
     """Encode an asset as the bytes of a GLB; parameters as for `write`."""
-    blob, images = Blob(), options.images
+    blob, images, facts = Blob(), options.images, provenance or {}
     origin = center(asset.mesh.vertices) if options.origin is None else options.origin
     primitive, transform = glb_geometry.add(blob, asset.mesh, origin, options.geometry)
     held = textures(asset)
@@ -89,6 +104,7 @@ def encode(
         "asset": {
             "version": "2.0",
             "generator": f"polcap {__version__}",
+            **({"copyright": facts["rights"]} if "rights" in facts else {}),
             "extras": {
                 "unit": "metre" if asset.mesh.metric else "relative",
                 "albedo": maps_folder.albedo_scale(asset.albedo_sigma),
@@ -103,7 +119,7 @@ def encode(
         },
         "extensionsUsed": used + required,
         **({"extensionsRequired": required} if required else {}),
-        "extensions": {"KHR_xmp_json_ld": {"packets": [_packet(name, provenance or {})]}},
+        "extensions": {"KHR_xmp_json_ld": {"packets": [_packet(name, facts)]}},
         "scene": 0,
         "scenes": [{"name": name, "nodes": [0]}],
         "nodes": [{"name": name, "mesh": 0, **transform}],
@@ -157,14 +173,15 @@ def _material(asset: Asset, name: str) -> dict[str, Any]:
 
 
 def _packet(name: str, provenance: Mapping[str, str]) -> dict[str, Any]:
-    """Title and origin of an asset as an XMP packet in JSON-LD (Dublin Core, and polcap's terms)."""
+    """Catalog entry and provenance in terms of Dublin Core, XMP and polcap, as JSON-LD."""
+    stated = {"title": name, **provenance}
     return {
         "@context": _CONTEXT,
         "@id": "",
-        "dc:title": {"@type": "rdf:Alt", "rdf:_1": {"@language": "x-default", "@value": name}},
+        **{term: write(stated[key]) for key, (term, write) in _CATALOG.items() if key in stated},
         "dc:format": "model/gltf-binary",
         "xmp:CreatorTool": f"polcap {__version__}",
-        **{f"polcap:{key}": value for key, value in provenance.items()},
+        **{f"polcap:{key}": value for key, value in provenance.items() if key not in _CATALOG},
     }
 
 

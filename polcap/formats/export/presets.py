@@ -11,8 +11,8 @@ from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.texture_set import Texture
 from polcap.images import Asset
 
-Format = Literal["gltf", "obj", "usd", "materialx", "exr"]
-FORMATS: tuple[Format, ...] = ("gltf", "obj", "usd", "materialx", "exr")
+Format = Literal["gltf", "obj", "usd", "usdz", "materialx", "exr"]
+FORMATS: tuple[Format, ...] = ("gltf", "obj", "usd", "usdz", "materialx", "exr")
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ PRESETS: Mapping[str, ExportPreset] = {
         triangles=50_000,
     ),
     "archive": ExportPreset(
-        formats=FORMATS,
+        formats=("gltf", "obj", "usd", "materialx", "exr"),
         description="every format, without loss; normals +Y; values in full precision in the layered EXR",
     ),
 }

@@ -26,12 +26,17 @@ def versions() -> dict[str, str]:
     return found
 
 
-def record(about: Mapping[str, Any]) -> dict[str, Any]:
-    """The origin of a result (photographs, versions, settings), from the content of its report.json."""
+def record(about: Mapping[str, Any], catalog: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """The origin of a result (photographs, versions, settings), from the content of its report.json.
+
+    Fields of the capture's `CatalogEntry` follow, where stated; those of `catalog` replace them.
+    """
     capture, model = about["capture"], about["model"]
     return {
         "format": "polcap provenance 1",
         "name": capture["name"],
+        **capture.get("catalog", {}),
+        **(catalog or {}),
         "camera": capture["camera"],
         "photographs": [  # after a space the digest names how the file was read
             {"file": frame["file"], "angle_deg": shot["angle_deg"], "sha256": frame["digest"].partition(" ")[0]}

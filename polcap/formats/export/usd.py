@@ -3,13 +3,16 @@
 Renderers that read MaterialX use `outputs:mtlx:surface`; all others read the UsdPreviewSurface. Its specular
 workflow takes F0 from a texture. Blender reads that texture as a tint of F0 in either workflow. So
 the mesh is bound twice: for every purpose to the material in the specular workflow, and for the purpose
-`full`, which Blender prefers, to a copy with F0 as a tint. Needs usd-core (extra [usd]).
+`full`, which Blender prefers, to a copy with F0 as a tint. USDZ, for phones, has the first of these materials, without
+OpenPBR. Needs usd-core (extra [usd]).
 
 References
 ----------
 OpenUSD, UsdPreviewSurface specification (normal maps: scale 2, bias -1, raw); UsdMtlx.
 """
 
+import os
+import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +26,8 @@ from polcap.formats.export import gltf, materialx
 from polcap.formats.export.texture_set import SPECULAR_RANGE, Key
 from polcap.images import Asset, Mesh
 from polcap.optics import fresnel
+
+_FIXED_TIME = 473_385_600  # s, 1985: times of the files in a USDZ, so that the same asset gives the same bytes
 
 
 def require() -> None:
@@ -43,6 +48,35 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], facts: 
     Raises SettingError: usd-core is not installed.
     Raises StorageError: the file cannot be written.
     """
+    _export(_stage(asset, name, files, facts, phone=False), path)
+
+
+def package(path: Path, asset: Asset, name: str, textures: Mapping[Key, bytes], facts: Mapping[str, str]) -> None:
+    """Write a USDZ, one file that holds the layer and its textures (PNG); otherwise as `write`."""
+    require()
+    from pxr import Sdf, UsdUtils
+
+    files: dict[Key, str] = {key: f"{key}.png" for key in textures}
+    with tempfile.TemporaryDirectory() as folder:
+        layer = Path(folder) / f"{materialx.identifier(name)}.usdc"
+        for key, file in files.items():
+            (layer.parent / file).write_bytes(textures[key])
+        _export(_stage(asset, name, files, facts, phone=True), layer)
+        for part in layer.parent.iterdir():
+            os.utime(part, (_FIXED_TIME, _FIXED_TIME))  # the package holds these times
+        with atomic.path(path) as temporary:
+            if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(temporary)):
+                raise OSError(f"usd-core could not write {path.name}")
+
+
+def _export(stage: Any, path: Path) -> None:
+    with atomic.path(path) as temporary:
+        if not stage.GetRootLayer().Export(str(temporary)):
+            raise OSError(f"usd-core could not export {path.name}")
+
+
+def _stage(asset: Asset, name: str, files: Mapping[Key, str], facts: Mapping[str, str], phone: bool) -> Any:
+    """The stage with mesh and materials; for a phone, with UsdPreviewSurface in the specular workflow only."""
     require()
     from pxr import Usd, UsdGeom, UsdShade
 
@@ -56,12 +90,17 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], facts: 
     word = root.GetPath().name
     shape = _mesh(stage, root.GetPath().AppendChild(f"{word}_mesh"), asset.mesh)
     binding = UsdShade.MaterialBindingAPI.Apply(shape.GetPrim())
-    binding.Bind(_material(stage, root.GetPath().AppendChild(f"{word}_material"), asset, files, tint=False))
-    full = _material(stage, root.GetPath().AppendChild(f"{word}_material_full"), asset, files, tint=True)
-    binding.Bind(full, materialPurpose=UsdShade.Tokens.full)
-    with atomic.path(path) as temporary:
-        if not stage.GetRootLayer().Export(str(temporary)):
-            raise OSError(f"usd-core could not export {path.name}")
+    path = root.GetPath().AppendChild(f"{word}_material")
+    material = UsdShade.Material.Define(stage, path)
+    material.CreateSurfaceOutput().ConnectToSource(_preview(stage, path, asset, files, tint=False))
+    binding.Bind(material)
+    if not phone:
+        _add_openpbr(stage, material, asset, files)
+        full = UsdShade.Material.Define(stage, root.GetPath().AppendChild(f"{word}_material_full"))
+        full.CreateSurfaceOutput().ConnectToSource(_preview(stage, full.GetPath(), asset, files, tint=True))
+        _add_openpbr(stage, full, asset, files)
+        binding.Bind(full, materialPurpose=UsdShade.Tokens.full)
+    return stage
 
 
 def _mesh(stage: Any, path: Any, mesh: Mesh) -> Any:
@@ -85,16 +124,14 @@ def _mesh(stage: Any, path: Any, mesh: Mesh) -> Any:
     return shape
 
 
-def _material(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tint: bool) -> Any:
-    from pxr import Sdf, UsdShade
+def _add_openpbr(stage: Any, material: Any, asset: Asset, files: Mapping[Key, str]) -> None:
+    """Add the OpenPBR surface to a material, for renderers that read MaterialX."""
+    from pxr import Sdf
 
-    material = UsdShade.Material.Define(stage, path)
     material.GetPrim().AddAppliedSchema("MaterialXConfigAPI")  # of UsdMtlx, which not every usd-core has
     version = material.GetPrim().CreateAttribute("config:mtlx:version", Sdf.ValueTypeNames.String, custom=False)
     version.Set(materialx.VERSION)
-    material.CreateSurfaceOutput().ConnectToSource(_preview(stage, path, asset, files, tint))
-    material.CreateSurfaceOutput("mtlx").ConnectToSource(_openpbr(stage, path, asset, files))
-    return material
+    material.CreateSurfaceOutput("mtlx").ConnectToSource(_openpbr(stage, material.GetPath(), asset, files))
 
 
 def _openpbr(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str]) -> Any:

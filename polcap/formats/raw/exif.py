@@ -10,15 +10,18 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime
+from functools import cache
 from itertools import islice
 from typing import Any
 
+from polcap.errors import SettingError
 from polcap.images import Exif
 
 _D65_FIRST = (21, 20, 22, 23, 1, 4, 9, 10, 11, 12, 13, 14, 15)  # EXIF LightSource, the daylights
 _UNIT_MM = {1: 25.4, 2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # FocalPlaneResolutionUnit; 1 "none" is inch in practice
 _SENSOR_MM = (2.0, 70.0)  # plausible widths; others come from a wrong unit
 _RESIZED = 1.12  # ratio of pixel counts above which a picture was resized, not cropped; mRAW has 4/3
+_SOUND = b"II*\0\x08\0\0\0\x01\0\x0f\x01\x02\0\x04\0\0\0abc\0\0\0\0\0"  # a TIFF with the make abc
 _TEXT_LENGTH = 100  # of a name; the rest is cut
 _HEADER = re.compile(rb"II\*\0|MM\0\*")  # of a TIFF
 _SEARCH_BYTES = 1 << 20  # from the beginning of a file
@@ -39,6 +42,7 @@ class _Tags:
     def __init__(self, data: bytes) -> None:
         import exifread
 
+        _check_reader()
         self._found: dict[str, Any] = {}
         for directory, part in _parts(data):
             try:
@@ -68,6 +72,23 @@ class _Tags:
             if text:
                 return text[:_TEXT_LENGTH]
         return ""
+
+
+@cache
+def _check_reader() -> None:
+    """Raise a SettingError if exifread does not read a sound tag: then it is not the photographs' fault."""
+    import exifread
+
+    try:
+        found = str(exifread.process_file(io.BytesIO(_SOUND), details=False, extract_thumbnail=False)["Image Make"])
+    except Exception as error:
+        found = f"{type(error).__name__}: {error}"
+    if found != "abc":
+        version = getattr(exifread, "__version__", "of unknown version")
+        raise SettingError(
+            f"EXIF cannot be read: exifread {version} does not read a sound tag ({found}); "
+            "pip install --force-reinstall 'exifread>=3.5'"
+        )
 
 
 def _parts(data: bytes) -> Iterator[tuple[str, bytes]]:

@@ -28,14 +28,14 @@ _SAME_PX = 0.5  # two starts that differ by less lead to one place
 
 @dataclass(frozen=True)
 class ObjectMotion:
-    """Motion of the object against its surroundings in each shot, (K,) grid px; NaN: too little detail."""
+    """Motion of the object relative to its surroundings in each shot, (K,) grid px; NaN: too little detail."""
 
     pushed: Floats  # shift of the object's middle, outline included; 0 within three errors; infinite: another object
     inside: Floats  # rms displacement of its inner detail, which moves when the object turns
 
 
 def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> ObjectMotion:
-    """Motion of the object, with its outline and inside it, against the motion of chart and backdrop."""
+    """Measure the motion of the object, with its outline and inside it, relative to that of chart and backdrop."""
     shots = len(radiance.angle)
     if radiance.offset_px is not None:  # shots cut from one mosaic
         return ObjectMotion(np.zeros(shots), np.zeros(shots))

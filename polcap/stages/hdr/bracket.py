@@ -31,7 +31,7 @@ class Bracket:
 
     @property
     def others(self) -> list[int]:
-        """All frames except the reference frame."""
+        """Indices of all frames of the bracket except the reference frame."""
         return [e for e in self.order if e != self.reference]
 
 

@@ -28,7 +28,9 @@ class Ratio:
 
 
 def of_tiles(a: Floats, b: Floats) -> Ratio | None:
-    """Exposure ratio b / a (C,) measured in tiles (T, C) of two frames, see `common_tiles`.
+    """Exposure ratio b / a (C,) of two frames from tiles (T, C), see `common_tiles`.
+
+    None if the tiles do not suffice.
 
     None if they do not suffice.
 
@@ -80,7 +82,7 @@ def vignetting(reference: Signals, other: Signals, ratio: Floats) -> Floats | No
 
 
 def _quadratic(x: Floats, y: Floats) -> Floats:
-    """Columns 1, x, y, x², xy, y² of points (N,)."""
+    """Design matrix of a quadratic surface: columns 1, x, y, x², xy, y² of points (N,)."""
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 

@@ -33,6 +33,7 @@ _FLOOR = 1e-3  # albedo
 _MAPS_SIGMA = 0.05  # of the estimators' own albedos, with a correct scale (docs/benchmarks/gates.md)
 _COMMON_F0 = 0.05  # median of an object; an index of 1.58
 _F0_RESPONSE = 0.3  # change of ln F0 per change of ln scale: the network expects common values (20 captures)
+_LARGEST_DOUBT = 0.7  # a factor of two in light, ln 2
 _COMMON_WHITE, _WHITE_RANGE = 0.9, 0.14  # 95th percentile of the albedo: usual limit; excess that doubts a factor of e
 _BAND = 2.0  # px, 1σ: shading in finer detail predicts the shading that is finer than a superpixel
 _DETAIL_AROUND = 4.0  # px, 1σ of the means of power, and of the albedo
@@ -115,9 +116,11 @@ def albedo_sigma(maps: SurfaceMaps, of_chart: float | None) -> float | None:
     """
     if of_chart is None or not maps.mask.any():
         return None
-    gloss = log(max(float(np.median(maps.specular[maps.mask].mean(-1))) / _COMMON_F0, 1.0)) / _F0_RESPONSE
     white = max(float(np.percentile(maps.diffuse[maps.mask].max(-1), 95)) - _COMMON_WHITE, 0.0) / _WHITE_RANGE
-    return hypot(of_chart, _MAPS_SIGMA, max(gloss, white))
+    gloss = log(max(float(np.median(maps.specular[maps.mask].mean(-1))) / _COMMON_F0, 1.0)) / _F0_RESPONSE
+    if maps.estimator == "analytic":
+        gloss = 0.0  # its F0 is too rough for this
+    return hypot(of_chart, _MAPS_SIGMA, min(max(gloss, white), _LARGEST_DOUBT))
 
 
 def select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:

@@ -94,7 +94,7 @@ class ContourLinks:
     step: Floats  # (M,) that and the slope of the nearer side [px]
 
     def select(self, at: Any) -> "ContourLinks":
-        """Some of the links."""
+        """The contour links at these indices or where this mask is true."""
         return ContourLinks(self.link[at], self.gap[at], self.step[at])
 
 
@@ -297,7 +297,9 @@ class PyramidLevel:
             self._become(self.without_cuts())
 
     def _close(self, pixels: Bools) -> None:
-        """Remove the cuts at these pixels (N,).
+        """Remove the surface's cuts at these pixels (N,), and solve z again.
+
+        The pixels no longer choose between neighbors, and their links have slopes again.
 
         They no longer choose, their links have slopes again. z is solved again.
         """

@@ -48,7 +48,7 @@ class PixelGrid:
 
     @property
     def pixel(self) -> NDArray[np.int64]:
-        """Row and column of each pixel, (N, 2)."""
+        """Row and column of each pixel of the grid, (N, 2)."""
         return np.stack([self.row, self.column], axis=-1)
 
     def _lay_out(self, right: Any, down: Any) -> None:

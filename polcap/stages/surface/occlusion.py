@@ -69,7 +69,10 @@ def occluding_contours(lean: tuple[Floats, Floats], mask: Bools) -> tuple[NDArra
 
 
 def _contour_candidates(lean: Floats, mask: Bools, axis: int, sign: int) -> tuple[Bools, Floats]:
-    """Links along an axis with an edge-on nearer pixel, the first (sign 1) or the second (−1); and its lean [rad]."""
+    """Pixel links along an axis across a possible occluding contour: the nearer pixel is nearly edge-on.
+
+    The nearer pixel is the first (sign 1) or the second (−1). Also the angle [rad] at which it falls away.
+    """
     away = sign * lean
     inside = np.isfinite(away)
     size = (1, _REACH) if axis else (_REACH, 1)
@@ -176,7 +179,7 @@ def _nearer_lean(on: Bools, beyond: tuple[Floats, ...], slope: tuple[Floats, Flo
 
 
 def contact_links(grid: PixelGrid, separate: Bools, excess: Floats, radius: float) -> Bools:
-    """Links (L,) at which two separated parts touch.
+    """Links (L,) between pixels at which two separated parts of the surface touch.
 
     Parameters
     ----------

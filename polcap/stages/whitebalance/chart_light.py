@@ -78,7 +78,7 @@ class _ChartPlane:
 
 
 def _slope(outlined: _ChartPlane, state: Floats) -> Floats:
-    """Relative change (2,) of the light per patch for a state (7,), by a linear fit over the patches."""
+    """Relative change (2,) of the light per chart patch, for flash position, falloff, rotation… in `state` (7,)."""
     plane = outlined.turned(state[3:5])
     level, *slope = _STRAIGHT @ point_light.irradiance(plane.point, state[:2], state[2], plane.normal)
     return np.asarray(np.array(slope) / level + state[5:])

@@ -91,6 +91,15 @@ def test_provenance_is_in_the_packet(asset: Asset) -> None:
     assert packet["@context"]["dc"] == "http://purl.org/dc/elements/1.1/"
 
 
+def test_catalog_entry_is_in_dublin_core_and_in_the_copyright(asset: Asset) -> None:
+    stated = {"title": "Krug", "creator": "Haus", "rights": "© Haus", "license": "CC0", "object_number": "7"}
+    said = document(gltf.encode(asset, "ball", provenance=stated))
+    packet = said["extensions"]["KHR_xmp_json_ld"]["packets"][0]
+    assert packet["dc:title"]["rdf:_1"]["@value"] == "Krug" and packet["dc:creator"] == {"@list": ["Haus"]}
+    assert packet["dc:rights"]["rdf:_1"]["@value"] == said["asset"]["copyright"] == "© Haus"
+    assert packet["xmpRights:WebStatement"] == "CC0" and packet["dc:identifier"] == "7"
+
+
 def test_open_surface_is_seen_from_behind_too(asset: Asset) -> None:
     assert document(gltf.encode(asset, "ball"))["materials"][0]["doubleSided"] is True
     tetrahedron = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]], dtype=np.int32)

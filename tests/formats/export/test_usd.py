@@ -1,5 +1,6 @@
 """USD and MaterialX: judged by OpenUSD's validators and by the MaterialX library, not by their writers."""
 
+import zipfile
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -29,22 +30,25 @@ def folder(asset: Asset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     where = tmp_path_factory.mktemp("usd")
     usd.write(where / "ball.usdc", asset, "ball", FILES, {"unit": "m"})
     materialx.write(where / "ball.mtlx", asset, "ball", FILES, "a ball")
+    textures: dict[Key, bytes] = {key: encoders.encode(LOOSE[key](asset), "png") for key in FILES}
     for key, file in FILES.items():
-        (where / file).write_bytes(encoders.encode(LOOSE[key](asset), "png"))
+        (where / file).write_bytes(textures[key])
+    usd.package(where / "ball.usdz", asset, "ball", textures, {"unit": "m"})
     return where
 
 
-def opened(folder: Path) -> Any:
+def opened(folder: Path, name: str = "ball.usdc") -> Any:
     from pxr import Usd
 
-    return Usd.Stage.Open(str(folder / "ball.usdc"))
+    return Usd.Stage.Open(str(folder / name))
 
 
-def test_usd_validators_find_nothing(folder: Path) -> None:
+@pytest.mark.parametrize("name", ["ball.usdc", "ball.usdz"])
+def test_usd_validators_find_nothing(folder: Path, name: str) -> None:
     """Those of OpenUSD's usdchecker; a usd-core without UsdMtlx cannot know MaterialX' nodes."""
     validation = pytest.importorskip("pxr.UsdValidation", reason="needs usd-core 25.11 or later")
     every = validation.ValidationRegistry().GetOrLoadAllValidators()
-    found = validation.ValidationContext(every).Validate(opened(folder))
+    found = validation.ValidationContext(every).Validate(opened(folder, name))
     assert len(every) > 20
     assert [one.GetMessage() for one in found if "shaderId 'ND_" not in one.GetMessage()] == []
 
@@ -61,6 +65,20 @@ def test_stage_is_upright_in_metres_and_names_its_root(folder: Path, asset: Asse
     st = np.array(UsdGeom.PrimvarsAPI(shape).GetPrimvar("st").Get())
     assert np.allclose(st[:, 1], 1 - asset.mesh.uv[:, 1], atol=1e-6)
     assert shape.GetDoubleSidedAttr().Get()
+
+
+def test_usdz_is_one_file_with_one_material_that_phones_know(folder: Path) -> None:
+    from pxr import UsdShade
+
+    with zipfile.ZipFile(folder / "ball.usdz") as package:
+        held = package.infolist()
+    assert {one.filename for one in held} == {"ball.usdc", *(f"{key}.png" for key in FILES)}
+    assert held[0].filename == "ball.usdc" and all(one.compress_type == zipfile.ZIP_STORED for one in held)
+    stage = opened(folder, "ball.usdz")
+    (material,) = [prim for prim in stage.Traverse() if prim.IsA(UsdShade.Material)]
+    surface = UsdShade.Material(material).ComputeSurfaceSource()[0]
+    assert surface.GetShaderId() == "UsdPreviewSurface"
+    assert not UsdShade.Material(material).GetSurfaceOutput("mtlx")
 
 
 def test_every_reader_finds_a_surface_with_measured_reflectance(folder: Path) -> None:
@@ -105,8 +123,15 @@ def test_nodes_follow_the_nodes_of_their_inputs(asset: Asset) -> None:
 
 def test_same_asset_gives_the_same_bytes(folder: Path, asset: Asset, tmp_path: Path) -> None:
     usd.write(tmp_path / "ball.usdc", asset, "ball", FILES, {"unit": "m"})
+    usd.package(
+        tmp_path / "ball.usdz",
+        asset,
+        "ball",
+        {key: (folder / f).read_bytes() for key, f in FILES.items()},
+        {"unit": "m"},
+    )
     materialx.write(tmp_path / "ball.mtlx", asset, "ball", FILES, "a ball")
-    for name in ("ball.usdc", "ball.mtlx"):
+    for name in ("ball.usdc", "ball.usdz", "ball.mtlx"):
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()
 
 

@@ -1,6 +1,7 @@
 """The folder maps/ holds every promised file and describes each."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import DecodeError, StorageError
-from polcap.formats.maps import exr, png
+from polcap.formats.maps import exr, png, result_maps
 from polcap.formats.maps import maps_folder as maps
 from polcap.images import ColorCalibration, Cues, Mesh, StokesImage, SurfaceMaps
 from polcap.stages import cues
@@ -178,3 +179,33 @@ def test_damaged_folder_is_one_line(folder: Path, tmp_path: Path) -> None:
     png.write(tmp_path / "mask.png", np.zeros((3, 3), dtype=np.uint8))
     with pytest.raises(DecodeError, match=r"mask\.png is not 160 × 120"):
         maps.read(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["capture/polcap/maps", "capture/polcap", "capture"])
+def test_python_reads_the_maps_of_a_result_by_any_of_its_folders(
+    result: Result, folder: Path, tmp_path: Path, name: str
+) -> None:
+    shutil.copytree(folder, tmp_path / "capture/polcap/maps")
+    of, mesh, stokes, cues_ = result
+    found = result_maps.read(tmp_path / name)
+    stored = maps.read(folder)
+    np.testing.assert_array_equal(found.normal, stored.maps.normal)
+    np.testing.assert_array_equal(found.depth, stored.depth)
+    assert found.metric is mesh.metric and repr(found.maps) == repr(stored.maps)
+    assert len(repr(found)) < 700 and f"float32 {of.normal.shape}" in repr(found)
+    inside = of.mask
+    np.testing.assert_allclose(
+        result_maps.read_stokes(tmp_path / name)[:, inside], stokes.stokes[:, inside], rtol=1e-3, atol=1e-4
+    )
+    read = result_maps.read_cues(str(tmp_path / name))
+    np.testing.assert_allclose(read["dolp"][inside], cues_.dolp[inside], rtol=1e-3, atol=1e-4)
+    double = 2 * read["aolp"][inside]
+    pointing = np.stack([np.cos(double), np.sin(double)])
+    np.testing.assert_allclose(pointing, cues_.normalized_stokes[:, inside], atol=0.01)
+    assert {name: value.shape for name, value in read.items()}["diffuse_color"] == of.normal.shape
+
+
+def test_a_folder_without_maps_is_one_clear_line(tmp_path: Path) -> None:
+    for read in (result_maps.read, result_maps.read_stokes, result_maps.read_cues):
+        with pytest.raises(DecodeError, match="give a result's folder"):
+            read(tmp_path)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from polcap.errors import DecodeError
+from polcap.errors import DecodeError, SettingError
 from polcap.formats.raw import exif, file_checks, file_kind, probe
 from polcap.formats.raw import libraw as raw
 from polcap.images import Exif
@@ -196,3 +196,14 @@ def test_real_files():
 @pytest.mark.parametrize("head", [b"\0MRM\0\0\1", b"\0MRM", b"FUJIFILMCCD-RAW ", b"\0\0\0\x18ftypcrx CMT1"])
 def test_a_head_cut_short_has_no_tags(head: bytes) -> None:
     assert exif.tags(head) == Exif()
+
+
+def test_an_exif_reader_that_does_not_work_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise all photographs would seem to have no EXIF."""
+    exif._check_reader.cache_clear()
+    assert exif.tags(BUILT["NEF"]).make == "Acme"
+    exif._check_reader.cache_clear()
+    monkeypatch.setattr("exifread.process_file", lambda file, strict: {})
+    with pytest.raises(SettingError, match=r"EXIF cannot be read: exifread 3\..*pip install"):
+        exif.tags(BUILT["NEF"])
+    exif._check_reader.cache_clear()

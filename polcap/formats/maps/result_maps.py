@@ -1,0 +1,79 @@
+"""Reads the maps of a result folder for Python users: `polcap.read_maps`, `read_stokes` and `read_cues`."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from polcap.errors import DecodeError
+from polcap.formats.maps import exr, maps_folder
+from polcap.formats.maps.maps_folder import StoredMaps
+from polcap.images import Floats, SurfaceMaps
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class ResultMaps(SurfaceMaps):
+    """All maps of a result, with its depth."""
+
+    depth: Floats  # (H, W) along the optical axis, growing away from the camera; NaN outside the mask
+    metric: bool  # depth is in metres; otherwise in a unit of its own
+
+    @property
+    def maps(self) -> SurfaceMaps:
+        """The maps without the depth."""
+        return SurfaceMaps(**{field.name: getattr(self, field.name) for field in fields(SurfaceMaps)})
+
+
+def read(result: str | Path) -> ResultMaps:
+    """Read all maps of a result: a result folder, its folder maps/, or the capture folder that holds the result.
+
+    Raises DecodeError: a file is missing, damaged, or not of the size in maps.json.
+    """
+    stored: StoredMaps = maps_folder.read(_folder(result))
+    values = {field.name: getattr(stored.maps, field.name) for field in fields(SurfaceMaps)}
+    return ResultMaps(**values, depth=stored.depth, metric=stored.metric)
+
+
+def read_stokes(result: str | Path) -> Floats:
+    """Linear Stokes parameters S0, S1, S2 of a result, (3, H, W, 3), in camera channels; white of the sensor is 1.
+
+    Raises DecodeError: the file is missing or damaged.
+    """
+    found = _channels(_folder(result) / "stokes.exr", [f"S{s}.{color}" for s in range(3) for color in "RGB"])
+    return np.moveaxis(np.stack(found).reshape(3, 3, *found[0].shape), 1, -1)
+
+
+def read_cues(result: str | Path) -> dict[str, Floats]:
+    """Polarization cues of a result by name.
+
+    `dolp` (H, W); `aolp` (H, W) rad, 0…π from image x toward image up; `normalized_stokes` (2, H, W);
+    `diffuse_color` (H, W, 3) of unit length.
+
+    Raises DecodeError: the file is missing or damaged.
+    """
+    names = ["dolp", "aolp", "normalized.S1", "normalized.S2", *(f"diffuse_color.{color}" for color in "RGB")]
+    dolp, aolp, s1, s2, *rgb = _channels(_folder(result) / "cues.exr", names)
+    return {
+        "dolp": dolp,
+        "aolp": np.radians(aolp),
+        "normalized_stokes": np.stack([s1, s2]),
+        "diffuse_color": np.stack(rgb, axis=-1),
+    }
+
+
+def _folder(result: str | Path) -> Path:
+    """The folder of the maps."""
+    named = Path(result)
+    places = [named, named / "maps", named / "polcap" / "maps"]
+    return next((place for place in places if (place / "maps.json").exists()), named)
+
+
+def _channels(file: Path, names: list[str]) -> list[Floats]:
+    """Channels (H, W) of an EXR file, in the order of `names`."""
+    if not file.exists():
+        raise DecodeError(f"{file}: there is no such file; give a result's folder, or process the capture again")
+    found, _ = exr.read(file)
+    missing = [name for name in names if name not in found]
+    if missing:
+        raise DecodeError(f"{file} has no channel {missing[0]}; process the capture again")
+    return [found[name] for name in names]

@@ -1,0 +1,146 @@
+"""Converts meshes and texture folders of other people into the data folder of `polcap train`.
+
+    python -m polcap.training.import_data SOURCE DATA
+
+SOURCE is searched with all its sub-folders. Meshes are OBJ, GLB, glTF, PLY, STL or OFF files. A texture folder has a
+picture of albedo and one of roughness; their names contain those words, as in `Bricks_2K_BaseColor.png`. Every tenth
+mesh and texture folder, the first included, is for tests; a single one is for both. Needs the extra [train].
+"""
+
+import argparse
+import re
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from polcap.errors import DecodeError, InputError, PolcapError, StorageError
+from polcap.formats import atomic, scene_files
+from polcap.training.progress import Report, silent
+
+_MESHES = {".obj", ".glb", ".gltf", ".ply", ".stl", ".off"}
+_PICTURES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr"}
+_ROLES = {  # of a texture by its file's name, the first that fits
+    "roughness": re.compile(r"rough", re.IGNORECASE),
+    "normal": re.compile(r"normal|(?<![a-z])nor(?![a-z])|(?<![a-z])nrm", re.IGNORECASE),
+    "height": re.compile(r"height|displace|(?<![a-z])disp", re.IGNORECASE),
+    "albedo": re.compile(r"albedo|base_?color|diff|(?<![a-z])colou?r|(?<![a-z])col(?![a-z])", re.IGNORECASE),
+}
+_GREEN_DOWN = re.compile(r"(?<![a-z])dx(?![a-z])|directx|(?<=normal)dx", re.IGNORECASE)
+_TEST_EVERY = 10
+_SIDE = 1024  # px, largest side of a texture; training uses 256
+
+
+def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
+    """Convert all meshes and texture folders below `source`; returns their numbers. Unusable ones are reported.
+
+    Raises
+    ------
+    InputError
+        Nothing usable was found.
+    """
+    meshes = sorted(path for path in source.rglob("*") if path.suffix.lower() in _MESHES and path.is_file())
+    textures = sorted({path.parent for path in source.rglob("*") if path.suffix.lower() in _PICTURES})
+    textures = [folder for folder in textures if {"albedo", "roughness"} <= _pictures(folder).keys()]
+    counts = [0, 0]
+    for kind, found in enumerate((meshes, textures)):
+        for number, path in enumerate(found):
+            try:
+                for split in _splits(number, len(found)):
+                    name = _name(path.relative_to(source))
+                    if kind == 0:
+                        write_mesh(path, data / "meshes" / split / f"{name}.npz")
+                    else:
+                        write_textures(path, data / "materials" / split / name)
+                counts[kind] += 1
+            except DecodeError as error:
+                report(f"left out: {error}")
+    if not any(counts):
+        kinds = ", ".join(sorted(_MESHES))
+        raise InputError(f"{source}: holds no mesh ({kinds}) and no folder with pictures of albedo and roughness")
+    report(f"{counts[0]} meshes and {counts[1]} texture folders in {data}")
+    return counts[0], counts[1]
+
+
+def _splits(number: int, count: int) -> tuple[str, ...]:
+    """The parts of the data to which the item of this number belongs."""
+    if count == 1:
+        return ("train", "test")
+    return ("test",) if number % _TEST_EVERY == 0 else ("train",)
+
+
+def _name(path: Path) -> str:
+    """Name of a mesh or texture folder, from its path inside the source."""
+    return re.sub(r"[^A-Za-z0-9]+", "_", "_".join(path.with_suffix("").parts)).strip("_").lower() or "unnamed"
+
+
+def write_mesh(path: Path, target: Path) -> None:
+    """Write a mesh with vertices of 16 bits; equal vertices become one, so that seams of textures are smooth.
+
+    Raises DecodeError: the file is no usable mesh.
+    """
+    vertices, faces = scene_files.read_mesh(path)
+    low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
+    if not size > 0:
+        raise DecodeError(f"{path}: all its vertices are one point; give another mesh")
+    quantized = np.rint((vertices - low) / size * 65535).astype(np.uint16)
+    corners, place = np.unique(quantized, axis=0, return_inverse=True)
+    joined = place.reshape(-1)[faces]
+    whole = (joined != np.roll(joined, 1, axis=1)).all(axis=1)  # without triangles that have no area
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with atomic.path(target) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, vq=corners, vmin=low, vscale=np.float32(size), faces=joined[whole].astype(np.int32))
+
+
+def write_textures(folder: Path, target: Path) -> None:
+    """Write the pictures of a texture folder as albedo.jpg, roughness.jpg and normal.jpg or height.jpg.
+
+    Normal maps are turned to green down (DirectX) unless their name states it. Raises DecodeError.
+    """
+    target.mkdir(parents=True, exist_ok=True)
+    for role, path in _pictures(folder).items():
+        picture = _read(path)
+        if role == "normal" and not _GREEN_DOWN.search(path.stem):
+            picture = picture.copy()
+            picture[..., 1] = 255 - picture[..., 1]
+        if not cv2.imwrite(str(target / f"{role}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 95]):
+            raise StorageError(f"{target / role}.jpg cannot be written; check the disk")
+
+
+def _pictures(folder: Path) -> dict[str, Path]:
+    """The pictures of a texture folder by role."""
+    found: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in _PICTURES:
+            role = next((role for role, words in _ROLES.items() if words.search(path.stem)), None)
+            if role is not None:
+                found.setdefault(role, path)
+    return found
+
+
+def _read(path: Path) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
+    """A picture (H, W, 3) of 8 bits, at most 1024 px wide and high, in OpenCV's order of the channels."""
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise DecodeError(f"{path}: is no picture that OpenCV reads; convert it to PNG")
+    factor = min(1.0, _SIDE / max(picture.shape[:2]))
+    return np.asarray(cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
+
+
+def _arguments() -> tuple[Path, Path]:
+    """Source and data folder of the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m polcap.training.import_data", description="Converts meshes and textures for polcap train."
+    )
+    parser.add_argument("source", type=Path, help="folder with meshes and texture folders")
+    parser.add_argument("data", type=Path, help="data folder of polcap train")
+    stated = parser.parse_args()
+    return stated.source, stated.data
+
+
+if __name__ == "__main__":
+    try:
+        main(*_arguments(), lambda text: print(text, file=sys.stderr))
+    except PolcapError as error:
+        sys.exit(f"polcap: error: {error}")

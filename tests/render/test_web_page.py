@@ -1,0 +1,49 @@
+"""The page of an exported GLB in a browser without network: model-viewer shows the object."""
+
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from polcap.errors import SettingError
+from polcap.formats.export import gltf, web_page
+from tests import surfaces
+from tests.render import browser, devtools
+
+SCRIPT = browser.MODULES / "@google" / "model-viewer" / "dist" / "model-viewer.min.js"
+
+
+def test_page_shows_the_object_without_network_or_complaint(tmp_path: Path) -> None:
+    if not SCRIPT.exists():
+        pytest.skip("needs `npm ci` in tests/gltf")
+    maps = surfaces.maps()
+    options = gltf.GlbOptions("webp", "quantized")
+    gltf.write(tmp_path / "ball.glb", surfaces.built(maps, surfaces.mesh(maps)), "ball", options)
+    web_page.write(tmp_path / "ball.html", tmp_path / "ball.glb", web_page.read_script(SCRIPT), "a <ball>")
+    with devtools.opened() as page:
+        page.call("Page.navigate", url=(tmp_path / "ball.html").as_uri())
+        limit, red, green = time.monotonic() + devtools.LIMIT_S, 0, 0
+        while red == 0:  # until the object is drawn
+            assert time.monotonic() < limit, page.complaints
+            time.sleep(0.5)
+            seen = drawn(page, tmp_path / "seen.png")
+            red, green = ((seen[..., a] > seen[..., b] + 30.0).sum() for a, b in ((2, 1), (1, 2)))
+        assert page.evaluate("document.title") == "a <ball>"
+        assert [one for one in page.complaints if "rAF timed out" not in one] == []  # on a busy machine
+        assert [one for one in page.asked if not one.startswith(("data:", "file:", "blob:"))] == []
+    assert green > 2 * red > 1000  # the ball has a red quarter
+
+
+def drawn(page: devtools.Page, file: Path) -> np.ndarray:
+    """The page as it is drawn now, (H, W, 3) blue, green, red."""
+    page.screenshot(file)
+    return np.asarray(cv2.imread(str(file)), np.float64)
+
+
+def test_another_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "three.js").write_text("nothing")
+    for name in ("three.js", "missing.js"):
+        with pytest.raises(SettingError, match=r"give model-viewer\.min\.js"):
+            web_page.read_script(tmp_path / name)
