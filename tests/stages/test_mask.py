@@ -194,3 +194,10 @@ def test_expected_error_is_one_minus_the_mean_overlap():
     found = chance > 0.5
     overlaps = [((t := rng.random(chance.shape) < chance) & found).sum() / (t | found).sum() for _ in range(20)]
     assert 1 - regions.expected_error(found, chance) == pytest.approx(np.mean(overlaps), abs=0.005)
+
+
+def test_parts_of_a_mask_are_numbered_by_area() -> None:
+    mask = np.zeros((20, 40), bool)
+    mask[2:6, 2:6], mask[5:15, 20:35] = True, True
+    assert regions.nth_part(mask, 1).sum() == 150 and regions.nth_part(mask, 2).sum() == 16
+    assert not regions.nth_part(mask, 3).any()

@@ -57,3 +57,13 @@ def test_too_few_bright_tiles_give_no_answer():
     assert ratio(planes(dark), planes(dark)) is None
     bright = picture(rng, 1)
     assert ratio(planes(bright), planes(bright, np.zeros((320, 400), bool))) is None
+
+
+def test_vignetting_is_a_smooth_factor_and_none_without_it():
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[-1:1:320j, -1:1:400j]
+    shade = (1 - 0.15 * (x * x + y * y))[..., None]
+    flat, darker = picture(rng, 1.0, low=0.05), picture(rng, 1.0, low=0.05) * shade
+    found = exposure.vignetting(planes(flat), planes(darker.astype(np.float32)), np.ones(3, np.float32))
+    assert found is not None and np.abs(found - shade[..., 0]).max() < 0.02
+    assert exposure.vignetting(planes(flat), planes(picture(rng, 1.0, low=0.05)), np.ones(3, np.float32)) is None
