@@ -330,7 +330,7 @@ class MaskedImage:
 class Mosaic:
     """A merged shot on its photosites, each of one color."""
 
-    value: Floats  # (2 H, 2 W) float16, sensor white at the reference exposure = 1
+    value: Floats  # (2H, 2W) float16, sensor white at the reference exposure = 1
     cfa: Bits  # (2, 2) of 0 R, 1 G, 2 B
 
 
@@ -572,7 +572,7 @@ class StokesImage:
     view: View  # of the crop
     residual: Floats | None  # (H, W) |measured − fitted| / S0 where K > 3
     body: MaskedImage | None = None  # S0 of the diffuse reflection only, from a crossed shot
-    detail: Floats | None = None  # (2 H, 2 W) float16, ln of the light of RAW pixels over these pixels, enlarged
+    detail: Floats | None = None  # (2H, 2W) float16, ln of the light of RAW pixels over these pixels, enlarged
 
 
 @dataclass(frozen=True)
@@ -592,7 +592,7 @@ class Cues:
     scale_sigma: float | None = None  # relative 1σ of the light on the chart against that on the object; None: no chart
     body: Floats | None = None  # (H, W, 3) radiance of the diffuse reflection only, from a crossed shot
     body_known: NDArray[np.bool_] | None = None  # (H, W) where the crossed shot is valid
-    detail: Floats | None = None  # (2 H, 2 W) float16, ln of the light of RAW pixels over these pixels, enlarged
+    detail: Floats | None = None  # (2H, 2W) float16, ln of the light of RAW pixels over these pixels, enlarged
 
 
 @dataclass(frozen=True)
@@ -626,7 +626,7 @@ class SurfaceMaps:
     view: View
     estimator: str
     albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown, albedos are relative
-    detail: Floats | None = None  # (2 H, 2 W) float16, ln of the albedo of RAW pixels over `diffuse`, enlarged
+    detail: Floats | None = None  # (2H, 2W) float16, ln of the albedo of RAW pixels over `diffuse`, enlarged
 
 
 @dataclass(frozen=True)
@@ -651,7 +651,7 @@ class Asset:
     """A 3-D asset: mesh with glTF textures and material factors."""
 
     mesh: Mesh
-    base_color: NDArray[np.uint8]  # (H, W, 3) sRGB; (2 H, 2 W, 3) with the detail of RAW pixels
+    base_color: NDArray[np.uint8]  # (H, W, 3) sRGB; (2H, 2W, 3) with the detail of RAW pixels
     occlusion_roughness_metallic: NDArray[np.uint8]  # (H, W, 3) linear
     normal: NDArray[np.uint8]  # (H, W, 3) tangent space, +Y
     specular_color: NDArray[np.uint8]  # (H, W, 3) sRGB, to be multiplied by the factor

@@ -33,13 +33,13 @@ def waves(seed: int, *periods: float) -> Floats:
 class Photographed:
     """A ball of known albedo, the maps that polcap makes of it, and its asset."""
 
-    albedo: Floats  # (2 H, 2 W) gray
+    albedo: Floats  # (2H, 2W) gray
     stokes: StokesImage
     maps: SurfaceMaps
 
     @property
     def inside(self) -> Floats:
-        """Pixels (2 H, 2 W) where the ball turns away by less than 60°, without its outline."""
+        """Pixels (2H, 2W) where the ball turns away by less than 60°, without its outline."""
         place = (np.array([X, Y]) - 0.5) / 2 - np.array(scenes.CENTER)[:, None, None]
         return np.asarray(np.hypot(*place) < 0.85 * scenes.RADIUS)
 

@@ -87,12 +87,12 @@ _DETAIL_STEPS = 50  # per unit of the logarithm
 
 
 def detail_levels(detail: Floats) -> NDArray[np.uint8]:
-    """The levels (2 H, 2 W) of detail.png, 128 + 50 ln, of a logarithm."""
+    """The levels (2H, 2W) of detail.png, 128 + 50 ln, of a logarithm."""
     return np.asarray(np.rint(np.clip(detail * np.float16(_DETAIL_STEPS), -127, 127)) + 128, np.uint8)
 
 
 def detail_of(levels: NDArray[np.uint8]) -> Floats:
-    """The logarithm (2 H, 2 W) float16 of the levels of detail.png."""
+    """The logarithm (2H, 2W) float16 of the levels of detail.png."""
     table = (np.arange(256, dtype=np.float32) - 128) / _DETAIL_STEPS
     return np.asarray(table.astype(np.float16)[levels])
 

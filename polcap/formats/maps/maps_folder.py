@@ -173,7 +173,7 @@ def read(folder: Path) -> StoredMaps:
 
 
 def _read_detail(folder: Path, size: tuple[int, int]) -> Floats:
-    """The logarithm (2 H, 2 W) in detail.png."""
+    """The logarithm (2H, 2W) in detail.png."""
     levels = png.read(folder / map_files.DETAIL)
     if levels.dtype != np.uint8 or levels.shape != (2 * size[1], 2 * size[0]):
         raise DecodeError(f"{folder / map_files.DETAIL} is not {2 * size[0]} × {2 * size[1]} of 8 bits; process again")

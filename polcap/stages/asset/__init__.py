@@ -72,7 +72,7 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
 
 
 def _with_detail(albedo: Floats, detail: Floats) -> NDArray[np.uint8]:
-    """An albedo (H, W, 3), enlarged linearly, times the exponential of its detail (2 H, 2 W); 8-bit sRGB."""
+    """An albedo (H, W, 3), enlarged linearly, times the exponential of its detail (2H, 2W); 8-bit sRGB."""
     factor = np.exp(detail, dtype=np.float32)
     planes = [color.srgb_eight_bits(cv2.resize(plane, detail.shape[::-1]) * factor) for plane in cv2.split(albedo)]
     return np.asarray(cv2.merge(planes))

@@ -14,7 +14,7 @@ _Part = tuple[SensorImage, Bools, Floats]  # a frame, the superpixels (H, W) it 
 
 
 def merge(bracket: Bracket, weighted: WeightedBracket, read: Reader) -> Mosaic:
-    """Photosites (2 H, 2 W) of a Bayer bracket: the sum of the signals over the sum of the exposures.
+    """Photosites (2H, 2W) of a Bayer bracket: the sum of the signals over the sum of the exposures.
 
     Each superpixel uses the frames that serve it in the merge. Frames that moved are left out: resampling would mix
     the colors.
@@ -32,7 +32,7 @@ def merge(bracket: Bracket, weighted: WeightedBracket, read: Reader) -> Mosaic:
 
 
 def _merge_rows(parts: list[_Part], out: Floats, rows: slice) -> None:
-    """Write the merged photosites of some rows of superpixels to `out` (2 H, 2 W)."""
+    """Write the merged photosites of some rows of superpixels to `out` (2H, 2W)."""
     width = out.shape[1]
     serves = [np.repeat(serves[rows], 2, axis=1).astype(np.float32) for _, serves, _ in parts]
     for i in (0, 1):  # rows of one phase of the color filter array

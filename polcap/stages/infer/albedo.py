@@ -124,7 +124,7 @@ def albedo_sigma(maps: SurfaceMaps, of_chart: float | None) -> float | None:
 
 
 def select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:
-    """The part of the photograph's detail (2 H, 2 W) that belongs to the albedo, as logarithm, float16.
+    """The part of the photograph's detail (2H, 2W) that belongs to the albedo, as logarithm, float16.
 
     Each pixel's detail is multiplied by the share of the power around it that neither shading nor noise explains (a
     Wiener filter). The detail covers the superpixels (H, W) of `maps`.

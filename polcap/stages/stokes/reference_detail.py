@@ -17,7 +17,7 @@ _LEAST = np.float32(1e-6)  # light
 
 
 def reference_detail(mosaic: Mosaic, crop: Box, lens: Distortion | None = None) -> Floats:
-    """Logarithm (2 h, 2 w) float16 of the light of each RAW pixel over that of the superpixels, enlarged linearly.
+    """Logarithm (2h, 2w) float16 of the light of each RAW pixel over that of the superpixels, enlarged linearly.
 
     Light is the sum of the demosaiced colors. `crop` (w × h) is in superpixels of the pinhole camera, and `lens` the
     distortion on that grid. Shading, gains and falloff are the same in both, so only fine detail remains.
@@ -36,7 +36,7 @@ def reference_detail(mosaic: Mosaic, crop: Box, lens: Distortion | None = None) 
 
 
 def _light(mosaic: Mosaic, box: Box, lens: Distortion | None) -> Floats:
-    """Sum of the demosaiced colors in a box (w × h) of superpixels, (2 h, 2 w); beyond the picture its edge repeats."""
+    """Sum of the demosaiced colors in a box (w × h) of superpixels, (2h, 2w); beyond the picture its edge repeats."""
     if lens is not None:
         fine = replace(lens, focal=2 * lens.focal, center=(2 * lens.center[0] + 0.5, 2 * lens.center[1] + 0.5))
         height, width = mosaic.value.shape
