@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.floating[Any]]
 Bits = NDArray[np.uint8]
+TexturePixels = NDArray[Any]  # uint8 or uint16; a share of the type's largest value
 Device = Literal["cpu", "cuda", "auto"]
 Bools = NDArray[np.bool_]
 Role = Literal["shot", "ambient", "repeat", "chart", "cross"]
@@ -651,12 +652,14 @@ class Asset:
     """A 3-D asset: mesh with glTF textures and material factors."""
 
     mesh: Mesh
-    base_color: NDArray[np.uint8]  # (H, W, 3) sRGB; (2H, 2W, 3) with the detail of RAW pixels
-    occlusion_roughness_metallic: NDArray[np.uint8]  # (H, W, 3) linear
-    normal: NDArray[np.uint8]  # (H, W, 3) tangent space, +Y
-    specular_color: NDArray[np.uint8]  # (H, W, 3) sRGB, to be multiplied by the factor
+    base_color: TexturePixels  # (H, W, 3) sRGB; (2H, 2W, 3) with the detail of RAW pixels
+    occlusion_roughness_metallic: TexturePixels  # (H, W, 3) linear
+    normal: TexturePixels  # (H, W, 3) tangent space, +Y
+    specular_color: TexturePixels  # (H, W, 3) sRGB, to be multiplied by the factor
     specular_factor: tuple[float, float, float]  # KHR_materials_specular specularColorFactor
     ior: float
+    displacement: TexturePixels | None = None  # (H, W) 0 at the farthest point, 1 at the nearest
+    object_normal: TexturePixels | None = None  # (H, W, 3) camera frame, n * 0.5 + 0.5
     albedo_sigma: float | None = None  # as in `SurfaceMaps`
 
 

@@ -12,6 +12,7 @@ from typer import Argument, Option
 from polcap.errors import SettingError
 
 if TYPE_CHECKING:
+    from polcap.formats.export.texture_set import Extra
     from polcap.images import ChartRequest
 
 
@@ -79,6 +80,23 @@ def catalog_fields(stated: Sequence[str]) -> dict[str, str]:
         if key not in known:
             raise SettingError(f"--about {key}: there is no such fact; there are {', '.join(known)}")
     return found
+
+
+def extra_textures(named: Sequence[str]) -> "tuple[Extra, ...]":
+    """--extra: names of further textures; SettingError for another one."""
+    from polcap.formats.export.texture_set import EXTRAS
+
+    for name in named:
+        if name not in EXTRAS:
+            raise SettingError(f"--extra {name}: there is no such texture; there are {', '.join(EXTRAS)}")
+    return tuple(extra for extra in EXTRAS if extra in named)
+
+
+def texture_bits(bits: int | None) -> Literal[8, 16] | None:
+    """--bits; SettingError for another number."""
+    if bits not in (None, 8, 16):
+        raise SettingError(f"--bits {bits}: PNG has 8 or 16 bits")
+    return None if bits is None else 8 if bits == 8 else 16
 
 
 def check_stages(named: Mapping[str, str | None]) -> None:

@@ -11,7 +11,16 @@ from polcap.cli import options
 from polcap.cli.options import Json, Result, choice
 from polcap.errors import SettingError
 
-PRESETS = ("blender", "unreal", "unity", "web", "archive")  # those of formats.export.presets, not imported at start
+PRESETS = (
+    "blender",
+    "unreal",
+    "unity",
+    "web",
+    "substance",
+    "maya",
+    "houdini",
+    "archive",
+)  # those of formats.export.presets, not imported at start
 
 
 def export(
@@ -50,6 +59,11 @@ def export(
             metavar="K=V", help="A fact for catalogs: title, creator, rights, license or object_number; repeatable."
         ),
     ] = None,
+    extra: Annotated[
+        list[str] | None,
+        Option(metavar="NAME", help="A further texture: displacement, occlusion or object-normal; repeatable."),
+    ] = None,
+    bits: Annotated[int | None, Option(metavar="8|16", help="Bits of a channel in PNG textures.")] = None,
     lod: Annotated[int, Option(min=0, max=6, help="Further GLBs, each with a quarter of the triangles.")] = 0,
     json: Json = False,
 ) -> None:
@@ -69,6 +83,8 @@ def export(
         triangles=triangles,
         color=color,
         texture_size=texture_size,
+        bits=options.texture_bits(bits),
+        extras=options.extra_textures(extra or []),
         page=page,
         catalog=options.catalog_fields(about or []),
         lod=lod,

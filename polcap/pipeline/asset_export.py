@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from polcap import parallel
 from polcap.config import Config
@@ -18,7 +18,7 @@ from polcap.formats.export import exr_layers, glb_geometry, gltf, materialx, obj
 from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.presets import PRESETS, ExportPreset, Format
-from polcap.formats.export.texture_set import Key, Texture
+from polcap.formats.export.texture_set import Extra, Key, Texture
 from polcap.formats.maps import maps_folder
 from polcap.images import Asset, Mesh
 from polcap.stages import asset, surface
@@ -37,6 +37,8 @@ class ExportRequest:
     geometry: Geometry | None = None  # inside the GLB; by default the preset's, or floats
     triangles: int | None = None  # at most; by default the preset's, or those of the full mesh
     color: str = exr_layers.LINEAR_REC709  # color space or role of the colors in the layered EXR
+    bits: Literal[8, 16] | None = None  # of a texture's channel; by default the preset's, or 8
+    extras: tuple[Extra, ...] = ()  # textures to make, in addition to the preset's
     texture_size: int | None = None  # px of the longer side; by default each texture's own
     page: Path | None = None  # file with model-viewer's script, for a web page that shows the GLB
     catalog: Mapping[str, str] = field(default_factory=dict)  # fields of `CatalogEntry` in place of the capture's
@@ -50,7 +52,7 @@ class ExportSource:
     stored: maps_folder.StoredMaps
     mesh: Mesh
     asset: Asset
-    back: surface.Back  # the setting of the mesh
+    config: Config
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ def read(folder: Path, config: Config) -> ExportSource:
     """
     stored = maps_folder.read(folder)
     mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, config.surface)
-    return ExportSource(stored, mesh, asset.build(stored.maps, mesh, config.asset), config.surface.back)
+    return ExportSource(stored, mesh, asset.build(stored.maps, mesh, config.asset), config)
 
 
 def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
@@ -98,20 +100,24 @@ def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
     ObjectError
         A level has too few triangles.
     """
-    full = len(source.mesh.faces)
-    most = min(effective(wanted).triangles or full, full)
-    found = [DetailLevel(source.asset) if most == full else _decimated(source, most)]
-    found += [_decimated(source, round(most * 0.25**k)) for k in range(1, wanted.lod + 1)]
+    preset, maps, full, whole = effective(wanted), source.stored.maps, len(source.mesh.faces), source.asset
+    if preset.bits != 8:
+        whole = asset.build(maps, source.mesh, source.config.asset, preset.bits)
+    if preset.extras:
+        whole = asset.with_extras(whole, maps, source.stored.depth, "occlusion" in preset.extras)
+    most = min(preset.triangles or full, full)
+    found = [DetailLevel(whole) if most == full else _decimated(source, whole, most)]
+    found += [_decimated(source, whole, round(most * 0.25**k)) for k in range(1, wanted.lod + 1)]
     size = wanted.texture_size
     if size is None:
         return found
     return [replace(level, asset=asset.resize_textures(level.asset, size)) for level in found]
 
 
-def _decimated(source: ExportSource, triangles: int) -> DetailLevel:
+def _decimated(source: ExportSource, whole: Asset, triangles: int) -> DetailLevel:
     maps = source.stored.maps
-    decimated = surface.decimate(source.mesh, maps.view, triangles, source.back)
-    return DetailLevel(asset.with_mesh(source.asset, maps, decimated.mesh), decimated)
+    decimated = surface.decimate(source.mesh, maps.view, triangles, source.config.surface.back)
+    return DetailLevel(asset.with_mesh(whole, maps, decimated.mesh), decimated)
 
 
 def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Sequence[DetailLevel]) -> list[Path]:
@@ -131,10 +137,11 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     preset, mesh = effective(wanted), whole.mesh
     name = atomic.safe_name(str(about["capture"].get("name")))  # files stay in the folder, whatever name the report has
     stem = preset.name.format(obj.stem(name) if preset.textures else name)
-    shared: dict[Key, str] = {key: f"{obj.stem(stem)}_{key}.png" for key in texture_set.LOOSE}
-    loose = {f"{pattern.format(obj.stem(name))}.png": make(whole) for pattern, make in preset.textures.items()}
+    shared: dict[Key, str] = {key: f"{obj.stem(stem)}_{key}.{preset.shared}" for key in texture_set.LOOSE}
+    loose = _loose_textures(preset, wanted, whole, obj.stem(name))
     if _SHARING.intersection(preset.formats):
-        loose |= {file: texture_set.LOOSE[key](whole) for key, file in shared.items()}
+        made = {file: texture_set.LOOSE[key](whole) for key, file in shared.items()}
+        loose |= {file: texture_set.linear(one) for file, one in made.items()} if preset.shared == "exr" else made
     folder = out / "asset" / (wanted.preset or "")
     options = gltf.GlbOptions(preset.images, preset.geometry, gltf.center(mesh.vertices))
     unit, record, encoder = (
@@ -180,6 +187,12 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     return [*written, sidecar]
 
 
+def _loose_textures(preset: ExportPreset, wanted: ExportRequest, whole: Asset, stem: str) -> dict[str, Texture]:
+    """The PNG textures of a preset and of options, by file name."""
+    made = {f"{pattern.format(stem)}.png": make(whole) for pattern, make in preset.textures.items()}
+    return made | {f"{stem}_{key.replace('-', '')}.png": texture_set.EXTRAS[key](whole) for key in wanted.extras}
+
+
 def effective(wanted: ExportRequest) -> ExportPreset:
     """The preset that an export uses.
 
@@ -196,6 +209,8 @@ def effective(wanted: ExportRequest) -> ExportPreset:
         images=wanted.images or preset.images,
         geometry=wanted.geometry or preset.geometry,
         triangles=wanted.triangles or preset.triangles,
+        bits=wanted.bits or preset.bits,
+        extras=(*preset.extras, *wanted.extras),
     )
 
 
@@ -219,6 +234,9 @@ def _write_usdz(file: Path, content: Asset, words: Mapping[str, str], encoder: T
 
 
 def _write_texture(file: Path, texture: Texture, encoder: TextureEncoder) -> list[Path]:
+    if file.suffix == ".exr":
+        texture_set.write_exr(file, texture)
+        return [file]
     with atomic.path(file) as temporary:
         temporary.write_bytes(encoder(texture, "png", text=True))
     return [file]

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from polcap.formats.export import encoders
+from polcap.formats.export import encoders, texture_set
 from polcap.formats.export.presets import PRESETS
-from polcap.formats.maps import png
+from polcap.formats.maps import exr, png
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.asset_export import ExportRequest
 from tests.conftest import ROOT, Command, shell
@@ -39,7 +39,7 @@ def own(result: Path, tmp_path: Path) -> Path:
     return copy
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", [name for name, preset in PRESETS.items() if "gltf" in preset.formats])
 def test_validator_finds_no_error_and_no_warning(exported: Path, preset: str) -> None:
     node = shutil.which("node")
     if node is None or not (NODE / "node_modules" / "gltf-validator").is_dir():
@@ -55,6 +55,9 @@ def test_maps_json_and_the_files_say_what_they_hold(exported: Path, preset: str)
     said = json.loads((exported / "maps" / "maps.json").read_text())["exports"][f"asset/{preset}"]
     assert said["unit"] in ("m", "relative") and "+Y" in said["for"]
     for name, meaning in said["textures"].items():
+        if name.endswith(".exr"):
+            assert meaning == exr.read(exported / "asset" / preset / name)[1]["polcap:meaning"]
+            continue
         assert meaning.encode() in (exported / "asset" / preset / name).read_bytes()[:300]
 
 
@@ -115,7 +118,7 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, own: P
 @pytest.mark.parametrize(
     ("flags", "says"),
     [
-        (["--preset", "maya"], f"--preset maya is none of {', '.join(PRESETS)}"),
+        (["--preset", "max"], f"--preset max is none of {', '.join(PRESETS)}"),
         (["--preset", "web", "--obj"], "leave out --obj"),
         (["--about", "author=me"], "--about author: there is no such fact; there are title, creator"),
         (["--obj", "--page", ROOT / "README.md"], "README.md is not model-viewer"),
@@ -204,6 +207,22 @@ def test_presets_of_one_command_each_get_their_folder(own: Path, polcap: Command
     for preset in ("web", "unreal"):
         assert said[f"asset/{preset}"]["mesh"]["triangles"] == pytest.approx(3000, rel=0.01)
     assert "KHR_mesh_quantization" in document((own / "asset/web/capture.glb").read_bytes())["extensionsRequired"]
+
+
+def test_extra_textures_and_sixteen_bits(own: Path, polcap: Command) -> None:
+    """Displacement is depth.png turned round; object-space normals are the maps'; the GLB holds the occlusion."""
+    named = [part for name in texture_set.EXTRAS for part in ("--extra", name)]
+    assert polcap("export", own, "--obj", "--gltf", "--bits", 16, *named).returncode == 0
+    pictures = {name: png.read(own / "asset" / f"capture_{name}.png") for name in ("displacement", "objectnormal")}
+    mask = png.read(own / "maps" / "mask.png") > 127
+    depth, normal = (png.read(own / "maps" / f"{name}.png").astype(int) for name in ("depth", "normal"))
+    assert np.abs(pictures["displacement"][mask] - (65535 - depth[mask])).max() <= 2
+    assert np.abs(pictures["objectnormal"][mask] - normal[mask]).max() <= 2
+    assert png.read(own / "asset" / "capture_basecolor.png").dtype == np.uint16
+    occlusion = png.read(own / "asset" / "capture_occlusion.png")[mask] / 65535
+    assert 0.5 < occlusion.mean() < 1 and occlusion.min() < 0.9
+    material = document((own / "asset/capture.glb").read_bytes())["materials"][0]
+    assert material["occlusionTexture"] == {"index": 1}
 
 
 def test_a_second_export_adds_to_the_records_of_the_first(own: Path) -> None:

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from polcap.errors import SettingError, StorageError
 from polcap.formats import atomic
-from polcap.formats.export.texture_set import Pixels, Texture
+from polcap.formats.export.texture_set import Texture
 from polcap.formats.maps import png
+from polcap.images import TexturePixels
 
 Kind = Literal["png", "jpeg", "webp", "ktx2"]
 MIME: dict[Kind, str] = {"png": "image/png", "jpeg": "image/jpeg", "webp": "image/webp", "ktx2": "image/ktx2"}
@@ -42,7 +43,7 @@ class TextureEncoder:
     def __init__(self) -> None:
         self._lock = Lock()
         # holds the pixels too, so that no other array can get their id
-        self._made: dict[tuple[int, Kind, bool], tuple[Pixels, Future[bytes]]] = {}
+        self._made: dict[tuple[int, Kind, bool], tuple[TexturePixels, Future[bytes]]] = {}
 
     def __call__(self, texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
         """The bytes of one texture as for `encode`; with `text`, a PNG also states its meaning in a tEXt chunk."""

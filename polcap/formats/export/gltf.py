@@ -162,6 +162,7 @@ def _material(asset: Asset, name: str) -> dict[str, Any]:
             "roughnessFactor": 1.0,
         },
         "normalTexture": {"index": 2},
+        **({"occlusionTexture": {"index": 1}} if np.ptp(asset.occlusion_roughness_metallic[..., 0]) else {}),
         "extensions": {
             "KHR_materials_specular": {
                 "specularColorFactor": list(asset.specular_factor),

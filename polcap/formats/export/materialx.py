@@ -40,6 +40,7 @@ def document(asset: Asset, name: str, files: Mapping[Key, str], doc: str) -> str
     return Template(template).substitute(
         {key: quoteattr(file) for key, file in files.items()},
         doc=quoteattr(doc),
+        space="lin_rec709" if files["basecolor"].endswith(".exr") else "srgb_texture",
         name=identifier(name),
         luminance=", ".join(f"{weight:.7g}" for weight in color.LUMINANCE),
         weight=f"{SPECULAR_RANGE / float(fresnel.normal_reflectance(asset.ior)):.7g}",

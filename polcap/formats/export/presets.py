@@ -8,7 +8,7 @@ from typing import Literal
 from polcap.formats.export import texture_set
 from polcap.formats.export.encoders import Kind
 from polcap.formats.export.glb_geometry import Geometry
-from polcap.formats.export.texture_set import Texture
+from polcap.formats.export.texture_set import Extra, Texture
 from polcap.images import Asset
 
 Format = Literal["gltf", "obj", "usd", "usdz", "materialx", "exr"]
@@ -25,6 +25,9 @@ class ExportPreset:
     images: Kind = "png"  # inside the GLB
     geometry: Geometry = "float"  # inside the GLB
     triangles: int | None = None  # at most; by default those of the full mesh
+    bits: Literal[8, 16] = 8  # of a texture's channel
+    shared: Literal["png", "exr"] = "png"  # files of the textures of OBJ, USD and MaterialX
+    extras: tuple[Extra, ...] = ()  # textures to make
     textures: Mapping[str, Callable[[Asset], Texture]] = field(default_factory=dict)  # PNG files next to the asset
 
 
@@ -60,6 +63,36 @@ PRESETS: Mapping[str, ExportPreset] = {
         images="webp",
         geometry="quantized",
         triangles=50_000,
+    ),
+    "substance": ExportPreset(
+        formats=("gltf",),
+        description="import the GLB as the mesh, and the loose maps into a material; normals +Y (OpenGL)",
+        bits=16,
+        extras=("displacement", "occlusion"),
+        textures={
+            "{}_basecolor": texture_set.base_color,
+            "{}_normal": texture_set.normal,
+            "{}_roughness": texture_set.roughness,
+            "{}_specularlevel": texture_set.specular_level,
+            "{}_height": texture_set.displacement,
+            "{}_ambientocclusion": texture_set.occlusion,
+        },
+    ),
+    "maya": ExportPreset(
+        formats=("usd", "materialx"),
+        description="File > Import > USD, or LookdevX for the MaterialX document; linear EXR textures; normals +Y",
+        bits=16,
+        shared="exr",
+        extras=("displacement",),
+        textures={"{}_displacement": texture_set.displacement},
+    ),
+    "houdini": ExportPreset(
+        formats=("usd", "materialx"),
+        description="Sublayer or Reference LOP for Karma and other renderers; linear EXR textures; normals +Y",
+        bits=16,
+        shared="exr",
+        extras=("displacement",),
+        textures={"{}_displacement": texture_set.displacement},
     ),
     "archive": ExportPreset(
         formats=("gltf", "obj", "usd", "materialx", "exr"),

@@ -5,25 +5,26 @@ Each has a sentence on the meaning of its channels, which goes into the file, in
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Asset, Floats
+from polcap.formats.maps import exr
+from polcap.images import Asset, Floats, TexturePixels
 from polcap.optics import color, fresnel
 
 SPECULAR_RANGE = 0.08  # F0 of white in the loose specular textures: Disney's, Blender's and Unreal's "specular"
 
 Key = Literal["basecolor", "roughness", "normal", "specular"]  # the texture files of OBJ, USD and MaterialX
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+Extra = Literal["displacement", "occlusion", "object-normal"]  # textures that are made by option
 
 
 @dataclass(frozen=True)
 class Texture:
     """A texture image, whether it is color or data, and a sentence on the meaning of its channels."""
 
-    pixels: Pixels  # (H, W), (H, W, 3) or (H, W, 4)
+    pixels: TexturePixels  # (H, W), (H, W, 3) or (H, W, 4)
     color: bool  # sRGB-encoded color; else numbers
     meaning: str
 
@@ -48,9 +49,27 @@ def roughness(asset: Asset) -> Texture:
     return Texture(np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1]), False, meaning)
 
 
+def displacement(asset: Asset) -> Texture:
+    """Height of the surface towards the camera."""
+    assert asset.displacement is not None
+    return Texture(asset.displacement, False, "height, linear: 0 at depth.far of maps.json, 1 at depth.near")
+
+
+def occlusion(asset: Asset) -> Texture:
+    """The ambient-occlusion channel of the packed texture."""
+    meaning = "ambient occlusion, linear: share of a uniform sky that is visible"
+    return Texture(np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 0]), False, meaning)
+
+
+def object_normal(asset: Asset) -> Texture:
+    """Normals in the frame of the object, which is that of the camera."""
+    assert asset.object_normal is not None
+    return Texture(asset.object_normal, False, "object-space normal n * 0.5 + 0.5: R right, G up, B toward the camera")
+
+
 def packed(asset: Asset) -> Texture:
     """Texture of occlusion (R), roughness (G) and metallic (B), as glTF packs them."""
-    meaning = "R occlusion (1: none measured), G perceptual roughness, B metallic (0); linear"
+    meaning = "R occlusion (1 everywhere unless exported with it), G perceptual roughness, B metallic (0); linear"
     return Texture(asset.occlusion_roughness_metallic, False, meaning)
 
 
@@ -102,6 +121,26 @@ LOOSE: Mapping[Key, Callable[[Asset], Texture]] = {
 }
 
 
+EXTRAS: Mapping[Extra, Callable[[Asset], Texture]] = {
+    "displacement": displacement,
+    "occlusion": occlusion,
+    "object-normal": object_normal,
+}
+
+
+def linear(texture: Texture) -> Texture:
+    """The texture with the meaning that `write_exr` gives its values."""
+    return replace(texture, meaning=texture.meaning.replace("sRGB-encoded", "linear"))
+
+
+def write_exr(path: Path, texture: Texture) -> None:
+    """Write a texture as an EXR of half floats, its colors linear Rec.709; StorageError."""
+    value = texture.pixels / np.float32(np.iinfo(texture.pixels.dtype).max)
+    planes = np.moveaxis(np.atleast_3d(color.decode_srgb(value) if texture.color else value), -1, 0)
+    names = "Y" if len(planes) == 1 else "RGBA"
+    exr.write(path, dict(zip(names, planes)), {"polcap:meaning": texture.meaning}, half=True)
+
+
 def _reflectance(asset: Asset) -> Floats:
     """F0 (reflectance at normal incidence) of each texel, (H, W, 3), linear."""
     relative = color.decode_srgb(asset.specular_color / np.float64(np.iinfo(asset.specular_color.dtype).max))
@@ -118,7 +157,7 @@ def _level(asset: Asset) -> Floats:
     return np.asarray(np.clip(_reflectance(asset) / SPECULAR_RANGE, 0.0, 1.0))
 
 
-def _quantized(value: Floats, like: Pixels) -> Pixels:
+def _quantized(value: Floats, like: TexturePixels) -> TexturePixels:
     if like.dtype == np.uint8:
         return np.rint(value * 255).astype(np.uint8)
     return np.rint(value * 65535).astype(np.uint16)

@@ -183,9 +183,10 @@ def _preview(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tint
     reader.CreateInput("varname", kinds.String).Set("st")
     st = reader.CreateOutput("result", kinds.Float2)
     whole = SPECULAR_RANGE / (float(fresnel.normal_reflectance(asset.ior)) if tint else 1.0)
+    color = "raw" if files["basecolor"].endswith(".exr") else "sRGB"
     textures: tuple[tuple[Key, str, Any, str, str, Any, Any], ...] = (
-        ("basecolor", "diffuseColor", kinds.Color3f, "rgb", "sRGB", None, None),
-        ("specular", "specularColor", kinds.Color3f, "rgb", "sRGB", (whole, whole, whole, 1.0), None),
+        ("basecolor", "diffuseColor", kinds.Color3f, "rgb", color, None, None),
+        ("specular", "specularColor", kinds.Color3f, "rgb", color, (whole, whole, whole, 1.0), None),
         ("roughness", "roughness", kinds.Float, "r", "raw", None, None),
         ("normal", "normal", kinds.Normal3f, "rgb", "raw", (2.0, 2.0, 2.0, 1.0), (-1.0, -1.0, -1.0, 0.0)),
     )

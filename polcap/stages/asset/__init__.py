@@ -6,7 +6,7 @@ Khronos, glTF 2.0 §3.9 (materials) and KHR_materials_specular.
 """
 
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import cv2
 import msgspec
@@ -14,12 +14,15 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from polcap.images import Asset, Floats, Mesh, SurfaceMaps
+from polcap.images import Asset, Floats, Mesh, SurfaceMaps, TexturePixels
 from polcap.optics import color, frames, fresnel
 from polcap.optics.resize import area_mean
 from polcap.stages import stage
+from polcap.stages.asset.ambient_occlusion import ambient_occlusion
 from polcap.stages.asset.texture_rasterizer import rasterize_frames
 
+Bits = Literal[8, 16]  # of a texture's channel
+_EXTRAS = ("displacement", "object_normal")
 _LEAST_Z = 0.05  # of a tangent-space normal, which must leave the surface (glTF: blue above one half)
 
 
@@ -35,8 +38,8 @@ class AssetSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @stage(version=4, keep=False)
-def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
-    """Build the object's glTF textures on the crop's grid, filled outwards so that no seam shows.
+def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings, bits: Bits = 8) -> Asset:
+    """Build the object's glTF textures (H, W, 3) on the crop's grid, filled outwards so that no seam shows.
 
     Our material has a diffuse term behind two Fresnel transmissions, glTF's has base·(1 − F). With base =
     ρ_d T₊(0)²/(1 − F0) both agree for a frontal surface. F0 is the index's own × factor × texture, and the factor holds
@@ -49,21 +52,21 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
     greatest = specular.max(axis=-1)
     top = float(greatest[maps.mask].max(initial=0.0))
     entry, _ = fresnel.transmission(np.float64(1.0), settings.ior)
-    roughness, known = _eight_bits(maps.roughness), _without_outline(maps.mask)
+    roughness, known = _integers(maps.roughness, bits), _without_outline(maps.mask)
+    full, detail = np.full_like(roughness, np.iinfo(roughness.dtype).max), maps.detail if settings.raw_pixels else None
     base = maps.diffuse * np.float32(entry**2) / (1 - np.minimum(greatest, 0.99))[..., None]
     base = fill_outward(base.astype(np.float32), known)
-    detail = maps.detail if settings.raw_pixels else None
     others = [
-        np.stack([np.full_like(roughness, 255), roughness, np.zeros_like(roughness)], axis=-1),
-        color.srgb_eight_bits(specular / max(top, 1e-9)),
+        np.stack([full, roughness, np.zeros_like(roughness)], axis=-1),
+        _srgb(specular / max(top, 1e-9), bits),
     ]
     filled = fill_outward(np.concatenate(others, axis=-1), known)
     packed, specular_color = (np.ascontiguousarray(filled[..., k : k + 3]) for k in (0, 3))
     return Asset(
         mesh=mesh,
-        base_color=color.srgb_eight_bits(base) if detail is None else _with_detail(base, detail),
+        base_color=_srgb(base, bits) if detail is None else _with_detail(base, detail, bits),
         occlusion_roughness_metallic=packed,
-        normal=_eight_bits(tangent_space(maps, mesh) / 2 + 0.5),
+        normal=_integers(tangent_space(maps, mesh) / 2 + 0.5, bits),
         specular_color=specular_color,
         specular_factor=(top / float(fresnel.normal_reflectance(settings.ior)),) * 3,
         ior=settings.ior,
@@ -71,16 +74,35 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings) -> Asset:
     )
 
 
-def _with_detail(albedo: Floats, detail: Floats) -> NDArray[np.uint8]:
-    """An albedo (H, W, 3), enlarged linearly, times the exponential of its detail (2H, 2W); 8-bit sRGB."""
+def _with_detail(albedo: Floats, detail: Floats, bits: Bits) -> TexturePixels:
+    """An albedo (H, W, 3), enlarged linearly, times the exponential of its detail (2H, 2W); sRGB."""
     factor = np.exp(detail, dtype=np.float32)
-    planes = [color.srgb_eight_bits(cv2.resize(plane, detail.shape[::-1]) * factor) for plane in cv2.split(albedo)]
+    planes = [_srgb(cv2.resize(plane, detail.shape[::-1]) * factor, bits) for plane in cv2.split(albedo)]
     return np.asarray(cv2.merge(planes))
 
 
 def with_mesh(asset: Asset, maps: SurfaceMaps, mesh: Mesh) -> Asset:
     """A copy of the asset with another mesh of the same maps, and the normal texture that fits this mesh."""
-    return replace(asset, mesh=mesh, normal=_eight_bits(tangent_space(maps, mesh) / 2 + 0.5))
+    return replace(asset, mesh=mesh, normal=_as(asset.normal, tangent_space(maps, mesh) / 2 + 0.5))
+
+
+def with_extras(asset: Asset, maps: SurfaceMaps, depth: Floats, occlusion: bool) -> Asset:
+    """The asset with displacement and object-space normals and, if asked for, ambient occlusion in its channel.
+
+    `depth` (H, W) is along the optical axis, NaN outside the mask.
+    """
+    near, far = float(np.nanmin(depth)), float(np.nanmax(depth))
+    height = np.where(maps.mask, (far - depth) / max(far - near, 1e-12), 0.0)
+    filled = fill_outward(np.concatenate([height[..., None], maps.normal / 2 + 0.5], axis=-1), maps.mask)
+    packed = asset.occlusion_roughness_metallic.copy()
+    if occlusion:
+        packed[..., 0] = _as(packed, ambient_occlusion(maps, depth))
+    return replace(
+        asset,
+        occlusion_roughness_metallic=packed,
+        displacement=_integers(np.ascontiguousarray(filled[..., 0]), 16),
+        object_normal=_as(asset.normal, filled[..., 1:]),
+    )
 
 
 def resize_textures(asset: Asset, size: int) -> Asset:
@@ -94,15 +116,18 @@ def resize_textures(asset: Asset, size: int) -> Asset:
     shorter = max(size * min(height, width) / max(height, width), 1.0)
     other = min(size, 1 << int(np.ceil(np.log2(shorter))))
     shape = (other, size) if width >= height else (size, other)
-    names = ("base_color", "occlusion_roughness_metallic", "normal", "specular_color")
-    textures = {name: _resize(getattr(asset, name), shape) / 255 for name in names}
-    textures["normal"] = frames.unit(2 * textures["normal"] - 1) / 2 + 0.5
-    eight_bits: dict[str, Any] = {name: _eight_bits(texture) for name, texture in textures.items()}
-    return replace(asset, **eight_bits)
+    textures: dict[str, Any] = {}
+    for name in ("base_color", "occlusion_roughness_metallic", "normal", "specular_color", *_EXTRAS):
+        before = getattr(asset, name)
+        if before is not None:
+            value = _resize(before, shape) / np.iinfo(before.dtype).max
+            value = frames.unit(2 * value - 1) / 2 + 0.5 if name.endswith("normal") else value
+            textures[name] = _as(before, value)
+    return replace(asset, **textures)
 
 
-def _resize(texture: NDArray[np.uint8], shape: tuple[int, int]) -> Floats:
-    """Resize a texture (H, W, 3) of 0…255: by area means if both sides shrink, else by cubic interpolation."""
+def _resize(texture: TexturePixels, shape: tuple[int, int]) -> Floats:
+    """Resize a texture (H, W[, 3]): by area means if both sides shrink, else by cubic interpolation."""
     image = texture.astype(np.float32)
     if shape[0] <= image.shape[0] and shape[1] <= image.shape[1]:
         return area_mean(image, shape)
@@ -152,5 +177,16 @@ def tangent_space(maps: SurfaceMaps, mesh: Mesh) -> Floats:
     return np.asarray(fill_outward(out, covered))
 
 
-def _eight_bits(value: Floats) -> NDArray[np.uint8]:
-    return np.asarray(np.rint(np.clip(value, 0.0, 1.0) * 255), dtype=np.uint8)
+def _integers(value: Floats, bits: Bits) -> TexturePixels:
+    """Values 0…1 as integers of 8 or 16 bits."""
+    return np.asarray(np.rint(np.clip(value, 0.0, 1.0) * (2**bits - 1)), dtype=np.uint8 if bits == 8 else np.uint16)
+
+
+def _as(texture: TexturePixels, value: Floats) -> TexturePixels:
+    """Values 0…1 as integers of the type of a texture."""
+    return _integers(value, 8 if texture.dtype == np.uint8 else 16)
+
+
+def _srgb(linear: Floats, bits: Bits) -> TexturePixels:
+    """Linear Rec.709 as sRGB-encoded integers."""
+    return color.srgb_eight_bits(linear) if bits == 8 else _integers(color.encode_srgb(np.clip(linear, 0, 1)), bits)

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from polcap.errors import SettingError
-from polcap.formats.export import encoders, gltf, materialx, usd
+from polcap.formats.export import encoders, gltf, materialx, texture_set, usd
 from polcap.formats.export.texture_set import LOOSE, Key
+from polcap.formats.maps import exr
 from polcap.images import Asset
+from polcap.optics import color
 from tests import surfaces
 
 FILES: dict[Key, str] = {key: f"ball_{key}.png" for key in LOOSE}
@@ -65,6 +67,22 @@ def test_stage_is_upright_in_metres_and_names_its_root(folder: Path, asset: Asse
     st = np.array(UsdGeom.PrimvarsAPI(shape).GetPrimvar("st").Get())
     assert np.allclose(st[:, 1], 1 - asset.mesh.uv[:, 1], atol=1e-6)
     assert shape.GetDoubleSidedAttr().Get()
+
+
+def test_linear_textures_are_declared_linear(asset: Asset, tmp_path: Path) -> None:
+    from pxr import UsdShade
+
+    files: dict[Key, str] = {key: f"ball_{key}.exr" for key in LOOSE}
+    usd.write(tmp_path / "ball.usdc", asset, "ball", files, {})
+    stage = opened(tmp_path)
+    spaces = [UsdShade.Shader(prim).GetInput("sourceColorSpace") for prim in stage.Traverse()]
+    assert {str(one.Get()) for one in spaces if one} == {"raw"}
+    assert "srgb_texture" not in materialx.document(asset, "ball", files, "a ball")
+    for key, file in files.items():
+        texture_set.write_exr(tmp_path / file, LOOSE[key](asset))
+    channels, _ = exr.read(tmp_path / "ball_basecolor.exr")
+    linear = color.decode_srgb(asset.base_color / 255)
+    assert np.allclose(np.stack([channels[c] for c in "RGB"], axis=-1), linear, atol=1e-3)
 
 
 def test_usdz_is_one_file_with_one_material_that_phones_know(folder: Path) -> None:

@@ -1,0 +1,57 @@
+"""Ambient occlusion from normals and depth, by the horizon in sixteen directions.
+
+References
+----------
+Jimenez et al., Practical real-time strategies for accurate indirect occlusion, 2016, eq. (7).
+"""
+
+import cv2
+import numpy as np
+
+from polcap.images import Floats, SurfaceMaps
+from polcap.optics import frames
+from polcap.optics.projection import back_project
+
+_SIDE = 512  # px, at most, of the longer side at which it is computed: it varies slowly
+_DIRECTIONS = 16
+_GROWTH = 1.05  # ratio of successive distances
+
+
+def ambient_occlusion(maps: SurfaceMaps, depth: Floats) -> Floats:
+    """Share (H, W) of a uniformly bright sky that reaches each pixel, weighted by the cosine; 1 outside the mask.
+
+    `depth` (H, W) is along the optical axis. In each direction the horizon is the highest surface towards the camera.
+    """
+    height, width = maps.mask.shape
+    step = -(-max(height, width) // _SIDE)
+    row, column = (np.arange(step // 2, side, step) for side in (height, width))
+    at = np.ix_(row, column)
+    x, y = np.meshgrid(column, row)
+    mask = maps.mask[at] & np.isfinite(depth[at])
+    point = back_project(maps.view, x, y) * np.where(mask, depth[at], np.nan)[..., None]
+    point, normal = point.astype(np.float32), maps.normal[at]
+    distances = np.unique((_GROWTH ** np.arange(np.log(max(mask.shape)) / np.log(_GROWTH))).astype(int))
+    share = np.zeros(mask.shape, np.float32)
+    for angle in 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
+        along = normal[..., 0] * np.cos(angle) - normal[..., 1] * np.sin(angle)  # y runs up, rows run down
+        tilt = np.arctan2(along, normal[..., 2])
+        rise = -np.sin(tilt)  # cosine of the angle between horizon and optical axis; the tangent plane's at least
+        for distance in distances:
+            towards = _shifted(point, round(distance * np.cos(angle)), round(distance * np.sin(angle))) - point
+            rise = np.fmax(rise, towards[..., 2] / np.maximum(np.sqrt(frames.dot(towards, towards)), 1e-12))
+        horizon = np.arccos(np.clip(rise, -1, 1))
+        lit = np.cos(tilt) - np.cos(2 * horizon - tilt) + 2 * horizon * np.sin(tilt)
+        share += np.hypot(along, normal[..., 2]) * lit / (2 * _DIRECTIONS)
+    small = np.where(mask, np.clip(share, 0, 1), 1).astype(np.float32)
+    return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR))
+
+
+def _shifted(image: Floats, across: int, down: int) -> Floats:
+    """The image (H, W, C) with pixel (y + down, x + across) at (y, x); NaN where that is outside."""
+    height, width = image.shape[:2]
+    out = np.full_like(image, np.nan)
+    if abs(across) >= width or abs(down) >= height:
+        return out
+    rows, columns = (slice(max(0, -step), min(side, side - step)) for step, side in ((down, height), (across, width)))
+    out[rows, columns] = image[rows.start + down : rows.stop + down, columns.start + across : columns.stop + across]
+    return out
