@@ -30,7 +30,7 @@ def train(
     threads: Annotated[int, Option("--threads", "-j", min=1, help="Batches learned from at a time.")] = 2,
     seed: Annotated[int, Option(min=0, help="Of views, batches and first weights.")] = 1,
 ) -> None:
-    """Train the network (extra [train])."""
+    """Train the main network (extra [train])."""
     terminal.print_progress("loading PyTorch, meshes and materials")
     trainer = options.training("train")
     stated = {"preset": preset, "data": data, "out": out, "minutes": minutes, "samples": samples, "variant": variant}

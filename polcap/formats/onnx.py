@@ -96,7 +96,9 @@ def run_session(session: Any, path: Path, inputs: Floats, limit_s: float = _RUN_
     except _failures() as error:
         if options.terminate:
             raise ModelError(f"{path} did not end within {limit_s:g} s; use another model") from error
-        raise ModelError(f"{path} failed on an input of shape {inputs.shape}: {_line(error)}") from error
+        raise ModelError(
+            f"{path} failed on an input of shape {inputs.shape}: {_line(error)}; use another model"
+        ) from error
     finally:
         overdue.cancel()
     for name, value in zip(names, results):
@@ -194,7 +196,10 @@ def _check(path: Path, session: Any, encoding: str) -> tuple[tuple[str, ...], di
     channels = tuple(name.strip() for name in metadata["channels"].split(","))
     shapes = [one.shape for one in session.get_inputs()]
     if len(shapes) != 1 or len(shapes[0]) != 4 or (isinstance(shapes[0][1], int) and shapes[0][1] != len(channels)):
-        raise ModelError(f"{path}: takes inputs {shapes}, but its metadata names {len(channels)} channels of one input")
+        raise ModelError(
+            f"{path}: takes inputs {shapes}, but its metadata names {len(channels)} channels of one input; "
+            "use another model"
+        )
     return channels, metadata
 
 

@@ -183,7 +183,10 @@ def _median(value: Floats, usable: NDArray[np.bool_]) -> Floats:
 
 
 def _reflectance(color: Floats, position: Floats, matrix: Floats, slope: Floats, glare: Floats) -> Floats:
-    """Reflectance (…, N, 3) of patches in camera channels (N, 3), corrected for the light's slope and the glare."""
+    """Reflectance (…, N, 3), linear Rec.709, of patches with camera colors (N, 3).
+
+    The glare and the slope of the light are removed.
+    """
     level = 1 + np.asarray(slope) @ position.T
     return np.asarray((color @ np.swapaxes(matrix, -1, -2) - np.asarray(glare)[..., None, None]) / level[..., None])
 

@@ -9,112 +9,136 @@ from msgspec import Meta
 class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Limits of the quality gates.
 
-    Beyond one, `check` asks to reshoot, and `process` writes the asset and ends with exit code 3.
+    If a value is beyond its limit, `check` asks to reshoot, and `process` writes the asset and ends with exit code 3.
     """
 
-    max_delta_e: Annotated[float, Meta(gt=0, description="mean color error of the chart's patches [CIEDE2000]")] = 5.0
-    max_scale_doubt: Annotated[float, Meta(gt=0, le=1, description="1σ of the scale of all albedos [1]")] = 0.2
+    max_delta_e: Annotated[
+        float, Meta(gt=0, description="allowed mean color error of the chart's patches [CIEDE2000]")
+    ] = 5.0
+    max_scale_doubt: Annotated[float, Meta(gt=0, le=1, description="allowed 1σ of the scale of all albedos [1]")] = 0.2
     max_tone_curvature: Annotated[
-        float, Meta(gt=0, le=1, description="slope of ln exposure ratio over ln brightness; 0 is linear [1]")
+        float, Meta(gt=0, le=1, description="allowed slope of ln exposure ratio over ln brightness; 0 is linear [1]")
     ] = 0.1
     max_gain_disagreement: Annotated[
         float,
-        Meta(gt=0, le=1, description="disagreement of chart and object on a shot's light beyond both errors [1]"),
+        Meta(
+            gt=0, le=1, description="allowed disagreement of chart and object on a shot's light beyond both errors [1]"
+        ),
     ] = 0.03
     max_gain_doubt: Annotated[
-        float, Meta(gt=0, le=1, description="1σ of the gain of a shot; 1 % costs 6° of the normals [1]")
+        float, Meta(gt=0, le=1, description="allowed 1σ of the gain of a shot; 1 % costs 6° of the normals [1]")
     ] = 0.006
     max_gain_change: Annotated[
-        float, Meta(gt=0, le=1, description="change of the light from shot to shot; a flash usually repeats better [1]")
+        float,
+        Meta(
+            gt=0, le=1, description="allowed change of the light from shot to shot; a flash usually repeats better [1]"
+        ),
     ] = 0.1
     max_energy_drift: Annotated[
-        float, Meta(gt=0, le=1, description="change of one frame's light against its bracket [1]")
+        float, Meta(gt=0, le=1, description="allowed change of one frame's light against its bracket [1]")
     ] = 0.06
     max_align_residual_px: Annotated[
-        float, Meta(gt=0, description="1σ error of a shot's registration [px of the merged picture]")
+        float, Meta(gt=0, description="allowed 1σ error of a shot's registration [px of the merged picture]")
     ] = 0.15
     min_object_shift: Annotated[
-        float, Meta(gt=0, le=1, description="movement of the object that is reported [radius of the object]")
+        float, Meta(gt=0, le=1, description="least movement of the object that is reported [radius of the object]")
     ] = 0.01
     max_object_shift_px: Annotated[
         float,
-        Meta(gt=0, description="movement of the object against its surroundings [px of the merged picture]"),
+        Meta(gt=0, description="allowed movement of the object against its surroundings [px of the merged picture]"),
     ] = 1.5
     max_mask_doubt: Annotated[
-        float, Meta(ge=0, le=1, description="expected error of the mask, 1 − overlap; half of it warns [1]")
+        float, Meta(ge=0, le=1, description="allowed expected error of the mask, 1 − overlap; half of it warns [1]")
     ] = 0.25
     max_mask_islands: Annotated[
-        float, Meta(ge=0, le=1, description="share of the mask outside its largest part [1]")
+        float, Meta(ge=0, le=1, description="allowed share of the mask outside its largest part [1]")
     ] = 0.02
-    max_mask_holes: Annotated[float, Meta(ge=0, le=1, description="area of holes relative to the mask [1]")] = 0.05
+    max_mask_holes: Annotated[float, Meta(ge=0, le=1, description="allowed area of holes relative to the mask [1]")] = (
+        0.05
+    )
     max_mask_border: Annotated[
-        float, Meta(ge=0, le=1, description="share of the picture's border that the object touches [1]")
+        float, Meta(ge=0, le=1, description="allowed share of the picture's border that the object touches [1]")
     ] = 0.0
-    max_clipped: Annotated[float, Meta(ge=0, le=1, description="share of the object that is clipped [1]")] = 0.02
+    max_clipped: Annotated[float, Meta(ge=0, le=1, description="allowed share of the object that is clipped [1]")] = (
+        0.02
+    )
     max_blur_px: Annotated[
         float,
-        Meta(gt=0, le=20, description="1σ of a frame's blur beyond the sharpest frame [RAW px]"),
+        Meta(gt=0, le=20, description="allowed 1σ of a frame's blur beyond the sharpest frame [RAW px]"),
     ] = 1.2
     max_edge_blur_px: Annotated[
-        float, Meta(gt=0, le=20, description="1σ blur of the object's sharpest edges [px of the merged picture]")
+        float,
+        Meta(gt=0, le=20, description="allowed 1σ blur of the object's sharpest edges [px of the merged picture]"),
     ] = 1.65
     max_turn_deg: Annotated[
         float,
-        Meta(ge=3, le=45, description="error of an angle, measured from the outline [degrees]"),
+        Meta(ge=3, le=45, description="allowed error of an angle, measured from the outline [degrees]"),
     ] = 8.0
     max_ring_turn_deg: Annotated[
         float,
-        Meta(gt=0, le=45, description="error of the ring's zero, with three angles [degrees]"),
+        Meta(gt=0, le=45, description="allowed error of the ring's zero, with three angles [degrees]"),
     ] = 3.0
     max_turn_fit: Annotated[
         float,
-        Meta(gt=0, lt=1, description="ratio of the outline's misfit with and without a turn, to accept the turn [1]"),
+        Meta(gt=0, lt=1, description="allowed ratio of the outline's misfit with a turn to that without [1]"),
     ] = 0.68
-    min_outline_dolp: Annotated[float, Meta(ge=0, le=1, description="least median polarization of the outline [1]")] = (
-        0.03
-    )
+    min_outline_dolp: Annotated[
+        float, Meta(ge=0, le=1, description="least allowed median polarization of the outline [1]")
+    ] = 0.03
     min_zenith_deg: Annotated[
         float,
-        Meta(ge=0, le=90, description="least median tilt of a weakly polarized shape; below it is flattened [degrees]"),
+        Meta(
+            ge=0,
+            le=90,
+            description="least allowed median tilt of a weakly polarized shape; below it is flattened [degrees]",
+        ),
     ] = 33.0
     max_inward_outline: Annotated[
-        float, Meta(ge=0, le=1, description="share of the outline's normals that point into the object [1]")
+        float, Meta(ge=0, le=1, description="allowed share of the outline's normals that point into the object [1]")
     ] = 0.06
     min_concentration: Annotated[
-        float, Meta(ge=0, le=1, description="least agreement of polarization and outline; 1 is perfect [1]")
+        float, Meta(ge=0, le=1, description="least allowed agreement of polarization and outline; 1 is perfect [1]")
     ] = 0.5
     max_one_sided: Annotated[
-        float, Meta(gt=0, description="uneven light round the outline, amplitude over mean [1]")
+        float, Meta(gt=0, description="allowed uneven light round the outline, amplitude over mean [1]")
     ] = 0.4
-    max_side_light: Annotated[float, Meta(gt=0, le=1, description="excess light on one side in one shot [1]")] = 0.07
+    max_side_light: Annotated[
+        float, Meta(gt=0, le=1, description="allowed excess light on one side in one shot [1]")
+    ] = 0.07
     max_dolp_noise: Annotated[
-        float, Meta(gt=0, le=1, description="false polarization from noise, median over the object [1]")
+        float, Meta(gt=0, le=1, description="allowed false polarization from noise, median over the object [1]")
     ] = 0.04
-    max_ambient: Annotated[float, Meta(gt=0, le=1, description="share of ambient light, which is subtracted [1]")] = 0.3
+    max_ambient: Annotated[
+        float, Meta(gt=0, le=1, description="allowed share of ambient light, which is subtracted [1]")
+    ] = 0.3
     max_highlight_dolp: Annotated[
-        float, Meta(gt=0, le=1, description="polarization that the brightest parts of the object share [1]")
+        float, Meta(gt=0, le=1, description="allowed polarization that the brightest parts of the object share [1]")
     ] = 0.006
     max_room_dolp: Annotated[
-        float, Meta(gt=0, le=1, description="polarization of the surroundings, common to all of them [1]")
+        float, Meta(gt=0, le=1, description="allowed polarization of the surroundings, common to all of them [1]")
     ] = 0.015
     max_crossed_misfit: Annotated[
         float,
-        Meta(gt=0, le=1, description="share of the object that is brighter in the cross-polarized shot than in S0 [1]"),
+        Meta(
+            gt=0,
+            le=1,
+            description="allowed share of the object that is brighter in the cross-polarized shot than in S0 [1]",
+        ),
     ] = 0.05
     max_ill_posed: Annotated[
-        float, Meta(ge=0, le=1, description="share of the object with a DoLP above that of any dielectric [1]")
+        float, Meta(ge=0, le=1, description="allowed share of the object with a DoLP above that of any dielectric [1]")
     ] = 0.05
     max_ghost: Annotated[
         float,
-        Meta(ge=0, le=1, description="share of the object where exposures of a shot disagree beyond noise [1]"),
+        Meta(ge=0, le=1, description="allowed share of the object where exposures of a shot disagree beyond noise [1]"),
     ] = 0.02
     max_normal_error_deg: Annotated[
-        float, Meta(gt=0, le=90, description="median expected error of the normals [degrees]")
+        float, Meta(gt=0, le=90, description="allowed median expected error of the normals [degrees]")
     ] = 20.0
-    max_mesh_pieces: Annotated[int, Meta(ge=1, description="number of pieces of the mesh")] = 10
+    max_mesh_pieces: Annotated[int, Meta(ge=1, description="allowed number of pieces of the mesh")] = 10
     max_mesh_cuts: Annotated[
-        float, Meta(ge=0, description="length of the cuts, both sides, over the outline's [1]")
+        float, Meta(ge=0, description="allowed length of the cuts, both sides, over the outline's [1]")
     ] = 2.0
     max_mesh_raggedness: Annotated[
-        float, Meta(ge=0, description="excess length of the mesh's boundary over its smoothed curve [1]")
+        float, Meta(ge=0, description="allowed excess length of the mesh's boundary over its smoothed curve [1]")
     ] = 0.25

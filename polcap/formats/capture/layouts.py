@@ -258,7 +258,9 @@ def _angle_folders(folder: Path) -> tuple[dict[float, Path], Path | None]:
     for path in inside:
         angle = stated.get(path.name, _degrees_of_cross(path) if path in crossed else None)
         if angle is not None and angle > 360:
-            raise CaptureError(f"{path}: {angle:g}° is not an angle of a polarizer; name it by 0 to 360 degrees")
+            raise CaptureError(
+                f"{path}: {angle:g}° is not an angle of a polarizer; rename the folder to 0 to 360 degrees"
+            )
         if angle is None or path in crossed:
             continue
         if angle in found:

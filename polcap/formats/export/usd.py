@@ -36,7 +36,8 @@ def require() -> None:
         from pxr import Usd  # noqa: F401
     except ModuleNotFoundError:
         raise SettingError(
-            "USD, and with it --preset archive, needs usd-core: pip install 'polcap[usd]', or name other formats"
+            "USD, and with it --preset archive, maya or houdini, needs usd-core: pip install 'polcap[usd]', "
+            "or name other formats"
         ) from None
 
 

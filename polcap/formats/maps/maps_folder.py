@@ -141,7 +141,9 @@ def read(folder: Path) -> StoredMaps:
     try:
         about = msgspec.convert(text_file.read_json(folder / "maps.json"), _Description)
     except OSError as error:
-        raise DecodeError(f"{folder} has no maps.json ({error.strerror}); give a result's folder") from error
+        raise DecodeError(
+            f"{folder / 'maps.json'}: cannot be read ({error.strerror}); give a result's folder"
+        ) from error
     except ValueError as error:
         raise DecodeError(f"{folder / 'maps.json'} is not a maps.json of polcap ({error}); process again") from error
     percent = about.albedo.uncertainty_percent

@@ -56,7 +56,9 @@ def common_tiles(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
 
 
 def vignetting(reference: Signals, other: Signals, ratio: Floats) -> Floats | None:
-    """Smooth factor (H, W) float32 on the exposure ratio (C,) of two frames, a quadratic in place; None below 1 %.
+    """Factor (H, W) float32 on the exposure ratio (C,) of two frames: exp of a quadratic in x and y.
+
+    None if the factor is within 1 % of 1 everywhere, or if too few tiles are bright.
 
     Apertures differ in vignetting, so corners of a bracket by aperture are darker in its wide frames.
     """

@@ -15,7 +15,7 @@ from polcap.stages.mask.regions import Bools
 _WORK_PIXELS = 3e5  # approximate size of the reduced picture that is cut
 _REACH = 0.006  # of the picture's longer side: largest movement of the outline
 _ROUNDS = 3  # of GrabCut
-_SURE = 0.996  # probability of object or backdrop; above it colors are not considered (decision 37)
+_SURE = 0.996  # probability of object or backdrop; above it colors are not considered (decision 15)
 
 
 def sharpen(picture: Floats, mask: Bools, chart: Bits, probability: Floats) -> Bools:

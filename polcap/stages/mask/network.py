@@ -20,7 +20,7 @@ _CLOSE_UP_PX = 256  # greatest longer side of a close-up
 _CLOSE_UPS = 2  # passes over the part with the object; the second adds parts that the first estimate lacked
 _ROOM = 0.12  # margin around that part, of its longer side
 _LIKELY = 0.3  # least probability of pixels that a close-up must include
-_MIRRORS = ((), (0,), (1,), (0, 1))  # axes of the mirror images that are averaged (decision 37)
+_MIRRORS = ((), (0,), (1,), (0, 1))  # axes of the mirror images that are averaged (decision 15)
 
 
 def object_probability(

@@ -13,7 +13,7 @@ _SPECK = 0.01  # of the largest region; smaller regions are specks
 _LIKELY = 0.3  # least maximum probability of a region; otherwise it is backdrop of the object's color
 _PINHOLE = 1e-3  # of the mask; smaller holes are dark texture
 _OPENING = 0.15  # largest mean probability of an open hole; with more it is a shadowed part of the object
-_LEEWAY = 1.7  # largest expected error of the mask by colors, over that of the network's mask (decision 37)
+_LEEWAY = 1.7  # largest expected error of the mask by colors, over that of the network's mask (decision 15)
 
 
 def likely_regions(probability: Floats) -> Bools:

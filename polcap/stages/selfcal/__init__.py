@@ -179,7 +179,7 @@ def _find_angles(
 ) -> tuple[Floats, float]:
     """Find unknown polarizer angles (K,) and their 1σ, rad, from shots divided by their gains."""
     shots = len(even.light)
-    otherwise = "or state the angles with --set selfcal.unknown_angles=false"
+    otherwise = "or use the stated angles: --set selfcal.unknown_angles=false"
     if shots < 4:
         raise CaptureError(
             f"{shots} shots at unknown angles: at least four are needed, five are better; take more, {otherwise}"

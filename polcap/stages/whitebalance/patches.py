@@ -46,7 +46,7 @@ class ChartFit:
 
 @dataclass(frozen=True)
 class PatchSamples:
-    """Colors of a chart's patches in one shot."""
+    """Colors of a chart's 24 patches in one shot, and whether each can be used."""
 
     color: Floats  # (24, 3) S0 of the patches, camera channels
     use: Bits  # (24,) PatchUse

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError, DecodeError, InputError
+from polcap.formats.capture import layouts
 from polcap.formats.capture import reader as capture
 from polcap.formats.raw import frame_decoder
 from tests.formats import headers
@@ -99,6 +100,11 @@ def test_numbered_folders_of_objects_are_not_angles(tmp_path, listed):
         shoot(tmp_path / name / "a.dng")
     with pytest.raises(CaptureError, match="but polcap looks for pol000"):
         capture.read(tmp_path)
+
+
+def test_a_batch_tells_angle_folders_from_numbered_captures(tmp_path):
+    assert layouts.looks_like_a_capture(tmp_path, ("0 Grad", "45 Grad", "90 Grad"), ())
+    assert not layouts.looks_like_a_capture(tmp_path, ("10", "20", "30"), ())
 
 
 def test_a_clockwise_ring_negates_the_angles(tmp_path):
