@@ -55,7 +55,10 @@ class BatchJob:
         return "polcap-" + (re.sub(r"[^a-z0-9]+", "-", self.root.name.lower()).strip("-")[:40] or "batch")
 
     def shell(self, shard: str = "") -> str:
-        """Shell command (/bin/sh) of one shard. `shard` is K/N, or empty where environment variables give it."""
+        """Shell command (/bin/sh) of one shard; exit code 3 counts as success.
+
+        `shard` is K/N, or empty where environment variables give it.
+        """
         return f"{shlex.join(self.command)}{shard and ' --shard ' + shard} || test $? -eq 3"
 
 

@@ -77,7 +77,8 @@ def _fit_axis(shots: list[PolarizerShot]) -> _MalusFit:
     angles = np.unique(np.round(np.degrees(ring) % 180, 2))
     if len(angles) < _LEAST or np.ptp(angles) < _SPAN_DEG:
         raise CaptureError(
-            f"{where}: {len(angles)} angles of the ring; take {_LEAST} or more over 180°, best every 15°"
+            f"{where}: {len(angles)} angles of the ring over {np.ptp(angles):.0f}°; take {_LEAST} or more over 180°, "
+            "best every 15°"
         )
     light = []
     for shot in shots:

@@ -33,7 +33,7 @@ REASONS = {
 
 
 def failure(target: Path, error: OSError) -> StorageError:
-    """The StorageError, with path, reason and remedy, for an OSError of writing the file `target`."""
+    """The StorageError for an OSError of writing the file `target`: path, reason and, where known, a remedy."""
     reason = REASONS.get(error.errno or 0, error.strerror or str(error))
     return StorageError(f"cannot write {target}: {reason}")
 

@@ -129,9 +129,10 @@ def _step(xp: Any, x: Any, nodes: Floats) -> tuple[Any, Any]:
 
 @lru_cache(maxsize=1)
 def _table() -> Floats:
-    """Table of diffuse reflection by refractive index, α and cosine, (3, 21, 49, 3).
+    """Table of diffuse reflection, (3, 21, 49, 3): refractive index, α, cosine of the zenith angle, value.
 
-    The values are ⟨T₊⟩ − T₊, and the DoLP relative to that of the smooth interface, for `local` 0 and 1.
+    The values are ⟨T₊⟩ − T₊ (⟨ ⟩: mean over the visible facets; T₊ alone: of the smooth interface), and the DoLP
+    relative to that of the smooth interface, for `Law.local` 0 and 1.
     """
     out = np.zeros((len(_INDICES), len(_ALPHAS), len(_COSINES), 3))
     out[..., 1:] = 1.0

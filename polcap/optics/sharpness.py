@@ -43,7 +43,11 @@ def places(image: SensorImage, clip: float) -> NDArray[np.int64]:
 
 
 def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
-    """Cut the tiles at corners (T, 2) px out of one decoded photograph."""
+    """Cut tiles out of one decoded photograph and judge whether they are usable.
+
+    `corners` (T, 2) are (row, column) in binned px, as of `places`.
+    From `clip` [white level] on photosites are clipped.
+    """
     step = image.superpixel
     margin = 1 if image.cfa is None else len(image.cfa)  # a clipped photosite makes its neighbors unusable
     side, spare = TILE * step, margin // step
@@ -65,9 +69,7 @@ def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
 
 
 def frames_blur(shots: Sequence[Sequence[Tiles]], px: float) -> Floats:
-    """Extra blur (K, E) of each frame, 1σ [RAW px], relative to the sharpest of the same exposure; NaN.
-
-    Not measurable.
+    """Extra blur (K, E) of each frame, 1σ [RAW px], relative to the sharpest of the same exposure; NaN: not measurable.
 
     shots: K brackets of E photographs; px: RAW px per px of the tiles.
     """

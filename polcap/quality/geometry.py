@@ -94,7 +94,7 @@ def _motion(found: Evidence) -> object_motion.ObjectMotion:
 
 
 def mask(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on the object's mask: a chart in it, an uncertain outline, an unusual shape."""
+    """Gate on the object's mask: a chart in it, uncertain pixels, contact with the picture's border, parts, holes."""
     object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
     charted = 0.0

@@ -54,7 +54,7 @@ def parse_bracket(text: str) -> tuple[Exposure, ...]:
 
 
 def relative_exposure(exposure: Exposure) -> float:
-    """Relative exposure: time × ISO × flash power / f-number²."""
+    """Relative exposure: time × ISO × flash power / f-number²; None counts as ISO 100, otherwise as 1."""
     light = (exposure.time_s or 1.0) * (exposure.flash or 1.0) / (exposure.f_number or 1.0) ** 2
     return light * (exposure.iso or 100.0)
 

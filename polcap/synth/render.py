@@ -166,10 +166,7 @@ def _shade(scene: Scene, ray: Floats, hits: Hits, flash_axis: float | None = Non
 
 
 def _normals(scene: Scene, hits: Hits) -> tuple[Floats, Floats]:
-    """Surface normals (N, 3) at hits.
-
-    Without relief in the object's frame, and with relief in the camera's frame, facing the lens.
-    """
+    """Surface normals (N, 3) at hits: without relief, in the object's frame; with relief, in the camera's frame."""
     facing = scene.turn.inv().apply(hits.normal)
     bent = scene_materials.add_relief(scene.coat, hits.local, facing)
     if bent is facing:

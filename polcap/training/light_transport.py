@@ -139,9 +139,10 @@ class IndirectLight:
         return np.stack([self.smooth(part) for part in total])
 
     def light(self, way: Floats, which: Indices) -> tuple[Indices, Floats]:
-        """Trace rays from points `which` along `way` (M, 3.
+        """Trace a ray from each of the points `which`; returns the points whose ray hits the mesh, and S0 (·, 3) there.
 
-        Ray frames): the points whose ray hits the mesh, and S0 (·, 3) of the hit.
+        `way` (M, 3) are the directions of all points, in ray frames. S0 is the diffuse flash light that the hit place
+        sends back along the ray.
         """
         tracer, places, pose = self.tracer, self.places, self.pose
         direction = frames.from_ray_frame(way[which], places.rays[which]) @ pose.rotation

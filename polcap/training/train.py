@@ -119,7 +119,10 @@ def _check(options: TrainingOptions) -> None:
             raise InputError(f"{name} {value!r} is not one of {', '.join(known)}")
     last, test_meshes = options.out / "last.pt", options.data / "meshes" / "test"
     if options.resume and options.start:
-        raise InputError(f"--resume continues from {last}, --start starts from {options.start}; give one of them")
+        raise InputError(
+            f"--resume continues the training of {last}, --start begins a new one with the weights of {options.start}; "
+            "give one of them"
+        )
     if options.resume and not last.exists():
         raise InputError(f"{last} does not exist, so there is nothing to resume; train without --resume first")
     if last.exists() and not options.resume:

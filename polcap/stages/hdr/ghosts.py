@@ -61,7 +61,7 @@ class Anchor:
         return own if self.darkest is None else own | self.darkest.signals.usable
 
     def rows(self, rows: slice) -> Floats:
-        """Radiance (C, h, W) of the anchor in some rows."""
+        """Radiance (C, h, W) of some rows: of the reference frame, of the darkest frame where the reference clips."""
         value, own = self.reference.signals.rows(rows), self.reference.signals.usable[rows]
         if self.darkest is None or own.all():
             return value

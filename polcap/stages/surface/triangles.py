@@ -86,7 +86,10 @@ class BoundaryFigures:
 
 
 def measure_boundary(place: NDArray[np.int64], faces: Faces, mask: Bools, step: int) -> BoundaryFigures:
-    """Measure how torn a mesh is, before smoothing; vertices at x, y px (V, 2) of the grid of every `step` px."""
+    """Measure how torn a mesh is, before smoothing: its pieces, the cuts inside the mask, the ragged boundary.
+
+    `place` (V, 2) are the vertices' pixels x, y in the mask; `step` is their distance in px.
+    """
     edge = boundary_edges(faces)
     size = np.ones((4 * step + 1, 4 * step + 1), np.uint8)
     inner = cv2.erode(np.pad(mask.astype(np.uint8), 1), size, borderValue=0)[1:-1, 1:-1] > 0
