@@ -328,6 +328,14 @@ class MaskedImage:
 
 
 @dataclass(frozen=True)
+class Mosaic:
+    """A merged shot on its photosites, each of one color."""
+
+    value: Floats  # (2H, 2W) float16, sensor white at the reference exposure = 1
+    cfa: Bits  # (2, 2) of 0 R, 1 G, 2 B
+
+
+@dataclass(frozen=True)
 class CrossedShot:
     """A shot with perpendicular polarizers at flash and lens, which block specular reflection."""
 
@@ -382,6 +390,7 @@ class AngleStack:
     equipment: Equipment = Equipment()
     offset_px: Floats | None = None  # (K, 2) x, y on this grid: shot px = reference px − offset; None: to be measured
     crossed: CrossedShot | None = None  # None: not taken
+    mosaic: Mosaic | None = None  # of the first shot; None: not a binned Bayer sensor
 
     def shot(self, k: int) -> MaskedImage:
         """Radiance, variance and quality of shot k, (H, W, 3)."""
@@ -564,6 +573,7 @@ class StokesImage:
     view: View  # of the crop
     residual: Floats | None  # (H, W) |measured − fitted| / S0 where K > 3
     body: MaskedImage | None = None  # S0 of the diffuse reflection only, from a crossed shot
+    detail: Floats | None = None  # (2H, 2W) float16, ln of the light of RAW pixels over these pixels, enlarged
 
 
 @dataclass(frozen=True)
@@ -583,6 +593,7 @@ class Cues:
     scale_sigma: float | None = None  # relative 1σ of the light on the chart against that on the object; None: no chart
     body: Floats | None = None  # (H, W, 3) radiance of the diffuse reflection only, from a crossed shot
     body_known: NDArray[np.bool_] | None = None  # (H, W) where the crossed shot is valid
+    detail: Floats | None = None  # (2H, 2W) float16, ln of the light of RAW pixels over these pixels, enlarged
 
 
 @dataclass(frozen=True)
@@ -616,6 +627,7 @@ class SurfaceMaps:
     view: View
     estimator: str
     albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown, albedos are relative
+    detail: Floats | None = None  # (2H, 2W) float16, ln of the albedo of RAW pixels over `diffuse`, enlarged
 
 
 @dataclass(frozen=True)
@@ -640,7 +652,7 @@ class Asset:
     """A 3-D asset: mesh with glTF textures and material factors."""
 
     mesh: Mesh
-    base_color: TexturePixels  # (H, W, 3) sRGB
+    base_color: TexturePixels  # (H, W, 3) sRGB; (2H, 2W, 3) with the detail of RAW pixels
     occlusion_roughness_metallic: TexturePixels  # (H, W, 3) linear
     normal: TexturePixels  # (H, W, 3) tangent space, +Y
     specular_color: TexturePixels  # (H, W, 3) sRGB, to be multiplied by the factor

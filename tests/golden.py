@@ -189,9 +189,11 @@ def radiance() -> images.AngleStack:
         bracket=images.single_frames(shots),
         sensor=images.ColorSensor(photographs[0].camera_matrix, photographs[0].white_balance, photographs[0].site_px),
         equipment=images.Equipment("flash"),
+        mosaic=images.Mosaic(((photographs[0].value - np.float32(256)) / (4095 - 256)).astype(np.float16), RGGB),
     )
 
 
+RGGB = np.array([[0, 1], [1, 2]], np.uint8)
 VIEW = View(focal=1344.0, center=(287.5, 215.5), scale=2.0)  # of the bundled capture
 
 
@@ -281,7 +283,14 @@ def stored_cues(inputs: Arrays) -> images.Cues:
         mask=inputs["cues.mask"],
         quality=np.zeros(sigma.shape, np.uint8),
         view=view,
+        detail=stored_detail(sigma.shape),
     )
+
+
+def stored_detail(shape: tuple[int, ...]) -> NDArray[np.float16]:
+    """Detail of RAW pixels, strong enough in every second stripe to differ from shading."""
+    y, x = np.mgrid[: 2 * shape[0], : 2 * shape[1]]
+    return np.asarray(np.sin(2.1 * x + 0.7 * y) * (0.05 + 0.4 * (x // 40 % 2)), np.float16)
 
 
 def stored_maps(inputs: Arrays) -> images.SurfaceMaps:
@@ -297,6 +306,7 @@ def stored_maps(inputs: Arrays) -> images.SurfaceMaps:
         mask=inputs["cues.mask"],
         view=stored_cues(inputs).view,
         estimator="stored",
+        detail=stored_detail(inputs["cues.mask"].shape),
     )
 
 

@@ -47,7 +47,7 @@ def export(
     ] = "lin_rec709",
     texture_size: Annotated[
         int | None,
-        Option(min=16, max=16384, help="Longer side of the textures, px; by default that of the maps."),
+        Option(min=16, max=16384, help="Longer side of the textures, px; by default each keeps its own size."),
     ] = None,
     page: Annotated[
         Path | None,

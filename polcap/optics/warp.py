@@ -57,7 +57,7 @@ def warp(
     inside = x0 >= 0 and y0 >= 0 and x1 <= image.shape[1] and y1 <= image.shape[0]
     if lens is None and inside and np.array_equal(transform, np.eye(3)):
         return np.asarray(image[y0:y1, x0:x1], dtype=np.float32)
-    left, top, right, bottom = _source(image.shape[:2], transform, (x0, y0, x1, y1), lens)
+    left, top, right, bottom = source_box(image.shape[:2], transform, (x0, y0, x1, y1), lens)
     part = np.asarray(image[top:bottom, left:right], np.float32)
     planes = [np.ascontiguousarray(plane) for plane in ([part] if part.ndim == 2 else cv2.split(part))]
     splines = [Spline(plane) for plane in planes] if order == 3 else []
@@ -130,7 +130,7 @@ def _mix(a: Floats, b: Floats, share: Floats) -> Floats:
     return b
 
 
-def _source(shape: tuple[int, ...], transform: Floats, box: Box, lens: Distortion | None = None) -> Box:
+def source_box(shape: tuple[int, ...], transform: Floats, box: Box, lens: Distortion | None = None) -> Box:
     """Box of an image of `shape` (H, W) that a warp over `box` reads."""
     x0, y0, x1, y1 = box
     x: Floats = np.array([x0, x1, x0, x1]) - 0.5

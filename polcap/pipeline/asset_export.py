@@ -39,7 +39,7 @@ class ExportRequest:
     color: str = exr_layers.LINEAR_REC709  # color space or role of the colors in the layered EXR
     bits: Literal[8, 16] | None = None  # of a texture's channel; by default the preset's, or 8
     extras: tuple[Extra, ...] = ()  # textures to make, in addition to the preset's
-    texture_size: int | None = None  # px of the longer side; by default the maps'
+    texture_size: int | None = None  # px of the longer side; by default each texture's own
     page: Path | None = None  # file with model-viewer's script, for a web page that shows the GLB
     catalog: Mapping[str, str] = field(default_factory=dict)  # fields of `CatalogEntry` in place of the capture's
     lod: int = 0  # number of further GLBs, each with a quarter of the triangles of the previous one
@@ -175,7 +175,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     description = {
         "for": preset.description,
         "unit": unit,
-        "glb": {f"{stem}_{key}": f"{texture.meaning}; {options.images}" for key, texture in embedded.items()},
+        "glb": {f"{stem}_{key}": _described(texture, options.images) for key, texture in embedded.items()},
         "mesh": {"triangles": len(mesh.faces), **_deviation(found[0])},
         "lods": {
             file.name: {"triangles": len(level.asset.mesh.faces), **_deviation(level)}
@@ -240,6 +240,12 @@ def _write_texture(file: Path, texture: Texture, encoder: TextureEncoder) -> lis
     with atomic.path(file) as temporary:
         temporary.write_bytes(encoder(texture, "png", text=True))
     return [file]
+
+
+def _described(texture: Texture, images: Kind) -> str:
+    """Meaning, size and file format of an embedded texture, for maps.json."""
+    height, width = texture.pixels.shape[:2]
+    return f"{texture.meaning}; {width} × {height} px; {images}"
 
 
 def _deviation(level: DetailLevel) -> dict[str, str]:

@@ -27,7 +27,8 @@ from polcap.stages import cues, infer, surface
 
 COLUMNS = (
     "capture", "normal mean", "median", "chart px", "align px", "gain %", "ratio %",
-    "diffuse", "roughness", "F0", "depth",
+    "diffuse", "roughness", "F0", "depth", "diffuse at RAW px", "with detail",
+    "its fine part", "with detail", "truth's",
 )  # fmt: skip
 
 
@@ -57,7 +58,33 @@ def measure(truth_file: Path, network: Network | None, rough: bool) -> list[floa
     found = path(capture, supplied, Config(), MemoryCache(until="surface"))
     with np.load(stem + ".truth.npz") as maps:
         errors = surface_errors(found, dict(maps), network, rough)
-    return [*errors[:2], *capture_errors(found, capture, told, meta), *errors[2:]]
+        detail = detail_errors(found, dict(maps))
+    return [*errors[:2], *capture_errors(found, capture, told, meta), *errors[2:], *detail]
+
+
+def detail_errors(found: Results, truth: dict[str, Floats]) -> list[float]:
+    """RMSE of the diffuse albedo at RAW pixels, enlarged and with its detail, and those of its fine part.
+
+    The last figure is the rms of the true fine part: gray albedo less its Gaussian mean of 0.75 px.
+    """
+    maps = found.maps
+    assert maps.detail is not None
+    (height, width), (x0, y0) = maps.detail.shape, (round(2 * edge) for edge in maps.view.origin)
+    crop = np.s_[y0 : y0 + height, x0 : x0 + width]
+    albedo = truth["albedo"][crop].astype(np.float32)
+    enlarged, covered = (cv2.resize(part, (width, height)) for part in (maps.diffuse, maps.mask.astype(np.float32)))
+    inside = (truth["mask"][crop] > 0) & (covered > 0.99)
+    detailed = np.clip(enlarged * np.exp(maps.detail, dtype=np.float32)[..., None], 0, 1)
+
+    def fine(image: Floats) -> Floats:
+        gray = image.mean(axis=-1)
+        return np.asarray(gray - cv2.GaussianBlur(gray, (0, 0), 0.75))
+
+    def rms(image: Floats) -> float:
+        return float(np.sqrt(np.mean(image[inside] ** 2)))
+
+    both = enlarged, detailed
+    return [*(rms(a - albedo) for a in both), *(rms(fine(a) - fine(albedo)) for a in both), rms(fine(albedo))]
 
 
 def capture_errors(found: Results, capture: Capture, told: dict, meta: dict) -> list[float]:  # type: ignore[type-arg]

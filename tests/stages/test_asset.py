@@ -68,6 +68,17 @@ def test_diffuse_and_specular_come_back_through_gltf_formulas() -> None:
     assert (built.occlusion_roughness_metallic[maps.mask] == [255, 94, 0]).all()
 
 
+def test_base_color_takes_the_detail_of_raw_pixels_unless_switched_off() -> None:
+    maps = surfaces.maps()
+    detail = 0.3 * np.sin(2.0 * np.arange(2 * surfaces.WIDTH)) * np.ones((2 * surfaces.HEIGHT, 1))
+    maps = replace(maps, diffuse=np.full_like(maps.diffuse, 0.3), detail=detail.astype(np.float16))
+    mesh = surfaces.mesh(maps)
+    built, plain = (asset.build(maps, mesh, asset.AssetSettings(raw_pixels=on)) for on in (True, False))
+    assert built.base_color.shape == (*detail.shape, 3) and built.normal.shape == plain.base_color.shape
+    expected = 0.96**2 * 0.3 * np.exp(detail)
+    assert np.allclose(color.decode_srgb(built.base_color[..., 1] / 255), expected, atol=0.004)  # half a step of sRGB
+
+
 def test_textures_reach_past_the_mask() -> None:
     maps = surfaces.maps()
     maps = replace(maps, diffuse=np.where(maps.mask[..., None], maps.diffuse, 0).astype(np.float32))

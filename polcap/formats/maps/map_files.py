@@ -82,6 +82,21 @@ def _separated(cues: Cues) -> dict[str, Floats]:
     return {f"{name}.{c}": part[..., k] for name, part in parts.items() for k, c in enumerate("RGB")}
 
 
+DETAIL = "detail.png"  # of twice the size of the other files; only of Bayer cameras
+_DETAIL_STEPS = 50  # per unit of the logarithm
+
+
+def detail_levels(detail: Floats) -> NDArray[np.uint8]:
+    """The levels (2H, 2W) of detail.png, 128 + 50 ln, of a logarithm."""
+    return np.asarray(np.rint(np.clip(detail * np.float16(_DETAIL_STEPS), -127, 127)) + 128, np.uint8)
+
+
+def detail_of(levels: NDArray[np.uint8]) -> Floats:
+    """The logarithm (2H, 2W) float16 of the levels of detail.png."""
+    table = (np.arange(256, dtype=np.float32) - 128) / _DETAIL_STEPS
+    return np.asarray(table.astype(np.float16)[levels])
+
+
 FLOAT_FILES = ("depth", "normal")  # .exr files of 32 bits; the others are half
 # inputs of each file, and the function for its content; the slowest first
 FILES: Mapping[str, tuple[tuple[Source, ...], Callable[..., Any]]] = {
@@ -99,5 +114,6 @@ FILES: Mapping[str, tuple[tuple[Source, ...], Callable[..., Any]]] = {
     "roughness.exr": (("maps",), lambda maps: {"Y": on_object(maps, maps.roughness)}),
     "roughness.png": (("maps",), lambda maps: png.sixteen_bits(on_object(maps, maps.roughness))),
     "confidence.exr": (("maps",), lambda maps: {"Y": on_object(maps, maps.confidence)}),
+    DETAIL: (("maps",), lambda maps: detail_levels(maps.detail)),
     "mask.png": (("maps",), lambda maps: np.where(inside(maps), 255, 0).astype(np.uint8)),
 }

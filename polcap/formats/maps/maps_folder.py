@@ -29,6 +29,10 @@ CONVENTIONS = {
     "outside": "values outside mask.png mean nothing; they are 0, and (0, 0, 1) in normal.png",
 }
 
+_DETAIL_MEANING = (
+    "8 bit, 128 + 50 ln(a / b): albedo a of RAW pixels, crop[0:2] + (i, j), over diffuse b, enlarged linearly; "
+    "0 where shading or noise explains the photograph's detail"
+)
 
 _Side = Annotated[int, Meta(ge=1, le=1 << 16)]
 _Positive = Annotated[float, Meta(gt=0, le=1e9)]
@@ -59,6 +63,7 @@ class _Description(Struct, frozen=True):
     depth: _Depth
     estimator: str
     albedo: _Albedo = _Albedo()
+    sizes: dict[str, tuple[_Side, _Side]] = {}
 
 
 @dataclass(frozen=True)
@@ -85,6 +90,7 @@ def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues
         parallel.results(
             partial(_write, temporary / name, partial(encode, *(made[source] for source in sources)))
             for name, (sources, encode) in map_files.FILES.items()
+            if name != map_files.DETAIL or maps.detail is not None
         )
         _write_json(temporary / "maps.json", _description(maps, depth))
 
@@ -111,6 +117,7 @@ def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
         view=maps.view,
         estimator=maps.estimator,
         albedo_sigma=None if maps.albedo_sigma is None else round(maps.albedo_sigma, 3),
+        detail=None if maps.detail is None else map_files.detail_of(map_files.detail_levels(maps.detail)),
     )
 
 
@@ -151,11 +158,28 @@ def read(folder: Path) -> StoredMaps:
     )
     roughness, confidence = (_read_map(folder, name, "Y", about.size) for name in ("roughness", "confidence"))
     maps = SurfaceMaps(
-        normal, diffuse, specular, roughness, None, confidence, mask=inside, view=view, estimator=about.estimator,
+        normal=normal,
+        diffuse=diffuse,
+        specular=specular,
+        roughness=roughness,
+        depth_prior=None,
+        confidence=confidence,
+        mask=inside,
+        view=view,
+        estimator=about.estimator,
         albedo_sigma=None if percent is None else round(percent / 100, 3),
-    )  # fmt: skip
+        detail=_read_detail(folder, about.size) if map_files.DETAIL in about.sizes else None,
+    )
     depth = np.where(inside, _read_map(folder, "depth", "Z", about.size), np.nan).astype(np.float32)
     return StoredMaps(maps, depth, metric=about.depth.unit == "m")
+
+
+def _read_detail(folder: Path, size: tuple[int, int]) -> Floats:
+    """The logarithm (2H, 2W) in detail.png."""
+    levels = png.read(folder / map_files.DETAIL)
+    if levels.dtype != np.uint8 or levels.shape != (2 * size[1], 2 * size[0]):
+        raise DecodeError(f"{folder / map_files.DETAIL} is not {2 * size[0]} × {2 * size[1]} of 8 bits; process again")
+    return map_files.detail_of(np.asarray(levels, np.uint8))
 
 
 def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
@@ -202,6 +226,7 @@ def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[st
         "format": "polcap maps 1",
         "crop": raw_crop(view, width, height),
         "size": [width, height],
+        "sizes": {} if maps.detail is None else {map_files.DETAIL: [2 * width, 2 * height]},
         "scale": _plain(view.scale),
         "camera": {
             "focal_px": float(view.focal),
@@ -226,6 +251,7 @@ def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[st
             "roughness.png": "16 bit, linear",
             "photograph.png": "S0 of the whole crop, linear Rec.709 with chart white = its reflectance; 8 bit, sRGB",
             "mask.png": "8 bit, 255 on the object",
+            **({} if maps.detail is None else {map_files.DETAIL: _DETAIL_MEANING}),
             "confidence.exr": "expected error of the normal, degrees; half",
             "stokes.exr": "S0.R ... S2.B in camera channels, linear, sensor white at the reference exposure = 1; half",
             "cues.exr": "dolp; aolp in degrees, 0 ... 180; normalized.S1, normalized.S2; diffuse_color.R, .G, .B; "

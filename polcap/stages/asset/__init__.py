@@ -32,9 +32,12 @@ class AssetSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ior: Annotated[
         float, Meta(ge=1.1, le=2.5, description="refractive index written to the asset; F0 does not depend on it [1]")
     ] = 1.5
+    raw_pixels: Annotated[
+        bool, Meta(description="base color at the RAW's pixels where they show printed detail, for Bayer cameras")
+    ] = True
 
 
-@stage(version=3, keep=False)
+@stage(version=4, keep=False)
 def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings, bits: Bits = 8) -> Asset:
     """Build the object's glTF textures (H, W, 3) on the crop's grid, filled outwards so that no seam shows.
 
@@ -42,25 +45,26 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings, bits: Bits = 8
     ρ_d T₊(0)²/(1 − F0) both agree for a frontal surface. F0 is the index's own × factor × texture, and the factor holds
     the map's greatest value.
 
-    The outermost pixels of the object, which mix with the backdrop, are filled from further inside.
+    The outermost pixels of the object, which mix with the backdrop, are filled from further inside. With the maps'
+    detail, the base color has twice their size; the other textures do not need it.
     """
     specular = np.clip(maps.specular, 0.0, 1.0)
     greatest = specular.max(axis=-1)
     top = float(greatest[maps.mask].max(initial=0.0))
     entry, _ = fresnel.transmission(np.float64(1.0), settings.ior)
-    roughness = _integers(maps.roughness, bits)
-    textures = [
-        _srgb(maps.diffuse * np.float32(entry**2) / (1 - np.minimum(greatest, 0.99))[..., None], bits),
-        np.stack(
-            [np.full_like(roughness, np.iinfo(roughness.dtype).max), roughness, np.zeros_like(roughness)], axis=-1
-        ),
+    roughness, known = _integers(maps.roughness, bits), _without_outline(maps.mask)
+    full, detail = np.full_like(roughness, np.iinfo(roughness.dtype).max), maps.detail if settings.raw_pixels else None
+    base = maps.diffuse * np.float32(entry**2) / (1 - np.minimum(greatest, 0.99))[..., None]
+    base = fill_outward(base.astype(np.float32), known)
+    others = [
+        np.stack([full, roughness, np.zeros_like(roughness)], axis=-1),
         _srgb(specular / max(top, 1e-9), bits),
     ]
-    filled = fill_outward(np.concatenate(textures, axis=-1), _without_outline(maps.mask))  # at once: half the time
-    base_color, packed, specular_color = (np.ascontiguousarray(filled[..., k : k + 3]) for k in (0, 3, 6))
+    filled = fill_outward(np.concatenate(others, axis=-1), known)
+    packed, specular_color = (np.ascontiguousarray(filled[..., k : k + 3]) for k in (0, 3))
     return Asset(
         mesh=mesh,
-        base_color=base_color,
+        base_color=_srgb(base, bits) if detail is None else _with_detail(base, detail, bits),
         occlusion_roughness_metallic=packed,
         normal=_integers(tangent_space(maps, mesh) / 2 + 0.5, bits),
         specular_color=specular_color,
@@ -68,6 +72,13 @@ def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings, bits: Bits = 8
         ior=settings.ior,
         albedo_sigma=maps.albedo_sigma,
     )
+
+
+def _with_detail(albedo: Floats, detail: Floats, bits: Bits) -> TexturePixels:
+    """An albedo (H, W, 3), enlarged linearly, times the exponential of its detail (2H, 2W); sRGB."""
+    factor = np.exp(detail, dtype=np.float32)
+    planes = [_srgb(cv2.resize(plane, detail.shape[::-1]) * factor, bits) for plane in cv2.split(albedo)]
+    return np.asarray(cv2.merge(planes))
 
 
 def with_mesh(asset: Asset, maps: SurfaceMaps, mesh: Mesh) -> Asset:

@@ -25,7 +25,7 @@ CHANNELS = (
 FLOOR = 0.02  # added to a radiance before its logarithm, in the channels and in their inverse
 
 
-@stage(version=4, keep=False)
+@stage(version=5, keep=False)
 def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
     """Compute all cues (radiance, DoLP, AoLP, diffuse color…) of a crop (H, W) from its Stokes parameters.
 
@@ -63,6 +63,7 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
         scale_sigma=scale.sigma(stokes, color),
         body=body,
         body_known=body_known,
+        detail=stokes.detail,
     )
 
 

@@ -43,7 +43,7 @@ from polcap.images import (
 )
 from polcap.optics import sharpness
 from polcap.stages import stage
-from polcap.stages.hdr import exposure, noise, planes, weights
+from polcap.stages.hdr import exposure, noise, photosites, planes, weights
 from polcap.stages.hdr.bracket import Bracket, compare
 from polcap.stages.hdr.planes import Reader, same_size
 
@@ -66,7 +66,7 @@ class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=13)
+@stage(version=14)
 def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack:
     """Merge every bracket: radiance (K, H, W, 3) of all shots, on the scale of each shot's reference frame.
 
@@ -104,7 +104,7 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     full = settings.demosaic == "full" and image.cfa is not None
     del image  # so that the reader can free the frame
     lines = noise.Lines(() if capture.calibration is None else capture.calibration.noise)
-    shape, stack = (0, 0, 0), _empty(0, (0, 0, 0))
+    shape, stack, mosaic = (0, 0, 0), _empty(0, (0, 0, 0)), None
     ratio, curvature, ambient_share, tiles = [], [], [], []
     for k, shot in enumerate(shots):
         # the crossed shot is merged on the scale of its own middle frame: its flash has another energy
@@ -116,6 +116,8 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
             shape, stack = weighted.shape, _empty(len(shots), weighted.shape)
         same_size("the cross-polarized shot" if k == count else f"shot {shot.name}", weighted.shape, shape)
         weighted.merge_into(MaskedImage(stack.value[k], stack.variance[k], stack.quality[k]))
+        if k == 0 and sensor.site_px is not None and side == 2:
+            mosaic = photosites.merge(bracket, weighted, read)
         if k < count:
             ratio.append([frame.ratio.astype(np.float64) for frame in compared.frames])
             curvature.append([frame.curvature for frame in compared.frames])
@@ -148,6 +150,7 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         equipment=_equipment(capture, view),
         offset_px=_offsets(capture.shots) if capture.layout == "sensor" else None,
         crossed=None if capture.crossed is None else CrossedShot(pictures[-1], capture.crossed_angle),
+        mosaic=mosaic,
     )
 
 

@@ -9,7 +9,7 @@ the camera frame.
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
         zenith         by the object's law of diffuse polarization
     half_turns     the side of the ray to which a normal leans, for both estimators
-    highlights     filled, and their albedo from a crossed shot; uncertainty of the scale of all albedos
+    albedo         in highlights, its uncertain scale, and its detail finer than a superpixel
 """
 
 from dataclasses import replace
@@ -20,7 +20,7 @@ from msgspec import Meta
 
 from polcap.images import Cues, Network, RunNetwork, SurfaceMaps
 from polcap.stages import stage
-from polcap.stages.infer import analytic, highlights, learned
+from polcap.stages.infer import albedo, analytic, learned
 
 
 class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -34,7 +34,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fine: Annotated[bool, Meta(description="a second network adds relief finer than the pixels of the first")] = True
 
 
-@stage(version=21)
+@stage(version=22)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Estimate normal, diffuse, specular, roughness and expected error from cues; without a network by inversion.
 
@@ -47,5 +47,9 @@ def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: Inf
         maps = analytic.estimate(cues, settings.ior)
     else:
         maps = learned.estimate(cues, network, run, settings.ior, settings.symmetries, fine_pass=settings.fine)
-    maps = highlights.correct_highlights(maps, cues, settings.ior)
-    return replace(maps, albedo_sigma=highlights.albedo_sigma(maps, cues.scale_sigma))
+    maps = albedo.correct_highlights(maps, cues, settings.ior)
+    return replace(
+        maps,
+        albedo_sigma=albedo.albedo_sigma(maps, cues.scale_sigma),
+        detail=None if cues.detail is None else albedo.select_detail(cues.detail, cues, maps),
+    )

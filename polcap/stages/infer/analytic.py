@@ -9,7 +9,7 @@ import numpy as np
 from polcap.images import Cues, Floats, Quality, SurfaceMaps
 from polcap.optics import brdf, frames, fresnel
 from polcap.stages.infer import half_turns
-from polcap.stages.infer.highlights import fill_highlights
+from polcap.stages.infer.albedo import fill_highlights
 from polcap.stages.infer.zenith import ZenithEstimate, estimate_zenith
 
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)  # in steps of 1.5, in which noise falls by a third

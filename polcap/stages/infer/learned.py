@@ -18,7 +18,7 @@ from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.cues import FLOOR
 from polcap.stages.infer import analytic, augmentation, fine, half_turns
-from polcap.stages.infer.highlights import REACHED, fill_highlights
+from polcap.stages.infer.albedo import REACHED, fill_highlights
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join, for the network's input holds the inversion
 # error = min(a·statedᵇ·exp(r·roughness), c), degrees: maximum likelihood on traced training meshes (decision 28)

@@ -30,6 +30,7 @@ from polcap.images import (
 from polcap.optics import crossing, distortion, fresnel, mueller
 from polcap.optics.warp import covered, warp
 from polcap.stages import stage
+from polcap.stages.stokes.reference_detail import reference_detail
 
 _MOST_CONDITION = 50.0  # that of three angles in steps of 12°: S1 has 26 times a shot's noise; 0, 45, 90° have 2.4
 # A pixel is metal if red and blue have this DoLP and their AoLPs differ by this angle, at this many σ. Set by hand,
@@ -57,7 +58,7 @@ class StokesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 5.0
 
 
-@stage(version=6)
+@stage(version=7)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,
@@ -105,6 +106,7 @@ def solve(
         ),
         residual=residual,
         body=_body(shots, alignment.crossed, calibration.crossed, stokes, quality, crop),
+        detail=None if radiance.mosaic is None else reference_detail(radiance.mosaic, crop, lens),
     )
 
 

@@ -74,6 +74,22 @@ def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
     assert {file.name: file.stat().st_mtime_ns for file in (tmp_path / "maps").iterdir()} == before
 
 
+def test_detail_of_raw_pixels_comes_back_and_maps_json_states_its_size(result: Result, tmp_path: Path) -> None:
+    of, mesh, image, seen = result
+    size = (2 * surfaces.HEIGHT, 2 * surfaces.WIDTH)
+    detailed = replace(of, detail=np.random.default_rng(2).normal(0, 0.5, size).astype(np.float16))
+    maps.write(tmp_path / "maps", detailed, mesh, image, seen)
+    stated = json.loads((tmp_path / "maps" / "maps.json").read_text("utf-8"))
+    assert stated["sizes"] == {"detail.png": [size[1], size[0]]} and "detail.png" in stated["maps"]
+    read, stored = maps.read(tmp_path / "maps").maps.detail, maps.as_stored(detailed).detail
+    assert detailed.detail is not None and read is not None and stored is not None
+    assert np.array_equal(read, stored)
+    assert np.abs(read.astype(float) - detailed.detail).max() < 0.011  # half a level of 1/50, and the half floats
+    png.write(tmp_path / "maps" / "detail.png", np.zeros((4, 4), np.uint8))
+    with pytest.raises(DecodeError, match=r"detail\.png is not 320 × 240"):
+        maps.read(tmp_path / "maps")
+
+
 def test_every_promised_file_is_there_and_described(folder: Path) -> None:
     assert {path.name for path in folder.iterdir()} == FILES
     said = json.loads((folder / "maps.json").read_text("utf-8"))

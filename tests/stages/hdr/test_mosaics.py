@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from msgspec import structs
+from scipy.ndimage import gaussian_filter
 
 from polcap.errors import CaptureError
 from polcap.formats.capture import reader as captures
@@ -51,6 +52,28 @@ def test_full_size_keeps_bias_and_variance_honest():
     clear = (stack.quality[0][inner] & Quality.CLIPPED) == 0
     assert abs(z[clear].mean()) < 0.05
     assert abs(z[clear].var() - 1) < 0.1
+
+
+def test_photosites_of_the_first_shot_are_merged_without_the_frame_that_moved():
+    """Light that differs from photosite to photosite, which superpixels do not show."""
+    rng = np.random.default_rng(6)
+    y, x = np.mgrid[:320, :400]
+    blobs = gaussian_filter(rng.normal(size=x.shape), 5)
+    light = 900 * np.exp(0.3 * blobs / blobs.std()) * (1 + 0.05 * np.sin(2.2 * x) * np.cos(1.9 * y))
+    light *= np.array([0.6, 1.0, 0.7])[np.tile(RGGB, (160, 200))]
+
+    def shoot(exposure, moved=0):
+        counts = (rng.poisson(np.roll(light, moved, 1) * exposure) + rng.normal(0, READ, light.shape)) / GAIN + BLACK
+        return SensorImage(np.clip(np.round(counts), 0, WHITE).astype(np.uint16), np.full((2, 2), BLACK), WHITE, RGGB)
+
+    frames = [frame(shoot(e, moved), iso=100.0) for e, moved in ((0.25, 0), (1, 0), (4, 8))]
+    stack = merge(capture(frames, frames), hdr.HdrSettings())
+    assert np.array_equal(stack.mosaic.cfa, RGGB) and stack.mosaic.value.shape == light.shape
+    exposure = 1.25  # of the two frames that did not move
+    variance = (light * exposure + 2 * (READ**2 + GAIN**2 / 12)) / exposure**2
+    z = (stack.mosaic.value - electrons_to_signal(light)) / electrons_to_signal(np.sqrt(variance))
+    assert abs(z[:, 20:-20].mean()) < 0.05
+    assert abs(z[:, 20:-20].var() - 1) < 0.05
 
 
 def test_x_trans_brackets_give_the_light_of_a_bayer_camera(tmp_path):
