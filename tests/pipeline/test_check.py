@@ -155,7 +155,7 @@ def test_ambient_light_is_measured(example: Path, tmp_path: Path) -> None:
         dark = middle.value.astype(float) - middle.black.mean()
         dng.write(
             tmp_path / f"dark{angle}.dng",
-            (middle.black.mean() + dark * 0.4).astype(np.uint16),
+            (middle.black.mean() + dark / 5).astype(np.uint16),
             cfa=middle.cfa,
             black=float(middle.black.mean()),
             white=middle.white,
@@ -166,7 +166,7 @@ def test_ambient_light_is_measured(example: Path, tmp_path: Path) -> None:
         frames.append(f'[[frame]]\nfile = "dark{angle}.dng"\nrole = "ambient"\nangle = {angle}\n')
     (tmp_path / "capture.toml").write_text("".join(frames))
     line = next(line for line in verdict(tmp_path).lines if line.name == "ambient")
-    assert line.state == "fail"
+    assert line.state == "pass" and line.value == pytest.approx(0.2, rel=0.2)
     # of all the light
     assert line.value == pytest.approx(0.2, rel=0.05)
 
