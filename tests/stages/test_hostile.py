@@ -93,7 +93,7 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
         "names": [str(k) for k in range(len(radiance.angle))], "focal_doubt": (0.0, 0.0), "grid_px": 1.0,
         "chart_missing": "", "clipped": (radiance.quality & 1 > 0)[:, None], "blur_px": radiance.bracket.blur_px,
         "radiance": radiance, "color": color, "alignment": alignment, "object_": object_, "selfcal": calibration,
-        "stokes": image, "maps": maps, "mesh": mesh,
+        "stokes": image, "cues": seen, "maps": maps, "mesh": mesh,
     }  # fmt: skip
     judged = list(gates.judge(Evidence.partial(**found), config.gates, config.align))
     assert all(gate.message and gate.state in ("pass", "warn", "fail", "not measured") for gate in judged)

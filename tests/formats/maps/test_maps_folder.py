@@ -170,7 +170,7 @@ def test_relative_depth_is_called_so(result: Result, tmp_path: Path) -> None:
 
 
 def test_damaged_folder_is_one_line(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(DecodeError, match="has no maps"):
+    with pytest.raises(DecodeError, match="cannot be read"):
         maps.read(tmp_path)
     (tmp_path / "maps.json").write_text("{}")
     with pytest.raises(DecodeError, match="process again"):
