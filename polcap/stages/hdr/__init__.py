@@ -102,6 +102,7 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     # in the middle frame by the metadata, as in `check`, which reads each frame only once
     places = sharpness.places(read(first.frames[(len(first.frames) - 1) // 2]), settings.clip)
     full = settings.demosaic == "full" and image.cfa is not None
+    bayer = image.cfa if sensor.site_px is not None and side == 2 else None  # binned
     del image  # so that the reader can free the frame
     lines = noise.Lines(() if capture.calibration is None else capture.calibration.noise)
     shape, stack, mosaic = (0, 0, 0), _empty(0, (0, 0, 0)), None
@@ -114,10 +115,9 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         weighted = weights.prepare(bracket, compared, lines, read, full)
         if k == 0:
             shape, stack = weighted.shape, _empty(len(shots), weighted.shape)
+            mosaic = None if bayer is None else photosites.merge(bracket, weighted, bayer, read)
         same_size("the cross-polarized shot" if k == count else f"shot {shot.name}", weighted.shape, shape)
         weighted.merge_into(MaskedImage(stack.value[k], stack.variance[k], stack.quality[k]))
-        if k == 0 and sensor.site_px is not None and side == 2:
-            mosaic = photosites.merge(bracket, weighted, read)
         if k < count:
             ratio.append([frame.ratio.astype(np.float64) for frame in compared.frames])
             curvature.append([frame.curvature for frame in compared.frames])

@@ -5,45 +5,42 @@ from functools import partial
 import numpy as np
 
 from polcap import parallel
-from polcap.images import Floats, Mosaic, SensorImage
+from polcap.images import Bits, Floats, Mosaic, SensorImage
 from polcap.stages.hdr.bracket import Bracket
-from polcap.stages.hdr.planes import Bools, Reader, blocks
-from polcap.stages.hdr.weights import WeightedBracket
-
-_Part = tuple[SensorImage, Bools, Floats]  # a frame, the superpixels (H, W) it serves, its exposure ratios (C,)
+from polcap.stages.hdr.planes import Reader, blocks
+from polcap.stages.hdr.weights import WeightedBracket, WeightedFrame
 
 
-def merge(bracket: Bracket, weighted: WeightedBracket, read: Reader) -> Mosaic:
+def merge(bracket: Bracket, weighted: WeightedBracket, cfa: Bits, read: Reader) -> Mosaic:
     """Photosites (2H, 2W) of a Bayer bracket: the sum of the signals over the sum of the exposures.
 
-    Each superpixel uses the frames that serve it in the merge. Frames that moved are left out: resampling would mix
-    the colors.
+    `cfa` (2, 2) is the color filter array. Each superpixel (H, W) uses the frames that serve it in
+    the merge. Frames that moved are left out: resampling would mix the colors.
     """
-    numbers = [bracket.reference, *bracket.others]
-    frames = [(read(bracket.shot.frames[e]), one) for e, one in zip(numbers, weighted.frames, strict=True)]
-    still = [(image, one) for image, one in frames if one.frame.motion is None and image.cfa is not None]
-    parts = [(image, one.serves, one.frame.ratio) for image, one in still]
     _, height, width = weighted.shape
-    value = np.empty((2 * height, 2 * width), np.float16)
-    parallel.results(partial(_merge_rows, parts, value, rows) for rows, _, _ in blocks(height))
-    cfa = parts[0][0].cfa
-    assert cfa is not None
+    signal, exposure = (np.zeros((2 * height, 2 * width), np.float32) for _ in range(2))
+    for e, frame in zip([bracket.reference, *bracket.others], weighted.frames, strict=True):
+        if frame.frame.motion is None:
+            image = read(bracket.shot.frames[e])  # one at a time: memory may have no room for all
+            parallel.results(partial(_add, image, frame, signal, exposure, rows) for rows, _, _ in blocks(height))
+    value = np.empty(signal.shape, np.float16)
+    for rows, _, _ in blocks(2 * height):
+        value[rows] = signal[rows] / np.maximum(exposure[rows], np.float32(1e-6))
     return Mosaic(value, cfa)
 
 
-def _merge_rows(parts: list[_Part], out: Floats, rows: slice) -> None:
-    """Write the merged photosites of some rows of superpixels to `out` (2H, 2W)."""
-    width = out.shape[1]
-    serves = [np.repeat(serves[rows], 2, axis=1).astype(np.float32) for _, serves, _ in parts]
+def _add(image: SensorImage, frame: WeightedFrame, signal: Floats, exposure: Floats, rows: slice) -> None:
+    """Add a frame's signals and exposures to those (2H, 2W) of some rows of superpixels."""
+    if image.cfa is None:
+        return
+    width = signal.shape[1]
+    serves = np.repeat(frame.serves[rows], 2, axis=1).astype(np.float32)
+    scale = np.float32(image.white - float(image.black.mean()))
     for i in (0, 1):  # rows of one phase of the color filter array
         places = slice(2 * rows.start + i, 2 * rows.stop, 2)
-        signal, exposure = (np.zeros((len(serves[0]), width), np.float32) for _ in range(2))
-        for (image, _, ratio), weight in zip(parts, serves):
-            assert image.cfa is not None
-            black = np.tile(np.broadcast_to(image.black, (2, 2))[i].astype(np.float32), width // 2)
-            part = image.value[places, :width] - black
-            part *= weight
-            part /= np.float32(image.white - float(image.black.mean()))
-            signal += part
-            exposure += weight * np.tile(ratio[image.cfa[i]], width // 2)
-        out[places] = signal / np.maximum(exposure, np.float32(1e-6))
+        black = np.tile(np.broadcast_to(image.black, (2, 2))[i].astype(np.float32), width // 2)
+        part = image.value[places, :width] - black
+        part *= serves
+        part /= scale
+        signal[places] += part
+        exposure[places] += serves * np.tile(frame.frame.ratio[image.cfa[i]], width // 2)

@@ -29,6 +29,7 @@ _AHEAD = 2  # frames decoded ahead of the merge; each thread waits for a decodin
 _PLANES_BYTES = 400_000_000  # most for a shot's signals; with more they are computed again for every pass
 _HELD_BYTES = 1_100_000_000  # most for decoded frames; others are decoded again when needed
 _WORK_BYTES = 60  # per pixel, for the first estimate, registration, masks and blocks
+_MOSAIC_BYTES = 8  # per pixel: four photosites of the first shot, half floats
 _FRACTIONS = 32  # steps per pixel in the table of cv2's Lanczos kernel
 
 
@@ -148,7 +149,7 @@ def plan_memory(shots: int, frames: int, pixels: int, frame_bytes: int) -> Memor
     if limit is None:
         return MemoryPlan()
     sample = np.dtype(np.float32).itemsize
-    stack = pixels * shots * (6 * sample + 1)
+    stack = pixels * (shots * (6 * sample + 1) + _MOSAIC_BYTES)
     one_shot = frames * (frame_bytes + pixels) + pixels * _WORK_BYTES
     left = limit - taken - stack - one_shot
     if left < 0:

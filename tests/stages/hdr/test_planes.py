@@ -24,11 +24,12 @@ def test_little_memory_gives_the_same_pixels_and_less_is_refused_by_its_least(mo
     quads = ramp(256, 256, high=2e4)
     shots = [[frame(expose(quads, e, np.random.default_rng(k)), exposure=e) for e in (1, 4)] for k in (0, 1)]
     plenty = merge(capture(*shots), hdr.HdrSettings())
-    needed = 128 * 128 * (2 * 25 + 2 * 9 + 60)
+    needed = 128 * 128 * (2 * 25 + 8 + 2 * 9 + 60)
     monkeypatch.setattr(planes, "process_memory", lambda: (0, needed))
     little = merge(capture(*shots), hdr.HdrSettings())
     for name in ("value", "variance", "quality"):
         np.testing.assert_array_equal(getattr(little, name), getattr(plenty, name))
+    np.testing.assert_array_equal(little.mosaic.value, plenty.mosaic.value)
     np.testing.assert_array_equal(little.bracket.exposure_ratio, plenty.bracket.exposure_ratio)
     monkeypatch.setattr(planes, "process_memory", lambda: (1_000_000_000, needed + 999_999_999))
     with pytest.raises(SettingError, match=r"needs 1\.00 GB at least"):
