@@ -124,7 +124,7 @@ def test_light_of_one_axis_does_not_show_the_sense(tmp_path):
     ("changes", "message"),
     [
         ({"extinction": (1.1, 1.1, 1.1)}, "hardly changes with the ring"),
-        ({"ring_step_deg": 60.0}, r"3 angles of the ring; take 5"),
+        ({"ring_step_deg": 60.0}, r"3 angles of the ring over 120°; take 5"),
     ],
 )
 def test_unsuitable_polarizer_photographs_are_one_clear_line(tmp_path, changes, message):
