@@ -72,4 +72,6 @@ def _number(environment: Mapping[str, str], name: str, default: str = "") -> int
     try:
         return int(text)
     except ValueError:
-        raise SettingError(f"{name}={text} is not a whole number; give --shard K/N") from None
+        raise SettingError(
+            f"the environment variable {name}={text} is not a whole number; correct it, or give --shard K/N"
+        ) from None

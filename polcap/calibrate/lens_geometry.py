@@ -96,7 +96,12 @@ def _fit_lens(boards: list[BoardView], size: tuple[int, int], first: Photograph,
             "in all corners of the picture"
         )
     lens = Distortion(px, (float(camera[0, 2]), float(camera[1, 2])), float(bend[0]), float(bend[1]))
-    if residual > _MOST_RESIDUAL or distortion.folds(lens, *size):
+    if distortion.folds(lens, *size):
+        raise CaptureError(
+            f"{folder}: the fitted distortion folds the picture's corners over; photograph the board in all corners, "
+            "and use no fisheye lens"
+        )
+    if residual > _MOST_RESIDUAL:
         raise CaptureError(
             f"{folder}: the corners lie {residual:.2f} px (rms) from those of a flat board, the limit is "
             f"{_MOST_RESIDUAL:g} px; use a flat, sharp board, and no fisheye lens"

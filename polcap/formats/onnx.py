@@ -176,7 +176,10 @@ def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
 
 
 def _check(path: Path, session: Any, encoding: str) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Names of the model's input channels, and its metadata. Raises ModelError if required metadata are missing."""
+    """Names of the model's input channels, and its metadata.
+
+    Raises ModelError if metadata are missing or invalid, state another encoding, or do not fit the input.
+    """
     try:
         metadata = {str(k): str(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
     except UnicodeError as error:

@@ -10,7 +10,7 @@ from polcap.optics.resize import area_mean, weighted_area_mean
 
 
 class ObjectReduction:
-    """Reduction of images (H, W, …) with an object `inside` (H, W) to at most `longest` pixels a side."""
+    """Reduces images (H, W, …) to at most `longest` px a side by means over the object's pixels `inside` (H, W)."""
 
     def __init__(self, inside: NDArray[np.bool_], longest: int) -> None:
         height, width = inside.shape

@@ -60,7 +60,10 @@ def relative_exposure(exposure: Exposure) -> float:
 
 
 def bracket_by_shutter(middle_s: float | None) -> tuple[Exposure, ...]:
-    """Default bracket without flash: three frames in steps of two stops of time around the camera's setting."""
+    """Default bracket without flash: three frames in steps of two stops of time around the camera's time `middle_s`.
+
+    Raises SettingError if the camera states no time.
+    """
     if not middle_s:
         raise SettingError("the camera states no shutter speed; give the exposures with --bracket")
     return tuple(Exposure(time_s=middle_s * factor) for factor in (0.25, 1.0, 4.0))

@@ -130,7 +130,10 @@ def structure(data: bytes) -> TiffStructure:
 
 
 def _entries(data: bytes, order: str, places: range, most: int) -> Iterator[tuple[int, tuple[int, ...]]]:
-    """Tag and values of the TIFF directory entries at the byte offsets `places`; at most `most` values each."""
+    """Tag and whole-number values of the known TIFF directory entries at the byte offsets `places`.
+
+    `most` values in all: an entry with more than remain is skipped. Values of other types are left out: ().
+    """
     for at in places:
         tag, form, count = struct.unpack_from(order + "HHI", data, at)
         if tag not in _TAGS_READ or count > most:

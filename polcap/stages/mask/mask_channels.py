@@ -78,5 +78,5 @@ def mirror(channels: Floats, axes: tuple[int, ...]) -> Floats:
 
 
 def _bright_s0(picture: ReducedPicture, bright: float) -> float:
-    """Scale of S0 summed over the camera's channels: its value in bright parts of the picture."""
+    """Bright level of S0 summed over the camera's channels; `bright` is that level in the mean of R, G and B."""
     return bright * float(picture.stokes[0].clip(0).sum() / max(picture.color.clip(0).mean(-1).sum(), 1e-9))

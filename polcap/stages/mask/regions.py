@@ -17,7 +17,7 @@ _LEEWAY = 1.7  # largest expected error of the mask by colors, over that of the 
 
 
 def likely_regions(probability: Floats) -> Bools:
-    """Mask (H, W) of the pixels with probability (H, W) above one half, without specks."""
+    """Mask (H, W) of the pixels with probability (H, W) above one half, without specks, with unlikely holes filled."""
     return fill_holes(_without_specks(probability > 0.5), _PINHOLE, probability)
 
 
