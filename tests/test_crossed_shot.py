@@ -112,7 +112,7 @@ def test_process_and_check_say_what_the_crossed_shot_shows(capture: Capture, res
     assert lines["crossed"].state == "pass" and "mirrored" in lines["crossed"].message
 
 
-def test_a_filter_that_was_not_crossed_is_told(capture: Capture) -> None:
+def test_a_filter_that_was_not_crossed_is_reported(capture: Capture) -> None:
     """The first shot once more for the crossed one: its highlights clip as well."""
     shown = replace(capture, crossed=replace(capture.shots[0], frames=capture.shots[0].frames))
     lines = {line.name: line for line in check.inspect(shown, Config(), ChartRequest("none"), no_networks).lines}

@@ -1,4 +1,4 @@
-"""Limits that no system can set are told at once, on one line."""
+"""Limits that no system can set are reported at once, on one line."""
 
 from pathlib import Path
 

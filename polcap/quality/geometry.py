@@ -17,7 +17,7 @@ from polcap.stages.whitebalance import chart_in_mask
 
 _LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ
 _DEGREES_PER_PUSH, _DEGREES_PER_TURN = 200.0, 350.0  # error of the normals per movement by the object's radius
-_STILL_PX = 0.2  # displacement of inner detail that polarization alone feigns, in three of four captures
+_STILL_PX = 0.2  # displacement of inner detail that polarization alone imitates, in three of four captures
 _INWARD = 0.2  # sine of the zenith from which a normal leans inward
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
 
@@ -78,7 +78,7 @@ def _object_moved(found: Evidence, limits: GateLimits) -> Gate:
         return Gate("alignment", "fail", figure, limit, message, remedy, max(cost, 5.0), bad, "px")
     if pushed[k] > least:
         return Gate("alignment", "warn", figure, least, message, remedy, cost, blamed(names, pushed > least), "px")
-    least *= 2  # polarization feigns a displacement of inner detail
+    least *= 2  # polarization imitates a displacement of inner detail
     turned = inside - _STILL_PX > least
     if turned.any():
         k = int(np.argmax(inside))

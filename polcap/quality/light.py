@@ -9,6 +9,7 @@ import numpy as np
 
 from polcap.images import AngleStack, Floats, Quality, StokesImage
 from polcap.optics import mueller
+from polcap.optics.resize import block_means
 from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, blamed
 from polcap.quality.limits import GateLimits
 from polcap.stages.whitebalance import patches
@@ -346,13 +347,11 @@ def _surroundings_dolp(found: Evidence) -> float:
         middle = found.color.place.corners.mean(0)
         frame = middle + _WITH_FRAME * (found.color.place.corners - middle)
         outside &= cv2.fillConvexPoly(np.zeros(outside.shape, np.uint8), frame.astype(np.int32), 1) == 0
-    size = (outside.shape[1] // _ROOM_TILE, outside.shape[0] // _ROOM_TILE)
-    cut = np.s_[: size[1] * _ROOM_TILE, : size[0] * _ROOM_TILE]
-    clear = cv2.resize(outside[cut].astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+    clear = block_means(outside, _ROOM_TILE) > 0.999
     if clear.sum() < _LEAST_ROOM_TILES:
         return float("nan")
     shots = zip(radiance.value, found.selfcal.gains.gain)
-    light = [cv2.resize((shot / gain).sum(-1)[cut], size, interpolation=cv2.INTER_AREA)[clear] for shot, gain in shots]
+    light = [block_means((shot / gain).sum(-1), _ROOM_TILE)[clear] for shot, gain in shots]
     s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(found.selfcal.angle), np.stack(light), rcond=None)[0]
     return float(np.hypot(np.median(s1 / np.maximum(s0, 1e-9)), np.median(s2 / np.maximum(s0, 1e-9))))
 

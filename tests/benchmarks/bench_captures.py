@@ -51,7 +51,7 @@ def main() -> None:
 def measure(truth_file: Path, network: Network | None, rough: bool) -> list[float]:
     """One capture's figures, in the order of COLUMNS."""
     stem = str(truth_file)[: -len(".truth.json")]
-    told = json.loads(truth_file.read_text())
+    applied = json.loads(truth_file.read_text())
     meta = json.loads(Path(stem + ".meta.json").read_text())
     capture = captures.read(Path(stem), None)
     supplied = UserInput(network=network, mask_network=models.load_mask_network(2))
@@ -59,7 +59,7 @@ def measure(truth_file: Path, network: Network | None, rough: bool) -> list[floa
     with np.load(stem + ".truth.npz") as maps:
         errors = surface_errors(found, dict(maps), network, rough)
         detail = detail_errors(found, dict(maps))
-    return [*errors[:2], *capture_errors(found, capture, told, meta), *errors[2:], *detail]
+    return [*errors[:2], *capture_errors(found, capture, applied, meta), *errors[2:], *detail]
 
 
 def detail_errors(found: Results, truth: dict[str, Floats]) -> list[float]:
@@ -87,13 +87,13 @@ def detail_errors(found: Results, truth: dict[str, Floats]) -> list[float]:
     return [*(rms(a - albedo) for a in both), *(rms(fine(a) - fine(albedo)) for a in both), rms(fine(albedo))]
 
 
-def capture_errors(found: Results, capture: Capture, told: dict, meta: dict) -> list[float]:  # type: ignore[type-arg]
+def capture_errors(found: Results, capture: Capture, applied: dict, meta: dict) -> list[float]:  # type: ignore[type-arg]
     """Chart centres and alignment [RAW px, worst], gains and bracket ratios [%, worst]."""
     centers = (np.array(meta["chart"]["patch_corners_px"]) - 1).mean(1) / 2  # their pixel centres lie at .5
     assert found.color.place is not None
     chart = 2 * np.linalg.norm(found.color.place.quads.mean(1) - centers, axis=1).max()
 
-    files = {shot["file"].split("/", 1)[1]: shot for shot in told["shots"]}
+    files = {shot["file"].split("/", 1)[1]: shot for shot in applied["shots"]}
     frames = [
         [files[str(Path(frame.path).relative_to(capture.folder))] for frame in shot.frames] for shot in capture.shots
     ]

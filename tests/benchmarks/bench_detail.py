@@ -4,11 +4,10 @@ Pictures of the evaluation at 1,024².
 
     python -m tests.benchmarks.bench_detail DATA [--pictures 6] [--size 1024] [--protocol 1] [--store DIR] [--look PNG]
 
-Test meshes in test materials, engraved with lettering, a relief that training never draws. The normals' error is told
-apart into bands: finer than what the first network can see (its Nyquist wavelength is two of its pixels), from there to
-what the inversion adds, and coarser. Each is the rms of the difference of band-passed normals inside the object,
-eroded, in degrees. The first band's is told apart again, so that squares add up: where one part hides another, and
-elsewhere.
+The objects are test meshes in test materials, engraved with lettering, a relief that training never draws. The error of
+the normals is split into three bands of wavelength: below two pixels of the first network, from there to the detail
+that the inversion adds, and above. Each figure is the rms difference of the band-passed normals inside the eroded
+mask, in degrees. The first band is split again: at edges where one part hides another, and elsewhere. Squares add up.
 """
 
 import argparse
@@ -32,8 +31,11 @@ Mask = NDArray[np.bool_]  # (H, W)
 _HALF = 0.375  # σ of the Gaussian that halves a wave of two, in units of half its length: √(2 ln 2)/π
 _TEXELS, _PERIOD = 1024, 0.6  # of the lettering; its length in sides of the object
 _DEEP = 0.7  # its steepest slope
-_JUMP, _BESIDE = 0.06, 3  # depth between neighbours, radii of the object, that is an edge; px beside it that count
-_COARSE = 2.0  # px of the first network, 1σ: the fine pass and the inversion tell what is finer
+_JUMP, _BESIDE = (
+    0.06,
+    3,
+)  # depth step of an edge [radii of the object]; px on either side of it
+_COARSE = 2.0  # px of the first network, 1σ: finer detail comes from the refinement and the inversion
 
 
 def main() -> None:
@@ -84,7 +86,7 @@ def errors(normal: Floats, case: Case, network: Network | None) -> dict[str, flo
 
 
 def _edges(depth: Floats, inside: Mask) -> Mask:
-    """Pixels (H, W) beside those of one part of the object that hides another."""
+    """Pixels (H, W) next to those of one part of the object that hides another."""
     small, large = np.ones((3, 3), np.uint8), np.ones((2 * _BESIDE + 1, 2 * _BESIDE + 1), np.uint8)
     low, high = (np.where(inside, depth, beyond).astype(np.float32) for beyond in (1e3, -1e3))
     jump = (cv2.dilate(high, small) - cv2.erode(low, small) > _JUMP) & inside

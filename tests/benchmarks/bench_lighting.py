@@ -3,10 +3,10 @@
 python -m tests.benchmarks.bench_lighting [--cases 100] [--first-seed 0] [--picture FILE.png]
 
 Needs $POLCAP_DATA for its light probes. Objects are bumps, clusters and vases of polcap.synth, 320 × 240 px, dark, as
-drawn or white, matte or glossy, or of metal. What is truly the matter is told by the true normals: the share of the
-object whose polarization lies nearer to across the azimuth than along it. A flash beside the lens is good; light from
-one side, metal, and light from around of which more than a tenth lies across is not; with less of that it is neither.
-The gates are right where they pass the good and speak of the others. Prints a Markdown row per light.
+drawn or white, matte or glossy, or of metal. The truth comes from the true normals: the share of the object with
+polarization closer to perpendicular than to parallel to the azimuth. A flash next to the lens is good. Light from one
+side, metal, and light from around with a share above a tenth are not good; light from around with less is neither.
+The gates are right if they pass the good captures and warn about the others. Prints a Markdown row per light.
 """
 
 import argparse

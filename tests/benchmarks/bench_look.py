@@ -57,8 +57,8 @@ def main(folder: Path) -> None:
         for one, other in PAIRS:
             scale = np.percentile(seen[other][inside], 99)
             off = np.abs(seen[one] - seen[other]).max(axis=-1) / scale
-            told = [" %, ".join(f"{100 * np.percentile(off[where], q):.1f}" for q in (50, 95)) for where in places]
-            print(f"{light:15}{f'{one} : {other}':26}" + "".join(f"{text + ' %':>18}" for text in told))
+            errors = [" %, ".join(f"{100 * np.percentile(off[where], q):.1f}" for q in (50, 95)) for where in places]
+            print(f"{light:15}{f'{one} : {other}':26}" + "".join(f"{text + ' %':>18}" for text in errors))
         np.savez(folder / f"{light}.npz", allow_pickle=False, **seen)
 
 

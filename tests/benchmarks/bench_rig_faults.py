@@ -5,7 +5,7 @@ python tests/benchmarks/bench_rig_faults.py [COUNT]
 The rotators are simulated at the protocol level, by a clock of their own; the camera hands out photographs made
 beforehand and sees the ring's true angle. Each trial checks: an end in time, every delivered frame on disk, every
 frame in capture.toml whole, no angle off by more than 0.06°, `--resume` takes exactly what is missing, and every frame
-of the finished capture equals the undisturbed one's. One capture per class is then processed beside the undisturbed
+of the finished capture equals the undisturbed one's. One capture per class is then processed, and so is the undisturbed
 one.
 """
 

@@ -1,4 +1,4 @@
-"""Benchmark of the albedo scale: its error on simulated captures with tilted charts and a flash beside the lens.
+"""Benchmark of the albedo scale: its error on simulated captures with tilted charts and a flash next to the lens.
 
     python -m tests.benchmarks.bench_scale [--captures 36] [--first 0] [--falloff 0] [--perfect-chart]
 

@@ -107,20 +107,20 @@ def made(folder: Path, megapixels: float) -> Path:
 
 def processed(capture: Path, out: Path) -> tuple[float, dict[str, float]]:
     """Wall seconds and CPU seconds by stage; `start` is reading the capture and the network."""
-    begun, told, last = time.monotonic(), {}, tree_cpu()
+    begun, by_stage, last = time.monotonic(), {}, tree_cpu()
     network, finder = models.load_network("network", None, "cpu", 0), models.load_mask_network()
     found = captures.read(capture)
-    told["start"] = tree_cpu() - last
+    by_stage["start"] = tree_cpu() - last
 
     def progress(stage: str, seconds: float | None, cached: bool) -> None:
         nonlocal last
         if seconds is None:
             last = tree_cpu()
         elif not cached:
-            told[stage] = tree_cpu() - last
+            by_stage[stage] = tree_cpu() - last
 
     pipeline.process(found, UserInput(network=network, mask_network=finder), Config(), out, progress=progress)
-    return time.monotonic() - begun, told
+    return time.monotonic() - begun, by_stage
 
 
 # ---------------------------------------------------------------- the floor
@@ -231,13 +231,13 @@ def watched(row: Bench) -> Iterator[None]:
         while not done.wait(0.3):
             row.peak_mb = max(row.peak_mb, anonymous_mb())
 
-    beside = threading.Thread(target=watch)
-    beside.start()
+    watcher = threading.Thread(target=watch)
+    watcher.start()
     try:
         yield
     finally:
         done.set()
-        beside.join()
+        watcher.join()
 
 
 def anonymous_mb() -> float:
@@ -252,7 +252,7 @@ def anonymous_mb() -> float:
     return total / 1000
 
 
-# ---------------------------------------------------------------- what is told
+# ---------------------------------------------------------------- output
 
 
 def ratio(row: Bench) -> float:

@@ -161,10 +161,10 @@ def mark(row: Row) -> str:
     """Whether a verdict is right: yes or NO of a good capture; named, found or NO of a faulty one."""
     if not row["kind"]:
         return "yes" if "fail" not in (row["check"], row["process"]) else "NO"
-    told = speaking(row)
-    if any(word in name for name in told for word in FAULTS[row["kind"]]):
+    named = speaking(row)
+    if any(word in name for name in named for word in FAULTS[row["kind"]]):
         return "named"
-    return "found" if told else "NO"
+    return "found" if named else "NO"
 
 
 def speaking(row: Row) -> set[str]:

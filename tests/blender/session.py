@@ -34,8 +34,15 @@ def require() -> str:
 def ask(folder: Path, files: list[Path], **job: Any) -> list[dict[str, Floats]]:
     """What Blender finds in each file: `inside.py` tells the keys of a job and of the answer."""
     note = folder / "job.json"
-    told = {"bake": None, "camera": None, "lights": [], "samples": 16, **job, "files": [str(file) for file in files]}
-    note.write_text(json.dumps(told))
+    settings = {
+        "bake": None,
+        "camera": None,
+        "lights": [],
+        "samples": 16,
+        **job,
+        "files": [str(file) for file in files],
+    }
+    note.write_text(json.dumps(settings))
     run(HERE / "inside.py", note)
     with np.load(note.with_suffix(".npz")) as answer:
         every = {name: answer[name] for name in answer.files}

@@ -54,7 +54,7 @@ def test_x_trans_block_is_one_pixel_with_every_color_in_its_middle():
     np.testing.assert_allclose(binned, ramp[1:24:3, 1:30:3], atol=1e-4)
 
 
-def test_x_trans_is_told_from_other_mosaics():
+def test_x_trans_is_distinguished_from_other_mosaics():
     for shift in ((0, 0), (1, 2), (5, 4)):
         down, right = demosaic.x_trans_corner(np.roll(X_TRANS, shift, (0, 1)))
         assert ((down - shift[0]) % 3, (right - shift[1]) % 3) == (0, 0)

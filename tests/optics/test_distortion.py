@@ -67,6 +67,6 @@ def test_what_lies_beyond_the_photograph_is_outside():
     assert seen[100, 150] and not seen[0, 0]
 
 
-def test_a_lens_that_folds_is_told():
+def test_a_lens_that_folds_is_reported():
     assert distortion.folds(Distortion(100.0, (150.0, 100.0), -0.5, 0.0), 300, 200)
     assert not distortion.folds(BARREL, 300, 200)

@@ -22,8 +22,8 @@ def lit(turned: float, dolp: float = 0.2) -> outline.OutlineBand:
 
 def test_way_out_of_a_disc_is_its_radius() -> None:
     direction, slope = outline.outward(DISC.astype(np.float32), 3.0)
-    told = np.arctan2(direction[1], direction[0])[BAND & (slope > 1e-4)]
-    off = np.angle(np.exp(1j * (told - np.arctan2(-Y, X)[BAND & (slope > 1e-4)])))
+    estimated = np.arctan2(direction[1], direction[0])[BAND & (slope > 1e-4)]
+    off = np.angle(np.exp(1j * (estimated - np.arctan2(-Y, X)[BAND & (slope > 1e-4)])))
     assert np.abs(off).max() < 2 / 24  # rad: two pixels of staircase at the inner edge
 
 
@@ -34,7 +34,7 @@ def test_sectors_part_a_ring_evenly() -> None:
 
 @pytest.mark.parametrize("turned_deg", [-20, 0, 7])
 def test_common_turn_of_the_polarizer_is_read_off_the_rim(turned_deg: int) -> None:
-    """The stated angles are `turned` too small, so every AoLP is told that much too small."""
+    """The stated angles are `turned` too small, so every AoLP is stated that much too small."""
     mean, sigma = outline.mean_and_sigma(*outline.phasor(lit(np.radians(turned_deg)), ANGLES))
     assert abs(mean) == pytest.approx(1, abs=1e-6)
     assert np.degrees(np.angle(mean) / 2) == pytest.approx(-turned_deg, abs=1e-4)

@@ -41,7 +41,7 @@ def test_few_noisy_tiles_of_one_scene_show_no_blur() -> None:
     assert (blur > 0.2).sum() <= 5
 
 
-def test_blur_that_spares_tiles_without_detail_is_told() -> None:
+def test_blur_that_spares_tiles_without_detail_is_reported() -> None:
     """Half of the tiles are nearly flat: noise is all that blur could take from them."""
     half = np.where(np.arange(384) < 192, scene(), 0.25 + 0.04 * (scene() - 0.25)).astype(np.float32)
     blur = measured([half, gaussian_filter(half, 2.0), half, half])

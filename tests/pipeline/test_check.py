@@ -24,7 +24,7 @@ from polcap.stages import hdr, whitebalance
 from tests import faulty
 from tests.conftest import Command
 
-WIDTH = 512  # the chart must be found: without its greys order and angles are told less well
+WIDTH = 512  # the chart must be found: without its greys order and angles are measured less well
 
 
 def verdict(folder: Path) -> Verdict:
@@ -48,7 +48,7 @@ def test_planted_fault_is_named(tmp_path: Path, fault: str) -> None:
     assert all(line.remedy for line in found.lines if line.state in ("warn", "fail"))
 
 
-def test_one_turned_shot_of_three_is_told_with_the_ring_that_it_looks_like(tmp_path: Path) -> None:
+def test_one_turned_shot_of_three_is_reported_with_the_ring_that_it_looks_like(tmp_path: Path) -> None:
     faulty.shoot(tmp_path / "bad", 1, "wrong angle", WIDTH)
     line = next(line for line in verdict(tmp_path / "bad").lines if line.name == "angles")
     assert line.state == "warn" and line.cost_deg > 1

@@ -88,15 +88,15 @@ def test_an_asset_and_the_textures_beside_it_are_spelled_alike(own: Path) -> Non
 
 
 def test_sidecar_knows_photographs_settings_and_files(exported: Path) -> None:
-    told = json.loads((exported / "asset" / "archive" / "capture.provenance.json").read_text())
+    recorded = json.loads((exported / "asset" / "archive" / "capture.provenance.json").read_text())
     about = json.loads((exported / "report.json").read_text())
-    assert [one["sha256"] for one in told["photographs"]] == [
+    assert [one["sha256"] for one in recorded["photographs"]] == [
         frame["digest"] for shot in about["capture"]["shots"] for frame in shot["frames"]
     ]
-    assert told["settings"] == about["settings"] and told["stages"] == about["keys"]
-    assert told["versions"]["polcap"] == about["polcap"] and "numpy" in told["versions"]
+    assert recorded["settings"] == about["settings"] and recorded["stages"] == about["keys"]
+    assert recorded["versions"]["polcap"] == about["polcap"] and "numpy" in recorded["versions"]
     files = {file.name for file in (exported / "asset" / "archive").iterdir()}
-    assert set(told["files"]) == files - {"capture.provenance.json"}
+    assert set(recorded["files"]) == files - {"capture.provenance.json"}
     packet = document((exported / "asset/archive/capture.glb").read_bytes())["extensions"]["KHR_xmp_json_ld"][
         "packets"
     ][0]
@@ -192,10 +192,10 @@ def test_texture_size_and_levels_of_detail(own: Path) -> None:
     pipeline.export(own, ExportRequest(formats=("gltf",), texture_size=128, lod=2))
     levels = json.loads((own / "maps" / "maps.json").read_text())["exports"]["asset"]["lods"]
     counts = []
-    for name, told in levels.items():
+    for name, recorded in levels.items():
         glb = document((own / "asset" / name).read_bytes())
         counts.append(glb["accessors"][glb["meshes"][0]["primitives"][0]["indices"]]["count"] // 3)
-        assert counts[-1] == told["triangles"] and told["error"].split()[1] in ("mm", "px")
+        assert counts[-1] == recorded["triangles"] and recorded["error"].split()[1] in ("mm", "px")
     assert len(counts) == 2 and counts[0] == pytest.approx(4 * counts[1], rel=0.1)
     origins = [document(file.read_bytes())["asset"]["extras"] for file in (own / "asset").glob("*.glb")]
     assert len({tuple(one["origin_in_camera"]) for one in origins}) == 1 and len(origins) == 3
@@ -238,7 +238,7 @@ def test_a_second_export_adds_to_the_records_of_the_first(own: Path) -> None:
 
 def test_a_sidecar_of_other_maps_is_replaced(own: Path) -> None:
     sidecar = own / "asset" / "capture.provenance.json"
-    told = json.loads(sidecar.read_text())
-    sidecar.write_text(json.dumps({**told, "stages": {}}))
+    recorded = json.loads(sidecar.read_text())
+    sidecar.write_text(json.dumps({**recorded, "stages": {}}))
     pipeline.export(own, ExportRequest(formats=("exr",)))
     assert set(json.loads(sidecar.read_text())["files"]) == {"capture_layers.exr"}

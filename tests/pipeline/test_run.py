@@ -108,8 +108,8 @@ def test_late_changes_end_as_a_first_run_with_these_settings_does(
     shutil.rmtree(late / "asset")
     assert polcap(*command, "--out", late, *settings).returncode == 3
     assert product(late) == product(first)
-    told, again = (json.loads((out / "report.json").read_text(encoding="utf-8")) for out in (late, first))
-    assert told == again
+    recorded, again = (json.loads((out / "report.json").read_text(encoding="utf-8")) for out in (late, first))
+    assert recorded == again
     assert (late / "report.html").read_bytes() == (first / "report.html").read_bytes()
 
 

@@ -150,7 +150,7 @@ def test_one_angle_that_keeps_four_shots_from_closing_fails(good: Evidence) -> N
 
 
 @pytest.mark.parametrize(("turn", "state"), [(1.5, "pass"), (5.0, "warn")])
-def test_a_turn_of_the_ring_is_told_though_taken_out(good: Evidence, turn: float, state: str) -> None:
+def test_a_turn_of_the_ring_is_reported_though_corrected(good: Evidence, turn: float, state: str) -> None:
     turned, doubt = np.radians([turn, 0.4])
     gate = judged(changed(good, selfcal=replace(good.selfcal, ring=RingZero(turned, doubt, turned))))["angles"]
     assert gate.state == state and f"{turn:+.1f}°" in gate.message and "corrected" in gate.message
@@ -180,7 +180,7 @@ def shaped(good: Evidence, polarized: float, flattened: float, roughness: float,
         (0.9, 0.4, 0.2, True, ""),  # the wall of a vessel
     ],
 )
-def test_body_that_polarizes_too_little_for_its_shape_is_told(
+def test_body_that_polarizes_too_little_for_its_shape_is_reported(
     good: Evidence, polarized: float, flattened: float, roughness: float, dimmed: bool, words: str
 ) -> None:
     gate = judged(shaped(good, polarized, flattened, roughness, dimmed))["body"]
@@ -188,7 +188,7 @@ def test_body_that_polarizes_too_little_for_its_shape_is_told(
     assert words in gate.message and (gate.cost_deg > 10) == bool(words)
 
 
-def test_light_from_around_is_told(good: Evidence) -> None:
+def test_light_from_around_is_reported(good: Evidence) -> None:
     image = good.stokes
     across = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]
     gate = judged(changed(good, stokes=replace(image, stokes=across)))["body"]
@@ -210,7 +210,7 @@ def test_a_lopsided_body_is_no_light_from_the_side(good: Evidence, uneven: float
     assert gate.state == state and ("side" in gate.message) == (state == "warn")
 
 
-def test_a_ring_that_was_mended_is_told() -> None:
+def test_a_ring_that_was_mended_is_reported() -> None:
     clocked = replace(scenes.stack(noise=0.002, angles=scenes.ANGLES + np.radians(4.0)), angle=scenes.ANGLES)
     gate = judged(found(radiance=clocked))["angles"]
     assert gate.state == "warn" and gate.value == pytest.approx(4.0, abs=0.5)  # it may be a single shot's

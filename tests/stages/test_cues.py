@@ -57,7 +57,7 @@ def test_diffuse_color_is_the_fitted_least_intensity(ball):
 
 
 def test_albedo_of_a_ball_is_within_the_error_of_the_chart_s_depth():
-    """Inverse squares over the visible half, seen and lit along the axis; the chart anywhere beside the ball."""
+    """Inverse squares over the visible half, seen and lit along the axis; the chart anywhere next to the ball."""
     solved = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     color = dataclasses.replace(scenes.no_color(), source="chart")
     doubt = cues.scale.sigma(solved, color)
@@ -97,13 +97,13 @@ def test_torch_and_numpy_give_the_same_channels(ball):
 def test_channels_hold_the_values_of_their_names(ball):
     seen, length = dict(zip(cues.CHANNELS, cues.channels(ball))), np.maximum(np.hypot(*ball.ratio), 1e-9)
     turned = ball.mask & (np.abs(ball.ratio[0]) > 0.01) & (np.abs(ball.ratio[1]) > 0.01)  # no two directions alike
-    told = {
+    expected_values = {
         "log_r": np.log(ball.radiance[..., 0] + 0.02), "log_b": np.log(ball.radiance[..., 2] + 0.02),
         "s1": 10 * ball.ratio[0], "s2": 10 * ball.ratio[1],
         "cos_2phi": ball.ratio[0] / length, "sin_2phi": ball.ratio[1] / length,
         "ray_x": ball.rays[..., 0], "ray_y": ball.rays[..., 1], "mask": 1.0, "clipped": 0.0,
     }  # fmt: skip
-    for name, expected in told.items():
+    for name, expected in expected_values.items():
         assert np.abs(seen[name] - expected)[turned].max() < 1e-4, name
     zenith = np.hypot(seen["zenith_x"], seen["zenith_y"])[turned]
     assert fresnel.diffuse_dolp(np.cos(zenith), 1.5) == pytest.approx(ball.dolp[turned], abs=1e-4)
@@ -169,12 +169,12 @@ def test_the_scale_follows_a_flash_at_the_chart_s_side_and_its_doubt_widens_the_
     white, flash = np.array([0.2, 0.0, -1.0]), np.array([0.1, 0.0, 0.0])
     color = dataclasses.replace(scenes.no_color(), source="chart")
     facing = np.array([0.0, 0.0, 1.0])
-    at_lens, beside, doubtful = (
+    at_lens, off_axis, doubtful = (
         dataclasses.replace(color, light=ChartLight(white, facing, at, spread))
         for at, spread in ((0 * flash, np.zeros((5, 5))), (flash, np.zeros((5, 5))), (flash, 0.01 * np.eye(5)))
     )
     ahead = 1 - np.sqrt(found.mask.sum() / np.pi) / found.view.focal / 2
     doubtful.light.normal.flags.writeable = False  # as the store hands them out
     lit = (1.01 / 1.04) ** -1.5 * (ahead**2 + 0.01) / ahead**2
-    assert cues.scale.factor(found, beside) / cues.scale.factor(found, at_lens) == pytest.approx(lit, rel=1e-6)
-    assert cues.scale.sigma(found, doubtful) > cues.scale.sigma(found, beside) + 0.002
+    assert cues.scale.factor(found, off_axis) / cues.scale.factor(found, at_lens) == pytest.approx(lit, rel=1e-6)
+    assert cues.scale.sigma(found, doubtful) > cues.scale.sigma(found, off_axis) + 0.002

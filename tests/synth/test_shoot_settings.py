@@ -24,9 +24,9 @@ CALIBRATION = ["sense=0", "ring_step_deg=0", "isos=[0]", "power=0", "extinction=
     ("kind", "text"), [*((Shoot, t) for t in SHOOT), *((CalibrationShoot, t) for t in CALIBRATION)]
 )
 def test_impossible_settings_are_refused_in_one_line(kind: type[msgspec.Struct], text: str) -> None:
-    with pytest.raises(SettingError, match=text.partition("=")[0]) as told:
+    with pytest.raises(SettingError, match=text.partition("=")[0]) as raised:
         fill(kind, {}, [text])
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
 
 
 def test_folder_names_state_the_angle(tmp_path: Path) -> None:

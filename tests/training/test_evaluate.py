@@ -28,8 +28,8 @@ def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @shipped
 def test_the_command_evaluates_all_columns(test_data: Path, networks: Path, tmp_path: Path) -> None:
-    told = ["--count", "2", "--size", "96", "--ablations", str(networks), "--out", str(tmp_path)]
-    done = CliRunner().invoke(app, ["evaluate", str(MODEL), str(test_data), *told])
+    options = ["--count", "2", "--size", "96", "--ablations", str(networks), "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, ["evaluate", str(MODEL), str(test_data), *options])
     assert done.exit_code == 0, done.output
     result = json.loads((tmp_path / "evaluation.json").read_text())
     assert list(result["table"]) == [

@@ -65,8 +65,8 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
         elif min(of_object, around) > _SURE_CORRELATION:
             places = [transform_points(found.matrix, middle) for found in (whole, outer)]
             error = float(np.hypot(whole.sigma_at(middle), outer.sigma_at(middle)))
-            apart = float(np.hypot(*(places[0] - places[1])))
-            pushed[k] = step * apart if apart > _SIGMAS * error else 0.0
+            distance = float(np.hypot(*(places[0] - places[1])))
+            pushed[k] = step * distance if distance > _SIGMAS * error else 0.0
     return ObjectMotion(pushed, inside)
 
 

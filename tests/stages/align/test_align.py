@@ -119,7 +119,7 @@ def test_shots_with_nothing_to_compare_are_named() -> None:
         align.register(clipped, scenes.no_color(), align.AlignSettings())
 
 
-def test_an_object_that_moved_before_a_still_backdrop_is_told_from_a_moved_camera():
+def test_an_object_that_moved_before_a_still_backdrop_is_distinguished_from_a_moved_camera():
     """A ball 3 px further in one shot, and a texture around it that stayed; or both moved, with a roll."""
     ball = scenes.ball_object()
     for true, expected in (([np.eye(3), pose(3, 0, 0), np.eye(3)], 3.0), ([np.eye(3)] * 3, 0.0)):

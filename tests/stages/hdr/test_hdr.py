@@ -34,7 +34,7 @@ from tests.stages.hdr.brackets import (
 def test_no_bias_from_20_electrons_up_and_honest_variance(name):
     """Bias < 0.3 % in each octave from 20 e⁻ up; z of mean 0 ± 0.05 and variance 1 ± 0.1; ratios to 0.1 %.
 
-    Gain and read noise are not told: the merge finds them in the frames.
+    Gain and read noise are not stated: the merge finds them in the frames.
     """
     quads = ramp(768, 1024)
     frames, exposures, isos = bracket(quads, BRACKETS[name], seed=len(name))

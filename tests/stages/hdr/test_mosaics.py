@@ -134,7 +134,7 @@ def test_wholly_clipped_frame_has_the_channels_of_the_others(channels, order):
     assert stack.value.shape == (1, 90, 120, 3) and np.isfinite(stack.value).all()
 
 
-def test_three_channel_frames_pass_unbinned_and_lossy_is_told():
+def test_three_channel_frames_pass_unbinned_and_lossy_is_reported():
     rng = np.random.default_rng(15)
     light = np.exp(np.linspace(5, 9, 300))[None, :, None] * np.ones((200, 1, 3)) * [0.6, 1, 0.7]
     frames = [

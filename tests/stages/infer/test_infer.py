@@ -52,7 +52,7 @@ def test_a_clean_ball_is_recovered():
     assert error.mean() < 2.0  # the outline's last pixel is half backdrop
 
 
-def test_a_noisy_textured_ball_is_recovered_and_its_error_foretold():
+def test_a_noisy_textured_ball_is_recovered_and_its_error_predicted():
     found = seen(noise=0.004)
     maps = estimate(found)
     error = errors_deg(maps, found)
