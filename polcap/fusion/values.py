@@ -1,0 +1,50 @@
+"""Values of the fusion: views with their poses, and the closed mesh.
+
+World frame: that of the board. The origin is the board's middle, y points up out of the board, x and z lie in it,
+right-handed, metres. Camera frame: x right, y up, z towards the camera.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polcap.images import Bools, Floats, View
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Position of the board before the camera: camera point = rotation @ world point + translation."""
+
+    rotation: Floats  # (3, 3) world to camera
+    translation: Floats  # (3,) m
+
+    @property
+    def center(self) -> Floats:
+        """Position (3,) of the lens in the world, m."""
+        return -self.rotation.T @ self.translation
+
+
+@dataclass(frozen=True)
+class FusionView:
+    """Maps of one capture, free of lens distortion, and its pose."""
+
+    name: str
+    pose: Pose
+    view: View  # pinhole camera of the maps' grid
+    light: Floats  # (3,) position of the flash in the camera frame, m
+    mask: Bools  # (H, W)
+    normal: Floats  # (H, W, 3) unit, camera frame
+    sigma_deg: Floats  # (H, W) expected error of the normals
+    diffuse: Floats  # (H, W, 3) albedo, linear Rec.709
+    specular: Floats  # (H, W, 3) F0
+    roughness: Floats  # (H, W) perceptual
+    s0: Floats | None = None  # (H, W, 3) white-balanced radiance under the flash; for highlights and residuals
+
+
+@dataclass(frozen=True)
+class ClosedMesh:
+    """A closed, manifold triangle mesh, outward orientation, in the world frame."""
+
+    vertices: Floats  # (V, 3) m
+    faces: NDArray[np.int32]  # (F, 3) counter-clockwise seen from outside
