@@ -31,6 +31,10 @@ def synth(
         bool, Option("--interreflection", help="One bounce of light between parts of the mesh.")
     ] = False,
     law: Annotated[Literal["smooth", "rough"], choice("Interface through which diffuse light leaves.")] = "smooth",
+    views: Annotated[
+        int | None,
+        Option(min=3, max=99, metavar="N", help="N captures from all sides, on a board; a mesh stands upright, y up."),
+    ] = None,
     calibration: Annotated[bool, Option("--calibration", help="Photographs for `polcap calibrate` instead.")] = False,
     dataset: Annotated[
         int | None,
@@ -42,7 +46,7 @@ def synth(
     from msgspec.structs import replace
 
     from polcap import config as settings
-    from polcap.synth import scenes
+    from polcap.synth import all_around, scenes
     from polcap.synth import shooting as synthetic
 
     made = folder
@@ -58,13 +62,18 @@ def synth(
     elif interreflection and mesh is None:
         raise SettingError("--interreflection needs a mesh; name one with --mesh")
     else:
-        shoot = settings.fill(synthetic.Shoot, {"seed": seed}, assignments or ())
+        kind = synthetic.Shoot if views is None else all_around.AroundShoot
+        shoot = settings.fill(kind, {"seed": seed}, assignments or ())
         chosen = scenes.random_scene(seed, scene)
         chosen = chosen if mesh is None else scenes.with_model(chosen, mesh, seed)
         chosen = chosen if material is None else scenes.with_textures(chosen, material)
         changes: dict[str, Any] = {"law": law} if law == "rough" else {}
         changes |= {"cast_shadows": True} if cast_shadow else {}
         changes |= {"interreflection": True} if interreflection else {}
-        with terminal.progress(len(shoot.angles_deg) * shoot.exposures) as bar:
-            synthetic.write(folder, replace(chosen, **changes), shoot, bar.frame)
+        chosen = replace(chosen, **changes)
+        with terminal.progress((views or 1) * len(shoot.angles_deg) * shoot.exposures) as bar:
+            if isinstance(shoot, all_around.AroundShoot) and views is not None:
+                all_around.write(folder, chosen, shoot, views, bar.frame)
+            else:
+                synthetic.write(folder, chosen, shoot, bar.frame)
     terminal.print_data({"written": [str(made)]} if json else str(made))

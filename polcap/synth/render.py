@@ -4,6 +4,7 @@ Every shot is rendered on its own pixels, so nothing is resampled. Camera frame 
 at the origin. Radiance is linear Rec.709.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -18,17 +19,18 @@ from polcap.errors import SettingError
 from polcap.images import Floats, GBuffer, View
 from polcap.optics import body, frames, fresnel, shade
 from polcap.synth import color_checker as charts
-from polcap.synth import interreflection, mesh_tracer, scene_materials, trace
+from polcap.synth import interreflection, laid_board, mesh_tracer, scene_materials, trace
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Model, Shape
+from polcap.synth.laid_board import LaidBoard
 from polcap.synth.scene_materials import Coat
-from polcap.synth.trace import Hits, Vector
+from polcap.synth.trace import Hits, Indices, Vector
 
 _ROUGH = body.Law(rough=1.0)  # facets with the roughness of the gloss, all with the same weight
 
 
 class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An object and a chart under a flash, in front of a dark backdrop. One flat list, as stored in truth.json."""
+    """An object, a chart and a board under a flash, before a dark backdrop. One flat list, as stored in truth.json."""
 
     shape: Shape | Model
     coat: Coat
@@ -39,9 +41,10 @@ class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     backdrop: float = 1.3  # m, distance from the lens
     backdrop_albedo: float = 0.03
     shadows: bool = True  # of the object on itself
-    cast_shadows: bool | UnsetType = UNSET  # of the object on chart and backdrop
+    cast_shadows: bool | UnsetType = UNSET  # of the object on chart, board and backdrop
     interreflection: bool | UnsetType = UNSET  # one diffuse bounce between parts of the object; meshes only
     law: Literal["smooth", "rough"] | UnsetType = UNSET  # surface model of the diffuse reflection; unset: smooth
+    board: LaidBoard | UnsetType = UNSET  # under the object
 
     @property
     def turn(self) -> Rotation:
@@ -105,16 +108,25 @@ def white_level(scene: Scene) -> float:
 
 
 def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits, Floats]:
-    """Visible hits of rays on the object, and S0 (P, 3) of the matt, unpolarized chart and backdrop behind."""
+    """Visible hits of rays on the object, and S0 (P, 3) of the matt, unpolarized chart, board and backdrop behind."""
     distance = scene.backdrop / v[:, 2]
     wall = scene.backdrop_albedo * _unshadowed_irradiance(scene, -v * distance[:, None], np.array([0.0, 0.0, 1.0]))
     out = np.repeat(wall[:, None], 3, axis=1)
     hits = trace.trace(scene.shape, scene.position, scene.turn, v, start)
-    if scene.chart is not None:
-        at, to_chart, albedo = charts.intersect(scene.chart, v)
-        distance[at] = to_chart
-        out[at] = albedo * _unshadowed_irradiance(scene, -v[at] * distance[at, None], scene.chart.axes[0])[:, None]
+    for normal, (at, reach, albedo) in _flat_things(scene, v):
+        nearer = reach < distance[at]
+        at, reach, albedo = at[nearer], reach[nearer], albedo[nearer]
+        distance[at] = reach
+        out[at] = albedo * _unshadowed_irradiance(scene, -v[at] * reach[:, None], normal)[:, None]
     return hits.take(np.flatnonzero(hits.distance < distance[hits.index])), out
+
+
+def _flat_things(scene: Scene, v: Floats) -> Iterator[tuple[Floats, tuple[Indices, Floats, Floats]]]:
+    """Normals of chart and board, and their intersections with rays: indices, lengths [m] and albedo."""
+    if scene.chart is not None:
+        yield scene.chart.axes[0], charts.intersect(scene.chart, v)
+    if scene.board is not UNSET:
+        yield scene.board.normal, laid_board.intersect(scene.board, v)
 
 
 def _unshadowed_irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:

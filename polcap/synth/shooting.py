@@ -96,7 +96,12 @@ def write(folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int
         The folder cannot be written; then it is removed.
     """
     forward_camera.require_empty(folder)
-    studio = Studio(scene, shoot)
+    write_capture(folder, Studio(scene, shoot), frame_written)
+
+
+def write_capture(folder: Path, studio: "Studio", frame_written: Callable[[int, int], None] | None = None) -> None:
+    """Write the capture that a studio is prepared for; see `write`."""
+    shoot = studio.shoot
     with atomic.folder(folder) as place:
         files = []
         shots = [("pol", angle) for angle in shoot.angles_deg]
@@ -140,12 +145,14 @@ class Dials:
 class Studio:
     """A lit scene in front of the simulated camera, ready to be photographed."""
 
-    def __init__(self, scene: Scene, shoot: Shoot) -> None:
+    def __init__(self, scene: Scene, shoot: Shoot, middle: float | None = None) -> None:
+        """`middle`: exposure of the middle frame, as of another studio; None: automatic."""
         self.scene, self.shoot = scene, shoot
         self.buffer = render.gbuffer(scene, shoot.view, shoot.height, shoot.width)
         self.to_camera = forward_camera.rec709_to_camera(shoot.color_matrix)
         self.reference = _light(scene, shoot, self.buffer, np.eye(3))
-        self.middle = _middle_exposure(scene, shoot, self.buffer, self.reference[0] @ self.to_camera.T)
+        automatic = _middle_exposure(scene, shoot, self.buffer, self.reference[0] @ self.to_camera.T)
+        self.middle = automatic if middle is None else middle
 
     def through(self, angle_deg: float, crossed: bool = False) -> Floats:
         """Light through the polarizer at this angle, as of `radiance`, for a camera that does not move."""

@@ -1,0 +1,163 @@
+"""Simulated captures of one object from all sides: object and board turn before a fixed camera and flash.
+
+::
+
+    FOLDER/view01/ …   one capture per view, as `shooting.py` writes it; the chart is in the first
+    FOLDER/truth.json  poses of the board, camera
+    FOLDER/truth.npz   true surface: vertices [m, world frame], faces, and the material at every vertex
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from scipy.spatial.transform import Rotation
+
+from polcap.errors import InputError
+from polcap.formats import atomic
+from polcap.images import Floats
+from polcap.synth import forward_camera, mesh_tracer, scene_materials, shooting
+from polcap.synth.color_checker import Chart
+from polcap.synth.distance_fields import Model
+from polcap.synth.laid_board import LaidBoard
+from polcap.synth.mesh_tracer import Triangles
+from polcap.synth.render import Scene
+from polcap.synth.shooting import Shoot, Studio
+
+Poses = list[tuple[Rotation, Floats]]  # turn and position [m] of the board in the camera frame
+_CONVENTIONS = (
+    "world: origin in the board's middle, x right and z down the printed page, y up, metres; "
+    "camera: x right, y up, z towards the camera; camera point = rotation @ world point + translation; "
+    "pixels are those of a pinhole with focal_px and principal_px, before the lens"
+)
+_GRID = 96  # points along a side of the grid on which a shape's surface is found
+
+
+class AroundShoot(Shoot, frozen=True, forbid_unknown_fields=True):
+    """Camera, polarizer and turntable of captures from all sides. One flat list, because users set fields by name."""
+
+    focal_mm: Annotated[float, Meta(ge=1, le=10000)] = 76.0
+    board: Literal["A4", "A3", "A2"] = "A4"
+    distance_m: Annotated[float, Meta(gt=0.1, le=100)] = 0.7  # from the lens to the object's middle
+    elevation_deg: Annotated[float, Meta(ge=5, le=85)] = 25.0  # of the lens above the board
+    turn_error_deg: Annotated[float, Meta(ge=0, le=45)] = 0.5  # 1σ of the table's angle
+    radius_m: Annotated[float, Meta(gt=0, le=10)] = 0.065  # of the sphere about the object, if it is a mesh
+    off_axis_m: Annotated[float, Meta(ge=0, le=0.1)] = 0.003  # from the table's axis to the board's middle
+
+
+def write(
+    folder: Path, scene: Scene, shoot: AroundShoot, views: int, frame_written: Callable[[int, int], None] | None = None
+) -> None:
+    """Write captures of `scene`'s object from `views` sides into a new folder; the same arguments give the same bytes.
+
+    The object stands on the board, its y axis up; position and turn of `scene` are not used. All views have the
+    exposure of the first. `frame_written` is called with the number of photographs written so far and in all.
+
+    Raises
+    ------
+    CaptureError
+        The folder holds something already.
+    StorageError
+        The folder cannot be written; then it is removed.
+    """
+    forward_camera.require_empty(folder)
+    if isinstance(scene.shape, Model):
+        sized = msgspec.structs.replace(scene.shape, radius=shoot.radius_m)
+        scene = msgspec.structs.replace(scene, shape=sized)
+    mesh = surface(scene)
+    low, high = float(mesh.vertices[:, 1].min()), float(mesh.vertices[:, 1].max())
+    lift = -low
+    poses = _poses(shoot, views, np.array([0.0, (high - low) / 2, 0.0]))
+    each = len(shoot.angles_deg) * shoot.exposures + shoot.exposures * shoot.cross
+    middle = None
+    with atomic.folder(folder) as place:
+        for k, (turn, position) in enumerate(poses):
+            name, seen = _name(k), _view(scene, shoot, turn, position, lift)
+            own = msgspec.structs.replace(shoot, seed=shoot.seed + 1000 * k)
+            done = k * each
+
+            def count(written: int, _: int, done: int = done) -> None:
+                if frame_written is not None:
+                    frame_written(done + written, views * each)
+
+            studio = Studio(seen if k == 0 else msgspec.structs.replace(seen, chart=None), own, middle)
+            middle = studio.middle
+            shooting.write_capture(place / name, studio, count)
+        _write_surface(place / "truth.npz", scene, mesh, lift)
+        _write_poses(place / "truth.json", scene, shoot, poses)
+
+
+def surface(scene: Scene) -> Triangles:
+    """True surface of a scene's object in its own frame [m].
+
+    Raises InputError where scikit-image is missing; a mesh does not need it.
+    """
+    if isinstance(scene.shape, Model):
+        return mesh_tracer.tracer(scene.shape.file, scene.shape.radius).mesh
+    try:
+        from skimage import measure
+    except ImportError:
+        raise InputError("--views needs scikit-image, or an object by --mesh; pip install 'polcap[fusion]'") from None
+    axis = np.linspace(-scene.shape.radius, scene.shape.radius, _GRID)
+    field = scene.shape.distance(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1))
+    found: Any = measure.marching_cubes(field, 0.0, spacing=(axis[1] - axis[0],) * 3)  # type: ignore[no-untyped-call]
+    return mesh_tracer.smooth(found[0] + axis[0], found[1])
+
+
+def _name(k: int) -> str:
+    return f"view{k + 1:02d}"
+
+
+def _poses(shoot: AroundShoot, views: int, target: Floats) -> Poses:
+    """Turn and position [m] of the board in the camera frame of each view; the lens aims at `target` (3,)."""
+    random = np.random.default_rng([shoot.seed, 0x7A61E])
+    off = shoot.off_axis_m * np.array([np.cos(angle := random.uniform(0, 2 * np.pi)), 0.0, np.sin(angle)])
+    tilt = Rotation.from_euler("x", shoot.elevation_deg, degrees=True)
+    out: Poses = []
+    for k in range(views):
+        degrees = 360.0 * k / views + shoot.turn_error_deg * random.normal() * (k > 0)
+        table = Rotation.from_euler("y", degrees, degrees=True)
+        out.append((tilt * table, tilt.apply(table.apply(off) - target) - [0.0, 0.0, shoot.distance_m]))
+    return out
+
+
+def _view(scene: Scene, shoot: AroundShoot, turn: Rotation, position: Floats, lift: float) -> Scene:
+    """The scene on its board in one pose of the board, with the chart upright at the right of the object."""
+    vector = tuple(turn.as_rotvec(degrees=True).tolist())
+    place = tuple((turn.apply([0.0, lift, 0.0]) + position).tolist())
+    right = 0.5 * forward_camera.SENSOR_WIDTH_MM / shoot.focal_mm * shoot.distance_m - 0.053
+    chart = Chart(center=(right, 0.03 * shoot.distance_m, -shoot.distance_m))
+    laid = LaidBoard(tuple(position.tolist()), vector, shoot.board)
+    return msgspec.structs.replace(
+        scene, turn_deg=vector, position=place, chart=chart, board=laid, cast_shadows=True, shadows=True
+    )
+
+
+def _write_surface(file: Path, scene: Scene, mesh: Triangles, lift: float) -> None:
+    facing: Floats = np.zeros(mesh.vertices.shape)
+    np.add.at(facing, mesh.faces, mesh.corner_normals)
+    facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
+    diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, mesh.vertices, facing)
+    values = {
+        "vertices": mesh.vertices + np.array([0.0, lift, 0.0]), "diffuse": diffuse, "specular": specular,
+        "roughness": roughness, "ior": ior,
+    }  # fmt: skip
+    single: dict[str, Any] = {name: value.astype(np.float32) for name, value in values.items()}
+    with atomic.path(file) as temporary:
+        np.savez_compressed(temporary, faces=mesh.faces, **single)
+
+
+def _write_poses(file: Path, scene: Scene, shoot: AroundShoot, poses: Poses) -> None:
+    views = [
+        {"name": _name(k), "rotation": turn.as_matrix().tolist(), "translation": position.tolist()}
+        for k, (turn, position) in enumerate(poses)
+    ]
+    document = {
+        "conventions": _CONVENTIONS, "board": shoot.board, "focal_px": shoot.view.focal,
+        "principal_px": shoot.view.center, "size_px": (shoot.width, shoot.height), "distortion": shoot.distortion,
+        "light": scene.light, "views": views,
+    }  # fmt: skip
+    atomic.write(file, msgspec.json.format(msgspec.json.encode(document), indent=1))

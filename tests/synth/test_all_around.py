@@ -1,0 +1,97 @@
+"""Captures from all sides: one board under the object, seen from every side, with its true poses."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from polcap.images import View
+from polcap.optics import board as boards
+from polcap.optics import frames, projection
+from polcap.synth import all_around, laid_board, render
+from polcap.synth.all_around import AroundShoot
+from polcap.synth.distance_fields import Cluster
+from polcap.synth.laid_board import LaidBoard
+from polcap.synth.render import Scene
+from polcap.synth.scene_materials import Coat, Material
+
+GREY = Coat((Material((0.6, 0.6, 0.6), (0.6, 0.6, 0.6), "plain", roughness=(0.5, 0.5)),))
+PEAR = Scene(shape=Cluster(((0, 0, 0, 0.04), (0.02, 0.04, 0, 0.025))), coat=GREY)
+SMALL = AroundShoot(width=288, height=216, exposures=1, samples=1, nudge_px=0.0, nudge_deg=0.0)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("around") / "session"
+    all_around.write(folder, PEAR, SMALL, 3)
+    return folder, json.loads((folder / "truth.json").read_text())
+
+
+def test_every_view_is_a_capture_and_the_first_has_the_chart(session: tuple[Path, dict[str, Any]]) -> None:
+    folder, truth = session
+    charts = []
+    for view in truth["views"]:
+        own = json.loads((folder / view["name"] / "truth.json").read_text())
+        assert [Path(file["file"]).parent.name for file in own["files"]] == ["pol000", "pol045", "pol090"]
+        charts.append(own["chart"] is not None)
+    assert charts == [True, False, False]
+
+
+def test_the_true_surface_projects_onto_the_true_mask_of_every_view(session: tuple[Path, dict[str, Any]]) -> None:
+    folder, truth = session
+    with np.load(folder / "truth.npz") as surface:
+        vertices, faces = surface["vertices"].astype(float), surface["faces"]
+    assert vertices[:, 1].min() == pytest.approx(0, abs=1e-6)  # it stands on the board
+    corner = vertices[faces]
+    volume = np.sum(corner[:, 0] * np.cross(corner[:, 1], corner[:, 2])) / 6
+    assert volume > 0.9 * 4 / 3 * np.pi * 0.04**3  # outward
+    view = View(truth["focal_px"], tuple(truth["principal_px"]), 1.0)
+    for one in truth["views"]:
+        with np.load(folder / one["name"] / "truth.npz") as maps:
+            mask = maps["mask"]
+        point = vertices @ np.array(one["rotation"]).T + one["translation"]
+        x, y = projection.project(view, point).T
+        row, column = np.nonzero(mask)
+        assert [x.min(), x.max()] == pytest.approx([column.min(), column.max()], abs=1.5)
+        assert [y.min(), y.max()] == pytest.approx([row.min(), row.max()], abs=1.5)
+
+
+def test_views_share_their_exposure(session: tuple[Path, dict[str, Any]]) -> None:
+    folder, truth = session
+    files = [json.loads((folder / view["name"] / "truth.json").read_text())["files"] for view in truth["views"]]
+    assert len({file["relative_exposure"] for one in files for file in one}) == 1
+
+
+def test_a_board_seen_from_above_has_its_squares_where_they_project() -> None:
+    laid = LaidBoard((0.0, 0.0, -0.7), (90.0, 0.0, 0.0))
+    view = View(800.0, (159.5, 119.5), 1.0)
+    y, x = np.mgrid[:240, :320].astype(float)
+    at, reach, albedo = laid_board.intersect(laid, frames.rays_at(view, x, y).reshape(-1, 3))
+    picture = np.full(x.size, np.nan)
+    picture[at] = albedo[:, 0]
+    board = boards.BOARDS["A4"]
+    cell = board.square_m / boards.CELLS
+    for row, column in ((0, 0), (0, 9), (12, 20), (63, 63), (32, 32)):
+        px = 159.5 + ((column + 0.5) * cell - board.side_m / 2) * 800 / 0.7
+        py = 119.5 + ((row + 0.5) * cell - board.side_m / 2) * 800 / 0.7
+        assert (picture.reshape(240, 320)[round(py), round(px)] < 0.1) == boards.ink(board)[row, column]
+    assert reach.min() == pytest.approx(0.7, abs=0.01)
+
+
+def test_the_object_hides_and_shades_the_board() -> None:
+    laid = LaidBoard((0.0, -0.03, -0.7), (25.0, 0.0, 0.0))
+    scene = replace(
+        PEAR, position=(0.0, 0.0, -0.7), chart=None, board=laid, cast_shadows=True, light=(0.3, 0.3, 0.0),
+    )  # fmt: skip
+    view = View(600.0, (159.5, 119.5), 1.0)
+    y, x = np.mgrid[:240, :320].astype(float)
+    with_object = render.stokes(scene, view, x, y)[0, ..., 1]
+    away = replace(scene, position=(0.0, 3.0, -0.7), light=(0.3, 0.3, 0.0))
+    mask = render.gbuffer(scene, view, 240, 320).mask
+    bare = render.stokes(away, view, x, y)[0, ..., 1]
+    shadow = ~mask & (with_object == 0) & (bare > 0)
+    assert shadow.sum() > 100
+    assert mask.sum() > 1000
