@@ -1,14 +1,16 @@
 """Corners of the board in the merged picture of a view, to a fraction of a pixel.
 
-OpenCV finds the markers. They give a homography from the board to the picture, which places every corner; corners
-whose squares look as printed are then located in linear light.
+OpenCV finds the markers. They give a homography from the board to the picture. Around each corner the print is drawn
+through it and registered to the picture in linear light; corners whose surroundings do not look as printed are hidden.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from polcap.errors import CaptureError
 from polcap.images import AngleStack, ColorCalibration, Floats
@@ -19,10 +21,12 @@ from polcap.optics.projection import transform_points
 _DETECTOR_PX = 2400  # longer side of the picture in which markers are searched
 _LEAST_MARKERS = 3  # of a board; fewer may be false
 _LEAST_CORNERS = 6  # a pose has six unknowns, and each corner two coordinates; the rest shows errors
-_WINDOW = 0.8 / boards.CELLS  # half side of a corner's search window, in squares: it ends within the markers' margin
-_MOST_WINDOW_PX = 12
-_MOST_MOVED = 0.12  # squares; from the homography's prediction, which neglects distortion
-_LEAST_CONTRAST = 2.5  # of paper over ink beside a corner
+_WINDOW = 0.45  # half side of the print that is compared around a corner, squares
+_SAMPLES = 4  # of the print, per pixel side
+_BLUR_PX = 0.5  # 1σ of the lens and the photosites together
+_ROUNDS = 6  # of the registration
+_MOST_MOVED = 0.15  # squares; from the homography's prediction, which neglects distortion
+_LEAST_CORRELATION = 0.85  # of picture and print around a corner
 _MOST_TWINS = 2  # markers seen twice: more are a second board
 
 
@@ -69,8 +73,7 @@ def detect(radiance: AngleStack, color: ColorCalibration, name: str) -> BoardCor
     if place is None:
         raise CaptureError(f"{name}: the board's markers contradict each other; show a flat board")
     number, world = boards.corners(board)
-    corner = world[:, [0, 2]] + board.side_m / 2
-    moved = _located(picture, place, corner, board.square_m)
+    moved = _located(picture, place, board)
     good = np.isfinite(moved).all(axis=1)
     if good.sum() < _LEAST_CORNERS:
         raise CaptureError(
@@ -115,34 +118,51 @@ def _one_board(markers: list[tuple[int, Floats]], name: str) -> Board:
     return BOARDS[there[0]]
 
 
-def _located(picture: Floats, place: Floats, corner: Floats, square: float) -> Floats:
-    """Corners (N, 2) px for flat positions `corner` (N, 2) m; NaN where the print around a corner is not visible."""
-    out = np.full(corner.shape, np.nan)
-    stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-4)
-    steps = square * np.array([[1.0, 0], [0, 1], [1, 1], [1, -1]])
-    height, width = picture.shape
-    for k, at in enumerate(corner):
-        start = transform_points(place, at)
-        reach = np.abs(transform_points(place, at + _WINDOW * steps) - start)
-        least = np.abs(reach[:2]).max(axis=1).min()  # of the shorter side of a square
-        half = int(np.clip(least, 2, _MOST_WINDOW_PX))
-        if not (2 * half < start[0] < width - 2 * half and 2 * half < start[1] < height - 2 * half):
+def _located(picture: Floats, place: Floats, board: Board) -> Floats:
+    """Corners (N, 2) px of the board; NaN where the print around a corner is not visible.
+
+    Around each corner the print is drawn through the homography `place`, and moved until it fits (Gauss-Newton).
+    """
+    _, world = boards.corners(board)
+    out = np.full((len(world), 2), np.nan)
+    for k, corner in enumerate(world[:, [0, 2]]):
+        at = corner + board.side_m / 2
+        x, y, drawn = _drawn(place, at, board)
+        reach = np.array([np.ptp(x), np.ptp(y)]) / (2 * _WINDOW)  # px per square
+        if min(x.min(), y.min()) < 0 or x.max() > picture.shape[1] - 1 or y.max() > picture.shape[0] - 1:
             continue
-        guess = start.astype(np.float32).reshape(1, 1, 2)
-        moved = cv2.cornerSubPix(picture, guess, (half, half), (-1, -1), stop).reshape(2).astype(np.float64)
-        if np.linalg.norm(moved - start) > max(_MOST_MOVED / _WINDOW * least, 1.5):
-            continue
-        if _looks_printed(picture, transform_points(place, at + 0.5 * _WINDOW * _DIAGONALS * square) + moved - start):
-            out[k] = moved
+        moved, correlation = _registered(picture, x, y, drawn)
+        if correlation > _LEAST_CORRELATION and (np.abs(moved) < np.maximum(_MOST_MOVED * reach, 1.5)).all():
+            out[k] = transform_points(place, at) + moved
     return out
 
 
-_DIAGONALS = np.array([[1.0, 1], [-1, -1], [1, -1], [-1, 1]])  # two squares of one color, then two of the other
+def _drawn(place: Floats, at: Floats, board: Board) -> tuple[Floats, Floats, Floats]:
+    """Pixels x, y (h, w) around the flat point `at` (2,) [m], and the share of paper that they should show."""
+    half = _WINDOW * board.square_m * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    around = transform_points(place, at + half)
+    low, high = np.floor(around.min(axis=0)), np.ceil(around.max(axis=0))
+    x, y = np.meshgrid(*(np.arange(first, last + 1) for first, last in zip(low, high, strict=True)))
+    back = np.linalg.inv(place)
+    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+    drawn: Floats = np.zeros(x.shape)
+    for dx, dy in itertools.product(steps, steps):
+        flat = transform_points(back, np.stack([x + dx, y + dy], axis=-1)) - board.side_m / 2
+        drawn += ~boards.is_ink(board, flat[..., 0], flat[..., 1]) / _SAMPLES**2
+    return x, y, gaussian_filter(drawn, _BLUR_PX)
 
 
-def _looks_printed(picture: Floats, beside: Floats) -> bool:
-    """Whether points (4, 2) px in the squares around a corner are two of paper and two of ink."""
-    point = beside.astype(np.float32)
-    value = cv2.remap(picture, point[:, 0], point[:, 1], cv2.INTER_LINEAR).ravel()
-    first, second = sorted((value[:2], value[2:]), key=lambda pair: float(pair.mean()))
-    return bool(second.min() > _LEAST_CONTRAST * max(first.max(), 1e-6) and second.max() < 2 * second.min())
+def _registered(picture: Floats, x: Floats, y: Floats, drawn: Floats) -> tuple[Floats, float]:
+    """Shift (2,) px from the pixels x, y to where the picture looks as `drawn` (h, w), and their correlation."""
+    down, across = np.gradient(drawn)
+    terms = np.stack([drawn, across, down, np.ones_like(drawn)], axis=-1).reshape(-1, 4)
+    shift: Floats = np.zeros(2)
+    for _ in range(_ROUNDS):
+        at = (x + shift[0]).astype(np.float32), (y + shift[1]).astype(np.float32)
+        seen = cv2.remap(picture, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()
+        weight = np.linalg.lstsq(terms, seen, rcond=None)[0]
+        if weight[0] <= 1e-6 * np.abs(seen).max():  # no print is here
+            return shift, 0.0
+        step = -weight[1:3] / weight[0]
+        shift = shift + np.clip(step, -2, 2)
+    return shift, float(np.corrcoef(seen, terms[:, 0])[0, 1])

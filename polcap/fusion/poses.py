@@ -9,13 +9,13 @@ Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000; Zhang, A flexible ne
 IEEE TPAMI 2000.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
-from scipy.sparse import lil_matrix
 from scipy.spatial.transform import Rotation
 
 from polcap.errors import CaptureError
@@ -25,13 +25,15 @@ from polcap.images import Capture, Distortion, Floats, View
 from polcap.optics import distortion, projection
 
 LEAST_VIEWS = 3
-_MOST_RESIDUAL = 1.0  # px rms of a view's corners; a flat, sharp board leaves 0.1 to 0.2
-_CORNER_SIGMA = 0.15  # px, of a corner; where the robust loss begins, in this unit, is 3
+_MOST_RESIDUAL = 1.0  # px rms of a view's corners; a flat, sharp board leaves 0.02 to 0.1
+_CORNER_SIGMA = 0.05  # px, of a corner; where the robust loss begins, in this unit, is 3
 _OUTLIER = 5.0  # times the robust spread of all corners, at least `_LEAST_OUTLIER` px
 _LEAST_OUTLIER = 0.5  # px
+_LEAST_KEPT = 0.75  # of a view's corners; where more are outliers, none is one
 _PRINCIPAL_SIGMA = 0.002  # of the picture's width: where lenses have their axis; weak, see above
 _BEND_SIGMA = 0.3, 1.0  # of k₁ and k₂ where nothing else is known
 _CAMERA = 5  # unknowns of the camera: ln focal length, principal point, k₁, k₂
+_STEPS = np.array([1e-6, 1e-3, 1e-3, 1e-5, 1e-4, *[1e-6] * 6])  # of the derivatives: camera; rad and m of a view
 _TO_CV = np.diag([1.0, -1.0, -1.0])  # camera frame of this package to OpenCV's
 
 
@@ -94,7 +96,8 @@ def solve(seen: Mapping[str, BoardCorners], capture: Capture) -> SessionPoses:
     sizes = {corners.board.name for corners in seen.values()}
     if len(sizes) > 1:
         raise CaptureError(f"the views show boards of sizes {' and '.join(sorted(sizes))}; use one board for all")
-    names, left_out = list(seen), {}
+    names = list(seen)
+    left_out: dict[str, str] = {}
     while True:
         if len(names) < LEAST_VIEWS:
             reasons = "; ".join(left_out.values())
@@ -139,7 +142,7 @@ def _adjust(seen: Sequence[BoardCorners], capture: Capture) -> _Adjusted:
 def _without(corners: BoardCorners, bad: Floats) -> BoardCorners:
     """Corners without the bad ones; all of them where the others are too few."""
     keep = ~np.asarray(bad, bool)
-    if keep.sum() < 0.5 * len(keep):
+    if keep.sum() < _LEAST_KEPT * len(keep):
         return corners
     return replace(corners, number=corners.number[keep], world=corners.world[keep], seen=corners.seen[keep])
 
@@ -181,20 +184,29 @@ def _minimize(seen: Sequence[BoardCorners], capture: Capture, start: Floats) -> 
     doubt = max(abs(capture.focal_doubt[0]), abs(capture.focal_doubt[1]), 0.05 if capture.focal_known else 0.5)
     weak = np.array([doubt, *[_PRINCIPAL_SIGMA * width] * 2, *_BEND_SIGMA])
 
+    counts = np.cumsum([_CAMERA, *(2 * len(one.number) for one in seen)])
+
+    def part(k: int, camera: Floats, place: Floats) -> Floats:
+        return _residual(seen[k], _camera(capture, camera), place).ravel() / _CORNER_SIGMA
+
     def residuals(unknown: Floats) -> Floats:
-        camera = _camera(capture, unknown)
-        parts = [_residual(one, camera, unknown[_place(k)]).ravel() / _CORNER_SIGMA for k, one in enumerate(seen)]
+        parts = [part(k, unknown[:_CAMERA], unknown[_place(k)]) for k in range(len(seen))]
         return np.concatenate([unknown[:_CAMERA] / weak, *parts])
 
-    counts = np.cumsum([_CAMERA, *(2 * len(one.number) for one in seen)])
-    pattern = lil_matrix((counts[-1], len(start)), dtype=np.int8)
-    pattern[:, :_CAMERA] = 1
-    for k, (first, last) in enumerate(zip(counts, counts[1:], strict=False)):
-        pattern[first:last, _place(k)] = 1
+    def jacobian(unknown: Floats) -> Floats:
+        out = np.zeros((counts[-1], len(unknown)))
+        out[range(_CAMERA), range(_CAMERA)] = 1 / weak
+        for k, (first, last) in enumerate(itertools.pairwise(counts)):
+            own = np.r_[:_CAMERA, _place(k)]
+            for column, step in zip(own, np.eye(len(own)) * _STEPS, strict=True):
+                ahead, back = (unknown[own] + sign * step for sign in (1, -1))
+                change = part(k, *np.split(ahead, [_CAMERA])) - part(k, *np.split(back, [_CAMERA]))
+                out[first:last, column] = change / (2 * step.max())
+        return out
+
     return least_squares(
-        residuals, start, jac_sparsity=pattern, x_scale="jac", loss="huber", f_scale=3.0, xtol=1e-12, ftol=1e-12,
-        max_nfev=200,
-    )  # fmt: skip
+        residuals, start, jacobian, x_scale="jac", loss="huber", f_scale=3.0, xtol=1e-12, ftol=1e-12, max_nfev=200
+    )
 
 
 def _with_errors(seen: Sequence[BoardCorners], capture: Capture, found: OptimizeResult) -> _Adjusted:
@@ -202,7 +214,7 @@ def _with_errors(seen: Sequence[BoardCorners], capture: Capture, found: Optimize
     camera = _camera(capture, found.x)
     error = [_residual(one, camera, found.x[_place(k)]) for k, one in enumerate(seen)]
     scale = float(np.sqrt(np.mean(np.concatenate(error) ** 2))) / _CORNER_SIGMA
-    jacobian = found.jac.toarray()
+    jacobian = found.jac
     sigma = max(scale, 0.1) * np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)))
     posed = [
         PosedView(
