@@ -53,7 +53,7 @@ class Atlas:
 def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSettings) -> Atlas:
     """Cut a closed mesh into charts, and pack them into a square texture.
 
-    Without a set size, its side is the least power of two for which a texel is no larger than a pixel of the views' maps.
+    Without a set size, its side is the least power of two whose texels are no larger than pixels of the views' maps.
 
     Raises
     ------

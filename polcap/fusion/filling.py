@@ -5,8 +5,10 @@ mesh. Far from seen surface x is harmonic, without steps.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
@@ -30,7 +32,9 @@ def fill(maps: AtlasMaps, atlas: Atlas) -> AtlasMaps:
     second, third = points.weights.T.astype(np.float64)
     shares = np.stack([1 - second - third, second, third], axis=-1)
     rows = np.repeat(np.arange(len(shares)), 3)
-    spread = sparse.csr_matrix((shares.ravel(), (rows, place[points.corners].ravel())), (len(shares), place.max() + 1))
+    spread: Any = sparse.csr_matrix(
+        (shares.ravel(), (rows, place[points.corners].ravel())), (len(shares), place.max() + 1)
+    )
     weight = maps.weight[atlas.covered].astype(np.float64)
     parts = [part[atlas.covered].reshape(len(weight), -1) for part in (maps.diffuse, maps.specular, maps.roughness)]
     values = np.concatenate(parts, axis=-1)
@@ -41,17 +45,17 @@ def fill(maps: AtlasMaps, atlas: Atlas) -> AtlasMaps:
     return replace(filled, albedo_sigma=maps.albedo_sigma)
 
 
-def _harmonic(atlas: Atlas, place: Floats, spread: sparse.csr_matrix, weight: Floats, values: Floats) -> Floats:
+def _harmonic(atlas: Atlas, place: NDArray[np.intp], spread: Any, weight: Floats, values: Floats) -> Floats:
     """Values (V, C) at the vertices without seams, by the equation above."""
     count = spread.shape[1]
     faces = place[atlas.mesh.faces]
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    links = sparse.coo_matrix((np.ones(len(ends)), ends.T), (count, count)).tocsr()
+    links: Any = sparse.coo_matrix((np.ones(len(ends)), ends.T), (count, count)).tocsr()
     links = ((links + links.T) > 0).astype(np.float64)
-    laplacian = sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links
+    laplacian: Any = sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links
     texels = np.asarray(spread.sum(axis=0)).ravel()  # of a vertex
     gathered = np.asarray(spread.T @ weight).ravel()
     seen = gathered / np.maximum(texels, 1e-9)
     mean = (spread.T @ (weight[:, None] * values)) / np.maximum(gathered, 1e-9)[:, None]
-    system = sparse.diags(seen + 1e-9) + _STIFFNESS * laplacian
+    system: Any = sparse.diags(seen + 1e-9) + _STIFFNESS * laplacian
     return np.asarray(splu(system.tocsc()).solve(seen[:, None] * mean))

@@ -22,7 +22,7 @@ from polcap.pipeline import asset_export, result_folder
 from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import Progress, StageCache, contents
 from polcap.quality import gates
-from polcap.quality.gate import Gate
+from polcap.quality.gate import Gate, State
 from polcap.report import animation
 
 OUTPUT = "fused"  # default folder of the result, in the session's folder
@@ -153,7 +153,7 @@ def _gates(found: Session, results: FusionResults, rows: Sequence[Mapping[str, A
     worst = max(rows, key=lambda row: row["reprojection_px"])
     value = worst["reprojection_px"]
     message = f"The board's corners are within {value:.2f} px (rms) in every view; the worst is {worst['name']}"
-    state = "pass" if value <= _MOST_RESIDUAL_PX else "fail"
+    state: State = "pass" if value <= _MOST_RESIDUAL_PX else "fail"
     remedy = "" if state == "pass" else "Keep the board flat, and focus and zoom unchanged"
     yield Gate("poses", state, value, _MOST_RESIDUAL_PX, message, remedy, unit="px")
     yield _agreement_gate(rows)

@@ -143,7 +143,7 @@ def closed(mesh: Mesh) -> ClosedMesh:
 def transferred(source: Atlas, maps: AtlasMaps, target: Atlas) -> AtlasMaps:
     """The maps of one atlas on the texels of another of the same object: means of the nearest texels."""
     distance, nearest = cKDTree(source.position).query(target.position, k=_NEIGHBORS)
-    share = 1 / (distance + 0.1 * source.texel)
+    share: Floats = 1 / (np.asarray(distance) + 0.1 * source.texel)
     share /= share.sum(axis=1, keepdims=True)
     parts = (maps.normal, maps.diffuse, maps.specular, maps.roughness, maps.weight)
     values = np.concatenate([part[source.covered].reshape(len(source.position), -1) for part in parts], axis=-1)

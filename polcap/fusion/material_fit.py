@@ -17,7 +17,7 @@ materials, lobes from few views); Walter et al. 2007 (GGX).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated
 
 import cv2
@@ -154,7 +154,7 @@ def _flash(samples: Sequence[LobeSamples | None]) -> Floats:
 
 def thinned(samples: LobeSamples, step: int) -> LobeSamples:
     """Every `step`-th sample."""
-    return LobeSamples(*(part[::step] for part in vars(samples).values()))
+    return LobeSamples(*(getattr(samples, one.name)[::step] for one in fields(samples)))
 
 
 def _lobe(samples: LobeSamples, light: Floats) -> Lobe:
@@ -187,7 +187,7 @@ def _amplitudes(samples: LobeSamples, diffuse: Floats, gloss: Floats, floor: flo
         normal = terms.T @ (w[:, None] * terms)
         amplitude = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(2), terms.T @ (w * samples.radiance))
         if amplitude[1] < 0:  # no highlight at all
-            amplitude = np.array([(w * diffuse) @ samples.radiance / max((w * diffuse) @ diffuse, 1e-12), 0.0])
+            amplitude = np.array([(w * diffuse) @ samples.radiance / max(float((w * diffuse) @ diffuse), 1e-12), 0.0])
         error = (samples.radiance - terms @ amplitude) / scale
         robust = 1 / (1 + error**2)
     loss = float((samples.weight * np.log1p(error**2)).sum() / samples.weight.sum())

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from polcap.fusion.atlas import Atlas
@@ -55,7 +56,9 @@ def render(atlas: Atlas, maps: AtlasMaps, tracer: Tracer, pose: Pose, view: View
     return out.reshape(side, side, 3)
 
 
-def sampled(atlas: Atlas, maps: AtlasMaps, face: Floats, weight: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def sampled(
+    atlas: Atlas, maps: AtlasMaps, face: NDArray[np.integer], weight: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Normal (N, 3), diffuse (N, 3), specular (N, 3) and roughness (N,) at points (N, 3) of triangles (N,)."""
     side = maps.mask.shape[0]
     uv = (atlas.mesh.uv[atlas.mesh.faces[face]] * weight[..., None]).sum(axis=1) * side - 0.5
