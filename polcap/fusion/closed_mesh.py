@@ -1,0 +1,83 @@
+"""Closed meshes: from signed distances, checked, decimated to levels, and made manifold."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from polcap.errors import ObjectError
+from polcap.fusion.hull import DistanceGrid
+from polcap.fusion.values import ClosedMesh
+
+_FEWEST = 16  # triangles of a level
+
+
+def iso_surface(of: DistanceGrid) -> ClosedMesh:
+    """Mesh of the surface at distance 0."""
+    from skimage.measure import marching_cubes
+
+    vertices, faces, _, _ = marching_cubes(of.distance, 0.0, spacing=(of.grid.step,) * 3, gradient_direction="descent")
+    return ClosedMesh(vertices + of.grid.origin, faces.astype(np.int32))
+
+
+def volume(mesh: ClosedMesh) -> float:
+    """Enclosed volume [m³]; negative if the triangles face inwards."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    return float(np.sum(a * np.cross(b, c)) / 6)
+
+
+def euler_number(mesh: ClosedMesh) -> int:
+    """Vertices − edges + triangles: 2 for a body like a ball, 0 for one with a handle."""
+    used = len(np.unique(mesh.faces))
+    return used - len(mesh.faces) // 2
+
+
+def is_closed(mesh: ClosedMesh) -> bool:
+    """Every edge belongs to two triangles that run along it in opposite directions."""
+    ends = np.concatenate([mesh.faces[:, [k, (k + 1) % 3]] for k in range(3)]).astype(np.int64)
+    count = len(mesh.vertices)
+    there, back = (np.sort(ends @ [a, b]) for a, b in ((count, 1), (1, count)))
+    return bool(np.array_equal(there, back) and np.all(np.diff(there) > 0))
+
+
+def solid(mesh: ClosedMesh) -> ClosedMesh:
+    """The mesh as manifold3d writes it: manifold, outward, its largest body alone.
+
+    Raises
+    ------
+    ObjectError
+        The mesh is not the border of a body.
+    """
+    import manifold3d
+
+    given = manifold3d.Mesh64(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.uint64))
+    given.merge()
+    body = manifold3d.Manifold(given)
+    if body.status() != manifold3d.Error.NoError or body.is_empty():
+        raise ObjectError(f"the fused mesh is not closed ({body.status().name}); check poses and masks of the views")
+    parts = body.decompose()
+    written = max(parts, key=lambda part: part.volume()).to_mesh64()
+    return ClosedMesh(np.array(written.vert_properties[:, :3]), np.array(written.tri_verts, np.int32))
+
+
+def levels(mesh: ClosedMesh, counts: Sequence[int]) -> list[ClosedMesh]:
+    """The mesh with about as many triangles as each of `counts`, each level closed and manifold.
+
+    Raises
+    ------
+    ObjectError
+        A level has too few triangles to enclose a body.
+    """
+    return [_decimated(mesh, count) for count in counts]
+
+
+def _decimated(mesh: ClosedMesh, count: int) -> ClosedMesh:
+    import fast_simplification
+
+    if count < _FEWEST:
+        raise ObjectError(f"a level of {count} triangles is under {_FEWEST}; ask for more triangles or fewer levels")
+    if count >= len(mesh.faces):
+        return mesh
+    points, faces = fast_simplification.simplify(
+        np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.int32), target_count=count
+    )
+    return solid(ClosedMesh(np.asarray(points, np.float64), np.asarray(faces, np.int32)))

@@ -1,0 +1,158 @@
+"""Visual hull: the largest body that all silhouettes allow, as signed distances on a grid.
+
+References
+----------
+Laurentini, The visual hull concept for silhouette-based image understanding, IEEE PAMI 1994.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from polcap.errors import ObjectError
+from polcap.fusion.small_views import SmallView
+from polcap.images import Bools, Floats
+
+GRID = 140  # steps along the object's longest side; docs/benchmarks/fusion.md
+_COARSE = 48  # steps of the grid that finds the object's box
+_MARGIN = 3  # steps around the object
+_NEAR = 3.5  # steps from the surface within which distances are exact; two points lie at most √3 steps apart
+_THIN = 2  # steps; handles and tunnels up to twice as thick are taken for false
+
+
+@dataclass(frozen=True)
+class VoxelGrid:
+    """A cubic grid of points origin + step · (i, j, k)."""
+
+    origin: Floats  # (3,) m, world frame
+    step: float  # m
+    shape: tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class DistanceGrid:
+    """Signed distances from a surface, negative inside."""
+
+    grid: VoxelGrid
+    distance: Floats  # shape of the grid, m, float32
+
+    def at(self, point: Floats) -> Floats:
+        """Distances (N,) m at world points (N, 3), linear; edges repeat."""
+        index = (point - self.grid.origin) / self.grid.step
+        return np.asarray(ndimage.map_coordinates(self.distance, index.T, order=1, mode="nearest"))
+
+
+def visual_hull(views: Sequence[SmallView], steps: int = GRID) -> DistanceGrid:
+    """Signed distance from the visual hull: the largest over the views; one body, without specks and false handles.
+
+    Raises
+    ------
+    ObjectError
+        The silhouettes have no point in common.
+    """
+    fine = _object_grid(views, steps)
+    distance = _largest_distance(views, fine)
+    return DistanceGrid(fine, plain_body(distance, fine.step))
+
+
+def _object_grid(views: Sequence[SmallView], steps: int) -> VoxelGrid:
+    """VoxelGrid over the object's box, from a coarse hull in the space that the views share."""
+    middle, reach = _shared_space(views)
+    step = 2 * reach / (_COARSE - 1)
+    coarse = VoxelGrid(middle - reach, step, (_COARSE,) * 3)
+    inside = np.argwhere(_largest_distance(views, coarse) < step)  # also where the object is thinner than a step
+    if not len(inside):
+        raise ObjectError("the silhouettes of the views have no point in common; check the poses and the masks")
+    low, high = (coarse.origin + step * bound for bound in (inside.min(axis=0), inside.max(axis=0)))
+    side = float((high - low).max()) / steps
+    shape = np.ceil((high - low) / side).astype(int) + 1 + 2 * _MARGIN
+    return VoxelGrid(low - _MARGIN * side, side, (int(shape[0]), int(shape[1]), int(shape[2])))
+
+
+def _shared_space(views: Sequence[SmallView]) -> tuple[Floats, float]:
+    """Point (3,) nearest to the rays of all masks' middles, and half the side of a cube around the object, m."""
+    normal, right, lenses = np.zeros((3, 3)), np.zeros(3), []
+    for view in views:
+        height, width = view.outline.shape
+        x, y = ((width - 1) / 2 - view.view.center[0], view.view.center[1] - (height - 1) / 2)
+        ray = np.array([x, y, -view.view.focal]) @ view.pose.rotation
+        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+        normal += across
+        right += across @ view.pose.center
+        lenses.append(np.hypot(*view.outline.shape) / 2 / view.view.focal)
+    middle = np.linalg.lstsq(normal, right)[0]
+    far = [np.linalg.norm(middle - view.pose.center) for view in views]
+    return middle, float(np.max(np.multiply(far, lenses)))
+
+
+def _largest_distance(views: Sequence[SmallView], grid: VoxelGrid) -> Floats:
+    """Largest signed distance over the views, float32; away from the surface, that of the nearest second point."""
+    index = np.stack(np.meshgrid(*(np.arange(0, side, 2) for side in grid.shape), indexing="ij"), axis=-1)
+    second = _largest(views, grid, index.reshape(-1, 3)).reshape(index.shape[:3])
+    for axis, side in enumerate(grid.shape):
+        second = second.repeat(2, axis=axis).take(range(side), axis=axis)
+    near = np.argwhere(np.abs(second) < _NEAR * grid.step)
+    second[tuple(near.T)] = _largest(views, grid, near)
+    return second
+
+
+def _largest(views: Sequence[SmallView], grid: VoxelGrid, index: NDArray[np.integer]) -> Floats:
+    """Largest signed distance (N,) m at the grid's points with indices (N, 3)."""
+    point = (grid.origin + grid.step * index).astype(np.float32)
+    distance = np.full(len(point), -np.inf, np.float32)
+    for view in views:
+        np.maximum(distance, view.distance(point), out=distance)
+    return distance
+
+
+def plain_body(distance: Floats, step: float) -> Floats:
+    """Signed distances of the largest body, without specks, enclosed holes, and false handles and tunnels."""
+    body = _largest_part(distance < 0)
+    body = ndimage.binary_fill_holes(body)
+    body = _without_false_loops(body)
+    body = ndimage.binary_fill_holes(_largest_part(body))
+    near = 0.05 * step  # where the body was changed, its surface lies beside the changed points
+    return np.where(body, np.minimum(distance, -near), np.maximum(distance, near)).astype(np.float32)
+
+
+def _largest_part(body: Bools) -> Bools:
+    label, count = ndimage.label(body)
+    if count < 2:
+        return body
+    return np.asarray(label == 1 + np.argmax(np.bincount(label.ravel())[1:]))
+
+
+def _without_false_loops(body: Bools) -> Bools:
+    """Body with its thin tunnels filled and thin handles cut, where either raises the Euler number.
+
+    A part that closing adds or opening removes is taken over if that leaves fewer loops and no further body.
+    """
+    for radius in range(1, _THIN + 1):
+        ball = ndimage.iterate_structure(ndimage.generate_binary_structure(3, 1), radius)
+        closed = ndimage.binary_closing(np.pad(body, radius + 1), ball)[(np.s_[radius + 1 : -radius - 1],) * 3]
+        body = _take_over(body, closed & ~body, True)
+        body = _take_over(body, body & ~ndimage.binary_opening(body, ball), False)
+    return body
+
+
+def _take_over(body: Bools, change: Bools, value: bool) -> Bools:
+    label, _ = ndimage.label(change, np.ones((3, 3, 3)))
+    for number, box in enumerate(ndimage.find_objects(label), 1):
+        around = tuple(slice(max(side.start - 2, 0), side.stop + 2) for side in box)
+        after = np.where(label[around] == number, value, body[around])
+        if _euler(after) > _euler(body[around]):
+            changed = body.copy()
+            changed[around] = after
+            if ndimage.label(changed)[1] == 1:
+                body = changed
+    return body
+
+
+def _euler(body: Bools) -> int:
+    """Euler number of a solid of cubes that touch by faces: bodies − tunnels + enclosed holes."""
+    from skimage.measure import euler_number
+
+    return int(euler_number(body, connectivity=1))

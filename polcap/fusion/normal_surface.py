@@ -1,0 +1,201 @@
+"""Surface inside the hull that has the measured normals and touches the silhouettes.
+
+Each round moves every vertex along its normal, by sparse least squares: the edges of each triangle lie square to the
+mean of the normals that the views measured there, and rims stay on their silhouettes.
+
+References
+----------
+Nehab et al., Efficiently combining positions and normals for precise 3D geometry, SIGGRAPH 2005 (edges square to
+measured normals).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import cg
+
+from polcap.fusion.hull import DistanceGrid
+from polcap.fusion.small_views import SmallView, sample
+from polcap.fusion.values import ClosedMesh
+from polcap.images import Bools, Floats
+from polcap.optics.frames import cross, dot, unit
+from polcap.synth.mesh_tracer import Tracer, Triangles
+
+ROUNDS = 7  # this and the numbers below: docs/benchmarks/fusion.md
+_LIFT = 0.3  # steps off the surface where rays towards the lenses start
+_FACING = 0.1  # least cosine between a vertex's normal and the direction to a lens that sees it
+_CAUCHY = np.radians(12.0)  # rad; a view that differs by as much from the mean counts half
+_RIM_DEPTH = 3.0  # steps inside the silhouette where rims are searched
+_RIM_LAYER = 1.0  # steps; of the outermost layer of this thickness the vertex most square to the ray is the rim
+_RIM_COSINE = 0.5  # largest cosine between a rim's measured normal and its ray
+_RIM_WEIGHT = 1.0  # of a rim's equation over that of an edge
+_DAMPING = 0.02  # weight of the equations displacement = 0
+_SMOOTHNESS = 0.1  # weight of the equations displacement = that of the neighbor
+_RELAXATION = 0.5  # share of the way to the neighbors' middle, along the surface
+
+
+@dataclass(frozen=True)
+class SurfaceNormals:
+    """Mean of the measured normals at each vertex."""
+
+    normal: Floats  # (V, 3) unit, world frame
+    weight: Floats  # (V,) 0 where no view sees the vertex … 1 where several views agree
+
+
+@dataclass(frozen=True)
+class RimAnchors:
+    """Vertices that touch silhouettes: slope · displacement = distance."""
+
+    vertex: NDArray[np.intp]  # (R,)
+    slope: Floats  # (R,) motion away from the silhouette's cone per displacement
+    distance: Floats  # (R,) m from the vertex out to the silhouette's cone
+
+
+def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid, rounds: int = ROUNDS) -> ClosedMesh:
+    """Surface with the views' normals, from a mesh of the hull; same triangles."""
+    step, faces = hull.grid.step, mesh.faces
+    vertices: Floats = mesh.vertices.astype(np.float64)
+    neighbors = _neighbor_means(faces, len(vertices))
+    for _ in range(rounds):
+        vertices = _relaxed(vertices, faces, neighbors)
+        outward = vertex_normals(vertices, faces)
+        seen = visible(vertices, faces, outward, views, step)
+        target = mean_normals(vertices, outward, seen, views)
+        rims = find_rims(vertices, outward, target, views, step)
+        move = _displacements(vertices, faces, outward, target, rims)
+        vertices = _inside(vertices + outward * move[:, None], hull)
+    return ClosedMesh(vertices, faces)
+
+
+def vertex_normals(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
+    """Unit normals (V, 3), means of the triangles' by area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = cross(b - a, c - a)
+    corner = faces.T.ravel()
+    total = [np.bincount(corner, np.tile(area[:, axis], 3), len(vertices)) for axis in range(3)]
+    return unit(np.stack(total, axis=-1))
+
+
+def visible(
+    vertices: Floats, faces: NDArray[np.integer], outward: Floats, views: Sequence[SmallView], step: float
+) -> Bools:
+    """Which view sees which vertex, (N, V): the vertex faces the lens, and the mesh does not hide it."""
+    corners = np.zeros((len(faces), 3, 3), np.float32)  # occlusion needs no shading normals
+    tracer = Tracer(Triangles(vertices.astype(np.float32), faces.astype(np.int32), corners))
+    start = vertices + outward * (_LIFT * step)
+    seen = np.zeros((len(views), len(vertices)), bool)
+    for row, view in zip(seen, views):
+        facing = np.flatnonzero(dot(outward, view.towards(vertices)) > _FACING)
+        row[facing] = ~tracer.hidden(start[facing], view.pose.center)
+    return seen
+
+
+def mean_normals(vertices: Floats, outward: Floats, seen: Bools, views: Sequence[SmallView]) -> SurfaceNormals:
+    """Robust mean of the views' normals at each vertex, by expected error and by cosine to the ray.
+
+    It begins at the view with the least Cauchy loss of all others, so that views outvote wrong half-turns.
+    """
+    measured, weight = [], []
+    for view, row in zip(views, seen):
+        pixel = view.pixels(vertices)
+        normal = unit(sample(view.normal, pixel))
+        facing = dot(normal, view.towards(vertices))
+        measured.append(normal)
+        weight.append(row * np.maximum(facing, 0) * sample(view.certainty, pixel))
+    n, w = np.stack(measured), np.stack(weight)  # (N, V, 3), (N, V)
+    loss = [np.sum(w * np.log1p(_angle2(n, one) / _CAUCHY**2), axis=0) for one in n]
+    best = np.argmin(np.where(w > 0, loss, np.inf), axis=0)
+    mean = n[best, np.arange(len(vertices))]
+    for _ in range(3):
+        agreeing = w / (1 + _angle2(n, mean) / _CAUCHY**2)
+        mean = unit(np.sum(agreeing[..., None] * n, axis=0))
+    views_agreeing = np.sum(agreeing, axis=0) / np.maximum(w.max(axis=0), 1e-12)
+    unseen = views_agreeing == 0
+    return SurfaceNormals(np.where(unseen[:, None], outward, mean), views_agreeing / (1 + views_agreeing))
+
+
+def _angle2(a: Floats, b: Floats) -> Floats:
+    """Squared angle between unit vectors [rad²], by the chord: 1.5 % low at 30°."""
+    return np.asarray(2 - 2 * dot(a, b))
+
+
+def find_rims(
+    vertices: Floats, outward: Floats, target: SurfaceNormals, views: Sequence[SmallView], step: float
+) -> RimAnchors:
+    """One vertex for each piece of each silhouette, a step long.
+
+    Of the outermost vertices at the piece it is the one with the measured normal most nearly square to the ray. To
+    pin all of them would freeze the hull, because each of its vertices touches some silhouette's cone.
+    """
+    found = []
+    for view in views:
+        distance = view.distance(vertices)
+        near = np.flatnonzero((distance > -_RIM_DEPTH * step) & (target.weight > 0))
+        pixel, out = view.nearest_outline(vertices[near])
+        side = step * view.view.focal / np.linalg.norm(view.pose.center - vertices.mean(axis=0))
+        piece = np.unique(np.round(pixel / side), axis=0, return_inverse=True)[1].ravel()
+        outermost = np.full(piece.max(initial=0) + 1, -np.inf)
+        np.maximum.at(outermost, piece, distance[near])
+        across = np.abs(dot(target.normal[near], view.towards(vertices[near])))
+        across[distance[near] < outermost[piece] - _RIM_LAYER * step] = 2  # covered by others
+        order = np.lexsort((across, piece))
+        first = order[np.diff(piece[order], prepend=-1) > 0]
+        first = first[across[first] < _RIM_COSINE]
+        slope = dot(out[first], outward[near[first]])
+        found.append(np.stack([near[first], slope, -distance[near[first]]]))
+    vertex, slope, distance = np.concatenate(found, axis=1)
+    return RimAnchors(vertex.astype(np.intp), slope, distance)
+
+
+def _displacements(
+    vertices: Floats, faces: NDArray[np.integer], outward: Floats, target: SurfaceNormals, rims: RimAnchors
+) -> Floats:
+    """Displacements (V,) m along `outward` by least squares.
+
+    Every equation has the form w (a_j d_j − a_i d_i) = w b for the two ends i, j of an edge, or w a_i d_i = w b.
+    """
+    count = len(vertices)
+    tilt = unit(np.sum((target.normal * target.weight[:, None])[faces], axis=1))  # (F, 3) target of each triangle
+    share = target.weight[faces].mean(axis=1)
+    i, j = (np.concatenate([faces[:, (k + first) % 3] for k in range(3)]) for first in (0, 1))
+    t, w2 = np.tile(tilt, (3, 1)), np.tile(share**2, 3)
+    a_i, a_j = dot(t, outward[i]), dot(t, outward[j])
+    b = -dot(t, vertices[j] - vertices[i])
+    smooth2 = _SMOOTHNESS**2
+    diagonal = np.full(count, _DAMPING**2)
+    diagonal += np.bincount(i, w2 * a_i**2 + smooth2, count) + np.bincount(j, w2 * a_j**2 + smooth2, count)
+    diagonal += np.bincount(rims.vertex, _RIM_WEIGHT**2 * rims.slope**2, count)
+    right = np.bincount(j, w2 * a_j * b, count) - np.bincount(i, w2 * a_i * b, count)
+    right += np.bincount(rims.vertex, _RIM_WEIGHT**2 * rims.slope * rims.distance, count)
+    beside = sparse.coo_matrix((-w2 * a_i * a_j - smooth2, (i, j)), shape=(count, count)).tocsr()
+    matrix = beside + beside.T + sparse.diags(diagonal)
+    move, _ = cg(matrix, right, rtol=1e-4, maxiter=400, M=sparse.diags(1 / diagonal))
+    return np.asarray(move)
+
+
+def _inside(vertices: Floats, hull: DistanceGrid) -> Floats:
+    """Vertices outside the hull moved back onto it."""
+    distance = hull.at(vertices)
+    out = np.flatnonzero(distance > 0)
+    steps = np.eye(3) * hull.grid.step / 2
+    slope = [hull.at(vertices[out] + one) - hull.at(vertices[out] - one) for one in steps]
+    moved = vertices.copy()
+    moved[out] -= distance[out, None] * unit(np.stack(slope, axis=-1))
+    return moved
+
+
+def _neighbor_means(faces: NDArray[np.integer], count: int) -> sparse.csr_matrix:
+    """Matrix (V, V) that replaces values at vertices by the mean of their neighbors'."""
+    i, j = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
+    joined = sparse.coo_matrix((np.ones(2 * len(i)), (np.r_[i, j], np.r_[j, i])), shape=(count, count)).tocsr()
+    return sparse.csr_matrix(sparse.diags(1 / np.asarray(joined.sum(axis=1)).ravel()) @ joined)
+
+
+def _relaxed(vertices: Floats, faces: NDArray[np.integer], neighbors: sparse.csr_matrix) -> Floats:
+    """Vertices moved along the surface towards their neighbors' middle, so that triangles stay even."""
+    way = neighbors @ vertices - vertices
+    outward = vertex_normals(vertices, faces)
+    return np.asarray(vertices + _RELAXATION * (way - outward * dot(way, outward)[:, None]))

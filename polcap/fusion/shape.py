@@ -1,0 +1,33 @@
+"""Shape of the object: several views' masks and normals to one closed mesh."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+from msgspec import Meta
+
+from polcap.fusion.closed_mesh import iso_surface, solid
+from polcap.fusion.hull import visual_hull
+from polcap.fusion.normal_surface import fit_normals
+from polcap.fusion.small_views import reduce_views
+from polcap.fusion.values import ClosedMesh, FusionView
+
+
+@dataclass(frozen=True)
+class ShapeSettings:
+    """Settings of the fused shape."""
+
+    grid: Annotated[int, Meta(ge=40, le=300, description="steps along the object's longest side")] = 140
+
+
+def fuse_shape(views: Sequence[FusionView], settings: ShapeSettings) -> ClosedMesh:
+    """Join views of one object into a closed, manifold, outward mesh in the world frame.
+
+    Raises
+    ------
+    ObjectError
+        The silhouettes have no point in common, or enclose no body.
+    """
+    small = reduce_views(views)
+    hull = visual_hull(small, settings.grid)
+    return solid(fit_normals(iso_surface(hull), small, hull))

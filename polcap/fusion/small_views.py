@@ -1,0 +1,112 @@
+"""Views reduced to the resolution of the shape: silhouette distances and world normals, and their values at points."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+
+from polcap import parallel
+from polcap.fusion.values import FusionView, Pose
+from polcap.images import Bools, Floats, View
+from polcap.optics.frames import dot, unit
+from polcap.optics.projection import project
+from polcap.optics.resize import area_mean, weighted_area_mean
+
+SIDE = 420  # px of the object's box in a small view, at most; three to a grid step
+_MARGIN = 3  # px around the box
+_LEAST_SIGMA = 1.0  # deg
+_ROW = 1024  # points that cv2.remap takes in a row
+
+
+@dataclass(frozen=True)
+class SmallView:
+    """One view on its own small grid, cropped to the object; images are float32."""
+
+    pose: Pose
+    view: View
+    outline: Floats  # (H, W) px from the silhouette, negative inside
+    slope: Floats  # (H, W, 2) gradient of `outline` along x and y
+    normal: Floats  # (H, W, 3) unit, world frame; 0 outside
+    certainty: Floats  # (H, W) 1/σ² of the normals, 1/deg²; 0 outside
+    diffuse: Floats  # (H, W, 3) albedo
+
+    def distance(self, point: Floats) -> Floats:
+        """Signed distances (N,) m of world points (N, 3) from the cone of the silhouette, negative inside."""
+        at = point @ self.pose.rotation.T.astype(point.dtype) + self.pose.translation.astype(point.dtype)
+        pixel = project(self.view, at)
+        height, width = self.outline.shape
+        inside = np.clip(pixel, 0, np.array([width - 1, height - 1], pixel.dtype))
+        px = sample(self.outline, inside) + np.hypot(*(pixel - inside).T)
+        return np.asarray(px * -at[:, 2] / self.view.focal)
+
+    def pixels(self, point: Floats) -> Floats:
+        """Pixels x, y (N, 2) of world points (N, 3)."""
+        return project(self.view, point @ self.pose.rotation.T + self.pose.translation)
+
+    def towards(self, point: Floats) -> Floats:
+        """Unit vectors (N, 3) from world points (N, 3) to the lens."""
+        return unit(self.pose.center - point)
+
+    def nearest_outline(self, point: Floats) -> tuple[Floats, Floats]:
+        """For world points (N, 3): the silhouette's nearest pixels x, y (N, 2), and the unit directions (N, 3) there.
+
+        The directions are square to the rays, in the world frame.
+        """
+        pixel = self.pixels(point)
+        way = sample(self.slope, pixel)
+        way = way / np.maximum(np.hypot(*way.T), 1e-9)[:, None]
+        ray = self.towards(point)
+        out = np.concatenate([way * [1, -1], np.zeros((len(way), 1))], axis=1) @ self.pose.rotation
+        return pixel - way * sample(self.outline, pixel)[:, None], unit(out - ray * dot(out, ray)[:, None])
+
+
+def reduce_views(views: Sequence[FusionView]) -> list[SmallView]:
+    """Crop each view to its object and reduce it to SIDE px."""
+    return parallel.results([partial(_reduce, view) for view in views])
+
+
+def _reduce(of: FusionView) -> SmallView:
+    rows, columns = (np.flatnonzero(of.mask.any(axis=axis)) for axis in (1, 0))
+    step = max(1.0, max(np.ptp(rows) + 1, np.ptp(columns) + 1) / SIDE)
+    margin = int(np.ceil(_MARGIN * step))
+    top, left = max(rows[0] - margin, 0), max(columns[0] - margin, 0)
+    box = np.s_[top : rows[-1] + margin + 1, left : columns[-1] + margin + 1]
+    mask = of.mask[box]
+    shape = tuple(max(1, round(side / step)) for side in mask.shape)
+    scale = np.array(mask.shape[::-1]) / shape[::-1]  # px of the map per small px, x and y, equal within 1/SIDE
+    x, y = ((np.array(of.view.center) - (left, top)) + 0.5) / scale - 0.5
+    view = View(of.view.focal / float(scale.mean()), (float(x), float(y)), of.view.scale * float(scale.mean()))
+    world = weighted_area_mean(of.normal[box], mask, shape) @ of.pose.rotation  # of the pixels in the mask
+    length = np.linalg.norm(world, axis=-1, keepdims=True)
+    outline = area_mean(_outline(mask), shape) / np.float32(scale.mean())
+    return SmallView(
+        of.pose,
+        view,
+        outline,
+        np.stack([np.gradient(outline, axis=axis) for axis in (1, 0)], axis=-1),
+        (world / np.maximum(length, 1e-9)).astype(np.float32),
+        area_mean(np.where(mask, 1 / np.maximum(of.sigma_deg[box], _LEAST_SIGMA) ** 2, 0).astype(np.float32), shape),
+        weighted_area_mean(of.diffuse[box], mask, shape),
+    )
+
+
+def _outline(mask: Bools) -> Floats:
+    """Signed distance (H, W) px from the border of a mask's pixels, negative inside."""
+    framed = np.pad(mask, 1).astype(np.uint8)
+    inside, outside = (cv2.distanceTransform(m, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for m in (framed, 1 - framed))
+    signed = np.where(framed > 0, 0.5 - inside, outside - 0.5)[1:-1, 1:-1]
+    return np.asarray(cv2.GaussianBlur(signed.astype(np.float32), (0, 0), 1.0))  # evens the pixels' stairs
+
+
+def sample(image: Floats, pixel: Floats) -> Floats:
+    """Values (N,) or (N, C) of an image (H, W) or (H, W, C) at pixels x, y (N, 2), linear; edges repeat."""
+    count = len(pixel)
+    places = np.zeros((max(1, -(-count // _ROW)) * _ROW, 2), np.float32)
+    places[:count] = pixel
+    x, y = places.T.reshape(2, -1, _ROW)
+    out = cv2.remap(
+        image, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(out.reshape(-1, *image.shape[2:])[:count])

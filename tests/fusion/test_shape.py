@@ -1,0 +1,67 @@
+"""Views of simple bodies are joined into closed meshes of the right size."""
+
+import numpy as np
+import pytest
+import trimesh
+
+pytest.importorskip("skimage")
+pytest.importorskip("manifold3d")
+pytest.importorskip("embreex")
+
+from polcap.errors import ObjectError
+from polcap.fusion.closed_mesh import euler_number, is_closed, levels, volume
+from polcap.fusion.shape import ShapeSettings, fuse_shape
+from polcap.fusion.values import ClosedMesh
+from tests.fusion.traced_views import SIZE, Body, all_around, capture, disturbed, ring, stand, with_errors
+
+GRID = 60
+
+
+@pytest.fixture(scope="module")
+def ball() -> Body:
+    sphere = trimesh.creation.icosphere(4)
+    return stand(sphere.vertices, sphere.faces)
+
+
+@pytest.fixture(scope="module")
+def fused_ball(ball: Body) -> ClosedMesh:
+    rng = np.random.default_rng(0)
+    views = [with_errors(ball, capture(ball, pose, 128), rng) for pose in all_around(ball, 9)]
+    return fuse_shape(views, ShapeSettings(grid=GRID))
+
+
+def test_a_ball_has_its_radius_where_normals_and_poses_err(ball: Body, fused_ball: ClosedMesh) -> None:
+    radius = np.linalg.norm(fused_ball.vertices - ball.middle, axis=1)
+    assert abs(radius.mean() - SIZE / 2) < 0.003 * SIZE  # ¼ px of these views, and the errors of their poses
+    assert radius.std() < 0.006 * SIZE
+
+
+def test_the_mesh_is_closed_manifold_and_outward(fused_ball: ClosedMesh) -> None:
+    assert is_closed(fused_ball)
+    assert euler_number(fused_ball) == 2
+    assert volume(fused_ball) == pytest.approx(np.pi / 6 * SIZE**3, rel=0.02)
+    assert trimesh.Trimesh(fused_ball.vertices, fused_ball.faces, process=False).is_volume
+
+
+def test_levels_are_closed_and_have_their_number_of_triangles(fused_ball: ClosedMesh) -> None:
+    for level, count in zip(levels(fused_ball, [2000, 500]), [2000, 500]):
+        assert is_closed(level) and volume(level) > 0
+        assert len(level.faces) == pytest.approx(count, rel=0.02)
+
+
+def test_a_torus_keeps_its_hole() -> None:
+    torus = trimesh.creation.torus(1.0, 0.35, 48, 24)
+    body = stand(torus.vertices, torus.faces)  # upright
+    views = [capture(body, pose, 128) for pose in ring(body, 12)]
+    fused = fuse_shape(views, ShapeSettings(grid=GRID))
+    assert euler_number(fused) == 0 and is_closed(fused)
+
+
+def test_views_that_look_past_each_other_are_refused(ball: Body) -> None:
+    poses = all_around(ball, 3)
+    views = [capture(ball, pose, 64) for pose in poses]
+    moved = disturbed(ball, poses[0], np.random.default_rng(0))
+    moved.translation[0] += 2 * SIZE
+    views[0] = type(views[0])(**{**vars(views[0]), "pose": moved})
+    with pytest.raises(ObjectError, match="no point in common"):
+        fuse_shape(views, ShapeSettings(grid=GRID))
