@@ -30,7 +30,7 @@ def fuse(
     """Join several captures of one object into a closed asset. Run again, it goes on where it was stopped."""
     from polcap import config as settings
     from polcap.fusion import fuse_run
-    from polcap.fusion.path import FusionSettings
+    from polcap.fusion.fusion_path import FusionSettings
     from polcap.fusion.session import SessionInput
     from polcap.pipeline import models
 

@@ -15,7 +15,7 @@ from polcap.fusion import fused_maps, fused_page, object_pictures, session
 from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.closed_mesh import is_closed
 from polcap.fusion.fused_maps import FusedSource
-from polcap.fusion.path import FusionResults, FusionSettings, path
+from polcap.fusion.fusion_path import FusionResults, FusionSettings, path
 from polcap.fusion.session import Report, Session, SessionInput
 from polcap.fusion.values import FusionView
 from polcap.pipeline import asset_export, result_folder

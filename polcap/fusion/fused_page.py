@@ -7,7 +7,7 @@ from typing import Any
 
 from polcap.formats import atomic, html
 from polcap.fusion import object_pictures
-from polcap.fusion.path import FusionResults
+from polcap.fusion.fusion_path import FusionResults
 from polcap.report import labels, page
 
 _SIDES = 8

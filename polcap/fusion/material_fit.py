@@ -17,7 +17,7 @@ materials, lobes from few views); Walter et al. 2007 (GGX).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import cv2
@@ -41,6 +41,7 @@ _LEAST_COSINE = 0.3  # between normal and view: flatter views show errors of the
 _FLOOR = 0.02  # of the median radiance: error of every sample, with `_RELATIVE`
 _RELATIVE = 0.08
 _ROUNDS = 3  # of reweighting
+_GAIN_SIGMA, _F0_SIGMA, _ROUGHNESS_SIGMA = 0.1, 0.015, 0.08  # errors of the means of the maps over a material
 _FARTHEST_FLASH = 0.15  # m from the lens
 _INDEX = 1.5  # refractive index of the diffuse law and of the Fresnel term
 
@@ -51,21 +52,23 @@ class MaterialSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     materials: Annotated[int, Meta(ge=1, le=32, description="most materials, by albedo [1]")] = 6
     normal_sigma_deg: Annotated[
         float, Meta(ge=0, le=20, description="error of the baked normals, per axis, which widens the lobes [°]")
-    ] = 2.5
+    ] = 3.0
     map_weight: Annotated[
-        float, Meta(ge=0, le=1, description="weight of the views' own maps against the fit of the highlights [1]")
-    ] = 0.3
+        float, Meta(ge=0, le=10, description="weight of the views' own maps against the fit of the highlights [1]")
+    ] = 0.05
 
 
 @dataclass(frozen=True)
 class LobeSamples:
-    """Radiance of points of one material in all views."""
+    """Radiance of points of one material in all views, and what the maps say of its gloss."""
 
     radiance: Floats  # (P,) luminance of S0 over the light that the point receives
     albedo: Floats  # (P,) luminance of the baked albedo
     normal: Floats  # (P, 3) baked, in the frame of the ray
     point: Floats  # (P, 3) m, camera frame
     weight: Floats  # (P,)
+    f0: float
+    alpha: float
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ class Lobe:
     f0: float
     alpha: float
     gain: float  # of the albedo
-    residual: float  # weighted mean square, in units of the expected error
+    residual: float  # weighted mean of ln(1 + error²), in units of the expected error, and the prior's part
 
 
 @stage(version=1)
@@ -86,9 +89,9 @@ def fit(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps, settings: 
         return maps
     share = _materials(maps, atlas, settings.materials)  # (N, K)
     samples = _samples(lit, sights(lit, atlas), atlas, maps, share)
-    light = _flash(samples)
-    lobes = [None if one is None else _lobe(one, light) for one in samples]
-    return _blended(atlas, maps, share, lobes, settings)
+    light = _flash(samples, settings)
+    lobes = [None if one is None else _lobe(one, light, settings) for one in samples]
+    return _blended(atlas, maps, share, lobes)
 
 
 def _materials(maps: AtlasMaps, atlas: Atlas, count: int) -> Floats:
@@ -125,6 +128,7 @@ def _samples(
         parts.append((radiance, albedo[one.texel[steep]], local, point, one.weight[steep], one.texel[steep]))
     radiance, base, local, point, weight, texel = (np.concatenate(column) for column in zip(*parts))
     material = share.argmax(axis=1)[texel]
+    gloss = np.stack([color.luminance(maps.specular[atlas.covered]), maps.roughness[atlas.covered]], axis=-1)
     found: list[LobeSamples | None] = []
     for k in range(share.shape[1]):
         mine = np.flatnonzero((material == k) & (weight > 0))
@@ -132,11 +136,13 @@ def _samples(
             found.append(None)
             continue
         mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), _SAMPLES)).astype(int)]
-        found.append(LobeSamples(radiance[mine], base[mine], local[mine], point[mine], weight[mine]))
+        f0, rough = (float(np.average(gloss[:, c], weights=share[:, k] * maps.weight[atlas.covered])) for c in (0, 1))
+        parts_of = (part[mine] for part in (radiance, base, local, point, weight))
+        found.append(LobeSamples(*parts_of, f0, rough**2))
     return found
 
 
-def _flash(samples: Sequence[LobeSamples | None]) -> Floats:
+def _flash(samples: Sequence[LobeSamples | None], settings: MaterialSettings) -> Floats:
     """Place (3,) of the flash in the camera frame for which all materials fit best."""
     few = [thinned(one, 8) for one in samples if one is not None]
     if not few:
@@ -144,7 +150,7 @@ def _flash(samples: Sequence[LobeSamples | None]) -> Floats:
 
     def misfit(place: Floats) -> float:
         far = max(float(np.hypot(*place)) / _FARTHEST_FLASH - 1, 0)
-        return sum(_lobe(one, np.append(place, 0.0)).residual for one in few) + 10 * far
+        return sum(_lobe(one, np.append(place, 0.0), settings).residual for one in few) + 10 * far
 
     simplex = np.array([[0.0, 0.0], [0.03, 0.0], [0.0, 0.03]])
     best = minimize(misfit, np.zeros(2), method="Nelder-Mead",
@@ -154,10 +160,11 @@ def _flash(samples: Sequence[LobeSamples | None]) -> Floats:
 
 def thinned(samples: LobeSamples, step: int) -> LobeSamples:
     """Every `step`-th sample."""
-    return LobeSamples(*(getattr(samples, one.name)[::step] for one in fields(samples)))
+    some = (part[::step] for part in (samples.radiance, samples.albedo, samples.normal, samples.point, samples.weight))
+    return LobeSamples(*some, samples.f0, samples.alpha)
 
 
-def _lobe(samples: LobeSamples, light: Floats) -> Lobe:
+def _lobe(samples: LobeSamples, light: Floats, settings: MaterialSettings) -> Lobe:
     """The lobe that fits the samples best for a flash at `light` (3,) [m, camera frame]."""
     to_lens = frames.unit(-samples.point)
     to_light = frames.to_ray_frame(frames.unit(light - samples.point), to_lens)
@@ -165,42 +172,45 @@ def _lobe(samples: LobeSamples, light: Floats) -> Lobe:
     body = shade.stokes(samples.normal, white, none, 0.5 * ones, _INDEX * ones, to_light, ones)[0][:, 0]
     diffuse = samples.albedo * body
     floor = _FLOOR * float(np.median(samples.radiance))
+    widened = 2 * np.radians(settings.normal_sigma_deg) ** 2
     best: Lobe | None = None
     for alpha in _ALPHAS:
         rough = np.sqrt(alpha) * ones
         gloss = shade.stokes(samples.normal, none, white, rough, _INDEX * ones, to_light, ones)[0][:, 0]
-        gain, f0, residual = _amplitudes(samples, diffuse, gloss, floor)
+        gain, f0, residual = _amplitudes(samples, diffuse, gloss, floor, settings.map_weight)
+        narrower = np.sqrt(max(alpha**2 - widened, _ALPHAS[0] ** 2))  # the lobe without the errors of the normals
+        residual += settings.map_weight * ((np.sqrt(narrower) - np.sqrt(samples.alpha)) / _ROUGHNESS_SIGMA) ** 2
         if best is None or residual < best.residual:
-            best = Lobe(f0, float(alpha), gain, residual)
+            best = Lobe(f0, float(narrower), gain, residual)
     assert best is not None
     return best
 
 
-def _amplitudes(samples: LobeSamples, diffuse: Floats, gloss: Floats, floor: float) -> tuple[float, float, float]:
-    """Gain of the albedo, F0 and the mean residual, by reweighted least squares."""
+def _amplitudes(
+    samples: LobeSamples, diffuse: Floats, gloss: Floats, floor: float, prior: float
+) -> tuple[float, float, float]:
+    """Gain of the albedo, F0 and the mean residual, by reweighted least squares around the maps."""
     terms = np.stack([diffuse, gloss], axis=-1)
     scale = floor + _RELATIVE * np.maximum(samples.radiance, 0)
     robust = np.ones(len(scale))
-    amplitude = np.array([1.0, 0.04])
+    expected, tie = np.array([1.0, samples.f0]), prior / np.array([_GAIN_SIGMA, _F0_SIGMA]) ** 2
     for _ in range(_ROUNDS):
-        w = samples.weight * robust / scale**2
-        normal = terms.T @ (w[:, None] * terms)
-        amplitude = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(2), terms.T @ (w * samples.radiance))
+        w = samples.weight * robust / scale**2 / samples.weight.sum()
+        normal = terms.T @ (w[:, None] * terms) + np.diag(tie)
+        amplitude = np.linalg.solve(normal, terms.T @ (w * samples.radiance) + tie * expected)
         if amplitude[1] < 0:  # no highlight at all
             amplitude = np.array([(w * diffuse) @ samples.radiance / max(float((w * diffuse) @ diffuse), 1e-12), 0.0])
         error = (samples.radiance - terms @ amplitude) / scale
         robust = 1 / (1 + error**2)
     loss = float((samples.weight * np.log1p(error**2)).sum() / samples.weight.sum())
+    loss += float(tie @ (amplitude - expected) ** 2)
     return float(amplitude[0]), float(amplitude[1]), loss
 
 
-def _blended(
-    atlas: Atlas, maps: AtlasMaps, share: Floats, lobes: Sequence[Lobe | None], settings: MaterialSettings
-) -> AtlasMaps:
-    """Maps whose F0 and roughness have, per material, the mean of fit and maps, and half of the maps' own variation."""
+def _blended(atlas: Atlas, maps: AtlasMaps, share: Floats, lobes: Sequence[Lobe | None]) -> AtlasMaps:
+    """Maps with the F0 and roughness of the lobes; a material without a lobe has the means of its maps."""
     specular, roughness = maps.specular[atlas.covered].astype(np.float64), maps.roughness[atlas.covered]
     seen = maps.weight[atlas.covered]
-    widened = 2 * np.radians(settings.normal_sigma_deg) ** 2
     target = np.zeros((len(share), 2))
     for k, lobe in enumerate(lobes):
         weight = share[:, k] * seen
@@ -209,9 +219,7 @@ def _blended(
         if lobe is None:
             target += share[:, k, None] * [mean_f0, mean_rough]
             continue
-        rough = float(np.sqrt(np.sqrt(max(lobe.alpha**2 - widened, 1e-4))))
-        own = settings.map_weight
-        target += share[:, k, None] * [own * mean_f0 + (1 - own) * lobe.f0, own * mean_rough + (1 - own) * rough]
+        target += share[:, k, None] * [lobe.f0, np.sqrt(lobe.alpha)]
     gray = np.maximum(color.luminance(specular), 1e-6)
     new_specular = specular * (target[:, 0] / gray)[:, None]
     values = np.concatenate(

@@ -15,7 +15,7 @@ from polcap.config import Config
 from polcap.errors import CaptureError, ChartError, InputError
 from polcap.formats import onnx, own_folders
 from polcap.formats.capture import layouts, reader
-from polcap.fusion import board_corners, poses, view_maps
+from polcap.fusion import board_corners, mask_agreement, poses, view_maps
 from polcap.fusion.board_corners import BoardCorners
 from polcap.fusion.board_eraser import erase
 from polcap.fusion.poses import LEAST_VIEWS, PosedView, SessionCamera, SessionPoses
@@ -62,12 +62,17 @@ class Session:
             try:
                 work(name)
             except InputError as error:
-                self.left_out[name] = str(error)
+                self.left_out[name] = _reason(name, error)
 
     @property
     def used(self) -> list[str]:
         """Names of the views that are not left out."""
         return [name for name in self.captures if name not in self.left_out]
+
+
+def _reason(name: str, error: InputError) -> str:
+    """Why a view is left out, without its name."""
+    return str(error).removeprefix(f"{name}: ")
 
 
 def out_of(folder: Path, name: str) -> Path:
@@ -90,7 +95,9 @@ def process(wanted: SessionInput, report: Report) -> tuple[Session, tuple[Fusion
     session.each(lambda name: _mask_object(name, session, wanted, corners[name], solved))
     session.each(lambda name: _make_maps(name, session, wanted, report))
     _enough(session)
-    return session, tuple(_view(name, session, wanted) for name in session.used)
+    views, contradicting = mask_agreement.agreeing([_view(name, session, wanted) for name in session.used])
+    session.left_out |= {name: reason.removeprefix(f"{name}: ") for name, reason in contradicting.items()}
+    return session, tuple(views)
 
 
 def _read(wanted: SessionInput) -> Session:
@@ -103,7 +110,7 @@ def _read(wanted: SessionInput) -> Session:
         try:
             session.captures[folder.name] = reader.read(folder, wanted.angles_deg, wanted.clockwise)
         except InputError as error:
-            session.left_out[folder.name] = str(error)
+            session.left_out[folder.name] = _reason(folder.name, error)
     _enough(session)
     return session
 
@@ -169,7 +176,7 @@ def _find_boards(session: Session, wanted: SessionInput, report: Report) -> dict
 def _solve_poses(session: Session, corners: Mapping[str, BoardCorners]) -> SessionPoses:
     seen = {name: corners[name] for name in session.used}
     solved = poses.solve(seen, session.captures[session.used[0]])
-    session.left_out.update(solved.left_out)
+    session.left_out |= {name: reason.removeprefix(f"{name}: ") for name, reason in solved.left_out.items()}
     session.camera, session.posed = solved.camera, solved.views
     return solved
 
