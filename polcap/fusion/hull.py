@@ -7,6 +7,7 @@ Laurentini, The visual hull concept for silhouette-based image understanding, IE
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,19 +25,24 @@ _THIN = 2  # steps; handles and tunnels up to twice as thick are taken for false
 
 
 @dataclass(frozen=True)
-class Grid:
+class VoxelGrid:
     """A cubic grid of points origin + step · (i, j, k)."""
 
     origin: Floats  # (3,) m, world frame
     step: float  # m
     shape: tuple[int, int, int]
 
+    def corners(self) -> Floats:
+        """The eight corners (8, 3) m of the grid's box."""
+        far = self.origin + self.step * (np.array(self.shape) - 1)
+        return np.array(list(product(*zip(self.origin, far))))
+
 
 @dataclass(frozen=True)
 class DistanceGrid:
     """Signed distances from a surface, negative inside."""
 
-    grid: Grid
+    grid: VoxelGrid
     distance: Floats  # shape of the grid, m, float32
 
     def at(self, point: Floats) -> Floats:
@@ -58,18 +64,18 @@ def visual_hull(views: Sequence[SmallView], steps: int = GRID) -> DistanceGrid:
     return DistanceGrid(fine, plain_body(distance, fine.step))
 
 
-def _object_grid(views: Sequence[SmallView], steps: int) -> Grid:
-    """Grid over the object's box, from a coarse hull in the space that the views share."""
+def _object_grid(views: Sequence[SmallView], steps: int) -> VoxelGrid:
+    """VoxelGrid over the object's box, from a coarse hull in the space that the views share."""
     middle, reach = _shared_space(views)
     step = 2 * reach / (_COARSE - 1)
-    coarse = Grid(middle - reach, step, (_COARSE,) * 3)
+    coarse = VoxelGrid(middle - reach, step, (_COARSE,) * 3)
     inside = np.argwhere(_largest_distance(views, coarse) < step)  # also where the object is thinner than a step
     if not len(inside):
         raise ObjectError("the silhouettes of the views have no point in common; check the poses and the masks")
     low, high = (coarse.origin + step * bound for bound in (inside.min(axis=0), inside.max(axis=0)))
     side = float((high - low).max()) / steps
     shape = np.ceil((high - low) / side).astype(int) + 1 + 2 * _MARGIN
-    return Grid(low - _MARGIN * side, side, (int(shape[0]), int(shape[1]), int(shape[2])))
+    return VoxelGrid(low - _MARGIN * side, side, (int(shape[0]), int(shape[1]), int(shape[2])))
 
 
 def _shared_space(views: Sequence[SmallView]) -> tuple[Floats, float]:
@@ -88,7 +94,7 @@ def _shared_space(views: Sequence[SmallView]) -> tuple[Floats, float]:
     return middle, float(np.max(np.multiply(far, lenses)))
 
 
-def _largest_distance(views: Sequence[SmallView], grid: Grid) -> Floats:
+def _largest_distance(views: Sequence[SmallView], grid: VoxelGrid) -> Floats:
     """Largest signed distance over the views, float32; away from the surface, that of the nearest second point."""
     index = np.stack(np.meshgrid(*(np.arange(0, side, 2) for side in grid.shape), indexing="ij"), axis=-1)
     second = _largest(views, grid, index.reshape(-1, 3)).reshape(index.shape[:3])
@@ -99,7 +105,7 @@ def _largest_distance(views: Sequence[SmallView], grid: Grid) -> Floats:
     return second
 
 
-def _largest(views: Sequence[SmallView], grid: Grid, index: NDArray[np.integer]) -> Floats:
+def _largest(views: Sequence[SmallView], grid: VoxelGrid, index: NDArray[np.integer]) -> Floats:
     """Largest signed distance (N,) m at the grid's points with indices (N, 3)."""
     point = (grid.origin + grid.step * index).astype(np.float32)
     distance = np.full(len(point), -np.inf, np.float32)
@@ -134,6 +140,8 @@ def _without_false_loops(body: Bools) -> Bools:
         ball = ndimage.iterate_structure(ndimage.generate_binary_structure(3, 1), radius)
         closed = ndimage.binary_closing(np.pad(body, radius + 1), ball)[(np.s_[radius + 1 : -radius - 1],) * 3]
         body = _take_over(body, closed & ~body, True)
+    for radius in range(1, _THIN + 1):  # after all tunnels are filled, so that no wall between two of them is cut
+        ball = ndimage.iterate_structure(ndimage.generate_binary_structure(3, 1), radius)
         body = _take_over(body, body & ~ndimage.binary_opening(body, ball), False)
     return body
 
