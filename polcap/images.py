@@ -9,7 +9,7 @@ one.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import IntFlag
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -630,21 +630,47 @@ class SurfaceMaps:
     detail: Floats | None = None  # (2H, 2W) float16, ln of the albedo of RAW pixels over `diffuse`, enlarged
 
 
+class TextureMaps(Protocol):
+    """Appearance of a surface on a pixel grid, as an asset's textures need it: `SurfaceMaps` or an atlas."""
+
+    @property
+    def normal(self) -> Floats: ...  # (H, W, 3) unit, in the mesh's frame
+    @property
+    def diffuse(self) -> Floats: ...  # (H, W, 3) albedo ρ_d, linear Rec.709
+    @property
+    def specular(self) -> Floats: ...  # (H, W, 3) F0, linear Rec.709
+    @property
+    def roughness(self) -> Floats: ...  # (H, W) perceptual, α = roughness²
+    @property
+    def mask(self) -> Bools: ...  # (H, W)
+    @property
+    def albedo_sigma(self) -> float | None: ...  # relative 1σ of the scale of all albedos; None: unknown
+    @property
+    def detail(self) -> Floats | None: ...  # (2H, 2W) float16, ln of the albedo of RAW pixels over `diffuse`
+
+
 @dataclass(frozen=True)
 class Mesh:
-    """The visible surface as a triangle mesh with figures on its quality. One value, as exporters need it."""
+    """A triangle mesh with texture coordinates, as exporters need it, and figures on its boundary."""
 
-    vertices: Floats  # (V, 3) camera frame; metres where scaled, else the object's depth is 1 focal length
+    vertices: Floats  # (V, 3) in `frame`; metres where `metric`
     normals: Floats  # (V, 3) unit
     uv: Floats  # (V, 2) 0…1, v down (glTF)
     tangents: Floats  # (V, 4) unit, w = handedness
-    faces: NDArray[np.int32]  # (F, 3) counter-clockwise seen from the camera
-    depth: Floats  # (H, W) along the optical axis, growing away from the camera; NaN outside
+    faces: NDArray[np.int32]  # (F, 3) counter-clockwise seen from outside
     metric: bool
-    pieces: int  # number of separate parts, without specks
-    cuts: float  # length of the boundary inside the mask, both sides, over the length along the mask's outline
-    cut_px: float  # length of the cuts inside the mask, one side, px of the maps
-    raggedness: float  # length of the boundary over its smoothed length, minus 1; before smoothing
+    pieces: int = 1  # number of separate parts, without specks
+    cuts: float = 0.0  # length of the boundary inside the mask, both sides, over the length along the mask's outline
+    cut_px: float = 0.0  # length of the cuts inside the mask, one side, px of the maps
+    raggedness: float = 0.0  # length of the boundary over its smoothed length, minus 1; before smoothing
+    frame: Literal["camera", "board"] = "camera"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReliefMesh(Mesh):
+    """The surface that one view shows, as a mesh over its depth map; unless metric, its depth is 1 focal length."""
+
+    depth: Floats  # (H, W) along the optical axis, growing away from the camera; NaN outside
 
 
 @dataclass(frozen=True)

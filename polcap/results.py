@@ -10,8 +10,8 @@ from polcap.images import (
     Asset,
     ColorCalibration,
     Cues,
-    Mesh,
     ObjectMask,
+    ReliefMesh,
     SelfCalibration,
     StokesImage,
     SurfaceMaps,
@@ -34,7 +34,7 @@ class Results:
     stokes: StokesImage
     cues: Cues
     maps: SurfaceMaps
-    mesh: Mesh
+    mesh: ReliefMesh
     asset: Asset
     keys: Mapping[str, str]  # cache key of each stage that ran, by stage
 

@@ -310,11 +310,11 @@ def stored_maps(inputs: Arrays) -> images.SurfaceMaps:
     )
 
 
-def stored_mesh(inputs: Arrays) -> images.Mesh:
+def stored_mesh(inputs: Arrays) -> images.ReliefMesh:
     """The mesh that `asset` runs on."""
-    part = {name.removeprefix("mesh."): array for name, array in inputs.items() if name.startswith("mesh.")}
+    part: Any = {name.removeprefix("mesh."): array for name, array in inputs.items() if name.startswith("mesh.")}
     depth = np.full(inputs["cues.mask"].shape, 0.7, np.float32)
-    return images.Mesh(**part, depth=depth, metric=True, pieces=1, cuts=0.0, cut_px=0.0, raggedness=0.0)
+    return images.ReliefMesh(**part, depth=depth, metric=True, pieces=1, cuts=0.0, cut_px=0.0, raggedness=0.0)
 
 
 # Store.

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from polcap.images import Asset, Floats, Mesh, SurfaceMaps, View
+from polcap.images import Asset, Floats, ReliefMesh, SurfaceMaps, View
 from polcap.stages import asset, surface
 
 VIEW = View(focal=400.0, center=(70.0, 50.0), scale=2.0, origin=(300.0, 200.0))
@@ -42,18 +42,18 @@ def maps(ripple: float = 0.0, roughness: float = 1.0, specular: float = 0.0) -> 
     )
 
 
-def mesh(of: SurfaceMaps, settings: surface.SurfaceSettings | None = None) -> Mesh:
+def mesh(of: SurfaceMaps, settings: surface.SurfaceSettings | None = None) -> ReliefMesh:
     return surface.integrate(of, DISTANCE, settings or surface.SurfaceSettings())
 
 
-def flat_mesh(of: SurfaceMaps) -> Mesh:
+def flat_mesh(of: SurfaceMaps) -> ReliefMesh:
     """A plane facing the camera under the same mask: all shape is left to the normal texture."""
     plane = np.zeros_like(of.normal)
     plane[..., 2] = 1
     return mesh(replace(of, normal=plane))
 
 
-def built(of: SurfaceMaps, on: Mesh) -> Asset:
+def built(of: SurfaceMaps, on: ReliefMesh) -> Asset:
     return asset.build(of, on, asset.AssetSettings())
 
 

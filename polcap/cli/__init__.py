@@ -12,6 +12,7 @@ calibrate_command  measured camera, lens, polarizer and flash
 doctor_command     check of this machine or of one photograph
 settings_command   list of all settings
 synth_command      captures of objects that do not exist
+board_command      the board to print, for captures from all sides
 capture_command    shooting with a rig
 training_commands  train, evaluate
 options            options that several commands share
@@ -28,6 +29,7 @@ from typer.exceptions import TyperException
 
 from polcap import __version__, terminal
 from polcap.cli.batch_command import batch
+from polcap.cli.board_command import board
 from polcap.cli.calibrate_command import calibrate
 from polcap.cli.capture_command import capture
 from polcap.cli.check_command import check
@@ -83,7 +85,8 @@ def _one_line(error: TyperException) -> str:
 
 
 COMMANDS = (
-    process, batch, export, show, status, report, check, settings, calibrate, doctor, synth, capture, train, evaluate,
+    process, batch, export, show, status, report, check, settings, calibrate, doctor, synth, board, capture,
+    train, evaluate,
 )  # fmt: skip
 app = typer.Typer(
     cls=OneLine,

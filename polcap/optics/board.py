@@ -20,7 +20,6 @@ from polcap.images import Bools, Floats
 
 SQUARES, RING = 8, 2  # squares along a side; width of the ring
 CELLS = 8  # along a square: a marker of 4 × 4 bits, its frame of one bit, and a margin of one bit
-_DICTIONARY = cv2.aruco.DICT_4X4_100
 _MARKERS = SQUARES**2 // 2  # of a board without a hole
 
 
@@ -54,12 +53,16 @@ BOARDS = {
 }
 
 
+def dictionary() -> cv2.aruco.Dictionary:
+    """The markers of all boards."""
+    return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
+
+
 def charuco(board: Board) -> cv2.aruco.CharucoBoard:
     """OpenCV's description of the board, as if it had no black middle."""
     ids = np.arange(board.first_marker, board.first_marker + _MARKERS)
-    size = (SQUARES, SQUARES)
-    dictionary = cv2.aruco.getPredefinedDictionary(_DICTIONARY)
-    return cv2.aruco.CharucoBoard(size, board.square_m, board.square_m * (CELLS - 2) / CELLS, dictionary, ids)
+    marker_m = board.square_m * (CELLS - 2) / CELLS
+    return cv2.aruco.CharucoBoard((SQUARES, SQUARES), board.square_m, marker_m, dictionary(), ids)
 
 
 @lru_cache

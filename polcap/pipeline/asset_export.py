@@ -20,7 +20,7 @@ from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.presets import PRESETS, ExportPreset, Format
 from polcap.formats.export.texture_set import Extra, Key, Texture
 from polcap.formats.maps import maps_folder
-from polcap.images import Asset, Mesh
+from polcap.images import Asset, ReliefMesh
 from polcap.stages import asset, surface
 
 _Writer = Callable[[], list[Path]]  # returns the files that it has written
@@ -50,7 +50,7 @@ class ExportSource:
     """The maps of a result, with the full mesh and asset made from them."""
 
     stored: maps_folder.StoredMaps
-    mesh: Mesh
+    mesh: ReliefMesh
     asset: Asset
     config: Config
 

@@ -26,8 +26,8 @@ from polcap.images import (
     ChartRequest,
     ColorCalibration,
     Decode,
-    Mesh,
     Network,
+    ReliefMesh,
     SurfaceMaps,
 )
 from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
@@ -110,6 +110,6 @@ def distance_m(color: ColorCalibration, radiance: AngleStack) -> float | None:
     return None if color.metres_per_px is None else color.metres_per_px * radiance.view.focal
 
 
-def remeshed(stored: SurfaceMaps, mesh: Mesh, settings: surface.SurfaceSettings) -> Mesh:
+def remeshed(stored: SurfaceMaps, mesh: ReliefMesh, settings: surface.SurfaceSettings) -> ReliefMesh:
     """Rebuild the mesh from the maps and depth as stored in maps/."""
     return surface.triangulate(maps_folder.stored_depth(stored, mesh), stored, mesh.metric, settings)

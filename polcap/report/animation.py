@@ -5,7 +5,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from polcap.images import Floats, Mesh, SurfaceMaps, View
+from polcap.images import Floats, ReliefMesh, SurfaceMaps, View
 from polcap.optics import color, frames, projection, shade
 from polcap.report.reduction import ObjectReduction
 from polcap.report.sheets import Picture
@@ -34,7 +34,7 @@ def light(maps: SurfaceMaps, ior: float) -> list[Picture]:
     return _to_srgb(drawn)
 
 
-def turntable(maps: SurfaceMaps, mesh: Mesh, ior: float) -> list[Picture]:
+def turntable(maps: SurfaceMaps, mesh: ReliefMesh, ior: float) -> list[Picture]:
     """Frames of the surface rotated to both sides and back, under a fixed light near the camera."""
     reduction = ObjectReduction(maps.mask & np.isfinite(mesh.depth), _OVERSAMPLING * _SIDE)
     small, depth = reduction.maps(maps), reduction.mean(mesh.depth)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import AngleStack, ColorCalibration, Cues, Floats, Mesh, SurfaceMaps, View
+from polcap.images import AngleStack, ColorCalibration, Cues, Floats, ReliefMesh, SurfaceMaps, View
 from polcap.optics import frames, shade
 from polcap.optics.resize import area_mean
 from polcap.report.reduction import ObjectReduction
@@ -28,7 +28,7 @@ class PageMaps:
     angle: Floats  # (K,) rad
 
 
-def reduce(maps: SurfaceMaps, mesh: Mesh, cues: Cues, angle: Floats, longest: int) -> PageMaps:
+def reduce(maps: SurfaceMaps, mesh: ReliefMesh, cues: Cues, angle: Floats, longest: int) -> PageMaps:
     """Reduce the maps of a result to at most `longest` pixels a side; means are taken over the object only."""
     reduction = ObjectReduction(np.asarray(maps.mask & cues.mask, bool), longest)
     light = np.maximum(frames.total(cues.radiance), 1e-6)

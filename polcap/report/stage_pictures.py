@@ -19,9 +19,9 @@ from polcap.images import (
     Cues,
     Floats,
     Gains,
-    Mesh,
     ObjectMask,
     Quality,
+    ReliefMesh,
     StokesImage,
     SurfaceMaps,
 )
@@ -104,7 +104,7 @@ def normal(found: SurfaceMaps) -> Picture:
     return _eight_bits((found.normal / 2 + 0.5) * found.mask[..., None])
 
 
-def shaded(mesh: Mesh, found: SurfaceMaps) -> Picture:
+def shaded(mesh: ReliefMesh, found: SurfaceMaps) -> Picture:
     """Picture of the shape without colors: the normals of the depth map under a light from the upper left."""
     inside = np.isfinite(mesh.depth)
     depth = np.where(inside, mesh.depth, np.nan)
@@ -216,7 +216,7 @@ def _maps(found: SurfaceMaps) -> list[Tile]:
     ]
 
 
-def _surface(mesh: Mesh, found: SurfaceMaps) -> list[Tile]:
+def _surface(mesh: ReliefMesh, found: SurfaceMaps) -> list[Tile]:
     """Pictures of the depth map and of its shaded shape."""
     inside = np.isfinite(mesh.depth)
     depth = mesh.depth * (1000.0 if mesh.metric else 1.0)

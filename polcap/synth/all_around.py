@@ -129,7 +129,7 @@ def _view(scene: Scene, shoot: AroundShoot, turn: Rotation, position: Floats, li
     vector = tuple(turn.as_rotvec(degrees=True).tolist())
     place = tuple((turn.apply([0.0, lift, 0.0]) + position).tolist())
     right = 0.5 * forward_camera.SENSOR_WIDTH_MM / shoot.focal_mm * shoot.distance_m - 0.053
-    chart = Chart(center=(right, 0.03 * shoot.distance_m, -shoot.distance_m))
+    chart = Chart(center=(right, 0.085 * shoot.distance_m, -shoot.distance_m))
     laid = LaidBoard(tuple(position.tolist()), vector, shoot.board)
     return msgspec.structs.replace(
         scene, turn_deg=vector, position=place, chart=chart, board=laid, cast_shadows=True, shadows=True

@@ -1,4 +1,4 @@
-"""Simulated board under the object: a flat, matt, unpolarized print."""
+"""Simulated board under the object: a flat, matt, unpolarized print, cut to a square as wide as its page."""
 
 from typing import Literal
 
@@ -11,7 +11,6 @@ from polcap.images import Floats
 from polcap.optics import board as boards
 
 _PAPER, _INK = 0.8, 0.03  # albedos
-_MARGIN = 0.5  # width of the paper around the print, in squares
 
 
 class LaidBoard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -41,6 +40,6 @@ def intersect(laid: LaidBoard, v: Floats) -> tuple[NDArray[np.integer], Floats, 
     distance = -(np.array(laid.position) @ normal) / (v[towards] @ normal)
     world = laid.turn.inv().apply(-v[towards] * distance[:, None] - laid.position)
     x, z = world[:, 0], world[:, 2]
-    on = (np.maximum(np.abs(x), np.abs(z)) < board.side_m / 2 + _MARGIN * board.square_m) & (distance > 0)
+    on = (np.maximum(np.abs(x), np.abs(z)) < board.page_m[0] / 2) & (distance > 0)
     albedo = np.where(boards.is_ink(board, x[on], z[on]), _INK, _PAPER)
     return towards[on], distance[on], np.repeat(albedo[:, None], 3, axis=1)

@@ -41,7 +41,7 @@ Indices = NDArray[np.integer[Any]]
 
 
 def trace_visibility(
-    tracer: Tracer, buffer: GBuffer, pose: light_transport.Pose, rng: np.random.Generator
+    tracer: Tracer, buffer: GBuffer, pose: light_transport.LitPose, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint16]]:
     """Trace one view.
 
@@ -95,7 +95,7 @@ def _draw_directions(normal: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _find_pixels(
-    place: Floats, origin: Indices, buffer: GBuffer, pose: light_transport.Pose, size: float
+    place: Floats, origin: Indices, buffer: GBuffer, pose: light_transport.LitPose, size: float
 ) -> NDArray[np.uint16]:
     """Flat index of the pixel in which the camera sees each place (N, 3) that a bounce ray hits.
 

@@ -57,7 +57,7 @@ class Case:
 class _Subject:
     """Geometry and material of one evaluation picture, before light is simulated."""
 
-    pose: light_transport.Pose
+    pose: light_transport.LitPose
     places: light_transport.SurfacePoints
     albedo: light_transport.Albedo
     truth: SurfaceMaps
@@ -115,7 +115,7 @@ class Protocol:
                 break
         inside = buffer.mask
         middle, unit = traced_views.depth_unit(inside, buffer.depth, view.focal)
-        pose = light_transport.Pose(turn, translation, np.array([0, FLASH * middle, 0]), middle**2)
+        pose = light_transport.LitPose(turn, translation, np.array([0, FLASH * middle, 0]), middle**2)
         frame, shift = random_shapes.rotation(rng), rng.uniform(-0.5, 0.5, 3)  # of the material's pattern
         position, v = buffer.position[inside].astype(np.float64), frames.rays(view, size, size)[inside]
 

@@ -28,7 +28,7 @@ Albedo = Callable[[Floats, Floats], Floats]  # places, facing directions (M, 3) 
 
 
 @dataclass(frozen=True)
-class Pose:
+class LitPose:
     """Position of mesh and flash in the camera frame: point = rotation @ vertex + translation."""
 
     rotation: Floats  # (3, 3)
@@ -58,7 +58,7 @@ class SurfacePoints:
         return replace(self, **taken)
 
 
-def flash_light(tracer: Tracer, place: Floats, flat: Floats, pose: Pose) -> tuple[Floats, Floats]:
+def flash_light(tracer: Tracer, place: Floats, flat: Floats, pose: LitPose) -> tuple[Floats, Floats]:
     """Direct flash light at points of a mesh: unit vectors to the flash (M, 3), and irradiance (M,), 0 in shadow.
 
     Mesh frame; the irradiance is S0 of a white plane that faces the flash.
@@ -71,7 +71,7 @@ def flash_light(tracer: Tracer, place: Floats, flat: Floats, pose: Pose) -> tupl
     return to_flash, np.where(hidden, 0, pose.strength / far**2)
 
 
-def stokes(tracer: Tracer, places: SurfacePoints, pose: Pose, albedo: Albedo, rng: np.random.Generator) -> Floats:
+def stokes(tracer: Tracer, places: SurfacePoints, pose: LitPose, albedo: Albedo, rng: np.random.Generator) -> Floats:
     """Stokes parameters (3, M, 3) of a mesh under the flash, with shadows and one bounce, in the frame of each ray."""
     to_flash, irradiance = flash_light(tracer, places.position, places.flat, pose)
     toward = frames.to_ray_frame(to_flash @ pose.rotation.T, places.rays)
@@ -90,7 +90,7 @@ def _shade(
 class IndirectLight:
     """Flash light that reaches visible places of a mesh by one bounce on its other parts."""
 
-    def __init__(self, tracer: Tracer, places: SurfacePoints, pose: Pose, albedo: Albedo) -> None:
+    def __init__(self, tracer: Tracer, places: SurfacePoints, pose: LitPose, albedo: Albedo) -> None:
         self.tracer, self.places, self.pose, self.albedo = tracer, places, pose, albedo
 
     def diffuse(self, rng: np.random.Generator) -> Floats:

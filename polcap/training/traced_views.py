@@ -157,7 +157,7 @@ def _store(
     arrays: Mapping[str, NDArray[Any]],
     index: int,
     buffer: GBuffer,
-    pose: light_transport.Pose,
+    pose: light_transport.LitPose,
     lit: NDArray[np.bool_],
     met: NDArray[np.uint16],
 ) -> None:
@@ -206,7 +206,7 @@ def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[fl
 
 def _trace_shape(
     number: int, meshes: list[Path], recipe: ViewsRecipe
-) -> Iterator[tuple[GBuffer, light_transport.Pose, NDArray[np.bool_], NDArray[np.uint16]]]:
+) -> Iterator[tuple[GBuffer, light_transport.LitPose, NDArray[np.bool_], NDArray[np.uint16]]]:
     """Each view of a mesh or random shape, the places of mesh and flash, and the result of `trace_visibility`."""
     if number < len(meshes):
         path = meshes[number]
@@ -222,7 +222,7 @@ def _trace_shape(
         way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, _MAX_OFFSET)
         offset = (off * np.cos(way), off * np.sin(way)) if recipe.flash is None else recipe.flash
         middle = float(buffer.depth[buffer.mask].mean(dtype=np.float64))
-        pose = light_transport.Pose(rotation, translation, middle * np.array([*offset, 0.0]), middle**2)
+        pose = light_transport.LitPose(rotation, translation, middle * np.array([*offset, 0.0]), middle**2)
         yield buffer, pose, *bounced_light.trace_visibility(tracer, buffer, pose, rng)
 
 

@@ -25,7 +25,7 @@ from polcap.formats.export.encoders import TextureEncoder
 from polcap.formats.export.presets import PRESETS, ExportPreset
 from polcap.formats.maps import maps_folder
 from polcap.formats.raw import worker
-from polcap.images import Asset, Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
+from polcap.images import Asset, Cues, Floats, ReliefMesh, StokesImage, SurfaceMaps, View
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.asset_export import ExportRequest
 from polcap.stages import asset, surface
@@ -109,7 +109,7 @@ def enlarged(values: Floats, side: int) -> Floats:
     return np.asarray(cv2.resize(np.asarray(values, np.float32), (side, side), interpolation=cv2.INTER_LINEAR))
 
 
-def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, noise: Floats) -> None:
+def write(folder: Path, maps: SurfaceMaps, mesh: ReliefMesh, noise: Floats) -> None:
     size = noise.shape
     stokes = StokesImage(
         stokes=np.stack([np.stack([maps.diffuse + noise[..., None]] * 3)[k] / 3 for k in range(3)]),

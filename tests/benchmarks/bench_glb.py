@@ -20,9 +20,9 @@ from polcap.config import Config
 from polcap.formats.export import gltf
 from polcap.images import Asset, Floats, Mesh
 from polcap.optics import frames
+from polcap.optics.texture_rasterizer import rasterize_frames
 from polcap.pipeline import asset_export
 from polcap.pipeline.asset_export import ExportRequest
-from polcap.stages.asset.texture_rasterizer import rasterize_frames
 
 CASES = {
     "float": ExportRequest(formats=("gltf",), geometry="float"),
@@ -91,7 +91,7 @@ def read(data: bytes, mesh: Mesh) -> Mesh:
 
 def rendered(mesh: Mesh, asset: Asset) -> Floats:
     """Normals (H, W, 3) of a renderer; NaN where no triangle is."""
-    frame, covered = rasterize_frames(mesh, *mesh.depth.shape)
+    frame, covered = rasterize_frames(mesh, *asset.normal.shape[:2])
     texture = cv2.resize(asset.normal, covered.shape[::-1])[covered] / np.float32(127.5) - 1
     n, t = frames.unit(frame[:, :3]), frames.unit(frame[:, 3:6])
     out = np.full((*covered.shape, 3), np.nan, np.float32)

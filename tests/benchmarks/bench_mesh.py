@@ -22,7 +22,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from polcap.images import Floats, Mesh, SurfaceMaps, View
+from polcap.images import Floats, ReliefMesh, SurfaceMaps, View
 from polcap.optics import frames
 from polcap.stages import surface
 from polcap.stages.surface.occlusion import least_step
@@ -80,13 +80,13 @@ def row(name: str, of: Case, noise: bool) -> str:
     )
 
 
-def timed(maps: SurfaceMaps, settings: surface.SurfaceSettings) -> tuple[Mesh, float]:
+def timed(maps: SurfaceMaps, settings: surface.SurfaceSettings) -> tuple[ReliefMesh, float]:
     start = time.process_time()
     mesh = surface.integrate(maps, None, settings)
     return mesh, time.process_time() - start
 
 
-def error(mesh: Mesh, of: Case) -> float:
+def error(mesh: ReliefMesh, of: Case) -> float:
     """RMS after the best scale, over the depth range."""
     inside = of.maps.mask & np.isfinite(mesh.depth)
     ours, true = mesh.depth[inside].astype(np.float64), of.depth[inside].astype(np.float64)
@@ -116,7 +116,7 @@ def true_pieces(of: Case) -> int:
     ).pieces
 
 
-def mesh_rim(mesh: Mesh, of: Case) -> Floats:
+def mesh_rim(mesh: ReliefMesh, of: Case) -> Floats:
     """Middles (B, 2) of the mesh's boundary edges, x, y px."""
     height, width = of.maps.mask.shape
     rim = boundary_edges(mesh.faces)
@@ -124,7 +124,7 @@ def mesh_rim(mesh: Mesh, of: Case) -> Floats:
     return np.asarray((place[rim[:, 0]] + place[rim[:, 1]]) / 2)
 
 
-def slits(mesh: Mesh, of: Case) -> float:
+def slits(mesh: ReliefMesh, of: Case) -> float:
     """Boundary edges far from outline and true contours."""
     mask = of.maps.mask
     far = cv2.distanceTransform((mask & ~contours(of)).astype(np.uint8), cv2.DIST_L2, 5)
@@ -134,7 +134,7 @@ def slits(mesh: Mesh, of: Case) -> float:
     return float((np.minimum(far, edge)[y, x] > NEAR).sum())
 
 
-def cut_share(mesh: Mesh, of: Case) -> float:
+def cut_share(mesh: ReliefMesh, of: Case) -> float:
     """Share of the true contours' pixels that have an edge of the mesh within `NEAR` px; the outline's own left out."""
     mask = of.maps.mask
     inner = cv2.erode(np.pad(mask.astype(np.uint8), 1), np.ones((4 * NEAR + 1,) * 2, np.uint8))[1:-1, 1:-1] > 0

@@ -22,7 +22,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from polcap.images import Floats, Mesh, SurfaceMaps, View
+from polcap.images import Floats, ReliefMesh, SurfaceMaps, View
 from polcap.stages import surface
 from polcap.stages.surface.slope_equations import normal_field, slope_terms
 
@@ -65,12 +65,12 @@ def scan(folder: Path) -> tuple[SurfaceMaps, Floats]:
         return maps, np.where(mask, stored["depth_gt"].astype(np.float64), np.nan)
 
 
-def timed_error(work: Callable[[], Mesh | Floats], truth: Floats) -> tuple[float, float]:
+def timed_error(work: Callable[[], ReliefMesh | Floats], truth: Floats) -> tuple[float, float]:
     """Mean absolute error after the median scale [mm], and CPU seconds."""
     start = time.process_time()
     result = work()
     seconds = time.process_time() - start
-    depth = result.depth if isinstance(result, Mesh) else result
+    depth = result.depth if isinstance(result, ReliefMesh) else result
     return mean_error(depth, truth), seconds
 
 

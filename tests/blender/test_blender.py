@@ -9,7 +9,7 @@ import pytest
 
 from polcap.formats.export import encoders, gltf, obj, texture_set, usd
 from polcap.formats.export.glb_geometry import Geometry
-from polcap.images import Floats, Mesh, SurfaceMaps
+from polcap.images import Floats, ReliefMesh, SurfaceMaps
 from tests import surfaces
 from tests.blender import session
 from tests.conftest import ROOT
@@ -35,12 +35,12 @@ def maps() -> SurfaceMaps:
 
 
 @pytest.fixture(scope="module")
-def mesh() -> Mesh:
+def mesh() -> ReliefMesh:
     return surfaces.mesh(surfaces.maps())
 
 
 @pytest.fixture(scope="module")
-def answers(maps: SurfaceMaps, mesh: Mesh, tmp_path_factory: pytest.TempPathFactory) -> Answers:
+def answers(maps: SurfaceMaps, mesh: ReliefMesh, tmp_path_factory: pytest.TempPathFactory) -> Answers:
     session.require()
     pytest.importorskip("pxr", reason="needs usd-core")
     folder, built = tmp_path_factory.mktemp("blender"), surfaces.built(maps, mesh)
@@ -57,7 +57,7 @@ def answers(maps: SurfaceMaps, mesh: Mesh, tmp_path_factory: pytest.TempPathFact
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_upright_and_of_the_right_size(answers: Answers, mesh: Mesh, case: str) -> None:
+def test_upright_and_of_the_right_size(answers: Answers, mesh: ReliefMesh, case: str) -> None:
     seen = answers[case]["vertices"]
     truth = mesh.vertices - gltf.center(mesh.vertices)
     assert np.allclose([seen.min(0), seen.max(0)], [truth.min(0), truth.max(0)], atol=1e-5)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from polcap.formats.export import gltf
-from polcap.images import Floats, Mesh, View
+from polcap.images import Floats, ReliefMesh, View
 
 HERE = Path(__file__).parent
 MODULES = HERE.parent / "gltf" / "node_modules"
@@ -31,7 +31,7 @@ class Job:
 
     name: str
     file: Path
-    mesh: Mesh
+    mesh: ReliefMesh
     view: View
     lights: tuple[tuple[float, float, float] | None, ...]
 

@@ -8,8 +8,8 @@ from scipy import ndimage
 
 from polcap.images import Asset, Floats, SurfaceMaps
 from polcap.optics import color
+from polcap.optics.texture_rasterizer import rasterize_frames
 from polcap.stages import asset, surface
-from polcap.stages.asset.texture_rasterizer import rasterize_frames
 from tests import surfaces
 
 

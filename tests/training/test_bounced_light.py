@@ -30,7 +30,7 @@ def _both(turn: Floats) -> tuple[Floats, Floats]:
     translation, view = np.array([0, 0, -4.0]), View(3.3 * SIZE, ((SIZE - 1) / 2, (SIZE - 1) / 2), 1.0)
     scene = Tracer(mesh)
     buffer = scene.trace(turn, translation, view, SIZE, SIZE)
-    pose, mask = light_transport.Pose(turn, translation, np.zeros(3), 16.0), buffer.mask
+    pose, mask = light_transport.LitPose(turn, translation, np.zeros(3), 16.0), buffer.mask
     lit, met = bounced_light.trace_visibility(scene, buffer, pose, np.random.default_rng(1))
     middle, unit = traced_views.depth_unit(mask, buffer.depth, view.focal)
     camera = np.array([[view.focal, *view.center, middle, unit, *turn.reshape(-1), 0, 0]], np.float32)

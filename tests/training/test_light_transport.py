@@ -18,7 +18,7 @@ def _sphere() -> Triangles:
 
 def _inside(
     roughness: float, specular: float, ior: float
-) -> tuple[Tracer, light_transport.SurfacePoints, light_transport.Pose]:
+) -> tuple[Tracer, light_transport.SurfacePoints, light_transport.LitPose]:
     """Places inside a sphere, each seen along its normal; the flash in the middle."""
     scene = Tracer(_sphere())
     rng = np.random.default_rng(3)
@@ -30,7 +30,7 @@ def _inside(
         np.ones((20, 20), bool), out * distance[:, None], flat, np.tile([0.0, 0.0, 1.0], (len(out), 1)), -out,
         _ALBEDO * one, specular * one, np.full(len(out), roughness), ior,
     )  # fmt: skip
-    pose = light_transport.Pose(np.eye(3), np.zeros(3), np.zeros(3), _RADIUS**2)  # irradiance 1 everywhere
+    pose = light_transport.LitPose(np.eye(3), np.zeros(3), np.zeros(3), _RADIUS**2)  # irradiance 1 everywhere
     return scene, places, pose
 
 
@@ -62,7 +62,7 @@ def test_flash_casts_shadows() -> None:
     scene = Tracer(mesh)
     x = np.linspace(-0.2, 0.2, 201)
     place = np.stack([x, 0 * x, np.sqrt(0.25 - x**2)], axis=1)
-    pose = light_transport.Pose(np.eye(3), np.zeros(3), np.array([0, 0, 2.0]), 1.0)
+    pose = light_transport.LitPose(np.eye(3), np.zeros(3), np.array([0, 0, 2.0]), 1.0)
     _, irradiance = light_transport.flash_light(scene, place, place / 0.5, pose)
     cone = np.tan(np.arcsin(0.05 / 1.2))
     dark = np.abs(x) < cone * (2 - place[:, 2])

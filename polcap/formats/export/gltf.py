@@ -1,7 +1,7 @@
 """Writes an asset as binary glTF 2.0 (GLB).
 
 The camera frame is that of glTF: right-handed, y up, the viewer on +z, metres. The object is moved
-to the origin; its place in the camera frame is in `asset.extras`. The provenance is in an XMP packet.
+to the origin; its place in the mesh's frame is in `asset.extras`. The provenance is in an XMP packet.
 
 References
 ----------
@@ -108,7 +108,7 @@ def encode(
             "extras": {
                 "unit": "metre" if asset.mesh.metric else "relative",
                 "albedo": maps_folder.albedo_scale(asset.albedo_sigma),
-                "origin_in_camera": origin.tolist(),
+                f"origin_in_{asset.mesh.frame}": origin.tolist(),
                 "pieces": asset.mesh.pieces,
                 "cuts": asset.mesh.cuts,
                 "cut_px": asset.mesh.cut_px,

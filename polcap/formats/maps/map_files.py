@@ -7,18 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.formats.maps import png
-from polcap.images import Cues, Floats, Mesh, StokesImage, SurfaceMaps
+from polcap.images import Cues, Floats, ReliefMesh, StokesImage, SurfaceMaps
 from polcap.optics import color
 
 Source = Literal["maps", "mesh", "stokes", "cues"]
 
 
-def object_depth(maps: SurfaceMaps, mesh: Mesh) -> Floats:
+def object_depth(maps: SurfaceMaps, mesh: ReliefMesh) -> Floats:
     """Depth map (H, W) of the mesh on the object's pixels, 0 outside."""
     return np.where(inside(maps) & np.isfinite(mesh.depth), mesh.depth, 0.0).astype(np.float32)
 
 
-def depth_range(maps: SurfaceMaps, mesh: Mesh) -> tuple[float, float, float]:
+def depth_range(maps: SurfaceMaps, mesh: ReliefMesh) -> tuple[float, float, float]:
     """Least, median and greatest depth of the mesh on the object."""
     depth = object_depth(maps, mesh)
     seen = depth[depth > 0]
@@ -26,7 +26,7 @@ def depth_range(maps: SurfaceMaps, mesh: Mesh) -> tuple[float, float, float]:
     return near, median, far
 
 
-def _depth_picture(maps: SurfaceMaps, mesh: Mesh) -> NDArray[np.uint16]:
+def _depth_picture(maps: SurfaceMaps, mesh: ReliefMesh) -> NDArray[np.uint16]:
     near, _, far = depth_range(maps, mesh)
     depth = object_depth(maps, mesh)
     return png.sixteen_bits(np.where(depth > 0, (depth - near) / max(far - near, 1e-9), 0))

@@ -16,7 +16,7 @@ from polcap import parallel
 from polcap.errors import DecodeError
 from polcap.formats import atomic, text_file
 from polcap.formats.maps import exr, map_files, png
-from polcap.images import Cues, Floats, Mesh, StokesImage, SurfaceMaps, View
+from polcap.images import Cues, Floats, ReliefMesh, StokesImage, SurfaceMaps, View
 
 CONVENTIONS = {
     "frame": "camera: x right, y up, z toward the camera; a normal facing the camera is (0, 0, 1)",
@@ -75,7 +75,7 @@ class StoredMaps:
     metric: bool
 
 
-def write(folder: Path, maps: SurfaceMaps, mesh: Mesh, stokes: StokesImage, cues: Cues) -> None:
+def write(folder: Path, maps: SurfaceMaps, mesh: ReliefMesh, stokes: StokesImage, cues: Cues) -> None:
     """Write the folder maps/ of a result: every map as EXR, the main ones as PNG too, and maps.json.
 
     Of the mesh its depth (H, W) is written. All images are on the crop (H, W) of `maps`. Files are encoded on
@@ -121,7 +121,7 @@ def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
     )
 
 
-def stored_depth(maps: SurfaceMaps, mesh: Mesh) -> Floats:
+def stored_depth(maps: SurfaceMaps, mesh: ReliefMesh) -> Floats:
     """The mesh's depth (H, W) as `read` returns it after `write`; NaN outside the mask."""
     return np.where(map_files.inside(maps), map_files.object_depth(maps, mesh), np.nan).astype(np.float32)
 

@@ -14,12 +14,12 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from polcap.images import Asset, Floats, Mesh, SurfaceMaps, TexturePixels
+from polcap.images import Asset, Floats, Mesh, SurfaceMaps, TextureMaps, TexturePixels
 from polcap.optics import color, frames, fresnel
 from polcap.optics.resize import area_mean
+from polcap.optics.texture_rasterizer import rasterize_frames
 from polcap.stages import stage
 from polcap.stages.asset.ambient_occlusion import ambient_occlusion
-from polcap.stages.asset.texture_rasterizer import rasterize_frames
 
 Bits = Literal[8, 16]  # of a texture's channel
 _EXTRAS = ("displacement", "object_normal")
@@ -38,8 +38,8 @@ class AssetSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @stage(version=4, keep=False)
-def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings, bits: Bits = 8) -> Asset:
-    """Build the object's glTF textures (H, W, 3) on the crop's grid, filled outwards so that no seam shows.
+def build(maps: TextureMaps, mesh: Mesh, settings: AssetSettings, bits: Bits = 8) -> Asset:
+    """Build the object's glTF textures (H, W, 3) on the maps' grid, filled outwards so that no seam shows.
 
     Our material has a diffuse term behind two Fresnel transmissions, glTF's has base·(1 − F). With base =
     ρ_d T₊(0)²/(1 − F0) both agree for a frontal surface. F0 is the index's own × factor × texture, and the factor holds
@@ -81,7 +81,7 @@ def _with_detail(albedo: Floats, detail: Floats, bits: Bits) -> TexturePixels:
     return np.asarray(cv2.merge(planes))
 
 
-def with_mesh(asset: Asset, maps: SurfaceMaps, mesh: Mesh) -> Asset:
+def with_mesh(asset: Asset, maps: TextureMaps, mesh: Mesh) -> Asset:
     """A copy of the asset with another mesh of the same maps, and the normal texture that fits this mesh."""
     return replace(asset, mesh=mesh, normal=_as(asset.normal, tangent_space(maps, mesh) / 2 + 0.5))
 
@@ -156,7 +156,7 @@ def fill_outward(value: Any, known: NDArray[np.bool_]) -> Any:
     return out.reshape(value.shape)
 
 
-def tangent_space(maps: SurfaceMaps, mesh: Mesh) -> Floats:
+def tangent_space(maps: TextureMaps, mesh: Mesh) -> Floats:
     """Tangent-space normals, (H, W, 3) unit, z > 0: the maps' normals in the mesh's frames, x t + y b + z n.
 
     The mesh shades with its own normals, so the texture holds the difference to the maps' only.

@@ -16,8 +16,9 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import ObjectError
-from polcap.images import Floats, Mesh, SurfaceMaps
+from polcap.images import Floats, ReliefMesh, SurfaceMaps
 from polcap.optics.projection import back_project
+from polcap.optics.vertex_frames import vertex_frames
 from polcap.stages import stage
 from polcap.stages.surface import triangles
 from polcap.stages.surface.decimation import DecimatedMesh, decimate
@@ -63,7 +64,7 @@ class SurfaceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @stage(version=13)
-def integrate(maps: SurfaceMaps, distance_m: float | None, settings: SurfaceSettings) -> Mesh:
+def integrate(maps: SurfaceMaps, distance_m: float | None, settings: SurfaceSettings) -> ReliefMesh:
     """Integrate normals to the visible surface of the object: depth and mesh.
 
     The median depth is `distance_m`, the object's distance along the optical axis [m], or 1 where it is unknown.
@@ -84,7 +85,7 @@ def integrate(maps: SurfaceMaps, distance_m: float | None, settings: SurfaceSett
     return triangulate(depth, maps, distance_m is not None, settings)
 
 
-def triangulate(depth: Floats, maps: SurfaceMaps, metric: bool, settings: SurfaceSettings) -> Mesh:
+def triangulate(depth: Floats, maps: SurfaceMaps, metric: bool, settings: SurfaceSettings) -> ReliefMesh:
     """Make the mesh of a depth map (H, W), in metres or relative; also for an export from stored maps.
 
     Raises
@@ -105,8 +106,8 @@ def triangulate(depth: Floats, maps: SurfaceMaps, metric: bool, settings: Surfac
     place, z_smooth = triangles.smooth_boundary(pixel.astype(np.float64), z[y, x], faces, step)
     vertices = back_project(maps.view, place[:, 0], place[:, 1]) * np.exp(z_smooth / maps.view.focal)[:, None]
     uv: Floats = (place + 0.5) / [width, height]
-    normals, tangents = triangles.vertex_frames(vertices, uv, faces)
-    mesh = Mesh(
+    normals, tangents = vertex_frames(vertices, uv, faces)
+    mesh = ReliefMesh(
         vertices=vertices,
         normals=normals,
         uv=uv,

@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from polcap.errors import ObjectError
-from polcap.images import Floats, Mesh, View
+from polcap.images import Floats, ReliefMesh, View
 from polcap.optics.projection import project
-from polcap.stages.surface.triangles import Back, face_areas, vertex_frames
+from polcap.optics.vertex_frames import vertex_frames
+from polcap.stages.surface.triangles import Back, face_areas
 
 _FEWEST = 16  # triangles
 _MEASURED = 20_000  # vertices, at most, of which the distance is measured
@@ -22,12 +23,12 @@ _MEASURED = 20_000  # vertices, at most, of which the distance is measured
 class DecimatedMesh:
     """A mesh with fewer triangles, and its distance from the full mesh."""
 
-    mesh: Mesh
+    mesh: ReliefMesh
     error: float  # 99th percentile of the first mesh's vertices from this surface, in the mesh's unit of length
     error_px: float  # the same in px of the maps, at the object's median depth
 
 
-def decimate(mesh: Mesh, view: View, count: int, back: Back) -> DecimatedMesh:
+def decimate(mesh: ReliefMesh, view: View, count: int, back: Back) -> DecimatedMesh:
     """Reduce a mesh to about `count` triangles; texture coordinates are those of the camera's view.
 
     `back` is the setting the mesh was made with: triangles that turn away from the camera are left out of an open one.
@@ -65,7 +66,7 @@ def decimate(mesh: Mesh, view: View, count: int, back: Back) -> DecimatedMesh:
     return DecimatedMesh(coarser, error, error * view.focal / float(np.nanmedian(mesh.depth)))
 
 
-def _distance(first: Mesh, coarser: Mesh) -> float:
+def _distance(first: ReliefMesh, coarser: ReliefMesh) -> float:
     """Distance of a decimated mesh from the full one: 99th percentile over the full mesh's vertices.
 
     Measured to the plane of the nearest triangle.

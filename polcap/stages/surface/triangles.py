@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats, Mesh
-from polcap.optics.frames import cross, dot
+from polcap.images import Floats, ReliefMesh
 from polcap.stages.surface.occlusion import depth_steps, least_step
 from polcap.stages.surface.slope_equations import Bools, NormalField, slope_terms
 
@@ -179,33 +178,7 @@ def face_areas(place: Floats, faces: Faces) -> Floats:
     return np.asarray(one[:, 1] * two[:, 0] - one[:, 0] * two[:, 1])
 
 
-def vertex_frames(vertices: Floats, uv: Floats, faces: Faces) -> tuple[Floats, Floats]:
-    """Normals (V, 3) and tangents (V, 4) of mesh vertices: unit, area-weighted means over the triangles around.
-
-    A tangent is ∂P/∂u made square to the normal. v runs down the picture and the normal texture's +Y runs up, so the
-    handedness w of glTF's bitangent w (n × t) is 1.
-    """
-    one, two = (vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2))
-    (u1, v1), (u2, v2) = ((uv[faces[:, k]] - uv[faces[:, 0]]).T for k in (1, 2))
-    area = cross(one, two)
-    along = (one * v2[:, None] - two * v1[:, None]) * np.sign(u1 * v2 - u2 * v1)[:, None]
-    normals = _unit(_sum_around(area, faces, len(vertices)))
-    tangents = _sum_around(along, faces, len(vertices))
-    tangents = _unit(tangents - normals * dot(normals, tangents)[:, None])
-    return normals, np.concatenate([tangents, np.ones((len(vertices), 1))], axis=-1)
-
-
-def _sum_around(values: Floats, faces: Faces, count: int) -> Floats:
-    """Sums (V, 3) of values (F, 3) over the triangles around each vertex."""
-    corner = faces.ravel()
-    return np.stack([np.bincount(corner, np.repeat(values[:, k], 3), count) for k in range(3)], axis=-1)
-
-
-def _unit(vector: Floats) -> Floats:
-    return np.asarray(vector / np.maximum(np.sqrt(dot(vector, vector)), 1e-30)[..., None])
-
-
-def add_back(front: Mesh, back: Back) -> Mesh:
+def add_back(front: ReliefMesh, back: Back) -> ReliefMesh:
     """Add a back to a mesh: walls straight back to a plane ("skirt"), or walls and that plane ("closed").
 
     The added vertices repeat the texture of those in front of them; nothing of the back was photographed.
@@ -231,7 +204,7 @@ def add_back(front: Mesh, back: Back) -> Mesh:
     )
 
 
-def to_float32(mesh: Mesh) -> Mesh:
+def to_float32(mesh: ReliefMesh) -> ReliefMesh:
     """Convert a mesh to float32.
 
     Vertices are multiples of 2⁻²³ of the greatest coordinate, so that moving them and back is exact.

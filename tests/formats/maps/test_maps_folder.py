@@ -12,7 +12,7 @@ import pytest
 from polcap.errors import DecodeError, StorageError
 from polcap.formats.maps import exr, png, result_maps
 from polcap.formats.maps import maps_folder as maps
-from polcap.images import ColorCalibration, Cues, Mesh, StokesImage, SurfaceMaps
+from polcap.images import ColorCalibration, Cues, ReliefMesh, StokesImage, SurfaceMaps
 from polcap.stages import cues
 from tests import surfaces
 
@@ -22,7 +22,7 @@ FILES = {
     "cues.exr", "photograph.png", "maps.json",
 }  # fmt: skip
 
-Result = tuple[SurfaceMaps, Mesh, StokesImage, Cues]
+Result = tuple[SurfaceMaps, ReliefMesh, StokesImage, Cues]
 
 
 @pytest.fixture(scope="module")

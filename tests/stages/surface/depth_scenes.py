@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from polcap.images import Floats, Mesh, SurfaceMaps, View
+from polcap.images import Floats, ReliefMesh, SurfaceMaps, View
 
 VIEW = View(focal=400.0, center=(63.5, 55.5), scale=2.0)
 SHAPE = (112, 128)
@@ -59,7 +59,7 @@ def from_depth(d: Floats, view: View = VIEW) -> Floats:
     return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
 
 
-def error_share(mesh: Mesh, truth: Floats, mask: NDArray[np.bool_]) -> float:
+def error_share(mesh: ReliefMesh, truth: Floats, mask: NDArray[np.bool_]) -> float:
     """RMSE after the best scale, over the depth range."""
     d, t = mesh.depth[mask].astype(np.float64), truth[mask]
     scale = (d @ t) / (d @ d)

@@ -1,4 +1,6 @@
-"""Rasterization of a mesh onto its texture: vertex frames interpolated at each pixel."""
+"""Rasterization of a mesh onto its texture: the triangle at each pixel, and values interpolated there."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,16 +10,37 @@ from polcap.images import Floats, Mesh
 _SLACK = 1e-4  # px and barycentric coordinates by which a pixel may miss a triangle, so that none falls between two
 
 
-def rasterize_frames(mesh: Mesh, height: int, width: int) -> tuple[Floats, NDArray[np.bool_]]:
-    """Interpolate a mesh's normals and tangents at pixels.
+@dataclass(frozen=True)
+class TexturePoints:
+    """Points of a mesh at the N covered pixels of its texture."""
 
-    (N, 7) at the N covered pixels, and the covered mask (H, W).
+    corners: NDArray[np.int32]  # (N, 3) vertices of the triangle
+    weights: Floats  # (N, 2) of the second and of the third corner
+    covered: NDArray[np.bool_]  # (H, W)
+
+    def interpolate(self, value: Floats) -> Floats:
+        """Values (N, C) at the pixels, from those (V, C) of the vertices."""
+        w1, w2 = self.weights.T[..., None]
+        out = value[self.corners[:, 0]] * (1 - w1 - w2)
+        out += value[self.corners[:, 1]] * w1
+        out += value[self.corners[:, 2]] * w2
+        return np.asarray(out)
+
+
+def rasterize_frames(mesh: Mesh, height: int, width: int) -> tuple[Floats, NDArray[np.bool_]]:
+    """A mesh's normals and tangents (N, 7), interpolated at the covered pixels, and the mask (H, W) of these."""
+    points = rasterize(mesh.uv, mesh.faces, height, width)
+    return points.interpolate(np.concatenate([mesh.normals, mesh.tangents], axis=-1, dtype=np.float32)), points.covered
+
+
+def rasterize(uv: Floats, faces: NDArray[np.int32], height: int, width: int) -> TexturePoints:
+    """Find the triangle (faces (F, 3), with texture coordinates uv (V, 2)) at each pixel of a texture.
 
     Only triangles that face the camera count: walls and back have no part of the texture. Where several cover a pixel
     the last one counts.
     """
-    place = mesh.uv * np.array([width, height]) - 0.5
-    corner = place[mesh.faces]  # (F, 3, 2) x, y [px]
+    place = uv * np.array([width, height]) - 0.5
+    corner = place[faces]  # (F, 3, 2) x, y [px]
     one, two = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     area = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
     facing = np.flatnonzero(area < 0)  # v runs down
@@ -43,10 +66,4 @@ def rasterize_frames(mesh: Mesh, height: int, width: int) -> tuple[Floats, NDArr
             owner[pixel] = f
             weights[pixel, 0], weights[pixel, 1] = w1[hit], w2[hit]
     covered = owner >= 0
-    corners = mesh.faces[facing][owner[covered]]  # (N, 3)
-    w1, w2 = weights[covered].T[..., None]
-    value = np.concatenate([mesh.normals, mesh.tangents], axis=-1, dtype=np.float32)
-    out = value[corners[:, 0]] * (1 - w1 - w2)
-    out += value[corners[:, 1]] * w1
-    out += value[corners[:, 2]] * w2
-    return out, covered.reshape(height, width)
+    return TexturePoints(faces[facing][owner[covered]], weights[covered], covered.reshape(height, width))

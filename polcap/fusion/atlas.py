@@ -1,0 +1,107 @@
+"""Texture atlas of a closed mesh: charts without overlap, and the surface point of each texel.
+
+References
+----------
+uvunwrap (segmentation into charts of low distortion, packing by shape).
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from polcap.errors import ObjectError, SettingError
+from polcap.fusion.values import ClosedMesh, FusionView
+from polcap.images import Bools, Floats, Mesh
+from polcap.optics import frames
+from polcap.optics.texture_rasterizer import rasterize
+from polcap.optics.vertex_frames import vertex_normals, vertex_tangents
+from polcap.stages import stage
+
+_FILLED = 0.6  # share of the texture that charts cover, about; uvunwrap reaches .55 to .63
+_SIDES = (256, 4096)  # px, least and greatest side of a texture whose size is not set
+
+
+class AtlasSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Settings of the stage `atlas` of the fusion."""
+
+    size: Annotated[int, Meta(ge=0, le=8192, description="side of the textures; 0: a texel is one map pixel [px]")] = 0
+    margin: Annotated[int, Meta(ge=1, le=32, description="distance between charts, filled from their borders [px]")] = 6
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """A closed mesh with texture coordinates, and the surface points of the N texels that it covers."""
+
+    mesh: Mesh  # board frame; vertices on the charts' borders are repeated
+    covered: Bools  # (S, S) texels with a surface point
+    position: Floats  # (N, 3) m, board frame
+    normal: Floats  # (N, 3) unit, of the mesh
+
+    @property
+    def texel(self) -> float:
+        """Side of a texel on the surface, m."""
+        corner = self.mesh.vertices[self.mesh.faces]
+        area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1).sum() / 2
+        return float(np.sqrt(area / max(len(self.position), 1)))
+
+
+@stage(version=1)
+def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSettings) -> Atlas:
+    """Cut a closed mesh into charts, and pack them into a square texture.
+
+    Without a set size, its side is the power of two for which a texel is nearest to a pixel of the views' maps.
+
+    Raises
+    ------
+    SettingError
+        The package uvunwrap is missing, or the charts do not fit into a texture of this size.
+    """
+    side = settings.size or _side(mesh, views)
+    uv, corner, faces = _charts(mesh, side, settings.margin)
+    normals = vertex_normals(mesh.vertices.astype(np.float64), mesh.faces)[corner]
+    vertices = mesh.vertices[corner].astype(np.float64)
+    points = rasterize(uv, faces, side, side)
+    unwrapped = Mesh(
+        vertices=vertices.astype(np.float32),
+        normals=normals.astype(np.float32),
+        uv=uv.astype(np.float32),
+        tangents=vertex_tangents(vertices, uv, faces, normals).astype(np.float32),
+        faces=faces,
+        metric=True,
+        frame="board",
+    )
+    normal = frames.unit(points.interpolate(unwrapped.normals))
+    return Atlas(unwrapped, points.covered, points.interpolate(unwrapped.vertices), normal)
+
+
+def _charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.int32]]:
+    """Texture coordinates (W, 2) with v down, the mesh's vertex of each (W,), and faces (F, 3) in their numbers."""
+    try:
+        import uvunwrap
+    except ModuleNotFoundError:
+        raise SettingError("a texture atlas needs uvunwrap: pip install 'polcap[fusion]'") from None
+    surface = uvunwrap.Mesh(mesh.vertices.astype(np.float32).ravel().tolist(), mesh.faces.ravel().tolist())
+    try:
+        packed = uvunwrap.generate([surface], page_size=side, padding=margin)
+    except uvunwrap.UnwrapError as error:
+        raise ObjectError(f"the mesh of {len(mesh.faces)} triangles has no texture atlas ({error})") from error
+    if packed.page_count != 1:
+        raise SettingError(f"the charts do not fit into {side} px; raise fusion.atlas.size")
+    found = packed.meshes[0]
+    uv = np.asarray(found.uv, np.float64).reshape(-1, 2) * [packed.width / side, packed.height / side]
+    faces = np.asarray(found.indices, np.int32).reshape(-1, 3)
+    return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=-1), np.asarray(found.xref, np.int64), faces
+
+
+def _side(mesh: ClosedMesh, views: tuple[FusionView, ...]) -> int:
+    """Side of the texture [px], a power of two, for which a texel is nearest to a pixel of the views' maps."""
+    corner = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1).sum() / 2
+    middle = mesh.vertices.mean(axis=0)
+    pixel = np.median([-(one.pose.rotation @ middle + one.pose.translation)[2] / one.view.focal for one in views])
+    wanted = np.log2(np.sqrt(area / _FILLED) / pixel)
+    return int(np.clip(2 ** round(float(wanted)), *_SIDES))

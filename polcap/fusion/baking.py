@@ -1,0 +1,253 @@
+"""Textures of the atlas from all views: which view sees which texel, how much it counts, and robust means.
+
+A view counts more where it looks squarely at the surface, where its maps expect small errors, and far from the
+object's outline and from edges of parts that hide others. Weights fade to 0 there, so that no seam shows.
+
+Every picture is parted into a smooth and a fine band. The smooth band is a mean over all views. The fine band comes
+from the best views: a mean of views whose poses err by a pixel would blur it. Normals are baked as differences from
+the mesh's own normals, so the mesh counts as one more view.
+
+References
+----------
+Baumberg, Blending images for texturing 3D models, BMVC 2002 (two frequency bands).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from polcap.fusion.atlas import Atlas
+from polcap.fusion.values import FusionView
+from polcap.images import Bools, Floats
+from polcap.optics import frames
+from polcap.optics.projection import project
+from polcap.stages import stage
+from polcap.stages.asset import fill_outward
+from polcap.synth.mesh_tracer import Tracer, Triangles
+
+_LEAST_COSINE = 0.15  # between surface and view: beyond 81° a map pixel covers seven texels
+_FADE = 0.04  # of the object's diameter: distance from an edge over which a view's weight rises to 1
+_EDGE = 8.0  # depth step between pixels that counts as an edge, in pixels' widths; that of a slope of 83°
+_BEHIND = 3.0  # a texel this far behind the traced surface is hidden, in pixels' widths over the cosine
+_SHARPNESS = 4  # power of the weights for the fine band
+_OUTLIER_DEG = 12.0  # scale of Cauchy's weight of a normal
+_OUTLIER = 0.15  # the same of albedo, F0 and roughness, over the median
+_FLOOR_DEG = 2.0  # error of every normal, added to the expected one
+_ROUNDS = 3  # of reweighting
+_SEEN = 0.02  # least total weight of a seen texel; that of a view along the normal, far from any edge, is 1
+_MARGIN_PX = 2  # around the charts, filled from their borders
+
+
+class BakingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Settings of the stage `baking` of the fusion."""
+
+    mesh_sigma_deg: Annotated[
+        float, Meta(ge=0.1, le=90, description="expected error of the mesh's own smooth normals [°]")
+    ] = 4.0
+    smooth: Annotated[
+        float, Meta(gt=0, le=0.5, description="1σ of the Gaussian that parts smooth from fine [object's diameter]")
+    ] = 0.03
+
+
+@dataclass(frozen=True)
+class AtlasMaps:
+    """Appearance of the object on the texels of its atlas."""
+
+    normal: Floats  # (S, S, 3) unit, board frame
+    diffuse: Floats  # (S, S, 3) albedo, linear Rec.709
+    specular: Floats  # (S, S, 3) F0
+    roughness: Floats  # (S, S) perceptual
+    mask: Bools  # (S, S) the charts, with a margin
+    weight: Floats  # (S, S) total weight of the views; 1: one view along the normal, far from any edge
+    albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown
+    detail: Floats | None = None  # none on an atlas
+
+    @property
+    def seen(self) -> Bools:
+        """Texels (S, S) that a view saw."""
+        return np.asarray(self.weight > _SEEN)
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The M texels that one view sees, and how well."""
+
+    texel: NDArray[np.intp]  # (M,) index among the atlas's N texels
+    pixel: Floats  # (M, 2) x, y in the view's maps
+    cosine: Floats  # (M,) between the mesh's normal and the view
+    weight: Floats  # (M,) 0…1, without the doubt of the maps
+    mesh_normal: Floats  # (H, W, 3) of the mesh at the view's pixels, camera frame
+
+    def sample(self, picture: Floats) -> Floats:
+        """Values (M, C) of a picture (H, W, C) of the view, interpolated linearly."""
+        x, y = np.array(self.pixel.T[:, None], np.float32)
+        parts = [slice(k, k + 30_000) for k in range(0, x.shape[1], 30_000)]  # OpenCV takes rows up to 32,767 px
+        image = np.ascontiguousarray(picture, np.float32)
+        found = [cv2.remap(image, x[:, part], y[:, part], cv2.INTER_LINEAR) for part in parts]
+        return np.concatenate(found, axis=1).reshape(len(self.pixel), -1) if found else np.zeros((0, 1), np.float32)
+
+
+@stage(version=1)
+def bake(views: tuple[FusionView, ...], atlas: Atlas, settings: BakingSettings) -> AtlasMaps:
+    """Bake the maps of all views into the atlas; values where no view sees the surface are those of no light, 0."""
+    seen = sights(views, atlas)
+    count = len(atlas.position)
+    normal = _bake_normals(views, seen, atlas, settings)
+    diffuse = _bake_bands([view.diffuse for view in views], views, seen, count, settings.smooth)
+    gloss = [np.concatenate([view.specular, view.roughness[..., None]], axis=-1) for view in views]
+    samples, plain = [one.sample(image) for one, image in zip(seen, gloss)], [one.weight for one in seen]
+    specular_roughness, _ = _reweighted(samples, plain, seen, count, _OUTLIER * _typical(samples))
+    total = np.zeros(count)
+    for one in seen:
+        total[one.texel] += one.weight
+    values = np.concatenate([normal, diffuse, specular_roughness, total[:, None]], axis=-1, dtype=np.float32)
+    return on_atlas(atlas, values)
+
+
+def on_atlas(atlas: Atlas, values: Floats) -> AtlasMaps:
+    """Maps from values (N, 11) of the texels: normal, diffuse, specular, roughness, weight; charts get a margin."""
+    image = np.zeros((*atlas.covered.shape, 11), np.float32)
+    image[atlas.covered] = values
+    size = np.ones((2 * _MARGIN_PX + 1,) * 2, np.uint8)
+    mask = cv2.dilate(atlas.covered.astype(np.uint8), size) > 0
+    image = np.where(mask[..., None], fill_outward(image, atlas.covered), 0)
+    normal, diffuse, specular = (np.ascontiguousarray(image[..., start : start + 3]) for start in (0, 3, 6))
+    return AtlasMaps(normal, diffuse, specular, image[..., 9].copy(), mask, image[..., 10].copy())
+
+
+def sights(views: Sequence[FusionView], atlas: Atlas) -> list[Sight]:
+    """The texels that each view sees."""
+    mesh = atlas.mesh
+    tracer = Tracer(Triangles(mesh.vertices, mesh.faces, mesh.normals[mesh.faces]))
+    return [_sight(view, atlas, tracer) for view in views]
+
+
+def _sight(view: FusionView, atlas: Atlas, tracer: Tracer) -> Sight:
+    rotation, translation = view.pose.rotation, view.pose.translation
+    height, width = view.mask.shape
+    surface = tracer.trace(rotation, translation, view.view, height, width)
+    point = atlas.position @ rotation.T + translation
+    cosine = frames.dot(atlas.normal @ rotation.T, frames.unit(-point))
+    pixel = project(view.view, point)
+    column, row = np.rint(pixel).astype(int).T
+    inside = (cosine > _LEAST_COSINE) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    texel = np.flatnonzero(inside & (point[:, 2] < 0))
+    row, column, cosine = row[texel], column[texel], cosine[texel]
+    slack = _BEHIND / view.view.focal / cosine
+    visible = -point[texel, 2] <= surface.depth[row, column] * (1 + slack)  # false where the surface is missed
+    fade = _distance_from_edges(view, surface.depth)[row, column]
+    weight = np.where(visible, cosine**2 * fade, 0)
+    kept = np.flatnonzero(weight > 0)
+    texel = texel[kept]
+    return Sight(
+        texel,
+        pixel[texel].astype(np.float32),
+        cosine[kept].astype(np.float32),
+        weight[kept].astype(np.float32),
+        surface.normal,
+    )
+
+
+def _distance_from_edges(view: FusionView, depth: Floats) -> Floats:
+    """Smooth step (H, W) from 0 at the outline and at edges of parts that hide others to 1."""
+    step = _EDGE / view.view.focal * np.where(np.isfinite(depth), depth, 0)
+    filled = np.where(np.isfinite(depth), depth, np.inf)
+    inside = view.mask & np.isfinite(depth)
+    with np.errstate(invalid="ignore"):
+        for axis in (0, 1):
+            jump = np.abs(np.diff(filled, axis=axis)) > np.take(step, range(step.shape[axis] - 1), axis=axis)
+            pad = [(0, 1), (0, 0)] if axis == 0 else [(0, 0), (0, 1)]
+            inside &= ~(np.pad(jump, pad) | np.pad(jump, [side[::-1] for side in pad]))
+    distance = cv2.distanceTransform(np.pad(inside, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
+    share = np.clip(distance / (_FADE * diameter_px(view)), 0, 1)
+    return np.asarray(share * share * (3 - 2 * share))
+
+
+def diameter_px(view: FusionView) -> float:
+    """Diameter of the object in a view, px: that of a disk with the mask's area."""
+    return float(np.sqrt(4 * max(int(view.mask.sum()), 1) / np.pi))
+
+
+def _bake_normals(views: Sequence[FusionView], seen: Sequence[Sight], atlas: Atlas, settings: BakingSettings) -> Floats:
+    """Unit normals (N, 3) in the board frame: those of the mesh plus the mean differences of the views from it."""
+    differences = []
+    for view, one in zip(views, seen):
+        both = view.mask & (frames.dot(one.mesh_normal, one.mesh_normal) > 0.5)
+        difference = np.where(both[..., None], view.normal - one.mesh_normal, 0).astype(np.float32)
+        bands = one.sample(_bands(difference, both, settings.smooth * diameter_px(view)))
+        differences.append(np.concatenate([bands[:, k : k + 3] @ view.pose.rotation for k in (0, 3)], axis=-1))
+    count, prior = len(atlas.position), settings.mesh_sigma_deg**-2
+    weights = [one.weight / (one.sample(view.sigma_deg)[:, 0] ** 2 + _FLOOR_DEG**2) for one, view in zip(seen, views)]
+    smooth, weights = _reweighted(
+        [one[:, :3] for one in differences], weights, seen, count, float(np.radians(_OUTLIER_DEG)), prior
+    )
+    fine, _ = _mean([one[:, 3:] for one in differences], [w**_SHARPNESS for w in weights], seen, count)
+    return frames.unit(atlas.normal + smooth + fine)
+
+
+def _bake_bands(
+    images: Sequence[Floats], views: Sequence[FusionView], seen: Sequence[Sight], count: int, smooth: float
+) -> Floats:
+    """Robust mean (N, C) of images (H, W, C) of the views: smooth band from all, fine band from the best."""
+    bands = [
+        one.sample(_bands(image, view.mask, smooth * diameter_px(view)))
+        for one, image, view in zip(seen, images, views)
+    ]
+    channels = images[0].shape[-1]
+    weights = [one.weight for one in seen]
+    low = [one[:, :channels] for one in bands]
+    mean, weights = _reweighted(low, weights, seen, count, _OUTLIER * _typical(low))
+    fine, _ = _mean([one[:, channels:] for one in bands], [w**_SHARPNESS for w in weights], seen, count)
+    return np.maximum(mean + fine, 0)
+
+
+def _typical(samples: Sequence[Floats]) -> float:
+    return float(np.median(np.concatenate([np.linalg.norm(one[::16], axis=-1) for one in samples])))
+
+
+def _bands(image: Floats, inside: Bools, sigma: float) -> Floats:
+    """Smooth band of an image (H, W, C) inside a mask, and the rest: (H, W, 2C)."""
+    inner = inside[..., None]
+    held = np.where(inner, image, 0).astype(np.float32)
+    share = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), sigma)[..., None]
+    smooth = cv2.GaussianBlur(held, (0, 0), sigma).reshape(held.shape) / np.maximum(share, 1e-6)
+    return np.concatenate([smooth, np.where(inner, held - smooth, 0)], axis=-1)
+
+
+def _reweighted(
+    samples: Sequence[Floats],
+    weights: Sequence[Floats],
+    seen: Sequence[Sight],
+    count: int,
+    scale: float,
+    prior: float = 0.0,
+) -> tuple[Floats, list[Floats]]:
+    """Mean (N, C) of samples with Cauchy's weights, and these weights.
+
+    A `prior` is the weight of a further sample of value 0.
+    """
+    robust = list(weights)
+    for _ in range(_ROUNDS):
+        mean, _ = _mean(samples, robust, seen, count, prior)
+        robust = [
+            w / (1 + np.sum((value - mean[one.texel]) ** 2, axis=-1) / scale**2)
+            for value, w, one in zip(samples, weights, seen)
+        ]
+    return _mean(samples, robust, seen, count, prior)[0], robust
+
+
+def _mean(
+    samples: Sequence[Floats], weights: Sequence[Floats], seen: Sequence[Sight], count: int, prior: float = 0.0
+) -> tuple[Floats, Floats]:
+    """Weighted mean (N, C) over the views, 0 where none has weight, and the total weight (N,)."""
+    total, mean = np.full(count, prior), np.zeros((count, samples[0].shape[-1]))
+    for value, weight, one in zip(samples, weights, seen):
+        total[one.texel] += weight
+        mean[one.texel] += weight[:, None] * value
+    return mean / np.maximum(total, 1e-30)[:, None], total

@@ -1,0 +1,168 @@
+"""Corners of the board in the merged picture of a view, to a fraction of a pixel.
+
+OpenCV finds the markers. They give a homography from the board to the picture. Around each corner the print is drawn
+through it and registered to the picture in linear light; corners whose surroundings do not look as printed are hidden.
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from polcap.errors import CaptureError
+from polcap.images import AngleStack, ColorCalibration, Floats
+from polcap.optics import board as boards
+from polcap.optics.board import BOARDS, Board
+from polcap.optics.projection import transform_points
+
+_DETECTOR_PX = 2400  # longer side of the picture in which markers are searched
+_LEAST_MARKERS = 3  # of a board; fewer may be false
+_LEAST_CORNERS = 6  # a pose has six unknowns, and each corner two coordinates; the rest shows errors
+_WINDOW = 0.45  # half side of the print that is compared around a corner, squares
+_SAMPLES = 4  # of the print, per pixel side
+_BLUR_PX = 0.5  # 1σ of the lens and the photosites together
+_ROUNDS = 6  # of the registration
+_MOST_MOVED = 0.15  # squares; from the homography's prediction, which neglects distortion
+_LEAST_CORRELATION = 0.85  # of picture and print around a corner
+_MOST_TWINS = 2  # markers seen twice: more are a second board
+
+
+@dataclass(frozen=True)
+class BoardCorners:
+    """Corners of one board in one view."""
+
+    board: Board
+    number: NDArray[np.int64]  # (N,) OpenCV's
+    world: Floats  # (N, 3) m
+    seen: Floats  # (N, 2) x, y in visible RAW px of the reference shot
+
+
+def gray_picture(radiance: AngleStack, color: ColorCalibration) -> tuple[Floats, float]:
+    """Picture (H, W) in which the board is gray, linear, and its RAW pixels per pixel.
+
+    These are the white-balanced photosites of the reference shot where it has them, else the mean of all shots.
+    """
+    white = np.linalg.inv(np.asarray(color.matrix, np.float64)) @ np.ones(3)  # in camera channels
+    if radiance.mosaic is None:
+        mean = np.mean(radiance.value, axis=0) / white.astype(np.float32)
+        return np.asarray(mean.mean(axis=-1), np.float32), radiance.view.scale
+    sites = np.asarray(radiance.mosaic.value, np.float32)
+    gain = (1 / white).astype(np.float32)[radiance.mosaic.cfa]  # (2, 2)
+    return sites * np.tile(gain, (sites.shape[0] // 2, sites.shape[1] // 2)), radiance.view.scale / 2
+
+
+def detect(radiance: AngleStack, color: ColorCalibration, name: str) -> BoardCorners:
+    """Detect the board in a view called `name`.
+
+    Raises
+    ------
+    CaptureError
+        No board is visible, too little of it, or two boards are.
+    """
+    picture, scale = gray_picture(radiance, color)
+    markers = _markers(picture)
+    board = _one_board(markers, name)
+    known = np.asarray(boards.charuco(board).getIds()).ravel().tolist()
+    plan = np.asarray(boards.charuco(board).getObjPoints())[..., :2]  # (M, 4, 2) m, from the top left
+    pairs = [(plan[known.index(number)], quad) for number, quad in markers if number in known]
+    flat, seen = (np.concatenate(side).astype(np.float64) for side in zip(*pairs, strict=True))
+    place, _ = cv2.findHomography(flat, seen, cv2.RANSAC, 0.02 * float(np.ptp(seen, axis=0).max()))
+    if place is None:
+        raise CaptureError(f"{name}: the board's markers contradict each other; show a flat board")
+    number, world = boards.corners(board)
+    moved = _located(picture, place, board)
+    good = np.isfinite(moved).all(axis=1)
+    if good.sum() < _LEAST_CORNERS:
+        raise CaptureError(
+            f"{name}: {good.sum()} of {len(number)} corners of the board are visible, {_LEAST_CORNERS} are needed; "
+            "let object and chart hide less of the board, and show it sharp"
+        )
+    return BoardCorners(board, number[good], world[good], scale * moved[good] + (scale - 1) / 2)
+
+
+def _markers(picture: Floats) -> list[tuple[int, Floats]]:
+    """Numbers of all markers in a linear picture, with their corners (4, 2) px."""
+    bright = max(float(np.quantile(picture, 0.98)), 1e-6)
+    gray = np.asarray(255 * np.clip(picture / bright, 0, 1) ** (1 / 2.2), np.uint8)
+    zoom = _DETECTOR_PX / max(gray.shape)
+    how = cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC
+    sized = cv2.resize(gray, None, fx=zoom, fy=zoom, interpolation=how)
+    detector = cv2.aruco.ArucoDetector(boards.dictionary())
+    quads, numbers, _ = detector.detectMarkers(sized)
+    if numbers is None:
+        return []
+    found = np.asarray(quads, np.float64).reshape(-1, 4, 2)
+    return list(zip(np.ravel(numbers).tolist(), (found + 0.5) / zoom - 0.5, strict=True))
+
+
+def _one_board(markers: list[tuple[int, Floats]], name: str) -> Board:
+    """The board that the markers belong to. Raises CaptureError for none or several."""
+    numbers = [number for number, _ in markers]
+    twins = len(numbers) - len(set(numbers))
+    seen = {
+        board.name: len(set(numbers) & set(np.ravel(boards.charuco(board).getIds()).tolist()))
+        for board in BOARDS.values()
+    }
+    there = [size for size, count in seen.items() if count >= _LEAST_MARKERS]
+    if not there:
+        raise CaptureError(
+            f"{name}: no board is visible ({max(seen.values())} of its markers, {_LEAST_MARKERS} are needed); "
+            "shoot with the object on the board of `polcap board`, sharp and lit"
+        )
+    if len(there) > 1 or twins > _MOST_TWINS:
+        which = " and ".join(there) if len(there) > 1 else f"{twins} markers twice"
+        raise CaptureError(f"{name}: two boards are visible ({which}); leave one in the picture")
+    return BOARDS[there[0]]
+
+
+def _located(picture: Floats, place: Floats, board: Board) -> Floats:
+    """Corners (N, 2) px of the board; NaN where the print around a corner is not visible.
+
+    Around each corner the print is drawn through the homography `place`, and moved until it fits (Gauss-Newton).
+    """
+    _, world = boards.corners(board)
+    out = np.full((len(world), 2), np.nan)
+    for k, corner in enumerate(world[:, [0, 2]]):
+        at = corner + board.side_m / 2
+        x, y, drawn = _drawn(place, at, board)
+        reach = np.array([np.ptp(x), np.ptp(y)]) / (2 * _WINDOW)  # px per square
+        if min(x.min(), y.min()) < 0 or x.max() > picture.shape[1] - 1 or y.max() > picture.shape[0] - 1:
+            continue
+        moved, correlation = _registered(picture, x, y, drawn)
+        if correlation > _LEAST_CORRELATION and (np.abs(moved) < np.maximum(_MOST_MOVED * reach, 1.5)).all():
+            out[k] = transform_points(place, at) + moved
+    return out
+
+
+def _drawn(place: Floats, at: Floats, board: Board) -> tuple[Floats, Floats, Floats]:
+    """Pixels x, y (h, w) around the flat point `at` (2,) [m], and the share of paper that they should show."""
+    half = _WINDOW * board.square_m * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    around = transform_points(place, at + half)
+    low, high = np.floor(around.min(axis=0)), np.ceil(around.max(axis=0))
+    x, y = np.meshgrid(*(np.arange(first, last + 1) for first, last in zip(low, high, strict=True)))
+    back = np.linalg.inv(place)
+    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+    drawn: Floats = np.zeros(x.shape)
+    for dx, dy in itertools.product(steps, steps):
+        flat = transform_points(back, np.stack([x + dx, y + dy], axis=-1)) - board.side_m / 2
+        drawn += ~boards.is_ink(board, flat[..., 0], flat[..., 1]) / _SAMPLES**2
+    return x, y, gaussian_filter(drawn, _BLUR_PX)
+
+
+def _registered(picture: Floats, x: Floats, y: Floats, drawn: Floats) -> tuple[Floats, float]:
+    """Shift (2,) px from the pixels x, y to where the picture looks as `drawn` (h, w), and their correlation."""
+    down, across = np.gradient(drawn)
+    terms = np.stack([drawn, across, down, np.ones_like(drawn)], axis=-1).reshape(-1, 4)
+    shift: Floats = np.zeros(2)
+    for _ in range(_ROUNDS):
+        at = (x + shift[0]).astype(np.float32), (y + shift[1]).astype(np.float32)
+        seen = cv2.remap(picture, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()
+        weight = np.linalg.lstsq(terms, seen, rcond=None)[0]
+        if weight[0] <= 1e-6 * np.abs(seen).max():  # no print is here
+            return shift, 0.0
+        step = -weight[1:3] / weight[0]
+        shift = shift + np.clip(step, -2, 2)
+    return shift, float(np.corrcoef(seen, terms[:, 0])[0, 1])

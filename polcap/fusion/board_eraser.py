@@ -1,0 +1,153 @@
+"""Erases the board's print from a view's picture, so that the object's mask is found as before a dark backdrop.
+
+The pose tells where paper and ink are. Their brightness is fitted as smooth functions over the board. Pixels that look
+as the print then get the brightness of ink. Paper is printed in strips only, and a closing over their width returns
+parts of the object that are as bright as the paper behind them.
+"""
+
+import itertools
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.ndimage import maximum_filter
+
+from polcap.fusion.poses import SessionCamera
+from polcap.fusion.values import Pose
+from polcap.images import Alignment, AngleStack, Bools, ColorCalibration, Floats
+from polcap.optics import board as boards
+from polcap.optics import distortion
+from polcap.optics.board import Board
+from polcap.optics.projection import back_project
+from polcap.optics.warp import warp
+
+_SAMPLES = 4  # per pixel side, for the share of paper
+_SITE_PX = 0.8  # side of the area that a channel's photosites and the lens's blur average over
+_SHIFT_PX = 0.25  # error of the print's position in the picture
+_TOLERANCE = 0.2  # relative, of a channel's brightness against the print's
+_NOISE = 0.02  # of the paper's brightness: noise and scattered light
+_BEYOND = 1.02  # to which the paper may reach, in half widths of the page: its edge in the picture is not sharp
+_ROUNDS = 8  # of the fit without pixels of the object
+_SPECK = 0.25  # squares; smaller parts before the board are noise
+_STRIP = 1 / boards.CELLS  # width of the strips of paper, in squares
+
+
+@dataclass(frozen=True)
+class _Print:
+    """The board as a view's camera sees it, on the grid of the merged picture."""
+
+    place: Floats  # (H, W, 2) x, z on the board, in half sides: −1…1 is printed
+    paper: Floats  # (H, W, 3) share of paper in a pixel of each channel, whose photosites lie side by side
+    doubt: Floats  # (H, W, 3) error of this share from errors of the position
+
+
+def erase(
+    radiance: AngleStack,
+    alignment: Alignment,
+    color: ColorCalibration,
+    board: Board,
+    posed: tuple[SessionCamera, Pose],
+) -> AngleStack:
+    """A copy of the merged shots in which the visible print of the board is as dark as its ink.
+
+    Where the board is not in the picture, or hidden, nothing changes.
+    """
+    print_ = _project(radiance, board, *posed)
+    picture = _mean_picture(radiance, alignment, color)
+    covered = np.abs(print_.place).max(axis=-1) <= _BEYOND * board.page_m[0] / board.side_m
+    if not covered.any():
+        return radiance
+    light, tint = _fit(picture, print_)
+    erased = covered & ~_object_like(picture / tint, print_, light, _strip_px(print_, board))
+    white = np.linalg.inv(np.asarray(color.matrix, np.float64)) @ tint
+    ink = (0.5 * light[1][..., None] * white).astype(np.float32)
+    value = np.where(erased[..., None], ink, radiance.value)
+    return replace(radiance, value=value, mosaic=None)
+
+
+def _mean_picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> Floats:
+    """S0 (H, W, 3) of the registered shots in linear Rec.709, as for unpolarized light."""
+    shots = [warp(shot, transform, order=1) for shot, transform in zip(radiance.value, alignment.transform)]
+    return np.asarray(cv2.transform(np.mean(shots, axis=0), 2 * np.asarray(color.matrix)), np.float32)
+
+
+def _project(radiance: AngleStack, board: Board, camera: SessionCamera, pose: Pose) -> _Print:
+    height, width = radiance.value.shape[1:3]
+    scale = radiance.view.scale
+    y, x = (scale * axis + (scale - 1) / 2 for axis in np.mgrid[:height, :width].astype(np.float64))
+    place = _on_board(camera, pose, x, y)
+    near = np.abs(place).max(axis=-1) <= board.page_m[0] / 2
+    down, across = (np.gradient(place, axis=axis)[near] for axis in (0, 1))  # m on the board per pixel
+    steps = _SITE_PX * ((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5)
+    sites = np.zeros((3, 2)) if radiance.sensor.site_px is None else radiance.sensor.site_px
+    paper: Floats = np.zeros((height, width, 3))
+    for channel, (dx, dy) in enumerate(sites):
+        total = sum(
+            ~boards.is_ink(board, *(place[near] + (dx + right) * across + (dy + low) * down).T)
+            for right, low in itertools.product(steps, steps)
+        )
+        paper[near, channel] = total / _SAMPLES**2
+    slope = np.hypot(np.gradient(paper, axis=0), np.gradient(paper, axis=1))
+    return _Print(2 * place / board.side_m, paper, _SHIFT_PX * maximum_filter(slope, (3, 3, 1)))
+
+
+def _on_board(camera: SessionCamera, pose: Pose, x: Floats, y: Floats) -> Floats:
+    """Points x, z (H, W, 2) [m] of the board's plane that RAW pixels show; infinite above the plane's horizon."""
+    ray = back_project(camera.view, *distortion.undistort(camera.lens, x, y)) @ pose.rotation  # world frame
+    start = pose.center
+    down = np.where(ray[..., 1] < -1e-6, -ray[..., 1], np.nan)
+    reach = np.nan_to_num(start[1] / down, nan=1e6)
+    return np.asarray(start[[0, 2]] + ray[..., [0, 2]] * reach[..., None])
+
+
+def _fit(picture: Floats, print_: _Print) -> tuple[tuple[Floats, Floats], Floats]:
+    """Brightness of paper and of ink (H, W), extended over the picture, and the print's color (3,) of mean 1.
+
+    Quadratic functions over the board, fitted without pixels that deviate.
+    """
+    on = (np.abs(print_.place).max(axis=-1) < 1) & (
+        np.abs(print_.place).max(axis=-1) > 1 - 2 * boards.RING / boards.SQUARES
+    )
+    gray, share = picture.mean(axis=-1)[on].astype(np.float64), print_.paper[on].mean(axis=-1)
+    base = _quadratic(print_.place[on])
+    terms = np.concatenate([base * share[:, None], base[:, :3] * (1 - share)[:, None]], axis=1)
+    use = np.ones(len(gray), bool)
+    for _ in range(_ROUNDS):
+        weight, *_ = np.linalg.lstsq(terms[use], gray[use], rcond=None)
+        error = np.abs(terms @ weight - gray)
+        use = error < max(3 * 1.48 * float(np.median(error)), 1e-9)
+    everywhere = _quadratic(np.clip(print_.place, -1.5, 1.5))
+    paper, ink = everywhere @ weight[:6], everywhere[..., :3] @ weight[6:]
+    light = float(np.median(gray[use & (share > 0.8)])) if (use & (share > 0.8)).any() else float(gray.max())
+    white = picture[on][use & (share > 0.6)]
+    tint = np.median(white, axis=0) if len(white) else np.ones(3)
+    return (np.maximum(paper, 0.1 * light), np.maximum(ink, 1e-3 * light)), np.asarray(tint / tint.mean())
+
+
+def _quadratic(place: Floats) -> Floats:
+    """Values (..., 6) of 1, x, z, x², x z, z²."""
+    x, z = place[..., 0], place[..., 1]
+    return np.stack([np.ones_like(x), x, z, x * x, x * z, z * z], axis=-1)
+
+
+def _strip_px(print_: _Print, board: Board) -> tuple[int, int]:
+    """Width of the print's strips of paper in the picture: across, and down [px]."""
+    inside = np.abs(print_.place).max(axis=-1) < 1
+    metres = 0.5 * board.side_m
+    slope = [np.hypot(*np.moveaxis(np.gradient(print_.place, axis=axis), -1, 0)) for axis in (1, 0)]
+    across, down = (float(np.median(s[inside])) * metres for s in slope)
+    return tuple(int(np.ceil(_STRIP * board.square_m / max(step, 1e-9))) for step in (across, down))  # type: ignore[return-value]
+
+
+def _object_like(picture: Floats, print_: _Print, light: tuple[Floats, Floats], strip: tuple[int, int]) -> Bools:
+    """Pixels (H, W) that differ from the print, closed over the strips of paper, without lines and specks."""
+    paper, ink = light
+    paper, ink = paper[..., None], ink[..., None]
+    expected = print_.paper * (paper - ink) + ink
+    off = (np.abs(picture - expected) > _TOLERANCE * expected + (print_.doubt + _NOISE) * paper).any(axis=-1)
+    element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * (strip[0] // 2) + 1, 2 * (strip[1] // 2) + 1))
+    closed = cv2.morphologyEx(off.astype(np.uint8), cv2.MORPH_CLOSE, element)
+    thick = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    _, label, stats, _ = cv2.connectedComponentsWithStats(thick)
+    large = stats[:, cv2.CC_STAT_AREA] > _SPECK * boards.CELLS**2 * strip[0] * strip[1]
+    return np.asarray(large[label] & (thick > 0))

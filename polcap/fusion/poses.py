@@ -1,0 +1,229 @@
+"""One camera and a pose of the board per view, from the board's corners in all views (bundle adjustment).
+
+Focal length, distortion k₁ and k₂, and six numbers per view minimize the distances between seen and projected
+corners. Turns of one plane about its normal do not determine the principal point, so it is held near the stated one.
+
+References
+----------
+Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000; Zhang, A flexible new technique for camera calibration,
+IEEE TPAMI 2000.
+"""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.optimize import OptimizeResult, least_squares
+from scipy.spatial.transform import Rotation
+
+from polcap.errors import CaptureError
+from polcap.fusion.board_corners import BoardCorners
+from polcap.fusion.values import Pose
+from polcap.images import Capture, Distortion, Floats, View
+from polcap.optics import distortion, projection
+
+LEAST_VIEWS = 3
+_MOST_RESIDUAL = 1.0  # px rms of a view's corners; a flat, sharp board leaves 0.02 to 0.1
+_CORNER_SIGMA = 0.05  # px, of a corner; where the robust loss begins, in this unit, is 3
+_OUTLIER = 5.0  # times the robust spread of all corners, at least `_LEAST_OUTLIER` px
+_LEAST_OUTLIER = 0.5  # px
+_LEAST_KEPT = 0.75  # of a view's corners; where more are outliers, none is one
+_PRINCIPAL_SIGMA = 0.002  # of the picture's width: where lenses have their axis; weak, see above
+_BEND_SIGMA = 0.3, 1.0  # of k₁ and k₂ where nothing else is known
+_CAMERA = 5  # unknowns of the camera: ln focal length, principal point, k₁, k₂
+_STEPS = np.array([1e-6, 1e-3, 1e-3, 1e-5, 1e-4, *[1e-6] * 6])  # of the derivatives: camera; rad and m of a view
+_TO_CV = np.diag([1.0, -1.0, -1.0])  # camera frame of this package to OpenCV's
+
+
+@dataclass(frozen=True)
+class SessionCamera:
+    """Camera of all views, on visible RAW pixels, with the 1σ of its focal length."""
+
+    focal_px: float
+    focal_sigma_px: float
+    principal_px: tuple[float, float]
+    k1: float
+    k2: float
+
+    @property
+    def view(self) -> View:
+        """The pinhole camera, on visible RAW pixels."""
+        return View(self.focal_px, self.principal_px, 1.0)
+
+    @property
+    def lens(self) -> Distortion:
+        """The lens distortion, on visible RAW pixels."""
+        return Distortion(self.focal_px, self.principal_px, self.k1, self.k2)
+
+    def project(self, pose: Pose, world: Floats) -> Floats:
+        """Visible RAW pixels (N, 2) of the photograph that show world points (N, 3) [m]."""
+        x, y = projection.project(self.view, world @ pose.rotation.T + pose.translation).T
+        return np.stack(distortion.distort(self.lens, x, y), axis=-1)
+
+
+@dataclass(frozen=True)
+class PosedView:
+    """Pose of one view with its errors."""
+
+    pose: Pose
+    corners: int  # used
+    residual_px: float  # rms of the corners, RAW px
+    sigma_deg: float  # 1σ of the rotation, largest axis
+    sigma_m: float  # 1σ of the translation across the line of sight at the board's middle
+
+
+@dataclass(frozen=True)
+class SessionPoses:
+    """Camera and poses of a session, and why views were left out."""
+
+    camera: SessionCamera
+    views: Mapping[str, PosedView]
+    left_out: Mapping[str, str]
+
+
+def solve(seen: Mapping[str, BoardCorners], capture: Capture) -> SessionPoses:
+    """Camera and poses of all views of a session; `capture` is one of them and states the camera's geometry.
+
+    A view whose corners do not fit is left out, and the others are solved again.
+
+    Raises
+    ------
+    CaptureError
+        Fewer than three views can be posed, or views show boards of several sizes.
+    """
+    sizes = {corners.board.name for corners in seen.values()}
+    if len(sizes) > 1:
+        raise CaptureError(f"the views show boards of sizes {' and '.join(sorted(sizes))}; use one board for all")
+    names = list(seen)
+    left_out: dict[str, str] = {}
+    while True:
+        if len(names) < LEAST_VIEWS:
+            reasons = "; ".join(left_out.values())
+            raise CaptureError(
+                f"{len(names)} views can be posed, {LEAST_VIEWS} are needed; show the board in more views"
+                + (f" ({reasons})" if reasons else "")
+            )
+        solved = _adjust([seen[name] for name in names], capture)
+        worst = max(range(len(names)), key=lambda k: solved.residual[k])
+        if solved.residual[worst] <= _MOST_RESIDUAL:
+            break
+        name = names.pop(worst)
+        left_out[name] = (
+            f"{name}: its corners are {solved.residual[worst]:.1f} px (rms) from those of the board, the limit is "
+            f"{_MOST_RESIDUAL:g} px; keep the board flat, focus and zoom unchanged"
+        )
+    return SessionPoses(solved.camera, dict(zip(names, solved.posed, strict=True)), left_out)
+
+
+@dataclass(frozen=True)
+class _Adjusted:
+    camera: SessionCamera
+    posed: list[PosedView]
+
+    @property
+    def residual(self) -> list[float]:
+        return [one.residual_px for one in self.posed]
+
+
+def _adjust(seen: Sequence[BoardCorners], capture: Capture) -> _Adjusted:
+    """Bundle adjustment, twice: the second time without corners far from the first solution."""
+    stated = View(capture.focal_px, capture.principal_px, 1.0)
+    start = np.concatenate([np.zeros(_CAMERA), *(_first_pose(one, stated) for one in seen)])
+    found = _minimize(seen, capture, start)
+    error = [_residual(one, _camera(capture, found.x), found.x[_place(k)]) for k, one in enumerate(seen)]
+    far = max(_OUTLIER * 1.48 * float(np.median(np.abs(np.concatenate(error)))), _LEAST_OUTLIER)
+    used = [_without(one, np.linalg.norm(e, axis=1) > far) for one, e in zip(seen, error, strict=True)]
+    found = _minimize(used, capture, found.x)
+    return _with_errors(used, capture, found)
+
+
+def _without(corners: BoardCorners, bad: Floats) -> BoardCorners:
+    """Corners without the bad ones; all of them where the others are too few."""
+    keep = ~np.asarray(bad, bool)
+    if keep.sum() < _LEAST_KEPT * len(keep):
+        return corners
+    return replace(corners, number=corners.number[keep], world=corners.world[keep], seen=corners.seen[keep])
+
+
+def _place(k: int) -> slice:
+    """Unknowns of view k: rotation vector and translation [m], world to camera."""
+    return slice(_CAMERA + 6 * k, _CAMERA + 6 * (k + 1))
+
+
+def _first_pose(corners: BoardCorners, view: View) -> Floats:
+    matrix = np.array([[view.focal, 0, view.center[0]], [0, view.focal, view.center[1]], [0, 0, 1]])
+    flat = corners.world @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # into the plane z = 0, right-handed
+    count, turns, shifts, errors = cv2.solvePnPGeneric(flat, corners.seen, matrix, None, flags=cv2.SOLVEPNP_IPPE)
+    best = min(range(count), key=lambda k: float(np.ravel(errors[k])[0]))
+    turn = cv2.Rodrigues(turns[best])[0] @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).T
+    vector = Rotation.from_matrix(_TO_CV @ turn).as_rotvec()
+    return np.concatenate([vector, _TO_CV @ np.ravel(shifts[best])])
+
+
+def _camera(capture: Capture, unknown: Floats, sigma: float = 0.0) -> SessionCamera:
+    x, y = capture.principal_px
+    focal = capture.focal_px * float(np.exp(unknown[0]))
+    return SessionCamera(
+        focal, focal * sigma, (x + float(unknown[1]), y + float(unknown[2])), float(unknown[3]), float(unknown[4])
+    )
+
+
+def _pose(unknown: Floats) -> Pose:
+    return Pose(Rotation.from_rotvec(unknown[:3]).as_matrix(), unknown[3:])
+
+
+def _residual(corners: BoardCorners, camera: SessionCamera, unknown: Floats) -> Floats:
+    """Projected minus seen corners (N, 2) px."""
+    return camera.project(_pose(unknown), corners.world) - corners.seen
+
+
+def _minimize(seen: Sequence[BoardCorners], capture: Capture, start: Floats) -> OptimizeResult:
+    width = capture.size_px[0]
+    doubt = max(abs(capture.focal_doubt[0]), abs(capture.focal_doubt[1]), 0.05 if capture.focal_known else 0.5)
+    weak = np.array([doubt, *[_PRINCIPAL_SIGMA * width] * 2, *_BEND_SIGMA])
+
+    counts = np.cumsum([_CAMERA, *(2 * len(one.number) for one in seen)])
+
+    def part(k: int, camera: Floats, place: Floats) -> Floats:
+        return _residual(seen[k], _camera(capture, camera), place).ravel() / _CORNER_SIGMA
+
+    def residuals(unknown: Floats) -> Floats:
+        parts = [part(k, unknown[:_CAMERA], unknown[_place(k)]) for k in range(len(seen))]
+        return np.concatenate([unknown[:_CAMERA] / weak, *parts])
+
+    def jacobian(unknown: Floats) -> Floats:
+        out = np.zeros((counts[-1], len(unknown)))
+        out[range(_CAMERA), range(_CAMERA)] = 1 / weak
+        for k, (first, last) in enumerate(itertools.pairwise(counts)):
+            own = np.r_[:_CAMERA, _place(k)]
+            for column, step in zip(own, np.eye(len(own)) * _STEPS, strict=True):
+                ahead, back = (unknown[own] + sign * step for sign in (1, -1))
+                change = part(k, *np.split(ahead, [_CAMERA])) - part(k, *np.split(back, [_CAMERA]))
+                out[first:last, column] = change / (2 * step.max())
+        return out
+
+    return least_squares(
+        residuals, start, jacobian, x_scale="jac", loss="huber", f_scale=3.0, xtol=1e-12, ftol=1e-12, max_nfev=200
+    )
+
+
+def _with_errors(seen: Sequence[BoardCorners], capture: Capture, found: OptimizeResult) -> _Adjusted:
+    """Camera and poses with their errors, from the curvature at the solution and the actual residuals."""
+    camera = _camera(capture, found.x)
+    error = [_residual(one, camera, found.x[_place(k)]) for k, one in enumerate(seen)]
+    scale = float(np.sqrt(np.mean(np.concatenate(error) ** 2))) / _CORNER_SIGMA
+    jacobian = found.jac
+    sigma = max(scale, 0.1) * np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)))
+    posed = [
+        PosedView(
+            pose=_pose(found.x[_place(k)]),
+            corners=len(one.number),
+            residual_px=float(np.sqrt(2 * np.mean(e**2))),
+            sigma_deg=float(np.degrees(sigma[_place(k)][:3].max())),
+            sigma_m=float(sigma[_place(k)][3:5].max()),
+        )
+        for k, (one, e) in enumerate(zip(seen, error, strict=True))
+    ]
+    return _Adjusted(_camera(capture, found.x, float(sigma[0])), posed)

@@ -1,0 +1,66 @@
+"""An ellipsoid before the camera, known everywhere: its mesh, and views of it."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from polcap.fusion.values import ClosedMesh, FusionView, Pose
+from polcap.images import Floats, View
+from polcap.optics import frames
+from polcap.synth.mesh_tracer import Tracer, smooth
+
+AXES = np.array([0.05, 0.035, 0.04])  # m
+DISTANCE, PIXELS = 0.6, 160
+VIEW = View(PIXELS * 0.85 * DISTANCE / 0.1, ((PIXELS - 1) / 2, (PIXELS - 1) / 2), 1.0)
+
+
+def mesh(subdivisions: int = 4) -> ClosedMesh:
+    """The ellipsoid about the origin as a closed mesh."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions)
+    return ClosedMesh((ball.vertices * AXES).astype(np.float32), ball.faces.astype(np.int32))
+
+
+def normals(position: Floats) -> Floats:
+    """Normals (..., 3) at points of the surface."""
+    return frames.unit(position / AXES**2)
+
+
+def albedo(position: Floats) -> Floats:
+    """Albedo (..., 3), smooth waves of 2 cm."""
+    wave = 0.4 + 0.2 * np.sin(position @ np.array([[310, 0, 40], [0, 290, 0], [60, 0, 330]]))
+    return np.asarray(wave, np.float32)
+
+
+def views(count: int, elevation_deg: float = 20.0) -> tuple[FusionView, ...]:
+    """Views without errors from a ring of positions around the ellipsoid."""
+    body = mesh(5)
+    tracer = Tracer(smooth(body.vertices, body.faces))
+    found: list[FusionView] = []
+    for azimuth in np.arange(count) * (360 / max(count, 1)):
+        turn = Rotation.from_euler("XY", [elevation_deg, -azimuth], degrees=True).as_matrix()
+        pose = Pose(turn, np.array([0.0, 0.0, -DISTANCE]))
+        surface = tracer.trace(pose.rotation, pose.translation, VIEW, PIXELS, PIXELS)
+        inside = surface.mask[..., None]
+        normal = np.where(inside, normals(surface.position) @ turn.T, 0).astype(np.float32)
+        flat = np.ones(surface.mask.shape, np.float32)
+        diffuse = np.where(inside, albedo(surface.position), 0).astype(np.float32)
+        gray = np.repeat(0.04 * flat[..., None], 3, axis=-1)
+        name = f"view{len(found) + 1:02d}"
+        found.append(
+            FusionView(name, pose, VIEW, np.zeros(3), surface.mask, normal, 4 * flat, diffuse, gray, 0.4 * flat)
+        )
+    return tuple(found)
+
+
+def tilted(view: FusionView, degrees: float, seed: int) -> FusionView:
+    """The view with its normals tilted by smooth random angles of this rms."""
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    tilt = [cv2.GaussianBlur(rng.normal(size=view.mask.shape), (0, 0), PIXELS / 16) for _ in range(2)]
+    tilt = [np.radians(degrees) / np.sqrt(2) * one / one.std() for one in tilt]
+    normal = frames.unit(view.normal + np.stack([*tilt, 0 * tilt[0]], axis=-1))
+    return replace(view, normal=np.where(view.mask[..., None], normal, 0).astype(np.float32))

@@ -1,0 +1,51 @@
+"""The atlas: charts without overlap, one point of the surface for each texel."""
+
+import numpy as np
+import pytest
+
+from polcap.fusion import atlas as atlases
+from polcap.fusion.atlas import Atlas, AtlasSettings
+from tests.fusion import ellipsoid
+
+SIDE = 256
+
+
+@pytest.fixture(scope="module")
+def atlas() -> Atlas:
+    return atlases.unwrap(ellipsoid.mesh(), (), AtlasSettings(size=SIDE))
+
+
+def test_charts_do_not_overlap(atlas: Atlas) -> None:
+    corner = atlas.mesh.uv[atlas.mesh.faces] * SIDE
+    one, two = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    area = np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]).sum() / 2
+    assert atlas.covered.sum() == pytest.approx(area, rel=0.01)
+
+
+def test_all_triangles_face_the_reader_of_the_texture(atlas: Atlas) -> None:
+    """Only then the handedness of every tangent is 1."""
+    corner = atlas.mesh.uv[atlas.mesh.faces]
+    one, two = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    assert (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0] < 0).all()  # v runs down
+
+
+def test_texels_lie_on_the_surface_with_its_normals(atlas: Atlas) -> None:
+    inside = np.sum((atlas.position / ellipsoid.AXES) ** 2, axis=-1)
+    assert np.abs(inside - 1).max() < 0.02
+    truth = ellipsoid.normals(atlas.position)
+    assert np.degrees(np.arccos(np.clip(np.sum(atlas.normal * truth, axis=-1), -1, 1))).max() < 2
+
+
+def test_the_mesh_is_closed_when_its_vertices_are_joined_by_position(atlas: Atlas) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    read = trimesh.Trimesh(atlas.mesh.vertices, atlas.mesh.faces, process=False)
+    assert not read.is_watertight  # the charts are parted
+    read.merge_vertices(merge_tex=True, merge_norm=True)
+    assert read.is_watertight and read.volume > 0
+
+
+def test_a_texel_is_about_one_pixel_of_the_maps() -> None:
+    views = ellipsoid.views(1)
+    found = atlases.unwrap(ellipsoid.mesh(), views, AtlasSettings())
+    pixel = ellipsoid.DISTANCE / views[0].view.focal
+    assert 0.6 < found.texel / pixel < 1.6

@@ -1,0 +1,84 @@
+"""Baking: views outvote errors, hidden surface takes nothing, and no view ends at a visible seam."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from polcap.fusion import atlas as atlases
+from polcap.fusion import baking
+from polcap.fusion.atlas import Atlas, AtlasSettings
+from polcap.fusion.baking import BakingSettings
+from polcap.fusion.values import ClosedMesh
+from polcap.images import Floats
+from polcap.stages import asset
+from tests.fusion import ellipsoid
+
+RING = ellipsoid.views(8)
+
+
+@pytest.fixture(scope="module")
+def atlas() -> Atlas:
+    return atlases.unwrap(ellipsoid.mesh(), (), AtlasSettings(size=256))
+
+
+def degrees(one: Floats, two: Floats) -> Floats:
+    return np.degrees(np.arccos(np.clip(np.sum(one * two, axis=-1), -1, 1)))
+
+
+def test_maps_without_errors_are_baked_as_they_are(atlas: Atlas) -> None:
+    made = baking.bake(RING, atlas, BakingSettings())
+    seen = made.seen[atlas.covered]
+    assert seen.mean() > 0.8
+    assert degrees(made.normal[atlas.covered], ellipsoid.normals(atlas.position))[seen].mean() < 0.5
+    error = made.diffuse[atlas.covered] - ellipsoid.albedo(atlas.position)
+    assert np.abs(error[seen]).mean() < 0.01
+    assert made.roughness[made.seen] == pytest.approx(0.4, abs=1e-4)
+
+
+def test_views_with_independent_errors_outvote_each_other(atlas: Atlas) -> None:
+    views = tuple(ellipsoid.tilted(view, 8.0, seed) for seed, view in enumerate(RING))
+    made = baking.bake(views, atlas, BakingSettings(mesh_sigma_deg=90))  # the mesh, which is the truth, has no vote
+    single = degrees(views[0].normal, RING[0].normal)[RING[0].mask].mean()
+    seen = made.seen[atlas.covered]
+    error = degrees(made.normal[atlas.covered], ellipsoid.normals(atlas.position))[seen].mean()
+    assert error < 0.8 * single  # a texel is seen by two to three of them
+
+
+def test_a_half_turn_in_one_view_is_outvoted(atlas: Atlas) -> None:
+    wrong = RING[0].normal * [-1, -1, 1]
+    views = (replace(RING[0], normal=wrong.astype(np.float32)), *RING[1:])
+    made = baking.bake(views, atlas, BakingSettings(mesh_sigma_deg=90))
+    seen = made.seen[atlas.covered]
+    error = degrees(made.normal[atlas.covered], ellipsoid.normals(atlas.position))[seen]
+    assert np.median(error) < 2 and degrees(wrong, RING[0].normal)[RING[0].mask].mean() > 30
+
+
+def test_a_part_behind_another_takes_nothing_from_the_view() -> None:
+    front = ellipsoid.mesh(3)
+    behind = front.vertices - np.array([0.0, 0.0, 0.15], np.float32)
+    both = ClosedMesh(
+        np.concatenate([front.vertices, behind]), np.concatenate([front.faces, front.faces + len(behind)])
+    )
+    atlas = atlases.unwrap(both, (), AtlasSettings(size=256))
+    (view,) = ellipsoid.views(1, elevation_deg=0)
+    (sight,) = baking.sights([view], atlas)
+    assert len(sight.texel) > 1000
+    assert (atlas.position[sight.texel, 2] > -0.06).all()
+
+
+def test_a_views_weight_fades_out_at_its_outline(atlas: Atlas) -> None:
+    (sight,) = baking.sights(RING[:1], atlas)
+    middle = (np.array([ellipsoid.PIXELS] * 2) - 1) / 2
+    away = np.linalg.norm(sight.pixel - middle, axis=-1)
+    assert sight.weight[away > away.max() - 2].max() < 0.05
+    assert sight.weight[away < 10].min() > 0.8
+
+
+def test_the_asset_stage_turns_the_atlas_into_tangent_space(atlas: Atlas) -> None:
+    """Textures of the closed mesh come from the same code as those of a single view."""
+    made = baking.bake(RING, atlas, BakingSettings())
+    found = asset.build(made, atlas.mesh, asset.AssetSettings())
+    local = found.normal[atlas.covered] / 127.5 - 1
+    assert np.degrees(np.arccos(np.clip(local[..., 2], -1, 1))).mean() < 1.5  # the mesh has the true normals
+    assert found.specular_factor[0] == pytest.approx(1.0, rel=1e-3)
