@@ -521,7 +521,7 @@ class ShotOrder:
     mirrored: bool = False  # angles count clockwise
 
     def remedy(self, names: Sequence[str]) -> str:
-        """Advice how to correct the stated angles to this order and sense; names (K,) are those of the stated angles."""
+        """Advice how to correct the stated angles to this order and sense; names (K,) are the shots' names."""
         moved = [(names[k], names[at]) for k, at in enumerate(self.shots) if k != at]
         renames = " and ".join(f"{old} to {new}" for old, new in moved)
         sense = "add --clockwise, or clockwise = true in capture.toml" if self.mirrored else ""
