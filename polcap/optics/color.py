@@ -159,9 +159,7 @@ def _fit_weighted(
 ) -> tuple[Floats, Floats, Floats]:
     """Fit color matrices by least squares with Huber weights, from the `usable` patches (…, N).
 
-    Returns M (…, 3, 3), e (…, 2) and b (…,).
-
-    M (…, 3, 3), e (…, 2) and b (…,) by least squares with Huber weights, from `usable` patches (…, N).
+    Returns matrix M (…, 3, 3), light slope e (…, 2) and glare b (…,) of `fit_matrix`.
     """
     exposure = float(np.mean(color[usable.reshape(-1, len(color)).any(axis=0)])) + 1e-12
     color, base = color / exposure, np.where(usable, _base(reference), 0.0)
@@ -183,10 +181,7 @@ def _median(value: Floats, usable: NDArray[np.bool_]) -> Floats:
 
 
 def _reflectance(color: Floats, position: Floats, matrix: Floats, slope: Floats, glare: Floats) -> Floats:
-    """Reflectance (…, N, 3), linear Rec.709, of patches with camera colors (N, 3).
-
-    The glare and the slope of the light are removed.
-    """
+    """Reflectance (…, N, 3), linear Rec.709, of patches with camera colors (N, 3), without glare and light slope."""
     level = 1 + np.asarray(slope) @ position.T
     return np.asarray((color @ np.swapaxes(matrix, -1, -2) - np.asarray(glare)[..., None, None]) / level[..., None])
 

@@ -178,7 +178,7 @@ def squared_gradient(picture: Floats) -> Floats:
 
 
 def _phase_correlation(reference: Level, other: Level) -> Floats:
-    """Whole-pixel shift between two pictures as a matrix (3, 3); the identity unless the shift is clearly better."""
+    """Whole-pixel shift between two pictures as a matrix (3, 3); the identity unless a shift fits clearly better."""
     a, b, both = reference.picture, other.picture, reference.usable & other.usable
     window = np.outer(np.hanning(a.shape[0]), np.hanning(a.shape[1]))
     if both.mean() < 0.05:
@@ -199,7 +199,7 @@ def _phase_correlation(reference: Level, other: Level) -> Floats:
 def _refine(
     reference: Pyramid, other: Pyramid, model: Model, scales: int, matrix: Floats
 ) -> tuple[Registration, int, float]:
-    """Refine a first guess of the motion from the coarsest of some scales to the full size.
+    """Refine a first guess of the motion on `scales` scales, from the coarsest to the full size.
 
     Returns the registration, the number of tiles that agree with it, and their share of the tiles usable in both.
     """
@@ -232,9 +232,9 @@ def _refine(
 
 
 def _match(reference: Level, other: Level, corner: Indices, matrix: Floats) -> _Matches:
-    """Residual shifts of tiles by one Gauss-Newton step.
+    """Estimate the residual shift δ of each tile under a motion, by one Gauss-Newton step.
 
-    It solves reference(x) = gain · (other(x') + ∇·δ) + offset for the shift δ of each tile.
+    It solves reference(x) = gain · (other(x') + ∇·δ) + offset.
     """
     parts = [
         _match_some(reference, other, part, matrix)
@@ -329,7 +329,7 @@ def _normalized(point: Floats, shape: tuple[int, ...]) -> Floats:
 
 
 def _design(u: Floats) -> Floats:
-    """Displacement (T, 2, 8) px per parameter at normalized points (T, 2).
+    """Displacement (T, 2, 8) of normalized points (T, 2) per unit of each of the 8 motion parameters.
 
     Parameters 0 and 1 are a translation, 2 and 3 complete a similarity, 4 to 7 a homography.
     """

@@ -15,10 +15,8 @@ Bools = NDArray[np.bool_]
 def signal(image: SensorImage, full: bool = False) -> Floats:
     """Convert sensor counts to a linear signal (H, W, C) float32, black = 0 and white = 1.
 
-    Negative noise is preserved.
-
-    A mosaic is binned by superpixels, or interpolated if `full`. C = 1 for a monochrome sensor, whose file
-    has three equal channels and no mosaic.
+    A mosaic is binned by superpixels, or demosaiced if `full`. C = 1 for a monochrome sensor, whose file has three
+    equal channels and no mosaic. Signals below black stay negative.
     """
     span = np.float32(image.white - float(image.black.mean()))
     if image.cfa is None:

@@ -1,4 +1,4 @@
-"""Fine detail of a shot's log radiance: the picture in which shots of different polarizer angles are compared."""
+"""Makes the pictures in which shots of different polarizer angles are compared: fine detail of log radiance."""
 
 import cv2
 import numpy as np
@@ -19,11 +19,10 @@ def averaging_step(shape: tuple[int, ...], most_pixels: float) -> int:
 
 
 def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
-    """Fine detail of a shot: log radiance, averaged by `step`, less all coarser than a Gaussian of `detail_px`.
+    """Compute the fine detail of a shot: log radiance minus its Gaussian mean of 1σ = `detail_px`.
 
-    `detail_px` is in averaged px.
-
-    Multiplied by d² / (d² + σ²), d the typical detail and σ the relative noise, as a Wiener filter does.
+    The shot is first averaged over `step` × `step` px; `detail_px` counts these averaged pixels. A Wiener filter
+    multiplies the detail by d² / (d² + σ²), d the typical detail and σ the relative noise.
     """
     total = block_means(_sum_of_channels(shot.value), step)
     height, width = total.shape
@@ -45,7 +44,7 @@ def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
 
 
 def edge_strength(shot: Pyramid) -> Pyramid:
-    """Strength of edges in a shot, independent of which side is brighter: root of the gradient."""
+    """Strength of the edges in a shot, independent of which side is brighter: root of the gradient's length."""
     strength = np.sqrt(cv2.GaussianBlur(np.sqrt(squared_gradient(shot[0].picture)), (0, 0), 1.0))
     return Pyramid(np.asarray(strength), shot[0].usable)
 

@@ -1,7 +1,7 @@
 """Detects motion of the object relative to its surroundings, which one transform of the whole picture would hide.
 
-A similarity's zoom and roll can stand for an object that was pushed while chart and backdrop stayed. So object and
-surroundings are registered separately, and the two motions are compared in the middle of the object.
+If the object was pushed while chart and backdrop stayed, one transform fits both by a false zoom and roll. So object
+and surroundings are registered separately, and the two motions are compared in the middle of the object.
 """
 
 from dataclasses import dataclass
@@ -71,9 +71,9 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
 
 
 def _registered(region: Pyramid, shot: Pyramid, start: Floats) -> tuple[Registration, float]:
-    """Motion of a region of the picture, and its correlation.
+    """Register one region of the picture; returns its motion and the correlation.
 
-    The search starts from the whole picture's motion and from none; the better result counts.
+    The search starts from the motion `start` of the whole picture, and from no motion; the better result is returned.
     """
     found = [registration.register(region, shot, "similarity")]
     corners = picture_corners(region.shape[1], region.shape[0])

@@ -1,7 +1,7 @@
-"""Ghost detection between the frames of a bracket, and a first estimate of the radiance.
+"""Finds ghosts (pixels where something moved between frames), and makes a first estimate of the radiance.
 
-A ghost is a pixel whose frames disagree, because something moved. Frames are registered; signals are in units of the
-sensor's range, radiance on the scale of the reference frame. All work is done in blocks of rows, channel by channel.
+Frames are registered. Signals are in units of the sensor's range; radiance is on the scale of the reference frame. All
+work is done in blocks of rows, channel by channel.
 """
 
 from dataclasses import dataclass
@@ -141,14 +141,14 @@ def first_estimate(parts: list[tuple[RegisteredFrame, Bools]], otherwise: Signal
 
 
 def _weight(serves: Bools) -> Floats | np.float32:
-    """Weight of a frame per pixel: 1 where it is used, else 0, (h, w); the number 1 if it is used everywhere."""
+    """Weight (h, w) of a frame: 1 in pixels where it is used, else 0; the number 1 if it is used everywhere."""
     return np.float32(1) if serves.all() else serves.astype(np.float32)
 
 
 def _wiener(x: Floats, electrons: Floats | np.float32, floor: Floats | np.float32) -> Floats:
-    """Wiener-filter a picture x (h, w) with known noise.
+    """Wiener-filter a picture x (h, w): local means replace detail that noise explains.
 
-    `electrons` per unit of x; `floor`: variance of read noise [electrons²].
+    `electrons` is their number per unit of x, `floor` the variance of the read noise [electrons²].
     """
     mean = box(x)
     distance = x - mean

@@ -101,9 +101,9 @@ def position() -> Floats:
 
 
 def sample(value: Floats, quality: Bits, place: Placement, share: float) -> PatchSamples:
-    """Sample S0 of each patch in a shot (H, W, 3) with quality (H, W): twice the trimmed mean over its inner part.
+    """Sample S0 of each chart patch in a shot (H, W, 3) with quality (H, W): twice the trimmed mean of its pixels.
 
-    `share` of each patch's side is sampled.
+    Only the inner part of a patch is sampled, a square with the share `share` of its side.
     """
     color_, uneven = np.zeros((24, 3)), np.zeros(24)
     use = np.zeros(24, np.uint8)
@@ -141,7 +141,7 @@ def left_out(use: Bits) -> str:
 
 
 def _between_quarters(pixels: Floats, x: Floats, y: Floats) -> float:
-    """Unevenness of a patch: largest difference of light (sum of channels) between a quarter and the whole patch."""
+    """Unevenness of a patch: largest difference of light (sum of channels) between one quarter and the whole patch."""
     light = pixels.sum(axis=1)
     quarter = 2 * (x > 0) + (y > 0)
     means = [np.median(light[quarter == q]) for q in range(4) if (quarter == q).sum() >= 4]
