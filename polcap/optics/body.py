@@ -86,12 +86,6 @@ def flattening(cos_i: Any, cos_o: Any, between: Any, alpha: Any) -> Any:
     return 1 + strength * xp.clip(between - cos_i * cos_o, 0.0, None) / (greater * (1 + greater))
 
 
-def make_tables() -> None:
-    """Compute the tables of `leaving` and `flattening` in advance; it takes 0.3 s."""
-    _table()
-    _strengths()
-
-
 def _interpolate_table(c: Any, alpha: Any, ior: Any) -> tuple[Any, Any, Any]:
     """Trilinear interpolation of `_table` at cosine, α and index: three values (...,)."""
     xp = array_namespace(c)

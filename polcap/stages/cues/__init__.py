@@ -96,10 +96,10 @@ def least_intensity_color(stokes: Any, matrix: Any) -> Any:
     return xp.where(length > 1e-4, color / (length + 1e-12), 0.0 * color)
 
 
-def zenith(dolp: Any, ior: float = NOMINAL_IOR) -> Any:
-    """Zenith angle (...) [rad] of a surface from the DoLP (...) of its diffuse reflection."""
+def zenith(dolp: Any) -> Any:
+    """Zenith angle (...) [rad] of a surface of refractive index 1.5, from the DoLP (...) of its diffuse reflection."""
     xp = array_namespace(dolp)
-    return xp.acos(xp.clip(fresnel.cos_zenith_from_dolp(dolp, ior), 0.0, 1.0))
+    return xp.acos(xp.clip(fresnel.cos_zenith_from_dolp(dolp, NOMINAL_IOR), 0.0, 1.0))
 
 
 def channels(cues: Any) -> Any:
