@@ -10,7 +10,6 @@ from polcap.rig.device_log import Log
 from polcap.rig.motor_grbl import MEANING, GrblMotor, GrblSettings
 from polcap.rig.serial_port import NoAnswer, Port
 from tests.clocks import SleepClock
-from tests.rig import virtual
 from tests.rig.devices import Grbl
 
 pytestmark = [pytest.mark.timeout(60), pytest.mark.usefixtures("clock")]
