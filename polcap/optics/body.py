@@ -119,8 +119,8 @@ def _step(xp: Any, x: Any, nodes: Floats) -> tuple[Any, Any]:
 def _table() -> Floats:
     """Table of diffuse reflection, (3, 21, 49, 3): refractive index, α, cosine of the zenith angle, value.
 
-    The values are ⟨T₊⟩ − T₊ (⟨ ⟩: mean over the visible facets; T₊ alone: of the smooth interface), and the DoLP
-    relative to that of the smooth interface, for `Law.local` 0 and 1.
+    The three values compare a rough interface with the smooth one: its mean transmittance T₊ minus that of the smooth
+    interface, and its DoLP over that of the smooth interface, for `Law.local` 0 and 1.
     """
     out = np.zeros((len(_INDICES), len(_ALPHAS), len(_COSINES), 3))
     out[..., 1:] = 1.0

@@ -281,10 +281,10 @@ def _match_some(reference: Level, other: Level, corner: Indices, matrix: Floats)
 
 
 def _without_noise(shift: Floats, normal: Floats, count: Floats, variance: Floats) -> tuple[Floats, Floats]:
-    """Tile shifts (T, 2) and information (T, 2, 2), corrected for gradient noise, which makes shifts too small.
+    """Correct the shifts (T, 2) of tiles for noise of their gradients, which makes them too small.
 
-    The normal matrix (T, 4, 4), with gain and offset eliminated, is the sum of the scene's gradients and the noise's:
-    half the variance (T,) of each of `count` (T,) pixels. Directions dominated by noise are left out.
+    `normal` (T, 4, 4) is the normal matrix of each tile; the noise adds half the `variance` (T,) of each of its `count`
+    (T,) pixels. Directions dominated by noise are left out. Also returns the information (T, 2, 2) of the shifts.
     """
     both = np.linalg.inv(np.linalg.inv(normal)[:, :2, :2])
     power, axes = np.linalg.eigh(both)

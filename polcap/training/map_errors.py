@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from polcap.images import Bools, Floats, Quality, SurfaceMaps
 from polcap.optics import frames, shade
+from polcap.optics.morphology import erode
 from polcap.stages import surface
 from polcap.training.evaluation_protocol import Case, render_lights
 
@@ -25,7 +25,7 @@ class Judge:
 
     def __init__(self, case: Case) -> None:
         self.case, self.mask = case, case.truth.mask
-        self.core = cv2.erode(self.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        self.core = erode(self.mask, 2)
         self.clipped = self.mask & ((case.cues.quality & Quality.CLIPPED) > 0)
         self.rendered_mask = np.zeros_like(self.mask)
         self.rendered_mask.flat[np.flatnonzero(self.mask)[:: -(-int(self.mask.sum()) // _MAX_PIXELS)]] = True

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from polcap.images import Floats, MaskedImage, Quality
+from polcap.optics.morphology import dilate
 from polcap.optics.registration import Pyramid, squared_gradient
 from polcap.optics.resize import block_means
 
@@ -39,8 +40,7 @@ def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
     sigma /= level
     fine /= 1 + (sigma / np.float32(_TYPICAL_DETAIL)) ** 2
     clipped = block_means(shot.quality & Quality.CLIPPED > 0, step) > 0
-    around = np.ones((int(np.ceil(2 * detail_px)) | 1,) * 2, np.uint8)
-    return Pyramid(fine, cv2.dilate(clipped.view(np.uint8), around) == 0)
+    return Pyramid(fine, ~dilate(clipped, int(np.ceil(2 * detail_px)) // 2))
 
 
 def edge_strength(shot: Pyramid) -> Pyramid:

@@ -6,11 +6,11 @@ and surroundings are registered separately, and the two motions are compared in 
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from polcap.images import Alignment, AngleStack, Floats, ObjectMask
 from polcap.optics import registration
+from polcap.optics.morphology import dilate, erode
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import Pyramid, Registration
 from polcap.optics.resize import area_mean
@@ -46,8 +46,7 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
     step = averaging_step(object_.mask.shape, _MOST_PIXELS)
     reference = detail(radiance.shot(0), _DETAIL_PX, step)[0]
     small = area_mean(object_.mask.astype(np.uint8), reference.picture.shape)
-    near = cv2.dilate(small, np.ones((2 * _RIM_PX + 1,) * 2, np.uint8)) > 0
-    core = cv2.erode(small, np.ones((_RIM_PX + 1,) * 2, np.uint8)) > 0
+    near, core = dilate(small > 0, _RIM_PX), erode(small > 0, _RIM_PX // 2)
     regions = [Pyramid(reference.picture, reference.usable & region) for region in (near, ~near, core)]
     points = np.argwhere(core)[::_EVERY, ::-1].astype(np.float64)
     middle = np.argwhere(small).mean(axis=0)[::-1] if small.any() else np.array(small.shape[::-1]) / 2

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Asset, Floats, Mesh, SurfaceMaps, TexturePixels
 from polcap.optics import color, frames, fresnel
+from polcap.optics.morphology import dilate, erode
 from polcap.optics.resize import area_mean
 from polcap.stages import stage
 from polcap.stages.asset.ambient_occlusion import ambient_occlusion
@@ -134,9 +135,8 @@ def _resize(texture: TexturePixels, shape: tuple[int, int]) -> Floats:
 
 def _without_outline(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Erode a mask by its outermost pixels, except for parts that would vanish."""
-    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    near = cv2.dilate(inner, np.ones((5, 5), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    return np.asarray((inner > 0) | (mask & (near == 0)))
+    inner = erode(mask, 1, from_border=True)
+    return np.asarray(inner | (mask & ~dilate(inner, 2)))
 
 
 def fill_outward(value: Any, known: NDArray[np.bool_]) -> Any:

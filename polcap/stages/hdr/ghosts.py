@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.images import Floats
+from polcap.optics.morphology import dilate, erode
 from polcap.optics.registration import squared_gradient
 from polcap.stages.hdr.noise import Noise
 from polcap.stages.hdr.planes import Signals, blocks
@@ -98,10 +99,10 @@ class Anchor:
                 if frame.vignetting is not None:
                     scaled /= frame.vignetting[rows]
                 off |= np.abs(scaled - level) > limit
-            found[target] = (off & _all_around(known[rows], _WINDOW // 2))[inner]
+            found[target] = (off & erode(known[rows], _WINDOW // 2))[inner]
 
         parallel.results(partial(compare, *block) for block in blocks(height, _WINDOW // 2 + 1))
-        return _any_around(_all_around(found, 1), _WINDOW // 2 + 2)
+        return dilate(erode(found, 1), _WINDOW // 2 + 2)
 
 
 def first_estimate(parts: list[tuple[RegisteredFrame, Bools]], otherwise: Signals | Anchor, ghost: Bools) -> Floats:
@@ -160,15 +161,3 @@ def box(picture: Floats) -> Floats:
     """Box filter: mean (h, w) over the window around each pixel of a picture (h, w); border pixels are repeated."""
     # twice as fast as cv2.blur, which sums in float64
     return np.asarray(cv2.sepFilter2D(picture, -1, _EVEN, _EVEN, borderType=cv2.BORDER_REPLICATE))
-
-
-def _any_around(mask: Bools, reach: int) -> Bools:
-    """Dilate a mask by `reach` px in all eight directions."""
-    kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    return np.asarray(cv2.dilate(mask.view(np.uint8), kernel)).view(bool)
-
-
-def _all_around(mask: Bools, reach: int) -> Bools:
-    """Erode a mask by `reach` px in all eight directions, except from the picture's border."""
-    kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    return np.asarray(cv2.erode(mask.view(np.uint8), kernel)).view(bool)

@@ -83,7 +83,7 @@ def roughness(picture: Floats) -> Floats:
 
 
 def strips(height: int, width: int, most: float = 0.75e6) -> list[slice]:
-    """Choose evenly spaced strips of rows in which noise is measured, about `most` px in all at the most.
+    """Choose evenly spaced strips of rows in which noise is measured, at most about `most` px in all.
 
     A strip is as high as a tile plus the 2 px that `roughness` needs.
     """

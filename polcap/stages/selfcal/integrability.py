@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Bools, Floats
 from polcap.optics import fresnel, mueller
+from polcap.optics.morphology import erode
 from polcap.optics.robust import biweight, jackknife, spread
 from polcap.stages.selfcal.object_gains import GainEstimate, unknown
 
@@ -77,7 +78,7 @@ def gains(light: Floats, usable: Bools, angle: Floats, start: Floats) -> GainEst
 
 @dataclass(frozen=True)
 class SlopeField:
-    """Shots averaged down to about 110 px a side, from which slopes and their derivatives are computed."""
+    """Reduced shots of about 110 px a side, from which the slopes and their derivatives are computed."""
 
     light: Floats  # (K, h, w)
     inside: Bools  # (h, w)
@@ -133,8 +134,7 @@ def reduced_slopes(light: Floats, usable: Bools, angle: Floats) -> SlopeField | 
     shape = (height // block, block, width // block, block)
     means = light[:, :height, :width].reshape(len(light), *shape).mean((2, 4), dtype=np.float64)
     whole = usable[:height, :width].reshape(shape).all((1, 3)) & (means > 0).all(0)
-    reach = 2 * int(2 * BLUR) + 1
-    inside = cv2.erode(whole.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+    inside = erode(whole, int(2 * BLUR))
     return SlopeField(means, inside, angle) if inside.sum() >= _LEAST else None
 
 

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from polcap import parallel
 from polcap.images import Alignment, AngleStack, Bits, Bools, Floats, ObjectMask, Quality
 from polcap.optics import frames, mueller
+from polcap.optics.morphology import erode
 from polcap.optics.outline import OutlineBand
 from polcap.optics.robust import biweight, jackknife, spread
 from polcap.optics.warp import warp
@@ -79,7 +80,7 @@ def register(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) ->
     quality = np.where(np.any(flagged, axis=0), np.uint8(Quality.CLIPPED), np.uint8(0))
     light = np.stack([cv2.GaussianBlur(frames.total(v), (0, 0), _BLUR_PX) for v in value])
     mask = object_.mask[y0:y1, x0:x1]
-    solid = cv2.erode(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    solid = erode(mask, 3)
     inside = np.asarray((solid if solid.sum() > 100 else mask) & (quality == 0))
     height, width = radiance.value.shape[1:3]
     return ObjectShots(value, light, quality, mask, inside, crop, (height, width))
