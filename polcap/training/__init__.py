@@ -29,6 +29,7 @@ Evaluation:
     evaluate                errors of every map (`map_errors`), for a model and for `evaluation_baselines`
     evaluation_protocol     the fixed pictures: `evaluation_materials` under the light of `light_transport`
     evaluation_page         the result as a page
+    ablation_study          all variants of the network, trained and evaluated
     evaluation_photographs  errors of the normals on photographs with measured normals
 
 Data:
