@@ -123,7 +123,7 @@ def save(file: Path, array: NDArray[Any]) -> list[Any]:
 
 
 def load(file: Path) -> NDArray[Any]:
-    """Open an array from an .npy file: large arrays as read-only memory maps, small ones read into memory.
+    """Open an array of any shape from an .npy file: as a read-only memory map if large, else read into memory.
 
     Raises StorageError: the file is missing or no .npy.
     """
