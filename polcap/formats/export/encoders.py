@@ -119,7 +119,7 @@ def _ktx2(texture: Texture) -> bytes:
 
 
 def eight_bits(texture: Texture) -> NDArray[np.uint8]:
-    """The pixels of a texture as integers of 8 bits."""
+    """The pixels of a texture, (H, W) or (H, W, C), as integers of 8 bits."""
     if texture.pixels.dtype == np.uint8:
         return np.asarray(texture.pixels, dtype=np.uint8)
     return np.asarray(np.rint(texture.pixels / 257.0), dtype=np.uint8)
