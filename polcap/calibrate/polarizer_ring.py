@@ -1,8 +1,8 @@
 """Extinction ratio, zero and sense of a polarizer on its ring, from polarized light of a known axis.
 
-At the ring angle θ the filter's axis is at s θ + z. Light polarized along α has the intensity I(θ) = a (1 + c cos 2(s θ
-+ z − α)). The contrast c gives the extinction ratio E = (1 + c)/(1 − c), the phase gives the zero z. To find the sense
-s = ±1, light of two axes is needed.
+At the ring angle θ the filter's axis is at s θ + z. The intensity of light polarized along α is then
+I(θ) = a (1 + c cos 2(s θ + z − α)). The contrast c gives the extinction ratio E = (1 + c)/(1 − c), the phase gives the
+zero z. To find the sense s = ±1, light of two axes is needed.
 
 References
 ----------

@@ -51,8 +51,8 @@ def greatest_diffuse_dolp(ior: float) -> float:
 def cos_zenith_from_dolp(dolp: Any, ior: float) -> Any:
     """Cosine (...,) of the zenith angle from the DoLP ρ (...,) of diffuse reflection: inverse of `diffuse_dolp`.
 
-    cos θ = (n − S)/√(S((1 + n²)S − 2n)) with S = √((1 + ρ)/(1 − ρ)). The DoLP is clipped to the range that the index n
-    = `ior` allows.
+    cos θ = (n − S)/√(S((1 + n²)S − 2n)) with S = √((1 + ρ)/(1 − ρ)) and the index n = `ior`. The DoLP is clipped to the
+    range of this index.
     """
     xp = array_namespace(dolp)
     rho = xp.clip(dolp, 0.0, greatest_diffuse_dolp(ior) - 1e-6)
