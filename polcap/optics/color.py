@@ -109,6 +109,11 @@ def fit_matrix(
     return MatrixFit(matrix=matrix, slope=slope, glare=float(glare), delta_e=residual)
 
 
+def residuals(fit: MatrixFit, color: Floats, reference: Floats, position: Floats) -> Floats:
+    """CIEDE2000 (N,) of patches (N, 3) under a matrix fitted to others; arguments as of `fit_matrix`."""
+    return delta_e(_reflectance(color, position, fit.matrix, fit.slope, np.asarray(fit.glare)), reference)
+
+
 def cross_validate(
     color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], rounds: int = 20
 ) -> Floats:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from polcap.formats.maps import maps_folder
-from polcap.images import ColorCalibration, Floats, Mesh, Quality, StokesImage
+from polcap.images import ColorCalibration, Floats, Mesh, PatchColors, Quality, StokesImage
 from polcap.report import page_data
 from polcap.results import Results
 from polcap.stages.whitebalance import patches
@@ -75,12 +75,22 @@ def _colors(color: ColorCalibration, albedo_sigma: float | None) -> dict[str, An
         "delta_e": _plain(delta_e, 2),
         "predicted_mean": None if predicted is None else _plain(np.nanmean(predicted)),
         "predicted": _plain(predicted, 2),
+        "surroundings": _surroundings(fit),
         "left_out": None if fit is None or fit.use is None else patches.left_out(fit.use),
         "detector_cost": _plain(color.cost),
         "metres_per_px": color.metres_per_px,
         "scale_doubt": albedo_sigma,
         "matrix": _plain(color.matrix, 5),
     }
+
+
+def _surroundings(fit: PatchColors | None) -> str | None:
+    """Use of the patches around the block of an SG, in words."""
+    if fit is None or fit.surroundings is None:
+        return None
+    used = fit.surroundings[~np.isnan(fit.surroundings)]
+    mean = f", mean color error {used.mean():.1f} ΔE2000" if len(used) else ""
+    return f"{len(used)} of {len(fit.surroundings)} used{mean}"
 
 
 def _object(results: Results) -> dict[str, Any]:
