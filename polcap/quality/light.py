@@ -345,7 +345,7 @@ def _surroundings_dolp(found: Evidence) -> float:
     if clear.sum() < _LEAST_ROOM_TILES:
         return float("nan")
     shots = zip(radiance.value, found.selfcal.gains.gain)
-    light = [block_means((shot / gain).sum(-1), _ROOM_TILE)[clear] for shot, gain in shots]
+    light = [block_means(shot, _ROOM_TILE)[clear] @ (1 / gain) for shot, gain in shots]
     s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(found.selfcal.angle), np.stack(light), rcond=None)[0]
     return float(np.hypot(np.median(s1 / np.maximum(s0, 1e-9)), np.median(s2 / np.maximum(s0, 1e-9))))
 

@@ -42,7 +42,10 @@ class Noise:
 
     def of_channel(self, channel: int, signal: Floats) -> Floats:
         """Variance (h, w) of one channel for its expected signals (h, w)."""
-        return np.asarray(np.maximum(signal, 0) * self.slope[channel] + self.floor[channel])
+        variance: Floats = np.maximum(signal, 0)
+        variance *= self.slope[channel]
+        variance += self.floor[channel]
+        return variance
 
     def of_radiance(self, ratio: Floats, gain: float = 1.0) -> "Noise":
         """The noise line of radiance: signals divided by their exposure ratio (C,), with `gain` times the variance."""
