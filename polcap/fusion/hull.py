@@ -7,6 +7,7 @@ Laurentini, The visual hull concept for silhouette-based image understanding, IE
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,11 @@ class VoxelGrid:
     origin: Floats  # (3,) m, world frame
     step: float  # m
     shape: tuple[int, int, int]
+
+    def corners(self) -> Floats:
+        """The eight corners (8, 3) m of the grid's box."""
+        far = self.origin + self.step * (np.array(self.shape) - 1)
+        return np.array(list(product(*zip(self.origin, far))))
 
 
 @dataclass(frozen=True)
@@ -134,6 +140,8 @@ def _without_false_loops(body: Bools) -> Bools:
         ball = ndimage.iterate_structure(ndimage.generate_binary_structure(3, 1), radius)
         closed = ndimage.binary_closing(np.pad(body, radius + 1), ball)[(np.s_[radius + 1 : -radius - 1],) * 3]
         body = _take_over(body, closed & ~body, True)
+    for radius in range(1, _THIN + 1):  # after all tunnels are filled, so that no wall between two of them is cut
+        ball = ndimage.iterate_structure(ndimage.generate_binary_structure(3, 1), radius)
         body = _take_over(body, body & ~ndimage.binary_opening(body, ball), False)
     return body
 

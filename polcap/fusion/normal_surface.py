@@ -24,14 +24,15 @@ from polcap.images import Bools, Floats
 from polcap.optics.frames import cross, dot, unit
 from polcap.synth.mesh_tracer import Tracer, Triangles
 
-ROUNDS = 7  # this and the numbers below: docs/benchmarks/fusion.md
-_LIFT = 0.3  # steps off the surface where rays towards the lenses start
+_LIFT = 0.3  # steps off the surface where rays towards the lenses start; the numbers: docs/benchmarks/fusion.md
 _FACING = 0.1  # least cosine between a vertex's normal and the direction to a lens that sees it
 _CAUCHY = np.radians(12.0)  # rad; a view that differs by as much from the mean counts half
 _RIM_DEPTH = 3.0  # steps inside the silhouette where rims are searched
 _RIM_LAYER = 1.0  # steps; of the outermost layer of this thickness the vertex most square to the ray is the rim
 _RIM_COSINE = 0.5  # largest cosine between a rim's measured normal and its ray
 _RIM_WEIGHT = 1.0  # of a rim's equation over that of an edge
+_HOLLOW_WEIGHT = 0.5  # of the equation that holds a carved vertex
+_HOLLOW_DEPTH = 2.0  # steps inside the hull from where on the surface was carved
 _DAMPING = 0.02  # weight of the equations displacement = 0
 _SMOOTHNESS = 0.1  # weight of the equations displacement = that of the neighbor
 _RELAXATION = 0.5  # share of the way to the neighbors' middle, along the surface
@@ -43,21 +44,52 @@ class SurfaceNormals:
 
     normal: Floats  # (V, 3) unit, world frame
     weight: Floats  # (V,) 0 where no view sees the vertex … 1 where several views agree
+    agreement: Floats  # (V,) share of the views' weight near the mean; 1 where no view sees the vertex
 
 
 @dataclass(frozen=True)
-class RimAnchors:
-    """Vertices that touch silhouettes: slope · displacement = distance."""
+class Anchors:
+    """Vertices with a known place: slope · displacement = distance."""
 
     vertex: NDArray[np.intp]  # (R,)
-    slope: Floats  # (R,) motion away from the silhouette's cone per displacement
-    distance: Floats  # (R,) m from the vertex out to the silhouette's cone
+    slope: Floats  # (R,) motion towards the place per displacement
+    distance: Floats  # (R,) m from the vertex to the place
+    weight: float  # of an equation over that of an edge
 
 
-def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid, rounds: int = ROUNDS) -> ClosedMesh:
-    """Surface with the views' normals, from a mesh of the hull; same triangles."""
+@dataclass(frozen=True)
+class FittedSurface:
+    """A closed surface, and how far the views agree on its normals."""
+
+    vertices: Floats  # (V, 3) m
+    faces: NDArray[np.int32]  # (F, 3)
+    agreement: Floats  # (V,) share of the views' weight near the mean normal
+    neighbors: sparse.csr_matrix  # (V, V) mean of the neighbors' values
+
+    @property
+    def mesh(self) -> ClosedMesh:
+        return ClosedMesh(self.vertices, self.faces)
+
+    def spread(self, value: Floats, rounds: int) -> Floats:
+        """Values (V,) averaged `rounds` times with their neighbors'."""
+        for _ in range(rounds):
+            value = self.neighbors @ value
+        return value
+
+    def tracer(self) -> Tracer:
+        """The surface prepared for ray tracing."""
+        return _tracer(self.vertices, self.faces)
+
+
+def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid, rounds: int) -> FittedSurface:
+    """Surface with the views' normals, from a mesh of the hull or of the carved hull; same triangles.
+
+    Rims hold the surface at the silhouettes. Hollows have none, so they are held where they were carved.
+    """
     step, faces = hull.grid.step, mesh.faces
-    vertices: Floats = mesh.vertices.astype(np.float64)
+    start: Floats = mesh.vertices.astype(np.float64)
+    hollow = np.flatnonzero(hull.at(start) < -_HOLLOW_DEPTH * step)
+    vertices = start
     neighbors = _neighbor_means(faces, len(vertices))
     for _ in range(rounds):
         vertices = _relaxed(vertices, faces, neighbors)
@@ -65,9 +97,12 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
         seen = visible(vertices, faces, outward, views, step)
         target = mean_normals(vertices, outward, seen, views)
         rims = find_rims(vertices, outward, target, views, step)
-        move = _displacements(vertices, faces, outward, target, rims)
+        carved = Anchors(
+            hollow, np.ones(len(hollow)), dot(outward[hollow], start[hollow] - vertices[hollow]), _HOLLOW_WEIGHT
+        )
+        move = _displacements(vertices, faces, outward, target, [rims, carved])
         vertices = _inside(vertices + outward * move[:, None], hull)
-    return ClosedMesh(vertices, faces)
+    return FittedSurface(vertices, faces, target.agreement, neighbors)
 
 
 def vertex_normals(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
@@ -83,14 +118,18 @@ def visible(
     vertices: Floats, faces: NDArray[np.integer], outward: Floats, views: Sequence[SmallView], step: float
 ) -> Bools:
     """Which view sees which vertex, (N, V): the vertex faces the lens, and the mesh does not hide it."""
-    corners = np.zeros((len(faces), 3, 3), np.float32)  # occlusion needs no shading normals
-    tracer = Tracer(Triangles(vertices.astype(np.float32), faces.astype(np.int32), corners))
+    tracer = _tracer(vertices, faces)
     start = vertices + outward * (_LIFT * step)
     seen = np.zeros((len(views), len(vertices)), bool)
     for row, view in zip(seen, views):
         facing = np.flatnonzero(dot(outward, view.towards(vertices)) > _FACING)
         row[facing] = ~tracer.hidden(start[facing], view.pose.center)
     return seen
+
+
+def _tracer(vertices: Floats, faces: NDArray[np.integer]) -> Tracer:
+    corners = np.zeros((len(faces), 3, 3), np.float32)  # shading normals are not needed
+    return Tracer(Triangles(vertices.astype(np.float32), faces.astype(np.int32), corners))
 
 
 def mean_normals(vertices: Floats, outward: Floats, seen: Bools, views: Sequence[SmallView]) -> SurfaceNormals:
@@ -105,16 +144,17 @@ def mean_normals(vertices: Floats, outward: Floats, seen: Bools, views: Sequence
         facing = dot(normal, view.towards(vertices))
         measured.append(normal)
         weight.append(row * np.maximum(facing, 0) * sample(view.certainty, pixel))
-    n, w = np.stack(measured), np.stack(weight)  # (N, V, 3), (N, V)
+    n, w = np.stack(measured).astype(np.float32), np.stack(weight).astype(np.float32)  # (N, V, 3), (N, V)
     loss = [np.sum(w * np.log1p(_angle2(n, one) / _CAUCHY**2), axis=0) for one in n]
     best = np.argmin(np.where(w > 0, loss, np.inf), axis=0)
     mean = n[best, np.arange(len(vertices))]
     for _ in range(3):
         agreeing = w / (1 + _angle2(n, mean) / _CAUCHY**2)
         mean = unit(np.sum(agreeing[..., None] * n, axis=0))
-    views_agreeing = np.sum(agreeing, axis=0) / np.maximum(w.max(axis=0), 1e-12)
-    unseen = views_agreeing == 0
-    return SurfaceNormals(np.where(unseen[:, None], outward, mean), views_agreeing / (1 + views_agreeing))
+    close, total = np.sum(agreeing, axis=0), np.sum(w, axis=0)
+    count = close / np.maximum(w.max(axis=0), 1e-12)  # of the agreeing views
+    agreement = np.where(total > 0, close / np.maximum(total, 1e-12), 1.0)
+    return SurfaceNormals(np.where(count[:, None] > 0, mean, outward), count / (1 + count), agreement)
 
 
 def _angle2(a: Floats, b: Floats) -> Floats:
@@ -124,7 +164,7 @@ def _angle2(a: Floats, b: Floats) -> Floats:
 
 def find_rims(
     vertices: Floats, outward: Floats, target: SurfaceNormals, views: Sequence[SmallView], step: float
-) -> RimAnchors:
+) -> Anchors:
     """One vertex for each piece of each silhouette, a step long.
 
     Of the outermost vertices at the piece it is the one with the measured normal most nearly square to the ray. To
@@ -147,11 +187,11 @@ def find_rims(
         slope = dot(out[first], outward[near[first]])
         found.append(np.stack([near[first], slope, -distance[near[first]]]))
     vertex, slope, distance = np.concatenate(found, axis=1)
-    return RimAnchors(vertex.astype(np.intp), slope, distance)
+    return Anchors(vertex.astype(np.intp), slope, distance, _RIM_WEIGHT)
 
 
 def _displacements(
-    vertices: Floats, faces: NDArray[np.integer], outward: Floats, target: SurfaceNormals, rims: RimAnchors
+    vertices: Floats, faces: NDArray[np.integer], outward: Floats, target: SurfaceNormals, anchors: Sequence[Anchors]
 ) -> Floats:
     """Displacements (V,) m along `outward` by least squares.
 
@@ -167,12 +207,13 @@ def _displacements(
     smooth2 = _SMOOTHNESS**2
     diagonal = np.full(count, _DAMPING**2)
     diagonal += np.bincount(i, w2 * a_i**2 + smooth2, count) + np.bincount(j, w2 * a_j**2 + smooth2, count)
-    diagonal += np.bincount(rims.vertex, _RIM_WEIGHT**2 * rims.slope**2, count)
     right = np.bincount(j, w2 * a_j * b, count) - np.bincount(i, w2 * a_i * b, count)
-    right += np.bincount(rims.vertex, _RIM_WEIGHT**2 * rims.slope * rims.distance, count)
+    for of in anchors:
+        diagonal += np.bincount(of.vertex, of.weight**2 * of.slope**2, count)
+        right += np.bincount(of.vertex, of.weight**2 * of.slope * of.distance, count)
     beside = sparse.coo_matrix((-w2 * a_i * a_j - smooth2, (i, j)), shape=(count, count)).tocsr()
     matrix = beside + beside.T + sparse.diags(diagonal)
-    move, _ = cg(matrix, right, rtol=1e-4, maxiter=400, M=sparse.diags(1 / diagonal))
+    move, _ = cg(matrix, right, rtol=1e-3, maxiter=200, M=sparse.diags(1 / diagonal))
     return np.asarray(move)
 
 

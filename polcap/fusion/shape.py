@@ -6,11 +6,17 @@ from typing import Annotated
 
 from msgspec import Meta
 
+from polcap.fusion.carving import carve
 from polcap.fusion.closed_mesh import iso_surface, solid
 from polcap.fusion.hull import visual_hull
 from polcap.fusion.normal_surface import fit_normals
 from polcap.fusion.small_views import reduce_views
 from polcap.fusion.values import ClosedMesh, FusionView
+
+_ROUNDS, _FIRST_ROUNDS = (
+    7,
+    4,
+)  # of the surface's fit, and of these before hollows are searched; docs/benchmarks/fusion.md
 
 
 @dataclass(frozen=True)
@@ -30,4 +36,10 @@ def fuse_shape(views: Sequence[FusionView], settings: ShapeSettings) -> ClosedMe
     """
     small = reduce_views(views)
     hull = visual_hull(small, settings.grid)
-    return solid(fit_normals(iso_surface(hull), small, hull))
+    surface = fit_normals(iso_surface(hull), small, hull, _FIRST_ROUNDS)
+    carved = carve(hull, surface, small)
+    if carved is not hull:
+        surface = fit_normals(iso_surface(carved), small, hull, _ROUNDS)
+    else:
+        surface = fit_normals(surface.mesh, small, hull, _ROUNDS - _FIRST_ROUNDS)
+    return solid(surface.mesh)

@@ -5,7 +5,7 @@ assumption. A gate that had nothing to measure is marked "not measured".
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -82,10 +82,7 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
 def document(
     facts: Mapping[str, Any], results: Results, config: Config, timings: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Assemble the content of report.json.
-
-    Facts of the run, figures, gates, and the computing time of each stage [s].
-    """
+    """Assemble the content of report.json: facts of the run, figures, gates, computing time of each stage [s]."""
     measured = {**figures.measured(results), "rerendering": figures.rerendering(results, config.infer.ior)}
     focal_doubt = tuple(facts["capture"].get("focal_doubt", (0.0, 0.0)))
     judged = list(gates.judge(full_size(results, focal_doubt), config.gates, config.align))
@@ -93,6 +90,7 @@ def document(
         "polcap": __version__,
         "versions": facts["versions"],
         "verdict": gates.verdict(judged),
+        "expected_error_deg": _expected_error_deg(judged),
         "capture": facts["capture"],
         "gates": msgspec.to_builtins(judged),
         "figures": measured,
@@ -104,11 +102,14 @@ def document(
     }
 
 
-def model_facts(network: Network | None) -> dict[str, str] | None:
-    """Metadata and digest of the estimator's network, with the digest of its refinement network.
+def _expected_error_deg(judged: Sequence[Gate]) -> float | None:
+    """Median of the expected error of the normals [°]; None where it was not measured."""
+    found = [gate.value for gate in judged if gate.name == "normal error" and isinstance(gate.value, float)]
+    return found[0] if found else None
 
-    None for the analytic estimator.
-    """
+
+def model_facts(network: Network | None) -> dict[str, str] | None:
+    """Metadata and digest of the estimator's network and of its refinement network; None: the analytic estimator."""
     if network is None:
         return None
     refinement = {} if network.fine is None else {"fine": network.fine.digest}

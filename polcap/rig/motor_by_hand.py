@@ -11,7 +11,7 @@ SETTINGS = RotatorSettings(settle=0.0, tolerance=180.0)  # any angle typed is ac
 
 
 class MotorByHand:
-    """Asks a person for every angle; the scale on the ring or on the table defines zero."""
+    """Driver that asks a person to turn the ring or the board to each angle; a scale on it defines zero."""
 
     model = "by hand"
     speed_deg_s = 9.0  # a quarter turn in ten seconds, for the plan

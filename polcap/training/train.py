@@ -36,13 +36,14 @@ class TrainingOptions:
     samples: int | None = None  # budget in pictures, instead of minutes
     resume: bool = False  # continue from out/last.pt
     start: Path | None = None  # ONNX model with the first weights; else random ones
-    done: int = 0  # pictures of `samples` that `start` has seen; the schedule goes on from there
+    done: int = 0  # pictures of `samples` with which `start` was trained; the schedule continues from there
     views: int | None = None  # of each mesh, instead of the preset's
     procedural: int | None = None  # random shapes, instead of the preset's
     threads: int = 2  # on a CPU, each with a batch of its own; one more thread makes the batches
     seed: int = 1
     rate: float = 1e-3  # of Muon; at twice this rate weights grew until training diverged
     variant: str = "ours"  # key of VARIANTS
+    traced: Path | None = None  # holds the traced views, instead of `out`
 
 
 @dataclass(frozen=True)
@@ -95,9 +96,10 @@ def main(options: TrainingOptions, report: Report = silent) -> Path:
     views = preset.views if options.views is None else options.views
     procedural = preset.procedural if options.procedural is None else options.procedural
     recipe = traced_views.ViewsRecipe(views=views, procedural=procedural, size=preset.size, seed=13)
-    cache = traced_views.open_cache(options.out / "views", traced_views.training_meshes(options.data), recipe, report)
+    traced = options.traced or options.out
+    cache = traced_views.open_cache(traced / "views", traced_views.training_meshes(options.data), recipe, report)
     library = materials.MaterialLibrary(options.data / "materials" / "train", device)
-    network.held_out = HeldOutPictures(options.data, options.out / "watch", device, report)
+    network.held_out = HeldOutPictures(options.data, traced / "watch", device, report)
     torch.set_num_threads(1)
     budget = loop.Budget(options.minutes, options.samples)
     made = _make_batches(Simulator(cache, library, device), preset, network, budget, options.seed + network.step)
@@ -137,7 +139,7 @@ def _check(options: TrainingOptions) -> None:
 def _make_batches(
     simulator: Simulator, preset: TrainingPreset, network: loop.Trainee, budget: loop.Budget, seed: int
 ) -> Iterator[Batch]:
-    """Endless training batches that follow from the seed: nothing else draws from torch's global random state."""
+    """Yield training batches without end. The seed determines them, because only this thread draws random numbers."""
     torch.manual_seed(seed)
     chooser, made = np.random.default_rng(seed), network.samples
     while True:

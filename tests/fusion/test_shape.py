@@ -12,7 +12,17 @@ from polcap.errors import ObjectError
 from polcap.fusion.closed_mesh import euler_number, is_closed, levels, volume
 from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.values import ClosedMesh
-from tests.fusion.traced_views import SIZE, Body, all_around, capture, disturbed, ring, stand, with_errors
+from tests.fusion.traced_views import (
+    SIZE,
+    Body,
+    all_around,
+    capture,
+    disturbed,
+    into_the_opening,
+    ring,
+    stand,
+    with_errors,
+)
 
 GRID = 60
 
@@ -55,6 +65,22 @@ def test_a_torus_keeps_its_hole() -> None:
     views = [capture(body, pose, 128) for pose in ring(body, 12)]
     fused = fuse_shape(views, ShapeSettings(grid=GRID))
     assert euler_number(fused) == 0 and is_closed(fused)
+
+
+def test_a_bowl_is_hollow() -> None:
+    profile = [[0, 0], [0.6, 0], [1, 0.9], [0.85, 0.9], [0.5, 0.15], [0, 0.15]]  # radius and height
+    turned = trimesh.creation.revolve(np.array(profile), sections=64)
+    turned = turned.subdivide_to_size(0.1)
+    body = stand(turned.vertices[:, [0, 2, 1]] * [1, 1, -1], turned.faces)  # the axis upwards
+    rng = np.random.default_rng(0)
+    views = [with_errors(body, capture(body, pose, 160), rng) for pose in into_the_opening(body, 12)]
+    fused = fuse_shape(views, ShapeSettings(grid=GRID))
+    scale = SIZE / 2
+    filled = np.pi * scale**3 * 0.9 * (1 + 0.6 + 0.36) / 3  # the bowl with a lid, a frustum
+    true = abs(turned.volume) * scale**3
+    assert is_closed(fused)
+    assert true < 0.5 * filled
+    assert volume(fused) == pytest.approx(true, abs=0.2 * filled)
 
 
 def test_views_that_look_past_each_other_are_refused(ball: Body) -> None:

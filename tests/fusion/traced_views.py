@@ -46,8 +46,7 @@ def ring(body: Body, count: int, elevation_deg: float = 25.0, tip: Rotation | No
     tip = tip or Rotation.identity()
     poses = []
     for azimuth in np.arange(count) * (360 / count):
-        turn = Rotation.from_euler("XY", [elevation_deg, -azimuth], degrees=True) * tip
-        poses.append(Pose(turn.as_matrix(), np.array([0, 0, -DISTANCE]) - turn.apply(body.middle)))
+        poses.append(look_at(body, Rotation.from_euler("XY", [elevation_deg, -azimuth], degrees=True) * tip))
     return poses
 
 
@@ -55,6 +54,20 @@ def all_around(body: Body, count: int) -> list[Pose]:
     """Two thirds of the poses on a ring about the standing object, one third after it is laid on its side."""
     laid = count // 3
     return ring(body, count - laid) + ring(body, laid, tip=Rotation.from_euler("x", 90, degrees=True))
+
+
+def into_the_opening(body: Body, count: int) -> list[Pose]:
+    """Half of the poses on a ring about a standing vessel; half look into it after it is laid on its side."""
+    laid = count // 2
+    tip, poses = Rotation.from_euler("x", 90, degrees=True), []
+    for azimuth in np.linspace(-40, 40, laid):
+        poses.append(look_at(body, Rotation.from_euler("XY", [15, -azimuth], degrees=True) * tip))
+    return ring(body, count - laid) + poses
+
+
+def look_at(body: Body, turn: Rotation) -> Pose:
+    """Pose of the turned object before the camera."""
+    return Pose(turn.as_matrix(), np.array([0, 0, -DISTANCE]) - turn.apply(body.middle))
 
 
 def capture(body: Body, pose: Pose, pixels: int = 384, name: str = "") -> FusionView:

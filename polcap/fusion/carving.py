@@ -1,0 +1,194 @@
+"""Hollows that no silhouette shows: depths by a plane sweep, carved out of the hull.
+
+Where views contradict each other on the surface inside the hull, each view searches along its rays for the depth at
+which other views measured the same world normal and the same albedo. Neither depends on the direction of view, as the
+flash photographs do. The space in front of these depths is carved.
+
+References
+----------
+Collins, A space-sweep approach to true multi-image matching, CVPR 1996. Curless & Levoy, A volumetric method for
+building complex models from range images, SIGGRAPH 1996 (mean of truncated signed distances).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import cv2
+import numpy as np
+from scipy import ndimage
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from polcap import parallel
+from polcap.fusion.hull import DistanceGrid, plain_body
+from polcap.fusion.normal_surface import FittedSurface, vertex_normals, visible
+from polcap.fusion.small_views import SmallView, sample
+from polcap.images import Bools, Floats
+from polcap.optics.frames import dot, unit
+from polcap.optics.projection import back_project
+from polcap.synth.mesh_tracer import Tracer
+
+_DOUBT = 0.4  # share of the views' weight that contradicts the mean normal; this and below: docs/benchmarks/fusion.md
+_SPREAD = 6  # rounds of averaging of the doubt over neighbors
+_LEAST_PART = 0.01  # share of the vertices on a doubtful part of the surface; smaller parts are no hollows
+_PLANES = 1.5  # steps between the sweep's planes
+_NORMAL_DEG = 15.0  # 1σ of the angle between two views' normals of one point
+_ALBEDO = 0.12  # 1σ of the relative difference of two views' albedos
+_FACING = 0.2  # least cosine at which another view can have measured a normal
+_AGREEING = 3  # views, of which the mean agreement is the score of a depth
+_WINDOW = 5  # px of the sweep over which scores are averaged
+_LEAST_SCORE = 0.45
+_SUPPORT = 3.0  # steps within which another view confirms a depth
+_TRUNCATION = 2.5  # steps
+_SOLID = 0.1  # votes for solid at every point
+_SMOOTHING = 1.0  # steps, 1σ
+_WALL = 1.5  # steps behind surface through which no view looks that are never carved
+_OPEN = 0.2  # share of open vertices around a vertex, from which on it is no wall
+
+
+@dataclass(frozen=True)
+class HollowDepths:
+    """Depths of one view inside the hull."""
+
+    view: SmallView  # on the grid of the sweep
+    depth: Floats  # (H, W) m along the optical axis; NaN where none is known
+    score: Floats  # (H, W) 0…1
+
+
+def carve(hull: DistanceGrid, surface: FittedSurface, views: Sequence[SmallView]) -> DistanceGrid:
+    """Signed distances of the hull less its hollows; the hull itself where views agree on the surface."""
+    doubtful = _doubtful(surface)
+    if not doubtful.any():
+        return hull
+    tracer = surface.tracer()
+    sweeps = [partial(_sweep, k, views, tracer, doubtful, hull) for k in range(len(views))]
+    depths = _confirmed(parallel.results(sweeps), hull.grid.step)
+    free = _mean_distance(hull, depths)
+    walls = surface.vertices[_is_wall(surface, depths, hull.grid.step)]
+    carved = np.maximum(hull.distance, _behind_walls(hull, walls, free))
+    return replace(hull, distance=plain_body(carved, hull.grid.step))
+
+
+def _doubtful(surface: FittedSurface) -> Bools:
+    """Vertices (V,) of large parts of the surface on which views contradict each other."""
+    doubtful = surface.spread(1 - surface.agreement, _SPREAD) > _DOUBT
+    index = np.flatnonzero(doubtful)
+    _, part = connected_components(surface.neighbors[index][:, index], directed=False)
+    large = np.bincount(part, minlength=1) >= _LEAST_PART * len(doubtful)
+    doubtful[index] = large[part]
+    return np.asarray(doubtful)
+
+
+def _sweep(
+    number: int, views: Sequence[SmallView], tracer: Tracer, doubtful: Bools, hull: DistanceGrid
+) -> HollowDepths:
+    """Best depth of each pixel of one view behind doubtful surface."""
+    step = hull.grid.step
+    view = _coarser(views[number], step)
+    height, width = view.outline.shape
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    ray = back_project(view.view, x, y) @ view.pose.rotation  # (H, W, 3) world, at depth 1
+    met = tracer.meet(np.broadcast_to(view.pose.center, (height * width, 3)), ray.reshape(-1, 3))
+    behind = np.zeros(height * width, bool)
+    behind[met.index] = doubtful[tracer.mesh.faces[met.face]].mean(axis=1) > 0.5
+    pixel = np.flatnonzero(behind)
+    corners = hull.grid.corners() @ view.pose.rotation.T + view.pose.translation
+    planes = np.arange(-corners[:, 2].max(), -corners[:, 2].min(), _PLANES * step)
+    score = np.zeros((len(planes), height, width), np.float32)
+    for layer, depth in zip(score.reshape(len(planes), -1), planes):
+        point = view.pose.center + depth * ray.reshape(-1, 3)[pixel]
+        inside = hull.at(point) < 0
+        layer[pixel[inside]] = _agreement(point[inside], pixel[inside], view, [*views[:number], *views[number + 1 :]])
+    share = np.maximum(cv2.blur(behind.reshape(height, width).astype(np.float32), (_WINDOW, _WINDOW)), 1e-6)
+    score = np.stack([cv2.blur(layer, (_WINDOW, _WINDOW)) / share for layer in score])
+    best = score.argmax(axis=0)
+    top = np.where(behind.reshape(height, width), score.max(axis=0), 0)
+    return HollowDepths(view, np.where(top > _LEAST_SCORE, planes[best], np.nan), top)
+
+
+def _agreement(point: Floats, pixel: Floats, view: SmallView, others: Sequence[SmallView]) -> Floats:
+    """How well other views agree with pixels (N,) of a view at world points (N, 3), 0…1."""
+    normal, albedo = view.normal.reshape(-1, 3)[pixel], view.diffuse.reshape(-1, 3)[pixel]
+    found = np.zeros((len(others), len(point)), np.float32)
+    for row, other in zip(found, others):
+        facing = np.flatnonzero(dot(normal, other.towards(point)) > _FACING)
+        at = other.pixels(point[facing])
+        angle2 = 2 - 2 * dot(unit(sample(other.normal, at)), normal[facing])
+        seen = sample(other.diffuse, at)
+        relative = np.abs(seen - albedo[facing]).sum(axis=-1) / np.maximum(
+            (seen + albedo[facing]).sum(axis=-1) / 2, 1e-6
+        )
+        row[facing] = np.exp(-angle2 / (2 * np.radians(_NORMAL_DEG) ** 2) - relative**2 / (2 * _ALBEDO**2))
+    return np.sort(found, axis=0)[-_AGREEING:].mean(axis=0)
+
+
+def _coarser(of: SmallView, step: float) -> SmallView:
+    """The view with about one pixel to a grid step."""
+    far = float(np.linalg.norm(of.pose.translation))
+    every = max(1, round(step * of.view.focal / far))
+    view = replace(of.view, focal=of.view.focal / every, center=tuple(c / every for c in of.view.center))
+    images = {name: np.ascontiguousarray(getattr(of, name)[::every, ::every]) for name in ("normal", "diffuse")}
+    return replace(of, view=view, outline=of.outline[::every, ::every], **images)
+
+
+def _confirmed(depths: Sequence[HollowDepths], step: float) -> list[HollowDepths]:
+    """Depths that at least one other view has at the same place."""
+    confirmed = []
+    for one in depths:
+        rows, columns = np.nonzero(np.isfinite(one.depth))
+        ray = back_project(one.view.view, columns.astype(float), rows.astype(float)) @ one.view.pose.rotation
+        point = one.view.pose.center + one.depth[rows, columns, None] * ray
+        support = np.zeros(len(point), int)
+        for other in depths:
+            if other is not one:
+                support += np.abs(_depth_beyond(other, point)) < _SUPPORT * step
+        depth = np.full_like(one.depth, np.nan)
+        depth[rows, columns] = np.where(support > 0, one.depth[rows, columns], np.nan)
+        confirmed.append(replace(one, depth=depth))
+    return confirmed
+
+
+def _depth_beyond(of: HollowDepths, point: Floats) -> Floats:
+    """Depth of the view's surface less that of world points (N, 3), m; NaN where it is unknown."""
+    pixel = np.round(of.view.pixels(point)).astype(int)
+    height, width = of.depth.shape
+    inside = np.all((pixel >= 0) & (pixel < [width, height]), axis=-1)
+    x, y = np.where(inside[:, None], pixel, 0).T
+    own = -(point @ of.view.pose.rotation[2] + of.view.pose.translation[2])
+    return np.where(inside, of.depth[y, x] - own, np.nan)
+
+
+def _mean_distance(hull: DistanceGrid, depths: Sequence[HollowDepths]) -> Floats:
+    """Mean of the truncated distances in front of the views' depths, positive in free space, smoothed."""
+    index = np.argwhere(hull.distance < 0)
+    point = hull.grid.origin + hull.grid.step * index
+    reach = _TRUNCATION * hull.grid.step
+    total, weight = np.zeros(len(point)), np.zeros(len(point))
+    for one in depths:
+        beyond = _depth_beyond(one, point)
+        known = beyond > -reach
+        total[known] += np.minimum(beyond[known], reach)
+        weight[known] += 1
+    sums, counts = (np.zeros(hull.distance.shape, np.float32) for _ in range(2))
+    sums[tuple(index.T)], counts[tuple(index.T)] = total - _SOLID * reach, weight + _SOLID
+    sums, counts = (ndimage.gaussian_filter(value, _SMOOTHING) for value in (sums, counts))
+    return np.asarray(sums / np.maximum(counts, 1e-6))
+
+
+def _is_wall(surface: FittedSurface, depths: Sequence[HollowDepths], step: float) -> Bools:
+    """Vertices (V,) through which no view looks at a depth behind them."""
+    outward = vertex_normals(surface.vertices, surface.faces)
+    seen = visible(surface.vertices, surface.faces, outward, [one.view for one in depths], step)
+    beyond = np.stack([_depth_beyond(one, surface.vertices) > _TRUNCATION * step for one in depths])
+    return np.asarray(surface.spread(np.any(seen & beyond, axis=0).astype(float), _SPREAD) < _OPEN)
+
+
+def _behind_walls(hull: DistanceGrid, walls: Floats, free: Floats) -> Floats:
+    """Free distances, limited so that _WALL steps stay behind wall vertices (N, 3)."""
+    index = np.argwhere(free > -hull.grid.step)
+    point = hull.grid.origin + hull.grid.step * index
+    distance, _ = cKDTree(walls).query(point, distance_upper_bound=4 * _WALL * hull.grid.step)
+    limited = free.copy()
+    limited[tuple(index.T)] = np.minimum(free[tuple(index.T)], distance - _WALL * hull.grid.step)
+    return limited
