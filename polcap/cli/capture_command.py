@@ -31,6 +31,12 @@ def capture(
     ambient: Annotated[bool, Option("--ambient", help="Also frames without the flash.")] = False,
     chart: Annotated[bool, Option("--chart", help="Also a frame of the chart alone.")] = False,
     cross: Annotated[bool, Option("--cross", help="Also a bracket under a cross-polarized flash.")] = False,
+    views: Annotated[
+        int | None, Option(min=3, max=99, metavar="N", help="N captures from all sides, in view01, view02, …")
+    ] = None,
+    turntable: Annotated[
+        str | None, Option(metavar="URL", help="Turns the object between the views; as --rotator.")
+    ] = None,
     tries: Annotated[int, Option(min=0, help="How often a bad frame is taken again.")] = 2,
     resume: Annotated[bool, Option("--resume", help="Go on with a stopped capture.")] = False,
     no_check: Annotated[bool, Option("--no-check", help="Leave out the verdict at the end.")] = False,
@@ -40,6 +46,7 @@ def capture(
     """Shoot a capture: turn the polarizer, take the brackets, check every frame."""
     from polcap.rig import dry_run as plans
     from polcap.rig import exposure_bracket, sequence
+    from polcap.rig import turntable as tables
     from polcap.rig.resume import complete_order
 
     stated = {
@@ -52,15 +59,36 @@ def capture(
         "chart": chart or None,
         "cross": cross or None,
     }
-    wanted = complete_order(folder, stated, resume)
+    session = tables.open_session(folder, views, turntable, resume)
+    wanted = complete_order(tables.first_view(folder) if session else folder, stated, resume)
     if dry_run:
         planned = plans.dry_run(wanted)
         terminal.print_data(planned if json else plans.table(planned))
+        return
+    if session is not None:
+        _shoot_session(folder, session, wanted, tries, not no_check, json)
         return
     done = sequence.shoot(folder, wanted, resume=resume, tries=tries, report=terminal.print_progress)
     verdict = None if no_check else _verdict(folder)
     terminal.print_data(done | {"check": verdict} if json else str(folder))
     if verdict and verdict["verdict"] != "keep":
+        raise Exit(GateError.exit_code)
+
+
+def _shoot_session(folder: Path, session: Any, wanted: Any, tries: int, judged: bool, json: bool) -> None:
+    """Shoot all views of a session, and judge each before the object turns."""
+    from polcap.rig import turntable as tables
+
+    verdicts: dict[str, Any] = {}
+
+    def judge(view: Path) -> None:
+        verdicts[view.name] = _verdict(view) if judged else None
+
+    report = terminal.print_progress
+    done = tables.shoot(folder, session, wanted, tries=tries, report=report, finished=judge)
+    summary = {"folder": str(folder), "views": done, "check": verdicts}
+    terminal.print_data(summary if json else str(folder))
+    if any(verdict and verdict["verdict"] != "keep" for verdict in verdicts.values()):
         raise Exit(GateError.exit_code)
 
 

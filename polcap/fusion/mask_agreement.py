@@ -33,7 +33,8 @@ def agreeing(views: Sequence[FusionView]) -> tuple[list[FusionView], dict[str, s
     CaptureError
         More than a third of the views contradict the others, or fewer than three are left.
     """
-    used, left_out = list(views), {}
+    used = list(views)
+    left_out: dict[str, str] = {}
     points, step = _points(used)
     inside = np.stack([_inside(view, points, step) for view in used])  # (N, P)
     while True:

@@ -3,6 +3,7 @@
 Angles are in degrees throughout, as the devices use them.
 
     sequence                turn, take the missing frames, check in the background
+    turntable               the views of an object from all sides, each a sequence
     exposure_bracket        `--bracket`, and the default exposures
     shooting_plan           every frame, in the order that turns the motor least
     dry_run                 the time that a plan takes
@@ -17,7 +18,7 @@ Angles are in degrees throughout, as the devices use them.
     motor_elliptec_ell14    Thorlabs ELL14, ELL18
     motor_grbl              a stepper on a GRBL 1.1 board
     motor_line_protocol     an Arduino or RP2040 with the sketch of `examples/rotator_firmware`
-    motor_by_hand           a person turns the ring
+    motor_by_hand           a person turns the ring or the board
     motor_simulated         no hardware
     serial_port             lines of text over a serial port, with timeouts
     camera                  the protocol `Camera` of all drivers

@@ -34,8 +34,8 @@ _QUESTIONS: list[tuple[int, str, float, tuple[Callable[[str], str | None], ...]]
 ]
 
 
-def open_rotator(url: str, log: Log) -> PolarizerRotator:
-    """Open the rotator of a URL: `KIND:PORT?setting=value&…`, `simulated?…` or `manual`.
+def open_rotator(url: str, log: Log, part: str = "polarizer") -> PolarizerRotator:
+    """Open the rotator of a URL: `KIND:PORT?setting=value&…`, `simulated?…` or `manual`; it turns `part`.
 
     Raises SettingError for a wrong URL, HardwareError if the port cannot be opened or another device answers.
     """
@@ -48,7 +48,7 @@ def open_rotator(url: str, log: Log) -> PolarizerRotator:
     if kind == "manual":
         if query:
             raise SettingError(f"rotator {url!r}: manual takes no settings; write manual")
-        return PolarizerRotator(motor_by_hand.MotorByHand(log), motor_by_hand.SETTINGS, log, by_hand=True)
+        return PolarizerRotator(motor_by_hand.MotorByHand(log, part), motor_by_hand.SETTINGS, log, by_hand=True)
     motor_class, settings_class = _MOTORS[kind]
     settings = _settings(url, query, settings_class)
     if kind == "simulated":

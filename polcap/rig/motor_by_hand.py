@@ -1,4 +1,4 @@
-"""Motor driver for `manual`: a person at the terminal turns the polarizer and may type the angle reached."""
+"""Motor driver for `manual`: a person at the terminal turns polarizer or board and may type the angle reached."""
 
 import math
 
@@ -11,23 +11,24 @@ SETTINGS = RotatorSettings(settle=0.0, tolerance=180.0)  # any angle typed is ac
 
 
 class MotorByHand:
-    """Driver that asks a person to turn the ring to each angle; the scale on the ring defines zero."""
+    """Driver that asks a person to turn the ring or the board to each angle; a scale on it defines zero."""
 
     model = "by hand"
     speed_deg_s = 9.0  # a quarter turn in ten seconds, for the plan
     wraps = False
 
-    def __init__(self, log: Log) -> None:
-        """Raises SettingError without a terminal."""
+    def __init__(self, log: Log, part: str = "polarizer") -> None:
+        """`part`: what the person turns. Raises SettingError without a terminal."""
         if not person.at_terminal():
             raise SettingError("rotator manual asks a person, and there is no terminal; run in one, or name a motor")
         self._log = log
+        self._part = part
         self._angle_deg = 0.0
 
     def home(self) -> None: ...
 
     def go(self, angle_deg: float) -> None:
-        question = f"turn the polarizer to {angle_deg:g}°, then press Enter; or type the angle on its scale: "
+        question = f"turn the {self._part} to {angle_deg:g}°, then press Enter; or type the angle on its scale: "
         self._angle_deg = math.nan
         while not math.isfinite(self._angle_deg):
             text = person.ask(question, self._log)

@@ -1,0 +1,124 @@
+"""Shoots an object from all sides: a turntable turns object and board, and each view is a capture of its own.
+
+`views.json` in the session's folder records the turntable and the finished views, so that an interrupted session
+continues with the view that was begun.
+"""
+
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from polcap.errors import CaptureError, SettingError
+from polcap.formats import atomic
+from polcap.rig import capture_record, device_urls, sequence
+from polcap.rig.device_log import Log
+from polcap.rig.shooting_plan import CaptureOrder
+
+NAME, LOG = "views.json", "turntable.log"
+
+
+class SessionFile(msgspec.Struct):
+    """Content of views.json."""
+
+    views: Annotated[int, Meta(ge=3)]
+    turntable: str  # URL
+    done: list[str] = []  # names of the finished views
+
+
+def open_session(folder: Path, views: int | None, turntable: str | None, resume: bool) -> SessionFile | None:
+    """The session of `--views` and `--turntable`, or with `resume` the one begun; None for a single capture.
+
+    Raises
+    ------
+    SettingError
+        One of the two is missing.
+    CaptureError
+        The folder holds another session, or other files.
+    """
+    file = folder / NAME
+    if resume and file.exists():
+        begun = _load(file)
+        if views not in (None, begun.views):
+            raise CaptureError(f"{folder} was begun with --views {begun.views}; leave it out, or choose a new folder")
+        return msgspec.structs.replace(begun, turntable=turntable or begun.turntable)
+    if views is None and turntable is None:
+        return None
+    if views is None or turntable is None:
+        raise SettingError("--views and --turntable belong together; give both, such as --views 12 --turntable manual")
+    if resume:
+        raise CaptureError(f"{folder} holds no session that was begun: there is nothing to resume; leave out --resume")
+    if folder.exists() and any(path.name != LOG for path in folder.iterdir()):
+        raise CaptureError(f"{folder} is not empty; continue with --resume, or choose another folder")
+    return SessionFile(views, turntable)
+
+
+def first_view(folder: Path) -> Path:
+    """Folder of the first view, whose record states the options of all."""
+    return folder / _name(0)
+
+
+def shoot(
+    folder: Path,
+    session: SessionFile,
+    order: CaptureOrder,
+    *,
+    tries: int = 2,
+    report: sequence.Report = lambda line: None,
+    finished: Callable[[Path], None] = lambda view: None,
+) -> list[dict[str, Any]]:
+    """Shoot the views of a session that are missing; returns the summary of each.
+
+    `finished` is called with the folder of each view while the object still stands in this view.
+
+    Raises
+    ------
+    CaptureError, HardwareError, StorageError
+        As for one capture, or of the turntable. The frames so far stay, and `--resume` continues.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    _check_ports(session.turntable, order.rotator)
+    done = []
+    with (
+        closing(Log(folder / LOG)) as log,
+        closing(device_urls.open_rotator(session.turntable, log, "turntable with the board")) as table,
+    ):
+        _write(folder, session)
+        for k in range(session.views):
+            view = folder / _name(k)
+            if view.name in session.done:
+                continue
+            table.move(360.0 * k / session.views)
+            report(f"{view.name} of {session.views}")
+            begun = (view / capture_record.NAME).exists()
+            own = order if k == 0 else msgspec.structs.replace(order, chart=False)  # one chart is enough
+            done.append(sequence.shoot(view, own, resume=begun, tries=tries, report=report))
+            finished(view)
+            session.done.append(view.name)
+            _write(folder, session)
+    return done
+
+
+def _name(k: int) -> str:
+    return f"view{k + 1:02d}"
+
+
+def _load(file: Path) -> SessionFile:
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=SessionFile)
+    except (OSError, msgspec.MsgspecError) as error:
+        raise CaptureError(f"{file}: cannot be read ({error}); shoot into another folder") from None
+
+
+def _write(folder: Path, session: SessionFile) -> None:
+    atomic.write(folder / NAME, msgspec.json.format(msgspec.json.encode(session), indent=1))
+
+
+def _check_ports(turntable: str, rotator: str) -> None:
+    """Raise SettingError where both motors are on one port."""
+    table, ring = (url.partition("?")[0].partition(":")[2] for url in (turntable, rotator))
+    if table and table == ring:
+        raise SettingError(f"--turntable and --rotator are both on {table}; connect each motor to a port of its own")
