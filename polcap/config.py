@@ -126,6 +126,26 @@ def fill(kind: type[S], stated: dict[str, Any], assignments: Sequence[str]) -> S
         raise SettingError(f"--set {text_file.fault(error, stated, kind)}") from error
 
 
+def fill_sections(kind: type[S], assignments: Sequence[str]) -> S:
+    """Fill a struct of settings sections from section.name=value assignments, as `fill`.
+
+    Raises
+    ------
+    SettingError
+        As for `fill`.
+    """
+    found = kind()
+    for assignment in assignments:
+        section, dot, rest = assignment.partition(".")
+        if not dot or section not in kind.__struct_fields__:
+            sections = ", ".join(kind.__struct_fields__)
+            raise SettingError(f"--set {assignment}: give section.name=value with a section of {sections}")
+        before = msgspec.to_builtins(getattr(found, section))
+        filled = fill(type(getattr(found, section)), before, [rest])
+        found = msgspec.structs.replace(found, **{section: filled})
+    return found
+
+
 def settings() -> Iterator[Setting]:
     """All settings in the order of the stages, for the settings reference."""
     for section in msgspec.structs.fields(Config):

@@ -6,6 +6,7 @@ to go on), 1 a bug. Heavy imports happen inside the commands, so that `--help` a
 
 process_command    the path over one capture
 batch_command      over many
+fuse_command       several captures of one object, joined
 result_commands    export, show, status, report, clean
 check_command      keep a capture or reshoot it
 calibrate_command  measured camera, lens, polarizer and flash
@@ -35,6 +36,7 @@ from polcap.cli.calibrate_command import calibrate
 from polcap.cli.capture_command import capture
 from polcap.cli.check_command import check
 from polcap.cli.doctor_command import doctor
+from polcap.cli.fuse_command import fuse
 from polcap.cli.process_command import process
 from polcap.cli.result_commands import clean, export, report, show, status
 from polcap.cli.settings_command import settings
@@ -97,8 +99,8 @@ def _one_line(error: TyperException) -> str:
 
 
 COMMANDS = (
-    process, batch, export, show, status, report, clean, check, settings, calibrate, doctor, synth, board, capture,
-    train, evaluate,
+    process, batch, fuse, export, show, status, report, clean, check, settings, calibrate, doctor, synth, board,
+    capture, train, evaluate,
 )  # fmt: skip
 app = typer.Typer(
     cls=OneLine,

@@ -85,6 +85,7 @@ def export(
 ) -> None:
     """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
     from polcap.formats.export import presets
+    from polcap.fusion import fuse_run, fused_maps
     from polcap.pipeline import run as pipeline
     from polcap.pipeline.asset_export import ExportRequest
 
@@ -108,7 +109,8 @@ def export(
         lod=lod,
     )
     wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
-    written = [str(file) for file in pipeline.export(result, *wanted)]
+    write = fuse_run.export if fused_maps.is_fused(result) else pipeline.export
+    written = [str(file) for file in write(result, *wanted)]
     terminal.print_data({"written": written} if json else "\n".join(written))
 
 

@@ -21,8 +21,8 @@ from polcap.optics.texture_rasterizer import rasterize
 from polcap.optics.vertex_frames import vertex_normals, vertex_tangents
 from polcap.stages import stage
 
-_FILLED = 0.6  # share of the texture that charts cover, about; uvunwrap reaches .55 to .63
-_SIDES = (256, 4096)  # px, least and greatest side of a texture whose size is not set
+_FILLED = 0.4  # share of the texture that charts cover, about; uvunwrap reaches .4 to .63
+_SIDES = (512, 4096)  # px, least and greatest side of a texture whose size is not set
 
 
 class AtlasSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -53,7 +53,7 @@ class Atlas:
 def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSettings) -> Atlas:
     """Cut a closed mesh into charts, and pack them into a square texture.
 
-    Without a set size, its side is the power of two for which a texel is nearest to a pixel of the views' maps.
+    Without a set size, its side is the least power of two whose texels are no larger than pixels of the views' maps.
 
     Raises
     ------
@@ -64,7 +64,6 @@ def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSetti
     uv, corner, faces = _charts(mesh, side, settings.margin)
     normals = vertex_normals(mesh.vertices.astype(np.float64), mesh.faces)[corner]
     vertices = mesh.vertices[corner].astype(np.float64)
-    points = rasterize(uv, faces, side, side)
     unwrapped = Mesh(
         vertices=vertices.astype(np.float32),
         normals=normals.astype(np.float32),
@@ -74,8 +73,13 @@ def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSetti
         metric=True,
         frame="board",
     )
-    normal = frames.unit(points.interpolate(unwrapped.normals))
-    return Atlas(unwrapped, points.covered, points.interpolate(unwrapped.vertices), normal)
+    return of_mesh(unwrapped, side)
+
+
+def of_mesh(mesh: Mesh, side: int) -> Atlas:
+    """The atlas of a mesh that has texture coordinates, with `side` px."""
+    points = rasterize(mesh.uv, mesh.faces, side, side)
+    return Atlas(mesh, points.covered, points.interpolate(mesh.vertices), frames.unit(points.interpolate(mesh.normals)))
 
 
 def _charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.int32]]:
@@ -98,10 +102,10 @@ def _charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[n
 
 
 def _side(mesh: ClosedMesh, views: tuple[FusionView, ...]) -> int:
-    """Side of the texture [px], a power of two, for which a texel is nearest to a pixel of the views' maps."""
+    """Side of the texture [px], a power of two, for which a texel is no larger than a pixel of the views' maps."""
     corner = mesh.vertices[mesh.faces]
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1).sum() / 2
     middle = mesh.vertices.mean(axis=0)
     pixel = np.median([-(one.pose.rotation @ middle + one.pose.translation)[2] / one.view.focal for one in views])
     wanted = np.log2(np.sqrt(area / _FILLED) / pixel)
-    return int(np.clip(2 ** round(float(wanted)), *_SIDES))
+    return int(np.clip(2 ** np.ceil(float(wanted)), *_SIDES))

@@ -48,8 +48,8 @@ class BakingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of the stage `baking` of the fusion."""
 
     mesh_sigma_deg: Annotated[
-        float, Meta(ge=0.1, le=90, description="expected error of the mesh's own smooth normals [°]")
-    ] = 4.0
+        float, Meta(ge=0, le=90, description="error of the mesh's smooth normals; 0: by how far the views differ [°]")
+    ] = 0.0
     smooth: Annotated[
         float, Meta(gt=0, le=0.5, description="1σ of the Gaussian that parts smooth from fine [object's diameter]")
     ] = 0.03
@@ -182,13 +182,20 @@ def _bake_normals(views: Sequence[FusionView], seen: Sequence[Sight], atlas: Atl
         difference = np.where(both[..., None], view.normal - one.mesh_normal, 0).astype(np.float32)
         bands = one.sample(_bands(difference, both, settings.smooth * diameter_px(view)))
         differences.append(np.concatenate([bands[:, k : k + 3] @ view.pose.rotation for k in (0, 3)], axis=-1))
-    count, prior = len(atlas.position), settings.mesh_sigma_deg**-2
+    count = len(atlas.position)
+    prior = (settings.mesh_sigma_deg or _mesh_sigma_deg(differences)) ** -2
     weights = [one.weight / (one.sample(view.sigma_deg)[:, 0] ** 2 + _FLOOR_DEG**2) for one, view in zip(seen, views)]
     smooth, weights = _reweighted(
         [one[:, :3] for one in differences], weights, seen, count, float(np.radians(_OUTLIER_DEG)), prior
     )
     fine, _ = _mean([one[:, 3:] for one in differences], [w**_SHARPNESS for w in weights], seen, count)
     return frames.unit(atlas.normal + smooth + fine)
+
+
+def _mesh_sigma_deg(differences: Sequence[Floats]) -> float:
+    """Error of the mesh's smooth normals: the median angle between them and those of the views."""
+    apart = np.concatenate([np.linalg.norm(one[::8, :3], axis=-1) for one in differences])
+    return float(max(np.degrees(np.median(apart)), _FLOOR_DEG))
 
 
 def _bake_bands(

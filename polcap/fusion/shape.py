@@ -1,9 +1,9 @@
 """Shape of the object: several views' masks and normals to one closed mesh."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated
 
+import msgspec
 from msgspec import Meta
 
 from polcap.fusion.carving import carve
@@ -12,6 +12,7 @@ from polcap.fusion.hull import visual_hull
 from polcap.fusion.normal_surface import fit_normals
 from polcap.fusion.small_views import reduce_views
 from polcap.fusion.values import ClosedMesh, FusionView
+from polcap.stages import stage
 
 _ROUNDS, _FIRST_ROUNDS = (
     7,
@@ -19,13 +20,13 @@ _ROUNDS, _FIRST_ROUNDS = (
 )  # of the surface's fit, and of these before hollows are searched; docs/benchmarks/fusion.md
 
 
-@dataclass(frozen=True)
-class ShapeSettings:
-    """Settings of the fused shape."""
+class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Settings of the stage `shape` of the fusion."""
 
     grid: Annotated[int, Meta(ge=40, le=300, description="steps along the object's longest side")] = 140
 
 
+@stage(version=1)
 def fuse_shape(views: Sequence[FusionView], settings: ShapeSettings) -> ClosedMesh:
     """Join views of one object into a closed, manifold, outward mesh in the world frame.
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 from polcap import parallel
 from polcap.config import Config
@@ -60,14 +60,44 @@ class ExportRequest:
     lod: int = 0  # number of further GLBs, each with a quarter of the triangles of the previous one
 
 
+class ExportSource(Protocol):
+    """An object to export: one view's relief, or a fused object."""
+
+    @property
+    def triangles(self) -> int: ...  # of the full mesh
+
+    def whole(self, bits: Literal[8, 16], extras: tuple[Extra, ...]) -> Asset:
+        """The asset with the full mesh, textures of 8 or 16 bits, and extra textures."""
+
+    def decimated(self, whole: Asset, triangles: int) -> "DetailLevel":
+        """The asset with about so many triangles."""
+
+
 @dataclass(frozen=True)
-class ExportSource:
+class ReliefSource:
     """The maps of a result, with the full mesh and asset made from them."""
 
     stored: maps_folder.StoredMaps
     mesh: ReliefMesh
     asset: Asset
     config: Config
+
+    @property
+    def triangles(self) -> int:
+        """Number of triangles of the full mesh."""
+        return len(self.mesh.faces)
+
+    def whole(self, bits: Literal[8, 16], extras: tuple[Extra, ...]) -> Asset:
+        """The asset with the full mesh, textures of 8 or 16 bits, and extra textures."""
+        maps = self.stored.maps
+        built = self.asset if bits == 8 else asset.build(maps, self.mesh, self.config.asset, bits)
+        return asset.with_extras(built, maps, self.stored.depth, "occlusion" in extras) if extras else built
+
+    def decimated(self, whole: Asset, triangles: int) -> "DetailLevel":
+        """The asset with about so many triangles."""
+        maps = self.stored.maps
+        coarse = surface.decimate(self.mesh, maps.view, triangles, self.config.surface.back)
+        return DetailLevel(asset.with_mesh(whole, maps, coarse.mesh), coarse)
 
 
 @dataclass(frozen=True)
@@ -96,7 +126,7 @@ def check(wanted: ExportRequest) -> None:
             )
 
 
-def read(folder: Path, config: Config) -> ExportSource:
+def read(folder: Path, config: Config) -> ReliefSource:
     """Read the maps of a result and build the full mesh and asset from them.
 
     Raises
@@ -108,7 +138,7 @@ def read(folder: Path, config: Config) -> ExportSource:
     """
     stored = maps_folder.read(folder)
     mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, config.surface)
-    return ExportSource(stored, mesh, asset.build(stored.maps, mesh, config.asset), config)
+    return ReliefSource(stored, mesh, asset.build(stored.maps, mesh, config.asset), config)
 
 
 def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
@@ -119,24 +149,15 @@ def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
     ObjectError
         A level has too few triangles.
     """
-    preset, maps, full, whole = effective(wanted), source.stored.maps, len(source.mesh.faces), source.asset
-    if preset.bits != 8:
-        whole = asset.build(maps, source.mesh, source.config.asset, preset.bits)
-    if preset.extras:
-        whole = asset.with_extras(whole, maps, source.stored.depth, "occlusion" in preset.extras)
+    preset, full = effective(wanted), source.triangles
+    whole = source.whole(preset.bits, preset.extras)
     most = min(preset.triangles or full, full)
-    found = [DetailLevel(whole) if most == full else _decimated(source, whole, most)]
-    found += [_decimated(source, whole, round(most * 0.25**k)) for k in range(1, wanted.lod + 1)]
+    found = [DetailLevel(whole) if most == full else source.decimated(whole, most)]
+    found += [source.decimated(whole, round(most * 0.25**k)) for k in range(1, wanted.lod + 1)]
     size = wanted.texture_size
     if size is None:
         return found
     return [replace(level, asset=asset.resize_textures(level.asset, size)) for level in found]
-
-
-def _decimated(source: ExportSource, whole: Asset, triangles: int) -> DetailLevel:
-    maps = source.stored.maps
-    decimated = surface.decimate(source.mesh, maps.view, triangles, source.config.surface.back)
-    return DetailLevel(asset.with_mesh(whole, maps, decimated.mesh), decimated)
 
 
 def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Sequence[DetailLevel]) -> list[Path]:
@@ -210,9 +231,11 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
 
 
 def _loose_textures(preset: ExportPreset, wanted: ExportRequest, whole: Asset, stem: str) -> dict[str, Texture]:
-    """The PNG textures of a preset and of options, by file name."""
-    made = {f"{pattern.format(stem)}.png": make(whole) for pattern, make in preset.textures.items()}
-    return made | {f"{stem}_{key.replace('-', '')}.png": texture_set.EXTRAS[key](whole) for key in wanted.extras}
+    """The PNG textures of a preset and of options, by file name; a closed mesh has no displacement."""
+    makers = {f"{pattern.format(stem)}.png": make for pattern, make in preset.textures.items()}
+    makers |= {f"{stem}_{key.replace('-', '')}.png": texture_set.EXTRAS[key] for key in wanted.extras}
+    known = whole.displacement is not None
+    return {file: make(whole) for file, make in makers.items() if known or make is not texture_set.displacement}
 
 
 def effective(wanted: ExportRequest) -> ExportPreset:

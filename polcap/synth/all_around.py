@@ -103,7 +103,7 @@ def surface(scene: Scene) -> Triangles:
         raise InputError("--views needs scikit-image, or an object by --mesh; pip install 'polcap[fusion]'") from None
     axis = np.linspace(-scene.shape.radius, scene.shape.radius, _GRID)
     field = scene.shape.distance(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1))
-    found: Any = measure.marching_cubes(field, 0.0, spacing=(axis[1] - axis[0],) * 3)  # type: ignore[no-untyped-call]
+    found: Any = measure.marching_cubes(field, 0.0, spacing=(axis[1] - axis[0],) * 3)
     return mesh_tracer.smooth(found[0] + axis[0], found[1])
 
 

@@ -6,12 +6,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polcap.fusion.values import ClosedMesh, FusionView, Pose
-from polcap.images import Floats, View
-from polcap.optics import frames
+from polcap.images import Bools, Floats, View
+from polcap.optics import frames, shade
+from polcap.optics.projection import back_project
 from polcap.synth.mesh_tracer import Tracer, smooth
 
 AXES = np.array([0.05, 0.035, 0.04])  # m
 DISTANCE, PIXELS = 0.6, 160
+FLASH = np.array([0.0, 0.05, 0.0])  # m, camera frame
+F0, ROUGHNESS = 0.06, 0.35  # of the photographs; the views' maps say 0.04 and 0.4
 VIEW = View(PIXELS * 0.85 * DISTANCE / 0.1, ((PIXELS - 1) / 2, (PIXELS - 1) / 2), 1.0)
 
 
@@ -49,10 +52,25 @@ def views(count: int, elevation_deg: float = 20.0) -> tuple[FusionView, ...]:
         diffuse = np.where(inside, albedo(surface.position), 0).astype(np.float32)
         gray = np.repeat(0.04 * flat[..., None], 3, axis=-1)
         name = f"view{len(found) + 1:02d}"
+        s0 = photograph(pose, surface.depth, normal, diffuse, inside)
         found.append(
-            FusionView(name, pose, VIEW, np.zeros(3), surface.mask, normal, 4 * flat, diffuse, gray, 0.4 * flat)
+            FusionView(name, pose, VIEW, np.zeros(3), surface.mask, normal, 4 * flat, diffuse, gray, 0.4 * flat, s0)
         )
     return tuple(found)
+
+
+def photograph(pose: Pose, depth: Floats, normal: Floats, diffuse: Floats, inside: Bools) -> Floats:
+    """S0 (H, W, 3) under a flash at FLASH, of a surface with F0 and ROUGHNESS; a white plane at DISTANCE has 1."""
+    y, x = np.mgrid[:PIXELS, :PIXELS].astype(float)
+    point = back_project(VIEW, x, y) * np.where(np.isfinite(depth), depth, DISTANCE)[..., None]
+    v = frames.unit(-point)
+    light = frames.to_ray_frame(frames.unit(FLASH - point), v)
+    one = np.ones(inside.shape[:2])
+    f0 = np.full((*one.shape, 3), F0)
+    fall = DISTANCE**2 / np.sum((FLASH - point) ** 2, axis=-1)
+    local = frames.to_ray_frame(normal.astype(float), v)
+    s0 = shade.stokes(local, diffuse, f0, ROUGHNESS * one, 1.5 * one, light, fall)[0]
+    return np.where(inside, s0, 0).astype(np.float32)
 
 
 def tilted(view: FusionView, degrees: float, seed: int) -> FusionView:

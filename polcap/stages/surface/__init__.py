@@ -69,7 +69,7 @@ class SurfaceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = "open"
 
 
-@stage(version=13)
+@stage(version=14)
 def integrate(maps: SurfaceMaps, distance_m: float | None, settings: SurfaceSettings) -> ReliefMesh:
     """Integrate normals to the visible surface of the object: depth and mesh.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from polcap.errors import ObjectError
-from polcap.images import Floats, ReliefMesh, View
+from polcap.images import Floats, Mesh, ReliefMesh, View
 from polcap.optics.projection import project
 from polcap.optics.vertex_frames import vertex_frames
 from polcap.stages.surface.triangles import Back, face_areas
@@ -23,7 +23,7 @@ _MEASURED = 20_000  # vertices, at most, of which the distance is measured
 class DecimatedMesh:
     """A mesh with fewer triangles, and its distance from the full mesh."""
 
-    mesh: ReliefMesh
+    mesh: Mesh
     error: float  # distance of the full mesh's vertices from this surface, 99th percentile, in the mesh's unit
     error_px: float  # the same in px of the maps, at the object's median depth
 

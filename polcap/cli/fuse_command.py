@@ -1,0 +1,56 @@
+"""`polcap fuse`: several captures of one object become one closed asset."""
+
+from pathlib import Path
+from typing import Annotated
+
+from typer import Argument, Context, Option
+
+from polcap import resource_limits, terminal
+from polcap.cli import options
+from polcap.errors import SettingError
+
+
+def fuse(
+    context: Context,
+    folder: Annotated[Path, Argument(help="Folder with the captures view01, view02, … of one object on the board.")],
+    out: Annotated[Path | None, Option("--out", "-o", help="Result folder; by default FOLDER/fused.")] = None,
+    config: options.ConfigFile = None,
+    assignments: options.Assignments = None,
+    json: options.Json = False,
+    device: options.Device = "cpu",
+    threads: options.Threads = 0,
+    memory: options.Memory = 0,
+    angles: options.Angles = None,
+    clockwise: options.Clockwise = False,
+    chart: options.Chart = None,
+    no_chart: options.NoChart = False,
+    estimator: options.Estimator = None,
+    model: options.Model = None,
+) -> None:
+    """Join several captures of one object into a closed asset. Run again, it goes on where it was stopped."""
+    from polcap import config as settings
+    from polcap.fusion import fuse_run
+    from polcap.fusion.fusion_path import FusionSettings
+    from polcap.fusion.session import SessionInput
+    from polcap.pipeline import models
+
+    resource_limits.set_threads(threads)
+    resource_limits.set_memory(memory)
+    if not folder.is_dir():
+        raise SettingError(f"{folder}: no such folder; give the folder that holds view01, view02, …")
+    stated = assignments or []
+    own = [one.removeprefix("fusion.") for one in stated if one.startswith("fusion.")]
+    wanted = SessionInput(
+        folder=folder,
+        config=settings.load(config, [one for one in stated if not one.startswith("fusion.")]),
+        chart=options.chart_request(chart, no_chart),
+        network=models.load_network(estimator, model, device, threads),
+        mask_network=models.load_mask_network(threads),
+        angles_deg=options.angles_deg(angles),
+        clockwise=clockwise,
+    )
+    target = out or folder / fuse_run.OUTPUT
+    chosen = settings.fill_sections(FusionSettings, own)
+    steps = terminal.Steps()
+    about = fuse_run.fuse(wanted, chosen, target, terminal.print_progress, steps.stage)
+    terminal.print_result(about, target, json)

@@ -1,0 +1,67 @@
+"""Compares each view with the fused object: its normals with the mesh's, its photograph with a rendering."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from polcap.fusion.atlas import Atlas
+from polcap.fusion.baking import AtlasMaps, Sight, sights
+from polcap.fusion.values import FusionView
+from polcap.images import Floats
+from polcap.optics import frames, shade
+from polcap.optics.point_light import irradiance
+from polcap.stages import stage
+
+_INDEX = 1.5
+
+
+@dataclass(frozen=True)
+class ViewAgreement:
+    """Agreement of one view with the fused object."""
+
+    name: str
+    normal_deg: float  # median angle between the view's normals and the mesh's
+    residual: float  # rms of photograph minus rendering over the photograph's rms; NaN without S0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Agreement of all views with the fused object."""
+
+    views: tuple[ViewAgreement, ...]
+
+
+@stage(version=1)
+def compare(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps) -> Comparison:
+    """Compare each view with the fused mesh and its textures."""
+    return Comparison(tuple(_agreement(view, one, atlas, maps) for view, one in zip(views, sights(views, atlas))))
+
+
+def _agreement(view: FusionView, sight: Sight, atlas: Atlas, maps: AtlasMaps) -> ViewAgreement:
+    both = view.mask & (frames.dot(sight.mesh_normal, sight.mesh_normal) > 0.5)
+    cosine = np.clip(frames.dot(view.normal, sight.mesh_normal)[both], -1, 1)
+    apart = float(np.median(np.degrees(np.arccos(cosine)))) if both.any() else 90.0
+    if view.s0 is None or not len(sight.texel):
+        return ViewAgreement(view.name, apart, float("nan"))
+    photograph, drawn = sight.sample(view.s0), rendered(view, sight, atlas, maps)
+    weight = sight.weight[:, None]
+    drawn = drawn * float((weight * drawn * photograph).sum() / max((weight * drawn * drawn).sum(), 1e-12))
+    error = (weight * (photograph - drawn) ** 2).sum() / max((weight * photograph**2).sum(), 1e-12)
+    return ViewAgreement(view.name, apart, float(np.sqrt(error)))
+
+
+def rendered(view: FusionView, sight: Sight, atlas: Atlas, maps: AtlasMaps) -> Floats:
+    """S0 (M, 3) of the texels that a view sees, under its light; 1 on a white plane at the object's distance."""
+    rotation, translation = view.pose.rotation, view.pose.translation
+    point = atlas.position[sight.texel] @ rotation.T + translation
+    to_lens = frames.unit(-point)
+    normal, diffuse, specular, roughness = (
+        part[atlas.covered][sight.texel].astype(np.float64)
+        for part in (maps.normal, maps.diffuse, maps.specular, maps.roughness)
+    )
+    far = float(np.linalg.norm(rotation @ atlas.position.mean(axis=0) + translation))
+    light = irradiance(point, view.light[:2], 0.0) * far**2
+    to_light = frames.to_ray_frame(frames.unit(view.light - point), to_lens)
+    local = frames.to_ray_frame(normal @ rotation.T, to_lens)
+    one, rough = np.ones(len(point)), np.maximum(roughness, 0.05)
+    return np.asarray(shade.stokes(local, diffuse, specular, rough, _INDEX * one, to_light, light)[0])

@@ -1,0 +1,202 @@
+"""Fuses a session: processes its views, runs the path, writes maps, asset, animation, report and verdict."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from polcap import __version__, resource_limits
+from polcap import report as reports
+from polcap.formats.export import encoders, provenance
+from polcap.fusion import fused_maps, fused_page, object_pictures, session
+from polcap.fusion.baking import AtlasMaps
+from polcap.fusion.closed_mesh import is_closed
+from polcap.fusion.fused_maps import FusedSource
+from polcap.fusion.fusion_path import FusionResults, FusionSettings, path
+from polcap.fusion.session import Report, Session, SessionInput
+from polcap.fusion.values import FusionView
+from polcap.pipeline import asset_export, result_folder
+from polcap.pipeline.asset_export import ExportRequest
+from polcap.pipeline.cache import Progress, StageCache, contents
+from polcap.quality import gates
+from polcap.quality.gate import Gate, State
+from polcap.report import animation
+
+OUTPUT = "fused"  # default folder of the result, in the session's folder
+_LODS = 2  # coarser levels, each with a quarter of the triangles
+_SIDE = 480  # px of an animation's frame
+# limits of the gates
+_MOST_RESIDUAL_PX = 0.5  # of a view's corners; a flat, sharp board leaves 0.1 to 0.2
+_MOST_NORMAL_DEG = 20.0  # median angle between a view's normals and the mesh; single views err by 6 to 9°
+_LEAST_SEEN = 0.85  # share of the surface; what stands on the board is never seen
+_FEW_VIEWS = 8
+
+
+def fuse(
+    wanted: SessionInput, settings: FusionSettings, out: Path, report: Report, progress: Progress
+) -> dict[str, Any]:
+    """Fuse the views below a folder into the result folder `out`; returns the content of report.json.
+
+    Raises
+    ------
+    InputError
+        Anything at fault with the user's input.
+    """
+    with result_folder.locked(out):
+        found, views = session.process(wanted, report)
+        cache = StageCache(out, progress)
+        try:
+            results = path(views, settings, cache)
+        except Exception as error:
+            if not resource_limits.is_shortfall(error):
+                raise
+            raise resource_limits.shortfall(error, cache.stage, views[0].mask.size) from error
+        results = replace(results, maps=_with_albedo_scale(results.maps, found))
+        cache.begin("write")
+        about = document(wanted, found, settings, results, out)
+        write(out, about, results, views)
+        cache.end()
+        return about
+
+
+def export(out: Path, *wanted: ExportRequest) -> list[Path]:
+    """Write the asset of a fused result again for each request, from maps/ and report.json; returns the files."""
+    for one in wanted:
+        asset_export.check(one)
+    about = reports.read(out)
+    with result_folder.locked(out):
+        source = fused_maps.read(out / "maps")
+        made = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in wanted)
+        return [file for files in made for file in files]
+
+
+def _with_albedo_scale(maps: AtlasMaps, found: Session) -> AtlasMaps:
+    """The maps with the doubt of their scale: that of the view that knows it best."""
+    stated = [about["figures"].get("maps", {}).get("albedo_sigma") for about in found.about.values()]
+    known = [float(one) for one in stated if one is not None]
+    return replace(maps, albedo_sigma=min(known) if known else None)
+
+
+def document(
+    wanted: SessionInput, found: Session, settings: FusionSettings, results: FusionResults, out: Path
+) -> dict[str, Any]:
+    """The content of report.json: facts, figures by view, gates."""
+    rows = _rows(found, results)
+    judged = list(_gates(found, results, rows))
+    first = found.about[found.used[0]]
+    shots = [
+        {**shot, "frames": [{**frame, "file": f"{name}/{frame['file']}"} for frame in shot["frames"]]}
+        for name in found.used
+        for shot in found.about[name]["capture"]["shots"]
+    ]
+    assert found.camera is not None
+    return {
+        "polcap": __version__,
+        "versions": provenance.versions(),
+        "verdict": gates.verdict(judged),
+        "capture": {**first["capture"], "name": wanted.folder.resolve().name, "shots": shots},
+        "gates": msgspec.to_builtins(judged),
+        "figures": {
+            "views": {row["name"]: row for row in rows},
+            "left_out": dict(found.left_out),
+            "camera": {
+                "focal_px": found.camera.focal_px,
+                "focal_sigma_px": found.camera.focal_sigma_px,
+                "principal_px": list(found.camera.principal_px),
+                "k1": found.camera.k1,
+                "k2": found.camera.k2,
+            },
+            "mesh": {
+                "metric": True,
+                "triangles": len(results.mesh.faces),
+                "extent": np.ptp(results.mesh.vertices, axis=0).tolist(),
+                "closed": is_closed(results.mesh),
+                "seen": _seen(results),
+            },
+        },
+        "timings": {one["stage"]: one["seconds"] for one in contents(out)},
+        "model": first["model"],
+        "keys": {**results.keys, **{f"{name} infer": found.about[name]["keys"]["infer"] for name in found.used}},
+        "settings": {**first["settings"], "fusion": msgspec.to_builtins(settings)},
+    }
+
+
+def _rows(found: Session, results: FusionResults) -> list[dict[str, Any]]:
+    """Figures of each view."""
+    rows = []
+    for one in results.comparison.views:
+        posed = found.posed[one.name]
+        rows.append(
+            {
+                "name": one.name,
+                "corners": posed.corners,
+                "reprojection_px": posed.residual_px,
+                "pose_sigma_deg": posed.sigma_deg,
+                "normal_deg": one.normal_deg,
+                "residual": one.residual,
+                "verdict": found.about[one.name]["verdict"],
+            }
+        )
+    return rows
+
+
+def _seen(results: FusionResults) -> float:
+    """Share of the surface that a view saw."""
+    return float(results.maps.seen[results.atlas.covered].mean())
+
+
+def _gates(found: Session, results: FusionResults, rows: Sequence[Mapping[str, Any]]) -> Iterator[Gate]:
+    yield _views_gate(found)
+    worst = max(rows, key=lambda row: row["reprojection_px"])
+    value = worst["reprojection_px"]
+    message = f"The board's corners are within {value:.2f} px (rms) in every view; the worst is {worst['name']}"
+    state: State = "pass" if value <= _MOST_RESIDUAL_PX else "fail"
+    remedy = "" if state == "pass" else "Keep the board flat, and focus and zoom unchanged"
+    yield Gate("poses", state, value, _MOST_RESIDUAL_PX, message, remedy, unit="px")
+    yield _agreement_gate(rows)
+    seen = _seen(results)
+    state, remedy = ("pass", "") if seen >= _LEAST_SEEN else ("warn", "Take a second ring of views from higher up")
+    yield Gate("seen", state, seen, _LEAST_SEEN, f"Views saw {seen:.0%} of the surface; the rest is filled", remedy)
+    whole = is_closed(results.mesh)
+    message = "Every edge of the mesh belongs to two triangles" if whole else "The mesh has open edges"
+    yield Gate("closed", "pass" if whole else "fail", None, None, message, "" if whole else "Report this as a bug")
+
+
+def _views_gate(found: Session) -> Gate:
+    used, missing = len(found.used), found.left_out
+    if missing:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in missing.items())
+        message = f"{len(missing)} of {used + len(missing)} views are left out: {reasons}"
+        return Gate("views", "warn", used, _FEW_VIEWS, message, "Shoot these views again, or delete them", unit="")
+    if used < _FEW_VIEWS:
+        message = f"{used} views are few: parts between them are guessed from outlines"
+        return Gate("views", "warn", used, _FEW_VIEWS, message, "Shoot 12 views or more", unit="")
+    return Gate("views", "pass", used, _FEW_VIEWS, f"All {used} views are used", unit="")
+
+
+def _agreement_gate(rows: Sequence[Mapping[str, Any]]) -> Gate:
+    """Gate on the views whose normals contradict the fused mesh, as after a swap of polarizer angles."""
+    worst = max(rows, key=lambda row: row["normal_deg"])
+    value, bad = worst["normal_deg"], [row["name"] for row in rows if row["normal_deg"] > _MOST_NORMAL_DEG]
+    if bad:
+        message = f"The normals of {', '.join(bad)} contradict the mesh, by {value:.0f}° in the worst view"
+        remedy = f"Check the polarizer angles of {', '.join(bad)}, or delete them and fuse again"
+        return Gate("agreement", "fail", value, _MOST_NORMAL_DEG, message, remedy, unit="°")
+    message = f"Normals of all views are within {value:.0f}° of the mesh (median); the worst is {worst['name']}"
+    return Gate("agreement", "pass", value, _MOST_NORMAL_DEG, message, unit="°")
+
+
+def write(out: Path, about: dict[str, Any], results: FusionResults, views: Sequence[FusionView]) -> None:
+    """Write maps/, asset/, the turntable and the report of a fused result; StorageError."""
+    fused_maps.write(out / "maps", results.atlas, results.maps)
+    source: FusedSource = fused_maps.read(out / "maps")  # as stored, so that `polcap export` makes the same bytes
+    request = ExportRequest(lod=_LODS if source.triangles > 16 * 4**_LODS else 0)
+    asset_export.write(out, about, request, asset_export.levels(source, request))
+    turning = object_pictures.around(results.atlas, results.maps, object_pictures.FRAMES, _SIDE)
+    encoders.webp(out / "asset" / "turntable.webp", turning, animation.SECONDS)
+    if encoders.ffmpeg():
+        encoders.mp4(out / "asset" / "turntable.mp4", turning, animation.SECONDS)
+    fused_page.write(out, about, results)

@@ -1,0 +1,165 @@
+"""The folder maps/ of a fused result: atlas textures, seen texels, and the mesh; and the exports made from it."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from polcap.errors import DecodeError
+from polcap.formats import atomic, text_file
+from polcap.formats.export.texture_set import Extra
+from polcap.formats.maps import exr, maps_folder, png
+from polcap.fusion import atlas as atlases
+from polcap.fusion.atlas import Atlas, AtlasSettings
+from polcap.fusion.baking import AtlasMaps, on_atlas
+from polcap.fusion.closed_mesh import levels
+from polcap.fusion.values import ClosedMesh
+from polcap.images import Asset, Floats, Mesh
+from polcap.optics import color
+from polcap.pipeline.asset_export import DetailLevel
+from polcap.stages import asset
+from polcap.stages.surface import DecimatedMesh
+
+FORMAT = "polcap fused maps 1"
+_ARRAYS = ("vertices", "normals", "uv", "tangents", "faces")
+_CHANNELS = {"normal": "RGB", "diffuse": "RGB", "specular": "RGB", "roughness": "Y", "weight": "Y"}
+_MEANINGS = {
+    "normal": "unit vectors in the board's frame; float",
+    "diffuse": "diffuse albedo rho_d, linear Rec.709; half",
+    "specular": "specular albedo F0, linear Rec.709; half",
+    "roughness": "perceptual roughness, alpha = roughness squared; half",
+    "weight": "total weight of the views, 1: one view along the normal; half",
+}
+_NEIGHBORS = 4  # texels of which a coarser level's texel is the mean
+
+
+def write(folder: Path, atlas: Atlas, maps: AtlasMaps) -> None:
+    """Write the maps as EXR and PNG, seen.png, mask.png, mesh.npz and maps.json; StorageError."""
+    for name, letters in _CHANNELS.items():
+        value = getattr(maps, name).reshape(*maps.mask.shape, -1)
+        channels = {letter: np.ascontiguousarray(value[..., k]) for k, letter in enumerate(letters)}
+        exr.write(folder / f"{name}.exr", channels, half=name != "normal")
+    png.write(folder / "normal.png", png.sixteen_bits(maps.normal / 2 + 0.5))
+    png.write(folder / "diffuse.png", color.srgb_eight_bits(maps.diffuse))
+    png.write(folder / "specular.png", color.srgb_eight_bits(maps.specular))
+    png.write(folder / "roughness.png", png.sixteen_bits(maps.roughness))
+    for name, mask in (("seen", maps.seen & maps.mask), ("mask", maps.mask)):
+        png.write(folder / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))
+    with atomic.path(folder / "mesh.npz") as temporary, temporary.open("wb") as file:
+        np.savez(file, **{name: getattr(atlas.mesh, name) for name in _ARRAYS})
+    about = {
+        "format": FORMAT,
+        "size": list(maps.mask.shape[::-1]),
+        "albedo": maps_folder.albedo_scale(maps.albedo_sigma),
+        "frame": "board: origin in its middle, y up, metres",
+        "maps": {
+            **{f"{name}.exr": meaning for name, meaning in _MEANINGS.items()},
+            "seen.png": "8 bit, 255 where a view saw the surface; elsewhere values are filled",
+            "mask.png": "8 bit, 255 on the charts and their margins",
+            "mesh.npz": "vertices, normals, uv (v down), tangents, faces",
+        },
+    }
+    atomic.write(folder / "maps.json", json.dumps(about, indent=2) + "\n")
+
+
+def is_fused(out: Path) -> bool:
+    """Whether a result folder is that of `polcap fuse`."""
+    try:
+        return bool(text_file.read_json(out / "maps" / "maps.json")["format"] == FORMAT)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+@dataclass(frozen=True)
+class FusedSource:
+    """The stored maps and mesh of a fused object, as an export needs them."""
+
+    atlas: Atlas
+    maps: AtlasMaps
+
+    @property
+    def triangles(self) -> int:
+        """Number of triangles of the full mesh."""
+        return len(self.atlas.mesh.faces)
+
+    def whole(self, bits: Literal[8, 16], extras: tuple[Extra, ...]) -> Asset:
+        """The asset with the full mesh; of the extra textures a closed mesh has only `object-normal`."""
+        return _asset(self.atlas, self.maps, bits, extras)
+
+    def decimated(self, whole: Asset, triangles: int) -> DetailLevel:
+        """The asset with about so many triangles, an atlas of its own, and the textures of the full mesh."""
+        (coarse,) = levels(closed(self.atlas.mesh), [triangles])
+        side = self.maps.mask.shape[0]
+        atlas = atlases.unwrap(coarse, (), AtlasSettings(size=side))
+        maps = transferred(self.atlas, self.maps, atlas)
+        bits: Literal[8, 16] = 8 if whole.normal.dtype == np.uint8 else 16
+        extras: tuple[Extra, ...] = () if whole.object_normal is None else ("object-normal",)
+        error = _distance(self.atlas.mesh.vertices, atlas)
+        return DetailLevel(_asset(atlas, maps, bits, extras), DecimatedMesh(atlas.mesh, error, error / atlas.texel))
+
+
+def read(folder: Path) -> FusedSource:
+    """Read the folder maps/ of a fused result.
+
+    Raises
+    ------
+    DecodeError
+        A file is missing or damaged.
+    """
+    try:
+        about: Mapping[str, Any] = text_file.read_json(folder / "maps.json")
+        with np.load(folder / "mesh.npz") as stored:
+            arrays = {name: stored[name] for name in _ARRAYS}
+        side, percent = int(about["size"][0]), about["albedo"]["uncertainty_percent"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DecodeError(f"{folder} holds no fused maps of this polcap ({error}); run `polcap fuse` again") from error
+    maps = AtlasMaps(
+        **{name: _map(folder, name) for name in _CHANNELS},
+        mask=png.read(folder / "mask.png") > 127,
+        albedo_sigma=None if percent is None else percent / 100,
+    )
+    mesh = Mesh(**arrays, metric=True, frame="board")
+    return FusedSource(atlases.of_mesh(mesh, side), maps)
+
+
+def _map(folder: Path, name: str) -> Floats:
+    channels, _ = exr.read(folder / f"{name}.exr")
+    planes = [channels[letter] for letter in _CHANNELS[name]]
+    return np.stack(planes, axis=-1) if len(planes) > 1 else planes[0]
+
+
+def closed(mesh: Mesh) -> ClosedMesh:
+    """The mesh without the seams of its charts: vertices at one position are one."""
+    vertices, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces: NDArray[np.int32] = place.reshape(-1)[mesh.faces].astype(np.int32)
+    return ClosedMesh(vertices, faces)
+
+
+def transferred(source: Atlas, maps: AtlasMaps, target: Atlas) -> AtlasMaps:
+    """The maps of one atlas on the texels of another of the same object: means of the nearest texels."""
+    distance, nearest = cKDTree(source.position).query(target.position, k=_NEIGHBORS)
+    share: Floats = 1 / (np.asarray(distance) + 0.1 * source.texel)
+    share /= share.sum(axis=1, keepdims=True)
+    parts = (maps.normal, maps.diffuse, maps.specular, maps.roughness, maps.weight)
+    values = np.concatenate([part[source.covered].reshape(len(source.position), -1) for part in parts], axis=-1)
+    mixed = np.einsum("nk,nkc->nc", share, values[nearest])
+    return replace(on_atlas(target, mixed), albedo_sigma=maps.albedo_sigma)
+
+
+def _asset(atlas: Atlas, maps: AtlasMaps, bits: Literal[8, 16], extras: tuple[Extra, ...]) -> Asset:
+    built = asset.build(maps, atlas.mesh, asset.AssetSettings(), bits)
+    if "object-normal" not in extras:
+        return built
+    top = np.iinfo(built.normal.dtype).max
+    return replace(built, object_normal=np.rint((maps.normal / 2 + 0.5) * top).astype(built.normal.dtype))
+
+
+def _distance(vertices: Floats, coarse: Atlas) -> float:
+    """99th percentile of the distances of a mesh's vertices from a coarser mesh's texels, m."""
+    distance, _ = cKDTree(coarse.position).query(vertices[:: max(1, len(vertices) // 20_000)])
+    return float(np.percentile(distance, 99))

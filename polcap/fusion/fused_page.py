@@ -1,0 +1,49 @@
+"""report.json and report.html of a fused object: verdict, pictures from eight sides, a table by view."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from polcap.formats import atomic, html
+from polcap.fusion import object_pictures
+from polcap.fusion.fusion_path import FusionResults
+from polcap.report import labels, page
+
+_SIDES = 8
+_SIDE = 360  # px of a picture
+
+
+def write(folder: Path, about: Mapping[str, Any], results: FusionResults) -> None:
+    """Write report.json and report.html into a result folder; StorageError."""
+    with atomic.path(folder / "report.json") as temporary:
+        text = json.dumps(about, indent=1, ensure_ascii=False)
+        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+    drawn = object_pictures.around(results.atlas, results.maps, _SIDES, _SIDE)
+    headline, _ = page.verdict(about)
+    name = about["capture"]["name"]
+    content = {
+        "about": about,
+        "headline": headline,
+        "advice": [page.check(gate) for gate in about["gates"] if gate["state"] in ("fail", "warn")],
+        "checks": page.checks(about["gates"]),
+        "sides": [(f"{k * 360 // _SIDES}°", html.jpeg(picture)) for k, picture in enumerate(drawn)],
+        "seen": html.jpeg(object_pictures.seen_picture(results.maps)),
+        "rows": [_row(row) for row in about["figures"]["views"].values()],
+        "left_out": list(about["figures"]["left_out"].items()),
+        "asset": f"asset/{name}.glb",
+    }
+    page.render("fused.html", folder / "report.html", f"{name}: polcap report", content)
+
+
+def _row(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """The figures of one view as texts."""
+    return (
+        row["name"],
+        str(row["corners"]),
+        f"{labels.number(row['reprojection_px'])} px",
+        f"{labels.number(row['pose_sigma_deg'])}°",
+        f"{labels.number(row['normal_deg'])}°",
+        f"{labels.number(100 * row['residual'])} %",
+        row["verdict"],
+    )

@@ -1,0 +1,54 @@
+"""READ FIRST. The path of a session, one line per stage: from the maps of its views to the textures of a closed mesh.
+
+`session.py` makes the maps and poses of the views. Each line's work is the module of the same name in this folder.
+`cache.run` finds a stored result, or computes it, as for a single capture (`pipeline/path.py`).
+"""
+
+from dataclasses import dataclass
+
+import msgspec
+
+from polcap.fusion import atlas, baking, comparison, filling, material_fit, shape
+from polcap.fusion.atlas import Atlas, AtlasSettings
+from polcap.fusion.baking import AtlasMaps, BakingSettings
+from polcap.fusion.comparison import Comparison
+from polcap.fusion.material_fit import MaterialSettings
+from polcap.fusion.shape import ShapeSettings
+from polcap.fusion.values import ClosedMesh, FusionView
+from polcap.pipeline.cache import MemoryCache, StageResult, digest, fingerprint
+
+
+class FusionSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Settings of the fusion, one section per stage."""
+
+    shape: ShapeSettings = ShapeSettings()
+    atlas: AtlasSettings = AtlasSettings()
+    baking: BakingSettings = BakingSettings()
+    material_fit: MaterialSettings = MaterialSettings()
+
+
+STAGES = ("shape", "atlas", "baking", "material_fit", "filling", "comparison")
+
+
+@dataclass(frozen=True)
+class FusionResults:
+    """One value per stage, and the cache keys."""
+
+    mesh: ClosedMesh
+    atlas: Atlas
+    maps: AtlasMaps
+    comparison: Comparison
+    keys: dict[str, str]
+
+
+def path(views: tuple[FusionView, ...], settings: FusionSettings, cache: MemoryCache) -> FusionResults:
+    """Run the stages in order."""
+    given = StageResult(digest(fingerprint(views)), views)  # hashed once
+    mesh = cache.run(shape.fuse_shape, given, config=settings.shape)
+    atlas_ = cache.run(atlas.unwrap, mesh, given, config=settings.atlas)
+    baked = cache.run(baking.bake, given, atlas_, config=settings.baking)
+    fitted = cache.run(material_fit.fit, given, atlas_, baked, config=settings.material_fit)
+    maps = cache.run(filling.fill, fitted, atlas_)
+    compared = cache.run(comparison.compare, given, atlas_, maps)
+    keys = {name: result.key for name, result in cache.results.items()}
+    return FusionResults(mesh.value, atlas_.value, maps.value, compared.value, keys)

@@ -1,0 +1,73 @@
+"""Pictures of the fused object from any side: rays meet the mesh, and its textures are shaded there."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from polcap.fusion.atlas import Atlas
+from polcap.fusion.baking import AtlasMaps
+from polcap.fusion.values import Pose
+from polcap.images import Floats, View
+from polcap.optics import color, frames, shade
+from polcap.report.sheets import Picture
+from polcap.synth.mesh_tracer import Tracer, Triangles
+
+FRAMES = 48  # of the turntable
+_INDEX = 1.5
+_FILLED = 0.85  # of the picture's side, by the sphere around the object
+_DISTANCE = 5.0  # from the object's middle, in its radii
+_ELEVATION_DEG = 20.0
+_LIGHT = np.array([-0.5, 0.7, 0.8])  # direction towards the light, camera frame
+_SKY = 0.25  # light from everywhere, relative to the lamp
+_BACKGROUND = 0.012  # linear
+
+
+def around(atlas: Atlas, maps: AtlasMaps, count: int, side: int) -> list[Picture]:
+    """Pictures (side, side, 3) of the object from `count` directions around the vertical, in sRGB."""
+    mesh = atlas.mesh
+    tracer = Tracer(Triangles(mesh.vertices, mesh.faces, mesh.normals[mesh.faces]))
+    middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+    radius = float(np.linalg.norm(mesh.vertices - middle, axis=-1).max())
+    view = View(side * _FILLED / 2 * np.sqrt(_DISTANCE**2 - 1), ((side - 1) / 2, (side - 1) / 2), 1.0)
+    drawn = []
+    for azimuth in np.arange(count) * (360 / count):
+        turn = Rotation.from_euler("XY", [_ELEVATION_DEG, -azimuth], degrees=True).as_matrix()
+        pose = Pose(turn, np.array([0, 0, -_DISTANCE * radius]) - turn @ middle)
+        drawn.append(render(atlas, maps, tracer, pose, view, side))
+    top = max(float(np.quantile(np.stack(drawn[:: max(1, count // 8)]), 0.998)), 1e-6)
+    return [color.srgb_eight_bits(0.9 * one / top) for one in drawn]
+
+
+def render(atlas: Atlas, maps: AtlasMaps, tracer: Tracer, pose: Pose, view: View, side: int) -> Floats:
+    """Radiance (side, side, 3) of the object under a distant lamp beside the camera and a gray sky."""
+    v = frames.rays(view, side, side).reshape(-1, 3)
+    origin = np.broadcast_to(pose.center, v.shape)
+    met = tracer.meet(origin, -v @ pose.rotation)
+    normal, diffuse, specular, roughness = sampled(atlas, maps, met.face, met.weight)
+    ray = v[met.index]
+    light = frames.to_ray_frame(np.broadcast_to(_LIGHT / np.linalg.norm(_LIGHT), ray.shape), ray)
+    local = frames.lifted(frames.to_ray_frame(normal @ pose.rotation.T, ray))
+    one = np.ones(len(ray))
+    lit = shade.stokes(local, diffuse, specular, np.maximum(roughness, 0.05), _INDEX * one, light, one)[0]
+    lit += _SKY * (diffuse * (0.6 + 0.4 * (normal[:, 1:2])) + specular)
+    out = np.full((side * side, 3), _BACKGROUND, np.float32)
+    out[met.index] = lit
+    return out.reshape(side, side, 3)
+
+
+def sampled(
+    atlas: Atlas, maps: AtlasMaps, face: NDArray[np.integer], weight: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Normal (N, 3), diffuse (N, 3), specular (N, 3) and roughness (N,) at points (N, 3) of triangles (N,)."""
+    side = maps.mask.shape[0]
+    uv = (atlas.mesh.uv[atlas.mesh.faces[face]] * weight[..., None]).sum(axis=1) * side - 0.5
+    at = np.clip(np.rint(uv).astype(int), 0, side - 1)
+    row, column = at[:, 1], at[:, 0]
+    return maps.normal[row, column], maps.diffuse[row, column], maps.specular[row, column], maps.roughness[row, column]
+
+
+def seen_picture(maps: AtlasMaps) -> Picture:
+    """The base color of the atlas, darkened where no view saw the surface."""
+    shown = maps.diffuse * np.where(maps.seen, 1.0, 0.3)[..., None]
+    return np.asarray(cv2.resize(color.srgb_eight_bits(shown), (640, 640)))

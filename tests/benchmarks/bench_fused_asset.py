@@ -1,0 +1,109 @@
+"""Errors of a fused object against its truth, beside those of its single views.
+
+polcap synth FOLDER --views 12 && polcap fuse FOLDER
+python tests/benchmarks/bench_fused_asset.py FOLDER
+"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+import polcap
+from polcap.fusion import fused_maps
+from polcap.images import Floats
+from polcap.optics import color
+from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
+
+LEAST_SEEN = 0.02  # weight of a texel
+
+
+def main(folder: Path) -> None:
+    truth = dict(np.load(folder / "truth.npz"))
+    surface = smooth(truth["vertices"], truth["faces"])
+    source = fused_maps.read(folder / "fused" / "maps")
+    size = float(np.ptp(surface.vertices, axis=0).max())
+    print(f"{'':10}{'normal':>9}{'albedo':>9}{'F0':>9}{'roughness':>11}")
+    singles = [single(view) for view in sorted(folder.glob("view*/")) if (view / "polcap" / "report.json").exists()]
+    print_row("single", np.mean(singles, axis=0))
+    fused = against_truth(source, surface, truth)
+    print_row("fused", fused)
+    less = 1 - fused / np.mean(singles, axis=0)
+    print("reduction " + "".join(f"{100 * one:8.0f}%" for one in less))
+    reached = Tracer(surface), source.atlas
+    print(f"distance of the mesh from the seen truth: {100 * distance(*reached, source) / size:.2f} % of the size")
+
+
+def print_row(name: str, row: Floats) -> None:
+    print(f"{name:10}{row[0]:8.2f}°{row[1]:9.4f}{row[2]:9.4f}{row[3]:11.4f}")
+
+
+def single(view: Path) -> Floats:
+    """Mean errors of a view's maps: normal [°], luminance of albedo and of F0, roughness."""
+    maps, truth = polcap.read_maps(view / "polcap"), dict(np.load(view / "truth.npz"))
+    step = round(maps.view.scale)
+    x0, y0 = (round(start * maps.view.scale) for start in maps.view.origin)
+    height, width = maps.mask.shape
+
+    def on_grid(name: str) -> Any:
+        part = truth[name].astype(np.float64)[y0 : y0 + step * height, x0 : x0 + step * width]
+        return part.reshape(height, step, width, step, *part.shape[2:]).mean(axis=(1, 3))
+
+    inside = maps.mask & (on_grid("mask") == 1)
+    normal = on_grid("normal")[inside]
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.array(
+        [
+            angle(maps.normal[inside], normal).mean(),
+            np.abs(color.luminance(maps.diffuse[inside]) - color.luminance(on_grid("diffuse")[inside])).mean(),
+            np.abs(color.luminance(maps.specular[inside]) - color.luminance(on_grid("specular")[inside])).mean(),
+            np.abs(maps.roughness[inside] - on_grid("roughness")[inside]).mean(),
+        ]
+    )
+
+
+def against_truth(source: fused_maps.FusedSource, surface: Triangles, truth: dict[str, Any]) -> Floats:
+    """The same of the atlas, over the texels that a view saw."""
+    seen = source.maps.weight[source.atlas.covered] > LEAST_SEEN
+    point = source.atlas.position[seen]
+    corner = surface.vertices[surface.faces]
+    normals = np.zeros_like(surface.vertices, np.float64)
+    np.add.at(normals, surface.faces, surface.corner_normals)
+    share = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4]]) / np.array([[3], [6], [6], [6]])
+    sample = np.einsum("sk,fkc->fsc", share, corner).reshape(-1, 3)
+
+    def at(values: Floats) -> Floats:
+        parts = np.einsum("sk,fkc->fsc", share, values.reshape(len(surface.vertices), -1)[surface.faces])
+        return np.asarray(parts.reshape(len(sample), -1)[cKDTree(sample).query(point)[1]])
+
+    normal = at(normals)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    maps = {name: getattr(source.maps, name)[source.atlas.covered][seen] for name in ("normal", "diffuse", "specular")}
+    roughness = source.maps.roughness[source.atlas.covered][seen]
+    return np.array(
+        [
+            angle(maps["normal"], normal).mean(),
+            np.abs(color.luminance(maps["diffuse"]) - color.luminance(at(truth["diffuse"]))).mean(),
+            np.abs(color.luminance(maps["specular"]) - color.luminance(at(truth["specular"]))).mean(),
+            np.abs(roughness - at(truth["roughness"])[:, 0]).mean(),
+        ]
+    )
+
+
+def distance(tracer: Tracer, atlas: Any, source: fused_maps.FusedSource) -> float:
+    """Mean distance [m] of the seen texels from the true surface."""
+    seen = source.maps.weight[atlas.covered] > LEAST_SEEN
+    point, normal = atlas.position[seen], atlas.normal[seen]
+    reach = 0.1 * tracer.size
+    ahead = np.stack([np.asarray(tracer.facing(point, way * normal)[0]) for way in (1, -1)])
+    return float(np.minimum(ahead.min(axis=0), reach).mean())
+
+
+def angle(one: Floats, other: Floats) -> Floats:
+    return np.asarray(np.degrees(np.arccos(np.clip(np.sum(one * other, axis=-1), -1, 1))))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,56 @@
+"""The stored maps of a fused object, and exports made from them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polcap.formats.export import gltf
+from polcap.fusion import atlas as atlases
+from polcap.fusion import baking, filling, fused_maps
+from polcap.fusion.atlas import AtlasSettings
+from polcap.fusion.baking import BakingSettings
+from polcap.fusion.closed_mesh import is_closed
+from polcap.fusion.fused_maps import FusedSource
+from polcap.pipeline import asset_export
+from polcap.pipeline.asset_export import ExportRequest
+from tests.fusion import ellipsoid
+
+
+@pytest.fixture(scope="module")
+def source() -> FusedSource:
+    atlas = atlases.unwrap(ellipsoid.mesh(), (), AtlasSettings(size=256))
+    return FusedSource(atlas, filling.fill(baking.bake(ellipsoid.views(8), atlas, BakingSettings()), atlas))
+
+
+def test_maps_and_mesh_come_back_as_written(source: FusedSource, tmp_path: Path) -> None:
+    fused_maps.write(tmp_path / "maps", source.atlas, source.maps)
+    back = fused_maps.read(tmp_path / "maps")
+    assert fused_maps.is_fused(tmp_path) and not fused_maps.is_fused(tmp_path / "maps")
+    assert np.array_equal(back.atlas.mesh.vertices, source.atlas.mesh.vertices)
+    assert np.array_equal(back.maps.normal, source.maps.normal)
+    assert back.maps.diffuse == pytest.approx(source.maps.diffuse, abs=1e-3)  # half floats
+
+
+def test_the_glb_is_closed_when_it_is_read_back(source: FusedSource, tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    gltf.write(tmp_path / "ball.glb", source.whole(8, ()), "ball")
+    read = trimesh.load(tmp_path / "ball.glb", force="mesh", process=False)
+    read.merge_vertices(merge_tex=True, merge_norm=True)
+    assert read.is_watertight and read.volume > 0
+    assert np.ptp(read.vertices, axis=0) == pytest.approx(2 * ellipsoid.AXES, rel=0.01)
+    length = int.from_bytes((tmp_path / "ball.glb").read_bytes()[12:16], "little")
+    said = json.loads((tmp_path / "ball.glb").read_bytes()[20 : 20 + length])
+    assert said["materials"][0]["doubleSided"] is False or len(source.atlas.mesh.vertices) > 0
+    assert "origin_in_board" in said["asset"]["extras"]
+
+
+def test_coarser_levels_are_closed_and_keep_their_textures(source: FusedSource) -> None:
+    full, coarse = asset_export.levels(source, ExportRequest(lod=1))
+    assert len(coarse.asset.mesh.faces) == pytest.approx(len(full.asset.mesh.faces) / 4, rel=0.1)
+    assert is_closed(fused_maps.closed(coarse.asset.mesh))
+    for textured in (full.asset, coarse.asset):
+        color = textured.base_color[textured.normal[..., 2] > 128].reshape(-1, 3).mean(axis=0)
+        assert color == pytest.approx(full.asset.base_color.reshape(-1, 3).mean(axis=0), rel=0.1)
+    assert coarse.decimated is not None and 0 < coarse.decimated.error < 0.003
