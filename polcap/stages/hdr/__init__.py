@@ -66,7 +66,7 @@ class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=14)
+@stage(version=15)
 def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack:
     """Merge every bracket: radiance (K, H, W, 3) of all shots, on the scale of each shot's reference frame.
 
@@ -145,6 +145,7 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
             ghost_fraction=np.array([np.mean((quality & Quality.GHOST) > 0) for quality in stack.quality[:count]]),
             ambient_share=np.array(ambient_share),
             blur_px=sharpness.frames_blur(tiles, side),
+            ambient_shared=_ambient_shared(capture.shots),
         ),
         sensor=replace(sensor, lossy=read.lossy),
         equipment=_equipment(capture, view),
@@ -152,6 +153,12 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         crossed=None if capture.crossed is None else CrossedShot(pictures[-1], capture.crossed_angle),
         mosaic=mosaic,
     )
+
+
+def _ambient_shared(shots: tuple[Shot, ...]) -> bool:
+    """Whether one ambient frame belongs to shots of several angles."""
+    digests = [digest for shot in shots for digest in {frame.digest for frame in shot.ambient}]
+    return len(set(digests)) < len(digests)
 
 
 def _check_counts(shots: tuple[Shot, ...]) -> None:
