@@ -32,6 +32,16 @@ class Result:
         """`pass`, `warn` (check an assumption) or `fail` (a gate failed: check the result before use)."""
         return str(self.report["verdict"])
 
+    @property
+    def expected_error_deg(self) -> float | None:
+        """Median of the expected error of the normals, degrees; None where it was not measured."""
+        return None if self.report["expected_error_deg"] is None else float(self.report["expected_error_deg"])
+
+    @property
+    def asset(self) -> Path:
+        """The GLB file."""
+        return self.folder / "asset" / f"{self.report['capture']['name']}.glb"
+
 
 def process(
     capture: str | Path,

@@ -7,7 +7,7 @@ one.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from enum import IntFlag
 from typing import Any, Literal
 
@@ -23,6 +23,18 @@ Role = Literal["shot", "ambient", "repeat", "chart", "cross"]
 NOT_IN_KEY = {"in_key": False}  # metadata of a field that cache keys ignore, because it does not change a result
 
 
+class ArrayValue:
+    """Base class of values with pictures: their repr shows type and shape of each array, not its numbers."""
+
+    def __repr__(self) -> str:
+        fields = ", ".join(f"{name}={_short(value)}" for name, value in vars(self).items())
+        return f"{type(self).__name__}({fields})"
+
+
+def _short(value: Any) -> str:
+    return f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else repr(value)
+
+
 class Quality(IntFlag):
     """Defects of a pixel, as bits of a uint8 map; 0: none known."""
 
@@ -36,7 +48,7 @@ class Quality(IntFlag):
 
 @dataclass(frozen=True)
 class Exif:
-    """Metadata of one photograph (EXIF); None where the file has no value. One flat list, as the tags are."""
+    """Camera settings of one photograph from its EXIF tags; None or "" where the file has no value."""
 
     make: str = ""
     model: str = ""
@@ -62,8 +74,8 @@ class Exif:
         return self.exposure_time * (self.iso or 100.0) / 100.0 / aperture**2
 
 
-@dataclass(frozen=True)
-class SensorImage:
+@dataclass(frozen=True, repr=False)
+class SensorImage(ArrayValue):
     """One decoded frame, linear, black level not subtracted."""
 
     value: Floats | NDArray[np.uint16]  # (H, W) mosaic, or (H, W, 3) without a mosaic; counts
@@ -91,7 +103,7 @@ class SensorImage:
 
 @dataclass(frozen=True)
 class NoiseLine:
-    """Noise of a sensor at one ISO: variance of a merged picture's pixel = slope · signal + floor, white = 1."""
+    """Noise of a sensor at one ISO: variance = slope · signal + floor, for a pixel of the merged picture; white = 1."""
 
     iso: float
     slope: tuple[float, ...]  # (C,)
@@ -140,9 +152,10 @@ class Falloff:
 
 @dataclass(frozen=True)
 class LensGeometry:
-    """A pinhole camera with distortion: a point at x appears at x (1 + k1 r² + k2 r⁴), each number with its 1σ.
+    """Measured geometry of a lens: focal length, principal point and radial distortion, each with its 1σ.
 
-    x and r are measured from the principal point, in focal lengths.
+    A point that a pinhole camera sees at x appears at x (1 + k1 r² + k2 r⁴). x and r = |x| are measured from the
+    principal point, in focal lengths.
     """
 
     focal_px: float  # visible RAW px
@@ -187,9 +200,9 @@ class FlashEnergy:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Measurements of `polcap calibrate` for one camera, lens and filter, each with its 1σ; C is 3 or 1.
+    """Measurements of `polcap calibrate` for one camera, lens and filter, each with its 1σ; None: not measured.
 
-    One field per measurement, because each can be made on its own.
+    C is the number of color channels, 3 or 1.
     """
 
     made: str  # ISO 8601
@@ -258,7 +271,7 @@ class CatalogEntry:
 
 @dataclass(frozen=True)
 class Capture:
-    """A capture: all photographs of one object, and the camera's geometry. Every stage begins from it."""
+    """A capture: all photographs of one object, and the camera's geometry. The input of a run."""
 
     name: str = field(metadata=NOT_IN_KEY)
     folder: str = field(metadata=NOT_IN_KEY)
@@ -318,8 +331,8 @@ class Distortion:
     k2: float
 
 
-@dataclass(frozen=True)
-class MaskedImage:
+@dataclass(frozen=True, repr=False)
+class MaskedImage(ArrayValue):
     """An image with radiance, variance and quality bits of each pixel."""
 
     value: Floats  # (H, W, 3) sensor white at the reference exposure = 1; may be negative
@@ -327,9 +340,9 @@ class MaskedImage:
     quality: Bits  # (H, W) Quality bits
 
 
-@dataclass(frozen=True)
-class Mosaic:
-    """A merged shot on its photosites, each of one color."""
+@dataclass(frozen=True, repr=False)
+class Mosaic(ArrayValue):
+    """A merged shot before demosaicing: each photosite has one color."""
 
     value: Floats  # (2H, 2W) float16, sensor white at the reference exposure = 1
     cfa: Bits  # (2, 2) of 0 R, 1 G, 2 B
@@ -345,7 +358,7 @@ class CrossedShot:
 
 @dataclass(frozen=True)
 class BracketMeasurement:
-    """Comparison of the frames of each bracket; NaN: unknown."""
+    """Comparison of the E frames within each of K brackets: exposure, linearity, motion, blur; NaN: unknown."""
 
     exposure_ratio: Floats  # (K, E, 3) of each frame to its shot's reference frame, from the pixels
     exif_ratio: Floats  # (K, E) the same from the metadata
@@ -377,8 +390,8 @@ class Equipment:
     distortion: Distortion | None = None  # of the lens, calibrated, on this grid; None: unknown, taken as a pinhole
 
 
-@dataclass(frozen=True)
-class AngleStack:
+@dataclass(frozen=True, repr=False)
+class AngleStack(ArrayValue):
     """The merged shots of a capture in camera channels, before registration."""
 
     value: Floats  # (K, H, W, 3) sensor white at the reference exposure = 1
@@ -442,7 +455,7 @@ class ChartPlace:
 
 @dataclass(frozen=True)
 class PatchColors:
-    """Residuals of a chart's patches after the fit to the maker's colors."""
+    """Color error of each chart patch after the fit of the color matrix to the maker's colors."""
 
     delta_e: Floats  # (24,) CIEDE2000 residual; NaN for patches left out
     use: Bits | None = None  # (24,) `whitebalance.patches.PatchUse`: 0 used, otherwise the reason; None: unknown
@@ -475,8 +488,8 @@ class Alignment:
     crossed: Floats | None = None  # (3, 3) reference grid px → crossed shot's grid px; None without one
 
 
-@dataclass(frozen=True)
-class ObjectMask:
+@dataclass(frozen=True, repr=False)
+class ObjectMask(ArrayValue):
     """Mask of the object's pixels on the full-frame grid, the crop around them, and figures on the mask's quality."""
 
     mask: NDArray[np.bool_]  # (H, W) full-frame grid
@@ -503,13 +516,13 @@ class Gains:
 
 @dataclass(frozen=True)
 class ShotOrder:
-    """Hypothesis on the polarizer's angles: order of the shots and sense of rotation."""
+    """A possible assignment of the stated polarizer angles to the shots: their order, and the sense of rotation."""
 
     shots: tuple[int, ...]  # (K,) index of the stated angle of each shot
     mirrored: bool = False  # angles count clockwise
 
     def remedy(self, names: Sequence[str]) -> str:
-        """The correction that turns the stated angles into this order and sense; names (K,) are the stated angles."""
+        """Advice how to correct the stated angles to this order and sense; names (K,) are the shots' names."""
         moved = [(names[k], names[at]) for k, at in enumerate(self.shots) if k != at]
         renames = " and ".join(f"{old} to {new}" for old, new in moved)
         sense = "add --clockwise, or clockwise = true in capture.toml" if self.mirrored else ""
@@ -534,7 +547,7 @@ class OutlineCheck:
 
 @dataclass(frozen=True)
 class TurnedShot:
-    """A shot with a polarizer angle that contradicts the others; can be found with more than three shots."""
+    """A shot whose polarizer angle contradicts the others. Only more than three shots can show this."""
 
     shots: tuple[int, ...] = ()  # all shots that could explain the contradiction, largest angle first; empty: all agree
     angle: float = 0.0  # rad, true minus stated angle of the first of them
@@ -563,8 +576,8 @@ class SelfCalibration:
     crossed: Floats | None = None  # (3,) factor from the crossed shot to the S0 of diffuse reflection; None without one
 
 
-@dataclass(frozen=True)
-class StokesImage:
+@dataclass(frozen=True, repr=False)
+class StokesImage(ArrayValue):
     """Linear Stokes parameters of the crop in camera channels."""
 
     stokes: Floats  # (3, H, W, 3) S0, S1, S2
@@ -577,8 +590,8 @@ class StokesImage:
     detail: Floats | None = None  # (2H, 2W) float16, ln of the light of RAW pixels over these pixels, enlarged
 
 
-@dataclass(frozen=True)
-class Cues:
+@dataclass(frozen=True, repr=False)
+class Cues(ArrayValue):
     """Inputs of the normal estimators on the crop's grid; stages/cues has each formula."""
 
     radiance: Floats  # (H, W, 3) S0 in linear Rec.709, chart white = its reflectance
@@ -614,8 +627,8 @@ class Network:
 RunNetwork = Callable[[Network, Floats], dict[str, Floats]]  # (1, N, H, W) → name → (1, n, H, W); as `formats.onnx.run`
 
 
-@dataclass(frozen=True)
-class SurfaceMaps:
+@dataclass(frozen=True, repr=False)
+class SurfaceMaps(ArrayValue):
     """Appearance and shape of the object on the crop's grid, camera frame."""
 
     normal: Floats  # (H, W, 3) unit, x right, y up, z to the camera
@@ -631,9 +644,9 @@ class SurfaceMaps:
     detail: Floats | None = None  # (2H, 2W) float16, ln of the albedo of RAW pixels over `diffuse`, enlarged
 
 
-@dataclass(frozen=True)
-class Mesh:
-    """The visible surface as a triangle mesh with figures on its quality. One value, as exporters need it."""
+@dataclass(frozen=True, repr=False)
+class Mesh(ArrayValue):
+    """The visible surface as a triangle mesh, with figures on its quality."""
 
     vertices: Floats  # (V, 3) camera frame; metres where scaled, else the object's depth is 1 focal length
     normals: Floats  # (V, 3) unit
@@ -648,8 +661,8 @@ class Mesh:
     raggedness: float  # length of the boundary over its smoothed length, minus 1; before smoothing
 
 
-@dataclass(frozen=True)
-class Asset:
+@dataclass(frozen=True, repr=False)
+class Asset(ArrayValue):
     """A 3-D asset: mesh with glTF textures and material factors."""
 
     mesh: Mesh
@@ -666,15 +679,15 @@ class Asset:
 
 @dataclass(frozen=True)
 class ChartRequest:
-    """The source of the color calibration, as requested by the user."""
+    """The user's choice of the color calibration: search the chart, given corners, a stored profile, or none."""
 
     mode: Literal["auto", "corners", "profile", "none"]
     corners: Floats | None = None  # (4, 2) outer patch corners, visible RAW px, dark-skin corner first, clockwise
     profile: ColorCalibration | None = None  # from another capture with the same equipment
 
 
-@dataclass(frozen=True)
-class GBuffer:
+@dataclass(frozen=True, repr=False)
+class GBuffer(ArrayValue):
     """Geometry buffer: the surface point at each pixel."""
 
     normal: Floats  # (H, W, 3) unit, camera frame; 0 outside
@@ -682,22 +695,3 @@ class GBuffer:
     mask: NDArray[np.bool_]  # (H, W)
     position: Floats  # (H, W, 3) in the object's own frame, for solid textures; 0 outside
     view: View
-
-
-def _repr(value: Any) -> str:
-    """Short text of a value: shape and type of each array, and at most 60 characters of each other field."""
-    listed = ", ".join(f"{one.name}={_short(getattr(value, one.name))}" for one in fields(value))
-    return f"{type(value).__name__}({listed})"
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, np.ndarray) and value.size > 9:
-        return f"{value.dtype} {value.shape}"
-    if is_dataclass(value):
-        return f"{type(value).__name__}(…)"
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else f"{text[:57]}…"
-
-
-for _value in [one for one in vars().values() if isinstance(one, type) and is_dataclass(one)]:
-    _value.__repr__ = _repr  # type: ignore[method-assign]  # arrays are not printed in full

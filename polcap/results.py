@@ -19,7 +19,7 @@ from polcap.images import (
 
 
 class NotReached(AttributeError):
-    """Error: a result was requested from a stage that did not run."""
+    """Error: the code asked for the result of a stage that did not run."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Results:
 
     @classmethod
     def partial(cls, **made: Any) -> Self:
-        """Results of the stages that ran; access to any other raises NotReached."""
+        """Results of some stages only; access to the result of any other stage raises NotReached."""
         found = object.__new__(cls)
         vars(found).update(made)
         return found

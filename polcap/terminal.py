@@ -3,12 +3,15 @@
 import functools
 import json
 import os
+import platform
+import shlex
 import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from datetime import datetime
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 import typer
 
@@ -25,12 +28,34 @@ if TYPE_CHECKING:
 _LONGEST = 600  # characters of a message
 _FRAMES_S = 5.0  # between two lines about frames, where there is no terminal to write over
 _verbosity = 0  # -1 with --quiet, 1 with --verbose
+_log_file: TextIO | None = None  # with --log
+_Level = Literal["INFO", "WARNING", "ERROR"]
 
 
 def set_verbosity(quiet: bool, verbose: bool) -> None:
     """Print no progress, or a line per frame and stage in place of a bar."""
     global _verbosity
     _verbosity = -1 if quiet else int(verbose)
+
+
+def open_log(file: "Path | None") -> None:
+    """Append all messages to a file too, after the command line and the versions. Raises OSError."""
+    global _log_file
+    _log_file = None
+    if file is not None:
+        from polcap.formats.export import provenance
+
+        _log_file = file.open("a", encoding="utf-8", errors="backslashreplace")
+        log(f"polcap {shlex.join(sys.argv[1:])}")
+        versions = {"Python": platform.python_version(), **provenance.versions()}
+        log(f"{', '.join(map(' '.join, versions.items()))}; {platform.platform()}")
+
+
+def log(text: str, level: _Level = "INFO") -> None:
+    """Write a message to the file of --log, if there is one: time and level before each line."""
+    if _log_file is not None:
+        now = datetime.now().astimezone().isoformat(timespec="milliseconds")
+        print(*(f"{now} {level:7} {row}" for row in printable(text).splitlines()), sep="\n", file=_log_file, flush=True)
 
 
 def reported(command: Callable[..., None]) -> Callable[..., None]:
@@ -50,7 +75,9 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
             if context.obj and isinstance(error, Exception):  # --debug
                 print_message("".join(traceback.format_exception(error)).rstrip())
             text, code = _explained(error, context.obj, kwargs.get("resume") is False)
-            print_message(f"polcap: {text}")
+            print_message(f"polcap: {text}", "ERROR")
+            if code == 1 and not context.obj:
+                log("".join(traceback.format_exception(error)), "ERROR")
             if not (isinstance(error, KeyboardInterrupt) and kwargs.get("watch")):  # Ctrl-C is its normal end
                 print_error_document(kwargs, error, text.removeprefix("error: "), code)
         raise typer.Exit(code)
@@ -91,15 +118,18 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" or "\ud800" <= c <= "\udfff" else "\ufffd" for c in text)
 
 
-def print_message(text: str) -> None:
+def print_message(text: str, level: _Level = "INFO") -> None:
     """Print a message on stderr."""
     print(printable(text), file=sys.stderr, flush=True)
+    log(text, level)
 
 
 def print_progress(text: str) -> None:
     """Print a message on stderr that --quiet suppresses."""
     if _verbosity >= 0:
         print_message(text)
+    else:
+        log(text)
 
 
 def print_data(data: Any) -> None:
@@ -129,11 +159,25 @@ def preview(drawn: "list[Path]") -> None:
             console.print(line_)
 
 
-def print_result(about: dict[str, Any], out: "Path", json: bool) -> None:
+def print_result(about: dict[str, Any], out: "Path", json: bool, open_: bool) -> None:
     """Print the asset's path or the report, and the verdict. Raises GateError where a gate failed."""
-    print_data(about if json else str(out / "asset" / f"{about['capture']['name']}.glb"))
-    print_progress(f"verdict {about['verdict']}; {out / 'report.html'}")
+    asset = str(out / "asset" / f"{about['capture']['name']}.glb")
+    outputs = {"asset": asset, "maps": str(out / "maps"), "report": str(out / "report.html")}
+    print_data({**about, "outputs": outputs} if json else asset)
+    error = about.get("expected_error_deg")
+    expected = "" if error is None else f", expected error of the normals {error:.1f}°"
+    print_progress(f"verdict {about['verdict']}{expected}; {outputs['report']}")
+    if open_:
+        open_page(out / "report.html")
     print_gates(about)
+
+
+def open_page(file: "Path") -> None:
+    """Open a page in the user's browser, but not in continuous integration (CI is set)."""
+    import webbrowser
+
+    if os.environ.get("CI") or not webbrowser.open(file.resolve().as_uri()):
+        print_message(f"polcap: no browser was opened; open {file} yourself")
 
 
 def print_gates(about: dict[str, Any]) -> None:
@@ -143,7 +187,8 @@ def print_gates(about: dict[str, Any]) -> None:
         if gate["state"] in ("fail", "warn"):
             word = "gate failed" if gate["state"] == "fail" else "warning"
             cost = f", costs about {gate['cost_deg']:.0f}°" if gate["cost_deg"] >= 1 else ""
-            print_message(f"polcap: {word}: {gate['name']}: {gate['says']}{cost}. {gate['remedy']}.")
+            text = f"polcap: {word}: {gate['name']}: {gate['says']}{cost}. {gate['remedy']}."
+            print_message(text, "ERROR" if gate["state"] == "fail" else "WARNING")
             failed += gate["state"] == "fail"
     if failed:
         raise GateError(f"{failed} of {len(about['gates'])} gates failed; the asset was written, see report.html")
@@ -158,7 +203,7 @@ class Steps:
     def stage(self, name: str, seconds: float | None, cached: bool) -> None:
         """Report that a stage begins (no seconds) or has ended."""
         if seconds is not None:
-            print_progress(f"{name:14}{'cached' if cached else f'{seconds:.2f} s'}")
+            print_progress(self._stage(name, seconds, cached))
 
     def frame(self, done: int, total: int) -> None:
         """Report that `done` of `total` photographs are done."""
@@ -166,6 +211,9 @@ class Steps:
         if now - self._last > _FRAMES_S or _verbosity > 0:
             self._last = now
             print_progress(self._frames(done, total, now))
+
+    def _stage(self, name: str, seconds: float, cached: bool) -> str:
+        return f"{name:14}{'cached' if cached else f'{seconds:.2f} s'}"
 
     def _frames(self, done: int, total: int, now: float) -> str:
         seconds = (now - self._begun) / done * (total - done)
@@ -183,6 +231,8 @@ class Bar(Steps):
     def stage(self, name: str, seconds: float | None, cached: bool) -> None:
         """Report that a stage begins (no seconds) or has ended."""
         self._bar.update(self._task, description=name, advance=0 if seconds is None else 1)
+        if seconds is not None:
+            log(self._stage(name, seconds, cached))
 
     def frame(self, done: int, total: int) -> None:
         """Report that `done` of `total` photographs are done."""

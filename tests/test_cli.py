@@ -42,7 +42,9 @@ def test_stdout_carries_data_only(result: Path, example: Path, polcap: Command, 
     plain = polcap("process", example, "--out", copy, "--estimator", "analytic")
     assert plain.stdout == f"{copy / 'asset' / 'capture.glb'}\n"
     document = json.loads(polcap("process", example, "--out", copy, "--estimator", "analytic", "--json").stdout)
-    assert document["verdict"] == "pass"
+    assert document["verdict"] == "pass" and 0 < document["expected_error_deg"] < 90
+    assert sorted(document["outputs"]) == ["asset", "maps", "report"]
+    assert all(Path(path).exists() for path in document["outputs"].values())
 
 
 def test_dry_run_prints_the_table_and_writes_nothing(example: Path, polcap: Command, tmp_path: Path) -> None:
@@ -131,6 +133,36 @@ def test_failed_gate_is_exit_3_after_everything_is_written(
     assert done.returncode == 3 and (copy / "asset" / "capture.glb").exists()
     assert "gate failed: normal error" in done.stderr
     assert json.loads((copy / "report.json").read_text())["verdict"] == "fail"
+
+
+def test_open_shows_the_report_but_not_in_ci(
+    result: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[str] = []
+    monkeypatch.setattr("webbrowser.open", lambda url: not shown.append(url))  # type: ignore[func-returns-value]
+    shutil.copytree(result, tmp_path / "copy")
+    monkeypatch.setenv("CI", "true")
+    assert "no browser was opened" in polcap("report", tmp_path / "copy", "--open").stderr
+    monkeypatch.delenv("CI")
+    polcap("report", tmp_path / "copy", "--open")
+    assert shown == [(tmp_path / "copy" / "report.html").as_uri()]
+
+
+def test_clean_removes_the_stage_cache_only(result: Path, polcap: Command, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy)
+    (copy / "work" / "photograph.dng").touch()
+    before = {file for file in copy.rglob("*") if file.is_file()}
+    dry = json.loads(polcap("clean", copy, "--dry-run", "--json").stdout)
+    assert {file for file in copy.rglob("*") if file.is_file()} == before
+    done = json.loads(polcap("clean", copy, "--json").stdout)
+    removed = before - {file for file in copy.rglob("*") if file.is_file()}
+    assert done["bytes"] == dry["bytes"] == sum((result / file.relative_to(copy)).stat().st_size for file in removed)
+    assert all(file.is_relative_to(copy / "work") for file in removed)
+    assert sorted(path.name for path in (copy / "work").iterdir()) == ["lock", "owner", "photograph.dng"]
+    assert polcap("export", copy, "--obj").returncode == 0
+    assert "holds no stage cache" in polcap("show", copy, "hdr").stderr
+    assert polcap("clean", tmp_path / "none").returncode == 2
 
 
 @pytest.mark.parametrize("stage", STAGES)

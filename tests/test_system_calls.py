@@ -21,6 +21,9 @@ import pytest
 from tests.conftest import EXAMPLE, ROOT
 
 WATCH_S = 12.0  # onnxruntime 1.32 looks up its host's address 9 s after it is loaded
+MINUTE_S = 60.0  # of a process that has loaded it
+HOMES = ("writable", "unset", "unwritable")
+slow = pytest.mark.skipif("POLCAP_SLOW" not in os.environ, reason="a minute each: set POLCAP_SLOW")
 CALLS = "open,openat,openat2,creat,mkdir,mkdirat,mknod,mknodat,truncate,rename,renameat,renameat2"
 CALLS += ",link,linkat,symlink,symlinkat,unlink,unlinkat,rmdir"
 CALL = re.compile(r"^\d+ +(\w+)\((.*)")
@@ -101,15 +104,22 @@ def test_a_request_and_a_file_of_a_child_are_seen(tmp_path: Path, environment: d
     assert outside(seen.written, tmp_path / "other") == [tmp_path / "made", tmp_path / "made" / "id"]
 
 
-@pytest.mark.parametrize("home", ["home", None])
+@pytest.fixture(params=HOMES)
+def home(request: pytest.FixtureRequest, tmp_path: Path, environment: dict[str, str]) -> None:
+    """A home folder; without one the user database alone knows it; one that nobody, root included, can write to."""
+    if request.param == "writable":
+        (tmp_path / "home").mkdir()
+    elif request.param == "unwritable":
+        (tmp_path / "home").touch()  # a file
+    if request.param != "unset":
+        environment["HOME"] = str(tmp_path / "home")
+
+
+@pytest.mark.usefixtures("home")
 def test_process_asks_no_network_and_writes_only_its_result(
-    tmp_path: Path, temporary: Path, environment: dict[str, str], home: str | None
+    tmp_path: Path, temporary: Path, environment: dict[str, str]
 ) -> None:
-    """With a home folder to write to, and where the user database alone knows it."""
     out, log = tmp_path / "out", tmp_path / "log"
-    if home:
-        (tmp_path / home).mkdir()
-        environment["HOME"] = str(tmp_path / home)
     command = [sys.executable, "-m", "polcap", "process", str(EXAMPLE), "--out", str(out)]
     done = subprocess.run(
         traced(command, log), cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
@@ -140,11 +150,11 @@ def test_workers_of_a_batch_ask_no_network_and_write_only_their_results(
 
 
 @pytest.fixture
-def watching(tmp_path: Path, environment: dict[str, str]) -> Iterator[subprocess.Popen[str]]:
-    """`process --watch` with a home that nobody, root included, can write to: onnxruntime sends then too."""
-    (tmp_path / "home").touch()  # a file
-    environment["HOME"] = str(tmp_path / "home")
+def watching(tmp_path: Path, environment: dict[str, str], home: None) -> Iterator[subprocess.Popen[str]]:
+    """`process --watch`, which also follows the settings file set.toml."""
+    (tmp_path / "set.toml").touch()
     command = [sys.executable, "-m", "polcap", "process", str(EXAMPLE), "--out", "out", "--watch"]
+    command += ["--config", "set.toml"]
     process = subprocess.Popen(
         traced(command, tmp_path / "log"),
         cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
@@ -155,19 +165,32 @@ def watching(tmp_path: Path, environment: dict[str, str]) -> Iterator[subprocess
         os.killpg(process.pid, signal.SIGKILL)
 
 
+@pytest.mark.parametrize(
+    ("home", "seconds"),
+    [("unwritable", WATCH_S), *(pytest.param(home, MINUTE_S, marks=slow) for home in HOMES)],
+    indirect=["home"],
+)
 def test_watch_asks_no_network_and_writes_only_its_result(
-    tmp_path: Path, temporary: Path, watching: subprocess.Popen[str]
+    tmp_path: Path, temporary: Path, watching: subprocess.Popen[str], seconds: float
 ) -> None:
-    assert watching.stderr is not None
-    while "watching" not in (line := watching.stderr.readline()):
-        assert line, "it ended before it had processed the capture"
+    _read_until_watching(watching)
     assert (tmp_path / "out" / "report.json").exists()
-    time.sleep(WATCH_S)
+    if seconds == MINUTE_S:
+        (tmp_path / "set.toml").write_text("[surface]\nback = 'skirt'\n")
+        _read_until_watching(watching)
+    time.sleep(seconds)
     os.killpg(watching.pid, signal.SIGINT)
     assert watching.wait(60) == 130
     seen = read(tmp_path / "log", tmp_path)
     assert seen.sockets == []
     assert outside(seen.written, tmp_path / "out", temporary) == []
+
+
+def _read_until_watching(process: subprocess.Popen[str]) -> None:
+    """Wait until the capture has been processed."""
+    assert process.stderr is not None
+    while "watching" not in (line := process.stderr.readline()):
+        assert line, "it ended before it had processed the capture"
 
 
 def test_a_trial_of_a_foreign_model_writes_nothing(

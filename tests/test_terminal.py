@@ -1,7 +1,11 @@
 """Messages of the commands, their streams and exit codes."""
 
 import json
+import os
+import subprocess
+import sys
 import time
+from datetime import datetime
 from itertools import chain
 from pathlib import Path
 from typing import get_args, get_type_hints
@@ -42,6 +46,31 @@ def test_quiet_prints_only_data_and_errors_wherever_it_is(polcap: Command, tmp_p
     small = ("--rotator", "simulated?settle=0", "--camera", "simulated?width=96&height=72&samples=1", "--no-check")
     assert polcap("capture", tmp_path / "c", *small, "-q") == (0, f"{tmp_path / 'c'}\n", "")
     assert polcap("-q", "process", tmp_path / "none").stderr.startswith("polcap: error: ")
+
+
+def test_log_has_all_messages_with_time_level_and_versions(polcap: Command, tmp_path: Path) -> None:
+    log = tmp_path / "one log.txt"
+    small = ("--rotator", "simulated?settle=0", "--camera", "simulated?width=96&height=72&samples=1", "--no-check")
+    assert polcap("capture", tmp_path / "c", *small, "-q", "--log", log).stderr == ""
+    failed = polcap("process", tmp_path / "none", f"--log={log}")
+    rows = [row.split(" ", 1) for row in log.read_text(encoding="utf-8").splitlines()]
+    assert all(datetime.fromisoformat(time).tzinfo for time, _ in rows)
+    texts = [text for _, text in rows]
+    assert texts[0].startswith("INFO    polcap ") and f"polcap {__version__}, numpy " in texts[1]
+    assert any("pol000" in text for text in texts)
+    assert texts[-1] == f"ERROR   {failed.stderr.rstrip()}"
+
+
+def test_log_has_the_traceback_of_a_bug(polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "show", lambda *_: 1 / 0)
+    assert "Traceback" not in polcap("show", "x", "hdr", "--log", tmp_path / "log").stderr
+    assert "ERROR   ZeroDivisionError" in (tmp_path / "log").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("words", [("--log",), ("--log", "none/file")])
+def test_a_log_that_cannot_be_written_is_one_line(polcap: Command, words: tuple[str, ...]) -> None:
+    done = polcap("process", "none", *words)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "--log" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -99,3 +128,19 @@ def test_frames_are_reported_every_five_seconds_with_the_time_left(
     steps.frame(5, 9)
     terminal.set_verbosity(quiet=False, verbose=False)
     assert capsys.readouterr().err.startswith("5 of 9 frames")
+
+
+@pytest.mark.parametrize(
+    ("words", "values"),
+    [
+        ("export r --preset u", ["unreal", "unity"]),
+        ("export r --extra d", ["displacement"]),
+        ("process c --until s", ["selfcal", "stokes", "surface"]),
+        ("export r --images w", ["webp"]),
+    ],
+)
+def test_the_shell_completes_values(words: str, values: list[str]) -> None:
+    line = {"COMP_WORDS": f"polcap {words}", "COMP_CWORD": str(len(words.split())), "_POLCAP_COMPLETE": "complete_bash"}
+    command = [sys.executable, "-c", "import sys; sys.argv[0] = 'polcap'; from polcap.cli import main; main()"]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **line}, timeout=60)
+    assert done.stdout.split() == values, done.stderr

@@ -15,6 +15,7 @@ import msgspec
 from polcap.batch.unit import FINISHED, FOLDER, Unit, UnitRecord
 from polcap.formats import atomic
 
+_COLUMNS = ("name", "state", "verdict", "expected_error_deg", "seconds", "attempts", "asset", "report", "says")
 _STYLE = """
 body { font: 14px/1.4 system-ui, sans-serif; margin: 1.5em; color: #222 } img { background: #000; display: block }
 table { border-collapse: collapse } td, th { text-align: left; padding: .2em .8em .2em 0; vertical-align: top }
@@ -39,7 +40,7 @@ def write(batch_folder: Path, units: Sequence[Unit], records: Sequence[UnitRecor
     """Write summary.html, summary.csv and summary.json into the batch's folder. Raises StorageError."""
     totals = summary(records)
     text = io.StringIO()
-    table = csv.DictWriter(text, ["name", "state", "seconds", "attempts", "says"], extrasaction="ignore")
+    table = csv.DictWriter(text, _COLUMNS, extrasaction="ignore")
     table.writeheader()
     table.writerows(totals["rows"])
     written = {
@@ -68,8 +69,10 @@ def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[UnitR
     lines.append('<div class="sheet">')
     for unit, record in zip(units, records, strict=True):
         if unit.thumbnail_file.exists():
-            report = (Path(unit.out) / "report.html").resolve().as_uri()
             picture = f'<img loading="lazy" width="256" height="128" src="thumbnails/{quote(unit.slug)}.jpg" alt="">'
-            caption = f'<span class="{record.state}">{escape(record.name)}</span> {record.seconds:.1f} s'
-            lines.append(f'<figure><a href="{report}">{picture}</a><figcaption>{caption}</figcaption></figure>')
+            error = "" if record.expected_error_deg is None else f", normals {record.expected_error_deg:.1f}°"
+            caption = f'<span class="{record.state}">{escape(record.name)}</span> {record.verdict}{error}'
+            caption += f', {record.seconds:.1f} s, <a href="{quote(record.asset)}">GLB</a>'
+            page = f'<a href="{quote(record.report)}">{picture}</a>'
+            lines.append(f"<figure>{page}<figcaption>{caption}</figcaption></figure>")
     return "\n".join([*lines, "</div></html>", ""])

@@ -84,6 +84,10 @@ class UnitRecord(msgspec.Struct, frozen=True):
     host: str = ""
     pid: int = 0
     attempts: int = 0
+    verdict: str = ""  # pass, warn or fail; empty: not finished
+    expected_error_deg: float | None = None  # median of the normals
+    asset: str = ""  # GLB, and page below; relative to the batch's folder
+    report: str = ""
 
 
 def run(unit: Unit, options: ProcessOptions, attempt: int = 1) -> UnitRecord:
@@ -95,7 +99,7 @@ def run(unit: Unit, options: ProcessOptions, attempt: int = 1) -> UnitRecord:
         about = _process(unit, options)
         failed = [gate for gate in about["gates"] if gate["state"] == "fail"]
         message = " ".join(f"{gate['name']}: {gate['says']}. {gate['remedy']}." for gate in failed)
-        record = replace(record, state="gates" if failed else "done", message=message)
+        record = replace(record, state="gates" if failed else "done", message=message, **_outcome(unit, about))
     except (PolcapError, OSError) as error:
         record = replace(record, state="failed", message=_line(error))
     except MemoryError:
@@ -122,6 +126,14 @@ def _process(unit: Unit, options: ProcessOptions) -> dict[str, Any]:
     unchanged.remember(Path(unit.out), asked)
     thumbnail.write(unit.thumbnail_file, Path(unit.out))
     return about
+
+
+def _outcome(unit: Unit, about: dict[str, Any]) -> dict[str, Any]:
+    """Verdict, expected error and outputs of a finished capture, for its record."""
+    asset = Path(unit.out, "asset", f"{about['capture']['name']}.glb")
+    outputs = {"asset": asset, "report": Path(unit.out, "report.html")}
+    places = {name: Path(os.path.relpath(path, unit.batch_folder)).as_posix() for name, path in outputs.items()}
+    return {"verdict": about["verdict"], "expected_error_deg": about["expected_error_deg"], **places}
 
 
 @lru_cache(maxsize=1)

@@ -6,7 +6,7 @@ to go on), 1 a bug. Heavy imports happen inside the commands, so that `--help` a
 
 process_command    the path over one capture
 batch_command      over many
-result_commands    export, show, status, report
+result_commands    export, show, status, report, clean
 check_command      keep a capture or reshoot it
 calibrate_command  measured camera, lens, polarizer and flash
 doctor_command     check of this machine or of one photograph
@@ -20,6 +20,7 @@ options            options that several commands share
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -33,13 +34,13 @@ from polcap.cli.capture_command import capture
 from polcap.cli.check_command import check
 from polcap.cli.doctor_command import doctor
 from polcap.cli.process_command import process
-from polcap.cli.result_commands import export, report, show, status
+from polcap.cli.result_commands import clean, export, report, show, status
 from polcap.cli.settings_command import settings
 from polcap.cli.synth_command import synth
 from polcap.cli.training_commands import evaluate, train
 from polcap.errors import SettingError
 
-_ANYWHERE = ("--debug", "-q", "--quiet", "-v", "--verbose")  # flags that may follow the command
+_ANYWHERE = ("--debug", "-q", "--quiet", "-v", "--verbose", "--log")  # options that may follow the command
 
 
 class OneLine(TyperGroup):
@@ -48,7 +49,7 @@ class OneLine(TyperGroup):
     def main(self, args: Sequence[str] | None = None, *rest: Any, standalone_mode: bool = True, **extra: Any) -> Any:
         """Parse the command line and run the command; exits with its code unless `standalone_mode` is false."""
         stated = list(sys.argv[1:] if args is None else args)
-        words = [word for word in stated if word in _ANYWHERE] + [word for word in stated if word not in _ANYWHERE]
+        words = _common_first(stated)
         if "help" in words[:1]:  # polcap help COMMAND
             words = [*words[1:], "--help"]
         try:
@@ -57,7 +58,7 @@ class OneLine(TyperGroup):
             if not standalone_mode:
                 raise
             text, code = _one_line(error), error.exit_code
-            terminal.print_message(text)
+            terminal.print_message(text, "ERROR")
             asked = {"json": "--json" in words}
             terminal.print_error_document(asked, SettingError(), text.removeprefix("polcap: error: "), code)
         except typer.Abort:  # a question without an answer
@@ -66,6 +67,17 @@ class OneLine(TyperGroup):
         if standalone_mode:
             sys.exit(code or 0)
         return code
+
+
+def _common_first(words: Sequence[str]) -> list[str]:
+    """The words of a command line; the options of all commands come before the command."""
+    if words[-1:] == ["--log"]:  # without its file: the parser names that
+        return ["--log"]
+    common, others = list[str](), list[str]()
+    for before, word in zip(["", *words], words):
+        is_common = word.partition("=")[0] in _ANYWHERE or before == "--log"
+        (common if is_common else others).append(word)
+    return common + others
 
 
 def _one_line(error: TyperException) -> str:
@@ -83,12 +95,14 @@ def _one_line(error: TyperException) -> str:
 
 
 COMMANDS = (
-    process, batch, export, show, status, report, check, settings, calibrate, doctor, synth, capture, train, evaluate,
+    process, batch, export, show, status, report, clean, check, settings, calibrate, doctor, synth, capture, train,
+    evaluate,
 )  # fmt: skip
 app = typer.Typer(
     cls=OneLine,
     help="Turns flash photographs taken through a rotating polarizer into a relightable 3-D asset.",
-    epilog="`polcap help COMMAND` explains a command, `polcap settings STAGE` the settings of a stage.",
+    epilog="`polcap help COMMAND` explains a command, `polcap settings STAGE` the settings of a stage. "
+    "--debug, -q, -v and --log may follow the command.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,  # plain help: half the start-up time
@@ -120,9 +134,17 @@ def front(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of a failure.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress, only data and errors.")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line per frame and stage.")] = False,
+    log: Annotated[
+        Path | None,
+        typer.Option("--log", metavar="FILE", help="Append all messages to a file, with times and versions."),
+    ] = None,
     version: Annotated[
         bool, typer.Option("--version", is_eager=True, callback=_version, help="Print the version and end.")
     ] = False,
 ) -> None:
     context.obj = debug
     terminal.set_verbosity(quiet, verbose)
+    try:
+        terminal.open_log(log)
+    except OSError as error:
+        raise typer.BadParameter(f"{log}: {error.strerror}; choose another file", param_hint="'--log'") from error

@@ -1,7 +1,7 @@
 """Options that several commands share, and the values they stand for."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
@@ -29,11 +29,17 @@ def choice(meaning: str) -> Any:
     return Option(case_sensitive=False, help=meaning)
 
 
+def completion(names: Sequence[str]) -> Callable[[str], list[str]]:
+    """A function that completes values of an option in the shell: those of `names` with the typed beginning."""
+    return lambda incomplete: [name for name in names if name.startswith(incomplete.lower())]
+
+
 Result = Annotated[
     Path, Argument(help="Result folder of `polcap process`, or the capture that holds it.", callback=result_folder)
 ]
 CaptureFolder = Annotated[Path, Argument(help="Folder with the photographs.")]
 Json = Annotated[bool, Option("--json", help="One JSON document on stdout.")]
+OpenPage = Annotated[bool, Option("--open", help="Open the report in the browser at the end.")]
 ConfigFile = Annotated[Path | None, Option(help="TOML file of settings, a section per stage.")]
 Assignments = Annotated[
     list[str] | None, Option("--set", metavar="K=V", help="A setting, such as hdr.clip=0.95; repeatable.")
@@ -48,8 +54,13 @@ Estimator = Annotated[Literal["network", "analytic"] | None, choice(_ESTIMATOR)]
 Model = Annotated[Path | None, Option(metavar="ONNX", help="A model of your own instead of the shipped one.")]
 _DEVICE = "Where the network runs; cuda fails where CUDA does not start."
 Device = Annotated[Literal["cpu", "cuda", "auto"], choice(_DEVICE)]
-Until = Annotated[str | None, Option(metavar="STAGE", help="Stop after this stage.")]
-Force = Annotated[str | None, Option(metavar="STAGE", help="Compute this stage and all after it again.")]
+_STAGES = completion(
+    ("hdr", "whitebalance", "align", "mask", "selfcal", "stokes", "cues", "infer", "surface", "asset")
+)  # those of pipeline.path, not imported at start
+Until = Annotated[str | None, Option(metavar="STAGE", help="Stop after this stage.", autocompletion=_STAGES)]
+Force = Annotated[
+    str | None, Option(metavar="STAGE", help="Compute this stage and all after it again.", autocompletion=_STAGES)
+]
 Threads = Annotated[int, Option("--threads", "-j", min=0, help="Threads to use; 0 is all.")]
 Memory = Annotated[float, Option(min=0, help="Most memory to take, GB; 0 is no limit.")]
 

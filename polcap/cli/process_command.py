@@ -10,7 +10,7 @@ from polcap import resource_limits, terminal
 from polcap.cli import options
 from polcap.cli.watch import at_every_change
 
-_NO_EFFECT = ("capture", "out", "json", "dry_run", "watch", "threads", "memory")  # on the bytes of a result
+_NO_EFFECT = ("capture", "out", "json", "dry_run", "watch", "open_", "threads", "memory")  # on the bytes of a result
 
 
 def process(
@@ -26,6 +26,7 @@ def process(
     ] = False,
     watch: Annotated[bool, Option("--watch", help="Process again after changes of the folder or --config.")] = False,
     json: options.Json = False,
+    open_: options.OpenPage = False,
     device: options.Device = "cpu",
     threads: options.Threads = 0,
     memory: options.Memory = 0,
@@ -50,7 +51,7 @@ def process(
         request = unchanged.request(asked, capture, target, files)
     if (finished := unchanged.find(target, request)) is not None:
         terminal.print_progress(f"{finished.table}\nNothing has changed since the last run.")
-        terminal.print_result(finished.report, target, json)
+        terminal.print_result(finished.report, target, json, open_)
         return
     resource_limits.set_threads(threads)  # before the libraries that start them
     resource_limits.set_memory(memory)
@@ -115,4 +116,4 @@ def _process(stated: dict[str, Any], target: Path, request: str | None) -> None:
         terminal.print_data({"until": stated["until"], "work": work} if stated["json"] else work)
         return
     unchanged.remember(target, request, table)
-    terminal.print_result(about, target, stated["json"])
+    terminal.print_result(about, target, stated["json"], stated["open_"])

@@ -1,5 +1,6 @@
-"""`polcap export`, `show`, `status` and `report`: commands on a result folder."""
+"""`polcap export`, `show`, `status`, `report` and `clean`: commands on a result folder."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -34,7 +35,11 @@ def export(
     exr: Annotated[bool, Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
     preset: Annotated[
         list[str] | None,
-        Option(metavar="NAME", help=f"Files for one program in asset/NAME/: {', '.join(PRESETS)}; repeatable."),
+        Option(
+            metavar="NAME",
+            help=f"Files for one program in asset/NAME/: {', '.join(PRESETS)}; repeatable.",
+            autocompletion=options.completion(PRESETS),
+        ),
     ] = None,
     images: Annotated[Literal["png", "jpeg", "webp", "ktx2"] | None, choice("Picture format in the GLB.")] = None,
     geometry: Annotated[
@@ -61,7 +66,11 @@ def export(
     ] = None,
     extra: Annotated[
         list[str] | None,
-        Option(metavar="NAME", help="A further texture: displacement, occlusion or object-normal; repeatable."),
+        Option(
+            metavar="NAME",
+            help="A further texture: displacement, occlusion or object-normal; repeatable.",
+            autocompletion=options.completion(("displacement", "occlusion", "object-normal")),
+        ),
     ] = None,
     bits: Annotated[int | None, Option(metavar="8|16", help="Bits of a channel in PNG textures.")] = None,
     lod: Annotated[int, Option(min=0, max=6, help="Further GLBs, each with a quarter of the triangles.")] = 0,
@@ -151,6 +160,7 @@ def report(
         Path | None, Option(metavar="OTHER", help="Another result folder.", callback=options.result_folder)
     ] = None,
     json: Json = False,
+    open_: options.OpenPage = False,
 ) -> None:
     """Judge a result again from its stage cache, or compare it with another."""
     from polcap import report as reports
@@ -169,9 +179,43 @@ def report(
         if not rows:
             terminal.print_message("polcap: no figure and no setting differs")
         terminal.print_message(f"polcap: comparison: {file}")
+        if open_:
+            terminal.open_page(file)
         return
     from polcap.pipeline import run as pipeline
 
     about = pipeline.judge_again(result)
     terminal.print_data(about if json else str(result / "report.html"))
+    if open_:
+        terminal.open_page(result / "report.html")
     terminal.print_gates(about)
+
+
+def clean(
+    context: Context,
+    result: Annotated[
+        Path, Argument(help="Result folder, its capture, or the folder of a batch.", callback=options.result_folder)
+    ],
+    dry_run: Annotated[bool, Option("--dry-run", "-n", help="Print the size, and remove nothing.")] = False,
+    json: Json = False,
+) -> None:
+    """Remove the stage cache `work/` of a result, or of all results of a batch; photographs, maps and assets stay."""
+    from polcap.pipeline import result_folder
+
+    removed = {str(folder / "work"): result_folder.clean(folder, dry_run) for folder in _results(result)}
+    total = sum(removed.values())
+    rows = [f"{size / 1e6:9.2f} MB  {work}" for work, size in removed.items()]
+    terminal.print_data({"removed": removed, "bytes": total, "dry_run": dry_run} if json else "\n".join(rows))
+    terminal.print_progress(f"{total / 1e6:.1f} MB {'would be free' if dry_run else 'are free'}")
+
+
+def _results(named: Path) -> Iterator[Path]:
+    """The result folder that was named, or the finished and begun results of a batch."""
+    if not (named / "polcap-batch").is_dir() or (named / "work").is_dir():
+        yield named
+        return
+    from polcap import batch as batches
+
+    for unit in batches.reopen(named):
+        if (Path(unit.out) / "work").is_dir():
+            yield Path(unit.out)

@@ -1,9 +1,12 @@
-"""A result folder: its lock, the removal of temporary files, and work/run.json, from which a result is opened again."""
+"""A result folder: its lock, the removal of temporary files and of the stage cache, and work/run.json.
+
+A result is opened again from work/run.json.
+"""
 
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,10 @@ from polcap.errors import SettingError, StorageError
 from polcap.formats import atomic, own_folders, text_file
 from polcap.formats.capture import layouts
 from polcap.pipeline.cache import seal
+from polcap.pipeline.path import STAGES
+
+_ANIMATIONS = [f"{motion}.{kind}" for motion in ("light", "turntable") for kind in ("webp", "mp4")]
+_WORK_FILES = ("run.json", "unchanged.json", *(f"{stage}.png" for stage in STAGES), *_ANIMATIONS)  # beside the stages
 
 
 def check(out: Path, photographs: Path) -> None:
@@ -65,6 +72,36 @@ def locked(out: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def clean(out: Path, dry_run: bool = False) -> int:
+    """Remove the stage cache and the pictures of `show` from work/; returns their size in bytes.
+
+    All other files stay, also those of other programs in work/. A dry run only measures.
+
+    Raises
+    ------
+    StorageError
+        There is no folder work/, another process works here, or a file cannot be removed.
+    """
+    work = out / "work"
+    if not work.is_dir():
+        raise StorageError(f"{out} holds no stage cache; give the result folder of `polcap process`")
+    stages = [manifest.parent for manifest in work.glob("[0-9][0-9]-*/manifest.json")]
+    cached = [file for stage in stages for file in stage.iterdir() if file.suffix in (".npy", ".json")]
+    files = [*cached, *(work / name for name in _WORK_FILES if (work / name).is_file())]
+    size = sum(file.stat().st_size for file in files)
+    if not dry_run:
+        with locked(out):
+            try:
+                for file in files:
+                    file.unlink(missing_ok=True)
+            except OSError as error:
+                raise StorageError(f"{error.filename} cannot be removed: {error.strerror}") from error
+            for stage in stages:
+                with suppress(OSError):  # it holds a file of another program
+                    stage.rmdir()
+    return size
 
 
 def write_run(out: Path, about: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""A gate, and the evidence that gates judge."""
+"""Defines a quality gate, and the evidence (results and measurements) that gates judge."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -27,7 +27,7 @@ class Gate(msgspec.Struct, frozen=True):
     message: str = msgspec.field(name="says")  # the finding, in one sentence; "says" in report.json
     remedy: str = ""  # advice to the user, unless it passed
     cost_deg: float = 0.0  # added to the expected error of the normals, squared
-    shots: tuple[str, ...] = ()  # to take again, if single ones are at fault
+    shots: tuple[str, ...] = ()  # names of the shots to take again; empty: no single shot is the cause
     unit: Unit = "%"
 
     def __post_init__(self) -> None:
@@ -39,9 +39,9 @@ class Gate(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Evidence(Results):
-    """Results of a path at full size or reduced, and facts that reducing hides.
+    """Everything that the gates judge: the stages' results, and measurements made before `check` reduces the pictures.
 
-    A path that was stopped early has only some of them, as `Results`; without a mesh its gate is left out.
+    If the path stopped early, later results are missing, as in `Results`. Without a mesh there is no mesh gate.
     """
 
     names: list[str]  # (K,) of the shots
@@ -53,7 +53,7 @@ class Evidence(Results):
 
 
 def full_size(results: Results, focal_doubt: tuple[float, float]) -> Evidence:
-    """The evidence of a run of `process`, with one merged picture in place of all exposures."""
+    """Evidence of a run of `process`; clipping is that of the merged picture of each shot, not of every exposure."""
     radiance = results.radiance
     return Evidence.partial(
         **vars(results),
@@ -77,9 +77,9 @@ def at_most(
     unit: Unit = "%",
     beyond: State = "fail",
 ) -> Gate:
-    """A gate on a value that must not exceed its limit; None or not finite: not measured.
+    """Make a gate on a value that must not exceed its limit; a value that is None or not finite is not measured.
 
-    `beyond` is the state of a value over the limit, `shots` are those at fault. One argument per field of `Gate`.
+    `beyond` is the gate's state if the value exceeds the limit. All other arguments are fields of `Gate`.
     """
     if value is None or not np.isfinite(value):
         return Gate(name, "not measured", None, limit, message, unit=unit)
@@ -91,5 +91,5 @@ def at_most(
 
 
 def blamed(names: list[str], bad: NDArray[np.bool_]) -> tuple[str, ...]:
-    """Names of the shots where `bad` (K,) is true."""
+    """Names of the shots to take again, those where `bad` (K,) is true."""
     return tuple(name for name, one in zip(names, bad) if one)

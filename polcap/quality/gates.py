@@ -1,8 +1,8 @@
-"""Every gate of a capture in the order of the path, for `process` and `check` alike.
+"""Judges a capture by all quality gates, in the order of the path; `process` and `check` both use it.
 
-A gate that fails means: do not trust the result unseen (`process` ends with exit code 3, `check` asks to reshoot). One
-that warns states an assumption or a loss. Each has a finding, a cost in degrees and a remedy; a comparison counts only
-beyond its own error.
+A gate that fails means that the result needs a look before use: `process` ends with exit code 3, `check` asks to
+reshoot. A gate that warns states an assumption or a loss. Each gate has a finding, a cost in degrees and a remedy. A
+difference counts only beyond its measurement error.
 """
 
 from collections.abc import Iterable, Iterator
@@ -59,8 +59,7 @@ def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iter
     yield from polarization.of_outline(found, limits)
     yield light.noise(found, limits)
     yield light.ambient(found, limits)
-    yield light.room(found, limits)
-    yield light.lighting(found, limits)
+    yield from light.polarized_light(found, limits)
     yield from light.crossed(found, limits)
     yield polarization.ill_posed(found, limits)
     yield geometry.inward_outline(found, limits)
@@ -69,7 +68,7 @@ def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iter
 
 
 def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Gate:
-    """Gate on the median expected error of the normals, with the costs of the other gates."""
+    """Gate on the median expected error of the normals: root of the squares of own error and all gates' costs."""
     own = _own_error(found.maps)
     expected = min(float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in judged))), MOST_DEG)
     because = ", ".join(gate.name for gate in judged if gate.cost_deg > 0.5 * own)

@@ -28,7 +28,7 @@ _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/ha
 
 
 def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate:
-    """Gate on movement of camera or object between shots, in px of the processed picture, and its error."""
+    """Gate on movement of camera or object between shots, and on its 1σ error, in px of the full picture."""
     measured, names = found.alignment, found.names
     height, width = found.radiance.value.shape[1:3]
     corners = picture_corners(width, height)
@@ -61,10 +61,7 @@ def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate
 
 
 def _object_moved(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on movement of the object relative to its surroundings.
-
-    The cost grows with a push's share of the object's size, and with a turn's angle.
-    """
+    """Gate on movement of the object relative to its surroundings: a push over the object's radius, or a turn."""
     names = found.names
     pushed = np.nan_to_num(_pushed(found), posinf=np.inf) * found.grid_px
     radius = max(outline.disc_radius(found.object_.mask) * found.grid_px, 1.0)
@@ -109,7 +106,7 @@ def _turn(found: Evidence) -> object_turn.ObjectTurn:
 
 
 def mask(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on the object's mask: a chart in it, uncertain pixels, contact with the picture's border, parts, holes."""
+    """Gate on the object's mask: a chart inside, uncertain pixels, contact with the picture's border, parts, holes."""
     object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
     charted = 0.0
@@ -208,9 +205,9 @@ def focus(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def _edge_blur(found: Evidence) -> float:
-    """Blur (1σ) of the object's sharpest edges [px]: a step of height h, blurred by σ, has the slope h/(σ√2π).
+    """Blur (1σ) of the object's sharpest edges [px], from their slope: a step h blurred by σ has the slope h/(σ√2π).
 
-    Edges are the tenth of the object with most contrast within 7 px; the sharpest are the twentieth of these.
+    Edges are the 10 % of the object with most contrast within 7 px. The sharpest are 5 % of these.
     """
     light = found.radiance.value[0].sum(-1)
     near = cv2.dilate(found.object_.mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
@@ -237,7 +234,10 @@ def focal_length(found: Evidence) -> Gate:
 
 
 def inward_outline(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on the share of normals at the outline that point into the object; on a closed surface they point out."""
+    """Gate on inside-out shapes: share of the normals at the outline that point into the object.
+
+    On a closed surface all of them point outwards.
+    """
     share = _inward_share(found.maps)
     message = f"{100 * share:.0f} % of the normals at the outline point into the object"
     if share > limits.max_inward_outline:
@@ -250,10 +250,7 @@ def inward_outline(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def _inward_share(maps: SurfaceMaps) -> float:
-    """Share of normals in a band inside the outline that point into the object.
-
-    The maps are reduced to _LONGEST px a side.
-    """
+    """Share of the normals within 3 px of the outline that point into the object, on maps of at most 256 px a side."""
     across = frames.to_ray_frame(maps.normal, frames.rays(maps.view, *maps.mask.shape))[..., :2]
     shrink = max(1.0, max(maps.mask.shape) / _LONGEST)
     shape = tuple(round(side / shrink) for side in maps.mask.shape)
@@ -268,7 +265,7 @@ def _inward_share(maps: SurfaceMaps) -> float:
 
 
 def _lean(maps: SurfaceMaps, least: float, most: float) -> float:
-    """Change of the view rays' tilt, degrees, if the focal length is at its limits; median over the object."""
+    """Largest change of a view ray's tilt [degrees] within the doubt of the focal length; median over the object."""
     y, x = np.nonzero(maps.mask)
     off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
     lean, more, less = (np.arctan(off * factor) for factor in (1.0, np.exp(-least), np.exp(-most)))

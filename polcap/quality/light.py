@@ -15,11 +15,11 @@ from polcap.quality.limits import GateLimits
 from polcap.stages.whitebalance import patches
 
 _EVEN_STEPS = (1.3, 20.0)  # from one exposure to the next: less is no bracket, more leaves a gap
-_ALIKE = 1.15  # steps in the pixels below this, where the metadata promise more than _PROMISED, are none
-_PROMISED = 1.4
-_TURNED = 0.35  # rad, from here on a chart's turn is worth a word: a sixteenth of its light
+# frames of a bracket count as equal if the step in pixels is below the first and in metadata above the second
+_ALIKE, _PROMISED = 1.15, 1.4
+_TURNED = 0.35  # rad: the message states larger turns of a chart, which cost a sixteenth of its light
 _BRIGHTER = 1.08  # times S0: the greatest that scale and registration explain; set by hand
-_EDGE_PX = 2.0  # 1σ over which two shots are compared: edges of a print need not meet
+_EDGE_PX = 2.0  # 1σ of the blur before two shots are compared, so that misaligned edges of a print do not count
 _STILL_CLIPPED = 0.5  # share of highlights that a crossed filter should have stopped
 _FEW = 20  # px
 _DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame for all angles: 1 to 2° at 15 %
@@ -59,7 +59,7 @@ def bracket(found: Evidence) -> Gate:
 
 
 def tone(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on linearity: a tone curve makes the ratio of two exposures depend on brightness."""
+    """Gate on linearity of the pixel values: a tone curve makes the ratio of two exposures depend on brightness."""
     radiance = found.radiance
     limit = limits.max_tone_curvature
     curved = np.abs(radiance.bracket.curvature)
@@ -119,7 +119,7 @@ def stillness(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def chart(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on the color error of the chart."""
+    """Gate on the chart: whether it was found, and the mean color error of its patches."""
     limit = limits.max_delta_e
     if found.chart_missing:
         remedy = (
@@ -146,10 +146,7 @@ def chart(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def albedo_scale(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on the scale of all albedos: whether it is known, and its uncertainty.
-
-    Without a chart albedos are relative.
-    """
+    """Gate on the common scale of all albedos: its uncertainty; without a chart the scale is unknown."""
     sigma, limit, source = found.maps.albedo_sigma, limits.max_scale_doubt, found.color.source
     remedy = "Put a ColorChecker next to the middle of the object, facing the lens, where only the flash lights it"
     if sigma is None:
@@ -168,7 +165,6 @@ def albedo_scale(found: Evidence, limits: GateLimits) -> Gate:
 
 def clipping(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on the share of the object that is clipped in the shortest exposure."""
-    # of the darkest frame
     clipped, limit = found.clipped[:, :, found.object_.mask].mean(2).min(1), limits.max_clipped
     k = int(np.argmax(clipped))
     message = f"{100 * clipped[k]:.1f} % of the object is clipped in the shortest exposure of the {found.names[k]} shot"
@@ -185,7 +181,7 @@ def clipping(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
-    """Gates on the flash energy of each shot and frame relative to the others, and on its uncertainty."""
+    """Gates on flash energy: shot against shot, uncertainty of that gain, frame against bracket."""
     measured, radiance, names = found.selfcal.gains, found.radiance, found.names
     shot = measured.gain.mean(1)
     light = shot[:, None] * radiance.bracket.exposure_ratio.mean(2)  # (K, E)
@@ -270,9 +266,12 @@ def crossed(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
 
 
 def _crossed(image: StokesImage) -> dict[str, Any]:
-    """Shares of pixels in the cross-polarized shot.
+    """Compare the cross-polarized shot with S0.
 
-    Highlights that stay clipped, brighter than S0, light that is missing.
+    left      share of the clipped highlights of S0 that are clipped in the crossed shot too
+    clipped   number of clipped pixels of S0
+    over      share of pixels that are brighter in the crossed shot than in S0, which is not possible
+    mirrored  share of the object's light that the crossed filter removes: specular reflection
     """
     assert image.body is not None
     known = image.mask & (image.body.quality == 0)
@@ -289,7 +288,7 @@ def _crossed(image: StokesImage) -> dict[str, Any]:
 
 
 def ambient(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on the share of ambient light, if frames without flash were taken.
+    """Gate on the share of ambient light; it is measured only if frames without flash were taken.
 
     The object polarizes the room's light too. Only an ambient frame at the same angle contains the same light.
     """
@@ -308,12 +307,20 @@ def ambient(found: Evidence, limits: GateLimits) -> Gate:
     return msgspec.structs.replace(at_most("ambient", worst, limit, message, remedy), cost_deg=cost)
 
 
-def lighting(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on light from two sides: common polarization of the object's brightest parts, relative to albedo.
+def polarized_light(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
+    """Gates on light from elsewhere than a flash at the lens: polarization that many pixels share.
 
-    Under a flash at the lens these face the camera, so their polarization points all ways. Two flashes or softboxes at
-    the sides put highlights where reflection polarizes, both in the same direction.
+    "room light" judges the surroundings of the object. A flash leaves them unpolarized, a window or a glossy lamp does
+    not. "lighting" judges the brightest parts of the object, relative to albedo. Under a flash at the lens they face
+    the camera and their polarization points in all directions. Two flashes or softboxes at the sides polarize them in
+    the same direction.
     """
+    share, limit = _surroundings_dolp(found), limits.max_room_dolp
+    message = f"The surroundings are polarized by {100 * share:.1f} %"
+    if share > limit:
+        message += ": polarized light from the room, or glossy surroundings"
+    remedy = "Darken the room, or take one ambient frame per angle: subtracting them is exact"
+    yield at_most("room light", share, limit, message, remedy, cost_deg=_DEGREES_PER_ROOM_DOLP * share, beyond="warn")
     share, limit = _highlight_dolp(found), limits.max_highlight_dolp
     message = f"The brightest parts of the object share a polarization of {100 * share:.1f} %"
     if share > limit:
@@ -321,11 +328,11 @@ def lighting(found: Evidence, limits: GateLimits) -> Gate:
     remedy = "Use one flash next to the lens, and darken the room"
     cost = float(_DEGREES_PER_ROOT_OF_HIGHLIGHT_DOLP * np.sqrt(max(np.nan_to_num(share) - _FALSE_HIGHLIGHT_DOLP, 0.0)))
     gate = at_most("lighting", share, limit, message, remedy, beyond=_grade(cost))
-    return msgspec.structs.replace(gate, cost_deg=round(cost, 1))
+    yield msgspec.structs.replace(gate, cost_deg=round(cost, 1))
 
 
 def _highlight_dolp(found: Evidence) -> float:
-    """Median polarization of the tenth of the object with most light over albedo; NaN without an object."""
+    """Common DoLP of the tenth of the object with most light over albedo; NaN without an object."""
     inside = found.maps.mask & found.cues.mask
     if not inside.any():
         return float("nan")
@@ -334,22 +341,8 @@ def _highlight_dolp(found: Evidence) -> float:
     return float(np.hypot(*np.median(found.cues.ratio[:, inside][:, bright], axis=1)))
 
 
-def room(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on room light: polarization of the surroundings.
-
-    A flash leaves them unpolarized, a window or a glossy lamp does not.
-    """
-    share, limit = _surroundings_dolp(found), limits.max_room_dolp
-    message = f"The surroundings are polarized by {100 * share:.1f} %"
-    if share > limit:
-        message += ": polarized light from the room, or glossy surroundings"
-    remedy = "Darken the room, or take one ambient frame per angle: subtracting them is exact"
-    cost = _DEGREES_PER_ROOM_DOLP * share
-    return at_most("room light", share, limit, message, remedy, cost_deg=cost, beyond="warn")
-
-
 def _surroundings_dolp(found: Evidence) -> float:
-    """Common polarization of the surroundings, outside object and chart, median of tiles; NaN for too few tiles."""
+    """Common DoLP of the surroundings, without object and chart: median of tiles; NaN for too few tiles."""
     radiance = found.radiance
     outside = (radiance.quality & int(Quality.CLIPPED) == 0).all(0) & ~found.object_.mask
     if found.color.place is not None:
@@ -366,13 +359,13 @@ def _surroundings_dolp(found: Evidence) -> float:
 
 
 def _promised_steps(radiance: AngleStack) -> float:
-    """Smallest exposure step of the bracket by metadata; NaN without them."""
+    """Smallest ratio of successive exposures of the bracket, by metadata; NaN without metadata."""
     stated = np.sort(radiance.bracket.exif_ratio[0])
     return float((stated[1:] / stated[:-1]).min()) if np.isfinite(stated).all() and len(stated) > 1 else float("nan")
 
 
 def _power(radiance: AngleStack) -> float:
-    """Slope of ln measured exposure over ln stated exposure; 1 without metadata or steps."""
+    """Power law between measured and stated exposures: slope of their logarithms; 1 without metadata or steps."""
     ratio = radiance.bracket.exif_ratio[0]
     stated: Floats = np.log(ratio) if np.isfinite(ratio).all() else np.zeros(1)
     seen = np.log(np.maximum(radiance.bracket.exposure_ratio.mean((0, 2)), 1e-6))

@@ -1,4 +1,4 @@
-"""Gates of polarization: order and zero of the angles, material and light."""
+"""Gates of polarization: order and zero of the polarizer angles, material of the object, stray light."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
 def order(found: Evidence) -> Gate:
-    """Gate on the order of the polarizer angles: whether the outline supports the stated order and sense."""
+    """Gate on the order of the polarizer angles: the polarization along the outline fits the stated order and sense."""
     outline, names = found.selfcal.outline, found.names
     if outline.as_stated and outline.rival is not None:
         other = _named(outline.rival, names)
@@ -54,7 +54,7 @@ def _named(order: ShotOrder, names: list[str]) -> str:
 
 
 def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
-    """Gates on angles, material and other light, as the polarization along the outline shows them."""
+    """Gates on angles, material and other light, judged by the polarization along the object's outline."""
     angle, limit = found.selfcal.angle - found.selfcal.ring.correction, limits.max_turn_deg
     seen = _outline(found, limit, angle)
     if seen is None:
@@ -89,9 +89,9 @@ class OutlineFigures:
 
 
 def _outline(found: Evidence, limit_deg: float, angle: Floats) -> OutlineFigures | None:
-    """Measure the outline's polarization for angles (K,) rad; None if it is too short.
+    """Measure polarization and light along the outline, for polarizer angles (K,) rad; None for a short outline.
 
-    Angle errors below the limit are not tried.
+    Angle errors smaller than `limit_deg` are not fitted.
     """
     band = rim.sample(*_reduced(found.stokes, angle))
     if len(band.azimuth) < _LEAST_RIM:
@@ -124,7 +124,7 @@ def _angles(
     names: list[str],
     limits: GateLimits,
 ) -> Gate:
-    """Gate on polarizer angles: a wrong angle of one shot, or of all, beyond the error of its estimate."""
+    """Gate on polarizer angles: it fails if one shot or all shots have a wrong angle, beyond the estimate's error."""
     limit = limits.max_turn_deg
     known = selfcal.gains.source in ("grey patches", "one exposure")
     common = -float(np.degrees(body.turned))  # an AoLP too small is an angle stated too small
@@ -158,7 +158,7 @@ def _angles(
 
 
 def _not_closing(turned: TurnedShot, names: list[str], limit: float) -> Gate:
-    """Gate on one angle, of more than three, that contradicts the others."""
+    """Gate on the polarizer angle of one shot that contradicts those of three or more other shots."""
     degrees, doubt = np.degrees([turned.angle, turned.sigma])
     shots = tuple(names[k] for k in turned.shots)
     which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])}, by as much or less)"
@@ -168,9 +168,10 @@ def _not_closing(turned: TurnedShot, names: list[str], limit: float) -> Gate:
 
 
 def _with_ring(gate: Gate, selfcal: SelfCalibration, limits: GateLimits) -> Gate:
-    """Add to the gate of the angles the zero error of the whole ring, which is corrected where it is certain.
+    """Replace a passed gate of the angles by one on the zero error of the ring, common to all shots.
 
-    With three angles, one turned shot looks like a smaller turn of all.
+    The path corrects this error where it is certain. With three angles, one turned shot looks like a smaller turn of
+    all, so the gate warns.
     """
     if selfcal.found_sigma is not None and gate.state == "pass":
         doubt, ring = float(np.degrees(selfcal.found_sigma)), np.degrees(selfcal.angle) % 180
@@ -196,10 +197,10 @@ def _with_ring(gate: Gate, selfcal: SelfCalibration, limits: GateLimits) -> Gate
 
 
 def _light_of_body(body: rim.RimFigures, found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on diffuse polarization: the outline of a dielectric under a flash is polarized across the contour.
+    """Gate "body" on diffuse polarization: under a flash, a dielectric's outline is polarized across the contour.
 
-    Rough and translucent objects polarize equally little. The estimators allow for roughness, so a rough object keeps a
-    shape as round as its shading; any other loss of polarization flattens the shape.
+    Rough and translucent objects both polarize little. The estimators account for roughness, so the shape of a rough
+    object is as round as its shading suggests. Any other loss of polarization flattens the shape.
     """
     limit = limits.min_outline_dolp
     remedy = "Darken the room, keep the flash next to the lens, and photograph an ambient frame"
@@ -244,7 +245,7 @@ def _light_of_body(body: rim.RimFigures, found: Evidence, limits: GateLimits) ->
 
 
 def _lopsided(body: rim.RimFigures) -> float:
-    """Factor on the limit of uneven light, since light from one side lowers the polarization of that side."""
+    """Factor on the limit of uneven light: an outline whose bright half is well polarized is lit by the flash."""
     if body.concentration <= _CLEAR or body.dolp_lit < _WEAK_DOLP:
         return 1.0
     return _LOPSIDED if body.dolp_lit < _LIT_DOLP else np.inf
@@ -259,7 +260,7 @@ def _median_shape(maps: SurfaceMaps) -> tuple[float, float]:
 
 
 def _reduced(image: StokesImage, angle: Floats) -> tuple[Floats, rim.Bools, rim.Bools]:
-    """Light of the shots (K, h, w) recomputed from the Stokes parameters, object and valid pixels, all reduced."""
+    """Reduced pictures: light of the shots (K, h, w) from the Stokes parameters, object (h, w), valid pixels (h, w)."""
     step = int(np.ceil(np.sqrt(max(image.mask.size / _MOST_PIXELS, 1))))
     doubtful = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
     usable = (image.quality & int(doubtful)) == 0

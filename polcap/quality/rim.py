@@ -1,9 +1,9 @@
 """Polarization and brightness along the object's outline, for the gates on angles, polarization and other light.
 
-At the outline the surface is seen edge-on, so its azimuth φ is the outline's direction. A shot at the angle θ sees
+At the outline the surface is seen edge-on, so its azimuth φ is the outline's direction. A shot at the angle θ records
 ½ S₀ (1 + ρ cos 2(θ − φ)), with two unknowns per pixel. Three shots leave one residual per pixel. Its pattern along the
-outline shows which stated angle is wrong, or that a second light shone from one side. This works as well as the mask
-follows the outline, and where the outline is not a cut by the picture's border.
+outline shows which stated angle is wrong, or that a second light shone from one side. The method needs a mask that
+follows the true outline. Pixels at the picture's border are left out.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ _STEP_DEG, _MOST_DEG = 3.0, 48.0  # step and limit of the angles tried; larger e
 
 @dataclass(frozen=True)
 class Rim(outline.OutlineBand):
-    """Pixels of a band inside the outline; `light` is relative to the mean of the shots."""
+    """The N pixels of a band inside the outline; `light` (K, N) is each shot over the mean of the shots."""
 
     total: Floats  # (N,) mean of the shots, relative to the object's mean
 
@@ -56,9 +56,9 @@ class RimFigures:
 
 
 def sample(light: Floats, mask: Bools, usable: Bools) -> Rim:
-    """Sample the band inside the outline of registered shots (K, H, W) with equal gains; usable (H, W).
+    """Sample registered shots (K, H, W), divided by their gains, in a band just inside the object's outline.
 
-    Valid pixels.
+    `mask` (H, W) is the object, `usable` (H, W) are the pixels without defects.
     """
     ok = (mask & usable).astype(np.float32)
     weight = cv2.GaussianBlur(ok, (0, 0), _SMOOTH_PX) + 1e-6
@@ -108,9 +108,10 @@ def _misfit(at: Rim, angle: Floats) -> Floats:
 
 
 def _sigmas(at: Rim, angle: Floats, way: Floats) -> float:
-    """Significance of an angle error in the direction `way` (K,): its best value over its jackknife error.
+    """Significance of an angle error: its linear estimate over the jackknife error of that estimate.
 
-    The fit is linear and signed: errors of the outline turn some sectors one way and some the other.
+    `way` (K,) is the pattern of the error over the shots (`_turns`) times its sign. The estimate keeps its sign, so
+    errors of the outline, which differ in sign from sector to sector, cancel.
     """
     away = 2 * (angle[:, None] - at.azimuth)
     wave, slope, light = (part - part.mean(0) for part in (np.cos(away), -2 * np.sin(away) * way[:, None], at.light))
@@ -145,9 +146,9 @@ def summarize(at: Rim, angle: Floats) -> RimFigures:
 
 
 def side_light(at: Rim) -> Floats:
-    """Relative brightness difference between two sides of the outline in each shot, compared with all shots, (K,).
+    """Measure one-sided extra light in each shot (K,): amplitude of the first harmonic of its relative light in φ.
 
-    This is the amplitude of the first harmonic in φ. Polarization changes opposite sides equally, a lamp does not.
+    Polarization changes opposite sides of the outline equally. A lamp that was on during one shot does not.
     """
     phi = at.azimuth
     basis = np.stack([np.ones_like(phi), *(f(n * phi) for n in (1, 2) for f in (np.cos, np.sin))], axis=1)

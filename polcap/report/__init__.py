@@ -5,7 +5,7 @@ assumption. A gate that had nothing to measure is marked "not measured".
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -93,6 +93,7 @@ def document(
         "polcap": __version__,
         "versions": facts["versions"],
         "verdict": gates.verdict(judged),
+        "expected_error_deg": _expected_error_deg(judged),
         "capture": facts["capture"],
         "gates": msgspec.to_builtins(judged),
         "figures": measured,
@@ -102,6 +103,12 @@ def document(
         "keys": dict(results.keys),
         "settings": facts["settings"],
     }
+
+
+def _expected_error_deg(judged: Sequence[Gate]) -> float | None:
+    """Median of the expected error of the normals [°]; None where it was not measured."""
+    found = [gate.value for gate in judged if gate.name == "normal error" and isinstance(gate.value, float)]
+    return found[0] if found else None
 
 
 def model_facts(network: Network | None) -> dict[str, str] | None:

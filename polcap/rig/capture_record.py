@@ -13,7 +13,7 @@ import msgspec
 import tomli_w
 
 from polcap.errors import CaptureError
-from polcap.formats import atomic
+from polcap.formats import atomic, text_file
 from polcap.formats.capture import capture_toml
 from polcap.formats.raw import file_bytes
 from polcap.images import Role
@@ -130,12 +130,17 @@ class CaptureRecord:
         return messages
 
     def write(self) -> None:
-        """Write rig.json, then capture.toml. Raises StorageError."""
+        """Write rig.json, then capture.toml, in which other keys stay, such as [catalog].
+
+        Raises StorageError; CaptureError if capture.toml was edited and is wrong.
+        """
         with self._lock:
             with atomic.path(self.folder / NAME) as temporary:
                 temporary.write_bytes(msgspec.json.format(msgspec.json.encode(self.content), indent=1))
-            with atomic.path(self.folder / capture_toml.NAME) as temporary:
-                temporary.write_text(tomli_w.dumps(self._toml()), encoding="utf-8")
+            capture_toml.load(self.folder)
+            file = self.folder / capture_toml.NAME
+            stated = text_file.read_toml(file) if file.exists() else {}
+            atomic.write(file, tomli_w.dumps(stated | self._toml()))
 
     def stated_deg(self, frame: AcceptedFrame) -> float | None:
         """Angle in capture.toml: the mean over its bracket; an ambient frame has the angle of the shot."""

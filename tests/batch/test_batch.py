@@ -1,13 +1,16 @@
 """A batch ends although captures fail, and processes no capture twice."""
 
+import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from contextlib import suppress
 from pathlib import Path
+from urllib.parse import unquote
 
 import pytest
 
@@ -66,7 +69,12 @@ def test_broken_capture_stops_no_other_and_is_listed_with_its_remedy(finished: P
     for name in ("obj0", "deeper/obj1"):
         assert rows[name]["state"] in ("done", "gates")
         assert (finished / name / "asset" / f"{Path(name).name}.glb").exists()
+        assert rows[name]["verdict"] in ("pass", "warn", "fail") and rows[name]["expected_error_deg"] > 0
     page = (finished / "polcap-batch/summary.html").read_text()
+    for link in re.findall(r'(?:href|src)="([^"]*)"', page):
+        assert (finished / "polcap-batch" / unquote(link)).is_file(), link
+    table = list(csv.DictReader((finished / "polcap-batch/summary.csv").read_text().splitlines()))
+    assert {row["name"]: row["report"] for row in table} == {name: row["report"] for name, row in rows.items()}
     assert page.count("<figure>") == 2 and "copy it from the card again" in page
 
 
@@ -88,6 +96,13 @@ def test_status_lists_every_capture(finished: Path, polcap: Command) -> None:
     about = json.loads(polcap("status", finished, "--json").stdout)
     assert about["states"]["failed"] == 1 and about["finished"] == 2
     assert "2 of 3 finished" in polcap("status", finished).stdout
+
+
+def test_clean_goes_through_a_batch(finished: Path, polcap: Command, tmp_path: Path) -> None:
+    removed = json.loads(polcap("clean", finished, "--json", "--dry-run").stdout)["removed"]
+    assert {name for name, size in removed.items() if size} == {
+        str(finished / name / "work") for name in ("obj0", "deeper/obj1")
+    }
 
 
 def test_fail_fast_stops(captures: Path, tmp_path: Path, polcap: Command) -> None:

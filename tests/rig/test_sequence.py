@@ -176,6 +176,16 @@ def test_resume_takes_only_missing_frames(rig: Rig) -> None:
     assert rig.taken == [] and rig.turner.moves == []
 
 
+def test_resume_keeps_what_a_person_added_to_capture_toml(rig: Rig) -> None:
+    rig.shoot()
+    file = rig.folder / "capture.toml"
+    file.write_text(f'name = "vase"\n{file.read_text()}\n[catalog]\ncreator = "A. Person"\n')
+    (rig.folder / "pol045" / "frame_2.dng").unlink()
+    rig.shoot(resume=True)
+    stated = tomllib.loads(file.read_text())
+    assert stated["name"] == "vase" and stated["catalog"] == {"creator": "A. Person"} and len(stated["frame"]) == 15
+
+
 def test_resume_rejects_changed_and_unchecked_files_and_takes_them_again(rig: Rig) -> None:
     rig.stop_at()
     (rig.folder / "pol000/frame_2.dng").write_bytes(b"overwritten")

@@ -9,18 +9,49 @@ the camera frame.
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
         zenith         by the object's law of diffuse polarization
     half_turns     the side of the ray to which a normal leans, for both estimators
-    albedo         in highlights, its uncertain scale, and its detail finer than a superpixel
+    highlights     the albedo in highlights, for both estimators
+
+Two properties of the albedo are estimated here. The error of its scale: a chart behind the object, or in a shadow, gets
+less light than the object. The picture of the chart does not show this, but then both albedos and F0 are higher
+than usual. And its detail: the reference shot at the RAW's pixels shows printed texture and fine relief
+alike. Relief continues from scale to scale, so the shading of the normals shows how strong finer shading may be. Where
+the normals are smooth and certain, fine detail of the light is detail of the albedo.
 """
 
 from dataclasses import replace
+from math import hypot, log, pi
 from typing import Annotated, Literal
 
+import cv2
 import msgspec
+import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
-from polcap.images import Cues, Network, RunNetwork, SurfaceMaps
+from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMaps
+from polcap.optics import brdf, frames
+from polcap.optics.resize import area_mean
 from polcap.stages import stage
-from polcap.stages.infer import albedo, analytic, learned
+from polcap.stages.infer import analytic, highlights, learned
+
+_MAPS_SIGMA = 0.05  # of the estimators' own albedos, with a correct scale (docs/benchmarks/gates.md)
+# of objects next to their chart: mean, and spread of the logarithm (docs/benchmarks/gates.md)
+_USUAL_F0, _F0_SPREAD = 0.044, 0.06  # median of an object
+_USUAL_WHITE, _WHITE_SPREAD = 0.65, 0.25  # 95th percentile of the albedo
+_USUAL, _DOUBT = 1.5, 0.25  # sum of both deviations that is still usual [spreads]; doubt per spread beyond
+_FLOOR = 1e-3  # of albedo and F0 in a logarithm
+_LARGEST_DOUBT = 0.7  # a factor of two in light, ln 2
+_COMMON_WHITE, _WHITE_RANGE = 0.9, 0.14  # 95th percentile of the albedo: usual limit; excess that doubts a factor of e
+_BAND = 2.0  # px, 1σ: shading in finer detail predicts the shading that is finer than a superpixel
+_DETAIL_AROUND = 4.0  # px, 1σ of the means of power, and of the albedo
+# factors on the power of each explanation of fine detail (docs/benchmarks/albedo.md)
+_SHADING = 4.0  # on that of the normals' shading
+_UNCERTAIN = 0.3  # on that of shading by the normals' expected error, most of which is coarser
+_NOISE = 4.0  # on the variance of S0: the detail comes from one shot, and one photosite a color
+_GRAZING = 0.1  # least cosine of the shading
+_DARKEST = 0.02  # least albedo and least roughness² of the shading
+_EDGE = np.ones((5, 5), np.uint8)  # px around the outline and around defects in which the light mixes
+_DEFECTS = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
 
 
 class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -47,9 +78,65 @@ def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: Inf
         maps = analytic.estimate(cues, settings.ior)
     else:
         maps = learned.estimate(cues, network, run, settings.ior, settings.symmetries, fine_pass=settings.fine)
-    maps = albedo.correct_highlights(maps, cues, settings.ior)
+    maps = highlights.correct(maps, cues, settings.ior)
     return replace(
         maps,
-        albedo_sigma=albedo.albedo_sigma(maps, cues.scale_sigma),
-        detail=None if cues.detail is None else albedo.select_detail(cues.detail, cues, maps),
+        albedo_sigma=_albedo_sigma(maps, cues.scale_sigma),
+        detail=None if cues.detail is None else _select_detail(cues.detail, cues, maps),
     )
+
+
+def _albedo_sigma(maps: SurfaceMaps, of_chart: float | None) -> float | None:
+    """Relative 1σ of the scale of all albedos; `of_chart` is 1σ of the light on the chart, None without a chart."""
+    if of_chart is None or not maps.mask.any():
+        return None
+    white = max(float(np.percentile(maps.diffuse[maps.mask].max(-1), 95)), _FLOOR)
+    gloss = max(float(np.median(maps.specular[maps.mask].mean(-1))), _FLOOR)
+    unusual = max(log(white / _USUAL_WHITE) / _WHITE_SPREAD, -_USUAL)  # dark objects are no reason for trust
+    if maps.estimator != "analytic":  # its F0 is too rough for this
+        unusual += log(gloss / _USUAL_F0) / _F0_SPREAD
+    doubt = max(_DOUBT * (unusual - _USUAL), (white - _COMMON_WHITE) / _WHITE_RANGE, 0.0)
+    return hypot(of_chart, _MAPS_SIGMA, min(doubt, _LARGEST_DOUBT))
+
+
+def _select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:
+    """Select the part of the RAW's fine detail that belongs to the albedo, by a Wiener filter; (2H, 2W) float16.
+
+    `detail` (2H, 2W) is the logarithm of light of RAW pixels over that of superpixels (H, W). It is multiplied by the
+    share of its local power that neither shading nor noise explains.
+    """
+    solid = cues.mask & ((cues.quality & np.uint8(_DEFECTS)) == 0)
+    inside = cv2.erode(solid.astype(np.uint8), _EDGE, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    height, width = inside.shape
+    explained = _mean(_power_of_shading(cues, maps) + _NOISE * cues.ratio_sigma**2, cues.mask, _DETAIL_AROUND)
+    power = _mean(area_mean(np.square(detail, dtype=np.float32), (height, width)), inside, _DETAIL_AROUND)
+    share = np.clip(1 - explained / np.maximum(power, 1e-9), 0, 1) * inside
+    selected = cv2.resize(share.astype(np.float32), (2 * width, 2 * height))
+    selected *= detail
+    return np.asarray(selected, np.float16)
+
+
+def _power_of_shading(cues: Cues, maps: SurfaceMaps) -> Floats:
+    """Squared logarithm (H, W) of the fine shading that the normals show, and that their error may hide."""
+    albedo = np.maximum(_mean(maps.diffuse.mean(axis=-1), cues.mask, _DETAIL_AROUND), _DARKEST)
+    gloss, alpha = maps.specular.mean(axis=-1), np.maximum(maps.roughness**2, _DARKEST)
+
+    def log_light(zenith: Floats) -> Floats:
+        """Logarithm (H, W) of the light of surfaces at a zenith angle, with the flash at the lens."""
+        c = np.maximum(np.cos(zenith), _GRAZING)
+        mirrored = pi * brdf.ggx_distribution(c, alpha) * brdf.smith_masking(c, c, alpha) / (4 * c)
+        return np.asarray(np.log(albedo * c + gloss * mirrored), np.float32)
+
+    zenith = np.arccos(np.clip(frames.dot(maps.normal, cues.rays), 0, 1))
+    error = np.radians(maps.confidence)
+    light = log_light(zenith)
+    fine = light - _mean(light, cues.mask, _BAND)
+    doubt = (log_light(np.maximum(zenith - error, 0)) - log_light(zenith + error)) / 2
+    return np.asarray(_SHADING * fine**2 + _UNCERTAIN * doubt**2)
+
+
+def _mean(image: Floats, inside: NDArray[np.bool_], sigma: float) -> Floats:
+    """Gaussian mean (H, W) of the pixels inside a mask."""
+    weight = inside.astype(np.float32)
+    total, share = (cv2.GaussianBlur(part, (0, 0), sigma) for part in (image.astype(np.float32) * weight, weight))
+    return np.asarray(total / np.maximum(share, 1e-3))

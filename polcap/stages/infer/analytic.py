@@ -8,8 +8,7 @@ import numpy as np
 
 from polcap.images import Cues, Floats, Quality, SurfaceMaps
 from polcap.optics import brdf, frames, fresnel
-from polcap.stages.infer import half_turns
-from polcap.stages.infer.albedo import fill_highlights
+from polcap.stages.infer import half_turns, highlights
 from polcap.stages.infer.zenith import ZenithEstimate, estimate_zenith
 
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)  # in steps of 1.5, in which noise falls by a third
@@ -21,9 +20,10 @@ _LEAST_COSINE = 0.2  # of the shading that divides
 
 
 def estimate(cues: Cues, ior: float) -> SurfaceMaps:
-    """Estimate the object's maps without a network.
+    """Estimate the maps (H, W, …) of an object without a network, by inversion of its polarization.
 
-    Normals by inversion of the DoLP, albedo and gloss by highlights.
+    Normals come from DoLP and AoLP; albedo, roughness and F0 from the separation of highlights. `ior` is the assumed
+    refractive index.
     """
     normal, error, cos_zenith = invert(cues, ior)
     diffuse, highlight = _albedo(cues, cos_zenith, ior)
@@ -43,10 +43,11 @@ def estimate(cues: Cues, ior: float) -> SurfaceMaps:
 
 
 def invert(cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -> tuple[Floats, Floats, Floats]:
-    """Normals (H, W, 3) from DoLP and AoLP, their expected error (H, W) in degrees, cosines of the zenith (H, W).
+    """Invert polarization to normals (H, W, 3), camera frame: zenith from the DoLP, azimuth from the AoLP.
 
     `guide` are the normals (H, W, 3) of another estimator in the frame of each ray, and their expected error (H, W) in
-    degrees. They choose the half-turn of the azimuth; without a guide, `half_turns` chooses it.
+    degrees. They decide the 180° ambiguity of the azimuth; without a guide, `half_turns` decides it. Also returns the
+    expected error (H, W) in degrees and the cosines of the zenith (H, W).
     """
     ratio, sigma = _adaptive_mean(cues)
     squared = ratio[0] ** 2 + ratio[1] ** 2
@@ -98,9 +99,8 @@ def _adaptive_mean(cues: Cues) -> tuple[Floats, Floats]:
 def _azimuth_by_guide(axis: Floats, rays: Floats, normal: Floats, sigma: Floats) -> tuple[Floats, Floats]:
     """Azimuths φ (H, W) rad from axes (cos 2φ, sin 2φ), with the 180° ambiguity solved by a guide's normals.
 
-    Also the certainty of the choice, (H, W).
-
-    The normal's error is Gaussian across the axis; the certainty is P(right side) − P(wrong side).
+    Also returns the certainty (H, W) of this choice, P(right side) − P(wrong side), for a guide with Gaussian errors of
+    1σ = `sigma` (H, W) degrees.
     """
     from scipy.special import erf  # here: importing it costs .2 s of every start
 
@@ -112,7 +112,7 @@ def _azimuth_by_guide(axis: Floats, rays: Floats, normal: Floats, sigma: Floats)
 
 
 def _local(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:
-    """Unit normals (H, W, 3) in ray frames from zenith and azimuth φ (H, W)."""
+    """Unit normals (H, W, 3) in the frame of each ray, from cosines of the zenith and azimuths φ (H, W)."""
     x, y = frames.axis_across(phi, rays)
     share = np.sqrt(np.maximum(1 - cos_zenith**2, 0) / (x * x + y * y))
     return np.stack([share * x, share * y, cos_zenith], axis=-1)
@@ -137,12 +137,12 @@ def _expected_error(zenith: ZenithEstimate, dolp: Floats, sigma: Floats, certain
 def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]:
     """Separate diffuse albedo (H, W, 3) and the radiance of the highlight (H, W).
 
-    A highlight is white, small, and faces the camera: the part of the darkest channel that a grey-scale opening
-    removes, where the zenith is under 35°. The rest of the radiance over cos θ T₊(θ) T₊(0) is the albedo. The cosine is
-    limited, for light from around brightens the outline. Off the axis the light has a longer way.
+    A highlight is white, small, and faces the camera. So it is the part of the darkest channel that a grey-scale
+    opening removes, where the zenith is under 35°. The rest of the radiance, divided by cos θ T₊(θ) T₊(0), is the
+    albedo. The cosine has a lower limit, because reflected room light brightens the outline.
     """
     size = max(5, round(_HIGHLIGHT * np.sqrt(max(cues.mask.sum(), 1)))) | 1
-    radiance = fill_highlights(cues.radiance, cues) / cues.rays[..., 2:] ** 2
+    radiance = highlights.fill(cues.radiance, cues) / cues.rays[..., 2:] ** 2
     darkest = cv2.GaussianBlur(radiance.min(-1), (0, 0), 1.0)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     opened = cv2.GaussianBlur(cv2.morphologyEx(darkest, cv2.MORPH_OPEN, kernel), (0, 0), size / 6)
@@ -155,9 +155,9 @@ def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]
 
 
 def _gloss(highlight: Floats, cos_zenith: Floats, cues: Cues) -> tuple[float, float]:
-    """One roughness and one F0 for the object: GGX lobe that fits the highlight (H, W) over the zenith best.
+    """Fit one roughness and one F0 for the object: the GGX lobe over the zenith that fits the highlight (H, W) best.
 
-    Without a clear highlight, those of a common dielectric (0.5, 0.04).
+    Without a clear highlight they are those of a common dielectric, (0.5, 0.04).
     """
     roughness, f0 = 0.5, 0.04
     usable = cues.mask & ((cues.quality & Quality.CLIPPED) == 0) & (cos_zenith > np.cos(np.radians(45)))

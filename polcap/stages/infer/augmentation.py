@@ -1,7 +1,7 @@
 """Test-time augmentation: the network's predictions in turned and mirrored positions, averaged.
 
-The symmetries of the square: a turn or mirror of the picture is one of the scene. Stokes parameters turn twice as
-fast, and rays turn with the picture.
+A picture that is turned by 90° or mirrored shows a scene that is turned or mirrored. Its Stokes vectors (S1, S2) turn
+by twice the angle, its rays by the angle itself. Each prediction is transformed back before the average.
 """
 
 from functools import partial
@@ -26,9 +26,9 @@ _NEAREST = 0.05  # least distance between unit vectors, about 3°: nearer ones w
 def predict(cues: Cues, network: Network, run: RunNetwork, symmetries: int) -> dict[str, Floats]:
     """The network's maps (H, W[, 3]), averaged over 1, 2, 4 or 8 rotated and mirrored copies of the picture.
 
-    The normal is the median direction, weighed by the stated errors: where positions differ it is often by half a turn,
-    and the mean of two half-turns is neither. `opposed` (H, W) is the share of positions in which the normal leans to
-    the other side of the ray. All other maps are means.
+    Most maps are means. The normal is the median direction, weighted by the predicted errors: positions often differ by
+    half a turn of the azimuth, and the mean of two half-turns is neither. The map `opposed` (H, W) is the share of the
+    positions in which the normal leans to the other side of the ray.
     """
     picture = np.moveaxis(channels(cues), 0, -1)
     calls = [
@@ -63,12 +63,10 @@ def _predict_turned(
 
 
 def _median_direction(normals: Floats, errors: Floats) -> Floats:
-    """Median direction (H, W, 3) of K normals (K, H, W, 3), weighted by their errors (K, H, W).
+    """Geometric median direction (H, W, 3) of K normals (K, H, W, 3), weighted by their errors (K, H, W).
 
-    Least sum of distances.
-
-    Weiszfeld's iteration: a mean weighed by the reciprocal of the distances from the previous one. Its length is at
-    most 1, and less where the directions differ.
+    It has the least sum of distances to the normals. Weiszfeld's iteration finds it: a mean weighted by the reciprocal
+    distances from the previous mean. Its length is at most 1, and less where the directions differ.
     """
     directions = frames.unit(normals)
     trust = 1 / np.maximum(errors, _LEAST_ERROR)
@@ -93,7 +91,7 @@ def _turn_vectors(vector: Floats, quarters: int, mirror: bool) -> Floats:
 
 
 def _turn_channels(picture: Floats, quarters: int, mirror: bool) -> Floats:
-    """Network channels (H, W, N) of a rotated or mirrored picture, with the directions in them changed too."""
+    """Rotate or mirror the directions that the network channels (H, W, N) contain, for a picture turned before."""
     out = np.array(picture)
     for first in ("s1", "zenith_x", "cos_2phi"):  # twice the angle: a quarter negates, a mirror conjugates
         at = CHANNELS.index(first)
@@ -107,9 +105,10 @@ def _turn_channels(picture: Floats, quarters: int, mirror: bool) -> Floats:
 def run_network(
     picture: Floats, network: Network, run: RunNetwork, names: tuple[str, ...], outputs: dict[str, int]
 ) -> dict[str, Floats]:
-    """Run a network on channels (N, H, W), padded to a multiple of its size; returns maps (H, W[, C]) by name.
+    """Run a network on channels (N, H, W); returns its maps (H, W[, C]) by name.
 
-    `names` are those of the channels, `outputs` the numbers C by name of the map.
+    `names` are the names of the channels, which the network must expect. `outputs` gives the number of channels C of
+    each map. The picture is padded to the size multiple that the network needs.
 
     Raises
     ------

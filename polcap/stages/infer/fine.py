@@ -1,8 +1,8 @@
 """Refinement of the normals: a second, small network adds relief finer than the main network resolves.
 
-It sees tiles of the crop at full resolution with the estimate so far, and returns a deviation of the normals. Only the
-part of it that is finer than the main network's pixels counts, so the shape stays. Training (`training/fine_*.py`)
-makes its input by `encode` too.
+Its input are tiles of the crop at full resolution, with the estimate so far. Its output is a deviation of the normals.
+Only the part finer than the main network's pixels is added, so the overall shape does not change. Training
+(`training/fine_*.py`) makes the input by `encode` too.
 """
 
 from collections.abc import Iterator
@@ -76,10 +76,7 @@ def refine(cues: Cues, estimate: CoarseEstimate, network: Network, run: RunNetwo
 
 
 def _tiles(mask: NDArray[np.bool_]) -> Iterator[tuple[Window, Window]]:
-    """Tiles that cover the object for the refinement network: each without and with its margin.
-
-    Margins are cut at the picture's edge.
-    """
+    """Divide the object into tiles for the refinement network; yields each tile without and with its margin."""
     height, width = mask.shape
     for y in range(0, height, _TILE):
         for x in range(0, width, _TILE):
@@ -90,7 +87,7 @@ def _tiles(mask: NDArray[np.bool_]) -> Iterator[tuple[Window, Window]]:
 
 
 def _window(cues: Cues, estimate: CoarseEstimate, window: Window) -> tuple[Cues, CoarseEstimate]:
-    """Cut a window out of cues and estimate; channels of the whole crop would fill the memory."""
+    """Cut a window out of cues and estimate: channels of the whole crop at once would fill the memory."""
     single = ("radiance", "ratio_sigma", "dolp", "rays", "mask", "quality")
     double = ("ratio", "normalized_stokes")
     cut = {name: getattr(cues, name)[window] for name in single}
@@ -110,14 +107,14 @@ def _tile_relief(
 
 
 def high_pass(image: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
-    """High-pass part of an image (H, W, 3), finer than the main network resolves; 0 outside the mask (H, W)."""
+    """High-pass part of an image (H, W, 3): structure too fine for the main network; 0 outside the mask (H, W)."""
     return np.asarray((image - low_pass(image, mask, shrink)) * mask.astype(np.float32)[..., None])
 
 
 def low_pass(image: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
-    """Low-pass part of an image (H, W, 3), as the main network resolves it, inside the mask (H, W).
+    """Low-pass part of an image (H, W, 3) inside the mask (H, W): the structure that the main network resolves.
 
-    Averaged down by `shrink`, blurred, and interpolated back.
+    The image is averaged down by the factor `shrink`, blurred, and interpolated back.
     """
     height, width = mask.shape
     small = max(1, round(height / shrink)), max(1, round(width / shrink))

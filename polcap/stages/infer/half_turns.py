@@ -1,9 +1,10 @@
-"""180° ambiguity of the azimuth: decides to which side of the view ray each normal points, and how sure this is.
+"""Solves the 180° ambiguity of the azimuth: to which side of the view ray each normal points, and how sure this is.
 
-Polarization shows the plane through a normal n and the view ray r, not the side: n and n′ = 2 (n·r) r − n give the same
-Stokes parameters. The network sometimes takes a whole region for its half-turn, most often on black gloss; the
-inversion knows no side at all. Both are decided here, by one minimum over the whole object. Every cell of a coarse grid
-keeps n or turns it. With t the part of n across the ray, of length sin θ, the energy is the sum of
+Polarization determines the plane through a normal n and the view ray r, not the side: n and n′ = 2 (n·r) r − n give the
+same Stokes parameters; n′ is the half-turn of n. The network sometimes predicts the half-turn of a whole region, most
+often on black gloss. The inversion does not determine the side at all. For both, the sides minimize one energy over the
+whole object: every cell of a coarse grid keeps n or turns it to n′. With t the part of n across the ray, of length
+sin θ, the energy is the sum of
 
     outline      3 e, e: share of object ahead of t less that behind it. A closed surface leans towards its outline;
                  where t runs along an outline (a neck that the mask cuts), e is 0
@@ -75,10 +76,10 @@ class Grid:
 
 
 def resolve(normal: Floats, mask: Bools, network: NetworkDoubt | None = None) -> HalfTurns:
-    """Solve the 180° ambiguity of the azimuths of a normal map (H, W, 3), ray frames, in a mask (H, W).
+    """Decide for each normal (H, W, 3), ray frames, in a mask (H, W) whether to turn its azimuth by 180°.
 
-    `network` is the doubt of the network that made the normals. Without it they are the inversion's, with arbitrary
-    sides.
+    `network` is the uncertainty of the network that predicted the normals; None for normals of the inversion, which
+    have arbitrary sides.
     """
     grid = coarse(normal, mask)
     if not grid.mask.any():
@@ -97,15 +98,12 @@ def resolve(normal: Floats, mask: Bools, network: NetworkDoubt | None = None) ->
 
 
 def error_with_doubt(error: Floats, doubt: Floats, cos_zenith: Floats) -> Floats:
-    """Expected normal error (H, W), degrees, including the probability of a wrong azimuth side: 2 θ off there."""
+    """Expected normal error (H, W), degrees: twice the zenith with the probability `doubt`, otherwise `error`."""
     return np.asarray((1 - doubt) * error + doubt * 2 * np.degrees(np.arccos(np.clip(cos_zenith, 0, 1))))
 
 
 def coarse(normal: Floats, mask: Bools) -> Grid:
-    """Average normals (H, W, 3) over the cells of a coarse grid.
-
-    Mean double azimuth and zenith, and the mean's side.
-    """
+    """Average normals (H, W, 3) over the cells of a coarse grid: double azimuth, zenith, and the side of the mean."""
     shrink = max(1.0, max(mask.shape) / _LONGEST)
     shape = tuple(max(8, round(side / shrink)) for side in mask.shape)
     x, y = normal[..., 0] * mask, normal[..., 1] * mask
@@ -119,9 +117,9 @@ def coarse(normal: Floats, mask: Bools) -> Grid:
 
 
 def sides(grid: Grid) -> tuple[Bools, Floats]:
-    """Cells (h, w) where the inversion's normals take the other azimuth side.
+    """Cells (h, w) in which the normals of the inversion turn by 180° in azimuth, by the minimum cut.
 
-    Also the evidence (h, w, 4) that a side is wrong, in the terms of `_CELL`.
+    Also returns the evidence (h, w, 4) that the chosen side is wrong: the terms of the odds `_CELL`.
     """
     outwards = _outwards(grid)
     cost = (_OUTLINE * _outline_evidence(grid) + _INSIDE * outwards)[grid.mask]  # of turning less that of keeping
@@ -183,7 +181,7 @@ def _enlarged(cells: Floats | Bools, shape: tuple[int, ...]) -> Floats:
 def _outline_evidence(grid: Grid) -> Floats:
     """Evidence (h, w) that normals point out of the object: sin θ (object share behind t − share ahead of it).
 
-    Where the grid ends the object may go on: no evidence.
+    The picture's edge gives no evidence, because the object may continue beyond it.
     """
     y, x = np.indices(grid.mask.shape, np.float32)
     sine = np.hypot(*grid.lean)
@@ -208,7 +206,7 @@ def _outwards(grid: Grid) -> Floats:
 def _links(grid: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
     """Pairs of neighboring cells, as indices (M,) and (M,), and the similarity (M,) of their azimuth axes, −2…2.
 
-    Flat neighbors and axes that cross weigh little.
+    It is near 0 if a neighbor faces the camera, or if the axes cross.
     """
     number = np.full(grid.mask.shape, -1)
     number[grid.mask] = np.arange(int(grid.mask.sum()))
@@ -225,13 +223,11 @@ def _links(grid: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
 
 
 def _cut(mask: Bools, cost: Floats, first: NDArray[np.intp], second: NDArray[np.intp], alike: Floats) -> Bools:
-    """Solve the minimum cut: cells (h, w) with x = 1 in the least Σ cost · x + Σ alike · (x ≠ x′).
+    """Minimize Σ cost · x + Σ alike · (x ≠ x′) over x = 0 or 1 of each cell; returns the cells (h, w) with x = 1.
 
-    Undecided cells have x = 0.
-
-    `cost` (N,) is of the mask's cells, `alike` (M,) of the links between its cells `first` and `second`.
-
-    Each cell has a node that is with the source where x is 0, and one that is with it where x is 1.
+    `cost` (N,) belongs to the mask's cells, `alike` (M,) to the links between its cells `first` and `second` (M,).
+    Cells that the cut leaves open have x = 0. Each cell has two nodes in the graph: the first is on the source's side
+    where x is 0, the second where x is 1.
     """
     from scipy import sparse  # here: importing it costs .3 s of every start
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow

@@ -17,8 +17,8 @@ from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMap
 from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.cues import FLOOR
-from polcap.stages.infer import analytic, augmentation, fine, half_turns
-from polcap.stages.infer.albedo import REACHED, fill_highlights
+from polcap.stages.infer import analytic, augmentation, fine, half_turns, highlights
+from polcap.stages.infer.highlights import REACHED
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join, for the network's input holds the inversion
 # error = min(a·statedᵇ·exp(r·roughness), c), degrees: maximum likelihood on traced training meshes (decision 28)
@@ -45,7 +45,7 @@ def estimate(
     maps, coarse, stated = estimate_coarse(cues, network, run, ior, symmetries)
     normal = fine.refine(cues, coarse, network.fine, run) if fine_pass and network.fine else coarse.normal
     light = (np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"])
-    diffuse = fill_highlights(light / _shading(normal, cues.rays) - FLOOR, _limit_radiance(cues))
+    diffuse = highlights.fill(light / _shading(normal, cues.rays) - FLOOR, _limit_radiance(cues))
     scale, power, rougher, most = _CALIBRATION
     error = np.minimum(scale * stated**power * np.exp(rougher * np.clip(maps["roughness"], 0, 1)), most)
     error = half_turns.error_with_doubt(error, maps["doubt"], frames.dot(normal, cues.rays))
@@ -66,10 +66,11 @@ def estimate(
 def estimate_coarse(
     cues: Cues, network: Network, run: RunNetwork, ior: float, symmetries: int
 ) -> tuple[dict[str, Floats], fine.CoarseEstimate, Floats]:
-    """Estimate of normals and material before refinement; also the input of the refinement network's training.
+    """Estimate normals and material before refinement (steps 1–3); also the input of the refinement network's training.
 
-    Returns the network's maps (H, W[, 3]) at the crop's size, with `factor`, see `_log_factor`, and `doubt`, the
-    probability of a wrong half-turn; then the normals before refinement, and their stated error (H, W) in degrees.
+    Returns three values: the network's maps (H, W[, 3]) at the crop's size, the normals before refinement, and their
+    expected error (H, W) in degrees, not yet calibrated. The maps also have `factor`, see `_log_factor`, and `doubt`,
+    the probability of a wrong azimuth side.
     """
     size = cues.mask.shape[::-1]
     shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
@@ -91,7 +92,7 @@ def estimate_coarse(
 
 
 def _limit_radiance(cues: Cues) -> Cues:
-    """Mark radiance that no diffuse reflection reaches as clipped, as in the training pictures."""
+    """Clip radiance above that of any diffuse reflection, and flag it CLIPPED, as in the training pictures."""
     beyond = (cues.radiance > _BRIGHTEST).any(axis=-1)
     quality = np.where(beyond, cues.quality | np.uint8(Quality.CLIPPED), cues.quality)
     return replace(cues, radiance=np.minimum(cues.radiance, _BRIGHTEST), quality=quality)
@@ -132,11 +133,10 @@ def _reduce(cues: Cues, scale: float) -> Cues:
 
 
 def _without_grid(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
-    """Remove the network's 2 px grid artifact from normals (H, W, 3).
+    """Remove the network's grid artifact, a pattern that repeats every 2 px, from normals (H, W, 3).
 
-    The common deviation of each place in its cells.
-
-    Relief does not repeat with the cells, so it remains.
+    For each of the four places in a 2×2 cell, the deviation that neighboring cells have in common is subtracted. Relief
+    does not repeat with the cells, so it remains.
     """
     whole = (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0).astype(np.float32)
     out = normal.astype(np.float32)
@@ -150,9 +150,9 @@ def _without_grid(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
 
 
 def _correct_half_turns(normal: Floats, seen: Cues, sigma: Floats, opposed: Floats) -> tuple[Floats, Floats]:
-    """Correct regions with a wrong azimuth side (180° ambiguity) in normals (H, W, 3).
+    """Turn regions of the network's normals (H, W, 3) that lean to the wrong side of the ray (180° ambiguity).
 
-    Also the probability (H, W) that the side is wrong.
+    Also returns the probability (H, W) that the chosen side is wrong.
     """
     found = half_turns.resolve(
         frames.to_ray_frame(frames.unit(normal), seen.rays), seen.mask, half_turns.NetworkDoubt(sigma, opposed)
@@ -186,7 +186,7 @@ def _masked_filter(
 ) -> Floats:
     """Separable filter of an image (H, W[, 3]) that uses only pixels in the mask (H, W), divided by their weight.
 
-    The divisor is at least `least`.
+    The weight counts as at least `least`.
     """
     inside = mask.astype(np.float32)
     extra = (None,) * (image.ndim - 2)
@@ -198,9 +198,10 @@ def _masked_filter(
 
 
 def _add_detail(coarse: Floats, by_pixel: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
-    """Add to coarse normals (H, W, 3) the detail of other normals that is finer than the network resolves.
+    """Add to coarse normals (H, W, 3) the fine detail of the inversion's normals `by_pixel`, (H, W, 3).
 
-    Interreflection, refractive index and half-turns bend the inversion's normals over whole regions; relief is finer.
+    Interreflection, a wrong refractive index and half-turns bend the inversion's normals over whole regions. So only
+    detail finer than the network resolves is taken.
     """
     return frames.unit(by_pixel + fine.low_pass((coarse - by_pixel).astype(np.float32), mask, shrink))
 

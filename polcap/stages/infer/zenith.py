@@ -1,14 +1,14 @@
 """Zenith angles from the DoLP, by the law of diffuse polarization that the object follows.
 
-One law for the object, estimated among candidates: facets of several roughnesses, weighed in two ways
-(`optics/body.py`), times a factor on the polarization, even or falling towards the outline. The smooth interface is one
-of them. A candidate is likely if
+The whole object has one law, which is one of many candidates: rough interfaces of several roughnesses and two kinds
+(`optics/body.py`), or the smooth one, times a factor on the polarization that may fall towards the outline. A candidate
+is probable if
 
-* albedo then does not depend on the zenith, for some flatness of the shading,
-* the surface then turns away from the outline as a ball's does, and
-* its zeniths are those of a guide, where there is one.
+* the albedo that follows from its zeniths does not depend on the zenith,
+* its zeniths near the outline are those of a ball, and
+* its zeniths agree with those of another estimator, if one is given.
 
-The answer is the mean over all candidates, and their spread is part of its error.
+The result is the mean over all candidates, weighted by their probability. Their spread is part of its error.
 """
 
 from dataclasses import dataclass
@@ -116,12 +116,12 @@ def candidate_laws(ior: float) -> DiffuseLaws:
 
 
 def _even_albedo(angles: Floats, light: Floats, laws: DiffuseLaws) -> Floats:
-    """Log likelihood (C,) of each diffuse law from constant albedo: the same at small and at large zeniths.
+    """Log likelihood (C,) of each diffuse law from an albedo that is equal at small and at large zeniths.
 
-    The pixels are sorted by DoLP into the same ten parts for all candidates. The error of a part's mean albedo is its
-    scatter over the root of its number of patches. Rough bodies shade flatter than smooth ones; the amount is
-    fitted to make the albedo most even, independently of the polarization. If no candidate fits (cast light, concave
-    parts), all are trusted less.
+    `angles` (C, N) are the zeniths of N pixels by each law, `light` (N,) their S0. The pixels are sorted by DoLP into
+    the same ten parts for all laws. The error of a part's mean albedo is its scatter over the root of its number of
+    patches. Rough surfaces shade flatter than smooth ones. The amount is fitted to the albedo, independently of the
+    polarization. If no law fits (reflected light, concave parts), all differences count less.
     """
     order = np.argsort(angles.sum(axis=0), kind="stable")
     order = order[len(order) % _TENTHS :]
@@ -140,10 +140,11 @@ def _even_albedo(angles: Floats, light: Floats, laws: DiffuseLaws) -> Floats:
 
 
 def _round_outline(dolp: Floats, cues: Cues, laws: DiffuseLaws) -> Floats:
-    """Log likelihood (C,) of each diffuse law from the outline, where a round object has cos θ = √(2x − x²).
+    """Log likelihood (C,) of each diffuse law from the outline, where a round object has sin θ = 1 − x.
 
-    x is the distance from the outline over a radius, about that of a disc with the object's area, and the same for all
-    rings. If at least half of a ring has the DoLP of a sharp edge, the outline favors no law.
+    x is the distance from the outline over the radius of the ball. The median DoLP of each of a few rings inside the
+    outline is compared. The radius is fitted, near that of a disc with the object's area. If the outline is a sharp
+    edge, it favors no law.
     """
     distance = cv2.distanceTransform(cues.mask.astype(np.uint8), cv2.DIST_L2, 5) - 0.5
     radius = disc_radius(cues.mask)

@@ -1,11 +1,17 @@
 """Stage 9: depth and mesh, integrated from the normals.
 
-A pixel (i, j) at distance d along the optical axis is at the point d·(a, b, −1), a = (i − cx)/f, b = −(j − cy)/f.
-Its normal n is square to the surface, so with the scaled log depth z = f ln d and m = n_z − a n_x − b n_y the slopes
-obey m ∂z/∂i = n_x and m ∂z/∂j = −n_y. They are linear in z, and one unit of z is about one pixel of depth.
+A pixel (i, j) at depth d along the optical axis is at the point d·(a, b, −1), with a = (i − cx)/f, b = −(j − cy)/f.
+The unknown is the scaled log depth z = f ln d; one unit of z is about one pixel of depth. The normal n is perpendicular
+to the surface. With m = n_z − a n_x − b n_y this gives the slope equations m ∂z/∂i = n_x and m ∂z/∂j = −n_y, which are
+linear in z.
 
-`slope_equations` sets them up on a pyramid of grids, `integration` solves them (by `multigrid`), `occlusion` finds
-where one part hides another, `triangles` makes the mesh, and `decimation` its coarser levels.
+    slope_equations   normals, weights and coefficients of these equations, on a pyramid of grids
+    pyramid_level     least-squares equations on one grid, and their solution
+    multigrid         solver of the sparse linear systems
+    integration       from coarse to fine: where the surface is cut, and its depth
+    occlusion         detection of places where one part hides another
+    triangles         mesh from the depth
+    decimation        meshes with fewer triangles
 """
 
 from dataclasses import replace
@@ -85,7 +91,7 @@ def integrate(maps: SurfaceMaps, distance_m: float | None, settings: SurfaceSett
 
 
 def triangulate(depth: Floats, maps: SurfaceMaps, metric: bool, settings: SurfaceSettings) -> Mesh:
-    """Make the mesh of a depth map (H, W), in metres or relative; also for an export from stored maps.
+    """Make the mesh of a depth map (H, W), NaN outside the object; `metric` tells that depths are in metres.
 
     Raises
     ------

@@ -23,14 +23,15 @@ class DecimatedMesh:
     """A mesh with fewer triangles, and its distance from the full mesh."""
 
     mesh: Mesh
-    error: float  # 99th percentile of the first mesh's vertices from this surface, in the mesh's unit of length
+    error: float  # distance of the full mesh's vertices from this surface, 99th percentile, in the mesh's unit
     error_px: float  # the same in px of the maps, at the object's median depth
 
 
 def decimate(mesh: Mesh, view: View, count: int, back: Back) -> DecimatedMesh:
-    """Reduce a mesh to about `count` triangles; texture coordinates are those of the camera's view.
+    """Reduce a mesh to about `count` triangles; texture coordinates are computed again from the camera's `view`.
 
-    `back` is the setting the mesh was made with: triangles that turn away from the camera are left out of an open one.
+    `back` is the setting with which the mesh was made. In an open mesh, triangles that face away from the camera are
+    removed.
 
     Raises
     ------
@@ -66,10 +67,7 @@ def decimate(mesh: Mesh, view: View, count: int, back: Back) -> DecimatedMesh:
 
 
 def _distance(first: Mesh, coarser: Mesh) -> float:
-    """Distance of a decimated mesh from the full one: 99th percentile over the full mesh's vertices.
-
-    Measured to the plane of the nearest triangle.
-    """
+    """Distance of the full mesh's vertices to the nearest triangle's plane in a coarser mesh: 99th percentile."""
     from scipy.spatial import cKDTree  # here: importing it costs .1 s of every start
 
     corner = coarser.vertices[coarser.faces].astype(np.float64)  # (F, 3, 3)

@@ -25,10 +25,9 @@ _DAMPING = 4 / 3 / _SPECTRUM
 
 
 class PixelGrid:
-    """The N pixels of a mask (H, W), numbered row by row, and the L links between neighbors.
+    """The N pixels of a mask (H, W) as a graph: pixels numbered row by row, and L links between neighbors.
 
-    `p` and `q` (L,) are the pixels that a link joins: first all links to the right, then, from number `turn` on, all
-    links down.
+    Link l joins the pixels `p[l]` and `q[l]`. The links to the right come first; from number `turn` on, links go down.
     """
 
     def __init__(self, mask: NDArray[np.bool_]) -> None:
@@ -52,7 +51,7 @@ class PixelGrid:
         return np.stack([self.row, self.column], axis=-1)
 
     def _lay_out(self, right: Any, down: Any) -> None:
-        """Compute the sparsity pattern of matrices on this grid: up, left, center, right and down of each pixel."""
+        """Compute the sparsity pattern of matrices on this grid: a pixel with its neighbors up, left, right, down."""
         size, count = self.size, len(self.p)
         place = np.full((size, 5), -1, dtype=np.int32)  # which link or pixel each stored value belongs to
         link = np.arange(count, dtype=np.int32)
@@ -79,7 +78,7 @@ class PixelGrid:
         return sparse.csr_matrix((values, self._indices, self._starts), (self.size, self.size))
 
     def divergence(self, flux: Floats) -> Floats:
-        """Divergence (N,) at each pixel of a flux (L,) along the links from p to q."""
+        """Divergence (N,) of a flux (L,) along the links: what flows into each pixel minus what flows out."""
         into = np.asarray(np.bincount(self.q, flux, self.size), dtype=np.float64)
         return np.asarray(into - np.bincount(self.p, flux, self.size))
 
@@ -90,7 +89,7 @@ class PixelGrid:
         return full
 
     def links(self, right: NDArray[Any], down: NDArray[Any]) -> NDArray[Any]:
-        """Collect values (L,) of the links from images of the links to the right (H, W−1) and down (H−1, W)."""
+        """Values (L,) of the links in their order, from images of the links right (H, W−1) and down (H−1, W)."""
         mask = self.mask
         return np.concatenate([right[mask[:, :-1] & mask[:, 1:]], down[mask[:-1] & mask[1:]]])
 
@@ -203,10 +202,10 @@ def _prolongation(matrix: Any, group: NDArray[np.int64], count: int) -> Any:
 
 
 class TwoGrid:
-    """Two-grid preconditioner: one cycle on a grid and on that of half its resolution, which has a preconditioner.
+    """Two-grid preconditioner: one cycle on a grid, with a correction from the grid of half its resolution.
 
-    The coarse equations are those of the same surface on blocks of 2×2 pixels, and the links of both grids weigh the
-    same per pixel of depth step, so means over the blocks correct the fine solution unscaled.
+    The coarse grid has one unknown per block of 2×2 pixels, and a preconditioner of its own. Both grids weight a link
+    by the same law, so the coarse correction is added to all pixels of a block without a factor.
 
     Parameters
     ----------

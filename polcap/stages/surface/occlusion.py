@@ -2,16 +2,16 @@
 
 Three tests, on the links between neighboring pixels:
 
-`occluding_contours` uses the normals alone. At an occluding contour the nearer surface turns edge-on, and the farther
-one leans much less. The depth step there is unknown: least squares would set the hidden part against the contour.
+`occluding_contours` uses the normals alone. At an occluding contour the nearer surface is seen edge-on, and the farther
+surface is tilted much less. The depth step there is unknown; without a cut, least squares would join both surfaces.
 
-`depth_steps` uses an integrated depth. On one smooth sheet the step of a link lies between the slopes at its ends.
-A step beyond them counts as an occlusion if it belongs to a long and high contour (noise makes short and low ones),
-and if the nearer side leans away (normals that fit no surface make long contours too, across pixels that face the
-camera).
+`depth_steps` uses an integrated depth. On one smooth surface the step of a link lies between the slopes at its ends. A
+step outside this range counts as an occlusion if two conditions hold. Its contour is long and high: noise makes short
+and low ones. The nearer side is tilted away: contradictory normals also make long contours, but across pixels that face
+the camera.
 
-`contact_links` finds where two separated parts touch. In the crease between two touching balls the normals lean as at
-an occluding contour, so the integration separates the balls, by the same step all along the crease. Along a true
+`contact_links` finds where two separated parts touch. In the crease between two touching balls the normals are tilted
+as at an occluding contour, so the integration separates the balls, by the same step all along the crease. Along a true
 occluding contour the step varies.
 """
 
@@ -47,10 +47,11 @@ _CONTACT_LENGTH = 0.43  # of a contact
 
 
 def occluding_contours(lean: tuple[Floats, Floats], mask: Bools) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-    """Links that cross an occluding contour: +1 where the first pixel is the nearer, −1 where the second is, else 0.
+    """Find the links that cross an occluding contour, by the normals alone.
 
-    Of links to the right (H, W−1) and down (H−1, W). `lean` is the angle by which the surface falls away to the right
-    and down, (H, W) each [rad]; NaN outside the mask.
+    Returns images of the links to the right (H, W−1) and down (H−1, W): +1 where the first pixel is the nearer one, −1
+    where the second is, 0 without a contour. `lean` are the angles at which the surface falls away to the right and
+    down, (H, W) each [rad]; NaN outside the mask.
     """
     candidates = [_contour_candidates(of, mask, axis, sign) for axis, of in zip((1, 0), lean) for sign in (1, -1)]
     total, count = np.zeros(mask.shape, np.float32), np.full(mask.shape, 1e-6, np.float32)
@@ -69,9 +70,10 @@ def occluding_contours(lean: tuple[Floats, Floats], mask: Bools) -> tuple[NDArra
 
 
 def _contour_candidates(lean: Floats, mask: Bools, axis: int, sign: int) -> tuple[Bools, Floats]:
-    """Pixel links along an axis across a possible occluding contour: the nearer pixel is nearly edge-on.
+    """Links along an axis that may cross an occluding contour, because the nearer pixel is nearly edge-on.
 
-    The nearer pixel is the first (sign 1) or the second (−1). Also the angle [rad] at which it falls away.
+    The nearer pixel is the first of the link (sign 1) or the second (−1). Also returns the angle [rad] at which the
+    surface falls away there.
     """
     away = sign * lean
     inside = np.isfinite(away)
@@ -93,7 +95,7 @@ def _contour_candidates(lean: Floats, mask: Bools, axis: int, sign: int) -> tupl
 
 @dataclass(frozen=True)
 class OcclusionMap:
-    """Links at which the depth steps from one sheet to another, and pixels at which the depth is torn."""
+    """Links across which one part of the surface hides another, and pixels where the normals fit no surface."""
 
     right: Bools  # (H, W−1) links to the right
     down: Bools  # (H−1, W) links down
@@ -152,7 +154,7 @@ def depth_steps(z: Floats, slope: tuple[Floats, Floats], mask: Bools, least: flo
 
 
 def _excess(z: Floats, slope: Floats, mask: Bools, axis: int) -> Floats:
-    """Depth step of each link less the nearest value between its ends' slopes [px]; 0 off the mask."""
+    """Depth step of each link beyond the range of the slopes at its two ends [px]; 0 outside the mask."""
     first, second = _ends(axis)
     step = z[second] - z[first]
     low, high = np.minimum(slope[first], slope[second]), np.maximum(slope[first], slope[second])
@@ -160,10 +162,7 @@ def _excess(z: Floats, slope: Floats, mask: Bools, axis: int) -> Floats:
 
 
 def _nearer_lean(on: Bools, beyond: tuple[Floats, ...], slope: tuple[Floats, Floats], least: float) -> Floats:
-    """Slope angle (H, W) [rad] of the nearer side of depth steps, falling towards the farther side.
-
-    It is the mean over the steps about each pixel.
-    """
+    """Slope angle (H, W) [rad] at which the nearer side of depth steps falls towards the farther side, local mean."""
     total, links = np.zeros(on.shape, dtype=np.float32), np.full(on.shape, 1e-6, dtype=np.float32)
     for axis, excess, of in zip((1, 0), beyond, slope):
         first, second = _ends(axis)
@@ -179,7 +178,7 @@ def _nearer_lean(on: Bools, beyond: tuple[Floats, ...], slope: tuple[Floats, Flo
 
 
 def contact_links(grid: PixelGrid, separate: Bools, excess: Floats, radius: float) -> Bools:
-    """Links (L,) between pixels at which two separated parts of the surface touch.
+    """Find links (L,) across which two separated parts of the surface touch.
 
     Parameters
     ----------
@@ -190,7 +189,7 @@ def contact_links(grid: PixelGrid, separate: Bools, excess: Floats, radius: floa
     excess
         (L,) depth step beyond the slopes at both ends, positive where the depth grows to the right or down [px].
     radius
-        Of the object [px].
+        Radius of the object [px].
     """
     part = _parts(grid, ~separate)
     first, second = part[grid.p], part[grid.q]
@@ -220,7 +219,7 @@ def _parts(grid: PixelGrid, together: Bools) -> NDArray[np.int64]:
 
 
 def _most_equal(step: Floats, width: float) -> tuple[float, int]:
-    """Middle and count of the fullest window of this width, among windows that begin near the smallest steps (B,)."""
+    """Most frequent small step: center and count of the fullest window of this width near the smallest steps (B,)."""
     low = np.sort(step)
     count = np.searchsorted(low, low + width, side="right") - np.arange(len(low))
     count[low > np.percentile(low, _LEAST_PERCENTILE) + width] = 0

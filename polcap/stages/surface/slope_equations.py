@@ -1,4 +1,4 @@
-"""Slope equations of a normal map: linear in the scaled log depth, weighted, on a pyramid of grids."""
+"""Slope equations of a normal map, with a weight per pixel, on grids of half the size each (a pyramid)."""
 
 from dataclasses import dataclass
 
@@ -32,9 +32,10 @@ class NormalField:
 
 
 def normal_field(maps: SurfaceMaps, steepest: float, prior_weight: float) -> NormalField:
-    """Normal field from maps, on their grid; normals are at most `steepest` rad from their view rays.
+    """Prepare the maps' normals for integration: weights by their error, a depth prior, a limit of their tilt.
 
-    Pixels without a normal get the zero vector, and the integration bridges them.
+    A normal is at most `steepest` rad from its view ray. Pixels without a normal get the zero vector; the integration
+    bridges them.
     """
     mask = np.asarray(maps.mask, dtype=bool)
     normal = np.nan_to_num(maps.normal[mask].astype(np.float64))
@@ -49,7 +50,7 @@ def normal_field(maps: SurfaceMaps, steepest: float, prior_weight: float) -> Nor
     return NormalField(
         mask=mask,
         view=maps.view,
-        normal=_limit_lean(normal, mask, maps.view, steepest),
+        normal=_limit_tilt(normal, mask, maps.view, steepest),
         weight=np.clip((median / sigma) ** 2, *_WEIGHTS),
         sigma=np.radians(np.clip(median, *_SIGMA_RANGE_DEG)),
         prior=prior,
@@ -57,7 +58,7 @@ def normal_field(maps: SurfaceMaps, steepest: float, prior_weight: float) -> Nor
     )
 
 
-def _limit_lean(normal: Floats, mask: Bools, view: View, steepest: float) -> Floats:
+def _limit_tilt(normal: Floats, mask: Bools, view: View, steepest: float) -> Floats:
     """Turn normals towards the camera until they are at most `steepest` rad from their view rays."""
     a, b = _ray_slopes(mask, view)
     facing = (normal[:, 2] - a * normal[:, 0] - b * normal[:, 1]) / np.sqrt(1 + a * a + b * b)

@@ -38,10 +38,11 @@ def unbroken_links(z: Floats, field: NormalField, jump: float) -> tuple[Bools, B
 
 
 def grid_triangles(z: Floats, links: tuple[Bools, Bools], step: int) -> tuple[NDArray[np.int64], Faces]:
-    """Triangles of the mesh on a grid of every `step` px: pixels x, y (V, 2) of the vertices, and faces (F, 3).
+    """Triangulate a depth z (H, W) on a grid of every `step` px: pixels x, y (V, 2) of the vertices, faces (F, 3).
 
-    Counter-clockwise as the camera sees them. A square of the grid with four unbroken sides is parted along the
-    diagonal of less depth; one with two adjacent unbroken sides gives one triangle.
+    `links` are those to the right and down that cross no occlusion. Faces are counter-clockwise as the camera sees
+    them. A grid square with four unbroken sides is divided along the diagonal with the smaller depth difference. A
+    square with two adjacent unbroken sides gives one triangle.
     """
     across, along = _unbroken_runs(links[0], step, 1)[::step], _unbroken_runs(links[1], step, 0)[:, ::step]
     height = z[::step, ::step]
@@ -66,7 +67,7 @@ def grid_triangles(z: Floats, links: tuple[Bools, Bools], step: int) -> tuple[ND
 
 
 def _unbroken_runs(links: Bools, step: int, axis: int) -> Bools:
-    """Whether all links of each run of `step` links between the grid's lines cross no occlusion."""
+    """Combine each `step` links along an axis to one grid side: true if none of them crosses an occlusion."""
     if step == 1:
         return links
     whole = links.shape[axis] // step * step
@@ -118,16 +119,16 @@ def _count_pieces(faces: Faces, count: int) -> int:
 
 
 def smooth_boundary(place: Floats, z: Floats, faces: Faces, step: int) -> tuple[Floats, Floats]:
-    """Smooth the mesh's boundary: vertices x, y (V, 2) px, and scaled log depth z (V,) more strongly.
+    """Smooth the stairs of pixels along the mesh's boundary: vertices x, y (V, 2) px, and scaled log depth z (V,).
 
-    The boundary follows the stairs of the pixels before, and the curve that they sample after.
+    Depth is smoothed more strongly. Returns the new positions and depths.
     """
     edge = boundary_edges(faces)
     move = _average_along(place, edge, _ROUNDS) - place
     distance = np.linalg.norm(move, axis=-1, keepdims=True)
     after = place + move * np.minimum(1, _FARTHEST * step / np.maximum(distance, 1e-9))
     area_before, area_after = face_areas(place, faces), face_areas(after, faces)
-    for _ in range(3):  # corners of a triangle that would turn over stay, which may turn over the next
+    for _ in range(3):  # a triangle that would turn over keeps its corners; then a neighbor may turn over
         bad = np.unique(faces[area_after < _LEAST_AREA * area_before])
         if not len(bad):
             break
@@ -138,7 +139,7 @@ def smooth_boundary(place: Floats, z: Floats, faces: Faces, step: int) -> tuple[
 
 
 def boundary_edges(faces: Faces) -> NDArray[np.int64]:
-    """Edges (B, 2) that belong to one triangle only, in its direction."""
+    """Boundary edges (B, 2) of a mesh: those of one triangle only, in the direction of that triangle."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     low, high = ends.min(axis=1), ends.max(axis=1)
     key = low * (int(faces.max()) + 1) + high
@@ -151,9 +152,9 @@ def boundary_edges(faces: Faces) -> NDArray[np.int64]:
 
 
 def _average_along(values: Floats, edge: NDArray[np.int64], rounds: int) -> Floats:
-    """Smooth values (V, C) of boundary vertices: each round moves them half-way to the mean of their two neighbors.
+    """Smooth values (V, C) along the boundary: each round moves a vertex half-way to the mean of its two neighbors.
 
-    A vertex where the boundary touches itself stays.
+    Vertices where the boundary touches itself do not move.
     """
     from scipy import sparse  # here: importing it costs .3 s of every start
 

@@ -10,7 +10,7 @@ from polcap.errors import ModelError
 from polcap.images import Quality
 from polcap.optics import frames
 from polcap.stages import cues, infer, stokes
-from polcap.stages.infer import albedo, analytic, augmentation, fine, learned
+from polcap.stages.infer import _albedo_sigma, analytic, augmentation, fine, learned
 from tests import scenes
 from tests.fake_network import FakeNetwork, run
 
@@ -62,8 +62,8 @@ def test_a_scale_that_makes_colors_and_gloss_unusual_is_doubted(
     maps = estimate(seen(noise=0.002))
     color = np.ones((*maps.mask.shape, 3), np.float32)
     unusual = dataclasses.replace(maps, diffuse=white * color, specular=f0 * color, estimator="network")
-    assert least <= albedo.albedo_sigma(unusual, 0.1) <= most
-    assert albedo.albedo_sigma(unusual, None) is None
+    assert least <= _albedo_sigma(unusual, 0.1) <= most
+    assert _albedo_sigma(unusual, None) is None
 
 
 def test_a_clean_ball_is_recovered():

@@ -14,6 +14,7 @@ from polcap.errors import ObjectError
 from polcap.images import Floats, View
 from polcap.stages import surface
 from polcap.stages.surface import integration
+from polcap.stages.surface.pyramid_level import PyramidLevel
 from polcap.stages.surface.slope_equations import normal_field
 from tests.stages.surface.depth_scenes import (
     SHAPE,
@@ -167,28 +168,28 @@ def test_noise_does_not_cut_a_smooth_surface(size: int) -> None:
 def test_cut_that_strains_the_surface_is_removed(step: float, removed: bool) -> None:
     """A piece of a ball's flank, set back by some pixels though nothing hides it, comes back."""
     ball, _ = waved(200, 2.0)
-    level = integration.PyramidLevel(normal_field(ball, np.radians(84), 0.0), SETTINGS.stiffness, SETTINGS.jump / 2)
+    level = PyramidLevel(normal_field(ball, np.radians(84), 0.0), SETTINGS.stiffness, SETTINGS.jump / 2)
     level.solve()
     plain = level.z
     row, column = (np.nonzero(ball.mask)[k] - 100 for k in (0, 1))
     level.choosing = np.ones(level.grid.size, dtype=bool)
     level.z = plain + step * ((column > 60) & (np.abs(row) < 40))
     assert level.occlusions().any() == removed
-    level.remove_useless_cuts()
+    integration.remove_useless_cuts(level)
     assert level.choosing.any() != removed
     assert np.allclose(level.z, plain, atol=1e-6)
 
 
 def test_cut_that_relieves_the_surface_remains() -> None:
     balls, _ = two_balls(0.12)
-    level = integration.PyramidLevel(normal_field(balls, np.radians(84), 0.0), SETTINGS.stiffness, SETTINGS.jump / 2)
-    level.cut_contours()
+    level = PyramidLevel(normal_field(balls, np.radians(84), 0.0), SETTINGS.stiffness, SETTINGS.jump / 2)
+    integration.cut_contours(level)
     level.integrate_bilaterally(SETTINGS.iterations, SETTINGS.tolerance)
-    level.restore_contours()
+    integration.restore_contours(level)
     links = len(level.contours.link)
     level.solve()
     assert links and level.occlusions().any()
-    level.remove_useless_cuts()
+    integration.remove_useless_cuts(level)
     assert level.choosing.all()
     assert len(level.contours.link) == links
 
