@@ -19,6 +19,10 @@ def train(
     minutes: Annotated[float, Option(min=0.1, help="Training time, resumed parts included.")] = 90,
     samples: Annotated[int | None, Option(min=1, help="Pictures to learn from, instead of minutes.")] = None,
     variant: Annotated[str, Option(help="Leave one thing out, for ablations; see training/variants.py.")] = "ours",
+    ablation: Annotated[
+        bool,
+        Option("--ablation", help="Train every variant, one after the other, and write the table of their errors."),
+    ] = False,
     resume: Annotated[bool, Option("--resume", help="Go on from the last checkpoint.")] = False,
     start: Annotated[Path | None, Option(metavar="ONNX", help="Begin with this model's weights.")] = None,
     done: Annotated[
@@ -33,10 +37,11 @@ def train(
     """Train the main network (extra [train])."""
     terminal.print_progress("loading PyTorch, meshes and materials")
     trainer = options.training("train")
+    run = options.training("ablation_study").main if ablation else trainer.main
     stated = {"preset": preset, "data": data, "out": out, "minutes": minutes, "samples": samples, "variant": variant}
     stated |= {"resume": resume, "start": start, "done": done, "rate": rate, "views": views}
     stated |= {"procedural": procedural, "threads": threads, "seed": seed}
-    terminal.print_data(str(trainer.main(trainer.TrainingOptions(**stated), terminal.print_progress)))
+    terminal.print_data(str(run(trainer.TrainingOptions(**stated), terminal.print_progress)))
 
 
 def evaluate(

@@ -22,6 +22,7 @@ The mask's network: `mask_views` traces objects before a backdrop, `mask_scenes`
 
 Evaluation: `evaluate` measures the error of every map (`map_errors`) on fixed pictures (`evaluation_protocol`, of
 `evaluation_materials` in `light_transport`) against `evaluation_baselines`; `evaluation_page` shows the result.
+`ablation_study` trains and evaluates all variants.
 `evaluation_photographs` measures normals on photographs that come with measured ones.
 
 `import_data` converts meshes and textures of other people.

@@ -43,6 +43,7 @@ class TrainingOptions:
     seed: int = 1
     rate: float = 1e-3  # of Muon; at twice this rate weights grew until training diverged
     variant: str = "ours"  # key of VARIANTS
+    traced: Path | None = None  # holds the traced views, instead of `out`
 
 
 @dataclass(frozen=True)
@@ -95,9 +96,10 @@ def main(options: TrainingOptions, report: Report = silent) -> Path:
     views = preset.views if options.views is None else options.views
     procedural = preset.procedural if options.procedural is None else options.procedural
     recipe = traced_views.ViewsRecipe(views=views, procedural=procedural, size=preset.size, seed=13)
-    cache = traced_views.open_cache(options.out / "views", traced_views.training_meshes(options.data), recipe, report)
+    traced = options.traced or options.out
+    cache = traced_views.open_cache(traced / "views", traced_views.training_meshes(options.data), recipe, report)
     library = materials.MaterialLibrary(options.data / "materials" / "train", device)
-    network.held_out = HeldOutPictures(options.data, options.out / "watch", device, report)
+    network.held_out = HeldOutPictures(options.data, traced / "watch", device, report)
     torch.set_num_threads(1)
     budget = loop.Budget(options.minutes, options.samples)
     made = _make_batches(Simulator(cache, library, device), preset, network, budget, options.seed + network.step)

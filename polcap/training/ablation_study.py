@@ -1,0 +1,63 @@
+"""The table of ablations in one command, `polcap train --ablation`: every variant trained alike, then evaluated.
+
+References
+----------
+Deschaintre, Lin & Ghosh, CVPR 2021, table 2 (the evaluation's page has its figures beside ours).
+"""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from polcap.errors import InputError
+from polcap.training import evaluate, evaluation_protocol, train
+from polcap.training.progress import Report, silent
+from polcap.training.train import TrainingOptions
+from polcap.training.variants import VARIANTS
+
+
+def main(
+    options: TrainingOptions,
+    report: Report = silent,
+    count: int = evaluation_protocol.QUICK_COUNT,
+    size: int = evaluation_protocol.QUICK_SIZE,
+) -> Path:
+    """Train each variant into out/NAME on the same traced views, evaluate all on `count` pictures of `size` px.
+
+    Returns the page out/evaluation.md. `report` is called with lines of text; the first states the cost.
+
+    Raises
+    ------
+    InputError
+        As in `train.main`; or the options choose a variant or a model to start with.
+    """
+    if options.variant != "ours" or options.start:
+        raise InputError("--ablation trains all variants from random weights; leave out --variant and --start")
+    report(_cost(options, count, size))
+    began = time.monotonic()
+    for number, name in enumerate(VARIANTS, 1):
+        out = options.out / name
+        resume = options.resume and (out / "last.pt").exists()
+        train.main(
+            replace(options, variant=name, out=out, resume=resume, traced=options.out),
+            lambda text, name=name, number=number: report(f"{number}/{len(VARIANTS)} {name}: {text}"),  # type: ignore[misc]
+        )
+    trained = time.monotonic()
+    judged = evaluate.EvaluationOptions(
+        options.out / "ours" / "model.onnx", options.data, options.out, options.out, count, size
+    )
+    evaluate.main(judged)
+    spent = f"training {(trained - began) / 60:.0f} min, evaluation {(time.monotonic() - trained) / 60:.0f} min"
+    report(f"{spent}; {options.out / 'evaluation.md'}")
+    return options.out / "evaluation.md"
+
+
+def _cost(options: TrainingOptions, count: int, size: int) -> str:
+    """What an ablation study costs, in words."""
+    networks = len(VARIANTS)
+    each = f"{options.minutes:g} min" if options.samples is None else f"{options.samples} pictures"
+    whole = f", {networks * options.minutes / 60:.1f} h in all" if options.samples is None else ""
+    return (
+        f"{networks} networks of {each} each{whole}; besides, the views are traced, and the networks evaluated on "
+        f"{count} pictures of {size}² px"
+    )
