@@ -21,7 +21,8 @@ _LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced map
 _DEGREES_PER_PUSH = 200.0  # error of the normals per movement by the object's radius
 _DEGREES_PER_TURN = 5.0  # error of the normals per degree by which the object turned (docs/benchmarks/gates.md)
 _FALSE_TURN_DEG = 0.2  # 1σ of a turn that polarization imitates
-_SHARP_PX, _DEGREES_PER_BLUR_PX = 1.0, 1.5  # blur of sharp edges; error of the normals per px beyond it
+_SHARP_PX, _DEGREES_PER_BLUR_PX = 1.2, 2.5  # greatest blur of sharp edges; error of the normals per px beyond it
+_EDGE_FLOOR = 0.1  # of the object's median light: dark backdrops differ by less
 _HOLD_STILL = "Fix the object, do not touch it between shots, and take that shot again"
 _INWARD = 0.2  # sine of the zenith from which a normal leans inward
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
@@ -205,17 +206,19 @@ def focus(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def _edge_blur(found: Evidence) -> float:
-    """Blur (1σ) of the object's sharpest edges [px], from their slope: a step h blurred by σ has the slope h/(σ√2π).
+    """Blur (1σ) of the object's sharpest edges [px]: a step of height h, blurred by σ, has the slope h/(σ√2π).
 
-    Edges are the 10 % of the object with most contrast within 7 px. The sharpest are 5 % of these.
+    Heights are ratios of light, so that the outline counts before a dark backdrop, however smooth the object is. Edges
+    are the tenth of the object with most contrast within 7 px; the sharpest are the twentieth of these.
     """
-    light = found.radiance.value[0].sum(-1)
-    near = cv2.dilate(found.object_.mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    light, mask = np.maximum(found.radiance.value[0].sum(-1), 0), found.object_.mask
+    near = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     if not near.any():
         return float("nan")
+    log = np.log(light + max(_EDGE_FLOOR * float(np.median(light[mask])), 1e-9)).astype(np.float32)
     window = np.ones((7, 7), np.uint8)
-    height = (cv2.dilate(light, window) - cv2.erode(light, window))[near]
-    slope = np.sqrt(squared_gradient(light))[near]
+    height = (cv2.dilate(log, window) - cv2.erode(log, window))[near]
+    slope = np.sqrt(squared_gradient(log))[near]
     edge = height >= np.percentile(height, 90)
     sharpest = np.percentile(slope[edge] / np.maximum(height[edge], 1e-9), 95)
     return float(1 / (np.sqrt(2 * np.pi) * max(float(sharpest), 1e-3)))

@@ -73,7 +73,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_edge_blur_px: Annotated[
         float,
         Meta(gt=0, le=20, description="allowed 1σ blur of the object's sharpest edges [px of the merged picture]"),
-    ] = 1.65
+    ] = 1.4
     max_turn_deg: Annotated[
         float,
         Meta(ge=3, le=45, description="allowed error of an angle, measured from the outline [degrees]"),

@@ -124,7 +124,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("alignment", "fail", {"alignment": {"transform": np.full((3, 3, 3), NAN)}}),
     ("alignment", "warn", {"figures": {"pushed": np.array([0.0, 1.2, 0.0])}}),
     ("alignment", "warn", {"figures": {"turn": ObjectTurn(np.array([0.0, 0.9, 0.0]), np.full(3, 0.1))}}),
-    ("alignment", "pass", {"figures": {"turn": ObjectTurn(np.array([0.0, 0.9, 0.0]), np.full(3, 0.2))}}),
+    ("alignment", "pass", {"figures": {"turn": ObjectTurn(np.array([0.0, 0.8, 0.0]), np.full(3, 0.2))}}),
     ("alignment", "fail", {"figures": {"pushed": np.array([0.0, 5.0, 0.0])}}),
     ("alignment", "fail", {"figures": {"pushed": np.array([0.0, np.inf, 0.0])}}),
     ("mask", "pass", {}),
