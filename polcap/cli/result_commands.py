@@ -58,6 +58,13 @@ def export(
         Path | None,
         Option(metavar="JS", help="Web page that shows the GLB with this model-viewer.min.js, without a network."),
     ] = None,
+    iiif: Annotated[
+        str | None,
+        Option(
+            metavar="URL",
+            help="asset/NAME_iiif/, a relightable layer for museums; URL is where this folder will be served.",
+        ),
+    ] = None,
     about: Annotated[
         list[str] | None,
         Option(
@@ -82,6 +89,7 @@ def export(
     from polcap.pipeline.asset_export import ExportRequest
 
     flags = {"gltf": gltf, "obj": obj, "usd": usd, "usdz": usdz, "materialx": materialx, "exr": exr}
+    flags["iiif"] = iiif is not None
     formats = tuple(name for name in presets.FORMATS if flags[name])
     if preset and formats:
         raise SettingError(f"--preset {preset[0]} brings its formats; leave out --{formats[0]}")
@@ -95,6 +103,7 @@ def export(
         bits=options.texture_bits(bits),
         extras=options.extra_textures(extra or []),
         page=page,
+        iiif=iiif,
         catalog=options.catalog_fields(about or []),
         lod=lod,
     )

@@ -40,11 +40,10 @@ _GAIN = 0.2, 5.0  # range of a tile's gain; beyond, the two tiles show different
 _LEAST_TILES = 6
 _TILE_ERROR_PX = 0.02  # of interpolation and aliasing, in the richest tile
 _PRIOR_PX = 0.1  # 1σ of a parameter's change in one step, before the tiles are used
-_AGREE_PX = 0.3  # a tile with a smaller residual agrees with the motion
+_AGREE_PX = 0.3  # a tile with a smaller residual agrees with the motion; after a smaller step, no new tiles are tried
 _LEAST_AGREE = 0.4  # share of the matched tiles; if fewer agree, no motion is found
-_SURE_AGREE = 0.6  # share of all usable tiles; if more agree, the first match is taken
 _FAR_BETTER = 1.25  # factor by which more tiles must agree with a distant match: detail may repeat
-_STILL_PX = 1.0  # smaller motions need no coarse scales
+_STILL_PX = 1.0  # smaller motions need no search from coarse to fine
 _SETTLED_PX = 0.005  # a smaller step ends the search; four times that on coarse scales
 _STEPS, _COARSE_STEPS = 6, 4
 
@@ -114,34 +113,40 @@ class Pyramid:
 class _Matches:
     """Residual shifts of tiles between two pictures under a motion."""
 
-    point: Floats  # (T, 2) tile centres x, y in the reference
+    corner: Indices  # (T, 2) = (row, column) of the tiles in the reference
     shift: Floats  # (T, 2) px
     information: Floats  # (T, 2, 2) inverse covariance of the shift [px⁻²]
-    tried: int  # tiles usable in both pictures, matched or not
+
+    @property
+    def point(self) -> Floats:
+        """Tile centers x, y (T, 2) in the reference, px."""
+        return np.asarray(self.corner[:, ::-1] + (_TILE - 1) / 2)
 
 
 def register(reference: Pyramid, other: Pyramid, model: Model = "simplest") -> Registration:
     """Estimate the motion from a reference picture to another picture of the same scene.
 
-    The search starts from the identity, then from a phase correlation. Where no tiles match or agree, the result is the
-    identity with `tiles` 0.
+    The match at full size counts if neither it, nor the coarsest scale, nor a phase correlation shows a motion of
+    `_STILL_PX`. Otherwise the search goes from coarse to fine, from the identity and from the phase correlation. Where
+    no tiles match or agree, the result is the identity with `tiles` 0.
     """
-    still, _, share = _refine(reference, other, model, 1, np.eye(3))
-    if still.shift_px < _STILL_PX and share > _SURE_AGREE:
+    coarsest = reference.scales - 1
+    still, _ = _refine(reference, other, model, 0, 0, np.eye(3))
+    start = _phase_correlation(reference[coarsest], other[coarsest])
+    if start[:2, 2].any():
+        near, agree = _refine(reference, other, model, coarsest, 0, np.eye(3))
+        far, more = _refine(reference, other, model, coarsest, 0, start)
+        return far if more > _FAR_BETTER * agree else near
+    coarse, _ = _refine(reference, other, model, coarsest, coarsest, np.eye(3))
+    if min(still.tiles, coarse.tiles) and max(still.shift_px, coarse.shift_px * 2**coarsest) < _STILL_PX:
         return still
-    scales = reference.scales
-    near, agree, _ = _refine(reference, other, model, scales, np.eye(3))
-    start = _phase_correlation(reference[scales - 1], other[scales - 1])
-    if not start[:2, 2].any():
-        return near
-    far, more, _ = _refine(reference, other, model, scales, start)
-    return far if more > _FAR_BETTER * agree else near
+    return _refine(reference, other, model, coarsest, 0, np.eye(3))[0]
 
 
 def refine(reference: Pyramid, other: Pyramid, model: Model, start: Floats) -> Registration:
     """Refine a first guess (3, 3) of the motion between two pictures; returns the guess where no tiles match."""
-    scales = reference.scales
-    found, _, _ = _refine(reference, other, model, scales, scaled(start, 1 / 2 ** (scales - 1)))
+    coarsest = reference.scales - 1
+    found, _ = _refine(reference, other, model, coarsest, 0, scaled(start, 1 / 2**coarsest))
     return found if found.tiles else replace(found, matrix=start)
 
 
@@ -178,7 +183,7 @@ def squared_gradient(picture: Floats) -> Floats:
 
 
 def _phase_correlation(reference: Level, other: Level) -> Floats:
-    """Whole-pixel shift between two pictures as a matrix (3, 3); the identity unless the shift is clearly better."""
+    """Whole-pixel shift between two pictures as a matrix (3, 3); the identity unless a shift fits clearly better."""
     a, b, both = reference.picture, other.picture, reference.usable & other.usable
     window = np.outer(np.hanning(a.shape[0]), np.hanning(a.shape[1]))
     if both.mean() < 0.05:
@@ -197,55 +202,57 @@ def _phase_correlation(reference: Level, other: Level) -> Floats:
 
 
 def _refine(
-    reference: Pyramid, other: Pyramid, model: Model, scales: int, matrix: Floats
-) -> tuple[Registration, int, float]:
-    """Refine a first guess of the motion from the coarsest of some scales to the full size.
+    reference: Pyramid, other: Pyramid, model: Model, coarsest: int, finest: int, matrix: Floats
+) -> tuple[Registration, int]:
+    """Refine a first guess of the motion from a coarse scale to a finer one, in px of the finer one.
 
-    Returns the registration, the number of tiles that agree with it, and their share of the tiles usable in both.
+    Returns the registration and the number of tiles that agree with it.
     """
-    sigma, agree, tried = np.inf, 0, 0
+    sigma, agree = np.inf, 0
     points: Floats = np.zeros((0, 2))
     covariance: Floats = np.zeros((2, 2))
-    for level in range(scales - 1, -1, -1):
+    for level in range(coarsest, finest - 1, -1):
         a, b = reference[level], other[level]
-        points = np.zeros((0, 2))
+        points, corner = np.zeros((0, 2)), a.tiles
         for _ in range(_COARSE_STEPS if level else _STEPS):
-            matches = _match(a, b, a.tiles, matrix)
-            if len(matches.point) < _LEAST_TILES:
+            matches = _match(a, b, corner, matrix)
+            if len(matches.corner) < _LEAST_TILES:
                 break
             update, covariance, sigma = _fit(matches, a.picture.shape, model)
             matrix = matrix @ update
             points = matches.point
             step = transform_points(update, points) - points
-            rest = matches.shift - step
-            agree, tried = int(np.sum(np.hypot(rest[:, 0], rest[:, 1]) < _AGREE_PX)), matches.tried
-            if float(np.abs(step).max()) < _SETTLED_PX * (4 if level else 1):
+            rest, largest = matches.shift - step, float(np.abs(step).max())
+            agree = int(np.sum(np.hypot(rest[:, 0], rest[:, 1]) < _AGREE_PX))
+            if largest < _SETTLED_PX * (4 if level else 1):
                 break
-        if level:
+            if largest < _AGREE_PX:
+                corner = matches.corner
+        if level > finest:
             matrix = scaled(matrix, 2)
+    shape = reference[finest].picture.shape
     if not len(points) or agree < _LEAST_AGREE * len(points):
-        return Registration(np.eye(3), 0.0, np.inf, 0, covariance, reference.shape), 0, 0.0
+        return Registration(np.eye(3), 0.0, np.inf, 0, covariance, shape), 0
     matrix = matrix / matrix[2, 2]
     moved = transform_points(matrix, points) - points
     shift_px = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
-    return Registration(matrix, shift_px, sigma, len(points), covariance, reference.shape), agree, agree / tried
+    return Registration(matrix, shift_px, sigma, len(points), covariance, shape), agree
 
 
 def _match(reference: Level, other: Level, corner: Indices, matrix: Floats) -> _Matches:
-    """Residual shifts of tiles by one Gauss-Newton step.
+    """Estimate the residual shift δ of each tile under a motion, by one Gauss-Newton step.
 
-    It solves reference(x) = gain · (other(x') + ∇·δ) + offset for the shift δ of each tile.
+    It solves reference(x) = gain · (other(x') + ∇·δ) + offset.
     """
     parts = [
         _match_some(reference, other, part, matrix)
         for part in np.split(corner, range(_TILES_AT_ONCE, len(corner), _TILES_AT_ONCE))
     ]
-    point, shift, information, tried = zip(*parts)
-    return _Matches(np.concatenate(point), np.concatenate(shift), np.concatenate(information), sum(tried))
+    return _Matches(*(np.concatenate(values) for values in zip(*parts)))
 
 
-def _match_some(reference: Level, other: Level, corner: Indices, matrix: Floats) -> tuple[Floats, Floats, Floats, int]:
-    """Match some tiles: their centers, shifts and information, and the number of tiles usable in both pictures."""
+def _match_some(reference: Level, other: Level, corner: Indices, matrix: Floats) -> tuple[Indices, Floats, Floats]:
+    """Match some tiles: corners, shifts and information of the tiles that match."""
     height, width = other.picture.shape
     each = np.arange(float(_TILE))
     u, v = coordinates(matrix, corner[:, 1, None, None] + each, corner[:, 0, None, None] + each[:, None])
@@ -257,7 +264,7 @@ def _match_some(reference: Level, other: Level, corner: Indices, matrix: Floats)
     corner, u, v, clear = corner[enough], u[enough], v[enough], clear[enough]
     count = len(corner)
     if not count:
-        return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)), 0
+        return corner, np.zeros((0, 2)), np.zeros((0, 2, 2))
     usable = np.asarray(clear & _windows(reference.usable, corner, _TILE), np.float64)
     patch = _windows(reference.picture, corner - 1, _TILE + 2).astype(np.float64)
     taps = Taps(u.reshape(-1, _TILE), v.reshape(-1, _TILE), (height, width))
@@ -276,15 +283,14 @@ def _match_some(reference: Level, other: Level, corner: Indices, matrix: Floats)
     shift, information = _without_noise(solution[:, :2], normal, pixels, variance)
     good = np.all(np.abs(shift) < _REACH_PX, axis=1) & np.any(information != 0, axis=(1, 2))
     good &= (solution[:, 2] > _GAIN[0]) & (solution[:, 2] < _GAIN[1])
-    center = corner[:, ::-1] + (_TILE - 1) / 2  # x, y
-    return center[good], shift[good], information[good], count
+    return corner[good], shift[good], information[good]
 
 
 def _without_noise(shift: Floats, normal: Floats, count: Floats, variance: Floats) -> tuple[Floats, Floats]:
-    """Tile shifts (T, 2) and information (T, 2, 2), corrected for gradient noise, which makes shifts too small.
+    """Correct the shifts (T, 2) of tiles for noise of their gradients, which makes them too small.
 
-    The normal matrix (T, 4, 4), with gain and offset eliminated, is the sum of the scene's gradients and the noise's:
-    half the variance (T,) of each of `count` (T,) pixels. Directions dominated by noise are left out.
+    `normal` (T, 4, 4) is the normal matrix of each tile; the noise adds half the `variance` (T,) of each of its `count`
+    (T,) pixels. Directions dominated by noise are left out. Also returns the information (T, 2, 2) of the shifts.
     """
     both = np.linalg.inv(np.linalg.inv(normal)[:, :2, :2])
     power, axes = np.linalg.eigh(both)
@@ -329,7 +335,7 @@ def _normalized(point: Floats, shape: tuple[int, ...]) -> Floats:
 
 
 def _design(u: Floats) -> Floats:
-    """Displacement (T, 2, 8) px per parameter at normalized points (T, 2).
+    """Displacement (T, 2, 8) of normalized points (T, 2) per unit of each of the 8 motion parameters.
 
     Parameters 0 and 1 are a translation, 2 and 3 complete a similarity, 4 to 7 a homography.
     """

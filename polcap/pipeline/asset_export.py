@@ -14,7 +14,20 @@ from polcap import parallel
 from polcap.config import Config
 from polcap.errors import SettingError
 from polcap.formats import atomic
-from polcap.formats.export import exr_layers, glb_geometry, gltf, materialx, obj, provenance, texture_set, usd, web_page
+from polcap.formats.export import (
+    exr_layers,
+    glb_geometry,
+    gltf,
+    iiif,
+    materialx,
+    obj,
+    openlime_page,
+    provenance,
+    relightable_layer,
+    texture_set,
+    usd,
+    web_page,
+)
 from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.presets import PRESETS, ExportPreset, Format
@@ -24,12 +37,13 @@ from polcap.images import Asset, Mesh
 from polcap.stages import asset, surface
 
 _Writer = Callable[[], list[Path]]  # returns the files that it has written
+_NEEDED: tuple[Extra, ...] = ("object-normal",)  # by the format `iiif`
 _SHARING = {"obj", "usd", "materialx"}  # formats that share texture files
 
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """Content of an export; with a preset, `formats` is ignored."""
+    """The user's choice for an export: file formats or a preset, and options; with a preset, `formats` is ignored."""
 
     formats: tuple[Format, ...] = ("gltf", "obj")
     preset: str | None = None
@@ -41,6 +55,7 @@ class ExportRequest:
     extras: tuple[Extra, ...] = ()  # textures to make, in addition to the preset's
     texture_size: int | None = None  # px of the longer side; by default each texture's own
     page: Path | None = None  # file with model-viewer's script, for a web page that shows the GLB
+    iiif: str | None = None  # address where the folder of the format `iiif` will be served
     catalog: Mapping[str, str] = field(default_factory=dict)  # fields of `CatalogEntry` in place of the capture's
     lod: int = 0  # number of further GLBs, each with a quarter of the triangles of the previous one
 
@@ -57,7 +72,7 @@ class ExportSource:
 
 @dataclass(frozen=True)
 class DetailLevel:
-    """One level of detail of an asset, and how its mesh was decimated, if it was."""
+    """One level of detail of an asset, and its decimated mesh if it has fewer triangles than the full one."""
 
     asset: Asset
     decimated: surface.DecimatedMesh | None = None
@@ -69,6 +84,10 @@ def check(wanted: ExportRequest) -> None:
     if not {"usd", "usdz"}.isdisjoint(preset.formats):
         usd.require()
     glb_geometry.require(preset.geometry)
+    if "iiif" in preset.formats:
+        iiif.check(wanted.iiif or "")
+        if wanted.texture_size is not None:
+            raise SettingError("--iiif keeps the proportions of the photographs; leave out --texture-size")
     if wanted.page is not None:
         web_page.read_script(wanted.page)
         if "gltf" not in preset.formats or preset.geometry == "draco":
@@ -159,6 +178,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
         "usdz": partial(_write_usdz, folder / f"{stem}.usdz", whole, words, encoder),
         "materialx": partial(_one, materialx.write, folder / f"{stem}.mtlx", whole, stem, shared, comment),
         "exr": partial(_one, exr_layers.write, layered, out / "maps", wanted.color, words),
+        "iiif": partial(_write_iiif, folder / f"{stem}_iiif", whole, words, wanted.iiif or ""),
     }
     coarser = {folder / f"{stem}_lod{k}.glb": level for k, level in enumerate(found[1:], 1)}
     tasks = [writers[one] for one in preset.formats]
@@ -170,7 +190,9 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
         web_page.write(page, glb, web_page.read_script(wanted.page), words.get("title", stem))
         written.append(page)
     sidecar = folder / f"{stem}.provenance.json"
-    provenance.write(sidecar, record, {file.name: provenance.digest(file) for file in written})
+    provenance.write(
+        sidecar, record, {file.relative_to(folder).as_posix(): provenance.digest(file) for file in written}
+    )
     embedded = gltf.textures(whole) if "gltf" in preset.formats else {}
     description = {
         "for": preset.description,
@@ -194,10 +216,7 @@ def _loose_textures(preset: ExportPreset, wanted: ExportRequest, whole: Asset, s
 
 
 def effective(wanted: ExportRequest) -> ExportPreset:
-    """The preset that an export uses.
-
-    That of the request, with the request's other options in place of the preset's.
-    """
+    """The preset that an export uses: the requested one, with its values replaced by the request's other options."""
     if wanted.preset is None:
         preset = ExportPreset(wanted.formats, "normals +Y")
     elif wanted.preset in PRESETS:
@@ -210,7 +229,7 @@ def effective(wanted: ExportRequest) -> ExportPreset:
         geometry=wanted.geometry or preset.geometry,
         triangles=wanted.triangles or preset.triangles,
         bits=wanted.bits or preset.bits,
-        extras=(*preset.extras, *wanted.extras),
+        extras=(*preset.extras, *wanted.extras, *(_NEEDED if "iiif" in preset.formats else ())),
     )
 
 
@@ -231,6 +250,12 @@ def _write_usdz(file: Path, content: Asset, words: Mapping[str, str], encoder: T
     textures = {key: encoder(make(content), "png") for key, make in texture_set.LOOSE.items()}
     usd.package(file, content, file.stem, textures, words)
     return [file]
+
+
+def _write_iiif(folder: Path, content: Asset, words: Mapping[str, str], address: str) -> list[Path]:
+    page = folder / "index.html"
+    openlime_page.write(page, words.get("title") or words["name"], words.get("rights", ""))
+    return [page, *iiif.write(folder, relightable_layer.pictures(content), words, address)]
 
 
 def _write_texture(file: Path, texture: Texture, encoder: TextureEncoder) -> list[Path]:

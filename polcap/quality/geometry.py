@@ -7,6 +7,7 @@ import numpy as np
 from polcap.formats import shipped_data
 from polcap.images import Floats, Mesh, SurfaceMaps
 from polcap.optics import frames, outline
+from polcap.optics.morphology import dilate
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean
@@ -212,7 +213,7 @@ def _edge_blur(found: Evidence) -> float:
     are the tenth of the object with most contrast within 7 px; the sharpest are the twentieth of these.
     """
     light, mask = np.maximum(found.radiance.value[0].sum(-1), 0), found.object_.mask
-    near = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    near = dilate(mask, 4)
     if not near.any():
         return float("nan")
     log = np.log(light + max(_EDGE_FLOOR * float(np.median(light[mask])), 1e-9)).astype(np.float32)

@@ -17,13 +17,14 @@ import numpy as np
 
 from polcap.images import Alignment, AngleStack, Bools, Floats, MaskedImage, ObjectMask, Quality, SurfaceMaps
 from polcap.optics import outline, registration
+from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
 from polcap.optics.warp import warp
 from polcap.stages.align.detail import averaging_step, detail
 
 _MOST_PIXELS = 0.8e6  # a larger picture is averaged down first
 _DETAIL_PX, _COLOR_PX, _BLUR_PX = 4.0, 8.0, 0.7  # 1σ: coarser structure is left out; smoothing before
-_INWARD_PX = 5  # side of the square by which the mask is eroded: the outline does not turn with the surface
+_INWARD_PX = 2  # of the mask that are left out: the outline does not turn with the surface
 _FLOOR = 0.01  # of the 99th percentile of the light, added before the logarithm
 _LEAST_PIXELS = 200
 _PRIOR = np.array([1.0, 1.0, 0.03, 0.03, 0.03, 0.03])  # 1σ of shift [px], zoom [1], roll, tilts [rad]
@@ -49,8 +50,7 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask, map
     step = averaging_step(object_.mask.shape, _MOST_PIXELS)
     relief = _relief(maps, object_, step)
     clipped = np.any(radiance.quality & int(Quality.CLIPPED) > 0, axis=0)
-    inside = cv2.erode((relief > 0).astype(np.uint8), np.ones((_INWARD_PX, _INWARD_PX), np.uint8)) > 0
-    inside &= block_means(clipped, step) == 0
+    inside = erode(relief > 0, _INWARD_PX) & (block_means(clipped, step) == 0)
     if radiance.offset_px is not None or inside.sum() < _LEAST_PIXELS:  # shots cut from one mosaic, or a tiny object
         return found
     field, cell = _displacements(relief, inside)

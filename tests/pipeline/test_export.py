@@ -122,12 +122,30 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, own: P
         (["--preset", "web", "--obj"], "leave out --obj"),
         (["--about", "author=me"], "--about author: there is no such fact; there are title, creator"),
         (["--obj", "--page", ROOT / "README.md"], "README.md is not model-viewer"),
+        (["--iiif", "museum.example/7"], "--iiif museum.example/7 is no web address"),
+        (["--iiif", "http://museum.example/7", "--texture-size", "512"], "leave out --texture-size"),
         (["--exr", "--color", "ACEScq"], "--color ACEScq is not a color space or role"),
     ],
 )
 def test_what_does_not_exist_is_one_line(own: Path, polcap: Command, flags: list[str], says: str) -> None:
     done = polcap("export", own, *flags)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and says in done.stderr
+
+
+def test_relightable_layer_has_the_facts_of_the_catalog_and_is_in_the_sidecar(own: Path, polcap: Command) -> None:
+    done = polcap(
+        "export", own, "--iiif", "http://localhost:8000/", "--about", "title=Vase", "--about", "creator=A. B."
+    )
+    assert done.returncode == 0, done.stderr
+    manifest = json.loads((own / "asset/capture_iiif/manifest.json").read_text())
+    assert manifest["id"] == "http://localhost:8000/manifest.json" and manifest["label"] == {"none": ["Vase"]}
+    assert [one["value"] for one in manifest["metadata"]] == [{"none": ["A. B."]}]
+    files = json.loads((own / "asset/capture.provenance.json").read_text())["files"]
+    written = {Path(line).relative_to(own / "asset").as_posix() for line in done.stdout.splitlines()}
+    assert written - {"capture.provenance.json"} <= set(files)
+    names = ("albedo", "specular", "normal", "gloss")
+    sizes = {cv2.imread(str(own / f"asset/capture_iiif/{name}/full/max/0/default.jpg")).shape[:2] for name in names}
+    assert len(sizes) == 1 and {f"capture_iiif/{name}/full/max/0/default.jpg" for name in names} <= written
 
 
 def test_ktx2_needs_an_encoder_and_says_so(own: Path, polcap: Command) -> None:

@@ -55,9 +55,13 @@ class Page:
         scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
         self.call("Emulation.setEmulatedMedia", features=scheme)
         self.call("Page.navigate", url=file.as_uri())
+        self.wait("document.documentElement?.dataset.ready || ''")
+
+    def wait(self, condition: str) -> None:
+        """Wait until an expression in the page is true."""
         limit = time.monotonic() + LIMIT_S
-        while self.evaluate("document.documentElement?.dataset.ready || ''") == "":
-            assert time.monotonic() < limit, "the page never got ready"
+        while not self.evaluate(condition):
+            assert time.monotonic() < limit, (condition, self.complaints)
             time.sleep(0.05)
 
     def screenshot(self, file: Path) -> None:

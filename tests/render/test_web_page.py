@@ -24,6 +24,7 @@ def test_page_shows_the_object_without_network_or_complaint(tmp_path: Path) -> N
     web_page.write(tmp_path / "ball.html", tmp_path / "ball.glb", web_page.read_script(SCRIPT), "a <ball>")
     with devtools.opened() as page:
         page.call("Page.navigate", url=(tmp_path / "ball.html").as_uri())
+        page.wait("document.readyState === 'complete' && innerWidth > 0")
         limit, red, green = time.monotonic() + devtools.LIMIT_S, 0, 0
         while red == 0:  # until the object is drawn
             assert time.monotonic() < limit, page.complaints

@@ -78,7 +78,7 @@ def encode(texture: Texture, kind: Kind) -> bytes:
     if kind == "ktx2":
         return _ktx2(texture)
     quality = _QUALITY[kind][texture.color]
-    pixels = png.swapped(_eight_bits(texture))
+    pixels = png.swapped(eight_bits(texture))
     if kind == "jpeg":
         if pixels.shape[-1] == 4:
             raise SettingError(f"{texture.meaning}: JPEG holds no fourth channel; choose png or webp")
@@ -103,7 +103,7 @@ def _ktx2(texture: Texture) -> bytes:
         raise SettingError("KTX2 needs `ktx` or `toktx` of Khronos' KTX software on the PATH; choose webp or png")
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "picture.png", Path(folder) / "picture.ktx2"
-        source.write_bytes(png.encode(_eight_bits(texture)))
+        source.write_bytes(png.encode(eight_bits(texture)))
         values = {
             "pixel": "R8G8B8" + "A8" * (texture.pixels.shape[-1] == 4) + ("_SRGB" if texture.color else "_UNORM"),
             "transfer": "srgb" if texture.color else "linear",
@@ -118,7 +118,8 @@ def _ktx2(texture: Texture) -> bytes:
         return target.read_bytes()
 
 
-def _eight_bits(texture: Texture) -> NDArray[np.uint8]:
+def eight_bits(texture: Texture) -> NDArray[np.uint8]:
+    """The pixels of a texture, (H, W) or (H, W, C), as integers of 8 bits."""
     if texture.pixels.dtype == np.uint8:
         return np.asarray(texture.pixels, dtype=np.uint8)
     return np.asarray(np.rint(texture.pixels / 257.0), dtype=np.uint8)

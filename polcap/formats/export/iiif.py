@@ -1,0 +1,154 @@
+"""Writes pictures as a folder that any web server publishes by IIIF: static tiles and a manifest, no image server.
+
+References
+----------
+IIIF Image API 3.0, §5 and compliance level 0; IIIF Presentation API 3.0.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from polcap.errors import SettingError
+from polcap.formats import atomic
+from polcap.formats.export import encoders
+from polcap.formats.export.texture_set import Texture
+from polcap.images import TexturePixels
+from polcap.optics.resize import area_mean
+
+TILE = 512  # px of a tile's sides
+FULL = "full/max/0/default.jpg"  # the whole picture, below the address of its service
+_RIGHTS = ("creativecommons.org/", "rightsstatements.org/")  # the addresses that a manifest's `rights` may hold
+_LABELS = {"creator": "Creator", "license": "License", "object_number": "Identifier"}  # Dublin Core
+
+
+def check(address: str) -> None:
+    """Raise a SettingError for an address that is not one of the web."""
+    if not address.startswith(("http://", "https://")):
+        raise SettingError(
+            f"--iiif {address} is no web address; give that of the folder, such as http://localhost:8000"
+        )
+
+
+def write(folder: Path, pictures: Mapping[str, Texture], facts: Mapping[str, str], address: str) -> list[Path]:
+    """Write tiles, descriptions and manifest of pictures that will be served at `address`.
+
+    `facts` are fields of `CatalogEntry` and the capture's `name`. Returns the manifest, the descriptions and the whole
+    pictures; tiles are parts of these.
+
+    Raises StorageError: a file cannot be written.
+    """
+    address = address.rstrip("/")
+    written = [folder / "manifest.json"]
+    for name, picture in pictures.items():
+        for place, part in _images(picture.pixels):
+            one = Texture(part, picture.color, picture.meaning)
+            atomic.write(folder / name / place, encoders.encode(one, "jpeg"), synced=False)
+        described = folder / name / "info.json"
+        height, width = picture.pixels.shape[:2]
+        _write_json(described, image_information(f"{address}/{name}", width, height))
+        written += [described, folder / name / FULL]
+    _write_json(written[0], manifest(pictures, facts, address))
+    return written
+
+
+def image_information(service: str, width: int, height: int) -> dict[str, Any]:
+    """The image information document of a picture whose service has the address `service`."""
+    factors = _scale_factors(width, height)
+    return {
+        "@context": "http://iiif.io/api/image/3/context.json",
+        "id": service,
+        "type": "ImageService3",
+        "protocol": "http://iiif.io/api/image",
+        "profile": "level0",
+        "width": width,
+        "height": height,
+        "sizes": [{"width": -(-width // factors[-1]), "height": -(-height // factors[-1])}],
+        "tiles": [{"width": TILE, "height": TILE, "scaleFactors": factors}],
+    }
+
+
+def manifest(pictures: Mapping[str, Texture], facts: Mapping[str, str], address: str) -> dict[str, Any]:
+    """The manifest: a canvas for each picture, and the facts of the catalog."""
+    license_ = facts.get("license", "")
+    named = license_.partition("://")[2].removeprefix("www.")
+    stated = {key: facts[key] for key in _LABELS if facts.get(key)}
+    return {
+        "@context": "http://iiif.io/api/presentation/3/context.json",
+        "id": f"{address}/manifest.json",
+        "type": "Manifest",
+        "label": _text(facts.get("title") or facts["name"]),
+        "metadata": [{"label": _text(_LABELS[key], "en"), "value": _text(value)} for key, value in stated.items()],
+        **({"rights": f"http://{named}"} if named.startswith(_RIGHTS) else {}),
+        **(
+            {"requiredStatement": {"label": _text("Rights", "en"), "value": _text(facts["rights"])}}
+            if facts.get("rights")
+            else {}
+        ),
+        "items": [_canvas(name, picture, address) for name, picture in pictures.items()],
+    }
+
+
+def _canvas(name: str, picture: Texture, address: str) -> dict[str, Any]:
+    canvas, service = f"{address}/canvas/{name}", f"{address}/{name}"
+    height, width = picture.pixels.shape[:2]
+    size = {"width": width, "height": height}
+    image = {
+        "id": f"{service}/{FULL}",
+        "type": "Image",
+        "format": "image/jpeg",
+        **size,
+        "service": [{"id": service, "type": "ImageService3", "profile": "level0"}],
+    }
+    annotation = {
+        "id": f"{canvas}/annotation",
+        "type": "Annotation",
+        "motivation": "painting",
+        "body": image,
+        "target": canvas,
+    }
+    page = {"id": f"{canvas}/page", "type": "AnnotationPage", "items": [annotation]}
+    return {
+        "id": canvas,
+        "type": "Canvas",
+        "label": _text(name, "en"),
+        "summary": _text(picture.meaning, "en"),
+        **size,
+        "items": [page],
+    }
+
+
+def _scale_factors(width: int, height: int) -> list[int]:
+    """Powers of two, up to the one by which the picture fits into a tile."""
+    factors = [1]
+    while max(width, height) > TILE * factors[-1]:
+        factors.append(2 * factors[-1])
+    return factors
+
+
+def _images(pixels: TexturePixels) -> Iterator[tuple[str, TexturePixels]]:
+    """Every image that the service has: place below its address, pixels.
+
+    Of an image in one tile viewers ask for the region as `full` or by its numbers, so it has both.
+    """
+    height, width = pixels.shape[:2]
+    yield FULL, pixels
+    for factor in _scale_factors(width, height):
+        reduced = area_mean(pixels, (-(-height // factor), -(-width // factor)))
+        for top in range(0, reduced.shape[0], TILE):
+            for left in range(0, reduced.shape[1], TILE):
+                tile = reduced[top : top + TILE, left : left + TILE]
+                x, y = left * factor, top * factor
+                region = f"{x},{y},{min(TILE * factor, width - x)},{min(TILE * factor, height - y)}"
+                yield f"{region}/{tile.shape[1]},{tile.shape[0]}/0/default.jpg", tile
+    yield f"full/{reduced.shape[1]},{reduced.shape[0]}/0/default.jpg", reduced
+
+
+def _text(words: str, language: str = "none") -> dict[str, list[str]]:
+    """A text as the Presentation API states it, by language."""
+    return {language: [words]}
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    atomic.write(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")

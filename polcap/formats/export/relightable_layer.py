@@ -1,0 +1,46 @@
+"""Makes the pictures of a relightable layer, for viewers that shade an image by Ward's law, such as OpenLIME.
+
+References
+----------
+Ward, Measuring and modeling anisotropic reflection, SIGGRAPH 1992, eq. (4).
+"""
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from polcap.formats.export import encoders, texture_set
+from polcap.formats.export.texture_set import Texture
+from polcap.images import Asset, TexturePixels
+from polcap.optics import color
+
+NO_NORMAL = 128  # a normal of length 0, by which viewers leave a pixel out
+
+
+def pictures(asset: Asset) -> dict[str, Texture]:
+    """Albedo, F0, gloss and normals of an asset as 8-bit pictures of the size of its base color.
+
+    Gloss is 1 - √roughness, so that Ward's slope parameter is (1 - gloss)⁴ = roughness². Outside the object the
+    normal is null and the others are 0. The asset needs its object-space normals.
+    """
+    assert asset.object_normal is not None
+    height, width = asset.base_color.shape[:2]
+    inside = cv2.resize(np.isfinite(asset.mesh.depth).astype(np.uint8), (width, height)) > 0
+    rough = encoders.eight_bits(texture_set.roughness(asset))
+    gloss = np.rint(255 - np.sqrt(255.0 * np.arange(256))).astype(np.uint8)[rough]
+    made = {
+        "albedo": Texture(asset.base_color, True, "base colour, sRGB-encoded Rec.709"),
+        "specular": Texture(color.srgb_eight_bits(texture_set.reflectance(asset)), True, "F0, sRGB-encoded"),
+        "normal": texture_set.object_normal(asset),
+        "gloss": Texture(gloss, False, "gloss, linear: 1 - square root of the perceptual roughness"),
+    }
+
+    def on_object(picture: Texture, outside: int) -> TexturePixels:
+        whole: Any = cv2.resize(encoders.eight_bits(picture), (width, height))
+        return np.where(inside if whole.ndim == 2 else inside[..., None], whole, np.uint8(outside))
+
+    return {
+        name: Texture(on_object(one, NO_NORMAL if name == "normal" else 0), one.color, one.meaning)
+        for name, one in made.items()
+    }

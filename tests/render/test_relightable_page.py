@@ -1,0 +1,121 @@
+"""The IIIF folder in a browser: a deep-zoom viewer finds every tile, and the page moves the light with the pointer."""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import cv2
+import numpy as np
+import pytest
+
+from polcap.formats.export import iiif, openlime_page, relightable_layer
+from polcap.stages import asset
+from tests import surfaces
+from tests.render import browser, devtools
+
+VIEWER = browser.MODULES / "openseadragon" / "build" / "openseadragon" / "openseadragon.min.js"
+TILES = """<!doctype html><meta charset="utf-8"><div id="view" style="width:900px;height:600px"></div>
+<script src="openseadragon.min.js"></script><script>
+const viewer = OpenSeadragon({ id: 'view', tileSources: 'albedo/info.json', showNavigationControl: false });
+const seen = new Set(), failed = [];
+viewer.addHandler('tile-loaded', (event) => seen.add(event.tile.getUrl()));
+viewer.addHandler('tile-load-failed', (event) => failed.push(event.tile.getUrl()));
+viewer.addHandler('open', () => viewer.viewport.zoomTo(viewer.viewport.imageToViewportZoom(1)));
+</script>"""
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """The address of a folder on a web server of its own."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder)))
+    Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+
+
+@contextmanager
+def visited(address: str) -> Iterator[devtools.Page]:
+    """A page of a server of this machine."""
+    with devtools.opened() as page:
+        page.call(
+            "Network.emulateNetworkConditions",
+            offline=False, latency=0, downloadThroughput=-1, uploadThroughput=-1,
+        )  # fmt: skip
+        page.call("Emulation.setDeviceMetricsOverride", width=900, height=600, deviceScaleFactor=1, mobile=False)
+        page.call("Page.navigate", url=address)
+        yield page
+
+
+def write(folder: Path, address: str, scale: int = 1) -> None:
+    maps = surfaces.maps(roughness=0.5, specular=0.04)
+    mesh = surfaces.mesh(maps)
+    built = asset.with_extras(surfaces.built(maps, mesh), maps, mesh.depth, occlusion=False)
+    if scale != 1:
+        built = asset.resize_textures(built, scale * surfaces.WIDTH)
+    iiif.write(folder, relightable_layer.pictures(built), {"name": "ball"}, address)
+    openlime_page.write(folder / "index.html", "A <ball>", "© Museum")
+
+
+def test_a_deep_zoom_viewer_finds_every_tile(tmp_path: Path) -> None:
+    if not VIEWER.exists():
+        pytest.skip("needs `npm ci` in tests/gltf")
+    shutil.copy(VIEWER, tmp_path)
+    (tmp_path / "tiles.html").write_text(TILES)
+    with served(tmp_path) as address:
+        write(tmp_path, address, scale=8)
+        with visited(f"{address}/tiles.html") as page:
+            page.wait("document.readyState === 'complete'")
+            page.wait("viewer.isOpen() && viewer.world.getItemAt(0).getFullyLoaded()")
+            assert page.evaluate("failed.length") == 0
+            asked = set(page.evaluate("[...seen]"))
+    assert f"{address}/albedo/0,0,512,512/512,512/0/default.jpg" in asked  # a tile at full size
+    assert any("/full/" in one or "/0,0,1280," in one for one in asked)  # and the coarsest
+
+
+def test_the_light_follows_the_pointer(tmp_path: Path) -> None:
+    shutil.copy(Path(__file__).parent / "openlime_stand_in.js", tmp_path / openlime_page.SCRIPT)
+    with served(tmp_path) as address:
+        write(tmp_path, address)
+        with visited(f"{address}/index.html") as page:
+            page.wait("document.documentElement?.dataset.ready > 0")
+            pictures = [drawn(page, tmp_path / "middle.png")]
+            for x, y in ((240, 300), (660, 300), (450, 90)):
+                before = page.evaluate("Number(document.documentElement.dataset.ready)")
+                page.move(x, y)
+                page.wait(f"document.documentElement.dataset.ready > {before}")
+                pictures.append(drawn(page, tmp_path / f"{x}_{y}.png"))
+            assert page.evaluate("document.title") == "A <ball>"
+            assert page.complaints == []
+    column, row = (share(picture) for picture in (pictures[2] - pictures[1], pictures[3] - pictures[0]))
+    assert column[0] < 0 < column[1] and row[2] > 0 > row[3]  # right is brighter, and then above
+
+
+def share(difference: np.ndarray) -> tuple[float, ...]:
+    """Mean of the left, right, upper and lower half."""
+    height, width = difference.shape
+    parts = (np.s_[:, : width // 2], np.s_[:, width // 2 :], np.s_[: height // 2], np.s_[height // 2 :])
+    return tuple(float(difference[part].mean()) for part in parts)
+
+
+def drawn(page: devtools.Page, file: Path) -> np.ndarray:
+    page.screenshot(file)
+    return np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), np.float64)[:560]  # above the words
+
+
+def test_without_openlime_the_page_names_the_missing_file(tmp_path: Path) -> None:
+    with served(tmp_path) as address:
+        write(tmp_path, address)
+        with visited(f"{address}/index.html") as page:
+            page.wait("document.readyState === 'complete' && document.getElementById('words') !== null")
+            assert "openlime.min.js" in page.evaluate("document.getElementById('words').textContent")
