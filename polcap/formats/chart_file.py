@@ -63,7 +63,7 @@ def surroundings(rec709: Floats) -> SurroundingPatches:
 
 
 def adapted(xyz: Floats, white_xy: Sequence[float]) -> Floats:
-    """Linear Rec.709 (N, 3) of XYZ (N, 3), white Y = 1, under a white of another chromaticity (Bradford)."""
+    """Convert XYZ (N, 3), Y = 1 for white, under a white of chromaticity `white_xy` to linear Rec.709 (Bradford)."""
     from polcap.optics.colour_science import colour
 
     white = colour.xy_to_XYZ(white_xy), colour.xy_to_XYZ(colour.RGB_COLOURSPACES["sRGB"].whitepoint)

@@ -1,4 +1,4 @@
-"""Figures of the report: the measured numbers of every stage, by subject, as plain JSON values."""
+"""Measures the figures of report.json: numbers on the result of every stage, as plain JSON values."""
 
 import math
 from typing import Any
@@ -56,7 +56,7 @@ def measured(results: Results) -> dict[str, dict[str, Any]]:
 
 
 def rerendering(results: Results, ior: float) -> dict[str, Any]:
-    """Difference between each photograph and the maps rendered under the same light and polarizer angle."""
+    """Figures of the re-rendering: photographs against the maps rendered under the same light and polarizer angle."""
     small = page_data.reduce(results.maps, results.mesh, results.cues, results.radiance.angle, _COMPARED_PX)
     rendered = page_data.rerender(small, ior)
     return {"rms": [_plain(one) for one in rendered.rms(small.maps.mask)], "scale": _plain(rendered.scale)}

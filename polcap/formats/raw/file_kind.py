@@ -134,7 +134,7 @@ def structure(data: bytes | mmap) -> TiffStructure:
 def _entries(data: bytes | mmap, order: str, places: range, most: int) -> Iterator[tuple[int, tuple[int, ...]]]:
     """Tag and whole-number values of the known TIFF directory entries at the byte offsets `places`.
 
-    `most` values in all: an entry with more than remain is skipped. Values of other types are left out: ().
+    At most `most` values are read in all; an entry with more values is skipped. Values of other types become ().
     """
     for at in places:
         tag, form, count = struct.unpack_from(order + "HHI", data, at)

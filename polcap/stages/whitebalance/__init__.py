@@ -124,6 +124,8 @@ def measure(
 
 @dataclass(frozen=True)
 class _Find:
+    """A located chart with its fitted colors."""
+
     place: Placement
     seen: ChartFit
     cost: float  # the detector's; NaN at corners from the user
@@ -236,10 +238,7 @@ def _find(
     settings: WhitebalanceSettings,
     cost: float = float("nan"),
 ) -> _Find:
-    """Sample and fit the colors of a chart at a place of the reference shot.
-
-    The detector's cost is NaN at corners from the user.
-    """
+    """Sample and fit the colors of a chart at a place of the reference shot; `cost` is the detector's."""
     samples = patches.sample(radiance.value[0], radiance.quality[0], place, settings.patch_share)
     return _Find(place, patches.fit(samples, reference), cost)
 

@@ -104,11 +104,11 @@ def position() -> Floats:
 def fit_with_surroundings(
     found: ChartFit, around: PatchSamples, reference: ChartReference
 ) -> tuple[color.MatrixFit, Floats]:
-    """Matrix fit to all patches of a chart of which `found` is the block, and ΔE2000 of the block's patches (24,).
+    """Fit the color matrix to all patches of a large chart: the 24 of its block `found` and the M `around` it.
 
-    The latter with the matrix of all other patches. Surrounding patches are used if they agree with the matrix of the
-    block, because a chart may be partly hidden; if less than half of them do, none is used. Residuals (24 + M,) of the
-    fit are NaN for patches not used.
+    A surrounding patch is used if it agrees with the matrix of the block, because a chart may be partly hidden. If less
+    than half of them agree, none is used. Residuals (24 + M,) of the fit are NaN for patches not used. Also returns the
+    cross-validated ΔE2000 (24,) of the block's patches: each under the matrix of all others.
     """
     others = reference.surroundings
     assert others is not None
@@ -123,9 +123,10 @@ def fit_with_surroundings(
 
 
 def sample(value: Floats, quality: Bits, place: Placement, share: float, at: Floats | None = None) -> PatchSamples:
-    """Sample S0 of each patch in a shot (H, W, 3) with quality (H, W): twice the trimmed mean over its inner part.
+    """Sample S0 of each chart patch in a shot (H, W, 3) with quality (H, W): twice the trimmed mean of its pixels.
 
-    `share` of each patch's side is sampled. `at` as in `Placement.quads`.
+    Only the inner part of a patch is sampled, a square with the share `share` of its side. `at` (M, 2) are the patches'
+    centers, as in `Placement.quads`.
     """
     quads = place.quads(share, at)
     color_, uneven = np.zeros((len(quads), 3)), np.zeros(len(quads))
@@ -164,7 +165,7 @@ def left_out(use: Bits) -> str:
 
 
 def _between_quarters(pixels: Floats, x: Floats, y: Floats) -> float:
-    """Unevenness of a patch: largest difference of light (sum of channels) between a quarter and the whole patch."""
+    """Unevenness of a patch: largest difference of light (sum of channels) between one quarter and the whole patch."""
     light = pixels.sum(axis=1)
     quarter = 2 * (x > 0) + (y > 0)
     means = [np.median(light[quarter == q]) for q in range(4) if (quarter == q).sum() >= 4]
