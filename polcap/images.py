@@ -419,7 +419,7 @@ def single_frames(shots: int) -> BracketMeasurement:
 
 @dataclass(frozen=True)
 class SurroundingPatches:
-    """Patches of a chart of more than 24 patches, around its block of 24."""
+    """Patches of a large chart (ColorChecker SG) around its block of 24 patches."""
 
     rec709: Floats  # (M, 3) linear Rec.709/D65 reflectance
     center: Floats  # (M, 2) column and row in patches from the block's first corner, negative before it
