@@ -417,6 +417,14 @@ def single_frames(shots: int) -> BracketMeasurement:
 
 
 @dataclass(frozen=True)
+class SurroundingPatches:
+    """Patches of a large chart (ColorChecker SG) around its block of 24 patches."""
+
+    rec709: Floats  # (M, 3) linear Rec.709/D65 reflectance
+    center: Floats  # (M, 2) column and row in patches from the block's first corner, negative before it
+
+
+@dataclass(frozen=True)
 class ChartReference:
     """Patch colors of a color chart, from its maker or measured."""
 
@@ -426,6 +434,7 @@ class ChartReference:
     patches: tuple[str, ...] = ()  # (24,) their names
     editions: tuple["ChartReference", ...] = ()  # versions of the chart from other years
     is_block: bool = False  # part of a larger chart, which cannot be searched for
+    surroundings: SurroundingPatches | None = None  # the other patches of that chart
 
 
 @dataclass(frozen=True)
@@ -462,6 +471,7 @@ class PatchColors:
     falloff: tuple[float, float] = (0.0, 0.0)  # relative change of the light per patch, to the right and down
     glare: float = 0.0  # white light that the chart's gloss and the lens add to every patch [reflectance]
     edition: str = ""  # `ChartReference.name` of the edition that fits best
+    surroundings: Floats | None = None  # (M,) residual of the patches around the block; NaN for those left out
 
 
 @dataclass(frozen=True)

@@ -87,6 +87,14 @@ def environment(temporary: Path) -> dict[str, str]:
     return usual | {"TMPDIR": str(temporary), "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
 
 
+def run_polcap(arguments: list[str], folder: Path, environment: dict[str, str]) -> Trace:
+    """System calls of a command that succeeds, run in `folder`."""
+    command = traced([sys.executable, "-m", "polcap", *arguments], folder / "log")
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return read(folder / "log", folder)
+
+
 def outside(paths: set[Path], *folders: Path) -> list[Path]:
     """The paths that lie in none of the folders."""
     return sorted(path for path in paths if not any(path.is_relative_to(folder) for folder in folders))
@@ -119,13 +127,8 @@ def home(request: pytest.FixtureRequest, tmp_path: Path, environment: dict[str, 
 def test_process_asks_no_network_and_writes_only_its_result(
     tmp_path: Path, temporary: Path, environment: dict[str, str]
 ) -> None:
-    out, log = tmp_path / "out", tmp_path / "log"
-    command = [sys.executable, "-m", "polcap", "process", str(EXAMPLE), "--out", str(out)]
-    done = subprocess.run(
-        traced(command, log), cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    seen = read(log, tmp_path)
+    out = tmp_path / "out"
+    seen = run_polcap(["process", str(EXAMPLE), "--out", str(out)], tmp_path, environment)
     assert seen.sockets == []
     assert any(path.parent == out for path in seen.written)
     assert outside(seen.written, out, temporary) == []
@@ -135,15 +138,10 @@ def test_workers_of_a_batch_ask_no_network_and_write_only_their_results(
     tmp_path: Path, temporary: Path, environment: dict[str, str]
 ) -> None:
     """They get a copy of their parent's environment, in which nothing has imported onnxruntime."""
-    captures, out, log = tmp_path / "captures", tmp_path / "out", tmp_path / "log"
+    captures, out = tmp_path / "captures", tmp_path / "out"
     shutil.copytree(EXAMPLE, captures / "one", ignore=shutil.ignore_patterns("polcap"))
     environment["HOME"] = str(tmp_path / "home")
-    command = [sys.executable, "-m", "polcap", "batch", str(captures), "--out", str(out)]
-    done = subprocess.run(
-        traced(command, log), cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    seen = read(log, tmp_path)
+    seen = run_polcap(["batch", str(captures), "--out", str(out)], tmp_path, environment)
     assert seen.sockets == []
     assert any(path.name == "report.json" for path in out.rglob("*"))
     assert outside(seen.written, out, temporary) == []

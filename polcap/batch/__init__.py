@@ -25,7 +25,7 @@ from polcap.formats.capture import layouts
 
 @dataclass(frozen=True)
 class BatchPlan:
-    """Captures to process, and the processes to use."""
+    """How a batch is processed: its shard, scheduler or number of processes, retries, behavior after a failure."""
 
     shard: Shard = WHOLE
     scheduler: str | None = None  # address of a Dask scheduler, or "local"; None: without Dask

@@ -55,9 +55,9 @@ class BatchJob:
         return "polcap-" + (re.sub(r"[^a-z0-9]+", "-", self.root.name.lower()).strip("-")[:40] or "batch")
 
     def shell(self, shard: str = "") -> str:
-        """Shell command (/bin/sh) of one shard; exit code 3 counts as success.
+        """Shell command (/bin/sh) of one shard K/N; "" if environment variables state the shard.
 
-        `shard` is K/N, or empty where environment variables give it.
+        Exit code 3 of polcap becomes 0.
         """
         return f"{shlex.join(self.command)}{shard and ' --shard ' + shard} || test $? -eq 3"
 
@@ -127,7 +127,7 @@ def _command(scheduler: Scheduler, job: BatchJob) -> str:
 
 
 def _json(text: str) -> str:
-    """Text escaped as inside a JSON string, without quotes; Python's string literals read it the same way."""
+    """Escape text for the inside of a JSON string, or of a Python string literal."""
     return json.dumps(text, ensure_ascii=False)[1:-1]
 
 

@@ -48,9 +48,9 @@ class _BatchProcess:
 
 
 def run(wanted: Sequence[Unit], options: ProcessOptions, workers: int, retries: int) -> Iterator[UnitRecord]:
-    """Process captures in several child processes; yields records in the order in which they end.
+    """Process captures in several child processes; yields records in the order in which captures end.
 
-    If its process dies, a capture is retried `retries` times.
+    If its process dies, a capture is processed again, up to `retries` times.
     """
     queue = deque((unit, 1) for unit in wanted)
     children = [_BatchProcess(options) for _ in range(min(workers, len(wanted)))]

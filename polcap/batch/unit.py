@@ -200,10 +200,7 @@ def _alive(pid: int) -> bool:
 
 
 def _write_traceback(unit: Unit) -> str:
-    """Write the traceback of the current exception to a file.
-
-    Returns the file's path, or why it could not be written.
-    """
+    """Write the traceback of the current exception to a file; returns its path, or the reason why it is missing."""
     file, text = unit.record_file.with_suffix(".txt"), traceback.format_exc()
     try:
         atomic.write(file, text)

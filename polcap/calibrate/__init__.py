@@ -10,9 +10,16 @@
     FOLDER/polarizer/axis000/pol000/ polarized light of a known axis (a second polarizer on a lamp, a screen)
                     /pol015/ …       through the filter at every angle of its ring; a second axis gives the sense
 
-Every folder is optional. A module measures one quantity: `photon_transfer` and `bracket_noise` noise,
-`sensor_levels` black and white, `linearity`, `lens_falloff`, `lens_geometry` focal length and distortion,
-`polarizer_ring` extinction, zero and sense, `flash_energy`.
+Every folder is optional. Each module measures one quantity:
+
+    photon_transfer   noise, from flat frames
+    bracket_noise     noise, from exposures of any scene
+    sensor_levels     black and white level
+    linearity         signal against exposure time
+    lens_falloff      light falloff towards the corners
+    lens_geometry     focal length and distortion
+    polarizer_ring    extinction, zero and sense of the polarizer's ring
+    flash_energy      spread and drift of the flash
 """
 
 from pathlib import Path

@@ -1,8 +1,8 @@
 """A sensor's noise at each ISO from exposure brackets of any still scene, without flat frames.
 
-Two exposures of one scene, h₂ = r h₁ but for noise, leave d = h₂ − r h₁, in which the scene cancels: var d / (1 + r²)
-lies on the sensor's noise line at the signal (h₂ + r² h₁) / (1 + r²). Second differences remove slow changes. Where a
-tile has edges, the rest that registration and aliasing leave there is fitted together with the line.
+Two exposures h₁ and h₂ of one scene have the ratio r, so in d = h₂ − r h₁ the scene cancels and noise remains:
+var d / (1 + r²) lies on the sensor's noise line at the signal (h₂ + r² h₁) / (1 + r²). Second differences remove slow
+changes. In tiles with edges, registration errors and aliasing add variance, which is fitted together with the line.
 
 References
 ----------
@@ -57,7 +57,7 @@ def brackets(folder: Path) -> list[list[Photograph]]:
 
 
 def measure(brackets: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
-    """Noise line (variance over signal) of every ISO with two exposures of one bracket.
+    """Measure the noise line (variance over signal) of every ISO that has two exposures in one bracket.
 
     Raises CaptureError if no two frames of a bracket share an ISO, if they moved, or the scene has one brightness.
     """
@@ -89,10 +89,7 @@ def measure(brackets: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
 
 
 def _pair(a: Signals, b: Signals) -> BracketTiles | None:
-    """Signal and variance of tiles of two frames, darker `a` and brighter `b`.
-
-    None if their exposures are too similar.
-    """
+    """Measure signal and variance in tiles of two frames, darker `a` and brighter `b`; None for similar exposures."""
     found = exposure.of_tiles(*exposure.common_tiles(a, b))
     if found is None or not np.all(np.maximum(found.value, 1 / found.value) > _LEAST_RATIO):
         return None
@@ -125,10 +122,7 @@ def _line(iso: float, pairs: list[BracketTiles], sites: Floats, folder: Path) ->
 
 
 def _fit(level: Floats, variance: Floats, edges: Floats, part: NDArray[np.int_]) -> tuple[Floats, Floats]:
-    """Fit one channel's noise line.
-
-    Slope and floor (2,), and their 1σ from the scatter between parts of the picture.
-    """
+    """Fit one channel's noise line: slope and floor (2,), and 1σ from the scatter between parts of the picture."""
     least = 0.05 * float(np.median(variance))
 
     def line(chosen: NDArray[np.bool_]) -> Floats:

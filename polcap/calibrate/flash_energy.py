@@ -11,9 +11,7 @@ _CLIPPED = 0.01
 
 
 def measure(photographs: list[Photograph]) -> FlashEnergy:
-    """Spread (1σ relative to the mean) and drift of the flash energy.
-
-    The largest series with one exposure setting is used.
+    """Measure spread (1σ relative to the mean) and drift of the flash energy, in the largest series of equal settings.
 
     Raises CaptureError for fewer than four frames of one setting, or over-exposed ones.
     """

@@ -1,6 +1,6 @@
 """Light falloff of a lens towards the corners, from flat frames; 1 in the middle.
 
-The surface is never lit quite evenly: a linear slope of its light is fitted together with the radial falloff.
+The light on the surface is never quite even, so its linear slope is fitted together with the radial falloff.
 """
 
 import numpy as np
@@ -16,9 +16,9 @@ _FAINT = 0.02  # of white; below, noise and the error of black matter
 
 
 def measure(flat: list[Photograph]) -> Falloff:
-    """Light falloff of the lens, 1 + a r² + b r⁴ + c r⁶ per channel, r = 1 in the corners.
+    """Measure the light falloff of the lens, 1 + a r² + b r⁴ + c r⁶ per channel, r = 1 in the corners.
 
-    The brightest setting that does not clip is used.
+    The flat frames of the brightest setting that does not clip are used.
 
     Raises CaptureError if every flat frame is clipped or dark.
     """

@@ -1,7 +1,7 @@
 """Focal length and distortion of a lens, from photographs of a tilted checkerboard or ColorChecker.
 
 A flat board at several tilts determines the camera (Zhang); OpenCV's bundle adjustment solves for it. OpenCV finds the
-corners of a checkerboard; on a ColorChecker the centers of the patches are used, for blur does not move them.
+corners of a checkerboard; on a ColorChecker the centers of the patches are used, because blur does not move them.
 
 References
 ----------
@@ -56,7 +56,7 @@ class BoardView:
 
 
 def measure(photographs: list[Photograph], squares: tuple[int, int]) -> LensGeometry:
-    """Focal length, principal point, distortion k₁ and k₂ of a lens, with 1σ.
+    """Measure focal length, principal point, distortion k₁ and k₂ of a lens, with 1σ.
 
     `squares` are the inner corners of the checkerboard, across and down.
 
@@ -127,9 +127,9 @@ def _fit_lens(boards: list[BoardView], size: tuple[int, int], first: Photograph,
 def _bundle_adjustment(
     boards: list[BoardView], size: tuple[int, int], flags: int
 ) -> tuple[float, Floats, Floats, Floats]:
-    """Fit the camera to the board's points.
+    """Fit the camera to the board's points by bundle adjustment.
 
-    Returns rms residual [px], camera matrix (3, 3), k₁ k₂ …, and 1σ of fx fy cx cy k₁ k₂ (…).
+    Returns rms residual [px], camera matrix (3, 3), distortion k₁ k₂ …, and 1σ of fx fy cx cy k₁ k₂ ….
     """
     width, height = size
     guess = np.array([[1.4 * width, 0, (width - 1) / 2], [0, 1.4 * width, (height - 1) / 2], [0, 0, 1]])
@@ -147,10 +147,7 @@ def _bundle_adjustment(
 
 
 def _checkerboard(image: SensorImage, squares: tuple[int, int]) -> BoardView | None:
-    """Detect a checkerboard's inner corners, row by row.
-
-    They are refined in linear light, because gamma moves edges.
-    """
+    """Detect a checkerboard's inner corners, row by row, refined in linear light (gamma would move edges)."""
     found, corners = cv2.findChessboardCornersSB(_gray(image), squares, flags=cv2.CALIB_CB_ACCURACY)
     if not found:
         return None
@@ -208,7 +205,7 @@ def _color_checker(image: SensorImage) -> BoardView | None:
 def _patch_center(light: Floats, place: Floats, center: Floats) -> Floats | None:
     """Center (2,) px of a patch near chart coordinates `center`; None if it is hardly brighter than the card.
 
-    Centroid of the light above the card's, in chart coordinates, so that tilt does not move it.
+    It is the centroid of the light above the card's, computed in chart coordinates, so that tilt does not move it.
     """
     step = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
     far = np.maximum(np.abs(step)[:, None], np.abs(step))

@@ -10,11 +10,10 @@ _LEAST = 0.02  # of white; below, the error of black matters more than a curve
 
 
 def measure(flat: list[Photograph]) -> Linearity | None:
-    """Deviation of the sensor from linearity, at the ISO and aperture with most exposure times.
+    """Measure the deviation of the sensor from linearity; None with fewer than three exposure times.
 
-    None with fewer than three.
-
-    Shutter times are true to one or two percent; larger deviations come from the sensor.
+    The ISO and aperture with most exposure times are used. Shutter times have errors of one or two percent; larger
+    deviations come from the sensor.
     """
     groups: dict[tuple[float, float], list[tuple[float, float]]] = {}
     for (iso, time, aperture), photographs in by_setting(flat).items():

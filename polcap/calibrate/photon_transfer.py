@@ -1,7 +1,7 @@
 """Photon transfer: a sensor's noise at each ISO, from pairs of flat frames and of dark frames.
 
-Two frames of the same thing differ by noise alone: dust, lens and uneven pixels cancel. Per channel the variance is a
-straight line over the signal; the slope is the inverse of the electrons at white, the floor is the read noise.
+Two frames of the same surface differ by noise alone: dust, lens and uneven pixels cancel. The variance of a channel is
+a straight line over its signal. The slope is the inverse of the electrons at white, the floor is the read noise.
 
 References
 ----------
@@ -23,7 +23,7 @@ _LEAST_RANGE = 2.0  # brightest over darkest tile: a line needs two ends
 
 
 def measure(flat: list[Photograph], dark: list[Photograph]) -> tuple[NoiseLine, ...]:
-    """Noise line (variance over signal) of every ISO with a pair of flat frames.
+    """Measure the noise line (variance over signal) of every ISO that has a pair of flat frames.
 
     Raises CaptureError if no two flat frames have the same setting, or all have one brightness.
     """
@@ -98,9 +98,9 @@ def _line(iso: float, points: list[tuple[Floats, Floats, Floats]], where: Photog
 def noise_line(
     iso: float, slope: tuple[Floats, Floats], floor: tuple[Floats, Floats], sites: Floats, source: str
 ) -> NoiseLine:
-    """Noise line from slope and floor (C,) with their 1σ.
+    """Make a noise line from slope and floor, (C,) each with 1σ, of pixels that average `sites` (C,) photosites.
 
-    Its electrons are those of one of the photosites, `sites` (C,) per pixel.
+    Its electron numbers are those of one photosite.
     """
     electrons = 1 / (slope[0] * sites)
     height = np.maximum(floor[0], 0.0)

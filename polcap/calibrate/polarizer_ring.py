@@ -1,7 +1,8 @@
 """Extinction ratio, zero and sense of a polarizer on its ring, from polarized light of a known axis.
 
-I(θ) = a (1 + c cos 2(s θ + z − α)) for light of axis α and a filter with its axis at s θ + z for the ring angle θ.
-c gives the extinction ratio E = (1 + c)/(1 − c), the phase the zero z; the sense s = ±1 needs light of two axes.
+At the ring angle θ the filter's axis is at s θ + z. The intensity of light polarized along α is then
+I(θ) = a (1 + c cos 2(s θ + z − α)). The contrast c gives the extinction ratio E = (1 + c)/(1 − c), the phase gives the
+zero z. To find the sense s = ±1, light of two axes is needed.
 
 References
 ----------
@@ -45,7 +46,7 @@ class _MalusFit:
 
 
 def measure(turned: list[PolarizerShot]) -> Polarizer:
-    """Extinction ratio, zero and sense of a polarizer on its ring, from light of all known axes.
+    """Measure extinction ratio, zero and sense of a polarizer on its ring, from light of all known axes.
 
     Raises CaptureError for too few angles, unequal exposures, or light that is not polarized.
     """

@@ -11,7 +11,7 @@ _DARK = 0.05  # of white; a frame above is not dark
 
 
 def measure(dark: list[Photograph], bright: list[Photograph]) -> Levels:
-    """Black level of each photosite of the mosaic's pattern, and the count at which frames saturate, if some do.
+    """Measure the black level of each photosite of the mosaic's pattern, and the saturated count, if frames saturate.
 
     Raises CaptureError if a dark frame is not dark.
     """

@@ -82,9 +82,9 @@ def batch(
 
 
 def _check_model(estimator: Literal["network", "analytic"] | None, model: Path | None) -> None:
-    """Refuse an unusable model once, before any capture is processed; ModelError, SettingError.
+    """Refuse an unusable model before any capture is processed. Raises ModelError, SettingError.
 
-    On the CPU: this machine may lack the workers' GPU.
+    The model is tried on the CPU, because the GPU may be in other machines.
     """
     from polcap.pipeline import models
 

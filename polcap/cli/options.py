@@ -1,4 +1,4 @@
-"""Options that several commands share, and the values they stand for."""
+"""Options that several commands share, and the functions that parse them."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -82,7 +82,7 @@ def numbers(flag: str, text: str) -> tuple[float, ...]:
 
 
 def catalog_fields(stated: Sequence[str]) -> dict[str, str]:
-    """--about: fields of `CatalogEntry`; SettingError for another one."""
+    """Parse --about K=V: fields of `CatalogEntry` by name. Raises SettingError for an unknown field."""
     from polcap.images import CatalogEntry
 
     known = [field.name for field in fields(CatalogEntry)]
@@ -94,7 +94,7 @@ def catalog_fields(stated: Sequence[str]) -> dict[str, str]:
 
 
 def extra_textures(named: Sequence[str]) -> "tuple[Extra, ...]":
-    """--extra: names of further textures; SettingError for another one."""
+    """Parse --extra: names of further textures. Raises SettingError for an unknown name."""
     from polcap.formats.export.texture_set import EXTRAS
 
     for name in named:
@@ -104,7 +104,7 @@ def extra_textures(named: Sequence[str]) -> "tuple[Extra, ...]":
 
 
 def texture_bits(bits: int | None) -> Literal[8, 16] | None:
-    """--bits; SettingError for another number."""
+    """Check --bits: 8 or 16. Raises SettingError for another number."""
     if bits not in (None, 8, 16):
         raise SettingError(f"--bits {bits}: PNG has 8 or 16 bits")
     return None if bits is None else 8 if bits == 8 else 16

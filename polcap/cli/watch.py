@@ -8,7 +8,7 @@ from polcap.errors import GateError, InputError, SettingError
 
 
 def at_every_change(capture: Path, target: Path, config: Path | None, once: Callable[[], None]) -> None:
-    """Call `once` now, and after each change of the capture folder or the settings file; its errors are printed.
+    """Call `once` now and after each change of the capture folder or the settings file; print its errors.
 
     Raises SettingError if there is no such folder, or the settings are wrong from the start.
     """

@@ -1,4 +1,4 @@
-"""`polcap doctor`: checks software, models, devices and disk of this machine: ok, warning or fault, with a remedy.
+"""`polcap doctor`: checks software, models, devices and disk of this machine; each is ok, a warning or a fault.
 
 Only a fault keeps `polcap process` from working.
 """

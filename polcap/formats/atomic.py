@@ -1,7 +1,7 @@
 """Writes a file or folder completely or not at all (temporary name, then rename); turns any text into a safe file name.
 
-It is written under a temporary name, synced to the disk and renamed, so the final name always leads to a complete
-file. The new name reaches the disk with the system's next journal write; after a power cut the old file may be back.
+A file is written under a temporary name, synced to the disk and renamed. So the final name always leads to a complete
+file. The new name reaches the disk with the system's next journal write; after a power cut the old file may be there.
 """
 
 import errno
@@ -33,7 +33,7 @@ REASONS = {
 
 
 def failure(target: Path, error: OSError) -> StorageError:
-    """The StorageError for an OSError of writing the file `target`: path, reason and, where known, a remedy."""
+    """The StorageError to raise for an OSError while writing the file `target`, with reason and remedy if known."""
     reason = REASONS.get(error.errno or 0, error.strerror or str(error))
     return StorageError(f"cannot write {target}: {reason}")
 
@@ -41,7 +41,7 @@ def failure(target: Path, error: OSError) -> StorageError:
 def write(final: str | Path, content: str | bytes, synced: bool = True) -> None:
     """Write `content` into the file `final`, completely or not at all; text is encoded as UTF-8.
 
-    Options and StorageError as for `path`.
+    Without `synced` the file may be incomplete after a power cut. Raises StorageError as `path` does.
     """
     if isinstance(content, str):
         content = content.encode("utf-8", "backslashreplace")  # the name of a file may not be text
@@ -126,7 +126,7 @@ def discard(target: Path) -> None:
 def safe_name(text: str) -> str:
     """Turn any text into a valid file name: forbidden characters become _.
 
-    Never empty, hidden or a reserved device name.
+    The name is never empty, hidden, or a reserved device name such as CON.
     """
     name = "".join("_" if c in _FORBIDDEN or not c.isprintable() else c for c in text)
     name = name.encode("utf-8", "replace")[:_NAME_BYTES].decode("utf-8", "ignore")

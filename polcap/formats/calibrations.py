@@ -106,7 +106,7 @@ def choose(exif: Exif, lens_filter: str | None, focal_length_mm: float | None) -
 
 
 def _alike(*pairs: tuple[float | None, float | None]) -> bool:
-    """Whether two lens settings (aperture or focal length) are equal in each pair; an unknown value equals any."""
+    """Whether the lens settings (aperture or focal length) of each pair are equal; an unknown value equals any."""
     return all(not one or not other or abs(one / other - 1) < _SAME_SETTING for one, other in pairs)
 
 

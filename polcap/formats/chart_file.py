@@ -14,10 +14,12 @@ import numpy as np
 
 from polcap.errors import ChartError
 from polcap.formats import text_file
-from polcap.images import ChartReference, Floats
+from polcap.images import ChartReference, Floats, SurroundingPatches
 from polcap.optics.color import REC709_TO_XYZ
 
+_SG = [f"{column}{row}" for row in range(1, 11) for column in "ABCDEFGHIJKLMN"]  # patches of an SG, row by row
 SG_BLOCK = tuple(f"{column}{row}" for row in (2, 3, 4, 5) for column in "EFGHIJ")  # of an SG: a Classic's colors
+SG_SURROUNDINGS = tuple(name for name in _SG if name not in SG_BLOCK)
 _MOST_BYTES = 4 << 20
 _BY_ROW = [f"{row}{column}" for row in "ABCD" for column in range(1, 7)]  # names of a Classic's patches, both ways
 _BY_COLUMN = [f"{column}{row}" for row in range(1, 5) for column in "ABCDEF"]
@@ -30,7 +32,7 @@ Rows = list[list[str]]
 
 
 def read(path: Path) -> ChartReference:
-    """Colors of a measured ColorChecker Classic (24 patches), or of the block E2 to J5 of a measured SG.
+    """Colors of a measured ColorChecker Classic (24 patches), or of a measured SG, at least its block E2 to J5.
 
     Raises
     ------
@@ -48,11 +50,20 @@ def read(path: Path) -> ChartReference:
     except ValueError as error:
         raise ChartError(f"whitebalance.chart = {path}: {error}") from None
     names = SG_BLOCK if is_block else tuple(str(number) for number in range(1, 25))
-    return ChartReference(f"measured chart {path.name}", rec709[order], None, names, is_block=is_block)
+    named, around = _named(columns, rows), None
+    if is_block and all(name in named for name in SG_SURROUNDINGS):
+        around = surroundings(rec709[[named[name] for name in SG_SURROUNDINGS]])
+    return ChartReference(f"measured chart {path.name}", rec709[order], None, names, (), is_block, around)
+
+
+def surroundings(rec709: Floats) -> SurroundingPatches:
+    """The patches SG_SURROUNDINGS (116, 3) of an SG, with their places around its block, which begins at E2."""
+    center = [(ord(name[0]) - ord("E") + 0.5, int(name[1:]) - 1.5) for name in SG_SURROUNDINGS]
+    return SurroundingPatches(rec709, np.array(center))
 
 
 def adapted(xyz: Floats, white_xy: Sequence[float]) -> Floats:
-    """Linear Rec.709 (N, 3) of XYZ (N, 3), white Y = 1, under a white of another chromaticity (Bradford)."""
+    """Convert XYZ (N, 3), Y = 1 for white, under a white of chromaticity `white_xy` to linear Rec.709 (Bradford)."""
     from polcap.optics.colour_science import colour
 
     white = colour.xy_to_XYZ(white_xy), colour.xy_to_XYZ(colour.RGB_COLOURSPACES["sRGB"].whitepoint)
@@ -124,14 +135,18 @@ def _numbers(rows: Rows, places: list[int]) -> Floats:
     return found
 
 
-def _order(columns: list[str], rows: Rows) -> tuple[list[int], bool]:
-    """Rows of the 24 patches, from dark skin row by row, and whether they are the block of an SG."""
-    named: dict[str, int] = {}
+def _named(columns: list[str], rows: Rows) -> dict[str, int]:
+    """Row of each patch by its name, such as A1; empty if no column has such names."""
     for at in range(len(columns)):
         found = [_PATCH.fullmatch(row[at].strip()) for row in rows]
         if found and all(found):
-            named = {f"{match[1].upper()}{int(match[2])}": number for number, match in enumerate(found) if match}
-            break
+            return {f"{match[1].upper()}{int(match[2])}": number for number, match in enumerate(found) if match}
+    return {}
+
+
+def _order(columns: list[str], rows: Rows) -> tuple[list[int], bool]:
+    """Rows of the 24 patches, from dark skin row by row, and whether they are the block of an SG."""
+    named = _named(columns, rows)
     for names in (_BY_ROW, _BY_COLUMN, SG_BLOCK):
         if all(name in named for name in names) and (names is SG_BLOCK or len(rows) == len(names)):
             return [named[name] for name in names], names is SG_BLOCK

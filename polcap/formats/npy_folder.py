@@ -110,10 +110,7 @@ def _expect(holds: bool, tree: Any, wanted: str, folder: Path) -> None:
 
 
 def save(file: Path, array: NDArray[Any]) -> list[Any]:
-    """Write an array of any shape as an .npy file and return its `checksum`.
-
-    Unlike numpy.save, an error states its cause.
-    """
+    """Write an array of any shape as an .npy file and return its `checksum`; an OSError states its cause."""
     array = np.asarray(array, order="C")
     head = io.BytesIO()
     np.lib.format.write_array_header_2_0(head, np.lib.format.header_data_from_array_1_0(array))
@@ -126,7 +123,7 @@ def save(file: Path, array: NDArray[Any]) -> list[Any]:
 
 
 def load(file: Path) -> NDArray[Any]:
-    """Open an .npy file, an array of any shape: as a read-only memory map if large, else read into memory.
+    """Open an array of any shape from an .npy file: as a read-only memory map if large, else read into memory.
 
     Raises StorageError: the file is missing or no .npy.
     """

@@ -8,9 +8,9 @@ A model states in its metadata which input it takes, and its licence:
     size_multiple  height and width must be multiples of this
     licence        SPDX name of the weights' licence
 
-A file without these is refused. A model that polcap does not ship is first run on a small picture in the limited
-child process: a crash, a loop or a lack of memory ends there. In this process every run has a time limit.
-The only module that imports onnxruntime: in `_onnxruntime`, which turns its telemetry off.
+A file without these is refused. A model that polcap does not ship is first run on a small picture in a child process
+with limits, so that a crash, an endless loop or a lack of memory cannot end polcap. Every run has a time limit. No
+other module imports onnxruntime; `_onnxruntime` turns its telemetry off.
 """
 
 import os
@@ -45,8 +45,8 @@ _MAX_NUMBER = 1 << 16  # px; of a size in the metadata
 def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: str = ENCODING) -> Network:
     """Open an ONNX network; a model that polcap does not ship is first tried in a child process.
 
-    `device` cuda fails where CUDA is missing or does not start; auto uses it where it starts. `threads` 0 is as many
-    as polcap may use. `encoding` is the version of the channels that the model must take.
+    With `device` "cuda" it is an error if CUDA does not start; "auto" uses the CPU then. `threads` 0 means all that
+    polcap may use. `encoding` is the version of the input channels that the model must expect.
 
     Raises ModelError: the file is missing or no model that this runtime can run, its metadata are missing or of another
     encoding, or there is no such device.
@@ -209,7 +209,7 @@ def _check(path: Path, session: Any, encoding: str) -> tuple[tuple[str, ...], di
 def _onnxruntime() -> Any:
     """Import onnxruntime with its telemetry (a device id in the home folder, events sent to its maker) turned off.
 
-    It reads the variable when it is first imported; child processes inherit it.
+    An environment variable turns it off; onnxruntime reads it at its first import, and child processes inherit it.
     """
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime

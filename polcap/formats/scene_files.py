@@ -15,8 +15,8 @@ from polcap.optics.resize import area_mean
 def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int64]]:
     """Read a triangle mesh: vertices (V, 3), in the file's unit and axes, and faces (F, 3).
 
-    An .npz holds `vq` uint16 (V, 3), position = vq/65535·vscale + vmin, and `faces`. Of a scene of
-    several meshes all are read, each in its place.
+    An .npz has `faces` and `vq` uint16 (V, 3), with position = vq/65535·vscale + vmin. If a file has several meshes,
+    all are read, each at its position.
 
     Raises DecodeError: the file is missing, of an unknown format, damaged, or holds no triangle.
     """
@@ -46,8 +46,8 @@ def _any(path: Path) -> tuple[Floats, NDArray[np.int64]]:
 def read_textures(folder: Path, side: int = 256) -> Floats:
     """Read a texture set: linear albedo (3), roughness, and relief slopes along columns and rows, (6, side, side).
 
-    albedo.jpg (sRGB) and roughness.jpg must be there; normal.jpg (tangent space, green down as in DirectX) or
-    height.jpg may be.
+    albedo.jpg (sRGB) and roughness.jpg are required; normal.jpg (tangent space, green down as in DirectX) or height.jpg
+    is optional.
 
     Raises DecodeError: a picture is missing or cannot be read.
     """

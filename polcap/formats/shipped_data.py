@@ -7,14 +7,14 @@ import numpy as np
 
 from polcap.errors import StorageError
 from polcap.formats import chart_file, text_file
-from polcap.images import ChartReference
+from polcap.images import ChartReference, Floats
 from polcap.optics.color import decode_srgb
 
 _NAMES = {
     "classic": "ColorChecker Classic (since November 2014)",
     "classic_before_2014": "ColorChecker Classic (before November 2014)",
     "classic_srgb": "ColorChecker Classic (the maker's sRGB values)",
-    "sg": "ColorChecker SG, block E2 to J5 (since November 2014)",
+    "sg": "ColorChecker SG (since November 2014)",
 }
 _TABLES = {  # of colour-science
     "classic": "ColorChecker24 - After November 2014",
@@ -54,7 +54,8 @@ def colorchecker(kind: str = "classic") -> ChartReference:
     """Reference colors of a ColorChecker: classic, classic_before_2014, classic_srgb, sg, or a file of measurements.
 
     The maker's measurements under D50 as tabulated by colour-science, adapted to D65 (Bradford). classic_srgb is
-    the maker's sRGB table, a file of ours. Of an SG it is the block E2 to J5, which repeats the Classic's colors.
+    the maker's sRGB table, a file of ours. Of an SG the block E2 to J5 repeats the Classic's colors; its other patches
+    are the reference's `surroundings`.
     """
     if kind not in _NAMES:
         return chart_file.read(Path(kind))
@@ -67,11 +68,16 @@ def colorchecker(kind: str = "classic") -> ChartReference:
         return ChartReference(_NAMES[kind], decode_srgb(np.array(file.srgb) / 255), None, names)
     table = colour.CCS_COLOURCHECKERS[_TABLES[kind]]
     keys = chart_file.SG_BLOCK if kind == "sg" else tuple(table.data)
+
+    def colors(of: tuple[str, ...]) -> Floats:
+        return chart_file.adapted(colour.xyY_to_XYZ([table.data[key] for key in of]), table.illuminant)
+
     return ChartReference(
         name=_NAMES[kind],
-        rec709=chart_file.adapted(colour.xyY_to_XYZ([table.data[key] for key in keys]), table.illuminant),
+        rec709=colors(keys),
         size_m=_CLASSIC_SIZE_M if kind == "classic" else None,
         patches=tuple(f"{key} {name}" for key, name in zip(keys, names, strict=True)) if kind == "sg" else names,
         is_block=kind == "sg",
+        surroundings=chart_file.surroundings(colors(chart_file.SG_SURROUNDINGS)) if kind == "sg" else None,
         editions=tuple(map(colorchecker, _EDITIONS)) if kind == "classic" else (),
     )

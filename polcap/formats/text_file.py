@@ -1,7 +1,7 @@
 """Reads TOML and JSON files from untrusted sources, and explains errors in their keys.
 
-Files are UTF-8, with or without a byte order mark. The reader gets plain data, or an `OSError` or `ValueError` of one
-line: a pipe, a huge file, deep nesting and infinite numbers are refused.
+Files are UTF-8, with or without a byte order mark. The functions return plain data, or raise an `OSError` or a
+`ValueError` with a message of one line. A pipe, a huge file, deep nesting and infinite numbers are refused.
 """
 
 import difflib
@@ -43,7 +43,7 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
 
 
 def read_toml(path: str | Path, finite: bool = True) -> dict[str, Any]:
-    """Read a TOML file from an untrusted source as plain data. Unless `finite`, its numbers may be NaN.
+    """Read a TOML file from an untrusted source as plain data; with `finite`, NaN and infinity are errors.
 
     Raises OSError or ValueError.
     """

@@ -1,4 +1,4 @@
-"""Physics and image mathematics that several packages use; NumPy or torch arrays alike where stated."""
+"""Physics and image mathematics that several packages use; where stated, for NumPy and torch arrays."""
 
 from polcap.errors import SettingError
 

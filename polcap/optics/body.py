@@ -36,10 +36,7 @@ _SEEN = 0.25  # least cosine at which the shading is fitted: zenith angles up to
 
 @dataclass(frozen=True)
 class Law:
-    """Parameters of the diffuse reflection of each pixel.
-
-    Rough or smooth interface, spread of light inside, factor on the DoLP.
-    """
+    """Parameters of the diffuse reflection of each pixel: roughness of the interface, spread of light inside, DoLP."""
 
     rough: Any = 0.0  # α for diffuse reflection over α of the gloss; 0: a smooth interface
     local: Any = 0.0  # 0…1: share of light that leaves through the facet by which it entered
@@ -54,12 +51,10 @@ SMOOTH = Law()
 
 
 def leaving(c: Any, alpha: Any, ior: Any, local: Any = 0.0) -> tuple[Any, Any]:
-    """Diffuse light through visible facets.
-
-    Mean transmittance T₊, and its part polarized along the projected normal.
+    """Transmittance of diffuse light through the visible facets: mean T₊, and the part polarized along the normal.
 
     c (...,) is the cosine of the zenith angle, alpha the GGX α 0…1, ior the refractive index, local `Law.local`; all
-    broadcast.
+    broadcast. Both results have their shape (...,).
     """
     plus, minus = fresnel.transmission(c, ior)
     extra, even, weighted = _interpolate_table(c, alpha, ior)
@@ -74,13 +69,12 @@ def dolp(c: Any, alpha: Any, ior: Any, local: Any = 0.0) -> Any:
 
 
 def flattening(cos_i: Any, cos_o: Any, between: Any, alpha: Any) -> Any:
-    """Factor (...,) on Lambert's shading of a rough surface with `local` 1.
+    """Factor (...,) on Lambert's shading by which rough surfaces (`local` 1) look flatter; 1 facing the camera.
 
-    It is 1 where the surface faces the camera.
-
-    Facets that face a light near the camera brighten the occluding contour: 1 + B(α) sin θᵢ sin θₒ max(0, cos Δφ) /
-    (g (1 + g)), g = max(cos θᵢ, cos θₒ), close to Oren & Nayar's form; B is fitted to the facets. With the flash at
-    the lens it is 1 + B (1/cos θ − 1). Oren & Nayar's A is 1 here: albedo is that of a surface facing the camera.
+    Under a light near the camera, facets that face the light brighten surfaces near the occluding contour. The factor
+    is 1 + B(α) sin θᵢ sin θₒ max(0, cos Δφ) / (g (1 + g)), g = max(cos θᵢ, cos θₒ), close to Oren & Nayar's form; B is
+    fitted to the facets. With the flash at the lens it is 1 + B (1/cos θ − 1). Oren & Nayar's A is 1 here, because
+    albedo is that of a surface facing the camera.
 
     cos_i and cos_o (...,) are the cosines of light and camera against the normal, between (...,) the cosine of the
     angle from light to camera, alpha (...,) the GGX α 0…1.
@@ -90,12 +84,6 @@ def flattening(cos_i: Any, cos_o: Any, between: Any, alpha: Any) -> Any:
     greater = xp.where(cos_i > cos_o, cos_i, cos_o)
     greater = xp.clip(greater, _GRAZING, None)
     return 1 + strength * xp.clip(between - cos_i * cos_o, 0.0, None) / (greater * (1 + greater))
-
-
-def make_tables() -> None:
-    """Compute the tables of `leaving` and `flattening` in advance; it takes 0.3 s."""
-    _table()
-    _strengths()
 
 
 def _interpolate_table(c: Any, alpha: Any, ior: Any) -> tuple[Any, Any, Any]:
@@ -121,7 +109,7 @@ def _interpolate(xp: Any, values: Any, x: Any, nodes: Floats) -> Any:
 
 
 def _step(xp: Any, x: Any, nodes: Floats) -> tuple[Any, Any]:
-    """Index of the node before each x, and the fraction 0…1 of the way to the next; x is clipped to the nodes."""
+    """Index of the node below each x, and the fraction 0…1 of the way to the next node; x is clipped to the nodes."""
     place = xp.clip((x - float(nodes[0])) * ((len(nodes) - 1) / float(nodes[-1] - nodes[0])), 0.0, len(nodes) - 1.0)
     at = xp.astype(xp.clip(xp.floor(place), 0.0, len(nodes) - 2.0), xp.int64)
     return at, place - at
@@ -131,8 +119,8 @@ def _step(xp: Any, x: Any, nodes: Floats) -> tuple[Any, Any]:
 def _table() -> Floats:
     """Table of diffuse reflection, (3, 21, 49, 3): refractive index, α, cosine of the zenith angle, value.
 
-    The values are ⟨T₊⟩ − T₊ (⟨ ⟩: mean over the visible facets; T₊ alone: of the smooth interface), and the DoLP
-    relative to that of the smooth interface, for `Law.local` 0 and 1.
+    The three values compare a rough interface with the smooth one: its mean transmittance T₊ minus that of the smooth
+    interface, and its DoLP over that of the smooth interface, for `Law.local` 0 and 1.
     """
     out = np.zeros((len(_INDICES), len(_ALPHAS), len(_COSINES), 3))
     out[..., 1:] = 1.0

@@ -19,6 +19,8 @@ REC709_TO_XYZ = np.array(
     [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]], dtype=np.float64
 )
 LUMINANCE = REC709_TO_XYZ[1]  # Y of linear Rec.709
+_ROUNDS = 20  # of reweighting the patches
+_TRIES = 60  # random starts of the least trimmed squares
 _RIDGE = 1e-12  # added to the scaled normal equations, so that too few colors raise no error
 _LEVELS = 65535  # of linear light; one is 1/20 of an 8-bit step where the curve is steepest
 
@@ -87,9 +89,7 @@ class MatrixFit:
     delta_e: Floats  # (N,) CIEDE2000; NaN for patches not used
 
 
-def fit_matrix(
-    color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], rounds: int = 20
-) -> MatrixFit:
+def fit_matrix(color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_]) -> MatrixFit:
     """Fit a camera's matrix M, with light of slope e and glare b: M c = (1 + e·x) r + b (1, 1, 1).
 
     color and reference (N, 3) are the patches in camera channels c and linear Rec.709 r. position (N, 2) is their
@@ -103,35 +103,36 @@ def fit_matrix(
     chart near its highlight 0.97 and 0.09. A root-polynomial (Finlayson et al., IEEE TIP 2015) or curved light
     improves nothing there.
     """
-    matrix, slope, glare = _fit_weighted(color, reference, position, usable, rounds)
+    matrix, slope, glare = _fit_weighted(color, reference, position, usable)
     corrected = _reflectance(color, position, matrix, slope, glare)
     residual = np.where(usable, delta_e(corrected, reference), np.nan)
     return MatrixFit(matrix=matrix, slope=slope, glare=float(glare), delta_e=residual)
 
 
-def cross_validate(
-    color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], rounds: int = 20
-) -> Floats:
+def residuals(fit: MatrixFit, color: Floats, reference: Floats, position: Floats) -> Floats:
+    """CIEDE2000 (N,) of patches that were not used for the fit; arguments as of `fit_matrix`."""
+    return delta_e(_reflectance(color, position, fit.matrix, fit.slope, np.asarray(fit.glare)), reference)
+
+
+def cross_validate(color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_]) -> Floats:
     """CIEDE2000 (N,) of each usable patch under the matrix fitted to all others; NaN for patches not used.
 
-    This is the error for colors outside the fit. It needs 13 usable patches; arguments of `fit_matrix`.
+    This is the error to expect for colors outside the fit. It needs 13 usable patches. Arguments as of `fit_matrix`.
     """
     left_out = np.flatnonzero(usable)
     others = usable & (np.arange(len(usable)) != left_out[:, None])
-    matrix, slope, glare = _fit_weighted(color, reference, position, others, rounds)
+    matrix, slope, glare = _fit_weighted(color, reference, position, others)
     each = np.arange(len(left_out))
     out = np.full(len(reference), np.nan)
     out[left_out] = delta_e(_reflectance(color, position, matrix, slope, glare)[each, left_out], reference[left_out])
     return out
 
 
-def trimmed_residuals(
-    color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], tries: int = 60
-) -> Floats:
+def trimmed_residuals(color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_]) -> Floats:
     """CIEDE2000 (N,) of every patch under a matrix fitted to the best 60 % of the usable patches.
 
     A shadow or a hand over many patches would bias ordinary least squares, but not least trimmed squares. The search
-    starts from `tries` random choices of nine patches, the same ones every time. Other arguments of `fit_matrix`.
+    starts from 60 random choices of nine patches, the same ones every time. Arguments as of `fit_matrix`.
 
     References
     ----------
@@ -141,7 +142,7 @@ def trimmed_residuals(
     base, random, system = _base(reference), np.random.default_rng(24), _ChartEquations(color, reference, position)
     able = np.flatnonzero(usable)
     most = max(9, round(0.6 * len(able)))
-    chosen = np.zeros((tries, len(base)), bool)
+    chosen = np.zeros((_TRIES, len(base)), bool)
     for row in chosen:
         row[random.choice(able, 9, replace=False)] = True
     for _ in range(3):  # each step lowers the sum (Rousseeuw's C-step)
@@ -155,18 +156,16 @@ def trimmed_residuals(
 
 
 def _fit_weighted(
-    color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_], rounds: int
+    color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_]
 ) -> tuple[Floats, Floats, Floats]:
     """Fit color matrices by least squares with Huber weights, from the `usable` patches (…, N).
 
-    Returns M (…, 3, 3), e (…, 2) and b (…,).
-
-    M (…, 3, 3), e (…, 2) and b (…,) by least squares with Huber weights, from `usable` patches (…, N).
+    Returns matrix M (…, 3, 3), light slope e (…, 2) and glare b (…,) of `fit_matrix`.
     """
     exposure = float(np.mean(color[usable.reshape(-1, len(color)).any(axis=0)])) + 1e-12
     color, base = color / exposure, np.where(usable, _base(reference), 0.0)
     system, weight = _ChartEquations(color, reference, position), base
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         matrix, slope, glare = system.solve(weight)
         corrected = _reflectance(color, position, matrix, slope, glare)
         error = np.linalg.norm(base[..., None] * (corrected - reference), axis=-1)
@@ -183,10 +182,7 @@ def _median(value: Floats, usable: NDArray[np.bool_]) -> Floats:
 
 
 def _reflectance(color: Floats, position: Floats, matrix: Floats, slope: Floats, glare: Floats) -> Floats:
-    """Reflectance (…, N, 3), linear Rec.709, of patches with camera colors (N, 3).
-
-    The glare and the slope of the light are removed.
-    """
+    """Reflectance (…, N, 3), linear Rec.709, of patches with camera colors (N, 3), without glare and light slope."""
     level = 1 + np.asarray(slope) @ position.T
     return np.asarray((color @ np.swapaxes(matrix, -1, -2) - np.asarray(glare)[..., None, None]) / level[..., None])
 

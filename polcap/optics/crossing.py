@@ -20,7 +20,7 @@ from polcap.images import Floats
 
 
 def polarization_along(s1: Floats, s2: Floats, angle: float) -> Floats:
-    """Polarized part p = S1 cos 2α + S2 sin 2α (H, W, C) along the axis α [rad] of the lens's polarizer."""
+    """Polarized part p = S1 cos 2α + S2 sin 2α (H, W, C) along the axis α = `angle` [rad] of the lens's polarizer."""
     return np.asarray(s1 * np.cos(2 * angle) + s2 * np.sin(2 * angle))
 
 

@@ -15,7 +15,7 @@ from polcap.images import Bits, Floats
 
 
 def superpixel(mosaic: Any, cfa: Bits) -> Floats:
-    """Bin a mosaic: each 2×2 quad, or 3×3 block of X-Trans, is one pixel of color means, (H, W) → (3, H//n, W//n).
+    """Bin a mosaic to color planes, (H, W) → (3, H//n, W//n): one pixel per 2×2 quad, or per 3×3 block of X-Trans.
 
     Rows and columns after the last whole block are dropped.
     """

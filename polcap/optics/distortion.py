@@ -16,7 +16,7 @@ _STEPS = 12  # of Newton's method; four are enough for any lens but a fisheye
 
 
 def distort(lens: Distortion, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Distort: pixels of the photograph for pinhole pixels x, y of shapes that broadcast, (W,) and (H, 1); float64."""
+    """Map pixels x, y of a pinhole camera to pixels of the photograph; shapes broadcast, e.g. (W,), (H, 1); float64."""
     u, v = (x - lens.center[0]) / lens.focal, (y - lens.center[1]) / lens.focal
     r2 = u * u + v * v
     stretch = r2 * (lens.k1 + r2 * lens.k2) * lens.focal
@@ -24,7 +24,7 @@ def distort(lens: Distortion, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def undistort(lens: Distortion, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Undistort: pinhole pixels for pixels x, y (H, W) or (N,) of the photograph, by Newton's method."""
+    """Map pixels x, y (H, W) or (N,) of the photograph to pixels of a pinhole camera, by Newton's method."""
     u, v = (x - lens.center[0]) / lens.focal, (y - lens.center[1]) / lens.focal
     seen = np.hypot(u, v)
     r = seen

@@ -80,21 +80,17 @@ def from_ray_frame(m: Any, v: Any) -> Any:
 
 
 def lifted(m: Any) -> Any:
-    """Turn unit vectors (..., 3) in ray frames so that all face the camera.
-
-    z below 0.02 becomes 0.02, then vectors are normalized again.
-    """
+    """Turn unit vectors (..., 3) in ray frames towards the camera: z becomes at least 0.02; unit length again."""
     xp = array_namespace(m)
     up = xp.concat([m[..., :2], xp.clip(m[..., 2:], 0.02, None)], axis=-1)
     return up / (dot(up, up) ** 0.5)[..., None]
 
 
 def axis_across(angle: Any, v: Any) -> tuple[Any, Any]:
-    """Direction (x, y) in the frame (e_x, e_y) of each ray v (..., 3) of an axis in the image plane.
+    """Project an axis in the image plane, such as a polarizer's, across each ray v (..., 3).
 
-    Its length is arbitrary.
-
-    The axis a = (cos θ, sin θ, 0), θ = `angle` [rad], is projected across the ray, a − (a·v)v; see `basis`.
+    The axis a = (cos θ, sin θ, 0), θ = `angle` [rad], becomes a − (a·v)v. Returns its components x and y (...,) along
+    the axes (e_x, e_y) of the ray's frame; the length is arbitrary.
     """
     xp = array_namespace(v)
     vx, sine = v[..., 0], xp.sin(angle)

@@ -15,10 +15,7 @@ from polcap.optics.namespace import array_namespace
 
 
 def transmission(c: Any, ior: Any) -> tuple[Any, Any]:
-    """Fresnel transmittances T₊, T₋ = (T_p ± T_s)/2 ≥ 0.
-
-    The same in both directions through the surface; c and ior broadcast.
-    """
+    """Fresnel transmittances T₊, T₋ = (T_p ± T_s)/2 ≥ 0, equal in both directions; c and ior broadcast."""
     g = _refracted(c, ior)
     n2 = ior * ior
     t_s = 4 * c * g / (c + g) ** 2
@@ -52,11 +49,10 @@ def greatest_diffuse_dolp(ior: float) -> float:
 
 
 def cos_zenith_from_dolp(dolp: Any, ior: float) -> Any:
-    """Cosine of the zenith angle from the DoLP of diffuse reflection.
+    """Cosine (...,) of the zenith angle from the DoLP ρ (...,) of diffuse reflection: inverse of `diffuse_dolp`.
 
-    Exact inverse of `diffuse_dolp`. cos θ = (n − S)/√(S((1 + n²)S − 2n)), S = √((1 + ρ)/(1 − ρ)), (...,) in 0…1.
-
-    dolp (...,) is clipped to the range of the material.
+    cos θ = (n − S)/√(S((1 + n²)S − 2n)) with S = √((1 + ρ)/(1 − ρ)) and the index n = `ior`. The DoLP is clipped to the
+    range of this index.
     """
     xp = array_namespace(dolp)
     rho = xp.clip(dolp, 0.0, greatest_diffuse_dolp(ior) - 1e-6)

@@ -12,9 +12,9 @@ from polcap.optics.namespace import array_namespace
 def analyzer(angle: Any, extinction_ratio: float = float("inf")) -> Any:
     """Weights with which a linear polarizer transmits (S0, S1, S2): intensity = weights · Stokes parameters.
 
-    Rows ½ (1, c cos 2θ, c sin 2θ), (..., 3), for axes θ (...,) rad; c = (E − 1)/(E + 1) for an
-    extinction ratio E, and 1 for an ideal polarizer. This is the first row of the Mueller matrix over the
-    greatest transmittance, without the factor (E + 1)/E, which the white balance absorbs.
+    Rows ½ (1, c cos 2θ, c sin 2θ), (..., 3), for axes θ (...,) rad, with c = (E − 1)/(E + 1) for an extinction ratio E,
+    and c = 1 for an ideal polarizer. A real polarizer transmits a constant factor less, which the white balance
+    absorbs.
 
     References
     ----------

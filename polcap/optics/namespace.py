@@ -6,10 +6,7 @@ import numpy as np
 
 
 def array_namespace(*arrays: Any) -> Any:
-    """The array API namespace (NumPy or torch) of these arrays.
-
-    `array_api_compat` is imported only where torch needs it.
-    """
+    """The array API namespace of these arrays: NumPy, or torch through `array_api_compat`."""
     if all(isinstance(array, (np.ndarray, np.generic)) for array in arrays):
         return np
     import array_api_compat

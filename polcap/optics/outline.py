@@ -38,11 +38,11 @@ def depth(mask: NDArray[np.bool_]) -> Floats:
 
 
 def outward(inside: Floats, blur_px: float) -> tuple[Floats, Floats]:
-    """Outward direction of the outline: unit vectors (2, H, W), x right, y up, and the gradient's length (H, W).
+    """Direction out of an object: unit vectors (2, H, W), x right, y up, and the length (H, W) of the gradient.
 
     `inside` (H, W) is a mask as floats, for directions near the outline only, or its `depth`, for directions
-    everywhere. It is blurred by a Gaussian of `blur_px` (1σ) first. The slope is 8 times that per px (Sobel's weights);
-    where it is 0, so is the vector.
+    everywhere. It is blurred by a Gaussian of 1σ = `blur_px` first. Sobel's weights make the gradient 8 times the slope
+    per px. Where it is 0, the vector is 0.
     """
     smooth = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), blur_px)
     dx, dy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
@@ -51,7 +51,7 @@ def outward(inside: Floats, blur_px: float) -> tuple[Floats, Floats]:
 
 
 def sectors(band: NDArray[np.bool_]) -> NDArray[np.int_]:
-    """Sector 0…23 of the outline, by direction from the object's center, of each pixel of the band (H, W); (N,)."""
+    """Sector 0…23 (N,) of each of the N pixels of a band (H, W) along the outline, by direction from its center."""
     y, x = np.nonzero(band)
     around = np.arctan2(y - y.mean(), x - x.mean()) if len(y) else np.zeros(0)
     return np.floor((around + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
@@ -64,7 +64,7 @@ def polarization(band: OutlineBand, angle: Floats) -> NDArray[Any]:
 
 
 def phasor(band: OutlineBand, angle: Floats) -> tuple[NDArray[Any], Floats]:
-    """Polarization relative to the contour, summed by sector: Σ w e^{2i(φ − φ_contour)} (24,) and Σ w (24,).
+    """Sum the polarization relative to the contour by sector: Σ w e^{2i(φ − φ_contour)} (24,) and Σ w (24,).
 
     φ is the AoLP from polarizer angles (K,) rad, φ_contour the outward direction, w the DoLP up to DOLP_CAP. The sum is
     real and positive for diffuse reflection, which is polarized across the contour.

@@ -8,9 +8,9 @@ from polcap.images import Floats
 def irradiance(point: Floats, flash: Floats, power: float, normal: Floats | None = None) -> Floats:
     """Irradiance (...,) at points (..., 3) of the camera frame: n·l / d² · cosᵖ θ, 1 on the axis at distance 1.
 
-    θ is the angle to the optical axis: cosᵖ θ is the falloff of the lens and of the beam, none for p = `power` = 0.
-    flash (2,) is its place right of the lens and above it, in the points' unit; normal (3,) that of a plane, None for
-    surfaces that face the flash.
+    cosᵖ θ is the falloff of lens and beam, with θ the angle to the optical axis and p = `power`; none for p = 0. flash
+    (2,) is the position of the light right of the lens and above it, in the unit of the points. normal (3,) is that of
+    a plane; None: every surface faces the light.
     """
     to_light = np.append(flash, 0.0) - point
     squared = np.sum(to_light**2, axis=-1)

@@ -14,7 +14,7 @@ def transform_points(matrix: Floats, point: Floats) -> Floats:
 
 
 def coordinates(matrix: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Apply a homography to separate x, y of any shapes that broadcast, as `transform_points`; float64."""
+    """Apply a homography (3, 3) to coordinates x and y of shapes that broadcast; returns x and y, float64."""
     h = np.asarray(matrix, np.float64)
     u, v = (h[k, 0] * x + (h[k, 1] * y + h[k, 2]) for k in (0, 1))
     if abs(h[2, 0]) + abs(h[2, 1]) > 0 or h[2, 2] != 1:
@@ -42,7 +42,7 @@ def back_project(view: View, x: Floats, y: Floats) -> Floats:
 
 
 def ray_slopes(view: View, x: NDArray[Any], y: NDArray[Any]) -> tuple[Floats, Floats]:
-    """Slopes x/−z and y/−z (…,) in the camera frame of the view rays of pixels x, y (…,)."""
+    """Slopes X/−Z and Y/−Z (…,), in the camera frame, of the view rays through pixels x, y (…,)."""
     return (x - view.center[0]) / view.focal, (view.center[1] - y) / view.focal
 
 

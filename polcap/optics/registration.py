@@ -126,9 +126,9 @@ class _Matches:
 def register(reference: Pyramid, other: Pyramid, model: Model = "simplest") -> Registration:
     """Estimate the motion from a reference picture to another picture of the same scene.
 
-    The match at full size counts if neither it, nor the coarsest scale, nor a phase correlation shows a motion of
-    `_STILL_PX`. Otherwise the search goes from coarse to fine, from the identity and from the phase correlation. Where
-    no tiles match or agree, the result is the identity with `tiles` 0.
+    First the pictures are matched at full size. The result is used if it, the coarsest scale and a phase correlation
+    all show a motion below `_STILL_PX`. Otherwise the search goes from coarse to fine, starting from the identity and
+    from the phase correlation. If no tiles match or agree, the result is the identity with `tiles` 0.
     """
     coarsest = reference.scales - 1
     still, _ = _refine(reference, other, model, 0, 0, np.eye(3))
@@ -183,7 +183,7 @@ def squared_gradient(picture: Floats) -> Floats:
 
 
 def _phase_correlation(reference: Level, other: Level) -> Floats:
-    """Whole-pixel shift between two pictures as a matrix (3, 3); the identity unless the shift is clearly better."""
+    """Whole-pixel shift between two pictures as a matrix (3, 3); the identity unless a shift fits clearly better."""
     a, b, both = reference.picture, other.picture, reference.usable & other.usable
     window = np.outer(np.hanning(a.shape[0]), np.hanning(a.shape[1]))
     if both.mean() < 0.05:
@@ -204,7 +204,7 @@ def _phase_correlation(reference: Level, other: Level) -> Floats:
 def _refine(
     reference: Pyramid, other: Pyramid, model: Model, coarsest: int, finest: int, matrix: Floats
 ) -> tuple[Registration, int]:
-    """Refine a first guess of the motion from a coarse scale to a finer one, in px of the finer one.
+    """Refine a first guess of the motion, from the scale `coarsest` to the scale `finest`, in px of the latter.
 
     Returns the registration and the number of tiles that agree with it.
     """
@@ -240,9 +240,9 @@ def _refine(
 
 
 def _match(reference: Level, other: Level, corner: Indices, matrix: Floats) -> _Matches:
-    """Residual shifts of tiles by one Gauss-Newton step.
+    """Estimate the residual shift δ of each tile under a motion, by one Gauss-Newton step.
 
-    It solves reference(x) = gain · (other(x') + ∇·δ) + offset for the shift δ of each tile.
+    It solves reference(x) = gain · (other(x') + ∇·δ) + offset.
     """
     parts = [
         _match_some(reference, other, part, matrix)
@@ -287,10 +287,10 @@ def _match_some(reference: Level, other: Level, corner: Indices, matrix: Floats)
 
 
 def _without_noise(shift: Floats, normal: Floats, count: Floats, variance: Floats) -> tuple[Floats, Floats]:
-    """Tile shifts (T, 2) and information (T, 2, 2), corrected for gradient noise, which makes shifts too small.
+    """Correct the shifts (T, 2) of tiles for noise of their gradients, which makes them too small.
 
-    The normal matrix (T, 4, 4), with gain and offset eliminated, is the sum of the scene's gradients and the noise's:
-    half the variance (T,) of each of `count` (T,) pixels. Directions dominated by noise are left out.
+    `normal` (T, 4, 4) is the normal matrix of each tile; the noise adds half the `variance` (T,) of each of its `count`
+    (T,) pixels. Directions dominated by noise are left out. Also returns the information (T, 2, 2) of the shifts.
     """
     both = np.linalg.inv(np.linalg.inv(normal)[:, :2, :2])
     power, axes = np.linalg.eigh(both)
@@ -335,7 +335,7 @@ def _normalized(point: Floats, shape: tuple[int, ...]) -> Floats:
 
 
 def _design(u: Floats) -> Floats:
-    """Displacement (T, 2, 8) px per parameter at normalized points (T, 2).
+    """Displacement (T, 2, 8) of normalized points (T, 2) per unit of each of the 8 motion parameters.
 
     Parameters 0 and 1 are a translation, 2 and 3 complete a similarity, 4 to 7 a homography.
     """

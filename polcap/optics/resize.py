@@ -10,10 +10,10 @@ from polcap.images import Floats
 
 
 def area_mean(image: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Image (H, W) or (H, W, C) averaged down to `shape` (height, width, …).
+    """Average an image (H, W) or (H, W, C) down to `shape` (height, width, …).
 
-    Booleans become the share of each pixel that they cover, 0…1 float32; other types stay, integers rounded.
-    An image that has this size already is returned itself.
+    A mask becomes the share 0…1 of each pixel that it covers, float32. Other types do not change; integers are rounded.
+    An image of this size is returned itself, not a copy.
     """
     if image.dtype == bool:
         image = image.astype(np.float32)

@@ -24,7 +24,7 @@ def biweight(residual: Floats, sigma: float) -> Floats:
 
 
 def jackknife(without: Floats, about: Floats | float | None = None) -> Floats:
-    """1σ of an estimate, (...,), from the estimates (P, ...) that leave out one of P parts each.
+    """Error (1σ) of an estimate, (...,), from P estimates (P, ...), each made without one of P parts of the data.
 
     `about` is the estimate from all parts; without it their mean is taken.
 
@@ -44,7 +44,7 @@ class NoiseFit:
 
     slope: float
     floor: float
-    covariance: Floats  # (2, 2) of both, as far as the number of differences lets expect
+    covariance: Floats  # (2, 2) of both, as expected from the number of differences
 
 
 def fit_noise_line(
@@ -59,10 +59,10 @@ def fit_noise_line(
 ) -> NoiseFit:
     """Fit a sensor's noise line (variance over signal) by iterated least squares of relative errors.
 
-    A variance (N,) of n differences (`freedom`) is known to √(2/n) of itself, so each weighs n/2 over the square of
-    the line there, but at most as at a variance of `least`. `edges` (N,) is a second cause of variance that is
-    fitted as well, `least_floor` the variance that rounding leaves, and `outliers` lowers the weight of variances
-    that lie more than 2.5σ from the line.
+    A variance that was measured from n differences (`freedom`) has a relative error √(2/n). So each variance (N,) has
+    the weight n/2 over the square of the line's value, which counts as at least `least`. `edges` (N,) is a second cause
+    of variance, fitted as well. `least_floor` is the variance of rounding. With `outliers`, variances more than 2.5σ
+    from the line have less weight.
 
     References
     ----------

@@ -2,12 +2,12 @@
 
 import math
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats, SensorImage
 from polcap.optics import demosaic
+from polcap.optics.morphology import dilate
 
 Bools = NDArray[np.bool_]
 
@@ -15,10 +15,8 @@ Bools = NDArray[np.bool_]
 def signal(image: SensorImage, full: bool = False) -> Floats:
     """Convert sensor counts to a linear signal (H, W, C) float32, black = 0 and white = 1.
 
-    Negative noise is preserved.
-
-    A mosaic is binned by superpixels, or interpolated if `full`. C = 1 for a monochrome sensor, whose file
-    has three equal channels and no mosaic.
+    A mosaic is binned by superpixels, or demosaiced if `full`. C = 1 for a monochrome sensor, whose file has three
+    equal channels and no mosaic. Signals below black stay negative.
     """
     span = np.float32(image.white - float(image.black.mean()))
     if image.cfa is None:
@@ -78,7 +76,7 @@ def below(image: SensorImage, level: float, full: bool = False) -> Bools:
         h, w = value.shape[0] // 2, value.shape[1] // 2
         over = over[: 2 * h : 2, : 2 * w] | over[1 : 2 * h : 2, : 2 * w]
         over = np.ascontiguousarray(over).view(np.uint16) != 0  # two neighbors at once
-    over = _grown(over)
+    over = dilate(over, 1)
     return ~(np.repeat(np.repeat(over, 2, axis=0), 2, axis=1) if full and image.cfa is not None else over)
 
 
@@ -102,8 +100,3 @@ def rounding_variance(image: SensorImage) -> float:
     """Noise variance from rounding to integer counts, in units of `signal`; nearly 0 for floating-point images."""
     step = 1.0 if np.issubdtype(image.value.dtype, np.integer) else 1e-3
     return float(step**2 / 12 / (image.white - float(image.black.mean())) ** 2)
-
-
-def _grown(mask: Bools) -> Bools:
-    """Dilate a mask by one pixel in all eight directions."""
-    return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((3, 3), np.uint8))).view(bool)

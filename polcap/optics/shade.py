@@ -98,10 +98,7 @@ def stokes(
 
 
 def _entering(normal: Any, to_light: Any, axis: Any, alpha: Any, ior: Any, law: bodies.Law) -> Any:
-    """Change of the entering transmittance T₊ (...,) for light polarized along `axis`.
-
-    It is T₋ cos 2Δ, with Δ from the azimuth to the axis.
-    """
+    """Change T₋ cos 2Δ (...,) of the entering transmittance T₊ for light polarized along `axis`, Δ from the azimuth."""
     xp = array_namespace(normal)
     cos_i = xp.clip(frames.dot(normal, to_light), _LEAST_COSINE, 1.0)
     if law is bodies.SMOOTH:
@@ -136,10 +133,7 @@ def _reflected(to_light: Any, axis: Any, cos_d: Any, ior: Any) -> tuple[Any, Any
 
 
 def _double_angle(vector: Any) -> tuple[Any, Any]:
-    """cos 2φ and sin 2φ of the azimuth φ of vectors (..., 3).
-
-    They are 0 for vectors along the ray, which have no azimuth.
-    """
+    """cos 2φ and sin 2φ (...,) of the azimuth φ of vectors (..., 3); 0 for vectors along the ray, without azimuth."""
     x, y = vector[..., 0], vector[..., 1]
     length2 = x * x + y * y + 1e-12
     return (x * x - y * y) / length2, 2 * x * y / length2

@@ -43,10 +43,10 @@ def places(image: SensorImage, clip: float) -> NDArray[np.int64]:
 
 
 def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
-    """Cut tiles out of one decoded photograph and judge whether they are usable.
+    """Cut tiles out of one decoded photograph, and find which are bright enough and unclipped.
 
-    `corners` (T, 2) are (row, column) in binned px, as of `places`.
-    From `clip` [white level] on photosites are clipped.
+    `corners` (T, 2) are (row, column) in binned px, as `places` returns them. Photosites are clipped from `clip` [white
+    level] on.
     """
     step = image.superpixel
     margin = 1 if image.cfa is None else len(image.cfa)  # a clipped photosite makes its neighbors unusable
@@ -71,7 +71,7 @@ def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
 def frames_blur(shots: Sequence[Sequence[Tiles]], px: float) -> Floats:
     """Extra blur (K, E) of each frame, 1σ [RAW px], relative to the sharpest of the same exposure; NaN: not measurable.
 
-    shots: K brackets of E photographs; px: RAW px per px of the tiles.
+    `shots` are K brackets of E photographs; `px` is the number of RAW px per px of the tiles.
     """
     each = [
         extra_blur(np.stack([frame.light for frame in frames]), np.stack([frame.usable for frame in frames]))
@@ -113,9 +113,9 @@ def choose_tiles(light: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
 def extra_blur(tiles: Floats, usable: NDArray[np.bool_]) -> Floats:
     """Extra Gaussian blur (K,) of each photograph, 1σ [px], relative to the sharpest one; NaN: not measurable.
 
-    tiles (K, T, n, n) are from K photographs of equal exposure; usable (K, T). A blur within the scatter of the tiles
-    counts as 0. The scatter is that of the photograph where it is least: blur itself adds scatter, because tiles with
-    much detail lose more.
+    tiles (K, T, n, n) are from K photographs of equal exposure, usable (K, T). A blur smaller than the scatter between
+    tiles counts as 0. The scatter is taken from the photograph with the least scatter, because blur itself adds some:
+    tiles with much detail lose more.
     """
     from scipy.special import stdtrit  # here: the import takes 0.2 s
 

@@ -16,8 +16,7 @@ def spread_over_cells(score: Floats, cells: tuple[int, int], per_cell: int) -> N
     for cell_rows in np.array_split(np.arange(rows), min(cells[0], rows)):
         for cell_columns in np.array_split(np.arange(columns), min(cells[1], columns)):
             cell = score[np.ix_(cell_rows, cell_columns)]
-            for k in np.argsort(cell, axis=None)[::-1][:per_cell]:
-                i, j = np.unravel_index(k, cell.shape)
-                if cell[i, j] > 0:
-                    found.append((cell_rows[i], cell_columns[j]))
-    return np.array(found, np.int64).reshape(-1, 2)
+            best = np.argsort(cell, axis=None)[::-1][:per_cell]
+            i, j = np.unravel_index(best[cell.ravel()[best] > 0], cell.shape)
+            found.append(np.stack([cell_rows[i], cell_columns[j]], axis=1))
+    return np.concatenate([np.zeros((0, 2), np.int64), *found])

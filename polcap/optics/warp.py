@@ -36,9 +36,9 @@ def warp(
     order: Literal[1, 3] = 3,
     lens: Distortion | None = None,
 ) -> Floats:
-    """Resample an image through a homography and a lens's distortion.
+    """Resample an image through a homography and a lens's distortion; the result is float32 and covers `box`.
 
-    Output px go through `lens`, then `transform`, to image px. The result is float32 and covers `box`.
+    A pixel of the output is mapped by `lens`, then by `transform`, to a position in the image.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ _SHARING = {"obj", "usd", "materialx"}  # formats that share texture files
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """Content of an export; with a preset, `formats` is ignored."""
+    """The user's choice for an export: file formats or a preset, and options; with a preset, `formats` is ignored."""
 
     formats: tuple[Format, ...] = ("gltf", "obj")
     preset: str | None = None
@@ -72,7 +72,7 @@ class ExportSource:
 
 @dataclass(frozen=True)
 class DetailLevel:
-    """One level of detail of an asset, and how its mesh was decimated, if it was."""
+    """One level of detail of an asset, and its decimated mesh if it has fewer triangles than the full one."""
 
     asset: Asset
     decimated: surface.DecimatedMesh | None = None
@@ -216,10 +216,7 @@ def _loose_textures(preset: ExportPreset, wanted: ExportRequest, whole: Asset, s
 
 
 def effective(wanted: ExportRequest) -> ExportPreset:
-    """The preset that an export uses.
-
-    That of the request, with the request's other options in place of the preset's.
-    """
+    """The preset that an export uses: the requested one, with its values replaced by the request's other options."""
     if wanted.preset is None:
         preset = ExportPreset(wanted.formats, "normals +Y")
     elif wanted.preset in PRESETS:

@@ -1,10 +1,10 @@
 """The stage cache: the result of each stage in its folder `work/NN-name/`, reused while its key is the same.
 
-A key is a digest of the stage's name and version, its settings and the keys of its inputs, back to the bytes of the
-RAW files and of the model file. Where files lie is not part of it: a capture may be moved. A folder holds an `.npy`
-per array and `manifest.json`. It is written under a temporary name and renamed, so a killed run leaves a whole result
-or none. Sizes and SHA-256 digests are compared when a result is read, at about 1.6 GB/s; a damaged result is computed
-again. Arrays come back as read-only memory maps, when they are computed as when they are read.
+A key is a digest of the stage's name and version, its settings and the keys of its inputs. The first inputs are the
+bytes of the RAW files and of the model file, not their paths, so a capture may be moved. A folder contains one `.npy`
+file per array, and `manifest.json`. It is written under a temporary name and renamed, so a killed run leaves a complete
+result or none. When a result is read, sizes and SHA-256 digests are compared; a damaged result is computed again. `run`
+returns arrays as read-only memory maps, whether the result was computed or read.
 """
 
 import json
@@ -37,7 +37,7 @@ def silent(stage: str, seconds: float | None, cached: bool) -> None:
 
 
 class StageReached(Exception):
-    """Raised to end the path early: the last stage that was asked for has run."""
+    """Exception that ends the path early, after the last stage that the user asked for."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +49,10 @@ class StageResult(Generic[T]):
 
 
 class MemoryCache:
-    """Computes the stages of one path, in order, and holds their results in memory; nothing is written.
+    """Runs the stages of one path, in order, and holds their results in memory; nothing is written.
 
-    `force` names a stage that is computed in any case, with all after it; `until` the stage after which
-    StageReached ends the path.
+    `force` names a stage that is computed again even if its result is stored, as are all stages after it. `until` names
+    the stage after which StageReached ends the path.
     """
 
     def __init__(self, progress: Progress = silent, force: str | None = None, until: str | None = None) -> None:
@@ -63,7 +63,7 @@ class MemoryCache:
         self._held: dict[str, Any] = {}  # by key
 
     def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
-        """The result of a stage: cached, else computed. Inputs: other results, plain values, functions (`decode`).
+        """The result of a stage, from the cache or computed. Inputs are other results, plain values or functions.
 
         Raises
         ------
@@ -78,19 +78,16 @@ class MemoryCache:
         return self.results[stage.name]
 
     def derive(self, function: Callable[..., T], *inputs: Any) -> StageResult[T]:
-        """A value that is cheap to compute from stage results and never stored.
-
-        Its key contains the function's name.
-        """
+        """Compute a value from stage results by a cheap function; never stored, its key has the function's name."""
         return StageResult(_derived_key(function, inputs), function(*map(value_of, inputs)))
 
     def begin(self, stage: str) -> None:
-        """Called when work on a stage begins."""
+        """Report to the progress display that work on a stage begins."""
         self.stage, self._began = stage, time.perf_counter()
         self.progress(stage, None, False)
 
     def end(self) -> None:
-        """Called when work on the current stage ends."""
+        """Report to the progress display that work on the current stage has ended."""
         self.progress(self.stage, time.perf_counter() - self._began, False)
 
     def _value(
@@ -183,7 +180,7 @@ class ArchiveCache(StageCache):
         Raises
         ------
         StorageError
-            It is not there, or damaged.
+            The result is missing or damaged.
         """
         if not stage.keep:
             return super().run(stage, *inputs, config=config)
@@ -221,7 +218,7 @@ def manifest(place: Path) -> dict[str, Any]:
 
 
 def seal(about: Mapping[str, Any]) -> str:
-    """Digest of a manifest's content, so that a later edit is detected."""
+    """Digest of a manifest's content, stored in it to detect later changes."""
     return digest({name: value for name, value in about.items() if name not in _NOT_SEALED})
 
 
@@ -270,7 +267,7 @@ def key_of(value: Any) -> str:
 
 
 def fingerprint(value: Any) -> Any:
-    """Plain data for a cache key: equal for two inputs exactly when no stage can distinguish them."""
+    """Convert an input to plain data for a cache key: equal for two inputs that give the same results."""
     if isinstance(value, np.ndarray):
         solid = np.ascontiguousarray(value)
         summed = sha256(solid.data.cast("B") if solid.size else b"")

@@ -31,7 +31,7 @@ class Verdict(msgspec.Struct, frozen=True):
     """Result of `polcap check`: whether to keep the capture, the judged gates, and shots to repeat."""
 
     keep: bool
-    shots: tuple[str, ...]  # to be taken again, as far as single ones are to blame
+    shots: tuple[str, ...]  # names of the shots to take again; empty: no single shot is the cause
     lines: tuple[Gate, ...]
     capture: str
     seconds: float
@@ -76,10 +76,7 @@ def inspect(
 
 
 def _judged(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config) -> list[Gate]:
-    """Judge the reduced capture by the gates, in the order of the path.
-
-    Where a stage fails, its error is the last one.
-    """
+    """Judge the reduced capture by the gates, in the order of the path; an error of a stage is the last gate."""
     cache, failure, chart_missing = MemoryCache(until="infer"), None, ""
     try:
         chart_missing = _run_path(capture, small, supplied, config, cache)
@@ -109,11 +106,10 @@ def _judged(capture: Capture, small: SmallCapture, supplied: UserInput, config: 
 
 
 def _run_path(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config, cache: MemoryCache) -> str:
-    """Run the path on the reduced capture into the cache.
+    """Run the path on the reduced capture; the results are in `cache`.
 
-    Without a chart if `process` would find none: returns the reason, otherwise "".
-
-    A chart that is not found in the small pictures is searched at full size, as `process` does.
+    If the small pictures show no chart, it is searched at full size, as `process` does. If there is none, the path runs
+    without a chart, and the reason is returned; otherwise "".
     """
     missing, settings = "", _settings(config, small.step)
     try:
@@ -125,7 +121,7 @@ def _run_path(capture: Capture, small: SmallCapture, supplied: UserInput, config
         try:
             request = ChartRequest("profile", profile=_colors_at_full_size(capture, config))
         except ChartError as error:
-            missing = str(error).partition(" (")[2].partition(")")[0] or str(error)
+            missing = str(error).partition(" (")[2].rpartition("); ")[0] or str(error)
         path(small.capture, replace(supplied, chart=request), settings, cache)
     return missing
 
@@ -137,10 +133,7 @@ def _colors_at_full_size(capture: Capture, config: Config) -> ColorCalibration:
 
 
 def _settings(config: Config, step: int) -> Config:
-    """Settings of the path for the reduced pictures.
-
-    The stages' own limits are disabled, because the gates judge instead.
-    """
+    """Settings of the path for the reduced pictures, without the stages' own limits: the gates judge instead."""
     changed = msgspec.structs.replace
     return changed(
         config,
@@ -152,15 +145,12 @@ def _settings(config: Config, step: int) -> Config:
 
 
 def _moved(chart: ChartRequest, step: int) -> ChartRequest:
-    """The chart's corners as given by the user, converted to the reduced pictures.
-
-    A reduced pixel covers `step` × `step` RAW pixels.
-    """
+    """Convert the chart's corners from the user to the reduced pictures, with pixels of `step` × `step` RAW pixels."""
     return chart if chart.corners is None else replace(chart, corners=(chart.corners - (step - 1) / 2) / step)
 
 
 def table(verdict: Verdict) -> str:
-    """The verdict as text for a person, in one screen."""
+    """The verdict as text for the terminal, on one screen."""
     head = "keep" if verdict.keep else f"reshoot {', '.join(verdict.shots)}".rstrip()
     if verdict.keep and verdict.needs:
         head += f", and process it with {verdict.needs}"

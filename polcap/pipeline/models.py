@@ -14,11 +14,9 @@ from polcap.stages.mask import mask_channels
 def load_network(
     estimator: Literal["network", "analytic"] | None, model: Path | None, device: Device = "cpu", threads: int = 0
 ) -> Network | None:
-    """Open the network of the normal estimator: the named model, else the shipped one.
+    """Open the network of the normal estimator: the named model, else the shipped one; None: the analytic estimator.
 
-    None is the analytic estimator.
-
-    `device` and `threads` as of `onnx.load`.
+    `device` and `threads` are those of `onnx.load`.
 
     Raises
     ------

@@ -1,9 +1,9 @@
 """READ FIRST. The path of a capture, one line per stage: from RAW brackets to the asset.
 
-Each line's work is the folder of the same name in `stages/`. Measure, then apply once: white balance, alignment and
-self-calibration return small values; `stokes` applies gains and transforms, `cues` the color matrix. Images are
-resampled once. `cache.run` finds a stored result, or computes it. `process`, `check`, `show` and a dry run all follow
-this path; they differ in the cache.
+The code of a stage is in the folder of the same name in `stages/`. White balance, alignment and self-calibration only
+measure: they return small values. `stokes` applies gains and transforms, `cues` the color matrix, so images are
+resampled once. `cache.run` reads a stored result, or computes it. `process`, `check`, `show` and a dry run all follow
+this path, with different caches.
 """
 
 from collections.abc import Mapping
@@ -83,14 +83,14 @@ def results_of(made: Mapping[str, StageResult[Any]]) -> Results:
 
 
 def on_grid(drawn: NDArray[np.bool_] | None, radiance: AngleStack) -> NDArray[np.bool_] | None:
-    """Convert the user's mask (H, W) to the grid of the merged picture.
+    """Convert the user's mask to the grid of the merged picture (H, W).
 
-    It may be drawn there, or on the pixels of the RAW or of the mosaic.
+    The user may draw it on that grid, or on the pixels of the RAW or of the mosaic.
 
     Raises
     ------
     ObjectError
-        It has neither size.
+        The mask has none of these sizes.
     """
     if drawn is None:
         return None
@@ -106,7 +106,7 @@ def on_grid(drawn: NDArray[np.bool_] | None, radiance: AngleStack) -> NDArray[np
 
 
 def distance_m(color: ColorCalibration, radiance: AngleStack) -> float | None:
-    """Distance of the chart [m], also taken as the object's; None without a chart of known size."""
+    """Distance of the object [m], assumed equal to the chart's; None without a chart of known size."""
     return None if color.metres_per_px is None else color.metres_per_px * radiance.view.focal
 
 

@@ -23,7 +23,7 @@ _WORK_FILES = ("run.json", "unchanged.json", *(f"{stage}.png" for stage in STAGE
 
 
 def check(out: Path, photographs: Path) -> None:
-    """Refuse a result folder that lies among the photographs, or has a name that no OpenEXR file can have.
+    """Refuse a result folder inside the photographs' folders, or with a name that no OpenEXR file can have.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def check(out: Path, photographs: Path) -> None:
 def locked(out: Path) -> Iterator[None]:
     """Context manager that locks a result folder for this process and removes temporary files of a killed run.
 
-    The system drops the lock when its owner dies, however it dies: there are no stale locks.
+    The operating system removes the lock when the process ends, so there are no stale locks.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def locked(out: Path) -> Iterator[None]:
 def clean(out: Path, dry_run: bool = False) -> int:
     """Remove the stage cache and the pictures of `show` from work/; returns their size in bytes.
 
-    All other files stay, also those of other programs in work/. A dry run only measures.
+    All other files in work/ stay. With `dry_run`, nothing is removed.
 
     Raises
     ------

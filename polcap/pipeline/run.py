@@ -44,7 +44,7 @@ def process(
     Raises
     ------
     InputError
-        Anything at fault with the user's input, from the stage that noticed it.
+        The user's input is wrong; the stage that found it raises the error.
     """
     result_folder.check(out, Path(capture.folder))
     cache = StageCache(out, progress, force, until)
@@ -91,10 +91,7 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
 
 
 def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
-    """A decode function that reports progress.
-
-    It calls `frame_read` with the numbers of decoded and of all photographs.
-    """
+    """A decode function that reports progress by `frame_read`: numbers of decoded and of all photographs."""
     brackets = capture.all_shots
     total, number = sum(len(shot.frames) for shot in brackets), count(1)
 
@@ -107,7 +104,7 @@ def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
 
 
 def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force: str | None = None) -> dict[str, str]:
-    """Dry run: the state of each stage before `process`: cached, compute, or on demand. Nothing is computed."""
+    """Dry run of `process`: whether each stage is cached, to compute, or on demand. Nothing is computed."""
     cache = DryRunCache(out, force)
     path(capture, supplied, config, cache)
     return cache.states
@@ -136,7 +133,7 @@ def reopen(out: Path, until: str = "surface") -> tuple[Results, dict[str, Any]]:
     Raises
     ------
     StorageError
-        `out` holds no stage cache, or not that far.
+        `out` has no stage cache, or the result of a stage is missing.
     """
     about = result_folder.read_run(out)
     config = restored(about, out / "work" / "run.json")
@@ -157,10 +154,7 @@ def show(out: Path, stages: Sequence[str]) -> list[Path]:
 
 
 def animate(out: Path, motion: animation.Motion) -> list[Path]:
-    """Write an animation with a moving light or object.
-
-    Returns the paths of the WebP and, if FFmpeg is installed, of the MP4.
-    """
+    """Write an animation with a moving light or object; returns the paths of the WebP and, with FFmpeg, of the MP4."""
     results, about = reopen(out)
     ior = float(about["settings"]["infer"]["ior"])
     turning = motion == "turntable"

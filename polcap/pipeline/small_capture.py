@@ -108,14 +108,10 @@ def _joined(meta: dict[str, Any], arrays: Arrays) -> ReducedFrame:
 
 
 def reduce_first(image: SensorImage, clip: float, most_pixels: float) -> tuple[dict[str, Any], Arrays]:
-    """Reduce the reference frame as `reduce_frame` does, and choose the reduction for the whole capture.
+    """In the child process: reduce the reference frame, and choose the reduction for the whole capture.
 
-    Runs in the child process.
-
-    Reduce the reference frame as `reduce_frame`, and choose the reduction of the whole capture.
-
-    `times` is the number of merged pixels along a block, `superpixel` that of RAW pixels along a merged pixel;
-    `corners` (T, 2) px are those of the tiles.
+    The choice is added to the answer of `reduce_frame`: `times`, the number of merged pixels along a block;
+    `superpixel`, the number of RAW pixels along a merged pixel; `corners` (T, 2) px of the tiles.
     """
     pixels = (image.value.shape[0] // image.superpixel) * (image.value.shape[1] // image.superpixel)
     times = max(1, int(np.ceil(np.sqrt(pixels / most_pixels))))
@@ -127,11 +123,9 @@ def reduce_first(image: SensorImage, clip: float, most_pixels: float) -> tuple[d
 def reduce_frame(
     image: SensorImage, clip: float, times: int, corners: list[list[int]]
 ) -> tuple[dict[str, Any], Arrays]:
-    """Reduce a frame to means over blocks of `times` merged pixels a side.
+    """In the child process: reduce a frame to means over blocks of `times` × `times` merged pixels.
 
-    Runs in the child process. Tiles at `corners` (T, 2) px are returned at full size.
-
-    Tiles at `corners` (T, 2) px are returned at full size.
+    The tiles at `corners` (T, 2) px are returned at full size.
     """
     clipped = block_means(~sensor.usable(image, clip), times)
     value = _means(image, times)

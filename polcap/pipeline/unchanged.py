@@ -1,7 +1,7 @@
 """Detects that a result folder is already up to date: same options, same files, nothing changed since.
 
-Compares sizes and times, as build tools do, before anything heavy is imported or hashed: a run that has nothing to do
-costs milliseconds. Where anything differs, the keys of the stage cache decide which stages are computed again.
+It compares sizes and times, as build tools do, before anything heavy is imported. So a run that has nothing to do takes
+milliseconds. If anything differs, the keys of the stage cache decide which stages are computed again.
 """
 
 import json
@@ -32,11 +32,9 @@ class Finished(NamedTuple):
 
 
 def request(options: Mapping[str, Any], capture: Path, out: Path, files: Iterable[Path] = ()) -> str | None:
-    """Digest of the options, program, photographs and other input files (by size and time) of a run.
+    """Digest of a run's request: options, program, and size and time of photographs and other input files.
 
-    None where these do not determine the result.
-
-    `options` is plain data; the user's calibrations are among the files.
+    `options` is plain data. The user's calibrations count as input files. None if these do not determine the result.
     """
     try:
         photographs = _stats(capture, except_=os.path.realpath(out))

@@ -6,6 +6,7 @@ import numpy as np
 from polcap.formats import shipped_data
 from polcap.images import Mesh, SurfaceMaps
 from polcap.optics import frames, outline
+from polcap.optics.morphology import dilate
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean
@@ -193,7 +194,7 @@ def _edge_blur(found: Evidence) -> float:
     Edges are the 10 % of the object with most contrast within 7 px. The sharpest are 5 % of these.
     """
     light = found.radiance.value[0].sum(-1)
-    near = cv2.dilate(found.object_.mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    near = dilate(found.object_.mask, 4)
     if not near.any():
         return float("nan")
     window = np.ones((7, 7), np.uint8)

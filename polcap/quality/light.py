@@ -9,6 +9,7 @@ import numpy as np
 
 from polcap.images import AngleStack, Floats, Quality, StokesImage
 from polcap.optics import mueller
+from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
 from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, blamed
 from polcap.quality.limits import GateLimits
@@ -280,7 +281,7 @@ def _crossed(image: StokesImage) -> dict[str, Any]:
     left = float((clipped & ~known).sum() / max(clipped.sum(), 1))
     weight = sound.astype(np.float32)
     smooth, whole = (cv2.GaussianBlur(part * weight, (0, 0), _EDGE_PX) for part in (body, total))
-    inner = cv2.erode(sound.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    inner = erode(sound, 2)
     over = float((smooth > _BRIGHTER * whole)[inner].mean()) if inner.any() else 1.0
     mirrored = float(np.maximum(total - body, 0)[sound].sum() / max(float(total[sound].sum()), 1e-9))
     return {"left": left, "clipped": int(clipped.sum()), "over": over, "mirrored": mirrored}
@@ -344,7 +345,7 @@ def _surroundings_dolp(found: Evidence) -> float:
     if clear.sum() < _LEAST_ROOM_TILES:
         return float("nan")
     shots = zip(radiance.value, found.selfcal.gains.gain)
-    light = [block_means((shot / gain).sum(-1), _ROOM_TILE)[clear] for shot, gain in shots]
+    light = [block_means(shot, _ROOM_TILE)[clear] @ (1 / gain) for shot, gain in shots]
     s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(found.selfcal.angle), np.stack(light), rcond=None)[0]
     return float(np.hypot(np.median(s1 / np.maximum(s0, 1e-9)), np.median(s2 / np.maximum(s0, 1e-9))))
 

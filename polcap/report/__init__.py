@@ -82,10 +82,7 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
 def document(
     facts: Mapping[str, Any], results: Results, config: Config, timings: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Assemble the content of report.json.
-
-    Facts of the run, figures, gates, and the computing time of each stage [s].
-    """
+    """Assemble the content of report.json: facts of the run, figures, gates, computing time of each stage [s]."""
     measured = {**figures.measured(results), "rerendering": figures.rerendering(results, config.infer.ior)}
     focal_doubt = tuple(facts["capture"].get("focal_doubt", (0.0, 0.0)))
     judged = list(gates.judge(full_size(results, focal_doubt), config.gates, config.align))
@@ -112,10 +109,7 @@ def _expected_error_deg(judged: Sequence[Gate]) -> float | None:
 
 
 def model_facts(network: Network | None) -> dict[str, str] | None:
-    """Metadata and digest of the estimator's network, with the digest of its refinement network.
-
-    None for the analytic estimator.
-    """
+    """Metadata and digest of the estimator's network and of its refinement network; None: the analytic estimator."""
     if network is None:
         return None
     refinement = {} if network.fine is None else {"fine": network.fine.digest}

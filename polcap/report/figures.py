@@ -1,4 +1,4 @@
-"""Figures of the report: the measured numbers of every stage, by subject, as plain JSON values."""
+"""Measures the figures of report.json: numbers on the result of every stage, as plain JSON values."""
 
 import math
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from polcap.formats.maps import maps_folder
-from polcap.images import ColorCalibration, Floats, Mesh, Quality, StokesImage
+from polcap.images import ColorCalibration, Floats, Mesh, PatchColors, Quality, StokesImage
 from polcap.report import page_data
 from polcap.results import Results
 from polcap.stages.whitebalance import patches
@@ -56,7 +56,7 @@ def measured(results: Results) -> dict[str, dict[str, Any]]:
 
 
 def rerendering(results: Results, ior: float) -> dict[str, Any]:
-    """Difference between each photograph and the maps rendered under the same light and polarizer angle."""
+    """Figures of the re-rendering: photographs against the maps rendered under the same light and polarizer angle."""
     small = page_data.reduce(results.maps, results.mesh, results.cues, results.radiance.angle, _COMPARED_PX)
     rendered = page_data.rerender(small, ior)
     return {"rms": [_plain(one) for one in rendered.rms(small.maps.mask)], "scale": _plain(rendered.scale)}
@@ -75,12 +75,22 @@ def _colors(color: ColorCalibration, albedo_sigma: float | None) -> dict[str, An
         "delta_e": _plain(delta_e, 2),
         "predicted_mean": None if predicted is None else _plain(np.nanmean(predicted)),
         "predicted": _plain(predicted, 2),
+        "surroundings": _surroundings(fit),
         "left_out": None if fit is None or fit.use is None else patches.left_out(fit.use),
         "detector_cost": _plain(color.cost),
         "metres_per_px": color.metres_per_px,
         "scale_doubt": albedo_sigma,
         "matrix": _plain(color.matrix, 5),
     }
+
+
+def _surroundings(fit: PatchColors | None) -> str | None:
+    """Text for the report: how many patches around the block of a ColorChecker SG were used."""
+    if fit is None or fit.surroundings is None:
+        return None
+    used = fit.surroundings[~np.isnan(fit.surroundings)]
+    mean = f", mean color error {used.mean():.1f} ΔE2000" if len(used) else ""
+    return f"{len(used)} of {len(fit.surroundings)} used{mean}"
 
 
 def _object(results: Results) -> dict[str, Any]:

@@ -31,10 +31,7 @@ class ColorKey:
     digits: int = 2  # behind the decimal point
 
     def level(self, value: Floats, inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """Convert values to levels 1…255 for low…high, clipped.
-
-        0 outside the object and where the value is not finite.
-        """
+        """Convert values low…high to levels 1…255, clipped; 0 outside the object and for values that are not finite."""
         known = inside & np.isfinite(value)
         share = (np.where(known, value, self.low) - self.low) / (self.high - self.low)
         if self.palette == "wheel":
@@ -94,10 +91,7 @@ SIGMA = ColorKey(0, 0.01, "", (0, 0.0025, 0.005, 0.01), "inferno", digits=4)
 
 
 def depth(values: Floats, metric: bool) -> ColorKey:
-    """Color key of a depth map, from the nearest to the farthest point of the object.
-
-    In mm where the scale is known.
-    """
+    """Color key of a depth map, from the object's nearest to its farthest point; in mm where the scale is known."""
     low, high = (float(edge) for edge in np.percentile(values, [0.5, 99.5])) if values.size else (0.0, 1.0)
     if high - low < 1e-9:
         high = low + 1.0

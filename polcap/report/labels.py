@@ -17,6 +17,7 @@ LABELS: dict[str, tuple[str, str]] = {
     "chart.delta_e": ("Color error of each patch, dark skin first", "ΔE2000"),
     "chart.predicted_mean": ("Mean color error, each patch left out of the fit in turn", "ΔE2000"),
     "chart.predicted": ("Color error of each patch when left out of the fit", "ΔE2000"),
+    "chart.surroundings": ("Patches around the block of 24", ""),
     "chart.left_out": ("Patches not used", ""),
     "chart.detector_cost": ("Cost of the chart's detection, 0 is best", ""),
     "chart.metres_per_px": ("Size of a pixel at the chart", "mm"),

@@ -98,9 +98,9 @@ def checks(gates: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
 
 
 def check(gate: Mapping[str, Any]) -> dict[str, str]:
-    """One quality gate as texts: finding, value, limit, cost and remedy.
+    """One quality gate as texts for a table: finding, value, limit, cost and remedy.
 
-    The cost is the normal error that the defect causes, empty below one degree.
+    The cost is the normal error that the defect causes; it is empty below one degree.
     """
     return {
         "title": gate["name"].capitalize(),
@@ -150,11 +150,9 @@ def _maps(about: Mapping[str, Any], results: Results) -> tuple[dict[str, Any], d
 
 
 def _mesh_preview(results: Results, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """A reduced mesh for the interactive view.
+    """Data of a reduced mesh for the page's interactive view: positions, texture coordinates and faces as base64 texts.
 
-    Base64 texts of 16-bit positions and texture coordinates, and face indices.
-
-    Positions are shares of the box `low`, `extent`; a share of 1 is stored as 65535. Faces are differences of indices.
+    Positions are 16-bit shares of the box `low`, `extent`: 65535 is 1. Face indices are stored as differences.
     """
     chosen = msgspec.convert(settings, Config).surface
     chosen = msgspec.structs.replace(chosen, max_vertices=min(chosen.max_vertices, _MOST_VERTICES))

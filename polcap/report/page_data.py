@@ -62,7 +62,7 @@ class Rerendering:
 
 
 def rerender(small: PageMaps, ior: float) -> Rerendering:
-    """Render the maps as the camera saw the object: flash, and polarizer at each angle of the photographs."""
+    """Render the maps under the flash for each polarizer angle, for comparison with the photographs."""
     maps = small.maps
     ray = frames.rays(maps.view, *maps.mask.shape)
     normal = frames.to_ray_frame(maps.normal, ray)
@@ -92,9 +92,9 @@ def exposure(small: PageMaps) -> float:
 
 
 def photograph(radiance: AngleStack, calibration: ColorCalibration, view: View, size: tuple[int, int]) -> Floats:
-    """The reference shot on the grid of the reduced maps, linear Rec.709 on the scale of S0, (H, W, 3).
+    """The reference shot on the grid of the reduced maps, (H, W, 3), linear Rec.709 on the scale of S0.
 
-    `view` belongs to the reduced maps, `size` is their (width, height).
+    `view` is the camera of the reduced maps, `size` their (width, height).
     """
     factor = view.scale / radiance.view.scale  # pixels of the merged shot per pixel of the maps
     x, y = (edge * factor for edge in view.origin)

@@ -24,7 +24,7 @@ class Mark:
     shape: Literal["dot", "ring", "cross", "bar"] = "dot"
     color: str = _BLUE
     error: float = 0.0  # 1σ, share of the axis
-    down_px: int = 0
+    down_px: int = 0  # offset below the row's line
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,9 @@ def exposures(measured: list[list[float]], stated: list[list[float | None]], nam
 
 
 def gains(found: Gains, names: Sequence[str]) -> RowPlot:
-    """Plot of the light of each shot relative to the first, per channel with 1σ.
+    """Plot of the light of each shot relative to the first, per channel, with 1σ.
 
-    Crosses: from pixels that face the camera.
+    Crosses are the same gains measured on the object itself.
     """
     far = np.concatenate([(found.gain - 1).ravel(), np.nan_to_num(found.anchor - 1).ravel()])
     span = max(0.005, 1.15 * float(np.abs(far).max()))
@@ -110,10 +110,7 @@ def shifts(found: Alignment, names: Sequence[str]) -> dict[str, Any]:
 
 
 def chart(reference: ChartReference, measured: Floats, fit: PatchColors, figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Plot of the 24 chart patches: the maker's color, the photographed color, and ΔE.
-
-    `measured` (24, 3) is in linear Rec.709.
-    """
+    """Plot of the 24 chart patches: the maker's color, the photographed one (24, 3), linear Rec.709, and ΔE."""
     note = "outside: the maker's color; inside: the photographed color; below: ΔE2000, mean "
     note += number(figures["delta_e_mean"], 2)
     if figures["predicted_mean"] is not None:

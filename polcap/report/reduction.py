@@ -10,7 +10,7 @@ from polcap.optics.resize import area_mean, weighted_area_mean
 
 
 class ObjectReduction:
-    """Reduces images (H, W, …) to at most `longest` px a side by means over the object's pixels `inside` (H, W)."""
+    """Reduction of images (H, W, …) to at most `longest` px a side: means over the object's pixels `inside` (H, W)."""
 
     def __init__(self, inside: NDArray[np.bool_], longest: int) -> None:
         height, width = inside.shape

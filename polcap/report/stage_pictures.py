@@ -153,7 +153,7 @@ def _merged(radiance: AngleStack) -> list[Tile]:
 
 
 def _gains(found: Gains, angle: Floats) -> Picture:
-    """Plot of the shots' gains with 1σ, as a picture. Crosses are the gains from pixels that face the camera."""
+    """Plot of the shots' gains with 1σ, as a picture. Crosses are the gains measured on the object itself."""
     height, left = 60 * len(found.gain) + 40, 120
     picture = np.full((height, WIDTH, 3), 255, np.uint8)
     span = max(0.02, 1.2 * float(np.abs(np.stack([found.gain, found.anchor]) - 1).max()))

@@ -40,9 +40,9 @@ class BackgroundCheck:
         self._pending[slot] = self._thread.submit(self._save_and_check, slot, read_deg, photograph)
 
     def collect(self, block: bool) -> None:
-        """Remove checked frames from the pending ones; with `block` wait for one.
+        """Remove the frames whose check has ended from `pending`; with `block`, first wait until one has.
 
-        Raises the error of a failed check.
+        Raises the error of a check that failed itself.
         """
         if block and self._pending:
             wait(self._pending.values(), return_when=FIRST_COMPLETED)

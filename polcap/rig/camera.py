@@ -28,8 +28,8 @@ class CameraFile:
     """One photograph as received from the camera: bytes, file name, exposure."""
 
     data: bytes
-    name: str  # the camera's own
-    exposure: Exposure  # as the camera really set it
+    name: str  # given by the camera
+    exposure: Exposure  # settings with which the camera took it
 
     @property
     def suffix(self) -> str:
@@ -54,14 +54,11 @@ class Camera(Protocol):
     polarizes_flash: bool  # can put the flash's filter on by itself
 
     def bracket(self, flash: bool) -> tuple[Exposure, ...]:
-        """Default exposures of the camera.
-
-        Under a flash they differ in ISO, because the shutter has no effect on a flash.
-        """
+        """Default exposures of the camera; they differ in ISO under a flash, which the shutter does not change."""
         ...
 
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
-        """Called before every frame: the polarizer's angle, the frame's role and its place in the bracket."""
+        """Prepare the camera before a frame: polarizer angle, role of the frame, its index in the bracket."""
         ...
 
     def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:

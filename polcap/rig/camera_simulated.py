@@ -25,9 +25,10 @@ class SimulatedCameraSettings(Shoot, frozen=True, forbid_unknown_fields=True):
 
 
 class SimulatedCamera:
-    """`simulated?seed=1&width=384`: takes the settings of `polcap synth`, and `scene`. It does not move.
+    """A simulated camera that does not move, such as `simulated?seed=1&width=384`.
 
-    It takes every bracket of `--bracket`: shutter times, apertures, ISO values and flash powers.
+    The URL takes the settings of `polcap synth`, and `scene`. Brackets may vary shutter time, aperture, ISO and flash
+    power.
     """
 
     model = "Polcap Synthetic"

@@ -33,7 +33,7 @@ class AcceptedFrame(msgspec.Struct, frozen=True):
     angle_deg: float | None  # requested
     step: int  # within the bracket
     read_deg: float | None  # read back from the rotator; near angle_deg, not modulo 360
-    exposure: Exposure  # as the camera really set it
+    exposure: Exposure  # settings with which the camera took it
     flash: bool
     camera_file: str
     facts: FrameFacts
@@ -81,7 +81,7 @@ class CaptureRecord:
             self.write()
 
     def reject(self, slot_name: str, file: Path, read_deg: float | None, reason: str) -> str:
-        """Move a photograph to `rejected`, never over another; its slot is empty again. Raises StorageError."""
+        """Move a photograph to the folder `rejected`, never over another; its slot is empty again. StorageError."""
         with self._lock:
             stem = slot_name.replace("/", "_")
             names = (f"{REJECTED}/{stem}.try{n}{file.suffix}" for n in range(1, 1 << 20))
@@ -97,7 +97,7 @@ class CaptureRecord:
             return name
 
     def reject_other_angle(self, slot: Slot, read_deg: float) -> list[str]:
-        """After the ring has returned to a bracket that was begun: reject its frames if they are at another angle."""
+        """When the ring returns to a begun bracket: reject the bracket's frames if they were taken at another angle."""
         begun = {name: frame for name, frame in self.accepted().items() if _bracket(frame) == _bracket(slot)}
         read = [frame.read_deg for frame in begun.values() if frame.read_deg is not None]
         if not read or max(abs(one - read_deg) for one in read) <= _SAME_DEG:
@@ -108,7 +108,7 @@ class CaptureRecord:
         return list(begun)
 
     def verify(self) -> list[str]:
-        """Reject frames that have changed, and files that no record names; returns a message for each."""
+        """Reject photographs that have changed since, and files without a record; returns a message for each."""
         messages = []
         for name, frame in self.accepted().items():
             file = self.folder / frame.file
@@ -130,7 +130,7 @@ class CaptureRecord:
         return messages
 
     def write(self) -> None:
-        """Write rig.json, then capture.toml, in which other keys stay, such as [catalog].
+        """Write rig.json, then capture.toml; keys that the user added, such as [catalog], do not change.
 
         Raises StorageError; CaptureError if capture.toml was edited and is wrong.
         """
@@ -143,7 +143,7 @@ class CaptureRecord:
             atomic.write(file, tomli_w.dumps(stated | self._toml()))
 
     def stated_deg(self, frame: AcceptedFrame) -> float | None:
-        """Angle in capture.toml: the mean over its bracket; an ambient frame has the angle of the shot."""
+        """Angle [degrees] for capture.toml: mean over the frame's bracket; for an ambient frame that of its shot."""
         if frame.angle_deg is None:
             return None
         bracket = "repeat" if frame.role == "repeat" else "shot", frame.angle_deg

@@ -17,7 +17,7 @@ class Log:
     def write(self, device: str, mark: str, text: str) -> None:
         """Append a line: `>` sent, `<` received, `!` a note.
 
-        Raises StorageError, once, if the file cannot be written; later lines are dropped.
+        Raises StorageError if the file cannot be written, but only once; later lines are lost without an error.
         """
         stamp = datetime.now().isoformat(timespec="milliseconds")
         with self._lock:

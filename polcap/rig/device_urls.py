@@ -82,9 +82,9 @@ def open_camera(name: str, log: Log) -> Camera:
 
 
 def probe(port_url: str) -> str | None:
-    """Name of the rotator on a serial port, asked within four seconds; None without one; nothing moves.
+    """Ask for the rotator on a serial port: its name, or None if none answers within four seconds. Nothing moves.
 
-    Opening the port restarts many Arduinos, which then send their name unasked.
+    Opening the port restarts many Arduinos, which then send their name without a request.
 
     Raises HardwareError if the port cannot be opened.
     """

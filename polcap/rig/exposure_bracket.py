@@ -37,7 +37,7 @@ class Exposure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def parse_bracket(text: str) -> tuple[Exposure, ...]:
     """Parse exposures `1/200,1/50,1/13`, or in full `1/160 f/11 iso100 flash1/64, flash1/16, flash1/4`.
 
-    Values that a frame does not name are those of the frame before. Raises SettingError.
+    A value that a frame does not state is that of the previous frame. Raises SettingError.
     """
     exposures: list[Exposure] = []
     for part in text.split(","):
@@ -78,9 +78,10 @@ def bracket_by_iso(offered: list[float]) -> tuple[Exposure, ...]:
 
 
 def nearest(name: str, wanted: float, offered: list[float], power: float = 1.0) -> float:
-    """The value that the camera offers nearest to `wanted`, in stops; SettingError beyond half a stop.
+    """The value among those `offered` by the camera that is nearest to `wanted`, in stops.
 
-    `power` is 2 for f-numbers.
+    `power` is the power with which the value enters the exposure: 2 for f-numbers, else 1. Raises SettingError if the
+    nearest value is more than half a stop away; `name` is for the message.
     """
     best = min(offered, key=lambda value: abs(log2(value / wanted)))
     if power * abs(log2(best / wanted)) > _NEAREST_STOPS:

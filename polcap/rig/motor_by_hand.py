@@ -11,7 +11,7 @@ SETTINGS = RotatorSettings(settle=0.0, tolerance=180.0)  # any angle typed is ac
 
 
 class MotorByHand:
-    """Asks a person for every angle; the scale on the polarizer's ring defines zero."""
+    """Driver that asks a person to turn the ring to each angle; the scale on the ring defines zero."""
 
     model = "by hand"
     speed_deg_s = 9.0  # a quarter turn in ten seconds, for the plan

@@ -120,7 +120,7 @@ class ElliptecMotor:
     def _ask(self, command: str, expected: str) -> str:
         """Send a command and return the data of its answer; a busy device is asked again.
 
-        `expected` is the kind of answer. Raises NoAnswer, HardwareError.
+        `expected` are the two letters of the answer. Raises NoAnswer, HardwareError.
         """
         end = time.monotonic() + self._settings.timeout
         while time.monotonic() < end:

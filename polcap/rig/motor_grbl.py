@@ -130,7 +130,7 @@ class GrblMotor:
     def _wait_for_ok(self, text: str, quiet_s: float) -> None:
         """Send a line that GRBL answers when the motor has stopped, and wait for the answer.
 
-        After a second without a line GRBL is asked for its state; without any line for `quiet_s` it is lost.
+        After a second of silence GRBL is asked for its state. After `quiet_s` of silence the connection is lost.
 
         Raises NoAnswer, HardwareError.
         """

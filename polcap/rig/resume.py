@@ -1,4 +1,4 @@
-"""Resumes an interrupted capture: its options and its record; for a new capture the options given."""
+"""Resumes an interrupted capture: reads its options and its record; for a new capture checks the options."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from polcap.rig.shooting_plan import CaptureOrder
 
 
 def complete_order(folder: Path, options: dict[str, Any], resume: bool) -> CaptureOrder:
-    """Complete the options of a capture: those given, then those of the capture to `resume`, then defaults.
+    """Complete the options of a capture: `options`, else those of the capture to `resume`, else defaults.
 
     Raises SettingError if rotator or camera is missing, or the angles make no capture; CaptureError if the capture was
     begun with other options.
@@ -36,7 +36,7 @@ def complete_order(folder: Path, options: dict[str, Any], resume: bool) -> Captu
 
 
 def open_folder(folder: Path, resume: bool) -> RigFile | None:
-    """The record of an earlier run with `resume`; None for a new capture. Creates the folder.
+    """Create or open a capture folder: with `resume`, returns the record of the earlier run, else None.
 
     Raises CaptureError if the folder holds other files.
     """

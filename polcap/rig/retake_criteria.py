@@ -1,8 +1,6 @@
-"""Decides which frame is retaken.
+"""Decides which frames are retaken: damaged, repeated, wrongly exposed, clipped, unsharp, or from another camera.
 
-Damaged, repeated, wrongly exposed, clipped, unsharp, or with another lens or camera.
-
-Frames are measured in the decoder's process: a damaged file does no harm, and the camera goes on meanwhile.
+Frames are measured in the decoder's child process, so a damaged file cannot end polcap.
 """
 
 from math import log2
@@ -64,10 +62,7 @@ def measure(path: str) -> worker.Answer:
 
 
 def _sharpness(light: Floats) -> float:
-    """Sharpness of a picture: contrast within 1 px over contrast within 4 px.
-
-    Exposure and subject cancel, blur remains.
-    """
+    """Sharpness of a picture: contrast within 1 px over contrast within 4 px; almost independent of exposure."""
     near, far = (cv2.GaussianBlur(np.asarray(light, np.float32), (0, 0), sigma) for sigma in (1.0, 4.0))
     coarse = float(np.std(near - far))
     return float(np.std(light - near)) / coarse if coarse > 0 else 0.0
@@ -78,7 +73,8 @@ def retake_reason(
 ) -> str | None:
     """Reason for which a frame must be retaken; None for a good frame.
 
-    others : the accepted frames of the capture. sharpest : greatest sharpness of those with the same exposure.
+    `wanted` and `flash` are the planned exposure, `shortest` tells that it is the shortest of its bracket. `others` are
+    the accepted frames of the capture, `sharpest` is the greatest sharpness of those with the same exposure.
     """
     if any(facts.digest == other.digest for other in others):
         return "is the same photograph as an earlier one"
@@ -98,10 +94,7 @@ def retake_reason(
 
 
 def is_blurred(sharpness: float, sharpest: float) -> bool:
-    """Whether a frame is less sharp than the sharpest of the same exposure.
-
-    Differences that the polarizer explains are allowed.
-    """
+    """Whether a frame is less sharp than the sharpest of the same exposure, by more than the polarizer can cause."""
     return sharpness < _LEAST_SHARPNESS * sharpest
 
 

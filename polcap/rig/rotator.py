@@ -48,7 +48,7 @@ class RotatorSettings(Struct, frozen=True):
 
 
 class PolarizerRotator:
-    """Turns the polarizer's axis to an angle and returns the angle read back."""
+    """The polarizer's rotator: turns the axis to an angle and returns the angle that the motor reports."""
 
     def __init__(
         self, motor: Motor, settings: RotatorSettings, log: Log, port: Port | None = None, by_hand: bool = False

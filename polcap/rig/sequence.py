@@ -41,7 +41,7 @@ def shoot(
 ) -> dict[str, Any]:
     """Shoot a capture into `folder`, or with `resume` the frames that it lacks; returns a summary.
 
-    Returns a summary.
+    `tries` is how often a rejected frame is retaken; `report` is called with lines of text about the progress.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def shoot(
 def _take_missing(
     url: str, record: CaptureRecord, check: BackgroundCheck, camera: Camera, log: Log, report: Report
 ) -> None:
-    """Run the rotator and take the missing frames. However this ends, the motor is stopped and released."""
+    """Open the rotator and take the missing frames. At the end, also after an error, the motor is released."""
     with closing(check), closing(device_urls.open_rotator(url, log)) as rotator:
         try:
             record.content.rotator = rotator.model

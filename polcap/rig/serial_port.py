@@ -36,7 +36,7 @@ _CANNOT_OPEN = {
 
 
 class NoAnswer(HardwareError):
-    """Error: a device gave no answer, half an answer or an unknown one; asking again may help."""
+    """Error: the answer of a device is missing, incomplete or unknown; asking again may help."""
 
 
 class Unplugged(HardwareError):

@@ -76,8 +76,8 @@ def plan_slots(order: CaptureOrder, switches_flash: bool) -> tuple[Slot, ...]:
 def next_slot(missing: Sequence[Slot], at_deg: float) -> Slot:
     """The frame of a shooting plan to take now.
 
-    First the chart; then all frames at the present angle; then from the nearer end of the remaining angles through
-    them. Frames for which a person switches the flash follow, and last those with the filter on the flash.
+    The order is: the chart; all frames at the present angle; the remaining angles in order, from the nearer end; frames
+    for which a person switches the flash; frames with the filter on the flash.
     """
     angles = [slot.angle_deg for slot in missing if slot.angle_deg is not None and slot.role != "cross"]
     goal = at_deg
@@ -102,10 +102,7 @@ def schedule(slots: Iterable[Slot], at_deg: float = 0.0) -> list[Slot]:
 
 
 def uses_flash(order: CaptureOrder) -> bool:
-    """Whether the light of a capture is a flash.
-
-    The options show it: flash power, frames without flash, or a filter on the flash.
-    """
+    """Whether a capture is lit by a flash, by its options: flash power, ambient frames or a filter on the flash."""
     return order.ambient or order.cross or any(one.flash for one in order.bracket)
 
 

@@ -1,4 +1,4 @@
-"""The ten stages: pure functions from values of `images.py` to values of `images.py`.
+"""The ten stages of the path. Each is a pure function: it takes and returns values of `images.py`.
 
 In the order of the path:
 
@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Stage(Generic[P, T]):
-    """A pure function with a name, and a version that is raised whenever its pixels change."""
+    """A stage: a pure function, with a version number that is raised whenever its results change."""
 
     function: Callable[P, T]
     version: int

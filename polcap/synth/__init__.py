@@ -1,4 +1,1 @@
-"""Synthetic captures.
-
-Renders random shapes, materials and light through a simulated camera, and writes a capture folder.
-"""
+"""Synthetic captures: renders random scenes through a simulated camera, and writes capture folders with the truth."""

@@ -30,10 +30,7 @@ _MOST_TILT_DEG = 35.0
 
 
 class CalibrationShoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The simulated equipment and the calibration photographs to take.
-
-    One flat list, because users set the fields by name.
-    """
+    """The simulated equipment and the calibration photographs to take; users set the fields by name."""
 
     seed: Annotated[int, Meta(ge=0)] = 0
     width: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 384  # visible RAW px

@@ -44,10 +44,7 @@ def patches(chart: Chart, margin: float = 0.0) -> Floats:
 
 
 def intersect(chart: Chart, v: Floats) -> tuple[NDArray[np.integer], Floats, Floats]:
-    """Intersect rays with the chart.
-
-    Indices (N,) of the rays v (P, 3) that hit it, lengths (N,) [m] and albedo (N, 3).
-    """
+    """Intersect rays v (P, 3) with the chart: indices (N,) of the rays that hit it, lengths (N,) [m], albedo (N, 3)."""
     center = np.array(chart.center)
     near = np.flatnonzero(-(v @ center) > np.linalg.norm(center) * np.cos(5 * chart.pitch / np.linalg.norm(center)))
     distance, column, row = meet_plane(chart, v[near])
@@ -60,10 +57,7 @@ def intersect(chart: Chart, v: Floats) -> tuple[NDArray[np.integer], Floats, Flo
 
 
 def meet_plane(chart: Chart, v: Floats) -> tuple[Floats, Floats, Floats]:
-    """Intersect rays v (P, 3) with the chart's plane.
-
-    Lengths (P,) [m], and columns and rows (P,) from the chart's middle, in patches.
-    """
+    """Intersect rays v (P, 3) with the chart's plane: lengths [m]; columns and rows from its middle, in patches."""
     facing, across, down = chart.axes
     distance = -(np.array(chart.center) @ facing) / (v @ facing)
     point = -v * distance[:, None] - chart.center

@@ -1,7 +1,7 @@
 """Shapes as distance fields for sphere tracing; each in its own frame, in metres.
 
-`distance(p)`, (..., 3) -> (...,), is 0 on the surface and outside at most the true distance. `radius` is that of a
-sphere about the origin that contains the shape.
+`distance(p)`, (..., 3) → (...,), is 0 on the surface; outside it is positive and at most the true distance. `radius` is
+that of a sphere about the origin that contains the shape.
 
 References
 ----------

@@ -42,10 +42,8 @@ def pinhole(focal_mm: float, width: int, height: int) -> View:
 def undistort(view: View, bend: tuple[float, float], x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Convert pixels x, y of a distorting lens to pixels of the pinhole camera `view` that see the same points.
 
-    The distortion is k₁, k₂.
-
-    A ray at an angle of tangent t to the optical axis reaches the sensor at the radius f · (t + k₁ t³ + k₂ t⁵). The
-    inverse is interpolated in a fine table of this radius.
+    `bend` is (k₁, k₂). A ray at an angle of tangent t to the optical axis reaches the sensor at the radius
+    f · (t + k₁ t³ + k₂ t⁵). The inverse is interpolated in a fine table of this radius.
     """
     if not any(bend):
         return x, y
@@ -60,9 +58,9 @@ def undistort(view: View, bend: tuple[float, float], x: Floats, y: Floats) -> tu
 
 
 def rec709_to_camera(color_matrix: Sequence[float]) -> Floats:
-    """Matrix (3, 3) from linear Rec.709 to camera channels, scaled so that green of white is 1. color_matrix.
+    """Matrix (3, 3) from linear Rec.709 to camera channels, scaled so that white has 1 in green.
 
-    XYZ → camera.
+    `color_matrix` (9) converts XYZ to camera channels, as in a DNG.
     """
     matrix = np.reshape(color_matrix, (3, 3)) @ REC709_TO_XYZ
     return np.asarray(matrix / matrix[1].sum())

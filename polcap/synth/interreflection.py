@@ -24,8 +24,9 @@ Lit = Callable[[Floats, Floats, Floats], Floats]
 def received(tracer: Tracer, lit: Lit, camera: Floats, ior: float) -> Floats:
     """Interreflected light that enters the surface at each vertex, (V, 3), relative to the light from a white plane.
 
-    lit(point, normal, towards) gives the diffusely reflected S0 (N, 3) of points in the mesh's own frame in the
-    direction `towards`. camera (3,) is in the same frame; open surfaces are taken to face it.
+    `lit(point, normal, towards)` computes the diffusely reflected S0 (N, 3) of points under the flash, in the direction
+    `towards`. All positions are in the frame of the mesh, also that of the `camera` (3,). Normals of open surfaces are
+    turned to face the camera.
     """
     mesh = tracer.mesh
     normal: Floats = np.zeros(mesh.vertices.shape)

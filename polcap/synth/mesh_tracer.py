@@ -125,10 +125,7 @@ class Tracer:
         return MeshHits(index, position, normal, face, weight)
 
     def facing(self, origin: Floats, direction: Floats) -> tuple[Floats, Floats]:
-        """Distances (M,) to the first hits of rays, and normals of the triangles, turned to face the rays.
-
-        The distance is infinite without a hit.
-        """
+        """Distances (M,) to the first hits of rays, infinite without one, and normals (M, 3) that face the rays."""
         start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
         hit = self._scene.run(start, way, query="INTERSECT", output=True)
         struck = hit["primID"] >= 0
@@ -157,9 +154,9 @@ def tracer(file: str, radius: float) -> Tracer:
 
 
 def face_camera(normal: Floats, v: Floats) -> Floats:
-    """Normals flipped where they face away from the camera.
+    """Turn normals (N, 3) towards the camera, along rays v (N, 3).
 
-    Normals that smoothing turned slightly away are tilted back.
+    Normals that face away are flipped. Normals that smoothing turned slightly away are tilted back.
     """
     facing = np.sum(normal * v, axis=-1, keepdims=True)
     normal = np.where(facing < -0.3, -normal, normal)

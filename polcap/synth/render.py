@@ -28,7 +28,7 @@ _ROUGH = body.Law(rough=1.0)  # facets with the roughness of the gloss, all with
 
 
 class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An object and a chart under a flash, in front of a dark backdrop. One flat list, as stored in truth.json."""
+    """An object and a chart under a flash, in front of a dark backdrop; stored in truth.json."""
 
     shape: Shape | Model
     coat: Coat
@@ -86,10 +86,7 @@ def gbuffer(scene: Scene, view: View, height: int, width: int) -> ObjectBuffer:
 
 
 def guide(buffer: GBuffer) -> Floats:
-    """Distance (H, W) [m] at which tracing of rays near each pixel may start.
-
-    Nearer there is no surface; infinite where they miss the object.
-    """
+    """Distance (H, W) [m], in front of the surface, at which rays near each pixel may start; infinite: no object."""
     height, width = buffer.mask.shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
     distance = buffer.depth / frames.rays_at(buffer.view, x, y)[..., 2]
@@ -118,10 +115,7 @@ def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits
 
 
 def _unshadowed_irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:
-    """Irradiance (N,) by the flash as of `_irradiance`.
-
-    0 in the object's cast shadow, if the scene has cast shadows.
-    """
+    """Irradiance (N,) by the flash as of `_irradiance`, but 0 in the object's cast shadow if the scene has any."""
     light = _irradiance(scene, point, normal)
     if scene.cast_shadows:
         light[trace.in_shadow(scene.shape, scene.position, scene.turn, point, scene.light)] = 0.0

@@ -46,11 +46,10 @@ class Coat(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def evaluate(coat: Coat, position: Floats, facing: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Material at positions (..., 3) [m].
+    """Evaluate the material at positions (..., 3) [m] in the object's frame.
 
-    Diffuse albedo (..., 3), specular F0 (..., 3), roughness (...,), index (...,).
-
-    facing (..., 3): normals without relief, object's own frame.
+    Returns diffuse albedo (..., 3), specular F0 (..., 3), roughness (...,) and refractive index (...,). `facing`
+    (..., 3) are the normals without relief.
     """
     parts = [_evaluate_one(material, position, facing) for material in coat.materials]
     joined = _choose(coat, position, [np.concatenate([d, f, r[..., None], n[..., None]], -1) for d, f, r, n in parts])
@@ -111,9 +110,9 @@ def _slope(material: Material, position: Floats, facing: Floats) -> Floats:
 
 
 def _project(material: Material, position: Floats, facing: Floats) -> tuple[Floats, Any, Floats]:
-    """Look up a texture set at positions.
+    """Look up a texture set at positions (..., 3), projected along the object's axis nearest to the normal.
 
-    Values (..., 6), axis of projection (..., 1), and signs of u and v, −1 where mirrored (..., 2).
+    Returns the values (..., 6), the axis of projection (..., 1), and the signs of u and v, −1 where mirrored (..., 2).
     """
     texture = _texture(str(material.texture))
     axis = np.abs(facing).argmax(axis=-1)[..., None]

@@ -53,7 +53,7 @@ _CONVENTIONS = (
 
 
 class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Camera, polarizer and the photographer's errors. One flat list, because users set the fields by name."""
+    """The simulated camera, polarizer and errors of the photographer; users set the fields by name."""
 
     seed: Annotated[int, Meta(ge=0)] = 0
     width: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 1152  # visible RAW px
@@ -122,7 +122,7 @@ class Take:
     shot: int
     frame: int  # within the bracket
     stops: float  # exposure relative to the middle frame, as a factor
-    again: int = 0  # number of earlier tries
+    again: int = 0  # number of earlier photographs of this frame
     lit: bool = True  # False: the light is off
     dials: "Dials | None" = None  # None: as the bracket of `Shoot`
 
@@ -246,8 +246,8 @@ def _blur(shoot: Shoot, image: Floats) -> Floats:
 def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) -> float:
     """Automatic exposure of the middle frame of a bracket, for s0 (H, W, 3) in camera channels.
 
-    The 90th percentile of the object and the white patch reach at most 0.35 of the white level in that frame, and
-    99.9 % of the object at most 0.95 in the darkest frame.
+    In that frame the 90th percentile of the object, and the white patch, have at most 0.35 of the white level. In the
+    darkest frame 99.9 % of the object have at most 0.95.
     """
     bright = s0[buffer.mask].max(axis=-1) / 2
     if not bright.size:

@@ -16,15 +16,24 @@ Training of the main network, in the order in which a picture passes:
     validation        errors on held-out pictures during training
     onnx_export       weights -> ONNX
 
-The mask's network: `mask_views` traces objects before a backdrop, `mask_scenes` adds materials, light and chart
-(`backdrop_patterns`), `mask_train` stores them and trains. The refinement network: `relief` changes traced normals,
-`fine_train` photographs them, runs the main network and trains. Both are a `unet`.
+Training of the mask network, and of the refinement network; both are a `unet`:
 
-Evaluation: `evaluate` measures the error of every map (`map_errors`) on fixed pictures (`evaluation_protocol`, of
-`evaluation_materials` in `light_transport`) against `evaluation_baselines`; `evaluation_page` shows the result.
-`ablation_study` trains and evaluates all variants.
-`evaluation_photographs` measures normals on photographs that come with measured ones.
+    mask_views        objects in front of a backdrop, traced
+    mask_scenes       their materials, light and chart; `backdrop_patterns` draws the backdrop
+    mask_train        the mask network in the training loop
+    relief            random fine relief on traced normals
+    fine_train        the refinement network in the training loop
 
-`import_data` converts meshes and textures of other people.
-`dataset_files` writes the simulated pictures and their truth as files.
+Evaluation:
+
+    evaluate                errors of every map (`map_errors`), for a model and for `evaluation_baselines`
+    evaluation_protocol     the fixed pictures: `evaluation_materials` under the light of `light_transport`
+    evaluation_page         the result as a page
+    ablation_study          all variants of the network, trained and evaluated
+    evaluation_photographs  errors of the normals on photographs with measured normals
+
+Data:
+
+    import_data       meshes and textures of other people -> the data folder of `polcap train`
+    dataset_files     simulated pictures and their truth as files
 """

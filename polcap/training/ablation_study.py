@@ -1,4 +1,4 @@
-"""The table of ablations in one command, `polcap train --ablation`: every variant trained alike, then evaluated.
+"""Ablation study, `polcap train --ablation`: trains every variant of the network alike, then evaluates all.
 
 References
 ----------
@@ -53,7 +53,7 @@ def main(
 
 
 def _cost(options: TrainingOptions, count: int, size: int) -> str:
-    """What an ablation study costs, in words."""
+    """A sentence on the computing time of an ablation study."""
     networks = len(VARIANTS)
     each = f"{options.minutes:g} min" if options.samples is None else f"{options.samples} pictures"
     whole = f", {networks * options.minutes / 60:.1f} h in all" if options.samples is None else ""

@@ -18,10 +18,7 @@ def draw_pattern(position: Floats, rng: np.random.Generator) -> Floats:
 
 
 def draw_print(position: Floats, rng: np.random.Generator) -> Floats:
-    """Albedo (M, 3) of a printed pattern in two colors (checks, stripes, dots, markers).
-
-    Points (M, 3) as in `draw_pattern`.
-    """
+    """Albedo (M, 3) of a printed pattern in two colors (checks, stripes, dots, markers) at points (M, 3)."""
     u, w = _plane_coordinates(position, rng)
     size = float(np.exp(rng.uniform(np.log(0.04), np.log(0.5))))
     u, w = u / size, w / size

@@ -1,8 +1,8 @@
 """Interreflection within an object, for training: rays are traced once per view, light is computed per step.
 
-The flash is next to the lens, so the camera sees the places that the flash lights: bounced light comes from pixels of
-the same picture. `trace_visibility` traces a few rays from every second pixel of every second row and stores the pixels
-that they meet. `bounced_stokes` computes the light along these rays for the materials of a step.
+The flash is next to the lens, so the camera sees the places that the flash lights. So bounced light comes from pixels
+of the same picture. `trace_visibility` traces a few rays from every second pixel of every second row, and stores which
+pixels they hit. `bounced_stokes` computes the light along these rays for the materials of a training step.
 `mirrored_surroundings` adds the mirror image of a backdrop and of the ground where no part of the object hides them.
 Neglected, as in `light_transport.py`: further bounces, and the weak polarization of the light that arrives.
 """
@@ -43,11 +43,9 @@ Indices = NDArray[np.integer[Any]]
 def trace_visibility(
     tracer: Tracer, buffer: GBuffer, pose: light_transport.Pose, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint16]]:
-    """Trace one view.
+    """Trace one view: the pixels (H, W) that the flash reaches, and the pixels that bounce rays hit.
 
-    Pixels (H, W) that the flash reaches, and flat indices (H/2, W/2, RAYS) of pixels that rays hit.
-
-    An index is ESCAPED or NOWHERE for rays that meet no pixel.
+    The latter are flat indices (H/2, W/2, RAYS); ESCAPED or NOWHERE for rays that hit no pixel of the picture.
     """
     mask = buffer.mask
     height, width = mask.shape
@@ -78,10 +76,7 @@ def trace_visibility(
 
 
 def _draw_directions(normal: Floats, rng: np.random.Generator) -> Floats:
-    """Random ray directions (M, RAYS, 3) about normals (M, 3), in ray frames.
-
-    `_density` is their probability density.
-    """
+    """Draw random ray directions (M, RAYS, 3) about normals (M, 3), in ray frames, with the density `_density`."""
     turn, shift = rng.uniform(0, 1, (2, len(normal)))
     ways = []
     for number, alpha in ((_COSINE_RAYS, None), *_LOBES):
@@ -113,12 +108,11 @@ def _find_pixels(
 
 
 def bounced_stokes(pixels: Any, normal: Tensor, surface: Surface, body: Tensor) -> Tensor:
-    """Stokes parameters (3, M, 3) of flash light that reaches each pixel by one bounce on the object.
+    """Stokes parameters (3, M, 3) of the flash light that each pixel reflects after one bounce on the object.
 
-    Not yet smoothed.
-
-    pixels: `simulator.ObjectPixels`; normal (M, 3) with bumps, in the frames of the rays; body (M, 3) diffuse S0 under
-    the flash alone. All rays are used for diffuse and mirrored light, weighted by the balance heuristic.
+    `pixels` are `simulator.ObjectPixels`; normal (M, 3) has bumps and is in the frames of the rays; body (M, 3) is
+    diffuse S0 under the flash alone. All rays are used for diffuse and for mirrored light, weighted by the balance
+    heuristic. The result is noisy; `smooth` follows.
 
     References
     ----------

@@ -28,7 +28,7 @@ class CameraErrors:
     blur: Tensor  # px, 1σ
     depolarization: Tensor  # factor on S1, S2
     ambient: Tensor  # S0 of a white surface in the stray light
-    noise_belief: Tensor  # factor on the variance that the cues get
+    noise_belief: Tensor  # stated variance over true variance
 
     @staticmethod
     def draw(count: int, device: torch.device) -> "CameraErrors":
@@ -83,12 +83,11 @@ class CameraErrors:
 def photograph(
     stokes: Tensor, diffuse: Tensor, mask: Tensor, rays: Tensor, at: Tensor, errors: CameraErrors
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Simulate photographs of true Stokes parameters, and measure the Stokes parameters from them.
+    """Simulate three photographs of true Stokes parameters, and measure the Stokes parameters from them.
 
-    Returns measured Stokes parameters (3, M, 3), their covariance (6, M, 3) and clipped pixels (M,) at pixels `at`.
-
-    stokes (3, B, H, W, 3) in the frame of each ray; diffuse (B, H, W, 3); mask (B, H, W); rays (B, H, W, 3); at (M,)
-    indices into B·H·W. The solution uses nominal angles in the image, as `stages/stokes` does.
+    stokes (3, B, H, W, 3) are in the frame of each ray; diffuse and rays are (B, H, W, 3), mask (B, H, W); at (M,) are
+    indices into B·H·W. Returns measured Stokes parameters (3, M, 3), their covariance (6, M, 3) and clipped pixels
+    (M,), all at the pixels `at`. The measurement uses nominal angles in the image, as `stages/stokes` does.
     """
     count, height, width = mask.shape
     wide = (count, 1, 1, 1)

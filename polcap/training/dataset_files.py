@@ -9,8 +9,8 @@
                   normal.png depth.png diffuse.png specular.png roughness.png mask.png
                   sample.json         camera, flash, depth's limits
 
-A sample follows from the seed and its number. Incomplete samples are never left; a stopped run can continue, and a run
-with a larger number adds samples.
+A sample is determined by the seed and its number. Its folder appears when it is complete, so a stopped run can
+continue, and a run with a larger number adds samples.
 
 References
 ----------

@@ -1,7 +1,7 @@
 """Evaluation of a model, `polcap evaluate`: errors of all maps on the protocol's pictures, and of baselines.
 
-Cues, inference and model file are those of captures. Each core evaluates other pictures. Results of pictures are
-stored in out/pictures.jsonl, so that a stopped run can continue.
+Cues and inference are computed by the same code as for captures. Pictures are divided among the cores. The result of
+each picture is stored in out/pictures.jsonl, so that a stopped run can continue.
 """
 
 import hashlib
@@ -54,10 +54,7 @@ class EvaluationOptions:
 
 
 def main(options: EvaluationOptions) -> dict[str, Score]:
-    """Evaluate the model and all baselines on the evaluation pictures.
-
-    Writes evaluation.json, evaluation.md and panel.png to `out`.
-    """
+    """Evaluate model and baselines; returns mean scores, writes evaluation.json, evaluation.md and panel.png."""
     torch.set_num_threads(1)
     network = models.open_network(options.model)
     made = Protocol(options.data, options.size, options.protocol)

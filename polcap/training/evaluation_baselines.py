@@ -32,10 +32,7 @@ def frontal(seen: Cues) -> SurfaceMaps:
 
 
 def inflated(seen: Cues) -> SurfaceMaps:
-    """Baseline maps with the normals of an inflated silhouette.
-
-    Zenith by the distance to the outline, azimuth towards it.
-    """
+    """Baseline maps with normals of an inflated silhouette: zenith by distance to the outline, azimuth towards it."""
     distance = cv2.distanceTransform(seen.mask.astype(np.uint8), cv2.DIST_L2, 5)
     reach = max(float(distance.max()), 1.0)
     height = np.sqrt(np.maximum(reach**2 - (reach - distance) ** 2, 0))
@@ -80,10 +77,7 @@ def find_checkpoints(folder: Path | None) -> dict[str, Path]:
 
 
 def network_alone(checkpoint: Path) -> Estimator:
-    """Estimator that runs only the network of a checkpoint, with averaged weights.
-
-    The picture is reduced to about the size of training.
-    """
+    """Estimator that runs only the network of a checkpoint, with averaged weights, on reduced pictures."""
     network, _ = train.load_average(checkpoint)
 
     def estimate(case: Case) -> SurfaceMaps:

@@ -120,10 +120,7 @@ def grid(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
 
 
 def make_row(case: Case, maps: SurfaceMaps) -> Picture:
-    """Picture of one evaluation case: true maps above, estimated maps below.
-
-    In the last column, the normal error above the predicted error.
-    """
+    """Picture of one evaluation case: true maps above estimated ones; last the normal error above the predicted."""
     seen, mask, both = case.cues, case.truth.mask, (case.truth, maps)
     s1, s2 = seen.ratio
     depth = [case.depth, case.depth * 0 if maps.depth_prior is None else maps.depth_prior]

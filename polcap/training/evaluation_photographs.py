@@ -100,7 +100,7 @@ def score(folder: Path, angles: list[str], name: str, network: Network | None) -
 
 
 def as_a_body(cues: Cues, normal: Floats) -> float:
-    """Mean cos 2(AoLP − azimuth) over pixels with enough DoLP and tilt: 1 for diffuse, −1 for specular reflection."""
+    """Mean cos 2(AoLP − azimuth of `normal`) where DoLP and tilt suffice: 1 for diffuse, −1 for specular reflection."""
     use = cues.mask & (cues.dolp > _MIN_DOLP) & (np.hypot(normal[..., 0], normal[..., 1]) > _MIN_TILT)
     turned = 2 * np.arctan2(normal[..., 1], normal[..., 0])[use]
     cos, sin = cues.normalized_stokes[:, use]

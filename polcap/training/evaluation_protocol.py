@@ -147,7 +147,7 @@ class Protocol:
 def combination(number: int) -> tuple[int, int]:
     """Indices of mesh and material of an evaluation picture.
 
-    30 pictures show each material once and each mesh 5 times; 180 show all pairs.
+    The first 30 pictures show each material once and each mesh 5 times. 180 pictures show all pairs.
     """
     order = np.random.default_rng(_SEED).permutation(evaluation_materials.TEXTURES + evaluation_materials.PATTERNS)
     mesh = number % MESHES

@@ -1,9 +1,9 @@
 """Training of the refinement network: `python -m polcap.training.fine_train DATA MODEL OUT MINUTES`.
 
-MODEL is the file of the main network. First, traced views get a random relief, are photographed, and pass the main
-network; then tiles of these pictures are learned. A stopped run continues. Writes OUT/fine.onnx, last.pt, metrics.csv
-and watch.csv. One file per picture, (N + 4, H, W) fp16: the channels of `stages/infer/fine.py`, the true normal in the
-frame of each ray (3), the mask of known normals (1).
+MODEL is the file of the main network. First the training pictures are made: traced views get a random relief, are
+photographed, and pass through the main network. Then the network is trained on tiles of these pictures. A stopped run
+continues. Writes OUT/fine.onnx, last.pt, metrics.csv and watch.csv. A picture file has (N + 4, H, W) fp16: the channels
+of `stages/infer/fine.py` (N), the true normal in the frame of each ray (3), the mask of known normals (1).
 """
 
 import sys
@@ -60,10 +60,7 @@ def main(data: Path, model: Path, out: Path, minutes: float) -> None:
 
 
 def make_picture(simulator: Simulator, network: Network, number: int) -> NDArray[np.float16]:
-    """Simulate a photograph of a traced view with random relief.
-
-    Returns the layers of a picture file, cropped to the object.
-    """
+    """Simulate a photograph of a traced view with random relief: layers of a picture file, cropped to the object."""
     rng = np.random.default_rng([_RECIPE.seed, number])
     view = number % len(simulator.camera)
     focal, x, y, middle = (float(value) for value in simulator.camera[view, :4])
@@ -131,10 +128,7 @@ class FineTraining(loop.PictureTraining):
 
 @cache
 def load_example(file: Path) -> NDArray[np.float16]:
-    """Read a training picture of the refinement network.
-
-    Input channels, target relief (3), mask of known relief (1).
-    """
+    """Read a training picture of the refinement network: input channels (N), target relief (3), its mask (1)."""
     picture = np.load(file)
     channels = picture[:_COUNT].astype(np.float32)
     truth, known = picture[_COUNT : _COUNT + 3].astype(np.float32), picture[-1] > 0
@@ -173,10 +167,7 @@ def rotate(picture: Floats, quarters: int, mirror: bool) -> Floats:
 
 
 def _predict(network: nn.Module, pictures: Floats) -> tuple[Tensor, Tensor, Tensor]:
-    """Run the refinement network on pictures (B, N + 4, H, W).
-
-    Returns estimated and target relief, and the mask of known relief.
-    """
+    """Run the refinement network on pictures (B, N + 4, H, W): estimated and target relief, mask of known relief."""
     batch = torch.from_numpy(pictures.astype(np.float32))
     channels = batch[:, :_COUNT].contiguous(memory_format=torch.channels_last)
     return network(channels), batch[:, _COUNT : _COUNT + 3], batch[:, _COUNT + 3 :]

@@ -67,9 +67,9 @@ def dark_albedo(shape: tuple[int, ...], device: torch.device) -> Tensor:
 
 
 def draw_gloss(all_dark: Tensor, shape: tuple[int, ...]) -> Gloss:
-    """Draw a random gloss family for each surface and values from it.
+    """Draw a random gloss family for each surface, and values from it; where `all_dark` is true, dark gloss.
 
-    `all_dark` (bool, broadcast to the shape) forces dark gloss.
+    All fields have the shape `shape`, to which `all_dark` broadcasts.
     """
     device = all_dark.device
     share = torch.tensor([family.share for family in FAMILIES.values()], device=device)

@@ -1,8 +1,8 @@
-"""Gloss from profiles in the main network: radiance against zenith angle, averaged over soft groups of places.
+"""Part of the main network that estimates gloss from profiles: light against zenith angle, for groups of pixels.
 
-The gloss of a material is visible only where it faces the flash. Learned features divide places into groups. The light
-of each group is averaged in bins of the estimated zenith, and every place of the group gets the gloss read from this
-profile.
+The gloss of a material is visible only where it faces the flash. So learned features divide the pixels into groups of
+one material each. The light of a group is averaged in bins of the estimated zenith, and every pixel of the group gets
+the gloss that follows from this profile.
 """
 
 from dataclasses import dataclass
@@ -45,9 +45,9 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
         nn.init.zeros_(self.part[-1].bias)
 
     def forward(self, coarse: Tensor, fine: Tensor, seen: GlossEvidence) -> Tensor:
-        """Estimate gloss from features that group pixels.
+        """Estimate gloss (B, outputs, H, W) from features that assign pixels to groups.
 
-        Coarse features (B, ·, H/2, W/2) group by region, fine ones (B, ·, H, W) within it.
+        Coarse features (B, ·, H/2, W/2) assign regions, fine features (B, ·, H, W) pixels within a region.
         """
         color = torch.log(seen.diffuse + 0.02)
         weight = seen.usable + 1e-4
@@ -61,12 +61,11 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
 
 
 def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) -> Tensor:
-    """The five quantities (B, 5, H, W) that the gloss profiles average in bins of zenith angle.
+    """Compute the five quantities (B, 5, H, W) that the gloss profiles average in bins of zenith angle.
 
-    Log of light / shading; log of light / diffuse light; its square; its square as a factor; missing share of the DoLP
-    of diffuse light.
-
-    level (B, 3, H, W) log radiance, ratio (B, 2, H, W) S1/S0 and S2/S0, normal and diffuse (B, 3, H, W).
+    They are the log of light / shading; the log of light / diffuse light; its square; its square as a factor; the
+    missing share of the DoLP of diffuse light. level (B, 3, H, W) is log radiance, ratio (B, 2, H, W) is S1/S0 and
+    S2/S0; normal and diffuse are (B, 3, H, W).
     """
     cosine = normal[:, 2:].clamp(0.03, 1.0)
     plus, minus = fresnel.transmission(cosine, NOMINAL_IOR)
@@ -82,9 +81,8 @@ def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) ->
 def profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
     """Average quantities in bins of zenith, per group of pixels: profiles (B, groups, bins · 6).
 
-    Inputs: weights (B, groups, N), figures (B, 5, N), cosines of zenith (B, 1, N).
-
-    Each bin has the log share of its group, then the means of the figures; 0 where it is empty.
+    weight (B, groups, N) assigns N pixels to groups, figures are (B, 5, N), cosine (B, 1, N) is that of the zenith. A
+    bin has six numbers: the log of its share of the group, and the means of the five figures; 0 if it is empty.
     """
     edges = cosine.new_tensor([cos(radians(angle)) for angle in _EDGES_DEG]).view(1, -1, 1)
     at = ((cosine <= edges[:, :-1]) & (cosine > edges[:, 1:])).to(weight.dtype)  # (B, bins, N)

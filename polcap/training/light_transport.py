@@ -1,7 +1,7 @@
 """Traced flash light on a mesh, for the evaluation's pictures: direct, with shadows, and after one diffuse bounce.
 
-Traced are the places that the flash reaches, and the diffuse light that each place receives from others; it reflects
-this light diffusely and by its facets. Neglected: further bounces, and the weak polarization of the light that arrives.
+Rays find the points that the flash reaches, and the diffuse light that each point receives from other points. A point
+reflects this light diffusely and by its facets. Neglected: further bounces, and the weak polarization of this light.
 """
 
 from collections.abc import Callable
@@ -61,7 +61,7 @@ class SurfacePoints:
 def flash_light(tracer: Tracer, place: Floats, flat: Floats, pose: Pose) -> tuple[Floats, Floats]:
     """Direct flash light at points of a mesh: unit vectors to the flash (M, 3), and irradiance (M,), 0 in shadow.
 
-    Mesh frame; the irradiance is S0 of a white plane that faces the flash.
+    All vectors are in the frame of the mesh. The irradiance is S0 of a white plane that faces the flash.
     """
     flash = (pose.flash - pose.translation) @ pose.rotation
     far = np.linalg.norm(flash - place, axis=1)
@@ -94,10 +94,7 @@ class IndirectLight:
         self.tracer, self.places, self.pose, self.albedo = tracer, places, pose, albedo
 
     def diffuse(self, rng: np.random.Generator) -> Floats:
-        """Diffuse reflection (3, M, 3) of one-bounce light at visible points.
-
-        Rays are cosine-distributed over the hemisphere.
-        """
+        """Diffuse reflection (3, M, 3) of one-bounce light at visible points, by rays with a cosine distribution."""
         places, count = self.places, len(self.places.normal)
         turn = rng.uniform(0, 1, (count, 2))
         received: Floats = np.zeros((count, 3))
@@ -113,12 +110,10 @@ class IndirectLight:
         return _shade(places, places.diffuse * received, 0 * places.specular, places.ior, places.normal, one)
 
     def mirrored(self, rng: np.random.Generator) -> Floats:
-        """Specular reflection (3, M, 3) of one-bounce light at visible points.
+        """Specular reflection (3, M, 3) of one-bounce light at visible points, by random facets of the GGX law.
 
-        Facets are drawn from the GGX distribution.
-
-        Facets have an index of their own, `facet_ior`, for the F0 of the material. A scaled Fresnel curve of the body's
-        index would reflect more than 100 % at grazing angles.
+        Facets have an index of their own, `facet_ior`, that gives the F0 of the material. A scaled Fresnel curve of the
+        material's index would reflect more than 100 % at grazing angles.
         """
         places, count = self.places, len(self.places.normal)
         ior = facet_ior(places.specular.mean(axis=1), np.full(count, places.ior))

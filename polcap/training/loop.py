@@ -177,10 +177,7 @@ def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path, re
 
 
 def make_optimizers(network: nn.Module, rate: float) -> list[torch.optim.Optimizer]:
-    """The optimizers of a network: Muon for hidden layers.
-
-    AdamW for first and last layers, biases and knots of curves.
-    """
+    """The optimizers of a network: Muon for hidden layers; AdamW for first and last layers, biases and curves."""
     hidden: list[Tensor] = []
     outer: list[Tensor] = []
     plain: list[Tensor] = []

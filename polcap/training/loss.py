@@ -1,8 +1,8 @@
 """Loss of the main network: the error of each map, and of pictures rendered from all maps.
 
-The rendering loss is that of Deschaintre, Lin & Ghosh (CVPR 2021). The polarized renderer (`optics/shade.py`, which
-made the input too) renders truth and estimate under random lights and from other sides. Compared are log S0 and the
-linear polarization relative to it. This couples maps that are ambiguous one by one.
+The rendering loss is that of Deschaintre, Lin & Ghosh (CVPR 2021). The polarized renderer `optics/shade.py` renders
+truth and estimate under random lights and from random sides. The loss compares log S0, and the linear polarization
+relative to S0. So it couples maps that are ambiguous one by one.
 """
 
 import torch
@@ -25,9 +25,9 @@ _FLAT = 0.2  # mean tangential part of the normals below which a region has no c
 def total(
     maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None, *, polarized: bool = True
 ) -> tuple[Tensor, dict[str, float]]:
-    """Training loss of estimated maps (B, ·, H, W), and its parts as numbers.
+    """Training loss of estimated maps (B, ·, H, W), and its parts as numbers by name.
 
-    `random` draws the lights of the re-rendering loss.
+    `random` draws the lights of the rendering loss; without `polarized` that loss compares S0 alone.
     """
     mask = truth.mask
     inside = mask[:, None].float()
@@ -78,9 +78,9 @@ def centered(depth: Tensor, inside: Tensor) -> Tensor:
 
 
 def _rendered(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None, polarized: bool) -> Tensor:
-    """Loss of pictures rendered from the estimated maps, with polarization, under a random light and view per pixel.
+    """Loss of pictures rendered from the estimated maps, under a random light and view for each pixel.
 
-    Every second pixel of every second row is used.
+    It uses every second pixel of every second row.
     """
     at = truth.mask[:, ::2, ::2].reshape(-1).nonzero()[:, 0]
 

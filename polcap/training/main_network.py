@@ -60,10 +60,12 @@ LARGE = NetworkShape(
 class MainNetwork(nn.Module):  # type: ignore[misc]  # torch comes without types here
     """Main network: cue channels (B, 14, H, W) -> maps (B, ·, H, W) by name; H and W are multiples of 32.
 
-    normal: unit, in the frame of each pixel's ray. depth: growing away from the camera, mean about 0, in units of
-    `traced_views.depth_unit`. diffuse, specular: ρ_d and F0, linear. roughness: perceptual. sigma: expected angle
-    between estimated and true normal, degrees. highlight: share of S0 that the surface reflects; it is learned because
-    it helps the other maps, and is not exported.
+    normal             unit vectors in the frame of each pixel's ray
+    depth              growing away from the camera, mean about 0, in units of `traced_views.depth_unit`
+    diffuse, specular  ρ_d and F0, linear
+    roughness          perceptual
+    sigma              expected angle between estimated and true normal, degrees
+    highlight          specular share of S0; not exported, but learned because it helps the other maps
     """
 
     def __init__(self, shape: NetworkShape = SMALL, variant: str = "ours") -> None:
@@ -158,7 +160,7 @@ class Context(nn.Module):  # type: ignore[misc]  # torch comes without types her
 
 
 class LinearAttention(nn.Module):  # type: ignore[misc]  # torch comes without types here
-    """Network layer that groups pixels softly and returns each pixel the means of its groups.
+    """Network layer that assigns pixels to soft groups and gives each pixel the means of its groups.
 
     The cost is linear in the number of pixels.
 

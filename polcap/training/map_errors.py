@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from polcap.images import Bools, Floats, Quality, SurfaceMaps
 from polcap.optics import frames, shade
+from polcap.optics.morphology import erode
 from polcap.stages import surface
 from polcap.training.evaluation_protocol import Case, render_lights
 
@@ -25,7 +25,7 @@ class Judge:
 
     def __init__(self, case: Case) -> None:
         self.case, self.mask = case, case.truth.mask
-        self.core = cv2.erode(self.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        self.core = erode(self.mask, 2)
         self.clipped = self.mask & ((case.cues.quality & Quality.CLIPPED) > 0)
         self.rendered_mask = np.zeros_like(self.mask)
         self.rendered_mask.flat[np.flatnonzero(self.mask)[:: -(-int(self.mask.sum()) // _MAX_PIXELS)]] = True
@@ -33,13 +33,12 @@ class Judge:
         self.rendered = self._render(case.truth)
 
     def score(self, maps: SurfaceMaps) -> Score:
-        """Errors of all maps of a picture: RMSE unless the name differs; degrees; shares 0…1.
+        """Errors of all maps of a picture by name: RMSE unless the name differs; angles in degrees, shares 0…1.
 
-        `·_core`: mask eroded by 2 px.
-
-        `·_picture`: over the whole square picture, with zero error outside the object. depth: both centred in the mask,
-        in units of the truth's range; `depth_fitted`: after the best scale and shift. diffuse_clipped: where all
-        exposures are saturated; absent for fewer than ten such pixels.
+        `·_core` is the error in the mask eroded by 2 px; `·_picture` that of the whole square picture, with zero error
+        outside the object. For `depth` both depths are centered in the mask, and divided by the truth's range;
+        `depth_fitted` is the error after the best scale and shift. `diffuse_clipped` is the error where all exposures
+        are saturated; it is absent for fewer than ten such pixels.
         """
         case, mask, error = self.case, self.mask, angle(maps, self.case)
         out = {}
@@ -75,10 +74,7 @@ class Judge:
         return {"depth_integrated": _depth(depth / unit, self.case.depth[thin][mask])["depth"]}
 
     def _render(self, maps: SurfaceMaps) -> Floats:
-        """S0 (20, M, 3) rendered from maps under the 20 test lights, clipped to 0…1.
-
-        1 is the 99th percentile of the truth under the flash.
-        """
+        """S0 (20, M, 3) rendered from maps under the 20 test lights, clipped to 0…1, the truth's 99th percentile."""
         images = [render_intensity(maps, self.case, self.rendered_mask, light) for light in render_lights()]
         return np.asarray(np.clip(np.stack(images) / self.white, 0, 1))
 

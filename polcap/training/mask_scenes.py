@@ -82,9 +82,9 @@ def make_scene(
 
 
 def simulate_measurement(color: Floats, sums: Floats, chart: Bools, rng: np.random.Generator) -> ReducedPicture:
-    """Add noise and errors of gain and alignment to a simulated picture.
+    """Add noise, and errors of gain and alignment, to a simulated picture.
 
-    It consists of S0 (H, W, 3) and the Stokes parameters summed over colors (3, H, W).
+    `color` is S0 (H, W, 3), `sums` are the Stokes parameters summed over colors (3, H, W), `chart` (H, W) is the chart.
     """
     bright = float(np.percentile(color.mean(-1), 98)) + 1e-9
     color, sums = color / bright, sums / bright
@@ -105,9 +105,9 @@ def simulate_measurement(color: Floats, sums: Floats, chart: Bools, rng: np.rand
 def _change_materials(
     surface: Surface, position: Floats, number: NDArray[np.intp], mode: Mode, rng: np.random.Generator
 ) -> tuple[Surface, Tensor]:
-    """Materials changed to a difficult case `mode`, and a factor on each pixel's polarization (M,).
+    """Change materials to a difficult case `mode`; also returns a factor on each pixel's polarization (M,).
 
-    number (M,): −1 for the object, 0 for the plane below or behind it, 1 for the wall behind that plane.
+    `number` (M,) is −1 for the object, 0 for the plane below or behind it, 1 for the wall behind that plane.
     """
     diffuse, rough, specular = surface.diffuse.numpy(), surface.roughness.numpy(), surface.specular.numpy()
     factor = np.full(len(diffuse), rng.uniform(0.35, 1.0), np.float32)
@@ -152,9 +152,9 @@ def _log_uniform(low: float, high: float, rng: np.random.Generator) -> float:
 
 
 def _recolor(diffuse: Floats, where: Bools, level: float, contrast: float, rng: np.random.Generator) -> None:
-    """Change the albedo of part of a picture, in place.
+    """Change the albedo of part of a picture, in place: to a mean of `level` and a contrast of the pattern.
 
-    Mean `level`, nearly gray in half of the cases, and contrast of its pattern.
+    The new color is nearly gray in half of the cases.
     """
     pattern = diffuse[where] / max(diffuse[where].mean(), 1e-3)
     hue = np.exp(rng.normal(0, rng.choice([0.03, 0.3]), 3))
@@ -175,11 +175,9 @@ def _light(
 
 
 def _add_chart(image: Floats, mask: Bools, touching: float, rng: np.random.Generator) -> tuple[Bools, Floats | None]:
-    """Paint a ColorChecker next to or behind the object into S0.
+    """Paint a ColorChecker next to or behind the object into a picture (H, W, 3).
 
-    Returns its detected area (H, W) and corners (4, 2); one in fourteen counts as not detected.
-
-    One in fourteen is not found.
+    Returns its detected area (H, W) and corners (4, 2); one in fourteen counts as not detected: no area, None.
     """
     height, width = mask.shape
     frame = rng.uniform(0.15, 0.5)
@@ -206,10 +204,7 @@ def _add_chart(image: Floats, mask: Bools, touching: float, rng: np.random.Gener
 
 
 def _place_chart(mask: Bools, ratio: float, near: bool, rng: np.random.Generator) -> Floats | None:
-    """Corners (4, 2) of a place for the chart, the best of 14 random ones (`near` the object, or anywhere).
-
-    None if none is free.
-    """
+    """Corners (4, 2) of a free place for the chart, `near` the object or anywhere; None if 14 random tries fail."""
     size = np.array(mask.shape[::-1])
     found: list[tuple[float, Floats]] = []
     distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)

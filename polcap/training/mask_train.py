@@ -1,9 +1,9 @@
 """Training of the mask network: `python -m polcap.training.mask_train DATA OUT MINUTES`.
 
-Pictures are made first; each follows from its number. Each step reads some with random light, noise and crop, and has
-two passes: over whole pictures at a reduced size, then over parts of them, with the first result as a hint. A stopped
-run continues. Writes OUT/mask.onnx, last.pt, metrics.csv and watch.csv. Picture files OUT/pictures/000017.npy hold
-(H, W, 7) fp16: S0 in linear Rec.709, S1 and S2 summed over colors, object, chart.
+First the training pictures are made; each is determined by its number. A training step reads some of them, with random
+light, noise and crop. It has two passes: over whole pictures at a reduced size, then over parts of them, with the first
+result as a hint. A stopped run continues. Writes OUT/mask.onnx, last.pt, metrics.csv and watch.csv. A picture file
+OUT/pictures/000017.npy has (H, W, 7) fp16: S0 in linear Rec.709, S1 and S2 summed over colors, object, chart.
 """
 
 import sys
@@ -88,10 +88,7 @@ def _draw_mesh(files: list[Path], rng: np.random.Generator) -> Triangles:
 
 
 def pack(picture: mask_scenes.MaskScene) -> Floats:
-    """Layers (H/2, W/2, 7) of a training picture file.
-
-    Means of 2 × 2 pixels; radiance in units of its 95th percentile.
-    """
+    """Layers (H/2, W/2, 7) of a training picture file: means of 2 × 2 pixels, radiance over its 95th percentile."""
     stokes = picture.stokes / max(float(np.percentile(picture.stokes[0].mean(-1), 95)), 1e-9)
     sums = np.moveaxis(stokes[1:].sum(-1), 0, -1)
     whole = np.concatenate([stokes[0], sums, picture.mask[..., None], picture.chart[..., None]], axis=-1)
@@ -99,11 +96,9 @@ def pack(picture: mask_scenes.MaskScene) -> Floats:
 
 
 def load_varied(file: Path, rng: np.random.Generator, other: Path | None = None) -> tuple[ReducedPicture, Floats]:
-    """Read a training picture with random light, crop, mirroring and noise.
+    """Read a training picture with random light, crop, mirroring and noise; returns it and its true mask (H, W).
 
-    Returns the picture and its true mask (H, W).
-
-    other: file of another picture; its object is inserted into this one.
+    `other` is the file of another picture; its object is inserted into this one.
     """
     layers = np.load(file).astype(np.float32)
     if other is not None:
@@ -130,9 +125,9 @@ def load_varied(file: Path, rng: np.random.Generator, other: Path | None = None)
 
 
 def _crop(layers: Floats, rng: np.random.Generator) -> Floats:
-    """Random crop of a picture (H, W, 7), in half of the cases.
+    """Crop a picture (H, W, 7) at random, in half of the cases.
 
-    The part has enough of the object and is enlarged to the same size.
+    The crop contains enough of the object, and is enlarged to the old size.
     """
     height, width = layers.shape[:2]
     for _ in range(4 if rng.random() < 0.5 else 0):
@@ -184,10 +179,7 @@ class MaskTraining(loop.PictureTraining):
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def validate(self, out: Path) -> dict[str, float]:
-        """Intersection over union (IoU) of the masks of both passes on held-out pictures.
-
-        Here the second pass sees the whole picture.
-        """
+        """Intersection over union (IoU) of the masks on held-out pictures, for both passes over whole pictures."""
         rows = []
         for number, file in enumerate(self.files[: self.held_out]):
             picture, truth = load_varied(file, np.random.default_rng(number))
@@ -203,7 +195,7 @@ class MaskTraining(loop.PictureTraining):
 def mask_loss(logits: Tensor, truth: Tensor) -> Tensor:
     """Loss of mask logits: cross entropy plus 0.3 (1 − soft IoU), mean over the pictures; truth (B, 1, H, W) 0…1.
 
-    Cross entropy makes the probabilities honest.
+    Cross entropy is least for true probabilities; soft IoU counts whole objects.
     """
     entropy = F.binary_cross_entropy_with_logits(logits, truth)
     chance = torch.sigmoid(logits)
@@ -221,11 +213,10 @@ def _encode_reduced(picture: ReducedPicture, width: int) -> Floats:
 def _cut_part(
     picture: ReducedPicture, truth: Floats, chance: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Input channels and true mask of a rectangle near the outline.
+    """Cut a rectangle near the outline for the second pass: its input channels and true mask.
 
-    The hint channel is `chance` (h, w), the result of the first pass.
-
-    Four in ten are placed where the first pass is wrong.
+    `chance` (h, w) is the probability from the first pass; it becomes the hint channel. Four in ten rectangles are
+    placed where the first pass is wrong.
     """
     height, width = truth.shape
     zoom = rng.uniform(*_ZOOM)

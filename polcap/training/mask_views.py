@@ -1,7 +1,8 @@
 """Traced views of objects before a backdrop, without materials, for the pictures of the mask's training.
 
-Lengths are in longest sides of the object; camera frame of `optics/frames.py`, the lens at the origin. The backdrop is
-one or two planes: a wall behind the object; a table, and a wall behind; or a cloth on which the object lies.
+The unit of length is the longest side of the object. Positions are in the camera frame of `optics/frames.py`, with the
+lens at the origin. The backdrop is one or two planes: a wall behind the object; a table and a wall behind it; or a
+cloth on which the object lies.
 """
 
 from dataclasses import dataclass
@@ -98,9 +99,9 @@ def trace_view(tracer: Tracer, kind: ViewKind, size: tuple[int, int], rng: np.ra
 
 
 def meet_planes(planes: Floats, v: Floats) -> tuple[Floats, Floats, NDArray[np.intp]]:
-    """Intersect rays −v (N, 3) with the backdrop's planes.
+    """Intersect rays −v (N, 3) with the backdrop's planes (P, 4).
 
-    Distance (N,) to the nearest plane, infinite without one; its normal (N, 3) and number (N,).
+    Returns the distance (N,) to the nearest plane, infinite without one, its normal (N, 3) and number (N,).
     """
     facing = v @ planes[:, :3].T  # (N, P)
     distance = np.where(facing > 1e-3, -planes[:, 3] / np.maximum(facing, 1e-3), np.inf)

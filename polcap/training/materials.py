@@ -66,9 +66,9 @@ class MaterialLibrary:
         self.noise = _noise_volume(seed).to(device)  # (1, 7, D, D, D)
 
     def sample_textures(self, which: Tensor, u: Tensor, v: Tensor) -> Tensor:
-        """Sample texture sets at coordinates u, v, (M, 6): albedo, roughness, slope along u and v.
+        """Sample texture sets at coordinates u, v (M,), mirrored at whole numbers: (M, 6).
 
-        Mirrored at integer u, v.
+        The six values are albedo (3), roughness, slope along u, slope along v. `which` (M,) is the number of the set.
         """
         count = self.texture.shape[2]
         slot = which.float() * (2.0 / max(count - 1, 1)) - 1.0
@@ -77,10 +77,7 @@ class MaterialLibrary:
         return sampled[0, :, 0, 0].T
 
     def sample_noise(self, position: Tensor) -> Tensor:
-        """Sample the noise volume at positions, (M, 7).
-
-        Four noises of standard deviation 1, then the gradient of the fourth.
-        """
+        """Sample the noise volume at positions: (M, 7), four noises of variance 1, then the gradient of the fourth."""
         grid = _mirror(position)[None, None, None]
         return F.grid_sample(self.noise, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0, 0].T
 

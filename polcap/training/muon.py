@@ -52,9 +52,8 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without 
 def orthogonal(matrix: Tensor) -> Tensor:
     """Approximate U Vᵀ of the singular value decompositions U S Vᵀ of matrices (N, rows, columns).
 
-    Uses 5 Newton–Schulz steps.
-
-    Singular values end between 0.7 and 1.2. More steps would bring them to 1; training does not need it.
+    Five Newton–Schulz steps bring the singular values to 0.7…1.2. More would bring them to 1, which training does not
+    need.
     """
     wide = matrix if matrix.shape[-2] <= matrix.shape[-1] else matrix.mT
     x = (wide / (torch.linalg.matrix_norm(wide, keepdim=True) + 1e-7)).to(compute_type(matrix.device))

@@ -189,11 +189,9 @@ def _sweep(curve: Floats, tangent: Floats, axis: Floats, radius: Floats, sectors
 
 
 def _faces(rings: int, sectors: int, *, closed: bool) -> Faces:
-    """Triangles that connect successive rings of vertices.
+    """Triangles that connect successive rings of vertices; with `closed`, also the last ring with the first.
 
-    They are counter-clockwise from outside if rings are counter-clockwise from above.
-
-    closed: the last ring meets the first.
+    They are counter-clockwise from outside if the rings are counter-clockwise from above.
     """
     i, j = np.meshgrid(np.arange(rings - (not closed)), np.arange(sectors), indexing="ij")
     here, next_ring = i * sectors, (i + 1) % rings * sectors

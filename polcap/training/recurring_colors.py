@@ -50,12 +50,11 @@ class Recolor(nn.Module):  # type: ignore[misc]  # torch comes without types her
     def forward(
         self, diffuse: Tensor, doubt: Tensor, cosine: Tensor, inside: Tensor, clipped: Tensor
     ) -> tuple[Tensor, Tensor, ColorMixture]:
-        """Correct uncertain albedo by the recurring colors of the picture.
+        """Correct uncertain albedo (B, 3, H, W) by the recurring colors of the picture.
 
-        Returns albedo (B, 3, H, W), each pixel's share in the colors (B, COLORS, H, W), and the colors.
-
-        doubt (B, 2, H, W) is added to the log of 1σ by zenith, for lightness and for hue; cosine of the zenith, inside
-        and clipped (B, 1, H, W).
+        `doubt` (B, 2, H, W) is added to the log of the albedo's 1σ, which depends on the zenith, for lightness and for
+        hue. `cosine` of the zenith, `inside` and `clipped` are (B, 1, H, W). Returns the albedo, each pixel's share in
+        the colors (B, COLORS, H, W), and the colors.
         """
         color = _opponent(diffuse)
         expected = _interpolation_weights(cosine.flatten(2)) @ self.knots.T
@@ -114,10 +113,7 @@ def fit_mixture(color: Tensor, weight: Tensor) -> ColorMixture:
 
 
 def _correct(color: Tensor, spread: Tensor, colors: ColorMixture) -> tuple[Tensor, Tensor]:
-    """Expected true colors (B, 3, N) of measured colors with variances `spread`.
-
-    Also their membership (B, COLORS, N) in the mixture.
-    """
+    """Expected true colors (B, 3, N) of measured ones with variances `spread`; their membership (B, COLORS, N)."""
     difference = color[:, None] - colors.center[..., None]  # (B, COLORS, 3, N)
     wide = spread[:, None] + colors.variance[..., None]
     pull = difference / wide
@@ -146,10 +142,10 @@ class ColorGloss(nn.Module):  # type: ignore[misc]  # torch comes without types 
 
 
 def describe_colors(seen: GlossEvidence, first: Tensor, member: Tensor, colors: ColorMixture) -> Tensor:
-    """Features (B, COLORS, ·) from which the gloss of each recurring color is read.
+    """Features (B, COLORS, ·) from which the gloss of each recurring color is estimated.
 
-    Its profile and the whole object's; the color, and relative to the object's mean; its share; the mean of the first
-    estimate.
+    They are the gloss profiles of the color and of the whole object; the color, also relative to the object's mean; its
+    share; the mean of the first estimate.
     """
     usable, figures, cosine = (part.flatten(2) for part in (seen.usable, seen.figures, seen.cosine))
     own = member.flatten(2) * usable

@@ -17,7 +17,7 @@ _NONE = 0.2  # share of objects without relief
 
 
 def random_slopes(position: Floats, px: float, rng: np.random.Generator) -> Floats:
-    """Gradients (M, 3) of a random relief at positions (M, 3), in the same frame; px: length that a pixel covers."""
+    """Gradients (M, 3) of a random relief at positions (M, 3), in the same frame; `px` is the length of a pixel."""
     if rng.random() < _NONE:
         return np.zeros_like(position)
     wavelength = px * _SHORTEST * (_LONGEST / _SHORTEST) ** rng.random()
@@ -46,10 +46,7 @@ def tilt_normals(normal: Floats, slope: Floats) -> Floats:
 
 
 def _waves(position: Floats, wavelength: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """A random wave relief: height (M,) and gradient (M, 3).
-
-    A sum of plane waves of similar length with standard deviation 1.
-    """
+    """A random relief of plane waves of similar length: height (M,) of standard deviation 1, and gradient (M, 3)."""
     way = rng.normal(size=(_WAVES, 3))
     way *= (2 * pi / wavelength * rng.uniform(0.5, 1.3, _WAVES) / np.linalg.norm(way, axis=1))[:, None]
     phase: NDArray[np.float64] = position @ way.T + rng.uniform(0, 2 * pi, _WAVES)

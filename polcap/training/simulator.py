@@ -85,7 +85,7 @@ class Simulator:
         self, views: dict[str, NDArray[Any]], library: materials.MaterialLibrary, device: torch.device,
         bounces: bool = True,
     ) -> None:  # fmt: skip
-        """bounces: whether parts of an object light each other."""
+        """With `bounces`, parts of an object light each other."""
         self.library, self.device, self.bounces = library, device, bounces
         self.size = views["mask"].shape[1]
         self.camera = views["camera"]
@@ -145,11 +145,9 @@ class Simulator:
     def _seen_pixels(
         self, view: Indices, y: Indices, x: Indices, order: Indices, mask: NDArray[np.bool_], owner: Indices
     ) -> tuple[Indices, NDArray[np.float32]]:
-        """Targets of bounce rays for pixels (y, x) of the cached views `view`.
+        """The fields `met` and `open` of `ObjectPixels` for pixels (y, x) of the cached views `view`.
 
-        They are the fields `met` and `open` of `ObjectPixels`.
-
-        The thinned pixels of a view are in `order`, their masks are (B, H·W).
+        `order` are the pixels that remain after subsampling, `mask` (B, H·W) their masks, `owner` the object of each.
         """
         full, area = self.size, len(order)
         size, coarse = isqrt(area), full // bounced_light.COARSE
@@ -210,10 +208,7 @@ def to_batch(photo: SimulatedPhotographs) -> Batch:
 
 
 def channels(photo: SimulatedPhotographs) -> Tensor:
-    """Cue channels (B, N, H, W) of simulated photographs by `stages/cues`, 0 outside the input mask.
-
-    Channels are last in memory.
-    """
+    """Cue channels (B, N, H, W) of simulated photographs by `stages/cues`, 0 outside the input mask; channels last."""
     count, height, width = photo.rays.shape[:3]
     ratio, sigma, dolp, normalized = cues.polarization(photo.stokes, photo.covariance)
     clipped, at = photo.clipped, photo.at
@@ -228,10 +223,7 @@ def channels(photo: SimulatedPhotographs) -> Tensor:
 
 
 def _mirror(pixels: Indices, flip: bool) -> tuple[Indices, NDArray[np.float32]]:
-    """Pixel indices (H, W) mirrored at random, and the matrix (3, 3) that mirrors vectors.
-
-    Mirror axes are x, y and the diagonal.
-    """
+    """Mirror pixel indices (H, W) at random about x, y, diagonal; also the matrix (3, 3) that mirrors vectors."""
     change = np.eye(3, dtype=np.float32)
     for axis in range(3):
         if not flip or torch.rand(()) < 0.5:

@@ -1,8 +1,6 @@
-"""Cache of traced views of training meshes, without materials.
+"""Cache of traced views of training meshes, without materials: geometry, flash visibility, rays between surface points.
 
-Geometry, flash visibility, and rays between surface points.
-
-Views are square, fp16, one array per quantity, readable as memory maps. All follows from the seed.
+Views are square, fp16, with one array file per quantity, which is read as a memory map. The seed determines all views.
 """
 
 import json
@@ -207,7 +205,7 @@ def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[fl
 def _trace_shape(
     number: int, meshes: list[Path], recipe: ViewsRecipe
 ) -> Iterator[tuple[GBuffer, light_transport.Pose, NDArray[np.bool_], NDArray[np.uint16]]]:
-    """Each view of a mesh or random shape, the places of mesh and flash, and the result of `trace_visibility`."""
+    """Trace the views of a mesh or random shape: G-buffer, pose of mesh and flash, result of `trace_visibility`."""
     if number < len(meshes):
         path = meshes[number]
         rng = np.random.default_rng([recipe.seed, zlib.crc32(path.stem.encode())])

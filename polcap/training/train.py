@@ -36,7 +36,7 @@ class TrainingOptions:
     samples: int | None = None  # budget in pictures, instead of minutes
     resume: bool = False  # continue from out/last.pt
     start: Path | None = None  # ONNX model with the first weights; else random ones
-    done: int = 0  # pictures of `samples` that `start` has seen; the schedule goes on from there
+    done: int = 0  # pictures of `samples` with which `start` was trained; the schedule continues from there
     views: int | None = None  # of each mesh, instead of the preset's
     procedural: int | None = None  # random shapes, instead of the preset's
     threads: int = 2  # on a CPU, each with a batch of its own; one more thread makes the batches
@@ -139,7 +139,7 @@ def _check(options: TrainingOptions) -> None:
 def _make_batches(
     simulator: Simulator, preset: TrainingPreset, network: loop.Trainee, budget: loop.Budget, seed: int
 ) -> Iterator[Batch]:
-    """Endless training batches that follow from the seed: nothing else draws from torch's global random state."""
+    """Yield training batches without end. The seed determines them, because only this thread draws random numbers."""
     torch.manual_seed(seed)
     chooser, made = np.random.default_rng(seed), network.samples
     while True:

@@ -20,7 +20,7 @@ class UNet(nn.Module):  # type: ignore[misc]  # torch comes without types here
     def __init__(
         self, inputs: int, outputs: int, widths: tuple[int, ...], *, upsampled: int, full: int, context: bool
     ) -> None:
-        """upsampled: channels that reach full resolution from below; full: width of the layer at full resolution."""
+        """`upsampled`: channels that pass from half to full resolution; `full`: channels at full resolution."""
         super().__init__()
         self.stem = nn.Conv2d(4 * inputs, widths[0], 3, padding=1)
         self.levels = nn.ModuleList(ResidualBlock(width) for width in widths)
@@ -66,8 +66,8 @@ class ResidualBlock(nn.Module):  # type: ignore[misc]  # torch comes without typ
 def mask_network() -> UNet:
     """The mask network: logit of the object at each pixel, from the channels of `stages/mask/mask_channels.py`.
 
-    It sees the whole picture at a reduced size first, then, with the same weights, the object with the first result
-    as a hint.
+    It runs twice with the same weights: on the whole picture at a reduced size, then on the part with the object, with
+    the first result as a hint.
     """
     return UNet(len(mask_channels.CHANNELS), 1, (16, 32, 64, 112), upsampled=8, full=12, context=True)
 
@@ -75,7 +75,7 @@ def mask_network() -> UNet:
 def fine_network() -> UNet:
     """The refinement network: correction of the normals, from the channels of `stages/infer/fine.py`.
 
-    It sees 62 px far and never the whole object, so that tiles give the same result as the whole picture.
+    Its receptive field is 62 px, so that tiles give the same result as the whole picture.
     """
     network = UNet(len(fine.CHANNELS), 3, (40, 48, 64), upsampled=10, full=16, context=False)
     nn.init.zeros_(network.out.weight)

@@ -44,10 +44,7 @@ class HeldOutPictures:
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def picture(self, network: nn.Module) -> Picture:
-        """Picture of eight held-out cases in rows.
-
-        S0, then truth and estimate of normal, diffuse, F0, roughness and depth.
-        """
+        """Picture of eight held-out cases in rows: S0; truth and estimate of normal, diffuse, F0, roughness, depth."""
         batch = self.batches[0]
         sides = [_draw(maps, batch.mask) for maps in (vars(batch), main_network.run(network, batch.channels))]
         light = (torch.exp(batch.channels[:, main_network.COLOR].float()) - FLOOR) * batch.mask[:, None]

@@ -38,11 +38,9 @@ def _unpolarized(x: Tensor) -> Tensor:
 
 
 def _published(x: Tensor) -> Tensor:
-    """Input of an ablation: the published method's five pictures, linear.
+    """Input of an ablation: the published method's pictures at 0°, 45° and 90°, normalized Stokes map, diffuse color.
 
-    These are pictures at 0°, 45° and 90°, normalized Stokes map, diffuse color.
-
-    The polarization of the pictures is the mean over the color channels, which differ by noise only.
+    The pictures are linear. Their polarization is the mean over the color channels, which differ by noise only.
     """
     s0 = torch.exp(x[:, _AT["log_r"] : _AT["log_b"] + 1]) - FLOOR
     s1, s2 = (x[:, _AT[name]].unsqueeze(1) / 10 for name in ("s1", "s2"))

@@ -83,13 +83,15 @@ def test_measured_spectra_are_seen_under_d65(tmp_path: Path, percent: bool) -> N
     assert errors.mean() < 1.5 and errors.max() < 4
 
 
-def test_of_a_measured_sg_its_block_is_used(tmp_path: Path) -> None:
+def test_of_a_measured_sg_the_block_and_all_others_are_used(tmp_path: Path) -> None:
     table = colour.CCS_COLOURCHECKERS["ColorCheckerSG - After November 2014"]
     xyz = np.asarray(colour.xyY_to_XYZ(list(table.data.values())))
     (tmp_path / "sg.csv").write_text("\n".join(["id,X,Y,Z", *rows(list(table.data), xyz, ",")]))
     found, shipped = shipped_data.colorchecker(str(tmp_path / "sg.csv")), shipped_data.colorchecker("sg")
     np.testing.assert_allclose(found.rec709, shipped.rec709, atol=1e-3)
     assert found.is_block and found.patches == chart_file.SG_BLOCK
+    assert found.surroundings is not None and shipped.surroundings is not None
+    np.testing.assert_allclose(found.surroundings.rec709, shipped.surroundings.rec709, atol=1e-3)
 
 
 @pytest.mark.parametrize(

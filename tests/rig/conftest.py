@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.clocks import SleepClock
 from tests.rig import virtual
 from tests.rig.pool import Key, photographs
 
@@ -15,7 +16,7 @@ def pool() -> dict[Key, bytes]:
 
 
 @pytest.fixture
-def clock() -> Iterator[virtual.Clock]:
+def clock() -> Iterator[SleepClock]:
     """Virtual time of the rig's ports and motors."""
     with virtual.time() as clock:
         yield clock

@@ -1,6 +1,5 @@
 """Complete RAW files are taken from a tethering folder, once each, and stay unchanged."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,27 +10,15 @@ from polcap.rig.camera_watch_folder import WatchFolderCamera
 from polcap.rig.device_log import Log
 from polcap.rig.device_urls import open_camera
 from polcap.rig.exposure_bracket import Exposure
-from tests.rig import virtual
+from tests.clocks import SleepClock
 from tests.rig.pool import tiny
 
 ANY = Exposure()
 
 
-class Clock(virtual.Clock):
-    """The waiting camera's clock; `meanwhile` fills the folder."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.meanwhile: Callable[[], object] = lambda: None
-
-    def sleep(self, seconds: float) -> None:
-        super().sleep(seconds)
-        self.meanwhile()
-
-
 @pytest.fixture(autouse=True)
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock()
+def clock(monkeypatch: pytest.MonkeyPatch) -> SleepClock:
+    clock = SleepClock()
     monkeypatch.setattr(camera_watch_folder, "time", clock)
     return clock
 
@@ -49,7 +36,7 @@ def watched(folder: Path, timeout_s: float = 20.0) -> WatchFolderCamera:
 
 
 def test_a_file_written_slowly_is_taken_when_complete_and_is_not_changed(
-    tether: Path, tmp_path: Path, clock: Clock
+    tether: Path, tmp_path: Path, clock: SleepClock
 ) -> None:
     camera, data = watched(tether), tiny(tmp_path / "new.dng", iso=200.0)
     parts = iter([data[start : start + 400] for start in range(0, len(data), 400)])

@@ -9,7 +9,7 @@ from polcap.rig import person
 from polcap.rig.device_log import Log
 from polcap.rig.motor_grbl import MEANING, GrblMotor, GrblSettings
 from polcap.rig.serial_port import NoAnswer, Port
-from tests.rig import virtual
+from tests.clocks import SleepClock
 from tests.rig.devices import Grbl
 
 pytestmark = [pytest.mark.timeout(60), pytest.mark.usefixtures("clock")]
@@ -74,7 +74,7 @@ def test_an_alarm_or_a_restart_is_explained_and_ended_by_homing(fault: str, word
         assert device.angle_deg == pytest.approx(45)
 
 
-def test_a_stop_holds_before_it_resets_and_the_motor_sleeps(clock: virtual.Clock) -> None:
+def test_a_stop_holds_before_it_resets_and_the_motor_sleeps(clock: SleepClock) -> None:
     with Grbl(speed_deg_s=45) as device:
         device.angle_deg = 0.0
         board = motor(device)

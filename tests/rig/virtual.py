@@ -12,26 +12,14 @@ from unittest import mock
 import serial
 
 from polcap.rig import device_urls, motor_elliptec_ell14, motor_grbl, motor_line_protocol, rotator, serial_port
+from tests.clocks import SleepClock
 
 _STEP_S = 0.002  # between two steps of a device
 _BITS = 10  # of a byte on the wire: start, eight, stop
 _MODULES = (serial_port, motor_elliptec_ell14, motor_grbl, motor_line_protocol, rotator, device_urls)
 
 
-class Clock:
-    """Replaces the module `time` in the rig."""
-
-    def __init__(self) -> None:
-        self._now = 1000.0
-
-    def monotonic(self) -> float:
-        return self._now
-
-    def sleep(self, seconds: float) -> None:
-        self._now += seconds
-
-
-CLOCK = Clock()
+CLOCK = SleepClock()
 PLUGGED: dict[str, Any] = {}  # devices of `far_end` by URL
 
 
@@ -76,7 +64,7 @@ def _open(url: str, *, baudrate: int, timeout: float, **options: object) -> obje
 
 
 @contextmanager
-def time() -> Iterator[Clock]:
+def time() -> Iterator[SleepClock]:
     """The rig's ports and motors use this clock."""
     with ExitStack() as patches:
         for module in _MODULES:

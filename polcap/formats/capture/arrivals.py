@@ -1,4 +1,4 @@
-"""Waits until a folder that a camera is filling, or a file that somebody edits, has changed and rests again."""
+"""Watches a folder that a camera is filling, or a file that somebody edits: waits until changes have ended."""
 
 import os
 import time
@@ -13,8 +13,8 @@ FileStates = dict[str, tuple[int, int]]  # size and time of change by path
 def settled(folder: Path, ignored: Path, still_s: float = 2.0, edited: Sequence[Path] = ()) -> Iterator[None]:
     """Watch a folder: yield at once, then each time files changed and nothing has changed for `still_s` seconds since.
 
-    The folder `ignored` (of results) and names that begin with a dot are not watched. The files `edited` are saved in
-    one step, as by an editor: they count as at rest at the next poll.
+    The folder `ignored` (of results) and names that begin with a dot are not watched. An editor saves the files
+    `edited` in one step, so their changes count as ended at the next poll.
     """
     folder, ignored = folder.resolve(), ignored.resolve()
     done: tuple[FileStates, FileStates] | None = None

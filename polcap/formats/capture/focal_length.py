@@ -1,4 +1,4 @@
-"""Focal length in pixels from EXIF, from the user's statement, or assumed; with its source and its possible range."""
+"""Finds the focal length in pixels: stated by the user, from EXIF, or assumed; with its source and possible range."""
 
 import math
 import tomllib

@@ -129,7 +129,7 @@ def _listed(names: Sequence[str]) -> str:
 def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[str]) -> bool:
     """Whether a folder with these sub-folders `inside` and `files` is one capture, judged by names and first bytes.
 
-    Photographs in a folder that has sub-folders are taken for notes, unless there is a capture.toml.
+    Photographs next to sub-folders do not count (they document the session), unless there is a capture.toml.
     """
     if capture_toml.NAME in files or _degrees_by_name(inside):
         return True
@@ -139,7 +139,7 @@ def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[st
 
 
 def counted_clockwise(plan: Plan) -> Plan:
-    """The plan with all angles negated: they were counted clockwise in the picture."""
+    """Negate all angles of a plan, because they were counted clockwise in the picture."""
     turned = tuple((-angle if angle else 0.0, bracket) for angle, bracket in plan.shots)
     others = tuple(
         replace(source, angle_deg=-source.angle_deg if source.angle_deg else source.angle_deg) for source in plan.others
@@ -290,8 +290,6 @@ def _by_name(pictures: list[Source]) -> dict[float, list[Source]]:
     """Pictures other than RAW, grouped by the polarizer angle in their names.
 
     Empty unless exactly one number in the names differs and can be an angle.
-
-    Empty unless exactly one number in the names differs and can be an angle.
     """
     stems = [source.path.stem for source in pictures]
     raw = any(source.probe.kind == "raw" for source in pictures)  # numbers of a camera's counter
@@ -307,9 +305,9 @@ def _by_name(pictures: list[Source]) -> dict[float, list[Source]]:
 
 
 def _by_time(folder: Path, pictures: list[Source], angles_deg: Sequence[float]) -> tuple[Shots, str]:
-    """Split a flat folder into K brackets of equal length in order of time, one per polarizer angle.
+    """Split the pictures of a flat folder by time into K brackets of equal length, one per polarizer angle.
 
-    Also a note on the order.
+    Also returns a note on the assumed order.
     """
     timed = all(source.probe.exif.taken for source in pictures)
     order = sorted(pictures, key=lambda one: (one.probe.exif.taken if timed else "", natural(one.path.name)))
@@ -359,9 +357,9 @@ def different(angles_deg: Iterable[float]) -> int:
 
 
 def _list(folder: Path, remedy: str = "") -> tuple[list[Source], list[str]]:
-    """The photographs of one folder, and notes; JPEGs and the like are left out if there are RAW files.
+    """List the photographs of one folder, with notes; JPEGs and the like are left out if there are RAW files.
 
-    With a `remedy`, a folder without photographs is a CaptureError.
+    If `remedy` is not empty, a folder without photographs is a CaptureError with this remedy.
     """
     files = [path for path in children(folder) if path.is_file()]
     probes = parallel.results([partial(_probe, path) for path in files], min(_AT_ONCE, parallel.threads()))

@@ -26,9 +26,9 @@ _SHOOT_RAW = "; set the camera to RAW or DNG"
 def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockwise: bool = False) -> Capture:
     """Read a capture folder: pol000/ pol045/ …, capture.toml, flat, or polarization-sensor frames.
 
-    Every file's metadata and bytes are read, no pixel is decoded. `angles_deg` is the order of
-    the brackets of a flat folder (0, 45, 90 by default); elsewhere it picks from the angles that
-    the folder states, the first being the reference. `clockwise`: the stated angles count clockwise in the picture.
+    Every file's metadata and bytes are read, but no pixel is decoded. `angles_deg` is the order of the brackets of a
+    flat folder (0, 45, 90 by default). In other layouts it selects from the angles that the folder states; the first is
+    the reference. `clockwise`: the stated angles are counted clockwise in the picture.
 
     Raises CaptureError: the photographs do not form a capture; the message names the file, the reason and the remedy.
     Raises DecodeError: a file is cut short, or no decoder recognises it.
@@ -154,10 +154,7 @@ def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Se
 
 
 def _crossed(folder: Path, plan: layouts.Plan, stated: CaptureFile) -> Shot | None:
-    """The cross-polarized shot (a polarizer on the flash too), if any.
-
-    Its angle is the stated one, else that of the first shot.
-    """
+    """The cross-polarized shot (polarizer on the flash too), if any; by default its angle is that of the first shot."""
     sources = [source for source in plan.others if source.role == "cross"]
     if not sources:
         return None

@@ -56,9 +56,10 @@ class Blob:
         return self.accessor(numbers, self.view(numbers.tobytes(), target=_ELEMENTS))
 
     def accessor(self, array: NDArray[Any], view: int | None, *, bounds: bool = False) -> int:
-        """Add an accessor for an array (N, C) that a view holds, or, without a view, an extension.
+        """Add an accessor, which describes an array (N, C) to readers; returns its index.
 
-        It describes the array.
+        The data are in the buffer view `view`; None: an extension has them. `bounds` adds the least and greatest
+        values.
         """
         entry: dict[str, Any] = {} if view is None else {"bufferView": view}
         entry |= {

@@ -189,7 +189,7 @@ def _packet(name: str, provenance: Mapping[str, str]) -> dict[str, Any]:
 def center(vertices: Floats) -> Floats:
     """Middle (3,) of the bounding box of vertices (V, 3): the asset's origin.
 
-    Subtracting it from float32 vertices loses nothing: they lie on a grid (`surface.triangles.on_grid`).
+    Subtracting it from float32 vertices loses nothing: they lie on a grid (`surface.triangles.to_float32`).
     """
     return np.asarray((vertices.min(axis=0).astype(np.float64) + vertices.max(axis=0)) / 2)
 

@@ -29,7 +29,7 @@ def stem(name: str) -> str:
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], comment: str = "") -> list[Path]:
     """Write a mesh as `path` (.obj), its .mtl and two EXR textures; returns the paths.
 
-    `files`: PNGs in the same folder.
+    `files` are the names of the PNG textures in the same folder, by kind.
 
     Raises StorageError: a file cannot be written.
     """

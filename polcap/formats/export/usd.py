@@ -170,9 +170,9 @@ def _openpbr(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str]) -> A
 
 
 def _preview(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tint: bool) -> Any:
-    """Add a UsdPreviewSurface material.
+    """Add a UsdPreviewSurface material; its F0 comes from a texture in the specular workflow.
 
-    F0 comes from a texture; with `tint`, as F0 divided by the F0 of the index (metallic workflow).
+    With `tint` it is in the metallic workflow, and the texture is F0 divided by the F0 of the index.
     """
     from pxr import Sdf, UsdShade
 

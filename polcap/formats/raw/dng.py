@@ -38,11 +38,9 @@ def write(
 ) -> None:
     """Write a mosaic (H, W) of even sides as a DNG, every count unchanged; after a failure no file is left.
 
-    The many parameters are the facts that a DNG has to state.
-
     cfa : (2, 2) or (6, 6) of 0 R, 1 G, 2 B. black : counts, one or (2, 2). white : counts.
     color_matrix : (3, 3) XYZ under D65 → camera. as_shot_neutral : (3,) camera values of a grey.
-    exif : fields that are None are left out; its width, height and color_matrix are not used.
+    exif : camera settings; width, height and color_matrix in it are not used.
 
     Raises ValueError: the mosaic is not uint16, or its sides are odd.
     Raises StorageError: the file cannot be written.

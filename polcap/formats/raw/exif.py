@@ -1,6 +1,6 @@
-"""Camera settings from a photograph's EXIF: every maker's RAW, and finished pictures. In the child process.
+"""Reads camera settings from the EXIF tags of RAW files of every maker, and of finished pictures.
 
-Only tags are read, about a millisecond per file; the pixel count comes from the decoder.
+It runs in the child process. The number of pixels comes from the decoder, not from the tags.
 """
 
 import io
@@ -76,7 +76,7 @@ class _Tags:
 
 @cache
 def _check_reader() -> None:
-    """Raise a SettingError if exifread does not read a sound tag: then it is not the photographs' fault."""
+    """Raise a SettingError if the installed exifread cannot read a valid tag, so that no photograph is blamed."""
     import exifread
 
     try:

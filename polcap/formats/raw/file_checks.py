@@ -1,6 +1,6 @@
 """Refuses photographs that are cut short, incomplete, have wrong levels, or are of a kind that decoders misread.
 
-Decoders return pixels from such files too: black, grey, or whatever was in memory. Runs in the child process.
+Decoders return false pixels from such files without an error. The checks run in the child process.
 """
 
 import re

@@ -23,11 +23,10 @@ def decode(frame: Frame) -> SensorImage:
 
 
 def apply(frame: Frame, function: Callable[..., worker.Answer], **options: Any) -> worker.Answer:
-    """Evaluate `function(image, **options)` on a photograph's pixels.
+    """Decode a photograph and return `function(image, **options)`; for a RAW all of it runs in the child process.
 
-    For a RAW in the child process, which returns only the result.
-
-    The function is a module's, the options plain JSON values. Raises DecodeError as `decode`.
+    So only the result is sent back. The function must be at the top level of a module, the options plain JSON values.
+    Raises DecodeError as `decode` does.
     """
     if frame.reading.kind != "raw" or frame.reading.sensor_deg is not None:
         return function(decode(frame), **options)

@@ -27,12 +27,11 @@ _MAX_CONDITION = 1e4  # of a color matrix; above, its inverse is meaningless. Se
 def read(path: str | Path, digest: str | None = None) -> SensorImage:
     """Decode one RAW file to sensor counts: black level not subtracted, masked border removed.
 
-    A Bayer file gives its mosaic (H, W) with `black` (2, 2) and `cfa` in the phase of its
-    first visible pixel; an X-Trans file from its first whole 3×3 block on, (6, 6) both. A file of
-    linear channels, or of a monochrome sensor, gives (H, W, 3) and no `cfa`.
-    `camera_matrix` includes the white balance: it takes the camera's response to a grey in the light of
-    the shot, 1/`white_balance`, to (1, 1, 1).
-    With the `digest` of `probe.read`, the file must still hold the bytes that were probed.
+    A Bayer file gives its mosaic (H, W), with `black` and `cfa` (2, 2) that begin at the first visible pixel. An
+    X-Trans file gives it from its first whole 3×3 block on, with `black` and `cfa` (6, 6). A file of linear channels,
+    or of a monochrome sensor, gives (H, W, 3) and no `cfa`. `camera_matrix` includes the white balance: it converts the
+    camera's response to a grey, 1/`white_balance`, to (1, 1, 1). With the `digest` of `probe.read`, the file must still
+    have the bytes that were probed.
 
     Raises DecodeError: not a RAW, damaged, changed since, of another mosaic or Foveon; or the decoder crashed, hung or
     ran out of memory.
@@ -56,11 +55,9 @@ def image(meta: dict[str, Any], arrays: worker.Arrays) -> SensorImage:
 
 
 def camera_matrix(xyz_to_camera: Floats, balance: Floats | None) -> Floats | None:
-    """Color matrix (3, 3) from camera RGB to linear Rec.709, including the white balance (3,).
+    """Color matrix (3, 3) from camera RGB to linear Rec.709, including the white balance (3,); None: daylight's.
 
-    Daylight if `balance` is None.
-
-    None where the matrix cannot be inverted.
+    The result is None if the matrix XYZ → camera cannot be inverted.
 
     References
     ----------
@@ -181,7 +178,7 @@ def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
 def unsupported(shape: tuple[int, ...] | None, rotated: bool = False) -> str:
     """Message why a color filter array with this period (rows, columns) cannot be used; None means a Foveon sensor.
 
-    rotated : its rows and columns run at 45° to the picture's.
+    `rotated`: the rows of photosites run at 45° to those of the picture.
     """
     if shape is None:
         reason = "not in front of each pixel: it is a Foveon's layers, or sub-sampled color"

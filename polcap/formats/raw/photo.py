@@ -37,9 +37,9 @@ def read(
 ) -> SensorImage:
     """Decode a finished picture as linear values (H, W, 3); a grey picture is repeated in all three channels.
 
-    Linear integers stay counts; floating point has white 1. An sRGB-encoded picture becomes linear 0…1 and
-    `lossy`, as every 8-bit one is. By default `encoding` is sRGB for 8 bits, else linear; `white` the greatest value
-    of the type. With the `digest` of `probe.read`, the file must still hold the bytes that were probed.
+    Linear integers stay counts; for floating point, white is 1. An sRGB-encoded picture becomes linear 0…1. It and
+    every 8-bit picture are marked `lossy`. By default `encoding` is sRGB for 8 bits, else linear, and `white` is the
+    greatest value of the type. With the `digest` of `probe.read`, the file must still have the bytes that were probed.
 
     Raises DecodeError: not a picture, damaged, or changed since it was probed.
     """
@@ -68,7 +68,7 @@ def read_mosaic(
     """One angle (0, 45, 90 or 135°) of a polarization sensor's raw frame, (H/2, W/2, 3), linear.
 
     The frame's 2×2 cell is 90 45 / 135 0 degrees. `white` and `black` are counts; by default those that the file
-    states, or the greatest of the type and 0. `kind` is that of the file; `digest` as in `read`.
+    states, or the greatest value of the type and 0. `kind` is the file's kind; `digest` as in `read`.
 
     Raises DecodeError: the frame is in color, or cannot be read.
     """

@@ -1,6 +1,6 @@
-"""Kind, digest, EXIF and size of a photograph, without decoding its pixels.
+"""Probes a photograph: kind, digest, EXIF and size, without decoding its pixels.
 
-One call into the child process and one reading of the file: metadata and digest are of the same bytes.
+The child process reads the file once, so metadata and digest belong to the same bytes.
 """
 
 from dataclasses import asdict, dataclass, replace

@@ -1,9 +1,9 @@
 """Runs a function on an untrusted file in a child process with limits on time and memory.
 
-C libraries crash, hang and eat memory on damaged files; here that ends one child and raises one `DecodeError` that
-names the file. The child is a fresh interpreter, never a fork (no OpenMP state is copied), and serves the next file
-too. Its answer is bounded and holds JSON and numbers only, so a file that takes over the child gains nothing from the
-parent. Arrays come back as raw bytes over the pipe, read straight into their final memory.
+On damaged files, C libraries crash, hang or use up the memory. Here this ends one child process and raises a
+`DecodeError` that names the file. The child is a new interpreter, not a fork, because a fork would copy OpenMP's state.
+It is used again for the next file. Its answer has a limited size and contains only JSON and numbers, so a malicious
+file that controls the child cannot run code in the parent. Arrays come back as raw bytes over a pipe.
 """
 
 import atexit
@@ -67,12 +67,13 @@ class Worker:
         limit_s: float | None = None,
         **options: Any,
     ) -> Answer:
-        """Run `function(path, **options)` in the child; the function is a module's, the options plain JSON values.
+        """Run `function(path, **options)` in the child process and return its answer.
 
-        `limit_s` is a tighter time limit than the worker's.
+        The function must be at the top level of a module, the options plain JSON values. `limit_s` is a time limit
+        shorter than the worker's.
 
         Raises DecodeError: the function refused the file, crashed, or exceeded its time or memory.
-        Raises ChildBug: the function failed in a way that no file may cause.
+        Raises ChildBug: the function has a defect.
         """
         name, limit = os.fspath(path), min(self.timeout_s, limit_s or self.timeout_s)
         request = [function.__module__, function.__qualname__, name, options, limit]
@@ -128,9 +129,7 @@ class Worker:
     def _answer(self, pipe: IO[bytes]) -> Answer:
         """Read the child process's answer from the pipe: JSON, then arrays.
 
-        ValueError if it is too large or an array is not numeric.
-
-        ValueError if it is too large or contains anything but numbers.
+        Raises ValueError: the answer is too large, or an array is not numeric.
         """
         head = json.loads(_receive(pipe, _HEAD_BYTES))
         if not head.keys() & {"meta", "error", "bug"}:

@@ -1,8 +1,8 @@
 """Stage 3: register every polarizer shot with the reference shot.
 
-Turning the polarizer changes brightness smoothly over the object, a nudge of the camera moves its texture. So the
-shots are compared in the logarithm of radiance without its coarse structure (`detail`): what is left is texture, chart
-and outline, which polarization hardly changes. Tiles where it does are outvoted (`optics.registration`).
+A turn of the polarizer changes brightness smoothly over the object. A move of the camera shifts its texture. So the
+shots are compared in the fine structure of the logarithm of radiance (`detail`): texture, chart and outline, which
+polarization hardly changes. Tiles in which it does change them are outliers of the fit (`optics.registration`).
 """
 
 from typing import Annotated, Literal
@@ -70,7 +70,7 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: AlignSetti
 
 
 def _of_mosaic(offset_px: Floats) -> Alignment:
-    """Alignment of shots cut from one polarization-sensor frame: their offsets (K, 2) px are known."""
+    """Alignment of shots that are cut from one frame of a polarization sensor: their offsets (K, 2) px are known."""
     transform = np.tile(np.eye(3), (len(offset_px), 1, 1))
     transform[:, :2, 2] = -offset_px
     return Alignment(transform, np.zeros(len(offset_px)), np.ones(len(offset_px)))
@@ -107,9 +107,10 @@ def _register_shot(
 
 
 def _best_match(reference: Pyramid, shot: Pyramid, settings: AlignSettings) -> tuple[registration.Registration, float]:
-    """The motion under which two shots correlate best in their detail, or else in their edges; and the correlation.
+    """Find the motion under which two shots correlate best, in their detail or in the strength of their edges.
 
-    Strong polarization may change which side of an edge is brighter, but not where the edge is.
+    Strong polarization may change which side of an edge is brighter, but not where the edge is. Also returns the
+    correlation.
     """
     assert settings.model != "none"
     found = registration.register(reference, shot, settings.model)

@@ -1,9 +1,10 @@
-"""Fine detail of a shot's log radiance: the picture in which shots of different polarizer angles are compared."""
+"""Makes the pictures in which shots of different polarizer angles are compared: fine detail of log radiance."""
 
 import cv2
 import numpy as np
 
 from polcap.images import Floats, MaskedImage, Quality
+from polcap.optics.morphology import dilate
 from polcap.optics.registration import Pyramid, squared_gradient
 from polcap.optics.resize import block_means
 
@@ -19,11 +20,10 @@ def averaging_step(shape: tuple[int, ...], most_pixels: float) -> int:
 
 
 def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
-    """Fine detail of a shot: log radiance, averaged by `step`, less all coarser than a Gaussian of `detail_px`.
+    """Compute the fine detail of a shot: log radiance minus its Gaussian mean of 1σ = `detail_px`.
 
-    `detail_px` is in averaged px.
-
-    Multiplied by d² / (d² + σ²), d the typical detail and σ the relative noise, as a Wiener filter does.
+    The shot is first averaged over `step` × `step` px; `detail_px` counts these averaged pixels. A Wiener filter
+    multiplies the detail by d² / (d² + σ²), d the typical detail and σ the relative noise.
     """
     total = block_means(_sum_of_channels(shot.value), step)
     height, width = total.shape
@@ -40,12 +40,11 @@ def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
     sigma /= level
     fine /= 1 + (sigma / np.float32(_TYPICAL_DETAIL)) ** 2
     clipped = block_means(shot.quality & Quality.CLIPPED > 0, step) > 0
-    around = np.ones((int(np.ceil(2 * detail_px)) | 1,) * 2, np.uint8)
-    return Pyramid(fine, cv2.dilate(clipped.view(np.uint8), around) == 0)
+    return Pyramid(fine, ~dilate(clipped, int(np.ceil(2 * detail_px)) // 2))
 
 
 def edge_strength(shot: Pyramid) -> Pyramid:
-    """Strength of edges in a shot, independent of which side is brighter: root of the gradient."""
+    """Strength of the edges in a shot, independent of which side is brighter: root of the gradient's length."""
     strength = np.sqrt(cv2.GaussianBlur(np.sqrt(squared_gradient(shot[0].picture)), (0, 0), 1.0))
     return Pyramid(np.asarray(strength), shot[0].usable)
 

@@ -1,16 +1,16 @@
 """Detects motion of the object relative to its surroundings, which one transform of the whole picture would hide.
 
-A similarity's zoom and roll can stand for an object that was pushed while chart and backdrop stayed. So object and
-surroundings are registered separately, and the two motions are compared in the middle of the object.
+If the object was pushed while chart and backdrop stayed, one transform fits both by a false zoom and roll. So object
+and surroundings are registered separately, and the two motions are compared in the middle of the object.
 """
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from polcap.images import Alignment, AngleStack, Floats, ObjectMask
 from polcap.optics import registration
+from polcap.optics.morphology import dilate, erode
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import Pyramid, Registration
 from polcap.optics.resize import area_mean
@@ -46,8 +46,7 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
     step = averaging_step(object_.mask.shape, _MOST_PIXELS)
     reference = detail(radiance.shot(0), _DETAIL_PX, step)[0]
     small = area_mean(object_.mask.astype(np.uint8), reference.picture.shape)
-    near = cv2.dilate(small, np.ones((2 * _RIM_PX + 1,) * 2, np.uint8)) > 0
-    core = cv2.erode(small, np.ones((_RIM_PX + 1,) * 2, np.uint8)) > 0
+    near, core = dilate(small > 0, _RIM_PX), erode(small > 0, _RIM_PX // 2)
     regions = [Pyramid(reference.picture, reference.usable & region) for region in (near, ~near, core)]
     points = np.argwhere(core)[::_EVERY, ::-1].astype(np.float64)
     middle = np.argwhere(small).mean(axis=0)[::-1] if small.any() else np.array(small.shape[::-1]) / 2
@@ -71,9 +70,9 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
 
 
 def _registered(region: Pyramid, shot: Pyramid, start: Floats) -> tuple[Registration, float]:
-    """Motion of a region of the picture, and its correlation.
+    """Register one region of the picture; returns its motion and the correlation.
 
-    The search starts from the whole picture's motion and from none; the better result counts.
+    The search starts from the motion `start` of the whole picture, and from no motion; the better result is returned.
     """
     found = [registration.register(region, shot, "similarity")]
     corners = picture_corners(region.shape[1], region.shape[0])

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Asset, Floats, Mesh, SurfaceMaps, TexturePixels
 from polcap.optics import color, frames, fresnel
+from polcap.optics.morphology import dilate, erode
 from polcap.optics.resize import area_mean
 from polcap.stages import stage
 from polcap.stages.asset.ambient_occlusion import ambient_occlusion
@@ -41,12 +42,12 @@ class AssetSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def build(maps: SurfaceMaps, mesh: Mesh, settings: AssetSettings, bits: Bits = 8) -> Asset:
     """Build the object's glTF textures (H, W, 3) on the crop's grid, filled outwards so that no seam shows.
 
-    Our material has a diffuse term behind two Fresnel transmissions, glTF's has base·(1 − F). With base =
-    ρ_d T₊(0)²/(1 − F0) both agree for a frontal surface. F0 is the index's own × factor × texture, and the factor holds
-    the map's greatest value.
+    In the maps' material, diffuse light passes two Fresnel transmissions; glTF's has base·(1 − F). With base =
+    ρ_d T₊(0)²/(1 − F0) both agree for a surface seen from the front. glTF's F0 is that of the index × factor × texture;
+    the factor is the greatest value of the map.
 
-    The outermost pixels of the object, which mix with the backdrop, are filled from further inside. With the maps'
-    detail, the base color has twice their size; the other textures do not need it.
+    The outermost pixels of the object mix with the backdrop, so they are filled from further inside. If the maps have
+    detail of the RAW pixels, the base color has twice their size (2H, 2W, 3).
     """
     specular = np.clip(maps.specular, 0.0, 1.0)
     greatest = specular.max(axis=-1)
@@ -106,11 +107,9 @@ def with_extras(asset: Asset, maps: SurfaceMaps, depth: Floats, occlusion: bool)
 
 
 def resize_textures(asset: Asset, size: int) -> Asset:
-    """A copy of the asset with textures of `size` px on the longer side.
+    """A copy of the asset with textures of `size` px on the longer side, and a power of two on the other.
 
-    The other side becomes the next power of two that holds it.
-
-    Smaller ones are area means; larger ones are interpolated and hold no more detail.
+    Smaller textures are area means. Larger ones are interpolated and have no more detail.
     """
     height, width = asset.normal.shape[:2]
     shorter = max(size * min(height, width) / max(height, width), 1.0)
@@ -136,9 +135,8 @@ def _resize(texture: TexturePixels, shape: tuple[int, int]) -> Floats:
 
 def _without_outline(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Erode a mask by its outermost pixels, except for parts that would vanish."""
-    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    near = cv2.dilate(inner, np.ones((5, 5), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    return np.asarray((inner > 0) | (mask & (near == 0)))
+    inner = erode(mask, 1, from_border=True)
+    return np.asarray(inner | (mask & ~dilate(inner, 2)))
 
 
 def fill_outward(value: Any, known: NDArray[np.bool_]) -> Any:
@@ -157,9 +155,9 @@ def fill_outward(value: Any, known: NDArray[np.bool_]) -> Any:
 
 
 def tangent_space(maps: SurfaceMaps, mesh: Mesh) -> Floats:
-    """Tangent-space normals, (H, W, 3) unit, z > 0: the maps' normals in the mesh's frames, x t + y b + z n.
+    """Convert the maps' normals to the tangent space of the mesh: (H, W, 3) unit vectors, z > 0.
 
-    The mesh shades with its own normals, so the texture holds the difference to the maps' only.
+    A vector (x, y, z) means the normal x t + y b + z n, with tangent, bitangent and normal of the mesh at this pixel.
     """
     at, covered = rasterize_frames(mesh, *maps.mask.shape)
     at, covered = at[maps.mask[covered]], covered & maps.mask

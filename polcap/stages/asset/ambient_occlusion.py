@@ -47,7 +47,7 @@ def ambient_occlusion(maps: SurfaceMaps, depth: Floats) -> Floats:
 
 
 def _shifted(image: Floats, across: int, down: int) -> Floats:
-    """The image (H, W, C) with pixel (y + down, x + across) at (y, x); NaN where that is outside."""
+    """Shift an image (H, W, C): pixel (y, x) of the result is (y + down, x + across) of it; NaN outside."""
     height, width = image.shape[:2]
     out = np.full_like(image, np.nan)
     if abs(across) >= width or abs(down) >= height:

@@ -9,12 +9,10 @@ _SLACK = 1e-4  # px and barycentric coordinates by which a pixel may miss a tria
 
 
 def rasterize_frames(mesh: Mesh, height: int, width: int) -> tuple[Floats, NDArray[np.bool_]]:
-    """Interpolate a mesh's normals and tangents at pixels.
+    """Interpolate a mesh's normals (3) and tangents (4) at the N pixels that it covers in its texture (H, W).
 
-    (N, 7) at the N covered pixels, and the covered mask (H, W).
-
-    Only triangles that face the camera count: walls and back have no part of the texture. Where several cover a pixel
-    the last one counts.
+    Returns them as (N, 7), and the mask (H, W) of covered pixels. Triangles that face away from the camera (walls and
+    back) are left out. Where several triangles cover a pixel, the last one is used.
     """
     place = mesh.uv * np.array([width, height]) - 0.5
     corner = place[mesh.faces]  # (F, 3, 2) x, y [px]

@@ -68,12 +68,10 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
 
 
 def polarization(stokes: Any, covariance: Any) -> tuple[Any, Any, Any, Any]:
-    """Normalized polarization: S1/S0 and S2/S0, their 1σ, DoLP without noise bias, normalized Stokes map.
+    """Compute S1/S0 and S2/S0 (2, ...), their 1σ (...), the DoLP (...), and the normalized Stokes map (2, ...).
 
-    Shapes (2, ...), (...), (...), (2, ...).
-
-    stokes (3, ..., 3) and covariance (6, ..., 3) are in camera channels. Noise increases the DoLP,
-    E[ρ̂²] = ρ² + 2σ²; √(ρ̂² − σ²) has the least bias where ρ > σ (Wardle & Kronberg, ApJ 1974).
+    stokes (3, ..., 3) and covariance (6, ..., 3) are in camera channels, which are summed. Noise increases the DoLP,
+    E[ρ̂²] = ρ² + 2σ². So the result is √(ρ̂² − σ²), which has the least bias where ρ > σ (Wardle & Kronberg, ApJ 1974).
     """
     xp = array_namespace(stokes)
     total = frames.total(stokes)  # (3, ...)
@@ -87,7 +85,10 @@ def polarization(stokes: Any, covariance: Any) -> tuple[Any, Any, Any, Any]:
 
 
 def least_intensity_color(stokes: Any, matrix: Any) -> Any:
-    """Color of the light at the polarizer angle of least intensity, ½(S0 − √(S1² + S2²)). Unit length, 0 if dark."""
+    """Color (..., 3) of the light at the polarizer angle of least intensity, ½(S0 − √(S1² + S2²)).
+
+    Polarized highlights are darkest there, so this is the color of diffuse reflection. Unit length; 0 where dark.
+    """
     xp = array_namespace(stokes)
     least = (stokes[0] - (stokes[1] ** 2 + stokes[2] ** 2) ** 0.5) / 2
     color = xp.clip(least @ matrix.T, 0.0, None)
@@ -95,10 +96,10 @@ def least_intensity_color(stokes: Any, matrix: Any) -> Any:
     return xp.where(length > 1e-4, color / (length + 1e-12), 0.0 * color)
 
 
-def zenith(dolp: Any, ior: float = NOMINAL_IOR) -> Any:
-    """Zenith angle (...) [rad] of a surface from the DoLP (...) of its diffuse reflection."""
+def zenith(dolp: Any) -> Any:
+    """Zenith angle (...) [rad] of a surface of refractive index 1.5, from the DoLP (...) of its diffuse reflection."""
     xp = array_namespace(dolp)
-    return xp.acos(xp.clip(fresnel.cos_zenith_from_dolp(dolp, ior), 0.0, 1.0))
+    return xp.acos(xp.clip(fresnel.cos_zenith_from_dolp(dolp, NOMINAL_IOR), 0.0, 1.0))
 
 
 def channels(cues: Any) -> Any:

@@ -21,9 +21,9 @@ _STEP = 1e-4
 
 
 def factor(stokes: StokesImage, color: ColorCalibration) -> float:
-    """Factor that scales radiance: 1 becomes a white plane facing the flash, on the axis at the object's distance.
+    """Factor on radiance after which a white plane that faces the flash has 1, on the axis at the object's distance.
 
-    The falloff of light over the object, with distance and to the sides, remains, as in the training pictures.
+    The light still falls off over the object, with distance and to the sides, as in the training pictures.
     """
     ahead = 1 - _BULGE * _radius(stokes)
     if color.light is None:
@@ -60,10 +60,7 @@ def _log_factor(light: ChartLight, middle: Floats) -> float:
 
 
 def _changed(light: ChartLight, step: Floats) -> ChartLight:
-    """The chart's light with flash position and falloff changed by step[:3], and the chart rotated by step[3:].
-
-    The rotation is about x and y.
-    """
+    """Change the chart's light: flash position and falloff by step[:3]; rotate the chart by step[3:] about x and y."""
     from scipy.spatial.transform import Rotation  # here: the import takes 0.2 s
 
     turned = Rotation.from_rotvec([*step[3:], 0.0]).apply(np.array(light.normal))  # SciPy takes no read-only array

@@ -1,6 +1,6 @@
-"""Comparison of the frames of one bracket: ambient light, motion, exposure ratio, noise, and ghosts.
+"""Compares the frames of one bracket: ambient light, motion, exposure ratio, noise, and ghosts.
 
-Everything is measured on the binned grid, frame by frame against the bracket's reference frame.
+Each frame is compared with the bracket's reference frame, after binning: one pixel per superpixel.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ _MOTION_SIGMAS = 3.0  # nor are frames that moved by less than this many of its 
 
 @dataclass(frozen=True)
 class Bracket:
-    """One shot with the order in which its frames are compared, and its reference frame."""
+    """One shot of E frames, with their order and the index of the reference frame."""
 
     shot: Shot
     order: tuple[int, ...]  # of the frames, darkest first
@@ -160,10 +160,7 @@ def _compare_frame(
 
 
 def brightness_pyramid(frame: Signals) -> Pyramid:
-    """Pyramid of a frame's brightness for registration: square root of the channels' sum, smoothed.
-
-    Its noise is nearly uniform.
-    """
+    """Brightness pyramid of a frame for registration: smoothed root of the channels' sum, with nearly even noise."""
     _, height, width = frame.shape
     out = np.empty((height, width), np.float32)
     for rows, inner, target in blocks(height, _SMOOTH.size // 2):
@@ -178,9 +175,7 @@ def brightness_pyramid(frame: Signals) -> Pyramid:
 
 
 def measure_motion(name: str, still: Pyramid, other: Pyramid, limit_px: float) -> Floats | None:
-    """Measure the motion of a frame relative to the reference frame: (3, 3), reference px → frame px.
-
-    None if the frame did not move measurably.
+    """Measure the motion of a frame relative to the reference frame: (3, 3), reference px → frame px; None: no motion.
 
     Raises
     ------
@@ -199,7 +194,7 @@ def measure_motion(name: str, still: Pyramid, other: Pyramid, limit_px: float) -
 def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool = False) -> AmbientLight | None:
     """Mean of a bracket's ambient frames (taken without flash); None if there are none.
 
-    With `full`, on the full grid.
+    `full`: on the grid of the photosites instead of the superpixels.
 
     Raises
     ------
@@ -231,10 +226,7 @@ def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool
 
 
 def _ambient_share(ambient: AmbientLight, flash: Floats) -> float:
-    """Share of ambient light in all light, in the brighter half of the picture.
-
-    `flash` (C, H, W) is the flash light.
-    """
+    """Share of ambient light in all light, in the brighter half of the picture; `flash` (C, H, W) is flash light."""
     without, lit = (picture[:, ::4, ::4].sum(0) for picture in (ambient.value, flash))
     bright = lit + without >= np.median(lit + without)
     return float(without[bright].sum() / max(float((lit + without)[bright].sum()), 1e-9))

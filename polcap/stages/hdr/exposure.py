@@ -28,15 +28,11 @@ class Ratio:
 
 
 def of_tiles(a: Floats, b: Floats) -> Ratio | None:
-    """Exposure ratio b / a (C,) of two frames from tiles (T, C), see `common_tiles`.
-
-    None if the tiles do not suffice.
-
-    None if they do not suffice.
+    """Measure the exposure ratio b / a (C,) of two frames from tiles (T, C) of `common_tiles`; None for too few.
 
     It is the quotient of sums over tiles: the maximum-likelihood estimate for Poisson counts, without the bias of a
-    mean of quotients or of logarithms. Tiles that disagree, because something moved, are dropped. A channel with an
-    error above 1 % takes the ratio of all channels together.
+    mean of quotients or of logarithms. Tiles that disagree, because something moved, are left out. A channel with an
+    error above 1 % gets the ratio of all channels together.
     """
     if not len(a):
         return None
@@ -56,11 +52,10 @@ def common_tiles(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
 
 
 def vignetting(reference: Signals, other: Signals, ratio: Floats) -> Floats | None:
-    """Factor (H, W) float32 on the exposure ratio (C,) of two frames: exp of a quadratic in x and y.
+    """Measure the change of vignetting between two frames: a factor (H, W) float32 on their exposure ratio (C,).
 
-    None if the factor is within 1 % of 1 everywhere, or if too few tiles are bright.
-
-    Apertures differ in vignetting, so corners of a bracket by aperture are darker in its wide frames.
+    Wide apertures darken the corners, so frames of a bracket by aperture differ. The factor is the exponential of a
+    quadratic in x and y. None if it is within 1 % of 1 everywhere, or if too few tiles are bright.
     """
     _, height, width = reference.shape
     a, b = tile_means(reference, TILE).sum(-1), (tile_means(other, TILE) / ratio).sum(-1)
@@ -119,7 +114,7 @@ def stated(frame: Frame, reference: Frame) -> float:
 
 
 def of_ambient(frame: Frame, reference: Frame) -> float:
-    """Ambient exposure ratio to the reference frame by camera settings; 1 if unknown."""
+    """Ratio of the exposures to ambient light, frame to reference frame, by camera settings; 1 if unknown."""
     settings = _by_settings(frame, reference)
     return settings if np.isfinite(settings) else 1.0
 
@@ -130,12 +125,11 @@ def _by_settings(frame: Frame, reference: Frame) -> float:
 
 
 def curvature(a: Floats, b: Floats) -> float:
-    """Nonlinearity of two frames: change of the exposure ratio with brightness, d ln(b/a) / d ln √(a b).
+    """Measure the nonlinearity of two frames: change of their exposure ratio with brightness, d ln(b/a) / d ln √(a b).
 
-    From tiles (T, C) of `common_tiles`.
-
-    It is 0 for linear files. A tone curve makes the ratio differ between shadows and highlights; a change of the light
-    does not. NaN if the tiles span too little brightness.
+    `a` and `b` (T, C) are tiles of `common_tiles`. The result is 0 for linear files. A tone curve makes the ratio
+    differ between shadows and highlights; a change of the light does not. NaN if the tiles differ too little in
+    brightness.
     """
     a, b = a.mean(axis=1), b.mean(axis=1)
     lit = (a > _TONE_RANGE[0]) & (b > _TONE_RANGE[0]) & (a < _TONE_RANGE[1]) & (b < _TONE_RANGE[1])

@@ -1,7 +1,7 @@
-"""Ghost detection between the frames of a bracket, and a first estimate of the radiance.
+"""Finds ghosts (pixels where something moved between frames), and makes a first estimate of the radiance.
 
-A ghost is a pixel whose frames disagree, because something moved. Frames are registered; signals are in units of the
-sensor's range, radiance on the scale of the reference frame. All work is done in blocks of rows, channel by channel.
+Frames are registered. Signals are in units of the sensor's range; radiance is on the scale of the reference frame. All
+work is done in blocks of rows, channel by channel.
 """
 
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.images import Floats
+from polcap.optics.morphology import dilate, erode
 from polcap.optics.registration import squared_gradient
 from polcap.stages.hdr.noise import Noise
 from polcap.stages.hdr.planes import Signals, blocks
@@ -98,10 +99,10 @@ class Anchor:
                 if frame.vignetting is not None:
                     scaled /= frame.vignetting[rows]
                 off |= np.abs(scaled - level) > limit
-            found[target] = (off & _all_around(known[rows], _WINDOW // 2))[inner]
+            found[target] = (off & erode(known[rows], _WINDOW // 2))[inner]
 
         parallel.results(partial(compare, *block) for block in blocks(height, _WINDOW // 2 + 1))
-        return _any_around(_all_around(found, 1), _WINDOW // 2 + 2)
+        return dilate(erode(found, 1), _WINDOW // 2 + 2)
 
 
 def first_estimate(parts: list[tuple[RegisteredFrame, Bools]], otherwise: Signals | Anchor, ghost: Bools) -> Floats:
@@ -141,14 +142,14 @@ def first_estimate(parts: list[tuple[RegisteredFrame, Bools]], otherwise: Signal
 
 
 def _weight(serves: Bools) -> Floats | np.float32:
-    """Weight of a frame per pixel: 1 where it is used, else 0, (h, w); the number 1 if it is used everywhere."""
+    """Weight (h, w) of a frame: 1 in pixels where it is used, else 0; the number 1 if it is used everywhere."""
     return np.float32(1) if serves.all() else serves.astype(np.float32)
 
 
 def _wiener(x: Floats, electrons: Floats | np.float32, floor: Floats | np.float32) -> Floats:
-    """Wiener-filter a picture x (h, w) with known noise.
+    """Wiener-filter a picture x (h, w): local means replace detail that noise explains.
 
-    `electrons` per unit of x; `floor`: variance of read noise [electrons²].
+    `electrons` is their number per unit of x, `floor` the variance of the read noise [electrons²].
     """
     mean = box(x)
     distance = x - mean
@@ -160,15 +161,3 @@ def box(picture: Floats) -> Floats:
     """Box filter: mean (h, w) over the window around each pixel of a picture (h, w); border pixels are repeated."""
     # twice as fast as cv2.blur, which sums in float64
     return np.asarray(cv2.sepFilter2D(picture, -1, _EVEN, _EVEN, borderType=cv2.BORDER_REPLICATE))
-
-
-def _any_around(mask: Bools, reach: int) -> Bools:
-    """Dilate a mask by `reach` px in all eight directions."""
-    kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    return np.asarray(cv2.dilate(mask.view(np.uint8), kernel)).view(bool)
-
-
-def _all_around(mask: Bools, reach: int) -> Bools:
-    """Erode a mask by `reach` px in all eight directions, except from the picture's border."""
-    kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    return np.asarray(cv2.erode(mask.view(np.uint8), kernel)).view(bool)

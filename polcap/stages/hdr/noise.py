@@ -42,13 +42,13 @@ class Noise:
 
     def of_channel(self, channel: int, signal: Floats) -> Floats:
         """Variance (h, w) of one channel for its expected signals (h, w)."""
-        return np.asarray(np.maximum(signal, 0) * self.slope[channel] + self.floor[channel])
+        variance: Floats = np.maximum(signal, 0)
+        variance *= self.slope[channel]
+        variance += self.floor[channel]
+        return variance
 
     def of_radiance(self, ratio: Floats, gain: float = 1.0) -> "Noise":
-        """The noise line of radiance, that is of signals divided by their exposure ratio (C,).
-
-        `gain` multiplies the variance.
-        """
+        """The noise line of radiance: signals divided by their exposure ratio (C,), with `gain` times the variance."""
         return Noise(self.slope * np.float32(gain) / ratio, self.floor * np.float32(gain) / ratio**2)
 
     def with_ambient(self, level: Floats) -> "Noise":
@@ -57,10 +57,7 @@ class Noise:
 
 
 def of_pixels(light: Floats, line: Noise, cfa: Bits | None) -> Floats:
-    """Noise variance (C, h, w) for expected signals (C, h, w).
-
-    `cfa` is given for interpolated pixels, None for binned ones.
-    """
+    """Noise variance (C, h, w) for expected signals (C, h, w); `cfa` (2, 2) for demosaiced pixels, None for binned."""
     expected = np.stack([line.of_channel(c, plane) for c, plane in enumerate(light)])
     if cfa is None:
         return expected
@@ -81,19 +78,17 @@ class Samples:
 
 
 def roughness(picture: Floats) -> Floats:
-    """High-pass filter for noise: second differences along both axes, (C, H, W) → (C, H−2, W−2).
+    """High-pass filter a picture to measure its noise: (C, H, W) → (C, H−2, W−2).
 
-    The variance of white noise is unchanged.
-
-    The filter [1, −2, 1] ⊗ [1, −2, 1] / 6 does not respond to a ramp.
+    The filter [1, −2, 1] ⊗ [1, −2, 1] / 6 is 0 on ramps, and does not change the variance of white noise.
     """
     return np.stack([np.asarray(cv2.sepFilter2D(plane, -1, _SECOND, _SECOND))[1:-1, 1:-1] for plane in picture])
 
 
 def strips(height: int, width: int, most: float = 0.75e6) -> list[slice]:
-    """Choose evenly spaced strips of rows for the noise measurement, at most about `most` px in all.
+    """Choose evenly spaced strips of rows in which noise is measured, at most about `most` px in all.
 
-    A strip is a row of tiles plus 2 px for `roughness`.
+    A strip is as high as a tile plus the 2 px that `roughness` needs.
     """
     rows = max((height - 2) // TILE, 0)
     wanted = max(1, min(rows, int(most / (TILE * max(width, 1)))))
@@ -104,9 +99,9 @@ def strips(height: int, width: int, most: float = 0.75e6) -> list[slice]:
 def tile_columns(
     frames: tuple[Signals, ...], maps: Callable[..., tuple[Floats, ...]], most: float = 0.75e6
 ) -> list[Floats]:
-    """Means over tiles (T, C) of each map that `maps` computes from the frames' strips (C, h, w).
+    """Compute maps from strips (C, h, w) of the frames by the function `maps`, and average each over tiles: (T, C).
 
-    NaN for tiles that are not fully usable in all frames. The maps are 1 px smaller on each side than the strips.
+    The maps are 1 px smaller on each side than the strips. Tiles that are not fully usable in all frames are NaN.
     """
     usable = np.logical_and.reduce([frame.usable for frame in frames])
     columns = []
@@ -232,7 +227,7 @@ class Lines:
 
 
 def _line(samples: list[Samples], channel: int, iso: float | None, least: float) -> tuple[float, float]:
-    """Slope and floor of one channel's noise line."""
+    """Fit slope and floor of one channel's noise line to samples of all frames of one ISO."""
     electrons = _TYPICAL_ELECTRONS * 100 / max(iso or 100.0, 1.0)
     typical = 1 / electrons, max(least, (_TYPICAL_READ / electrons) ** 2)
     bins: list[tuple[Floats, Floats, bool]] = []  # signal and variance (n,) of tiles of like signal

@@ -1,4 +1,4 @@
-"""Merged photosites of the reference shot, which hold detail finer than a superpixel."""
+"""Merges the photosites of the reference shot without binning, for detail finer than a superpixel."""
 
 from functools import partial
 
@@ -12,10 +12,10 @@ from polcap.stages.hdr.weights import WeightedBracket, WeightedFrame
 
 
 def merge(bracket: Bracket, weighted: WeightedBracket, cfa: Bits, read: Reader) -> Mosaic:
-    """Photosites (2H, 2W) of a Bayer bracket: the sum of the signals over the sum of the exposures.
+    """Merge the photosites (2H, 2W) of a Bayer bracket: sum of the signals over sum of the exposures.
 
-    `cfa` (2, 2) is the color filter array. Each superpixel (H, W) uses the frames that serve it in
-    the merge. Frames that moved are left out: resampling would mix the colors.
+    `cfa` (2, 2) is the color filter array. Each superpixel (H, W) uses the same frames as in the merge. Frames that
+    moved are left out, because resampling would mix the colors.
     """
     _, height, width = weighted.shape
     signal, exposure = (np.zeros((2 * height, 2 * width), np.float32) for _ in range(2))

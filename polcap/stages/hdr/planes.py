@@ -35,7 +35,7 @@ _FRACTIONS = 32  # steps per pixel in the table of cv2's Lanczos kernel
 
 @dataclass(frozen=True)
 class Signals:
-    """Linear signals of one frame, black = 0 and white = 1, and its usable pixels."""
+    """Linear signals of one frame, black = 0 and white = 1, read block by block, and its usable pixels."""
 
     shape: tuple[int, int, int]  # C, H, W
     usable: Bools  # (H, W)
@@ -76,9 +76,9 @@ def planar(picture: Floats) -> Floats:
 
 
 def blocks(height: int, halo: int = 0, rows: int = _ROWS) -> Iterator[tuple[slice, slice, slice]]:
-    """Divide a picture into blocks of rows.
+    """Divide a picture into blocks of rows, each read with `halo` more rows on both sides for filters.
 
-    Rows to read with a halo, the part without halo, its rows in the picture.
+    Yields the rows to read, the rows of the block within these, and the rows of the block in the picture.
     """
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
@@ -136,9 +136,9 @@ class MemoryPlan:
 
 
 def plan_memory(shots: int, frames: int, pixels: int, frame_bytes: int) -> MemoryPlan:
-    """Divide the memory limit between signals and decoded frames of the merge.
+    """Divide the memory limit between the signals and the decoded frames of a merge.
 
-    `shots` of `frames` each, `frame_bytes` decoded, `pixels` merged.
+    There are `shots` of `frames` frames each. A decoded frame has `frame_bytes`; the merged picture has `pixels`.
 
     Raises
     ------

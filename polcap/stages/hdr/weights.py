@@ -106,10 +106,9 @@ class WeightedBracket:
         return number, variance
 
     def _trust(self, one: WeightedFrame, estimate: Floats, rows: slice) -> Floats | np.float32:
-        """Factor on a frame's weight near saturation, (h, W) or one number.
+        """Factor on a frame's weight, (h, W) or one number: it falls smoothly from 1 to almost 0 near saturation.
 
-        It falls smoothly from 1 to _LEAST at saturation, so that weights have no step, and is least where the frame is
-        not used.
+        So weights have no step. Where the frame is not used, the factor is almost 0 too.
         """
         serves = one.serves[rows]
         trust: Floats | np.float32 = np.float32(1) if serves.all() else np.maximum(serves, one.least)
@@ -139,7 +138,7 @@ def prepare(
 ) -> WeightedBracket:
     """Prepare a compared bracket for the merge: registered frames, and the pixels for which each is used.
 
-    With `full`, on the full grid.
+    `full`: on the grid of the photosites instead of the superpixels.
     """
     ambient = ambient_light(bracket, lines, read, full)
     ghost, estimate = compared.ghost, compared.estimate
@@ -174,10 +173,7 @@ def prepare(
 
 
 def _read_again(shot: Shot, e: int, frame: RegisteredFrame, read: Reader, full: bool) -> RegisteredFrame:
-    """Read frame e again for the merge, with its ambient light.
-
-    With `full`, on the full grid, which has half the pixel pitch.
-    """
+    """Read frame e again for the merge, with its ambient light; `full`: on the grid of the photosites."""
     signals, gain = read.signals(shot, e, full), None
     if frame.motion is not None:
         signals, gain = resample(signals, scaled(frame.motion, 2) if full else frame.motion)

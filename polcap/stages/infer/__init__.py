@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMaps
 from polcap.optics import brdf, frames
+from polcap.optics.morphology import erode
 from polcap.optics.resize import area_mean
 from polcap.stages import stage
 from polcap.stages.infer import analytic, highlights, learned
@@ -47,7 +48,7 @@ _UNCERTAIN = 0.3  # on that of shading by the normals' expected error, most of w
 _NOISE = 4.0  # on the variance of S0: the detail comes from one shot, and one photosite a color
 _GRAZING = 0.1  # least cosine of the shading
 _DARKEST = 0.02  # least albedo and least roughness² of the shading
-_EDGE = np.ones((5, 5), np.uint8)  # px around the outline and around defects in which the light mixes
+_EDGE_PX = 2  # around the outline and around defects, where the light mixes
 _DEFECTS = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
 
 
@@ -101,7 +102,7 @@ def _select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:
     share of its local power that neither shading nor noise explains.
     """
     solid = cues.mask & ((cues.quality & np.uint8(_DEFECTS)) == 0)
-    inside = cv2.erode(solid.astype(np.uint8), _EDGE, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    inside = erode(solid, _EDGE_PX, from_border=True)
     height, width = inside.shape
     explained = _mean(_power_of_shading(cues, maps) + _NOISE * cues.ratio_sigma**2, cues.mask, _DETAIL_AROUND)
     power = _mean(area_mean(np.square(detail, dtype=np.float32), (height, width)), inside, _DETAIL_AROUND)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Cues, Floats, Quality, SurfaceMaps
 from polcap.optics import frames, fresnel
+from polcap.optics.morphology import dilate
 from polcap.optics.outline import disc_radius
 
 REACHED = 0.05  # least share of known pixels under a Gaussian for a mean
@@ -28,7 +29,7 @@ _FLOOR = 1e-3  # albedo
 def fill(image: Floats, cues: Cues) -> Floats:
     """Fill clipped highlights of an image (H, W, 3) with means of the pixels around them; returns the filled image."""
     clipped = cues.mask & ((cues.quality & Quality.CLIPPED) > 0)
-    hole = cues.mask & (cv2.dilate(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    hole = cues.mask & dilate(clipped, 1)
     known = cues.mask & ~hole
     out = np.array(image, np.float32)
     if hole.any() and known.any():

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMaps
 from polcap.optics import frames
+from polcap.optics.morphology import erode
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.cues import FLOOR
 from polcap.stages.infer import analytic, augmentation, fine, half_turns, highlights
@@ -138,7 +139,7 @@ def _without_grid(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
     For each of the four places in a 2×2 cell, the deviation that neighboring cells have in common is subtracted. Relief
     does not repeat with the cells, so it remains.
     """
-    whole = (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0).astype(np.float32)
+    whole = erode(mask, 1).astype(np.float32)
     out = normal.astype(np.float32)
     uneven = (out - cv2.sepFilter2D(out, -1, _BINOMIAL, _BINOMIAL)) * whole[..., None]
     for place in (np.s_[y::2, x::2] for y in (0, 1) for x in (0, 1)):

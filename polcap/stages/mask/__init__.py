@@ -106,10 +106,7 @@ def _mean_picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibr
 
 
 def _chart_zone(radiance: AngleStack, color: ColorCalibration, margin: float) -> Bits:
-    """Zone (H, W) that the object cannot be in.
-
-    1 on the chart's patches and up to `margin` patch widths around them.
-    """
+    """Zone (H, W) of the chart, where the object cannot be: 1 on its patches and `margin` patch widths around them."""
     zone = np.zeros(radiance.value.shape[1:3], np.uint8)
     if color.place is not None:
         corners = np.asarray(color.place.corners, np.float64)

@@ -1,4 +1,4 @@
-"""Separation of object and backdrop: the object is brighter than the picture's border, or has another color.
+"""Finds the object without a network: it is brighter than the picture's border, or has another color.
 
 Under a flash near the lens, the near object is bright, and the far or black backdrop is dark.
 """
@@ -54,14 +54,14 @@ def probability(color: Floats, chart: Bools) -> Floats:
 
 
 def find_object(picture: Floats, chart: Bits, min_area: float) -> Bools:
-    """Segment the object without a network.
+    """Segment the object without a network: mask (H, W) from a linear Rec.709 picture (H, W, 3).
 
-    Mask (H, W) from a linear Rec.709 picture (H, W, 3), outside the chart (H, W).
+    The zone of the `chart` (H, W) is left out.
 
     Raises
     ------
     ObjectError
-        It covers less than `min_area` of the picture.
+        The object covers a share of the picture smaller than `min_area`.
     """
     small, outside = graph_cut.reduce_picture(picture, chart)
     seed = (probability(small, outside) > 0.5).astype(np.uint8)
@@ -77,10 +77,7 @@ def find_object(picture: Floats, chart: Bits, min_area: float) -> Bools:
 
 
 def _object_regions(mask: Bits, min_area: float) -> Bits:
-    """The large regions of a mask.
-
-    Regions along the picture's edge (a wall, a table) are dropped if there are others.
-    """
+    """Keep the large regions of a mask; those along the picture's edge (wall, table) only if there are no others."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     if count < 2:
         return mask

@@ -21,8 +21,8 @@ _SURE = 0.996  # probability of object or backdrop; above it colors are not cons
 def sharpen(picture: Floats, mask: Bools, chart: Bits, probability: Floats) -> Bools:
     """Move the outline of a mask (H, W) to color edges. Colors decide where the probabilities are uncertain.
 
-    picture (H, W, 3) is linear Rec.709, chart (H, W) 1 on the chart, probability (H, W) 0…1 that of being the object.
-    The mask must be right to a few pixels, or where its probabilities are near 0 or 1.
+    picture (H, W, 3) is linear Rec.709, chart (H, W) is 1 on the chart, probability (H, W) 0…1 is that of being the
+    object. The given mask must be right to a few pixels wherever the probabilities are near 0 or 1.
     """
     small, outside = reduce_picture(picture, chart)
     seed = cv2.resize(mask.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST)

@@ -37,12 +37,10 @@ def grid(height: int, width: int) -> Floats:
 
 
 def encode(picture: ReducedPicture, bright: float, estimate: Floats | None = None) -> Floats:
-    """Compute the mask network's channels (11, H, W) float32.
+    """Compute the mask network's input channels (11, H, W) float32 from a picture and an estimate of the mask.
 
-    Inputs are a picture and a previous estimate (H, W) of the object's probability.
-
-    Without an estimate, the picture must be whole; its difference from the backdrop is then the estimate. `bright` is
-    the `brightness` of the whole picture.
+    `estimate` (H, W) is the probability of being the object, from an earlier pass. Without it the picture must be
+    whole; its difference from the backdrop is then the estimate. `bright` is the `brightness` of the whole picture.
     """
     floor = 2.0**-STOPS
     color = np.maximum(picture.color, 0) / bright
@@ -78,5 +76,5 @@ def mirror(channels: Floats, axes: tuple[int, ...]) -> Floats:
 
 
 def _bright_s0(picture: ReducedPicture, bright: float) -> float:
-    """Bright level of S0 summed over the camera's channels; `bright` is that level in the mean of R, G and B."""
+    """Convert `bright`, a level of the mean of R, G and B, to the level of S0 summed over the camera's channels."""
     return bright * float(picture.stokes[0].clip(0).sum() / max(picture.color.clip(0).mean(-1).sum(), 1e-9))

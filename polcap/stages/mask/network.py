@@ -49,7 +49,7 @@ def object_probability(
 def reduced_picture(
     radiance: AngleStack, alignment: Alignment, color: ColorCalibration, chart: Bits, box: Box, longest: int
 ) -> ReducedPicture:
-    """Color and Stokes parameters in a box of the reference grid, averaged down to at most `longest` px.
+    """Input picture of the mask network: a box of the reference grid, averaged down to at most `longest` px a side.
 
     `chart` (H, W) is 1 on the chart.
     """

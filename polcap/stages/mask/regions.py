@@ -17,7 +17,7 @@ _LEEWAY = 1.7  # largest expected error of the mask by colors, over that of the 
 
 
 def likely_regions(probability: Floats) -> Bools:
-    """Mask (H, W) of the pixels with probability (H, W) above one half, without specks, with unlikely holes filled."""
+    """Mask (H, W) of pixels with a probability (H, W) above one half, without specks and without doubtful holes."""
     return fill_holes(_without_specks(probability > 0.5), _PINHOLE, probability)
 
 
@@ -67,10 +67,10 @@ def expected_error(mask: Bools, probability: Floats) -> float:
 
 
 def measure_shape(mask: Bools) -> tuple[float, float, float]:
-    """Measure three shares of a mask (H, W) that are small for a whole object inside the picture.
+    """Measure three figures of a mask (H, W) that are near 0 for a whole object inside the picture.
 
-    Share of the mask outside its largest region; area of the holes over that of the mask; share of the picture's edge
-    that the mask covers.
+    They are the share of the mask outside its largest region, the area of its holes over its own area, and the share of
+    the picture's edge that the mask covers.
     """
     area = mask.sum()
     _, _, parts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)

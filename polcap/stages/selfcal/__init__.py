@@ -93,7 +93,7 @@ def solve(
     shots = object_gains.register(radiance, alignment, object_)
     greys = grey_patches.measure(radiance, alignment, color)
     facing = object_gains.facing(shots.light, shots.inside, radiance.angle)
-    gain, sigma, _ = _believed(radiance, greys, facing)  # without the angles, because these are not checked yet
+    gain, sigma, _ = _best_gains(radiance, greys, facing)  # without the angles, because these are not checked yet
     first = GainEstimate(gain.mean(1), sigma.mean(1))
     even = replace(shots, light=shots.light / first.gain[:, None, None])
     rim = angles.rim(even)
@@ -134,13 +134,10 @@ def solve(
     )
 
 
-def _believed(
+def _best_gains(
     radiance: AngleStack, greys: GreyPatches | None, by_object: GainEstimate
 ) -> tuple[Floats, Floats, Literal["grey patches", "object", "one exposure", "none"]]:
-    """Gains (K, 3) of the shots from the best source, their 1σ, and the source.
-
-    The sources are one exposure, grey patches, or else the object.
-    """
+    """Gains (K, 3) of the shots from the best source, their 1σ, and the source: one exposure, patches or object."""
     shape = len(radiance.angle), 3
     if radiance.equipment.light == "one exposure":
         return np.ones(shape), np.zeros(shape), "one exposure"
@@ -152,8 +149,8 @@ def _believed(
 
 
 def _gains(radiance: AngleStack, greys: GreyPatches | None, anchor: GainEstimate) -> Gains:
-    """Gains (K, 3) of the shots from the best source. Those from the object (`anchor`) are a cross-check."""
-    gain, sigma, source = _believed(radiance, greys, anchor)
+    """Gains (K, 3) of the shots from the best source, cross-checked with those from the object (`anchor`)."""
+    gain, sigma, source = _best_gains(radiance, greys, anchor)
     both = np.hypot(anchor.sigma, sigma.mean(1))
     difference = np.abs(gain.mean(1) / anchor.gain - 1)
     return Gains(

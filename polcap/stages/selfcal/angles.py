@@ -132,10 +132,7 @@ def hypotheses(angle: Floats) -> dict[ShotOrder, Floats]:
 
 
 def _misfit(band: OutlineBand, angle: Floats) -> float:
-    """Misfit of the outline's light to polarizer angles: median relative residual.
-
-    1 for three shots, which always fit.
-    """
+    """Misfit of the outline's light to polarizer angles (K,): median relative residual; 1 for three shots."""
     if len(angle) < 4:
         return 1.0
     weights = mueller.analyzer(angle)
@@ -145,10 +142,7 @@ def _misfit(band: OutlineBand, angle: Floats) -> float:
 
 
 def _sigma_of_difference(one: Floats, one_weight: Floats, other: Floats, other_weight: Floats) -> float:
-    """1σ of the difference of two order scores, by jackknife over sectors (24,).
-
-    The scores are Σone/Σone_weight and Σother/Σother_weight.
-    """
+    """1σ of the difference of two scores Σone/Σone_weight and Σother/Σother_weight, by jackknife over sectors (24,)."""
     used = np.flatnonzero(one_weight + other_weight)
     if len(used) < 2:
         return 1.0
@@ -162,9 +156,9 @@ def _sigma_of_difference(one: Floats, one_weight: Floats, other: Floats, other_w
 def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma: Floats) -> TurnedShot:
     """Detect one shot, of more than three, with a polarizer angle that contradicts the others.
 
-    The result is empty for three shots or too few cells. light (K, P) are means of small cells of the object, divided
-    by the gains; row (P,) is the row of each cell: neighbors belong to the same part. angle (K,) rad are the stated
-    angles, gain_sigma (K,) 1σ of the gains.
+    light (K, P) are means of P small cells of the object, divided by the gains. row (P,) is the row of each cell;
+    neighboring rows form the parts of the jackknife. angle (K,) rad are the stated angles, gain_sigma (K,) is 1σ of the
+    gains. The result is empty for three shots or too few cells.
     """
     shots = len(angle)
     if shots < 4 or light.shape[1] < _LEAST_CELLS:
@@ -197,6 +191,8 @@ def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma:
 
 @dataclass(frozen=True)
 class _TurnFit:
+    """Angle error of one shot, fitted together with the gains."""
+
     turn: float  # rad
     sigma: float  # rad
     stated: float  # misfit with the stated angles and fitted gains
@@ -250,13 +246,13 @@ def _fit_turn(k: int, start: float, light: Floats, angle: Floats, part: NDArray[
 
 
 def find(band: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> tuple[Floats, float]:
-    """Find the polarizer angles (K,) in 0…π of four or more shots, and their 1σ, rad, from outline and inside.
+    """Find the unknown polarizer angles (K,) in 0…π rad of four or more shots, and their common 1σ [rad].
 
-    1σ is π/2 if nothing is known. The shots are divided by their gains. cells (K, P) are means of small blocks of the
-    inside, row (P,) the row of each block; neighbors have common errors. The outline is summed over bins of φ, and the
-    residual of the inside is its distance from the column space of A(θ); both are weighted by their scatter. The error
-    combines the jackknife over parts of outline and inside, the change with the assumed 1σ of the outline, and the
-    distance to other solutions that fit equally well.
+    `band` is the object's outline; cells (K, P) are means of small blocks of its inside, row (P,) is the row of each
+    block. All are divided by the gains. The outline is averaged over bins of φ. The residual of the inside is its
+    distance from the column space of A(θ). Both are weighted by their scatter. The 1σ combines a jackknife over parts
+    of outline and inside, the change with the assumed 1σ of the outline, and the distance to other solutions that fit
+    equally well. It is π/2 if nothing is known.
     """
     shots = len(cells)
     around, part = _by_direction(band)
@@ -293,7 +289,8 @@ def _by_direction(band: OutlineBand) -> tuple[Floats, Floats]:
 def _condensed(cells: Floats) -> Floats:
     """Condense cells (K, P) to a matrix (K, K) with the same sum of squared distances from any subspace.
 
-    Each cell is relative to its light. The mean over the cells is subtracted, because errors of the gains affect it.
+    Each cell is divided by its mean light. The mean over all cells is subtracted, because errors of the gains change
+    it.
     """
     relative = cells / cells.mean(axis=0)
     relative = relative - relative.mean(axis=1, keepdims=True)
@@ -306,7 +303,7 @@ def _solve(
 ) -> tuple[float, Floats]:
     """Fit polarizer angles (K,) from a start; returns misfit and angles.
 
-    Of two solutions 90° apart, the one for diffuse reflection is taken.
+    Two solutions 90° apart fit equally well; the result is that of diffuse reflection.
     """
     relative = around / around.mean(axis=1, keepdims=True)
     from scipy.optimize import least_squares  # here: the import takes 0.3 s
@@ -319,10 +316,7 @@ def _solve(
 
 
 def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats, law: float) -> Floats:
-    """Residuals of polarizer angles over their 1σ.
-
-    Of the outline from the span of 1, cos 2(φ − θ), of the inside from A(θ).
-    """
+    """Residuals for polarizer angles, over their 1σ: outline from the span of 1 and cos 2(φ − θ), inside from A(θ)."""
     ones = np.ones(len(angle)) / np.sqrt(len(angle))
     wave = np.cos(2 * (part[:, None] - angle))
     wave = wave - (wave @ ones)[:, None] * ones

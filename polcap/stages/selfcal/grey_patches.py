@@ -1,8 +1,8 @@
 """Gains of the shots from a chart's grey patches, and the gloss of the chart.
 
-A matt patch is unpolarized: its light in two shots differs only by the gain. Gloss adds the same light to dark and
-bright patches, and this light is polarized if the chart does not face flash and camera. So the ratio of two shots is a
-line over 1/(light of the patch): its value at 0 is the gain, its slope the gloss of the chart. Patches that white
+A matt patch is unpolarized, so its light in two shots differs only by the gain. Gloss adds the same light to dark and
+bright patches. This light is polarized if the chart does not face flash and camera. So the ratio of two shots, plotted
+over 1/(light of the patch), is a line: its value at 0 is the gain, its slope the gloss of the chart. Patches that white
 balance excluded (hidden, in shade, glossy) are not used.
 """
 
@@ -87,7 +87,7 @@ def _means(picture: MaskedImage, transform: Floats, color: ColorCalibration) -> 
 
 
 def _gloss(light: Floats, variance: Floats) -> float:
-    """Largest share of gloss in a ratio of shots on the lightest patch, minus 4σ; light and variance are (K, P)."""
+    """Largest part of a ratio of two shots on the lightest patch that comes from gloss, minus 4σ; inputs are (K, P)."""
     if light.shape[1] < 4:
         return 0.0
     ratio = light / light[0]
@@ -102,7 +102,7 @@ def _gloss(light: Floats, variance: Floats) -> float:
 
 
 def _one_for_all_channels(gain: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-    """Replace the gains of a shot's channels by one if they agree within 3σ. Most flashes do not change color."""
+    """Replace a shot's gains of three channels by one where they agree within 3σ: most flashes do not change color."""
     weight = 1 / np.maximum(sigma, 1e-6) ** 2
     mean = (gain * weight).sum(1, keepdims=True) / weight.sum(1, keepdims=True)
     agree = (np.abs(gain - mean) <= 3 * np.maximum(sigma, 1e-6)).all(1, keepdims=True)

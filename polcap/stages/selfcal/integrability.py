@@ -1,15 +1,16 @@
 """Gains of the shots from integrability: the slopes of any surface are derivatives of one height field.
 
-An error of a gain adds the same wrong polarization δ to every pixel. Let q = (S1 + i S2)/S0, and w = tan²θ e^{2iφ} be
-computed from it, so that z = √w = h_x + i h_y are the slopes of the height h. Then the derivative
-z_ζ = ½(∂x − i∂y) z = ½ Δh is real. The sign of the square root is unknown, so the law is used in the form
+Let q = (S1 + i S2)/S0 be the polarization of a pixel, and w = tan²θ e^{2iφ} the squared slope that follows from it.
+Then z = √w = h_x + i h_y are the slopes of the height h, and the derivative z_ζ = ½(∂x − i∂y) z = ½ Δh is real. The
+sign of the square root is unknown, so the law is used in the form
 
     Im(w_ζ² w*) = 0,   for w = z², w_ζ = 2 z z_ζ, w_ζ² w* = 4 |z|⁴ z_ζ².
 
-Each pixel with curvature gives an equation for the gains. The effect of δ is largest near facing pixels, where w is
-small. Neither an outline nor a facing surface is needed. If the sum of w_ζ² w* is not positive, the polarization does
-not come from diffuse reflection, and the gains are unknown. A common turn of the angles turns w_ζ² w* by the same angle
-in all pixels: it is a free parameter here, and `ring_zero.by_slopes` measures it.
+An error of a gain adds the same wrong polarization to q in every pixel, and breaks the law. So each pixel with
+curvature gives an equation for the gains. The effect is largest near facing pixels, where w is small. Neither an
+outline nor a facing surface is needed. If the sum of w_ζ² w* is not positive, the polarization does not come from
+diffuse reflection, and the gains are unknown. A common turn of the angles turns w_ζ² w* by the same angle in all
+pixels. It is a free parameter here, and `ring_zero.by_slopes` measures it.
 
 References
 ----------
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Bools, Floats
 from polcap.optics import fresnel, mueller
+from polcap.optics.morphology import erode
 from polcap.optics.robust import biweight, jackknife, spread
 from polcap.stages.selfcal.object_gains import GainEstimate, unknown
 
@@ -76,16 +78,16 @@ def gains(light: Floats, usable: Bools, angle: Floats, start: Floats) -> GainEst
 
 @dataclass(frozen=True)
 class SlopeField:
-    """Shots averaged down to about 110 px a side, from which slopes and their derivatives are computed."""
+    """Reduced shots of about 110 px a side, from which the slopes and their derivatives are computed."""
 
     light: Floats  # (K, h, w)
     inside: Bools  # (h, w)
     angle: Floats  # (K,) rad
 
     def at(self, unknowns: Floats) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """Slope terms w_ζ² w*, w and w_ζ (N,) for gains and angle error `unknowns` (K,).
+        """Slope terms w_ζ² w*, w and w_ζ, (N,) each.
 
-        The unknowns are the gains after the first, and the common angle error [rad].
+        `unknowns` (K,) are the gains of all shots but the first, then the common angle error [rad].
         """
         gain = np.concatenate([[1.0], unknowns[:-1]])
         solve = np.linalg.pinv(mueller.analyzer(self.angle))
@@ -107,9 +109,9 @@ class Equations:
     product: NDArray[Any]  # (N,) w_ζ² w*
 
     def step(self, weight: Floats, prior: Floats | float = 0.0, moved: Floats | float = 0.0) -> Floats:
-        """Least-squares step (K,) of gains and angle.
+        """Least-squares step (K,) of the unknowns (gains and angle error).
 
-        `prior` (K,) are weights that pull unknowns back by `moved` (K,).
+        `prior` (K,) are the weights with which a prior pulls them back; `moved` (K,) is their distance from it.
         """
         square = self.rows.T @ (self.rows * weight[:, None]) + prior * np.eye(self.rows.shape[1])
         damped = square + (1e-9 * np.trace(square) + 1e-12) * np.eye(len(square))
@@ -132,8 +134,7 @@ def reduced_slopes(light: Floats, usable: Bools, angle: Floats) -> SlopeField | 
     shape = (height // block, block, width // block, block)
     means = light[:, :height, :width].reshape(len(light), *shape).mean((2, 4), dtype=np.float64)
     whole = usable[:height, :width].reshape(shape).all((1, 3)) & (means > 0).all(0)
-    reach = 2 * int(2 * BLUR) + 1
-    inside = cv2.erode(whole.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+    inside = erode(whole, int(2 * BLUR))
     return SlopeField(means, inside, angle) if inside.sum() >= _LEAST else None
 
 
@@ -169,7 +170,7 @@ def _derivative(w: NDArray[Any]) -> NDArray[Any]:
 
 
 def _slopes_of_dolp() -> tuple[Floats, Floats]:
-    """Table of DoLP of diffuse reflection against tan²θ over DoLP; constant beyond _STEEPEST."""
+    """Table to convert a DoLP of diffuse reflection to a squared slope: DoLPs, and tan²θ / DoLP for each."""
     dolp = np.linspace(1e-4, _STEEPEST, 200)
     cosine = np.asarray(fresnel.cos_zenith_from_dolp(dolp, _IOR))
     return dolp, (1 / cosine**2 - 1) / dolp

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from polcap import parallel
 from polcap.images import Alignment, AngleStack, Bits, Bools, Floats, ObjectMask, Quality
 from polcap.optics import frames, mueller
+from polcap.optics.morphology import erode
 from polcap.optics.outline import OutlineBand
 from polcap.optics.robust import biweight, jackknife, spread
 from polcap.optics.warp import warp
@@ -79,7 +80,7 @@ def register(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) ->
     quality = np.where(np.any(flagged, axis=0), np.uint8(Quality.CLIPPED), np.uint8(0))
     light = np.stack([cv2.GaussianBlur(frames.total(v), (0, 0), _BLUR_PX) for v in value])
     mask = object_.mask[y0:y1, x0:x1]
-    solid = cv2.erode(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    solid = erode(mask, 3)
     inside = np.asarray((solid if solid.sum() > 100 else mask) & (quality == 0))
     height, width = radiance.value.shape[1:3]
     return ObjectShots(value, light, quality, mask, inside, crop, (height, width))
@@ -110,7 +111,7 @@ def weighted_mean(value: Floats, sigma: Floats) -> tuple[Floats, Floats]:
 
 
 def with_prior(measured: GainEstimate, prior: float) -> GainEstimate:
-    """Measured gains (K,), averaged with gains of 1 with 1σ = `prior`.
+    """Average measured gains (K,) with a prior: gains of 1 with 1σ = `prior`.
 
     A gain far from 1 with a large error is replaced by 1, with its distance from 1 as the error.
     """
@@ -128,10 +129,7 @@ def with_prior(measured: GainEstimate, prior: float) -> GainEstimate:
 
 
 def closure(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
-    """Gains (K,) with which more than three shots (K, H, W) are consistent with three Stokes parameters.
-
-    Unknown for K = 3.
-    """
+    """Gains (K,) with which more than three shots (K, H, W) agree with three Stokes parameters; unknown for K = 3."""
     shots = len(angle)
     if shots < 4:
         return unknown(shots)
@@ -149,7 +147,7 @@ def closure(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
 
 
 def outline(rim: OutlineBand, angle: Floats) -> GainEstimate:
-    """Gains (K,) with which the outline is polarized across the contour; `rim.light` includes the gains."""
+    """Gains (K,) with which the outline is polarized across the contour; `rim.light` is not yet divided by gains."""
     shots = len(angle)
     parts = np.unique(rim.sector)
     if len(rim.azimuth) < _LEAST_RIM or len(parts) < _PARTS // 2:
@@ -170,14 +168,12 @@ def outline(rim: OutlineBand, angle: Floats) -> GainEstimate:
 
 
 def facing(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
-    """Gains (K,) from pixels that face the camera, at the densest ratios of the shots (K, H, W).
-
-    The angles (K,) rad affect only the error.
+    """Gains (K,) from pixels that face the camera: the ratios of the shots (K, H, W) that most pixels have.
 
     On a rounded object the density of (S1, S2)/S0 grows as 1/θ² towards 0, independent of the albedo. Mean shift with a
-    shrinking kernel finds peaks from several starts, and the peak with most pixels is taken. Other peaks with nearly as
-    many pixels increase the error: flat faces and light from all sides have several. The peak of a tilted ridge is
-    wrong; the slopes around it are then all on one side, which increases the error too.
+    shrinking kernel finds peaks from several starts, and the peak with most pixels is the result. Two cases increase
+    its error. Other peaks have nearly as many pixels: flat faces and light from all sides. All slopes around the peak
+    point to one side: it is a tilted ridge. The angles (K,) rad affect only the error.
     """
     shots = len(light)
     usable = usable & (light.sum(0) > np.quantile(light.sum(0)[usable], 0.2)) if usable.any() else usable
@@ -238,9 +234,10 @@ def cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
 def _null_vector(
     equations: Callable[[Floats], Floats], angle: Floats, part: NDArray[np.int_], floor: float, times: float = 1.0
 ) -> GainEstimate:
-    """Gains 1/h, with h₀ = 1, from the h that minimizes rows (P, C, K) · h, with biweights.
+    """Solve equations rows · h = 0 for h = 1/gain, with h₀ = 1, by least squares with biweights; returns the gains.
 
-    The error combines `times` the jackknife over parts, the effect of an error of each angle, and `floor`.
+    `equations` gives the rows (P, C, K) for polarizer angles (K,). The error combines `times` the jackknife over the
+    parts (P,), the effect of an error of each angle, and `floor`.
     """
     rows = equations(angle)
     weight: Floats = np.ones(len(rows))

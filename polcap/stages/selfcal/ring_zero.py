@@ -1,15 +1,14 @@
 """Zero error of the polarizer's ring, measured from the object's outline and from the slopes inside it.
 
-Diffuse reflection is polarized along the slope g = tan θ (cos φ, sin φ) of the surface. A slope has no curl: along a
-closed curve inside the outline, ∮ g·t = 0 on any smooth surface, symmetrical or not. A ring with a zero off by δ
-turns g, and then ∮ g·t / ∮ g·n = tan δ, n pointing out of the curve. Instead of one curve a band of them is taken: the
-contours of a blurred mask. The DoLP serves as tan θ; any weight does on a symmetrical object. The law does not hold
-for occluded parts, sharp edges, reflected light and interreflection. Their effects differ with the depth, so the spread
-over depths gives the error (decision 26).
+At the outline: diffuse reflection is polarized along the slope g = tan θ (cos φ, sin φ) of the surface. A slope has no
+curl, so along a closed curve with tangent t, ∮ g·t = 0 on any smooth surface. A zero error δ turns g by δ, and then ∮
+g·t / ∮ g·n = tan δ, with n pointing out of the curve. The curves are the contours of a blurred mask, at several depths
+inside the outline. The DoLP is used in place of tan θ. The law does not hold for occluded parts, sharp edges, mirrored
+light and interreflection. Their effects change with the depth, so the spread over depths gives the error (decision 26).
 
-Inside, Im(w_ζ² w*) = 0 (`integrability`) holds for one common turn of the angles only: an error δ turns w_ζ² w* by 2δ
-at every pixel. Contours, edges and highlights are outliers. Neither outline nor symmetry is needed. The gains, which
-matter where a surface faces the camera, are fitted too, with their error as prior (decision 26).
+Inside: Im(w_ζ² w*) = 0 (`integrability`) holds for one common turn of the angles only, because an error δ turns w_ζ² w*
+by 2δ at every pixel. Occlusions, edges and highlights are outliers. The gains are fitted too, with their error as prior
+(decision 26).
 """
 
 import cv2
@@ -58,8 +57,8 @@ def by_outline(
 ) -> RingZero:
     """Error of the polarizer ring's zero, from the outline of registered shots (K, H, W) without their gains.
 
-    sound (H, W) are the pixels to use, angle (K,) rad the stated angles, gain_sigma the relative 1σ of the gains. If
-    the object leaves the picture there is no closed curve, and the result is UNKNOWN.
+    sound (H, W) are the pixels without defects, angle (K,) rad the stated angles, gain_sigma the relative 1σ of the
+    gains. If the object leaves the picture there is no closed curve, and the result is UNKNOWN.
     """
     margin = int(np.ceil(4 * _RIM_PX))
     light = np.pad(light, ((0, 0), (margin, margin), (margin, margin)))
@@ -118,10 +117,7 @@ def _outward(inside: Floats | Bools, sigma: float) -> Complexes:
 
 
 def _turn(slope: Complexes, outward: Complexes) -> float:
-    """Mean angle [rad] from the outward direction to the slope from polarization.
-
-    Of the two slopes of an AoLP, the outward one is used.
-    """
+    """Mean angle [rad] from the outward direction to the slopes from polarization, with their signs outward."""
     across = slope * np.conj(outward)
     real, imaginary = np.ascontiguousarray(across.real), np.ascontiguousarray(across.imag)
     turn = 0.0
@@ -157,7 +153,7 @@ def by_slopes(light: Floats, usable: Bools, angle: Floats, gain_sigma: float) ->
 
 
 def _step(found: integrability.Equations, weight: Floats, moved: Floats, gain_sigma: float) -> Floats:
-    """Least-squares step (K,) of gains and angle error; `moved` is the change of the gains so far, limited by 1σ."""
+    """Least-squares step (K,) of gains and angle error; a prior with 1σ of the gains limits their change `moved`."""
     noise = float((weight * found.residual**2).sum() / max(float(weight.sum()), 1e-9))
     prior = np.append(np.full(len(moved) - 1, 1 / max(gain_sigma, 1e-4) ** 2), 0.0) * noise * _CORRELATED
     return found.step(weight, prior, moved)

@@ -134,9 +134,9 @@ class _Shots:
 def _solve_in_blocks(
     shots: _Shots, analyzers: Floats, crop: Box, settings: StokesSettings
 ) -> tuple[Floats, Floats, Bits, Floats | None]:
-    """Solve the Stokes parameters (3, h, w, 3) block by block.
+    """Solve the Stokes parameters (3, h, w, 3) of the crop, block by block to limit memory.
 
-    Also covariance (6, h, w, 3), quality (h, w) and, for K > 3, residual (h, w).
+    Also returns covariance (6, h, w, 3), quality (h, w) and, for K > 3, residual (h, w).
     """
     x0, y0, x1, y1 = crop
     size, count = (y1 - y0, x1 - x0), len(analyzers)
@@ -179,7 +179,7 @@ def _body(
 
 
 def _flagged(quality: Bits) -> list[tuple[Quality, Bits]]:
-    """Quality bits of a shot (H, W) that occur and have to be resampled, each with its plane."""
+    """Quality bits that occur in a shot (H, W) and have to be resampled, each with its mask."""
     planes = [(bit, quality & np.uint8(bit)) for bit in (Quality.CLIPPED, Quality.GHOST)]
     return [(bit, plane) for bit, plane in planes if plane.any()]
 
@@ -187,9 +187,9 @@ def _flagged(quality: Bits) -> list[tuple[Quality, Bits]]:
 def _defects(
     flags: list[tuple[Quality, Bits]], shape: tuple[int, int], transform: Floats, box: Box, lens: Distortion | None
 ) -> Bits:
-    """Quality bits (h, w) of a resampled shot (H, W) = `shape`: OUTSIDE, and those of flagged pixels.
+    """Quality bits (h, w) of a resampled shot of `shape` (H, W): OUTSIDE, and the bits of its flagged pixels.
 
-    A flagged pixel counts where it contributes more than 1 %.
+    A bit is set where flagged pixels contribute more than 1 %.
     """
     quality: Bits = np.where(covered(shape, transform, box, lens=lens), np.uint8(0), np.uint8(Quality.OUTSIDE))
     for bit, plane in flags:

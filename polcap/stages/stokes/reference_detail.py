@@ -17,7 +17,9 @@ _LEAST = np.float32(1e-6)  # light
 
 
 def reference_detail(mosaic: Mosaic, crop: Box, lens: Distortion | None = None) -> Floats:
-    """Logarithm (2h, 2w) float16 of the light of each RAW pixel over that of the superpixels, enlarged linearly.
+    """Fine detail of the reference shot: logarithm of the light of each RAW pixel over that of the superpixels.
+
+    The result is (2h, 2w) float16; the superpixels are enlarged linearly before the division.
 
     Light is the sum of the demosaiced colors. `crop` (w × h) is in superpixels of the pinhole camera, and `lens` the
     distortion on that grid. Shading, gains and falloff are the same in both, so only fine detail remains.

@@ -25,9 +25,10 @@ Cao, Santo, Shi, Okura & Matsushita, Bilateral normal integration, ECCV 2022.
 import numpy as np
 
 from polcap.images import Floats
+from polcap.optics.morphology import dilate
 from polcap.optics.outline import disc_radius
 from polcap.stages.surface import occlusion
-from polcap.stages.surface.occlusion import OcclusionMap, dilate, label_contours
+from polcap.stages.surface.occlusion import OcclusionMap, label_contours
 from polcap.stages.surface.pyramid_level import GAP, REACH, ContourLinks, PyramidLevel
 from polcap.stages.surface.slope_equations import Bools, NormalField, halve
 
@@ -67,7 +68,7 @@ def log_depth(field: NormalField, stiffness: float, iterations: int, tolerance: 
 
 
 def decide(level: PyramidLevel, iterations: int, tolerance: float) -> None:
-    """Solve z and decide the cuts on the coarsest grid (steps 1–6 of the module)."""
+    """Decide on the coarsest grid where the surface is cut, and solve its z (the six steps above)."""
     if level.stiffness > 0:
         cut_contours(level)
     level.integrate_bilaterally(iterations, tolerance)
@@ -84,7 +85,7 @@ def decide(level: PyramidLevel, iterations: int, tolerance: float) -> None:
 
 
 def cut_contours(level: PyramidLevel) -> None:
-    """Cut the surface at the occluding contours that the normals show: links across them lose their slope terms."""
+    """Cut the surface at the occluding contours that the normals show: remove the slope terms of links across them."""
     sure = level.field.weight > _SURE
     lean = [np.where(sure, np.arctan2(side, np.maximum(level.facing, 1e-6)), np.nan) for side in level.side]
     found = occlusion.occluding_contours((level.grid.image(lean[0]), level.grid.image(lean[1])), level.field.mask)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats
+from polcap.optics.morphology import dilate
 from polcap.optics.outline import disc_radius
 from polcap.stages.surface.multigrid import PixelGrid
 from polcap.stages.surface.slope_equations import Bools
@@ -229,13 +230,8 @@ def _most_equal(step: Floats, width: float) -> tuple[float, int]:
 
 def label_contours(at: Bools) -> NDArray[np.int32]:
     """Number (H, W) of the contour on which each marked pixel (H, W) lies; gaps of two pixels are closed."""
-    near = cv2.dilate(at.astype(np.uint8), np.ones((3, 3), np.uint8))
+    near = dilate(at, 1).view(np.uint8)
     return np.asarray(cv2.connectedComponents(near, connectivity=8)[1], dtype=np.int32)
-
-
-def dilate(at: Bools, reach: int) -> Bools:
-    """Dilate a mask (H, W) by `reach` px along rows and columns."""
-    return np.asarray(cv2.dilate(at.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0)
 
 
 def _ends(axis: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:

@@ -112,9 +112,10 @@ class PyramidLevel:
         return np.concatenate([self.slope[0][ends[:turn]], self.slope[1][ends[turn:]]])
 
     def integrate_bilaterally(self, iterations: int, tolerance: float) -> None:
-        """Bilateral integration: solve z with all pixels choosing between neighbors.
+        """Solve z by bilateral integration: every pixel chooses between its neighbors along each axis.
 
-        The stiffness grows from `_SOFT` times the setting.
+        The stiffness grows from a quarter of the setting to the setting. The iterations end when it is reached and the
+        energy changes by a share of less than `tolerance`, or after `iterations`.
         """
         self.choosing = np.full(self.grid.size, True)
         before, taken, solver = np.inf, 0, None

@@ -3,12 +3,12 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Floats, Mesh
 from polcap.optics.frames import cross, dot
+from polcap.optics.morphology import erode
 from polcap.stages.surface.occlusion import depth_steps, least_step
 from polcap.stages.surface.slope_equations import Bools, NormalField, slope_terms
 
@@ -92,8 +92,7 @@ def measure_boundary(place: NDArray[np.int64], faces: Faces, mask: Bools, step: 
     `place` (V, 2) are the vertices' pixels x, y in the mask; `step` is their distance in px.
     """
     edge = boundary_edges(faces)
-    size = np.ones((4 * step + 1, 4 * step + 1), np.uint8)
-    inner = cv2.erode(np.pad(mask.astype(np.uint8), 1), size, borderValue=0)[1:-1, 1:-1] > 0
+    inner = erode(mask, 2 * step, from_border=True)
     inside = inner[place[:, 1], place[:, 0]][edge].any(axis=1)
     position = place.astype(np.float64)
     length = np.linalg.norm(position[edge[:, 0]] - position[edge[:, 1]], axis=-1)

@@ -47,8 +47,8 @@ class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         Meta(
             pattern=r"^(classic|classic_before_2014|classic_srgb|sg)$|[./\\]",
             description="classic, classic_before_2014, classic_srgb, sg, or a file of measured colors (CSV or CGATS); "
-            "classic: the edition since 2014 unless another fits its colors much better; of a (Digital) SG the block "
-            "E2 to J5, whose corners --chart states",
+            "classic: the edition since 2014 unless another fits its colors much better; sg needs --chart with the "
+            "corners of a (Digital) SG, or of its block E2 to J5",
         ),
     ] = "classic"
     chart_width_m: (
@@ -92,12 +92,17 @@ def measure(
         found = _at_corners(radiance, reference, request.corners, settings)
     elif reference.is_block:
         raise ChartError(
-            "polcap cannot search for a ColorChecker SG; give the outer corners of patches E2, J2, J5, E5 with --chart"
+            "polcap cannot search for a ColorChecker SG; give the outer corners of patches A1, N1, N10, A10, or of "
+            "E2, J2, J5, E5, with --chart"
         )
     else:
         found = _search(radiance, reference, settings)
     found, edition = _edition(radiance, found, reference, settings)
-    fit = found.seen.fit
+    fit, predicted = found.seen.fit, patches.cross_validate(found.seen, edition)
+    if edition.surroundings is not None:
+        at, share = edition.surroundings.center, settings.patch_share
+        around = patches.sample(radiance.value[0], radiance.quality[0], found.place, share, at)
+        fit, predicted = patches.fit_with_surroundings(found.seen, around, edition)
     return ColorCalibration(
         matrix=fit.matrix,
         source="corners" if request.mode == "corners" else "chart",
@@ -106,18 +111,21 @@ def measure(
         place=ChartPlace(found.place.quads(settings.patch_share), found.place.corners()),
         light=chart_light.measure(found.place, radiance.view, fit.slope, found.error),
         patches=PatchColors(
-            delta_e=fit.delta_e,
+            delta_e=fit.delta_e[: len(found.seen.use)],
             use=found.seen.use,
-            predicted=patches.cross_validate(found.seen, edition),
+            predicted=predicted,
             falloff=(float(fit.slope[0]), float(fit.slope[1])),
             glare=fit.glare,
             edition=edition.name,
+            surroundings=None if edition.surroundings is None else fit.delta_e[len(found.seen.use) :],
         ),
     )
 
 
 @dataclass(frozen=True)
 class _Find:
+    """A located chart with its fitted colors."""
+
     place: Placement
     seen: ChartFit
     cost: float  # the detector's; NaN at corners from the user
@@ -183,6 +191,8 @@ def _at_corners(
     scale = radiance.view.scale
     corners = (np.asarray(corners_px, np.float64) - (scale - 1) / 2) / scale
     placement = chart.from_corners(corners)
+    if reference.surroundings is not None and _shows_more(radiance, corners, reference, settings):
+        placement = chart.from_sg_corners(corners)
     stated = "chart corners " + ", ".join(f"({x:g}, {y:g})" for x, y in corners_px)
     if not chart.is_view(placement.homography):
         raise ChartError(f"{stated} are not clockwise; start at the dark-skin patch and go along its row")
@@ -194,7 +204,7 @@ def _at_corners(
             f"{_LEAST_PITCH_PX:g} are needed; show the chart larger, or demosaic at full size"
         )
     refined = chart.refine(radiance.value[0], placement)
-    moved = float(np.abs(refined.corners() - corners).max()) / placement.pitch_px
+    moved = float(np.abs(refined.corners() - placement.corners()).max()) / placement.pitch_px
     place = refined if _plausible(refined, settings.min_explained) and moved < _MOST_MOVED else placement
     find = _find(radiance, place, reference, settings)
     if find.error > settings.max_delta_e:
@@ -208,6 +218,19 @@ def _at_corners(
     return find
 
 
+def _shows_more(
+    radiance: AngleStack, corners: Floats, reference: ChartReference, settings: WhitebalanceSettings
+) -> bool:
+    """Whether corners (4, 2) px from the user enclose a whole ColorChecker SG, not its block, judged by the colors."""
+    errors = []
+    for place in (chart.from_corners(corners), chart.from_sg_corners(corners)):
+        try:
+            errors.append(_find(radiance, place, reference, settings).error)
+        except ChartError:  # too few patches are usable
+            errors.append(np.inf)
+    return errors[1] < errors[0]
+
+
 def _find(
     radiance: AngleStack,
     place: Placement,
@@ -215,10 +238,7 @@ def _find(
     settings: WhitebalanceSettings,
     cost: float = float("nan"),
 ) -> _Find:
-    """Sample and fit the colors of a chart at a place of the reference shot.
-
-    The detector's cost is NaN at corners from the user.
-    """
+    """Sample and fit the colors of a chart at a place of the reference shot; `cost` is the detector's."""
     samples = patches.sample(radiance.value[0], radiance.quality[0], place, settings.patch_share)
     return _Find(place, patches.fit(samples, reference), cost)
 

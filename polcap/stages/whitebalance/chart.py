@@ -53,9 +53,13 @@ class Placement:
         area = cv2.contourArea(transform_points(self.homography, _outer(1.0)).astype(np.float32))
         return float(np.sqrt(area / (ROWS * COLUMNS)))
 
-    def quads(self, share: float = 1.0) -> Floats:
-        """Corners (24, 4, 2) px of each chart patch, shrunk to `share` of its side; from dark skin, row by row."""
-        return transform_points(self.homography, centers()[:, None] + share * self.patch / 2 * _SQUARE)
+    def quads(self, share: float = 1.0, at: Floats | None = None) -> Floats:
+        """Corners (N, 4, 2) px of patches with centers `at` (N, 2), shrunk to `share` of their side.
+
+        By default the 24 patches of the chart, from dark skin, row by row.
+        """
+        middle = centers() if at is None else at
+        return transform_points(self.homography, middle[:, None] + share * self.patch / 2 * _SQUARE)
 
     def corners(self) -> Floats:
         """Outer corners (4, 2) px of the chart's corner patches, dark skin first, clockwise on the chart."""
@@ -84,6 +88,16 @@ def from_centers(points: Floats) -> Placement:
 def from_corners(points: Floats, patch: float = USUAL_PATCH) -> Placement:
     """The placement of a chart with outer patch corners (4, 2) px, dark skin first, clockwise on the chart."""
     return Placement(_homography(_outer(patch), points), patch)
+
+
+def from_sg_corners(points: Floats, patch: float = USUAL_PATCH) -> Placement:
+    """The placement of the 24-patch block of a ColorChecker SG, from the outer corners (4, 2) px of A1, N1, N10, A10.
+
+    The block begins at column 5 of 14 and row 2 of 10.
+    """
+    gap = (1 - patch) / 2
+    left, top, right, bottom = gap - 4, gap - 1, 10 - gap, 9 - gap
+    return Placement(_homography(np.array([[left, top], [right, top], [right, bottom], [left, bottom]]), points), patch)
 
 
 def is_view(homography: Floats) -> bool:

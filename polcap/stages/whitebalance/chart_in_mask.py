@@ -1,4 +1,4 @@
-"""Detects a ColorChecker that was taken for part of the object, when the chart search did not find it."""
+"""Detects a ColorChecker inside the object's mask, which the chart search did not find."""
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ _PATCH_SHARE = 0.6  # sampled share of a patch's side
 
 
 def share(radiance: AngleStack, mask: NDArray[np.bool_], reference: ChartReference) -> float:
-    """Share of the mask (H, W) that is a ColorChecker in the first shot."""
+    """Share of the mask (H, W) that shows a ColorChecker in the first shot; 0 without one."""
     count, label, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     total = max(int(mask.sum()), 1)
     parts = [n for n in range(1, count) if about[n, cv2.CC_STAT_AREA] > _LEAST_SHARE * total]

@@ -1,10 +1,10 @@
 """Estimates the chart's plane, the position of the flash and the falloff of light, from the chart in one shot.
 
-A flash at L lights points P of a chart with normal n as n·(L − P)/|L − P|³. Across the chart n·(L − P) is constant.
-So the slope of the light gives the flash's position over the chart's plane: per patch it is 3 pitches over the
-distance, times the sine of the angle from the normal to the flash. A lamp near the chart or a lens's vignetting adds a
-slope of its own, with unknown effect on the level. The chart's orientation comes from its outline: the first two
-columns of its homography point along rows and columns.
+A flash at L lights a point P of a chart with normal n by n·(L − P)/|L − P|³. Across the chart n·(L − P) is constant. So
+the slope of the light over the chart shows where the flash is: the relative change per patch is 3 pitches over the
+distance, times the sine of the angle from the normal to the flash. A lamp near the chart or a lens's vignetting adds
+another slope, with an unknown effect on the level. The chart's orientation comes from its homography: its first two
+columns point along the chart's rows and columns.
 
 References
 ----------

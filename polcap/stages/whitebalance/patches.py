@@ -21,6 +21,7 @@ _LEAST = 12  # patches; the fit has 12 unknowns and three equations per patch
 _CLIPPED = 0.02  # share of a patch's pixels that may be clipped
 _UNEVEN, _UNEVEN_WHITE = 0.15, 0.01  # largest difference of a patch's quarter: of the patch, plus of the white patch
 _ODD, _LEAST_ODD = 6.0, 4.0  # an outlier has more than this many times the median ΔE, and at least this ΔE
+_LEAST_SURROUNDINGS = 0.5  # share of the patches around a block that must agree with it
 _MOST_COUNTED = 30.0  # largest ΔE of an excluded patch in the mean that decides whether it is a chart
 
 
@@ -46,10 +47,10 @@ class ChartFit:
 
 @dataclass(frozen=True)
 class PatchSamples:
-    """Colors of a chart's 24 patches in one shot, and whether each can be used."""
+    """Colors of a chart's N patches in one shot, and whether each can be used."""
 
-    color: Floats  # (24, 3) S0 of the patches, camera channels
-    use: Bits  # (24,) PatchUse
+    color: Floats  # (N, 3) S0 of the patches, camera channels
+    use: Bits  # (N,) PatchUse
 
     def turned(self) -> "PatchSamples":
         """The patch colors of the same chart read upside down."""
@@ -100,14 +101,37 @@ def position() -> Floats:
     return np.asarray(chart.centers() - chart.centers()[WHITE])
 
 
-def sample(value: Floats, quality: Bits, place: Placement, share: float) -> PatchSamples:
-    """Sample S0 of each patch in a shot (H, W, 3) with quality (H, W): twice the trimmed mean over its inner part.
+def fit_with_surroundings(
+    found: ChartFit, around: PatchSamples, reference: ChartReference
+) -> tuple[color.MatrixFit, Floats]:
+    """Fit the color matrix to all patches of a large chart: the 24 of its block `found` and the M `around` it.
 
-    `share` of each patch's side is sampled.
+    A surrounding patch is used if it agrees with the matrix of the block, because a chart may be partly hidden. If less
+    than half of them agree, none is used. Residuals (24 + M,) of the fit are NaN for patches not used. Also returns the
+    cross-validated ΔE2000 (24,) of the block's patches: each under the matrix of all others.
     """
-    color_, uneven = np.zeros((24, 3)), np.zeros(24)
-    use = np.zeros(24, np.uint8)
-    for index, quad in enumerate(place.quads(share)):
+    others = reference.surroundings
+    assert others is not None
+    at = others.center - chart.centers()[WHITE]
+    error = color.residuals(found.fit, around.color, others.rec709, at)
+    most = max(_LEAST_ODD, _ODD * float(np.nanmedian(found.fit.delta_e)))
+    agree = (around.use == PatchUse.USED) & (error < most)
+    agree &= agree.mean() >= _LEAST_SURROUNDINGS
+    seen, known = np.vstack([found.color, around.color]), np.vstack([reference.rec709, others.rec709])
+    arguments = (seen, known, np.vstack([position(), at]), np.concatenate([found.use == PatchUse.USED, agree]))
+    return color.fit_matrix(*arguments), color.cross_validate(*arguments)[:24]
+
+
+def sample(value: Floats, quality: Bits, place: Placement, share: float, at: Floats | None = None) -> PatchSamples:
+    """Sample S0 of each chart patch in a shot (H, W, 3) with quality (H, W): twice the trimmed mean of its pixels.
+
+    Only the inner part of a patch is sampled, a square with the share `share` of its side. `at` (M, 2) are the patches'
+    centers, as in `Placement.quads`.
+    """
+    quads = place.quads(share, at)
+    color_, uneven = np.zeros((len(quads), 3)), np.zeros(len(quads))
+    use = np.zeros(len(quads), np.uint8)
+    for index, quad in enumerate(quads):
         x, y = pixels_inside(quad, value.shape).T
         if len(x) < 4:
             use[index] = PatchUse.OUTSIDE
@@ -141,7 +165,7 @@ def left_out(use: Bits) -> str:
 
 
 def _between_quarters(pixels: Floats, x: Floats, y: Floats) -> float:
-    """Unevenness of a patch: largest difference of light (sum of channels) between a quarter and the whole patch."""
+    """Unevenness of a patch: largest difference of light (sum of channels) between one quarter and the whole patch."""
     light = pixels.sum(axis=1)
     quarter = 2 * (x > 0) + (y > 0)
     means = [np.median(light[quarter == q]) for q in range(4) if (quarter == q).sum() >= 4]

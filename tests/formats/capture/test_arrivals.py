@@ -1,38 +1,23 @@
 """A folder that is being filled is reported once it rests, and not before."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import pytest
 
 from polcap.formats.capture import arrivals
-
-
-class Clock:
-    """The clock of the waiting function; `meanwhile` fills the folder during its sleep."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-        self.meanwhile: Callable[[], object] = lambda: None
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
-        self.meanwhile()
+from tests.clocks import SleepClock
 
 
 @pytest.fixture(autouse=True)
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock()
+def clock(monkeypatch: pytest.MonkeyPatch) -> SleepClock:
+    clock = SleepClock()
     monkeypatch.setattr(arrivals, "time", clock)
     return clock
 
 
 def test_a_folder_that_rests_after_a_change_is_reported(
-    tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SleepClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = tmp_path / "polcap"
     made.mkdir()
@@ -55,7 +40,7 @@ def test_a_folder_that_rests_after_a_change_is_reported(
     assert len(written) == 4 and clock.now - written[-1] >= 0.6
 
 
-def test_a_removed_file_is_reported(tmp_path: Path, clock: Clock) -> None:
+def test_a_removed_file_is_reported(tmp_path: Path, clock: SleepClock) -> None:
     (tmp_path / "a.dng").write_bytes(b"a")
     moments = arrivals.settled(tmp_path, tmp_path / "polcap", still_s=0.0)
     next(moments)
@@ -64,7 +49,7 @@ def test_a_removed_file_is_reported(tmp_path: Path, clock: Clock) -> None:
     assert not (tmp_path / "a.dng").exists()
 
 
-def test_an_edited_file_rests_at_once_unless_photographs_arrive(tmp_path: Path, clock: Clock) -> None:
+def test_an_edited_file_rests_at_once_unless_photographs_arrive(tmp_path: Path, clock: SleepClock) -> None:
     folder, settings = tmp_path / "capture", tmp_path / "settings.toml"
     folder.mkdir()
     moments = arrivals.settled(folder, folder / "polcap", still_s=2.0, edited=[settings])

@@ -22,8 +22,12 @@ def pose(pitch: float, turn_deg: float, at: tuple[float, float], tilt: tuple[flo
     return np.array([[1, 0, at[0]], [0, 1, at[1]], [0, 0, 1]]) @ flat
 
 
-def draw(homography: Floats, colors: Floats, patch: float = 0.87, card: float = 0.03, samples: int = 4) -> Floats:
-    """A chart on a softly patterned table (H, W, 3), linear Rec.709: each pixel the mean of many points."""
+def draw(
+    homography: Floats, colors: Floats, patch: float = 0.87, card: float = 0.03, samples: int = 4,
+    size: tuple[int, int] = (6, 4),
+) -> Floats:  # fmt: skip
+    """A chart of columns × rows on a softly patterned table (H, W, 3), linear Rec.709: each pixel many points' mean."""
+    columns, rows = size
     inverse = np.linalg.inv(homography)
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
     table = 0.2 + 0.05 * np.sin(x / 17)[..., None] * np.cos(y / 23)[..., None] * np.array([1, 0.8, 0.5])
@@ -32,11 +36,12 @@ def draw(homography: Floats, colors: Floats, patch: float = 0.87, card: float = 
         for dx in (np.arange(samples) + 0.5) / samples - 0.5:
             at = transform_points(inverse, np.stack([x + dx, y + dy], axis=-1))
             u, v = at[..., 0], at[..., 1]
-            on = (u > -0.1) & (u < 6.1) & (v > -0.1) & (v < 4.1)
-            column, row = np.clip(np.floor(u), 0, 5).astype(int), np.clip(np.floor(v), 0, 3).astype(int)
+            on = (u > -0.1) & (u < columns + 0.1) & (v > -0.1) & (v < rows + 0.1)
+            column = np.clip(np.floor(u), 0, columns - 1).astype(int)
+            row = np.clip(np.floor(v), 0, rows - 1).astype(int)
             inside = on & (abs(u - column - 0.5) < patch / 2) & (abs(v - row - 0.5) < patch / 2)
             picture = np.where(on[..., None], card, table)
-            total += np.where(inside[..., None], colors[row * 6 + column], picture)
+            total += np.where(inside[..., None], colors[row * columns + column], picture)
     return total / samples**2
 
 

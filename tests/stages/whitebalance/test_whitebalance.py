@@ -1,6 +1,7 @@
 """The chart found where it is, refused where it is not, and colors on the scale of its white patch."""
 
 import functools
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -186,8 +187,67 @@ def test_block_of_an_sg_chart_is_read_at_its_corners_and_only_there():
     color = measure(image, request, sg, chart="sg")
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.03)
     assert np.nanmean(color.patches.delta_e) < 1
-    with pytest.raises(ChartError, match=r"E2, J2, J5, E5 with --chart"):
+    assert color.patches.surroundings is not None and np.isnan(color.patches.surroundings).all()  # only a table
+    with pytest.raises(ChartError, match=r"A1, N1, N10, A10, or of E2, J2, J5, E5, with --chart"):
         measure(image, AUTO, sg, chart="sg")
+
+
+SG, SG_PLACE = shipped_data.colorchecker("sg"), pose(22, 6, (230, 120), (2e-4, -1e-4))
+
+
+def sg_picture(spread: float = 0.0, patch: float = 0.9, seed: int = 7) -> Floats:
+    """A whole SG, 14 × 10 patches, each with a color that differs by `spread` from the reference (1σ)."""
+    assert SG.surroundings is not None
+    colors = np.zeros((10, 14, 3))
+    for rec709, center in ((SG.rec709, chart.centers()), (SG.surroundings.rec709, SG.surroundings.center)):
+        column, row = np.floor(center + np.array([4, 1])).astype(int).T
+        colors[row, column] = rec709
+    colors *= 1 + spread * np.random.default_rng(seed).normal(size=colors.shape)
+    whole = SG_PLACE @ np.array([[1, 0, -4], [0, 1, -1], [0, 0, 1]])
+    return np.asarray(draw(whole, colors.reshape(140, 3), patch, size=(14, 10)) @ CAMERA.T / 2)
+
+
+def sg_corners(whole: bool, patch: float = 0.9) -> ChartRequest:
+    """RAW px of the outer corners of the whole SG, or of its block."""
+    gap = (1 - patch) / 2
+    left, top, right, bottom = (gap - 4, gap - 1, 10 - gap, 9 - gap) if whole else (gap, gap, 6 - gap, 4 - gap)
+    at = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+    return ChartRequest("corners", corners=2 * transform_points(SG_PLACE, at) + 0.5)
+
+
+@pytest.mark.parametrize("whole", [True, False], ids=["corners of all", "corners of the block"])
+def test_all_patches_of_an_sg_are_fitted(whole: bool) -> None:
+    color = measure(sg_picture(), sg_corners(whole), SG, chart="sg")
+    assert centers_off(color, SG_PLACE).max() < 0.2
+    assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
+    assert color.patches.surroundings.shape == (116,) and np.nanmax(color.patches.surroundings) < 1
+    assert np.isfinite(color.patches.surroundings).sum() == 116
+
+
+def test_more_patches_make_the_matrix_better() -> None:
+    """By about √(24/140) where each patch has an error of its own."""
+    block, off = replace(SG, surroundings=None), []
+    for seed in range(5):
+        picture = sg_picture(spread=0.03, seed=seed)
+        found = [
+            measure(picture, sg_corners(whole=True), SG, chart="sg"),
+            measure(picture, sg_corners(whole=False), block, chart="sg"),
+        ]
+        off.append([color.matrix @ CAMERA - np.eye(3) for color in found])
+    of_all, of_block = np.sqrt(np.mean(np.square(off), axis=(0, 2, 3)))
+    assert of_all < 0.7 * of_block
+
+
+def test_hidden_patches_of_an_sg_are_left_out() -> None:
+    picture = sg_picture()
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    u = transform_points(np.linalg.inv(SG_PLACE), np.stack([x, y], axis=-1).astype(float))[..., 0]
+    picture[u < -2] = CAMERA @ [0.35, 0.2, 0.15] / 2  # a hand on the first two columns
+    color = measure(picture, sg_corners(whole=True), SG, chart="sg")
+    used = np.isfinite(color.patches.surroundings)
+    hidden = SG.surroundings.center[:, 0] < -2
+    assert used[~hidden].mean() > 0.95 and used[hidden].mean() < 0.2
+    assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
 
 
 REFUSED = {
