@@ -366,6 +366,7 @@ class BracketMeasurement:
     ghost_fraction: Floats  # (K,) share of pixels with exposures that differ by more than noise
     ambient_share: Floats  # (K,) share of the light that is present without the flash
     blur_px: Floats  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]
+    ambient_shared: bool = False  # one ambient frame was subtracted from shots of several angles
 
 
 @dataclass(frozen=True)
