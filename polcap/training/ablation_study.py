@@ -46,7 +46,7 @@ def main(
     judged = evaluate.EvaluationOptions(
         options.out / "ours" / "model.onnx", options.data, options.out, options.out, count, size
     )
-    evaluate.main(judged)
+    evaluate.main(judged, report)
     spent = f"training {(trained - began) / 60:.0f} min, evaluation {(time.monotonic() - trained) / 60:.0f} min"
     report(f"{spent}; {options.out / 'evaluation.md'}")
     return options.out / "evaluation.md"
