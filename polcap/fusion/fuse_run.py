@@ -10,6 +10,7 @@ import numpy as np
 
 from polcap import __version__, resource_limits
 from polcap import report as reports
+from polcap.errors import SettingError
 from polcap.formats.export import encoders, provenance
 from polcap.fusion import fused_maps, fused_page, object_pictures, session
 from polcap.fusion.baking import AtlasMaps
@@ -66,6 +67,8 @@ def export(out: Path, *wanted: ExportRequest) -> list[Path]:
     """Write the asset of a fused result again for each request, from maps/ and report.json; returns the files."""
     for one in wanted:
         asset_export.check(one)
+        if "exr" in asset_export.effective(one).formats:
+            raise SettingError("a fused object has no layered EXR; leave out --exr and --preset archive, and use maps/")
     about = reports.read(out)
     with result_folder.locked(out):
         source = fused_maps.read(out / "maps")
