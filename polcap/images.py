@@ -366,6 +366,7 @@ class BracketMeasurement:
     ghost_fraction: Floats  # (K,) share of pixels with exposures that differ by more than noise
     ambient_share: Floats  # (K,) share of the light that is present without the flash
     blur_px: Floats  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]
+    ambient_shared: bool = False  # one ambient frame was subtracted from shots of several angles
 
 
 @dataclass(frozen=True)
@@ -418,7 +419,7 @@ def single_frames(shots: int) -> BracketMeasurement:
 
 @dataclass(frozen=True)
 class SurroundingPatches:
-    """Patches of a chart of more than 24 patches, around its block of 24."""
+    """Patches of a large chart (ColorChecker SG) around its block of 24 patches."""
 
     rec709: Floats  # (M, 3) linear Rec.709/D65 reflectance
     center: Floats  # (M, 2) column and row in patches from the block's first corner, negative before it

@@ -39,7 +39,7 @@ def set_verbosity(quiet: bool, verbose: bool) -> None:
 
 
 def open_log(file: "Path | None") -> None:
-    """Append all messages to a file too, after the command line and the versions. Raises OSError."""
+    """Open the file of --log: write command line and versions; messages are appended from now on. Raises OSError."""
     global _log_file
     _log_file = None
     if file is not None:

@@ -5,14 +5,14 @@ setting is at fault, 3 the asset was written but a gate failed, 4 hardware, 130 
 to go on), 1 a bug. Heavy imports happen inside the commands, so that `--help` answers at once.
 
 process_command    the path over one capture
-batch_command      over many
-fuse_command       several captures of one object, joined
+batch_command      the path over many captures
+fuse_command       several captures of one object to one mesh
 result_commands    export, show, status, report, clean
 check_command      keep a capture or reshoot it
-calibrate_command  measured camera, lens, polarizer and flash
+calibrate_command  measurement of camera, lens, polarizer and flash
 doctor_command     check of this machine or of one photograph
 settings_command   list of all settings
-synth_command      captures of objects that do not exist
+synth_command      synthetic captures
 board_command      the board to print, for captures from all sides
 capture_command    shooting with a rig
 training_commands  train, evaluate
@@ -74,7 +74,7 @@ class OneLine(TyperGroup):
 
 
 def _common_first(words: Sequence[str]) -> list[str]:
-    """The words of a command line; the options of all commands come before the command."""
+    """Reorder the words of a command line: options that all commands share are moved in front of the command."""
     if words[-1:] == ["--log"]:  # without its file: the parser names that
         return ["--log"]
     common, others = list[str](), list[str]()

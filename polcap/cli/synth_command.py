@@ -53,7 +53,8 @@ def synth(
     if dataset is not None:
         corpus, made = options.training("dataset_files"), folder / "dataset.json"
         named = {"seed": seed, "mesh": str(mesh or ""), "material": str(material or ""), "law": law}
-        corpus.main(folder, dataset, settings.fill(corpus.DatasetRecipe, named, assignments or ()))
+        recipe = settings.fill(corpus.DatasetRecipe, named, assignments or ())
+        corpus.main(folder, dataset, recipe, terminal.print_progress)
     elif calibration:
         from polcap.synth import calibration_frames
 

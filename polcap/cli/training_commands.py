@@ -73,5 +73,6 @@ def evaluate(
         return
     judge, fixed = options.training("evaluate"), options.training("evaluation_protocol")
     usual = (fixed.QUICK_COUNT, fixed.QUICK_SIZE) if quick else (fixed.COUNT, fixed.SIZE)
-    judge.main(judge.EvaluationOptions(model, data, out, ablations, count or usual[0], size or usual[1], protocol))
+    stated = judge.EvaluationOptions(model, data, out, ablations, count or usual[0], size or usual[1], protocol)
+    judge.main(stated, terminal.print_progress)
     terminal.print_data(str(out / "evaluation.md"))

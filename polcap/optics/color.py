@@ -110,7 +110,7 @@ def fit_matrix(color: Floats, reference: Floats, position: Floats, usable: NDArr
 
 
 def residuals(fit: MatrixFit, color: Floats, reference: Floats, position: Floats) -> Floats:
-    """CIEDE2000 (N,) of patches (N, 3) under a matrix fitted to others; arguments as of `fit_matrix`."""
+    """CIEDE2000 (N,) of patches that were not used for the fit; arguments as of `fit_matrix`."""
     return delta_e(_reflectance(color, position, fit.matrix, fit.slope, np.asarray(fit.glare)), reference)
 
 

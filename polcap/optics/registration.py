@@ -126,9 +126,9 @@ class _Matches:
 def register(reference: Pyramid, other: Pyramid, model: Model = "simplest") -> Registration:
     """Estimate the motion from a reference picture to another picture of the same scene.
 
-    The match at full size counts if neither it, nor the coarsest scale, nor a phase correlation shows a motion of
-    `_STILL_PX`. Otherwise the search goes from coarse to fine, from the identity and from the phase correlation. Where
-    no tiles match or agree, the result is the identity with `tiles` 0.
+    First the pictures are matched at full size. The result is used if it, the coarsest scale and a phase correlation
+    all show a motion below `_STILL_PX`. Otherwise the search goes from coarse to fine, starting from the identity and
+    from the phase correlation. If no tiles match or agree, the result is the identity with `tiles` 0.
     """
     coarsest = reference.scales - 1
     still, _ = _refine(reference, other, model, 0, 0, np.eye(3))
@@ -204,7 +204,7 @@ def _phase_correlation(reference: Level, other: Level) -> Floats:
 def _refine(
     reference: Pyramid, other: Pyramid, model: Model, coarsest: int, finest: int, matrix: Floats
 ) -> tuple[Registration, int]:
-    """Refine a first guess of the motion from a coarse scale to a finer one, in px of the finer one.
+    """Refine a first guess of the motion, from the scale `coarsest` to the scale `finest`, in px of the latter.
 
     Returns the registration and the number of tiles that agree with it.
     """

@@ -121,7 +121,7 @@ def _run_path(capture: Capture, small: SmallCapture, supplied: UserInput, config
         try:
             request = ChartRequest("profile", profile=_colors_at_full_size(capture, config))
         except ChartError as error:
-            missing = str(error).partition(" (")[2].partition(")")[0] or str(error)
+            missing = str(error).partition(" (")[2].rpartition("); ")[0] or str(error)
         path(small.capture, replace(supplied, chart=request), settings, cache)
     return missing
 

@@ -77,7 +77,7 @@ def locked(out: Path) -> Iterator[None]:
 def clean(out: Path, dry_run: bool = False) -> int:
     """Remove the stage cache and the pictures of `show` from work/; returns their size in bytes.
 
-    All other files stay, also those of other programs in work/. A dry run only measures.
+    All other files in work/ stay. With `dry_run`, nothing is removed.
 
     Raises
     ------

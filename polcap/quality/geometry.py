@@ -1,24 +1,30 @@
 """Gates of geometry: alignment, mask, mesh, outline, sharpness, focal length."""
 
 import cv2
+import msgspec
 import numpy as np
 
 from polcap.formats import shipped_data
-from polcap.images import Mesh, SurfaceMaps
+from polcap.images import Floats, Mesh, SurfaceMaps
 from polcap.optics import frames, outline
 from polcap.optics.morphology import dilate
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean
 from polcap.optics.sharpness import TILE
+from polcap.quality import object_turn
 from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, blamed
 from polcap.quality.limits import GateLimits
 from polcap.stages.align import AlignSettings, object_motion
 from polcap.stages.whitebalance import chart_in_mask
 
 _LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ
-_DEGREES_PER_PUSH, _DEGREES_PER_TURN = 200.0, 350.0  # error of the normals per movement by the object's radius
-_STILL_PX = 0.2  # displacement of inner detail that polarization alone imitates, in three of four captures
+_DEGREES_PER_PUSH = 200.0  # error of the normals per movement by the object's radius
+_DEGREES_PER_TURN = 5.0  # error of the normals per degree by which the object turned (docs/benchmarks/gates.md)
+_FALSE_TURN_DEG = 0.2  # 1σ of a turn that polarization imitates
+_SHARP_PX, _DEGREES_PER_BLUR_PX = 1.2, 2.5  # greatest blur of sharp edges; error of the normals per px beyond it
+_EDGE_FLOOR = 0.1  # of the object's median light: dark backdrops differ by less
+_HOLD_STILL = "Fix the object, do not touch it between shots, and take that shot again"
 _INWARD = 0.2  # sine of the zenith from which a normal leans inward
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
 
@@ -57,38 +63,48 @@ def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate
 
 
 def _object_moved(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on movement of the object relative to its surroundings; the cost grows with movement over object radius."""
-    motion, names = _motion(found), found.names
-    pushed, inside = (np.nan_to_num(one, posinf=np.inf) * found.grid_px for one in (motion.pushed, motion.inside))
+    """Gate on movement of the object relative to its surroundings: a push over the object's radius, or a turn."""
+    names = found.names
+    pushed = np.nan_to_num(_pushed(found), posinf=np.inf) * found.grid_px
     radius = max(outline.disc_radius(found.object_.mask) * found.grid_px, 1.0)
     least = limits.min_object_shift * radius
-    cost = float(max(_DEGREES_PER_PUSH * pushed.max(), _DEGREES_PER_TURN * max(inside.max() - _STILL_PX, 0.0)) / radius)
-    remedy = "Fix the object, do not touch it between shots, and take that shot again"
+    turned = _object_turned(found, limits)
+    cost = float(np.hypot(_DEGREES_PER_PUSH * pushed.max() / radius, turned.cost_deg))
     k = int(np.argmax(pushed))
     limit = limits.max_object_shift_px
     bad = blamed(names, pushed > limit)
     message = f"The object moved by {pushed[k]:.1f} px against its surroundings in {names[k]}"
     if np.isinf(pushed[k]):
         message = f"The {names[k]} shot shows another object in the same surroundings"
-        return Gate("alignment", "fail", None, limit, message, remedy, 45.0, bad, "px")
+        return Gate("alignment", "fail", None, limit, message, _HOLD_STILL, 45.0, bad, "px")
     figure = round(float(pushed[k]), 3)
     if bad:
-        return Gate("alignment", "fail", figure, limit, message, remedy, max(cost, 5.0), bad, "px")
+        return Gate("alignment", "fail", figure, limit, message, _HOLD_STILL, max(cost, 5.0), bad, "px")
     if pushed[k] > least:
-        return Gate("alignment", "warn", figure, least, message, remedy, cost, blamed(names, pushed > least), "px")
-    least *= 2  # polarization imitates a displacement of inner detail
-    turned = inside - _STILL_PX > least
-    if turned.any():
-        k = int(np.argmax(inside))
-        message = f"Detail inside the object moved by {inside[k]:.1f} px in {names[k]}: the object turned"
-        return Gate(
-            "alignment", "warn", round(float(inside[k]), 3), least, message, remedy, cost, blamed(names, turned), "px"
-        )
-    return Gate("alignment", "pass", figure, least, message, cost_deg=cost, unit="px")
+        return Gate("alignment", "warn", figure, least, message, _HOLD_STILL, cost, blamed(names, pushed > least), "px")
+    return msgspec.structs.replace(turned, cost_deg=cost)
 
 
-def _motion(found: Evidence) -> object_motion.ObjectMotion:
+def _object_turned(found: Evidence, limits: GateLimits) -> Gate:
+    """Gate on a turn of the object between shots, beyond twice its error."""
+    turn, names, limit = _turn(found), found.names, limits.max_object_turn_deg
+    least = turn.degrees - 2 * turn.sigma
+    k = int(np.argmax(least))
+    true = np.sqrt(np.maximum(turn.degrees**2 - turn.sigma**2 - _FALSE_TURN_DEG**2, 0))
+    figure, cost = round(float(turn.degrees[k]), 3), _DEGREES_PER_TURN * float(true.max())
+    message = f"The object turned by {figure:.1f}° ± {turn.sigma[k]:.1f}° in {names[k]}, as its visible detail shows"
+    if least[k] <= limit:
+        return Gate("alignment", "pass", figure, limit, message, cost_deg=cost, unit="°")
+    return Gate("alignment", "warn", figure, limit, message, _HOLD_STILL, cost, blamed(names, least > limit), "°")
+
+
+def _pushed(found: Evidence) -> Floats:
     return object_motion.measure(found.radiance, found.alignment, found.object_)
+
+
+def _turn(found: Evidence) -> object_turn.ObjectTurn:
+    maps = found.maps if hasattr(found, "maps") else None
+    return object_turn.measure(found.radiance, found.alignment, found.object_, maps)
 
 
 def mask(found: Evidence, limits: GateLimits) -> Gate:
@@ -185,21 +201,25 @@ def focus(found: Evidence, limits: GateLimits) -> Gate:
     if blur > limit:
         message += ": all shots are out of focus, which costs about 0.04 of roughness"
     remedy = "Focus by hand on the front of the object, with f/8 to f/11"
-    return at_most("focus", blur, limit, message, remedy, cost_deg=1.0, unit="px", beyond="warn")
+    gate = at_most("focus", blur, limit, message, remedy, unit="px", beyond="warn")
+    excess = max(blur - _SHARP_PX, 0.0) if np.isfinite(blur) else 0.0  # a smooth object looks the same
+    return msgspec.structs.replace(gate, cost_deg=round(_DEGREES_PER_BLUR_PX * excess, 1))
 
 
 def _edge_blur(found: Evidence) -> float:
-    """Blur (1σ) of the object's sharpest edges [px], from their slope: a step h blurred by σ has the slope h/(σ√2π).
+    """Blur (1σ) of the object's sharpest edges [px]: a step of height h, blurred by σ, has the slope h/(σ√2π).
 
-    Edges are the 10 % of the object with most contrast within 7 px. The sharpest are 5 % of these.
+    Heights are ratios of light, so that the outline counts before a dark backdrop, however smooth the object is. Edges
+    are the tenth of the object with most contrast within 7 px; the sharpest are the twentieth of these.
     """
-    light = found.radiance.value[0].sum(-1)
-    near = dilate(found.object_.mask, 4)
+    light, mask = np.maximum(found.radiance.value[0].sum(-1), 0), found.object_.mask
+    near = dilate(mask, 4)
     if not near.any():
         return float("nan")
+    log = np.log(light + max(_EDGE_FLOOR * float(np.median(light[mask])), 1e-9)).astype(np.float32)
     window = np.ones((7, 7), np.uint8)
-    height = (cv2.dilate(light, window) - cv2.erode(light, window))[near]
-    slope = np.sqrt(squared_gradient(light))[near]
+    height = (cv2.dilate(log, window) - cv2.erode(log, window))[near]
+    slope = np.sqrt(squared_gradient(log))[near]
     edge = height >= np.percentile(height, 90)
     sharpest = np.percentile(slope[edge] / np.maximum(height[edge], 1e-9), 95)
     return float(1 / (np.sqrt(2 * np.pi) * max(float(sharpest), 1e-3)))

@@ -23,9 +23,10 @@ _BRIGHTER = 1.08  # times S0: the greatest that scale and registration explain; 
 _EDGE_PX = 2.0  # 1σ of the blur before two shots are compared, so that misaligned edges of a print do not count
 _STILL_CLIPPED = 0.5  # share of highlights that a crossed filter should have stopped
 _FEW = 20  # px
-_DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame that was subtracted: 1 to 2° at 15 %
+_DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame for all angles: 1 to 2° at 15 %
 _LEAST_ALBEDO = 0.02  # sum of the channels
-_DEGREES_PER_HIGHLIGHT_DOLP = 100.0  # of the normals: 1 to 2° at 1 %, 2 to 11° at 3 to 15 %
+_DEGREES_PER_ROOT_OF_HIGHLIGHT_DOLP = 30.0  # of the normals: 2 to 4° at 1 %, 4 to 8° at 2 %, 2 to 11° at 3 to 15 %
+_FALSE_HIGHLIGHT_DOLP = 0.002  # under one flash: up to .0025 (24 captures)
 _ROOM_TILE, _LEAST_ROOM_TILES = 16, 20  # px; tiles
 _WITH_FRAME = 1.5  # size of a chart with its frame over the size of its patches
 _DEGREES_PER_ROOM_DOLP = 50.0  # of the normals: 1.3 to 2.6° at 5.5 % (docs/benchmarks/gates.md)
@@ -288,16 +289,23 @@ def _crossed(image: StokesImage) -> dict[str, Any]:
 
 
 def ambient(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on the share of ambient light; it is measured only if frames without flash were taken."""
-    share = found.radiance.bracket.ambient_share
-    limit = limits.max_ambient
-    if not np.isfinite(share).any():
+    """Gate on the share of ambient light; it is measured only if frames without flash were taken.
+
+    The object polarizes the room's light too. Only an ambient frame at the same angle contains the same light.
+    """
+    bracket, limit = found.radiance.bracket, limits.max_ambient
+    if not np.isfinite(bracket.ambient_share).any():
         return Gate("ambient", "not measured", None, limit, "No frame was taken without the flash")
-    worst = float(np.nanmax(share))
+    worst = float(np.nanmax(bracket.ambient_share))
     message = f"{100 * worst:.1f} % of the light does not come from the flash; the ambient frames are subtracted"
+    cost = round(_DEGREES_PER_AMBIENT * worst, 1) if bracket.ambient_shared else 0.0
+    if bracket.ambient_shared and limits.max_ambient_shared < worst <= limit:
+        limit = limits.max_ambient_shared
+        message = f"{100 * worst:.1f} % of the light is the room's, and one ambient frame serves several angles"
+        remedy = "Darken the room, or take one ambient frame per angle: subtracting them is exact"
+        return Gate("ambient", "warn", round(worst, 5), limit, message, remedy, cost)
     remedy = "Darken the room: the noise and changes of so much ambient light remain"
-    gate = at_most("ambient", worst, limit, message, remedy)
-    return msgspec.structs.replace(gate, cost_deg=round(_DEGREES_PER_AMBIENT * worst, 1))
+    return msgspec.structs.replace(at_most("ambient", worst, limit, message, remedy), cost_deg=cost)
 
 
 def polarized_light(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
@@ -319,17 +327,18 @@ def polarized_light(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     if share > limit:
         message += ": light from the sides (two flashes, softboxes, a window), which bends normals and roughness"
     remedy = "Use one flash next to the lens, and darken the room"
-    cost = _DEGREES_PER_HIGHLIGHT_DOLP * share
-    yield at_most("lighting", share, limit, message, remedy, cost_deg=cost, beyond=_grade(cost))
+    cost = float(_DEGREES_PER_ROOT_OF_HIGHLIGHT_DOLP * np.sqrt(max(np.nan_to_num(share) - _FALSE_HIGHLIGHT_DOLP, 0.0)))
+    gate = at_most("lighting", share, limit, message, remedy, beyond=_grade(cost))
+    yield msgspec.structs.replace(gate, cost_deg=round(cost, 1))
 
 
 def _highlight_dolp(found: Evidence) -> float:
-    """Common DoLP of the 2 % of the object with most light over albedo; NaN without an object."""
+    """Common DoLP of the tenth of the object with most light over albedo; NaN without an object."""
     inside = found.maps.mask & found.cues.mask
     if not inside.any():
         return float("nan")
     light = found.cues.radiance[inside].sum(-1) / np.maximum(found.maps.diffuse[inside].sum(-1), _LEAST_ALBEDO)
-    bright = light >= np.percentile(light, 98)
+    bright = light >= np.percentile(light, 90)
     return float(np.hypot(*np.median(found.cues.ratio[:, inside][:, bright], axis=1)))
 
 

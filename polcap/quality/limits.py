@@ -47,6 +47,10 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float,
         Meta(gt=0, description="allowed movement of the object against its surroundings [px of the merged picture]"),
     ] = 1.5
+    max_object_turn_deg: Annotated[
+        float,
+        Meta(gt=0, le=45, description="allowed turn of the object between shots, beyond twice its error [degrees]"),
+    ] = 0.45
     max_mask_doubt: Annotated[
         float, Meta(ge=0, le=1, description="allowed expected error of the mask, 1 − overlap; half of it warns [1]")
     ] = 0.25
@@ -69,7 +73,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_edge_blur_px: Annotated[
         float,
         Meta(gt=0, le=20, description="allowed 1σ blur of the object's sharpest edges [px of the merged picture]"),
-    ] = 1.65
+    ] = 1.4
     max_turn_deg: Annotated[
         float,
         Meta(ge=3, le=45, description="allowed error of an angle, measured from the outline [degrees]"),
@@ -111,9 +115,13 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_ambient: Annotated[
         float, Meta(gt=0, le=1, description="allowed share of ambient light, which is subtracted [1]")
     ] = 0.3
+    max_ambient_shared: Annotated[
+        float,
+        Meta(gt=0, le=1, description="allowed share of ambient light if one ambient frame serves several angles [1]"),
+    ] = 0.08
     max_highlight_dolp: Annotated[
         float, Meta(gt=0, le=1, description="allowed polarization that the brightest parts of the object share [1]")
-    ] = 0.006
+    ] = 0.004
     max_room_dolp: Annotated[
         float, Meta(gt=0, le=1, description="allowed polarization of the surroundings, common to all of them [1]")
     ] = 0.015

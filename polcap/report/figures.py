@@ -85,7 +85,7 @@ def _colors(color: ColorCalibration, albedo_sigma: float | None) -> dict[str, An
 
 
 def _surroundings(fit: PatchColors | None) -> str | None:
-    """Use of the patches around the block of an SG, in words."""
+    """Text for the report: how many patches around the block of a ColorChecker SG were used."""
     if fit is None or fit.surroundings is None:
         return None
     used = fit.surroundings[~np.isnan(fit.surroundings)]

@@ -130,7 +130,7 @@ class CaptureRecord:
         return messages
 
     def write(self) -> None:
-        """Write rig.json, then capture.toml, in which other keys stay, such as [catalog].
+        """Write rig.json, then capture.toml; keys that the user added, such as [catalog], do not change.
 
         Raises StorageError; CaptureError if capture.toml was edited and is wrong.
         """

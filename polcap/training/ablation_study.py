@@ -1,4 +1,4 @@
-"""The table of ablations in one command, `polcap train --ablation`: every variant trained alike, then evaluated.
+"""Ablation study, `polcap train --ablation`: trains every variant of the network alike, then evaluates all.
 
 References
 ----------
@@ -46,14 +46,14 @@ def main(
     judged = evaluate.EvaluationOptions(
         options.out / "ours" / "model.onnx", options.data, options.out, options.out, count, size
     )
-    evaluate.main(judged)
+    evaluate.main(judged, report)
     spent = f"training {(trained - began) / 60:.0f} min, evaluation {(time.monotonic() - trained) / 60:.0f} min"
     report(f"{spent}; {options.out / 'evaluation.md'}")
     return options.out / "evaluation.md"
 
 
 def _cost(options: TrainingOptions, count: int, size: int) -> str:
-    """What an ablation study costs, in words."""
+    """A sentence on the computing time of an ablation study."""
     networks = len(VARIANTS)
     each = f"{options.minutes:g} min" if options.samples is None else f"{options.samples} pictures"
     whole = f", {networks * options.minutes / 60:.1f} h in all" if options.samples is None else ""

@@ -35,6 +35,7 @@ from polcap.optics import frames, mueller
 from polcap.stages import cues
 from polcap.synth.mesh_tracer import Tracer, centred
 from polcap.training import materials, random_shapes, traced_views
+from polcap.training.progress import Report, silent
 
 ANGLES_DEG = (0, 45, 90, 135)
 _LARGEST, _KNEE = 16.0, 0.01  # HDR encoding: radiance at 65535, and the limit between linear and logarithmic parts
@@ -51,8 +52,11 @@ class DatasetRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     law: Literal["smooth", "rough"] = "smooth"  # interface of diffuse light
 
 
-def main(out: Path, count: int, recipe: DatasetRecipe) -> int:
-    """Make the samples 0…count − 1 that the folder lacks; returns the number of new samples."""
+def main(out: Path, count: int, recipe: DatasetRecipe, report: Report = silent) -> int:
+    """Make the samples 0…count − 1 that the folder lacks; returns the number of new samples.
+
+    `report` is called with a line of text per new sample.
+    """
     library, files = _open_library(recipe.material), _list_meshes(recipe.mesh)
     _describe(out, recipe)
     made = 0
@@ -63,6 +67,7 @@ def main(out: Path, count: int, recipe: DatasetRecipe) -> int:
         with atomic.folder(place) as folder:
             _write_sample(folder, recipe, library, files, number)
         made += 1
+        report(f"{number + 1} of {count} samples")
     return made
 
 

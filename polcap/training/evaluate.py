@@ -8,7 +8,6 @@ import hashlib
 import json
 import multiprocessing
 import os
-import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -29,6 +28,7 @@ from polcap.training import evaluation_baselines, evaluation_page, evaluation_pr
 from polcap.training.evaluation_baselines import Estimator, Means
 from polcap.training.evaluation_protocol import Protocol
 from polcap.training.map_errors import MAPS, Judge, Score, angle, deciles
+from polcap.training.progress import Report, silent
 
 _PANEL = 8  # pictures in panel.png
 _SAMPLE = 500  # pixels of a picture for the check of the expected error
@@ -53,13 +53,16 @@ class EvaluationOptions:
     protocol: int = 1  # 1 | 2, of evaluation_protocol.py
 
 
-def main(options: EvaluationOptions) -> dict[str, Score]:
-    """Evaluate model and baselines; returns mean scores, writes evaluation.json, evaluation.md and panel.png."""
+def main(options: EvaluationOptions, report: Report = silent) -> dict[str, Score]:
+    """Evaluate model and baselines; returns mean scores, writes evaluation.json, evaluation.md and panel.png.
+
+    `report` is called with a line of text per picture.
+    """
     torch.set_num_threads(1)
     network = models.open_network(options.model)
     made = Protocol(options.data, options.size, options.protocol)
     head = _head(options, network)
-    rows = _evaluate_pictures(options, evaluation_baselines.mean_maps(made, options.count), head)
+    rows = _evaluate_pictures(options, evaluation_baselines.mean_maps(made, options.count), head, report)
     result = _summary(head, rows)
     shown = (made.case(number) for number in range(min(_PANEL, options.count)))
     strips = [evaluation_page.make_row(case, _estimate(case.cues, network)) for case in shown]
@@ -93,7 +96,7 @@ def _estimate(seen: Cues, network: Network | None) -> SurfaceMaps:
     return infer.estimate(seen, network, onnx.run, infer.InferSettings())
 
 
-def _evaluate_pictures(options: EvaluationOptions, means: Means, head: dict[str, Any]) -> list[Row]:
+def _evaluate_pictures(options: EvaluationOptions, means: Means, head: dict[str, Any], report: Report) -> list[Row]:
     """Results of all evaluation pictures; stored ones of an earlier run with the same inputs are used again."""
     path = options.out / "pictures.jsonl"
     rows = _read_results(path, head)
@@ -108,11 +111,10 @@ def _evaluate_pictures(options: EvaluationOptions, means: Means, head: dict[str,
             each = (time.monotonic() - started) / (len(rows) - first)
             left = each * (options.count - len(rows)) / 60
             mean = np.mean([row["scores"][OURS]["normal_mean"] for row in rows])
-            print(
+            report(
                 f"{len(rows)}/{options.count}  {each:.1f} s per picture, {left:.0f} min left; "
-                f"{OURS}: normals {mean:.2f}° on average",
-                file=sys.stderr, flush=True,
-            )  # fmt: skip
+                f"{OURS}: normals {mean:.2f}° on average"
+            )
     return rows
 
 

@@ -7,6 +7,7 @@ stopped run continues. The table counts:
 
 handled      maps as good as without the weakness, verdict not fail
 reported     worse maps, and a gate of the weakness warns or fails, or the expected error covers the actual one
+             (normals), or the gate of the albedo's scale warns (albedo)
 silent       worse maps, and neither
 false alarm  maps as good, verdict fail
 crash        an exception that is no error message
@@ -131,8 +132,10 @@ def outcome(row: Row, usual: Row | None) -> str:
     dim = abs(row["scale"] - before["scale"]) > max(WORSE_SCALE, 2 * (row.get("scale_sigma") or 0))
     if not (worse or rough or dim):
         return "false alarm" if row["verdict"] == "fail" else "handled"
-    covered = worse and not (rough or dim) and row["expected"] >= row["normal_median"] and row["expected"] > row["own"]
-    return "reported" if named or covered or row["verdict"] == "fail" else "silent"
+    if named or row["verdict"] == "fail":
+        return "reported"
+    covered = row["expected"] >= row["normal_median"] and row["expected"] > row["own"]
+    return "silent" if rough or (worse and not covered) or (dim and "albedo scale" not in spoke) else "reported"
 
 
 def table(rows: list[Row]) -> str:

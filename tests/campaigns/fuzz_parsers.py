@@ -6,7 +6,6 @@ A parser may return a value or raise one of its declared errors, within a second
 exit code 1 after a failure.
 """
 
-import io
 import json
 import os
 import sys
@@ -114,7 +113,9 @@ def _calibration_file(file: Path) -> object:
 def _header(data: bytes, folder: Path) -> object:
     structure = file_kind.structure(data)
     file_checks.check_structure("fuzz", structure, data)
-    return file_kind.kind(io.BytesIO(data), ".dng"), structure.truncated, structure.dng
+    (folder / "fuzz.dng").write_bytes(data)
+    with (folder / "fuzz.dng").open("rb") as file:
+        return file_kind.kind(file, ".dng"), structure.truncated, structure.dng
 
 
 def _name(text: str) -> object:

@@ -86,7 +86,7 @@ def test_process_measures_the_blur_that_check_measures(tmp_path: Path) -> None:
         np.testing.assert_array_equal(merged.bracket.blur_px, reduce(capture, 0.98, pool).blur_px)
 
 
-def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> None:
+def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     faulty.shoot(tmp_path / "small", 1, "", 200)  # too small for a chart to be found
     capture = captures.read(tmp_path / "small")
     found = verdict(tmp_path / "small")
@@ -95,6 +95,13 @@ def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path) -> N
     with pytest.raises(ChartError):
         merged = hdr.merge(capture, frame_decoder.decode, Config().hdr)
         whitebalance.measure(merged, shipped_data.colorchecker(), AUTO, Config().whitebalance)
+
+    def fail(*_: object) -> None:
+        raise ChartError("no chart (the best (cost 0.05) is none); give its corners")
+
+    monkeypatch.setattr(check, "_colors_at_full_size", fail)
+    again = next(line for line in verdict(tmp_path / "small").lines if line.name == "chart")
+    assert "(the best (cost 0.05) is none);" in again.message  # the whole reason
     asked = check.inspect(capture, Config(), ChartRequest("none"), lambda: (None, None))
     assert asked.needs == "" and next(line for line in asked.lines if line.name == "chart").state == "not measured"
 

@@ -27,7 +27,7 @@ from polcap.images import (
 from polcap.quality import gate as gate_module
 from polcap.quality import gates, geometry, light, polarization, rim
 from polcap.quality.gate import Evidence, Gate
-from polcap.stages.align.object_motion import ObjectMotion
+from polcap.quality.object_turn import ObjectTurn
 from tests import scenes
 
 MODULES: tuple[ModuleType, ...] = (gates, gate_module, light, geometry, polarization)
@@ -40,13 +40,14 @@ BODY = {
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
-    "object_motion": ObjectMotion(np.array([0.0, 0.1, 0.1]), np.array([0.0, 0.1, 0.1])), "edge_blur": 0.8,
+    "pushed": np.array([0.0, 0.1, 0.1]), "turn": ObjectTurn(np.array([0.0, 0.2, 0.1]), np.full(3, 0.1)),
+    "edge_blur": 0.8,
     "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "shape": [45.0, 0.2],
     "normal_error": 4.0, "lean": 2.0, "crossed": {"left": 0.0, "clipped": 0, "over": 0.0, "mirrored": 0.1},
 }  # fmt: skip
 MEASURES = {  # the function that measures each figure
     "surroundings": (light, "_surroundings_dolp"), "highlight": (light, "_highlight_dolp"),
-    "object_motion": (geometry, "_motion"), "edge_blur": (geometry, "_edge_blur"),
+    "pushed": (geometry, "_pushed"), "turn": (geometry, "_turn"), "edge_blur": (geometry, "_edge_blur"),
     "charted": (geometry, "_charted"), "lean": (geometry, "_lean"),
     "noise": (light, "_noise"), "crossed": (light, "_crossed"), "ill_posed": (polarization, "_ill_posed"),
     "shape": (polarization, "_median_shape"), "outline": (polarization, "_outline"),
@@ -121,10 +122,11 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("alignment", "fail", {"alignment": {"correlation": np.array([1.0, 0.1, 1.0])}}),
     ("alignment", "fail", {"alignment": {"residual_px": np.array([0.0, 0.5, 0.0])}}),
     ("alignment", "fail", {"alignment": {"transform": np.full((3, 3, 3), NAN)}}),
-    ("alignment", "warn", {"figures": {"object_motion": ObjectMotion(np.array([0.0, 1.2, 0.0]), np.zeros(3))}}),
-    ("alignment", "warn", {"figures": {"object_motion": ObjectMotion(np.zeros(3), np.array([0.0, 5.0, 0.0]))}}),
-    ("alignment", "fail", {"figures": {"object_motion": ObjectMotion(np.array([0.0, 5.0, 0.0]), np.zeros(3))}}),
-    ("alignment", "fail", {"figures": {"object_motion": ObjectMotion(np.array([0.0, np.inf, 0.0]), np.zeros(3))}}),
+    ("alignment", "warn", {"figures": {"pushed": np.array([0.0, 1.2, 0.0])}}),
+    ("alignment", "warn", {"figures": {"turn": ObjectTurn(np.array([0.0, 0.9, 0.0]), np.full(3, 0.1))}}),
+    ("alignment", "pass", {"figures": {"turn": ObjectTurn(np.array([0.0, 0.8, 0.0]), np.full(3, 0.2))}}),
+    ("alignment", "fail", {"figures": {"pushed": np.array([0.0, 5.0, 0.0])}}),
+    ("alignment", "fail", {"figures": {"pushed": np.array([0.0, np.inf, 0.0])}}),
     ("mask", "pass", {}),
     ("mask", "pass", {"object_": {"doubt": None}}),
     ("mask", "not measured", {"object_": {"doubt": None, "source": "automatic"}}),
@@ -178,6 +180,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("noise", "fail", {"figures": {"noise": 0.1}}),
     ("noise", "not measured", {"figures": {"noise": NAN}}),
     ("ambient", "pass", {"bracket": {"ambient_share": np.full(3, 0.001)}}),
+    ("ambient", "pass", {"bracket": {"ambient_share": np.full(3, 0.15)}}),
+    ("ambient", "warn", {"bracket": {"ambient_share": np.full(3, 0.15), "ambient_shared": True}}),
     ("ambient", "fail", {"bracket": {"ambient_share": np.full(3, 0.4)}}),
     ("lighting", "pass", {}),
     ("lighting", "warn", {"figures": {"highlight": 0.05}}),

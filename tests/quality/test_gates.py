@@ -4,6 +4,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -186,6 +187,45 @@ def test_body_that_polarizes_too_little_for_its_shape_is_reported(
     gate = judged(shaped(good, polarized, flattened, roughness, dimmed))["body"]
     assert gate.state == ("warn" if words else "pass"), gate
     assert words in gate.message and (gate.cost_deg > 10) == bool(words)
+
+
+def test_room_light_costs_what_one_ambient_frame_cannot_remove(good: Evidence) -> None:
+    """The object polarizes the room's light: only a frame at the same angle shows the same light."""
+    share = {"ambient_share": np.full(3, 0.15)}
+    one = judged(changed(good, radiance=bracket(good.radiance, **share, ambient_shared=True)))["ambient"]
+    each = judged(changed(good, radiance=bracket(good.radiance, **share)))["ambient"]
+    assert (one.state, each.state) == ("warn", "pass") and "per angle" in one.remedy
+    assert one.cost_deg > 1 and each.cost_deg == 0
+
+
+def test_light_from_both_sides_is_reported(good: Evidence) -> None:
+    """The brightest tenth of the object shares a polarization where two lamps mirror, not under a flash at the lens."""
+    assert judged(good)["lighting"].state == "pass"
+    ratio = good.cues.ratio.copy()
+    ratio[0] += 0.01
+    gate = judged(changed(good, cues=replace(good.cues, ratio=ratio)))["lighting"]
+    assert gate.state == "warn" and gate.cost_deg == pytest.approx(2.7, abs=0.5)
+
+
+def test_an_unsharp_picture_costs_degrees_before_it_warns(good: Evidence) -> None:
+    """A smooth object looks like one out of focus: the expected error counts the doubt."""
+    sharp = scenes.before_backdrop([np.eye(3)] * 3)
+    soft = replace(sharp, value=np.stack([cv2.GaussianBlur(shot, (0, 0), 1.3) for shot in sharp.value]))
+    before, after = (judged(changed(good, radiance=radiance))["focus"] for radiance in (sharp, soft))
+    assert (before.state, after.state) == ("pass", "pass")
+    assert before.cost_deg == 0 and after.cost_deg > 0.3
+
+
+def test_a_turned_object_is_reported_in_degrees(good: Evidence) -> None:
+    """Detail that rolls by 1° about the object's middle, before a camera that stood still."""
+    x, y = scenes.CENTER
+    moved = []
+    for t in np.radians([0.0, 1.0, 0.0]):
+        c, s = np.cos(t), np.sin(t)
+        moved.append(np.array([[c, -s, x - x * c + y * s], [s, c, y - x * s - y * c], [0, 0, 1]]))
+    gate = judged(changed(good, radiance=scenes.before_backdrop(moved)))["alignment"]
+    assert gate.state == "warn" and gate.unit == "°" and gate.shots == ("45°",)
+    assert gate.value == pytest.approx(1.0, abs=0.15) and gate.cost_deg == pytest.approx(5, abs=1)
 
 
 def test_light_from_around_is_reported(good: Evidence) -> None:

@@ -1,4 +1,4 @@
-"""Writes pictures as a folder that any web server publishes by IIIF: static tiles and a manifest, no image server.
+"""Writes pictures as static IIIF files (tiles and a manifest), which any web server can publish.
 
 References
 ----------
@@ -24,7 +24,7 @@ _LABELS = {"creator": "Creator", "license": "License", "object_number": "Identif
 
 
 def check(address: str) -> None:
-    """Raise a SettingError for an address that is not one of the web."""
+    """Raise a SettingError for an address that is not a web address (http or https)."""
     if not address.startswith(("http://", "https://")):
         raise SettingError(
             f"--iiif {address} is no web address; give that of the folder, such as http://localhost:8000"
@@ -54,7 +54,7 @@ def write(folder: Path, pictures: Mapping[str, Texture], facts: Mapping[str, str
 
 
 def image_information(service: str, width: int, height: int) -> dict[str, Any]:
-    """The image information document of a picture whose service has the address `service`."""
+    """The IIIF image information of a picture of this size [px]; `service` is the address of its tiles."""
     factors = _scale_factors(width, height)
     return {
         "@context": "http://iiif.io/api/image/3/context.json",
@@ -70,7 +70,7 @@ def image_information(service: str, width: int, height: int) -> dict[str, Any]:
 
 
 def manifest(pictures: Mapping[str, Texture], facts: Mapping[str, str], address: str) -> dict[str, Any]:
-    """The manifest: a canvas for each picture, and the facts of the catalog."""
+    """The IIIF manifest: a canvas for each picture, and the facts of the catalog."""
     license_ = facts.get("license", "")
     named = license_.partition("://")[2].removeprefix("www.")
     stated = {key: facts[key] for key in _LABELS if facts.get(key)}
@@ -120,7 +120,7 @@ def _canvas(name: str, picture: Texture, address: str) -> dict[str, Any]:
 
 
 def _scale_factors(width: int, height: int) -> list[int]:
-    """Powers of two, up to the one by which the picture fits into a tile."""
+    """Reductions of the tiles: powers of two, up to that with which the whole picture fits into one tile."""
     factors = [1]
     while max(width, height) > TILE * factors[-1]:
         factors.append(2 * factors[-1])
@@ -128,9 +128,9 @@ def _scale_factors(width: int, height: int) -> list[int]:
 
 
 def _images(pixels: TexturePixels) -> Iterator[tuple[str, TexturePixels]]:
-    """Every image that the service has: place below its address, pixels.
+    """Yield all tiles of a picture: path below its address, and pixels.
 
-    Of an image in one tile viewers ask for the region as `full` or by its numbers, so it has both.
+    Viewers request an image of one tile as `full` or by its region, so it is written under both paths.
     """
     height, width = pixels.shape[:2]
     yield FULL, pixels
@@ -146,7 +146,7 @@ def _images(pixels: TexturePixels) -> Iterator[tuple[str, TexturePixels]]:
 
 
 def _text(words: str, language: str = "none") -> dict[str, list[str]]:
-    """A text as the Presentation API states it, by language."""
+    """A text in the form of the Presentation API: a list by language."""
     return {language: [words]}
 
 

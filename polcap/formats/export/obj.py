@@ -20,6 +20,8 @@ from polcap.formats.export.texture_set import SPECULAR_RANGE, Key
 from polcap.formats.maps import exr
 from polcap.images import Asset
 
+_ROWS = 10_000  # of a table, formatted at a time
+
 
 def stem(name: str) -> str:
     """File name without spaces, because OBJ and MTL cannot quote names."""
@@ -56,16 +58,17 @@ def _geometry(file: IO[bytes], asset: Asset, material: str, library: str) -> Non
     """Write the mesh of an OBJ file: vertices, texture coordinates, normals, and faces with one index for all."""
     mesh = asset.mesh
     file.write(f"mtllib {library}\no {material}\n".encode())
-    file.write(_lines("v %.8f %.8f %.8f\n", mesh.vertices - gltf.center(mesh.vertices)))
-    file.write(_lines("vt %.8f %.8f\n", mesh.uv * [1.0, -1.0] + [0.0, 1.0]))
-    file.write(_lines("vn %.6f %.6f %.6f\n", mesh.normals))
+    _table(file, "v %.8f %.8f %.8f\n", mesh.vertices - gltf.center(mesh.vertices))
+    _table(file, "vt %.8f %.8f\n", mesh.uv * [1.0, -1.0] + [0.0, 1.0])
+    _table(file, "vn %.6f %.6f %.6f\n", mesh.normals)
     file.write(f"usemtl {material}\ns 1\n".encode())
-    file.write(_lines("f" + 3 * " %d/%d/%d" + "\n", np.repeat(mesh.faces + 1, 3, axis=1)))
+    _table(file, "f" + 3 * " %d/%d/%d" + "\n", np.repeat(mesh.faces + 1, 3, axis=1))
 
 
-def _lines(line: str, values: NDArray[Any]) -> bytes:
-    """A table (N, k) as text; `line` is the format of a row. Takes a third of the time of `np.savetxt`."""
-    return (line * len(values) % tuple(values.ravel().tolist())).encode()
+def _table(file: IO[bytes], line: str, values: NDArray[Any]) -> None:
+    """Write a table (N, k) as text; `line` is the format of a row. Takes a third of the time of `np.savetxt`."""
+    for rows in np.array_split(values, len(values) // _ROWS + 1):
+        file.write((line * len(rows) % tuple(rows.ravel().tolist())).encode())
 
 
 def _material(asset: Asset, material: str, files: Mapping[Key, str], data: Mapping[Key, str]) -> str:

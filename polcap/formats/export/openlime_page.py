@@ -1,4 +1,4 @@
-"""Writes a web page on which OpenLIME shows a relightable layer; its script stands beside the page."""
+"""Writes a web page on which the viewer OpenLIME shows a relightable layer; its script is in the same folder."""
 
 from html import escape
 from pathlib import Path
@@ -53,6 +53,6 @@ else {
 
 
 def write(path: Path, title: str, rights: str) -> None:
-    """Write the page beside the folders of the pictures; StorageError."""
+    """Write the page into the folder that contains the folders of the pictures. Raises StorageError."""
     page = _PAGE.substitute(title=escape(title), rights=escape(rights), script=SCRIPT, full=iiif.FULL)
     atomic.write(path, page)

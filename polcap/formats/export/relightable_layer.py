@@ -21,8 +21,8 @@ NO_NORMAL = 128  # a normal of length 0, by which viewers leave a pixel out
 def pictures(asset: Asset) -> dict[str, Texture]:
     """Albedo, F0, gloss and normals of an asset as 8-bit pictures of the size of its base color.
 
-    Gloss is 1 - √roughness, so that Ward's slope parameter is (1 - gloss)⁴ = roughness². Outside the object the
-    normal is null and the others are 0. The asset needs its object-space normals.
+    Gloss is 1 − √roughness, so that Ward's slope parameter is (1 − gloss)⁴ = roughness². Outside the object the normal
+    is the zero vector and all other pictures are 0. The asset must have its object-space normals.
     """
     assert asset.object_normal is not None
     height, width = asset.base_color.shape[:2]

@@ -6,6 +6,7 @@ All of it runs in the child process of `worker`.
 import struct
 from collections import deque
 from collections.abc import Iterator
+from mmap import ACCESS_READ, mmap
 from typing import BinaryIO, Literal, NamedTuple
 
 Kind = Literal["raw", "photo", "other", "unknown"]
@@ -69,7 +70,8 @@ def kind(file: BinaryIO, suffix: str) -> Kind:
     if _is_raw_magic(head):
         return "raw"
     if head[:4] in _TIFF_MAGIC:
-        return "raw" if _is_raw(structure(head + file.read())) else "photo"
+        with mmap(file.fileno(), 0, access=ACCESS_READ) as data:  # reads the directories' pages only
+            return "raw" if _is_raw(structure(data)) else "photo"
     # HEIC, AVIF or WebP next to a RAW; films; sounds
     known = head[4:8] == b"ftyp" or head[:4] == b"RIFF" or suffix.lower() in _SIDECARS
     return "other" if known or _is_text(file) else "unknown"
@@ -106,7 +108,7 @@ def _is_raw(tiff: TiffStructure) -> bool:
     return MAKE in main and SUB_IFDS in main and main.get(SUBTYPE) == (1,)  # a preview in front of sensor data
 
 
-def structure(data: bytes) -> TiffStructure:
+def structure(data: bytes | mmap) -> TiffStructure:
     """Parse the image directories of a TIFF, as far as they are readable; none if the bytes are not a TIFF."""
     directories: list[Directory] = []
     if data[:4] in _TIFF_MAGIC and len(data) >= 8:
@@ -129,7 +131,7 @@ def structure(data: bytes) -> TiffStructure:
     return TiffStructure(tuple(directories), len(data))
 
 
-def _entries(data: bytes, order: str, places: range, most: int) -> Iterator[tuple[int, tuple[int, ...]]]:
+def _entries(data: bytes | mmap, order: str, places: range, most: int) -> Iterator[tuple[int, tuple[int, ...]]]:
     """Tag and whole-number values of the known TIFF directory entries at the byte offsets `places`.
 
     At most `most` values are read in all; an entry with more values is skipped. Values of other types become ().

@@ -4,13 +4,11 @@ If the object was pushed while chart and backdrop stayed, one transform fits bot
 and surroundings are registered separately, and the two motions are compared in the middle of the object.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from polcap.images import Alignment, AngleStack, Floats, ObjectMask
 from polcap.optics import registration
-from polcap.optics.morphology import dilate, erode
+from polcap.optics.morphology import dilate
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import Pyramid, Registration
 from polcap.optics.resize import area_mean
@@ -18,47 +16,35 @@ from polcap.stages.align.detail import averaging_step, detail
 
 _DETAIL_PX = 4.0  # as `align.detail_px`
 _MOST_PIXELS = 0.8e6  # a larger picture is averaged down first
-_RIM_PX = 6  # around the object, which its outline needs; half of it is left out inside
-_EVERY = 50  # px of the object; at these its inner motion is compared
+_RIM_PX = 6  # around the object, which its outline needs
 _SURE_CORRELATION = 0.6  # of detail: from here on a region was found in the shot
 _OTHER_CORRELATION = 0.4  # of the object: below, it is another or too far away; noise has less
 _SIGMAS = 3.0  # of both places: a chart in a corner hardly tells where the object's middle should be
 _SAME_PX = 0.5  # two starts that differ by less lead to one place
 
 
-@dataclass(frozen=True)
-class ObjectMotion:
-    """Motion of the object relative to its surroundings in each shot, (K,) grid px; NaN: too little detail."""
+def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> Floats:
+    """Shift of the object's middle, outline included, relative to chart and backdrop in each shot, (K,) grid px.
 
-    pushed: Floats  # shift of the object's middle, outline included; 0 within three errors; infinite: another object
-    inside: Floats  # rms displacement of its inner detail, which moves when the object turns
-
-
-def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> ObjectMotion:
-    """Measure the motion of the object, with its outline and inside it, relative to that of chart and backdrop."""
+    0 within three errors; infinite: another object; NaN: too little detail.
+    """
     shots = len(radiance.angle)
     if radiance.offset_px is not None:  # shots cut from one mosaic
-        return ObjectMotion(np.zeros(shots), np.zeros(shots))
-    pushed, inside = np.full((2, shots), np.nan)
-    pushed[0] = inside[0] = 0.0
+        return np.zeros(shots)
+    pushed = np.full(shots, np.nan)
+    pushed[0] = 0.0
     if not object_.mask.any():
-        return ObjectMotion(pushed, inside)
+        return pushed
     step = averaging_step(object_.mask.shape, _MOST_PIXELS)
     reference = detail(radiance.shot(0), _DETAIL_PX, step)[0]
     small = area_mean(object_.mask.astype(np.uint8), reference.picture.shape)
-    near, core = dilate(small > 0, _RIM_PX), erode(small > 0, _RIM_PX // 2)
-    regions = [Pyramid(reference.picture, reference.usable & region) for region in (near, ~near, core)]
-    points = np.argwhere(core)[::_EVERY, ::-1].astype(np.float64)
+    near = dilate(small > 0, _RIM_PX)
+    regions = [Pyramid(reference.picture, reference.usable & region) for region in (near, ~near)]
     middle = np.argwhere(small).mean(axis=0)[::-1] if small.any() else np.array(small.shape[::-1]) / 2
     for k in range(1, shots):
         shot = detail(radiance.shot(k), _DETAIL_PX, step)
         start = registration.scaled(alignment.transform[k], 1 / step)
-        (whole, of_object), (outer, around) = (_registered(region, shot, start) for region in regions[:2])
-        inner = registration.refine(regions[2], shot, "similarity", start)
-        if inner.tiles and len(points):
-            camera = outer.matrix if around > _SURE_CORRELATION else start
-            moved = transform_points(inner.matrix, points) - transform_points(camera, points)
-            inside[k] = step * float(np.sqrt((moved**2).sum(axis=1).mean()))
+        (whole, of_object), (outer, around) = (_registered(region, shot, start) for region in regions)
         if around > _SURE_CORRELATION and of_object < _OTHER_CORRELATION:
             pushed[k] = np.inf
         elif min(of_object, around) > _SURE_CORRELATION:
@@ -66,7 +52,7 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
             error = float(np.hypot(whole.sigma_at(middle), outer.sigma_at(middle)))
             distance = float(np.hypot(*(places[0] - places[1])))
             pushed[k] = step * distance if distance > _SIGMAS * error else 0.0
-    return ObjectMotion(pushed, inside)
+    return pushed
 
 
 def _registered(region: Pyramid, shot: Pyramid, start: Floats) -> tuple[Registration, float]:

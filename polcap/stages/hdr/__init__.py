@@ -66,7 +66,7 @@ class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=14)
+@stage(version=15)
 def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack:
     """Merge every bracket: radiance (K, H, W, 3) of all shots, on the scale of each shot's reference frame.
 
@@ -131,7 +131,6 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     if falloff is not None and settings.falloff:
         for picture in pictures:
             weights.divide_by_falloff(picture, view, capture.size_px, falloff)
-    stated = [[exposure.stated(f, shot.frames[_middle(order)]) for f in shot.frames] for shot in capture.shots]
     return AngleStack(
         value=stack.value[:count],
         variance=stack.variance[:count],
@@ -140,11 +139,12 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         view=view,
         bracket=BracketMeasurement(
             exposure_ratio=np.repeat(ratio, 3 // shape[0], axis=2),
-            exif_ratio=np.array(stated),
+            exif_ratio=_stated_ratios(capture.shots, _middle(order)),
             curvature=np.array(curvature),
             ghost_fraction=np.array([np.mean((quality & Quality.GHOST) > 0) for quality in stack.quality[:count]]),
             ambient_share=np.array(ambient_share),
             blur_px=sharpness.frames_blur(tiles, side),
+            ambient_shared=_ambient_shared(capture.shots),
         ),
         sensor=replace(sensor, lossy=read.lossy),
         equipment=_equipment(capture, view),
@@ -152,6 +152,17 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         crossed=None if capture.crossed is None else CrossedShot(pictures[-1], capture.crossed_angle),
         mosaic=mosaic,
     )
+
+
+def _ambient_shared(shots: tuple[Shot, ...]) -> bool:
+    """Whether one ambient frame belongs to shots of several angles."""
+    digests = [digest for shot in shots for digest in {frame.digest for frame in shot.ambient}]
+    return len(set(digests)) < len(digests)
+
+
+def _stated_ratios(shots: tuple[Shot, ...], middle: int) -> Floats:
+    """Exposures (K, E) of all frames by their metadata, relative to frame `middle` of their shot."""
+    return np.array([[exposure.stated(frame, shot.frames[middle]) for frame in shot.frames] for shot in shots])
 
 
 def _check_counts(shots: tuple[Shot, ...]) -> None:

@@ -12,8 +12,8 @@ the camera frame.
     highlights     the albedo in highlights, for both estimators
 
 Two properties of the albedo are estimated here. The error of its scale: a chart behind the object, or in a shadow, gets
-less light than the object. The picture of the chart does not show this, but then albedos approach 1, and F0 exceeds
-that of common dielectrics. And its detail: the reference shot at the RAW's pixels shows printed texture and fine relief
+less light than the object. The picture of the chart does not show this, but then both albedos and F0 are higher
+than usual. And its detail: the reference shot at the RAW's pixels shows printed texture and fine relief
 alike. Relief continues from scale to scale, so the shading of the normals shows how strong finer shading may be. Where
 the normals are smooth and certain, fine detail of the light is detail of the albedo.
 """
@@ -36,8 +36,11 @@ from polcap.stages import stage
 from polcap.stages.infer import analytic, highlights, learned
 
 _MAPS_SIGMA = 0.05  # of the estimators' own albedos, with a correct scale (docs/benchmarks/gates.md)
-_COMMON_F0 = 0.05  # median of an object; an index of 1.58
-_F0_RESPONSE = 0.3  # change of ln F0 per change of ln scale: the network expects common values (20 captures)
+# of objects next to their chart: mean, and spread of the logarithm (docs/benchmarks/gates.md)
+_USUAL_F0, _F0_SPREAD = 0.044, 0.06  # median of an object
+_USUAL_WHITE, _WHITE_SPREAD = 0.65, 0.25  # 95th percentile of the albedo
+_USUAL, _DOUBT = 1.5, 0.25  # sum of both deviations that is still usual [spreads]; doubt per spread beyond
+_FLOOR = 1e-3  # of albedo and F0 in a logarithm
 _LARGEST_DOUBT = 0.7  # a factor of two in light, ln 2
 _COMMON_WHITE, _WHITE_RANGE = 0.9, 0.14  # 95th percentile of the albedo: usual limit; excess that doubts a factor of e
 _BAND = 2.0  # px, 1σ: shading in finer detail predicts the shading that is finer than a superpixel
@@ -63,7 +66,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fine: Annotated[bool, Meta(description="a second network adds relief finer than the pixels of the first")] = True
 
 
-@stage(version=22)
+@stage(version=23)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Estimate normal, diffuse, specular, roughness and expected error from cues; without a network by inversion.
 
@@ -88,11 +91,13 @@ def _albedo_sigma(maps: SurfaceMaps, of_chart: float | None) -> float | None:
     """Relative 1σ of the scale of all albedos; `of_chart` is 1σ of the light on the chart, None without a chart."""
     if of_chart is None or not maps.mask.any():
         return None
-    white = max(float(np.percentile(maps.diffuse[maps.mask].max(-1), 95)) - _COMMON_WHITE, 0.0) / _WHITE_RANGE
-    gloss = log(max(float(np.median(maps.specular[maps.mask].mean(-1))) / _COMMON_F0, 1.0)) / _F0_RESPONSE
-    if maps.estimator == "analytic":
-        gloss = 0.0  # its F0 is too rough for this
-    return hypot(of_chart, _MAPS_SIGMA, min(max(gloss, white), _LARGEST_DOUBT))
+    white = max(float(np.percentile(maps.diffuse[maps.mask].max(-1), 95)), _FLOOR)
+    gloss = max(float(np.median(maps.specular[maps.mask].mean(-1))), _FLOOR)
+    unusual = max(log(white / _USUAL_WHITE) / _WHITE_SPREAD, -_USUAL)  # dark objects are no reason for trust
+    if maps.estimator != "analytic":  # its F0 is too rough for this
+        unusual += log(gloss / _USUAL_F0) / _F0_SPREAD
+    doubt = max(_DOUBT * (unusual - _USUAL), (white - _COMMON_WHITE) / _WHITE_RANGE, 0.0)
+    return hypot(of_chart, _MAPS_SIGMA, min(doubt, _LARGEST_DOUBT))
 
 
 def _select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:

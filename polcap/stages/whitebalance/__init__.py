@@ -221,7 +221,7 @@ def _at_corners(
 def _shows_more(
     radiance: AngleStack, corners: Floats, reference: ChartReference, settings: WhitebalanceSettings
 ) -> bool:
-    """Whether corners (4, 2) px are those of a whole SG, not those of its block, by the colors of the block."""
+    """Whether corners (4, 2) px from the user enclose a whole ColorChecker SG, not its block, judged by the colors."""
     errors = []
     for place in (chart.from_corners(corners), chart.from_sg_corners(corners)):
         try:

@@ -91,7 +91,7 @@ def from_corners(points: Floats, patch: float = USUAL_PATCH) -> Placement:
 
 
 def from_sg_corners(points: Floats, patch: float = USUAL_PATCH) -> Placement:
-    """The placement of the block of an SG whose patches A1, N1, N10, A10 have outer corners (4, 2) px.
+    """The placement of the 24-patch block of a ColorChecker SG, from the outer corners (4, 2) px of A1, N1, N10, A10.
 
     The block begins at column 5 of 14 and row 2 of 10.
     """

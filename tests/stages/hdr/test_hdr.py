@@ -1,6 +1,7 @@
 """The merge is unbiased down to the dark, knows its own variance, and says where it cannot know."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -139,6 +140,17 @@ def test_ambient_light_is_subtracted_with_its_variance():
     z = scores(stack, electrons_to_signal(quads))
     assert abs(z.mean()) < 0.05
     assert abs(z.var() - 1) < 0.1
+
+
+def test_an_ambient_frame_of_several_angles_is_noted() -> None:
+    quads = ramp(256, 256, high=4e3, ripple=0)
+    rng = np.random.default_rng(0)
+    frames = [frame(expose(quads, 1, rng), iso=100.0, exposure_time=0.01) for _ in range(2)]
+    dark = [replace(frame(expose(0.1 * quads, 1, rng), iso=100.0, exposure_time=0.01), digest=name) for name in "ab"]
+    for ambient, shared in (((dark[:1], dark[:1]), True), ((dark[:1], dark[1:]), False)):
+        both = capture(frames[:1], frames[1:])
+        shots = tuple(replace(shot, ambient=tuple(own)) for shot, own in zip(both.shots, ambient))
+        assert merge(replace(both, shots=shots), hdr.HdrSettings()).bracket.ambient_shared == shared
 
 
 def test_ghost_is_flagged_and_taken_from_the_reference_alone():

@@ -1,0 +1,124 @@
+"""Turn of the object between shots, from the motion of its visible detail.
+
+A rigid turn moves a point of the surface across the picture by its angle times the point's depth, and a roll moves it
+about the object's middle. The polarizer moves nothing. It changes brightness with the relief, which imitates motion,
+but not with this pattern; and it changes colors less than brightness. So both are fitted: brightness and colors.
+
+References
+----------
+Longuet-Higgins and Prazdny, The interpretation of a moving retinal image, Proc. R. Soc. B 1980 (displacements).
+Holland and Welsch, Robust regression, 1977 (Cauchy weights). White, Econometrica 1980 (error from the residuals).
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from polcap.images import Alignment, AngleStack, Bools, Floats, MaskedImage, ObjectMask, Quality, SurfaceMaps
+from polcap.optics import outline, registration
+from polcap.optics.morphology import erode
+from polcap.optics.resize import block_means
+from polcap.optics.warp import warp
+from polcap.stages.align.detail import averaging_step, detail
+
+_MOST_PIXELS = 0.8e6  # a larger picture is averaged down first
+_DETAIL_PX, _COLOR_PX, _BLUR_PX = 4.0, 8.0, 0.7  # 1σ: coarser structure is left out; smoothing before
+_INWARD_PX = 2  # of the mask that are left out: the outline does not turn with the surface
+_FLOOR = 0.01  # of the 99th percentile of the light, added before the logarithm
+_LEAST_PIXELS = 200
+_PRIOR = np.array([1.0, 1.0, 0.03, 0.03, 0.03, 0.03])  # 1σ of shift [px], zoom [1], roll, tilts [rad]
+_CAUCHY = 2.0  # robust standard deviations
+_STEPS = 5
+_CELL = 12  # px: residuals of different cells are independent
+
+
+@dataclass(frozen=True)
+class ObjectTurn:
+    """Turn of the object from the first shot to each other one: (K,) degrees, and its 1σ."""
+
+    degrees: Floats
+    sigma: Floats
+
+
+def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask, maps: SurfaceMaps | None) -> ObjectTurn:
+    """Turn of the object in each shot, in degrees, about any axis; 0 where there is too little detail.
+
+    Without `maps`, or without a depth in them, the object is taken as a ball inflated from its outline.
+    """
+    found = ObjectTurn(*np.zeros((2, len(radiance.angle))))
+    step = averaging_step(object_.mask.shape, _MOST_PIXELS)
+    relief = _relief(maps, object_, step)
+    clipped = np.any(radiance.quality & int(Quality.CLIPPED) > 0, axis=0)
+    inside = erode(relief > 0, _INWARD_PX) & (block_means(clipped, step) == 0)
+    if radiance.offset_px is not None or inside.sum() < _LEAST_PIXELS:  # shots cut from one mosaic, or a tiny object
+        return found
+    field, cell = _displacements(relief, inside)
+    reference = _signals(radiance.shot(0), step)
+    for k in range(1, len(radiance.angle)):
+        camera = registration.scaled(alignment.transform[k], 1 / step)
+        moved = [warp(signal, camera) for signal in _signals(radiance.shot(k), step)]
+        motion, covariance = _fit(reference, moved, field, inside, cell)
+        found.degrees[k] = np.degrees(np.sqrt((motion[3:] ** 2).sum()))
+        found.sigma[k] = np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))
+    return found
+
+
+def _relief(maps: SurfaceMaps | None, object_: ObjectMask, step: int) -> Floats:
+    """Height of the surface towards the camera, (h, w) px of the reduced picture, 1 at the deepest; 0 outside."""
+    if maps is None or maps.depth_prior is None:
+        depth = outline.depth(object_.mask)
+        height = np.sqrt(np.maximum((2 * depth.max() - depth) * depth, 0))
+    else:
+        height = np.zeros(object_.mask.shape, np.float32)
+        (x, y), (tall, wide) = (round(at) for at in maps.view.origin), maps.mask.shape
+        prior = -outline.disc_radius(maps.mask) * maps.depth_prior
+        height[y : y + tall, x : x + wide] = np.where(maps.mask, prior - prior[maps.mask].min(), 0)
+    whole = block_means(object_.mask, step) > 0.99
+    return np.where(whole, block_means(height, step) / step + 1, 0)
+
+
+def _displacements(relief: Floats, inside: Bools) -> tuple[Floats, Floats]:
+    """Displacement (N, 2, 6) of the pixels inside per shift, zoom, roll and two tilts, and the cell (N,) of each."""
+    y, x = np.nonzero(inside)
+    height = relief[inside] - relief[inside].mean()
+    cell = y // _CELL * (inside.shape[1] // _CELL + 1) + x // _CELL
+    x, y = x - x.mean(), y - y.mean()
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    across, down = [one, zero, x, -y, height, zero], [zero, one, y, x, zero, height]
+    return np.stack([np.stack(across, -1), np.stack(down, -1)], axis=1), cell
+
+
+def _signals(shot: MaskedImage, step: int) -> list[Floats]:
+    """Fine detail (h, w) of a shot's brightness and of its two colors, as logarithms."""
+    light = np.maximum(block_means(shot.value, step), 0)
+    level = light + _FLOOR * np.percentile(light[::5, ::5], 99)
+    log = np.asarray(cv2.GaussianBlur(np.log(level), (0, 0), _BLUR_PX))
+    colors = [log[..., channel] - log[..., 1] for channel in (0, 2)]
+    fine = [color - cv2.GaussianBlur(color, (0, 0), _COLOR_PX) for color in colors]
+    return [detail(shot, _DETAIL_PX, step)[0].picture, *fine]
+
+
+def _fit(
+    reference: list[Floats], moved: list[Floats], field: Floats, inside: Bools, cell: Floats
+) -> tuple[Floats, Floats]:
+    """Motion (6,) between signals by robust least squares on their differences, and its covariance (6, 6)."""
+    design, missing = [], []
+    for first, other in zip(reference, moved):
+        slope = np.array(np.gradient((first + other) / 2))[::-1, inside].T  # (N, 2), x before y
+        difference = (first - other)[inside]
+        design.append((slope[:, None] @ field)[:, 0])
+        missing.append(difference - np.median(difference))
+    of_signal = np.stack(missing).shape
+    a, b = np.concatenate(design).astype(np.float64), np.concatenate(missing)
+    rest = b
+    for _ in range(_STEPS):
+        scale = 1.4826 * np.median(np.abs(rest.reshape(of_signal)), axis=1) + 1e-9
+        scale = np.repeat(scale, of_signal[1])
+        weighted = a.T / (scale**2 + (rest / _CAUCHY) ** 2)
+        inverse = np.linalg.inv(weighted @ a + np.diag(_PRIOR**-2))
+        motion = inverse @ weighted @ b
+        rest = b - a @ motion
+    score = weighted * rest
+    of_cell = np.stack([np.bincount(np.tile(cell, of_signal[0]), row) for row in score])  # (6, cells)
+    return np.asarray(motion), np.asarray(inverse @ of_cell @ of_cell.T @ inverse)

@@ -1,0 +1,74 @@
+"""The turn of an object is measured in degrees, and polarization alone does not look like a turn."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from polcap.images import AngleStack, SurfaceMaps
+from polcap.optics import mueller, shade
+from polcap.quality import object_turn
+from tests import scenes
+
+
+def photographs(turn_deg: tuple[float, float, float], noise: float = 0.003) -> AngleStack:
+    """A ball of colored stone that turns about x, y, z from each shot to the next, by as much."""
+    y, x = np.mgrid[0 : scenes.HEIGHT, 0 : scenes.WIDTH].astype(float)
+    normal, inside = scenes.normals(x, y)
+    light = np.broadcast_to([0.0, 0.0, 1.0], normal.shape)
+    ones = np.ones(x.shape)
+    values = []
+    for k, angle in enumerate(scenes.ANGLES):
+        u, v, w = np.moveaxis(Rotation.from_euler("xyz", [-k * t for t in turn_deg], degrees=True).apply(
+            scenes.RADIUS * normal.reshape(-1, 3)).reshape(normal.shape), -1, 0)  # fmt: skip
+        grey = scenes.texture(u + 0.4 * w, v - 0.3 * w)
+        albedo = grey * np.stack([1 + 0.4 * np.sin(0.21 * u + 0.3 * w), ones, 1 + 0.4 * np.sin(0.25 * v - 0.2 * w)], -1)
+        stokes = shade.stokes(normal, albedo, 0.04 * np.ones_like(albedo), 0.5 * ones, 1.5 * ones, light, ones)
+        values.append(np.tensordot(mueller.analyzer(np.array([angle]))[0], stokes, 1) * inside[..., None])
+    value = np.stack(values) + noise * np.random.default_rng(4).normal(size=(3, *normal.shape))
+    return replace(scenes.stack(), value=value.astype(np.float32))
+
+
+def measured(radiance: AngleStack, maps: SurfaceMaps | None = None) -> object_turn.ObjectTurn:
+    return object_turn.measure(radiance, scenes.still(), scenes.ball_object(), maps)
+
+
+@pytest.mark.parametrize("turn", [(0.5, 0.0, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5), (0.3, 0.3, -0.3)])
+def test_a_turn_about_any_axis_is_measured_in_degrees(turn: tuple[float, float, float]) -> None:
+    """Twice as large in the third shot as in the second; the shape of a ball follows from its outline."""
+    found = measured(photographs(turn))
+    each = float(np.linalg.norm(turn))
+    assert found.degrees[0] == 0
+    assert found.degrees[1:] == pytest.approx([each, 2 * each], rel=0.2)
+
+
+def test_polarization_of_a_still_object_is_no_turn() -> None:
+    found = measured(photographs((0.0, 0.0, 0.0)))
+    assert (found.degrees[1:] < 0.1).all()
+
+
+def test_the_depth_of_the_maps_gives_the_turn_where_it_is_known() -> None:
+    """A surface of half the relief turns by twice the angle for the same displacements."""
+    normal, mask = scenes.truth()
+    radius = np.sqrt(mask.sum() / np.pi)
+    flat = np.ones(mask.shape, np.float32)
+    color = np.repeat(flat[..., None], 3, -1)
+    x0, y0, _, _ = scenes.ball_object().crop
+    view = replace(scenes.VIEW, origin=(float(x0), float(y0)))
+    turns = []
+    for share in (1.0, 0.5):
+        prior = -share * scenes.RADIUS / radius * normal[..., 2]
+        maps = SurfaceMaps(normal, color, color, flat, prior, flat, mask, view, "network")
+        turns.append(measured(photographs((0.0, 0.4, 0.0)), maps).degrees[2])
+    assert turns == pytest.approx([0.8, 1.6], rel=0.2)
+
+
+def test_the_error_covers_what_noise_does() -> None:
+    found = measured(photographs((0.0, 0.0, 0.0), noise=0.05))
+    assert (found.degrees[1:] < 3 * found.sigma[1:] + 0.1).all()
+
+
+def test_a_mosaic_holds_all_angles_at_once() -> None:
+    radiance = replace(photographs((0.0, 2.0, 0.0)), offset_px=np.zeros((3, 2)))
+    assert not measured(radiance).degrees.any()
