@@ -17,6 +17,7 @@ def fuse(
     config: options.ConfigFile = None,
     assignments: options.Assignments = None,
     json: options.Json = False,
+    open_: options.OpenPage = False,
     device: options.Device = "cpu",
     threads: options.Threads = 0,
     memory: options.Memory = 0,
@@ -53,4 +54,4 @@ def fuse(
     chosen = settings.fill_sections(FusionSettings, own)
     steps = terminal.Steps()
     about = fuse_run.fuse(wanted, chosen, target, terminal.print_progress, steps.stage)
-    terminal.print_result(about, target, json)
+    terminal.print_result(about, target, json, open_)

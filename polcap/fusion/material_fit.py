@@ -24,6 +24,7 @@ import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from polcap.fusion.atlas import Atlas
@@ -69,6 +70,17 @@ class LobeSamples:
     weight: Floats  # (P,)
     f0: float
     alpha: float
+
+    def take(self, index: NDArray[np.intp] | slice) -> "LobeSamples":
+        """Some of the samples."""
+        return replace(
+            self,
+            radiance=self.radiance[index],
+            albedo=self.albedo[index],
+            normal=self.normal[index],
+            point=self.point[index],
+            weight=self.weight[index],
+        )
 
 
 @dataclass(frozen=True)
@@ -137,14 +149,13 @@ def _samples(
             continue
         mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), _SAMPLES)).astype(int)]
         f0, rough = (float(np.average(gloss[:, c], weights=share[:, k] * maps.weight[atlas.covered])) for c in (0, 1))
-        parts_of = (part[mine] for part in (radiance, base, local, point, weight))
-        found.append(LobeSamples(*parts_of, f0, rough**2))
+        found.append(LobeSamples(radiance, base, local, point, weight, f0, rough**2).take(mine))
     return found
 
 
 def _flash(samples: Sequence[LobeSamples | None], settings: MaterialSettings) -> Floats:
     """Place (3,) of the flash in the camera frame for which all materials fit best."""
-    few = [thinned(one, 8) for one in samples if one is not None]
+    few = [one.take(slice(None, None, 8)) for one in samples if one is not None]
     if not few:
         return np.zeros(3)
 
@@ -156,12 +167,6 @@ def _flash(samples: Sequence[LobeSamples | None], settings: MaterialSettings) ->
     best = minimize(misfit, np.zeros(2), method="Nelder-Mead",
                     options={"initial_simplex": simplex, "maxfev": 40, "xatol": 0.002, "fatol": 1e-4})  # fmt: skip
     return np.append(best.x, 0.0)
-
-
-def thinned(samples: LobeSamples, step: int) -> LobeSamples:
-    """Every `step`-th sample."""
-    some = (part[::step] for part in (samples.radiance, samples.albedo, samples.normal, samples.point, samples.weight))
-    return LobeSamples(*some, samples.f0, samples.alpha)
 
 
 def _lobe(samples: LobeSamples, light: Floats, settings: MaterialSettings) -> Lobe:
