@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from polcap.images import Asset, Floats, ReliefMesh, SurfaceMaps, View
+from polcap.images import Asset, Floats, Mesh, ReliefMesh, SurfaceMaps, View
 from polcap.stages import asset, surface
 
 VIEW = View(focal=400.0, center=(70.0, 50.0), scale=2.0, origin=(300.0, 200.0))
@@ -53,7 +53,7 @@ def flat_mesh(of: SurfaceMaps) -> ReliefMesh:
     return mesh(replace(of, normal=plane))
 
 
-def built(of: SurfaceMaps, on: ReliefMesh) -> Asset:
+def built(of: SurfaceMaps, on: Mesh) -> Asset:
     return asset.build(of, on, asset.AssetSettings())
 
 

@@ -16,6 +16,7 @@ from functools import partial
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -107,7 +108,7 @@ def _sweep(
     return HollowDepths(view, np.where(top > _LEAST_SCORE, planes[best], np.nan), top)
 
 
-def _agreement(point: Floats, pixel: Floats, view: SmallView, others: Sequence[SmallView]) -> Floats:
+def _agreement(point: Floats, pixel: NDArray[np.intp], view: SmallView, others: Sequence[SmallView]) -> Floats:
     """How well other views agree with pixels (N,) of a view at world points (N, 3), 0…1."""
     normal, albedo = view.normal.reshape(-1, 3)[pixel], view.diffuse.reshape(-1, 3)[pixel]
     found = np.zeros((len(others), len(point)), np.float32)
@@ -120,16 +121,16 @@ def _agreement(point: Floats, pixel: Floats, view: SmallView, others: Sequence[S
             (seen + albedo[facing]).sum(axis=-1) / 2, 1e-6
         )
         row[facing] = np.exp(-angle2 / (2 * np.radians(_NORMAL_DEG) ** 2) - relative**2 / (2 * _ALBEDO**2))
-    return np.sort(found, axis=0)[-_AGREEING:].mean(axis=0)
+    return np.asarray(np.sort(found, axis=0)[-_AGREEING:].mean(axis=0))
 
 
 def _coarser(of: SmallView, step: float) -> SmallView:
     """The view with about one pixel to a grid step."""
     far = float(np.linalg.norm(of.pose.translation))
     every = max(1, round(step * of.view.focal / far))
-    view = replace(of.view, focal=of.view.focal / every, center=tuple(c / every for c in of.view.center))
-    images = {name: np.ascontiguousarray(getattr(of, name)[::every, ::every]) for name in ("normal", "diffuse")}
-    return replace(of, view=view, outline=of.outline[::every, ::every], **images)
+    view = replace(of.view, focal=of.view.focal / every, center=(of.view.center[0] / every, of.view.center[1] / every))
+    normal, diffuse = (np.ascontiguousarray(image[::every, ::every]) for image in (of.normal, of.diffuse))
+    return replace(of, view=view, outline=of.outline[::every, ::every], normal=normal, diffuse=diffuse)
 
 
 def _confirmed(depths: Sequence[HollowDepths], step: float) -> list[HollowDepths]:

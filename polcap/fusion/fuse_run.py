@@ -67,8 +67,11 @@ def export(out: Path, *wanted: ExportRequest) -> list[Path]:
     """Write the asset of a fused result again for each request, from maps/ and report.json; returns the files."""
     for one in wanted:
         asset_export.check(one)
-        if "exr" in asset_export.effective(one).formats:
-            raise SettingError("a fused object has no layered EXR; leave out --exr and --preset archive, and use maps/")
+        for flag in {"exr", "iiif"} & set(asset_export.effective(one).formats):
+            raise SettingError(
+                f"--{flag} is for results of one view, not for a fused object; "
+                "leave it out (and --preset archive), and use maps/"
+            )
     about = reports.read(out)
     with result_folder.locked(out):
         source = fused_maps.read(out / "maps")

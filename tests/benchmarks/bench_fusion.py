@@ -16,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from trimesh import Trimesh, triangles
@@ -85,7 +86,7 @@ def row(name: str, count: int, pictures: Path | None) -> str:
     )
 
 
-def true_euler(vertices: Floats, faces: Floats) -> int:
+def true_euler(vertices: Floats, faces: NDArray[np.int64]) -> int:
     """Euler number of the true mesh, corners at one place counted as one."""
     mesh = Trimesh(vertices, faces, process=False)
     mesh.merge_vertices()

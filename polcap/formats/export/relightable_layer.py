@@ -12,7 +12,7 @@ import numpy as np
 
 from polcap.formats.export import encoders, texture_set
 from polcap.formats.export.texture_set import Texture
-from polcap.images import Asset, TexturePixels
+from polcap.images import Asset, ReliefMesh, TexturePixels
 from polcap.optics import color
 
 NO_NORMAL = 128  # a normal of length 0, by which viewers leave a pixel out
@@ -22,9 +22,9 @@ def pictures(asset: Asset) -> dict[str, Texture]:
     """Albedo, F0, gloss and normals of an asset as 8-bit pictures of the size of its base color.
 
     Gloss is 1 − √roughness, so that Ward's slope parameter is (1 − gloss)⁴ = roughness². Outside the object the normal
-    is the zero vector and all other pictures are 0. The asset must have its object-space normals.
+    is the zero vector and all other pictures are 0. The asset must be of one view, with its object-space normals.
     """
-    assert asset.object_normal is not None
+    assert asset.object_normal is not None and isinstance(asset.mesh, ReliefMesh)
     height, width = asset.base_color.shape[:2]
     inside = cv2.resize(np.isfinite(asset.mesh.depth).astype(np.uint8), (width, height)) > 0
     rough = encoders.eight_bits(texture_set.roughness(asset))

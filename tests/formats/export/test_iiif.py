@@ -12,7 +12,7 @@ import pytest
 from polcap.errors import SettingError
 from polcap.formats.export import iiif, relightable_layer
 from polcap.formats.export.texture_set import Texture
-from polcap.images import Asset, Floats
+from polcap.images import Asset, Floats, ReliefMesh
 from polcap.optics import color, shade
 from polcap.stages import asset
 from tests import surfaces
@@ -105,6 +105,7 @@ def test_compression_changes_normals_by_half_a_degree_at_most(ball: Asset, tmp_p
     made = relightable_layer.pictures(ball)
     iiif.write(tmp_path, made, FACTS, ADDRESS)
     before, after = (unit(one) for one in (made["normal"].pixels, read(tmp_path, "normal/full/max")[..., ::-1]))
+    assert isinstance(ball.mesh, ReliefMesh)
     inner = cv2.erode((ball.mesh.depth > 0).astype(np.uint8), np.ones((5, 5), np.uint8))
     inside = cv2.resize(inner, before.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
     angle = np.degrees(np.arccos(np.clip((before * after).sum(-1)[inside], -1, 1)))
