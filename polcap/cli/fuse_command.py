@@ -1,5 +1,6 @@
 """`polcap fuse`: several captures of one object become one closed asset."""
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -8,6 +9,8 @@ from typer import Argument, Context, Option
 from polcap import resource_limits, terminal
 from polcap.cli import options
 from polcap.errors import SettingError
+
+_NEEDED = ("embreex", "manifold3d", "skimage", "uvunwrap")  # packages of the extra [fusion]
 
 
 def fuse(
@@ -37,6 +40,8 @@ def fuse(
 
     resource_limits.set_threads(threads)
     resource_limits.set_memory(memory)
+    if missing := [name for name in _NEEDED if find_spec(name) is None]:
+        raise SettingError(f"polcap fuse needs {', '.join(missing)}: pip install 'polcap[fusion]'")
     if not folder.is_dir():
         raise SettingError(f"{folder}: no such folder; give the folder that holds view01, view02, …")
     stated = assignments or []
