@@ -83,7 +83,8 @@ def measure(brackets: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
     if not tiles:
         reason = f"the camera moved between {moved} of them" if moved else "no two well exposed frames share an ISO"
         raise CaptureError(
-            f"{folder}: the bracket shows no noise ({reason}); lock camera and ISO, and step the exposure time"
+            f"{folder}: the noise cannot be measured from this bracket ({reason}); lock camera and ISO, and step the "
+            "exposure time"
         )
     return tuple(_line(iso, pairs, sites, folder) for iso, pairs in sorted(tiles.items()))
 

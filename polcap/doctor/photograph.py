@@ -74,7 +74,7 @@ def _pixels(image: SensorImage, exif: Exif) -> Iterator[Finding]:
         name = f"Bayer {bayer}" if image.superpixel == 2 else "X-Trans, merged as 3×3 superpixels"
         yield Finding("pattern", "ok", f"{name}, {size}")
     elif sensor.monochrome(image):
-        remedy = "gains, normals and shape work; colors are grey, and no ColorChecker can be read"
+        remedy = "gains, normals and shape work; colors are gray, and no ColorChecker can be read"
         yield Finding("pattern", "warning", f"one channel (a monochrome sensor), {size}", remedy)
     else:
         yield Finding("pattern", "ok", f"three channels a pixel, {size}: developed or linear DNG, no mosaic left")

@@ -152,7 +152,8 @@ def _order(columns: list[str], rows: Rows) -> tuple[list[int], bool]:
             return [named[name] for name in names], names is SG_BLOCK
     if len(rows) == 24 and not named:
         return list(range(24)), False
+    first = f" named {', '.join(list(named)[:3])}, … are not the patches of a chart" if named else " without names"
     raise ValueError(
-        f"{len(rows)} patches{'' if named else ' without names'}; a Classic has 24, from dark skin or named A1 to D6, "
-        "an SG at least those named E2 to J5"
+        f"{len(rows)} patches{first}; a Classic has 24, from dark skin or named A1 to D6, an SG at least those named "
+        "E2 to J5"
     )

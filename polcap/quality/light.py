@@ -74,7 +74,7 @@ def tone(found: Evidence, limits: GateLimits) -> Gate:
     if evenly and np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens greys too
         worst, reason = (
             abs(slope - 1) / 2,
-            f"The chart's greys follow their reflectance to the power {slope:.2f}, not 1",
+            f"The chart's grays follow their reflectance to the power {slope:.2f}, not 1",
         )
     message = reason if worst > limit else "Pixel values are linear"
     remedy = "Use the RAW files, or develop them linearly to 16 bits, without tone curve, denoising or lens profile"
@@ -227,10 +227,10 @@ def _gain_doubt(found: Evidence, limits: GateLimits) -> Gate:
         doubt, message = gloss, f"The chart is glossy: its gloss changes the gains by up to {100 * gloss:.1f} %"
         remedy = "Turn the chart until it mirrors neither flash nor window, or use a matte one"
     elif measured.source == "grey patches":
-        message = f"The chart's grey patches give the light of each shot only within {100 * doubt:.1f} % (1σ)"
-        remedy = "Show the whole grey row of the chart, evenly lit, or use --no-chart"
+        message = f"The chart's gray patches give the light of each shot only within {100 * doubt:.1f} % (1σ)"
+        remedy = "Show the whole gray row of the chart, evenly lit, or use --no-chart"
     else:
-        message = f"Without grey patches the light of each shot is known within {100 * doubt:.1f} % (1σ)"
+        message = f"Without gray patches the light of each shot is known within {100 * doubt:.1f} % (1σ)"
         if measured.source == "none":
             message = f"The light of each shot is unknown; it is assumed equal within {100 * doubt:.1f} % (1σ)"
         remedy = "Put a ColorChecker next to the object"

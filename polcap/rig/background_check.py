@@ -87,4 +87,5 @@ class BackgroundCheck:
         self._rejections[slot_name] += 1
         self._log.write("check", "!", f"{slot_name}: {reason}; moved to {moved}")
         if self._rejections[slot_name] > self._tries:
-            raise CaptureError(f"{slot_name} {reason} ({self._rejections[slot_name]} times)")
+            count = self._rejections[slot_name]
+            raise CaptureError(f"{slot_name}: rejected {count} time{'s' * (count > 1)}; last reason: {reason}")

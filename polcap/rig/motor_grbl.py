@@ -72,7 +72,7 @@ class GrblMotor:
         stored = {int(match[1]): float(match[2]) for match in matches}
         for key in (100 + self._axis, 110 + self._axis):
             if not stored.get(key, 0.0) > 0.0:
-                raise NoAnswer(f"{self.model} on {port.url} did not state ${key}; set it in GRBL, or try again")
+                raise NoAnswer(f"{self.model} on {port.url} stated no ${key} above 0; set it in GRBL, or try again")
         steps_per_unit, units_per_minute = stored[100 + self._axis], stored[110 + self._axis]
         self._units_per_degree = 1.0 if settings.steps is None else settings.steps / steps_per_unit
         self.speed_deg_s = units_per_minute / 60.0 / self._units_per_degree
@@ -197,7 +197,7 @@ class GrblMotor:
 
 
 def recognize(line: str) -> str | None:
-    """Name of a GRBL board if this line is its greeting; else None."""
+    """Name of a GRBL board if this line is its greeting or a status report; else None."""
     if match := _BANNER.fullmatch(line):
         return f"GRBL {match[1]}"
     return "GRBL" if _STATUS.fullmatch(line) else None

@@ -143,7 +143,7 @@ class Faulty(PoolCamera):
 
 def test_a_frame_that_stays_bad_ends_the_run_with_its_reason(rig: Rig) -> None:
     rig.camera = Faulty(rig.pool, ("shot", 45.0, 2), rig.pool["shot", 135.0, 1])  # underexposed
-    words = r"pol045/frame_3 .*exposure time.* \(1 times\); the frames so far are saved"
+    words = r"pol045/frame_3: rejected 1 time; last reason: .*exposure time.*; the frames so far are saved"
     with pytest.raises(CaptureError, match=words):
         rig.shoot(tries=0)
     assert rig.turner.closed

@@ -25,7 +25,7 @@ SENSOR_DEG: tuple[tuple[float, tuple[int, int]], ...] = (  # row, column of each
     (135.0, (1, 0)),
 )
 _MOST_CHANNELS = 64  # of a layered EXR
-_COLOR_LEVELS = 0.05  # averages of neighbouring 2×2 cells differ less than this on a monochrome sensor
+_COLOR_LEVELS = 0.05  # averages of neighboring 2×2 cells differ less than this on a monochrome sensor
 
 
 def read(
@@ -35,7 +35,7 @@ def read(
     black: float = 0.0,
     digest: str | None = None,
 ) -> SensorImage:
-    """Decode a finished picture as linear values (H, W, 3); a grey picture is repeated in all three channels.
+    """Decode a finished picture as linear values (H, W, 3); a gray picture is repeated in all three channels.
 
     Linear integers stay counts; for floating point, white is 1. An sRGB-encoded picture becomes linear 0…1. It and
     every 8-bit picture are marked `lossy`. By default `encoding` is sRGB for 8 bits, else linear, and `white` is the
@@ -181,14 +181,14 @@ def opened(path: str, data: bytes) -> Iterator[Any]:
 
 
 def _channels(path: str, spec: Any) -> list[int]:
-    """Indices of the picture's channels R, G and B, or of its single grey channel."""
+    """Indices of the picture's channels R, G and B, or of its single gray channel."""
     names = [name.rpartition(".")[2].upper() for name in spec.channelnames]
     if sum(name in ("R", "G", "B") for name in names) == 3:
         return [names.index(name) for name in "RGB"]
     grey = [i for i, name in enumerate(names) if i != spec.alpha_channel]
     if len(grey) == 1:
         return grey
-    raise DecodeError(f"{path}: has the channels {', '.join(spec.channelnames)}; polcap reads R, G, B or one grey")
+    raise DecodeError(f"{path}: has the channels {', '.join(spec.channelnames)}; polcap reads R, G, B or one gray")
 
 
 def _counts(pixels: NDArray[Any]) -> Any:
@@ -202,6 +202,6 @@ def _check_monochrome(path: str | Path, mosaic: NDArray[Any]) -> None:
     levels = cells.mean(axis=(0, 2, 3, 5), dtype=np.float64)  # (2, 2)
     if levels.max() > (1 + _COLOR_LEVELS) * levels.min():
         raise DecodeError(
-            f"{path}: neighbouring 2×2 cells differ by {levels.max() / levels.min() - 1:.0%}, as on a color "
+            f"{path}: neighboring 2×2 cells differ by {levels.max() / levels.min() - 1:.0%}, as on a color "
             "polarization sensor, which is not supported; give one demosaiced picture per angle"
         )
