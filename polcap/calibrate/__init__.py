@@ -90,7 +90,11 @@ def _noise(flat: list[Photograph], dark: list[Photograph], brackets: list[list[P
 
 
 def _polarizer_shots(folder: Path, axis_deg: float) -> list[polarizer_ring.PolarizerShot]:
-    """The calibration photographs of `polarizer/`, each with the axis of the light and the angle of the ring."""
+    """The calibration photographs of `polarizer/`, each with the axis of the light and the angle of the ring, degrees.
+
+    Folders polNNN give the ring's angle. Folders axisNNN around them give the axis of the light; without such folders
+    it is `axis_deg`.
+    """
     shots = [
         polarizer_ring.PolarizerShot(axis, ring, photograph)
         for axis, axis_folder in angle_folders(folder, "axis") or [(axis_deg, folder)]

@@ -203,9 +203,11 @@ def _color_checker(image: SensorImage) -> BoardView | None:
 
 
 def _patch_center(light: Floats, place: Floats, center: Floats) -> Floats | None:
-    """Center (2,) px of a patch near chart coordinates `center`; None if it is hardly brighter than the card.
+    """Center (2,) px of a patch near chart coordinates `center`.
 
-    It is the centroid of the light above the card's, computed in chart coordinates, so that tilt does not move it.
+    None if the patch is at the picture's edge, or hardly brighter than the card between the patches. `place` (3, 3) is
+    the homography from chart coordinates to px. The center is the centroid of the light above the card's, computed in
+    chart coordinates, so that tilt does not move it.
     """
     step = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
     far = np.maximum(np.abs(step)[:, None], np.abs(step))

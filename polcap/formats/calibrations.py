@@ -176,7 +176,7 @@ _Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
 
 
 class _Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Keys of a color profile file; the fields are those of `ColorCalibration`."""
+    """Keys of a color profile file: a `ColorCalibration` with its place and patches written as single keys."""
 
     matrix: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
     source: Literal["chart", "corners", "profile", "camera", "none"]

@@ -110,7 +110,10 @@ def _expect(holds: bool, tree: Any, wanted: str, folder: Path) -> None:
 
 
 def save(file: Path, array: NDArray[Any]) -> list[Any]:
-    """Write an array of any shape as an .npy file and return its `checksum`; an OSError states its cause."""
+    """Write an array of any shape as an .npy file; returns the file's size and SHA-256 digest, as `checksum` does.
+
+    Raises OSError: the file cannot be written.
+    """
     array = np.asarray(array, order="C")
     head = io.BytesIO()
     np.lib.format.write_array_header_2_0(head, np.lib.format.header_data_from_array_1_0(array))

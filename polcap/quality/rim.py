@@ -56,9 +56,10 @@ class RimFigures:
 
 
 def sample(light: Floats, mask: Bools, usable: Bools) -> Rim:
-    """Sample registered shots (K, H, W), divided by their gains, in a band just inside the object's outline.
+    """Sample the light in a band just inside the object's outline, smoothed and divided by the mean of the shots.
 
-    `mask` (H, W) is the object, `usable` (H, W) are the pixels without defects.
+    `light` (K, H, W) is the light at each polarizer angle, computed from the Stokes parameters. `mask` (H, W) is the
+    object, `usable` (H, W) are the pixels without defects.
     """
     ok = (mask & usable).astype(np.float32)
     weight = cv2.GaussianBlur(ok, (0, 0), _SMOOTH_PX) + 1e-6

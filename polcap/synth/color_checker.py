@@ -57,7 +57,10 @@ def intersect(chart: Chart, v: Floats) -> tuple[NDArray[np.integer], Floats, Flo
 
 
 def meet_plane(chart: Chart, v: Floats) -> tuple[Floats, Floats, Floats]:
-    """Intersect rays v (P, 3) with the chart's plane: lengths [m]; columns and rows from its middle, in patches."""
+    """Intersect rays with the chart's plane: lengths [m]; columns and rows from the chart's middle, in patches.
+
+    v (P, 3) are unit vectors from the surface to the lens.
+    """
     facing, across, down = chart.axes
     distance = -(np.array(chart.center) @ facing) / (v @ facing)
     point = -v * distance[:, None] - chart.center

@@ -60,7 +60,10 @@ def mean_maps(protocol: Protocol, count: int) -> Means:
 
 
 def constant(seen: Cues, values: Means) -> SurfaceMaps:
-    """Baseline maps with the same values (from `mean_maps`) at all pixels."""
+    """Baseline maps with the same values (from `mean_maps`) at all pixels.
+
+    The normal is the same in the frame of each pixel's view ray.
+    """
     normal, diffuse, specular, roughness = (np.broadcast_to(v, (*seen.mask.shape, len(v))) for v in values)
     return replace(
         frontal(seen), normal=np.asarray(frames.from_ray_frame(normal, seen.rays)), diffuse=diffuse, specular=specular,

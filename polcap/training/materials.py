@@ -136,7 +136,8 @@ def _albedo(
 ) -> tuple[Tensor, Tensor]:
     """Pattern (M,) 0…1 that mixes two surfaces, and diffuse albedo (M, 3), of a drawn material.
 
-    The pattern is that of the relief, or a print, or the lightness of the texture.
+    `own` chooses the source of the pattern: the noise `fine` of the relief, the noise `printed`, or the `lightness` of
+    the texture `picture`. It also chooses whether the albedo is mixed from two colors or taken from the texture.
     """
     noise = torch.where(own["raised"] > 0.5, fine[:, 3], printed[:, 0])
     pattern = torch.sigmoid(own["contrast"] * (noise + own["level"]))

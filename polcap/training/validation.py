@@ -54,7 +54,10 @@ class HeldOutPictures:
 
 
 def _draw(maps: dict[str, Tensor], mask: Tensor) -> list[list[Picture]]:
-    """Images of the maps of all pictures: normal (in each ray's frame), diffuse, F0 0…0.3, roughness and depth."""
+    """Images of the maps, one list per map with an image per picture of the batch.
+
+    The maps are normal (in the frame of each pixel's ray), diffuse, F0 from 0 to 0.3, roughness and depth.
+    """
     inside = mask.cpu().numpy()
     normal, diffuse, specular, roughness, depth = (
         _arrays(maps[name] * mask[:, None]) for name in ("normal", "diffuse", "specular", "roughness", "depth")

@@ -68,10 +68,10 @@ class TextureEncoder:
 def encode(texture: Texture, kind: Kind) -> bytes:
     """Encode one texture as PNG, JPEG, WebP or KTX2.
 
-    JPEG and WebP have 8 bits per channel, PNG 8 or 16 as the texture.
+    JPEG, WebP and KTX2 have 8 bits per channel, PNG 8 or 16 as the texture.
 
-    Raises SettingError: the kind cannot hold the picture's channels, or its encoder is not installed.
-    Raises StorageError: the encoder failed.
+    Raises SettingError: JPEG for four channels, or the KTX2 encoder is missing or failed.
+    Raises StorageError: OpenCV cannot encode the picture as JPEG or WebP.
     """
     if kind == "png":
         return png.encode(texture.pixels)

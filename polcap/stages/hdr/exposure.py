@@ -84,12 +84,14 @@ def _quadratic(x: Floats, y: Floats) -> Floats:
 
 
 def measured_or_stated(name: str, measured: Ratio | None, channels: int, frame: Frame, reference: Frame) -> Floats:
-    """Exposure ratio (C,) float32 to the reference frame: the measured one, else that of the metadata.
+    """Exposure ratio (C,) float32 to the reference frame: the measured one, else the stated one.
+
+    A ratio from EXIF does not count if the flash fired.
 
     Raises
     ------
     CaptureError
-        Neither pixels nor metadata of the frame `name` give a ratio.
+        The frame `name` has neither a measured nor a stated ratio.
     """
     if measured is not None:
         return measured.value.astype(np.float32)

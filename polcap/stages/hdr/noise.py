@@ -221,7 +221,10 @@ class Lines:
         return iso in self._settled
 
     def settle(self) -> None:
-        """Make the current noise lines final: later shots use them."""
+        """Freeze the noise lines (variance over signal) estimated so far, and drop all samples.
+
+        Later shots use these lines.
+        """
         self._settled = set(self._known)
         self._samples.clear()
 

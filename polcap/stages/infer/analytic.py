@@ -119,9 +119,10 @@ def _local(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:
 
 
 def _expected_error(zenith: ZenithEstimate, dolp: Floats, sigma: Floats, certainty: Floats, cues: Cues) -> Floats:
-    """Expected normal error (H, W), degrees: noise, 180° ambiguity, choice of the diffuse law, model error.
+    """Expected normal error (H, W), degrees.
 
-    A wrong half-turn costs 2θ and happens with probability (1 − certainty)/2.
+    Its terms are noise, the choice of the diffuse law, model error, the 180° ambiguity, and 15° at pixels whose quality
+    flags show that the model fails. A wrong half-turn costs 2θ and happens with probability (1 − certainty)/2.
     """
     step = np.maximum(sigma, 1e-5)
     low, high = (zenith.at(np.maximum(dolp + s * step, 0)) for s in (-1, 1))

@@ -106,7 +106,10 @@ def _mean_picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibr
 
 
 def _chart_zone(radiance: AngleStack, color: ColorCalibration, margin: float) -> Bits:
-    """Zone (H, W) of the chart, where the object cannot be: 1 on its patches and `margin` patch widths around them."""
+    """Zone (H, W) of the chart, where the object cannot be: 1 inside, 0 outside.
+
+    The zone's corners are those of the chart's patches, moved outward by `margin` patch widths.
+    """
     zone = np.zeros(radiance.value.shape[1:3], np.uint8)
     if color.place is not None:
         corners = np.asarray(color.place.corners, np.float64)

@@ -24,7 +24,7 @@ _ALONG_EDGE = 0.1  # share of a region's outline along the picture's edge; with 
 
 
 def brightness(color: Floats) -> float:
-    """Brightness scale of a whole picture: the 95th percentile of its S0 (H, W, 3)."""
+    """Brightness scale of a whole picture: 95th percentile over the pixels of the channel mean of S0 (H, W, 3)."""
     return max(float(np.percentile(color.mean(-1), _BRIGHT)), 1e-9)
 
 

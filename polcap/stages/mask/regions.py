@@ -10,6 +10,7 @@ Bools = NDArray[np.bool_]
 Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px, end exclusive
 
 _SPECK = 0.01  # of the largest region; smaller regions are specks
+_INSIDE = 0.5  # probability above which a pixel belongs to the object
 _LIKELY = 0.3  # least maximum probability of a region; otherwise it is backdrop of the object's color
 _PINHOLE = 1e-3  # of the mask; smaller holes are dark texture
 _OPENING = 0.15  # largest mean probability of an open hole; with more it is a shadowed part of the object
@@ -17,8 +18,8 @@ _LEEWAY = 1.7  # largest expected error of the mask by colors, over that of the 
 
 
 def likely_regions(probability: Floats) -> Bools:
-    """Mask (H, W) of pixels with a probability (H, W) above one half, without specks and without doubtful holes."""
-    return fill_holes(_without_specks(probability > 0.5), _PINHOLE, probability)
+    """Mask (H, W) of pixels with a probability (H, W) above `_INSIDE`, without specks and without doubtful holes."""
+    return fill_holes(_without_specks(probability > _INSIDE), _PINHOLE, probability)
 
 
 def clean(mask: Bools, probability: Floats) -> Bools:

@@ -119,7 +119,10 @@ class Equations:
 
     @property
     def coherence(self) -> float:
-        """Balance −1…1 of the sign of w_ζ² w*: 1 for diffuse reflection, negative for specular reflection."""
+        """Weighted sum of Re(w_ζ² w*) over the weighted sum of |w_ζ² w*|, −1…1.
+
+        It is near 1 for diffuse reflection, negative for specular reflection.
+        """
         size = float((self.weight * np.abs(self.product)).sum())
         return float((self.weight * self.product.real).sum() / max(size, 1e-30))
 

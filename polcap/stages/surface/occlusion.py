@@ -117,7 +117,10 @@ class OcclusionMap:
 
 
 def least_step(mask: Bools, share: float) -> float:
-    """Least depth step of an occlusion [px]: a share of the radius of the mask (H, W)."""
+    """Least depth step of an occlusion [px]: `share` of the radius of a disc with the area of the mask (H, W).
+
+    It is at least 2 px.
+    """
     return max(_LEAST_STEP_PX, share * disc_radius(mask))
 
 

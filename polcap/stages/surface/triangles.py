@@ -1,4 +1,4 @@
-"""Triangle mesh over a depth map: cut at depth steps, smooth along the boundary, with a back and texture frames."""
+"""Triangle mesh of a depth map: cut at occlusions, smooth along the boundary, with or without a back."""
 
 from dataclasses import dataclass, replace
 from typing import Literal

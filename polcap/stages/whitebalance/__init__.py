@@ -2,7 +2,8 @@
 
 The chart is searched in 8-bit gamma pictures of the merged radiance (`chart_search`), and located to a fraction of a
 pixel in the radiance itself (`chart`). Its patches are sampled in the linear radiance (`patches`). A candidate is
-accepted only if detector, drawn model and colors all agree with a ColorChecker Classic.
+accepted only if detector, drawn model and colors all agree with a ColorChecker Classic. `optics/color.fit_matrix`
+solves for the color matrix.
 
 References
 ----------
@@ -184,7 +185,14 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Whitebala
 def _at_corners(
     radiance: AngleStack, reference: ChartReference, corners_px: Floats | None, settings: WhitebalanceSettings
 ) -> _Find:
-    """Locate the chart at corners (4, 2) RAW px from the user; they are refined in the picture if possible."""
+    """Locate the chart at corners (4, 2) RAW px from the user, refined in the picture where that is plausible.
+
+    Raises
+    ------
+    ChartError
+        There are not four corners; they are not clockwise, outside the picture, or too close together; or the colors
+        between them are not those of a chart.
+    """
     if corners_px is None or np.shape(corners_px) != (4, 2):
         raise ChartError("--chart needs the four outer corners of the patches x0,y0,…,x3,y3, clockwise from dark skin")
     height, width = radiance.value.shape[1:3]

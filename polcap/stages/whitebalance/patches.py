@@ -91,7 +91,10 @@ def cross_validate(found: ChartFit, reference: ChartReference) -> Floats | None:
 
 
 def residual(found: ChartFit, reference: ChartReference) -> float:
-    """Mean ΔE2000 of the patches in use against the colors of a chart."""
+    """Mean ΔE2000 of the patches in use, after a color matrix is fitted to the colors of `reference`.
+
+    It compares editions of the chart.
+    """
     used = found.use == PatchUse.USED
     return float(np.nanmean(color.fit_matrix(found.color, reference.rec709, position(), used).delta_e))
 
