@@ -37,7 +37,7 @@ from polcap.stages.infer import analytic, highlights, learned
 
 _MAPS_SIGMA = 0.05  # of the estimators' own albedos, with a correct scale (docs/benchmarks/gates.md)
 # of objects next to their chart: mean, and spread of the logarithm (docs/benchmarks/gates.md)
-_USUAL_F0, _F0_SPREAD = 0.044, 0.06  # median of an object
+_USUAL_F0, _F0_SPREAD = 0.044, 0.10  # median of an object
 _USUAL_WHITE, _WHITE_SPREAD = 0.65, 0.25  # 95th percentile of the albedo
 _USUAL, _DOUBT = 1.5, 0.25  # sum of both deviations that is still usual [spreads]; doubt per spread beyond
 _FLOOR = 1e-3  # of albedo and F0 in a logarithm
@@ -66,7 +66,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fine: Annotated[bool, Meta(description="a second network adds relief finer than the pixels of the first")] = True
 
 
-@stage(version=23)
+@stage(version=24)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Estimate normal, diffuse, specular, roughness and expected error from cues; without a network by inversion.
 
