@@ -135,8 +135,9 @@ def _strip_px(print_: _Print, board: Board) -> tuple[int, int]:
     inside = np.abs(print_.place).max(axis=-1) < 1
     metres = 0.5 * board.side_m
     slope = [np.hypot(*np.moveaxis(np.gradient(print_.place, axis=axis), -1, 0)) for axis in (1, 0)]
-    across, down = (float(np.median(s[inside])) * metres for s in slope)
-    return tuple(int(np.ceil(_STRIP * board.square_m / max(step, 1e-9))) for step in (across, down))  # type: ignore[return-value]
+    across, down = (max(float(np.median(s[inside])) * metres, 1e-9) for s in slope)
+    strip = _STRIP * board.square_m
+    return int(np.ceil(strip / across)), int(np.ceil(strip / down))
 
 
 def _object_like(picture: Floats, print_: _Print, light: tuple[Floats, Floats], strip: tuple[int, int]) -> Bools:

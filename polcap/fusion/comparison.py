@@ -40,14 +40,14 @@ def compare(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps) -> Com
 def _agreement(view: FusionView, sight: Sight, atlas: Atlas, maps: AtlasMaps) -> ViewAgreement:
     both = view.mask & (frames.dot(sight.mesh_normal, sight.mesh_normal) > 0.5)
     cosine = np.clip(frames.dot(view.normal, sight.mesh_normal)[both], -1, 1)
-    apart = float(np.median(np.degrees(np.arccos(cosine)))) if both.any() else 90.0
+    angle_deg = float(np.median(np.degrees(np.arccos(cosine)))) if both.any() else 90.0
     if view.s0 is None or not len(sight.texel):
-        return ViewAgreement(view.name, apart, float("nan"))
+        return ViewAgreement(view.name, angle_deg, float("nan"))
     photograph, drawn = sight.sample(view.s0), rendered(view, sight, atlas, maps)
     weight = sight.weight[:, None]
     drawn = drawn * float((weight * drawn * photograph).sum() / max((weight * drawn * drawn).sum(), 1e-12))
     error = (weight * (photograph - drawn) ** 2).sum() / max((weight * photograph**2).sum(), 1e-12)
-    return ViewAgreement(view.name, apart, float(np.sqrt(error)))
+    return ViewAgreement(view.name, angle_deg, float(np.sqrt(error)))
 
 
 def rendered(view: FusionView, sight: Sight, atlas: Atlas, maps: AtlasMaps) -> Floats:
