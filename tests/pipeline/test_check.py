@@ -20,6 +20,7 @@ from polcap.pipeline import check
 from polcap.pipeline.check import Verdict
 from polcap.pipeline.path import AUTO
 from polcap.pipeline.small_capture import reduce
+from polcap.quality.gate import Gate
 from polcap.stages import hdr, whitebalance
 from tests import faulty
 from tests.conftest import Command
@@ -29,6 +30,12 @@ WIDTH = 512  # the chart must be found: without its greys order and angles are m
 
 def verdict(folder: Path) -> Verdict:
     return check.inspect(captures.read(folder), Config(), networks=lambda: (None, None))
+
+
+def test_a_fault_of_no_single_shot_is_named_in_the_first_line() -> None:
+    order = Gate("order", "fail", None, None, "The outline fits another order")
+    assert check.table(check.Verdict(False, (), (order,), "vase", 1.0)).startswith("reshoot: order   (vase")
+    assert check.table(check.Verdict(False, ("45°",), (order,), "vase", 1.0)).startswith("reshoot 45°   (vase")
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
