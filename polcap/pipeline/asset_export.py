@@ -6,9 +6,11 @@ same bytes, with any number of threads.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, Protocol
+
+import msgspec
 
 from polcap import parallel
 from polcap.config import Config
@@ -96,8 +98,16 @@ class ReliefSource:
     def decimated(self, whole: Asset, triangles: int) -> "DetailLevel":
         """The asset with about so many triangles."""
         maps = self.stored.maps
-        coarse = surface.decimate(self.mesh, maps.view, triangles, self.config.surface.back)
+        coarse = surface.decimate(self._front, maps.view, triangles, self.config.surface.back)
         return DetailLevel(asset.with_mesh(whole, maps, coarse.mesh), coarse)
+
+    @cached_property
+    def _front(self) -> ReliefMesh:
+        """The full mesh without its back."""
+        if self.config.surface.back == "open":
+            return self.mesh
+        settings = msgspec.structs.replace(self.config.surface, back="open")
+        return surface.triangulate(self.stored.depth, self.stored.maps, self.stored.metric, settings)
 
 
 @dataclass(frozen=True)
