@@ -34,7 +34,7 @@ def test_captures_are_found_however_deep_and_results_are_not(captures: Path, tmp
 @pytest.mark.parametrize(
     ("model", "estimator", "words"),
     [
-        ("none.onnx", "network", "No such file or directory; name a model file with --model"),
+        ("none.onnx", "network", "No such file or directory; give the path of an ONNX model"),
         ("noise.onnx", "network", "noise.onnx"),
         ("noise.onnx", "analytic", "--model and --estimator analytic exclude each other"),
     ],
