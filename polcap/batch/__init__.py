@@ -59,7 +59,9 @@ def reopen(place: Path) -> list[Unit]:
 
 def _captures(root: Path) -> Iterator[str]:
     for folder, inside, files in os.walk(root):
-        if layouts.looks_like_a_capture(Path(folder), inside, files):
+        if "maps" in inside and "report.json" in files:  # a result of `process --out`
+            inside.clear()
+        elif layouts.looks_like_a_capture(Path(folder), inside, files):
             inside.clear()
             yield folder
         else:
