@@ -93,7 +93,7 @@ def export(
     flags["iiif"] = iiif is not None
     formats = tuple(name for name in presets.FORMATS if flags[name])
     if preset and formats:
-        raise SettingError(f"--preset {preset[0]} brings its formats; leave out --{formats[0]}")
+        raise SettingError(f"--preset {preset[0]} brings its formats; write --{formats[0]} by a second export")
     plain = ExportRequest(
         formats=formats or ("gltf", "obj"),
         images=images,
@@ -110,7 +110,9 @@ def export(
     )
     wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
     write = fuse_run.export if fused_maps.is_fused(result) else pipeline.export
-    written = [str(file) for file in write(result, *wanted)]
+    files = write(result, *wanted)
+    options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
+    written = [str(file) for file in files]
     terminal.print_data({"written": written} if json else "\n".join(written))
 
 

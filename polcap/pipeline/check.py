@@ -160,8 +160,8 @@ def table(verdict: Verdict) -> str:
     for line in verdict.lines:
         limit = ""
         if isinstance(line.limit, float | int):
-            number = f"{100 * line.limit:g}" if line.unit == "%" else f"{line.limit:g}"
-            limit = f" (limit {number} {line.unit})".replace(" )", ")")
+            number, unit = (100 * line.limit, "%") if line.unit == "1" else (line.limit, line.unit)
+            limit = f" (limit {number:g} {unit})".replace(" )", ")")
         cost = f", costs about {line.cost_deg:.0f}°" if line.cost_deg >= 1 and line.state in ("warn", "fail") else ""
         rows.append(f"{line.state:13}{line.name:14}{line.message}{limit}{cost}")
         if line.remedy:

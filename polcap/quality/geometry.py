@@ -159,12 +159,12 @@ def mesh(of: Mesh, limits: GateLimits) -> Gate:
         faults.append((f"The mesh has {of.pieces} pieces, more than {pieces}", of.pieces, pieces, ""))
     if of.cuts > cuts:
         message = f"Cuts of {of.cut_px:.0f} px are {of.cuts:.0%} of the outline's length, more than {cuts:.0%}"
-        faults.append((message, of.cuts, cuts, "%"))
+        faults.append((message, of.cuts, cuts, "1"))
     if faults:
         remedies.append("See the error of the normals: they fit no surface; --set surface.stiffness=0 closes all cuts")
     if of.raggedness > rim:
         message = f"The boundary is {of.raggedness:.0%} longer than when smoothed, more than {rim:.0%}"
-        faults.append((message, of.raggedness, rim, "%"))
+        faults.append((message, of.raggedness, rim, "1"))
         remedies.append("If the mask's outline is jagged, use --mask PNG")
     if faults:
         _, value, limit, unit = faults[0]

@@ -13,11 +13,13 @@ from contextlib import suppress
 from pathlib import Path
 from urllib.parse import unquote
 
+import numpy as np
 import pytest
 
 from polcap import batch
 from polcap.batch import unit as one
 from polcap.errors import CaptureError
+from polcap.formats.maps import png
 from tests.batch.conftest import OPTIONS
 from tests.conftest import ROOT, Command, shell
 
@@ -31,11 +33,21 @@ def test_captures_are_found_however_deep_and_results_are_not(captures: Path, tmp
         batch.find(tmp_path)
 
 
+def test_results_of_process_are_no_captures(captures: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    shutil.copytree(captures / "obj0", root / "obj0")
+    for part in ("maps", "asset"):
+        (root / "results" / part).mkdir(parents=True)
+        png.write(root / "results" / part / "normal.png", np.zeros((8, 8, 3), np.uint16))
+    (root / "results" / "report.json").write_text("{}")
+    assert [unit.name for unit in batch.find(root)] == ["obj0"]
+
+
 @pytest.mark.parametrize("more", [(), ("--write-jobs", "slurm")], ids=["run", "job file"])
 @pytest.mark.parametrize(
     ("model", "estimator", "words"),
     [
-        ("none.onnx", "network", "No such file or directory; name a model file with --model"),
+        ("none.onnx", "network", "No such file or directory; give the path of an ONNX model"),
         ("noise.onnx", "network", "noise.onnx"),
         ("noise.onnx", "analytic", "--model and --estimator analytic exclude each other"),
     ],
