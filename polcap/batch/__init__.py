@@ -75,11 +75,15 @@ def _captures(root: Path) -> Iterator[str]:
 def _without_capture(root: Path, found: Sequence[Unit]) -> list[str]:
     """Names of the sub-folders of a batch's root that hold neither a capture nor a result."""
     used = {Path(unit.capture) for unit in found}
+    if root in used:  # the batch is one capture
+        return []
     used |= {parent for path in used for parent in path.parents}
     others = [path for path in layouts.children(root) if path.is_dir() and path not in used]
-    known = (*own_folders.OURS, *layouts.angle_folder_names(root))
-    results = (path for path in others if layouts.is_result(path) or layouts.is_result(path / FUSED))
-    return [path.name for path in others if path.name not in known and path not in set(results)]
+    return [path.name for path in others if path.name not in own_folders.OURS and not _holds_result(path)]
+
+
+def _holds_result(folder: Path) -> bool:
+    return any(layouts.is_result(Path(inside)) for inside, _, _ in os.walk(folder))
 
 
 def _unit(root: Path, folder: Path, out: Path | None, batch_folder: str) -> Unit:

@@ -105,8 +105,12 @@ def test_folders_without_a_capture_are_named(captures: Path, tmp_path: Path, pol
     for name in ("broken", "lost"):
         (tmp_path / name).mkdir()
     shutil.copytree(captures / "broken", tmp_path / "broken", dirs_exist_ok=True)
+    for name in ("cup/fused", "jug/fused", "results/vase"):
+        (tmp_path / name / "maps").mkdir(parents=True)
+        (tmp_path / name / "report.json").touch()
     done = polcap("batch", tmp_path, *OPTIONS)
     assert "no capture in lost: " in done.stderr and done.returncode == 2
+    assert "no capture" not in polcap("batch", tmp_path / "broken", *OPTIONS).stderr
 
 
 def test_second_run_opens_no_finished_capture(captures: Path, finished: Path, polcap: Command) -> None:
