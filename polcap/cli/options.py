@@ -11,6 +11,7 @@ from typer import Argument, Option
 
 from polcap import terminal
 from polcap.errors import SettingError
+from polcap.formats import own_folders
 
 if TYPE_CHECKING:
     from polcap.formats.export.texture_set import Extra
@@ -21,11 +22,13 @@ _NAMED = 5  # outdated exports that a warning lists
 
 
 def result_folder(named: Path | None) -> Path | None:
-    """The result folder that an argument names: itself, or for a capture folder the result in it."""
+    """The result folder that an argument names: itself, or the result in the folder of a capture or of views."""
     if named is None or any((named / name).exists() for name in ("work", "report.json", "maps")):
         return named
-    inside = named / "polcap"
-    return inside if (inside / "report.json").exists() or (inside / "work").is_dir() else named
+    for inside in (named / own_folders.OUTPUT, named / own_folders.FUSED):
+        if (inside / "report.json").exists() or (inside / "work").is_dir():
+            return inside
+    return named
 
 
 def choice(meaning: str) -> Any:

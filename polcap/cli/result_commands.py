@@ -134,6 +134,7 @@ def show(
     from polcap.pipeline import run as pipeline
     from polcap.pipeline.path import STAGES
 
+    _check_single(result, "show")
     if (stage is None) + (not all_) + (animate is None) != 2:
         raise SettingError(f"show {result}: give one of a stage ({', '.join(STAGES)}), --all or --animate")
     if animate is not None:
@@ -197,6 +198,7 @@ def report(
         return
     from polcap.pipeline import run as pipeline
 
+    _check_single(result, "report")
     about = pipeline.judge_again(result)
     terminal.print_data(about if json else str(result / "report.html"))
     if open_:
@@ -220,6 +222,17 @@ def clean(
     rows = [f"{size / 1e6:9.2f} MB  {work}" for work, size in removed.items()]
     terminal.print_data({"removed": removed, "bytes": total, "dry_run": dry_run} if json else "\n".join(rows))
     terminal.print_progress(f"{total / 1e6:.1f} MB {'would be free' if dry_run else 'are free'}")
+
+
+def _check_single(result: Path, command: str) -> None:
+    """Raise a SettingError for the result of `polcap fuse`, which has other stages."""
+    from polcap.fusion import fused_maps
+
+    if fused_maps.is_fused(result):
+        raise SettingError(
+            f"`polcap {command}` is for results of one view, and {result} is a fused object: see its report.html and "
+            "asset/turntable.webp, or give one of its views"
+        )
 
 
 def _results(named: Path) -> Iterator[Path]:

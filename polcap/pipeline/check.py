@@ -152,6 +152,8 @@ def _moved(chart: ChartRequest, step: int) -> ChartRequest:
 def table(verdict: Verdict) -> str:
     """The verdict as text for the terminal, on one screen."""
     head = "keep" if verdict.keep else f"reshoot {', '.join(verdict.shots)}".rstrip()
+    if not verdict.keep and not verdict.shots:  # the fault is of the whole capture
+        head += f": {', '.join(line.name for line in verdict.lines if line.state == 'fail')}"
     if verdict.keep and verdict.needs:
         head += f", and process it with {verdict.needs}"
     rows = [f"{head}   ({verdict.capture}, {verdict.seconds:.1f} s)"]

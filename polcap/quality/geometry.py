@@ -233,7 +233,7 @@ def focal_length(found: Evidence) -> Gate:
     cost = _lean(found.maps, least, most)
     times = np.exp(max(most, -least))
     message = f"The focal length is assumed and may be wrong by a factor of {times:.1f}, which bends shape and depth"
-    remedy = "State focal_length_mm and sensor_width_mm in capture.toml"
+    remedy = "State focal_length_mm and sensor_width_mm in capture.toml, a text file in the capture's folder"
     return Gate("focal length", "warn", "assumed", "known", message, remedy, round(cost, 1), unit="")
 
 

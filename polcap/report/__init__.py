@@ -152,6 +152,8 @@ def read(folder: Path) -> dict[str, Any]:
     except OSError as error:
         if not folder.exists():
             raise StorageError(f"{folder}: no such folder; give the result folder of `polcap process`") from error
+        if folder.is_file():
+            raise StorageError(f"{folder} is a file; give the result folder of `polcap process`") from error
         if (folder.parent / "report.json").exists():
             raise StorageError(f"{folder} is only a part of a result; give the whole, {folder.parent}") from error
         raise StorageError(f"{folder} holds no report.json; run `polcap process` first") from error

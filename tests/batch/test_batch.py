@@ -91,6 +91,24 @@ def test_broken_capture_stops_no_other_and_is_listed_with_its_remedy(finished: P
     assert page.count("<figure>") == 2 and "copy it from the card again" in page
 
 
+def test_views_and_maps_of_a_fused_object_are_no_captures(tmp_path: Path) -> None:
+    for name in ("cup/view01", "cup/view02", "jug"):
+        for angle in ("pol000", "pol045", "pol090"):
+            (tmp_path / name / angle).mkdir(parents=True)
+    (tmp_path / "cup/fused/maps").mkdir(parents=True)
+    assert [unit.name for unit in batch.find(tmp_path)] == ["cup/view01", "cup/view02", "jug"]
+    (tmp_path / "cup/fused/report.json").touch()
+    assert [unit.name for unit in batch.find(tmp_path)] == ["jug"]
+
+
+def test_folders_without_a_capture_are_named(captures: Path, tmp_path: Path, polcap: Command) -> None:
+    for name in ("broken", "lost"):
+        (tmp_path / name).mkdir()
+    shutil.copytree(captures / "broken", tmp_path / "broken", dirs_exist_ok=True)
+    done = polcap("batch", tmp_path, *OPTIONS)
+    assert "no capture in lost: " in done.stderr and done.returncode == 2
+
+
 def test_second_run_opens_no_finished_capture(captures: Path, finished: Path, polcap: Command) -> None:
     before = (finished / "obj0/report.json").stat().st_mtime_ns
     done = polcap("batch", captures, "--out", finished, *OPTIONS, "--shard", "3/3")

@@ -33,6 +33,12 @@ def verdict(folder: Path) -> Verdict:
     return check.inspect(captures.read(folder), Config(), networks=lambda: (None, None))
 
 
+def test_a_fault_of_no_single_shot_is_named_in_the_first_line() -> None:
+    order = Gate("order", "fail", None, None, "The outline fits another order")
+    assert check.table(check.Verdict(False, (), (order,), "vase", 1.0)).startswith("reshoot: order   (vase")
+    assert check.table(check.Verdict(False, ("45°",), (order,), "vase", 1.0)).startswith("reshoot 45°   (vase")
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_ordinary_jitter_and_nudges_are_kept(tmp_path: Path, seed: int) -> None:
     faulty.shoot(tmp_path / "good", seed, "", WIDTH)

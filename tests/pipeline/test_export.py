@@ -88,6 +88,11 @@ def test_an_asset_and_the_textures_beside_it_are_spelled_alike(own: Path) -> Non
     assert {"SM_blue_jug_7.glb", "T_blue_jug_7_N.png"} <= named and not any(" " in name for name in named)
 
 
+def test_archived_textures_have_16_bits(exported: Path) -> None:
+    pictures = list((exported / "asset" / "archive").glob("*.png"))
+    assert pictures and all(png.read(file).dtype == np.uint16 for file in pictures)
+
+
 def test_sidecar_knows_photographs_settings_and_files(exported: Path) -> None:
     recorded = json.loads((exported / "asset" / "archive" / "capture.provenance.json").read_text())
     about = json.loads((exported / "report.json").read_text())
