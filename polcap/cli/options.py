@@ -104,15 +104,15 @@ def catalog_fields(stated: Sequence[str]) -> dict[str, str]:
 
 
 def warn_of_outdated_exports(out: Path, records: Sequence[Path]) -> None:
-    """Print a warning if the exports with these sidecars in a result folder, or parts of them, are of earlier maps."""
+    """Print a warning if exports with these sidecars in a result folder, or files of them, have other maps or facts."""
     from polcap.formats import text_file
     from polcap.pipeline import asset_export
 
     old = asset_export.outdated(records, text_file.read_json(out / "report.json").get("keys", {}))
     if old:
         named = ", ".join([path.relative_to(out).as_posix() for path in old[:_NAMED]] + ["…"] * (len(old) > _NAMED))
-        text = f"polcap: warning: {named} in {out}: exported from earlier maps; export again, or remove"
-        terminal.print_message(text, "WARNING")
+        text = f"{named} in {out}: exported earlier, with other maps, settings or facts; export again, or remove"
+        terminal.print_message(f"polcap: warning: {text}", "WARNING")
 
 
 def extra_textures(named: Sequence[str]) -> "tuple[Extra, ...]":

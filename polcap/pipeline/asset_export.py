@@ -265,7 +265,7 @@ def sidecars(out: Path) -> list[Path]:
 def outdated(records: Sequence[Path], keys: Mapping[str, str]) -> list[Path]:
     """Exports of other maps than those of the result with these cache keys: whole folders, then single files.
 
-    `records` are sidecars. A folder has one; a file that its sidecar does not list was exported from earlier maps.
+    `records` are sidecars. A folder has one; a file that it does not list was exported with another record.
     """
     folders, files = [], []
     for sidecar in records:
