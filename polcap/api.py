@@ -74,7 +74,8 @@ def process(
     clockwise
         Whether the polarizer was turned clockwise as seen in the picture.
     chart
-        Source of the color calibration; by default a ColorChecker in the reference shot.
+        Source of the color calibration; by default a ColorChecker in the reference shot. `ChartRequest("none")` uses
+        the camera's own colors.
     mask
         (H, W), true on the object, in RAW pixels; by default the object is detected.
     estimator

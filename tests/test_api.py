@@ -3,12 +3,14 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import polcap
 from polcap.api import Result
+from polcap.errors import SettingError
 from polcap.formats.maps import result_maps as maps
 from polcap.images import MaskedImage
 from polcap.pipeline import models
@@ -55,6 +57,13 @@ def test_python_takes_the_network_as_the_command_line_does(monkeypatch: pytest.M
     with pytest.raises(polcap.PolcapError, match="far enough"):
         polcap.process("nowhere")
     assert asked == [(None, None, "cpu", 0)]  # what `polcap process` without flags asks for
+
+
+@pytest.mark.parametrize(("name", "value"), [("device", "gpu"), ("estimator", "nn")])
+def test_an_unknown_device_or_estimator_is_refused(tmp_path: Path, name: str, value: str) -> None:
+    option: dict[str, Any] = {name: value}
+    with pytest.raises(SettingError, match=f"{name} '{value}': there is no such one"):
+        polcap.process(tmp_path, **option)
 
 
 def test_results_and_values_have_a_short_repr(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from polcap import cli
+from polcap.fusion import fused_maps
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import STAGES
 from tests.conftest import Command, shell
@@ -163,6 +164,16 @@ def test_clean_removes_the_stage_cache_only(result: Path, polcap: Command, tmp_p
     assert polcap("export", copy, "--obj").returncode == 0
     assert "holds no stage cache" in polcap("show", copy, "hdr").stderr
     assert polcap("clean", tmp_path / "none").returncode == 2
+
+
+def test_a_fused_object_is_refused_where_only_one_view_will_do(polcap: Command, tmp_path: Path) -> None:
+    """Also if the folder of the views is named, whose result it is."""
+    (tmp_path / "fused" / "maps").mkdir(parents=True)
+    (tmp_path / "fused" / "maps" / "maps.json").write_text(json.dumps({"format": fused_maps.FORMAT}))
+    (tmp_path / "fused" / "report.json").write_text("{}")
+    for command in (("show", tmp_path, "hdr"), ("show", tmp_path, "--animate", "turntable"), ("report", tmp_path)):
+        done = polcap(*command)
+        assert done.returncode == 2 and "fused is a fused object: see its report.html" in done.stderr
 
 
 @pytest.mark.parametrize("stage", STAGES)

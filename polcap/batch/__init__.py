@@ -21,6 +21,7 @@ from polcap.batch.unit import FINISHED, FOLDER, ProcessOptions, Unit, UnitRecord
 from polcap.errors import CaptureError
 from polcap.formats import atomic, own_folders
 from polcap.formats.capture import layouts
+from polcap.formats.own_folders import FUSED
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,10 @@ def find(root: Path, out: Path | None = None) -> list[Unit]:
     batch_folder = str((out or root) / FOLDER)
     found = [_unit(root, Path(folder), out, batch_folder) for folder in _captures(root)]
     if not found:
-        raise CaptureError(f"{root} holds no capture: no folders pol000, pol045, …, no capture.toml, no photographs")
+        raise CaptureError(
+            f"{root} holds no capture: no folders pol000, pol045, …, no capture.toml, no photographs "
+            "(views of a fused object do not count)"
+        )
     return sorted(found, key=lambda unit: layouts.natural(unit.name))
 
 
@@ -59,11 +63,27 @@ def reopen(place: Path) -> list[Unit]:
 
 def _captures(root: Path) -> Iterator[str]:
     for folder, inside, files in os.walk(root):
-        if layouts.looks_like_a_capture(Path(folder), inside, files):
+        if layouts.is_result(Path(folder)) or layouts.is_result(Path(folder, FUSED)):
+            inside.clear()  # maps are no photographs, and the views of a fused object are processed
+        elif layouts.looks_like_a_capture(Path(folder), inside, files):
             inside.clear()
             yield folder
         else:
             inside[:] = [name for name in inside if not name.startswith(".") and name not in own_folders.OURS]
+
+
+def _without_capture(root: Path, found: Sequence[Unit]) -> list[str]:
+    """Names of the sub-folders of a batch's root that hold neither a capture nor a result."""
+    used = {Path(unit.capture) for unit in found}
+    if root in used:  # the batch is one capture
+        return []
+    used |= {parent for path in used for parent in path.parents}
+    others = [path for path in layouts.children(root) if path.is_dir() and path not in used]
+    return [path.name for path in others if path.name not in own_folders.OURS and not _holds_result(path)]
+
+
+def _holds_result(folder: Path) -> bool:
+    return any(layouts.is_result(Path(inside)) for inside, _, _ in os.walk(folder))
 
 
 def _unit(root: Path, folder: Path, out: Path | None, batch_folder: str) -> Unit:
@@ -87,13 +107,15 @@ def run(
     records = {unit: record for unit in mine if (record := units.finished(unit, options)) is not None}
     wanted = [unit for unit in mine if unit not in records]
     print_line(f"{len(found)} captures, shard {plan.shard}: {len(mine)}, finished before: {len(records)}")
+    if empty := _without_capture(root, found):
+        print_line(f"no capture in {', '.join(empty)}: no folders pol000, pol045, …, and no photographs")
     by_name = {unit.name: unit for unit in wanted}
     start = time.monotonic()
     for done, record in enumerate(_process(wanted, options, plan, print_line) if wanted else (), 1):
         records[by_name[record.name]] = record
         left = timedelta(seconds=round((time.monotonic() - start) / done * (len(wanted) - done)))
         message = f": {record.message}" if record.message else ""
-        state = f"{done}/{len(wanted)} {record.name} {record.state} {record.seconds:.1f} s"
+        state = f"{done}/{len(wanted)} {record.name} {units.WORDS[record.state]} {record.seconds:.1f} s"
         print_line(f"{state}, {left} left{message}")
         if record.state not in FINISHED and not plan.keep_going:
             print_line("stopped at the first failure; --keep-going processes the others")
@@ -120,9 +142,10 @@ def status(found: Sequence[Unit]) -> dict[str, Any]:
 def table(summary: dict[str, Any]) -> str:
     """Summary of a batch as text: one line per capture, then the counts."""
     rows = [
-        f"{row['state']:12}{row['seconds']:8.1f} s  {row['name']}  {row['says']}".rstrip() for row in summary["rows"]
+        f"{units.WORDS[row['state']]:14}{row['seconds']:8.1f} s  {row['name']}  {row['says']}".rstrip()
+        for row in summary["rows"]
     ]
-    counts = ", ".join(f"{count} {state}" for state, count in summary["states"].items())
+    counts = ", ".join(f"{count} {units.WORDS[state]}" for state, count in summary["states"].items())
     return "\n".join([*rows, f"{summary['finished']} of {summary['captures']} finished ({counts})"])
 
 

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 import msgspec
 
-from polcap.batch.unit import FINISHED, FOLDER, Unit, UnitRecord
+from polcap.batch.unit import FINISHED, FOLDER, WORDS, Unit, UnitRecord
 from polcap.formats import atomic
 
 _COLUMNS = ("name", "state", "verdict", "expected_error_deg", "seconds", "attempts", "asset", "report", "says")
@@ -53,7 +53,7 @@ def write(batch_folder: Path, units: Sequence[Unit], records: Sequence[UnitRecor
 
 
 def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[UnitRecord]) -> str:
-    states = ", ".join(f"{count} {state}" for state, count in totals["states"].items())
+    states = ", ".join(f"{count} {WORDS[state]}" for state, count in totals["states"].items())
     lines = [
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{FOLDER}</title><style>{_STYLE}</style>',
         f"<h1>{totals['finished']} of {totals['captures']} captures finished ({escape(states)})</h1>",
@@ -62,7 +62,7 @@ def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[UnitR
     if wrong:
         lines.append("<table><tr><th>capture</th><th></th><th>reason and remedy</th></tr>")
         lines += [
-            f'<tr><td>{escape(r.name)}</td><td class="{r.state}">{r.state}</td><td>{escape(r.message)}</td></tr>'
+            f'<tr><td>{escape(r.name)}</td><td class="{r.state}">{WORDS[r.state]}</td><td>{escape(r.message)}</td></tr>'
             for r in wrong
         ]
         lines.append("</table>")

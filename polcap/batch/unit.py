@@ -15,7 +15,7 @@ import traceback
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import msgspec
 from msgspec.structs import replace
@@ -32,6 +32,7 @@ from polcap.pipeline.cache import fingerprint
 from polcap.pipeline.path import UserInput
 
 State = Literal["todo", "running", "interrupted", "done", "gates", "failed", "bug", "crashed"]
+WORDS: dict[State, str] = {**{state: state for state in get_args(State)}, "gates": "gate failed"}  # for people
 FINISHED: tuple[State, ...] = ("done", "gates")  # the asset is there
 FOLDER = own_folders.BATCH  # in ROOT or --out: records, thumbnails, summary, job files; safe to delete
 

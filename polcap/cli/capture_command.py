@@ -54,7 +54,7 @@ def capture(
         "camera": camera,
         "angles_deg": options.angles_deg(angles),
         "bracket": None if bracket is None else exposure_bracket.parse_bracket(bracket),
-        "repeat_deg": None if repeat is None else options.numbers("--repeat", repeat),
+        "repeat_deg": None if repeat is None else options.numbers("--repeat", repeat, "write 45 or 0,90"),
         "ambient": ambient or None,
         "chart": chart or None,
         "cross": cross or None,

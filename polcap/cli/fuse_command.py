@@ -9,6 +9,7 @@ from typer import Argument, Context, Option
 from polcap import resource_limits, terminal
 from polcap.cli import options
 from polcap.errors import SettingError
+from polcap.formats import own_folders
 
 _NEEDED = ("embreex", "manifold3d", "skimage", "uvunwrap")  # packages of the extra [fusion]
 
@@ -55,7 +56,7 @@ def fuse(
         angles_deg=options.angles_deg(angles),
         clockwise=clockwise,
     )
-    target = out or folder / fuse_run.OUTPUT
+    target = out or folder / own_folders.FUSED
     chosen = settings.fill_sections(FusionSettings, own)
     steps = terminal.Steps()
     about = fuse_run.fuse(wanted, chosen, target, terminal.print_progress, steps.stage)

@@ -9,19 +9,26 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Option
 
+from polcap import terminal
 from polcap.errors import SettingError
+from polcap.formats import own_folders
 
 if TYPE_CHECKING:
     from polcap.formats.export.texture_set import Extra
     from polcap.images import ChartRequest
 
 
+_NAMED = 5  # outdated exports that a warning lists
+
+
 def result_folder(named: Path | None) -> Path | None:
-    """The result folder that an argument names: itself, or for a capture folder the result in it."""
+    """The result folder that an argument names: itself, or the result in the folder of a capture or of views."""
     if named is None or any((named / name).exists() for name in ("work", "report.json", "maps")):
         return named
-    inside = named / "polcap"
-    return inside if (inside / "report.json").exists() or (inside / "work").is_dir() else named
+    for inside in (named / own_folders.OUTPUT, named / own_folders.FUSED):
+        if (inside / "report.json").exists() or (inside / "work").is_dir():
+            return inside
+    return named
 
 
 def choice(meaning: str) -> Any:
@@ -67,15 +74,15 @@ Memory = Annotated[float, Option(min=0, help="Most memory to take, GB; 0 is no l
 
 def angles_deg(text: str | None) -> tuple[float, ...] | None:
     """Parse --angles, in degrees; None without it."""
-    return None if text is None else numbers("--angles", text)
+    return None if text is None else numbers("--angles", text, "write 0,45,90")
 
 
-def numbers(flag: str, text: str) -> tuple[float, ...]:
-    """Parse a comma-separated list of finite numbers of an option `flag`."""
+def numbers(flag: str, text: str, remedy: str) -> tuple[float, ...]:
+    """Parse a comma-separated list of finite numbers of an option `flag`; `remedy` ends the error's message."""
     try:
         found = tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise SettingError(f"{flag} {text}: not numbers separated by commas") from None
+        raise SettingError(f"{flag} {text}: not numbers separated by commas; {remedy}") from None
     if not all(map(math.isfinite, found)):
         raise SettingError(f"{flag} {text}: every number must be finite")
     return found
@@ -86,11 +93,26 @@ def catalog_fields(stated: Sequence[str]) -> dict[str, str]:
     from polcap.images import CatalogEntry
 
     known = [field.name for field in fields(CatalogEntry)]
+    for text in stated:
+        if "=" not in text:
+            raise SettingError(f'--about {text}: write FACT=TEXT, for example title="Vase with handles"')
     found = dict(text.partition("=")[::2] for text in stated)
     for key in found:
         if key not in known:
             raise SettingError(f"--about {key}: there is no such fact; there are {', '.join(known)}")
     return found
+
+
+def warn_of_outdated_exports(out: Path, records: Sequence[Path]) -> None:
+    """Print a warning if exports with these sidecars in a result folder, or files of them, have other maps or facts."""
+    from polcap.formats import text_file
+    from polcap.pipeline import asset_export
+
+    old = asset_export.outdated(records, text_file.read_json(out / "report.json").get("keys", {}))
+    if old:
+        named = ", ".join([path.relative_to(out).as_posix() for path in old[:_NAMED]] + ["…"] * (len(old) > _NAMED))
+        text = f"{named} in {out}: exported earlier, with other maps, settings or facts; export again, or remove"
+        terminal.print_message(f"polcap: warning: {text}", "WARNING")
 
 
 def extra_textures(named: Sequence[str]) -> "tuple[Extra, ...]":
@@ -132,7 +154,7 @@ def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
         raise SettingError("--chart and --no-chart exclude each other; leave one out")
     if Path(text).suffix == ".toml":
         return ChartRequest("profile", profile=calibrations.read_profile(Path(text)))
-    corners = numbers("--chart", text)
+    corners = numbers("--chart", text, "give 8 numbers, or a color profile that ends in .toml")
     if len(corners) != 8:
         raise SettingError(f"--chart gives {len(corners)} numbers; four corners have 8, a profile ends in .toml")
     return ChartRequest("corners", corners=np.reshape(corners, (4, 2)))

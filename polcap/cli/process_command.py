@@ -101,8 +101,8 @@ def _process(stated: dict[str, Any], target: Path, request: str | None) -> None:
     from dataclasses import replace
 
     from polcap.formats.capture import reader as captures
+    from polcap.pipeline import asset_export, unchanged
     from polcap.pipeline import run as pipeline
-    from polcap.pipeline import unchanged
     from polcap.pipeline.path import STAGES
 
     capture, supplied, config = _inputs(stated)
@@ -115,5 +115,6 @@ def _process(stated: dict[str, Any], target: Path, request: str | None) -> None:
         work = str(target / "work")
         terminal.print_data({"until": stated["until"], "work": work} if stated["json"] else work)
         return
+    options.warn_of_outdated_exports(target, asset_export.sidecars(target))
     unchanged.remember(target, request, table)
     terminal.print_result(about, target, stated["json"], stated["open_"])

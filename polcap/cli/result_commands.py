@@ -93,7 +93,7 @@ def export(
     flags["iiif"] = iiif is not None
     formats = tuple(name for name in presets.FORMATS if flags[name])
     if preset and formats:
-        raise SettingError(f"--preset {preset[0]} brings its formats; leave out --{formats[0]}")
+        raise SettingError(f"--preset {preset[0]} brings its formats; write --{formats[0]} by a second export")
     plain = ExportRequest(
         formats=formats or ("gltf", "obj"),
         images=images,
@@ -110,7 +110,9 @@ def export(
     )
     wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
     write = fuse_run.export if fused_maps.is_fused(result) else pipeline.export
-    written = [str(file) for file in write(result, *wanted)]
+    files = write(result, *wanted)
+    options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
+    written = [str(file) for file in files]
     terminal.print_data({"written": written} if json else "\n".join(written))
 
 
@@ -132,6 +134,7 @@ def show(
     from polcap.pipeline import run as pipeline
     from polcap.pipeline.path import STAGES
 
+    _check_single(result, "show")
     if (stage is None) + (not all_) + (animate is None) != 2:
         raise SettingError(f"show {result}: give one of a stage ({', '.join(STAGES)}), --all or --animate")
     if animate is not None:
@@ -195,6 +198,7 @@ def report(
         return
     from polcap.pipeline import run as pipeline
 
+    _check_single(result, "report")
     about = pipeline.judge_again(result)
     terminal.print_data(about if json else str(result / "report.html"))
     if open_:
@@ -218,6 +222,17 @@ def clean(
     rows = [f"{size / 1e6:9.2f} MB  {work}" for work, size in removed.items()]
     terminal.print_data({"removed": removed, "bytes": total, "dry_run": dry_run} if json else "\n".join(rows))
     terminal.print_progress(f"{total / 1e6:.1f} MB {'would be free' if dry_run else 'are free'}")
+
+
+def _check_single(result: Path, command: str) -> None:
+    """Raise a SettingError for the result of `polcap fuse`, which has other stages."""
+    from polcap.fusion import fused_maps
+
+    if fused_maps.is_fused(result):
+        raise SettingError(
+            f"`polcap {command}` is for results of one view, and {result} is a fused object: see its report.html and "
+            "asset/turntable.webp, or give one of its views"
+        )
 
 
 def _results(named: Path) -> Iterator[Path]:

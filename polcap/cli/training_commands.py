@@ -18,7 +18,9 @@ def train(
     preset: Annotated[Literal["cpu", "gpu"], choice("Size of the network and of a batch.")] = "cpu",
     minutes: Annotated[float, Option(min=0.1, help="Training time, resumed parts included.")] = 90,
     samples: Annotated[int | None, Option(min=1, help="Pictures to learn from, instead of minutes.")] = None,
-    variant: Annotated[str, Option(help="Leave one thing out, for ablations; see training/variants.py.")] = "ours",
+    variant: Annotated[
+        str, Option(help="Leave one thing out, such as 'plain skips'; an unknown name lists all.")
+    ] = "ours",
     ablation: Annotated[
         bool,
         Option("--ablation", help="Train every variant, one after the other, and write the table of their errors."),

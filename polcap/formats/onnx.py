@@ -140,7 +140,7 @@ def _bytes(path: Path) -> bytes:
     try:
         return text_file.read_bytes(path, _MAX_BYTES)
     except OSError as error:
-        raise ModelError(f"{path}: {error.strerror or error}; name a model file with --model") from error
+        raise ModelError(f"{path}: {error.strerror or error}; give the path of an ONNX model") from error
 
 
 def providers(path: Path) -> dict[str, str]:

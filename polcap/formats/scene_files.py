@@ -20,6 +20,8 @@ def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int64]]:
 
     Raises DecodeError: the file is missing, of an unknown format, damaged, or holds no triangle.
     """
+    if not path.is_file():
+        raise DecodeError(f"{path}: no such file; give a mesh as PLY, OBJ, STL or GLB")
     try:
         vertices, faces = _compact(path) if path.suffix == ".npz" else _any(path)
     except OSError as error:
@@ -66,7 +68,7 @@ def read_textures(folder: Path, side: int = 256) -> Floats:
 
 
 def _picture(path: Path, side: int) -> Floats:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None  # OpenCV would print a warning
     if image is None:
         raise DecodeError(f"{path} is missing or not a picture; a texture set has an albedo.jpg and a roughness.jpg")
     return area_mean(image, (side, side)).astype(np.float32) / 255

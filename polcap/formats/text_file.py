@@ -109,6 +109,8 @@ def fault(error: msgspec.ValidationError, data: Any, kind: type[msgspec.Struct])
         return f"{f'{where}.' if where else ''}{unknown[1]}: there is no such key; {hint}"
     if message.startswith("Invalid enum value"):
         message = f"not one of {', '.join(map(str, _of(form, inspect.LiteralType).values))}"
+    elif message.startswith("Expected `str`"):
+        message = "is not text; put it in quotes"
     text = f"{message[:1].lower()}{message[1:]}"
     if not where or isinstance(value, (dict, list, tuple)):
         return f"{where}: {text}" if where else text

@@ -26,7 +26,6 @@ from polcap.quality import gates
 from polcap.quality.gate import Gate, State
 from polcap.report import animation
 
-OUTPUT = "fused"  # default folder of the result, in the session's folder
 _LODS = 2  # coarser levels, each with a quarter of the triangles
 _SIDE = 480  # px of an animation's frame
 # limits of the gates
@@ -163,8 +162,10 @@ def _gates(found: Session, results: FusionResults, rows: Sequence[Mapping[str, A
     remedy = "" if state == "pass" else "Keep the board flat, and focus and zoom unchanged"
     yield Gate("poses", state, value, _MOST_RESIDUAL_PX, message, remedy, unit="px")
     yield _agreement_gate(rows)
-    seen = _seen(results)
-    state, remedy = ("pass", "") if seen >= _LEAST_SEEN else ("warn", "Take a second ring of views from higher up")
+    seen, state, remedy = _seen(results), "pass", ""
+    if seen < _LEAST_SEEN:
+        few = len(found.used) < _FEW_VIEWS
+        state, remedy = "warn", "Shoot more views" if few else "Take a second ring of views from higher up"
     yield Gate("seen", state, seen, _LEAST_SEEN, f"Views saw {seen:.0%} of the surface; the rest is filled", remedy)
     whole = is_closed(results.mesh)
     message = "Every edge of the mesh belongs to two triangles" if whole else "The mesh has open edges"

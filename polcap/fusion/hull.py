@@ -22,6 +22,8 @@ _COARSE = 48  # steps of the grid that finds the object's box
 _MARGIN = 3  # steps around the object
 _NEAR = 3.5  # steps from the surface within which distances are exact; two points lie at most √3 steps apart
 _THIN = 2  # steps; handles and tunnels up to twice as thick are taken for false
+_LARGEST_CUT = 0.002  # of the body's volume; a larger thin part with loops is a wall with holes, no handle
+_EDGE = 0.01  # steps inside the surface, of points that touch others of the body by an edge alone
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,29 @@ def plain_body(distance: Floats, step: float) -> Floats:
     body = _without_false_loops(body)
     body = ndimage.binary_fill_holes(_largest_part(body))
     near = 0.05 * step  # where the body was changed, its surface lies beside the changed points
-    return np.where(body, np.minimum(distance, -near), np.maximum(distance, near)).astype(np.float32)
+    changed = np.where(body, np.minimum(distance, -near), np.maximum(distance, near))
+    touching = _touches_by_an_edge(body)  # there marching cubes joins neither, as `_euler` counts
+    changed[touching] = -_EDGE * step
+    return changed.astype(np.float32)
+
+
+def _touches_by_an_edge(body: Bools) -> Bools:
+    """Points of a body that are joined to another by a cube's edge, but not by faces around this edge."""
+    touching = np.zeros_like(body)
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        corner = {(i, j): _corner(body, a, b, i, j) for i, j in product(range(2), range(2))}
+        one = corner[0, 0] & corner[1, 1] & ~corner[0, 1] & ~corner[1, 0]
+        other = corner[0, 1] & corner[1, 0] & ~corner[0, 0] & ~corner[1, 1]
+        for (i, j), pair in (((0, 0), one), ((1, 1), one), ((0, 1), other), ((1, 0), other)):
+            _corner(touching, a, b, i, j)[pair] = True
+    return touching
+
+
+def _corner(array: Bools, a: int, b: int, i: int, j: int) -> Bools:
+    """View of corner (i, j) of all squares of points in the plane of axes a and b."""
+    box = [slice(None)] * 3
+    box[a], box[b] = slice(i, array.shape[a] - 1 + i), slice(j, array.shape[b] - 1 + j)
+    return array[tuple(box)]
 
 
 def _largest_part(body: Bools) -> Bools:
@@ -134,7 +158,7 @@ def _largest_part(body: Bools) -> Bools:
 def _without_false_loops(body: Bools) -> Bools:
     """Body with its thin tunnels filled and thin handles cut, where either raises the Euler number.
 
-    A part that closing adds or opening removes is taken over if that leaves fewer loops and no further body.
+    A part that closing adds or opening removes is taken over if that leaves fewer loops, one body and no enclosed hole.
     """
     for radius in range(1, _THIN + 1):
         ball = ndimage.iterate_structure(ndimage.generate_binary_structure(3, 1), radius)
@@ -148,13 +172,15 @@ def _without_false_loops(body: Bools) -> Bools:
 
 def _take_over(body: Bools, change: Bools, value: bool) -> Bools:
     label, _ = ndimage.label(change, np.ones((3, 3, 3)))
+    largest = np.inf if value else _LARGEST_CUT * np.count_nonzero(body)
     for number, box in enumerate(ndimage.find_objects(label), 1):
         around = tuple(slice(max(side.start - 2, 0), side.stop + 2) for side in box)
-        after = np.where(label[around] == number, value, body[around])
-        if _euler(after) > _euler(body[around]):
+        part = label[around] == number
+        after = np.where(part, value, body[around])
+        if np.count_nonzero(part) <= largest and _euler(after) > _euler(body[around]):
             changed = body.copy()
             changed[around] = after
-            if ndimage.label(changed)[1] == 1:
+            if ndimage.label(changed)[1] == 1 and ndimage.label(np.pad(~changed, 1, constant_values=True))[1] == 1:
                 body = changed
     return body
 

@@ -28,13 +28,13 @@ _LIFT = 0.3  # steps off the surface where rays towards the lenses start; the nu
 _FACING = 0.1  # least cosine between a vertex's normal and the direction to a lens that sees it
 _CAUCHY = np.radians(12.0)  # rad; a view that differs by as much from the mean counts half
 _RIM_DEPTH = 3.0  # steps inside the silhouette where rims are searched
-_RIM_LAYER = 1.0  # steps; of the outermost layer of this thickness the vertex most square to the ray is the rim
-_RIM_COSINE = 0.5  # largest cosine between a rim's measured normal and its ray
-_RIM_WEIGHT = 1.0  # of a rim's equation over that of an edge
+_RIM_LAYER = 0.5  # steps; the rim is a vertex of the outermost layer of this thickness
+_RIM_SIGMA = np.radians(6.0)  # 1σ of the angle between a rim's mean normal and the silhouette's; weights fall with it
+_RIM_LIMIT = 3.0  # 1σ; vertices beyond are no rims
 _HOLLOW_WEIGHT = 0.5  # of the equation that holds a carved vertex
 _HOLLOW_DEPTH = 2.0  # steps inside the hull from where on the surface was carved
 _DAMPING = 0.02  # weight of the equations displacement = 0
-_SMOOTHNESS = 0.1  # weight of the equations displacement = that of the neighbor
+_SMOOTHNESS = 0.03  # weight of the equations displacement = that of the neighbor
 _RELAXATION = 0.5  # share of the way to the neighbors' middle, along the surface
 
 
@@ -54,7 +54,7 @@ class Anchors:
     vertex: NDArray[np.intp]  # (R,)
     slope: Floats  # (R,) motion towards the place per displacement
     distance: Floats  # (R,) m from the vertex to the place
-    weight: float  # of an equation over that of an edge
+    weight: Floats  # (R,) of an equation over that of an edge
 
 
 @dataclass(frozen=True)
@@ -97,9 +97,8 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
         seen = visible(vertices, faces, outward, views, step)
         target = mean_normals(vertices, outward, seen, views)
         rims = find_rims(vertices, outward, target, views, step)
-        carved = Anchors(
-            hollow, np.ones(len(hollow)), dot(outward[hollow], start[hollow] - vertices[hollow]), _HOLLOW_WEIGHT
-        )
+        back = dot(outward[hollow], start[hollow] - vertices[hollow])
+        carved = Anchors(hollow, np.ones(len(hollow)), back, np.full(len(hollow), _HOLLOW_WEIGHT))
         move = _displacements(vertices, faces, outward, target, [rims, carved])
         vertices = _inside(vertices + outward * move[:, None], hull)
     return FittedSurface(vertices, faces, target.agreement, neighbors)
@@ -167,8 +166,9 @@ def find_rims(
 ) -> Anchors:
     """One vertex for each piece of each silhouette, a step long.
 
-    Of the outermost vertices at the piece it is the one with the measured normal most nearly square to the ray. To
-    pin all of them would freeze the hull, because each of its vertices touches some silhouette's cone.
+    Of the outermost vertices at the piece it is the one with the mean normal nearest to the silhouette's, which is
+    square to the ray. To pin all of them would freeze the hull, because each of its vertices touches some
+    silhouette's cone.
     """
     found = []
     for view in views:
@@ -179,15 +179,15 @@ def find_rims(
         piece = np.unique(np.round(pixel / side), axis=0, return_inverse=True)[1].ravel()
         outermost = np.full(piece.max(initial=0) + 1, -np.inf)
         np.maximum.at(outermost, piece, distance[near])
-        across = np.abs(dot(target.normal[near], view.towards(vertices[near])))
-        across[distance[near] < outermost[piece] - _RIM_LAYER * step] = 2  # covered by others
-        order = np.lexsort((across, piece))
+        off2 = _angle2(target.normal[near], out) / _RIM_SIGMA**2
+        off2[distance[near] < outermost[piece] - _RIM_LAYER * step] = np.inf  # covered by others
+        order = np.lexsort((off2, piece))
         first = order[np.diff(piece[order], prepend=-1) > 0]
-        first = first[across[first] < _RIM_COSINE]
+        first = first[off2[first] < _RIM_LIMIT**2]
         slope = dot(out[first], outward[near[first]])
-        found.append(np.stack([near[first], slope, -distance[near[first]]]))
-    vertex, slope, distance = np.concatenate(found, axis=1)
-    return Anchors(vertex.astype(np.intp), slope, distance, _RIM_WEIGHT)
+        found.append(np.stack([near[first], slope, -distance[near[first]], np.exp(-off2[first] / 2)]))
+    vertex, slope, distance, weight = np.concatenate(found, axis=1)
+    return Anchors(vertex.astype(np.intp), slope, distance, weight)
 
 
 def _displacements(

@@ -121,7 +121,9 @@ def _enough(session: Session) -> None:
     if len(session.used) < LEAST_VIEWS:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in session.left_out.items())
         raise CaptureError(
-            f"{len(session.used)} views can be used, {LEAST_VIEWS} are needed" + (f" ({reasons})" if reasons else "")
+            f"{len(session.used)} views can be used, {LEAST_VIEWS} are needed"
+            + (f" ({reasons})" if reasons else "")
+            + "; shoot more, 12 for a simple shape"
         )
 
 

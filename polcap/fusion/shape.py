@@ -14,10 +14,8 @@ from polcap.fusion.small_views import reduce_views
 from polcap.fusion.values import ClosedMesh, FusionView
 from polcap.stages import stage
 
-_ROUNDS, _FIRST_ROUNDS = (
-    7,
-    4,
-)  # of the surface's fit, and of these before hollows are searched; docs/benchmarks/fusion.md
+_ROUNDS = 7  # of the surface's fit; docs/benchmarks/fusion.md
+_FIRST_ROUNDS = 1  # of these before hollows are searched: a surface that sinks into a hollow hides that views disagree
 
 
 class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -26,7 +24,7 @@ class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     grid: Annotated[int, Meta(ge=40, le=300, description="steps along the object's longest side")] = 140
 
 
-@stage(version=1)
+@stage(version=2)
 def fuse_shape(views: Sequence[FusionView], settings: ShapeSettings) -> ClosedMesh:
     """Join views of one object into a closed, manifold, outward mesh in the world frame.
 

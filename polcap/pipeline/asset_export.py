@@ -6,14 +6,16 @@ same bytes, with any number of threads.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, Protocol
+
+import msgspec
 
 from polcap import parallel
 from polcap.config import Config
 from polcap.errors import SettingError
-from polcap.formats import atomic
+from polcap.formats import atomic, text_file
 from polcap.formats.export import (
     exr_layers,
     glb_geometry,
@@ -38,6 +40,7 @@ from polcap.stages import asset, surface
 
 _Writer = Callable[[], list[Path]]  # returns the files that it has written
 _NEEDED: tuple[Extra, ...] = ("object-normal",)  # by the format `iiif`
+_SUFFIXES = {".glb", ".obj", ".mtl", ".usdc", ".usdz", ".mtlx", ".exr", ".png", ".html"}  # of exported files
 _SHARING = {"obj", "usd", "materialx"}  # formats that share texture files
 
 
@@ -96,8 +99,16 @@ class ReliefSource:
     def decimated(self, whole: Asset, triangles: int) -> "DetailLevel":
         """The asset with about so many triangles."""
         maps = self.stored.maps
-        coarse = surface.decimate(self.mesh, maps.view, triangles, self.config.surface.back)
+        coarse = surface.decimate(self._front, maps.view, triangles, self.config.surface.back)
         return DetailLevel(asset.with_mesh(whole, maps, coarse.mesh), coarse)
+
+    @cached_property
+    def _front(self) -> ReliefMesh:
+        """The full mesh without its back."""
+        if self.config.surface.back == "open":
+            return self.mesh
+        settings = msgspec.structs.replace(self.config.surface, back="open")
+        return surface.triangulate(self.stored.depth, self.stored.maps, self.stored.metric, settings)
 
 
 @dataclass(frozen=True)
@@ -109,8 +120,16 @@ class DetailLevel:
 
 
 def check(wanted: ExportRequest) -> None:
-    """Raise a SettingError for an unknown preset or a missing package, before anything is computed."""
+    """Raise a SettingError for an unknown preset, a missing package or an option without effect, before any work."""
     preset = effective(wanted)
+    if wanted.color != exr_layers.LINEAR_REC709 and "exr" not in preset.formats:
+        raise SettingError(
+            f"--color {wanted.color} converts the colors of the layered EXR only; add --exr, or choose --preset archive"
+        )
+    if (wanted.images or wanted.geometry) and "gltf" not in preset.formats and not wanted.lod:
+        raise SettingError(
+            "--images and --geometry change the GLB, which is not written; leave them out, or add --gltf"
+        )
     if not {"usd", "usdz"}.isdisjoint(preset.formats):
         usd.require()
     glb_geometry.require(preset.geometry)
@@ -236,6 +255,27 @@ def _loose_textures(preset: ExportPreset, wanted: ExportRequest, whole: Asset, s
     makers |= {f"{stem}_{key.replace('-', '')}.png": texture_set.EXTRAS[key] for key in wanted.extras}
     known = whole.displacement is not None
     return {file: make(whole) for file, make in makers.items() if known or make is not texture_set.displacement}
+
+
+def sidecars(out: Path) -> list[Path]:
+    """The records of provenance of all exports of a result."""
+    return sorted((out / "asset").glob("**/*.provenance.json"))
+
+
+def outdated(records: Sequence[Path], keys: Mapping[str, str]) -> list[Path]:
+    """Exports of other maps than those of the result with these cache keys: whole folders, then single files.
+
+    `records` are sidecars. A folder has one; a file that it does not list was exported with another record.
+    """
+    folders, files = [], []
+    for sidecar in records:
+        about, folder = text_file.read_json(sidecar), sidecar.parent
+        if about.get("stages") != keys:
+            folders.append(folder)
+        else:
+            known = {folder / name for name in about.get("files", {})} | {sidecar}
+            files += [file for file in sorted(folder.iterdir()) if file.suffix in _SUFFIXES and file not in known]
+    return folders + files
 
 
 def effective(wanted: ExportRequest) -> ExportPreset:

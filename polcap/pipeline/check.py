@@ -152,14 +152,16 @@ def _moved(chart: ChartRequest, step: int) -> ChartRequest:
 def table(verdict: Verdict) -> str:
     """The verdict as text for the terminal, on one screen."""
     head = "keep" if verdict.keep else f"reshoot {', '.join(verdict.shots)}".rstrip()
+    if not verdict.keep and not verdict.shots:  # the fault is of the whole capture
+        head += f": {', '.join(line.name for line in verdict.lines if line.state == 'fail')}"
     if verdict.keep and verdict.needs:
         head += f", and process it with {verdict.needs}"
     rows = [f"{head}   ({verdict.capture}, {verdict.seconds:.1f} s)"]
     for line in verdict.lines:
         limit = ""
         if isinstance(line.limit, float | int):
-            number = f"{100 * line.limit:g}" if line.unit == "%" else f"{line.limit:g}"
-            limit = f" (limit {number} {line.unit})".replace(" )", ")")
+            number, unit = (100 * line.limit, "%") if line.unit == "1" else (line.limit, line.unit)
+            limit = f" (limit {number:g} {unit})".replace(" )", ")")
         cost = f", costs about {line.cost_deg:.0f}°" if line.cost_deg >= 1 and line.state in ("warn", "fail") else ""
         rows.append(f"{line.state:13}{line.name:14}{line.message}{limit}{cost}")
         if line.remedy:

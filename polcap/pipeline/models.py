@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from polcap.errors import ModelError, SettingError
 from polcap.formats import onnx, shipped_data
@@ -10,9 +10,11 @@ from polcap.images import Device, Network
 from polcap.stages.infer import fine
 from polcap.stages.mask import mask_channels
 
+Estimator = Literal["network", "analytic"]
+
 
 def load_network(
-    estimator: Literal["network", "analytic"] | None, model: Path | None, device: Device = "cpu", threads: int = 0
+    estimator: Estimator | None, model: Path | None, device: Device = "cpu", threads: int = 0
 ) -> Network | None:
     """Open the network of the normal estimator: the named model, else the shipped one; None: the analytic estimator.
 
@@ -25,6 +27,12 @@ def load_network(
     SettingError
         A model was named for the analytic estimator.
     """
+    for name, value, known in (
+        ("estimator", estimator, (*get_args(Estimator), None)),
+        ("device", device, get_args(Device)),
+    ):
+        if value not in known:  # from Python; the command line has checked it
+            raise SettingError(f"{name} {value!r}: there is no such one; choose {' or '.join(map(repr, known))}")
     if estimator == "analytic":
         if model is not None:
             raise SettingError("--model and --estimator analytic exclude each other; leave one out")

@@ -11,7 +11,7 @@ from polcap.images import Floats, Quality
 from polcap.results import Results
 
 State = Literal["pass", "warn", "fail", "not measured"]
-Unit = Literal["%", "px", "°", "×", "ΔE2000", ""]
+Unit = Literal["1", "px", "°", "×", "ΔE2000", ""]
 
 MOST_DEG = 90.0  # of an error: normals face the camera
 DEGREES_PER_GAIN = 600.0  # 1 % of a shot's light tilts facing pixels by about 6° (error budget)
@@ -28,7 +28,7 @@ class Gate(msgspec.Struct, frozen=True):
     remedy: str = ""  # advice to the user, unless it passed
     cost_deg: float = 0.0  # added to the expected error of the normals, squared
     shots: tuple[str, ...] = ()  # names of the shots to take again; empty: no single shot is the cause
-    unit: Unit = "%"
+    unit: Unit = "1"  # a share or a number, as in report.json's units
 
     def __post_init__(self) -> None:
         """Replace NumPy scalars by Python numbers, for JSON."""
@@ -74,7 +74,7 @@ def at_most(
     remedy: str,
     shots: tuple[str, ...] = (),
     cost_deg: float = 0.0,
-    unit: Unit = "%",
+    unit: Unit = "1",
     beyond: State = "fail",
 ) -> Gate:
     """Make a gate on a value that must not exceed its limit; a value that is None or not finite is not measured.

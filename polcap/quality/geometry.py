@@ -159,12 +159,12 @@ def mesh(of: Mesh, limits: GateLimits) -> Gate:
         faults.append((f"The mesh has {of.pieces} pieces, more than {pieces}", of.pieces, pieces, ""))
     if of.cuts > cuts:
         message = f"Cuts of {of.cut_px:.0f} px are {of.cuts:.0%} of the outline's length, more than {cuts:.0%}"
-        faults.append((message, of.cuts, cuts, "%"))
+        faults.append((message, of.cuts, cuts, "1"))
     if faults:
         remedies.append("See the error of the normals: they fit no surface; --set surface.stiffness=0 closes all cuts")
     if of.raggedness > rim:
         message = f"The boundary is {of.raggedness:.0%} longer than when smoothed, more than {rim:.0%}"
-        faults.append((message, of.raggedness, rim, "%"))
+        faults.append((message, of.raggedness, rim, "1"))
         remedies.append("If the mask's outline is jagged, use --mask PNG")
     if faults:
         _, value, limit, unit = faults[0]
@@ -233,7 +233,7 @@ def focal_length(found: Evidence) -> Gate:
     cost = _lean(found.maps, least, most)
     times = np.exp(max(most, -least))
     message = f"The focal length is assumed and may be wrong by a factor of {times:.1f}, which bends shape and depth"
-    remedy = "State focal_length_mm and sensor_width_mm in capture.toml"
+    remedy = "State focal_length_mm and sensor_width_mm in capture.toml, a text file in the capture's folder"
     return Gate("focal length", "warn", "assumed", "known", message, remedy, round(cost, 1), unit="")
 
 

@@ -218,9 +218,9 @@ def _gain_doubt(found: Evidence, limits: GateLimits) -> Gate:
     doubt = float(measured.sigma.mean(1).max())
     if measured.source == "grey patches" and max(doubt, gloss := _GLOSS_PART * measured.chart_gloss) <= limit:
         gap, limit = measured.disagreement, limits.max_gain_disagreement
-        message = f"Grey patches and object agree on the light of each shot (1σ {100 * doubt:.2f} %)"
+        message = f"Gray patches and object agree on the light of each shot (1σ {100 * doubt:.2f} %)"
         if gap > limit:
-            message = f"Grey patches and object disagree by {100 * gap:.1f} % on a shot's light, beyond their errors"
+            message = f"Gray patches and object disagree by {100 * gap:.1f} % on a shot's light, beyond their errors"
         remedy = "Turn the chart to the camera, and light it as the object"
         return at_most("gain doubt", gap, limit, message, remedy, cost_deg=DEGREES_PER_GAIN * gap)
     if measured.source == "grey patches" and gloss > limit:

@@ -17,7 +17,7 @@ from polcap import __version__
 from polcap.config import Config
 from polcap.errors import StorageError
 from polcap.formats import atomic, text_file
-from polcap.images import Capture, Network
+from polcap.images import Capture, Frame, Network
 from polcap.quality import gates
 from polcap.quality.gate import Gate, full_size
 from polcap.report import figures, labels, page
@@ -58,11 +58,8 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
     """Camera, angles and photographs of a capture, as report.json has them."""
     shots = []
     for shot in capture.shots:
-        frames = [
-            {"file": Path(frame.path).name, "exposure_time": frame.exif.exposure_time, "digest": frame.digest}
-            for frame in shot.frames
-        ]
-        shots.append({"angle_deg": float(np.degrees(shot.angle)), "frames": frames})
+        frames = [_frame_facts(frame, Path(capture.folder)) for frame in shot.frames]
+        shots.append({"angle_deg": round(float(np.degrees(shot.angle)), 6), "frames": frames})
     camera = capture.shots[0].frames[0].exif
     return {
         "name": capture.name,
@@ -76,6 +73,17 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
         "shots": shots,
         "notes": list(capture.notes),
         "catalog": {key: text for key, text in asdict(capture.catalog).items() if text},
+    }
+
+
+def _frame_facts(frame: Frame, folder: Path) -> dict[str, Any]:
+    path, exif = Path(frame.path), frame.exif
+    return {
+        "file": (path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix(),
+        "exposure_time": exif.exposure_time,
+        "iso": exif.iso,
+        "f_number": exif.f_number,
+        "digest": frame.digest,
     }
 
 
@@ -144,6 +152,8 @@ def read(folder: Path) -> dict[str, Any]:
     except OSError as error:
         if not folder.exists():
             raise StorageError(f"{folder}: no such folder; give the result folder of `polcap process`") from error
+        if folder.is_file():
+            raise StorageError(f"{folder} is a file; give the result folder of `polcap process`") from error
         if (folder.parent / "report.json").exists():
             raise StorageError(f"{folder} is only a part of a result; give the whole, {folder.parent}") from error
         raise StorageError(f"{folder} holds no report.json; run `polcap process` first") from error

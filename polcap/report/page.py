@@ -117,7 +117,9 @@ def _gate_number(gate: Mapping[str, Any], name: str) -> str:
     """Value or limit of a quality gate, with its unit."""
     value, unit = gate[name], gate.get("unit", "")
     if isinstance(value, (int, float)) and not isinstance(value, bool):
-        shown = labels.number(100 * value if unit == "%" else value)
+        if unit == "1":
+            value, unit = 100 * value, "%"
+        shown = labels.number(value)
         return f"{shown}{unit}" if unit == "°" else f"{shown} {unit}".rstrip()
     if value is None:
         return "not measured" if name == "value" and gate["state"] != "pass" else ""

@@ -115,6 +115,6 @@ def table(plan: dict[str, Any]) -> str:
         "",
         f"rotator  {plan['rotator']}: {plan['speed_deg_s']:g} degrees/s, settles in {plan['settle_s']:g} s",
         f"camera   {plan['camera']}: {plan['overhead_s']:g} s per frame, without the exposure",
-        f"paper    about a minute (Deschaintre et al. 2021); this takes {share:.2f} of it",
+        f"compare  the published method takes about a minute (Deschaintre et al. 2021); this takes {share:.2f} of it",
     ]
     return "\n".join(lines + ([f"light    {plan['note']}"] if plan["note"] else []))

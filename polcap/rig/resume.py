@@ -12,6 +12,11 @@ from polcap.rig import capture_record
 from polcap.rig.capture_record import RigFile
 from polcap.rig.shooting_plan import CaptureOrder
 
+_DEVICES = {
+    "rotator": "its URL, such as elliptec:/dev/ttyUSB0, `manual` to turn the ring by hand",
+    "camera": "`gphoto2` for a camera on a cable, `folder:PATH` for the folder of a tethering program",
+}
+
 
 def complete_order(folder: Path, options: dict[str, Any], resume: bool) -> CaptureOrder:
     """Complete the options of a capture: `options`, else those of the capture to `resume`, else defaults.
@@ -31,7 +36,7 @@ def complete_order(folder: Path, options: dict[str, Any], resume: bool) -> Captu
                 "with --rotator and --camera"
             )
         if name not in stated:
-            raise SettingError(f"--{name} is missing; name one, or `simulated` to try without")
+            raise SettingError(f"--{name} is missing; give {_DEVICES[name]}, or `simulated` to try without")
     return CaptureOrder(**({"angles_deg": layouts.DEFAULT_DEG, "bracket": ()} | stated))
 
 

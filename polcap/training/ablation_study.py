@@ -33,6 +33,7 @@ def main(
     """
     if options.variant != "ours" or options.start:
         raise InputError("--ablation trains all variants from random weights; leave out --variant and --start")
+    evaluation_protocol.Protocol(options.data, size)  # unusable test data end the run before its hours
     report(_cost(options, count, size))
     began = time.monotonic()
     for number, name in enumerate(VARIANTS, 1):

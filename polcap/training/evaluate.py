@@ -61,7 +61,7 @@ def main(options: EvaluationOptions, report: Report = silent) -> dict[str, Score
     torch.set_num_threads(1)
     network = models.open_network(options.model)
     made = Protocol(options.data, options.size, options.protocol)
-    head = _head(options, network)
+    head = _head(options, network, made.subjects)
     rows = _evaluate_pictures(options, evaluation_baselines.mean_maps(made, options.count), head, report)
     result = _summary(head, rows)
     shown = (made.case(number) for number in range(min(_PANEL, options.count)))
@@ -74,7 +74,7 @@ def main(options: EvaluationOptions, report: Report = silent) -> dict[str, Score
     return {**result["table"], **result["ablations"]}
 
 
-def _head(options: EvaluationOptions, network: Network) -> dict[str, Any]:
+def _head(options: EvaluationOptions, network: Network, subjects: str) -> dict[str, Any]:
     """The settings and digests that identify an evaluation: if one changes, earlier results are not used again."""
     digest = hashlib.sha256()
     tests = [(options.data / "meshes" / "test").glob("*.npz"), (options.data / "materials" / "test").glob("*/*")]
@@ -82,7 +82,7 @@ def _head(options: EvaluationOptions, network: Network) -> dict[str, Any]:
         digest.update(file.relative_to(options.data).as_posix().encode() + file.read_bytes())
     found = evaluation_baselines.find_checkpoints(options.ablations)
     return {
-        "pictures": options.count, "size": options.size,
+        "pictures": options.count, "size": options.size, "subjects": subjects,
         "protocol": f"{options.protocol}.{evaluation_protocol.VERSION}",
         "materials": evaluation_protocol.PROTOCOLS[options.protocol], "camera": evaluation_protocol.CONDITIONS,
         "model": network.digest, "version": network.metadata.get("version", ""), "data": digest.hexdigest(),

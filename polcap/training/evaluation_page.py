@@ -73,7 +73,7 @@ def make_page(result: Mapping[str, Any]) -> str:
     ratios = [f"{name} {value:.2f}" for name, value in result["of_mean_maps"].items()]
     parts = [
         f"# Evaluation: {conditions['pictures']} pictures at {conditions['size']}²",
-        f"6 test meshes × 30 test materials, protocol {conditions['protocol']} ({conditions['materials']}). "
+        f"{conditions['subjects']}, protocol {conditions['protocol']} ({conditions['materials']}). "
         f"Model {conditions['model'][:12]} {conditions['version']}. Camera: {conditions['camera']}.",
         f"Standard deviation of the truth's F0 over all pictures: {conditions['f0_deviation']:.3f}.",
         _table(result["table"], PUBLISHED),

@@ -1,4 +1,4 @@
-"""The evaluation protocol: fixed pictures of 6 test meshes × 30 test materials, as cues and truth.
+"""The evaluation protocol: fixed pictures of the test meshes (6) with the test materials (30), as cues and truth.
 
 Protocol 1: diffuse light leaves through a smooth interface, and half of the materials have a high F0. Protocol 2: it
 leaves through facets of the gloss's roughness (`optics/body.py`), and F0 is that of everyday objects. Shapes, patterns
@@ -26,7 +26,7 @@ from polcap.training.camera_errors import CameraErrors, photograph
 VERSION = 1  # to be raised when a number gives other pixels
 COUNT, SIZE = 250, 512
 QUICK_COUNT, QUICK_SIZE = 50, 256
-MESHES = 6
+MESHES = 6  # of the figures in polcap's pages
 LIGHTS = 20
 _SEED = 20211121
 _FIELD_OF_VIEW = 30.0  # degrees, of the side of the picture
@@ -69,9 +69,10 @@ class Protocol:
 
     def __init__(self, data: Path, size: int, protocol: int = 1) -> None:
         files = sorted((data / "meshes" / "test").glob("*.npz"))
-        if len(files) != MESHES:
+        if not files:
             raise InputError(
-                f"{data}/meshes/test holds {len(files)} meshes, not {MESHES}; give the unchanged DATA folder"
+                f"{data}/meshes/test holds no mesh; `python -m polcap.training.import_data SOURCE {data}` converts "
+                "OBJ, GLB and PLY"
             )
         self.size, self.protocol = size, protocol
         self.names = [file.stem for file in files]
@@ -80,7 +81,7 @@ class Protocol:
 
     def case(self, number: int) -> Case:
         """Simulate the evaluation picture with this number."""
-        subject, (mesh, material) = self._subject(number, self.size), combination(number)
+        subject, (mesh, material) = self._subject(number, self.size), self._combination(number)
         rng = np.random.default_rng([_SEED, number, 1])
         light = light_transport.stokes(self.tracers[mesh], subject.places, subject.pose, subject.albedo, rng)
         with torch.random.fork_rng():
@@ -98,12 +99,20 @@ class Protocol:
             depth=subject.depth,
         )
 
+    @property
+    def subjects(self) -> str:
+        """Number of test meshes and test materials, in words."""
+        return f"{len(self.names)} test meshes × {len(self.materials)} test materials"
+
+    def _combination(self, number: int) -> tuple[int, int]:
+        return combination(number, len(self.names), len(self.materials))
+
     def truth(self, number: int, size: int) -> SurfaceMaps:
         """True maps of an evaluation picture, without simulating light."""
         return self._subject(number, size).truth
 
     def _subject(self, number: int, size: int) -> _Subject:
-        index, which = combination(number)
+        index, which = self._combination(number)
         tracer, material = self.tracers[index], self.materials[which]
         rng = np.random.default_rng([_SEED, number])
         focal = size / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
@@ -144,14 +153,15 @@ class Protocol:
         return _Subject(pose, places, albedo, truth, depth)
 
 
-def combination(number: int) -> tuple[int, int]:
+def combination(number: int, meshes: int, materials: int) -> tuple[int, int]:
     """Indices of mesh and material of an evaluation picture.
 
-    The first 30 pictures show each material once and each mesh 5 times. 180 pictures show all pairs.
+    With 6 meshes and 30 materials, the first 30 pictures show each material once and each mesh 5 times. All pairs are
+    shown by `meshes` × `materials` pictures.
     """
-    order = np.random.default_rng(_SEED).permutation(evaluation_materials.TEXTURES + evaluation_materials.PATTERNS)
-    mesh = number % MESHES
-    return mesh, int(order[(number // MESHES + 5 * mesh) % len(order)])
+    order = np.random.default_rng(_SEED).permutation(materials)
+    mesh = number % meshes
+    return mesh, int(order[(number // meshes + 5 * mesh) % len(order)])
 
 
 def body_law(number: int) -> Law:

@@ -40,6 +40,8 @@ def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
     InputError
         Nothing usable was found.
     """
+    if not source.is_dir():
+        raise InputError(f"{source}: no such folder; give the one that holds your meshes and textures")
     meshes = sorted(path for path in source.rglob("*") if path.suffix.lower() in _MESHES and path.is_file())
     textures = sorted({path.parent for path in source.rglob("*") if path.suffix.lower() in _PICTURES})
     textures = [folder for folder in textures if {"albedo", "roughness"} <= _pictures(folder).keys()]
@@ -143,4 +145,5 @@ if __name__ == "__main__":
     try:
         main(*_arguments(), lambda text: print(text, file=sys.stderr))
     except PolcapError as error:
-        sys.exit(f"polcap: error: {error}")
+        print(f"polcap: error: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)

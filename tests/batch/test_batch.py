@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,11 +13,13 @@ from contextlib import suppress
 from pathlib import Path
 from urllib.parse import unquote
 
+import numpy as np
 import pytest
 
 from polcap import batch
 from polcap.batch import unit as one
 from polcap.errors import CaptureError
+from polcap.formats.maps import png
 from tests.batch.conftest import OPTIONS
 from tests.conftest import ROOT, Command, shell
 
@@ -30,11 +33,21 @@ def test_captures_are_found_however_deep_and_results_are_not(captures: Path, tmp
         batch.find(tmp_path)
 
 
+def test_results_of_process_are_no_captures(captures: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    shutil.copytree(captures / "obj0", root / "obj0")
+    for part in ("maps", "asset"):
+        (root / "results" / part).mkdir(parents=True)
+        png.write(root / "results" / part / "normal.png", np.zeros((8, 8, 3), np.uint16))
+    (root / "results" / "report.json").write_text("{}")
+    assert [unit.name for unit in batch.find(root)] == ["obj0"]
+
+
 @pytest.mark.parametrize("more", [(), ("--write-jobs", "slurm")], ids=["run", "job file"])
 @pytest.mark.parametrize(
     ("model", "estimator", "words"),
     [
-        ("none.onnx", "network", "No such file or directory; name a model file with --model"),
+        ("none.onnx", "network", "No such file or directory; give the path of an ONNX model"),
         ("noise.onnx", "network", "noise.onnx"),
         ("noise.onnx", "analytic", "--model and --estimator analytic exclude each other"),
     ],
@@ -76,6 +89,28 @@ def test_broken_capture_stops_no_other_and_is_listed_with_its_remedy(finished: P
     table = list(csv.DictReader((finished / "polcap-batch/summary.csv").read_text().splitlines()))
     assert {row["name"]: row["report"] for row in table} == {name: row["report"] for name, row in rows.items()}
     assert page.count("<figure>") == 2 and "copy it from the card again" in page
+
+
+def test_views_and_maps_of_a_fused_object_are_no_captures(tmp_path: Path) -> None:
+    for name in ("cup/view01", "cup/view02", "jug"):
+        for angle in ("pol000", "pol045", "pol090"):
+            (tmp_path / name / angle).mkdir(parents=True)
+    (tmp_path / "cup/fused/maps").mkdir(parents=True)
+    assert [unit.name for unit in batch.find(tmp_path)] == ["cup/view01", "cup/view02", "jug"]
+    (tmp_path / "cup/fused/report.json").touch()
+    assert [unit.name for unit in batch.find(tmp_path)] == ["jug"]
+
+
+def test_folders_without_a_capture_are_named(captures: Path, tmp_path: Path, polcap: Command) -> None:
+    for name in ("broken", "lost"):
+        (tmp_path / name).mkdir()
+    shutil.copytree(captures / "broken", tmp_path / "broken", dirs_exist_ok=True)
+    for name in ("cup/fused", "jug/fused", "results/vase"):
+        (tmp_path / name / "maps").mkdir(parents=True)
+        (tmp_path / name / "report.json").touch()
+    done = polcap("batch", tmp_path, *OPTIONS)
+    assert "no capture in lost: " in done.stderr and done.returncode == 2
+    assert "no capture" not in polcap("batch", tmp_path / "broken", *OPTIONS).stderr
 
 
 def test_second_run_opens_no_finished_capture(captures: Path, finished: Path, polcap: Command) -> None:

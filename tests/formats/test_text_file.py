@@ -27,6 +27,11 @@ from polcap.synth.shooting import Shoot
         ({"step": 0.5}, Shoot, "step = 0.5: expected `float` > 1.0"),
         ({"angles_deg": [0, "x"]}, Shoot, "angles_deg[1] = 'x': expected `float`, got `str`"),
         ({"distortion": [0, "x"]}, Shoot, "distortion[1] = 'x': expected `float`, got `str`"),
+        (
+            {"catalog": {"object_number": 7.5}},
+            CaptureFile,
+            "catalog.object_number = 7.5: is not text; put it in quotes",
+        ),
         ({"angles_deg": []}, Shoot, "angles_deg: expected `array` of length >= 1"),
         ({"sensor": {"isoo": 100}}, Shoot, "sensor.isoo: there is no such key"),
     ],

@@ -9,7 +9,8 @@ pytest.importorskip("manifold3d")
 pytest.importorskip("embreex")
 
 from polcap.errors import ObjectError
-from polcap.fusion.closed_mesh import euler_number, is_closed, levels, volume
+from polcap.fusion.closed_mesh import euler_number, is_closed, iso_surface, levels, volume
+from polcap.fusion.hull import DistanceGrid, VoxelGrid, plain_body
 from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.values import ClosedMesh
 from tests.fusion.traced_views import (
@@ -65,6 +66,37 @@ def test_a_torus_keeps_its_hole() -> None:
     views = [capture(body, pose, 128) for pose in ring(body, 12)]
     fused = fuse_shape(views, ShapeSettings(grid=GRID))
     assert euler_number(fused) == 0 and is_closed(fused)
+
+
+def test_a_dent_that_no_silhouette_shows_has_its_depth() -> None:
+    sphere = trimesh.creation.icosphere(5)
+    angle = np.arccos(np.clip(sphere.vertices[:, 2], -1, 1))
+    depth = 0.15 * np.exp(-((angle / 0.45) ** 2))
+    body = stand(sphere.vertices * (1 - depth)[:, None], sphere.faces)
+    views = [capture(body, pose, 128) for pose in all_around(body, 12)]
+    fused = fuse_shape(views, ShapeSettings(grid=GRID))
+    start = body.middle + np.array([0, 0, SIZE])
+    met = trimesh.Trimesh(fused.vertices, fused.faces).ray.intersects_location([start], [[0, 0, -1.0]])[0][:, 2].max()
+    true = trimesh.Trimesh(body.triangles.vertices, body.triangles.faces)
+    bottom = true.ray.intersects_location([start], [[0, 0, -1.0]])[0][:, 2].max()
+    assert met == pytest.approx(bottom, abs=0.003 * SIZE)  # of a dent of 7.5 % of the size
+
+
+def test_parts_that_touch_by_an_edge_alone_are_not_joined() -> None:
+    distance = np.full((9, 9, 9), 0.2, np.float32)  # so near the surface that the edge could as well be inside
+    distance[2:7, 2:7, 2] = distance[2:7, 2, 2:7] = -1  # an L
+    distance[4, 3, 6] = distance[4, 4, 6] = distance[4, 4, 5] = distance[4, 5, 4] = distance[4, 5, 3] = -1  # a strut
+    body = plain_body(distance, 1.0)
+    assert body[4, 5, 3] < 0 and body[4, 4, 5] < 0
+    mesh = iso_surface(DistanceGrid(VoxelGrid(np.zeros(3), 1.0, (9, 9, 9)), body))
+    assert is_closed(mesh) and euler_number(mesh) == 2
+
+
+def test_a_thin_wall_with_a_window_is_no_handle() -> None:
+    distance = np.ones((40, 40, 40), np.float32)
+    distance[4:36, 4:36, 4:12] = distance[4:36, 4:7, 12:36] = -1  # a wall of three steps on a block
+    distance[12:28, 4:7, 18:30] = 1
+    assert np.array_equal(plain_body(distance, 1.0) < 0, distance < 0)
 
 
 def test_a_bowl_is_hollow() -> None:

@@ -20,6 +20,8 @@ from polcap.pipeline import check
 from polcap.pipeline.check import Verdict
 from polcap.pipeline.path import AUTO
 from polcap.pipeline.small_capture import reduce
+from polcap.quality.gate import Gate
+from polcap.report import page
 from polcap.stages import hdr, whitebalance
 from tests import faulty
 from tests.conftest import Command
@@ -29,6 +31,12 @@ WIDTH = 512  # the chart must be found: without its greys order and angles are m
 
 def verdict(folder: Path) -> Verdict:
     return check.inspect(captures.read(folder), Config(), networks=lambda: (None, None))
+
+
+def test_a_fault_of_no_single_shot_is_named_in_the_first_line() -> None:
+    order = Gate("order", "fail", None, None, "The outline fits another order")
+    assert check.table(check.Verdict(False, (), (order,), "vase", 1.0)).startswith("reshoot: order   (vase")
+    assert check.table(check.Verdict(False, ("45°",), (order,), "vase", 1.0)).startswith("reshoot 45°   (vase")
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -199,3 +207,11 @@ def test_corners_of_the_chart_are_moved_to_the_reduced_picture() -> None:
     edges = np.array([[-0.5, -0.5], [39.5, -0.5], [39.5, 23.5], [-0.5, 23.5]])
     moved = check._moved(ChartRequest("corners", corners=edges), 4)
     np.testing.assert_allclose(moved.corners, [[-0.5, -0.5], [9.5, -0.5], [9.5, 5.5], [-0.5, 5.5]])
+
+
+def test_shares_are_per_cent_on_the_terminal_and_shares_in_json() -> None:
+    verdict = Verdict(True, (), (Gate("mask", "pass", 0.03, 0.25, "About 3 % of the outline may be wrong"),), "bowl", 1)
+    assert "(limit 25 %)" in check.table(verdict)
+    (line,) = json.loads(json.dumps(check.shown(verdict)))["lines"]
+    assert (line["value"], line["limit"], line["unit"]) == (0.03, 0.25, "1")
+    assert page.check(line)["limit"] == "25 %"

@@ -14,6 +14,7 @@ import pytest
 from polcap.formats.export import encoders, texture_set
 from polcap.formats.export.presets import PRESETS
 from polcap.formats.maps import exr, png
+from polcap.pipeline import asset_export
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.asset_export import ExportRequest
 from tests.conftest import ROOT, Command, shell
@@ -87,6 +88,11 @@ def test_an_asset_and_the_textures_beside_it_are_spelled_alike(own: Path) -> Non
     assert {"SM_blue_jug_7.glb", "T_blue_jug_7_N.png"} <= named and not any(" " in name for name in named)
 
 
+def test_archived_textures_have_16_bits(exported: Path) -> None:
+    pictures = list((exported / "asset" / "archive").glob("*.png"))
+    assert pictures and all(png.read(file).dtype == np.uint16 for file in pictures)
+
+
 def test_sidecar_knows_photographs_settings_and_files(exported: Path) -> None:
     recorded = json.loads((exported / "asset" / "archive" / "capture.provenance.json").read_text())
     about = json.loads((exported / "report.json").read_text())
@@ -119,7 +125,10 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, own: P
     ("flags", "says"),
     [
         (["--preset", "max"], f"--preset max is none of {', '.join(PRESETS)}"),
-        (["--preset", "web", "--obj"], "leave out --obj"),
+        (["--preset", "web", "--obj"], "write --obj by a second export"),
+        (["--preset", "maya", "--color", "ACEScg"], "converts the colors of the layered EXR only"),
+        (["--obj", "--geometry", "draco"], "change the GLB, which is not written"),
+        (["--about", "title"], "--about title: write FACT=TEXT"),
         (["--about", "author=me"], "--about author: there is no such fact; there are title, creator"),
         (["--obj", "--page", ROOT / "README.md"], "README.md is not model-viewer"),
         (["--iiif", "museum.example/7"], "--iiif museum.example/7 is no web address"),
@@ -217,6 +226,17 @@ def test_texture_size_and_levels_of_detail(own: Path) -> None:
     assert len(counts) == 2 and counts[0] == pytest.approx(4 * counts[1], rel=0.1)
     origins = [document(file.read_bytes())["asset"]["extras"] for file in (own / "asset").glob("*.glb")]
     assert len({tuple(one["origin_in_camera"]) for one in origins}) == 1 and len(origins) == 3
+
+
+def test_exports_of_earlier_maps_are_named(own: Path, polcap: Command) -> None:
+    assert polcap("export", own, "--preset", "unreal", "--lod", 2, "--texture-size", 64).stderr == ""
+    asset, about = own / "asset", json.loads((own / "report.json").read_text())
+    assert asset_export.outdated(asset_export.sidecars(own), about["keys"]) == []
+    about["keys"]["surface"] = "of other maps"
+    (own / "report.json").write_text(json.dumps(about))
+    assert asset_export.outdated(asset_export.sidecars(own), about["keys"]) == [asset, asset / "unreal"]
+    again = polcap("export", own, "--preset", "unreal", "--lod", 1, "--texture-size", 64)
+    assert again.returncode == 0 and "asset/unreal/SM_capture_lod2.glb in" in again.stderr
 
 
 def test_presets_of_one_command_each_get_their_folder(own: Path, polcap: Command) -> None:

@@ -307,6 +307,15 @@ def test_the_example_from_python_runs(copy: Path, example: Path) -> None:
     assert done.returncode == 0 and "stillness pass" in done.stdout, done.stderr
 
 
+def test_the_example_against_the_truth_runs(copy: Path, example: Path) -> None:
+    script = ROOT / "examples" / "against_truth.py"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, script, example, copy], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    mean = float(done.stdout.split("mean ")[1].split("°")[0])
+    assert 0 < mean < 5 and "roughness: RMSE" in done.stdout
+
+
 def test_the_gallery_shows_each_result_and_stands_alone(copy: Path, tmp_path: Path) -> None:
     page = tmp_path / "gallery.html"
     command = [sys.executable, *map(str, (ROOT / "examples" / "gallery.py", page, copy, copy))]

@@ -282,8 +282,8 @@ def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: Evi
     ("fault", "words", "unit"),
     [
         ({"pieces": 26}, "26 pieces", ""),
-        ({"cuts": 2.5}, "250% of the outline", "%"),
-        ({"raggedness": 0.4}, "boundary is 40%", "%"),
+        ({"cuts": 2.5}, "250% of the outline", "1"),
+        ({"raggedness": 0.4}, "boundary is 40%", "1"),
     ],
 )
 def test_mesh_in_shreds_fails_by_the_figure_that_is_over(

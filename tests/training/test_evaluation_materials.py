@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap.errors import InputError
 from polcap.images import Floats
 from polcap.training import evaluation_materials
 
@@ -54,6 +53,9 @@ def test_slopes_of_materials_are_bounded(
         assert 0 < np.sqrt(np.mean(steep**2)) < 0.4 and steep.max() < 0.61, material.name
 
 
-def test_missing_texture_sets_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds 0 texture sets"):
-        evaluation_materials.test_materials(tmp_path)
+def test_without_texture_sets_the_patterns_remain(
+    library: list[evaluation_materials.TestMaterial], tmp_path: Path, places: tuple[Floats, Floats]
+) -> None:
+    alone = evaluation_materials.test_materials(tmp_path)
+    assert [material.name for material in alone] == [one.name for one in library[evaluation_materials.TEXTURES :]]
+    assert np.array_equal(alone[3].at(*places).diffuse, library[evaluation_materials.TEXTURES + 3].at(*places).diffuse)

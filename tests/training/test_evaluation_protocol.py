@@ -18,12 +18,16 @@ def made(test_data: Path) -> Protocol:
 
 
 def test_each_material_on_each_mesh_before_any_comes_again() -> None:
-    pairs = [evaluation_protocol.combination(k) for k in range(evaluation_protocol.COUNT)]
+    pairs = [evaluation_protocol.combination(k, 6, 30) for k in range(evaluation_protocol.COUNT)]
     assert len(set(pairs[:180])) == 180
     for first in range(0, 240, 30):
         meshes, materials = zip(*pairs[first : first + 30])
         assert sorted(materials) == list(range(30))
         assert all(meshes.count(mesh) == 5 for mesh in range(6))
+
+
+def test_all_pairs_of_own_meshes_and_materials_come() -> None:
+    assert len({evaluation_protocol.combination(k, 4, 22) for k in range(88)}) == 88
 
 
 def test_a_picture_follows_from_its_number_alone(made: Protocol, test_data: Path) -> None:
@@ -96,5 +100,5 @@ def test_binning_keeps_light_and_lowers_noise(test_data: Path) -> None:
 
 
 def test_missing_meshes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds 0 meshes"):
+    with pytest.raises(InputError, match="holds no mesh"):
         Protocol(tmp_path, 96)

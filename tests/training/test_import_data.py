@@ -68,6 +68,8 @@ def test_pictures_are_found_by_name_and_normals_point_down(tmp_path: Path, name:
 def test_a_folder_without_anything_usable_is_one_clear_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no mesh"):
         import_data.main(tmp_path, tmp_path / "data")
+    with pytest.raises(InputError, match="no such folder"):
+        import_data.main(tmp_path / "none", tmp_path / "data")
     command = [sys.executable, "-m", "polcap.training.import_data", str(tmp_path), str(tmp_path / "data")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "polcap: error: " in done.stderr
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "polcap: error: " in done.stderr

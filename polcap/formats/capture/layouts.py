@@ -29,6 +29,7 @@ EQUAL_STOPS = 0.15  # EXIF rounds exposure times to a sixth of a stop at most
 _FOLDER = re.compile(r"pol[ _-]?(?P<pol>\d+(?:\.\d+)?)|cross(?:[ _-]?(?P<cross>\d+(?:\.\d+)?))?", re.IGNORECASE)
 _AT_ONCE = 2  # files read in parallel: as many child processes as decode them later
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
+_VIEW = re.compile(r"view[ _-]?\d+", re.IGNORECASE)
 _FOLDER_NUMBER = re.compile(r"\d+(?:[.,]\d+)?")
 _LOSSY_SUFFIXES = {".heic", ".heif", ".hif", ".avif", ".webp"}  # of phones and small cameras; not decoded
 
@@ -72,6 +73,11 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     sub_folders, crossed = _angle_folders(folder)
     if sub_folders:
         return _folders(folder, sub_folders, crossed, angles_deg)
+    if views := _views(folder):
+        raise CaptureError(
+            f"{folder}: its sub-folders {_listed(views)} are views of one object: join them with `polcap fuse`, or "
+            "give one of them"
+        )
     pictures, notes = _list(folder)
     if not pictures:
         raise CaptureError(f"{folder}: holds no photograph that polcap reads; {_hint(folder)}")
@@ -91,17 +97,31 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
 
 def _hint(folder: Path) -> str:
     """A sentence on the likely mistake of a user who named a folder without photographs."""
-    inside = [path for path in children(folder) if path.is_dir()]
+    inside = [path for path in children(folder) if path.is_dir() and not is_result(path)]
     named = _listed([path.name for path in inside])
     if remedy := _lossy_or_packed(folder):
         return remedy
     if any(_angle_folders(path)[0] for path in inside):
-        return f"its sub-folders {named} hold captures: give one of them, or run `polcap batch` on the folder"
-    if (folder / "report.json").is_file() and (folder / "maps").is_dir():
+        return (
+            f"its sub-folders {named} hold captures: give one of them, or run `polcap batch` on the folder; for views "
+            "of one object, name them view01, view02, … and run `polcap fuse`"
+        )
+    if is_result(folder):
         return "it is a result of polcap: give the folder of the photographs"
     if inside:
         return f"its sub-folders are {named}, but polcap looks for pol000, pol045, …"
     return "give the folder that holds the photographs"
+
+
+def is_result(folder: Path) -> bool:
+    """Whether a folder is a result of `polcap process` or `polcap fuse`."""
+    return (folder / "report.json").is_file() and (folder / "maps").is_dir()
+
+
+def _views(folder: Path) -> list[str]:
+    """Sub-folders view01, view02, … that hold captures: those that `polcap fuse` joins."""
+    named = [path for path in children(folder) if path.is_dir() and _VIEW.fullmatch(path.name)]
+    return [path.name for path in named if _angle_folders(path)[0]]
 
 
 def _lossy_or_packed(folder: Path) -> str:

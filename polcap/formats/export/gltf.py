@@ -48,9 +48,8 @@ _CATALOG: Mapping[str, tuple[str, Callable[[str], Any]]] = {  # fields of `Catal
     "title": ("dc:title", _alternatives),
     "creator": ("dc:creator", lambda text: {"@list": [text]}),
     "rights": ("dc:rights", _alternatives),
-    "license": ("xmpRights:WebStatement", str),
     "object_number": ("dc:identifier", str),
-}
+}  # the license follows, see `_license`
 
 
 @dataclass(frozen=True)
@@ -180,10 +179,18 @@ def _packet(name: str, provenance: Mapping[str, str]) -> dict[str, Any]:
         "@context": _CONTEXT,
         "@id": "",
         **{term: write(stated[key]) for key, (term, write) in _CATALOG.items() if key in stated},
+        **(_license(stated["license"]) if "license" in stated else {}),
         "dc:format": "model/gltf-binary",
         "xmp:CreatorTool": f"polcap {__version__}",
-        **{f"polcap:{key}": value for key, value in provenance.items() if key not in _CATALOG},
+        **{f"polcap:{key}": value for key, value in provenance.items() if key not in (*_CATALOG, "license")},
     }
+
+
+def _license(text: str) -> dict[str, Any]:
+    """The license in XMP: WebStatement takes an address only, UsageTerms any text."""
+    if text.startswith(("http://", "https://")):
+        return {"xmpRights:WebStatement": text}
+    return {"xmpRights:UsageTerms": _alternatives(text)}
 
 
 def center(vertices: Floats) -> Floats:

@@ -96,6 +96,7 @@ PRESETS: Mapping[str, ExportPreset] = {
     ),
     "archive": ExportPreset(
         formats=("gltf", "obj", "usd", "materialx", "exr"),
-        description="every format, without loss; normals +Y; values in full precision in the layered EXR",
+        description="every format; textures of 16 bits, values in full precision in the layered EXR; normals +Y",
+        bits=16,
     ),
 }

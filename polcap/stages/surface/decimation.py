@@ -13,9 +13,12 @@ from polcap.errors import ObjectError
 from polcap.images import Floats, Mesh, ReliefMesh, View
 from polcap.optics.projection import project
 from polcap.optics.vertex_frames import vertex_frames
-from polcap.stages.surface.triangles import Back, face_areas
+from polcap.stages.surface.triangles import Back, Faces, add_back, boundary_edges, face_areas
 
 _FEWEST = 16  # triangles
+_FRONT = {"open": 1.0, "skirt": 1.0, "closed": 0.6}  # of the requested triangles: those of the front at first
+_LEAST_FRONT = 3  # a back takes no more than the other triangles; a coarse front would lose its shape
+_AROUND = {"skirt": 2, "closed": 3}  # triangles of the back, at least, per edge of the boundary
 _MEASURED = 20_000  # vertices, at most, of which the distance is measured
 
 
@@ -28,34 +31,53 @@ class DecimatedMesh:
     error_px: float  # the same in px of the maps, at the object's median depth
 
 
-def decimate(mesh: ReliefMesh, view: View, count: int, back: Back) -> DecimatedMesh:
-    """Reduce a mesh to about `count` triangles; texture coordinates are computed again from the camera's `view`.
+def decimate(front: ReliefMesh, view: View, count: int, back: Back) -> DecimatedMesh:
+    """Reduce an open mesh to about `count` triangles, those of a back included.
 
-    `back` is the setting with which the mesh was made. In an open mesh, triangles that face away from the camera are
-    removed.
+    Texture coordinates are computed again from the camera's `view`. A back is made from the boundary of the reduced
+    front: the walls of a full mesh are slivers, which no collapse removes. Triangles of the front that face away from
+    the camera are removed.
 
     Raises
     ------
     ObjectError
         Too few triangles would be left.
     """
-    import fast_simplification  # here: its 0.25 s are for exports with levels of detail alone
-
     if count < _FEWEST:
         raise ObjectError(f"a mesh of {count} triangles is under {_FEWEST}; ask for more triangles or fewer levels")
+    reduced = _simplify(front, view, round(_FRONT[back] * count))
+    folded = face_areas(reduced.uv, reduced.faces) <= 0  # by a collapse
+    reduced = _framed(front, view, reduced.vertices, reduced.faces[~folded])
+    if back != "open":
+        around = _AROUND[back] * len(boundary_edges(reduced.faces))
+        if len(reduced.faces) + around > count:
+            reduced = _simplify(reduced, view, max(count - around, count // _LEAST_FRONT))
+        reduced = _simplify(add_back(reduced, back), view, count)
+    error = _distance(front, reduced)
+    return DecimatedMesh(reduced, error, error * view.focal / float(np.nanmedian(front.depth)))
+
+
+def _simplify(mesh: ReliefMesh, view: View, count: int) -> ReliefMesh:
+    """Collapse edges until about `count` triangles are left."""
+    import fast_simplification  # here: its 0.25 s are for exports with levels of detail alone
+
+    if count >= len(mesh.faces):
+        return _framed(mesh, view, mesh.vertices, mesh.faces)
     points, faces = fast_simplification.simplify(  # which takes no read-only arrays
         np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.int32), target_count=count
     )
-    vertices = np.asarray(points, dtype=np.float64)
+    return _framed(mesh, view, np.asarray(points), np.asarray(faces))
+
+
+def _framed(mesh: ReliefMesh, view: View, vertices: Floats, faces: Faces) -> ReliefMesh:
+    """The mesh with other triangles, texture coordinates by the camera's view, and new normals and tangents."""
     height, width = mesh.depth.shape
+    used, renumbered = np.unique(faces, return_inverse=True)
+    faces = renumbered.reshape(-1, 3).astype(np.int32)
+    vertices = vertices[used].astype(np.float64)
     uv = (project(view, vertices) + 0.5) / [width, height]
-    faces = np.asarray(faces, dtype=np.int32)
-    if back == "open":
-        faces = faces[face_areas(uv, faces) > 0]  # the others were folded over by a collapse
-    used, faces = np.unique(faces, return_inverse=True)
-    vertices, uv, faces = vertices[used], uv[used], faces.reshape(-1, 3).astype(np.int32)
     normals, tangents = vertex_frames(vertices, uv, faces)
-    coarser = replace(
+    return replace(
         mesh,
         vertices=vertices.astype(np.float32),
         normals=normals.astype(np.float32),
@@ -63,8 +85,6 @@ def decimate(mesh: ReliefMesh, view: View, count: int, back: Back) -> DecimatedM
         tangents=tangents.astype(np.float32),
         faces=faces,
     )
-    error = _distance(mesh, coarser)
-    return DecimatedMesh(coarser, error, error * view.focal / float(np.nanmedian(mesh.depth)))
 
 
 def _distance(first: ReliefMesh, coarser: ReliefMesh) -> float:

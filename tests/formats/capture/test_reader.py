@@ -215,6 +215,15 @@ def test_a_folder_of_captures_is_named_as_such(tmp_path):
         capture.read(tmp_path)
 
 
+def test_views_of_one_object_are_for_fuse(tmp_path):
+    """Other files next to the views, such as a truth, do not hide the remedy; the fused result is no capture."""
+    folders(tmp_path / "view01")
+    (tmp_path / "truth.npz").write_bytes(b"PK\x05\x06" + bytes(18))
+    (tmp_path / "fused" / "maps").mkdir(parents=True)
+    with pytest.raises(CaptureError, match="sub-folders view01 are views of one object: join them with `polcap fuse`"):
+        capture.read(tmp_path)
+
+
 def test_untimed_brackets_in_one_folder_are_to_be_sorted(tmp_path):
     """No order of angles can separate them, so the message asks for none."""
     folder = pictures(tmp_path, [f"krug_{angle}_grad_{number}.png" for angle in (0, 45, 90) for number in range(3)])

@@ -97,7 +97,19 @@ def test_catalog_entry_is_in_dublin_core_and_in_the_copyright(asset: Asset) -> N
     packet = said["extensions"]["KHR_xmp_json_ld"]["packets"][0]
     assert packet["dc:title"]["rdf:_1"]["@value"] == "Krug" and packet["dc:creator"] == {"@list": ["Haus"]}
     assert packet["dc:rights"]["rdf:_1"]["@value"] == said["asset"]["copyright"] == "© Haus"
-    assert packet["xmpRights:WebStatement"] == "CC0" and packet["dc:identifier"] == "7"
+    assert packet["dc:identifier"] == "7"
+
+
+def test_only_the_address_of_a_license_is_a_web_statement(asset: Asset) -> None:
+    def packet(text: str) -> dict[str, Any]:
+        said = document(gltf.encode(asset, "ball", provenance={"license": text}))
+        found: dict[str, Any] = said["extensions"]["KHR_xmp_json_ld"]["packets"][0]
+        return found
+
+    address = "https://creativecommons.org/licenses/by/4.0/"
+    assert packet(address)["xmpRights:WebStatement"] == address
+    named = packet("CC BY 4.0")
+    assert named["xmpRights:UsageTerms"]["rdf:_1"]["@value"] == "CC BY 4.0" and "xmpRights:WebStatement" not in named
 
 
 def test_open_surface_is_seen_from_behind_too(asset: Asset) -> None:

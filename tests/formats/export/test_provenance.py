@@ -18,10 +18,12 @@ NOTHING = {"versions": {}, "polcap": "", "model": None, "settings": {}, "keys": 
 def test_photographs_have_their_sha256_and_the_catalog_entry_is_taken_over(tmp_path: Path, how: str) -> None:
     for angle in (0, 60, 120):
         picture = np.random.default_rng(angle).integers(100, 4000, (48, 64, 3)).astype(np.uint16)
-        png.write(tmp_path / f"bowl_{angle}.png", picture)
+        (tmp_path / f"pol{angle:03}").mkdir()
+        png.write(tmp_path / f"pol{angle:03}" / "bowl.png", picture)
     (tmp_path / "capture.toml").write_text(how + '[catalog]\ntitle = "Bowl"\nrights = "©"\n', encoding="utf-8")
     facts = report.capture_facts(capture.read(tmp_path))
     record = provenance.record({"capture": facts, **NOTHING}, {"rights": "CC0"})
     assert (record["title"], record["rights"], record.get("creator")) == ("Bowl", "CC0", None)
+    assert [one["angle_deg"] for one in record["photographs"]] == [0, 60, 120]  # not 59.99999999999999
     for one in record["photographs"]:
         assert one["sha256"] == hashlib.sha256((tmp_path / one["file"]).read_bytes()).hexdigest()
