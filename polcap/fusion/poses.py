@@ -57,6 +57,13 @@ class SessionCamera:
         """The lens distortion, on visible RAW pixels."""
         return Distortion(self.focal_px, self.principal_px, self.k1, self.k2)
 
+    def reduced(self, scale: float) -> "SessionCamera":
+        """The camera on a grid whose pixels are `scale` RAW pixels wide."""
+        x, y = ((principal - (scale - 1) / 2) / scale for principal in self.principal_px)
+        return replace(
+            self, focal_px=self.focal_px / scale, focal_sigma_px=self.focal_sigma_px / scale, principal_px=(x, y)
+        )
+
     def project(self, pose: Pose, world: Floats) -> Floats:
         """Visible RAW pixels (N, 2) of the photograph that show world points (N, 3) [m]."""
         x, y = projection.project(self.view, world @ pose.rotation.T + pose.translation).T

@@ -19,12 +19,14 @@ from polcap.fusion import board_corners, mask_agreement, poses, view_maps
 from polcap.fusion.board_corners import BoardCorners
 from polcap.fusion.board_eraser import erase
 from polcap.fusion.poses import LEAST_VIEWS, PosedView, SessionCamera, SessionPoses
+from polcap.fusion.silhouettes import Silhouette
 from polcap.fusion.values import FusionView
 from polcap.images import Bools, Capture, ChartRequest, Network
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import AUTO, UserInput
 from polcap.results import Results
 from polcap.stages import mask
+from polcap.stages.mask import regions
 
 _REFUSED = ("order",)  # gates of a view whose failure makes its normals wrong everywhere
 Report = Callable[[str], None]  # of what is done
@@ -93,11 +95,11 @@ def process(wanted: SessionInput, report: Report) -> tuple[Session, tuple[Fusion
     corners = _find_boards(session, wanted, report)
     solved = _solve_poses(session, corners)
     session.each(lambda name: _mask_object(name, session, wanted, corners[name], solved))
+    _enough(session)
+    _compare_masks(session, wanted)
     session.each(lambda name: _make_maps(name, session, wanted, report))
     _enough(session)
-    views, contradicting = mask_agreement.agreeing([_view(name, session, wanted) for name in session.used])
-    session.left_out |= {name: reason.removeprefix(f"{name}: ") for name, reason in contradicting.items()}
-    return session, tuple(views)
+    return session, tuple(_view(name, session, wanted) for name in session.used)
 
 
 def _read(wanted: SessionInput) -> Session:
@@ -190,11 +192,28 @@ def _mask_object(
     results = pipeline.reopen(out_of(wanted.folder, name), "align")[0]
     posed = solved.camera, solved.views[name].pose
     erased = erase(results.radiance, results.alignment, results.color, corners.board, posed)
-    largest = msgspec.structs.replace(wanted.config.mask, part=1)  # what remains of the board is smaller
+    settings = msgspec.structs.replace(wanted.config.mask, part=0)  # remains of the board are found in the next step
     found: Bools = mask.segment(
-        erased, results.alignment, results.color, None, wanted.mask_network, onnx.run, largest
+        erased, results.alignment, results.color, None, wanted.mask_network, onnx.run, settings
     ).mask
     session.supplied[name] = replace(session.supplied[name], mask=found)
+
+
+def _compare_masks(session: Session, wanted: SessionInput) -> None:
+    """Remove from the masks what no other view confirms, and leave out views whose masks contradict the others."""
+    used, contradicting = mask_agreement.agreeing([_silhouette(name, session, wanted) for name in session.used])
+    session.left_out |= contradicting
+    for view in used:
+        object_ = regions.nth_part(view.mask, 1)  # what remains of the board is smaller
+        session.supplied[view.name] = replace(session.supplied[view.name], mask=object_)
+
+
+def _silhouette(name: str, session: Session, wanted: SessionInput) -> Silhouette:
+    """The mask of a view, which is on the grid of the merged picture, with the session's camera on this grid."""
+    found, camera = session.supplied[name].mask, session.camera
+    assert found is not None and camera is not None
+    scale = pipeline.reopen(out_of(wanted.folder, name), "align")[0].radiance.view.scale
+    return Silhouette(name, found, camera.reduced(scale), session.posed[name].pose)
 
 
 def _make_maps(name: str, session: Session, wanted: SessionInput, report: Report) -> None:

@@ -1,0 +1,90 @@
+"""Masks of the views before a grid of points: which points lie inside them, and which pixels the points cover."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from polcap.fusion.poses import SessionCamera
+from polcap.fusion.values import Pose
+from polcap.images import Bools, Floats
+
+_GRID = 80  # points along the longest side of the object's box
+_COARSE = 40  # the same, to find this box
+
+
+@dataclass(frozen=True)
+class Silhouette:
+    """The object's mask in one view."""
+
+    name: str
+    mask: Bools  # (H, W) of the photograph, or reduced
+    camera: SessionCamera  # on the mask's pixels
+    pose: Pose
+
+    @property
+    def distance(self) -> float:
+        """Distance of the board's middle along the optical axis [m]."""
+        return float(-self.pose.translation[2])
+
+    def cell_px(self, step: float) -> float:
+        """Size in the mask of a step [m] at the board's distance, px."""
+        return step * self.camera.focal_px / self.distance
+
+    def inside(self, points: Floats, step: float) -> Bools:
+        """Points (P,) whose cells of size `step` [m] touch the mask; outside the picture there is no object."""
+        reach = max(round(0.9 * self.cell_px(step)), 1)
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        framed = np.pad(self.mask.astype(np.uint8), reach + 1)
+        grown = cv2.dilate(framed, disc)
+        x, y = np.rint(self.camera.project(self.pose, points) + reach + 1).astype(int).T
+        height, width = grown.shape
+        within = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        return np.asarray(within & (grown[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] > 0))
+
+    def covered(self, points: Floats, step: float) -> tuple[Bools, Bools]:
+        """Mask (h, w) on pixels as wide as a cell, and which of them the points (P, 3) cover."""
+        coarse = max(self.cell_px(step), 1.0)
+        height, width = (int(np.ceil(side / coarse)) for side in self.mask.shape)
+        mask = cv2.resize(self.mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
+        x, y = np.rint((self.camera.project(self.pose, points) + 0.5) / coarse - 0.5).astype(int).T
+        within = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        covered = np.zeros((height, width), np.uint8)
+        covered[y[within], x[within]] = 1
+        return mask, cv2.dilate(covered, np.ones((3, 3), np.uint8)) > 0
+
+    def near(self, points: Floats, step: float) -> Bools:
+        """Pixels (H, W) of the picture that the points cover."""
+        height, width = self.mask.shape
+        covered = self.covered(points, step)[1].astype(np.uint8)
+        return np.asarray(cv2.resize(covered, (width, height), interpolation=cv2.INTER_NEAREST) > 0)
+
+
+def grid_around(views: Sequence[Silhouette]) -> tuple[Floats, float]:
+    """Grid points (P, 3) [m] around the object, and their spacing [m]."""
+    reach = max(_extent(view) for view in views)
+    low, high = np.array([-reach, -0.2 * reach, -reach]), np.array([reach, 2 * reach, reach])
+    points, step = _grid(low, high, _COARSE)
+    seen = np.mean([view.inside(points, step) for view in views], axis=0)
+    there = points[seen >= max(0.5, 0.8 * seen.max())]
+    return _grid(there.min(axis=0) - step, there.max(axis=0) + step, _GRID)
+
+
+def _grid(low: Floats, high: Floats, count: int) -> tuple[Floats, float]:
+    step = float((high - low).max() / count)
+    axes = [np.arange(first, last + step, step) for first, last in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), step
+
+
+def _extent(view: Silhouette) -> float:
+    """Longer side of a mask at the board's distance [m]."""
+    row, column = np.nonzero(view.mask)
+    pixels = max(np.ptp(row), np.ptp(column)) if len(row) else 0
+    return float(pixels) * view.distance / view.camera.focal_px
+
+
+def halved(points: Floats, step: float) -> tuple[Floats, float]:
+    """The points (8 P, 3) in the corners of the cells about `points`, and their spacing [m]."""
+    corners = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    return (points[:, None] + step * corners).reshape(-1, 3), step / 2
