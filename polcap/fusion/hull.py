@@ -23,7 +23,7 @@ _MARGIN = 3  # steps around the object
 _NEAR = 3.5  # steps from the surface within which distances are exact; two points lie at most √3 steps apart
 _THIN = 2  # steps; handles and tunnels up to twice as thick are taken for false
 _LARGEST_CUT = 0.002  # of the body's volume; a larger thin part with loops is a wall with holes, no handle
-_EDGE = 0.01  # steps inside the surface, of points that touch others of the body by an edge alone
+_LOOSE = 0.01  # steps inside the surface, of points that touch others of the body by an edge alone
 
 
 @dataclass(frozen=True)
@@ -125,26 +125,27 @@ def plain_body(distance: Floats, step: float) -> Floats:
     near = 0.05 * step  # where the body was changed, its surface lies beside the changed points
     changed = np.where(body, np.minimum(distance, -near), np.maximum(distance, near))
     touching = _touches_by_an_edge(body)  # there marching cubes joins neither, as `_euler` counts
-    changed[touching] = -_EDGE * step
+    changed[touching] = -_LOOSE * step
     return changed.astype(np.float32)
 
 
 def _touches_by_an_edge(body: Bools) -> Bools:
     """Points of a body that are joined to another by a cube's edge, but not by faces around this edge."""
     touching = np.zeros_like(body)
-    for a, b in ((0, 1), (0, 2), (1, 2)):
-        corner = {(i, j): _corner(body, a, b, i, j) for i, j in product(range(2), range(2))}
-        one = corner[0, 0] & corner[1, 1] & ~corner[0, 1] & ~corner[1, 0]
-        other = corner[0, 1] & corner[1, 0] & ~corner[0, 0] & ~corner[1, 1]
-        for (i, j), pair in (((0, 0), one), ((1, 1), one), ((0, 1), other), ((1, 0), other)):
-            _corner(touching, a, b, i, j)[pair] = True
+    for axes in ((0, 1), (0, 2), (1, 2)):
+        corners = list(product(range(2), range(2)))
+        two = sum(_corner(body, axes, at).astype(np.int8) for at in corners) == 2
+        for i, j in corners:
+            alone = two & _corner(body, axes, (i, j)) & _corner(body, axes, (1 - i, 1 - j))
+            _corner(touching, axes, (i, j))[alone] = True
     return touching
 
 
-def _corner(array: Bools, a: int, b: int, i: int, j: int) -> Bools:
-    """View of corner (i, j) of all squares of points in the plane of axes a and b."""
+def _corner(array: Bools, axes: tuple[int, int], at: tuple[int, int]) -> Bools:
+    """View of one corner of all squares of neighboring points along two axes."""
     box = [slice(None)] * 3
-    box[a], box[b] = slice(i, array.shape[a] - 1 + i), slice(j, array.shape[b] - 1 + j)
+    for axis, side in zip(axes, at, strict=True):
+        box[axis] = slice(side, array.shape[axis] - 1 + side)
     return array[tuple(box)]
 
 

@@ -33,6 +33,8 @@ _RIM_SIGMA = np.radians(6.0)  # 1σ of the angle between a rim's mean normal and
 _RIM_LIMIT = 3.0  # 1σ; vertices beyond are no rims
 _HOLLOW_WEIGHT = 0.5  # of the equation that holds a carved vertex
 _HOLLOW_DEPTH = 2.0  # steps inside the hull from where on the surface was carved
+_FACET_POWER = 4  # of the cosine between a triangle and its target, in the weight: far off, they are other surfaces
+_MOST_MOVE = 1.0  # steps of a vertex in a round; more folds the surface
 _DAMPING = 0.02  # weight of the equations displacement = 0
 _SMOOTHNESS = 0.03  # weight of the equations displacement = that of the neighbor
 _RELAXATION = 0.5  # share of the way to the neighbors' middle, along the surface
@@ -100,17 +102,23 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
         back = dot(outward[hollow], start[hollow] - vertices[hollow])
         carved = Anchors(hollow, np.ones(len(hollow)), back, np.full(len(hollow), _HOLLOW_WEIGHT))
         move = _displacements(vertices, faces, outward, target, [rims, carved])
+        move = np.clip(move, -_MOST_MOVE * step, _MOST_MOVE * step)
         vertices = _inside(vertices + outward * move[:, None], hull)
     return FittedSurface(vertices, faces, target.agreement, neighbors)
 
 
 def vertex_normals(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
     """Unit normals (V, 3), means of the triangles' by area."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = cross(b - a, c - a)
+    area = _doubled_areas(vertices, faces)
     corner = faces.T.ravel()
     total = [np.bincount(corner, np.tile(area[:, axis], 3), len(vertices)) for axis in range(3)]
     return unit(np.stack(total, axis=-1))
+
+
+def _doubled_areas(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
+    """Normals (F, 3) of the triangles with twice their areas as lengths."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.asarray(cross(b - a, c - a))
 
 
 def visible(
@@ -199,7 +207,8 @@ def _displacements(
     """
     count = len(vertices)
     tilt = unit(np.sum((target.normal * target.weight[:, None])[faces], axis=1))  # (F, 3) target of each triangle
-    share = target.weight[faces].mean(axis=1)
+    facing = np.maximum(dot(tilt, unit(_doubled_areas(vertices, faces))), 0)
+    share = target.weight[faces].mean(axis=1) * facing**_FACET_POWER
     i, j = (np.concatenate([faces[:, (k + first) % 3] for k in range(3)]) for first in (0, 1))
     t, w2 = np.tile(tilt, (3, 1)), np.tile(share**2, 3)
     a_i, a_j = dot(t, outward[i]), dot(t, outward[j])
