@@ -50,7 +50,7 @@ _INDEX = 1.5  # refractive index of the diffuse law and of the Fresnel term
 class MaterialSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of the stage `material_fit` of the fusion."""
 
-    materials: Annotated[int, Meta(ge=1, le=32, description="most materials, by albedo [1]")] = 6
+    materials: Annotated[int, Meta(ge=1, le=32, description="most materials, by albedo [1]")] = 12
     normal_sigma_deg: Annotated[
         float, Meta(ge=0, le=20, description="error of the baked normals, per axis, which widens the lobes [°]")
     ] = 3.0
@@ -93,7 +93,7 @@ class Lobe:
     residual: float  # weighted mean of ln(1 + error²), in units of the expected error, and the prior's part
 
 
-@stage(version=1)
+@stage(version=2)
 def fit(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps, settings: MaterialSettings) -> AtlasMaps:
     """Refine F0 and roughness by the highlights of all views; without S0 in the views the maps stay as they are."""
     lit = [view for view in views if view.s0 is not None]

@@ -73,7 +73,7 @@ class Session:
 
 
 def _reason(name: str, error: InputError) -> str:
-    """Why a view is left out, without its name."""
+    """Why a view is left out, without its name or folder."""
     return str(error).removeprefix(f"{name}: ")
 
 
@@ -112,7 +112,7 @@ def _read(wanted: SessionInput) -> Session:
         try:
             session.captures[folder.name] = reader.read(folder, wanted.angles_deg, wanted.clockwise)
         except InputError as error:
-            session.left_out[folder.name] = _reason(folder.name, error)
+            session.left_out[folder.name] = _reason(str(folder), error)
     _enough(session)
     return session
 

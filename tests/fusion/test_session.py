@@ -1,0 +1,56 @@
+"""A session goes on without the views that cannot be used, and says why each is left out."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from polcap.config import Config
+from polcap.errors import CaptureError
+from polcap.formats.capture import reader
+from polcap.fusion import session as sessions
+from polcap.fusion.session import Session, SessionInput
+from polcap.pipeline.path import UserInput
+from tests.fusion import board_views
+
+SWAPPED = {"name": "order", "state": "fail", "says": "90°, 45°, 0° fit better", "remedy": "rename the folders"}
+
+
+def wanted(folder: Path, *names: str) -> SessionInput:
+    for name in names:
+        (folder / name).mkdir()
+    return SessionInput(folder, Config())
+
+
+def test_a_view_that_lacks_a_shot_is_left_out_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def read(folder: Path, *_: Any) -> Any:
+        if folder.name == "view03":
+            raise CaptureError(f"{folder}: 2 different polarizer angles where 3 are needed; add the missing shot")
+        return board_views.capture()
+
+    monkeypatch.setattr(reader, "read", read)
+    found = sessions._read(wanted(tmp_path, "view01", "view02", "view03", "view05"))  # view04 was never shot
+    assert found.used == ["view01", "view02", "view05"]
+    assert found.left_out == {"view03": "2 different polarizer angles where 3 are needed; add the missing shot"}
+
+
+def test_three_views_are_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reader, "read", lambda *_: board_views.capture())
+    with pytest.raises(CaptureError, match="2 views can be used, 3 are needed"):
+        sessions._read(wanted(tmp_path, "view01", "view02"))
+
+
+def test_a_view_with_swapped_angles_is_left_out_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ("view01", "view02", "view03", "view04")
+    found = Session({name: board_views.capture() for name in names}, supplied={name: UserInput() for name in names})
+
+    def run(name: str, session: Session, *_: Any) -> None:
+        session.about[name] = {"gates": [SWAPPED] if name == "view02" else []}
+
+    monkeypatch.setattr(sys.modules[sessions.__name__], "_run", run)
+    found.each(lambda name: sessions._make_maps(name, found, wanted(tmp_path), lambda _: None))
+    assert found.left_out == {"view02": "90°, 45°, 0° fit better. rename the folders"}
+    assert len(found.used) == 3
