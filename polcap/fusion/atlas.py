@@ -14,6 +14,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from polcap.errors import ObjectError, SettingError
+from polcap.fusion.closed_mesh import levels
 from polcap.fusion.values import ClosedMesh, FusionView
 from polcap.images import Bools, Floats, Mesh
 from polcap.optics import frames
@@ -22,6 +23,8 @@ from polcap.optics.vertex_frames import vertex_normals, vertex_tangents
 from polcap.stages import stage
 
 _FILLED = 0.4  # share of the texture that charts cover, about; uvunwrap reaches .4 to .63
+_TRIANGLE = 4  # map pixels to a triangle of the mesh; docs/benchmarks/fusion.md
+_FEWEST = 2000  # triangles
 _SIDES = (512, 4096)  # px, least and greatest side of a texture whose size is not set
 
 
@@ -44,24 +47,42 @@ class Atlas:
     @property
     def texel(self) -> float:
         """Side of a texel on the surface, m."""
-        corner = self.mesh.vertices[self.mesh.faces]
-        area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1).sum() / 2
-        return float(np.sqrt(area / max(len(self.position), 1)))
+        return float(np.sqrt(_area(self.mesh.vertices[self.mesh.faces]) / max(len(self.position), 1)))
 
 
-@stage(version=1)
+@stage(version=2)
 def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSettings) -> Atlas:
     """Cut a closed mesh into charts, and pack them into a square texture.
 
-    Without a set size, its side is the least power of two whose texels are no larger than pixels of the views' maps.
+    The mesh is reduced to a triangle for four pixels of the views' maps: smaller ones would cut it into charts of a few
+    texels. Without a set size, the side is the least power of two whose texels are no larger than these pixels.
 
     Raises
     ------
     SettingError
         The package uvunwrap is missing, or the charts do not fit into a texture of this size.
     """
-    side = settings.size or _side(mesh, views)
-    uv, corner, faces = _charts(mesh, side, settings.margin)
+    pixel = _pixel(mesh, views)
+    mesh = levels(mesh, [max(int(_area(mesh.vertices[mesh.faces]) / (_TRIANGLE * pixel**2)), _FEWEST)])[0]
+    if settings.size:
+        return charted(mesh, settings.size, settings.margin)
+    side = _side(mesh, pixel)
+    found = charted(mesh, side, settings.margin)
+    while found.texel > pixel and side < _SIDES[1]:  # the charts' margins took the room
+        side *= 2
+        found = charted(mesh, side, settings.margin)
+    return found
+
+
+def charted(mesh: ClosedMesh, side: int, margin: int) -> Atlas:
+    """Cut a closed mesh into charts, and pack them into a texture of `side` px, `margin` px apart.
+
+    Raises
+    ------
+    SettingError
+        The package uvunwrap is missing, or the charts do not fit into a texture of this size.
+    """
+    uv, corner, faces = _charts(mesh, side, margin)
     normals = vertex_normals(mesh.vertices.astype(np.float64), mesh.faces)[corner]
     vertices = mesh.vertices[corner].astype(np.float64)
     unwrapped = Mesh(
@@ -101,11 +122,18 @@ def _charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[n
     return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=-1), np.asarray(found.xref, np.int64), faces
 
 
-def _side(mesh: ClosedMesh, views: tuple[FusionView, ...]) -> int:
-    """Side of the texture [px], a power of two, for which a texel is no larger than a pixel of the views' maps."""
-    corner = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1).sum() / 2
-    middle = mesh.vertices.mean(axis=0)
-    pixel = np.median([-(one.pose.rotation @ middle + one.pose.translation)[2] / one.view.focal for one in views])
-    wanted = np.log2(np.sqrt(area / _FILLED) / pixel)
+def _side(mesh: ClosedMesh, pixel: float) -> int:
+    """Least side of the texture [px], a power of two, with which a texel may be no larger than `pixel` [m]."""
+    wanted = np.log2(np.sqrt(_area(mesh.vertices[mesh.faces]) / _FILLED) / pixel)
     return int(np.clip(2 ** np.ceil(float(wanted)), *_SIDES))
+
+
+def _pixel(mesh: ClosedMesh, views: tuple[FusionView, ...]) -> float:
+    """Side of a pixel of the views' maps at the object [m]."""
+    middle = mesh.vertices.mean(axis=0)
+    return float(np.median([-(one.pose.rotation @ middle + one.pose.translation)[2] / one.view.focal for one in views]))
+
+
+def _area(corner: Floats) -> float:
+    """Area of triangles (F, 3, 3)."""
+    return float(np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1).sum() / 2)

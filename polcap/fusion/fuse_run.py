@@ -116,7 +116,7 @@ def document(
             },
             "mesh": {
                 "metric": True,
-                "triangles": len(results.mesh.faces),
+                "triangles": len(results.atlas.mesh.faces),
                 "extent": np.ptp(results.mesh.vertices, axis=0).tolist(),
                 "closed": is_closed(results.mesh),
                 "seen": _seen(results),

@@ -95,7 +95,7 @@ class FusedSource:
         """The asset with about so many triangles, an atlas of its own, and the textures of the full mesh."""
         (coarse,) = levels(closed(self.atlas.mesh), [triangles])
         side = self.maps.mask.shape[0]
-        atlas = atlases.unwrap(coarse, (), AtlasSettings(size=side))
+        atlas = atlases.charted(coarse, side, AtlasSettings().margin)
         maps = transferred(self.atlas, self.maps, atlas)
         bits: Literal[8, 16] = 8 if whole.normal.dtype == np.uint8 else 16
         extras: tuple[Extra, ...] = () if whole.object_normal is None else ("object-normal",)

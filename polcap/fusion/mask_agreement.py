@@ -5,6 +5,9 @@ Where the hull leaves a part of one mask uncovered, this mask holds the board's 
 the part is removed. Where it leaves parts of several masks uncovered that it covers without one view, this view's mask
 lacks a part of the object. Where an object slid, one side of its mask is uncovered, and lacking on the other.
 
+A slit in one mask, such as a narrow shadow, cuts through the whole hull. So slits are closed first, where the hull of
+the other masks is solid.
+
 References
 ----------
 Laurentini, The visual hull concept for silhouette-based image understanding, IEEE TPAMI 1994.
@@ -13,6 +16,7 @@ Laurentini, The visual hull concept for silhouette-based image understanding, IE
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from polcap.errors import CaptureError
@@ -20,6 +24,7 @@ from polcap.fusion.poses import LEAST_VIEWS
 from polcap.fusion.silhouettes import Silhouette, grid_around, halved
 from polcap.images import Bools, Floats
 
+_SLIT = 0.05  # of the object's diameter in a view; wider gaps in a mask are gaps between the object's parts
 _MOST_UNCOVERED = 0.01  # of a mask's area; masks whose outlines err by one cell of the grid leave 0.000
 _TRAILING = (
     0.003  # of the masks' areas, in sum: what a slid object uncovers in other views; a piece of the board, nothing
@@ -37,9 +42,9 @@ def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, s
         More than a third of the views contradict the others, fewer than three are left, or the masks have too little
         in common.
     """
-    used = list(views)
+    points, step = grid_around(views)
+    used = _without_slits(views, points, step)
     left_out: dict[str, str] = {}
-    points, step = grid_around(used)
     inside = np.stack([view.inside(points, step) for view in used])  # (N, P)
     while True:
         shares = _uncovered(used, points[inside.all(axis=0)], step)
@@ -59,6 +64,21 @@ def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, s
     if len(left_out) + len(larger) > _MOST_TRIMMED * len(views):
         raise _contradiction([*left_out, *larger], len(views))
     return _trimmed(used, points[inside.all(axis=0)], step), left_out
+
+
+def _without_slits(views: Sequence[Silhouette], points: Floats, step: float) -> list[Silhouette]:
+    """The views with the narrow gaps of their masks closed where all other masks have a point in common."""
+    inside = np.stack([view.inside(points, step) for view in views])
+    votes = inside.sum(axis=0)
+    out = []
+    for view, own in zip(views, inside, strict=True):
+        reach = max(round(_SLIT / 2 * view.diameter_px), 1)
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        framed = np.pad(view.mask.astype(np.uint8), reach)
+        closed = cv2.morphologyEx(framed, cv2.MORPH_CLOSE, disc)[reach:-reach, reach:-reach] > 0
+        solid = view.near(points[votes - own == len(views) - 1], step)
+        out.append(replace(view, mask=view.mask | closed & solid))
+    return out
 
 
 def _contradiction(names: Sequence[str], count: int) -> CaptureError:

@@ -1,5 +1,7 @@
 """The atlas: charts without overlap, one point of the surface for each texel."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ SIDE = 256
 
 @pytest.fixture(scope="module")
 def atlas() -> Atlas:
-    return atlases.unwrap(ellipsoid.mesh(), (), AtlasSettings(size=SIDE))
+    return atlases.charted(ellipsoid.mesh(), SIDE, 6)
 
 
 def test_charts_do_not_overlap(atlas: Atlas) -> None:
@@ -49,3 +51,10 @@ def test_a_texel_is_no_larger_than_a_pixel_of_the_maps() -> None:
     found = atlases.unwrap(ellipsoid.mesh(), views, AtlasSettings())
     pixel = ellipsoid.DISTANCE / views[0].view.focal
     assert 0.2 < found.texel / pixel <= 1.05
+
+
+def test_a_dense_mesh_is_reduced_to_what_the_maps_resolve() -> None:
+    views, dense = ellipsoid.views(1), ellipsoid.mesh()
+    views = tuple(replace(one, view=replace(one.view, focal=one.view.focal / 4)) for one in views)
+    found = atlases.unwrap(dense, views, AtlasSettings())
+    assert 1900 < len(found.mesh.faces) < len(dense.faces)

@@ -7,7 +7,7 @@ import pytest
 
 from polcap.fusion import atlas as atlases
 from polcap.fusion import baking
-from polcap.fusion.atlas import Atlas, AtlasSettings
+from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import BakingSettings
 from polcap.fusion.values import ClosedMesh
 from polcap.images import Floats
@@ -19,7 +19,7 @@ RING = ellipsoid.views(8)
 
 @pytest.fixture(scope="module")
 def atlas() -> Atlas:
-    return atlases.unwrap(ellipsoid.mesh(), (), AtlasSettings(size=256))
+    return atlases.charted(ellipsoid.mesh(), 256, 6)
 
 
 def degrees(one: Floats, two: Floats) -> Floats:
@@ -60,7 +60,7 @@ def test_a_part_behind_another_takes_nothing_from_the_view() -> None:
     both = ClosedMesh(
         np.concatenate([front.vertices, behind]), np.concatenate([front.faces, front.faces + len(behind)])
     )
-    atlas = atlases.unwrap(both, (), AtlasSettings(size=256))
+    atlas = atlases.charted(both, 256, 6)
     (view,) = ellipsoid.views(1, elevation_deg=0)
     (sight,) = baking.sights([view], atlas)
     assert len(sight.texel) > 1000

@@ -9,7 +9,6 @@ import pytest
 from polcap.formats.export import gltf
 from polcap.fusion import atlas as atlases
 from polcap.fusion import baking, filling, fused_maps
-from polcap.fusion.atlas import AtlasSettings
 from polcap.fusion.baking import BakingSettings
 from polcap.fusion.closed_mesh import is_closed
 from polcap.fusion.fused_maps import FusedSource
@@ -20,7 +19,7 @@ from tests.fusion import ellipsoid
 
 @pytest.fixture(scope="module")
 def source() -> FusedSource:
-    atlas = atlases.unwrap(ellipsoid.mesh(), (), AtlasSettings(size=256))
+    atlas = atlases.charted(ellipsoid.mesh(), 256, 6)
     return FusedSource(atlas, filling.fill(baking.bake(ellipsoid.views(8), atlas, BakingSettings()), atlas))
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from polcap.fusion import atlas as atlases
 from polcap.fusion import baking, comparison, filling, material_fit
-from polcap.fusion.atlas import Atlas, AtlasSettings
+from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, BakingSettings
 from polcap.fusion.material_fit import MaterialSettings
 from tests.fusion import ellipsoid
@@ -17,7 +17,7 @@ RING = ellipsoid.views(8)
 
 @pytest.fixture(scope="module")
 def atlas() -> Atlas:
-    return atlases.unwrap(ellipsoid.mesh(), (), AtlasSettings(size=256))
+    return atlases.charted(ellipsoid.mesh(), 256, 6)
 
 
 @pytest.fixture(scope="module")
