@@ -38,6 +38,7 @@ _MOST_MOVE = 1.0  # steps of a vertex in a round; more folds the surface
 _DAMPING = 0.02  # weight of the equations displacement = 0
 _SMOOTHNESS = 0.03  # weight of the equations displacement = that of the neighbor
 _RELAXATION = 0.5  # share of the way to the neighbors' middle, along the surface
+_UNFOLDING = 1.0  # the same along the normal, where it is square to its target
 
 
 @dataclass(frozen=True)
@@ -91,10 +92,9 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
     step, faces = hull.grid.step, mesh.faces
     start: Floats = mesh.vertices.astype(np.float64)
     hollow = np.flatnonzero(hull.at(start) < -_HOLLOW_DEPTH * step)
-    vertices = start
-    neighbors = _neighbor_means(faces, len(vertices))
+    neighbors = _neighbor_means(faces, len(start))
+    vertices = _relaxed(start, faces, neighbors)
     for _ in range(rounds):
-        vertices = _relaxed(vertices, faces, neighbors)
         outward = vertex_normals(vertices, faces)
         seen = visible(vertices, faces, outward, views, step)
         target = mean_normals(vertices, outward, seen, views)
@@ -103,7 +103,8 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
         carved = Anchors(hollow, np.ones(len(hollow)), back, np.full(len(hollow), _HOLLOW_WEIGHT))
         move = _displacements(vertices, faces, outward, target, [rims, carved])
         move = np.clip(move, -_MOST_MOVE * step, _MOST_MOVE * step)
-        vertices = _inside(vertices + outward * move[:, None], hull)
+        moved = _unfolded(vertices + outward * move[:, None], faces, neighbors, target)
+        vertices = _inside(_relaxed(moved, faces, neighbors), hull)
     return FittedSurface(vertices, faces, target.agreement, neighbors)
 
 
@@ -249,3 +250,13 @@ def _relaxed(vertices: Floats, faces: NDArray[np.integer], neighbors: sparse.csr
     way = neighbors @ vertices - vertices
     outward = vertex_normals(vertices, faces)
     return np.asarray(vertices + _RELAXATION * (way - outward * dot(way, outward)[:, None]))
+
+
+def _unfolded(
+    vertices: Floats, faces: NDArray[np.integer], neighbors: sparse.csr_matrix, target: SurfaceNormals
+) -> Floats:
+    """Vertices moved along their normals towards their neighbors' middle, the more these contradict their targets."""
+    outward = vertex_normals(vertices, faces)
+    facing = np.maximum(dot(outward, target.normal), 0)
+    share = _UNFOLDING * (1 - facing**_FACET_POWER) * (target.weight > 0)
+    return np.asarray(vertices + outward * (share * dot(neighbors @ vertices - vertices, outward))[:, None])

@@ -1,5 +1,7 @@
 """Views of simple bodies are joined into closed meshes of the right size."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -12,7 +14,9 @@ from polcap.errors import ObjectError
 from polcap.fusion.closed_mesh import euler_number, is_closed, iso_surface, levels, volume
 from polcap.fusion.hull import DistanceGrid, VoxelGrid, plain_body
 from polcap.fusion.shape import ShapeSettings, fuse_shape
+from polcap.fusion.small_views import reduce_views
 from polcap.fusion.values import ClosedMesh
+from polcap.optics import frames
 from tests.fusion.traced_views import (
     SIZE,
     Body,
@@ -58,6 +62,20 @@ def test_levels_are_closed_and_have_their_number_of_triangles(fused_ball: Closed
     for level, count in zip(levels(fused_ball, [2000, 500]), [2000, 500]):
         assert is_closed(level) and volume(level) > 0
         assert len(level.faces) == pytest.approx(count, rel=0.02)
+
+
+def test_normals_that_lie_in_the_surface_do_not_fold_it(ball: Body) -> None:
+    views = []
+    for pose in all_around(ball, 9):
+        view = capture(ball, pose, 128)
+        axis = pose.rotation @ [1.0, 0, 0]
+        across = frames.unit(np.cross(axis, view.normal) + 1e-6).astype(np.float32)
+        views.append(replace(view, normal=np.where((view.normal @ axis > 0.8)[..., None], across, view.normal)))
+    fused = fuse_shape(views, ShapeSettings(grid=GRID))
+    mesh = trimesh.Trimesh(fused.vertices, fused.faces, process=False)
+    outside = np.max([view.distance(fused.vertices) for view in reduce_views(views)])
+    assert outside < SIZE / GRID  # nothing leaves the hull by a step
+    assert np.mean(mesh.face_adjacency_angles > np.radians(100)) < 1e-3
 
 
 def test_a_torus_keeps_its_hole() -> None:
