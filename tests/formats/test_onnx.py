@@ -84,7 +84,7 @@ def test_broken_file_is_one_line(tmp_path: Path, content: bytes | None) -> None:
 
 
 def test_missing_file_and_too_new_opset(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="--model"):
+    with pytest.raises(ModelError, match="give the path of an ONNX model"):
         load(tmp_path / "none.onnx")
     with pytest.raises(ModelError, match="opset"):
         load(write(tmp_path / "m.onnx", SAID, opset=99))
