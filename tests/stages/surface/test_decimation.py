@@ -44,7 +44,7 @@ def test_too_many_levels_are_refused() -> None:
 @pytest.mark.parametrize("back", ["skirt", "closed"])
 @pytest.mark.parametrize("share", [8, 60])
 def test_a_back_stays_in_fewer_triangles(back: Back, share: int) -> None:
-    """Its walls are slivers; they are made anew, because no collapse removes them."""
+    """Its walls are slivers; no collapse removes them, so they are made from the reduced front."""
     whole = surfaces.mesh(surfaces.maps(), surface.SurfaceSettings(back=back))
     count = len(whole.faces) // share
     less = surface.decimate(surfaces.mesh(surfaces.maps()), surfaces.VIEW, count, back)
