@@ -19,7 +19,7 @@ from polcap.fusion.values import ClosedMesh, FusionView
 from polcap.images import Bools, Floats, Mesh
 from polcap.optics import frames
 from polcap.optics.texture_rasterizer import rasterize
-from polcap.optics.vertex_frames import vertex_normals, vertex_tangents
+from polcap.optics.vertex_frames import area_vectors, vertex_normals, vertex_tangents
 from polcap.stages import stage
 
 _FILLED = 0.4  # share of the texture that charts cover, about; uvunwrap reaches .4 to .63
@@ -47,7 +47,7 @@ class Atlas:
     @property
     def texel(self) -> float:
         """Side of a texel on the surface, m."""
-        return float(np.sqrt(_area(self.mesh.vertices[self.mesh.faces]) / max(len(self.position), 1)))
+        return float(np.sqrt(_area(self.mesh) / max(len(self.position), 1)))
 
 
 @stage(version=2)
@@ -63,19 +63,19 @@ def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSetti
         The package uvunwrap is missing, or the charts do not fit into a texture of this size.
     """
     pixel = _pixel(mesh, views)
-    mesh = levels(mesh, [max(int(_area(mesh.vertices[mesh.faces]) / (_TRIANGLE * pixel**2)), _FEWEST)])[0]
+    mesh = levels(mesh, [max(int(_area(mesh) / (_TRIANGLE * pixel**2)), _FEWEST)])[0]
     if settings.size:
         return charted(mesh, settings.size, settings.margin)
     side = _side(mesh, pixel)
     found = charted(mesh, side, settings.margin)
-    while found.texel > pixel and side < _SIDES[1]:  # the charts' margins took the room
+    while found.texel > pixel and side < _SIDES[1]:  # the margins of the charts need room, too
         side *= 2
         found = charted(mesh, side, settings.margin)
     return found
 
 
 def charted(mesh: ClosedMesh, side: int, margin: int) -> Atlas:
-    """Cut a closed mesh into charts, and pack them into a texture of `side` px, `margin` px apart.
+    """Cut a closed mesh into charts, and pack them into a texture of `side` px, with `margin` px between them.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def _charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[n
 
 def _side(mesh: ClosedMesh, pixel: float) -> int:
     """Least side of the texture [px], a power of two, with which a texel may be no larger than `pixel` [m]."""
-    wanted = np.log2(np.sqrt(_area(mesh.vertices[mesh.faces]) / _FILLED) / pixel)
+    wanted = np.log2(np.sqrt(_area(mesh) / _FILLED) / pixel)
     return int(np.clip(2 ** np.ceil(float(wanted)), *_SIDES))
 
 
@@ -134,6 +134,6 @@ def _pixel(mesh: ClosedMesh, views: tuple[FusionView, ...]) -> float:
     return float(np.median([-(one.pose.rotation @ middle + one.pose.translation)[2] / one.view.focal for one in views]))
 
 
-def _area(corner: Floats) -> float:
-    """Area of triangles (F, 3, 3)."""
-    return float(np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1).sum() / 2)
+def _area(mesh: ClosedMesh | Mesh) -> float:
+    """Area of a mesh's surface [m²]."""
+    return float(np.linalg.norm(area_vectors(mesh.vertices, mesh.faces), axis=-1).sum() / 2)

@@ -49,7 +49,7 @@ class BakingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     mesh_sigma_deg: Annotated[
         float,
-        Meta(ge=0, le=90, description="error of the mesh's smooth normals; 0: twice by how far the views differ [°]"),
+        Meta(ge=0, le=90, description="error of the mesh's normals; 0: twice their median angle to the views' [°]"),
     ] = 0.0
     smooth: Annotated[
         float, Meta(gt=0, le=0.5, description="1σ of the Gaussian that parts smooth from fine [object's diameter]")
@@ -198,8 +198,8 @@ def _mesh_sigma_deg(differences: Sequence[Floats]) -> float:
 
     Twice, because the mesh was fitted to these normals; docs/benchmarks/fusion.md.
     """
-    apart = np.concatenate([np.linalg.norm(one[::8, :3], axis=-1) for one in differences])
-    return float(max(2 * np.degrees(np.median(apart)), _FLOOR_DEG))
+    angle = np.concatenate([np.linalg.norm(one[::8, :3], axis=-1) for one in differences])
+    return float(max(2 * np.degrees(np.median(angle)), _FLOOR_DEG))
 
 
 def _bake_bands(

@@ -22,7 +22,7 @@ _COARSE = 48  # steps of the grid that finds the object's box
 _MARGIN = 3  # steps around the object
 _NEAR = 3.5  # steps from the surface within which distances are exact; two points lie at most √3 steps apart
 _THIN = 2  # steps; handles and tunnels up to twice as thick are taken for false
-_LARGEST_CUT = 0.002  # of the body's volume; a larger thin part with loops is a wall with holes, no handle
+_LARGEST_CUT = 0.002  # of the body's volume; a larger thin part with loops is no handle, but a wall with holes
 _LOOSE = 0.01  # steps inside the surface, of points that touch others of the body by an edge alone
 
 
@@ -124,8 +124,7 @@ def plain_body(distance: Floats, step: float) -> Floats:
     body = ndimage.binary_fill_holes(_largest_part(body))
     near = 0.05 * step  # where the body was changed, its surface lies beside the changed points
     changed = np.where(body, np.minimum(distance, -near), np.maximum(distance, near))
-    touching = _touches_by_an_edge(body)  # there marching cubes joins neither, as `_euler` counts
-    changed[touching] = -_LOOSE * step
+    changed[_touches_by_an_edge(body)] = -_LOOSE * step  # so that marching cubes does not join them; nor does `_euler`
     return changed.astype(np.float32)
 
 

@@ -3,7 +3,7 @@
 The points that lie inside the masks of all views form the visual hull; every pixel of the object shows one of them.
 Where the hull leaves a part of one mask uncovered, this mask holds the board's edge, a shadow or a reflection, and
 the part is removed. Where it leaves parts of several masks uncovered that it covers without one view, this view's mask
-lacks a part of the object. Where an object slid, one side of its mask is uncovered, and lacking on the other.
+lacks a part of the object. If the object slid, its mask shows one side too far out, and lacks the other side.
 
 A slit in one mask, such as a narrow shadow, cuts through the whole hull. So slits are closed first, where the hull of
 the other masks is solid.
@@ -26,9 +26,9 @@ from polcap.images import Bools, Floats
 
 _SLIT = 0.05  # of the object's diameter in a view; wider gaps in a mask are gaps between the object's parts
 _MOST_UNCOVERED = 0.01  # of a mask's area; masks whose outlines err by one cell of the grid leave 0.000
-_TRAILING = (
-    0.003  # of the masks' areas, in sum: what a slid object uncovers in other views; a piece of the board, nothing
-)
+# of the masks' areas, in sum: part of the other masks that a slid object leaves uncovered; a piece of the board in one
+# mask leaves nothing of the others uncovered
+_TRAILING = 0.003
 _MOST_LEFT_OUT = 1 / 3  # of the views; where more contradict, nobody knows which are right
 _MOST_TRIMMED = 1 / 2  # of the views may be left out, or hold more than the object
 
@@ -108,7 +108,7 @@ def _contradicting(
             others = [j for j in range(len(views)) if j != k]
             rest = _uncovered([views[j] for j in others], points[inside[others].all(axis=0)], step)
             gain = shares[others] - rest  # of area that is covered without this view
-            lacks = np.sort(gain)[-2]  # a piece of the board in one other mask gives one gain
+            lacks = np.sort(gain)[-2]  # the second largest: a piece of the board in one other mask gives one gain
             slid = shares[k] if gain.sum() > _TRAILING else 0.0
             by[k] = max(lacks, slid)
     worst = int(np.argmax(by))

@@ -21,7 +21,8 @@ from polcap.fusion.hull import DistanceGrid
 from polcap.fusion.small_views import SmallView, sample
 from polcap.fusion.values import ClosedMesh
 from polcap.images import Bools, Floats
-from polcap.optics.frames import cross, dot, unit
+from polcap.optics.frames import dot, unit
+from polcap.optics.vertex_frames import area_vectors, vertex_normals
 from polcap.synth.mesh_tracer import Tracer, Triangles
 
 _LIFT = 0.3  # steps off the surface where rays towards the lenses start; the numbers: docs/benchmarks/fusion.md
@@ -33,12 +34,12 @@ _RIM_SIGMA = np.radians(6.0)  # 1σ of the angle between a rim's mean normal and
 _RIM_LIMIT = 3.0  # 1σ; vertices beyond are no rims
 _HOLLOW_WEIGHT = 0.5  # of the equation that holds a carved vertex
 _HOLLOW_DEPTH = 2.0  # steps inside the hull from where on the surface was carved
-_FACET_POWER = 4  # of the cosine between a triangle and its target, in the weight: far off, they are other surfaces
-_MOST_MOVE = 1.0  # steps of a vertex in a round; more folds the surface
+_FACET_POWER = 4  # of the cosine between a triangle and its target, in the triangle's weight
+_MOST_MOVE = 1.0  # steps that a vertex may move in a round; more would fold the surface
 _DAMPING = 0.02  # weight of the equations displacement = 0
 _SMOOTHNESS = 0.03  # weight of the equations displacement = that of the neighbor
 _RELAXATION = 0.5  # share of the way to the neighbors' middle, along the surface
-_UNFOLDING = 1.0  # the same along the normal, where it is square to its target
+_UNFOLDING = 1.0  # the same along the vertex's normal, if the normal is square to its target
 
 
 @dataclass(frozen=True)
@@ -99,8 +100,8 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
         seen = visible(vertices, faces, outward, views, step)
         target = mean_normals(vertices, outward, seen, views)
         rims = find_rims(vertices, outward, target, views, step)
-        back = dot(outward[hollow], start[hollow] - vertices[hollow])
-        carved = Anchors(hollow, np.ones(len(hollow)), back, np.full(len(hollow), _HOLLOW_WEIGHT))
+        sunk = dot(outward[hollow], start[hollow] - vertices[hollow])
+        carved = Anchors(hollow, np.ones(len(hollow)), sunk, np.full(len(hollow), _HOLLOW_WEIGHT))
         move = _displacements(vertices, faces, outward, target, [rims, carved])
         move = np.clip(move, -_MOST_MOVE * step, _MOST_MOVE * step)
         moved = _unfolded(vertices + outward * move[:, None], faces, neighbors, target)
@@ -108,22 +109,8 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
     return FittedSurface(vertices, faces, target.agreement, neighbors)
 
 
-def vertex_normals(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
-    """Unit normals (V, 3), means of the triangles' by area."""
-    area = _doubled_areas(vertices, faces)
-    corner = faces.T.ravel()
-    total = [np.bincount(corner, np.tile(area[:, axis], 3), len(vertices)) for axis in range(3)]
-    return unit(np.stack(total, axis=-1))
-
-
-def _doubled_areas(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
-    """Normals (F, 3) of the triangles with twice their areas as lengths."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return np.asarray(cross(b - a, c - a))
-
-
 def visible(
-    vertices: Floats, faces: NDArray[np.integer], outward: Floats, views: Sequence[SmallView], step: float
+    vertices: Floats, faces: NDArray[np.int32], outward: Floats, views: Sequence[SmallView], step: float
 ) -> Bools:
     """Which view sees which vertex, (N, V): the vertex faces the lens, and the mesh does not hide it."""
     tracer = _tracer(vertices, faces)
@@ -135,7 +122,7 @@ def visible(
     return seen
 
 
-def _tracer(vertices: Floats, faces: NDArray[np.integer]) -> Tracer:
+def _tracer(vertices: Floats, faces: NDArray[np.int32]) -> Tracer:
     corners = np.zeros((len(faces), 3, 3), np.float32)  # shading normals are not needed
     return Tracer(Triangles(vertices.astype(np.float32), faces.astype(np.int32), corners))
 
@@ -188,19 +175,19 @@ def find_rims(
         piece = np.unique(np.round(pixel / side), axis=0, return_inverse=True)[1].ravel()
         outermost = np.full(piece.max(initial=0) + 1, -np.inf)
         np.maximum.at(outermost, piece, distance[near])
-        off2 = _angle2(target.normal[near], out) / _RIM_SIGMA**2
-        off2[distance[near] < outermost[piece] - _RIM_LAYER * step] = np.inf  # covered by others
-        order = np.lexsort((off2, piece))
+        squared = _angle2(target.normal[near], out) / _RIM_SIGMA**2
+        squared[distance[near] < outermost[piece] - _RIM_LAYER * step] = np.inf  # covered by others
+        order = np.lexsort((squared, piece))
         first = order[np.diff(piece[order], prepend=-1) > 0]
-        first = first[off2[first] < _RIM_LIMIT**2]
+        first = first[squared[first] < _RIM_LIMIT**2]
         slope = dot(out[first], outward[near[first]])
-        found.append(np.stack([near[first], slope, -distance[near[first]], np.exp(-off2[first] / 2)]))
+        found.append(np.stack([near[first], slope, -distance[near[first]], np.exp(-squared[first] / 2)]))
     vertex, slope, distance, weight = np.concatenate(found, axis=1)
     return Anchors(vertex.astype(np.intp), slope, distance, weight)
 
 
 def _displacements(
-    vertices: Floats, faces: NDArray[np.integer], outward: Floats, target: SurfaceNormals, anchors: Sequence[Anchors]
+    vertices: Floats, faces: NDArray[np.int32], outward: Floats, target: SurfaceNormals, anchors: Sequence[Anchors]
 ) -> Floats:
     """Displacements (V,) m along `outward` by least squares.
 
@@ -208,7 +195,7 @@ def _displacements(
     """
     count = len(vertices)
     tilt = unit(np.sum((target.normal * target.weight[:, None])[faces], axis=1))  # (F, 3) target of each triangle
-    facing = np.maximum(dot(tilt, unit(_doubled_areas(vertices, faces))), 0)
+    facing = np.maximum(dot(tilt, unit(area_vectors(vertices, faces))), 0)
     share = target.weight[faces].mean(axis=1) * facing**_FACET_POWER
     i, j = (np.concatenate([faces[:, (k + first) % 3] for k in range(3)]) for first in (0, 1))
     t, w2 = np.tile(tilt, (3, 1)), np.tile(share**2, 3)
@@ -238,14 +225,14 @@ def _inside(vertices: Floats, hull: DistanceGrid) -> Floats:
     return moved
 
 
-def _neighbor_means(faces: NDArray[np.integer], count: int) -> sparse.csr_matrix:
+def _neighbor_means(faces: NDArray[np.int32], count: int) -> sparse.csr_matrix:
     """Matrix (V, V) that replaces values at vertices by the mean of their neighbors'."""
     i, j = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
     joined = sparse.coo_matrix((np.ones(2 * len(i)), (np.r_[i, j], np.r_[j, i])), shape=(count, count)).tocsr()
     return sparse.csr_matrix(sparse.diags(1 / np.asarray(joined.sum(axis=1)).ravel()) @ joined)
 
 
-def _relaxed(vertices: Floats, faces: NDArray[np.integer], neighbors: sparse.csr_matrix) -> Floats:
+def _relaxed(vertices: Floats, faces: NDArray[np.int32], neighbors: sparse.csr_matrix) -> Floats:
     """Vertices moved along the surface towards their neighbors' middle, so that triangles stay even."""
     way = neighbors @ vertices - vertices
     outward = vertex_normals(vertices, faces)
@@ -253,9 +240,12 @@ def _relaxed(vertices: Floats, faces: NDArray[np.integer], neighbors: sparse.csr
 
 
 def _unfolded(
-    vertices: Floats, faces: NDArray[np.integer], neighbors: sparse.csr_matrix, target: SurfaceNormals
+    vertices: Floats, faces: NDArray[np.int32], neighbors: sparse.csr_matrix, target: SurfaceNormals
 ) -> Floats:
-    """Vertices moved along their normals towards their neighbors' middle, the more these contradict their targets."""
+    """Vertices moved along their normals towards the middle of their neighbors.
+
+    The more a vertex's normal differs from its target, the farther the vertex moves. This removes folds.
+    """
     outward = vertex_normals(vertices, faces)
     facing = np.maximum(dot(outward, target.normal), 0)
     share = _UNFOLDING * (1 - facing**_FACET_POWER) * (target.weight > 0)

@@ -204,8 +204,8 @@ def _compare_masks(session: Session, wanted: SessionInput) -> None:
     used, contradicting = mask_agreement.agreeing([_silhouette(name, session, wanted) for name in session.used])
     session.left_out |= contradicting
     for view in used:
-        object_ = regions.nth_part(view.mask, 1)  # what remains of the board is smaller
-        session.supplied[view.name] = replace(session.supplied[view.name], mask=object_)
+        largest = regions.nth_part(view.mask, 1)  # what remains of the board is smaller
+        session.supplied[view.name] = replace(session.supplied[view.name], mask=largest)
 
 
 def _silhouette(name: str, session: Session, wanted: SessionInput) -> Silhouette:

@@ -9,6 +9,7 @@ import numpy as np
 from polcap.fusion.poses import SessionCamera
 from polcap.fusion.values import Pose
 from polcap.images import Bools, Floats
+from polcap.optics.resize import area_mean
 
 _GRID = 80  # points along the longest side of the object's box
 _COARSE = 40  # the same, to find this box
@@ -52,7 +53,7 @@ class Silhouette:
         """Mask (h, w) on pixels as wide as a cell, and which of them the points (P, 3) cover."""
         coarse = max(self.cell_px(step), 1.0)
         height, width = (int(np.ceil(side / coarse)) for side in self.mask.shape)
-        mask = cv2.resize(self.mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
+        mask = area_mean(self.mask, (height, width)) > 0.5
         x, y = np.rint((self.camera.project(self.pose, points) + 0.5) / coarse - 0.5).astype(int).T
         within = (x >= 0) & (y >= 0) & (x < width) & (y < height)
         covered = np.zeros((height, width), np.uint8)

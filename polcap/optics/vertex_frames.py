@@ -17,8 +17,13 @@ def vertex_frames(vertices: Floats, uv: Floats, faces: Faces) -> tuple[Floats, F
 
 def vertex_normals(vertices: Floats, faces: Faces) -> Floats:
     """Normals (V, 3) of mesh vertices (V, 3): unit, area-weighted means over the triangles around."""
+    return _unit(_sum_around(area_vectors(vertices, faces), faces, len(vertices)))
+
+
+def area_vectors(vertices: Floats, faces: Faces) -> Floats:
+    """Normals (F, 3) of triangles of vertices (V, 3), each as long as twice the triangle's area."""
     one, two = (vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2))
-    return _unit(_sum_around(cross(one, two), faces, len(vertices)))
+    return np.asarray(cross(one, two))
 
 
 def vertex_tangents(vertices: Floats, uv: Floats, faces: Faces, normals: Floats) -> Floats:
