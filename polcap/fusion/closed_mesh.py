@@ -40,7 +40,7 @@ def is_closed(mesh: ClosedMesh) -> bool:
 
 
 def solid(mesh: ClosedMesh, floor: float | None = None) -> ClosedMesh:
-    """The mesh as manifold3d writes it: manifold, outward, its largest body alone; cut off below the height `floor` [m].
+    """The mesh as manifold3d writes it: manifold, outward, its largest body alone, above the height `floor` [m].
 
     Raises
     ------
