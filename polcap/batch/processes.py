@@ -4,7 +4,9 @@
 """
 
 import multiprocessing
+import os
 import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -154,6 +156,7 @@ def _process(options: ProcessOptions, unit: Unit, attempt: int) -> UnitRecord:
 def _serve(pipe: connection.Connection, limits: Limits) -> None:
     """Main function of a child process: execute calls until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     prepare(limits)
     while True:
         try:
@@ -161,6 +164,14 @@ def _serve(pipe: connection.Connection, limits: Limits) -> None:
         except (EOFError, OSError):
             return
         pipe.send(call.function(call.task, call.attempt))
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent dies: it would hold its result folder, which the next run needs."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def prepare(limits: Limits | ProcessOptions) -> None:

@@ -16,7 +16,15 @@ import msgspec
 
 from polcap.batch.processes import UNLIMITED, Died, Limits, ProcessPool
 from polcap.config import Config
-from polcap.errors import CaptureError, ChartError, InputError, SettingError
+from polcap.errors import (
+    AlignmentError,
+    CaptureError,
+    ChartError,
+    DecodeError,
+    InputError,
+    ObjectError,
+    SettingError,
+)
 from polcap.formats import onnx, own_folders
 from polcap.formats.capture import layouts, reader
 from polcap.fusion import board_corners, mask_agreement, poses, view_maps
@@ -34,6 +42,8 @@ from polcap.stages.mask import regions
 
 _REFUSED = ("order",)  # gates of a view whose failure makes its normals wrong everywhere
 _RETRIES = 1  # of a view, if its process died
+# faults of a view, without which the others go on; settings, models and the disk are common to all
+_FAULTS = (CaptureError, DecodeError, ChartError, AlignmentError, ObjectError)
 Report = Callable[[str], None]  # of what is done
 T = TypeVar("T")
 R = TypeVar("R")
@@ -97,7 +107,7 @@ class Session:
         found = {}
         for name in tasks:  # in their order, not in that of their ends
             outcome = outcomes[name]
-            if isinstance(outcome, InputError):
+            if isinstance(outcome, _FAULTS):
                 self.left_out[name] = _reason(name, outcome)
             elif isinstance(outcome, Exception):
                 raise outcome
@@ -127,7 +137,7 @@ def _outcomes(
     for name, task in tasks.items():
         try:
             yield name, work(task)
-        except InputError as error:
+        except _FAULTS as error:
             yield name, error
 
 
@@ -189,7 +199,7 @@ def _read(wanted: SessionInput) -> Session:
     for folder in found:
         try:
             session.captures[folder.name] = reader.read(folder, wanted.angles_deg, wanted.clockwise)
-        except InputError as error:
+        except _FAULTS as error:
             session.left_out[folder.name] = _reason(str(folder), error)
     _enough(session)
     return session

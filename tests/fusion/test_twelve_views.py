@@ -1,6 +1,11 @@
-"""The whole chain on twelve small views: `polcap synth --views 12`, then `polcap fuse`, against the true object."""
+"""The whole chain on small views, `polcap synth --views` and `polcap fuse`: against the true object; after kills."""
 
 import json
+import os
+import shutil
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import bench_fused_asset
@@ -9,7 +14,7 @@ import pytest
 
 from polcap.fusion import fused_maps
 from polcap.fusion.closed_mesh import is_closed
-from tests.conftest import shell
+from tests.conftest import ROOT, shell
 
 pytest.importorskip("embreex")
 
@@ -38,3 +43,47 @@ def test_twelve_raw_views_become_a_closed_object_that_is_like_the_true_one(tmp_p
     assert errors.distance < 0.01  # of the size; a pixel and a half
     normal, albedo, specular, roughness = errors.fused / errors.single
     assert normal < 1.2 and albedo < 1.0 and specular < 0.8 and roughness < 0.8
+
+
+def killed(folder: Path, *options: str, after: str) -> None:
+    """Start a fusion and kill it a moment after it has printed a line that begins with `after`."""
+    command = [sys.executable, "-m", "polcap", "fuse", str(folder), *options]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as running:
+        assert running.stderr is not None
+        assert any(line.startswith(after) for line in running.stderr)
+        time.sleep(0.3)
+        running.kill()
+
+
+def written(folder: Path, pattern: str) -> dict[str, bytes]:
+    """Bytes of the files below a folder, by their paths."""
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.glob(pattern) if file.is_file()}
+
+
+def finished(folder: Path) -> dict[Path, int]:
+    """Stored stages below a folder, and when they were written."""
+    return {file: file.stat().st_mtime_ns for file in folder.glob("*/**/work/*/manifest.json")}
+
+
+def test_a_fusion_that_was_killed_twice_ends_as_one_that_was_not(tmp_path: Path) -> None:
+    """And so does one of two views at a time as one of a single one."""
+    folder, coarse = synth(tmp_path / "object", 4), ("--set", "fusion.shape.grid=60")
+    whole = tmp_path / "whole" / "object"
+    shutil.copytree(folder, whole)
+    assert shell("fuse", whole, *coarse).returncode == 0
+    killed(folder, *coarse, "--workers", "2", after="view02: maps")
+    assert not (folder / "view04/polcap/report.json").exists()
+    before = finished(folder)
+    killed(folder, *coarse, "--workers", "2", after="shape ")
+    assert not (folder / "fused/report.json").exists() and not (folder / "fused/maps/maps.json").exists()
+    assert finished(folder).items() >= before.items()  # nothing was computed again
+    before = finished(folder)
+    done = shell("fuse", folder, *coarse)
+    assert done.returncode == 0, done.stderr
+    assert finished(folder).items() >= before.items()
+    assert written(folder, "view*/polcap/maps/*") == written(whole, "view*/polcap/maps/*")
+    assert written(folder, "**/*").keys() == written(whole, "**/*").keys()  # nothing partial is left
+    again, once = (fused_maps.read(one / "fused/maps") for one in (folder, whole))
+    assert again.atlas.mesh.vertices == pytest.approx(once.atlas.mesh.vertices, abs=1e-6)  # m
+    assert again.maps.normal == pytest.approx(once.maps.normal, abs=1e-3)
