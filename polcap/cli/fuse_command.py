@@ -23,8 +23,9 @@ def fuse(
     json: options.Json = False,
     open_: options.OpenPage = False,
     device: options.Device = "cpu",
-    threads: options.Threads = 0,
-    memory: options.Memory = 0,
+    workers: Annotated[int, Option("--workers", "-j", min=1, help="Views at a time, each in a process.")] = 1,
+    threads: Annotated[int, Option(min=0, help="Threads per process; 0 is all.")] = 0,
+    memory: Annotated[float, Option(min=0, help="Most memory per process, GB; 0 is no limit.")] = 0,
     angles: options.Angles = None,
     clockwise: options.Clockwise = False,
     chart: options.Chart = None,
@@ -34,6 +35,7 @@ def fuse(
 ) -> None:
     """Join several captures of one object into a closed asset. Run again, it goes on where it was stopped."""
     from polcap import config as settings
+    from polcap.batch.processes import Limits
     from polcap.fusion import fuse_run
     from polcap.fusion.fusion_path import FusionSettings
     from polcap.fusion.session import SessionInput
@@ -55,6 +57,8 @@ def fuse(
         mask_network=models.load_mask_network(threads),
         angles_deg=options.angles_deg(angles),
         clockwise=clockwise,
+        workers=workers,
+        limits=Limits(threads, memory),
     )
     target = out or folder / own_folders.FUSED
     chosen = settings.fill_sections(FusionSettings, own)

@@ -69,6 +69,9 @@ def carve(hull: DistanceGrid, surface: FittedSurface, views: Sequence[SmallView]
     free = _mean_distance(hull, depths)
     walls = surface.vertices[_is_wall(surface, depths, hull.grid.step)]
     carved = np.maximum(hull.distance, _behind_walls(hull, walls, free))
+    height = hull.grid.origin[1] + hull.grid.step * np.arange(hull.grid.shape[1])
+    floor = height < _WALL * hull.grid.step  # the board is behind it
+    carved[:, floor] = hull.distance[:, floor]
     return replace(hull, distance=plain_body(carved, hull.grid.step))
 
 

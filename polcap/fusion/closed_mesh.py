@@ -39,8 +39,8 @@ def is_closed(mesh: ClosedMesh) -> bool:
     return bool(np.array_equal(there, back) and np.all(np.diff(there) > 0))
 
 
-def solid(mesh: ClosedMesh) -> ClosedMesh:
-    """The mesh as manifold3d writes it: manifold, outward, its largest body alone.
+def solid(mesh: ClosedMesh, floor: float | None = None) -> ClosedMesh:
+    """The mesh as manifold3d writes it: manifold, outward, its largest body alone, above the height `floor` [m].
 
     Raises
     ------
@@ -54,6 +54,8 @@ def solid(mesh: ClosedMesh) -> ClosedMesh:
     body = manifold3d.Manifold(given)
     if body.status() != manifold3d.Error.NoError or body.is_empty():
         raise ObjectError(f"the fused mesh is not closed ({body.status().name}); check poses and masks of the views")
+    if floor is not None:
+        body = body.trim_by_plane((0.0, 1.0, 0.0), floor)
     parts = body.decompose()
     written = max(parts, key=lambda part: part.volume()).to_mesh64()
     return ClosedMesh(np.array(written.vert_properties[:, :3]), np.array(written.tri_verts, np.int32))

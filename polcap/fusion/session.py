@@ -4,32 +4,39 @@ Each view is a capture that `polcap process` takes, with its result in viewNN/po
 out, with the reason; the others go on.
 """
 
-from collections.abc import Callable, Mapping
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
+from polcap.batch.processes import UNLIMITED, Died, Limits, ProcessPool
 from polcap.config import Config
-from polcap.errors import CaptureError, ChartError, InputError
+from polcap.errors import CaptureError, ChartError, InputError, SettingError
 from polcap.formats import onnx, own_folders
 from polcap.formats.capture import layouts, reader
 from polcap.fusion import board_corners, mask_agreement, poses, view_maps
 from polcap.fusion.board_corners import BoardCorners
 from polcap.fusion.board_eraser import erase
-from polcap.fusion.poses import LEAST_VIEWS, PosedView, SessionCamera, SessionPoses
+from polcap.fusion.poses import LEAST_VIEWS, PosedView, SessionCamera
 from polcap.fusion.silhouettes import Silhouette
-from polcap.fusion.values import FusionView
+from polcap.fusion.values import FusionView, Pose
 from polcap.images import Bools, Capture, ChartRequest, Network
+from polcap.optics.board import Board
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import AUTO, UserInput
-from polcap.results import Results
 from polcap.stages import mask
 from polcap.stages.mask import regions
 
 _REFUSED = ("order",)  # gates of a view whose failure makes its normals wrong everywhere
+_RETRIES = 1  # of a view, if its process died
 Report = Callable[[str], None]  # of what is done
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,29 @@ class SessionInput:
     mask_network: Network | None = None
     angles_deg: tuple[float, ...] | None = None
     clockwise: bool = False
+    workers: int = 1  # views at a time, each in a process
+    limits: Limits = UNLIMITED  # of each of these processes
+
+
+@dataclass(frozen=True)
+class ViewTask:
+    """A view, and what is needed to run the path of captures on it in another process."""
+
+    name: str
+    capture: Capture
+    supplied: UserInput
+    config: Config
+    out: Path
+
+
+@dataclass(frozen=True)
+class MaskTask:
+    """A view in which the object is searched, with the board in it."""
+
+    view: ViewTask
+    board: Board
+    camera: SessionCamera
+    pose: Pose
 
 
 @dataclass
@@ -56,20 +86,58 @@ class Session:
     posed: Mapping[str, PosedView] = field(default_factory=dict)
     about: dict[str, dict[str, Any]] = field(default_factory=dict)  # content of report.json of each view
 
-    def each(self, work: Callable[[str], None]) -> None:
-        """Do some work on every view; a view for which it fails is left out."""
-        for name in self.captures:
-            if name in self.left_out:
-                continue
-            try:
-                work(name)
-            except InputError as error:
-                self.left_out[name] = _reason(name, error)
+    def each(
+        self, work: Callable[[T], R], tasks: Mapping[str, T], pool: ProcessPool | None, done: Report
+    ) -> dict[str, R]:
+        """Do some work on views, by name; a view for which it fails is left out. `done` is called with each name."""
+        outcomes = {}
+        for name, outcome in _outcomes(work, tasks, pool):
+            outcomes[name] = outcome
+            done(name)
+        found = {}
+        for name in tasks:  # in their order, not in that of their ends
+            outcome = outcomes[name]
+            if isinstance(outcome, InputError):
+                self.left_out[name] = _reason(name, outcome)
+            elif isinstance(outcome, Exception):
+                raise outcome
+            elif isinstance(outcome, Died):
+                raise SettingError(
+                    f"{name}: its process died {outcome.attempts} times, most often from lack of memory; "
+                    "run fewer --workers"
+                )
+            else:
+                found[name] = outcome
+        return found
 
     @property
     def used(self) -> list[str]:
         """Names of the views that are not left out."""
         return [name for name in self.captures if name not in self.left_out]
+
+
+def _outcomes(
+    work: Callable[[T], R], tasks: Mapping[str, T], pool: ProcessPool | None
+) -> Iterator[tuple[str, R | Exception | Died]]:
+    """Name and outcome of each task, in child processes or one after the other."""
+    if pool is not None:
+        for (name, _), outcome in pool.run(partial(_outcome, work), list(tasks.items())):
+            yield name, outcome
+        return
+    for name, task in tasks.items():
+        try:
+            yield name, work(task)
+        except InputError as error:
+            yield name, error
+
+
+def _outcome(work: Callable[[T], R], named: tuple[str, T], _: int) -> R | Exception:
+    """Result of a task, or its error with a traceback for the process that raises it again."""
+    try:
+        return work(named[1])
+    except Exception as error:
+        error.add_note(traceback.format_exc())
+        return error
 
 
 def _reason(name: str, error: InputError) -> str:
@@ -92,14 +160,24 @@ def process(wanted: SessionInput, report: Report) -> tuple[Session, tuple[Fusion
     """
     session = _read(wanted)
     _calibrate_colors(session, wanted, report)
-    corners = _find_boards(session, wanted, report)
-    solved = _solve_poses(session, corners)
-    session.each(lambda name: _mask_object(name, session, wanted, corners[name], solved))
-    _enough(session)
-    _compare_masks(session, wanted)
-    session.each(lambda name: _make_maps(name, session, wanted, report))
+    with ExitStack() as stack:
+        pool = None
+        if wanted.workers > 1:
+            pool = stack.enter_context(ProcessPool(wanted.workers, _RETRIES, wanted.limits))
+        boards = session.each(_find_board, _tasks(session, wanted), pool, _says(report, "exposures and board"))
+        _enough(session)
+        _solve_poses(session, boards)
+        masks = session.each(_mask_object, _mask_tasks(session, wanted, boards), pool, _says(report, "mask"))
+        _enough(session)
+        _compare_masks(session, wanted, masks)
+        session.about = session.each(_make_maps, _tasks(session, wanted), pool, _says(report, "maps"))
     _enough(session)
     return session, tuple(_view(name, session, wanted) for name in session.used)
+
+
+def _says(report: Report, what: str) -> Report:
+    """A function that reports that something of a named view is done."""
+    return lambda name: report(f"{name}: {what}")
 
 
 def _read(wanted: SessionInput) -> Session:
@@ -127,13 +205,20 @@ def _enough(session: Session) -> None:
         )
 
 
-def _run(name: str, session: Session, wanted: SessionInput, supplied: UserInput, until: str | None) -> Results:
-    """Run the path of one view up to a stage; returns the results so far."""
-    out = out_of(wanted.folder, name)
-    about = pipeline.process(session.captures[name], supplied, wanted.config, out, until)
-    if about is not None:
-        session.about[name] = about
-    return pipeline.reopen(out, until or "surface")[0]
+def _tasks(session: Session, wanted: SessionInput) -> dict[str, ViewTask]:
+    """Tasks of the views that are not left out, by name."""
+    return {
+        name: ViewTask(name, session.captures[name], session.supplied[name], wanted.config, out_of(wanted.folder, name))
+        for name in session.used
+    }
+
+
+def _mask_tasks(session: Session, wanted: SessionInput, boards: Mapping[str, BoardCorners]) -> dict[str, MaskTask]:
+    assert session.camera is not None
+    return {
+        name: MaskTask(task, boards[name].board, session.camera, session.posed[name].pose)
+        for name, task in _tasks(session, wanted).items()
+    }
 
 
 def _calibrate_colors(session: Session, wanted: SessionInput, report: Report) -> None:
@@ -148,8 +233,10 @@ def _calibrate_colors(session: Session, wanted: SessionInput, report: Report) ->
     charted, others = "", plain
     for name in session.used if wanted.chart.mode == "auto" else ():
         report(f"{name}: chart")
+        out = out_of(wanted.folder, name)
         try:
-            color = _run(name, session, wanted, plain, "whitebalance").color
+            pipeline.process(session.captures[name], plain, wanted.config, out, "whitebalance")
+            color = pipeline.reopen(out, "whitebalance")[0].color
         except ChartError:
             continue
         profile = replace(color, source="profile", place=None)
@@ -163,65 +250,55 @@ def _calibrate_colors(session: Session, wanted: SessionInput, report: Report) ->
     session.supplied = {name: plain if name == charted else others for name in session.used}
 
 
-def _find_boards(session: Session, wanted: SessionInput, report: Report) -> dict[str, BoardCorners]:
-    """Corners of the board in each view."""
-    corners: dict[str, BoardCorners] = {}
-
-    def detect(name: str) -> None:
-        report(f"{name}: exposures and board")
-        results = _run(name, session, wanted, session.supplied[name], "align")
-        corners[name] = board_corners.detect(results.radiance, results.color, name)
-
-    session.each(detect)
-    _enough(session)
-    return corners
+def _find_board(task: ViewTask) -> BoardCorners:
+    """Corners of the board in a view."""
+    pipeline.process(task.capture, task.supplied, task.config, task.out, "align")
+    results = pipeline.reopen(task.out, "align")[0]
+    return board_corners.detect(results.radiance, results.color, task.name)
 
 
-def _solve_poses(session: Session, corners: Mapping[str, BoardCorners]) -> SessionPoses:
-    seen = {name: corners[name] for name in session.used}
-    solved = poses.solve(seen, session.captures[session.used[0]])
+def _solve_poses(session: Session, corners: Mapping[str, BoardCorners]) -> None:
+    solved = poses.solve(corners, session.captures[session.used[0]])
     session.left_out |= {name: reason.removeprefix(f"{name}: ") for name, reason in solved.left_out.items()}
     session.camera, session.posed = solved.camera, solved.views
-    return solved
 
 
-def _mask_object(
-    name: str, session: Session, wanted: SessionInput, corners: BoardCorners, solved: SessionPoses
-) -> None:
+def _mask_object(task: MaskTask) -> Bools:
     """Find the object's mask of a view on its picture without the board."""
-    results = pipeline.reopen(out_of(wanted.folder, name), "align")[0]
-    posed = solved.camera, solved.views[name].pose
-    erased = erase(results.radiance, results.alignment, results.color, corners.board, posed)
-    settings = msgspec.structs.replace(wanted.config.mask, part=0)  # remains of the board are found in the next step
-    found: Bools = mask.segment(
-        erased, results.alignment, results.color, None, wanted.mask_network, onnx.run, settings
+    view = task.view
+    results = pipeline.reopen(view.out, "align")[0]
+    erased = erase(results.radiance, results.alignment, results.color, task.board, (task.camera, task.pose))
+    settings = msgspec.structs.replace(view.config.mask, part=0)  # remains of the board are found in the next step
+    return mask.segment(
+        erased, results.alignment, results.color, None, view.supplied.mask_network, onnx.run, settings
     ).mask
-    session.supplied[name] = replace(session.supplied[name], mask=found)
 
 
-def _compare_masks(session: Session, wanted: SessionInput) -> None:
+def _compare_masks(session: Session, wanted: SessionInput, masks: Mapping[str, Bools]) -> None:
     """Remove from the masks what no other view confirms, and leave out views whose masks contradict the others."""
-    used, contradicting = mask_agreement.agreeing([_silhouette(name, session, wanted) for name in session.used])
+    views = [_silhouette(name, found, session, wanted) for name, found in masks.items()]
+    used, contradicting = mask_agreement.agreeing(views)
     session.left_out |= contradicting
     for view in used:
         largest = regions.nth_part(view.mask, 1)  # what remains of the board is smaller
         session.supplied[view.name] = replace(session.supplied[view.name], mask=largest)
 
 
-def _silhouette(name: str, session: Session, wanted: SessionInput) -> Silhouette:
+def _silhouette(name: str, found: Bools, session: Session, wanted: SessionInput) -> Silhouette:
     """The mask of a view, which is on the grid of the merged picture, with the session's camera on this grid."""
-    found, camera = session.supplied[name].mask, session.camera
-    assert found is not None and camera is not None
+    assert session.camera is not None
     scale = pipeline.reopen(out_of(wanted.folder, name), "align")[0].radiance.view.scale
-    return Silhouette(name, found, camera.reduced(scale), session.posed[name].pose)
+    return Silhouette(name, found, session.camera.reduced(scale), session.posed[name].pose)
 
 
-def _make_maps(name: str, session: Session, wanted: SessionInput, report: Report) -> None:
-    report(f"{name}: maps")
-    _run(name, session, wanted, session.supplied[name], None)
-    for gate in session.about[name]["gates"]:
+def _make_maps(task: ViewTask) -> dict[str, Any]:
+    """Run the path of a view; returns the content of its report.json."""
+    about = pipeline.process(task.capture, task.supplied, task.config, task.out)
+    assert about is not None  # only `until` leaves it out
+    for gate in about["gates"]:
         if gate["name"] in _REFUSED and gate["state"] == "fail":
             raise CaptureError(f"{gate['says']}. {gate['remedy']}")
+    return about
 
 
 def _view(name: str, session: Session, wanted: SessionInput) -> FusionView:

@@ -24,7 +24,7 @@ class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     grid: Annotated[int, Meta(ge=40, le=300, description="steps along the object's longest side")] = 140
 
 
-@stage(version=4)
+@stage(version=5)
 def fuse_shape(views: Sequence[FusionView], settings: ShapeSettings) -> ClosedMesh:
     """Join views of one object into a closed, manifold, outward mesh in the world frame.
 
@@ -41,4 +41,4 @@ def fuse_shape(views: Sequence[FusionView], settings: ShapeSettings) -> ClosedMe
         surface = fit_normals(iso_surface(carved), small, hull, _ROUNDS)
     else:
         surface = fit_normals(surface.mesh, small, hull, _ROUNDS - _FIRST_ROUNDS)
-    return solid(surface.mesh)
+    return solid(surface.mesh, floor=0.0)  # views from above do not bound the object below the board

@@ -6,7 +6,7 @@ python tests/benchmarks/bench_fused_asset.py FOLDER
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -20,20 +20,32 @@ from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
 LEAST_SEEN = 0.02  # weight of a texel
 
 
+class Errors(NamedTuple):
+    """Mean errors: normal [°], luminance of albedo and of F0, roughness; and the distance of the mesh."""
+
+    single: Floats  # (4,) mean over the views
+    fused: Floats  # (4,) of the texels that a view saw
+    distance: float  # of the mesh from the seen truth, share of the object's size
+
+
 def main(folder: Path) -> None:
+    found = errors(folder)
+    print(f"{'':10}{'normal':>9}{'albedo':>9}{'F0':>9}{'roughness':>11}")
+    print_row("single", found.single)
+    print_row("fused", found.fused)
+    print("reduction " + "".join(f"{100 * one:8.0f}%" for one in 1 - found.fused / found.single))
+    print(f"distance of the mesh from the seen truth: {100 * found.distance:.2f} % of the size")
+
+
+def errors(folder: Path) -> Errors:
+    """Errors of the object that was fused in a folder of `polcap synth --views`."""
     truth = dict(np.load(folder / "truth.npz"))
     surface = smooth(truth["vertices"], truth["faces"])
     source = fused_maps.read(folder / "fused" / "maps")
     size = float(np.ptp(surface.vertices, axis=0).max())
-    print(f"{'':10}{'normal':>9}{'albedo':>9}{'F0':>9}{'roughness':>11}")
     singles = [single(view) for view in sorted(folder.glob("view*/")) if (view / "polcap" / "report.json").exists()]
-    print_row("single", np.mean(singles, axis=0))
-    fused = against_truth(source, surface, truth)
-    print_row("fused", fused)
-    less = 1 - fused / np.mean(singles, axis=0)
-    print("reduction " + "".join(f"{100 * one:8.0f}%" for one in less))
-    reached = Tracer(surface), source.atlas
-    print(f"distance of the mesh from the seen truth: {100 * distance(*reached, source) / size:.2f} % of the size")
+    away = distance(Tracer(surface), source.atlas, source) / size
+    return Errors(np.mean(singles, axis=0), against_truth(source, surface, truth), away)
 
 
 def print_row(name: str, row: Floats) -> None:

@@ -1,6 +1,5 @@
 """A session goes on without the views that cannot be used, and says why each is left out."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from polcap.errors import CaptureError
 from polcap.formats.capture import reader
 from polcap.fusion import session as sessions
 from polcap.fusion.session import Session, SessionInput
+from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput
 from tests.fusion import board_views
 
@@ -47,10 +47,10 @@ def test_a_view_with_swapped_angles_is_left_out_with_the_remedy(
     names = ("view01", "view02", "view03", "view04")
     found = Session({name: board_views.capture() for name in names}, supplied={name: UserInput() for name in names})
 
-    def run(name: str, session: Session, *_: Any) -> None:
-        session.about[name] = {"gates": [SWAPPED] if name == "view02" else []}
+    def process(_: Any, __: Any, ___: Any, out: Path) -> dict[str, Any]:
+        return {"gates": [SWAPPED] if out.parent.name == "view02" else []}
 
-    monkeypatch.setattr(sys.modules[sessions.__name__], "_run", run)
-    found.each(lambda name: sessions._make_maps(name, found, wanted(tmp_path), lambda _: None))
+    monkeypatch.setattr(pipeline, "process", process)
+    made = found.each(sessions._make_maps, sessions._tasks(found, wanted(tmp_path)), None, lambda _: None)
     assert found.left_out == {"view02": "90°, 45°, 0° fit better. rename the folders"}
-    assert len(found.used) == 3
+    assert list(made) == found.used == ["view01", "view03", "view04"]
