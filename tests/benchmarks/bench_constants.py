@@ -48,7 +48,7 @@ SELFCAL: Mapping[ModuleType, tuple[str, ...]] = {
 }
 ANALYTIC = {
     analytic: ("_BLURS_PX", "_SAME", "_MODEL_ERROR_DEG"),
-    half_turns: ("_LONGEST", "_OUTLINE", "_INSIDE", "_AHEAD", "_BLUR", "_AROUND"),
+    half_turns: ("_LONGEST", "_INVERSION_OUTLINE", "_INSIDE", "_AHEAD", "_BLUR", "_AROUND"),
     zenith: (
         "_FLAT", "_FLATTEST", "_SMOOTH_LIKELIER", "_DEPOLARIZED_LIKELIER", "_PATCHES", "_UNEVEN", "_RADIUS_SPREAD",
         "_OUTLINE_DEG", "_SHARP",
@@ -58,7 +58,7 @@ LEARNED: Mapping[ModuleType, tuple[str, ...]] = {
     learned: ("_INVERSION", "_CELLS", "_BRIGHTEST"),
     fine: ("_COARSEST",),
     analytic: ("_MODEL_ERROR_DEG", "_SAME"),
-    half_turns: ("_LONGEST", "_OUTLINE", "_INSIDE", "_NETWORK", "_AHEAD", "_BLUR", "_SURE_DEG", "_SUREST"),
+    half_turns: ("_LONGEST", "_OUTLINE", "_INSIDE", "_NETWORK", "_AHEAD", "_BLUR", "_NEAR"),
 }
 
 

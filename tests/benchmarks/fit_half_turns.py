@@ -1,14 +1,14 @@
-"""Fits `_REGION` and `_CELL` of `infer/half_turns.py` (odds of a wrong azimuth side) on objects with known normals.
+"""Fits `_WRONG`, `_REGION` and `_CELL` of `infer/half_turns.py` (odds of a wrong azimuth side) on known normals.
 
     python tests/benchmarks/fit_half_turns.py DATA SCENES … [--sixths 27] [--model ONNX]
 
 SCENES are folders of `make_mitsuba.py`, of training meshes: black gloss and others; every third is seen under the
 rough law. Added to them are six pictures for each of --sixths: training meshes and materials in both protocols at 256².
 
-The cut is made with half, the usual and twice the weight of the network, for more regions to learn from. A region
-counts by what turning it changes of the mean normal error, 0.5° at most, over the root of the regions of its picture;
-cells of the inversion count alike. Then the odds are scaled by maximum likelihood, each region
-weighted by its whole error. Prints both laws, and what the accepted regions gain and lose.
+Cells of the network and of the inversion whose two sides differ by more than 10° give `_WRONG` and `_CELL`; every
+picture counts alike. Then the cut is made with half, the usual and twice the weight of the network, for more regions
+to learn from. A region counts by what turning it changes of the mean normal error, 0.5° at most, over the root of the
+regions of its picture. Prints the three laws, and what the accepted regions gain and lose.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from scipy.optimize import minimize
 from polcap.formats import onnx
 from polcap.images import Cues, Floats, Network
 from polcap.optics import frames
-from polcap.optics.resize import area_mean, weighted_area_mean
+from polcap.optics.resize import area_mean
 from polcap.pipeline import models
 from polcap.stages.infer import analytic, augmentation, half_turns, learned
 from polcap.training import evaluation_materials, evaluation_protocol, traced_views
@@ -47,21 +47,27 @@ def main() -> None:
     options = parser.parse_args()
     network = models.load_network("network", options.model, "cpu", 1)
     assert network is not None
-    regions, cells = [], []
+    network_cells, cells, grids = [], [], []
     for case in chain(path_traced(options.scenes), pictures(options.data, options.sixths)):
-        regions.append(proposed(case, network))
+        grid, terms, change = predicted(case, network)
+        clear = np.abs(change) > CLEAR_DEG
+        network_cells.append((terms[clear], change[clear] > 0, np.full(int(clear.sum()), 1 / max(int(clear.sum()), 1))))
+        grids.append((grid, terms, change / max(int(grid.mask.sum()), 1)))
         cells.append(inverted(case))
-        print(case.name, len(regions[-1][0]), "regions", flush=True)
-    x, gain, weight = (np.concatenate(column) for column in zip(*regions))
-    law = fit(x, gain > 0, np.minimum(np.abs(gain), MOST_DEG) * weight, SHRINK)
-    law = (
-        law * fit((x @ law)[:, None], gain > 0, np.abs(gain) * weight, 0.0)[0]
-    )  # same decisions; doubts by all they cost
-    accepted = x @ law > 0
+        print(case.name, flush=True)
+    wrong = fit(*(np.concatenate(column) for column in zip(*network_cells)))
+    print("_WRONG =", rounded(wrong))
+    odds, gain, weight = (np.concatenate(column) for column in zip(*(proposed(*one, wrong) for one in grids)))
+    terms = np.stack([np.ones(len(odds)), odds], axis=-1)
+    law = fit(terms, gain > 0, np.minimum(np.abs(gain), MOST_DEG) * weight)
+    accepted = terms @ law > 0
     gained, lost = (gain[accepted & side].sum() for side in (gain > 0, gain < 0))
-    print("_REGION =", tuple(float(f"{one:.3g}") for one in law), f"gains {gained:.1f}°, loses {-lost:.1f}° in all")
-    x, bad, weight = (np.concatenate(column) for column in zip(*cells))
-    print("_CELL =", tuple(float(f"{one:.3g}") for one in fit(x, bad, weight, 0.0)))
+    print("_REGION =", rounded(law), f"gains {gained:.1f}°, loses {-lost:.1f}° in all")
+    print("_CELL =", rounded(fit(*(np.concatenate(column) for column in zip(*cells)))))
+
+
+def rounded(law: Floats) -> tuple[float, ...]:
+    return tuple(float(f"{one:.3g}") for one in law)
 
 
 def path_traced(folders: list[Path]) -> Iterator[Case]:
@@ -82,25 +88,29 @@ def pictures(data: Path, sixths: int) -> Iterator[Case]:
                 yield drawn[number % 2].case(sixth * MESHES + number)
 
 
-def proposed(case: Case, network: Network) -> tuple[Floats, Floats, Floats]:
-    """Regions that the cut turns: terms (R, 5), by how much each lowers the mean error [degrees], weights (R,)."""
+def predicted(case: Case, network: Network) -> tuple[half_turns.Grid, Floats, Floats]:
+    """The network's normals on the coarse grid, terms (h, w, 4) of `_WRONG`, and what turning a cell gains, degrees."""
     shrink = max(1.0, max(case.cues.mask.shape) / int(network.metadata["native_size"]))
     seen = learned._reduce(learned._limit_radiance(case.cues), 1 / shrink)
     maps = augmentation.predict(seen, network, onnx.run, 4)
-    normal = frames.to_ray_frame(maps["normal"], seen.rays)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-    grid = half_turns.coarse(normal, seen.mask)
-    sigma, opposed = (weighted_area_mean(maps[name], seen.mask, grid.mask.shape) for name in ("sigma", "opposed"))
-    change, usual = gain_of_turning(grid, case) / max(int(grid.mask.sum()), 1), half_turns._NETWORK
-    terms, gains = [], []
+    grid = half_turns.coarse(frames.to_ray_frame(frames.unit(maps["normal"]), seen.rays), seen.mask)
+    overview = learned._overview(seen, network, onnx.run)
+    doubt = half_turns.NetworkDoubt(maps["sigma"], maps["opposed"], overview)
+    return grid, half_turns.wrong_terms(grid, doubt, seen.mask), gain_of_turning(grid, case)
+
+
+def proposed(grid: half_turns.Grid, terms: Floats, change: Floats, wrong: Floats) -> tuple[Floats, Floats, Floats]:
+    """Regions that the cut turns: mean log odds, gain in mean error [degrees], and weight of each, (R,)."""
+    usual = half_turns._NETWORK
+    odds, gains = [], []
     for factor in (0.5, 1.0, 2.0):
         half_turns._NETWORK = factor * usual
-        region, of_region = half_turns.proposals(grid, sigma, opposed)
-        terms.append(of_region[1:])
+        region, of_region = half_turns.proposals(grid, terms @ wrong)
+        odds.append(of_region[1:])
         gains.append(np.bincount(region.ravel(), change.ravel(), len(of_region))[1:])
     half_turns._NETWORK = usual
     gain = np.asarray(np.concatenate(gains), np.float64)
-    return np.concatenate(terms), gain, np.full(len(gain), 1 / np.sqrt(max(len(gain), 1)))
+    return np.concatenate(odds), gain, np.full(len(gain), 1 / np.sqrt(max(len(gain), 1)))
 
 
 def inverted(case: Case) -> tuple[Floats, NDArray[np.bool_], Floats]:
@@ -127,12 +137,12 @@ def gain_of_turning(grid: half_turns.Grid, case: Case) -> Floats:
     return np.asarray((kept - turned) * grid.mask)
 
 
-def fit(terms: Floats, true: NDArray[np.bool_], weight: Floats, shrink: float) -> Floats:
-    """Logistic coefficients of maximum likelihood, rows weighted by `weight`; all but the first are shrunk."""
+def fit(terms: Floats, true: NDArray[np.bool_], weight: Floats) -> Floats:
+    """Logistic coefficients of maximum likelihood, rows weighted by `weight`; all but the first are shrunk a little."""
     sign = np.where(true, 1.0, -1.0)
 
     def unlikely(law: Floats) -> float:
-        return float(weight @ np.logaddexp(0, -sign * (terms @ law)) / weight.sum() + shrink * (law[1:] ** 2).sum())
+        return float(weight @ np.logaddexp(0, -sign * (terms @ law)) / weight.sum() + SHRINK * (law[1:] ** 2).sum())
 
     return np.asarray(minimize(unlikely, np.zeros(terms.shape[1])).x)
 

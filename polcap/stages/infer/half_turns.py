@@ -6,17 +6,20 @@ often on black gloss. The inversion does not determine the side at all. For both
 whole object: every cell of a coarse grid keeps n or turns it to n′. With t the part of n across the ray, of length
 sin θ, the energy is the sum of
 
-    outline      3 e, e: share of object ahead of t less that behind it. A closed surface leans towards its outline;
+    outline      e, e: share of object ahead of t less that behind it. A closed surface leans towards its outline;
                  where t runs along an outline (a neck that the mask cuts), e is 0
     inside       −0.015 t·o, o the direction away from the object's inside: decides where nothing else does
-    network      0.04 sin θ · 30°/σ for turning, σ the network's error
+    network      −0.16 L for turning, L the log odds that the network erred in this cell: where its positions disagree,
+                 where it says the opposite of smaller pictures, in which it sees more of the object at once, and
+                 where it expects a large error
     neighbors   ∓2 min(sin θ, sin θ′)² cos Δ |cos Δ| for equal and unequal choices, Δ the angle between t and t′
 
 Half of the neighbor terms favor unequal choices, so the minimum is found by quadratic pseudo-Boolean optimization:
 one minimum cut with two nodes for each cell. The cells that it leaves open keep their normals.
 
-Turned cells of the network make connected regions. The sum of weak terms over a large region is no strong evidence,
-so each region is judged as a whole, by a logistic law that was fitted to path-traced captures with known normals.
+The inversion has no network term, and its outline counts three times as much. Turned cells of the network make
+connected regions. The sum of weak terms over a large region is no strong evidence, so each region is judged as a whole,
+by its mean L. All laws of odds were fitted to path-traced captures with known normals.
 
 References
 ----------
@@ -36,15 +39,15 @@ from polcap.optics.resize import area_mean, weighted_area_mean
 Bools = NDArray[np.bool_]
 
 _LONGEST = 128  # cells of the grid's longer side
-_OUTLINE, _INSIDE, _NETWORK = 3.0, 0.015, 0.04  # weights of the terms; the neighbors' is 1
+_OUTLINE, _INVERSION_OUTLINE, _INSIDE, _NETWORK = 1.0, 3.0, 0.015, 0.16  # weights of the terms; the neighbors' is 1
 _AHEAD = 1.5  # cells from a cell to the places ahead and behind
 _BLUR = 3.0  # cells, 1σ, of the depth inside the mask
-_SURE_DEG, _SUREST = 30.0, 3.0  # a network's error that counts 1, and the most that a small one counts
 _INTEGER = 1000  # capacities per unit of energy: the flow is one of whole numbers
-# ln odds that a region of the cut is turned: constant, outline evidence over √cells, mean inward lean, share of the
-# network's positions that disagree, ln of its error in degrees; tests/benchmarks/fit_half_turns.py
-_REGION = (-15.8, 2.42, 2.00, 18.6, 3.50)
-_MOST_OUTLINE, _MOST_OPPOSED = 2.0, 0.5  # larger values count as these
+# ln odds that the network's side of a cell is wrong: constant, share of its positions that disagree, correlation with
+# smaller pictures (both with the cells around), ln of its error in degrees; tests/benchmarks/fit_half_turns.py
+_WRONG = (-6.56, 4.51, -1.45, 1.67)
+_NEAR = 2.0  # cells, 1σ
+_REGION = (0.46, 0.68)  # ln odds that a region is turned: constant, mean ln odds of its cells; same benchmark
 # ln odds that a cell of the inversion is on the wrong side: constant, energy of turning it alone, ln of the share of
 # links around it that contradict each other, mean lean away from the inside around it; same benchmark
 _CELL = (2.94, -0.176, 1.04, -2.31)
@@ -57,6 +60,7 @@ class NetworkDoubt:
 
     sigma: Floats  # (H, W) expected error, degrees
     opposed: Floats  # (H, W) share of its positions in which the normal leans to the other side
+    overview: Floats  # (2, H, W) lean of the normals that it predicts from smaller pictures, see `Grid`
 
 
 @dataclass(frozen=True)
@@ -89,9 +93,8 @@ def resolve(normal: Floats, mask: Bools, network: NetworkDoubt | None = None) ->
         x, y = (_enlarged(part, mask.shape) for part in np.where(turned, -1, 1) * grid.lean)
         doubt = _chance(terms @ np.array(_CELL))
         return HalfTurns(x * normal[..., 0] + y * normal[..., 1] < 0, _enlarged(doubt, mask.shape))
-    sigma, opposed = (weighted_area_mean(image, mask, grid.mask.shape) for image in (network.sigma, network.opposed))
-    region, terms = proposals(grid, sigma, opposed)
-    chance = _chance(terms @ np.array(_REGION))
+    region, odds = proposals(grid, wrong_terms(grid, network, mask) @ np.array(_WRONG))
+    chance = _chance(_REGION[0] + _REGION[1] * odds)
     chance[0] = 0  # cells that the cut does not turn: the network's error covers them
     doubt = np.minimum(chance, 1 - chance)[region]
     return HalfTurns(_enlarged((chance > 0.5)[region], mask.shape) > 0.5, _enlarged(doubt, mask.shape))
@@ -122,7 +125,7 @@ def sides(grid: Grid) -> tuple[Bools, Floats]:
     Also returns the evidence (h, w, 4) that the chosen side is wrong: the terms of the odds `_CELL`.
     """
     outwards = _outwards(grid)
-    cost = (_OUTLINE * _outline_evidence(grid) + _INSIDE * outwards)[grid.mask]  # of turning less that of keeping
+    cost = (_INVERSION_OUTLINE * _outline_evidence(grid) + _INSIDE * outwards)[grid.mask]
     first, second, alike = _links(grid)
     turned = _cut(grid.mask, cost, first, second, alike)
     sign = np.where(turned, -1, 1)
@@ -144,29 +147,33 @@ def sides(grid: Grid) -> tuple[Bools, Floats]:
     return turned, np.stack([np.ones(turned.shape), energy, np.log(contradiction + 0.01), lean], axis=-1)
 
 
-def proposals(grid: Grid, sigma: Floats, opposed: Floats) -> tuple[NDArray[np.int32], Floats]:
-    """Regions of the network's normals that the minimum cut turns by 180° in azimuth, and the evidence for each.
+def wrong_terms(grid: Grid, network: NetworkDoubt, mask: Bools) -> Floats:
+    """Evidence (h, w, 4) that the network's normals lean to the wrong side: the terms of the odds `_WRONG`.
 
-    `sigma` and `opposed` (h, w) are those of `NetworkDoubt`. Returns the number (h, w) of each cell's region, 0 for
-    cells that do not turn, and terms (R, 5) of the regions' odds, see `_REGION`.
+    `network` and `mask` have the size of the picture. Outline and neighbors are not part of this evidence.
     """
-    evidence, outwards = _outline_evidence(grid), _outwards(grid)
-    sure = np.minimum(_SURE_DEG / np.maximum(sigma, 1), _SUREST) / _SUREST
-    cost = _OUTLINE * evidence + _INSIDE * outwards + _NETWORK * np.hypot(*grid.lean) * sure
+    images = (network.sigma, network.opposed, *network.overview)
+    sigma, opposed, *overview = (weighted_area_mean(image, mask, grid.mask.shape) for image in images)
+
+    def near(image: Floats) -> Floats:
+        return np.asarray(cv2.GaussianBlur((image * grid.mask).astype(np.float32), (0, 0), _NEAR))
+
+    alike = near((grid.lean * overview).sum(axis=0)) / (near(np.hypot(*grid.lean) * np.hypot(*overview)) + 1e-3)
+    disagree = near(opposed) / (near(np.ones(grid.mask.shape)) + 1e-6)
+    return np.stack([np.ones(alike.shape), disagree, alike, np.log(np.maximum(sigma, 1))], axis=-1)
+
+
+def proposals(grid: Grid, odds: Floats) -> tuple[NDArray[np.int32], Floats]:
+    """Regions of the network's normals that the minimum cut turns by 180° in azimuth.
+
+    `odds` (h, w) are those of `_WRONG`. Returns the number (h, w) of each cell's region, 0 for cells that do not turn,
+    and the mean odds (R,) of each region.
+    """
+    cost = _OUTLINE * _outline_evidence(grid) + _INSIDE * _outwards(grid) - _NETWORK * odds
     turned = _cut(grid.mask, cost[grid.mask], *_links(grid))
     count, region = cv2.connectedComponents(turned.astype(np.uint8), connectivity=4)
     cells = np.maximum(np.bincount(region.ravel(), minlength=count), 1)
-    clear, inward, against, error = (
-        np.bincount(region.ravel(), image.ravel(), count) / cells for image in (-evidence, -outwards, opposed, sigma)
-    )
-    terms = [
-        np.ones(count),
-        np.clip(clear * np.sqrt(cells), -1, _MOST_OUTLINE),
-        inward,
-        np.minimum(against, _MOST_OPPOSED),
-        np.log(np.maximum(error, 1)),
-    ]
-    return region.astype(np.int32), np.stack(terms, axis=1)
+    return region.astype(np.int32), np.bincount(region.ravel(), odds.ravel(), count) / cells
 
 
 def _chance(odds: Floats) -> Floats:

@@ -24,6 +24,7 @@ from polcap.stages.infer.highlights import REACHED
 _INVERSION = 4.0  # factor on the inversion's expected error in the join, for the network's input holds the inversion
 # error = min(a·statedᵇ·exp(r·roughness), c), degrees: maximum likelihood on traced training meshes (decision 28)
 _CALIBRATION = (0.515, 1.12, 0.906, 50.0)
+_OVERVIEWS, _OVERVIEW_POSITIONS = (0.5, 0.35), 4  # sizes of smaller pictures, evidence for the side of normals
 _CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is constant
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _GRAZING = 0.15  # least cosine of the shading; .1 and .2 leave the same error
@@ -79,7 +80,8 @@ def estimate_coarse(
     small = augmentation.predict(seen, network, run, symmetries)
     # zeros outside the object, so that the object's own pixels alone set the direction at its edge when enlarged
     small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
-    small["normal"], small["doubt"] = _correct_half_turns(small["normal"], seen, small["sigma"], small.pop("opposed"))
+    doubt = half_turns.NetworkDoubt(small["sigma"], small.pop("opposed"), _overview(seen, network, run))
+    small["normal"], small["doubt"] = _correct_half_turns(small["normal"], seen, doubt)
     small["factor"] = _log_factor(small["diffuse"] * _shading(small["normal"], seen.rays), seen)
     for name in ("specular", "roughness"):
         small[name] = _smooth_gloss(small[name], seen.mask)
@@ -150,14 +152,26 @@ def _without_grid(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
     return out
 
 
-def _correct_half_turns(normal: Floats, seen: Cues, sigma: Floats, opposed: Floats) -> tuple[Floats, Floats]:
+def _overview(seen: Cues, network: Network, run: RunNetwork) -> Floats:
+    """Mean lean (2, H, W) across the ray of the normals that the network predicts from pictures smaller than `seen`.
+
+    The fewer the pixels, the more of the object the network takes in at once. One position alone is not reliable.
+    """
+    lean = np.zeros((2, *seen.mask.shape), np.float32)
+    for size in _OVERVIEWS:
+        low = _reduce(seen, size)
+        normal = augmentation.predict(low, network, run, _OVERVIEW_POSITIONS)["normal"]
+        local = frames.to_ray_frame(frames.unit(normal), low.rays)[..., :2] * low.mask[..., None]
+        lean += np.moveaxis(cv2.resize(local.astype(np.float32), seen.mask.shape[::-1]), -1, 0) / len(_OVERVIEWS)
+    return lean
+
+
+def _correct_half_turns(normal: Floats, seen: Cues, doubt: half_turns.NetworkDoubt) -> tuple[Floats, Floats]:
     """Turn regions of the network's normals (H, W, 3) that lean to the wrong side of the ray (180° ambiguity).
 
     Also returns the probability (H, W) that the chosen side is wrong.
     """
-    found = half_turns.resolve(
-        frames.to_ray_frame(frames.unit(normal), seen.rays), seen.mask, half_turns.NetworkDoubt(sigma, opposed)
-    )
+    found = half_turns.resolve(frames.to_ray_frame(frames.unit(normal), seen.rays), seen.mask, doubt)
     opposite = 2 * frames.dot(normal, seen.rays)[..., None] * seen.rays - normal
     return np.where(found.turned[..., None], opposite, normal).astype(np.float32), found.doubt
 

@@ -24,9 +24,10 @@ def opposite(normal):
     return normal * [-1, -1, 1]
 
 
-def doubt(mask, sigma=20.0, opposed=0.0):
-    ones = np.ones(mask.shape)
-    return half_turns.NetworkDoubt(sigma * ones, opposed * ones)
+def doubt(overview, sigma=20.0, opposed=0.0):
+    """Doubt (H, W) of a network that predicts the normals `overview` (H, W, 3) from smaller pictures."""
+    ones = np.ones(overview.shape[:2])
+    return half_turns.NetworkDoubt(sigma * ones, opposed * ones, np.moveaxis(overview[..., :2], -1, 0))
 
 
 def leaning(normal):
@@ -38,14 +39,14 @@ def test_a_region_of_a_ball_that_was_turned_is_turned_back(region: str) -> None:
     normal, mask = ball()
     wrong = mask & {"whole": X > -1, "half": X > 60, "patch at the outline": np.hypot(X - 100, Y - 60) < 22}[region]
     normals = np.where(wrong[..., None], opposite(normal), normal)
-    found = half_turns.resolve(normals, mask, doubt(mask, 25.0))
+    found = half_turns.resolve(normals, mask, doubt(normal, 25.0))
     judged = mask & leaning(normal)
     assert (found.turned == wrong)[judged].mean() > 0.97
 
 
 def test_a_right_ball_keeps_its_normals_without_doubt() -> None:
     normal, mask = ball()
-    found = half_turns.resolve(normal, mask, doubt(mask))
+    found = half_turns.resolve(normal, mask, doubt(normal))
     assert not found.turned.any()
     assert found.doubt.max() == 0
 
@@ -58,7 +59,7 @@ def test_a_true_dent_stays_a_dent() -> None:
     hollow = np.stack([-u, -v, np.sqrt(np.maximum(1 - u * u - v * v, 0.1))], axis=-1)
     hollow /= np.linalg.norm(hollow, axis=-1, keepdims=True)
     normals = np.where(dent[..., None], hollow, normal)
-    assert not half_turns.resolve(normals, mask, doubt(mask, 10.0)).turned.any()
+    assert not half_turns.resolve(normals, mask, doubt(normals, 10.0)).turned.any()
 
 
 def test_a_neck_that_the_mask_cuts_does_not_anchor() -> None:
@@ -98,7 +99,7 @@ def test_positions_that_disagree_raise_the_odds_of_a_region() -> None:
     normal, mask = ball()
     wrong = np.hypot(X - 95, Y - 60) < 18
     normals = np.where(wrong[..., None], opposite(normal), normal)
-    agreed, split = (half_turns.resolve(normals, mask, doubt(mask, 8.0, opposed)) for opposed in (0.0, 0.5))
+    agreed, split = (half_turns.resolve(normals, mask, doubt(0 * normals, 20.0, opposed)) for opposed in (0.0, 0.5))
     assert not agreed.turned.any() and agreed.doubt.max() > 0.02
     assert split.turned[wrong & mask & leaning(normal)].mean() > 0.9
 
