@@ -72,7 +72,8 @@ def synth(
         changes |= {"cast_shadows": True} if cast_shadow else {}
         changes |= {"interreflection": True} if interreflection else {}
         chosen = replace(chosen, **changes)
-        with terminal.progress((views or 1) * len(shoot.angles_deg) * shoot.exposures) as bar:
+        captures = views + shoot.laid if isinstance(shoot, all_around.AroundShoot) and views is not None else 1
+        with terminal.progress(captures * len(shoot.angles_deg) * shoot.exposures) as bar:
             if isinstance(shoot, all_around.AroundShoot) and views is not None:
                 all_around.write(folder, chosen, shoot, views, bar.frame)
             else:

@@ -107,6 +107,7 @@ def document(
         "figures": {
             "views": {row["name"]: row for row in rows},
             "left_out": dict(found.left_out),
+            "sets": dict(found.shared),
             "camera": {
                 "focal_px": found.camera.focal_px,
                 "focal_sigma_px": found.camera.focal_sigma_px,
@@ -168,6 +169,9 @@ def _gates(found: Session, results: FusionResults, rows: Sequence[Mapping[str, A
     remedy = "" if state == "pass" else "Keep the board flat, and focus and zoom unchanged"
     yield Gate("poses", state, value, _MOST_RESIDUAL_PX, message, remedy, unit="px")
     yield _agreement_gate(rows)
+    for folder, share in found.shared.items():
+        message = f"The first set confirms {share:.0%} of the surface of {folder}"
+        yield Gate(f"join {folder}", "pass", share, session.LEAST_SHARED, message)
     seen, state, remedy = _seen(results), "pass", ""
     if seen < _LEAST_SEEN:
         few = len(found.used) < _FEW_VIEWS

@@ -1,7 +1,8 @@
 """Processes all views of a session: one color calibration, one camera, poses from the board, masks, maps.
 
 Each view is a capture that `polcap process` takes, with its result in viewNN/polcap. A view that cannot be used is left
-out, with the reason; the others go on.
+out, with the reason; the others go on. Between sets of views (setA/view01 …, setB/view01 …) the object was laid on
+another side; their boards become one frame at the end.
 """
 
 import traceback
@@ -27,7 +28,7 @@ from polcap.errors import (
 )
 from polcap.formats import onnx, own_folders
 from polcap.formats.capture import layouts, reader
-from polcap.fusion import board_corners, mask_agreement, poses, view_maps
+from polcap.fusion import board_corners, joining, mask_agreement, poses, view_maps
 from polcap.fusion.board_corners import BoardCorners
 from polcap.fusion.board_eraser import erase
 from polcap.fusion.poses import LEAST_VIEWS, PosedView, SessionCamera
@@ -41,6 +42,9 @@ from polcap.stages import mask
 from polcap.stages.mask import regions
 
 _REFUSED = ("order",)  # gates of a view whose failure makes its normals wrong everywhere
+LEAST_SHARED = (
+    0.7  # of a set's surface, that the first set confirms; right joins have .9, those of two objects up to .5
+)
 _RETRIES = 1  # of a view, if its process died
 # faults of a view, without which the others go on; settings, models and the disk are common to all
 _FAULTS = (CaptureError, DecodeError, ChartError, AlignmentError, ObjectError)
@@ -95,6 +99,7 @@ class Session:
     camera: SessionCamera | None = None
     posed: Mapping[str, PosedView] = field(default_factory=dict)
     about: dict[str, dict[str, Any]] = field(default_factory=dict)  # content of report.json of each view
+    shared: dict[str, float] = field(default_factory=dict)  # of each further set: share that the first one confirms
 
     def each(
         self, work: Callable[[T], R], tasks: Mapping[str, T], pool: ProcessPool | None, done: Report
@@ -124,6 +129,16 @@ class Session:
     def used(self) -> list[str]:
         """Names of the views that are not left out."""
         return [name for name in self.captures if name not in self.left_out]
+
+    @property
+    def sets(self) -> dict[str, list[str]]:
+        """Used views by the folder of their set, which is empty for views without one."""
+        found: dict[str, list[str]] = {}
+        for name in self.captures:
+            names = found.setdefault(name.rpartition("/")[0], [])
+            if name not in self.left_out:
+                names.append(name)
+        return found
 
 
 def _outcomes(
@@ -182,7 +197,7 @@ def process(wanted: SessionInput, report: Report) -> tuple[Session, tuple[Fusion
         _compare_masks(session, wanted, masks)
         session.about = session.each(_make_maps, _tasks(session, wanted), pool, _says(report, "maps"))
     _enough(session)
-    return session, tuple(_view(name, session, wanted) for name in session.used)
+    return session, _joined(session, wanted)
 
 
 def _says(report: Report, what: str) -> Report:
@@ -191,28 +206,31 @@ def _says(report: Report, what: str) -> Report:
 
 
 def _read(wanted: SessionInput) -> Session:
-    """Read the captures of all folders view…/."""
-    found = sorted(wanted.folder.glob("view*/"), key=lambda folder: layouts.natural(folder.name))
-    if not found:
+    """Read the captures of all folders view…/ and set…/view…/."""
+    folders = [*wanted.folder.glob("view*/"), *wanted.folder.glob("set*/view*/")]
+    names = sorted((folder.relative_to(wanted.folder).as_posix() for folder in folders), key=layouts.natural)
+    if not names:
         raise CaptureError(f"{wanted.folder} holds no views; put each capture into a folder view01, view02, …")
     session = Session({})
-    for folder in found:
+    for name in names:
+        folder = wanted.folder / name
         try:
-            session.captures[folder.name] = reader.read(folder, wanted.angles_deg, wanted.clockwise)
+            session.captures[name] = reader.read(folder, wanted.angles_deg, wanted.clockwise)
         except _FAULTS as error:
-            session.left_out[folder.name] = _reason(str(folder), error)
+            session.left_out[name] = _reason(str(folder), error)
     _enough(session)
     return session
 
 
 def _enough(session: Session) -> None:
-    if len(session.used) < LEAST_VIEWS:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in session.left_out.items())
-        raise CaptureError(
-            f"{len(session.used)} views can be used, {LEAST_VIEWS} are needed"
-            + (f" ({reasons})" if reasons else "")
-            + "; shoot more, 12 for a simple shape"
-        )
+    for folder, used in session.sets.items():
+        if len(used) < LEAST_VIEWS:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in session.left_out.items())
+            raise CaptureError(
+                f"{len(used)} views {f'of {folder} ' * bool(folder)}can be used, {LEAST_VIEWS} are needed"
+                + (f" ({reasons})" if reasons else "")
+                + "; shoot more, 12 for a simple shape"
+            )
 
 
 def _tasks(session: Session, wanted: SessionInput) -> dict[str, ViewTask]:
@@ -286,12 +304,13 @@ def _mask_object(task: MaskTask) -> Bools:
 
 def _compare_masks(session: Session, wanted: SessionInput, masks: Mapping[str, Bools]) -> None:
     """Remove from the masks what no other view confirms, and leave out views whose masks contradict the others."""
-    views = [_silhouette(name, found, session, wanted) for name, found in masks.items()]
-    used, contradicting = mask_agreement.agreeing(views)
-    session.left_out |= contradicting
-    for view in used:
-        largest = regions.nth_part(view.mask, 1)  # what remains of the board is smaller
-        session.supplied[view.name] = replace(session.supplied[view.name], mask=largest)
+    for names in session.sets.values():
+        views = [_silhouette(name, masks[name], session, wanted) for name in names]
+        used, contradicting = mask_agreement.agreeing(views)
+        session.left_out |= contradicting
+        for view in used:
+            largest = regions.nth_part(view.mask, 1)  # what remains of the board is smaller
+            session.supplied[view.name] = replace(session.supplied[view.name], mask=largest)
 
 
 def _silhouette(name: str, found: Bools, session: Session, wanted: SessionInput) -> Silhouette:
@@ -316,3 +335,24 @@ def _view(name: str, session: Session, wanted: SessionInput) -> FusionView:
     assert session.camera is not None
     undistorted = results.radiance.equipment.distortion is not None and wanted.config.stokes.undistort
     return view_maps.fusion_view(name, results, session.camera, session.posed[name].pose, undistorted)
+
+
+def _joined(session: Session, wanted: SessionInput) -> tuple[FusionView, ...]:
+    """The maps of all used views, in the frame of the first set's board.
+
+    Raises
+    ------
+    CaptureError
+        A set does not show the object of the first one.
+    """
+    first, *others = ([_view(name, session, wanted) for name in names] for names in session.sets.values())
+    out = list(first)
+    for folder, views in zip(list(session.sets)[1:], others, strict=True):
+        joined, session.shared[folder] = joining.join(first, views)
+        if session.shared[folder] < LEAST_SHARED:
+            raise CaptureError(
+                f"{folder}: the first set confirms {session.shared[folder]:.0%} of this set's surface, "
+                f"{LEAST_SHARED:.0%} are needed; show the same object, with some sides in both sets"
+            )
+        out += joined
+    return tuple(out)

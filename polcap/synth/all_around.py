@@ -5,9 +5,13 @@
     FOLDER/view01/ …   one capture per view, as `shooting.py` writes it; the chart is in the first
     FOLDER/truth.json  poses of the board, camera
     FOLDER/truth.npz   true surface: vertices [m, world frame], faces, and the material at every vertex
+
+With views of the object laid on its side, these folders are setA/view01 … and setB/view01 …; truth.json then has the
+turn and the shift of the object from the first board to the second.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,6 +37,7 @@ _CONVENTIONS = (
     "camera: x right, y up, z towards the camera; camera point = rotation @ world point + translation; "
     "pixels are those of a pinhole with focal_px and principal_px, before the lens"
 )
+_LAID = Rotation.from_euler("yxz", [40, 87, 5], degrees=True)  # of the object, by a hand that lays it down
 _GRID = 96  # points along a side of the grid on which a shape's surface is found
 
 
@@ -46,6 +51,29 @@ class AroundShoot(Shoot, frozen=True, forbid_unknown_fields=True):
     turn_error_deg: Annotated[float, Meta(ge=0, le=45)] = 0.5  # 1σ of the table's angle
     radius_m: Annotated[float, Meta(gt=0, le=10)] = 0.065  # of the sphere about the object, if it is a mesh
     off_axis_m: Annotated[float, Meta(ge=0, le=0.1)] = 0.003  # from the table's axis to the board's middle
+    laid: Annotated[int, Meta(ge=0, le=99)] = 0  # further views, after the object was laid on its side
+
+
+@dataclass(frozen=True)
+class Placement:
+    """An object on the board, turned from its own frame."""
+
+    mesh: Triangles
+    turn: Rotation
+
+    @property
+    def _heights(self) -> Floats:
+        return np.asarray(self.turn.apply(self.mesh.vertices))[:, 1]
+
+    @property
+    def lift(self) -> float:
+        """Height of the origin of the object's frame above the board [m]."""
+        return -float(self._heights.min())
+
+    @property
+    def middle(self) -> Floats:
+        """Point (3,) m of the world frame that the lens aims at."""
+        return np.array([0.0, np.ptp(self._heights) / 2, 0.0])
 
 
 def write(
@@ -68,26 +96,28 @@ def write(
         sized = msgspec.structs.replace(scene.shape, radius=shoot.radius_m)
         scene = msgspec.structs.replace(scene, shape=sized)
     mesh = surface(scene)
-    low, high = float(mesh.vertices[:, 1].min()), float(mesh.vertices[:, 1].max())
-    lift = -low
-    poses = _poses(shoot, views, np.array([0.0, (high - low) / 2, 0.0]))
+    sets = [Placement(mesh, Rotation.identity())] + [Placement(mesh, _LAID)] * bool(shoot.laid)
+    named = [
+        (f"set{letter}/" * bool(shoot.laid) + _name(k), placed, *pose)
+        for letter, placed, count in zip("AB", sets, (views, shoot.laid))
+        for k, pose in enumerate(_poses(shoot, count, placed.middle))
+    ]
     each = len(shoot.angles_deg) * shoot.exposures + shoot.exposures * shoot.cross
     middle = None
     with atomic.folder(folder) as place:
-        for k, (turn, position) in enumerate(poses):
-            name, seen = _name(k), _view(scene, shoot, turn, position, lift)
+        for k, (name, placed, turn, position) in enumerate(named):
+            seen, done = _view(scene, shoot, turn, position, placed), k * each
             own = msgspec.structs.replace(shoot, seed=shoot.seed + 1000 * k)
-            done = k * each
 
             def count(written: int, _: int, done: int = done) -> None:
                 if frame_written is not None:
-                    frame_written(done + written, views * each)
+                    frame_written(done + written, len(named) * each)
 
             studio = Studio(seen if k == 0 else msgspec.structs.replace(seen, chart=None), own, middle)
             middle = studio.middle
             shooting.write_capture(place / name, studio, count)
-        _write_surface(place / "truth.npz", scene, mesh, lift)
-        _write_poses(place / "truth.json", scene, shoot, poses)
+        _write_surface(place / "truth.npz", scene, mesh, sets[0].lift)
+        _write_poses(place / "truth.json", scene, shoot, {name: (turn, at) for name, _, turn, at in named}, sets)
 
 
 def surface(scene: Scene) -> Triangles:
@@ -124,15 +154,16 @@ def _poses(shoot: AroundShoot, views: int, target: Floats) -> Poses:
     return out
 
 
-def _view(scene: Scene, shoot: AroundShoot, turn: Rotation, position: Floats, lift: float) -> Scene:
+def _view(scene: Scene, shoot: AroundShoot, turn: Rotation, position: Floats, placed: Placement) -> Scene:
     """The scene on its board in one pose of the board, with the chart upright at the right of the object."""
     vector = tuple(turn.as_rotvec(degrees=True).tolist())
-    place = tuple((turn.apply([0.0, lift, 0.0]) + position).tolist())
+    own = tuple((turn * placed.turn).as_rotvec(degrees=True).tolist())
+    place = tuple((turn.apply([0.0, placed.lift, 0.0]) + position).tolist())
     right = 0.5 * forward_camera.SENSOR_WIDTH_MM / shoot.focal_mm * shoot.distance_m - 0.053
     chart = Chart(center=(right, 0.085 * shoot.distance_m, -shoot.distance_m))
     laid = LaidBoard(tuple(position.tolist()), vector, shoot.board)
     return msgspec.structs.replace(
-        scene, turn_deg=vector, position=place, chart=chart, board=laid, cast_shadows=True, shadows=True
+        scene, turn_deg=own, position=place, chart=chart, board=laid, cast_shadows=True, shadows=True
     )
 
 
@@ -150,14 +181,20 @@ def _write_surface(file: Path, scene: Scene, mesh: Triangles, lift: float) -> No
         np.savez_compressed(temporary, faces=mesh.faces, **single)
 
 
-def _write_poses(file: Path, scene: Scene, shoot: AroundShoot, poses: Poses) -> None:
+def _write_poses(
+    file: Path, scene: Scene, shoot: AroundShoot, poses: dict[str, tuple[Rotation, Floats]], sets: Sequence[Placement]
+) -> None:
     views = [
-        {"name": _name(k), "rotation": turn.as_matrix().tolist(), "translation": position.tolist()}
-        for k, (turn, position) in enumerate(poses)
+        {"name": name, "rotation": turn.as_matrix().tolist(), "translation": position.tolist()}
+        for name, (turn, position) in poses.items()
     ]
-    document = {
+    document: dict[str, Any] = {
         "conventions": _CONVENTIONS, "board": shoot.board, "focal_px": shoot.view.focal,
         "principal_px": shoot.view.center, "size_px": (shoot.width, shoot.height), "distortion": shoot.distortion,
         "light": scene.light, "views": views,
     }  # fmt: skip
+    if shoot.laid:
+        first, second = sets
+        shift = np.array([0.0, second.lift, 0.0]) - second.turn.apply([0.0, first.lift, 0.0])
+        document["laid"] = {"rotation": second.turn.as_matrix().tolist(), "translation": shift.tolist()}
     atomic.write(file, msgspec.json.format(msgspec.json.encode(document), indent=1))

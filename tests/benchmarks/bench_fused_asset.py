@@ -44,7 +44,8 @@ def errors(folder: Path) -> Errors:
     surface = smooth(truth["vertices"], truth["faces"])
     source = fused_maps.read(folder / "fused" / "maps")
     size = float(np.ptp(surface.vertices, axis=0).max())
-    singles = [single(view) for view in sorted(folder.glob("view*/")) if (view / "polcap" / "report.json").exists()]
+    views = sorted([*folder.glob("view*/"), *folder.glob("set*/view*/")])
+    singles = [single(view) for view in views if (view / "polcap" / "report.json").exists()]
     away = distance(Tracer(surface), source.atlas, source) / size
     return Errors(np.mean(singles, axis=0), against_truth(source, surface, truth), away)
 

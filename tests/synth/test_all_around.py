@@ -59,6 +59,23 @@ def test_the_true_surface_projects_onto_the_true_mask_of_every_view(session: tup
         assert [y.min(), y.max()] == pytest.approx([row.min(), row.max()], abs=1.5)
 
 
+def test_the_surface_laid_on_its_side_projects_onto_the_masks_of_the_second_set(tmp_path: Path) -> None:
+    folder = tmp_path / "session"
+    all_around.write(folder, PEAR, replace(SMALL, laid=1), 3)
+    truth = json.loads((folder / "truth.json").read_text())
+    assert [view["name"] for view in truth["views"]] == ["setA/view01", "setA/view02", "setA/view03", "setB/view01"]
+    with np.load(folder / "truth.npz") as surface:
+        vertices = surface["vertices"].astype(float)
+    laid = vertices @ np.array(truth["laid"]["rotation"]).T + truth["laid"]["translation"]
+    assert laid[:, 1].min() == pytest.approx(0, abs=1e-6)
+    view, last = View(truth["focal_px"], tuple(truth["principal_px"]), 1.0), truth["views"][-1]
+    with np.load(folder / last["name"] / "truth.npz") as maps:
+        row, column = np.nonzero(maps["mask"])
+    x, y = projection.project(view, laid @ np.array(last["rotation"]).T + last["translation"]).T
+    assert [x.min(), x.max()] == pytest.approx([column.min(), column.max()], abs=1.5)
+    assert [y.min(), y.max()] == pytest.approx([row.min(), row.max()], abs=1.5)
+
+
 def test_views_share_their_exposure(session: tuple[Path, dict[str, Any]]) -> None:
     folder, truth = session
     files = [json.loads((folder / view["name"] / "truth.json").read_text())["files"] for view in truth["views"]]

@@ -1,0 +1,170 @@
+"""Joins sets of views between which the object was laid on another side, by the shape and albedo that each set shows.
+
+Each set alone gives a closed mesh on its own board. One mesh is moved onto the other: of many sampled turns, the best
+by distances, normals and albedos of nearest points are refined by iterated closest points.
+
+References
+----------
+Besl & McKay, A method for registration of 3-D shapes, IEEE TPAMI 1992; Chen & Medioni, Object modelling by registration
+of multiple range images, Image and Vision Computing 1992 (distances from planes).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from polcap.fusion.normal_surface import visible
+from polcap.fusion.shape import ShapeSettings, fuse_shape
+from polcap.fusion.small_views import reduce_views, sample
+from polcap.fusion.values import FusionView, Pose
+from polcap.images import Floats
+from polcap.optics.frames import dot
+from polcap.optics.vertex_frames import vertex_normals
+
+_GRID = 80  # steps along a set's own mesh, which is for this registration alone
+_LEAST_SEEN = 0.3  # sum of the cosines to the views of a point that they know
+_TURNS = 3000  # sampled: every turn is within about 15° of one of them
+_SHIFTS = 3  # tried with each turn
+_TRIED = 40  # of the turns are refined
+_FEW, _MANY = 400, 8000  # points, of the search and of the last rounds
+_NORMAL = 0.4  # 1σ of the difference of two normals of one point
+_ALBEDO = 0.1  # the same of albedos
+_CLOSE = (0.06, 0.03, 0.015, 0.008, 0.004)  # 1σ of distances, of the object's size; from the search to the last rounds
+_ROUNDS = 6  # with each of them
+_FAR = 3.0  # σ; points that differ by more have no partner
+_ALONG = 0.1  # weight of distances along the surface over that of distances from it
+
+
+@dataclass(frozen=True)
+class SeenSurface:
+    """Points that a set of views saw, in the frame of its board."""
+
+    point: Floats  # (P, 3) m
+    normal: Floats  # (P, 3) unit
+    albedo: Floats  # (P, 3)
+    middle: Floats  # (3,) m, of the closed mesh, with its unseen parts
+
+    @property
+    def size(self) -> float:
+        """Longest side of the points' box, m."""
+        return float(np.ptp(self.point, axis=0).max())
+
+    def some(self, count: int, random: np.random.Generator) -> "SeenSurface":
+        """About `count` of the points."""
+        index = random.choice(len(self.point), min(count, len(self.point)), replace=False)
+        return SeenSurface(self.point[index], self.normal[index], self.albedo[index], self.middle)
+
+    def features(self, close: float) -> Floats:
+        """Positions, normals and albedos (P, 9) in units of their 1σ; `close` is that of positions, m."""
+        return np.concatenate([self.point / close, self.normal / _NORMAL, self.albedo / _ALBEDO], axis=1)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A rigid motion: point -> rotation @ point + translation."""
+
+    rotation: Floats  # (3, 3)
+    translation: Floats  # (3,) m
+
+    def apply(self, surface: SeenSurface) -> SeenSurface:
+        """The moved surface."""
+        point = surface.point @ self.rotation.T + self.translation
+        middle = self.rotation @ surface.middle + self.translation
+        return SeenSurface(point, surface.normal @ self.rotation.T, surface.albedo, middle)
+
+    def pose(self, before: Pose) -> Pose:
+        """The pose of a view after the object and its board were moved."""
+        rotation = before.rotation @ self.rotation.T
+        return Pose(rotation, before.translation - rotation @ self.translation)
+
+
+def join(fixed: Sequence[FusionView], moving: Sequence[FusionView]) -> tuple[list[FusionView], float]:
+    """The views of a set in the frame of another, and the share of their surface that the other confirms."""
+    motion, share = register(seen_surface(moving), seen_surface(fixed))
+    return [replace(view, pose=motion.pose(view.pose)) for view in moving], share
+
+
+def seen_surface(views: Sequence[FusionView]) -> SeenSurface:
+    """What one set of views shows of the object."""
+    mesh, small = fuse_shape(views, ShapeSettings(grid=_GRID)), reduce_views(views)
+    outward = vertex_normals(mesh.vertices, mesh.faces)
+    step = float(np.ptp(mesh.vertices, axis=0).max()) / _GRID
+    seen = visible(mesh.vertices, mesh.faces, outward, small, step)
+    cosine = np.stack([np.maximum(dot(outward, view.towards(mesh.vertices)), 0) for view in small])
+    diffuse = np.stack([sample(view.diffuse, view.pixels(mesh.vertices)) for view in small])
+    weight = seen * cosine  # (N, V)
+    total = weight.sum(axis=0)
+    there = np.flatnonzero(total > _LEAST_SEEN)
+    albedo = np.einsum("nv,nvc->vc", weight[:, there], diffuse[:, there]) / total[there, None]
+    return SeenSurface(mesh.vertices[there], outward[there], albedo, mesh.vertices.mean(axis=0))
+
+
+def register(moving: SeenSurface, fixed: SeenSurface) -> tuple[Motion, float]:
+    """The motion of one surface onto another, and the share of its points that then have a partner there."""
+    random = np.random.default_rng(0)
+    few, coarse = moving.some(_FEW, random), fixed.some(10 * _FEW, random)
+    tried = [_refined(motion, few, coarse, _CLOSE[:2]) for motion in _likely_turns(few, coarse)]
+    best = min(tried, key=lambda motion: _difference(motion.apply(few), coarse, _CLOSE[1]))
+    many = moving.some(_MANY, random)
+    motion = _refined(best, many, fixed, _CLOSE[1:])
+    partner, _ = _partners(motion.apply(many), cKDTree(fixed.features(_CLOSE[2] * fixed.size)), _CLOSE[2] * fixed.size)
+    return motion, float(np.isfinite(partner).mean())
+
+
+def _likely_turns(moving: SeenSurface, fixed: SeenSurface) -> list[Motion]:
+    """Motions by the best of many sampled turns, middle onto middle and then shifted, by points nearest in space."""
+    tree, close = cKDTree(fixed.point), _CLOSE[0] * fixed.size
+    features = fixed.features(close)
+    found = []
+    for turn in Rotation.random(_TURNS, rng=0).as_matrix():
+        motion = Motion(turn, fixed.middle - turn @ moving.middle)
+        for _ in range(_SHIFTS):
+            moved = motion.apply(moving)
+            _, index = tree.query(moved.point)
+            off2 = np.sum((moved.features(close) - features[index]) ** 2, axis=1)
+            weight = np.exp(-off2 / 4) + 1e-9
+            shift = np.average(fixed.point[index] - moved.point, axis=0, weights=weight)
+            found.append((np.minimum(off2, _FAR**2).mean(), motion))
+            motion = Motion(turn, motion.translation + shift)
+    return [motion for _, motion in sorted(found, key=lambda one: one[0])[:_TRIED]]
+
+
+def _difference(moved: SeenSurface, fixed: SeenSurface, close: float) -> float:
+    """Mean squared difference of points from their partners, σ²."""
+    away, _ = _partners(moved, cKDTree(fixed.features(close * fixed.size)), close * fixed.size)
+    return float(np.mean(np.minimum(away, _FAR) ** 2))
+
+
+def _partners(moved: SeenSurface, tree: "cKDTree[None]", close: float) -> tuple[Floats, Floats]:
+    """Differences (P,) σ of points from the most alike ones of a tree of features, infinite beyond _FAR; indices."""
+    away, index = tree.query(moved.features(close), distance_upper_bound=_FAR)
+    return np.asarray(away), np.asarray(index)
+
+
+def _refined(motion: Motion, moving: SeenSurface, fixed: SeenSurface, steps: Sequence[float]) -> Motion:
+    """A motion improved by iterated closest points, closer at each of `steps` [sizes]."""
+    for close in steps:
+        tree = cKDTree(fixed.features(close * fixed.size))
+        for _ in range(_ROUNDS):
+            moved = motion.apply(moving)
+            away, index = _partners(moved, tree, close * fixed.size)
+            there = np.isfinite(away)
+            if there.sum() < 6:  # a motion has six unknowns
+                return motion
+            weight = 1 / (1 + away[there] ** 2)
+            motion = _nearer(motion, moved.point[there], fixed.point[index[there]], fixed.normal[index[there]], weight)
+    return motion
+
+
+def _nearer(motion: Motion, point: Floats, target: Floats, normal: Floats, weight: Floats) -> Motion:
+    """A motion followed by the small one that brings points nearest to the planes of their targets."""
+    middle = point.mean(axis=0)
+    axes = [normal, *(np.broadcast_to(_ALONG * axis, normal.shape) for axis in np.eye(3))]
+    rows = [np.concatenate([np.cross(point - middle, axis), axis], axis=1) * weight[:, None] for axis in axes]
+    off = [dot(axis, target - point) * weight for axis in axes]
+    found = np.linalg.lstsq(np.concatenate(rows), np.concatenate(off), rcond=None)[0]
+    turn = Rotation.from_rotvec(found[:3]).as_matrix()
+    return Motion(turn @ motion.rotation, turn @ (motion.translation - middle) + middle + found[3:])
