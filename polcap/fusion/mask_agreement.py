@@ -26,9 +26,9 @@ from polcap.images import Bools, Floats
 
 _SLIT = 0.05  # of the object's diameter in a view; wider gaps in a mask are gaps between the object's parts
 _MOST_UNCOVERED = 0.01  # of a mask's area; masks whose outlines err by one cell of the grid leave 0.000
-# of the masks' areas, in sum: part of the other masks that a slid object leaves uncovered; a piece of the board in one
-# mask leaves nothing of the others uncovered
-_TRAILING = 0.003
+# of the masks' areas, in sum: part of the other masks that a slid object leaves uncovered, without the mask that loses
+# most: this one may hold a piece of the board
+_TRAILING = 0.002
 _MOST_LEFT_OUT = 1 / 3  # of the views; where more contradict, nobody knows which are right
 _MOST_TRIMMED = 1 / 2  # of the views may be left out, or hold more than the object
 
@@ -107,8 +107,8 @@ def _contradicting(
         for k in range(len(views)):
             others = [j for j in range(len(views)) if j != k]
             rest = _uncovered([views[j] for j in others], points[inside[others].all(axis=0)], step)
-            gain = shares[others] - rest  # of area that is covered without this view
-            lacks = np.sort(gain)[-2]  # the second largest: a piece of the board in one other mask gives one gain
+            gain = np.sort(shares[others] - rest)[:-1]  # of area that is covered without this view
+            lacks = gain[-1]  # the second largest of all: a piece of the board in one other mask gives one gain
             slid = shares[k] if gain.sum() > _TRAILING else 0.0
             by[k] = max(lacks, slid)
     worst = int(np.argmax(by))

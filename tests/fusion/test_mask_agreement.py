@@ -93,6 +93,17 @@ def test_a_view_in_which_the_object_had_slid_is_left_out(views: list[Silhouette]
     assert "moved on the board" in left_out["view08"]
 
 
+def test_pieces_of_the_board_at_the_object_in_two_masks_leave_no_view_out(views: list[Silhouette]) -> None:
+    wrong = list(views)
+    for k in (4, 5):
+        mask = views[k].mask.copy()
+        row, column = np.nonzero(mask)
+        edge, middle = column.min(), row[column.argmin()]
+        mask[middle - 8 : middle + 8, edge - 12 : edge] = True
+        wrong[k] = replace(views[k], mask=mask)
+    assert not mask_agreement.agreeing(wrong)[1]
+
+
 def test_an_object_that_slid_halfway_is_refused(views: list[Silhouette]) -> None:
     slid = [view(k, np.array([0.012, 0, 0.0])) for k in range(4, COUNT)]
     with pytest.raises(CaptureError, match="moved on the board"):
