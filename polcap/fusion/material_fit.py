@@ -42,7 +42,7 @@ _LEAST_COSINE = 0.3  # between normal and view: flatter views show errors of the
 _FLOOR = 0.02  # of the median radiance: error of every sample, with `_RELATIVE`
 _RELATIVE = 0.08
 _ROUNDS = 3  # of reweighting
-_GAIN_SIGMA, _F0_SIGMA, _ROUGHNESS_SIGMA = 0.1, 0.015, 0.08  # errors of the means of the maps over a material
+_GAIN_SIGMA, _F0_SIGMA, _ROUGHNESS_SIGMA = 0.1, 0.008, 0.08  # errors of the means of the maps over a material
 _FARTHEST_FLASH = 0.15  # m from the lens
 _INDEX = 1.5  # refractive index of the diffuse law and of the Fresnel term
 
@@ -93,7 +93,7 @@ class Lobe:
     residual: float  # weighted mean of ln(1 + error²), in units of the expected error, and the prior's part
 
 
-@stage(version=2)
+@stage(version=3)
 def fit(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps, settings: MaterialSettings) -> AtlasMaps:
     """Refine F0 and roughness by the highlights of all views; without S0 in the views the maps stay as they are."""
     lit = [view for view in views if view.s0 is not None]
