@@ -55,7 +55,7 @@ class AroundShoot(Shoot, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True)
-class Placement:
+class ObjectPose:
     """An object on the board, turned from its own frame."""
 
     mesh: Triangles
@@ -96,7 +96,7 @@ def write(
         sized = msgspec.structs.replace(scene.shape, radius=shoot.radius_m)
         scene = msgspec.structs.replace(scene, shape=sized)
     mesh = surface(scene)
-    sets = [Placement(mesh, Rotation.identity())] + [Placement(mesh, _LAID)] * bool(shoot.laid)
+    sets = [ObjectPose(mesh, Rotation.identity())] + [ObjectPose(mesh, _LAID)] * bool(shoot.laid)
     named = [
         (f"set{letter}/" * bool(shoot.laid) + _name(k), placed, *pose)
         for letter, placed, count in zip("AB", sets, (views, shoot.laid))
@@ -154,7 +154,7 @@ def _poses(shoot: AroundShoot, views: int, target: Floats) -> Poses:
     return out
 
 
-def _view(scene: Scene, shoot: AroundShoot, turn: Rotation, position: Floats, placed: Placement) -> Scene:
+def _view(scene: Scene, shoot: AroundShoot, turn: Rotation, position: Floats, placed: ObjectPose) -> Scene:
     """The scene on its board in one pose of the board, with the chart upright at the right of the object."""
     vector = tuple(turn.as_rotvec(degrees=True).tolist())
     own = tuple((turn * placed.turn).as_rotvec(degrees=True).tolist())
@@ -182,7 +182,7 @@ def _write_surface(file: Path, scene: Scene, mesh: Triangles, lift: float) -> No
 
 
 def _write_poses(
-    file: Path, scene: Scene, shoot: AroundShoot, poses: dict[str, tuple[Rotation, Floats]], sets: Sequence[Placement]
+    file: Path, scene: Scene, shoot: AroundShoot, poses: dict[str, tuple[Rotation, Floats]], sets: Sequence[ObjectPose]
 ) -> None:
     views = [
         {"name": name, "rotation": turn.as_matrix().tolist(), "translation": position.tolist()}

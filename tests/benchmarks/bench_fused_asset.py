@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 import polcap
 from polcap.fusion import fused_maps
+from polcap.fusion.fusion_path import FusionResults
 from polcap.images import Floats
 from polcap.optics import color
 from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
@@ -77,7 +78,7 @@ def single(view: Path) -> Floats:
     )
 
 
-def against_truth(source: fused_maps.FusedSource, surface: Triangles, truth: dict[str, Any]) -> Floats:
+def against_truth(source: fused_maps.FusedSource | FusionResults, surface: Triangles, truth: dict[str, Any]) -> Floats:
     """The same of the atlas, over the texels that a view saw."""
     seen = source.maps.weight[source.atlas.covered] > LEAST_SEEN
     point = source.atlas.position[seen]

@@ -104,7 +104,16 @@ def build(
     mi: Any, mesh: Triangles, name: str, texture: Path | None, size: int, depth: int, random: np.random.Generator
 ) -> tuple[dict[str, Floats], dict[str, Any]]:
     """Stokes parameters (3, H, W, 3) in the frame of each ray, truth maps, camera; and how it was made."""
-    rotation, translation, view = traced_views.random_pose(mesh, size, random)
+    pose = traced_views.random_pose(mesh, size, random)
+    return shoot(mi, mesh, pose, name, texture, size, depth, random)
+
+
+def shoot(
+    mi: Any, mesh: Triangles, pose: tuple[Floats, Floats, View], name: str, texture: Path | None, size: int, depth: int,
+    random: np.random.Generator,
+) -> tuple[dict[str, Floats], dict[str, Any]]:  # fmt: skip
+    """What `build` returns, of a mesh with a rotation and a translation (object to camera) before a camera."""
+    rotation, translation, view = pose
     corner, normal = subdivided(mesh)
     material = MATERIALS.get(name)
     coat = plain(corner, material, texture, random) if material else dressed(corner, texture, random)

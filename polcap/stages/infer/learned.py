@@ -24,7 +24,7 @@ from polcap.stages.infer.highlights import REACHED
 _INVERSION = 4.0  # factor on the inversion's expected error in the join, for the network's input holds the inversion
 # error = min(a·statedᵇ·exp(r·roughness), c), degrees: maximum likelihood on traced training meshes (decision 28)
 _CALIBRATION = (0.515, 1.12, 0.906, 50.0)
-_OVERVIEWS, _OVERVIEW_POSITIONS = (0.5, 0.35), 4  # sizes of smaller pictures, evidence for the side of normals
+_OVERVIEWS, _OVERVIEW_POSITIONS = (0.5, 0.35), 2  # sizes of smaller pictures, evidence for the side of normals
 _CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is constant
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _GRAZING = 0.15  # least cosine of the shading; .1 and .2 leave the same error
