@@ -150,7 +150,7 @@ def _rows(found: Session, results: FusionResults) -> list[dict[str, Any]]:
 
 
 def _verdict(about: Mapping[str, Any]) -> str:
-    """Verdict on a view by its report.json, apart from its albedo scale: the view with the chart gives that to all."""
+    """Verdict on a view by its report.json without its albedo scale, which the view with the chart gives to all."""
     states = {gate["state"] for gate in about["gates"] if gate["name"] != "albedo scale"}
     return next((state for state in ("fail", "warn") if state in states), "pass")
 

@@ -42,9 +42,8 @@ from polcap.stages import mask
 from polcap.stages.mask import regions
 
 _REFUSED = ("order",)  # gates of a view whose failure makes its normals wrong everywhere
-LEAST_SHARED = (
-    0.7  # of a set's surface, that the first set confirms; right joins have .9, those of two objects up to .5
-)
+# share of a set's surface that the first set confirms: .84 or more if correctly joined, mostly .5 or less for other objects
+LEAST_SHARED = 0.7
 _RETRIES = 1  # of a view, if its process died
 # faults of a view, without which the others go on; settings, models and the disk are common to all
 _FAULTS = (CaptureError, DecodeError, ChartError, AlignmentError, ObjectError)
