@@ -42,7 +42,7 @@ from polcap.stages import mask
 from polcap.stages.mask import regions
 
 _REFUSED = ("order",)  # gates of a view whose failure makes its normals wrong everywhere
-# share of a set's surface that the first set confirms: .84 or more if correctly joined, mostly .5 or less for other objects
+# share of a set's surface that the first set confirms: correctly joined .84 or more, other objects mostly .5 or less
 LEAST_SHARED = 0.7
 _RETRIES = 1  # of a view, if its process died
 # faults of a view, without which the others go on; settings, models and the disk are common to all
