@@ -105,7 +105,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.5
     max_one_sided: Annotated[
         float, Meta(gt=0, description="allowed uneven light round the outline, amplitude over mean [1]")
-    ] = 0.4
+    ] = 0.5
     max_side_light: Annotated[
         float, Meta(gt=0, le=1, description="allowed excess light on one side in one shot [1]")
     ] = 0.07

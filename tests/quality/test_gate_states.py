@@ -42,7 +42,7 @@ FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
     "pushed": np.array([0.0, 0.1, 0.1]), "turn": ObjectTurn(np.array([0.0, 0.2, 0.1]), np.full(3, 0.1)),
     "edge_blur": 0.8,
-    "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "shape": [45.0, 0.2],
+    "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "medians": [45.0, 0.2, 0.3],
     "normal_error": 4.0, "lean": 2.0, "crossed": {"left": 0.0, "clipped": 0, "over": 0.0, "mirrored": 0.1},
 }  # fmt: skip
 MEASURES = {  # the function that measures each figure
@@ -50,7 +50,7 @@ MEASURES = {  # the function that measures each figure
     "pushed": (geometry, "_pushed"), "turn": (geometry, "_turn"), "edge_blur": (geometry, "_edge_blur"),
     "charted": (geometry, "_charted"), "lean": (geometry, "_lean"),
     "noise": (light, "_noise"), "crossed": (light, "_crossed"), "ill_posed": (polarization, "_ill_posed"),
-    "shape": (polarization, "_median_shape"), "outline": (polarization, "_outline"),
+    "medians": (polarization, "_medians"), "outline": (polarization, "_outline"),
     "normal_error": (gates, "_own_error"), "inward_outline": (geometry, "_inward_share"),
 }  # fmt: skip
 MESH = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
@@ -170,10 +170,11 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("polarized", "fail", {"figures": outline(dolp=0.004)}),
     ("body", "pass", {}),
     ("body", "fail", {"figures": outline(along=-0.9)}),
-    ("body", "warn", {"figures": outline(concentration=0.3, dolp=0.02)}),
-    ("body", "warn", {"figures": {**outline(dolp=0.02), "shape": [10.0, 0.6]}}),
+    ("body", "warn", {"figures": {**outline(along=-0.9), "medians": [45.0, 0.2, 0.04]}}),
+    ("body", "warn", {"figures": outline(concentration=0.3)}),
+    ("body", "warn", {"figures": {**outline(dolp=0.02), "medians": [10.0, 0.6, 0.3]}}),
     ("body", "warn", {"figures": outline(dolp=0.02)}),
-    ("body", "warn", {"figures": outline(one_sided=0.9, concentration=0.6)}),
+    ("body", "warn", {"figures": outline(one_sided=0.9, dolp_lit=0.03)}),
     ("other light", "pass", {}),
     ("other light", "fail", {"figures": outline(side=0.2)}),
     ("noise", "pass", {}),
