@@ -25,12 +25,12 @@ _LIT_DOLP = 0.07  # of an outline's brighter half; above, the flash lights it (9
 _LOPSIDED = 1.4  # factor on the limit of uneven light for an object that is polarized all round: its shape is uneven
 _DIMMED = 0.9  # of the mean light: below, an outline turns away
 _ROUGH = 0.5  # roughness from which facets alone leave little polarization
-# What a finding adds to the estimator's own expected error, by simulated captures with known normals (docs/benchmarks)
+# What a finding adds to the estimator's own expected error, by simulated captures with known normals (docs/benchmarks/gates.md)
 _UNPOLARIZED_DEG = 11.0
 _ALONG_DEG = 30.0
 _TRANSLUCENT_DEG = 9.0
 _SIDE_LIGHT_DEG = 6.0
-_LOOSE_FIT_DEG = 3.0
+_LOOSE_FIT_DEG = 7.0  # 24° for shots in a wrong order, nothing for objects with sharp edges, which are usual
 _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
@@ -228,7 +228,7 @@ def _light_of_body(body: rim.RimFigures, found: Evidence, limits: GateLimits) ->
     if body.concentration < (least := limits.min_concentration):
         message = (
             f"Polarization hardly follows the outline (fit {body.concentration:.2f} of 1): ambient light, "
-            "or an object with sharp edges as outline"
+            "shots in a wrong order, or an object with sharp edges as outline"
         )
         return Gate("body", "warn", round(body.concentration, 2), least, message, remedy, _LOOSE_FIT_DEG, unit="")
     if body.one_sided > (most := limits.max_one_sided * _lopsided(body)):
