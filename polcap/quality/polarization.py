@@ -25,7 +25,7 @@ _LIT_DOLP = 0.07  # of an outline's brighter half; above, the flash lights it (9
 _LOPSIDED = 1.4  # factor on the limit of uneven light for an object that is polarized all round: its shape is uneven
 _DIMMED = 0.9  # of the mean light: below, an outline turns away
 _ROUGH = 0.5  # roughness from which facets alone leave little polarization
-# What a finding adds to the estimator's own expected error, by simulated captures with known normals (docs/benchmarks/gates.md)
+# What a finding adds to the expected error of the normals, by captures with known normals: docs/benchmarks/gates.md
 _UNPOLARIZED_DEG = 11.0
 _ALONG_DEG = 30.0
 _TRANSLUCENT_DEG = 9.0
