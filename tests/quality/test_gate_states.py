@@ -220,7 +220,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("normal error", "not measured", {"figures": {"normal_error": NAN}}),
     ("mesh", "pass", {}),
     ("mesh", "fail", {"mesh": SimpleNamespace(**MESH | {"pieces": 99})}),
-    ("mesh", "fail", {"mesh": SimpleNamespace(**MESH | {"raggedness": 0.9})}),
+    ("mesh", "warn", {"mesh": SimpleNamespace(**MESH | {"raggedness": 0.9})}),
 ]  # fmt: skip
 
 
