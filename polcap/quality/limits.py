@@ -99,13 +99,13 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 33.0
     max_inward_outline: Annotated[
         float, Meta(ge=0, le=1, description="allowed share of the outline's normals that point into the object [1]")
-    ] = 0.06
+    ] = 0.12
     min_concentration: Annotated[
         float, Meta(ge=0, le=1, description="least allowed agreement of polarization and outline; 1 is perfect [1]")
     ] = 0.5
     max_one_sided: Annotated[
         float, Meta(gt=0, description="allowed uneven light round the outline, amplitude over mean [1]")
-    ] = 0.4
+    ] = 0.5
     max_side_light: Annotated[
         float, Meta(gt=0, le=1, description="allowed excess light on one side in one shot [1]")
     ] = 0.07

@@ -186,7 +186,7 @@ def test_body_that_polarizes_too_little_for_its_shape_is_reported(
 ) -> None:
     gate = judged(shaped(good, polarized, flattened, roughness, dimmed))["body"]
     assert gate.state == ("warn" if words else "pass"), gate
-    assert words in gate.message and (gate.cost_deg > 10) == bool(words)
+    assert words in gate.message and (gate.cost_deg > 5) == bool(words)
 
 
 def test_room_light_costs_what_one_ambient_frame_cannot_remove(good: Evidence) -> None:
