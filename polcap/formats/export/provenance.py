@@ -70,8 +70,7 @@ def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> N
     if earlier != json.loads(json.dumps(facts)):
         files = {}
     files = {name: known for name, known in files.items() if (path.parent / name).exists()} | dict(digests)
-    text = json.dumps({**facts, "files": dict(sorted(files.items()))}, indent=1, ensure_ascii=False)
-    atomic.write(path, text + "\n")
+    atomic.write_json(path, {**facts, "files": dict(sorted(files.items()))})
 
 
 def digest(file: Path) -> str:

@@ -1,6 +1,5 @@
 """Writes and reads the folder maps/ of a result (docs/reference/result.md)."""
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -92,7 +91,7 @@ def write(folder: Path, maps: SurfaceMaps, mesh: ReliefMesh, stokes: StokesImage
             for name, (sources, encode) in map_files.FILES.items()
             if name != map_files.DETAIL or maps.detail is not None
         )
-        _write_json(temporary / "maps.json", _description(maps, depth))
+        atomic.write_json(temporary / "maps.json", _description(maps, depth))
 
 
 def _write(file: Path, content: Callable[[], Any]) -> None:
@@ -196,11 +195,7 @@ def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
         for key, value in about.items()
     }
     known["exports"] = dict(sorted({**exports, where: note}.items()))
-    _write_json(file, known)
-
-
-def _write_json(file: Path, content: Mapping[str, Any]) -> None:
-    atomic.write(file, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
+    atomic.write_json(file, known)
 
 
 def _read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Floats:
