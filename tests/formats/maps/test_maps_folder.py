@@ -158,8 +158,8 @@ def test_maps_as_stored_equal_the_maps_read(folder: Path, result: Result) -> Non
     maps.write(folder.parent / "other", of, mesh, *result[2:])
     read, known = maps.read(folder.parent / "other"), maps.as_stored(of)
     assert np.array_equal(read.depth, maps.stored_depth(known, mesh), equal_nan=True) and read.metric == mesh.metric
-    for name, value in vars(read).items():
-        other = getattr(known, name)
+    for name, other in vars(known).items():
+        value = getattr(read, name)
         assert np.array_equal(value, other) if isinstance(value, np.ndarray) else value == other, name
 
 
