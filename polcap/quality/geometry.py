@@ -5,7 +5,7 @@ import msgspec
 import numpy as np
 
 from polcap.formats import shipped_data
-from polcap.images import Floats, Mesh, SurfaceMaps
+from polcap.images import Mesh, SurfaceMaps
 from polcap.optics import frames, outline
 from polcap.optics.morphology import dilate
 from polcap.optics.projection import picture_corners, transform_points
@@ -20,6 +20,7 @@ from polcap.stages.whitebalance import chart_in_mask
 
 _LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ
 _DEGREES_PER_PUSH = 200.0  # error of the normals per movement by the object's radius
+_SIGMAS = 2.3  # of a push: one in two hundred still shots exceeds it
 _DEGREES_PER_TURN = 5.0  # error of the normals per degree by which the object turned (docs/benchmarks/gates.md)
 _FALSE_TURN_DEG = 0.2  # 1σ of a turn that polarization imitates
 _SHARP_PX, _DEGREES_PER_BLUR_PX = 1.2, 2.5  # greatest blur of sharp edges; error of the normals per px beyond it
@@ -63,25 +64,28 @@ def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate
 
 
 def _object_moved(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on movement of the object relative to its surroundings: a push over the object's radius, or a turn."""
-    names = found.names
-    pushed = np.nan_to_num(_pushed(found), posinf=np.inf) * found.grid_px
+    """Gate on movement of the object relative to its surroundings: a push over the object's radius, or a turn.
+
+    A push within its error does not count; it fails if it exceeds its limit by more than its error.
+    """
+    names, pushed = found.names, _pushed(found)
+    length = np.nan_to_num(pushed.length, posinf=np.inf) * found.grid_px
+    doubt = _SIGMAS * pushed.sigma * found.grid_px
     radius = max(outline.disc_radius(found.object_.mask) * found.grid_px, 1.0)
-    least = limits.min_object_shift * radius
     turned = _object_turned(found, limits)
-    cost = float(np.hypot(_DEGREES_PER_PUSH * pushed.max() / radius, turned.cost_deg))
-    k = int(np.argmax(pushed))
-    limit = limits.max_object_shift_px
-    bad = blamed(names, pushed > limit)
-    message = f"The object moved by {pushed[k]:.1f} px against its surroundings in {names[k]}"
-    if np.isinf(pushed[k]):
+    true = np.sqrt(np.maximum(length**2 - (doubt / _SIGMAS) ** 2, 0))
+    cost = float(np.hypot(_DEGREES_PER_PUSH * true.max() / radius, turned.cost_deg))
+    k = int(np.argmax(length - doubt))
+    figure, limit, least = round(float(length[k]), 3), limits.max_object_shift_px, limits.min_object_shift * radius
+    message = f"The object moved by {figure:.1f} ± {doubt[k] / _SIGMAS:.1f} px against its surroundings in {names[k]}"
+    if np.isinf(length[k]):
         message = f"The {names[k]} shot shows another object in the same surroundings"
-        return Gate("alignment", "fail", None, limit, message, _HOLD_STILL, 45.0, bad, "px")
-    figure = round(float(pushed[k]), 3)
-    if bad:
-        return Gate("alignment", "fail", figure, limit, message, _HOLD_STILL, max(cost, 5.0), bad, "px")
-    if pushed[k] > least:
-        return Gate("alignment", "warn", figure, least, message, _HOLD_STILL, cost, blamed(names, pushed > least), "px")
+        shots = blamed(names, np.isinf(length))
+        return Gate("alignment", "fail", None, limit, message, _HOLD_STILL, 45.0, shots, "px")
+    if shots := blamed(names, length - doubt > limit):
+        return Gate("alignment", "fail", figure, limit, message, _HOLD_STILL, max(cost, 5.0), shots, "px")
+    if shots := blamed(names, length > np.maximum(least, doubt)):
+        return Gate("alignment", "warn", figure, least, message, _HOLD_STILL, cost, shots, "px")
     return msgspec.structs.replace(turned, cost_deg=cost)
 
 
@@ -98,7 +102,7 @@ def _object_turned(found: Evidence, limits: GateLimits) -> Gate:
     return Gate("alignment", "warn", figure, limit, message, _HOLD_STILL, cost, blamed(names, least > limit), "°")
 
 
-def _pushed(found: Evidence) -> Floats:
+def _pushed(found: Evidence) -> object_motion.ObjectShift:
     return object_motion.measure(found.radiance, found.alignment, found.object_)
 
 

@@ -28,19 +28,26 @@ from polcap.quality import gate as gate_module
 from polcap.quality import gates, geometry, light, polarization, rim
 from polcap.quality.gate import Evidence, Gate
 from polcap.quality.object_turn import ObjectTurn
+from polcap.stages.align.object_motion import ObjectShift
 from tests import scenes
 
 MODULES: tuple[ModuleType, ...] = (gates, gate_module, light, geometry, polarization)
 MAKERS = ("Gate", "at_most")
 NAN = float("nan")
+
+
+def pushed(second: float, third: float = 0.0, sigma: float = 0.1) -> ObjectShift:
+    return ObjectShift(np.array([0.0, second, third]), np.array([0.0, sigma, sigma]))
+
+
 BODY = {
-    "dolp": 0.1, "dolp_lit": 0.1, "along": 0.9, "concentration": 0.95, "turned": 0.0, "turned_sigma": 0.01,
-    "brightness": 0.5, "one_sided": 0.1,
+    "dolp": 0.1, "dolp_lit": 0.1, "dolp_most": 0.1, "along": 0.9, "concentration": 0.95, "turned": 0.0,
+    "turned_sigma": 0.01, "brightness": 0.5, "one_sided": 0.1,
 }  # fmt: skip
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
-    "pushed": np.array([0.0, 0.1, 0.1]), "turn": ObjectTurn(np.array([0.0, 0.2, 0.1]), np.full(3, 0.1)),
+    "pushed": pushed(0.1, 0.1), "turn": ObjectTurn(np.array([0.0, 0.2, 0.1]), np.full(3, 0.1)),
     "edge_blur": 0.8,
     "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "medians": [45.0, 0.2, 0.3],
     "normal_error": 4.0, "lean": 2.0, "crossed": {"left": 0.0, "clipped": 0, "over": 0.0, "mirrored": 0.1},
@@ -122,11 +129,13 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("alignment", "fail", {"alignment": {"correlation": np.array([1.0, 0.1, 1.0])}}),
     ("alignment", "fail", {"alignment": {"residual_px": np.array([0.0, 0.5, 0.0])}}),
     ("alignment", "fail", {"alignment": {"transform": np.full((3, 3, 3), NAN)}}),
-    ("alignment", "warn", {"figures": {"pushed": np.array([0.0, 1.2, 0.0])}}),
+    ("alignment", "warn", {"figures": {"pushed": pushed(1.2)}}),
     ("alignment", "warn", {"figures": {"turn": ObjectTurn(np.array([0.0, 0.9, 0.0]), np.full(3, 0.1))}}),
     ("alignment", "pass", {"figures": {"turn": ObjectTurn(np.array([0.0, 0.8, 0.0]), np.full(3, 0.2))}}),
-    ("alignment", "fail", {"figures": {"pushed": np.array([0.0, 5.0, 0.0])}}),
-    ("alignment", "fail", {"figures": {"pushed": np.array([0.0, np.inf, 0.0])}}),
+    ("alignment", "warn", {"figures": {"pushed": pushed(1.8, sigma=0.2)}}),
+    ("alignment", "pass", {"figures": {"pushed": pushed(1.8, sigma=0.9)}}),
+    ("alignment", "fail", {"figures": {"pushed": pushed(5.0)}}),
+    ("alignment", "fail", {"figures": {"pushed": pushed(np.inf)}}),
     ("mask", "pass", {}),
     ("mask", "pass", {"object_": {"doubt": None}}),
     ("mask", "not measured", {"object_": {"doubt": None, "source": "automatic"}}),
@@ -167,7 +176,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("angles", "warn", {"selfcal": {"found_sigma": 0.02}}),
     ("angles", "warn", {"selfcal": {"ring": RingZero(0.2, 0.01)}}),
     ("angles", "pass", {"selfcal": {"ring": RingZero(0.03, 0.01, 0.03)}}),
-    ("polarized", "fail", {"figures": outline(dolp=0.004)}),
+    ("polarized", "fail", {"figures": outline(dolp_most=0.004)}),
     ("body", "pass", {}),
     ("body", "fail", {"figures": outline(along=-0.9)}),
     ("body", "warn", {"figures": {**outline(along=-0.9), "medians": [45.0, 0.2, 0.04]}}),

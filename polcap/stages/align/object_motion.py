@@ -4,6 +4,8 @@ If the object was pushed while chart and backdrop stayed, one transform fits bot
 and surroundings are registered separately, and the two motions are compared in the middle of the object.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from polcap.images import Alignment, AngleStack, Floats, ObjectMask
@@ -19,20 +21,29 @@ _MOST_PIXELS = 0.8e6  # a larger picture is averaged down first
 _RIM_PX = 6  # around the object, which its outline needs
 _SURE_CORRELATION = 0.6  # of detail: from here on a region was found in the shot
 _OTHER_CORRELATION = 0.4  # of the object: below, it is another or too far away; noise has less
-_SIGMAS = 3.0  # of both places: a chart in a corner hardly tells where the object's middle should be
+_ERROR_SCALE = 1.3  # actual error of the shift over that of the tiles, in 80 still shots (docs/benchmarks/gates.md)
 _SAME_PX = 0.5  # two starts that differ by less lead to one place
 
 
-def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> Floats:
-    """Shift of the object's middle, outline included, relative to chart and backdrop in each shot, (K,) grid px.
+@dataclass(frozen=True)
+class ObjectShift:
+    """Shift of the object's middle, outline included, relative to chart and backdrop in each shot.
 
-    0 within three errors; infinite: another object; NaN: too little detail.
+    An infinite shift is another object, NaN is too little detail. The error is large for a chart in a corner, which
+    hardly tells where the object's middle should be.
     """
+
+    length: Floats  # (K,) grid px
+    sigma: Floats  # (K,) rms length of its error [grid px]
+
+
+def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> ObjectShift:
+    """Register object and surroundings of each shot separately, and compare the two motions."""
     shots = len(radiance.angle)
+    pushed = ObjectShift(*np.zeros((2, shots)))
     if radiance.offset_px is not None:  # shots cut from one mosaic
-        return np.zeros(shots)
-    pushed = np.full(shots, np.nan)
-    pushed[0] = 0.0
+        return pushed
+    pushed.length[1:] = np.nan
     if not object_.mask.any():
         return pushed
     step = averaging_step(object_.mask.shape, _MOST_PIXELS)
@@ -46,12 +57,12 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
         start = registration.scaled(alignment.transform[k], 1 / step)
         (whole, of_object), (outer, around) = (_registered(region, shot, start) for region in regions)
         if around > _SURE_CORRELATION and of_object < _OTHER_CORRELATION:
-            pushed[k] = np.inf
+            pushed.length[k] = np.inf
         elif min(of_object, around) > _SURE_CORRELATION:
             places = [transform_points(found.matrix, middle) for found in (whole, outer)]
-            error = float(np.hypot(whole.sigma_at(middle), outer.sigma_at(middle)))
-            distance = float(np.hypot(*(places[0] - places[1])))
-            pushed[k] = step * distance if distance > _SIGMAS * error else 0.0
+            per_axis = np.hypot(whole.sigma_at(middle), outer.sigma_at(middle))
+            pushed.length[k] = step * np.hypot(*(places[0] - places[1]))
+            pushed.sigma[k] = step * _ERROR_SCALE * np.sqrt(2) * per_axis
     return pushed
 
 

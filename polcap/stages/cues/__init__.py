@@ -25,7 +25,7 @@ CHANNELS = (
 FLOOR = 0.02  # added to a radiance before its logarithm, in the channels and in their inverse
 
 
-@stage(version=5, keep=False)
+@stage(version=6, keep=False)
 def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
     """Compute all cues (radiance, DoLP, AoLP, diffuse color…) of a crop (H, W) from its Stokes parameters.
 
@@ -60,7 +60,7 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
         mask=stokes.mask,
         quality=stokes.quality,
         view=stokes.view,
-        scale_sigma=scale.sigma(stokes, color),
+        scale_sigma=scale.sigma(stokes, color, radiance),
         body=body,
         body_known=body_known,
         detail=stokes.detail,

@@ -125,6 +125,6 @@ def test_an_object_that_moved_before_a_still_backdrop_is_distinguished_from_a_mo
     for true, expected in (([np.eye(3), pose(3, 0, 0), np.eye(3)], 3.0), ([np.eye(3)] * 3, 0.0)):
         stack = scenes.before_backdrop(true)
         found = align.register(stack, scenes.no_color(), align.AlignSettings())
-        assert object_motion.measure(stack, found, ball)[1] == pytest.approx(expected, abs=0.5)
+        assert object_motion.measure(stack, found, ball).length[1] == pytest.approx(expected, abs=0.5)
     radiance = scenes.stack(noise=0.002)
-    assert np.nanmax(object_motion.measure(radiance, scenes.still(3), ball)) < 0.5
+    assert np.nanmax(object_motion.measure(radiance, scenes.still(3), ball).length) < 0.5
