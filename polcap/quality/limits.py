@@ -99,7 +99,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 33.0
     max_inward_outline: Annotated[
         float, Meta(ge=0, le=1, description="allowed share of the outline's normals that point into the object [1]")
-    ] = 0.06
+    ] = 0.12
     min_concentration: Annotated[
         float, Meta(ge=0, le=1, description="least allowed agreement of polarization and outline; 1 is perfect [1]")
     ] = 0.5

@@ -14,7 +14,7 @@ from polcap.quality.gate import Evidence, Gate, State, at_most
 from polcap.quality.limits import GateLimits
 
 _LEAST_RIM = 200  # pixels of outline, to estimate an angle
-_LEAST_DOLP = 0.01  # of the outline; there the least index has ten times that
+_LEAST_DOLP = 0.01  # of the most polarized tenth of the outline; there the least index has ten times that
 _SAME_DEG = 5.0  # axes nearer than this are the same angle
 _SURE = 2.5  # σ between sectors of the outline: least significance of a turn
 _CERTAIN = 0.8  # of the limit of the misfit: above, also good captures fit a turn (docs/benchmarks/gates.md)
@@ -66,17 +66,18 @@ def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
         yield Gate("angles", "not measured", None, limit, "The outline is too short", unit="°")
         return
     body = seen.body
-    if body.dolp < _LEAST_DOLP:
-        message = f"The outline is polarized by only {100 * body.dolp:.1f} %"
+    if body.dolp_most < _LEAST_DOLP:
+        message = f"No part of the outline is polarized by more than {100 * body.dolp_most:.1f} %"
         remedy = "Check that the polarizer was on and turned; metal and translucent objects (wax, milk) hardly polarize"
-        yield Gate("polarized", "fail", round(body.dolp, 4), _LEAST_DOLP, message, remedy, _UNPOLARIZED_DEG)
+        yield Gate("polarized", "fail", round(body.dolp_most, 4), _LEAST_DOLP, message, remedy, _UNPOLARIZED_DEG)
         return
     of_shots = _angles(seen.turn, body, angle, found.selfcal, found.names, limits)
-    yield _with_ring(of_shots, found.selfcal, limits)
+    yield _with_ring(of_shots, body, found.selfcal, limits)
     yield _light_of_body(body, found, limits)
     side = seen.side
-    if found.object_.border > limits.max_mask_border:
-        yield Gate("other light", "not measured", None, limits.max_side_light, "The picture cuts the outline off")
+    if body.concentration <= _CLEAR or found.object_.border > limits.max_mask_border:
+        message = "Polarization does not follow a closed outline in the picture"
+        yield Gate("other light", "not measured", None, limits.max_side_light, message)
         return
     k = int(np.argmax(side))
     message = f"The {found.names[k]} shot is {100 * side[k]:.1f} % brighter on one side than the others"
@@ -173,11 +174,11 @@ def _not_closing(turned: TurnedShot, names: list[str], limit: float) -> Gate:
     return Gate("angles", "fail", round(float(degrees), 1), limit, message, remedy, abs(float(degrees)) / 2, shots, "°")
 
 
-def _with_ring(gate: Gate, selfcal: SelfCalibration, limits: GateLimits) -> Gate:
+def _with_ring(gate: Gate, body: rim.RimFigures, selfcal: SelfCalibration, limits: GateLimits) -> Gate:
     """Replace a passed gate of the angles by one on the zero error of the ring, common to all shots.
 
     The path corrects this error where it is certain. With three angles, one turned shot looks like a smaller turn of
-    all, so the gate warns.
+    all, so the gate warns, if the polarization follows the outline.
     """
     if selfcal.found_sigma is not None and gate.state == "pass":
         doubt, ring = float(np.degrees(selfcal.found_sigma)), np.degrees(selfcal.angle) % 180
@@ -187,6 +188,7 @@ def _with_ring(gate: Gate, selfcal: SelfCalibration, limits: GateLimits) -> Gate
     turn, doubt = np.degrees([selfcal.ring.offset, selfcal.ring.sigma])
     applied = selfcal.ring.correction != 0
     noted = len(selfcal.angle) == 3 and abs(turn) > max(limits.max_ring_turn_deg, _SURE * doubt)
+    noted = noted and body.concentration > _CLEAR and abs(turn) < 45  # above: reflections, see "body"
     if gate.state != "pass" or not (applied or noted):
         return gate
     message = f"The ring's zero was off by {turn:+.1f}° ± {doubt:.1f}°"

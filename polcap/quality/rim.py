@@ -47,6 +47,7 @@ class RimFigures:
 
     dolp: float  # median degree of linear polarization
     dolp_lit: float  # median of the brighter half
+    dolp_most: float  # 90th percentile: a flat object is polarized at some parts of its outline only
     along: float  # −1…1: mean of cos 2(AoLP − φ); 1 is diffuse, −1 is specular reflection
     concentration: float  # 0…1, of the AoLP relative to φ, after removal of the common turn
     turned: float  # rad, common turn of the AoLP relative to φ
@@ -137,6 +138,7 @@ def summarize(at: Rim, angle: Floats) -> RimFigures:
     return RimFigures(
         dolp=float(np.median(dolp)),
         dolp_lit=float(np.median(dolp[at.total >= np.median(at.total)])),
+        dolp_most=float(np.quantile(dolp, 0.9)),
         along=mean.real,
         concentration=abs(mean),
         turned=float(np.angle(mean) / 2),

@@ -41,8 +41,8 @@ def pushed(second: float, third: float = 0.0, sigma: float = 0.1) -> ObjectShift
 
 
 BODY = {
-    "dolp": 0.1, "dolp_lit": 0.1, "along": 0.9, "concentration": 0.95, "turned": 0.0, "turned_sigma": 0.01,
-    "brightness": 0.5, "one_sided": 0.1,
+    "dolp": 0.1, "dolp_lit": 0.1, "dolp_most": 0.1, "along": 0.9, "concentration": 0.95, "turned": 0.0,
+    "turned_sigma": 0.01, "brightness": 0.5, "one_sided": 0.1,
 }  # fmt: skip
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 FIGURES = {
@@ -177,7 +177,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("angles", "warn", {"selfcal": {"found_sigma": 0.02}}),
     ("angles", "warn", {"selfcal": {"ring": RingZero(0.2, 0.01)}}),
     ("angles", "pass", {"selfcal": {"ring": RingZero(0.03, 0.01, 0.03)}}),
-    ("polarized", "fail", {"figures": outline(dolp=0.004)}),
+    ("polarized", "fail", {"figures": outline(dolp_most=0.004)}),
     ("body", "pass", {}),
     ("body", "fail", {"figures": outline(along=-0.9)}),
     ("body", "warn", {"figures": {**outline(along=-0.9), "medians": [45.0, 0.2, 0.04]}}),

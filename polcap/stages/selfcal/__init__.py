@@ -31,6 +31,7 @@ _PRIOR = {"flash": 0.03, "steady": 0.01, "unknown": 0.03}  # prior 1σ of a shot
 # state 0.5–2 % from flash to flash for studio flashes at full recycling, and under 1 % for LED and HMI lamps
 _LEAST_PRIOR = 0.001  # least prior 1σ, also of a calibrated flash
 _SURPRISE = 3.0  # two measurements contradict each other if they differ by more than this many σ
+_FLAT_ERROR = 0.05  # error of the gains by facing pixels of an object with flat faces (8 path-traced captures)
 _REMOUNTED = np.radians(0.3)  # 1σ of the zero after a filter is screwed on again (play of the thread); assumed
 # Least score of another order, with measured and with estimated gains, which turn AoLPs too. Set by hand; none of 32
 # simulated captures in the right order was refused (tests/benchmarks/bench_verdicts.py).
@@ -73,7 +74,7 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=15)
+@stage(version=16)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,
@@ -122,6 +123,8 @@ def solve(
             partial(integrability.gains, shots.light, shots.inside, angle, facing.gain),
         ]
     )
+    if not np.isfinite(by_angles[-1].sigma).all():  # flat faces: most pixels may share a polarization
+        facing = replace(facing, sigma=np.hypot(facing.sigma, np.where(facing.sigma > 0, _FLAT_ERROR, 0)))
     gains = _gains(radiance, greys, object_gains.combined([*by_angles, facing]))
     return SelfCalibration(
         gains=gains,

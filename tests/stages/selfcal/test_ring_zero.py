@@ -49,9 +49,9 @@ def test_mirror_reflection_and_planes_leave_the_turn_unknown(rng: np.random.Gene
 def test_two_measurements_are_averaged_by_their_errors_or_doubted() -> None:
     both = ring_zero.combined(RingZero(0.02, 0.004), RingZero(0.024, 0.003))
     assert both.offset == pytest.approx((0.02 / 16 + 0.024 / 9) / (1 / 16 + 1 / 9))
-    assert both.sigma == pytest.approx(0.0024)
+    assert both.sigma == pytest.approx(1.6 * 0.0024)
     different = ring_zero.combined(RingZero(0.0, 0.004), RingZero(0.05, 0.003))
-    assert different.sigma == pytest.approx(0.024)  # ten times the distance that their errors let expect
+    assert different.sigma == pytest.approx(1.6 * 0.024)  # ten times the distance that their errors let expect
 
 
 @pytest.mark.parametrize("turn", [7.0, -2.5])
