@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from polcap.config import load as load_config
     from polcap.errors import PolcapError
     from polcap.formats.capture.reader import read as read_capture
-    from polcap.formats.maps.result_maps import ResultMaps, read_cues, read_stokes
+    from polcap.formats.maps.maps_folder import ResultMaps
     from polcap.formats.maps.result_maps import read as read_maps
+    from polcap.formats.maps.result_maps import read_cues, read_stokes
     from polcap.images import Asset, Capture, ChartRequest, Cues, Frame, Mesh, Shot, StokesImage, SurfaceMaps, View
 
 __version__ = "0.1.0"
@@ -53,7 +54,7 @@ _HOME = {  # public name → module and its name there; the others are values of
     "load_config": ("polcap.config", "load"),
     "PolcapError": ("polcap.errors", "PolcapError"),
     "read_capture": ("polcap.formats.capture.reader", "read"),
-    "ResultMaps": ("polcap.formats.maps.result_maps", "ResultMaps"),
+    "ResultMaps": ("polcap.formats.maps.maps_folder", "ResultMaps"),
     "read_cues": ("polcap.formats.maps.result_maps", "read_cues"),
     "read_maps": ("polcap.formats.maps.result_maps", "read"),
     "read_stokes": ("polcap.formats.maps.result_maps", "read_stokes"),

@@ -58,7 +58,12 @@ class Setting(NamedTuple):
 
 
 def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
-    """Settings from a TOML file and assignments of the form stage.name=value.
+    """Settings from a TOML file and assignments of the form stage.name=value; see `fill_sections`."""
+    return fill_sections(Config, file, assignments)
+
+
+def fill_sections(kind: type[S], file: Path | None, assignments: Sequence[str]) -> S:
+    """Fill a struct of settings sections from a TOML file and assignments of the form section.name=value.
 
     Raises
     ------
@@ -76,12 +81,12 @@ def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
             raise SettingError(f"--set {assignment}: write stage.name=value, for example hdr.clip=0.95")
         stated.setdefault(section, {})[name] = _parse(text.strip())
     _check_finite(stated)
-    known = {setting.key: setting for setting in settings()}
+    known = {setting.key: setting for setting in settings(kind)}
     for section, values in stated.items():
         for name, value in values.items():
             _check_known(f"{section}.{name}", value, known)
     try:
-        return msgspec.convert(stated, Config)
+        return msgspec.convert(stated, kind)
     except msgspec.ValidationError as error:
         raise _explain(error, stated, known) from error
     except UnicodeError as error:
@@ -126,29 +131,9 @@ def fill(kind: type[S], stated: dict[str, Any], assignments: Sequence[str]) -> S
         raise SettingError(f"--set {text_file.fault(error, stated, kind)}") from error
 
 
-def fill_sections(kind: type[S], assignments: Sequence[str]) -> S:
-    """Fill a struct of settings sections from section.name=value assignments, as `fill`.
-
-    Raises
-    ------
-    SettingError
-        As for `fill`.
-    """
-    found = kind()
-    for assignment in assignments:
-        section, dot, rest = assignment.partition(".")
-        if not dot or section not in kind.__struct_fields__:
-            sections = ", ".join(kind.__struct_fields__)
-            raise SettingError(f"--set {assignment}: give section.name=value with a section of {sections}")
-        before = msgspec.to_builtins(getattr(found, section))
-        filled = fill(type(getattr(found, section)), before, [rest])
-        found = msgspec.structs.replace(found, **{section: filled})
-    return found
-
-
-def settings() -> Iterator[Setting]:
-    """All settings in the order of the stages, for the settings reference."""
-    for section in msgspec.structs.fields(Config):
+def settings(kind: type[msgspec.Struct] = Config) -> Iterator[Setting]:
+    """All settings of a struct of sections, in the order of the stages, for the settings reference."""
+    for section in msgspec.structs.fields(kind):
         hints = get_type_hints(section.type, include_extras=True)
         for field in msgspec.structs.fields(section.type):
             hint = hints[field.name]
@@ -195,7 +180,8 @@ def _check_known(key: str, value: Any, known: dict[str, Setting]) -> None:
     if key in known:
         return
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-    hint = f"; did you mean {near[0]}?" if near else f"; sections are {', '.join(Config.__struct_fields__)}"
+    sections = dict.fromkeys(name.partition(".")[0] for name in known)
+    hint = f"; did you mean {near[0]}?" if near else f"; sections are {', '.join(sections)}"
     raise SettingError(f"{key} = {value!r}: there is no such setting{hint}")
 
 

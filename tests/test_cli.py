@@ -60,8 +60,8 @@ def test_dry_run_prints_the_table_and_writes_nothing(example: Path, polcap: Comm
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--until", "polish"], "--until polish"),
-        (["--force", "polish"], "--force polish"),
+        (["--until", "polish"], "'--until': 'polish' is not one of 'hdr'"),
+        (["--force", "polish"], "'--force': 'polish' is not one of 'hdr'"),
         (["--set", "hdr.clip=7"], "hdr.clip = 7"),
         (["--angles", "0,x"], "--angles 0,x"),
         (["--angles", "0,60"], "3"),

@@ -103,7 +103,7 @@ def run(
     mine = plan.shard.of(found)
     batch_folder = Path(found[0].batch_folder)
     places = {"root": str(root.resolve()), "out": None if out is None else str(out.resolve())}
-    atomic.write(batch_folder / "batch.json", json.dumps(places) + "\n")  # for `reopen`
+    atomic.write_json(batch_folder / "batch.json", places)  # for `reopen`
     records = {unit: record for unit in mine if (record := units.finished(unit, options)) is not None}
     wanted = [unit for unit in mine if unit not in records]
     print_line(f"{len(found)} captures, shard {plan.shard}: {len(mine)}, finished before: {len(records)}")

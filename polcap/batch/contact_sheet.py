@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 from collections import Counter
 from collections.abc import Sequence
 from html import escape
@@ -43,13 +42,9 @@ def write(batch_folder: Path, units: Sequence[Unit], records: Sequence[UnitRecor
     table = csv.DictWriter(text, _COLUMNS, extrasaction="ignore")
     table.writeheader()
     table.writerows(totals["rows"])
-    written = {
-        "summary.json": json.dumps(totals, ensure_ascii=False, indent=1) + "\n",
-        "summary.csv": text.getvalue(),
-        "summary.html": _page(totals, units, records),
-    }
-    for name, content in written.items():
-        atomic.write(batch_folder / name, content)  # names of folders are bytes
+    atomic.write_json(batch_folder / "summary.json", totals)
+    atomic.write(batch_folder / "summary.csv", text.getvalue())
+    atomic.write(batch_folder / "summary.html", _page(totals, units, records))
 
 
 def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[UnitRecord]) -> str:

@@ -7,8 +7,8 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import connection
@@ -49,56 +49,47 @@ class Died:
     attempts: int
 
 
-@dataclass(frozen=True)
-class _Call:
-    """A function's call on a task."""
-
-    function: Callable[..., Any]
-    task: Any
-    attempt: int
-
-
 class _Child:
-    """A child process, its pipe and the call that it executes."""
+    """A child process that executes one call at a time."""
 
     def __init__(self, limits: Limits) -> None:
-        self.pipe, there = _SPAWN.Pipe()
-        self.process = _SPAWN.Process(target=_serve, args=(there, limits))
-        self.process.start()
+        self._pipe, there = _SPAWN.Pipe()
+        self._process = _SPAWN.Process(target=_serve, args=(there, limits))
+        self._process.start()
         there.close()
-        self.busy: _Call | None = None
 
-    def send(self, call: _Call) -> None:
-        self.busy = call
-        self.pipe.send(call)
-
-    def receive(self) -> Any:
-        """Wait for the outcome of the call; None if the process died."""
+    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Wait for the result of a function; None if the process died."""
         try:
-            return self.pipe.recv() if self.pipe.poll() else None
+            self._pipe.send((function, arguments))
+            return self._pipe.recv()
         except (EOFError, OSError):
             return None
 
     def stop(self) -> None:
-        self.pipe.close()  # an idle child then ends
-        if self.busy:
-            self.process.terminate()
-        self.process.join()
+        self._process.terminate()
+        self._process.join()
 
 
 class ProcessPool:
-    """Up to `workers` child processes, which live from one `run` to the next."""
+    """Up to `workers` child processes, which live from one `run` to the next; a thread waits for each."""
 
     def __init__(self, workers: int, retries: int, limits: Limits) -> None:
-        self._workers, self._retries, self._limits = workers, retries, limits
-        self._children: list[_Child] = []
+        self._threads = ThreadPoolExecutor(workers)
+        self._retries, self._limits = retries, limits
+        self._children: set[_Child] = set()
+        self._idle: list[_Child] = []
+        self._closed = False
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        for child in self._children:
+        self._closed = True
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        for child in list(self._children):
             child.stop()
+        self._threads.shutdown()
 
     def run(self, function: Callable[[T, int], R], tasks: Sequence[T]) -> Iterator[tuple[T, R | Died]]:
         """Call `function` on each task and the number of the attempt; yields tasks and outcomes as they end.
@@ -106,36 +97,24 @@ class ProcessPool:
         The function is found by its name, and never returns None. If its process dies, a task is begun again, up to
         `retries` times.
         """
-        queue = deque(_Call(function, task, 1) for task in tasks)
-        while len(self._children) < min(self._workers, len(tasks)):
-            self._children.append(_Child(self._limits))
-        for child in self._children[: len(tasks)]:
-            child.send(queue.popleft())
-        while busy := {child.process.sentinel: child for child in self._children if child.busy}:
-            ready = connection.wait([*busy, *(child.pipe for child in busy.values())])
-            for sentinel, child in busy.items():
-                if child.pipe not in ready and sentinel not in ready:
-                    continue
-                assert child.busy is not None
-                call, outcome = child.busy, child.receive()
-                child.busy = None
-                if outcome is None:
-                    child = self._replaced(child)
-                    if call.attempt <= self._retries:
-                        queue.append(_Call(function, call.task, call.attempt + 1))
-                    else:
-                        outcome = Died(call.attempt)
-                if outcome is not None:
-                    yield call.task, outcome
-                if queue:
-                    child.send(queue.popleft())
+        begun = {self._threads.submit(self._call, function, task): task for task in tasks}
+        for future in as_completed(begun):
+            yield begun[future], future.result()
 
-    def _replaced(self, child: _Child) -> _Child:
-        """A new child process in the place of one that died."""
-        child.stop()
-        new = _Child(self._limits)
-        self._children[self._children.index(child)] = new
-        return new
+    def _call(self, function: Callable[[T, int], R], task: T) -> R | Died:
+        """Call a function in an idle child process, or in a new one; in a thread of the pool."""
+        attempt = 0
+        while attempt <= self._retries and not self._closed:
+            attempt += 1
+            child = self._idle.pop() if self._idle else _Child(self._limits)
+            self._children.add(child)
+            outcome: R | None = None if self._closed else child.call(function, task, attempt)
+            if outcome is not None:
+                self._idle.append(child)
+                return outcome
+            self._children.discard(child)
+            child.stop()
+        return Died(attempt)
 
 
 def run(wanted: Sequence[Unit], options: ProcessOptions, workers: int, retries: int) -> Iterator[UnitRecord]:
@@ -160,10 +139,10 @@ def _serve(pipe: connection.Connection, limits: Limits) -> None:
     prepare(limits)
     while True:
         try:
-            call = pipe.recv()
+            function, arguments = pipe.recv()
         except (EOFError, OSError):
             return
-        pipe.send(call.function(call.task, call.attempt))
+        pipe.send(function(*arguments))
 
 
 def _end_with_parent() -> None:

@@ -177,7 +177,7 @@ def read_record(unit: Unit) -> UnitRecord:
 
 
 def write_record(unit: Unit, record: UnitRecord) -> None:
-    atomic.write(unit.record_file, json.dumps(msgspec.to_builtins(record)) + "\n", synced=False)
+    atomic.write_json(unit.record_file, record, synced=False)
 
 
 def crashed(unit: Unit, message: str, attempt: int) -> UnitRecord:

@@ -34,7 +34,7 @@ from polcap.calibrate import (
     polarizer_ring,
     sensor_levels,
 )
-from polcap.calibrate.calibration_photographs import Photograph, angle_folders, angle_of, photographs_in
+from polcap.calibrate.calibration_photographs import Photograph, angle_folders, photographs_in
 from polcap.errors import CaptureError
 from polcap.images import Calibration, NoiseLine
 
@@ -116,6 +116,3 @@ def _check_one_camera(photographs: list[Photograph]) -> None:
                     f"{other.path}: was taken with {found}, {first.path.name} with {expected}; "
                     "calibrate one set-up at a time"
                 )
-
-
-__all__ = ["angle_of", "measure"]

@@ -7,7 +7,8 @@ to go on), 1 a bug. Heavy imports happen inside the commands, so that `--help` a
 process_command    the path over one capture
 batch_command      the path over many captures
 fuse_command       several captures of one object to one mesh
-result_commands    export, show, status, report, clean
+export_command     the asset of a result in other formats
+result_commands    show, status, report, clean
 check_command      keep a capture or reshoot it
 calibrate_command  measurement of camera, lens, polarizer and flash
 doctor_command     check of this machine or of one photograph
@@ -36,9 +37,10 @@ from polcap.cli.calibrate_command import calibrate
 from polcap.cli.capture_command import capture
 from polcap.cli.check_command import check
 from polcap.cli.doctor_command import doctor
+from polcap.cli.export_command import export
 from polcap.cli.fuse_command import fuse
 from polcap.cli.process_command import process
-from polcap.cli.result_commands import clean, export, report, show, status
+from polcap.cli.result_commands import clean, report, show, status
 from polcap.cli.settings_command import settings
 from polcap.cli.synth_command import synth
 from polcap.cli.training_commands import evaluate, train

@@ -61,7 +61,7 @@ def fuse(
         limits=Limits(threads, memory),
     )
     target = out or folder / own_folders.FUSED
-    chosen = settings.fill_sections(FusionSettings, own)
+    chosen = settings.fill_sections(FusionSettings, None, own)
     steps = terminal.Steps()
     about = fuse_run.fuse(wanted, chosen, target, terminal.print_progress, steps.stage)
     terminal.print_result(about, target, json, open_)

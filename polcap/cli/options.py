@@ -1,8 +1,7 @@
 """Options that several commands share, and the functions that parse them."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,7 +13,6 @@ from polcap.errors import SettingError
 from polcap.formats import own_folders
 
 if TYPE_CHECKING:
-    from polcap.formats.export.texture_set import Extra
     from polcap.images import ChartRequest
 
 
@@ -31,9 +29,9 @@ def result_folder(named: Path | None) -> Path | None:
     return named
 
 
-def choice(meaning: str) -> Any:
-    """A command-line option with a fixed list of values; upper and lower case are equal."""
-    return Option(case_sensitive=False, help=meaning)
+def choice(meaning: str, metavar: str | None = None) -> Any:
+    """A command-line option with a fixed list of values; `metavar` stands for them in the help."""
+    return Option(case_sensitive=False, help=meaning, metavar=metavar)
 
 
 def completion(names: Sequence[str]) -> Callable[[str], list[str]]:
@@ -61,13 +59,11 @@ Estimator = Annotated[Literal["network", "analytic"] | None, choice(_ESTIMATOR)]
 Model = Annotated[Path | None, Option(metavar="ONNX", help="A model of your own instead of the shipped one.")]
 _DEVICE = "Where the network runs; cuda fails where CUDA does not start."
 Device = Annotated[Literal["cpu", "cuda", "auto"], choice(_DEVICE)]
-_STAGES = completion(
-    ("hdr", "whitebalance", "align", "mask", "selfcal", "stokes", "cues", "infer", "surface", "asset")
-)  # those of pipeline.path, not imported at start
-Until = Annotated[str | None, Option(metavar="STAGE", help="Stop after this stage.", autocompletion=_STAGES)]
-Force = Annotated[
-    str | None, Option(metavar="STAGE", help="Compute this stage and all after it again.", autocompletion=_STAGES)
-]
+Stage = Literal[  # those of pipeline.path, not imported at start
+    "hdr", "whitebalance", "align", "mask", "selfcal", "stokes", "cues", "infer", "surface", "asset"
+]  # fmt: skip
+Until = Annotated[Stage | None, choice("Stop after this stage.", "STAGE")]
+Force = Annotated[Stage | None, choice("Compute this stage and all after it again.", "STAGE")]
 Threads = Annotated[int, Option("--threads", "-j", min=0, help="Threads to use; 0 is all.")]
 Memory = Annotated[float, Option(min=0, help="Most memory to take, GB; 0 is no limit.")]
 
@@ -88,21 +84,6 @@ def numbers(flag: str, text: str, remedy: str) -> tuple[float, ...]:
     return found
 
 
-def catalog_fields(stated: Sequence[str]) -> dict[str, str]:
-    """Parse --about K=V: fields of `CatalogEntry` by name. Raises SettingError for an unknown field."""
-    from polcap.images import CatalogEntry
-
-    known = [field.name for field in fields(CatalogEntry)]
-    for text in stated:
-        if "=" not in text:
-            raise SettingError(f'--about {text}: write FACT=TEXT, for example title="Vase with handles"')
-    found = dict(text.partition("=")[::2] for text in stated)
-    for key in found:
-        if key not in known:
-            raise SettingError(f"--about {key}: there is no such fact; there are {', '.join(known)}")
-    return found
-
-
 def warn_of_outdated_exports(out: Path, records: Sequence[Path]) -> None:
     """Print a warning if exports with these sidecars in a result folder, or files of them, have other maps or facts."""
     from polcap.formats import text_file
@@ -113,32 +94,6 @@ def warn_of_outdated_exports(out: Path, records: Sequence[Path]) -> None:
         named = ", ".join([path.relative_to(out).as_posix() for path in old[:_NAMED]] + ["…"] * (len(old) > _NAMED))
         text = f"{named} in {out}: exported earlier, with other maps, settings or facts; export again, or remove"
         terminal.print_message(f"polcap: warning: {text}", "WARNING")
-
-
-def extra_textures(named: Sequence[str]) -> "tuple[Extra, ...]":
-    """Parse --extra: names of further textures. Raises SettingError for an unknown name."""
-    from polcap.formats.export.texture_set import EXTRAS
-
-    for name in named:
-        if name not in EXTRAS:
-            raise SettingError(f"--extra {name}: there is no such texture; there are {', '.join(EXTRAS)}")
-    return tuple(extra for extra in EXTRAS if extra in named)
-
-
-def texture_bits(bits: int | None) -> Literal[8, 16] | None:
-    """Check --bits: 8 or 16. Raises SettingError for another number."""
-    if bits not in (None, 8, 16):
-        raise SettingError(f"--bits {bits}: PNG has 8 or 16 bits")
-    return None if bits is None else 8 if bits == 8 else 16
-
-
-def check_stages(named: Mapping[str, str | None]) -> None:
-    """Raise a SettingError if an option names a stage that does not exist; the message names the option."""
-    from polcap.pipeline.path import STAGES
-
-    for flag, stage in named.items():
-        if stage not in (None, *STAGES):
-            raise SettingError(f"{flag} {stage}: no such stage; choose one of {', '.join(STAGES)}")
 
 
 def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":

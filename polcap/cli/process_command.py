@@ -55,7 +55,6 @@ def process(
         return
     resource_limits.set_threads(threads)  # before the libraries that start them
     resource_limits.set_memory(memory)
-    options.check_stages({"--until": until, "--force": force})
     once = partial(_plan, stated, target) if dry_run else partial(_process, stated, target, request)
     if watch:
         at_every_change(capture, target, config, once)

@@ -1,7 +1,6 @@
-"""`polcap export`, `show`, `status`, `report` and `clean`: commands on a result folder."""
+"""`polcap show`, `status`, `report` and `clean`: commands on a result folder."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,111 +8,8 @@ from typer import Argument, Context, Option
 
 from polcap import terminal
 from polcap.cli import options
-from polcap.cli.options import Json, Result, choice
+from polcap.cli.options import Json, Result
 from polcap.errors import SettingError
-
-PRESETS = (
-    "blender",
-    "unreal",
-    "unity",
-    "web",
-    "substance",
-    "maya",
-    "houdini",
-    "archive",
-)  # those of formats.export.presets, not imported at start
-
-
-def export(
-    context: Context,
-    result: Result,
-    gltf: Annotated[bool, Option("--gltf", help="asset/NAME.glb")] = False,
-    obj: Annotated[bool, Option("--obj", help="asset/NAME.obj, .mtl and textures")] = False,
-    usd: Annotated[bool, Option("--usd", help="asset/NAME.usdc and textures (extra [usd])")] = False,
-    usdz: Annotated[bool, Option("--usdz", help="asset/NAME.usdz, one file for phones (extra [usd])")] = False,
-    materialx: Annotated[bool, Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
-    exr: Annotated[bool, Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
-    preset: Annotated[
-        list[str] | None,
-        Option(
-            metavar="NAME",
-            help=f"Files for one program in asset/NAME/: {', '.join(PRESETS)}; repeatable.",
-            autocompletion=options.completion(PRESETS),
-        ),
-    ] = None,
-    images: Annotated[Literal["png", "jpeg", "webp", "ktx2"] | None, choice("Picture format in the GLB.")] = None,
-    geometry: Annotated[
-        Literal["float", "quantized", "draco"] | None,
-        choice("Mesh in the GLB: 32-bit floats, integers, or Draco (extra [draco])."),
-    ] = None,
-    triangles: Annotated[int | None, Option(min=16, help="Most triangles of the mesh; web has 50,000.")] = None,
-    color: Annotated[
-        str, Option(metavar="SPACE", help="Color space or OCIO role of the colors in the EXR, such as ACEScg.")
-    ] = "lin_rec709",
-    texture_size: Annotated[
-        int | None,
-        Option(min=16, max=16384, help="Longer side of the textures, px; by default each keeps its own size."),
-    ] = None,
-    page: Annotated[
-        Path | None,
-        Option(metavar="JS", help="Web page that shows the GLB with this model-viewer.min.js, without a network."),
-    ] = None,
-    iiif: Annotated[
-        str | None,
-        Option(
-            metavar="URL",
-            help="asset/NAME_iiif/, a relightable layer for museums; URL is where this folder will be served.",
-        ),
-    ] = None,
-    about: Annotated[
-        list[str] | None,
-        Option(
-            metavar="K=V", help="A fact for catalogs: title, creator, rights, license or object_number; repeatable."
-        ),
-    ] = None,
-    extra: Annotated[
-        list[str] | None,
-        Option(
-            metavar="NAME",
-            help="A further texture: displacement, occlusion or object-normal; repeatable.",
-            autocompletion=options.completion(("displacement", "occlusion", "object-normal")),
-        ),
-    ] = None,
-    bits: Annotated[int | None, Option(metavar="8|16", help="Bits of a channel in PNG textures.")] = None,
-    lod: Annotated[int, Option(min=0, max=6, help="Further GLBs, each with a quarter of the triangles.")] = 0,
-    json: Json = False,
-) -> None:
-    """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
-    from polcap.formats.export import presets
-    from polcap.fusion import fuse_run, fused_maps
-    from polcap.pipeline import run as pipeline
-    from polcap.pipeline.asset_export import ExportRequest
-
-    flags = {"gltf": gltf, "obj": obj, "usd": usd, "usdz": usdz, "materialx": materialx, "exr": exr}
-    flags["iiif"] = iiif is not None
-    formats = tuple(name for name in presets.FORMATS if flags[name])
-    if preset and formats:
-        raise SettingError(f"--preset {preset[0]} brings its formats; write --{formats[0]} by a second export")
-    plain = ExportRequest(
-        formats=formats or ("gltf", "obj"),
-        images=images,
-        geometry=geometry,
-        triangles=triangles,
-        color=color,
-        texture_size=texture_size,
-        bits=options.texture_bits(bits),
-        extras=options.extra_textures(extra or []),
-        page=page,
-        iiif=iiif,
-        catalog=options.catalog_fields(about or []),
-        lod=lod,
-    )
-    wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
-    write = fuse_run.export if fused_maps.is_fused(result) else pipeline.export
-    files = write(result, *wanted)
-    options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
-    written = [str(file) for file in files]
-    terminal.print_data({"written": written} if json else "\n".join(written))
 
 
 def show(

@@ -5,12 +5,16 @@ file. The new name reaches the disk with the system's next journal write; after 
 """
 
 import errno
+import json
 import os
 import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from polcap.errors import StorageError
 
@@ -47,6 +51,12 @@ def write(final: str | Path, content: str | bytes, synced: bool = True) -> None:
         content = content.encode("utf-8", "backslashreplace")  # the name of a file may not be text
     with path(final, synced) as temporary:
         temporary.write_bytes(content)
+
+
+def write_json(final: str | Path, content: Any, synced: bool = True) -> None:
+    """Write plain data, msgspec structs and dataclasses as a JSON file, otherwise as `write`; NaN is a ValueError."""
+    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False, default=msgspec.to_builtins)
+    write(final, text + "\n", synced)
 
 
 @contextmanager

@@ -6,9 +6,12 @@ which one view cannot. Texels of like albedo are taken for one material. Its rad
     S0 = E (g ρ_d D(n, l, v) + F0 S(n, l, v, α))
 
 with the diffuse and the specular law of `optics/shade.py`, and E the flash's light at the distance of the point. For
-each α of a table, g and F0 follow from weighted least squares; the α with the least residual is the fit. Errors of the
-normals widen the lobe: α² is less by twice their variance. The flash's place near the lens is found first, as the
-one for which all materials fit best.
+each α, g and F0 follow from weighted least squares; the α with the least residual is the fit. Errors of the normals
+widen the lobe: α² is less by twice their variance. The flash's place near the lens is found first, as the one for
+which all materials fit best.
+
+The brightness of a highlight tells F0/α², and its width tells α. So F0 and roughness of the views' maps are held, in
+proportion to the residual. They are medians over the views, because a view's F0 and roughness err alike everywhere.
 
 References
 ----------
@@ -25,7 +28,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, Sight, on_atlas, sights
@@ -35,14 +38,18 @@ from polcap.optics import color, frames, shade
 from polcap.optics.point_light import irradiance
 from polcap.stages import stage
 
-_ALPHAS = np.geomspace(0.01, 1.0, 28)
+_ALPHAS = np.geomspace(0.01, 1.0, 14)
+_ALPHA_ERROR = 0.01  # relative; F0 changes by twice as much, because the brightness F0/α² at the highlight is fixed
 _SAMPLES = 6000  # of a material, at most
 _LEAST_SAMPLES = 300  # of a material, below which its maps are left as they are
+_LEAST_SHARE = 0.02  # of the weight in the view that sees most of a material, for a view's maps to count
 _LEAST_COSINE = 0.3  # between normal and view: flatter views show errors of the normals
 _FLOOR = 0.02  # of the median radiance: error of every sample, with `_RELATIVE`
 _RELATIVE = 0.08
 _ROUNDS = 3  # of reweighting
-_GAIN_SIGMA, _F0_SIGMA, _ROUGHNESS_SIGMA = 0.1, 0.008, 0.08  # errors of the means of the maps over a material
+_GAIN_SIGMA, _ROUGHNESS_SIGMA = 0.1, 0.16  # errors of the maps over a material
+_F0_SIGMA = 0.012  # the same; highlights of rough surfaces tell less:
+_F0_SIGMA_ROUGH = 0.0002  # times 1/α², because a wide highlight, ∝ F0/α², cannot be told from an error of the albedo
 _FARTHEST_FLASH = 0.15  # m from the lens
 _INDEX = 1.5  # refractive index of the diffuse law and of the Fresnel term
 
@@ -56,7 +63,7 @@ class MaterialSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 3.0
     map_weight: Annotated[
         float, Meta(ge=0, le=10, description="weight of the views' own maps against the fit of the highlights [1]")
-    ] = 0.05
+    ] = 0.15
 
 
 @dataclass(frozen=True)
@@ -93,7 +100,7 @@ class Lobe:
     residual: float  # weighted mean of ln(1 + error²), in units of the expected error, and the prior's part
 
 
-@stage(version=3)
+@stage(version=4)
 def fit(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps, settings: MaterialSettings) -> AtlasMaps:
     """Refine F0 and roughness by the highlights of all views; without S0 in the views the maps stay as they are."""
     lit = [view for view in views if view.s0 is not None]
@@ -139,18 +146,31 @@ def _samples(
         radiance = color.luminance(one.sample(view.s0))[steep] / light
         parts.append((radiance, albedo[one.texel[steep]], local, point, one.weight[steep], one.texel[steep]))
     radiance, base, local, point, weight, texel = (np.concatenate(column) for column in zip(*parts))
-    material = share.argmax(axis=1)[texel]
-    gloss = np.stack([color.luminance(maps.specular[atlas.covered]), maps.roughness[atlas.covered]], axis=-1)
+    best = share.argmax(axis=1)
+    material, gloss = best[texel], _typical_gloss(views, seen, best, share.shape[1])
     found: list[LobeSamples | None] = []
-    for k in range(share.shape[1]):
+    for k, (f0, rough) in enumerate(gloss):
         mine = np.flatnonzero((material == k) & (weight > 0))
         if len(mine) < _LEAST_SAMPLES:
             found.append(None)
             continue
         mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), _SAMPLES)).astype(int)]
-        f0, rough = (float(np.average(gloss[:, c], weights=share[:, k] * maps.weight[atlas.covered])) for c in (0, 1))
-        found.append(LobeSamples(radiance, base, local, point, weight, f0, rough**2).take(mine))
+        found.append(LobeSamples(radiance, base, local, point, weight, f0, max(rough**2, _ALPHAS[0])).take(mine))
     return found
+
+
+def _typical_gloss(
+    views: Sequence[FusionView], seen: Sequence[Sight], material: NDArray[np.intp], count: int
+) -> list[tuple[float, float]]:
+    """F0 and roughness of each material in the maps: medians over the views that see enough of it."""
+    rows = np.zeros((len(views), count, 3))  # means of F0 and roughness, weight
+    for row, view, one in zip(rows, views, seen):
+        gloss = color.luminance(one.sample(view.specular)), one.sample(view.roughness)[:, 0], np.ones(len(one.texel))
+        row[:] = np.stack([np.bincount(material[one.texel], one.weight * x, count) for x in gloss], axis=-1)
+        row[:, :2] /= np.maximum(row[:, 2:], 1e-9)
+    enough = rows[..., 2] > _LEAST_SHARE * rows[..., 2].max(axis=0)
+    return [tuple(np.median(rows[enough[:, k], k, :2], axis=0)) if enough[:, k].any() else (0.0, 0.0)
+            for k in range(count)]  # fmt: skip
 
 
 def _flash(samples: Sequence[LobeSamples | None], settings: MaterialSettings) -> Floats:
@@ -178,17 +198,22 @@ def _lobe(samples: LobeSamples, light: Floats, settings: MaterialSettings) -> Lo
     diffuse = samples.albedo * body
     floor = _FLOOR * float(np.median(samples.radiance))
     widened = 2 * np.radians(settings.normal_sigma_deg) ** 2
-    best: Lobe | None = None
-    for alpha in _ALPHAS:
-        rough = np.sqrt(alpha) * ones
-        gloss = shade.stokes(samples.normal, none, white, rough, _INDEX * ones, to_light, ones)[0][:, 0]
-        gain, f0, residual = _amplitudes(samples, diffuse, gloss, floor, settings.map_weight)
+
+    def lobe(log_alpha: float, prior: float) -> Lobe:
+        alpha = np.exp(log_alpha)
+        gloss = shade.stokes(samples.normal, none, white, np.sqrt(alpha) * ones, _INDEX * ones, to_light, ones)[0][:, 0]
+        gain, f0, residual = _amplitudes(samples, diffuse, gloss, floor, prior)
         narrower = np.sqrt(max(alpha**2 - widened, _ALPHAS[0] ** 2))  # the lobe without the errors of the normals
-        residual += settings.map_weight * ((np.sqrt(narrower) - np.sqrt(samples.alpha)) / _ROUGHNESS_SIGMA) ** 2
-        if best is None or residual < best.residual:
-            best = Lobe(f0, float(narrower), gain, residual)
-    assert best is not None
-    return best
+        residual += prior * ((np.sqrt(narrower) - np.sqrt(samples.alpha)) / _ROUGHNESS_SIGMA) ** 2
+        return Lobe(f0, float(narrower), gain, residual)
+
+    of_maps = lobe(0.5 * float(np.log(samples.alpha**2 + widened)), settings.map_weight)
+    prior = settings.map_weight * of_maps.residual  # what no lobe explains makes highlights count less
+    steps = np.log(_ALPHAS)
+    best = int(np.argmin([lobe(one, prior).residual for one in steps]))
+    around = steps[max(best - 1, 0)], steps[min(best + 1, len(steps) - 1)]
+    found = minimize_scalar(lambda one: lobe(one, prior).residual, bounds=around, options={"xatol": _ALPHA_ERROR})
+    return lobe(float(found.x), prior)
 
 
 def _amplitudes(
@@ -198,7 +223,8 @@ def _amplitudes(
     terms = np.stack([diffuse, gloss], axis=-1)
     scale = floor + _RELATIVE * np.maximum(samples.radiance, 0)
     robust = np.ones(len(scale))
-    expected, tie = np.array([1.0, samples.f0]), prior / np.array([_GAIN_SIGMA, _F0_SIGMA]) ** 2
+    f0_sigma = min(_F0_SIGMA, _F0_SIGMA_ROUGH / samples.alpha**2)
+    expected, tie = np.array([1.0, samples.f0]), prior / np.array([_GAIN_SIGMA, f0_sigma]) ** 2
     for _ in range(_ROUNDS):
         w = samples.weight * robust / scale**2 / samples.weight.sum()
         normal = terms.T @ (w[:, None] * terms) + np.diag(tie)

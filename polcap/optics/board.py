@@ -37,11 +37,6 @@ class Board:
         """Side of the printed square."""
         return SQUARES * self.square_m
 
-    @property
-    def free_m(self) -> float:
-        """Side of the black middle, where the object stands."""
-        return (SQUARES - 2 * RING) * self.square_m
-
 
 BOARDS = {
     board.name: board

@@ -80,7 +80,7 @@ class ExportSource(Protocol):
 class ReliefSource:
     """The maps of a result, with the full mesh and asset made from them."""
 
-    stored: maps_folder.StoredMaps
+    maps: maps_folder.ResultMaps
     mesh: ReliefMesh
     asset: Asset
     config: Config
@@ -92,13 +92,13 @@ class ReliefSource:
 
     def whole(self, bits: Literal[8, 16], extras: tuple[Extra, ...]) -> Asset:
         """The asset with the full mesh, textures of 8 or 16 bits, and extra textures."""
-        maps = self.stored.maps
+        maps = self.maps
         built = self.asset if bits == 8 else asset.build(maps, self.mesh, self.config.asset, bits)
-        return asset.with_extras(built, maps, self.stored.depth, "occlusion" in extras) if extras else built
+        return asset.with_extras(built, maps, maps.depth, "occlusion" in extras) if extras else built
 
     def decimated(self, whole: Asset, triangles: int) -> "DetailLevel":
         """The asset with about so many triangles."""
-        maps = self.stored.maps
+        maps = self.maps
         coarse = surface.decimate(self._front, maps.view, triangles, self.config.surface.back)
         return DetailLevel(asset.with_mesh(whole, maps, coarse.mesh), coarse)
 
@@ -108,7 +108,7 @@ class ReliefSource:
         if self.config.surface.back == "open":
             return self.mesh
         settings = msgspec.structs.replace(self.config.surface, back="open")
-        return surface.triangulate(self.stored.depth, self.stored.maps, self.stored.metric, settings)
+        return surface.triangulate(self.maps.depth, self.maps, self.maps.metric, settings)
 
 
 @dataclass(frozen=True)
@@ -155,9 +155,9 @@ def read(folder: Path, config: Config) -> ReliefSource:
     ObjectError
         No triangle fits into the mask.
     """
-    stored = maps_folder.read(folder)
-    mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, config.surface)
-    return ReliefSource(stored, mesh, asset.build(stored.maps, mesh, config.asset), config)
+    maps = maps_folder.read(folder)
+    mesh = surface.triangulate(maps.depth, maps, maps.metric, config.surface)
+    return ReliefSource(maps, mesh, asset.build(maps, mesh, config.asset), config)
 
 
 def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
@@ -203,21 +203,17 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
         loose |= {file: texture_set.linear(one) for file, one in made.items()} if preset.shared == "exr" else made
     folder = out / "asset" / (wanted.preset or "")
     options = gltf.GlbOptions(preset.images, preset.geometry, gltf.center(mesh.vertices))
-    unit, record, encoder = (
-        "m" if mesh.metric else "relative",
-        provenance.record(about, wanted.catalog),
-        TextureEncoder(),
-    )
+    unit, encoder = "m" if mesh.metric else "relative", TextureEncoder()
+    record = provenance.record(about, wanted.catalog)
     words = {"unit": unit, "normals": "+Y (OpenGL)", **provenance.words(record)}
     comment = f"polcap; unit of length: {unit}; normals +Y (OpenGL); made from: {stem}.provenance.json"
-    layered = folder / f"{stem}_layers.exr"
     writers: dict[Format, _Writer] = {
         "gltf": partial(_write_glb, folder / f"{stem}.glb", whole, options, words, encoder),
         "obj": partial(obj.write, folder / f"{stem}.obj", whole, stem, shared, comment),
-        "usd": partial(_one, usd.write, folder / f"{stem}.usdc", whole, stem, shared, words),
+        "usd": partial(_write_usd, folder / f"{stem}.usdc", whole, shared, words),
         "usdz": partial(_write_usdz, folder / f"{stem}.usdz", whole, words, encoder),
-        "materialx": partial(_one, materialx.write, folder / f"{stem}.mtlx", whole, stem, shared, comment),
-        "exr": partial(_one, exr_layers.write, layered, out / "maps", wanted.color, words),
+        "materialx": partial(_write_materialx, folder / f"{stem}.mtlx", whole, shared, comment),
+        "exr": partial(_write_exr, folder / f"{stem}_layers.exr", out / "maps", wanted.color, words),
         "iiif": partial(_write_iiif, folder / f"{stem}_iiif", whole, words, wanted.iiif or ""),
     }
     coarser = {folder / f"{stem}_lod{k}.glb": level for k, level in enumerate(found[1:], 1)}
@@ -230,19 +226,14 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
         web_page.write(page, glb, web_page.read_script(wanted.page), words.get("title", stem))
         written.append(page)
     sidecar = folder / f"{stem}.provenance.json"
-    provenance.write(
-        sidecar, record, {file.relative_to(folder).as_posix(): provenance.digest(file) for file in written}
-    )
-    embedded = gltf.textures(whole) if "gltf" in preset.formats else {}
+    digests = {file.relative_to(folder).as_posix(): provenance.digest(file) for file in written}
+    provenance.write(sidecar, record, digests)
     description = {
         "for": preset.description,
         "unit": unit,
-        "glb": {f"{stem}_{key}": _described(texture, options.images) for key, texture in embedded.items()},
-        "mesh": {"triangles": len(mesh.faces), **_deviation(found[0])},
-        "lods": {
-            file.name: {"triangles": len(level.asset.mesh.faces), **_deviation(level)}
-            for file, level in coarser.items()
-        },
+        "glb": {f"{stem}_{key}": text for key, text in _embedded(whole, preset).items()},
+        "mesh": _size(found[0]),
+        "lods": {file.name: _size(level) for file, level in coarser.items()},
         "textures": {file: texture.meaning for file, texture in sorted(loose.items())},
     }
     maps_folder.note_export(out / "maps", folder.relative_to(out).as_posix(), description)
@@ -296,22 +287,31 @@ def effective(wanted: ExportRequest) -> ExportPreset:
     )
 
 
-def _one(write_file: Callable[..., None], file: Path, *content: Any) -> list[Path]:
-    """Write one file of an export by the function `write_file`; returns the file in a list."""
-    write_file(file, *content)
-    return [file]
-
-
 def _write_glb(
     file: Path, content: Asset, options: gltf.GlbOptions, words: Mapping[str, str], encoder: TextureEncoder
 ) -> list[Path]:
-    gltf.write(file, content, file.stem, options, words, encoder)
+    atomic.write(file, gltf.encode(content, file.stem, options, words, encoder))
+    return [file]
+
+
+def _write_usd(file: Path, content: Asset, textures: Mapping[Key, str], words: Mapping[str, str]) -> list[Path]:
+    usd.write(file, content, file.stem, textures, words)
     return [file]
 
 
 def _write_usdz(file: Path, content: Asset, words: Mapping[str, str], encoder: TextureEncoder) -> list[Path]:
     textures = {key: encoder(make(content), "png") for key, make in texture_set.LOOSE.items()}
     usd.package(file, content, file.stem, textures, words)
+    return [file]
+
+
+def _write_materialx(file: Path, content: Asset, textures: Mapping[Key, str], comment: str) -> list[Path]:
+    atomic.write(file, materialx.document(content, file.stem, textures, comment))
+    return [file]
+
+
+def _write_exr(file: Path, maps: Path, color: str, words: Mapping[str, str]) -> list[Path]:
+    exr_layers.write(file, maps, color, words)
     return [file]
 
 
@@ -324,21 +324,21 @@ def _write_iiif(folder: Path, content: Asset, words: Mapping[str, str], address:
 def _write_texture(file: Path, texture: Texture, encoder: TextureEncoder) -> list[Path]:
     if file.suffix == ".exr":
         texture_set.write_exr(file, texture)
-        return [file]
-    with atomic.path(file) as temporary:
-        temporary.write_bytes(encoder(texture, "png", text=True))
+    else:
+        atomic.write(file, encoder(texture, "png", text=True))
     return [file]
 
 
-def _described(texture: Texture, images: Kind) -> str:
-    """Meaning, size and file format of an embedded texture, for maps.json."""
-    height, width = texture.pixels.shape[:2]
-    return f"{texture.meaning}; {width} × {height} px; {images}"
+def _embedded(content: Asset, preset: ExportPreset) -> dict[str, str]:
+    """Meaning, size and file format of the textures in the GLB, for maps.json; none without a GLB."""
+    textures = gltf.textures(content) if "gltf" in preset.formats else {}
+    sizes = {key: "{1} × {0}".format(*texture.pixels.shape) for key, texture in textures.items()}
+    return {key: f"{texture.meaning}; {sizes[key]} px; {preset.images}" for key, texture in textures.items()}
 
 
-def _deviation(level: DetailLevel) -> dict[str, str]:
-    """Distance of a decimated mesh from the full one, for maps.json."""
-    coarse = level.decimated
+def _size(level: DetailLevel) -> dict[str, Any]:
+    """Triangles of a mesh, and its distance from the full one, for maps.json."""
+    coarse, count = level.decimated, {"triangles": len(level.asset.mesh.faces)}
     if coarse is None:
-        return {}
-    return {"error": f"{1000 * coarse.error:.4g} mm" if coarse.mesh.metric else f"{coarse.error_px:.3g} px"}
+        return count
+    return {**count, "error": f"{1000 * coarse.error:.4g} mm" if coarse.mesh.metric else f"{coarse.error_px:.3g} px"}

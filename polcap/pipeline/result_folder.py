@@ -3,7 +3,6 @@
 A result is opened again from work/run.json.
 """
 
-import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -64,8 +63,7 @@ def locked(out: Path) -> Iterator[None]:
     except OSError as error:
         raise atomic.failure(work / "lock", error) from error
     try:
-        with atomic.path(owner, synced=False) as temporary:
-            temporary.write_text(f"{os.getpid()}\n", encoding="utf-8")
+        atomic.write(owner, f"{os.getpid()}\n", synced=False)
         for place in (work, out, out / "maps", out / "asset", *(out / "asset").glob("*/")):
             for left in [*place.glob(".*.part*"), *place.glob(".*.old")]:
                 atomic.discard(left)
@@ -112,9 +110,7 @@ def write_run(out: Path, about: Mapping[str, Any]) -> None:
     StorageError
         It cannot be written.
     """
-    text = json.dumps({**about, "digest": seal(about)}, indent=1)
-    with atomic.path(out / "work" / "run.json", synced=False) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    atomic.write_json(out / "work" / "run.json", {**about, "digest": seal(about)}, synced=False)
 
 
 def read_run(out: Path) -> dict[str, Any]:

@@ -67,9 +67,8 @@ def remember(out: Path, asked: str | None, table: str = "") -> None:
         The result folder cannot be written.
     """
     if asked is not None:
-        text = json.dumps({"request": asked, "table": table, "result": _result(out)})
-        with atomic.path(out / "work" / _FILE, synced=False) as temporary:
-            temporary.write_text(text + "\n", encoding="utf-8")
+        content = {"request": asked, "table": table, "result": _result(out)}
+        atomic.write_json(out / "work" / _FILE, content, synced=False)
 
 
 @cache

@@ -4,7 +4,6 @@ A failed gate means that the asset was written but must be checked before use (e
 assumption. A gate that had nothing to measure is marked "not measured".
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -132,9 +131,7 @@ def write(folder: Path, about: dict[str, Any], results: Results) -> None:
     StorageError
         The folder cannot be written.
     """
-    with atomic.path(folder / "report.json") as temporary:
-        text = json.dumps(about, indent=1, ensure_ascii=False, allow_nan=False)
-        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")  # names of files are bytes
+    atomic.write_json(folder / "report.json", about)
     page.write(folder, about, results)
 
 

@@ -77,7 +77,7 @@ def _names(folders: tuple[Path, Path]) -> tuple[str, str]:
 def _maps(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
     """Figures of the maps of two results by title, with difference maps where the crops have the same size."""
     try:
-        stored = [maps_folder.read(folder / "maps").maps for folder in folders]
+        stored = [maps_folder.read(folder / "maps") for folder in folders]
     except DecodeError as error:
         return {"fault": str(error)}
     small = [ObjectReduction(maps.mask, _LONGEST).maps(maps) for maps in stored]

@@ -56,8 +56,7 @@ class BackgroundCheck:
     def _save_and_check(self, slot: Slot, read_deg: float | None, photograph: CameraFile) -> None:
         name = f"{slot.name}{photograph.suffix}"
         file = self._record.folder / name
-        with atomic.path(file) as temporary:
-            temporary.write_bytes(photograph.data)
+        atomic.write(file, photograph.data)
         try:
             facts, small = retake_criteria.inspect(file)
         except DecodeError as error:

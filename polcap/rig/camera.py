@@ -9,18 +9,6 @@ from polcap.images import Role
 from polcap.rig.exposure_bracket import Exposure
 
 _MAKERS = {"nikon": ".nef", "sony": ".arw", "pentax": ".pef", "ricoh": ".pef", "samsung": ".srw", "canon": ".cr2"}
-_SIGNATURES = (
-    (0, b"FUJIFILMCCD-RAW", ".raf"),
-    (0, b"\0MRM", ".mrw"),
-    (0, b"FOVb", ".x3f"),
-    (0, b"IIU\0", ".rw2"),
-    (0, b"IIRO", ".orf"),
-    (0, b"IIRS", ".orf"),
-    (0, b"MMOR", ".orf"),
-    (0, b"\xff\xd8\xff", ".jpg"),
-    (4, b"ftypcrx ", ".cr3"),
-    (6, b"HEAPCCDR", ".crw"),
-)  # offset, bytes, suffix
 
 
 @dataclass(frozen=True)
@@ -34,9 +22,10 @@ class CameraFile:
     @property
     def suffix(self) -> str:
         """File name suffix by the file's content; the camera's suffix if the content is not recognized."""
-        for offset, signature, suffix in _SIGNATURES:
-            if self.data.startswith(signature, offset):
-                return suffix
+        if suffix := file_kind.raw_suffix(self.data):
+            return suffix
+        if self.data.startswith(b"\xff\xd8\xff"):
+            return ".jpg"
         if self.data[:4] in (b"II*\0", b"MM\0*"):
             if file_kind.structure(self.data).dng:
                 return ".dng"

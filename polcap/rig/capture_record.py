@@ -7,7 +7,7 @@ import os
 import threading
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import tomli_w
@@ -21,6 +21,7 @@ from polcap.rig.exposure_bracket import Exposure
 from polcap.rig.retake_criteria import FrameFacts
 from polcap.rig.shooting_plan import CaptureOrder, Slot
 
+T = TypeVar("T")
 NAME, LOG, REJECTED = "rig.json", "rig.log", "rejected"
 _SAME_DEG = 0.1  # the frames of a bracket are at one angle up to this
 
@@ -135,8 +136,7 @@ class CaptureRecord:
         Raises StorageError; CaptureError if capture.toml was edited and is wrong.
         """
         with self._lock:
-            with atomic.path(self.folder / NAME) as temporary:
-                temporary.write_bytes(msgspec.json.format(msgspec.json.encode(self.content), indent=1))
+            atomic.write_json(self.folder / NAME, self.content)
             capture_toml.load(self.folder)
             file = self.folder / capture_toml.NAME
             stated = text_file.read_toml(file) if file.exists() else {}
@@ -165,9 +165,13 @@ class CaptureRecord:
 
 def load(folder: Path) -> RigFile | None:
     """The rig.json of an earlier run, or None. Raises CaptureError."""
-    file = folder / NAME
+    return read(folder / NAME, RigFile) if (folder / NAME).exists() else None
+
+
+def read(file: Path, kind: type[T]) -> T:
+    """Read a file of this package, rig.json or views.json. Raises CaptureError."""
     try:
-        return msgspec.json.decode(file.read_bytes(), type=RigFile) if file.exists() else None
+        return msgspec.json.decode(file.read_bytes(), type=kind)
     except (OSError, msgspec.MsgspecError) as error:
         raise CaptureError(f"{file}: cannot be read ({error}); shoot into another folder") from None
 

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from polcap.errors import DecodeError
+from polcap.formats.capture import reader
 from polcap.formats.raw import libraw as raw
 from polcap.formats.raw import probe, worker
 from polcap.images import Exif, Floats
@@ -20,7 +21,6 @@ from polcap.rig.exposure_bracket import Exposure
 BLURRED = "is less sharp than its neighbors; wait until the tripod is steady"
 PREVIEW_PX = 480  # width of the small picture
 _DIAL_STOPS = 0.34  # EXIF rounds an exposure by up to one step of the dial
-_ZOOM = 0.01  # relative change of the focal length that is more than rounding
 _SATURATED = 0.98  # of the white level
 _MOST_CLIPPED = 0.01  # share of the picture, in the shortest exposure
 _LEAST_SHARPNESS = 0.75  # of that of the sharpest frame of the same exposure
@@ -87,7 +87,7 @@ def retake_reason(
             f"more than {100 * _MOST_CLIPPED:g} %; give a shorter --bracket or less light"
         )
     if reason is None and others:
-        reason = _other_equipment(facts.exif, others[0].exif)
+        reason = reader.other_equipment(facts.exif, others[0].exif)
     if reason is None and is_blurred(facts.sharpness, sharpest):
         reason = BLURRED
     return reason
@@ -108,15 +108,3 @@ def _wrong_exposure(stated: Exif, wanted: Exposure) -> str | None:
         if expected and found and power * abs(log2(found / expected)) > _DIAL_STOPS:
             return f"{name} {found:.4g}, but {expected:.4g} was set; set the camera to manual"
     return None
-
-
-def _other_equipment(here: Exif, first: Exif) -> str | None:
-    lengths = here.focal_length_mm, first.focal_length_mm
-    zoomed = lengths[0] and lengths[1] and abs(lengths[0] / lengths[1] - 1) > _ZOOM
-    rows = (
-        ("taken with the camera", f"{here.make} {here.model}", f"{first.make} {first.model}"),
-        ("taken through the lens", here.lens or first.lens, first.lens or here.lens),
-        ("recorded with a size of", f"{here.width}×{here.height} px", f"{first.width}×{first.height} px"),
-        ("taken at", f"{lengths[0]:g} mm" if zoomed else "", f"{lengths[1]:g} mm" if zoomed else ""),
-    )
-    return next((f"was {text} {found}, not {wanted}" for text, found, wanted in rows if found != wanted), None)

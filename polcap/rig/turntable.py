@@ -41,7 +41,7 @@ def open_session(folder: Path, views: int | None, turntable: str | None, resume:
     """
     file = folder / NAME
     if resume and file.exists():
-        begun = _load(file)
+        begun = capture_record.read(file, SessionFile)
         if views not in (None, begun.views):
             raise CaptureError(f"{folder} was begun with --views {begun.views}; leave it out, or choose a new folder")
         return msgspec.structs.replace(begun, turntable=turntable or begun.turntable)
@@ -86,7 +86,7 @@ def shoot(
         closing(Log(folder / LOG)) as log,
         closing(device_urls.open_rotator(session.turntable, log, "turntable with the board")) as table,
     ):
-        _write(folder, session)
+        atomic.write_json(folder / NAME, session)
         for k in range(session.views):
             view = folder / _name(k)
             if view.name in session.done:
@@ -98,23 +98,12 @@ def shoot(
             done.append(sequence.shoot(view, own, resume=begun, tries=tries, report=report))
             finished(view)
             session.done.append(view.name)
-            _write(folder, session)
+            atomic.write_json(folder / NAME, session)
     return done
 
 
 def _name(k: int) -> str:
     return f"view{k + 1:02d}"
-
-
-def _load(file: Path) -> SessionFile:
-    try:
-        return msgspec.json.decode(file.read_bytes(), type=SessionFile)
-    except (OSError, msgspec.MsgspecError) as error:
-        raise CaptureError(f"{file}: cannot be read ({error}); shoot into another folder") from None
-
-
-def _write(folder: Path, session: SessionFile) -> None:
-    atomic.write(folder / NAME, msgspec.json.format(msgspec.json.encode(session), indent=1))
 
 
 def _check_ports(turntable: str, rotator: str) -> None:

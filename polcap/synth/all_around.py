@@ -197,4 +197,4 @@ def _write_poses(
         first, second = sets
         shift = np.array([0.0, second.lift, 0.0]) - second.turn.apply([0.0, first.lift, 0.0])
         document["laid"] = {"rotation": second.turn.as_matrix().tolist(), "translation": shift.tolist()}
-    atomic.write(file, msgspec.json.format(msgspec.json.encode(document), indent=1))
+    atomic.write_json(file, document)

@@ -84,8 +84,7 @@ def write(folder: Path, shoot: CalibrationShoot) -> None:
             exif = replace(base, exposure_time=time, iso=iso, flash_fired=name == "flash")
             file = place / name / f"IMG_{number:04d}.DNG"
             forward_camera.write_dng(file, counts, shoot.sensor, _CFA, COLOR_MATRIX, exif)
-        with atomic.path(place / "truth.json") as temporary:
-            temporary.write_bytes(msgspec.json.format(msgspec.json.encode(shoot), indent=1))
+        atomic.write_json(place / "truth.json", shoot)
 
 
 def _photographs(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, float]]:

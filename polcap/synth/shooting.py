@@ -304,11 +304,9 @@ def _write_truth(place: Path, studio: Studio, files: list[dict[str, Any]]) -> No
     document = {
         "conventions": _CONVENTIONS, "focal_px": view.focal, "principal_px": view.center,
         "camera_matrix_from_linear_srgb": studio.to_camera.tolist(), "white_S0": white, "chart": chart, "files": files,
-        "scene": msgspec.to_builtins(scene), "shoot": msgspec.to_builtins(shoot),
+        "scene": scene, "shoot": shoot,
     }  # fmt: skip
-    with atomic.path(place / "truth.json") as temporary:
-        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(document), indent=1))
-
+    atomic.write_json(place / "truth.json", document)
     if any(shoot.distortion):  # the true maps are those of a pinhole camera
         reference = _light(scene, msgspec.structs.replace(shoot, distortion=(0.0, 0.0)), buffer, np.eye(3))
     diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, buffer.position, buffer.facing)

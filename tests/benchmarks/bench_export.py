@@ -35,8 +35,8 @@ from tests import surfaces
 def main(folder: Path, side: int) -> None:
     result(folder, side)
     stored = maps_folder.read(folder / "maps")
-    mesh = surface.triangulate(stored.depth, stored.maps, stored.metric, surface.SurfaceSettings())
-    built = asset.build(stored.maps, mesh, asset.AssetSettings())
+    mesh = surface.triangulate(stored.depth, stored, stored.metric, surface.SurfaceSettings())
+    built = asset.build(stored, mesh, asset.AssetSettings())
     print(f"{'preset':10}{'alone s':>10}{'export s':>10}{'ratio':>8}{'MB':>8}")
     for name in PRESETS:
         encode, whole = (min(times) for times in zip(*(both(folder, built, name) for _ in range(3))))

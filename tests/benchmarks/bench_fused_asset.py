@@ -2,20 +2,37 @@
 
 polcap synth FOLDER --views 12 && polcap fuse FOLDER
 python tests/benchmarks/bench_fused_asset.py FOLDER
+
+Of a folder with a second set (`--set laid=8`) prints how well the sets are joined: errors of the turn [degrees] and,
+at the object's middle, of the place [% of its size]; the share of the second set's surface that the first confirms; the
+share of the mesh that views saw, and the mean distance of the whole true surface from it [%], from the first set and
+from both; and this distance from a mesh of both with the true turn.
 """
 
+import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from bench_fusion import mean_distance
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from trimesh import Trimesh
+from trimesh.sample import sample_surface
 
 import polcap
-from polcap.fusion import fused_maps
-from polcap.fusion.fusion_path import FusionResults
+from polcap import config
+from polcap.fusion import fused_maps, session
+from polcap.fusion.fusion_path import FusionResults, FusionSettings, path
+from polcap.fusion.session import SessionInput
+from polcap.fusion.shape import ShapeSettings, fuse_shape
+from polcap.fusion.values import Pose
 from polcap.images import Floats
 from polcap.optics import color
+from polcap.pipeline import models
+from polcap.pipeline.cache import MemoryCache
 from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
 
 LEAST_SEEN = 0.02  # weight of a texel
@@ -30,6 +47,9 @@ class Errors(NamedTuple):
 
 
 def main(folder: Path) -> None:
+    if (folder / "setB").exists():
+        print(joined(folder))
+        return
     found = errors(folder)
     print(f"{'':10}{'normal':>9}{'albedo':>9}{'F0':>9}{'roughness':>11}")
     print_row("single", found.single)
@@ -48,6 +68,43 @@ def errors(folder: Path) -> Errors:
     singles = [single(view) for view in views if (view / "polcap" / "report.json").exists()]
     away = distance(Tracer(surface), source.atlas, source) / size
     return Errors(np.mean(singles, axis=0), against_truth(source, surface, truth), away)
+
+
+def joined(folder: Path) -> str:
+    """Table row on the join of two sets."""
+    network, mask_network = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
+    wanted = SessionInput(folder, config.load(None, []), network=network, mask_network=mask_network)
+    found, views = session.process(wanted, lambda _: None)
+    truth, about = dict(np.load(folder / "truth.npz")), json.loads((folder / "truth.json").read_text())
+    surface = Trimesh(truth["vertices"], truth["faces"], process=False)
+    point, size = sample_surface(surface, 30_000, seed=0)[0], float(np.ptp(truth["vertices"], axis=0).max())
+    laid = Pose(*(np.array(about["laid"][part]) for part in ("rotation", "translation")))
+    boards = {one["name"]: Pose(np.array(one["rotation"]), np.array(one["translation"])) for one in about["views"]}
+    first, second = ([view for view in views if view.name.startswith(name)] for name in ("setA", "setB"))
+    true = [after(laid, boards[view.name]) for view in second]
+    pairs = [(view.pose, pose) for view, pose in zip(second, true)]
+    turns = [Rotation.from_matrix(one.rotation @ other.rotation.T).magnitude() for one, other in pairs]
+    middle = (point.min(axis=0) + point.max(axis=0)) / 2
+    places = [np.linalg.norm(move(one, middle) - move(other, middle)) for one, other in pairs]
+    results = [path(tuple(some), FusionSettings(), MemoryCache()) for some in (first, views)]
+    seen = [one.maps.seen[one.atlas.covered].mean() for one in results]
+    right = first + [replace(view, pose=pose) for view, pose in zip(second, true)]
+    meshes = [*(one.mesh for one in results), fuse_shape(right, ShapeSettings())]
+    away = [100 * mean_distance(mesh, point) / size for mesh in meshes]
+    return (
+        f"| {folder.name} | {np.degrees(np.mean(turns)):.2f} | {100 * np.mean(places) / size:.2f} | "
+        f"{found.shared['setB']:.2f} | {seen[0]:.2f} → {seen[1]:.2f} | {away[0]:.2f} → {away[1]:.2f} | {away[2]:.2f} |"
+    )
+
+
+def after(first: Pose, second: Pose) -> Pose:
+    """Two rigid motions, one after the other."""
+    return Pose(second.rotation @ first.rotation, second.rotation @ first.translation + second.translation)
+
+
+def move(pose: Pose, point: Floats) -> Floats:
+    """A point (3,) in the camera frame, m."""
+    return pose.rotation @ point + pose.translation
 
 
 def print_row(name: str, row: Floats) -> None:

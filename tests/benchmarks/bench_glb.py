@@ -36,7 +36,7 @@ COMPONENT: dict[int, Any] = {5120: np.int8, 5122: np.int16, 5123: np.uint16, 512
 
 def main(folder: Path) -> None:
     source = asset_export.read(folder / "maps", Config())
-    maps = source.stored.maps
+    maps = source.maps
     print(f"{'case':12}{'MB':>7}{'triangles':>11}{'texture: median, 95 %':>24}{'float: median, 99 %':>22}")
     first = None
     for name, wanted in CASES.items():

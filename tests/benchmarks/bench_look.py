@@ -76,7 +76,7 @@ def write(folder: Path, asset: Asset) -> None:
     files: dict[texture_set.Key, str] = {key: f"ball_{key}.png" for key in texture_set.LOOSE}
     for key, file in files.items():
         (folder / file).write_bytes(encoders.encode(texture_set.LOOSE[key](asset), "png"))
-    gltf.write(folder / "ball.glb", asset, "ball")
+    (folder / "ball.glb").write_bytes(gltf.encode(asset, "ball"))
     usd.write(folder / "ball.usdc", asset, "ball", files, {})
 
 

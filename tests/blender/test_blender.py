@@ -47,9 +47,9 @@ def answers(maps: SurfaceMaps, mesh: ReliefMesh, tmp_path_factory: pytest.TempPa
     files: dict[texture_set.Key, str] = {key: f"ball_{key}.png" for key in texture_set.LOOSE}
     for key, file in files.items():
         (folder / file).write_bytes(encoders.encode(texture_set.LOOSE[key](built), "png"))
-    gltf.write(folder / "ball.glb", built, "ball")
+    (folder / "ball.glb").write_bytes(gltf.encode(built, "ball"))
     for geometry in PACKED:
-        gltf.write(folder / f"ball_{geometry}.glb", built, "ball", gltf.GlbOptions(geometry=geometry))
+        (folder / f"ball_{geometry}.glb").write_bytes(gltf.encode(built, "ball", gltf.GlbOptions(geometry=geometry)))
     obj.write(folder / "ball.obj", built, "ball", files)
     usd.write(folder / "ball.usdc", built, "ball", files, {})
     found = session.ask(folder, [folder / f"ball{ending}" for ending in CASES], bake=SIZE)

@@ -83,7 +83,7 @@ def run(folder: Path, drawn: np.ndarray | None) -> str:
         assert "\n" not in str(error), error
         return type(error).__name__
     stored = maps.read(out / "maps")  # refuses values that are not finite
-    assert about is not None and stored.maps.mask.any()
+    assert about is not None and stored.mask.any()
     return f"verdict {about['verdict']}"
 
 

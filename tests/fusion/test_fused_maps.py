@@ -34,7 +34,7 @@ def test_maps_and_mesh_come_back_as_written(source: FusedSource, tmp_path: Path)
 
 def test_the_glb_is_closed_when_it_is_read_back(source: FusedSource, tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
-    gltf.write(tmp_path / "ball.glb", source.whole(8, ()), "ball")
+    (tmp_path / "ball.glb").write_bytes(gltf.encode(source.whole(8, ()), "ball"))
     read = trimesh.load(tmp_path / "ball.glb", force="mesh", process=False)
     read.merge_vertices(merge_tex=True, merge_norm=True)
     assert read.is_watertight and read.volume > 0

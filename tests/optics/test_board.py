@@ -40,4 +40,3 @@ def test_boards_of_other_sizes_have_other_markers() -> None:
 @SIZES
 def test_the_print_fits_on_its_page(board: Board) -> None:
     assert board.side_m < board.page_m[0] - 0.008  # printers leave a margin of 4 mm
-    assert board.free_m == pytest.approx(board.side_m / 2)

@@ -62,7 +62,7 @@ def test_the_chart_of_one_capture_serves_another(polcap: Command, result: Path, 
 def test_normals_of_the_bundled_capture_are_near_the_truth(result: Path, example: Path) -> None:
     """Analytic estimator, three noisy shots with 1 % flash jitter and moved by up to 1.5 px: under 12° on the mean."""
     truth = np.load(example / "truth.npz")
-    found = maps.read(result / "maps").maps
+    found = maps.read(result / "maps")
     (x, y), (height, width) = map(round, found.view.origin), found.mask.shape
     normal = truth["normal"].astype(np.float64)
     binned = sum(normal[i::2, j::2] for i in (0, 1) for j in (0, 1))[y : y + height, x : x + width]

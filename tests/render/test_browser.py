@@ -37,13 +37,15 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Pictures:
     jobs = []
     for shape, mesh in (("ball", surfaces.mesh(surfaces.maps())), ("plane", surfaces.flat_mesh(RIPPLED))):
         asset = surfaces.built(RIPPLED, mesh)
-        gltf.write(folder / f"{shape}.glb", asset, shape)
+        (folder / f"{shape}.glb").write_bytes(gltf.encode(asset, shape))
         files = {key: f"{shape}_{key}.png" for key in texture_set.LOOSE}
         obj.write(folder / f"{shape}.obj", asset, shape, files)
         for key, file in files.items():
             (folder / file).write_bytes(encoders.encode(texture_set.LOOSE[key](asset), "png"))
         for geometry in PACKED:
-            gltf.write(folder / f"{shape}_{geometry}.glb", asset, shape, gltf.GlbOptions(geometry=geometry))
+            (folder / f"{shape}_{geometry}.glb").write_bytes(
+                gltf.encode(asset, shape, gltf.GlbOptions(geometry=geometry))
+            )
         for model in (folder / case for case in CASES if case.startswith(shape)):
             jobs.append(browser.Job(model.name, model, mesh, RIPPLED.view, tuple(LIGHTS.values())))
     answer = browser.render(folder, jobs)

@@ -68,7 +68,7 @@ def test_light_obeys_the_law_of_the_maps(
     page.evaluate(f"relight.aim({light[0]}, {light[1]}); relight.draw()")
     drawn = seen(page, "relight", tmp_path)
     exposure, ior = page.evaluate("[DATA.view.exposure, DATA.view.ior]")
-    stored = maps.read(result / "maps").maps
+    stored = maps.read(result / "maps")
     ray = frames.rays(stored.view, *stored.mask.shape)
     to_light = np.array([*light, np.sqrt(1 - light[0] ** 2 - light[1] ** 2)])
     local = frames.to_ray_frame(np.broadcast_to(to_light, ray.shape), ray)
@@ -94,16 +94,16 @@ def test_surface_turns_and_changes_its_clothes(page: devtools.Page, tmp_path: Pa
 
 def test_pointer_reads_the_maps(page: devtools.Page, result: Path) -> None:
     stored = maps.read(result / "maps")
-    height, width = stored.maps.mask.shape
-    row, column = np.argwhere(stored.maps.mask & (stored.maps.normal[..., 2] > 0.9))[500]
+    height, width = stored.mask.shape
+    row, column = np.argwhere(stored.mask & (stored.normal[..., 2] > 0.9))[500]
     page.evaluate(f"point({(column + 0.5) / width}, {(row + 0.5) / height})")
     texts = {
         name: page.evaluate(f"document.querySelector('#map-{name} output').textContent")
         for name in ("normal", "diffuse", "roughness", "error", "depth")
     }
     numbers = {name: np.array([float(n) for n in re.findall(r"-?[\d.]+", text)]) for name, text in texts.items()}
-    assert np.allclose(numbers["normal"], stored.maps.normal[row, column], atol=0.011)  # 8 bits, two digits
-    assert np.allclose(numbers["diffuse"], stored.maps.diffuse[row, column], atol=0.04)  # JPEG
-    assert np.allclose(numbers["roughness"], stored.maps.roughness[row, column], atol=0.01)
-    assert np.allclose(numbers["error"], stored.maps.confidence[row, column], atol=0.35)
+    assert np.allclose(numbers["normal"], stored.normal[row, column], atol=0.011)  # 8 bits, two digits
+    assert np.allclose(numbers["diffuse"], stored.diffuse[row, column], atol=0.04)  # JPEG
+    assert np.allclose(numbers["roughness"], stored.roughness[row, column], atol=0.01)
+    assert np.allclose(numbers["error"], stored.confidence[row, column], atol=0.35)
     assert np.allclose(numbers["depth"], stored.depth[row, column], rtol=2e-3)

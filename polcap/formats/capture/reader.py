@@ -215,21 +215,23 @@ def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
         raise CaptureError(f"{folder}: {who} {listed}: {count} different polarizer angles where 3 are needed; {remedy}")
 
 
+def other_equipment(fact: Exif, first: Exif) -> str | None:
+    """Difference in camera, lens, size or focal length of one photograph from the first; None for equal equipment."""
+    lengths = fact.focal_length_mm, first.focal_length_mm
+    zoomed = lengths[0] and lengths[1] and abs(lengths[0] / lengths[1] - 1) > _ZOOM
+    rows = (
+        ("was taken with", f"{fact.make} {fact.model}", f"{first.make} {first.model}"),
+        ("was taken through", fact.lens or first.lens, first.lens or fact.lens),
+        ("has", f"{fact.width}×{fact.height} px", f"{first.width}×{first.height} px"),
+        ("was taken at", f"{lengths[0]:g} mm" if zoomed else "", f"{lengths[1]:g} mm" if zoomed else ""),
+    )
+    return next((f"{text} {found}, not {wanted}" for text, found, wanted in rows if found != wanted), None)
+
+
 def _check_one_camera(facts: dict[Path, Exif]) -> None:
     first_path, first = next(iter(facts.items()))
     for path, fact in facts.items():
-        fault = ""
-        if (fact.make, fact.model) != (first.make, first.model):
-            fault = f"was taken with {fact.make} {fact.model}, not {first.make} {first.model}"
-        elif fact.lens and first.lens and fact.lens != first.lens:
-            fault = f"was taken through {fact.lens}, not {first.lens}"
-        elif (fact.width, fact.height) != (first.width, first.height):
-            fault = f"has {fact.width}×{fact.height} px, not {first.width}×{first.height}"
-        elif fact.focal_length_mm and first.focal_length_mm:
-            ratio = fact.focal_length_mm / first.focal_length_mm
-            if abs(ratio - 1) > _ZOOM:
-                fault = f"was taken at {fact.focal_length_mm:g} mm, not {first.focal_length_mm:g} mm"
-        if fault:
+        if fault := other_equipment(fact, first):
             raise CaptureError(f"{path}: {fault} as {first_path.name}; use one set-up per capture, or remove the file")
 
 

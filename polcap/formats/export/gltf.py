@@ -1,4 +1,4 @@
-"""Writes an asset as binary glTF 2.0 (GLB).
+"""Encodes an asset as binary glTF 2.0 (GLB).
 
 The camera frame is that of glTF: right-handed, y up, the viewer on +z, metres. The object is moved
 to the origin; its place in the mesh's frame is in `asset.extras`. The provenance is in an XMP packet.
@@ -13,14 +13,12 @@ import json
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap import __version__
-from polcap.formats import atomic
 from polcap.formats.export import encoders, glb_geometry, texture_set
 from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.glb_geometry import Blob, Geometry
@@ -61,25 +59,6 @@ class GlbOptions:
     origin: Floats | None = None  # (3,) camera frame; by default the middle of the mesh
 
 
-def write(
-    path: Path,
-    asset: Asset,
-    name: str,
-    options: GlbOptions = GlbOptions(),
-    provenance: Mapping[str, str] | None = None,
-    encoder: TextureEncoder | None = None,
-) -> None:
-    """Write a GLB with embedded textures; the same asset gives the same bytes.
-
-    `name` is that of scene, node, mesh and material; `provenance` goes into the XMP packet (KHR_xmp_json_ld); an
-    `encoder` that is shared by the files of an export encodes no texture twice.
-
-    Raises SettingError: there is no encoder for this kind of images or geometry.
-    Raises StorageError: the file cannot be written.
-    """
-    atomic.write(path, encode(asset, name, options, provenance, encoder))
-
-
 def encode(
     asset: Asset,
     name: str,
@@ -87,7 +66,13 @@ def encode(
     provenance: Mapping[str, str] | None = None,
     encoder: TextureEncoder | None = None,
 ) -> bytes:
-    """Encode an asset as the bytes of a GLB; parameters as for `write`."""
+    """Encode an asset as a GLB with embedded textures; the same asset gives the same bytes.
+
+    `name` is that of scene, node, mesh and material; `provenance` goes into the XMP packet (KHR_xmp_json_ld); an
+    `encoder` that is shared by the files of an export encodes no texture twice.
+
+    Raises SettingError: there is no encoder for this kind of images or geometry.
+    """
     blob, images, facts = Blob(), options.images, provenance or {}
     origin = center(asset.mesh.vertices) if options.origin is None else options.origin
     primitive, transform = glb_geometry.add(blob, asset.mesh, origin, options.geometry)

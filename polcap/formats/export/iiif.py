@@ -5,7 +5,6 @@ References
 IIIF Image API 3.0, §5 and compliance level 0; IIIF Presentation API 3.0.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -47,9 +46,9 @@ def write(folder: Path, pictures: Mapping[str, Texture], facts: Mapping[str, str
             atomic.write(folder / name / place, encoders.encode(one, "jpeg"), synced=False)
         described = folder / name / "info.json"
         height, width = picture.pixels.shape[:2]
-        _write_json(described, image_information(f"{address}/{name}", width, height))
+        atomic.write_json(described, image_information(f"{address}/{name}", width, height))
         written += [described, folder / name / FULL]
-    _write_json(written[0], manifest(pictures, facts, address))
+    atomic.write_json(written[0], manifest(pictures, facts, address))
     return written
 
 
@@ -148,7 +147,3 @@ def _images(pixels: TexturePixels) -> Iterator[tuple[str, TexturePixels]]:
 def _text(words: str, language: str = "none") -> dict[str, list[str]]:
     """A text in the form of the Presentation API: a list by language."""
     return {language: [words]}
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    atomic.write(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")

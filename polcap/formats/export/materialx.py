@@ -1,4 +1,4 @@
-"""Writes an asset's material as a MaterialX 1.39 document with OpenPBR, from the template `openpbr.mtlx`.
+"""Describes an asset's material by a MaterialX 1.39 document with OpenPBR, from the template `openpbr.mtlx`.
 
 In the document every node comes after the nodes that it takes inputs from. The specular texture holds F0/0.08 in
 color: its luminance becomes specular_weight, F0 over the F0 of the asset's index; the color divided by its luminance
@@ -13,11 +13,9 @@ that reflection at grazing stays 1); MaterialX 1.39, standard nodes.
 import re
 from collections.abc import Mapping
 from importlib.resources import files as resources
-from pathlib import Path
 from string import Template
 from xml.sax.saxutils import quoteattr
 
-from polcap.formats import atomic
 from polcap.formats.export.texture_set import SPECULAR_RANGE, Key
 from polcap.images import Asset
 from polcap.optics import color, fresnel
@@ -26,16 +24,8 @@ VERSION = "1.39"
 _DARKEST = 1e-4  # luminance below which the tint of a specular texel means nothing
 
 
-def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], doc: str) -> None:
-    """Write a MaterialX document; its textures `files` are in the same folder, `doc` is its doc string.
-
-    Raises StorageError: the file cannot be written.
-    """
-    atomic.write(path, document(asset, name, files, doc))
-
-
 def document(asset: Asset, name: str, files: Mapping[Key, str], doc: str) -> str:
-    """The XML of the MaterialX document that `write` writes."""
+    """The XML of a MaterialX document; its textures `files` are in the same folder, `doc` is its doc string."""
     template = resources("polcap.formats.export").joinpath("openpbr.mtlx").read_text(encoding="utf-8")
     return Template(template).substitute(
         {key: quoteattr(file) for key, file in files.items()},

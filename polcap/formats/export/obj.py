@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.formats import atomic
-from polcap.formats.export import gltf
+from polcap.formats.export import gltf, texture_set
 from polcap.formats.export.texture_set import SPECULAR_RANGE, Key
-from polcap.formats.maps import exr
 from polcap.images import Asset
 
 _ROWS = 10_000  # of a table, formatted at a time
@@ -38,8 +37,8 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], comment
     base = stem(path.stem)
     written = [path, *(path.with_name(f"{base}{ending}") for ending in (".mtl", "_roughness.exr", "_normal.exr"))]
     _, library, roughness, normal = written
-    _data(normal, {c: asset.normal[..., k] for k, c in enumerate("RGB")})
-    _data(roughness, {"Y": np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1])})
+    texture_set.write_exr(normal, texture_set.normal(asset))
+    texture_set.write_exr(roughness, texture_set.roughness(asset))
     data: dict[Key, str] = {"roughness": roughness.name, "normal": normal.name}
     header = "".join(f"# {line}\n" for line in comment.splitlines())
     atomic.write(library, header + _material(asset, stem(name), files, data))
@@ -47,11 +46,6 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], comment
         file.write(header.encode())
         _geometry(file, asset, stem(name), library.name)
     return written
-
-
-def _data(file: Path, channels: Mapping[str, NDArray[Any]]) -> None:
-    """Write integer texture channels as an EXR of half floats: each value divided by the greatest value of its type."""
-    exr.write(file, {name: one / np.float32(np.iinfo(one.dtype).max) for name, one in channels.items()}, half=True)
 
 
 def _geometry(file: IO[bytes], asset: Asset, material: str, library: str) -> None:

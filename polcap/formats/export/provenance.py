@@ -27,16 +27,18 @@ def versions() -> dict[str, str]:
 
 
 def record(about: Mapping[str, Any], catalog: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """The origin of a result (photographs, versions, settings), from the content of its report.json.
+    """The origin of a result (photographs, versions, settings) and its verdict, from the content of its report.json.
 
     Fields of the capture's `CatalogEntry` follow, where stated; those of `catalog` replace them.
     """
-    capture, model = about["capture"], about["model"]
+    capture, model, error = about["capture"], about["model"], about.get("expected_error_deg")
     return {
         "format": "polcap provenance 1",
         "name": capture["name"],
         **capture.get("catalog", {}),
         **(catalog or {}),
+        "verdict": about["verdict"],
+        **({} if error is None else {"expected_error_deg": error}),  # median of the normals
         "camera": capture["camera"],
         "photographs": [  # after a space the digest names how the file was read
             {"file": frame["file"], "angle_deg": shot["angle_deg"], "sha256": frame["digest"].partition(" ")[0]}
@@ -70,8 +72,7 @@ def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> N
     if earlier != json.loads(json.dumps(facts)):
         files = {}
     files = {name: known for name, known in files.items() if (path.parent / name).exists()} | dict(digests)
-    text = json.dumps({**facts, "files": dict(sorted(files.items()))}, indent=1, ensure_ascii=False)
-    atomic.write(path, text + "\n")
+    atomic.write_json(path, {**facts, "files": dict(sorted(files.items()))})
 
 
 def digest(file: Path) -> str:

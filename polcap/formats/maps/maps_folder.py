@@ -1,6 +1,5 @@
 """Writes and reads the folder maps/ of a result (docs/reference/result.md)."""
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -66,13 +65,12 @@ class _Description(Struct, frozen=True):
     sizes: dict[str, tuple[_Side, _Side]] = {}
 
 
-@dataclass(frozen=True)
-class StoredMaps:
-    """The maps of a result as read from its folder maps/, with the depth (H, W) and whether it is metric."""
+@dataclass(frozen=True, kw_only=True, repr=False)
+class ResultMaps(SurfaceMaps):
+    """All maps of a result, with its depth."""
 
-    maps: SurfaceMaps
-    depth: Floats  # (H, W) NaN outside the mask
-    metric: bool
+    depth: Floats  # (H, W) along the optical axis, growing away from the camera; NaN outside the mask
+    metric: bool  # depth is in metres; otherwise in a unit of its own
 
 
 def write(folder: Path, maps: SurfaceMaps, mesh: ReliefMesh, stokes: StokesImage, cues: Cues) -> None:
@@ -92,7 +90,7 @@ def write(folder: Path, maps: SurfaceMaps, mesh: ReliefMesh, stokes: StokesImage
             for name, (sources, encode) in map_files.FILES.items()
             if name != map_files.DETAIL or maps.detail is not None
         )
-        _write_json(temporary / "maps.json", _description(maps, depth))
+        atomic.write_json(temporary / "maps.json", _description(maps, depth))
 
 
 def _write(file: Path, content: Callable[[], Any]) -> None:
@@ -132,7 +130,7 @@ def _masked_half(values: Floats, inside: NDArray[np.bool_]) -> Floats:
     return np.clip(map_files.masked(values, inside), -limit, limit).astype(np.float16).astype(np.float32)
 
 
-def read(folder: Path) -> StoredMaps:
+def read(folder: Path) -> ResultMaps:
     """Read the folder maps/ of a result that `write` wrote: EXRs, mask.png and maps.json.
 
     Raises DecodeError: a file is missing, damaged, or not of the size in maps.json.
@@ -157,7 +155,7 @@ def read(folder: Path) -> StoredMaps:
         _read_map(folder, name, "RGB", about.size) for name in ("normal", "diffuse", "specular")
     )
     roughness, confidence = (_read_map(folder, name, "Y", about.size) for name in ("roughness", "confidence"))
-    maps = SurfaceMaps(
+    return ResultMaps(
         normal=normal,
         diffuse=diffuse,
         specular=specular,
@@ -169,9 +167,9 @@ def read(folder: Path) -> StoredMaps:
         estimator=about.estimator,
         albedo_sigma=None if percent is None else round(percent / 100, 3),
         detail=_read_detail(folder, about.size) if map_files.DETAIL in about.sizes else None,
+        depth=np.where(inside, _read_map(folder, "depth", "Z", about.size), np.nan).astype(np.float32),
+        metric=about.depth.unit == "m",
     )
-    depth = np.where(inside, _read_map(folder, "depth", "Z", about.size), np.nan).astype(np.float32)
-    return StoredMaps(maps, depth, metric=about.depth.unit == "m")
 
 
 def _read_detail(folder: Path, size: tuple[int, int]) -> Floats:
@@ -196,11 +194,7 @@ def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
         for key, value in about.items()
     }
     known["exports"] = dict(sorted({**exports, where: note}.items()))
-    _write_json(file, known)
-
-
-def _write_json(file: Path, content: Mapping[str, Any]) -> None:
-    atomic.write(file, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
+    atomic.write_json(file, known)
 
 
 def _read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Floats:

@@ -1,27 +1,13 @@
 """Reads the maps of a result folder for Python users: `polcap.read_maps`, `read_stokes` and `read_cues`."""
 
-from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
 from polcap.errors import DecodeError
 from polcap.formats.maps import exr, maps_folder
-from polcap.formats.maps.maps_folder import StoredMaps
-from polcap.images import Floats, SurfaceMaps
-
-
-@dataclass(frozen=True, kw_only=True, repr=False)
-class ResultMaps(SurfaceMaps):
-    """All maps of a result, with its depth."""
-
-    depth: Floats  # (H, W) along the optical axis, growing away from the camera; NaN outside the mask
-    metric: bool  # depth is in metres; otherwise in a unit of its own
-
-    @property
-    def maps(self) -> SurfaceMaps:
-        """The maps without the depth."""
-        return SurfaceMaps(**{field.name: getattr(self, field.name) for field in fields(SurfaceMaps)})
+from polcap.formats.maps.maps_folder import ResultMaps
+from polcap.images import Floats
 
 
 def read(result: str | Path) -> ResultMaps:
@@ -29,9 +15,7 @@ def read(result: str | Path) -> ResultMaps:
 
     Raises DecodeError: a file is missing, damaged, or not of the size in maps.json.
     """
-    stored: StoredMaps = maps_folder.read(_folder(result))
-    values = {field.name: getattr(stored.maps, field.name) for field in fields(SurfaceMaps)}
-    return ResultMaps(**values, depth=stored.depth, metric=stored.metric)
+    return maps_folder.read(_folder(result))
 
 
 def read_stokes(result: str | Path) -> Floats:

@@ -17,6 +17,11 @@ DNG_VERSION, CFA_LAYOUT = 50706, 50711
 CFA, LINEAR_RAW = 32803, 34892  # values of PHOTOMETRIC
 
 _TIFF_MAGIC = (b"II*\0", b"MM\0*")
+_RAW_SIGNATURES = (  # offset, bytes, suffix
+    (0, b"FUJIFILMCCD-RAW", ".raf"), (0, b"\0MRM", ".mrw"), (0, b"FOVb", ".x3f"), (0, b"IIU\0", ".rw2"),
+    (0, b"IIRO", ".orf"), (0, b"IIRS", ".orf"), (0, b"MMOR", ".orf"), (4, b"ftypcrx ", ".cr3"),
+    (6, b"HEAPCCDR", ".crw"),
+)  # fmt: skip
 # Sony, Samsung, Kodak, Panasonic, Nikon, Kodak, Pentax
 _RAW_COMPRESSION = {32767, 32769, 32770, 32867, 34316, 34713, 65000, 65535}
 _TAGS_READ = {
@@ -87,15 +92,14 @@ def _is_text(file: BinaryIO) -> bool:
     return bool(pieces[0]) and not any(byte < 9 or 13 < byte < 27 for byte in set(b"".join(pieces)))
 
 
+def raw_suffix(head: bytes) -> str | None:
+    """File name suffix of a RAW file that is not an ordinary TIFF, by its first bytes; None for other files."""
+    return next((suffix for at, signature, suffix in _RAW_SIGNATURES if head.startswith(signature, at)), None)
+
+
 def _is_raw_magic(head: bytes) -> bool:
-    """Whether a file's first bytes mark a RAW format that is not an ordinary TIFF."""
-    return (
-        head[:15] == b"FUJIFILMCCD-RAW"
-        or head[4:12] == b"ftypcrx "  # Canon CR3
-        or head[6:14] == b"HEAPCCDR"  # Canon CRW
-        or head[:4] in (b"\0MRM", b"FOVb", b"IIRO", b"IIRS", b"MMOR", b"IIU\0")  # Minolta, Sigma, Olympus, Panasonic
-        or (head[:2] in (b"II", b"MM") and (head[8:10] == b"CR" or head[8:12] in (b"IIII", b"MMMM")))  # CR2, IIQ
-    )
+    tiff = head[:2] in (b"II", b"MM") and (head[8:10] == b"CR" or head[8:12] in (b"IIII", b"MMMM"))  # CR2, IIQ
+    return tiff or raw_suffix(head) is not None
 
 
 def _is_raw(tiff: TiffStructure) -> bool:

@@ -31,7 +31,7 @@ def folder(asset: Asset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("pxr", reason="needs usd-core")
     where = tmp_path_factory.mktemp("usd")
     usd.write(where / "ball.usdc", asset, "ball", FILES, {"unit": "m"})
-    materialx.write(where / "ball.mtlx", asset, "ball", FILES, "a ball")
+    (where / "ball.mtlx").write_text(materialx.document(asset, "ball", FILES, "a ball"))
     textures: dict[Key, bytes] = {key: encoders.encode(LOOSE[key](asset), "png") for key in FILES}
     for key, file in FILES.items():
         (where / file).write_bytes(textures[key])
@@ -148,7 +148,7 @@ def test_same_asset_gives_the_same_bytes(folder: Path, asset: Asset, tmp_path: P
         {key: (folder / f).read_bytes() for key, f in FILES.items()},
         {"unit": "m"},
     )
-    materialx.write(tmp_path / "ball.mtlx", asset, "ball", FILES, "a ball")
+    (tmp_path / "ball.mtlx").write_text(materialx.document(asset, "ball", FILES, "a ball"))
     for name in ("ball.usdc", "ball.usdz", "ball.mtlx"):
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()
 

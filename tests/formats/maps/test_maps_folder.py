@@ -81,7 +81,7 @@ def test_detail_of_raw_pixels_comes_back_and_maps_json_states_its_size(result: R
     maps.write(tmp_path / "maps", detailed, mesh, image, seen)
     stated = json.loads((tmp_path / "maps" / "maps.json").read_text("utf-8"))
     assert stated["sizes"] == {"detail.png": [size[1], size[0]]} and "detail.png" in stated["maps"]
-    read, stored = maps.read(tmp_path / "maps").maps.detail, maps.as_stored(detailed).detail
+    read, stored = maps.read(tmp_path / "maps").detail, maps.as_stored(detailed).detail
     assert detailed.detail is not None and read is not None and stored is not None
     assert np.array_equal(read, stored)
     assert np.abs(read.astype(float) - detailed.detail).max() < 0.011  # half a level of 1/50, and the half floats
@@ -143,11 +143,11 @@ def test_stokes_and_cues_are_readable_by_name(folder: Path, result: Result) -> N
 def test_stored_maps_come_back(folder: Path, result: Result) -> None:
     of, mesh, *_ = result
     stored = maps.read(folder)
-    assert stored.metric and stored.maps.view == of.view and stored.maps.estimator == "truth"
-    assert np.array_equal(stored.maps.mask, of.mask)
-    assert np.array_equal(stored.maps.normal[of.mask], of.normal[of.mask])
+    assert stored.metric and stored.view == of.view and stored.estimator == "truth"
+    assert np.array_equal(stored.mask, of.mask)
+    assert np.array_equal(stored.normal[of.mask], of.normal[of.mask])
     assert np.array_equal(stored.depth, mesh.depth, equal_nan=True)
-    assert np.allclose(stored.maps.diffuse[of.mask], of.diffuse[of.mask], rtol=1e-3)
+    assert np.allclose(stored.diffuse[of.mask], of.diffuse[of.mask], rtol=1e-3)
 
 
 def test_maps_as_stored_equal_the_maps_read(folder: Path, result: Result) -> None:
@@ -158,8 +158,8 @@ def test_maps_as_stored_equal_the_maps_read(folder: Path, result: Result) -> Non
     maps.write(folder.parent / "other", of, mesh, *result[2:])
     read, known = maps.read(folder.parent / "other"), maps.as_stored(of)
     assert np.array_equal(read.depth, maps.stored_depth(known, mesh), equal_nan=True) and read.metric == mesh.metric
-    for name, value in vars(read.maps).items():
-        other = getattr(known, name)
+    for name, other in vars(known).items():
+        value = getattr(read, name)
         assert np.array_equal(value, other) if isinstance(value, np.ndarray) else value == other, name
 
 
@@ -189,9 +189,9 @@ def test_python_reads_the_maps_of_a_result_by_any_of_its_folders(
     of, mesh, stokes, cues_ = result
     found = result_maps.read(tmp_path / name)
     stored = maps.read(folder)
-    np.testing.assert_array_equal(found.normal, stored.maps.normal)
+    np.testing.assert_array_equal(found.normal, stored.normal)
     np.testing.assert_array_equal(found.depth, stored.depth)
-    assert found.metric is mesh.metric and repr(found.maps) == repr(stored.maps)
+    assert found.metric is mesh.metric and repr(found) == repr(stored)
     assert len(repr(found)) < 700 and f"float32 {of.normal.shape}" in repr(found)
     inside = of.mask
     np.testing.assert_allclose(

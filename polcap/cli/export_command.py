@@ -1,0 +1,115 @@
+"""`polcap export`: the asset of a result again, in other formats or for one program."""
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from typer import Context, Option
+
+from polcap import terminal
+from polcap.cli import options
+from polcap.cli.options import Json, Result, choice
+from polcap.errors import SettingError
+
+if TYPE_CHECKING:
+    from polcap.formats.export.texture_set import Extra
+
+# names in formats.export, which is not imported at start
+PRESETS = ("blender", "unreal", "unity", "web", "substance", "maya", "houdini", "archive")
+EXTRAS = ("displacement", "occlusion", "object-normal")
+_PRESET = f"Files for one program in asset/NAME/: {', '.join(PRESETS)}; repeatable."
+_EXTRA = "A further texture: displacement, occlusion or object-normal; repeatable."
+_ABOUT = "A fact for catalogs: title, creator, rights, license or object_number; repeatable."
+_IIIF = "asset/NAME_iiif/, a relightable layer for museums; URL is where this folder will be served."
+_PAGE = "Web page that shows the GLB with this model-viewer.min.js, without a network."
+_COLOR = "Color space or OCIO role of the colors in the EXR, such as ACEScg."
+_SIZE = "Longer side of the textures, px; by default each keeps its own size."
+_GEOMETRY = "Mesh in the GLB: 32-bit floats, integers, or Draco (extra [draco])."
+Images = Annotated[Literal["png", "jpeg", "webp", "ktx2"] | None, choice("Picture format in the GLB.")]
+Geometry = Annotated[Literal["float", "quantized", "draco"] | None, choice(_GEOMETRY)]
+Bits = Annotated[Literal["8", "16"] | None, choice("Bits of a channel in PNG textures.", "8|16")]
+
+
+def _names(meaning: str, names: Sequence[str]) -> Any:
+    """An option that may be repeated, with the names that the shell completes."""
+    return Option(metavar="NAME", help=meaning, autocompletion=options.completion(names))
+
+
+def export(
+    context: Context,
+    result: Result,
+    gltf: Annotated[bool, Option("--gltf", help="asset/NAME.glb")] = False,
+    obj: Annotated[bool, Option("--obj", help="asset/NAME.obj, .mtl and textures")] = False,
+    usd: Annotated[bool, Option("--usd", help="asset/NAME.usdc and textures (extra [usd])")] = False,
+    usdz: Annotated[bool, Option("--usdz", help="asset/NAME.usdz, one file for phones (extra [usd])")] = False,
+    materialx: Annotated[bool, Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
+    exr: Annotated[bool, Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
+    preset: Annotated[list[str] | None, _names(_PRESET, PRESETS)] = None,
+    images: Images = None,
+    geometry: Geometry = None,
+    triangles: Annotated[int | None, Option(min=16, help="Most triangles of the mesh; web has 50,000.")] = None,
+    color: Annotated[str, Option(metavar="SPACE", help=_COLOR)] = "lin_rec709",
+    texture_size: Annotated[int | None, Option(min=16, max=16384, help=_SIZE)] = None,
+    page: Annotated[Path | None, Option(metavar="JS", help=_PAGE)] = None,
+    iiif: Annotated[str | None, Option(metavar="URL", help=_IIIF)] = None,
+    about: Annotated[list[str] | None, Option(metavar="K=V", help=_ABOUT)] = None,
+    extra: Annotated[list[str] | None, _names(_EXTRA, EXTRAS)] = None,
+    bits: Bits = None,
+    lod: Annotated[int, Option(min=0, max=6, help="Further GLBs, each with a quarter of the triangles.")] = 0,
+    json: Json = False,
+) -> None:
+    """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
+    from polcap.formats.export import presets
+    from polcap.fusion import fuse_run, fused_maps
+    from polcap.pipeline import run as pipeline
+    from polcap.pipeline.asset_export import ExportRequest
+
+    formats = tuple(name for name in presets.FORMATS if context.params[name] not in (None, False))
+    if preset and formats:
+        raise SettingError(f"--preset {preset[0]} brings its formats; write --{formats[0]} by a second export")
+    plain = ExportRequest(
+        formats=formats or ("gltf", "obj"),
+        images=images,
+        geometry=geometry,
+        triangles=triangles,
+        color=color,
+        texture_size=texture_size,
+        bits=None if bits is None else 8 if bits == "8" else 16,
+        extras=_extra_textures(extra or []),
+        page=page,
+        iiif=iiif,
+        catalog=_catalog_fields(about or []),
+        lod=lod,
+    )
+    wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
+    write = fuse_run.export if fused_maps.is_fused(result) else pipeline.export
+    files = write(result, *wanted)
+    options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
+    written = [str(file) for file in files]
+    terminal.print_data({"written": written} if json else "\n".join(written))
+
+
+def _extra_textures(named: Sequence[str]) -> "tuple[Extra, ...]":
+    """Parse --extra: names of further textures. Raises SettingError for an unknown name."""
+    from polcap.formats.export.texture_set import EXTRAS
+
+    for name in named:
+        if name not in EXTRAS:
+            raise SettingError(f"--extra {name}: there is no such texture; there are {', '.join(EXTRAS)}")
+    return tuple(extra for extra in EXTRAS if extra in named)
+
+
+def _catalog_fields(stated: Sequence[str]) -> dict[str, str]:
+    """Parse --about K=V: fields of `CatalogEntry` by name. Raises SettingError for an unknown field."""
+    from polcap.images import CatalogEntry
+
+    known = [field.name for field in fields(CatalogEntry)]
+    found = {}
+    for text in stated:
+        key, equals, found[key] = text.partition("=")
+        if not equals:
+            raise SettingError(f'--about {text}: write FACT=TEXT, for example title="Vase with handles"')
+        if key not in known:
+            raise SettingError(f"--about {key}: there is no such fact; there are {', '.join(known)}")
+    return found
