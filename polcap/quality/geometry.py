@@ -154,7 +154,8 @@ def _charted(found: Evidence) -> float:
 def mesh(of: Mesh, limits: GateLimits) -> Gate:
     """Gate on the mesh: number of pieces, cuts, jagged boundary.
 
-    The surface is cut where one part hides another, and where the normals are wrong.
+    The surface is cut where one part hides another, and where the normals are wrong. A jagged boundary is smoothed
+    afterwards and does not change the normals, so alone it only warns.
     """
     faults: list[tuple[str, float, float, Unit]] = []  # in words, its figure, its limit
     remedies = []
@@ -164,6 +165,7 @@ def mesh(of: Mesh, limits: GateLimits) -> Gate:
     if of.cuts > cuts:
         message = f"Cuts of {of.cut_px:.0f} px are {of.cuts:.0%} of the outline's length, more than {cuts:.0%}"
         faults.append((message, of.cuts, cuts, "1"))
+    state: State = "fail" if faults else "warn"
     if faults:
         remedies.append("See the error of the normals: they fit no surface; --set surface.stiffness=0 closes all cuts")
     if of.raggedness > rim:
@@ -173,7 +175,7 @@ def mesh(of: Mesh, limits: GateLimits) -> Gate:
     if faults:
         _, value, limit, unit = faults[0]
         said = "; ".join(fault[0] for fault in faults)
-        return Gate("mesh", "fail", round(value, 4), limit, said, "; ".join(remedies), unit=unit)
+        return Gate("mesh", state, round(value, 4), limit, said, "; ".join(remedies), unit=unit)
     message = f"{of.pieces} {'piece' if of.pieces == 1 else 'pieces'}, "
     message += (
         f"cut along {of.cut_px:.0f} px, at occlusions or where the normals are wrong" if of.cut_px else "without a cut"

@@ -10,13 +10,14 @@ from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
 from polcap.quality import rim
-from polcap.quality.gate import Evidence, Gate, at_most
+from polcap.quality.gate import Evidence, Gate, State, at_most
 from polcap.quality.limits import GateLimits
 
 _LEAST_RIM = 200  # pixels of outline, to estimate an angle
 _LEAST_DOLP = 0.01  # of the most polarized tenth of the outline; there the least index has ten times that
 _SAME_DEG = 5.0  # axes nearer than this are the same angle
 _SURE = 2.5  # σ between sectors of the outline: least significance of a turn
+_CERTAIN = 0.8  # of the limit of the misfit: above, also good captures fit a turn (docs/benchmarks/gates.md)
 _CLEAR = 0.8  # least concentration of the AoLP about the outline, to estimate a common turn
 _ALONG = -0.3  # below: the AoLP is along the contour
 _DARK = 0.1  # albedo below which a glossy object shows mostly reflections of itself
@@ -159,7 +160,8 @@ def _angles(
     times = 1 / found.misfit
     message = f"The {names[found.shot]} shot looks turned by {degrees:+.0f}°: the outline fits {times:.1f} times better"
     remedy = "Set the ring to its mark and take the shot again, or state its true angle"
-    return Gate("angles", "fail", round(degrees, 1), limit, message, remedy, cost, (names[found.shot],), "°")
+    state: State = "fail" if found.misfit < _CERTAIN * fit else "warn"
+    return Gate("angles", state, round(degrees, 1), limit, message, remedy, cost, (names[found.shot],), "°")
 
 
 def _not_closing(turned: TurnedShot, names: list[str], limit: float) -> Gate:

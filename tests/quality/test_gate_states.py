@@ -172,6 +172,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("angles", "fail", {"figures": outline(turned=0.3)}),
     ("angles", "fail", {"selfcal": {"turned": TurnedShot((1,), 0.3, 0.02)}}),
     ("angles", "fail", {"figures": outline({"shot": 1, "angle": 0.3, "misfit": 0.2, "sigmas": 9.0})}),
+    ("angles", "warn", {"figures": outline({"shot": 1, "angle": 0.3, "misfit": 0.6, "sigmas": 9.0})}),
     ("angles", "fail", {"figures": outline({"shot": 1, "angle": -np.pi / 4, "misfit": 0.2, "sigmas": 9.0})}),
     ("angles", "warn", {"selfcal": {"found_sigma": 0.02}}),
     ("angles", "warn", {"selfcal": {"ring": RingZero(0.2, 0.01)}}),
@@ -219,7 +220,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("normal error", "not measured", {"figures": {"normal_error": NAN}}),
     ("mesh", "pass", {}),
     ("mesh", "fail", {"mesh": SimpleNamespace(**MESH | {"pieces": 99})}),
-    ("mesh", "fail", {"mesh": SimpleNamespace(**MESH | {"raggedness": 0.9})}),
+    ("mesh", "warn", {"mesh": SimpleNamespace(**MESH | {"raggedness": 0.9})}),
 ]  # fmt: skip
 
 
