@@ -1,11 +1,12 @@
 """Benchmark of the gates on path-traced objects: RAW captures of the scenes of `make_mitsuba.py` beside a chart.
 
-    python tests/benchmarks/bench_verdicts_mitsuba.py SCENES FOLDER [--lamp X,Y,Z]
+    python tests/benchmarks/bench_verdicts_mitsuba.py SCENES FOLDER [--lamp X,Y,Z] [--turned 90,45,0]
 
 Each object is put into the picture of a simulated studio with chart and backdrop, at its own focal length, and shot at
 0°, 45° and 90° with three exposures. --lamp adds unpolarized light from that direction (camera frame), .8 of the
-flash's. Prints for each capture the verdict, the expected and the actual error of the normals (medians over the object,
-degrees), and the gates that warn or fail; then how often each gate spoke.
+flash's. --turned gives the angles to which the polarizer is turned in the three shots. Prints for each capture the
+verdict, the expected and the actual error of the normals (medians over the object, degrees), and the gates that warn or
+fail; then how often each gate spoke.
 """
 
 import argparse
@@ -50,14 +51,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--lamp", type=lambda text: np.array([float(part) for part in text.split(",")]))
+    parser.add_argument("--lamp", type=_numbers)
+    parser.add_argument("--turned", type=_numbers, default=np.array(ANGLES))
     options = parser.parse_args()
     spoke: Counter[str] = Counter()
     for seed, file in enumerate(sorted(options.scenes.glob("*.npz"))):
         with np.load(file) as stored:
             scene = {name: stored[name] for name in stored.files}
         place = options.folder / file.stem
-        corner = photograph(place, scene, seed, options.lamp)
+        corner = photograph(place, scene, seed, options.lamp, options.turned)
         try:
             lines, error = judged(place, scene, corner)
         except InputError as refused:
@@ -74,7 +76,11 @@ def main() -> None:
     print(spoke.most_common())
 
 
-def photograph(place: Path, scene: dict[str, Any], seed: int, lamp: Floats | None) -> tuple[int, int]:
+def _numbers(text: str) -> Floats:
+    return np.array([float(part) for part in text.split(",")])
+
+
+def photograph(place: Path, scene: dict[str, Any], seed: int, lamp: Floats | None, turned: Floats) -> tuple[int, int]:
     """Write the capture; returns the RAW pixel x, y of the scene's first pixel."""
     focal = TIMES * float(scene["focal"])  # RAW px
     shoot = Shoot(
@@ -95,8 +101,8 @@ def photograph(place: Path, scene: dict[str, Any], seed: int, lamp: Floats | Non
         target = plane[y : y + mask.shape[0], x : x + mask.shape[1]]
         target[mask] = (_enlarged(seen[box], cv2.INTER_LINEAR) / share)[mask]
     random = np.random.default_rng(seed)
-    for k, angle in enumerate(ANGLES):
-        radiance = studio.through(angle + shoot.angle_error_deg * random.normal())
+    for k, (angle, actual) in enumerate(zip(ANGLES, turned)):
+        radiance = studio.through(actual + shoot.angle_error_deg * random.normal())
         for e in range(shoot.exposures):
             file = place / f"pol{angle:05.1f}" / f"{e}.DNG"
             file.parent.mkdir(parents=True, exist_ok=True)
