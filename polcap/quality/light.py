@@ -9,6 +9,7 @@ import numpy as np
 
 from polcap.images import AngleStack, Floats, Quality, StokesImage
 from polcap.optics import mueller
+from polcap.optics.frames import dot, rays
 from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
 from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, blamed
@@ -25,6 +26,8 @@ _STILL_CLIPPED = 0.5  # share of highlights that a crossed filter should have st
 _FEW = 20  # px
 _DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame for all angles: 1 to 2° at 15 %
 _LEAST_ALBEDO = 0.02  # sum of the channels
+_TOWARDS_CAMERA = float(np.cos(np.radians(30)))  # cosine; lamps 45° to the side are mirrored at 22°
+_LEAST_TOWARDS = 0.02  # of the object
 _DEGREES_PER_ROOT_OF_HIGHLIGHT_DOLP = 30.0  # of the normals: 2 to 4° at 1 %, 4 to 8° at 2 %, 2 to 11° at 3 to 15 %
 _FALSE_HIGHLIGHT_DOLP = 0.002  # under one flash: up to .0025 (24 captures)
 _ROOM_TILE, _LEAST_ROOM_TILES = 16, 20  # px; tiles
@@ -312,9 +315,9 @@ def polarized_light(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     """Gates on light from elsewhere than a flash at the lens: polarization that many pixels share.
 
     "room light" judges the surroundings of the object. A flash leaves them unpolarized, a window or a glossy lamp does
-    not. "lighting" judges the brightest parts of the object, relative to albedo. Under a flash at the lens they face
-    the camera and their polarization points in all directions. Two flashes or softboxes at the sides polarize them in
-    the same direction.
+    not. "lighting" judges the brightest of the parts that face the camera, relative to albedo. Under a flash at the
+    lens their polarization points in all directions. Two flashes or softboxes at the sides polarize them in the same
+    direction.
     """
     share, limit = _surroundings_dolp(found), limits.max_room_dolp
     message = f"The surroundings are polarized by {100 * share:.1f} %"
@@ -323,7 +326,7 @@ def polarized_light(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     remedy = "Darken the room, or take one ambient frame per angle: subtracting them is exact"
     yield at_most("room light", share, limit, message, remedy, cost_deg=_DEGREES_PER_ROOM_DOLP * share, beyond="warn")
     share, limit = _highlight_dolp(found), limits.max_highlight_dolp
-    message = f"The brightest parts of the object share a polarization of {100 * share:.1f} %"
+    message = f"The brightest parts that face the camera share a polarization of {100 * share:.1f} %"
     if share > limit:
         message += ": light from the sides (two flashes, softboxes, a window), which bends normals and roughness"
     remedy = "Use one flash next to the lens, and darken the room"
@@ -333,13 +336,17 @@ def polarized_light(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
 
 
 def _highlight_dolp(found: Evidence) -> float:
-    """Common DoLP of the tenth of the object with most light over albedo; NaN without an object."""
-    inside = found.maps.mask & found.cues.mask
-    if not inside.any():
+    """Common DoLP of the tenth of the surfaces that face the camera with most light over albedo.
+
+    Highlights of lamps at the sides are there, too. NaN if too little of the object faces the camera.
+    """
+    maps, both = found.maps, found.maps.mask & found.cues.mask
+    towards = both & (dot(maps.normal, rays(maps.view, *maps.mask.shape)) > _TOWARDS_CAMERA)
+    if not towards.any() or towards.sum() < _LEAST_TOWARDS * both.sum():
         return float("nan")
-    light = found.cues.radiance[inside].sum(-1) / np.maximum(found.maps.diffuse[inside].sum(-1), _LEAST_ALBEDO)
+    light = found.cues.radiance[towards].sum(-1) / np.maximum(maps.diffuse[towards].sum(-1), _LEAST_ALBEDO)
     bright = light >= np.percentile(light, 90)
-    return float(np.hypot(*np.median(found.cues.ratio[:, inside][:, bright], axis=1)))
+    return float(np.hypot(*np.median(found.cues.ratio[:, towards][:, bright], axis=1)))
 
 
 def _surroundings_dolp(found: Evidence) -> float:

@@ -120,7 +120,8 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Meta(gt=0, le=1, description="allowed share of ambient light if one ambient frame serves several angles [1]"),
     ] = 0.08
     max_highlight_dolp: Annotated[
-        float, Meta(gt=0, le=1, description="allowed polarization that the brightest parts of the object share [1]")
+        float,
+        Meta(gt=0, le=1, description="allowed polarization that the brightest parts which face the camera share [1]"),
     ] = 0.004
     max_room_dolp: Annotated[
         float, Meta(gt=0, le=1, description="allowed polarization of the surroundings, common to all of them [1]")

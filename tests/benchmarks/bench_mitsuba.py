@@ -12,6 +12,7 @@ the tangential part of the normal points away from the true one, at true zenith 
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from bench_captures import kept
 from scipy import ndimage
 
 from polcap.formats import onnx
-from polcap.images import ColorCalibration, SurfaceMaps, View
+from polcap.images import ColorCalibration, Floats, SurfaceMaps, View
 from polcap.optics import frames
 from polcap.pipeline import models
 from polcap.stages import cues, infer
@@ -84,12 +85,11 @@ def read(file: Path, clean: bool, rough: bool, seed: int) -> tuple[Case, str]:
     with np.load(file) as stored:
         made = {name: stored[name] for name in stored.files}
     mask, about = made["mask"], json.loads(str(made["about"]))
-    view = View(float(made["focal"]), (float(made["center"][0]), float(made["center"][1])), 1.0)
+    view = _view(made)
     rays = frames.rays(view, *mask.shape)
-    if rough or about["rough_law"]:
-        made["stokes"][1:] *= kept(made["normal"], made["roughness"] ** 2, made["ior"], rays)[..., None]
     scene, diffuse, given, v = (
-        torch.from_numpy(np.asarray(value, order="C"))[None] for value in (made["stokes"], made["diffuse"], mask, rays)
+        torch.from_numpy(np.asarray(value, order="C"))[None]
+        for value in (scene_light(made, rough), made["diffuse"], mask, rays)
     )
     one = torch.ones(1)
     at = np.flatnonzero(mask)
@@ -112,6 +112,19 @@ def read(file: Path, clean: bool, rough: bool, seed: int) -> tuple[Case, str]:
         estimator="truth",
     )
     return Case(file.stem, measured, measured, measured, truth, depth), about["material"]
+
+
+def scene_light(made: dict[str, Any], rough: bool = False) -> Floats:
+    """Stokes parameters (3, H, W, 3) of a scene; under the microfacet law if asked, and for rough materials always."""
+    light = made["stokes"].copy()
+    if rough or json.loads(str(made["about"]))["rough_law"]:
+        rays = frames.rays(_view(made), *made["mask"].shape)
+        light[1:] *= kept(made["normal"], made["roughness"] ** 2, made["ior"], rays)[..., None]
+    return np.asarray(light)
+
+
+def _view(made: dict[str, Any]) -> View:
+    return View(float(made["focal"]), (float(made["center"][0]), float(made["center"][1])), 1.0)
 
 
 if __name__ == "__main__":

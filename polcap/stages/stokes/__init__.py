@@ -298,7 +298,8 @@ def _metal(stokes: Floats, covariance: Floats) -> Bools:
     """
     (x0, y0, square0, noise0), (x1, y1, square1, noise1) = (_polarization(stokes, covariance, c) for c in (0, 2))
     enough = np.minimum(square0, square1) > np.float32(_METAL_DOLP**2)
-    excess = np.abs(x0 * y1 - y0 * x1) - np.float32(np.sin(2 * np.radians(_METAL_DEG))) * np.sqrt(square0 * square1)
+    most = np.float32(np.sin(2 * np.radians(_METAL_DEG))) * np.sqrt(square0) * np.sqrt(square1)
+    excess = np.abs(x0 * y1 - y0 * x1) - most
     noise = np.sqrt(noise0 * square1 + noise1 * square0)
     return np.asarray(enough & (excess > np.float32(_METAL_SIGMA) * noise))
 
