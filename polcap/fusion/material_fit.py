@@ -10,8 +10,9 @@ each α, g and F0 follow from weighted least squares; the α with the least resi
 widen the lobe: α² is less by twice their variance. The flash's place near the lens is found first, as the one for
 which all materials fit best.
 
-The brightness of a highlight tells F0/α², and its width tells α. So F0 and roughness of the views' maps are held, in
-proportion to the residual. They are medians over the views, because a view's F0 and roughness err alike everywhere.
+The brightness of a highlight gives F0/α², and its width gives α. F0 and roughness of the views' maps have a weight in
+the fit, in proportion to the residual. They are medians over the views, because the errors of one view are alike
+everywhere.
 
 References
 ----------
@@ -48,8 +49,8 @@ _FLOOR = 0.02  # of the median radiance: error of every sample, with `_RELATIVE`
 _RELATIVE = 0.08
 _ROUNDS = 3  # of reweighting
 _GAIN_SIGMA, _ROUGHNESS_SIGMA = 0.1, 0.16  # errors of the maps over a material
-_F0_SIGMA = 0.012  # the same; highlights of rough surfaces tell less:
-_F0_SIGMA_ROUGH = 0.0002  # times 1/α², because a wide highlight, ∝ F0/α², cannot be told from an error of the albedo
+_F0_SIGMA = 0.012  # the same, at most
+_F0_SIGMA_ROUGH = 0.0002  # over α²: errors of the diffuse light change the F0 of a highlight by 4 α² times as much
 _FARTHEST_FLASH = 0.15  # m from the lens
 _INDEX = 1.5  # refractive index of the diffuse law and of the Fresnel term
 
@@ -208,7 +209,7 @@ def _lobe(samples: LobeSamples, light: Floats, settings: MaterialSettings) -> Lo
         return Lobe(f0, float(narrower), gain, residual)
 
     of_maps = lobe(0.5 * float(np.log(samples.alpha**2 + widened)), settings.map_weight)
-    prior = settings.map_weight * of_maps.residual  # what no lobe explains makes highlights count less
+    prior = settings.map_weight * of_maps.residual  # the residual is the noise of the highlights
     steps = np.log(_ALPHAS)
     best = int(np.argmin([lobe(one, prior).residual for one in steps]))
     around = steps[max(best - 1, 0)], steps[min(best + 1, len(steps) - 1)]
