@@ -434,7 +434,7 @@ class ChartReference:
     size_m: tuple[float, float] | None  # width, height between the outer patch corners; None: unknown
     patches: tuple[str, ...] = ()  # (24,) their names
     editions: tuple["ChartReference", ...] = ()  # versions of the chart from other years
-    is_block: bool = False  # part of a larger chart, which cannot be searched for
+    is_block: bool = False  # the 24 patches E2 to J5 of a ColorChecker SG
     surroundings: SurroundingPatches | None = None  # the other patches of that chart
 
 

@@ -109,6 +109,9 @@ def run(
     print_line(f"{len(found)} captures, shard {plan.shard}: {len(mine)}, finished before: {len(records)}")
     if empty := _without_capture(root, found):
         print_line(f"no capture in {', '.join(empty)}: no folders pol000, pol045, …, and no photographs")
+    for folder in sorted({Path(unit.capture).parent for unit in found}):
+        if len(views := layouts.views(folder)) > 1:
+            print_line(f"{folder}: {views[0]} to {views[-1]} are views of one object; `polcap fuse` joins them")
     by_name = {unit.name: unit for unit in wanted}
     start = time.monotonic()
     for done, record in enumerate(_process(wanted, options, plan, print_line) if wanted else (), 1):

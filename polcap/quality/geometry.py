@@ -68,24 +68,24 @@ def _object_moved(found: Evidence, limits: GateLimits) -> Gate:
 
     A push within its error does not count; it fails if it exceeds its limit by more than its error.
     """
-    names, pushed = found.names, _pushed(found)
-    length = np.nan_to_num(pushed.length, posinf=np.inf) * found.grid_px
-    doubt = _SIGMAS * pushed.sigma * found.grid_px
+    names, pushed, limit = found.names, _pushed(found), limits.max_object_shift_px
+    length, sigma = np.nan_to_num(pushed.length, posinf=np.inf) * found.grid_px, pushed.sigma * found.grid_px
+    sure = length - _SIGMAS * sigma
     radius = max(outline.disc_radius(found.object_.mask) * found.grid_px, 1.0)
-    turned = _object_turned(found, limits)
-    true = np.sqrt(np.maximum(length**2 - (doubt / _SIGMAS) ** 2, 0))
+    least, turned = limits.min_object_shift * radius, _object_turned(found, limits)
+    true = np.sqrt(np.maximum(length**2 - sigma**2, 0))
     cost = float(np.hypot(_DEGREES_PER_PUSH * true.max() / radius, turned.cost_deg))
-    k = int(np.argmax(length - doubt))
-    figure, limit, least = round(float(length[k]), 3), limits.max_object_shift_px, limits.min_object_shift * radius
-    message = f"The object moved by {figure:.1f} ± {doubt[k] / _SIGMAS:.1f} px against its surroundings in {names[k]}"
+    k = int(np.argmax(sure))
+    figure = round(float(length[k]), 3)
+    message = f"The object moved by {figure:.1f} ± {sigma[k]:.1f} px against its surroundings in {names[k]}"
+    bad, moved = blamed(names, sure > limit), blamed(names, (sure > 0) & (length > least))
     if np.isinf(length[k]):
         message = f"The {names[k]} shot shows another object in the same surroundings"
-        shots = blamed(names, np.isinf(length))
-        return Gate("alignment", "fail", None, limit, message, _HOLD_STILL, 45.0, shots, "px")
-    if shots := blamed(names, length - doubt > limit):
-        return Gate("alignment", "fail", figure, limit, message, _HOLD_STILL, max(cost, 5.0), shots, "px")
-    if shots := blamed(names, length > np.maximum(least, doubt)):
-        return Gate("alignment", "warn", figure, least, message, _HOLD_STILL, cost, shots, "px")
+        return Gate("alignment", "fail", None, limit, message, _HOLD_STILL, 45.0, bad, "px")
+    if bad:
+        return Gate("alignment", "fail", figure, limit, message, _HOLD_STILL, max(cost, 5.0), bad, "px")
+    if moved:
+        return Gate("alignment", "warn", figure, least, message, _HOLD_STILL, cost, moved, "px")
     return msgspec.structs.replace(turned, cost_deg=cost)
 
 

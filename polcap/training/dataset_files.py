@@ -185,5 +185,4 @@ def _describe(out: Path, recipe: DatasetRecipe) -> None:
             "mask.png": "8 bit, 255 on the object; elsewhere every picture is 0",
         },
     }
-    with atomic.path(file) as temporary:
-        temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    atomic.write_json(file, document)

@@ -67,10 +67,8 @@ def main(options: EvaluationOptions, report: Report = silent) -> dict[str, Score
     shown = (made.case(number) for number in range(min(_PANEL, options.count)))
     strips = [evaluation_page.make_row(case, _estimate(case.cues, network)) for case in shown]
     png.write(options.out / "panel.png", evaluation_page.make_sheet(strips))
-    page = evaluation_page.make_page(result)
-    for name, text in (("evaluation.json", json.dumps(result, indent=1)), ("evaluation.md", page)):
-        with atomic.path(options.out / name) as temporary:
-            temporary.write_text(text)
+    atomic.write_json(options.out / "evaluation.json", result)
+    atomic.write(options.out / "evaluation.md", evaluation_page.make_page(result))
     return {**result["table"], **result["ablations"]}
 
 
@@ -100,8 +98,7 @@ def _evaluate_pictures(options: EvaluationOptions, means: Means, head: dict[str,
     """Results of all evaluation pictures; stored ones of an earlier run with the same inputs are used again."""
     path = options.out / "pictures.jsonl"
     rows = _read_results(path, head)
-    with atomic.path(path) as temporary:
-        temporary.write_text("".join(json.dumps(row) + "\n" for row in [head, *rows]))
+    atomic.write(path, "".join(json.dumps(row) + "\n" for row in [head, *rows]))
     started, first = time.monotonic(), len(rows)
     with path.open("a") as file:
         for row in _evaluate_range(options, means, range(first, options.count)):

@@ -10,7 +10,6 @@ At least three angles are needed. Photographs pass the whole path, with the mask
 of these sets have light from all sides, not the flash that polcap needs.
 """
 
-import json
 import tempfile
 from pathlib import Path
 
@@ -52,9 +51,8 @@ def main(folder: Path, model: Path, out: Path) -> dict[str, Score]:
         for column in ("ours", "analytic")
     }
     result = {"folder": str(folder), "model": network.digest, "table": table, "pictures": rows}
-    for file, text in (("real.json", json.dumps(result, indent=1)), ("real.md", _page(folder, rows, table))):
-        with atomic.path(out / file) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+    atomic.write_json(out / "real.json", result)
+    atomic.write(out / "real.md", _page(folder, rows, table))
     return table
 
 

@@ -72,8 +72,7 @@ def open_cache(
     inputs = json.dumps(asdict(recipe) | {"meshes": [mesh.stem for mesh in meshes]})
     if not index.exists():
         _build_cache(folder, meshes, recipe, inputs, report)
-        with atomic.path(index) as temporary:
-            temporary.write_text(inputs)
+        atomic.write(index, inputs)
         (folder / _PROGRESS).unlink()
     elif index.read_text() != inputs:
         raise InputError(

@@ -101,6 +101,13 @@ def test_views_and_maps_of_a_fused_object_are_no_captures(tmp_path: Path) -> Non
     assert [unit.name for unit in batch.find(tmp_path)] == ["jug"]
 
 
+def test_views_of_one_object_are_named(captures: Path, tmp_path: Path, polcap: Command) -> None:
+    for name in ("cup/view01", "cup/view02"):
+        shutil.copytree(captures / "broken", tmp_path / name)
+    done = polcap("batch", tmp_path, *OPTIONS)
+    assert f"{tmp_path / 'cup'}: view01 to view02 are views of one object; `polcap fuse` joins them" in done.stderr
+
+
 def test_folders_without_a_capture_are_named(captures: Path, tmp_path: Path, polcap: Command) -> None:
     for name in ("broken", "lost"):
         (tmp_path / name).mkdir()
@@ -109,7 +116,7 @@ def test_folders_without_a_capture_are_named(captures: Path, tmp_path: Path, pol
         (tmp_path / name / "maps").mkdir(parents=True)
         (tmp_path / name / "report.json").touch()
     done = polcap("batch", tmp_path, *OPTIONS)
-    assert "no capture in lost: " in done.stderr and done.returncode == 2
+    assert "no capture in lost: " in done.stderr and done.returncode == 2 and "views of one object" not in done.stderr
     assert "no capture" not in polcap("batch", tmp_path / "broken", *OPTIONS).stderr
 
 

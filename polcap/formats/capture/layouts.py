@@ -73,9 +73,9 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     sub_folders, crossed = _angle_folders(folder)
     if sub_folders:
         return _folders(folder, sub_folders, crossed, angles_deg)
-    if views := _views(folder):
+    if found := views(folder):
         raise CaptureError(
-            f"{folder}: its sub-folders {_listed(views)} are views of one object: join them with `polcap fuse`, or "
+            f"{folder}: its sub-folders {_listed(found)} are views of one object: join them with `polcap fuse`, or "
             "give one of them"
         )
     pictures, notes = _list(folder)
@@ -118,7 +118,7 @@ def is_result(folder: Path) -> bool:
     return (folder / "report.json").is_file() and (folder / "maps").is_dir()
 
 
-def _views(folder: Path) -> list[str]:
+def views(folder: Path) -> list[str]:
     """Sub-folders view01, view02, … that hold captures: those that `polcap fuse` joins."""
     named = [path for path in children(folder) if path.is_dir() and _VIEW.fullmatch(path.name)]
     return [path.name for path in named if _angle_folders(path)[0]]

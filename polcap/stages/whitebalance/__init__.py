@@ -48,8 +48,8 @@ class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         Meta(
             pattern=r"^(classic|classic_before_2014|classic_srgb|sg)$|[./\\]",
             description="classic, classic_before_2014, classic_srgb, sg, or a file of measured colors (CSV or CGATS); "
-            "classic: the edition since 2014 unless another fits its colors much better; sg needs --chart with the "
-            "corners of a (Digital) SG, or of its block E2 to J5",
+            "classic: the edition since 2014 unless another fits its colors much better; sg: a (Digital) SG; its "
+            "corners by --chart may be those of the whole chart, or of its block E2 to J5",
         ),
     ] = "classic"
     chart_width_m: (
@@ -80,7 +80,7 @@ def measure(
     Raises
     ------
     ChartError
-        No ColorChecker Classic is found, or it is not visible at the corners from the user, or it is over-exposed.
+        No ColorChecker is found, or it is not visible at the corners from the user, or it is over-exposed.
     """
     monochrome = (radiance.value[0] == radiance.value[0, ..., :1]).all()
     if request.mode == "none" or (request.mode == "auto" and monochrome):
@@ -91,11 +91,6 @@ def measure(
         return replace(request.profile, source="profile", place=None)
     if request.mode == "corners":
         found = _at_corners(radiance, reference, request.corners, settings)
-    elif reference.is_block:
-        raise ChartError(
-            "polcap cannot search for a ColorChecker SG; give the outer corners of patches A1, N1, N10, A10, or of "
-            "E2, J2, J5, E5, with --chart"
-        )
     else:
         found = _search(radiance, reference, settings)
     found, edition = _edition(radiance, found, reference, settings)
@@ -141,7 +136,7 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Whitebala
     finds: list[_Find] = []
     cheapest, small_px = np.inf, 0.0
     exposed: ChartError | None = None
-    for centers, cost in chart_search.candidates(radiance.value[0]):
+    for centers, cost in chart_search.candidates(radiance.value[0], reference.is_block):
         cheapest = min(cheapest, cost)
         start = chart.from_centers(centers)
         if cost > settings.max_cost or not chart.is_view(start.homography):
@@ -151,13 +146,13 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Whitebala
             if place.explained >= settings.min_explained:
                 small_px = max(small_px, place.pitch_px)
             continue
-        try:  # the detector may see it upside down
-            ways = [_find(radiance, way, reference, settings, cost) for way in (place, place.turned())]
+        try:
+            way = _read(radiance, place, reference, settings, cost)
         except ChartError as error:
             exposed = error
             continue
         most = np.inf if place.explained >= settings.min_explained else settings.max_delta_e / 3
-        finds += [way for way in ways if way.error <= most]
+        finds += [way] if way.error <= most else []
         if any(find.error <= settings.max_delta_e / 2 for find in finds):  # otherwise a later picture may be better
             break
     best = min(finds, key=lambda find: find.error, default=None)
@@ -179,7 +174,33 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Whitebala
         why = f"best detector cost {cheapest:.3f}, limit whitebalance.max_cost = {settings.max_cost:g}"
     else:
         why = f"the best candidate (cost {cheapest:.3f}) does not show 6 × 4 patches on a dark card"
-    raise ChartError(f"no ColorChecker Classic in the reference shot, at any scale or exposure ({why}); {_REMEDY}")
+    name = "ColorChecker SG" if reference.is_block else "ColorChecker Classic"
+    raise ChartError(f"no {name} in the reference shot, at any scale or exposure ({why}); {_REMEDY}")
+
+
+def _read(
+    radiance: AngleStack, place: Placement, reference: ChartReference, settings: WhitebalanceSettings, cost: float
+) -> _Find:
+    """The chart at a place, either way up: that with the smaller color residual.
+
+    On a ColorChecker SG any 6 × 4 patches look like its block, so all that fit around the place are tried.
+    """
+    ways = [place, place.turned()]  # the detector may see it upside down
+    if reference.is_block:
+        ways = [way.shifted(right, down) for way in ways for right in range(-4, 5) for down in range(-5, 2)]
+    finds, exposed = list[_Find](), ChartError("")
+    for way in ways:
+        try:
+            finds.append(_find(radiance, way, reference, settings, cost))
+        except ChartError as error:
+            exposed = error
+    if not finds:
+        raise exposed
+    best = min(finds, key=lambda find: find.error)
+    if not reference.is_block:
+        return best
+    refined = chart.refine(radiance.value[0], best.place)
+    return _find(radiance, refined if _plausible(refined, settings.min_explained) else place, reference, settings, cost)
 
 
 def _at_corners(

@@ -69,6 +69,10 @@ class Placement:
         """Location of the same chart read upside down."""
         return replace(self, homography=self.homography @ [[-1.0, 0, COLUMNS], [0, -1.0, ROWS], [0, 0, 1]])
 
+    def shifted(self, right: int, down: int) -> "Placement":
+        """Location of the same number of patches, by whole patches to the right and down on the chart."""
+        return replace(self, homography=self.homography @ [[1.0, 0, right], [0, 1.0, down], [0, 0, 1]])
+
     def moved(self, transform: Floats) -> "Placement":
         """Location of the chart in another image; transform (3, 3) maps px of this image to px of the other."""
         return replace(self, homography=transform @ self.homography)

@@ -15,15 +15,23 @@ _TILE_PX, _TILE_STEP_PX = 900, 600
 _CANDIDATES = 3  # per picture, because the detector may prefer a texture to the chart
 
 
-def candidates(value: Floats) -> Iterator[tuple[Floats, float]]:
-    """Possible charts in a picture (H, W, 3): patch centers (24, 2) px and detector cost of each."""
+def candidates(value: Floats, of_sg: bool = False) -> Iterator[tuple[Floats, float]]:
+    """Possible charts in a picture (H, W, 3): patch centers (24, 2) px and detector cost of each.
+
+    With `of_sg` they are any 24 patches of a ColorChecker SG: in some pictures OpenCV finds the whole chart, in others
+    only what looks like a Classic.
+    """
     detector: Any = cv2.mcc.CCheckerDetector.create()
-    detector.setColorChartType(cv2.mcc.MCC24)
-    for picture, transform in _pictures(value):
+    kinds = (cv2.mcc.SG140, cv2.mcc.MCC24) if of_sg else (cv2.mcc.MCC24,)
+    for picture, transform, kind in ((*seen, kind) for seen in _pictures(value) for kind in kinds):
+        detector.setColorChartType(kind)
         if detector.process(picture, _CANDIDATES):
             for checker in detector.getListColorChecker():
-                quads = np.asarray(checker.getColorCharts(), dtype=np.float64).reshape(24, 4, 2)
-                yield transform_points(np.linalg.inv(transform), quads.mean(axis=1)), float(checker.getCost())
+                quads = np.asarray(checker.getColorCharts(), dtype=np.float64).reshape(-1, 4, 2)
+                centers = transform_points(np.linalg.inv(transform), quads.mean(axis=1))
+                if kind == cv2.mcc.SG140:
+                    centers = centers.reshape(10, 14, 2)[1:5, 4:10].reshape(24, 2)  # its block E2 to J5
+                yield centers, float(checker.getCost())
 
 
 def _pictures(value: Floats) -> Iterator[tuple[NDArray[np.uint8], Floats]]:

@@ -179,7 +179,7 @@ def test_patches_in_shade_are_left_out():
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.03)
 
 
-def test_block_of_an_sg_chart_is_read_at_its_corners_and_only_there():
+def test_block_of_an_sg_chart_is_read_at_its_corners():
     sg, place = shipped_data.colorchecker("sg"), pose(24, 8, (260, 170))
     image = photograph(place, sg.rec709)
     exact = chart.Placement(place, 0.87).corners()
@@ -188,8 +188,6 @@ def test_block_of_an_sg_chart_is_read_at_its_corners_and_only_there():
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.03)
     assert np.nanmean(color.patches.delta_e) < 1
     assert color.patches.surroundings is not None and np.isnan(color.patches.surroundings).all()  # only a table
-    with pytest.raises(ChartError, match=r"A1, N1, N10, A10, or of E2, J2, J5, E5, with --chart"):
-        measure(image, AUTO, sg, chart="sg")
 
 
 SG, SG_PLACE = shipped_data.colorchecker("sg"), pose(22, 6, (230, 120), (2e-4, -1e-4))
@@ -222,6 +220,19 @@ def test_all_patches_of_an_sg_are_fitted(whole: bool) -> None:
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
     assert color.patches.surroundings.shape == (116,) and np.nanmax(color.patches.surroundings) < 1
     assert np.isfinite(color.patches.surroundings).sum() == 116
+
+
+@pytest.mark.parametrize(("turn_deg", "pitch"), [(-18, 22), (-161, 17)])
+def test_a_whole_sg_is_found_by_itself(turn_deg: float, pitch: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = pose(pitch, turn_deg, (240, 180), (1e-4, -1e-4)) @ np.array([[1, 0, 0], [0, 1, -2], [0, 0, 1]])
+    monkeypatch.setitem(globals(), "SG_PLACE", place)
+    color = measure(sg_picture(spread=0.02), AUTO, SG, chart="sg")
+    assert centers_off(color, place).max() < 0.2 and np.isfinite(color.patches.surroundings).sum() > 110
+
+
+def test_patches_of_other_colors_are_no_sg() -> None:
+    with pytest.raises(ChartError, match="no ColorChecker SG in the reference shot"):
+        measure(photograph(pose(40, 5, (240, 180)), np.roll(CLASSIC.rec709, 7, axis=0)), AUTO, SG, chart="sg")
 
 
 def test_more_patches_make_the_matrix_better() -> None:
