@@ -26,7 +26,7 @@ from polcap.formats.maps import png
 from polcap.fusion import fused_maps
 from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.values import Pose
-from polcap.images import Floats, Mesh, SurfaceMaps, View
+from polcap.images import Bools, Floats, Mesh, SurfaceMaps, View
 from polcap.optics import color, frames, shade
 from polcap.pipeline import run
 from polcap.synth import render, trace
@@ -65,7 +65,7 @@ def main() -> None:
         fused = TexturedMesh(source.atlas.mesh, source.maps, pose)
         assets = (fused, relief(options.folder / name, near, pose, truth_depth(options.folder / name)))
         drawn = [picture(one, view, mask.shape, origin) for one in assets]
-        print(f"| {name} | {row(truth, mask, drawn)} |")
+        print(f"| {name} | {row(truth, mask, drawn)} |", flush=True)
         if options.pictures:
             beside = np.hstack([truth, *(image for image, _ in drawn)]) / np.quantile(truth[mask], 0.998)
             png.write(options.pictures / f"beside_{name}.png", color.srgb_eight_bits(beside))
@@ -79,7 +79,7 @@ def between(one: Pose, other: Pose) -> Pose:
 
 def true_picture(
     folder: Path, pose: Pose, near: Pose, view: View, size: tuple[int, int]
-) -> tuple[Floats, Floats, Floats]:
+) -> tuple[Floats, Bools, Floats]:
     """S0 (H, W, 3) and mask of the object in a pose of the board; origin (3,) of its own frame, m."""
     scene = msgspec.convert(json.loads((folder / "truth.json").read_text())["scene"], Scene)
     turn = pose.rotation @ near.rotation.T
@@ -108,7 +108,7 @@ def relief(folder: Path, near: Pose, pose: Pose, depth: float) -> TexturedMesh:
     return TexturedMesh(mesh, results.maps, Pose(turn, pose.translation - turn @ near.translation))
 
 
-def picture(asset: TexturedMesh, view: View, size: tuple[int, int], origin: Floats) -> tuple[Floats, Floats]:
+def picture(asset: TexturedMesh, view: View, size: tuple[int, int], origin: Floats) -> tuple[Floats, Bools]:
     """S0 (H, W, 3) of a mesh with its maps, and its mask; light as in `render`, relative to the object's origin."""
     mesh, maps, pose = asset
     tracer = Tracer(Triangles(mesh.vertices, mesh.faces, mesh.normals[mesh.faces]))
@@ -135,7 +135,7 @@ def picture(asset: TexturedMesh, view: View, size: tuple[int, int], origin: Floa
     return out.reshape(*size, 3), there.reshape(size)
 
 
-def row(truth: Floats, mask: Floats, drawn: Sequence[tuple[Floats, Floats]]) -> str:
+def row(truth: Floats, mask: Bools, drawn: Sequence[tuple[Floats, Bools]]) -> str:
     """Mean errors of the fused object and of the single view, and the share where the fused object errs less."""
     blur = BLUR * float(np.sqrt(4 * mask.sum() / np.pi))
     errors = [np.abs(color.luminance(image - truth)) for image, _ in drawn]
