@@ -163,7 +163,7 @@ def albedo_scale(found: Evidence, limits: GateLimits) -> Gate:
     if sigma > limit and light is not None and light.uneven > limit / 2:
         message += ": the chart is lit unevenly, by another lamp or through a lens that darkens the corners"
     elif sigma > limit:
-        message += ": they or the gloss are higher than usual, so the chart may get less light than the object"
+        message += ": they are higher than usual, so the chart may get less light than the object"
     return at_most("albedo scale", sigma, limit, message, remedy, beyond="warn")
 
 

@@ -19,7 +19,7 @@ the normals are smooth and certain, fine detail of the light is detail of the al
 """
 
 from dataclasses import replace
-from math import hypot, log, pi
+from math import hypot, pi
 from typing import Annotated, Literal
 
 import cv2
@@ -36,13 +36,6 @@ from polcap.stages import stage
 from polcap.stages.infer import analytic, highlights, learned
 
 _MAPS_SIGMA = 0.05  # of the estimators' own albedos, with a correct scale (docs/benchmarks/gates.md)
-# of objects next to their chart: mean, and spread of the logarithm (docs/benchmarks/gates.md)
-_USUAL_F0, _F0_SPREAD = 0.044, 0.10  # median of an object
-_USUAL_WHITE, _WHITE_SPREAD = 0.65, 0.25  # 95th percentile of the albedo
-_USUAL, _DOUBT = 1.5, 0.25  # sum of both deviations that is still usual [spreads]; doubt per spread beyond
-_FLOOR = 1e-3  # of albedo and F0 in a logarithm
-_LARGEST_DOUBT = 0.7  # a factor of two in light, ln 2
-_COMMON_WHITE, _WHITE_RANGE = 0.9, 0.14  # 95th percentile of the albedo: usual limit; excess that doubts a factor of e
 _BAND = 2.0  # px, 1σ: shading in finer detail predicts the shading that is finer than a superpixel
 _DETAIL_AROUND = 4.0  # px, 1σ of the means of power, and of the albedo
 # factors on the power of each explanation of fine detail (docs/benchmarks/albedo.md)
@@ -66,7 +59,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fine: Annotated[bool, Meta(description="a second network adds relief finer than the pixels of the first")] = True
 
 
-@stage(version=26)
+@stage(version=27)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Estimate normal, diffuse, specular, roughness and expected error from cues; without a network by inversion.
 
@@ -82,22 +75,9 @@ def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: Inf
     maps = highlights.correct(maps, cues, settings.ior)
     return replace(
         maps,
-        albedo_sigma=_albedo_sigma(maps, cues.scale_sigma),
+        albedo_sigma=None if cues.scale_sigma is None else hypot(cues.scale_sigma, _MAPS_SIGMA),
         detail=None if cues.detail is None else _select_detail(cues.detail, cues, maps),
     )
-
-
-def _albedo_sigma(maps: SurfaceMaps, of_chart: float | None) -> float | None:
-    """Relative 1σ of the scale of all albedos; `of_chart` is 1σ of the light on the chart, None without a chart."""
-    if of_chart is None or not maps.mask.any():
-        return None
-    white = max(float(np.percentile(maps.diffuse[maps.mask].max(-1), 95)), _FLOOR)
-    gloss = max(float(np.median(maps.specular[maps.mask].mean(-1))), _FLOOR)
-    unusual = max(log(white / _USUAL_WHITE) / _WHITE_SPREAD, -_USUAL)  # dark objects are no reason for trust
-    if maps.estimator != "analytic":  # its F0 is too rough for this
-        unusual += log(gloss / _USUAL_F0) / _F0_SPREAD
-    doubt = max(_DOUBT * (unusual - _USUAL), (white - _COMMON_WHITE) / _WHITE_RANGE, 0.0)
-    return hypot(of_chart, _MAPS_SIGMA, min(doubt, _LARGEST_DOUBT))
 
 
 def _select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:

@@ -10,7 +10,7 @@ from polcap.errors import ModelError
 from polcap.images import Quality
 from polcap.optics import frames
 from polcap.stages import cues, infer, stokes
-from polcap.stages.infer import _albedo_sigma, analytic, augmentation, fine, learned
+from polcap.stages.infer import analytic, augmentation, fine, learned
 from tests import scenes
 from tests.fake_network import FakeNetwork, run
 
@@ -45,26 +45,10 @@ def errors_deg(maps, cues_) -> np.ndarray:
     return np.degrees(np.arccos(np.clip((maps.normal * true).sum(-1), -1, 1)))[inside]
 
 
-@pytest.mark.parametrize(
-    ("white", "f0", "least", "most"),
-    [
-        (0.6, 0.044, 0.1, 0.15),
-        (0.1, 0.046, 0.1, 0.15),
-        (0.65, 0.05, 0.1, 0.15),  # an index of 1.58
-        (0.8, 0.06, 0.5, 0.7),
-        (0.1, 0.07, 0.3, 0.6),
-        (1.0, 0.04, 0.7, 0.8),
-    ],
-)
-def test_a_scale_that_makes_colors_and_gloss_unusual_is_doubted(
-    white: float, f0: float, least: float, most: float
-) -> None:
-    """A chart in half the object's light doubles its colors, and F0 grows: both together are no usual object."""
-    maps = estimate(seen(noise=0.002))
-    color = np.ones((*maps.mask.shape, 3), np.float32)
-    unusual = dataclasses.replace(maps, diffuse=white * color, specular=f0 * color, estimator="network")
-    assert least <= _albedo_sigma(unusual, 0.1) <= most
-    assert _albedo_sigma(unusual, None) is None
+def test_the_error_of_the_albedos_scale_is_that_of_the_chart_and_of_the_maps() -> None:
+    found = seen(noise=0.002)
+    assert estimate(dataclasses.replace(found, scale_sigma=0.1)).albedo_sigma == pytest.approx(np.hypot(0.1, 0.05))
+    assert estimate(dataclasses.replace(found, scale_sigma=None)).albedo_sigma is None
 
 
 def test_a_clean_ball_is_recovered():
