@@ -20,6 +20,7 @@ from typing import Any, Literal, get_args
 import msgspec
 from msgspec.structs import replace
 
+from polcap import resource_limits
 from polcap.batch import thumbnail
 from polcap.config import Config
 from polcap.errors import InputError, PolcapError, StorageError
@@ -103,11 +104,12 @@ def run(unit: Unit, options: ProcessOptions, attempt: int = 1) -> UnitRecord:
         record = replace(record, state="gates" if failed else "done", message=message, **_outcome(unit, about))
     except (PolcapError, OSError) as error:
         record = replace(record, state="failed", message=_line(error))
-    except MemoryError:
-        record = replace(record, state="failed", message="out of memory; raise --memory or run fewer workers")
     except Exception as error:
-        message = f"{type(error).__name__}: {_line(error)}; {_write_traceback(unit)}"
-        record = replace(record, state="bug", message=message)
+        if resource_limits.is_shortfall(error):
+            record = replace(record, state="failed", message="out of memory; raise --memory or run fewer workers")
+        else:
+            message = f"{type(error).__name__}: {_line(error)}; {_write_traceback(unit)}"
+            record = replace(record, state="bug", message=message)
     record = replace(record, seconds=round(time.perf_counter() - start, 3))
     try:
         write_record(unit, record)

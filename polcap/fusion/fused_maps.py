@@ -1,6 +1,5 @@
 """The folder maps/ of a fused result: atlas textures, seen texels, and the mesh; and the exports made from it."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -64,7 +63,7 @@ def write(folder: Path, atlas: Atlas, maps: AtlasMaps) -> None:
             "mesh.npz": "vertices, normals, uv (v down), tangents, faces",
         },
     }
-    atomic.write(folder / "maps.json", json.dumps(about, indent=2) + "\n")
+    atomic.write_json(folder / "maps.json", about)
 
 
 def is_fused(out: Path) -> bool:

@@ -1,6 +1,5 @@
 """report.json and report.html of a fused object: verdict, pictures from eight sides, a table by view."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,7 @@ _SIDE = 360  # px of a picture
 
 def write(folder: Path, about: Mapping[str, Any], results: FusionResults) -> None:
     """Write report.json and report.html into a result folder; StorageError."""
-    with atomic.path(folder / "report.json") as temporary:
-        text = json.dumps(about, indent=1, ensure_ascii=False)
-        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+    atomic.write_json(folder / "report.json", about)
     drawn = object_pictures.around(results.atlas, results.maps, _SIDES, _SIDE)
     headline, _ = page.verdict(about)
     name = about["capture"]["name"]

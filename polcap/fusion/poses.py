@@ -78,7 +78,6 @@ class PosedView:
     corners: int  # used
     residual_px: float  # rms of the corners, RAW px
     sigma_deg: float  # 1σ of the rotation, largest axis
-    sigma_m: float  # 1σ of the translation across the line of sight at the board's middle
 
 
 @dataclass(frozen=True)
@@ -229,7 +228,6 @@ def _with_errors(seen: Sequence[BoardCorners], capture: Capture, found: Optimize
             corners=len(one.number),
             residual_px=float(np.sqrt(2 * np.mean(e**2))),
             sigma_deg=float(np.degrees(sigma[_place(k)][:3].max())),
-            sigma_m=float(sigma[_place(k)][3:5].max()),
         )
         for k, (one, e) in enumerate(zip(seen, error, strict=True))
     ]
