@@ -30,7 +30,7 @@ def result_folder(named: Path | None) -> Path | None:
 
 
 def choice(meaning: str, metavar: str | None = None) -> Any:
-    """A command-line option with a fixed list of values; `metavar` stands for them in the help."""
+    """A command-line option with a fixed list of values; `metavar` replaces them in the help."""
     return Option(case_sensitive=False, help=meaning, metavar=metavar)
 
 

@@ -21,7 +21,7 @@ class ViewAgreement:
 
     name: str
     normal_deg: float  # median angle between the view's normals and the mesh's
-    residual: float  # rms of photograph minus rendering over the photograph's rms; NaN without S0
+    residual: float | None  # rms of photograph minus rendering over the photograph's rms; None without S0
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Comparison:
     views: tuple[ViewAgreement, ...]
 
 
-@stage(version=1)
+@stage(version=2)
 def compare(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps) -> Comparison:
     """Compare each view with the fused mesh and its textures."""
     return Comparison(tuple(_agreement(view, one, atlas, maps) for view, one in zip(views, sights(views, atlas))))
@@ -42,7 +42,7 @@ def _agreement(view: FusionView, sight: Sight, atlas: Atlas, maps: AtlasMaps) ->
     cosine = np.clip(frames.dot(view.normal, sight.mesh_normal)[both], -1, 1)
     angle_deg = float(np.median(np.degrees(np.arccos(cosine)))) if both.any() else 90.0
     if view.s0 is None or not len(sight.texel):
-        return ViewAgreement(view.name, angle_deg, float("nan"))
+        return ViewAgreement(view.name, angle_deg, None)
     photograph, drawn = sight.sample(view.s0), rendered(view, sight, atlas, maps)
     weight = sight.weight[:, None]
     drawn = drawn * float((weight * drawn * photograph).sum() / max((weight * drawn * drawn).sum(), 1e-12))

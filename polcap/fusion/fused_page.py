@@ -41,6 +41,6 @@ def _row(row: Mapping[str, Any]) -> tuple[str, ...]:
         f"{labels.number(row['reprojection_px'])} px",
         f"{labels.number(row['pose_sigma_deg'])}°",
         f"{labels.number(row['normal_deg'])}°",
-        f"{labels.number(100 * row['residual'])} %",
+        "–" if row["residual"] is None else f"{labels.number(100 * row['residual'])} %",
         row["verdict"],
     )

@@ -67,8 +67,8 @@ def main() -> None:
         drawn = [picture(one, view, mask.shape, origin) for one in assets]
         print(f"| {name} | {row(truth, mask, drawn)} |", flush=True)
         if options.pictures:
-            beside = np.hstack([truth, *(image for image, _ in drawn)]) / np.quantile(truth[mask], 0.998)
-            png.write(options.pictures / f"beside_{name}.png", color.srgb_eight_bits(beside))
+            strip = np.hstack([truth, *(image for image, _ in drawn)]) / np.quantile(truth[mask], 0.998)
+            png.write(options.pictures / f"{name}.png", color.srgb_eight_bits(strip))
 
 
 def between(one: Pose, other: Pose) -> Pose:

@@ -1,4 +1,4 @@
-"""Benchmark of the gates on path-traced objects: RAW captures of the scenes of `make_mitsuba.py` beside a chart.
+"""Benchmark of the gates on path-traced objects: RAW captures of the scenes of `make_mitsuba.py` next to a chart.
 
     python tests/benchmarks/bench_verdicts_mitsuba.py SCENES FOLDER [--lamp X,Y,Z] [--turned 90,45,0]
 
@@ -111,7 +111,7 @@ def photograph(place: Path, scene: dict[str, Any], seed: int, lamp: Floats | Non
 
 
 def _studio(shoot: Shoot, focal: float, mask: Bools, corner: Floats, seed: int) -> Studio:
-    """A studio with a chart beside the object's place, and in that place a ball of one pixel that it will hide."""
+    """A studio with a chart next to the object's place, and there a ball of one pixel that the object will hide."""
     columns = np.nonzero(mask)[1]
     left, right = corner[0] + TIMES * columns.min(), corner[0] + TIMES * columns.max()
     room = max(left, WIDTH - right) - 4 * EDGE

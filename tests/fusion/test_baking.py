@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.fusion import atlas as atlases
-from polcap.fusion import baking
+from polcap.fusion import baking, comparison, fused_page
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import BakingSettings
 from polcap.fusion.values import ClosedMesh
@@ -82,3 +82,14 @@ def test_the_asset_stage_turns_the_atlas_into_tangent_space(atlas: Atlas) -> Non
     local = found.normal[atlas.covered] / 127.5 - 1
     assert np.degrees(np.arccos(np.clip(local[..., 2], -1, 1))).mean() < 1.5  # the mesh has the true normals
     assert found.specular_factor[0] == pytest.approx(1.0, rel=1e-3)
+
+
+def test_a_view_without_a_photograph_has_no_residual_and_a_row_in_the_report(atlas: Atlas) -> None:
+    bare = replace(RING[0], s0=None)
+    (found,) = comparison.compare((bare,), atlas, baking.bake(RING, atlas, BakingSettings())).views
+    assert found.residual is None and found.normal_deg < 1
+    row = {
+        "name": "view01", "corners": 30, "reprojection_px": 0.1, "pose_sigma_deg": 0.1,
+        "normal_deg": found.normal_deg, "residual": found.residual, "verdict": "pass",
+    }  # fmt: skip
+    assert fused_page._row(row)[-2:] == ("–", "pass")

@@ -63,7 +63,7 @@ def written(folder: Path, pattern: str) -> dict[str, bytes]:
 
 def finished(folder: Path) -> dict[Path, int]:
     """Stored stages below a folder, and when they were written."""
-    return {file: file.stat().st_mtime_ns for file in folder.glob("*/**/work/*/manifest.json")}
+    return {file: file.stat().st_mtime_ns for file in folder.rglob("manifest.json")}
 
 
 def test_a_fusion_that_was_killed_twice_ends_as_one_that_was_not(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def sigma(stokes: StokesImage, color: ColorCalibration, radiance: Floats) -> flo
 
 
 def _far_chart(radiance: Floats) -> float:
-    """RMS error of ln scale if the chart perhaps gets half of the light of the object with this radiance (N, 3)."""
+    """RMS error of ln scale, as the chart may get half of the object's light; radiance (N, 3) of the object."""
     if not len(radiance):
         return 0.0
     bright = log(max(float(np.percentile(radiance.max(-1), _BRIGHTEST)), 1e-6))

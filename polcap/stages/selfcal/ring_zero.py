@@ -37,7 +37,7 @@ _SPREAD_TO_SIGMA = 2.0  # error of the outermost result over its rms difference 
 _FLOOR = np.radians(0.25)  # least error (decision 26)
 _LEAST_RIM_PX = 200
 _TURNS = 4  # iterations
-_SHAPES = 1.6  # rms of error over estimated 1σ on 32 path-traced objects; about 1 on rounded ones (decision 26)
+_SHAPES = 1.6  # rms of error over estimated 1σ on 29 path-traced objects (docs/benchmarks/gains-and-angles.md)
 # By the slopes.
 _STEEPEST = 9.0  # largest tan²θ of the pixels used
 _ROUNDS = 12
