@@ -41,6 +41,8 @@ def export(
     result: Result,
     gltf: Annotated[bool, Option("--gltf", help="asset/NAME.glb")] = False,
     obj: Annotated[bool, Option("--obj", help="asset/NAME.obj, .mtl and textures")] = False,
+    ply: Annotated[bool, Option("--ply", help="asset/NAME.ply, the mesh with a color per vertex")] = False,
+    stl: Annotated[bool, Option("--stl", help="asset/NAME.stl, the mesh alone, for printing")] = False,
     usd: Annotated[bool, Option("--usd", help="asset/NAME.usdc and textures (extra [usd])")] = False,
     usdz: Annotated[bool, Option("--usdz", help="asset/NAME.usdz, one file for phones (extra [usd])")] = False,
     materialx: Annotated[bool, Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
