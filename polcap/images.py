@@ -19,6 +19,8 @@ Bits = NDArray[np.uint8]
 TexturePixels = NDArray[Any]  # uint8 or uint16; a share of the type's largest value
 Device = Literal["cpu", "cuda", "auto"]
 Bools = NDArray[np.bool_]
+Indices = NDArray[np.integer[Any]]
+Faces = NDArray[np.int32]  # (F, 3) vertices of triangles
 Role = Literal["shot", "ambient", "repeat", "chart", "cross"]
 NOT_IN_KEY = {"in_key": False}  # metadata of a field that cache keys ignore, because it does not change a result
 
@@ -502,7 +504,7 @@ class Alignment:
 class ObjectMask(ArrayValue):
     """Mask of the object's pixels on the full-frame grid, the crop around them, and figures on the mask's quality."""
 
-    mask: NDArray[np.bool_]  # (H, W) full-frame grid
+    mask: Bools  # (H, W) full-frame grid
     crop: tuple[int, int, int, int]  # x0, y0, x1, y1 full-frame grid px, end exclusive
     source: Literal["automatic", "user"]
     doubt: float | None = None  # 1 − the expected IoU with the true mask; None without a network
@@ -593,7 +595,7 @@ class StokesImage(ArrayValue):
     stokes: Floats  # (3, H, W, 3) S0, S1, S2
     covariance: Floats  # (6, H, W, 3) 00 01 02 11 12 22
     quality: Bits  # (H, W)
-    mask: NDArray[np.bool_]  # (H, W)
+    mask: Bools  # (H, W)
     view: View  # of the crop
     residual: Floats | None  # (H, W) |measured − fitted| / S0 where K > 3
     body: MaskedImage | None = None  # S0 of the diffuse reflection only, from a crossed shot
@@ -611,12 +613,12 @@ class Cues(ArrayValue):
     normalized_stokes: Floats  # (2, H, W) (S1, S2)/√(S1² + S2²)
     diffuse_color: Floats  # (H, W, 3) unit length, 0 where dark
     rays: Floats  # (H, W, 3) unit vectors from the surface to the camera
-    mask: NDArray[np.bool_]  # (H, W)
+    mask: Bools  # (H, W)
     quality: Bits  # (H, W)
     view: View
     scale_sigma: float | None = None  # relative 1σ of the light on the chart against that on the object; None: no chart
     body: Floats | None = None  # (H, W, 3) radiance of the diffuse reflection only, from a crossed shot
-    body_known: NDArray[np.bool_] | None = None  # (H, W) where the crossed shot is valid
+    body_known: Bools | None = None  # (H, W) where the crossed shot is valid
     detail: Floats | None = None  # (2H, 2W) float16, ln of the light of RAW pixels over these pixels, enlarged
 
 
@@ -647,7 +649,7 @@ class SurfaceMaps(ArrayValue):
     roughness: Floats  # (H, W) perceptual, α = roughness²
     depth_prior: Floats | None  # (H, W) coarse depth, growing away, mean about 0; unit: √(mask pixels/π) px
     confidence: Floats  # (H, W) expected normal error, degrees
-    mask: NDArray[np.bool_]  # (H, W)
+    mask: Bools  # (H, W)
     view: View
     estimator: str
     albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown, albedos are relative
@@ -681,7 +683,7 @@ class Mesh(ArrayValue):
     normals: Floats  # (V, 3) unit
     uv: Floats  # (V, 2) 0…1, v down (glTF)
     tangents: Floats  # (V, 4) unit, w = handedness
-    faces: NDArray[np.int32]  # (F, 3) counter-clockwise seen from outside
+    faces: Faces  # (F, 3) counter-clockwise seen from outside
     metric: bool
     pieces: int = 1  # number of separate parts, without specks
     cuts: float = 0.0  # length of the boundary inside the mask, both sides, over the length along the mask's outline
@@ -728,6 +730,6 @@ class GBuffer(ArrayValue):
 
     normal: Floats  # (H, W, 3) unit, camera frame; 0 outside
     depth: Floats  # (H, W) along the optical axis, growing away from the camera, m; NaN outside
-    mask: NDArray[np.bool_]  # (H, W)
+    mask: Bools  # (H, W)
     position: Floats  # (H, W, 3) in the object's own frame, for solid textures; 0 outside
     view: View

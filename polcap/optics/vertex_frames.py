@@ -1,12 +1,9 @@
 """Normals and tangents of mesh vertices, as means over the triangles around them."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Faces, Floats
 from polcap.optics.frames import cross, dot
-
-Faces = NDArray[np.int32]
 
 
 def vertex_frames(vertices: Floats, uv: Floats, faces: Faces) -> tuple[Floats, Floats]:
