@@ -12,6 +12,7 @@ from enum import IntFlag
 from typing import Any, Literal, Protocol
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 Floats = NDArray[np.floating[Any]]
@@ -260,9 +261,8 @@ class Shot:
         return f"{np.degrees(self.angle):g}°"
 
 
-@dataclass(frozen=True)
-class CatalogEntry:
-    """Facts for the catalog of a collection, as the user states them; an empty text is not stated."""
+class CatalogEntry(Struct, frozen=True, forbid_unknown_fields=True):
+    """Facts for the catalog of a collection: the table `[catalog]` of capture.toml; an empty text is not stated."""
 
     title: str = ""  # of the object
     creator: str = ""  # person or institution that made the photographs

@@ -1,7 +1,7 @@
 """`polcap export`: the asset of a result again, in other formats or for one program."""
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -106,7 +106,7 @@ def _catalog_fields(stated: Sequence[str]) -> dict[str, str]:
     """Parse --about K=V: fields of `CatalogEntry` by name. Raises SettingError for an unknown field."""
     from polcap.images import CatalogEntry
 
-    known = [field.name for field in fields(CatalogEntry)]
+    known = CatalogEntry.__struct_fields__
     found = {}
     for text in stated:
         key, equals, found[key] = text.partition("=")

@@ -195,7 +195,6 @@ class _ChartEquations:
     """Linear equations of N chart patches × 3 channels for color matrix M, light slope e and glare b."""
 
     def __init__(self, color: Floats, reference: Floats, position: Floats) -> None:
-        self._color, self._reference, self._position = color, reference, position
         rows = np.zeros((3, len(color), 12))
         for channel in range(3):
             rows[channel, :, 3 * channel : 3 * channel + 3] = color
