@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from polcap.calibrate import photon_transfer
 from polcap.calibrate.calibration_photographs import CLIP, Photograph, photographs_in
+from polcap.calibration_values import NoiseLine
 from polcap.errors import CaptureError
 from polcap.formats.capture import layouts
-from polcap.images import Bools, Floats, NoiseLine
+from polcap.images import Bools, Floats
 from polcap.optics import robust
 from polcap.stages.hdr import bracket, exposure, noise, planes
 from polcap.stages.hdr.planes import Signals
