@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from polcap.errors import InputError, StorageError
 from polcap.formats import atomic, scene_files, text_file
 from polcap.images import Bools, Floats, GBuffer, View
+from polcap.optics.outline import disc_radius
 from polcap.synth.mesh_tracer import Tracer, Triangles, scatter, smooth
 from polcap.training import bounced_light, light_transport, random_shapes
 from polcap.training.progress import Report, silent
@@ -198,7 +199,7 @@ def depth_unit(mask: Bools, depth: Floats, focal: float) -> tuple[float, float]:
     photograph, the mask gives the unit up to the unknown distance.
     """
     middle = float(depth[mask].mean(dtype=np.float64))
-    return middle, float(np.sqrt(mask.sum() / np.pi) * middle / focal)
+    return middle, disc_radius(mask) * middle / focal
 
 
 def _trace_shape(
