@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap.config import Config
 from polcap.errors import ObjectError
@@ -22,6 +21,7 @@ from polcap.formats.maps import maps_folder
 from polcap.formats.raw import frame_decoder
 from polcap.images import (
     AngleStack,
+    Bools,
     Capture,
     ChartRequest,
     ColorCalibration,
@@ -49,7 +49,7 @@ class UserInput:
     """Inputs of the path besides the photographs: chart, mask, networks, decoder."""
 
     chart: ChartRequest = AUTO
-    mask: NDArray[np.bool_] | None = None  # on the RAW pixels or on the grid of the merged picture
+    mask: Bools | None = None  # on the RAW pixels or on the grid of the merged picture
     network: Network | None = None  # None: the analytic estimator
     mask_network: Network | None = None  # None: the object is found by its contrast to the backdrop
     decode: Decode = frame_decoder.decode  # the pixels of a photograph
@@ -84,7 +84,7 @@ def results_of(made: Mapping[str, StageResult[Any]]) -> Results:
     return Results.partial(keys=keys, **{_FIELD[stage]: result.value for stage, result in made.items()})
 
 
-def on_grid(drawn: NDArray[np.bool_] | None, radiance: AngleStack) -> NDArray[np.bool_] | None:
+def on_grid(drawn: Bools | None, radiance: AngleStack) -> Bools | None:
     """Convert the user's mask to the grid of the merged picture (H, W).
 
     The user may draw it on that grid, or on the pixels of the RAW or of the mosaic.

@@ -3,16 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Floats, SurfaceMaps
+from polcap.images import Bools, Floats, SurfaceMaps
 from polcap.optics.resize import area_mean, weighted_area_mean
 
 
 class ObjectReduction:
     """Reduction of images (H, W, …) to at most `longest` px a side: means over the object's pixels `inside` (H, W)."""
 
-    def __init__(self, inside: NDArray[np.bool_], longest: int) -> None:
+    def __init__(self, inside: Bools, longest: int) -> None:
         height, width = inside.shape
         self.inside = inside
         self.factor = min(1.0, longest / max(height, width))

@@ -15,6 +15,7 @@ from polcap.images import (
     Alignment,
     AngleStack,
     Asset,
+    Bools,
     ColorCalibration,
     Cues,
     Floats,
@@ -122,12 +123,12 @@ def display(linear: Floats, top: float | None = None) -> Picture:
     return color.srgb_eight_bits(np.asarray(linear, np.float32) / np.float32(top or _top(linear)))
 
 
-def scale(value: Floats, low: float, high: float, inside: NDArray[np.bool_]) -> Picture:
+def scale(value: Floats, low: float, high: float, inside: Bools) -> Picture:
     """Convert values low…high to colors from dark to bright, black outside the object."""
     return keys.ColorKey(low, max(high, low + 1e-12), "", (), "inferno").picture(value, inside)
 
 
-def hue(aolp: Floats, inside: NDArray[np.bool_]) -> Picture:
+def hue(aolp: Floats, inside: Bools) -> Picture:
     """Convert an angle of polarization (modulo π) to a hue."""
     return keys.AOLP.picture(np.degrees(aolp) % 180, inside)
 
@@ -198,7 +199,7 @@ def _cues(found: Cues) -> list[Tile]:
     ]
 
 
-def _polarization(dolp: Floats, aolp: Floats, inside: NDArray[np.bool_]) -> list[Tile]:
+def _polarization(dolp: Floats, aolp: Floats, inside: Bools) -> list[Tile]:
     return [
         Tile(keys.DOLP.picture(dolp, inside), "Degree of linear polarization", keys.DOLP),
         Tile(hue(aolp, inside), "Angle of linear polarization", keys.AOLP),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from polcap.errors import InputError
 from polcap.formats import scene_files
-from polcap.images import Floats, GBuffer, View
+from polcap.images import Bools, Floats, GBuffer, View
 from polcap.optics import frames
 
 _LEAST_FACING = 0.01  # least cosine between normal and view; smoothing may turn normals away from the camera
@@ -133,7 +133,7 @@ class Tracer:
         normal = np.where(np.sum(normal * direction, axis=1, keepdims=True) > 0, -normal, normal)
         return np.where(struck, hit["tfar"], np.inf), normal
 
-    def hidden(self, origin: Floats, target: Floats) -> NDArray[np.bool_]:
+    def hidden(self, origin: Floats, target: Floats) -> Bools:
         """True where the mesh hides points (P, 3) from targets, (P, 3) or (3,)."""
         way = target - origin
         far = np.linalg.norm(way, axis=1)

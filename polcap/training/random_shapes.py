@@ -3,16 +3,13 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from polcap.images import Floats
+from polcap.images import Faces, Floats
 from polcap.synth.mesh_tracer import Triangles, centred, smooth, union
 
 _RINGS, _SECTORS = 96, 128  # vertices of a body
 _BRANCH_RINGS, _BRANCH_SECTORS = 24, 14  # vertices of a branch
-
-Faces = NDArray[np.int32]  # (F, 3)
 
 
 def compose(rng: np.random.Generator) -> Triangles:

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from polcap.errors import ObjectError
-from polcap.images import Floats, Mesh, ReliefMesh, View
+from polcap.images import Faces, Floats, Mesh, ReliefMesh, View
 from polcap.optics.projection import project
 from polcap.optics.vertex_frames import vertex_frames
-from polcap.stages.surface.triangles import Back, Faces, add_back, boundary_edges, face_areas
+from polcap.stages.surface.triangles import Back, add_back, boundary_edges, face_areas
 
 _FEWEST = 16  # triangles
 _FRONT = {"open": 1.0, "skirt": 1.0, "closed": 0.6}  # of the requested triangles: those of the front at first
