@@ -435,11 +435,28 @@ class OutlineCheck:
     best: ShotOrder  # as stated, unless another order clearly fits better
     concentration: float  # 0…1, how well the AoLP follows the outline
     rival: ShotOrder | None = None  # another order that fits equally well; None: no other
+    score: float = 0.0  # −1…1, as `concentration`; negative if the AoLP is along the outline
 
     @property
     def as_stated(self) -> bool:
         """Whether the stated order and sense of the polarizer angles fit the outline best."""
         return self.best == ShotOrder(tuple(range(len(self.best.shots))))
+
+
+@dataclass(frozen=True)
+class OtherOrder:
+    """An order of the shots that the outline does not exclude."""
+
+    order: ShotOrder
+    matrix: Floats  # (3, 3) from the Stokes parameters by the stated order to those by this order
+
+
+@dataclass(frozen=True)
+class OrderTest:
+    """Comparison of the stated order of the shots with other orders, by the error that the network expects."""
+
+    rival: ShotOrder  # the other order with the least expected error
+    ratio: float  # its expected error over that of the stated order
 
 
 @dataclass(frozen=True)
@@ -471,6 +488,7 @@ class SelfCalibration:
     turned: TurnedShot = TurnedShot()
     found_sigma: float | None = None  # rad, 1σ of angles that were estimated; None: stated angles
     crossed: Floats | None = None  # (3,) factor from the crossed shot to the S0 of diffuse reflection; None without one
+    other_orders: tuple[OtherOrder, ...] = ()  # empty: the outline confirms the stated order
 
 
 @dataclass(frozen=True, repr=False)
@@ -504,6 +522,7 @@ class Cues(ArrayValue):
     scale_sigma: float | None = None  # relative 1σ of the light on the chart against that on the object; None: no chart
     body: Floats | None = None  # (H, W, 3) radiance of the diffuse reflection only, from a crossed shot
     body_known: Bools | None = None  # (H, W) where the crossed shot is valid
+    other_orders: tuple[OtherOrder, ...] = ()
     detail: Floats | None = None  # (2H, 2W) float16, ln of the light of RAW pixels over these pixels, enlarged
 
 
@@ -539,6 +558,7 @@ class SurfaceMaps(ArrayValue):
     estimator: str
     albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown, albedos are relative
     detail: Floats | None = None  # (2H, 2W) float16, ln of the albedo of RAW pixels over `diffuse`, enlarged
+    order: OrderTest | None = None  # None without a network, or without other orders
 
 
 class TextureMaps(Protocol):

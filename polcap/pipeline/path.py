@@ -27,7 +27,9 @@ from polcap.images import (
     ColorCalibration,
     Decode,
     Network,
+    OtherOrder,
     ReliefMesh,
+    SelfCalibration,
     SurfaceMaps,
 )
 from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
@@ -65,7 +67,7 @@ def path(capture: Capture | None, supplied: UserInput, config: Config, cache: Me
         object_ = cache.run(mask.segment, radiance, alignment, color, drawn, finder, onnx.run, config=config.mask)
         calibration = cache.run(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
         stokes_ = cache.run(stokes.solve, radiance, alignment, calibration, object_, config=config.stokes)
-        cues_ = cache.run(cues.compute, stokes_, color)
+        cues_ = cache.run(cues.compute, stokes_, color, cache.derive(other_orders, calibration))
         maps = cache.run(infer.estimate, cues_, supplied.network, onnx.run, config=config.infer)
         distance = cache.derive(distance_m, color, radiance)
         mesh = cache.run(surface.integrate, maps, distance, config=config.surface)
@@ -103,6 +105,11 @@ def on_grid(drawn: Bools | None, radiance: AngleStack) -> Bools | None:
         return np.asarray(drawn[::step, ::step][:height, :width])
     sizes = dict.fromkeys(f"{n * width}×{n * height}" for n in (step, 1))
     raise ObjectError(f"--mask is {wide}×{tall} px; draw it on the picture's {' or '.join(sizes)} px")
+
+
+def other_orders(calibration: SelfCalibration) -> tuple[OtherOrder, ...]:
+    """Orders of the shots that the outline does not exclude; the estimators test them."""
+    return calibration.other_orders
 
 
 def distance_m(color: ColorCalibration, radiance: AngleStack) -> float | None:
