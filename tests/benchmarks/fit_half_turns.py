@@ -92,7 +92,7 @@ def predicted(case: Case, network: Network) -> tuple[half_turns.Grid, Floats, Fl
     """The network's normals on the coarse grid, terms (h, w, 4) of `_WRONG`, and what turning a cell gains, degrees."""
     shrink = max(1.0, max(case.cues.mask.shape) / int(network.metadata["native_size"]))
     seen = learned._reduce(learned._limit_radiance(case.cues), 1 / shrink)
-    maps = augmentation.predict(seen, network, onnx.run, 4)
+    maps = augmentation.predict([seen], network, onnx.run, 4)
     grid = half_turns.coarse(frames.to_ray_frame(frames.unit(maps["normal"]), seen.rays), seen.mask)
     overview = learned._overview(seen, network, onnx.run)
     doubt = half_turns.NetworkDoubt(maps["sigma"], maps["opposed"], overview)

@@ -4,15 +4,19 @@ A picture that is turned by 90° or mirrored shows a scene that is turned or mir
 by twice the angle, its rays by the angle itself. Each prediction is transformed back before the average.
 """
 
+from collections.abc import Sequence
 from functools import partial
 
+import cv2
 import numpy as np
 
 from polcap import parallel
 from polcap.errors import ModelError
-from polcap.images import Cues, Floats, Network, RunNetwork
+from polcap.images import Bools, Cues, Floats, Network, RunNetwork
 from polcap.optics import frames
+from polcap.optics.morphology import erode
 from polcap.stages.cues import CHANNELS, channels
+from polcap.stages.infer.highlights import REACHED
 
 OUTPUTS = {"normal": 3, "depth": 1, "diffuse": 3, "specular": 3, "roughness": 1, "sigma": 1}  # channels of each map
 _POSITIONS = tuple(
@@ -20,36 +24,69 @@ _POSITIONS = tuple(
 )
 _STEPS = 5  # of the median's iteration
 _LEAST_ERROR = 0.5  # degrees
+_NEAR_PX = 16.0  # 1σ of the means of expected errors by which the sizes are weighted
+_POWER = 12  # of these errors in the weights
+_CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is constant
+BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _NEAREST = 0.05  # least distance between unit vectors, about 3°: nearer ones weigh the same
 
 
-def predict(cues: Cues, network: Network, run: RunNetwork, symmetries: int) -> dict[str, Floats]:
-    """The network's maps (H, W[, 3]), averaged over 1, 2, 4 or 8 rotated and mirrored copies of the picture.
+def predict(pictures: Sequence[Cues], network: Network, run: RunNetwork, symmetries: int) -> dict[str, Floats]:
+    """The network's maps (H, W[, 3]), averaged over 1, 2, 4 or 8 rotated and mirrored positions of each picture.
 
-    Most maps are means. The normal is the median direction, weighted by the predicted errors: positions often differ by
-    half a turn of the azimuth, and the mean of two half-turns is neither. The map `opposed` (H, W) is the share of the
-    positions in which the normal leans to the other side of the ray.
+    `pictures` show the same object at different sizes; the maps have the grid of the first. The network resolves more
+    in a large picture, and understands textures and large forms better in a small one. Where it expects a smaller error
+    in one size than in another, that size counts more. The map `opposed` (H, W) is the share of all predictions in
+    which the normal leans to the other side of the ray.
     """
-    picture = np.moveaxis(channels(cues), 0, -1)
+    first = pictures[0]
     calls = [
-        partial(_predict_turned, picture, cues.rays, network, run, *position) for position in _POSITIONS[:symmetries]
+        partial(_predict_turned, encoded, picture, network, run, *position)
+        for picture, encoded in zip(pictures, [np.moveaxis(channels(picture), 0, -1) for picture in pictures])
+        for position in _POSITIONS[:symmetries]
     ]
-    predictions = parallel.results(calls, network.at_once)
-    maps = {name: np.asarray(np.mean([maps[name] for maps in predictions], axis=0), np.float32) for name in OUTPUTS}
-    normals, errors = (np.stack([maps[name] for maps in predictions]) for name in ("normal", "sigma"))
-    median = _median_direction(normals, errors)
-    towards = median - frames.dot(median, cues.rays)[..., None] * cues.rays
-    opposed = np.mean([frames.dot(normal, towards) < 0 for normal in normals], axis=0)
-    return maps | {"normal": median, "opposed": opposed.astype(np.float32)}
+    predictions = [
+        {name: np.asarray(cv2.resize(image, first.mask.shape[::-1])) for name, image in maps.items()}
+        for maps in parallel.results(calls, network.at_once)
+    ]
+    sizes = [_mean(predictions[k : k + symmetries]) for k in range(0, len(predictions), symmetries)]
+    weights = _weights([maps["sigma"] for maps in sizes], first.mask)
+    maps = {
+        name: np.asarray(sum(np.einsum("yx,yx...->yx...", w, of[name]) for w, of in zip(weights, sizes)), np.float32)
+        for name in OUTPUTS
+    }
+    normal = maps["normal"] * first.mask[..., None]
+    towards = normal - frames.dot(normal, first.rays)[..., None] * first.rays
+    opposed = np.mean([frames.dot(of["normal"], towards) < 0 for of in predictions], axis=0)
+    return maps | {"normal": normal, "opposed": opposed.astype(np.float32)}
+
+
+def _mean(predictions: Sequence[dict[str, Floats]]) -> dict[str, Floats]:
+    """Average maps (H, W[, 3]) over positions.
+
+    The normal is the median direction, weighted by the predicted errors: positions often differ by half a turn of the
+    azimuth, and the mean of two half-turns is neither.
+    """
+    maps = {name: np.asarray(np.mean([of[name] for of in predictions], axis=0), np.float32) for name in OUTPUTS}
+    normals, errors = (np.stack([of[name] for of in predictions]) for name in ("normal", "sigma"))
+    return maps | {"normal": _median_direction(normals, errors)}
+
+
+def _weights(errors: Sequence[Floats], mask: Bools) -> Floats:
+    """Weights (K, H, W) of K sizes of the picture by their expected errors (H, W), averaged over the neighborhood."""
+    inside = mask.astype(np.float32)
+    near = np.stack([cv2.GaussianBlur(error * inside, (0, 0), _NEAR_PX) for error in errors]) + _LEAST_ERROR
+    odds = (near / near.min(axis=0)) ** -_POWER
+    return np.asarray(odds / odds.sum(axis=0), np.float32)
 
 
 def _predict_turned(
-    picture: Floats, rays: Floats, network: Network, run: RunNetwork, quarters: int, mirror: bool
+    picture: Floats, cues: Cues, network: Network, run: RunNetwork, quarters: int, mirror: bool
 ) -> dict[str, Floats]:
     """Run the network on a rotated or mirrored picture (H, W, N), and transform its maps back."""
     turned = _turn_channels(_turn(picture, quarters, mirror), quarters, mirror)
     maps = run_network(np.moveaxis(turned, -1, 0), network, run, CHANNELS, OUTPUTS)
-    own = np.array(_turn(rays, quarters, mirror))
+    own = np.array(_turn(cues.rays, quarters, mirror))
     own[..., :2] = _turn_vectors(own[..., :2], quarters, mirror)
     maps["normal"] = np.array(frames.from_ray_frame(maps["normal"], own))
     for name, image in maps.items():
@@ -59,7 +96,26 @@ def _predict_turned(
             upright = _turn_vectors(back[..., :2], -quarters, False) * [-1.0 if mirror else 1.0, 1.0]
             back = np.concatenate([upright, back[..., 2:]], axis=-1)
         maps[name] = np.asarray(back, np.float32)
+    # zeros outside the object, so that its own pixels alone set the direction at its edge when enlarged
+    maps["normal"] = _without_grid(maps["normal"], cues.mask) * cues.mask[..., None]
     return maps
+
+
+def _without_grid(normal: Floats, mask: Bools) -> Floats:
+    """Remove the network's grid artifact, a pattern that repeats every 2 px, from normals (H, W, 3).
+
+    For each of the four places in a 2×2 cell, the deviation that neighboring cells have in common is subtracted. Relief
+    does not repeat with the cells, so it remains.
+    """
+    whole = erode(mask, 1).astype(np.float32)
+    out = normal.astype(np.float32)
+    uneven = (out - cv2.sepFilter2D(out, -1, BINOMIAL, BINOMIAL)) * whole[..., None]
+    for place in (np.s_[y::2, x::2] for y in (0, 1) for x in (0, 1)):
+        common, share = (
+            cv2.GaussianBlur(np.ascontiguousarray(part[place]), (0, 0), _CELLS) for part in (uneven, whole)
+        )
+        out[place] -= common / np.maximum(share, REACHED)[..., None] * mask[place][..., None]
+    return out
 
 
 def _median_direction(normals: Floats, errors: Floats) -> Floats:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from polcap.images import Cues, Floats, Network, OrderTest, Quality, RunNetwork, SurfaceMaps
 from polcap.optics import frames
-from polcap.optics.morphology import erode
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.cues import FLOOR
 from polcap.stages.infer import analytic, augmentation, fine, half_turns, highlights
@@ -24,10 +23,9 @@ from polcap.stages.infer.highlights import REACHED
 _INVERSION = 4.0  # factor on the inversion's expected error in the join, for the network's input holds the inversion
 # error = min(a·statedᵇ·exp(r·roughness), c), degrees: maximum likelihood on traced training meshes (decision 28)
 _CALIBRATION = (0.515, 1.12, 0.906, 50.0)
+_SIZES = (1.5625, 0.875)  # of the network's pictures over that of its training: 400 and 224 px
 _OVERVIEWS, _OVERVIEW_POSITIONS = (0.5, 0.35), 2  # sizes of smaller pictures, evidence for the side of normals
 _TEST_SIZE = 0.35  # of the picture by which orders of the shots are compared
-_CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is constant
-_BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _GRAZING = 0.15  # least cosine of the shading; .1 and .2 leave the same error
 _BRIGHTEST = 2.0  # greatest S0 of diffuse reflection; white paper that faces the flash near the chart has 1
 
@@ -62,7 +60,7 @@ def estimate(
         confidence=(error * cues.mask).astype(np.float32),
         mask=cues.mask,
         view=cues.view,
-        order=_compare_orders(cues, network, run, coarse.shrink),
+        order=_compare_orders(cues, network, run),
         estimator=f"network {network.metadata.get('version', network.digest[:8])}",
     )
 
@@ -77,12 +75,13 @@ def estimate_coarse(
     the probability of a wrong azimuth side.
     """
     size = cues.mask.shape[::-1]
-    shrink = max(1.0, max(size) / int(network.metadata["native_size"]))
-    seen = _reduce(_limit_radiance(cues), 1 / shrink)
-    small = augmentation.predict(seen, network, run, symmetries)
-    # zeros outside the object, so that the object's own pixels alone set the direction at its edge when enlarged
-    small["normal"] = _without_grid(small["normal"], seen.mask) * seen.mask[..., None]
-    doubt = half_turns.NetworkDoubt(small["sigma"], small.pop("opposed"), _overview(seen, network, run))
+    scale = int(network.metadata["native_size"]) / max(size)
+    largest, *others = sorted({min(1.0, factor * scale) for factor in _SIZES}, reverse=True)
+    seen = _reduce(_limit_radiance(cues), largest)
+    pictures = [seen, *(_reduce(seen, other / largest) for other in others)]
+    small = augmentation.predict(pictures, network, run, symmetries)
+    overview = _overview(seen, min(scale, 1.0) / largest, network, run)
+    doubt = half_turns.NetworkDoubt(small["sigma"], small.pop("opposed"), overview)
     small["normal"], small["doubt"] = _correct_half_turns(small["normal"], seen, doubt)
     small["factor"] = _log_factor(small["diffuse"] * _shading(small["normal"], seen.rays), seen)
     for name in ("specular", "roughness"):
@@ -91,12 +90,13 @@ def estimate_coarse(
     smooth = frames.unit(maps["normal"])
     guide = np.asarray(frames.to_ray_frame(smooth, cues.rays)), maps["sigma"]
     by_pixel, error, _ = analytic.invert(cues, ior, guide)
+    shrink = 1 / largest
     detailed = _add_detail(smooth, by_pixel, cues.mask, shrink)
     normal, stated = _join((smooth, maps["sigma"]), (detailed, _INVERSION * error))
     return maps, fine.CoarseEstimate(normal, smooth, maps["sigma"], maps["roughness"], shrink), stated
 
 
-def _compare_orders(cues: Cues, network: Network, run: RunNetwork, shrink: float) -> OrderTest | None:
+def _compare_orders(cues: Cues, network: Network, run: RunNetwork) -> OrderTest | None:
     """Compare the orders of the shots by the mean error that the network expects, in a small picture.
 
     Under a wrong order the polarization fits no shape with this outline and shading, so the network expects
@@ -104,10 +104,11 @@ def _compare_orders(cues: Cues, network: Network, run: RunNetwork, shrink: float
     """
     if not cues.other_orders:
         return None
-    low = _reduce(_limit_radiance(cues), _TEST_SIZE / shrink)
+    scale = int(network.metadata["native_size"]) / max(cues.mask.shape)
+    low = _reduce(_limit_radiance(cues), _TEST_SIZE * min(scale, 1.0))
 
     def error(matrix: Floats) -> float:
-        predicted = augmentation.predict(_transformed(low, matrix), network, run, 1)
+        predicted = augmentation.predict([_transformed(low, matrix)], network, run, 1)
         return float(predicted["sigma"][low.mask].mean())
 
     errors = [error(other.matrix) for other in cues.other_orders]
@@ -171,32 +172,15 @@ def _reduce(cues: Cues, scale: float) -> Cues:
     )
 
 
-def _without_grid(normal: Floats, mask: NDArray[np.bool_]) -> Floats:
-    """Remove the network's grid artifact, a pattern that repeats every 2 px, from normals (H, W, 3).
-
-    For each of the four places in a 2×2 cell, the deviation that neighboring cells have in common is subtracted. Relief
-    does not repeat with the cells, so it remains.
-    """
-    whole = erode(mask, 1).astype(np.float32)
-    out = normal.astype(np.float32)
-    uneven = (out - cv2.sepFilter2D(out, -1, _BINOMIAL, _BINOMIAL)) * whole[..., None]
-    for place in (np.s_[y::2, x::2] for y in (0, 1) for x in (0, 1)):
-        common, share = (
-            cv2.GaussianBlur(np.ascontiguousarray(part[place]), (0, 0), _CELLS) for part in (uneven, whole)
-        )
-        out[place] -= common / np.maximum(share, REACHED)[..., None] * mask[place][..., None]
-    return out
-
-
-def _overview(seen: Cues, network: Network, run: RunNetwork) -> Floats:
+def _overview(seen: Cues, scale: float, network: Network, run: RunNetwork) -> Floats:
     """Mean lean (2, H, W) across the ray of the normals that the network predicts from pictures smaller than `seen`.
 
     The fewer the pixels, the more of the object the network takes in at once. One position alone is not reliable.
     """
     lean = np.zeros((2, *seen.mask.shape), np.float32)
     for size in _OVERVIEWS:
-        low = _reduce(seen, size)
-        normal = augmentation.predict(low, network, run, _OVERVIEW_POSITIONS)["normal"]
+        low = _reduce(seen, size * scale)
+        normal = augmentation.predict([low], network, run, _OVERVIEW_POSITIONS)["normal"]
         local = frames.to_ray_frame(frames.unit(normal), low.rays)[..., :2] * low.mask[..., None]
         lean += np.moveaxis(cv2.resize(local.astype(np.float32), seen.mask.shape[::-1]), -1, 0) / len(_OVERVIEWS)
     return lean
@@ -221,14 +205,14 @@ def _log_factor(light: Floats, seen: Cues) -> Floats:
     factor = np.log((light + FLOOR) / (np.maximum(seen.radiance, 0) + FLOOR))
     near, far = (
         _masked_filter(factor, known, kernel, 1e-3, cv2.BORDER_CONSTANT)
-        for kernel in (_BINOMIAL, cv2.getGaussianKernel(9, 2).astype(np.float32))
+        for kernel in (augmentation.BINOMIAL, cv2.getGaussianKernel(9, 2).astype(np.float32))
     )
     return np.where(known[..., None], near, far)
 
 
 def _smooth_gloss(image: Floats, mask: NDArray[np.bool_]) -> Floats:
     """Remove the network's grid artifact of one or two pixels from a map (H, W[, 3]) inside the mask."""
-    smooth = _masked_filter(image, mask, _BINOMIAL, REACHED)
+    smooth = _masked_filter(image, mask, augmentation.BINOMIAL, REACHED)
     return np.where(mask if image.ndim == 2 else mask[..., None], smooth, image)
 
 

@@ -193,14 +193,14 @@ def test_a_grid_of_the_network_does_not_reach_the_normals_and_relief_does():
     relief = 0.15 * np.sin(2 * np.pi * x / 7) + 0.05 * np.sin(2 * np.pi * y / 3)
     grid = 0.05 * np.where((x % 2 == 0) & (y % 2 == 1), 1.0, -0.3) * (x / 160)
     clean, seen_ = (np.stack([relief + part, 0 * x, 1 + 0 * x], axis=-1) * mask[..., None] for part in (0 * x, grid))
-    found = learned._without_grid(seen_, mask)
+    found = augmentation._without_grid(seen_, mask)
     core = cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     before, after = (np.sqrt(np.mean((n - clean)[core] ** 2)) for n in (seen_, found))
     pattern = (np.bincount(((x % 2) + 2 * (y % 2))[core], (n - clean)[..., 0][core]) for n in (seen_, found))
     uneven, even = (np.ptp(sums) for sums in pattern)
     assert even < 0.1 * uneven and after < before
-    assert np.array_equal(learned._without_grid(seen_ + 1, mask)[~mask], (seen_ + 1)[~mask].astype(np.float32))
-    bare = learned._without_grid(clean, mask)
+    assert np.array_equal(augmentation._without_grid(seen_ + 1, mask)[~mask], (seen_ + 1)[~mask].astype(np.float32))
+    bare = augmentation._without_grid(clean, mask)
     assert np.sqrt(np.mean((bare - clean)[core] ** 2)) < 0.02 * np.std(relief)
 
 
@@ -289,7 +289,7 @@ def test_averaged_over_turns_a_turned_object_gets_the_turned_maps(quarters: int,
         },
     )  # fmt: skip
     moved.rays[..., :2] = augmentation._turn_vectors(moved.rays[..., :2], quarters, mirror)
-    whole, turned = (augmentation.predict(c, lopsided(), run, 8) for c in (found, moved))
+    whole, turned = (augmentation.predict([c], lopsided(), run, 8) for c in (found, moved))
     np.testing.assert_allclose(turned["depth"], augmentation._turn(whole["depth"], quarters, mirror), atol=1e-4)
     expected = np.array(augmentation._turn(whole["normal"], quarters, mirror))
     expected[..., :2] = augmentation._turn_vectors(expected[..., :2], quarters, mirror)
