@@ -36,6 +36,7 @@ _RATIO = 0.85  # of the distances of the nearest and the second descriptor
 _SAMPLES = 200  # pairs of matches that are tried as the turn between two views
 _AGREES = np.radians(15.0)  # between matching normals after the right turn; normals of single views err by 3 to 8°
 _LEAST_MATCHES = 12  # of two views, with agreeing normals, and a third of all
+_MOST_POINTS = 3000  # those that most views see are used: the time of the adjustment grows with them
 _NORMAL_SIGMA = np.radians(5.0)  # 1σ of a normal, in the first turns
 _SCALES_PX = (12.0, 6.0, 3.0, 1.5, 1.0, 1.0)  # of the Cauchy weights, by round; the first turns err by some pixels
 _FAR = 3.0  # times the last of these; features beyond are wrong matches
@@ -83,7 +84,7 @@ class _Motion:
 
 
 @dataclass(frozen=True)
-class _Adjusted:
+class _AdjustedMotion:
     """Motion with its errors, and how well the features fit."""
 
     seen: _Sightings
@@ -112,7 +113,7 @@ def solve(seen: Mapping[str, Results], capture: Capture) -> SessionPoses:
     camera, metric = SessionCamera(capture.focal_px, 0.0, capture.principal_px, 0.0, 0.0), False
     if len(views) >= LEAST_VIEWS:
         sightings = _sightings(features, pairs, start, views)
-        doubt = max(*np.abs(capture.focal_doubt), 0.05 if capture.focal_known else 0.5)
+        doubt = max(*np.abs(capture.focal_doubt), 0.002 if capture.focal_known else 0.5)
         found = _adjusted(sightings, start, first.maps.view.focal, float(doubt))
         chart = first.color.metres_per_px
         distance, metric = (1.0, False) if chart is None else (chart * first.radiance.view.focal, True)
@@ -128,7 +129,7 @@ def solve(seen: Mapping[str, Results], capture: Capture) -> SessionPoses:
     return SessionPoses(camera, posed, {name: reason for name in names if name not in posed}, metric)
 
 
-def _camera(capture: Capture, seen: Results, found: _Adjusted) -> SessionCamera:
+def _camera(capture: Capture, seen: Results, found: _AdjustedMotion) -> SessionCamera:
     """Camera with the adjusted focal length and the stated distortion, which an object in the middle does not tell."""
     lens, change = seen.radiance.equipment.distortion, float(np.exp(found.motion.value[4]))
     k1, k2 = (0.0, 0.0) if lens is None else (lens.k1, lens.k2)
@@ -136,7 +137,7 @@ def _camera(capture: Capture, seen: Results, found: _Adjusted) -> SessionCamera:
     return SessionCamera(focal, focal * float(found.sigma[4]), capture.principal_px, k1, k2)
 
 
-def _posed(found: _Adjusted, distance: float, focal_px: float) -> dict[int, PosedView]:
+def _posed(found: _AdjustedMotion, distance: float, focal_px: float) -> dict[int, PosedView]:
     """Poses of the views with enough features, by number; the lens is `distance` from the axis."""
     seen, motion = found.seen, found.motion
     point = _points(seen, motion, found.near.astype(float))[0]
@@ -246,11 +247,13 @@ def _sightings(
     joined = coo_matrix((good[good], (one[good], other[good])), shape=(len(view),) * 2)
     _, track = csgraph.connected_components(joined, directed=False)
     use = np.unique(np.stack([track, view]), axis=1, return_index=True)[1]
-    use = use[np.bincount(track[use])[track[use]] > 1]
+    size = np.bincount(track[use])
+    longest = np.argsort(-size, kind="stable")[:_MOST_POINTS]
+    use = use[(size[track[use]] > 1) & np.isin(track[use], longest)]
     return _Sightings(np.searchsorted(views, view[use]), np.unique(track[use], return_inverse=True)[1], ray[use])
 
 
-def _adjusted(seen: _Sightings, first: _Motion, focal_px: float, doubt: float) -> _Adjusted:
+def _adjusted(seen: _Sightings, first: _Motion, focal_px: float, doubt: float) -> _AdjustedMotion:
     """The motion that fits the sightings best; `doubt` is the 1σ of the logarithm of the focal length."""
     count = (len(first.value) - 5) // 3
     prior = np.full(len(first.value), np.inf)
@@ -271,7 +274,7 @@ def _adjusted(seen: _Sightings, first: _Motion, focal_px: float, doubt: float) -
     near, jacobian = far < _FAR, np.asarray(best.jac)
     spread = float(np.sqrt(np.mean(error[near] ** 2))) * focal_px / scale
     sigma = spread * np.sqrt(np.abs(np.diag(np.linalg.pinv(jacobian.T @ jacobian))))
-    return _Adjusted(seen, _Motion(first.base, value), sigma, error, near)
+    return _AdjustedMotion(seen, _Motion(first.base, value), sigma, error, near)
 
 
 def _points(seen: _Sightings, motion: _Motion, weight: Floats) -> tuple[Floats, Floats]:

@@ -290,9 +290,20 @@ def _calibrate_colors(session: Session, wanted: SessionInput, report: Report) ->
 def _find_boards(
     session: Session, wanted: SessionInput, pool: ProcessPool | None, report: Report
 ) -> dict[str, BoardCorners]:
-    """Corners of the board by view; none if no view shows a board."""
+    """Corners of the board by view; none if no view shows a board.
+
+    Raises
+    ------
+    CaptureError
+        No view shows a board, and there are several sets of views.
+    """
     found = session.each(_find_board, _tasks(session, wanted), pool, _says(report, "exposures and board"))
     boards = {name: one for name, one in found.items() if isinstance(one, BoardCorners)}
+    if found and not boards and len(session.sets) > 1:
+        raise CaptureError(
+            "no view shows a board, which several sets of views need; shoot with the object on the board of "
+            "`polcap board`, or fuse one set"
+        )
     if boards or not found:
         session.left_out |= {name: one for name, one in found.items() if isinstance(one, str)}
         _enough(session)
@@ -310,18 +321,7 @@ def _find_board(task: ViewTask) -> BoardCorners | str:
 
 
 def _place_by_features(session: Session, wanted: SessionInput, report: Report) -> None:
-    """Give a session without a board its poses, from features of the views' maps, and compare its masks.
-
-    Raises
-    ------
-    CaptureError
-        There are several sets of views, or too few features.
-    """
-    if len(session.sets) > 1:
-        raise CaptureError(
-            "no view shows a board, which several sets of views need; shoot with the object on the board of "
-            "`polcap board`, or put the views of one set into the folder"
-        )
+    """Give a session without a board its poses, from features of the views' maps, and compare its masks."""
     report("no board: poses from features of the object")
     seen = {name: pipeline.reopen(out_of(wanted.folder, name), "infer")[0] for name in session.used}
     session.board = False
