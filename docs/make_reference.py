@@ -53,7 +53,7 @@ def settings_page() -> str:
         lines += ["", f"## {name}", "", "| setting | type | default | range | meaning [unit] |"]
         lines += ["| --- | --- | --- | --- | --- |"]
         for row in rows:
-            kind = row.kind.replace("Optional[float]", "float").removeprefix("Literal").strip("[]")
+            kind = row.kind.removeprefix("Literal").strip("[]")
             default = "unset" if row.default is None else f"`{row.default}`"
             lines.append(f"| `{row.key}` | {kind} | {default} | {row.limits or '–'} | {row.description} |")
     return "\n".join(lines) + "\n"

@@ -4,13 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from polcap import resource_limits
 from polcap.config import Config
 from polcap.formats.capture import reader as captures
-from polcap.images import ChartRequest, Device
+from polcap.images import Bools, ChartRequest, Device
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.cache import Progress, silent
@@ -51,7 +48,7 @@ def process(
     angles_deg: tuple[float, ...] | None = None,
     clockwise: bool = False,
     chart: ChartRequest = AUTO,
-    mask: NDArray[np.bool_] | None = None,
+    mask: Bools | None = None,
     estimator: Literal["network", "analytic"] | None = None,
     model: str | Path | None = None,
     device: Device = "cpu",

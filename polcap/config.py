@@ -9,7 +9,7 @@ import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import Meta
@@ -140,7 +140,8 @@ def settings(kind: type[msgspec.Struct] = Config) -> Iterator[Setting]:
             arms = [hint] if get_origin(hint) is Annotated else [*get_args(hint)] or [hint]
             meta = next((extra for arm in arms for extra in get_args(arm)[1:] if isinstance(extra, Meta)), Meta())
             kind = get_type_hints(section.type)[field.name]
-            word = str(kind).replace("typing.", "") if get_args(kind) else kind.__name__
+            choices = get_origin(kind) is Literal
+            word = str(kind).replace("typing.", "") if choices else (*get_args(kind), kind)[0].__name__  # without None
             yield Setting(f"{section.name}.{field.name}", word, field.default, _limits(meta), meta.description or "")
 
 

@@ -12,13 +12,18 @@ from enum import IntFlag
 from typing import Any, Literal, Protocol
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
+
+from polcap.calibration_values import Calibration
 
 Floats = NDArray[np.floating[Any]]
 Bits = NDArray[np.uint8]
 TexturePixels = NDArray[Any]  # uint8 or uint16; a share of the type's largest value
 Device = Literal["cpu", "cuda", "auto"]
 Bools = NDArray[np.bool_]
+Indices = NDArray[np.integer[Any]]
+Faces = NDArray[np.int32]  # (F, 3) vertices of triangles
 Role = Literal["shot", "ambient", "repeat", "chart", "cross"]
 NOT_IN_KEY = {"in_key": False}  # metadata of a field that cache keys ignore, because it does not change a result
 
@@ -102,123 +107,6 @@ class SensorImage(ArrayValue):
 
 
 @dataclass(frozen=True)
-class NoiseLine:
-    """Noise of a sensor at one ISO: variance = slope · signal + floor, for a pixel of the merged picture; white = 1."""
-
-    iso: float
-    slope: tuple[float, ...]  # (C,)
-    slope_sigma: tuple[float, ...]
-    floor: tuple[float, ...]  # (C,)
-    floor_sigma: tuple[float, ...]
-    electrons_at_white: tuple[float, ...]  # (C,) of one photosite
-    read_noise_electrons: tuple[float, ...]  # (C,) 1σ of one photosite
-    read_noise_sigma: tuple[float, ...] = ()  # (C,) e⁻, 1σ upwards
-    source: str = "flat frames"  # or "bracket"
-
-
-@dataclass(frozen=True)
-class Levels:
-    """Black and white level of a sensor, in counts."""
-
-    black: tuple[float, ...]  # per phase of the mosaic, row by row
-    black_sigma: tuple[float, ...]
-    black_stated: tuple[float, ...]  # from the file's metadata
-    white_stated: float  # from the file's metadata
-    white: float | None = None  # measured saturation; None if no frame saturated
-
-
-@dataclass(frozen=True)
-class Linearity:
-    """Linearity of a sensor: signal against exposure time."""
-
-    greatest_deviation: float  # from a straight line through 0, relative
-    power: float  # exponent of the exposure time; 1 is linear
-    power_sigma: float
-    darkest: float  # signal relative to white
-    brightest: float
-    exposures: int
-
-
-@dataclass(frozen=True)
-class Falloff:
-    """Light falloff of a lens: 1 + a r² + b r⁴ + c r⁶, r = 1 in the corners."""
-
-    coefficient: tuple[tuple[float, float, float], ...]  # (C, 3)
-    sigma: tuple[tuple[float, float, float], ...]
-    corner: tuple[float, ...]  # (C,) light in the corners relative to the middle
-    f_number: float | None = None  # of the photographs; the falloff is valid for these two
-    focal_length_mm: float | None = None
-
-
-@dataclass(frozen=True)
-class LensGeometry:
-    """Measured geometry of a lens: focal length, principal point and radial distortion, each with its 1σ.
-
-    A point that a pinhole camera sees at x appears at x (1 + k1 r² + k2 r⁴). x and r = |x| are measured from the
-    principal point, in focal lengths.
-    """
-
-    focal_px: float  # visible RAW px
-    focal_sigma_px: float
-    principal_px: tuple[float, float]  # visible RAW px
-    principal_sigma_px: float  # 0: assumed to be the picture's middle
-    k1: float
-    k1_sigma: float
-    k2: float
-    k2_sigma: float
-    size_px: tuple[int, int]  # width, height, visible RAW px
-    residual_px: float  # rms of the board's corners, RAW px
-    pinhole_residual_px: float  # the same without k1 and k2
-    photographs: int
-    board: str
-    focal_length_mm: float | None = None  # of the photographs; the geometry is valid for it
-
-
-@dataclass(frozen=True)
-class Polarizer:
-    """A polarizer on its ring: true angle = sense · stated angle + zero, from image x towards image up."""
-
-    zero_deg: float
-    zero_sigma_deg: float
-    sense: int  # 1: the ring counts from image x towards image up; −1: the other way
-    sense_known: bool  # False: assumed, because light of one axis does not determine it
-    extinction: tuple[float, ...]  # (C,) largest over smallest transmittance
-    extinction_sigma: tuple[float, ...]
-    frames: int
-
-
-@dataclass(frozen=True)
-class FlashEnergy:
-    """Variation of a flash's energy from pop to pop, relative to its mean."""
-
-    spread: float  # 1σ
-    spread_sigma: float
-    drift_per_pop: float
-    drift_sigma: float
-    pops: int
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """Measurements of `polcap calibrate` for one camera, lens and filter, each with its 1σ; None: not measured.
-
-    C is the number of color channels, 3 or 1.
-    """
-
-    made: str  # ISO 8601
-    camera: str  # make and model
-    lens: str
-    filter: str  # the polarizer's name, from the user
-    noise: tuple[NoiseLine, ...] = ()
-    levels: Levels | None = None
-    linearity: Linearity | None = None
-    falloff: Falloff | None = None
-    geometry: LensGeometry | None = None
-    polarizer: Polarizer | None = None
-    flash: FlashEnergy | None = None
-
-
-@dataclass(frozen=True)
 class FrameReading:
     """Options for reading the pixels of a frame's file."""
 
@@ -258,9 +146,8 @@ class Shot:
         return f"{np.degrees(self.angle):g}°"
 
 
-@dataclass(frozen=True)
-class CatalogEntry:
-    """Facts for the catalog of a collection, as the user states them; an empty text is not stated."""
+class CatalogEntry(Struct, frozen=True, forbid_unknown_fields=True):
+    """Facts for the catalog of a collection: the table `[catalog]` of capture.toml; an empty text is not stated."""
 
     title: str = ""  # of the object
     creator: str = ""  # person or institution that made the photographs
@@ -502,7 +389,7 @@ class Alignment:
 class ObjectMask(ArrayValue):
     """Mask of the object's pixels on the full-frame grid, the crop around them, and figures on the mask's quality."""
 
-    mask: NDArray[np.bool_]  # (H, W) full-frame grid
+    mask: Bools  # (H, W) full-frame grid
     crop: tuple[int, int, int, int]  # x0, y0, x1, y1 full-frame grid px, end exclusive
     source: Literal["automatic", "user"]
     doubt: float | None = None  # 1 − the expected IoU with the true mask; None without a network
@@ -548,11 +435,28 @@ class OutlineCheck:
     best: ShotOrder  # as stated, unless another order clearly fits better
     concentration: float  # 0…1, how well the AoLP follows the outline
     rival: ShotOrder | None = None  # another order that fits equally well; None: no other
+    score: float = 0.0  # −1…1, as `concentration`; negative if the AoLP is along the outline
 
     @property
     def as_stated(self) -> bool:
         """Whether the stated order and sense of the polarizer angles fit the outline best."""
         return self.best == ShotOrder(tuple(range(len(self.best.shots))))
+
+
+@dataclass(frozen=True)
+class OtherOrder:
+    """An order of the shots that the outline does not exclude."""
+
+    order: ShotOrder
+    matrix: Floats  # (3, 3) from the Stokes parameters by the stated order to those by this order
+
+
+@dataclass(frozen=True)
+class OrderTest:
+    """Comparison of the stated order of the shots with other orders, by the error that the network expects."""
+
+    rival: ShotOrder  # the other order with the least expected error
+    ratio: float  # its expected error over that of the stated order
 
 
 @dataclass(frozen=True)
@@ -584,6 +488,7 @@ class SelfCalibration:
     turned: TurnedShot = TurnedShot()
     found_sigma: float | None = None  # rad, 1σ of angles that were estimated; None: stated angles
     crossed: Floats | None = None  # (3,) factor from the crossed shot to the S0 of diffuse reflection; None without one
+    other_orders: tuple[OtherOrder, ...] = ()  # empty: the outline confirms the stated order
 
 
 @dataclass(frozen=True, repr=False)
@@ -593,7 +498,7 @@ class StokesImage(ArrayValue):
     stokes: Floats  # (3, H, W, 3) S0, S1, S2
     covariance: Floats  # (6, H, W, 3) 00 01 02 11 12 22
     quality: Bits  # (H, W)
-    mask: NDArray[np.bool_]  # (H, W)
+    mask: Bools  # (H, W)
     view: View  # of the crop
     residual: Floats | None  # (H, W) |measured − fitted| / S0 where K > 3
     body: MaskedImage | None = None  # S0 of the diffuse reflection only, from a crossed shot
@@ -611,12 +516,13 @@ class Cues(ArrayValue):
     normalized_stokes: Floats  # (2, H, W) (S1, S2)/√(S1² + S2²)
     diffuse_color: Floats  # (H, W, 3) unit length, 0 where dark
     rays: Floats  # (H, W, 3) unit vectors from the surface to the camera
-    mask: NDArray[np.bool_]  # (H, W)
+    mask: Bools  # (H, W)
     quality: Bits  # (H, W)
     view: View
     scale_sigma: float | None = None  # relative 1σ of the light on the chart against that on the object; None: no chart
     body: Floats | None = None  # (H, W, 3) radiance of the diffuse reflection only, from a crossed shot
-    body_known: NDArray[np.bool_] | None = None  # (H, W) where the crossed shot is valid
+    body_known: Bools | None = None  # (H, W) where the crossed shot is valid
+    other_orders: tuple[OtherOrder, ...] = ()
     detail: Floats | None = None  # (2H, 2W) float16, ln of the light of RAW pixels over these pixels, enlarged
 
 
@@ -647,11 +553,12 @@ class SurfaceMaps(ArrayValue):
     roughness: Floats  # (H, W) perceptual, α = roughness²
     depth_prior: Floats | None  # (H, W) coarse depth, growing away, mean about 0; unit: √(mask pixels/π) px
     confidence: Floats  # (H, W) expected normal error, degrees
-    mask: NDArray[np.bool_]  # (H, W)
+    mask: Bools  # (H, W)
     view: View
     estimator: str
     albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown, albedos are relative
     detail: Floats | None = None  # (2H, 2W) float16, ln of the albedo of RAW pixels over `diffuse`, enlarged
+    order: OrderTest | None = None  # None without a network, or without other orders
 
 
 class TextureMaps(Protocol):
@@ -681,7 +588,7 @@ class Mesh(ArrayValue):
     normals: Floats  # (V, 3) unit
     uv: Floats  # (V, 2) 0…1, v down (glTF)
     tangents: Floats  # (V, 4) unit, w = handedness
-    faces: NDArray[np.int32]  # (F, 3) counter-clockwise seen from outside
+    faces: Faces  # (F, 3) counter-clockwise seen from outside
     metric: bool
     pieces: int = 1  # number of separate parts, without specks
     cuts: float = 0.0  # length of the boundary inside the mask, both sides, over the length along the mask's outline
@@ -728,6 +635,6 @@ class GBuffer(ArrayValue):
 
     normal: Floats  # (H, W, 3) unit, camera frame; 0 outside
     depth: Floats  # (H, W) along the optical axis, growing away from the camera, m; NaN outside
-    mask: NDArray[np.bool_]  # (H, W)
+    mask: Bools  # (H, W)
     position: Floats  # (H, W, 3) in the object's own frame, for solid textures; 0 outside
     view: View

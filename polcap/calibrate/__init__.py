@@ -35,8 +35,8 @@ from polcap.calibrate import (
     sensor_levels,
 )
 from polcap.calibrate.calibration_photographs import Photograph, angle_folders, photographs_in
+from polcap.calibration_values import Calibration, NoiseLine
 from polcap.errors import CaptureError
-from polcap.images import Calibration, NoiseLine
 
 _FOLDERS = ("dark", "flat", "bracket", "flash", "lens", "polarizer")
 

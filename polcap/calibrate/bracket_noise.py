@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from polcap.calibrate import photon_transfer
 from polcap.calibrate.calibration_photographs import CLIP, Photograph, photographs_in
+from polcap.calibration_values import NoiseLine
 from polcap.errors import CaptureError
 from polcap.formats.capture import layouts
-from polcap.images import Floats, NoiseLine
+from polcap.images import Bools, Floats
 from polcap.optics import robust
 from polcap.stages.hdr import bracket, exposure, noise, planes
 from polcap.stages.hdr.planes import Signals
@@ -126,7 +127,7 @@ def _fit(level: Floats, variance: Floats, edges: Floats, part: NDArray[np.int_])
     """Fit one channel's noise line: slope and floor (2,), and 1σ from the scatter between parts of the picture."""
     least = 0.05 * float(np.median(variance))
 
-    def line(chosen: NDArray[np.bool_]) -> Floats:
+    def line(chosen: Bools) -> Floats:
         fit = robust.fit_noise_line(
             level[chosen], variance[chosen], noise.FREEDOM, least=least, edges=edges[chosen], outliers=True
         )

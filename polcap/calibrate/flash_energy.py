@@ -3,8 +3,8 @@
 import numpy as np
 
 from polcap.calibrate.calibration_photographs import Photograph, by_setting, center
+from polcap.calibration_values import FlashEnergy
 from polcap.errors import CaptureError
-from polcap.images import FlashEnergy
 
 _LEAST = 4  # pops
 _CLIPPED = 0.01

@@ -6,8 +6,9 @@ The light on the surface is never quite even, so its linear slope is fitted toge
 import numpy as np
 
 from polcap.calibrate.calibration_photographs import CLIP, Photograph, by_setting
+from polcap.calibration_values import Falloff
 from polcap.errors import CaptureError
-from polcap.images import Falloff, Floats
+from polcap.images import Floats
 from polcap.optics import sensor
 from polcap.optics.resize import area_mean
 

@@ -16,19 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.calibrate.calibration_photographs import Photograph
+from polcap.calibration_values import LensGeometry
 from polcap.errors import CaptureError, ChartError
 from polcap.formats import shipped_data
-from polcap.images import (
-    AngleStack,
-    ChartRequest,
-    ColorSensor,
-    Distortion,
-    Floats,
-    LensGeometry,
-    SensorImage,
-    View,
-    single_frames,
-)
+from polcap.images import AngleStack, ChartRequest, ColorSensor, Distortion, Floats, SensorImage, View, single_frames
 from polcap.optics import distortion, sensor
 from polcap.optics.projection import transform_points
 from polcap.stages import whitebalance

@@ -4,7 +4,7 @@ import numpy as np
 from scipy import stats
 
 from polcap.calibrate.calibration_photographs import Photograph, by_setting, center
-from polcap.images import Linearity
+from polcap.calibration_values import Linearity
 
 _LEAST = 0.02  # of white; below, the error of black matters more than a curve
 

@@ -11,11 +11,11 @@ Janesick, Photon Transfer, SPIE 2007, ch. 5; EMVA Standard 1288, release 4.0, ch
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap.calibrate.calibration_photographs import CLIP, Photograph, by_setting
+from polcap.calibration_values import NoiseLine
 from polcap.errors import CaptureError
-from polcap.images import Floats, NoiseLine, SensorImage
+from polcap.images import Bools, Floats, SensorImage
 from polcap.optics import robust, sensor
 
 _TILE = 16  # px; within a tile the lens's falloff changes nothing
@@ -57,7 +57,7 @@ def _points(photographs: list[Photograph]) -> Iterator[tuple[Floats, Floats, Flo
             yield (*_tiles(a, b, usable, ratio), photosites(one, a.shape[-1]))
 
 
-def _tiles(a: Floats, b: Floats, usable: NDArray[np.bool_], ratio: float) -> tuple[Floats, Floats]:
+def _tiles(a: Floats, b: Floats, usable: Bools, ratio: float) -> tuple[Floats, Floats]:
     """Noise of two frames per tile: signal (b + r² a) / (1 + r²) and variance var(b − r a) / (1 + r²), (T, C) each."""
     rows, columns = a.shape[0] // _TILE, a.shape[1] // _TILE
     shape = rows, _TILE, columns, _TILE

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from polcap.calibrate.calibration_photographs import Photograph, center
+from polcap.calibration_values import Polarizer
 from polcap.errors import CaptureError
-from polcap.images import Floats, Polarizer
+from polcap.images import Floats
 
 _LEAST = 5  # angles of the ring, for three unknowns and a scatter
 _CLIPPED = 0.01

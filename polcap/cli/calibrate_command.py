@@ -9,7 +9,7 @@ from polcap import terminal
 from polcap.cli.options import Json
 
 if TYPE_CHECKING:
-    from polcap.images import Calibration
+    from polcap.calibration_values import Calibration
 
 
 def calibrate(

@@ -1,7 +1,7 @@
 """`polcap export`: the asset of a result again, in other formats or for one program."""
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -41,6 +41,8 @@ def export(
     result: Result,
     gltf: Annotated[bool, Option("--gltf", help="asset/NAME.glb")] = False,
     obj: Annotated[bool, Option("--obj", help="asset/NAME.obj, .mtl and textures")] = False,
+    ply: Annotated[bool, Option("--ply", help="asset/NAME.ply, the mesh with a color per vertex")] = False,
+    stl: Annotated[bool, Option("--stl", help="asset/NAME.stl, the mesh alone, for printing")] = False,
     usd: Annotated[bool, Option("--usd", help="asset/NAME.usdc and textures (extra [usd])")] = False,
     usdz: Annotated[bool, Option("--usdz", help="asset/NAME.usdz, one file for phones (extra [usd])")] = False,
     materialx: Annotated[bool, Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
@@ -104,7 +106,7 @@ def _catalog_fields(stated: Sequence[str]) -> dict[str, str]:
     """Parse --about K=V: fields of `CatalogEntry` by name. Raises SettingError for an unknown field."""
     from polcap.images import CatalogEntry
 
-    known = [field.name for field in fields(CatalogEntry)]
+    known = CatalogEntry.__struct_fields__
     found = {}
     for text in stated:
         key, equals, found[key] = text.partition("=")

@@ -14,9 +14,10 @@ import numpy as np
 import tomli_w
 from msgspec import Meta
 
+from polcap.calibration_values import Calibration, LensGeometry
 from polcap.errors import CaptureError, ChartError
 from polcap.formats import atomic, own_folders, text_file
-from polcap.images import Calibration, ChartPlace, ColorCalibration, Distortion, Exif, LensGeometry, PatchColors
+from polcap.images import ChartPlace, ColorCalibration, Distortion, Exif, PatchColors
 from polcap.optics import distortion
 
 _FULL_TURN = 360.0  # degrees

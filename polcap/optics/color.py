@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.optics.namespace import array_namespace
 
 # Linear Rec.709 → CIE XYZ (white: Y = 1), IEC 61966-2-1:1999.
@@ -89,7 +89,7 @@ class MatrixFit:
     delta_e: Floats  # (N,) CIEDE2000; NaN for patches not used
 
 
-def fit_matrix(color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_]) -> MatrixFit:
+def fit_matrix(color: Floats, reference: Floats, position: Floats, usable: Bools) -> MatrixFit:
     """Fit a camera's matrix M, with light of slope e and glare b: M c = (1 + e·x) r + b (1, 1, 1).
 
     color and reference (N, 3) are the patches in camera channels c and linear Rec.709 r. position (N, 2) is their
@@ -114,7 +114,7 @@ def residuals(fit: MatrixFit, color: Floats, reference: Floats, position: Floats
     return delta_e(_reflectance(color, position, fit.matrix, fit.slope, np.asarray(fit.glare)), reference)
 
 
-def cross_validate(color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_]) -> Floats:
+def cross_validate(color: Floats, reference: Floats, position: Floats, usable: Bools) -> Floats:
     """CIEDE2000 (N,) of each usable patch under the matrix fitted to all others; NaN for patches not used.
 
     This is the error to expect for colors outside the fit. It needs 13 usable patches. Arguments as of `fit_matrix`.
@@ -128,7 +128,7 @@ def cross_validate(color: Floats, reference: Floats, position: Floats, usable: N
     return out
 
 
-def trimmed_residuals(color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_]) -> Floats:
+def trimmed_residuals(color: Floats, reference: Floats, position: Floats, usable: Bools) -> Floats:
     """CIEDE2000 (N,) of every patch under a matrix fitted to the best 60 % of the usable patches.
 
     A shadow or a hand over many patches would bias ordinary least squares, but not least trimmed squares. The search
@@ -155,9 +155,7 @@ def trimmed_residuals(color: Floats, reference: Floats, position: Floats, usable
     return delta_e(corrected[best], reference)
 
 
-def _fit_weighted(
-    color: Floats, reference: Floats, position: Floats, usable: NDArray[np.bool_]
-) -> tuple[Floats, Floats, Floats]:
+def _fit_weighted(color: Floats, reference: Floats, position: Floats, usable: Bools) -> tuple[Floats, Floats, Floats]:
     """Fit color matrices by least squares with Huber weights, from the `usable` patches (…, N).
 
     Returns matrix M (…, 3, 3), light slope e (…, 2) and glare b (…,) of `fit_matrix`.
@@ -174,7 +172,7 @@ def _fit_weighted(
     return matrix / exposure, slope, glare
 
 
-def _median(value: Floats, usable: NDArray[np.bool_]) -> Floats:
+def _median(value: Floats, usable: Bools) -> Floats:
     """Median (…,) of the usable values of (…, N)."""
     ordered, count = np.sort(np.where(usable, value, np.inf), axis=-1), usable.sum(axis=-1, keepdims=True)
     middle = [np.take_along_axis(ordered, at, axis=-1)[..., 0] for at in ((count - 1) // 2, count // 2)]
@@ -197,7 +195,6 @@ class _ChartEquations:
     """Linear equations of N chart patches × 3 channels for color matrix M, light slope e and glare b."""
 
     def __init__(self, color: Floats, reference: Floats, position: Floats) -> None:
-        self._color, self._reference, self._position = color, reference, position
         rows = np.zeros((3, len(color), 12))
         for channel in range(3):
             rows[channel, :, 3 * channel : 3 * channel + 3] = color

@@ -58,7 +58,7 @@ def total(a: Any) -> Any:
 
 def unit(a: Floats) -> Floats:
     """Unit vectors along vectors a (..., 3); 0 where a is 0."""
-    return np.asarray(a / np.maximum(dot(a, a) ** 0.5, 1e-12)[..., None])
+    return np.asarray(a / np.maximum(dot(a, a) ** 0.5, 1e-30)[..., None])
 
 
 def to_ray_frame(n: Any, v: Any) -> Any:

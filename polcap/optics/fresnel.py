@@ -37,19 +37,13 @@ def normal_reflectance(ior: Any) -> Any:
     return ((ior - 1) / (ior + 1)) ** 2
 
 
-def diffuse_dolp(c: Any, ior: Any) -> Any:
-    """ρ(θ) = T₋/T₊: the degree of linear polarization (DoLP) of diffuse reflection at zenith angle θ."""
-    plus, minus = transmission(c, ior)
-    return minus / plus
-
-
 def greatest_diffuse_dolp(ior: float) -> float:
     """Largest DoLP of diffuse reflection, at θ = 90°: (n² − 1)/(n² + 1)."""
     return (ior**2 - 1) / (ior**2 + 1)
 
 
 def cos_zenith_from_dolp(dolp: Any, ior: float) -> Any:
-    """Cosine (...,) of the zenith angle from the DoLP ρ (...,) of diffuse reflection: inverse of `diffuse_dolp`.
+    """Cosine (...,) of the zenith angle from the DoLP ρ (...,) T₋/T₊ of diffuse reflection.
 
     cos θ = (n − S)/√(S((1 + n²)S − 2n)) with S = √((1 + ρ)/(1 − ρ)) and the index n = `ior`. The DoLP is clipped to the
     range of this index.

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.optics import mueller
 
 SECTORS = 24  # parts of an outline, 15° each from the object's center; their scatter gives the error
@@ -27,12 +27,12 @@ class OutlineBand:
     sector: NDArray[np.int_]  # (N,) 0…23, part of the outline by direction from the object's center
 
 
-def disc_radius(mask: NDArray[np.bool_]) -> float:
+def disc_radius(mask: Bools) -> float:
     """Radius √(N/π) of a disc with as many pixels as the mask (H, W), px: the size of an object."""
     return float(np.sqrt(mask.sum() / np.pi))
 
 
-def depth(mask: NDArray[np.bool_]) -> Floats:
+def depth(mask: Bools) -> Floats:
     """Distance [px] of each object pixel to the outline (H, W); the picture's edge counts as outline."""
     return np.asarray(cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, 5)[1:-1, 1:-1])
 
@@ -50,7 +50,7 @@ def outward(inside: Floats, blur_px: float) -> tuple[Floats, Floats]:
     return np.stack([-dx, dy]) / (slope + 1e-6), slope  # rows run down
 
 
-def sectors(band: NDArray[np.bool_]) -> NDArray[np.int_]:
+def sectors(band: Bools) -> NDArray[np.int_]:
     """Sector 0…23 (N,) of each of the N pixels of a band (H, W) along the outline, by direction from its center."""
     y, x = np.nonzero(band)
     around = np.arctan2(y - y.mean(), x - x.mean()) if len(y) else np.zeros(0)

@@ -5,11 +5,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats, SensorImage
+from polcap.images import Bools, Floats, SensorImage
 from polcap.optics import demosaic
 from polcap.optics.morphology import dilate
-
-Bools = NDArray[np.bool_]
 
 
 def signal(image: SensorImage, full: bool = False) -> Floats:

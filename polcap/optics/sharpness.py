@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats, SensorImage
+from polcap.images import Bools, Floats, SensorImage
 from polcap.optics import sensor
 from polcap.optics.resize import block_means
 from polcap.optics.tiles import spread_over_cells
@@ -34,7 +34,7 @@ class Tiles:
     """Small tiles of one photograph, at places that are the same in all photographs."""
 
     light: Floats  # (T, TILE, TILE) mean of its photosites
-    usable: NDArray[np.bool_]  # (T,) unclipped and bright enough
+    usable: Bools  # (T,) unclipped and bright enough
 
 
 def places(image: SensorImage, clip: float) -> NDArray[np.int64]:
@@ -96,7 +96,7 @@ def _light(signal: Floats) -> Floats:
     return signal[..., 0] if signal.shape[2] == 1 else cv2.transform(signal, np.array([[0.25, 0.5, 0.25]]))
 
 
-def choose_tiles(light: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
+def choose_tiles(light: Floats, usable: Bools) -> NDArray[np.int64]:
     """Corners (T, 2) = (row, column) of the tiles with most detail in each part of a picture (H, W)."""
     rows, columns = light.shape[0] // TILE, light.shape[1] // TILE
     if not rows or not columns:
@@ -110,7 +110,7 @@ def choose_tiles(light: Floats, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
     return TILE * spread_over_cells(score, _CELLS, _PER_CELL)
 
 
-def extra_blur(tiles: Floats, usable: NDArray[np.bool_]) -> Floats:
+def extra_blur(tiles: Floats, usable: Bools) -> Floats:
     """Extra Gaussian blur (K,) of each photograph, 1σ [px], relative to the sharpest one; NaN: not measurable.
 
     tiles (K, T, n, n) are from K photographs of equal exposure, usable (K, T). A blur smaller than the scatter between

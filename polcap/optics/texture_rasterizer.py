@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats, Mesh
+from polcap.images import Bools, Floats, Mesh
 
 _SLACK = 1e-4  # px and barycentric coordinates by which a pixel may miss a triangle, so that none falls between two
 
@@ -16,7 +16,7 @@ class TexturePoints:
 
     corners: NDArray[np.int32]  # (N, 3) vertices of the triangle
     weights: Floats  # (N, 2) of the second and of the third corner
-    covered: NDArray[np.bool_]  # (H, W)
+    covered: Bools  # (H, W)
 
     def interpolate(self, value: Floats) -> Floats:
         """Values (N, C) at the pixels, from those (V, C) of the vertices."""
@@ -27,7 +27,7 @@ class TexturePoints:
         return np.asarray(out)
 
 
-def rasterize_frames(mesh: Mesh, height: int, width: int) -> tuple[Floats, NDArray[np.bool_]]:
+def rasterize_frames(mesh: Mesh, height: int, width: int) -> tuple[Floats, Bools]:
     """A mesh's normals and tangents (N, 7), interpolated at the covered pixels, and the mask (H, W) of these."""
     points = rasterize(mesh.uv, mesh.faces, height, width)
     return points.interpolate(np.concatenate([mesh.normals, mesh.tangents], axis=-1, dtype=np.float32)), points.covered

@@ -1,12 +1,9 @@
 """Normals and tangents of mesh vertices, as means over the triangles around them."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Floats
-from polcap.optics.frames import cross, dot
-
-Faces = NDArray[np.int32]
+from polcap.images import Faces, Floats
+from polcap.optics.frames import cross, dot, unit
 
 
 def vertex_frames(vertices: Floats, uv: Floats, faces: Faces) -> tuple[Floats, Floats]:
@@ -17,7 +14,7 @@ def vertex_frames(vertices: Floats, uv: Floats, faces: Faces) -> tuple[Floats, F
 
 def vertex_normals(vertices: Floats, faces: Faces) -> Floats:
     """Normals (V, 3) of mesh vertices (V, 3): unit, area-weighted means over the triangles around."""
-    return _unit(_sum_around(area_vectors(vertices, faces), faces, len(vertices)))
+    return unit(_sum_around(area_vectors(vertices, faces), faces, len(vertices)))
 
 
 def area_vectors(vertices: Floats, faces: Faces) -> Floats:
@@ -35,7 +32,7 @@ def vertex_tangents(vertices: Floats, uv: Floats, faces: Faces, normals: Floats)
     (u1, v1), (u2, v2) = ((uv[faces[:, k]] - uv[faces[:, 0]]).T for k in (1, 2))
     along = (one * v2[:, None] - two * v1[:, None]) * np.sign(u1 * v2 - u2 * v1)[:, None]
     tangents = _sum_around(along, faces, len(vertices))
-    tangents = _unit(tangents - normals * dot(normals, tangents)[:, None])
+    tangents = unit(tangents - normals * dot(normals, tangents)[:, None])
     return np.concatenate([tangents, np.ones((len(vertices), 1))], axis=-1)
 
 
@@ -43,7 +40,3 @@ def _sum_around(values: Floats, faces: Faces, count: int) -> Floats:
     """Sums (V, 3) of values (F, 3) over the triangles around each vertex."""
     corner = faces.ravel()
     return np.stack([np.bincount(corner, np.repeat(values[:, k], 3), count) for k in range(3)], axis=-1)
-
-
-def _unit(vector: Floats) -> Floats:
-    return np.asarray(vector / np.maximum(np.sqrt(dot(vector, vector)), 1e-30)[..., None])

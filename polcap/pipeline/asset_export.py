@@ -24,6 +24,7 @@ from polcap.formats.export import (
     materialx,
     obj,
     openlime_page,
+    ply_stl,
     provenance,
     relightable_layer,
     texture_set,
@@ -40,7 +41,19 @@ from polcap.stages import asset, surface
 
 _Writer = Callable[[], list[Path]]  # returns the files that it has written
 _NEEDED: tuple[Extra, ...] = ("object-normal",)  # by the format `iiif`
-_SUFFIXES = {".glb", ".obj", ".mtl", ".usdc", ".usdz", ".mtlx", ".exr", ".png", ".html"}  # of exported files
+_SUFFIXES = {
+    ".glb",
+    ".obj",
+    ".mtl",
+    ".ply",
+    ".stl",
+    ".usdc",
+    ".usdz",
+    ".mtlx",
+    ".exr",
+    ".png",
+    ".html",
+}  # of exported files
 _SHARING = {"obj", "usd", "materialx"}  # formats that share texture files
 
 
@@ -210,6 +223,8 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     writers: dict[Format, _Writer] = {
         "gltf": partial(_write_glb, folder / f"{stem}.glb", whole, options, words, encoder),
         "obj": partial(obj.write, folder / f"{stem}.obj", whole, stem, shared, comment),
+        "ply": partial(_write_mesh, folder / f"{stem}.ply", whole),
+        "stl": partial(_write_mesh, folder / f"{stem}.stl", whole),
         "usd": partial(_write_usd, folder / f"{stem}.usdc", whole, shared, words),
         "usdz": partial(_write_usdz, folder / f"{stem}.usdz", whole, words, encoder),
         "materialx": partial(_write_materialx, folder / f"{stem}.mtlx", whole, shared, comment),
@@ -291,6 +306,11 @@ def _write_glb(
     file: Path, content: Asset, options: gltf.GlbOptions, words: Mapping[str, str], encoder: TextureEncoder
 ) -> list[Path]:
     atomic.write(file, gltf.encode(content, file.stem, options, words, encoder))
+    return [file]
+
+
+def _write_mesh(file: Path, content: Asset) -> list[Path]:
+    ply_stl.write(file, content)
     return [file]
 
 

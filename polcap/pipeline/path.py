@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap.config import Config
 from polcap.errors import ObjectError
@@ -22,12 +21,15 @@ from polcap.formats.maps import maps_folder
 from polcap.formats.raw import frame_decoder
 from polcap.images import (
     AngleStack,
+    Bools,
     Capture,
     ChartRequest,
     ColorCalibration,
     Decode,
     Network,
+    OtherOrder,
     ReliefMesh,
+    SelfCalibration,
     SurfaceMaps,
 )
 from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
@@ -47,7 +49,7 @@ class UserInput:
     """Inputs of the path besides the photographs: chart, mask, networks, decoder."""
 
     chart: ChartRequest = AUTO
-    mask: NDArray[np.bool_] | None = None  # on the RAW pixels or on the grid of the merged picture
+    mask: Bools | None = None  # on the RAW pixels or on the grid of the merged picture
     network: Network | None = None  # None: the analytic estimator
     mask_network: Network | None = None  # None: the object is found by its contrast to the backdrop
     decode: Decode = frame_decoder.decode  # the pixels of a photograph
@@ -65,7 +67,7 @@ def path(capture: Capture | None, supplied: UserInput, config: Config, cache: Me
         object_ = cache.run(mask.segment, radiance, alignment, color, drawn, finder, onnx.run, config=config.mask)
         calibration = cache.run(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
         stokes_ = cache.run(stokes.solve, radiance, alignment, calibration, object_, config=config.stokes)
-        cues_ = cache.run(cues.compute, stokes_, color)
+        cues_ = cache.run(cues.compute, stokes_, color, cache.derive(other_orders, calibration))
         maps = cache.run(infer.estimate, cues_, supplied.network, onnx.run, config=config.infer)
         distance = cache.derive(distance_m, color, radiance)
         mesh = cache.run(surface.integrate, maps, distance, config=config.surface)
@@ -82,7 +84,7 @@ def results_of(made: Mapping[str, StageResult[Any]]) -> Results:
     return Results.partial(keys=keys, **{_FIELD[stage]: result.value for stage, result in made.items()})
 
 
-def on_grid(drawn: NDArray[np.bool_] | None, radiance: AngleStack) -> NDArray[np.bool_] | None:
+def on_grid(drawn: Bools | None, radiance: AngleStack) -> Bools | None:
     """Convert the user's mask to the grid of the merged picture (H, W).
 
     The user may draw it on that grid, or on the pixels of the RAW or of the mosaic.
@@ -103,6 +105,11 @@ def on_grid(drawn: NDArray[np.bool_] | None, radiance: AngleStack) -> NDArray[np
         return np.asarray(drawn[::step, ::step][:height, :width])
     sizes = dict.fromkeys(f"{n * width}×{n * height}" for n in (step, 1))
     raise ObjectError(f"--mask is {wide}×{tall} px; draw it on the picture's {' or '.join(sizes)} px")
+
+
+def other_orders(calibration: SelfCalibration) -> tuple[OtherOrder, ...]:
+    """Orders of the shots that the outline does not exclude; the estimators test them."""
+    return calibration.other_orders
 
 
 def distance_m(color: ColorCalibration, radiance: AngleStack) -> float | None:

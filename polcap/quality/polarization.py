@@ -2,10 +2,11 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import numpy as np
 
-from polcap.images import Floats, Quality, SelfCalibration, ShotOrder, StokesImage, SurfaceMaps, TurnedShot
+from polcap.images import Floats, OrderTest, Quality, SelfCalibration, ShotOrder, StokesImage, SurfaceMaps, TurnedShot
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
@@ -19,6 +20,7 @@ _SAME_DEG = 5.0  # axes nearer than this are the same angle
 _SURE = 2.5  # σ between sectors of the outline: least significance of a turn
 _CERTAIN = 0.8  # of the limit of the misfit: above, also good captures fit a turn (docs/benchmarks/gates.md)
 _CLEAR = 0.8  # least concentration of the AoLP about the outline, to estimate a common turn
+_LIKELIER = 1.1  # factor between expected errors that decides on an order (docs/benchmarks/gates.md)
 _ALONG = -0.3  # below: the AoLP is along the contour
 _DARK = 0.1  # albedo below which a glossy object shows mostly reflections of itself
 _WEAK_DOLP = 0.05  # of an outline: above, no shape counts as flattened; below, uneven light is light from the side
@@ -36,22 +38,42 @@ _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
 def order(found: Evidence) -> Gate:
-    """Gate on the order of the polarizer angles: the polarization along the outline fits the stated order and sense."""
+    """Gate on the order and sense of the polarizer angles.
+
+    The polarization along the outline decides, or the error that the network expects for this order and for others.
+    """
     outline, names = found.selfcal.outline, found.names
-    if outline.as_stated and outline.rival is not None:
+    test = _test(found)
+    better = None
+    if not outline.as_stated:
+        better, because = outline.best, "The outline fits"
+    elif test is not None and test.ratio < 1 / _LIKELIER:
+        better, because = test.rival, f"The network expects {1 / test.ratio:.1f} times smaller errors for"
+    if better is not None:
+        message = f"{because} the order {_named(better, names)} rather than the stated one"
+        steps = better.remedy(names)
+        remedy = f"{steps[:1].upper()}{steps[1:]}; or take the shots again in order"
+        return Gate("order", "fail", _named(better, names), "as stated", message, remedy, 45.0, unit="")
+    message = f"The outline supports the stated order (fit {outline.concentration:.2f} of 1)"
+    if _confirmed(test):
+        message = f"In any other order, the network expects errors that are at least {test.ratio:.1f} times as large"
+    elif outline.rival is not None:
         other = _named(outline.rival, names)
         message = f"The outline fits the order {other} as well as the stated one (fit {outline.concentration:.2f} of 1)"
-        better = "a rounded object or a chart" + ("" if len(names) > 3 else " or four angles")
-        remedy = f"Check folders and ring yourself; {better} would decide"
+        surer = "a rounded object or a chart" + ("" if len(names) > 3 else " or four angles")
+        remedy = f"Check folders and ring yourself; {surer} would decide"
         return Gate("order", "warn", "cannot tell", "as stated", message, remedy, unit="")
-    if outline.as_stated:
-        message = f"The outline supports the stated order (fit {outline.concentration:.2f} of 1)"
-        return Gate("order", "pass", "as stated", "as stated", message, unit="")
-    best = _named(outline.best, names)
-    message = f"The outline fits the order {best} better than the stated one"
-    steps = outline.best.remedy(names)
-    remedy = f"{steps[:1].upper()}{steps[1:]}; or take the shots again in order"
-    return Gate("order", "fail", best, "as stated", message, remedy, 45.0, unit="")
+    return Gate("order", "pass", "as stated", "as stated", message, unit="")
+
+
+def _test(found: Evidence) -> OrderTest | None:
+    """Test of the order by the network; None without one."""
+    return found.maps.order if hasattr(found, "maps") else None
+
+
+def _confirmed(test: OrderTest | None) -> TypeGuard[OrderTest]:
+    """Whether the network expects clearly larger errors in any other order: the object is polarized as it should be."""
+    return test is not None and test.ratio > _LIKELIER
 
 
 def _named(order: ShotOrder, names: list[str]) -> str:
@@ -213,7 +235,8 @@ def _light_of_body(body: rim.RimFigures, found: Evidence, limits: GateLimits) ->
     limit = limits.min_outline_dolp
     remedy = "Darken the room, keep the flash next to the lens, and photograph an ambient frame"
     zenith, roughness, albedo = _medians(found.maps)
-    if body.along < _ALONG:
+    confirmed = _confirmed(_test(found))
+    if body.along < _ALONG and not (confirmed and albedo < _DARK):  # dark gloss reflects itself
         return _along_contour(body.along, albedo, remedy)
     flat, dimmed = zenith < limits.min_zenith_deg, body.brightness < _DIMMED
     hint = "Trust the shape less: translucent objects polarize little"
@@ -229,7 +252,7 @@ def _light_of_body(body: rim.RimFigures, found: Evidence, limits: GateLimits) ->
             "a translucent object (wax, skin, milk), or ambient light"
         )
         return Gate("body", "warn", round(body.dolp, 4), limit, message, hint, _TRANSLUCENT_DEG)
-    if body.concentration < (least := limits.min_concentration):
+    if body.concentration < (least := limits.min_concentration) and not confirmed:
         message = (
             f"Polarization hardly follows the outline (fit {body.concentration:.2f} of 1): ambient light, "
             "shots in a wrong order, or an object with sharp edges as outline"

@@ -5,7 +5,6 @@ assumption. A gate that had nothing to measure is marked "not measured".
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
@@ -71,7 +70,7 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
         "focal_doubt": list(capture.focal_doubt),
         "shots": shots,
         "notes": list(capture.notes),
-        "catalog": {key: text for key, text in asdict(capture.catalog).items() if text},
+        "catalog": {key: text for key, text in msgspec.structs.asdict(capture.catalog).items() if text},
     }
 
 

@@ -47,7 +47,7 @@ def turntable(maps: SurfaceMaps, mesh: ReliefMesh, ior: float) -> list[Picture]:
         turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
         moved = np.broadcast_to(middle, (*inside.shape, 3)).copy()
         moved[inside] = (points - middle) @ turn.T + middle
-        ray = -moved / np.linalg.norm(moved, axis=-1, keepdims=True)
+        ray = frames.unit(-moved)
         shaded = _shade(small, small.normal @ turn.T, ray, _TURNTABLE_LIGHT, ior)
         drawn.append(_draw_points(moved[inside], shaded[inside], small.view, inside.shape))
     return _to_srgb(drawn)

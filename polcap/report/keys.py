@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 
 Palette = Literal["inferno", "viridis", "wheel", "balance"]
 LEVELS = 255
@@ -30,7 +30,7 @@ class ColorKey:
     power: float = 1.0  # number = low + (high − low)·level^power: 2 gives small numbers more levels
     digits: int = 2  # behind the decimal point
 
-    def level(self, value: Floats, inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    def level(self, value: Floats, inside: Bools) -> NDArray[np.uint8]:
         """Convert values low…high to levels 1…255, clipped; 0 outside the object and for values that are not finite."""
         known = inside & np.isfinite(value)
         share = (np.where(known, value, self.low) - self.low) / (self.high - self.low)
@@ -44,7 +44,7 @@ class ColorKey:
         """Position of a value on the color bar, 0…1."""
         return float(np.clip((value - self.low) / (self.high - self.low), 0, 1) ** (1 / self.power))
 
-    def picture(self, value: Floats, inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    def picture(self, value: Floats, inside: Bools) -> NDArray[np.uint8]:
         """Convert values to colors (H, W, 3), black outside the object."""
         return np.concatenate([np.zeros((1, 3), np.uint8), colors(self.palette)])[self.level(value, inside)]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.formats import html
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.optics.color import srgb_eight_bits
 from polcap.report import keys
 from polcap.report.keys import ColorKey
@@ -72,7 +72,7 @@ def differences(small: PageMaps, rendering: Rerendering, rms: Sequence[float | N
     ]
 
 
-def scalar(name: str, title: str, note: str, value: Floats, inside: NDArray[np.bool_], key: ColorKey) -> MapFigure:
+def scalar(name: str, title: str, note: str, value: Floats, inside: Bools, key: ColorKey) -> MapFigure:
     """Figure of a map with one number per pixel."""
     probe = {name: getattr(key, name) for name in ("low", "high", "power", "palette", "unit", "digits")}
     palette = keys.colors(key.palette)
@@ -85,7 +85,7 @@ def scalar(name: str, title: str, note: str, value: Floats, inside: NDArray[np.b
     return MapFigure(name, title, note, image, {"kind": "scalar", **probe}, bar, ticks)
 
 
-def normal(name: str, title: str, vectors: Floats, inside: NDArray[np.bool_]) -> MapFigure:
+def normal(name: str, title: str, vectors: Floats, inside: Bools) -> MapFigure:
     """Figure of a normal map."""
     y, x = np.mgrid[1:-1:96j, -1:1:96j]
     z2 = 1 - x * x - y * y
@@ -105,7 +105,7 @@ def css_colors(rgb: NDArray[np.uint8]) -> tuple[str, ...]:
     return tuple(f"#{bytes(color).hex()}" for color in rgb)
 
 
-def _albedo(name: str, title: str, note: str, linear: Floats, inside: NDArray[np.bool_], top: float) -> MapFigure:
+def _albedo(name: str, title: str, note: str, linear: Floats, inside: Bools, top: float) -> MapFigure:
     """Figure of a color map with values from 0 to `top`."""
     image = html.jpeg(_extend(srgb_eight_bits(linear / top), inside), whole_color=True)
     bar = srgb_eight_bits(np.linspace(0, 1, 17))[:, None].repeat(3, axis=1)
@@ -118,7 +118,7 @@ def _normal_colors(vectors: Floats) -> NDArray[np.uint8]:
     return np.rint(255 * (vectors / 2 + 0.5)).astype(np.uint8)
 
 
-def _extend(picture: NDArray[np.uint8], inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def _extend(picture: NDArray[np.uint8], inside: Bools) -> NDArray[np.uint8]:
     """Continue a picture a few pixels beyond the object's outline, for smooth scaling; black farther out."""
     if not inside.any():
         return np.zeros_like(picture)

@@ -6,11 +6,10 @@ from typing import Any, get_args
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap.config import Config
 from polcap.formats import html, shipped_data
-from polcap.images import Floats
+from polcap.formats.maps import png
 from polcap.optics.color import srgb_eight_bits
 from polcap.report import keys, labels, map_figures, page_data, plots
 from polcap.report import stage_pictures as pictures
@@ -162,16 +161,12 @@ def _mesh_preview(results: Results, settings: Mapping[str, Any]) -> dict[str, An
     low = mesh.vertices.min(axis=0)
     extent = np.maximum(mesh.vertices.max(axis=0) - low, 1e-9)
     return {
-        "position": html.packed(_sixteen_bits((mesh.vertices - low) / extent)),
-        "uv": html.packed(_sixteen_bits(mesh.uv)),
+        "position": html.packed(png.sixteen_bits((mesh.vertices - low) / extent)),
+        "uv": html.packed(png.sixteen_bits(mesh.uv)),
         "faces": html.packed(np.diff(mesh.faces.astype(np.int32).ravel(), prepend=np.int32(0))),
         "low": low.tolist(),
         "extent": extent.tolist(),
     }
-
-
-def _sixteen_bits(share: Floats) -> NDArray[np.uint16]:
-    return np.asarray(np.rint(np.clip(share, 0, 1) * 65535), np.uint16)
 
 
 def _plots(about: Mapping[str, Any], results: Results) -> dict[str, Any]:

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import AngleStack, ColorCalibration, Cues, Floats, ReliefMesh, SurfaceMaps, View
+from polcap.images import AngleStack, Bools, ColorCalibration, Cues, Floats, ReliefMesh, SurfaceMaps, View
 from polcap.optics import frames, shade
 from polcap.optics.resize import area_mean
 from polcap.report.reduction import ObjectReduction
@@ -56,7 +55,7 @@ class Rerendering:
     flashed: Floats  # (H, W, 3) S0 of the maps under that flash, linear Rec.709
     scale: float  # brightness of the photographs over that of the re-rendering, median of the pixels
 
-    def rms(self, inside: NDArray[np.bool_]) -> list[float]:
+    def rms(self, inside: Bools) -> list[float]:
         """Root mean square difference between photograph and re-rendering at each angle, relative to white."""
         return [float(np.sqrt(np.mean((m - p)[inside] ** 2))) for m, p in zip(self.measured, self.predicted)]
 

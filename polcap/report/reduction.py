@@ -3,16 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Floats, SurfaceMaps
+from polcap.images import Bools, Floats, SurfaceMaps
+from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 
 
 class ObjectReduction:
     """Reduction of images (H, W, …) to at most `longest` px a side: means over the object's pixels `inside` (H, W)."""
 
-    def __init__(self, inside: NDArray[np.bool_], longest: int) -> None:
+    def __init__(self, inside: Bools, longest: int) -> None:
         height, width = inside.shape
         self.inside = inside
         self.factor = min(1.0, longest / max(height, width))
@@ -26,12 +26,11 @@ class ObjectReduction:
 
     def maps(self, maps: SurfaceMaps) -> SurfaceMaps:
         """Reduce all maps of a result; the network's coarse depth is left out."""
-        normal = self.mean(maps.normal)
         x, y = ((edge + 0.5) * self.factor - 0.5 for edge in maps.view.center)
         left, top = (edge * self.factor for edge in maps.view.origin)
         return replace(
             maps,
-            normal=normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6),
+            normal=frames.unit(self.mean(maps.normal)),
             diffuse=self.mean(maps.diffuse),
             specular=self.mean(maps.specular),
             roughness=self.mean(maps.roughness),

@@ -15,6 +15,7 @@ from polcap.images import (
     Alignment,
     AngleStack,
     Asset,
+    Bools,
     ColorCalibration,
     Cues,
     Floats,
@@ -122,12 +123,12 @@ def display(linear: Floats, top: float | None = None) -> Picture:
     return color.srgb_eight_bits(np.asarray(linear, np.float32) / np.float32(top or _top(linear)))
 
 
-def scale(value: Floats, low: float, high: float, inside: NDArray[np.bool_]) -> Picture:
+def scale(value: Floats, low: float, high: float, inside: Bools) -> Picture:
     """Convert values low…high to colors from dark to bright, black outside the object."""
     return keys.ColorKey(low, max(high, low + 1e-12), "", (), "inferno").picture(value, inside)
 
 
-def hue(aolp: Floats, inside: NDArray[np.bool_]) -> Picture:
+def hue(aolp: Floats, inside: Bools) -> Picture:
     """Convert an angle of polarization (modulo π) to a hue."""
     return keys.AOLP.picture(np.degrees(aolp) % 180, inside)
 
@@ -181,7 +182,7 @@ def _stokes(image: StokesImage) -> list[Tile]:
     s0, s1, s2 = frames.total(image.stokes)
     dolp = np.hypot(s1, s2) / np.maximum(s0, 1e-6)
     tile = Tile(display(image.stokes[0]), "S0", note="camera channels, brightest parts white")
-    return [tile, *_polarization(dolp, np.arctan2(s2, s1) / 2, image.mask)]
+    return [tile, *polarization(dolp, np.arctan2(s2, s1) / 2, image.mask)]
 
 
 def _cues(found: Cues) -> list[Tile]:
@@ -191,14 +192,15 @@ def _cues(found: Cues) -> list[Tile]:
     normalized = _eight_bits(np.stack([np.full_like(cos, 0.5), cos / 2 + 0.5, sin / 2 + 0.5], -1) * inside)
     return [
         Tile(display(found.radiance), "S0", note="calibrated colors, brightest parts white"),
-        *_polarization(found.dolp, np.arctan2(sin, cos) / 2, found.mask),
+        *polarization(found.dolp, np.arctan2(sin, cos) / 2, found.mask),
         Tile(normalized, "Normalized Stokes parameters", note="green S1, blue S2: 0.5 is zero"),
         Tile(display(found.diffuse_color * inside, 1.0), "Diffuse color", note="normalized to unit length"),
         Tile(keys.SIGMA.picture(found.ratio_sigma, found.mask), "Noise of S1/S0 and S2/S0, 1σ", keys.SIGMA),
     ]
 
 
-def _polarization(dolp: Floats, aolp: Floats, inside: NDArray[np.bool_]) -> list[Tile]:
+def polarization(dolp: Floats, aolp: Floats, inside: Bools) -> list[Tile]:
+    """Tiles of DoLP and of AoLP [rad] (H, W), black outside the object."""
     return [
         Tile(keys.DOLP.picture(dolp, inside), "Degree of linear polarization", keys.DOLP),
         Tile(hue(aolp, inside), "Angle of linear polarization", keys.AOLP),

@@ -8,7 +8,6 @@ import numpy as np
 from polcap.formats.maps import png
 from polcap.images import Floats
 from polcap.optics import mueller
-from polcap.report import keys
 from polcap.report import stage_pictures as pictures
 from polcap.report.sheets import Tile, sheet
 
@@ -26,11 +25,9 @@ def write(folder: Path, angle_deg: Sequence[float], small: Sequence[Floats]) -> 
     s0, s1, s2 = np.tensordot(np.linalg.pinv(weights), light, axes=1)
     inside = s0 > _FADE * np.percentile(s0, 99.5)
     dolp = np.hypot(s1, s2) / np.maximum(s0, 1e-6)
-    aolp = np.degrees(np.arctan2(s2, s1) / 2) % 180
     tiles = [
         Tile(pictures.display(np.repeat(s0[..., None], 3, -1)), "S0"),
-        Tile(keys.DOLP.picture(dolp, inside), "Degree of linear polarization", keys.DOLP),
-        Tile(keys.AOLP.picture(aolp, inside), "Angle of linear polarization", keys.AOLP),
+        *pictures.polarization(dolp, np.arctan2(s2, s1) / 2, inside),
     ]
     file = folder / NAME
     png.write(file, sheet(tiles))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from polcap.errors import InputError
 from polcap.formats import scene_files
-from polcap.images import Floats, GBuffer, View
+from polcap.images import Bools, Floats, GBuffer, View
 from polcap.optics import frames
 
 _LEAST_FACING = 0.01  # least cosine between normal and view; smoothing may turn normals away from the camera
@@ -39,15 +39,15 @@ def smooth(vertices: Floats, faces: NDArray[np.integer], crease: float = 0.75) -
     _, place = np.unique(np.round(vertices / grain).astype(np.int64), axis=0, return_inverse=True)
     place = place.reshape(-1)[index]  # (F, 3)
     corner = vertices[index]
-    flat = _unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+    flat = frames.unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
     total = np.zeros((place.max() + 1, 3), dtype=np.float64)
     for k in range(3):
-        ahead, back = (_unit(corner[:, (k + j) % 3] - corner[:, k]) for j in (1, 2))
+        ahead, back = (frames.unit(corner[:, (k + j) % 3] - corner[:, k]) for j in (1, 2))
         angle = np.arccos(np.clip(np.sum(ahead * back, axis=1), -1, 1))
         for axis in range(3):
             total[:, axis] += np.bincount(place[:, k], weights=angle * flat[:, axis], minlength=len(total))
     flat = flat[:, None, :]
-    shared = _unit(total)[place]  # (F, 3, 3)
+    shared = frames.unit(total)[place]  # (F, 3, 3)
     sharp = np.sum(shared * flat, axis=-1, keepdims=True) < np.cos(crease)
     return Triangles(vertices, index, np.where(sharp, flat, shared).astype(np.float32))
 
@@ -96,7 +96,7 @@ class Tracer:
         TriangleMesh(self._scene, mesh.vertices, mesh.faces)
         self.size = float(np.ptp(mesh.vertices, axis=0).max())
         corner = mesh.vertices[mesh.faces].astype(np.float64)
-        self._flat = _unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+        self._flat = frames.unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
 
     def trace(self, rotation: Floats, translation: Floats, view: View, height: int, width: int) -> GBuffer:
         """G-buffer of the mesh with vertices at rotation @ vertex + translation [m, camera frame].
@@ -121,7 +121,7 @@ class Tracer:
         b, c = hit["u"][index], hit["v"][index]
         weight = np.stack([1 - b - c, b, c], axis=1)
         position = np.sum(self.mesh.vertices[self.mesh.faces[face]] * weight[..., None], axis=1)
-        normal = _unit(np.sum(self.mesh.corner_normals[face] * weight[..., None], axis=1))
+        normal = frames.unit(np.sum(self.mesh.corner_normals[face] * weight[..., None], axis=1))
         return MeshHits(index, position, normal, face, weight)
 
     def facing(self, origin: Floats, direction: Floats) -> tuple[Floats, Floats]:
@@ -133,7 +133,7 @@ class Tracer:
         normal = np.where(np.sum(normal * direction, axis=1, keepdims=True) > 0, -normal, normal)
         return np.where(struck, hit["tfar"], np.inf), normal
 
-    def hidden(self, origin: Floats, target: Floats) -> NDArray[np.bool_]:
+    def hidden(self, origin: Floats, target: Floats) -> Bools:
         """True where the mesh hides points (P, 3) from targets, (P, 3) or (3,)."""
         way = target - origin
         far = np.linalg.norm(way, axis=1)
@@ -161,7 +161,7 @@ def face_camera(normal: Floats, v: Floats) -> Floats:
     facing = np.sum(normal * v, axis=-1, keepdims=True)
     normal = np.where(facing < -0.3, -normal, normal)
     facing = np.where(facing < -0.3, -facing, facing)
-    return _unit(normal + np.maximum(_LEAST_FACING - facing, 0.0) * v)
+    return frames.unit(normal + np.maximum(_LEAST_FACING - facing, 0.0) * v)
 
 
 def scatter(value: Floats, at: NDArray[np.integer], size: tuple[int, ...], empty: float = 0.0) -> Floats:
@@ -169,7 +169,3 @@ def scatter(value: Floats, at: NDArray[np.integer], size: tuple[int, ...], empty
     out = np.full((size[0] * size[1], *value.shape[1:]), empty, dtype=np.float32)
     out[at] = value
     return out.reshape(*size, *value.shape[1:])
-
-
-def _unit(v: Floats) -> Floats:
-    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-20))

@@ -16,7 +16,7 @@ from scipy.ndimage import minimum_filter
 from scipy.spatial.transform import Rotation
 
 from polcap.errors import SettingError
-from polcap.images import Floats, GBuffer, View
+from polcap.images import Floats, GBuffer, Indices, View
 from polcap.optics import body, frames, fresnel, shade
 from polcap.synth import color_checker as charts
 from polcap.synth import interreflection, laid_board, mesh_tracer, scene_materials, trace
@@ -24,7 +24,7 @@ from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Model, Shape
 from polcap.synth.laid_board import LaidBoard
 from polcap.synth.scene_materials import Coat
-from polcap.synth.trace import Hits, Indices, Vector
+from polcap.synth.trace import Hits, Vector
 
 _ROUGH = body.Law(rough=1.0)  # facets with the roughness of the gloss, all with the same weight
 

@@ -6,18 +6,15 @@ Hart, Sphere tracing, The Visual Computer 1996.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from polcap.images import Bools, Floats
+from polcap.images import Bools, Floats, Indices
 from polcap.synth import mesh_tracer
 from polcap.synth.distance_fields import Model, Shape
 
 Vector = tuple[float, float, float]
-Indices = NDArray[np.integer[Any]]
 _TOLERANCE = 1e-6  # m, distance at which a ray has arrived
 _STEPS = 300  # most steps of a ray
 _GRAZING = 1e-4  # m, the same after the last step, for rays along the surface

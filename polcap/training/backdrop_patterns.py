@@ -5,12 +5,13 @@ from collections.abc import Callable
 import numpy as np
 
 from polcap.images import Floats
+from polcap.training import random_shapes
 
 
 def draw_pattern(position: Floats, rng: np.random.Generator) -> Floats:
     """Albedo (M, 3) of a random pattern in two to six colors at points (M, 3); unit: the object's longest side."""
     u, w = _plane_coordinates(position, rng)
-    size = float(np.exp(rng.uniform(np.log(0.05), np.log(0.9))))
+    size = random_shapes.log_uniform(0.05, 0.9, rng)
     if rng.random() < 0.4:  # uneven cloth
         u = u + 0.15 * size * _waves(u / size, w / size, rng)
     level = _PATTERNS[rng.integers(len(_PATTERNS))](u / size, w / size, rng)
@@ -20,7 +21,7 @@ def draw_pattern(position: Floats, rng: np.random.Generator) -> Floats:
 def draw_print(position: Floats, rng: np.random.Generator) -> Floats:
     """Albedo (M, 3) of a printed pattern in two colors (checks, stripes, dots, markers) at points (M, 3)."""
     u, w = _plane_coordinates(position, rng)
-    size = float(np.exp(rng.uniform(np.log(0.04), np.log(0.5))))
+    size = random_shapes.log_uniform(0.04, 0.5, rng)
     u, w = u / size, w / size
     kind = rng.integers(4)
     if kind == 0:
@@ -32,7 +33,7 @@ def draw_print(position: Floats, rng: np.random.Generator) -> Floats:
     else:  # squares with random cells, as on a board of markers
         cells = rng.random((7, 7)) < 0.5
         second = cells[np.floor(5 * u).astype(int) % 7, np.floor(5 * w).astype(int) % 7]
-    colors = np.exp(rng.uniform(np.log(0.02), np.log(0.9), (2, 1))) * np.exp(rng.normal(0, 0.25, (2, 3)))
+    colors = random_shapes.log_uniform(0.02, 0.9, rng, (2, 1)) * np.exp(rng.normal(0, 0.25, (2, 3)))
     return np.asarray(np.clip(colors[second.astype(int)], 0.005, 0.95))
 
 
@@ -45,7 +46,7 @@ def _plane_coordinates(position: Floats, rng: np.random.Generator) -> tuple[Floa
 def _color(level: Floats, rng: np.random.Generator) -> Floats:
     """Map pattern levels 0…1 (M,) to colors (M, 3): a few discrete colors, or a gradient between them."""
     count = int(rng.integers(2, 7))
-    middle = np.exp(rng.uniform(np.log(0.015), np.log(0.9)))
+    middle = random_shapes.log_uniform(0.015, 0.9, rng)
     contrast, hue = rng.uniform(0.15, 1.3), rng.choice([0.05, 0.2, 0.5])
     colors = middle * np.exp(contrast * rng.normal(size=(count, 1)) + hue * rng.normal(size=(count, 3)))
     colors = np.clip(colors, 0.004, 0.95)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from polcap.images import Floats, GBuffer
+from polcap.images import Bools, Floats, GBuffer, Indices
 from polcap.optics import brdf, frames, shade
 from polcap.optics.projection import project
 from polcap.synth import mesh_tracer
@@ -37,12 +37,10 @@ _MAX_DISTANCE = 0.01  # sides of the object between a hit and the place that its
 
 _LOG_ALBEDO = (log(0.01), log(0.5))  # of backdrop and ground: dark cloth to paper
 
-Indices = NDArray[np.integer[Any]]
-
 
 def trace_visibility(
     tracer: Tracer, buffer: GBuffer, pose: light_transport.LitPose, rng: np.random.Generator
-) -> tuple[NDArray[np.bool_], NDArray[np.uint16]]:
+) -> tuple[Bools, NDArray[np.uint16]]:
     """Trace one view: the pixels (H, W) that the flash reaches, and the pixels that bounce rays hit.
 
     The latter are flat indices (H/2, W/2, RAYS); ESCAPED or NOWHERE for rays that hit no pixel of the picture.

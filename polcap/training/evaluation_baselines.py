@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from polcap.errors import InputError
 from polcap.images import Cues, SurfaceMaps
 from polcap.optics import frames
+from polcap.optics.outline import disc_radius
 from polcap.stages.cues import channels
 from polcap.training import main_network, train
 from polcap.training.evaluation_protocol import Case, Protocol
@@ -38,12 +39,11 @@ def inflated(seen: Cues) -> SurfaceMaps:
     height = np.sqrt(np.maximum(reach**2 - (reach - distance) ** 2, 0))
     smooth = cv2.GaussianBlur(height.astype(np.float32), (0, 0), 0.06 * reach + 1)
     down, right = np.gradient(smooth)
-    local = np.stack([-right, down, np.ones_like(right)], axis=-1)
-    local = local / np.linalg.norm(local, axis=-1, keepdims=True)
+    local = frames.unit(np.stack([-right, down, np.ones_like(right)], axis=-1))
     return replace(
         frontal(seen), normal=np.asarray(frames.from_ray_frame(local, seen.rays)),
         diffuse=np.clip(seen.radiance / np.maximum(local[..., 2:], 0.2), 0, 1),
-        depth_prior=-smooth / np.sqrt(seen.mask.sum() / np.pi), estimator="silhouette",
+        depth_prior=-smooth / disc_radius(seen.mask), estimator="silhouette",
     )  # fmt: skip
 
 
@@ -98,7 +98,7 @@ def network_alone(checkpoint: Path) -> Estimator:
             enlarged[name] = larger[0].permute(1, 2, 0).numpy()
         normal = frames.from_ray_frame(enlarged["normal"], case.cues.rays)
         return SurfaceMaps(
-            normal=np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)),
+            normal=frames.unit(normal),
             diffuse=enlarged["diffuse"], specular=enlarged["specular"], roughness=enlarged["roughness"][..., 0],
             depth_prior=enlarged["depth"][..., 0], confidence=enlarged["sigma"][..., 0], mask=case.cues.mask,
             view=case.cues.view, estimator=checkpoint.parent.name,

@@ -7,15 +7,13 @@ roughness and F0 share one pattern, as in real materials. Unit of length: the lo
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polcap.formats import scene_files
-from polcap.images import Floats
+from polcap.images import Floats, Indices
 
 TEXTURES, PATTERNS = 10, 20  # of the figures in polcap's pages
 _SEED = 2021
@@ -24,7 +22,6 @@ _MAX_SLOPE = 0.6  # of the relief
 _ORDINARY, _STRONG = (0.030, 0.052), (0.06, 0.26)  # protocol 1: F0 of every second material, and of the others
 _COMMON, _RARE = (0.034, 0.055), (0.06, 0.18)  # protocol 2: F0 of four of five materials, and of the fifth
 
-Indices = NDArray[np.integer[Any]]
 Field = Callable[[Floats], tuple[Floats, Floats]]  # (M, 3) -> tone 0…1, depth of grooves 0…1; (M,) each
 
 

@@ -21,6 +21,7 @@ from polcap.formats import atomic
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import png
 from polcap.images import ChartRequest, Cues, Floats, Network
+from polcap.optics import frames
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
@@ -75,8 +76,7 @@ def score(folder: Path, angles: list[str], name: str, network: Network | None) -
     """Process one object's photographs; returns normal errors against the measured normals [°], and shares 0…1."""
     picture, vector = png.read(folder / "mask" / name), png.read(folder / "normal" / name)
     mask = np.asarray(picture > 0 if picture.ndim == 2 else (picture[..., :3] > 0).any(axis=-1))
-    truth = vector[..., :3].astype(np.float64) / np.iinfo(vector.dtype).max * 2 - 1
-    truth /= np.maximum(np.linalg.norm(truth, axis=-1, keepdims=True), 1e-6)
+    truth = frames.unit(vector[..., :3].astype(np.float64) / np.iinfo(vector.dtype).max * 2 - 1)
     with tempfile.TemporaryDirectory() as place:
         for angle in angles:
             (Path(place) / "shots" / angle).mkdir(parents=True)

@@ -7,15 +7,13 @@ and cameras are the same. A picture follows from its number, at any size. `CONDI
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from polcap.errors import InputError
-from polcap.images import Bits, ColorCalibration, Cues, Floats, Quality, StokesImage, SurfaceMaps, View
+from polcap.images import Bits, Bools, ColorCalibration, Cues, Floats, Indices, Quality, StokesImage, SurfaceMaps, View
 from polcap.optics import frames, resize
 from polcap.optics.body import SMOOTH, Law
 from polcap.stages import cues
@@ -183,9 +181,7 @@ def render_lights() -> Floats:
     return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=1)
 
 
-def stokes_image(
-    measured: tuple[Tensor, Tensor, Tensor], at: NDArray[np.integer[Any]], mask: NDArray[np.bool_], view: View
-) -> StokesImage:
+def stokes_image(measured: tuple[Tensor, Tensor, Tensor], at: Indices, mask: Bools, view: View) -> StokesImage:
     """Build a `StokesImage` from Stokes parameters, covariance and clipped flags measured at the pixels `at`."""
 
     def image(flat: Tensor) -> Floats:

@@ -11,9 +11,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats, Indices
 from polcap.optics import brdf, frames, fresnel, shade
 from polcap.optics.body import SMOOTH, Law
 from polcap.optics.namespace import array_namespace
@@ -23,7 +22,6 @@ LIFT = 1e-3  # longest sides of the mesh, from the surface to the start of a ray
 _HEMISPHERE_RAYS, _MIRROR_RAYS = 12, 6  # per place: over the hemisphere, and about the mirror direction
 _SMOOTH = 0.004  # 1σ of the average of traced light, picture sides
 
-Indices = NDArray[np.integer[Any]]
 Albedo = Callable[[Floats, Floats], Floats]  # places, facing directions (M, 3) -> diffuse albedo (M, 3)
 
 
@@ -41,7 +39,7 @@ class LitPose:
 class SurfacePoints:
     """Positions, normals and material of a mesh at the M visible pixels of a picture."""
 
-    mask: NDArray[np.bool_]  # (H, W)
+    mask: Bools  # (H, W)
     position: Floats  # (M, 3) mesh frame
     flat: Floats  # (M, 3) geometric normals of the triangles, mesh frame, towards the camera
     normal: Floats  # (M, 3) in the frame of each ray, with relief

@@ -7,6 +7,7 @@ import numpy as np
 from polcap.images import Bools, Floats, Quality, SurfaceMaps
 from polcap.optics import frames, shade
 from polcap.optics.morphology import erode
+from polcap.optics.outline import disc_radius
 from polcap.stages import surface
 from polcap.training.evaluation_protocol import Case, render_lights
 
@@ -70,7 +71,7 @@ class Judge:
             view=replace(maps.view, focal=maps.view.focal / by, center=(x / by, y / by), scale=maps.view.scale * by),
         )  # fmt: skip
         depth = surface.integrate(thinned, None, surface.SurfaceSettings()).depth[mask]
-        unit = float(depth.mean() * np.sqrt(mask.sum() / np.pi) / thinned.view.focal)
+        unit = float(depth.mean() * disc_radius(mask) / thinned.view.focal)
         return {"depth_integrated": _depth(depth / unit, self.case.depth[thin][mask])["depth"]}
 
     def _render(self, maps: SurfaceMaps) -> Floats:

@@ -19,7 +19,7 @@ from polcap.images import Bools, Floats
 from polcap.optics import frames
 from polcap.optics.body import SMOOTH
 from polcap.stages.mask.mask_channels import ReducedPicture, grid
-from polcap.training import backdrop_patterns, materials
+from polcap.training import backdrop_patterns, materials, random_shapes
 from polcap.training.mask_views import MaskView, meet_planes
 from polcap.training.materials import Surface
 
@@ -88,7 +88,7 @@ def simulate_measurement(color: Floats, sums: Floats, chart: Bools, rng: np.rand
     """
     bright = float(np.percentile(color.mean(-1), 98)) + 1e-9
     color, sums = color / bright, sums / bright
-    noise = float(np.exp(rng.uniform(np.log(3e-4), np.log(6e-3))))
+    noise = random_shapes.log_uniform(3e-4, 6e-3, rng)
     spread = noise * np.hypot(np.sqrt(np.maximum(color, 0)), rng.uniform(0.02, 0.2))
     color = color + spread * rng.standard_normal(spread.shape, np.float32)
     total = spread.sum(-1) / np.sqrt(3)
@@ -113,7 +113,7 @@ def _change_materials(
     factor = np.full(len(diffuse), rng.uniform(0.35, 1.0), np.float32)
     object_ = number < 0
     if mode == "black":
-        _recolor(diffuse, object_, _log_uniform(0.003, 0.05, rng), rng.uniform(0, 0.6), rng)
+        _recolor(diffuse, object_, random_shapes.log_uniform(0.003, 0.05, rng), rng.uniform(0, 0.6), rng)
         rough[object_] = np.clip(0.3 * rough[object_] + rng.uniform(0.05, 0.35), 0.08, 1)
         specular[object_] = rng.uniform(0.03, 0.06)
     elif mode == "white":
@@ -124,7 +124,7 @@ def _change_materials(
         wall = number == plane
         gloss = mode not in ("dark", "black") and rng.random() < 0.3
         if mode in ("dark", "black", "shadow"):
-            level = _log_uniform(0.004, 0.06, rng)
+            level = random_shapes.log_uniform(0.004, 0.06, rng)
             _recolor(diffuse, wall, level, rng.choice([0.0, rng.uniform(0, 0.6)]), rng)
         elif mode == "white":
             _recolor(diffuse, wall, rng.uniform(0.45, 0.92), rng.choice([0.0, rng.uniform(0, 0.2)]), rng)
@@ -137,7 +137,7 @@ def _change_materials(
         elif mode == "pictured":
             diffuse[wall] = backdrop_patterns.draw_pattern(position[wall], rng)
         elif rng.random() < 0.5:  # plain paper, cloth or board
-            _recolor(diffuse, wall, _log_uniform(0.02, 0.9, rng), rng.uniform(0, 0.3), rng)
+            _recolor(diffuse, wall, random_shapes.log_uniform(0.02, 0.9, rng), rng.uniform(0, 0.3), rng)
         specular[wall] = rng.uniform(0.03, 0.05) if gloss else rng.uniform(0.0, 0.02)
         rough[wall] = rng.uniform(0.15, 0.6) if gloss else rng.uniform(0.6, 1.0)
         factor[wall] = rng.uniform(0.4, 1.0) if gloss else rng.uniform(0.0, 0.35)
@@ -145,10 +145,6 @@ def _change_materials(
         torch.from_numpy(a) for a in (np.clip(diffuse, 0.0, 0.97), np.clip(specular, 0.0, 0.97), rough, factor)
     )
     return replace(surface, diffuse=diffuse, specular=specular, roughness=rough, law=SMOOTH), factor
-
-
-def _log_uniform(low: float, high: float, rng: np.random.Generator) -> float:
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
 def _recolor(diffuse: Floats, where: Bools, level: float, contrast: float, rng: np.random.Generator) -> None:
@@ -170,7 +166,7 @@ def _light(
     normal, diffuse, specular = materials.reflect(surface, rays, to_flash, torch.from_numpy(lit) * view.distance**2)
     stokes = diffuse + specular
     stokes[1:] *= polarizing[None, :, None]
-    stokes[0] += _log_uniform(5e-4, 0.08, rng) * surface.diffuse * (0.4 + 0.6 * normal[:, 2:])
+    stokes[0] += random_shapes.log_uniform(5e-4, 0.08, rng) * surface.diffuse * (0.4 + 0.6 * normal[:, 2:])
     return np.asarray(stokes.numpy(), dtype=np.float32)
 
 

@@ -113,7 +113,7 @@ def meet_planes(planes: Floats, v: Floats) -> tuple[Floats, Floats, NDArray[np.i
 def _frame(turned: Floats, framing: Framing, size: tuple[int, int], rng: np.random.Generator) -> tuple[View, Floats]:
     """Camera view (35–100 mm lens, 36 mm sensor) and object position (3,) that frame rotated vertices (V, 3)."""
     side = np.array(size[::-1])  # width, height
-    focal = side.max() * float(np.exp(rng.uniform(np.log(35), np.log(100)))) / 36
+    focal = side.max() * random_shapes.log_uniform(35, 100, rng) / 36
     low, high = turned.min(axis=0), turned.max(axis=0)
     extent, fill = (high - low)[:2], rng.uniform(*_FRAMINGS[framing][1:3])
     distance = focal * float((extent / (fill * side)).max())
@@ -135,7 +135,7 @@ def _draw_planes(place: Floats, backdrop: Backdrop, rng: np.random.Generator) ->
         cloth = np.array([0.3 * rng.normal() * np.sin(lean), np.sin(lean), np.cos(lean)])
         return np.array([_behind(place, cloth, 0.0)])
     if backdrop == "wall":
-        gap = float(np.exp(rng.uniform(np.log(0.02), np.log(2.5)))) if rng.random() < 0.8 else 0.0
+        gap = random_shapes.log_uniform(0.02, 2.5, rng) if rng.random() < 0.8 else 0.0
         return np.array([_behind(place, wall, gap)])
     lean = np.radians(rng.uniform(6, 55))
     table = np.array([0.06 * rng.normal(), np.cos(lean), np.sin(lean)])

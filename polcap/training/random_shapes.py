@@ -1,18 +1,16 @@
 """Random closed meshes for training: one to seven simple bodies joined, some with arms, legs or branches."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from polcap.images import Floats
+from polcap.images import Faces, Floats
 from polcap.synth.mesh_tracer import Triangles, centred, smooth, union
 
 _RINGS, _SECTORS = 96, 128  # vertices of a body
 _BRANCH_RINGS, _BRANCH_SECTORS = 24, 14  # vertices of a branch
-
-Faces = NDArray[np.int32]  # (F, 3)
 
 
 def compose(rng: np.random.Generator) -> Triangles:
@@ -45,6 +43,11 @@ def compose_with_branches(rng: np.random.Generator) -> Triangles:
     return centred(union(parts))
 
 
+def log_uniform(low: float, high: float, rng: np.random.Generator, size: int | tuple[int, ...] | None = None) -> Any:
+    """Random numbers between `low` and `high` with an even distribution of their logarithm; one without a `size`."""
+    return np.exp(rng.uniform(np.log(low), np.log(high), size))
+
+
 def rotation(rng: np.random.Generator) -> Floats:
     """A uniformly random rotation matrix, (3, 3)."""
     return np.asarray(Rotation.from_quat(np.roll(rng.normal(size=4), -1)).as_matrix())  # scalar last
@@ -55,7 +58,7 @@ def _displaced(rng: np.random.Generator) -> tuple[Floats, Faces]:
     unit, faces = _sphere(_RINGS, _SECTORS)
     field = np.zeros(len(unit))
     for _ in range(int(rng.integers(2, 9))):
-        frequency = np.exp(rng.uniform(np.log(1.5), np.log(14)))
+        frequency = log_uniform(1.5, 14, rng)
         wave = unit @ (rng.normal(size=3) * frequency)
         field = field + rng.normal() * np.sin(wave + rng.uniform(0, 6.28)) / frequency
     radius = 0.5 * (1 + rng.uniform(0.2, 0.9) * np.tanh(field))
@@ -69,7 +72,7 @@ def _dented(rng: np.random.Generator) -> tuple[Floats, Faces]:
     """
     unit, faces = _sphere(2 * _RINGS, 2 * _SECTORS)
     radius = np.ones(len(unit))
-    widest = np.exp(rng.uniform(np.log(0.2), np.log(0.9)))  # rad
+    widest = log_uniform(0.2, 0.9, rng)  # rad
     for _ in range(int(rng.integers(3, 17))):
         width = widest * rng.uniform(0.4, 1.0)
         away = np.arccos(np.clip(unit @ rotation(rng)[0], -1, 1)) / width
@@ -88,7 +91,7 @@ def _dented(rng: np.random.Generator) -> tuple[Floats, Faces]:
 def _superquadric(rng: np.random.Generator) -> tuple[Floats, Faces]:
     """Random mesh of a superquadric: box, cylinder, ellipsoid, star and shapes between them."""
     unit, faces = _sphere(_RINGS, _SECTORS)
-    east, north = np.exp(rng.uniform(np.log(0.12), np.log(2.2), 2))
+    east, north = log_uniform(0.12, 2.2, rng, 2)
     longitude = np.arctan2(unit[:, 1], unit[:, 0])
     circle = np.stack([np.cos(longitude), np.sin(longitude)], axis=1)
     ring = np.maximum(1 - unit[:, 2:] ** 2, 0) ** (north / 2)
@@ -117,7 +120,7 @@ def _vessel(rng: np.random.Generator) -> tuple[Floats, Faces]:
     radius = mouth * rise ** rng.uniform(0.15, 0.9) + waist * np.sin(np.pi * rise) * rise
     radius = np.clip(radius + rng.normal() * 0.03 * np.sin(rng.uniform(2, 9) * rise), 0.02, 0.7)
     radius[0] = 0.0
-    wall, tall = rng.uniform(0.01, 0.06), np.exp(rng.uniform(np.log(0.12), np.log(1.3)))
+    wall, tall = rng.uniform(0.01, 0.06), log_uniform(0.12, 1.3, rng)
     inner = np.clip(radius[::-1] - wall, 0.0, None)
     height = np.concatenate([rise * tall, np.maximum(rise[::-1] * tall, wall)])
     lobes = 1 + (rng.random() < 0.3) * rng.uniform(0, 0.15) * np.cos(rng.integers(3, 13) * _longitudes())

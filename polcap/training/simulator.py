@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from polcap.images import Quality
+from polcap.images import Bools, Indices, Quality
 from polcap.stages import cues
 from polcap.training import bounced_light, materials, traced_views
 from polcap.training.camera_errors import CameraErrors, photograph
-
-Indices = NDArray[np.integer[Any]]
 
 
 @dataclass(frozen=True)
@@ -101,7 +99,7 @@ class Simulator:
         jitter = torch.rand(count, device=self.device)
         return to_batch(self.photograph(views, strength, CameraErrors.draw(count, self.device), jitter))
 
-    def gather(self, pick: NDArray[np.integer[Any]], size: int, *, flip: bool) -> ViewBatch:
+    def gather(self, pick: Indices, size: int, *, flip: bool) -> ViewBatch:
         """Read cached traced views by index, subsampled to size² pixels. With `flip`, they are mirrored at random."""
         full, area = self.size, size * size
         mirrored, change = _mirror(np.arange(area).reshape(size, size), flip)
@@ -143,7 +141,7 @@ class Simulator:
         )
 
     def _seen_pixels(
-        self, view: Indices, y: Indices, x: Indices, order: Indices, mask: NDArray[np.bool_], owner: Indices
+        self, view: Indices, y: Indices, x: Indices, order: Indices, mask: Bools, owner: Indices
     ) -> tuple[Indices, NDArray[np.float32]]:
         """The fields `met` and `open` of `ObjectPixels` for pixels (y, x) of the cached views `view`.
 

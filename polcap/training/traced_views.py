@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from polcap.errors import InputError, StorageError
 from polcap.formats import atomic, scene_files, text_file
-from polcap.images import Floats, GBuffer, View
+from polcap.images import Bools, Floats, GBuffer, View
+from polcap.optics.outline import disc_radius
 from polcap.synth.mesh_tracer import Tracer, Triangles, scatter, smooth
 from polcap.training import bounced_light, light_transport, random_shapes
 from polcap.training.progress import Report, silent
@@ -155,7 +156,7 @@ def _store(
     index: int,
     buffer: GBuffer,
     pose: light_transport.LitPose,
-    lit: NDArray[np.bool_],
+    lit: Bools,
     met: NDArray[np.uint16],
 ) -> None:
     """Write one view into the arrays of a cache."""
@@ -186,24 +187,24 @@ def read_mesh(path: Path) -> Triangles:
     return smooth(*scene_files.read_mesh(path))
 
 
-def fill(mask: NDArray[np.bool_], values: Floats) -> Floats:
+def fill(mask: Bools, values: Floats) -> Floats:
     """Image (H, W, ·) with values (M, ·) at the pixels of the mask, 0 elsewhere."""
     return scatter(values, np.flatnonzero(mask), mask.shape)
 
 
-def depth_unit(mask: NDArray[np.bool_], depth: Floats, focal: float) -> tuple[float, float]:
+def depth_unit(mask: Bools, depth: Floats, focal: float) -> tuple[float, float]:
     """Mean depth of the object, and the unit of the network's relative depth.
 
     The unit is the radius of the disc with the area of the mask, at the mean depth: √(area/π) · depth / focal. For a
     photograph, the mask gives the unit up to the unknown distance.
     """
     middle = float(depth[mask].mean(dtype=np.float64))
-    return middle, float(np.sqrt(mask.sum() / np.pi) * middle / focal)
+    return middle, disc_radius(mask) * middle / focal
 
 
 def _trace_shape(
     number: int, meshes: list[Path], recipe: ViewsRecipe
-) -> Iterator[tuple[GBuffer, light_transport.LitPose, NDArray[np.bool_], NDArray[np.uint16]]]:
+) -> Iterator[tuple[GBuffer, light_transport.LitPose, Bools, NDArray[np.uint16]]]:
     """Trace the views of a mesh or random shape: G-buffer, pose of mesh and flash, result of `trace_visibility`."""
     if number < len(meshes):
         path = meshes[number]

@@ -18,7 +18,7 @@ from polcap.config import Config
 from polcap.formats import onnx
 from polcap.formats.capture import reader as captures
 from polcap.images import Capture, Floats, Network
-from polcap.optics import body, frames, fresnel
+from polcap.optics import body, frames
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, distance_m, path
@@ -164,7 +164,7 @@ def kept(normal: Floats, alpha: Floats, ior: Floats, rays: Floats) -> Floats:
     """Share of the smooth body's DoLP that facets leave (H, W)."""
     cosine = np.clip(frames.to_ray_frame(normal, rays)[..., 2], 0.05, 1 - 1e-6)
     index = np.clip(ior, 1.3, 1.7)
-    return np.asarray(body.dolp(cosine, alpha, index) / fresnel.diffuse_dolp(cosine, index), np.float32)
+    return np.asarray(body.dolp(cosine, alpha, index) / body.dolp(cosine, 0.0, index), np.float32)
 
 
 if __name__ == "__main__":

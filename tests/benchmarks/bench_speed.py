@@ -53,7 +53,7 @@ class Bench:
     floor: dict[str, float] = field(default_factory=dict)  # CPU s
     cold: dict[str, float] = field(default_factory=dict)  # CPU s by stage
     wall: dict[str, float] = field(default_factory=dict)  # s, of cold and warm
-    again: float = 0.0  # CPU s of a first run of the command on that result: keys are compared
+    again: float = 0.0  # CPU s of a first run of the command on that result: stages are cached, outputs are written
     warm: float = 0.0  # CPU s of the next: nothing changed
     peak_mb: float = 0.0  # anonymous memory of the process tree, shared parts counted once
 
@@ -283,8 +283,8 @@ def table(rows: list[Bench], start: float) -> str:
         ("**floor**", lambda row: sum(row.floor.values())),
         ("**whole, cold**", lambda row: sum(row.cold.values())),
         ("whole / floor", ratio),
-        ("keys compared, nothing to do", lambda row: row.again),
-        ("warm", lambda row: row.warm),
+        ("all results cached, outputs written again", lambda row: row.again),
+        ("nothing changed", lambda row: row.warm),
         ("peak memory, MB", lambda row: row.peak_mb),
     ):
         lines.append(f"| {name} | " + " | ".join(f"{of(row):.2f}" for row in rows) + " |")

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from polcap import calibrate
+from polcap.calibration_values import Calibration, LensGeometry
 from polcap.cli import calibrate_command
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import calibrations
-from polcap.images import Calibration, Distortion, Exif, LensGeometry
+from polcap.images import Distortion, Exif
 from polcap.optics import distortion
 from polcap.synth import calibration_frames
 from polcap.synth.calibration_frames import CalibrationShoot

@@ -18,26 +18,22 @@ import msgspec
 import numpy as np
 
 from polcap import config, report
-from polcap.errors import PolcapError
-from polcap.formats import atomic, calibrations, npy_folder, text_file
-from polcap.formats.capture import capture_toml
-from polcap.formats.maps import maps_folder as maps
-from polcap.formats.raw import exif, file_checks, file_kind
-from polcap.images import (
+from polcap.calibration_values import (
     Calibration,
-    ColorCalibration,
-    Exif,
     Falloff,
     FlashEnergy,
     LensGeometry,
     Levels,
     Linearity,
     NoiseLine,
-    PatchColors,
     Polarizer,
-    StokesImage,
-    View,
 )
+from polcap.errors import PolcapError
+from polcap.formats import atomic, calibrations, npy_folder, text_file
+from polcap.formats.capture import capture_toml
+from polcap.formats.maps import maps_folder as maps
+from polcap.formats.raw import exif, file_checks, file_kind
+from polcap.images import ColorCalibration, Exif, PatchColors, StokesImage, View
 from polcap.rig import exposure_bracket, serial_port
 from polcap.rig.device_log import Log
 from polcap.rig.motor_elliptec_ell14 import ElliptecMotor, ElliptecSettings

@@ -7,22 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from polcap.calibration_values import Calibration, Falloff, FlashEnergy, LensGeometry, Levels, NoiseLine, Polarizer
 from polcap.errors import CaptureError, ChartError
 from polcap.formats import calibrations
 from polcap.formats.capture import reader as capture
-from polcap.images import (
-    Calibration,
-    ChartPlace,
-    ColorCalibration,
-    Exif,
-    Falloff,
-    FlashEnergy,
-    LensGeometry,
-    Levels,
-    NoiseLine,
-    PatchColors,
-    Polarizer,
-)
+from polcap.images import ChartPlace, ColorCalibration, Exif, PatchColors
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "capture"
 EXIF = Exif(make="Polcap", model="Synthetic", lens="Synthetic 60mm", f_number=11.0, focal_length_mm=60.0)

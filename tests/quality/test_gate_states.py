@@ -17,6 +17,7 @@ import pytest
 from polcap.config import Config
 from polcap.images import (
     AngleStack,
+    OrderTest,
     OutlineCheck,
     PatchColors,
     Quality,
@@ -167,6 +168,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("order", "pass", {}),
     ("order", "warn", {"selfcal": {"outline": OutlineCheck(STATED, 0.9, ShotOrder((0, 2, 1)))}}),
     ("order", "fail", {"selfcal": {"outline": OutlineCheck(ShotOrder((2, 1, 0)), 0.9)}}),
+    ("order", "fail", {"maps": SimpleNamespace(albedo_sigma=0.1, order=OrderTest(ShotOrder((2, 1, 0)), 0.5))}),
+    ("order", "pass", {"maps": SimpleNamespace(albedo_sigma=0.1, order=OrderTest(ShotOrder((2, 1, 0)), 2.0))}),
     ("angles", "pass", {}),
     ("angles", "not measured", {"figures": {"outline": None}}),
     ("angles", "fail", {"figures": outline(turned=0.3)}),
@@ -211,8 +214,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("outline", "pass", {}),
     ("outline", "fail", {"figures": {"inward_outline": 0.3}}),
     ("albedo scale", "pass", {}),
-    ("albedo scale", "warn", {"maps": SimpleNamespace(albedo_sigma=0.5)}),
-    ("albedo scale", "warn", {"maps": SimpleNamespace(albedo_sigma=None)}),
+    ("albedo scale", "warn", {"maps": SimpleNamespace(albedo_sigma=0.5, order=None)}),
+    ("albedo scale", "warn", {"maps": SimpleNamespace(albedo_sigma=None, order=None)}),
     ("focal length", "pass", {}),
     ("focal length", "warn", {"focal_doubt": (-0.7, 0.7)}),
     ("normal error", "pass", {}),
@@ -246,7 +249,7 @@ def good() -> dict[str, Any]:
         "radiance": with_field(scenes.stack(), "bracket", exposures(1.0, 4.0)),
         "color": scenes.no_color(), "alignment": scenes.still(), "object_": replace(scenes.ball_object(), doubt=0.01),
         "selfcal": replace(scenes.equal(), gains=GAINS, outline=OutlineCheck(STATED, 0.95)),
-        "stokes": SimpleNamespace(body=True), "maps": SimpleNamespace(albedo_sigma=0.1),
+        "stokes": SimpleNamespace(body=True), "maps": SimpleNamespace(albedo_sigma=0.1, order=None),
         "mesh": SimpleNamespace(**MESH),
         "figures": FIGURES | outline(),
     }  # fmt: skip

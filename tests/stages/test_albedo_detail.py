@@ -10,6 +10,7 @@ from scipy import ndimage
 from polcap.formats import onnx
 from polcap.images import Distortion, Floats, Mosaic, ObjectMask, StokesImage, SurfaceMaps
 from polcap.optics import color, demosaic, distortion, mueller, shade
+from polcap.optics.resize import block_means
 from polcap.stages import asset, cues, infer, stokes, surface
 from polcap.stages.stokes.reference_detail import reference_detail
 from tests import scenes
@@ -105,6 +106,20 @@ def test_neither_shading_of_fine_relief_nor_noise_enters_the_albedo(slope: Float
     assert ball.stokes.detail is not None and ball.maps.detail is not None
     photographed, ours = (part[ball.inside].astype(float).std() for part in (ball.stokes.detail, ball.maps.detail))
     assert ours < 0.3 * photographed
+
+
+def test_dark_print_on_a_saturated_color_gets_no_dots() -> None:
+    """Demosaiced colors may be negative there; their logarithm would be a pattern of black dots."""
+    shape = ndimage.gaussian_filter((waves(5, 14.0, 18.0, 23.0) > 0.7).astype(float), 0.5)
+    rgb = np.array([0.35, 0.08, 0.03]) + shape[..., None] * np.array([-0.33, -0.075, -0.024])
+    mosaic = np.empty(X.shape, np.float16)
+    for i, j in np.ndindex(2, 2):
+        mosaic[i::2, j::2] = rgb[i::2, j::2, RGGB[i, j]]
+    light = rgb.sum(axis=-1)
+    coarse = cv2.resize(block_means(light, 2), X.shape[::-1])
+    found = reference_detail(Mosaic(mosaic, RGGB), (0, 0, scenes.WIDTH, scenes.HEIGHT))
+    error = np.abs(found - np.log(light / coarse))[8:-8, 8:-8]
+    assert error.max() < 1.5 and np.sqrt(np.mean(error**2)) < 0.3
 
 
 def test_detail_of_a_distorted_lens_is_where_the_pinhole_camera_sees_it() -> None:

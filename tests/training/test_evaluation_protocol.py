@@ -7,7 +7,7 @@ import pytest
 
 from polcap.errors import InputError
 from polcap.images import Floats
-from polcap.optics import body, frames, fresnel
+from polcap.optics import body, frames
 from polcap.training import evaluation_protocol
 from polcap.training.evaluation_protocol import Protocol
 
@@ -69,7 +69,7 @@ def test_bodies_of_the_second_protocol_polarize_as_rough_ones(made: Protocol, te
         law = evaluation_protocol.body_law(number)
         alpha = smooth.truth.roughness**2
         expected = law.dolp_factor * body.dolp(np.maximum(local[..., 2], 0.1), alpha, 1.5, law.local)
-        expected = expected / fresnel.diffuse_dolp(np.maximum(local[..., 2], 0.1), 1.5)
+        expected = expected / body.dolp(np.maximum(local[..., 2], 0.1), 0.0, 1.5)
         tilted = smooth.truth.mask & (smooth.clean.dolp > 0.03) & (local[..., 2] > 0.3)
         found = rough.clean.dolp[tilted] / smooth.clean.dolp[tilted]
         ratios.append(np.median(found - expected[tilted]))

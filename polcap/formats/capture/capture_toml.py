@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from polcap.errors import CaptureError
 from polcap.formats import text_file
-from polcap.images import Role
+from polcap.images import CatalogEntry, Role
 
 NAME = "capture.toml"
 Positive = Annotated[float, Meta(gt=0)]
@@ -32,16 +32,6 @@ class Rotator(Struct, frozen=True, forbid_unknown_fields=True):
     log: str = ""  # file of the angles reached, in the same folder
 
 
-class Catalog(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table `[catalog]`: the fields of `CatalogEntry`."""
-
-    title: str = ""
-    creator: str = ""
-    rights: str = ""
-    license: str = ""
-    object_number: str = ""
-
-
 class CaptureFile(Struct, frozen=True, forbid_unknown_fields=True):
     """The content of capture.toml; every key is optional."""
 
@@ -55,7 +45,7 @@ class CaptureFile(Struct, frozen=True, forbid_unknown_fields=True):
     black: Annotated[float, Meta(ge=0)] = 0.0  # stored value of darkness, linear pictures
     filter: str | None = None  # the polarizer's name, as in `polcap calibrate --filter`
     rotator: Rotator | None = None
-    catalog: Catalog = Catalog()
+    catalog: CatalogEntry = CatalogEntry()
     frame: tuple[FrameEntry, ...] = ()
 
 

@@ -6,8 +6,9 @@ from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
+from polcap.calibration_values import LensGeometry
 from polcap.formats import shipped_data
-from polcap.images import Exif, LensGeometry
+from polcap.images import Exif
 
 FULL_FRAME_MM = (36.0, 24.0)
 _CONTRADICTION = 0.1  # ln of the ratio of two statements; focus breathing and rounding stay below

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
-import msgspec
 import numpy as np
 
 from polcap.errors import CaptureError
@@ -16,7 +15,7 @@ from polcap.formats.capture import capture_toml, focal_length, layouts
 from polcap.formats.capture.capture_toml import CaptureFile
 from polcap.formats.capture.layouts import Source
 from polcap.formats.raw import photo
-from polcap.images import Capture, CatalogEntry, Exif, Frame, FrameReading, Shot
+from polcap.images import Capture, Exif, Frame, FrameReading, Shot
 
 _ZOOM = 0.01  # relative change of the focal length above rounding
 LOSS = ": normals and albedo lose accuracy against RAW"
@@ -88,7 +87,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
         notes=(*plan.notes, *notes, *calibration_notes, f"focal length {lens.note}"),
         calibration=calibration,
         crossed=crossed,
-        catalog=CatalogEntry(**msgspec.structs.asdict(stated.catalog)),
+        catalog=stated.catalog,
     )
 
 

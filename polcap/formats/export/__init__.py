@@ -3,6 +3,7 @@
 gltf          GLB with mesh, material and textures
 glb_geometry  the mesh of a GLB: floats, integers or Draco
 obj           OBJ, MTL and EXR textures
+ply_stl       the mesh alone, PLY with a color per vertex, and STL
 usd           USD with OpenPBR and UsdPreviewSurface; USDZ
 web_page      a page that shows the GLB without a network
 materialx     MaterialX 1.39, and the OpenPBR node graph

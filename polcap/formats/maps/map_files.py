@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.formats.maps import png
-from polcap.images import Cues, Floats, ReliefMesh, StokesImage, SurfaceMaps
+from polcap.images import Bools, Cues, Floats, ReliefMesh, StokesImage, SurfaceMaps
 from polcap.optics import color
 
 Source = Literal["maps", "mesh", "stokes", "cues"]
@@ -37,7 +37,7 @@ def _normal_picture(maps: SurfaceMaps) -> NDArray[np.uint16]:
     return png.sixteen_bits(flat / 2 + 0.5)
 
 
-def inside(maps: SurfaceMaps) -> NDArray[np.bool_]:
+def inside(maps: SurfaceMaps) -> Bools:
     """Mask (H, W) of the pixels that the object covers."""
     return np.asarray(maps.mask, dtype=bool)
 
@@ -47,7 +47,7 @@ def on_object(maps: SurfaceMaps, values: Floats) -> Floats:
     return masked(values, inside(maps))
 
 
-def masked(values: Floats, inside: NDArray[np.bool_]) -> Floats:
+def masked(values: Floats, inside: Bools) -> Floats:
     """A copy of an image (H, W[, C]) with 0 outside the mask `inside`."""
     return np.where(inside if values.ndim == 2 else inside[..., None], values, 0).astype(np.float32)
 

@@ -9,13 +9,12 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct
-from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.errors import DecodeError
 from polcap.formats import atomic, text_file
 from polcap.formats.maps import exr, map_files, png
-from polcap.images import Cues, Floats, ReliefMesh, StokesImage, SurfaceMaps, View
+from polcap.images import Bools, Cues, Floats, ReliefMesh, StokesImage, SurfaceMaps, View
 
 CONVENTIONS = {
     "frame": "camera: x right, y up, z toward the camera; a normal facing the camera is (0, 0, 1)",
@@ -124,7 +123,7 @@ def stored_depth(maps: SurfaceMaps, mesh: ReliefMesh) -> Floats:
     return np.where(map_files.inside(maps), map_files.object_depth(maps, mesh), np.nan).astype(np.float32)
 
 
-def _masked_half(values: Floats, inside: NDArray[np.bool_]) -> Floats:
+def _masked_half(values: Floats, inside: Bools) -> Floats:
     """A map with 0 outside the object, clipped to the range of half floats and rounded to half."""
     limit = np.finfo(np.float16).max
     return np.clip(map_files.masked(values, inside), -limit, limit).astype(np.float16).astype(np.float32)

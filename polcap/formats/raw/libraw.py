@@ -61,11 +61,13 @@ def camera_matrix(xyz_to_camera: Floats, balance: Floats | None) -> Floats | Non
 
     References
     ----------
-    Adobe, Digital Negative Specification 1.4, ch. 6; dcraw's normalisation to the white of D65.
+    Adobe, Digital Negative Specification 1.4, ch. 6; dcraw's normalization to the white of D65.
     """
+    if not np.isfinite(xyz_to_camera).all():
+        return None
     camera = xyz_to_camera @ REC709_TO_XYZ
     daylight = camera.sum(axis=1)  # the camera's response to D65
-    if not np.isfinite(camera).all() or (daylight <= 0).any():
+    if (daylight <= 0).any():
         return None
     normalized = camera / daylight[:, None]  # white gives 1 in every channel, in any unit of the file
     if np.linalg.cond(normalized) > _MAX_CONDITION:

@@ -12,9 +12,8 @@ import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
-from polcap.images import Asset, Floats, Mesh, SurfaceMaps, TextureMaps, TexturePixels
+from polcap.images import Asset, Bools, Floats, Mesh, SurfaceMaps, TextureMaps, TexturePixels
 from polcap.optics import color, frames, fresnel
 from polcap.optics.morphology import dilate, erode
 from polcap.optics.resize import area_mean
@@ -133,13 +132,13 @@ def _resize(texture: TexturePixels, shape: tuple[int, int]) -> Floats:
     return np.asarray(cv2.resize(image, shape[::-1], interpolation=cv2.INTER_CUBIC))
 
 
-def _without_outline(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _without_outline(mask: Bools) -> Bools:
     """Erode a mask by its outermost pixels, except for parts that would vanish."""
     inner = erode(mask, 1, from_border=True)
     return np.asarray(inner | (mask & ~dilate(inner, 2)))
 
 
-def fill_outward(value: Any, known: NDArray[np.bool_]) -> Any:
+def fill_outward(value: Any, known: Bools) -> Any:
     """Fill unknown pixels of an image (H, W, C) with the value of the nearest known pixel."""
     if known.all() or not known.any():
         return value

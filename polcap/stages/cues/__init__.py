@@ -6,7 +6,7 @@ no cv2, no torch. Pixel axes are (..., H, W).
 
 from typing import Any
 
-from polcap.images import ColorCalibration, Cues, Quality, StokesImage
+from polcap.images import ColorCalibration, Cues, OtherOrder, Quality, StokesImage
 from polcap.optics import frames, fresnel
 from polcap.optics.namespace import array_namespace
 from polcap.stages import stage
@@ -25,8 +25,8 @@ CHANNELS = (
 FLOOR = 0.02  # added to a radiance before its logarithm, in the channels and in their inverse
 
 
-@stage(version=6, keep=False)
-def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
+@stage(version=7, keep=False)
+def compute(stokes: StokesImage, color: ColorCalibration, other_orders: tuple[OtherOrder, ...] = ()) -> Cues:
     """Compute all cues (radiance, DoLP, AoLP, diffuse color…) of a crop (H, W) from its Stokes parameters.
 
     The color matrix is applied to S0 only. DoLP and AoLP are computed in camera channels, which are summed before any
@@ -63,6 +63,7 @@ def compute(stokes: StokesImage, color: ColorCalibration) -> Cues:
         scale_sigma=scale.sigma(stokes, color, radiance),
         body=body,
         body_known=body_known,
+        other_orders=other_orders,
         detail=stokes.detail,
     )
 

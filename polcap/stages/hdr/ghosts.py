@@ -9,16 +9,13 @@ from functools import partial
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap import parallel
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.optics.morphology import dilate, erode
 from polcap.optics.registration import squared_gradient
 from polcap.stages.hdr.noise import Noise
 from polcap.stages.hdr.planes import Signals, blocks
-
-Bools = NDArray[np.bool_]
 
 _WINDOW = 5  # px, side of the window for comparison and smoothing
 _EVEN = np.full(_WINDOW, 1 / _WINDOW, np.float32)

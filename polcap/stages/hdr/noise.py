@@ -15,8 +15,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from polcap.images import Bits, Bools, Floats, NoiseLine
+from polcap.calibration_values import NoiseLine
+from polcap.images import Bits, Bools, Floats
 from polcap.optics import demosaic
+from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean
 from polcap.optics.robust import fit_noise_line
 from polcap.stages.hdr.planes import Signals
@@ -141,8 +143,7 @@ def inner(picture: Floats) -> Floats:
 
 def squared_differences(picture: Floats) -> Floats:
     """Squared gradient (C, h−2, w−2) of a picture (C, h, w) by central differences, per px²."""
-    gx, gy = picture[:, 1:-1, 2:] - picture[:, 1:-1, :-2], picture[:, 2:, 1:-1] - picture[:, :-2, 1:-1]
-    return np.asarray((gx * gx + gy * gy) / 4)
+    return inner(np.stack([squared_gradient(plane) for plane in picture]))
 
 
 def fit(samples: list[Samples], iso: float | None, least_floor: float) -> Noise:

@@ -13,16 +13,13 @@ from functools import lru_cache, partial
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap import parallel
 from polcap.errors import CaptureError, SettingError
-from polcap.images import Decode, Floats, Frame, SensorImage, Shot
+from polcap.images import Bools, Decode, Floats, Frame, SensorImage, Shot
 from polcap.optics import sensor
 from polcap.optics.projection import coordinates
 from polcap.optics.resize import block_means
-
-Bools = NDArray[np.bool_]
 
 _ROWS = 64  # of a block: one channel of a 24 MP picture then fits a core's cache
 _AHEAD = 2  # frames decoded ahead of the merge; each thread waits for a decoding process

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 
 from polcap import parallel
-from polcap.images import Bits, Bools, Falloff, Floats, MaskedImage, Quality, Shot, View
+from polcap.calibration_values import Falloff
+from polcap.images import Bits, Bools, Floats, MaskedImage, Quality, Shot, View
 from polcap.optics.registration import scaled, squared_gradient
 from polcap.stages.hdr import exposure, noise
 from polcap.stages.hdr.bracket import AmbientLight, Bracket, ComparedBracket, ambient_light

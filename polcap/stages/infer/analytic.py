@@ -61,7 +61,7 @@ def invert(cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -
     if guide is None:
         phi = np.arctan2(axis[1], axis[0]) / 2
         found = half_turns.resolve(_local(cos_zenith, phi, cues.rays), cues.mask)
-        phi, certainty = phi + np.where(found.turned, np.pi, 0.0), 1 - 2 * found.doubt
+        phi, certainty = np.where(found.turned, phi + np.pi, phi), 1 - 2 * found.doubt
     else:
         phi, certainty = _azimuth_by_guide(axis, cues.rays, *guide)
     normal = frames.from_ray_frame(_local(cos_zenith, phi, cues.rays), cues.rays)
@@ -108,7 +108,7 @@ def _azimuth_by_guide(axis: Floats, rays: Floats, normal: Floats, sigma: Floats)
     turned = frames.axis_on_ray(phi, rays)
     along = normal[..., 0] * np.cos(turned) + normal[..., 1] * np.sin(turned)
     spread = np.radians(np.maximum(sigma, 1.0))
-    return phi + np.where(along < 0, np.pi, 0.0), np.asarray(erf(np.abs(along) / (np.sqrt(2) * spread)))
+    return np.where(along < 0, phi + np.pi, phi), np.asarray(erf(np.abs(along) / (np.sqrt(2) * spread)))
 
 
 def _local(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:

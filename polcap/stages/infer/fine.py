@@ -52,7 +52,8 @@ def encode(cues: Cues, estimate: CoarseEstimate) -> Floats:
     channels = [
         *np.moveaxis(frames.to_ray_frame(estimate.normal, cues.rays), -1, 0),
         *np.moveaxis(frames.to_ray_frame(estimate.smooth, cues.rays), -1, 0),
-        np.log(np.maximum(estimate.sigma, 0.5)), estimate.roughness, np.full(cues.mask.shape, np.log(estimate.shrink)),
+        np.log(np.maximum(estimate.sigma, 0.5)), estimate.roughness,
+        np.full(cues.mask.shape, np.log(estimate.shrink), np.float32),
     ]  # fmt: skip
     return np.concatenate([cue_channels.channels(cues), np.stack(channels) * cues.mask]).astype(np.float32)
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMaps
+from polcap.images import Cues, Floats, Network, OrderTest, Quality, RunNetwork, SurfaceMaps
 from polcap.optics import frames
 from polcap.optics.morphology import erode
 from polcap.optics.resize import area_mean, weighted_area_mean
@@ -25,6 +25,7 @@ _INVERSION = 4.0  # factor on the inversion's expected error in the join, for th
 # error = min(a·statedᵇ·exp(r·roughness), c), degrees: maximum likelihood on traced training meshes (decision 28)
 _CALIBRATION = (0.515, 1.12, 0.906, 50.0)
 _OVERVIEWS, _OVERVIEW_POSITIONS = (0.5, 0.35), 2  # sizes of smaller pictures, evidence for the side of normals
+_TEST_SIZE = 0.35  # of the picture by which orders of the shots are compared
 _CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is constant
 _BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _GRAZING = 0.15  # least cosine of the shading; .1 and .2 leave the same error
@@ -61,6 +62,7 @@ def estimate(
         confidence=(error * cues.mask).astype(np.float32),
         mask=cues.mask,
         view=cues.view,
+        order=_compare_orders(cues, network, run, coarse.shrink),
         estimator=f"network {network.metadata.get('version', network.digest[:8])}",
     )
 
@@ -94,6 +96,45 @@ def estimate_coarse(
     return maps, fine.CoarseEstimate(normal, smooth, maps["sigma"], maps["roughness"], shrink), stated
 
 
+def _compare_orders(cues: Cues, network: Network, run: RunNetwork, shrink: float) -> OrderTest | None:
+    """Compare the orders of the shots by the mean error that the network expects, in a small picture.
+
+    Under a wrong order the polarization fits no shape with this outline and shading, so the network expects
+    errors that are 1.1 to 3 times as large.
+    """
+    if not cues.other_orders:
+        return None
+    low = _reduce(_limit_radiance(cues), _TEST_SIZE / shrink)
+
+    def error(matrix: Floats) -> float:
+        predicted = augmentation.predict(_transformed(low, matrix), network, run, 1)
+        return float(predicted["sigma"][low.mask].mean())
+
+    errors = [error(other.matrix) for other in cues.other_orders]
+    least = int(np.argmin(errors))
+    return OrderTest(cues.other_orders[least].order, errors[least] / error(np.eye(3)))
+
+
+def _transformed(cues: Cues, matrix: Floats) -> Cues:
+    """Cues after multiplication of the Stokes parameters by a matrix (3, 3)."""
+    stokes = np.einsum("jk,khw->jhw", matrix, np.stack([np.ones_like(cues.dolp), *cues.ratio]))
+    total = np.maximum(stokes[0], 1e-3)
+    changed = replace(cues, radiance=cues.radiance * total[..., None])
+    return _with_polarization(changed, stokes[1:] / total, cues.ratio_sigma)
+
+
+def _with_polarization(cues: Cues, ratio: Floats, sigma: Floats) -> Cues:
+    """Replace the polarization of cues: S1/S0 and S2/S0 (2, H, W), their 1σ (H, W), and all that follows from them."""
+    squared = ratio[0] ** 2 + ratio[1] ** 2
+    return replace(
+        cues,
+        ratio=ratio,
+        ratio_sigma=sigma,
+        dolp=np.sqrt(np.clip(squared - sigma**2, 0, 1)),
+        normalized_stokes=ratio / np.sqrt(squared + 1e-12),
+    )
+
+
 def _limit_radiance(cues: Cues) -> Cues:
     """Clip radiance above that of any diffuse reflection, and flag it CLIPPED, as in the training pictures."""
     beyond = (cues.radiance > _BRIGHTEST).any(axis=-1)
@@ -112,7 +153,6 @@ def _reduce(cues: Cues, scale: float) -> Cues:
     averaging = min(1.0, scale * np.sqrt(width / small[1] * scale))
     sigma = weighted_area_mean(cues.ratio_sigma, light, small) * averaging
     mask = area_mean(cues.mask, small) > 0.5
-    squared = ratio[0] ** 2 + ratio[1] ** 2
     view = replace(
         cues.view,
         focal=cues.view.focal * scale,
@@ -121,12 +161,8 @@ def _reduce(cues: Cues, scale: float) -> Cues:
     )
     clipped = area_mean((cues.quality & Quality.CLIPPED) > 0, small) > 0.5
     return replace(
-        cues,
+        _with_polarization(cues, ratio, sigma),
         radiance=weighted_area_mean(cues.radiance, cues.mask, small),
-        ratio=ratio,
-        ratio_sigma=sigma,
-        dolp=np.sqrt(np.clip(squared - sigma**2, 0, 1)),
-        normalized_stokes=ratio / np.sqrt(squared + 1e-12),
         diffuse_color=area_mean(cues.diffuse_color.astype(np.float32), small),
         rays=frames.rays(view, *mask.shape),
         mask=mask,

@@ -26,6 +26,7 @@ _ALPHAS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 _FACTORS = (1.0, 0.9, 0.8, 0.7, 0.5)  # on the polarization, everywhere
 _EDGE_LOSSES = (0.0, 0.15, 0.3, 0.45, 0.6)  # share lost edge-on, times sin²θ elsewhere: two real balls lose about .55
 _ZENITHS = np.radians(np.linspace(0, 88, 177))  # of the tables from DoLP to zenith
+_GRID = 600  # DoLPs of the mean table
 _SMOOTH_LIKELIER = 1.5  # log prior of the smooth interface over any other candidate: most captures so far
 _DEPOLARIZED_LIKELIER = -8.0  # log prior, times the share of the polarization that is lost everywhere
 
@@ -54,12 +55,12 @@ class ZenithEstimate:
 
     angle: Floats  # (H, W) rad
     spread: Floats  # (H, W) rad, 1σ between laws
-    _dolps: Floats  # (C, Z) of all laws
-    _weights: Floats  # (C,)
+    _dolps: Floats  # (G,) grid of DoLPs
+    _means: Floats  # (G,) rad, mean zenith for each
 
     def at(self, dolp: Floats) -> Floats:
         """Zeniths [rad] for DoLPs of any shape, averaged over the candidate laws."""
-        return _mean_zenith(dolp, self._dolps, self._weights)[0]
+        return np.interp(dolp, self._dolps, self._means).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -92,8 +93,12 @@ def estimate_zenith(dolp: Floats, cues: Cues, ior: float, guide: tuple[Floats, F
             score -= _PATCHES / 2 * np.minimum(deviation**2, _MOST_MISFIT).mean(axis=1)
     weights = np.exp(score - score.max())
     weights /= weights.sum()
-    angle, spread = _mean_zenith(dolp, laws.dolp, weights)
-    return ZenithEstimate(angle, spread, laws.dolp, weights)
+    grid = np.linspace(0, float(laws.dolp.max()), _GRID)
+    zenith = np.stack([np.interp(grid, row, _ZENITHS) for row in laws.dolp])  # (C, G)
+    means = weights @ zenith
+    spreads = np.sqrt(np.maximum(weights @ zenith**2 - means**2, 0))
+    angle, spread = (np.interp(dolp, grid, values).astype(np.float32) for values in (means, spreads))
+    return ZenithEstimate(angle, spread, grid, means)
 
 
 @lru_cache(maxsize=4)
@@ -161,12 +166,3 @@ def _round_outline(dolp: Floats, cues: Cues, laws: DiffuseLaws) -> Floats:
     found = np.degrees([np.interp(high, row, _ZENITHS) for row in laws.dolp])  # (C, rings)
     misfit = (((found[:, None] - ball) / _OUTLINE_DEG) ** 2).sum(axis=-1) + (np.log(_RADII) / _RADIUS_SPREAD) ** 2
     return np.asarray(np.log(np.exp(-misfit.min(axis=1) / 2) + _SHARP))
-
-
-def _mean_zenith(dolp: Floats, dolps: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Mean and deviation (...,) of the zenith [rad] for a DoLP, over laws with DoLPs (C, Z) and weights (C,)."""
-    grid = np.linspace(0, float(dolps.max()), 600)
-    zenith = np.stack([np.interp(grid, row, _ZENITHS) for row in dolps])
-    mean = weights @ zenith
-    deviation = np.sqrt(np.maximum(weights @ zenith**2 - mean**2, 0))
-    return np.interp(dolp, grid, mean), np.interp(dolp, grid, deviation)

@@ -17,12 +17,11 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import ObjectError
-from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Network, ObjectMask, RunNetwork
+from polcap.images import Alignment, AngleStack, Bits, Bools, ColorCalibration, Floats, Network, ObjectMask, RunNetwork
 from polcap.optics.warp import warp
 from polcap.stages import stage
 from polcap.stages.mask import backdrop, graph_cut, regions
 from polcap.stages.mask.network import object_probability
-from polcap.stages.mask.regions import Bools
 
 
 class MaskSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

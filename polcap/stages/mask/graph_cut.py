@@ -8,9 +8,8 @@ Rother, Kolmogorov & Blake, GrabCut, SIGGRAPH 2004.
 import cv2
 import numpy as np
 
-from polcap.images import Bits, Floats
+from polcap.images import Bits, Bools, Floats
 from polcap.optics.resize import area_mean
-from polcap.stages.mask.regions import Bools
 
 _WORK_PIXELS = 3e5  # approximate size of the reduced picture that is cut
 _REACH = 0.006  # of the picture's longer side: largest movement of the outline

@@ -7,9 +7,8 @@ distinguishes black gloss from black cloth.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.stages.mask import backdrop
 from polcap.stages.mask.backdrop import STOPS, brightness
 
@@ -26,7 +25,7 @@ class ReducedPicture:
 
     color: Floats  # (H, W, 3) S0 in linear Rec.709, any scale
     stokes: Floats  # (3, H, W) S0, S1, S2 summed over the camera's channels
-    chart: NDArray[np.bool_]  # (H, W)
+    chart: Bools  # (H, W)
     place: Floats  # (2, H, W) position: x right and y down, −1…1 over the whole picture
 
 

@@ -2,11 +2,9 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Bits, Floats
+from polcap.images import Bits, Bools, Floats
 
-Bools = NDArray[np.bool_]
 Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px, end exclusive
 
 _SPECK = 0.01  # of the largest region; smaller regions are specks

@@ -74,7 +74,7 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=16)
+@stage(version=17)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,
@@ -134,6 +134,7 @@ def solve(
         turned=angles.turned_shot(*object_gains.cells(even.light, even.inside), angle, first.sigma),
         found_sigma=found_sigma,
         crossed=crossed_light.measure(radiance, alignment, color, shots, gains.gain, angle),
+        other_orders=angles.other_orders(order.check, angle) if settings.check_order else (),
     )
 
 
@@ -207,7 +208,7 @@ def _wrong_order(found: angles.OrderFit, angle: Floats) -> str:
     stated, best = ", ".join(names), ", ".join(names[i] for i in found.check.best.shots)
     mirrored = " counted clockwise" if found.check.best.mirrored else ""
     return (
-        f"the angles {stated} contradict the polarization at the object's outline (fit {found.score:.2f}); "
+        f"the angles {stated} contradict the polarization at the object's outline (fit {found.check.score:.2f}); "
         f"{best}{mirrored} fit better ({found.best_score:.2f}): {found.check.best.remedy(names)}; "
         "or shoot in a dark room (reflections turn polarization by 90°), or --set selfcal.check_order=false"
     )

@@ -23,7 +23,7 @@ from itertools import combinations, permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats, OutlineCheck, ShotOrder, TurnedShot
+from polcap.images import Floats, OtherOrder, OutlineCheck, ShotOrder, TurnedShot
 from polcap.optics import mueller, outline
 from polcap.optics.outline import OutlineBand
 from polcap.optics.robust import biweight, jackknife, spread
@@ -35,6 +35,8 @@ _MOST_PERMUTED = 4  # shots; with more, only exchanges of two shots and the reve
 _CLOSES = 3.0  # factor of misfit (K > 3) with which an order is excluded, or accepted; set by hand
 _AHEAD = 2.0  # σ; another order is excluded if the stated one is better by more
 _BETTER = 3.0  # σ by which another order must be better to be accepted
+_CONCLUSIVE = 0.75  # score above which an outline without a rival decides (docs/benchmarks/gates.md)
+_EQUAL = 0.02  # largest difference of equal analyzers
 _LEAST_RIVAL = 0.25  # least score of an order that may be true too; set by hand
 _ROUGH = 0.01  # largest relative misfit by gains and interpolation: a flash repeats within 1 %
 # One turned shot.
@@ -75,10 +77,9 @@ def rim(shots: ObjectShots) -> OutlineBand:
 
 @dataclass(frozen=True)
 class OrderFit:
-    """Result of the check of order and sense, with the scores −1…1 of the stated and the best order."""
+    """Result of the check of order and sense, with the score −1…1 of the best order."""
 
     check: OutlineCheck
-    score: float  # mean of w cos 2(φ − φ_contour)
     best_score: float
 
 
@@ -89,7 +90,7 @@ def check_order(band: OutlineBand, angle: Floats, margin: float, least_score: fl
     """
     stated = ShotOrder(tuple(range(len(angle))))
     if band.light.shape[1] == 0:
-        return OrderFit(OutlineCheck(stated, 0.0), 0.0, 0.0)
+        return OrderFit(OutlineCheck(stated, 0.0), 0.0)
     total, weight = outline.phasor(band, angle)
     mean, _ = outline.mean_and_sigma(total, weight)
     along = (total * np.exp(-1j * np.angle(mean))).real
@@ -110,7 +111,21 @@ def check_order(band: OutlineBand, angle: Floats, margin: float, least_score: fl
         needed = max(least, _BETTER * sigma * (least > 0))
         if score > max(best_score, least_score) and score - abs(mean) > needed:
             best, best_score = order, score
-    return OrderFit(OutlineCheck(best, abs(mean), rival), mean.real, best_score)
+    return OrderFit(OutlineCheck(best, abs(mean), rival, mean.real), best_score)
+
+
+def other_orders(check: OutlineCheck, angle: Floats) -> tuple[OtherOrder, ...]:
+    """Orders and senses of the polarizer angles (K,) rad that neither the outline nor a redundant shot excludes."""
+    if check.rival is None and check.score > _CONCLUSIVE:
+        return ()
+    light = mueller.analyzer(angle)
+    found = []
+    for order, turned in list(hypotheses(angle).items())[1:]:
+        weights = mueller.analyzer(turned)
+        matrix = np.linalg.pinv(weights) @ light
+        if np.abs(weights @ matrix - light).max() < _EQUAL:  # always, for three shots
+            found.append(OtherOrder(order, matrix))
+    return tuple(found)
 
 
 def hypotheses(angle: Floats) -> dict[ShotOrder, Floats]:
@@ -126,7 +141,7 @@ def hypotheses(angle: Floats) -> dict[ShotOrder, Floats]:
         for mirrored in (False, True):
             turned = angle[list(order)] * (-1 if mirrored else 1)
             weights = mueller.analyzer(turned)
-            if all(np.abs(weights - mueller.analyzer(known)).max() > 0.02 for known in found.values()):
+            if all(np.abs(weights - mueller.analyzer(known)).max() > _EQUAL for known in found.values()):
                 found[ShotOrder(order, mirrored)] = turned
     return found
 

@@ -66,7 +66,7 @@ def by_outline(
     sound, mask = np.pad(sound, margin), np.pad(mask, margin)
     depth = outline.depth(mask)
     inside = depth > _LEAST_DEPTH_PX
-    radius = float(np.sqrt(mask.sum() / np.pi))
+    radius = outline.disc_radius(mask)
     if leaves_picture or int((mask & (depth < 2 * _RIM_PX)).sum()) < _LEAST_RIM_PX:
         return UNKNOWN
     s0, s1, s2 = np.linalg.pinv(mueller.analyzer(angle)) @ _smoothed(light, mask & sound)[:, inside & sound]

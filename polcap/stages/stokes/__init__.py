@@ -58,7 +58,7 @@ class StokesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 5.0
 
 
-@stage(version=7)
+@stage(version=8)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,

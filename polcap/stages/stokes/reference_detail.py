@@ -12,7 +12,7 @@ from polcap.optics.warp import Box, source_box, warp
 
 _ROWS = 64  # superpixels of a block
 _HALO = 3  # superpixels around a block: demosaicing reaches 3 photosites, the enlargement one superpixel
-_MOST = 2.5  # greatest logarithm: a factor of 12
+_MOST = 1.0  # greatest logarithm; larger ones are dots of demosaicing in dark colors (docs/benchmarks/albedo.md)
 _LEAST = np.float32(1e-6)  # light
 
 

@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from polcap.errors import ObjectError
-from polcap.images import Floats, Mesh, ReliefMesh, View
+from polcap.images import Faces, Floats, Mesh, ReliefMesh, View
+from polcap.optics.frames import unit
 from polcap.optics.projection import project
 from polcap.optics.vertex_frames import vertex_frames
-from polcap.stages.surface.triangles import Back, Faces, add_back, boundary_edges, face_areas
+from polcap.stages.surface.triangles import Back, add_back, boundary_edges, face_areas
 
 _FEWEST = 16  # triangles
 _FRONT = {"open": 1.0, "skirt": 1.0, "closed": 0.6}  # of the requested triangles: those of the front at first
@@ -94,8 +95,7 @@ def _distance(first: ReliefMesh, coarser: ReliefMesh) -> float:
     corner = coarser.vertices[coarser.faces].astype(np.float64)  # (F, 3, 3)
     share = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4], [0, 1, 1], [1, 0, 1], [1, 1, 0]], float)
     sample = np.einsum("sk,fkc->fsc", share / share.sum(axis=1, keepdims=True), corner)
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
+    normal = unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
     every = max(1, len(first.vertices) // _MEASURED)
     vertex: Floats = first.vertices[::every].astype(np.float64)
     _, nearest = cKDTree(sample.reshape(-1, 3)).query(vertex)

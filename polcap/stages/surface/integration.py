@@ -24,13 +24,13 @@ Cao, Santo, Shi, Okura & Matsushita, Bilateral normal integration, ECCV 2022.
 
 import numpy as np
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.optics.morphology import dilate
 from polcap.optics.outline import disc_radius
 from polcap.stages.surface import occlusion
 from polcap.stages.surface.occlusion import OcclusionMap, label_contours
 from polcap.stages.surface.pyramid_level import GAP, REACH, ContourLinks, PyramidLevel
-from polcap.stages.surface.slope_equations import Bools, NormalField, halve
+from polcap.stages.surface.slope_equations import NormalField, halve
 
 _DECISION_PIXELS = 80_000  # most pixels of the grid that decides on cuts (docs/benchmarks/surface.md)
 _SURE = 1 / 16  # least weight of a normal that can show an occluding contour: an error of four times the median

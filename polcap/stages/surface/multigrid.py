@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 
 _COARSEST = 400  # unknowns that are solved directly
 _STRONG = 0.02  # least link, over √(a_ii a_jj), along which unknowns are aggregated
@@ -30,7 +30,7 @@ class PixelGrid:
     Link l joins the pixels `p[l]` and `q[l]`. The links to the right come first; from number `turn` on, links go down.
     """
 
-    def __init__(self, mask: NDArray[np.bool_]) -> None:
+    def __init__(self, mask: Bools) -> None:
         self.mask = mask
         number = np.full(mask.shape, -1, dtype=np.int32)
         number[mask] = np.arange(int(mask.sum()), dtype=np.int32)

@@ -21,11 +21,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.optics.morphology import dilate
 from polcap.optics.outline import disc_radius
 from polcap.stages.surface.multigrid import PixelGrid
-from polcap.stages.surface.slope_equations import Bools
 
 # lengths in shares of the object's radius
 _LEAST_LENGTH = 0.1  # of a contour, of both kinds

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.optics.outline import disc_radius
 from polcap.stages.surface import occlusion
 from polcap.stages.surface.multigrid import Multigrid, PixelGrid, TwoGrid, conjugate_gradients
 from polcap.stages.surface.occlusion import OcclusionMap
-from polcap.stages.surface.slope_equations import Bools, NormalField, block_numbers, slope_terms
+from polcap.stages.surface.slope_equations import NormalField, block_numbers, slope_terms
 
 REACH = 2  # px around a cut within which pixels choose, also on the next finer grid
 GAP = 0.25  # expected depth step behind a contour, over the object's radius

@@ -6,13 +6,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats, ReliefMesh
+from polcap.images import Bools, Faces, Floats, ReliefMesh
 from polcap.optics.morphology import erode
 from polcap.stages.surface.occlusion import depth_steps, least_step
-from polcap.stages.surface.slope_equations import Bools, NormalField, slope_terms
+from polcap.stages.surface.slope_equations import NormalField, slope_terms
 
 Back = Literal["open", "skirt", "closed"]
-Faces = NDArray[np.int32]
 
 _LEAST_FACING = 0.05  # cosine: flatter views give no slope
 _SPECK = 0.002  # of the mesh's triangles: smaller pieces do not count

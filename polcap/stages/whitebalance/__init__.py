@@ -10,6 +10,7 @@ References
 McCamy, Marcus, Davidson, A Color-Rendition Chart, J. Applied Photographic Engineering 1976.
 """
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -66,7 +67,7 @@ class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     patch_share: Annotated[float, Meta(ge=0.2, le=0.95, description="sampled share of each patch's side")] = 0.6
 
 
-@stage(version=10)
+@stage(version=11)
 def measure(
     radiance: AngleStack, reference: ChartReference, request: ChartRequest, settings: WhitebalanceSettings
 ) -> ColorCalibration:
@@ -181,13 +182,11 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Whitebala
 def _read(
     radiance: AngleStack, place: Placement, reference: ChartReference, settings: WhitebalanceSettings, cost: float
 ) -> _Find:
-    """The chart at a place, either way up: that with the smaller color residual.
-
-    On a ColorChecker SG any 6 × 4 patches look like its block, so all that fit around the place are tried.
-    """
+    """The chart at a place, either way up: that with the smaller color residual; of a ColorChecker SG its block."""
     ways = [place, place.turned()]  # the detector may see it upside down
     if reference.is_block:
-        ways = [way.shifted(right, down) for way in ways for right in range(-4, 5) for down in range(-5, 2)]
+        block = chart.refine(radiance.value[0], _sg_block(radiance, place, reference, settings))
+        ways = [block if _plausible(block, settings.min_explained) else place]
     finds, exposed = list[_Find](), ChartError("")
     for way in ways:
         try:
@@ -196,11 +195,33 @@ def _read(
             exposed = error
     if not finds:
         raise exposed
-    best = min(finds, key=lambda find: find.error)
-    if not reference.is_block:
-        return best
-    refined = chart.refine(radiance.value[0], best.place)
-    return _find(radiance, refined if _plausible(refined, settings.min_explained) else place, reference, settings, cost)
+    return min(finds, key=lambda find: find.error)
+
+
+def _sg_block(
+    radiance: AngleStack, place: Placement, reference: ChartReference, settings: WhitebalanceSettings
+) -> Placement:
+    """Find the block of a ColorChecker SG: of the 6 × 4 patches around a place that with the least color residual.
+
+    Any 6 × 4 patches of an SG look like its block to the detector, and may be upside down. Raises ChartError.
+    """
+    column, row = (grid.ravel() for grid in np.meshgrid(np.arange(-4, 10), np.arange(-5, 9)))
+    around = np.stack([column, row], axis=-1) + 0.5
+    seen = patches.sample(radiance.value[0], radiance.quality[0], place, settings.patch_share, around)
+    found, exposed = list[tuple[float, Placement]](), ChartError("")
+    for right, down in itertools.product(range(-4, 5), range(-5, 6)):
+        inside = (column >= right) & (column < right + chart.COLUMNS) & (row >= down) & (row < down + chart.ROWS)
+        block, samples = place.shifted(right, down), seen.select(inside)
+        ways = [(block, samples)] if down < 2 else []  # the block is in rows 2 to 5 of ten
+        ways += [(block.turned(), samples.turned())] if down > -2 else []
+        for way, colors in ways:
+            try:
+                found.append((patches.fit(colors, reference).mean, way))
+            except ChartError as error:
+                exposed = error
+    if not found:
+        raise exposed
+    return min(found, key=lambda one: one[0])[1]
 
 
 def _at_corners(

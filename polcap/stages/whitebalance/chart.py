@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.optics.projection import pixels_inside, transform_points
 from polcap.optics.robust import spread
 
@@ -195,7 +195,7 @@ def _fit(image: Floats, start: Placement) -> Placement:
     return Placement(homography / homography[2, 2], float(unknowns[8]), explained)
 
 
-def _cover(point: Floats, unknowns: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.bool_]]:
+def _cover(point: Floats, unknowns: Floats) -> tuple[Floats, NDArray[np.intp], Bools]:
     """Share of each pixel that a chart's patch covers, the index of the patch, and whether the pixel is on the chart.
 
     point (3, N) are homogeneous coordinates; the ten unknowns are a homography to chart coordinates without its last

@@ -2,10 +2,9 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap.errors import ChartError
-from polcap.images import AngleStack, ChartReference
+from polcap.images import AngleStack, Bools, ChartReference
 from polcap.stages.whitebalance import chart, patches
 
 _LEAST_SHARE = 0.05  # of the mask; smaller parts do little harm
@@ -17,7 +16,7 @@ _DELTA_E = 15.0  # largest mean ΔE of its colors, as `whitebalance.max_delta_e`
 _PATCH_SHARE = 0.6  # sampled share of a patch's side
 
 
-def share(radiance: AngleStack, mask: NDArray[np.bool_], reference: ChartReference) -> float:
+def share(radiance: AngleStack, mask: Bools, reference: ChartReference) -> float:
     """Share of the mask (H, W) that shows a ColorChecker in the first shot; 0 without one."""
     count, label, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     total = max(int(mask.sum()), 1)
@@ -25,7 +24,7 @@ def share(radiance: AngleStack, mask: NDArray[np.bool_], reference: ChartReferen
     return sum(int(about[n, cv2.CC_STAT_AREA]) for n in parts if _is_chart(radiance, label == n, reference)) / total
 
 
-def _is_chart(radiance: AngleStack, part: NDArray[np.bool_], reference: ChartReference) -> bool:
+def _is_chart(radiance: AngleStack, part: Bools, reference: ChartReference) -> bool:
     """Whether a connected part (H, W) of the mask shows 6 × 4 flat patches of a chart's colors on a card."""
     y, x = np.nonzero(part)
     rectangle = cv2.minAreaRect(np.stack([x, y], axis=-1).astype(np.float32))

@@ -10,7 +10,7 @@ from enum import IntEnum
 import numpy as np
 
 from polcap.errors import ChartError
-from polcap.images import Bits, ChartReference, Floats, Quality
+from polcap.images import Bits, Bools, ChartReference, Floats, Quality
 from polcap.optics import color
 from polcap.optics.projection import pixels_inside
 from polcap.stages.whitebalance import chart
@@ -51,6 +51,10 @@ class PatchSamples:
 
     color: Floats  # (N, 3) S0 of the patches, camera channels
     use: Bits  # (N,) PatchUse
+
+    def select(self, which: Bools) -> "PatchSamples":
+        """The patches that a mask (N,) selects."""
+        return PatchSamples(self.color[which], self.use[which])
 
     def turned(self) -> "PatchSamples":
         """The patch colors of the same chart read upside down."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.images import NoiseLine
+from polcap.calibration_values import NoiseLine
 from polcap.stages.hdr import noise
 from tests.stages.hdr.brackets import planes
 

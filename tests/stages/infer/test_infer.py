@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from polcap.errors import ModelError
-from polcap.images import Quality
+from polcap.images import OutlineCheck, Quality, ShotOrder
 from polcap.optics import frames
+from polcap.pipeline import models
 from polcap.stages import cues, infer, stokes
 from polcap.stages.infer import analytic, augmentation, fine, learned
+from polcap.stages.selfcal.angles import other_orders
 from tests import scenes
 from tests.fake_network import FakeNetwork, run
 
@@ -292,3 +294,21 @@ def test_averaged_over_turns_a_turned_object_gets_the_turned_maps(quarters: int,
     expected = np.array(augmentation._turn(whole["normal"], quarters, mirror))
     expected[..., :2] = augmentation._turn_vectors(expected[..., :2], quarters, mirror)
     np.testing.assert_allclose(turned["normal"], expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_the_shipped_network_expects_larger_errors_in_a_wrong_order(swapped: bool) -> None:
+    stated = ShotOrder((0, 1, 2))
+    found = seen(noise=0.002)
+    others = other_orders(OutlineCheck(stated, 0.0), scenes.ANGLES)
+    exchanged = next(other for other in others if other.order == ShotOrder((2, 1, 0)))
+    if swapped:
+        found = learned._transformed(found, exchanged.matrix)
+    found = dataclasses.replace(found, other_orders=others)
+    order = estimate(found, models.load_network("network", None, "cpu", 1)).order
+    assert order is not None
+    if swapped:
+        assert order.ratio < 0.8 and order.rival == exchanged.order
+    else:
+        assert order.ratio > 1.2
+    assert estimate(found).order is None  # the inversion expects nothing

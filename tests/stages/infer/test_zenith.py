@@ -63,7 +63,7 @@ def test_a_ball_drawn_by_a_law_gets_its_zeniths_back(alpha: float, textured: boo
 
 def test_an_even_depolarization_is_found_too() -> None:
     """An even loss is less certain than one that grows towards the outline; the two laws differ by 2° only."""
-    cues, truth = ball(lambda zenith: 0.8 * fresnel.diffuse_dolp(np.cos(zenith), 1.5), 0.0)
+    cues, truth = ball(lambda zenith: 0.8 * body.dolp(np.cos(zenith), 0.0, 1.5), 0.0)
     found = bias_deg(estimate_zenith(cues.dolp, cues, 1.5).angle, truth, cues.mask)
     smooth = bias_deg(np.arccos(fresnel.cos_zenith_from_dolp(cues.dolp.astype(float), 1.5)), truth, cues.mask)
     assert np.abs(found).max() < 2.2 and np.abs(found).mean() < 0.5 * np.abs(smooth).mean()
@@ -75,7 +75,7 @@ def test_real_balls_are_read_within_2_degrees(which: str, shading: str) -> None:
     """From 25° to 70°, where the smooth law reads 68° as 53°; how flat a real rough body looks is not known."""
 
     def measured(zenith: Floats) -> Floats:
-        return np.interp(np.degrees(zenith), PLACES, MEASURED[which]) * fresnel.diffuse_dolp(np.cos(zenith), 1.5)
+        return np.interp(np.degrees(zenith), PLACES, MEASURED[which]) * body.dolp(np.cos(zenith), 0.0, 1.5)
 
     cues, truth = ball(measured, 0.27, chequered() if shading == "chequered" else 0.4)
     if shading == "flat":
@@ -100,7 +100,7 @@ def test_a_guide_settles_what_shading_leaves_open() -> None:
 
 
 def test_too_few_pixels_leave_the_laws_as_likely_as_before() -> None:
-    cues, _ = ball(lambda zenith: fresnel.diffuse_dolp(np.cos(zenith), 1.5), 0.0)
+    cues, _ = ball(lambda zenith: body.dolp(np.cos(zenith), 0.0, 1.5), 0.0)
     mask = np.zeros_like(cues.mask)
     mask[80, 80:84] = True
     found = estimate_zenith(cues.dolp, replace(cues, mask=mask), 1.5)

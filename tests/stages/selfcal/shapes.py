@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from polcap.images import AngleStack, Bools, ColorCalibration, Floats, ObjectMask, SelfCalibration
-from polcap.optics import fresnel, mueller
+from polcap.optics import body, mueller
 from polcap.stages import selfcal
 from tests import scenes
 
@@ -29,7 +29,7 @@ def shots(height: Height, random: np.random.Generator, angle: Floats = ANGLES, g
         (height(x + dx, y + dy) - height(x - dx, y - dy)) / (2 * step) for dx, dy in ((step, 0.0), (0.0, step))
     )
     cosine = 1 / np.sqrt(1 + slope_x**2 + slope_y**2)
-    dolp = fresnel.diffuse_dolp(cosine, 1.5)
+    dolp = body.dolp(cosine, 0.0, 1.5)
     azimuth = np.arctan2(slope_y, slope_x)
     s0 = (0.4 + 0.4 * (np.sin(9 * x) * np.sin(7 * y) > 0)) * cosine
     stokes = np.stack([s0, s0 * dolp * np.cos(2 * azimuth), s0 * dolp * np.sin(2 * azimuth)])

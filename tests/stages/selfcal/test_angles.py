@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
-from polcap.images import Equipment, ShotOrder
+from polcap.images import Equipment, OutlineCheck, ShotOrder
 from polcap.optics import mueller
 from polcap.optics.outline import OutlineBand
 from polcap.stages import stokes
@@ -71,6 +71,21 @@ def test_an_order_that_fits_as_well_is_named():
     radiance = scenes.stack(noise=0.002)
     assert solve(radiance).outline.rival is None
     assert solve(replace(radiance, angle=radiance.angle + np.pi / 2)).outline.rival is not None
+
+
+@pytest.mark.parametrize(("degrees", "count"), [((0, 45, 90), 11), ((0, 45, 90, 135), 7), ((0, 40, 90, 135), 3)])
+def test_orders_that_the_outline_does_not_exclude_explain_the_same_light(degrees, count):
+    angle = np.radians(np.array(degrees, float))
+    unclear = OutlineCheck(ShotOrder(tuple(range(len(degrees)))), 0.3)
+    found = angles_.other_orders(unclear, angle)
+    assert len(found) == count
+    stokes_ = np.array([1.0, 0.1, -0.05])
+    for other in found:
+        turned = angle[list(other.order.shots)] * (-1 if other.order.mirrored else 1)
+        np.testing.assert_allclose(
+            mueller.analyzer(turned) @ other.matrix @ stokes_, mueller.analyzer(angle) @ stokes_, atol=0.02
+        )
+    assert solve(scenes.stack(noise=0.002)).other_orders == ()
 
 
 @pytest.mark.parametrize("victim", [1, 2])
