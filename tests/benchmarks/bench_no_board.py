@@ -27,12 +27,14 @@ from polcap import config
 from polcap.fusion import fuse_run, fused_maps, session
 from polcap.fusion.fusion_path import FusionSettings
 from polcap.fusion.session import Session, SessionInput
+from polcap.fusion.values import Pose
 from polcap.images import Floats
 from polcap.pipeline import models
 from polcap.synth import all_around, scenes
 
 PATTERN_M = 0.006  # size of the pattern
 ROUNDS, NEAR = 20, 0.9  # of the placing; share of the nearest points that it uses
+TEXELS = 10  # every tenth is compared
 
 
 def main(out: Path, mesh: str, views: int, step: int) -> None:
@@ -47,11 +49,12 @@ def main(out: Path, mesh: str, views: int, step: int) -> None:
         wanted = SessionInput(folder, config.load(None, []), network=networks[0], mask_network=networks[1])
         fuse_run.fuse(wanted, FusionSettings(), folder / "fused", print, lambda *_: None)
         found, _ = session.process(wanted, lambda _: None)
-        turns = rotation_errors(folder, found)
+        pairs = true_poses(folder, found)
+        turns = rotation_errors(pairs)
         residual = np.mean([one.residual_px for one in found.posed.values()])
         print(
             f"| {mesh}, {len(turns)} of {views // step} views | {'board' if board != 'none' else 'features'} | "
-            f"{turns.mean():.2f}, {turns.max():.2f} | {residual:.2f} | {100 * distance(folder):.2f} |"
+            f"{turns.mean():.2f}, {turns.max():.2f} | {residual:.2f} | {100 * distance(folder, pairs):.2f} |"
         )
 
 
@@ -65,44 +68,46 @@ def render(folder: Path, mesh: str, board: Any, views: int) -> None:
     all_around.write(folder, replace(scene, coat=replace(scene.coat, materials=materials)), shoot, views)
 
 
-def rotation_errors(folder: Path, found: Session) -> Floats:
+def true_poses(folder: Path, found: Session) -> list[tuple[Pose, Pose]]:
+    """Found and true pose of each used view."""
+    views = json.loads((folder / "truth.json").read_text())["views"]
+    true = {one["name"]: Pose(np.array(one["rotation"]), np.array(one["translation"])) for one in views}
+    return [(found.posed[name].pose, true[name]) for name in found.used]
+
+
+def world(pairs: list[tuple[Pose, Pose]]) -> Floats:
+    """Rotation (3, 3) from the true world to the found one that fits the rotations of all views best."""
+    return Rotation.from_matrix([one.rotation.T @ true.rotation for one, true in pairs]).mean().as_matrix()
+
+
+def rotation_errors(pairs: list[tuple[Pose, Pose]]) -> Floats:
     """Angles [°] between the found and the true rotations of all views, in the world frame that fits them best."""
-    true = {one["name"]: np.array(one["rotation"]) for one in json.loads((folder / "truth.json").read_text())["views"]}
-    pairs = [(found.posed[name].pose.rotation, true[name]) for name in found.used]
-    world = Rotation.from_matrix([one.T @ right for one, right in pairs]).mean().as_matrix()
-    return np.degrees([Rotation.from_matrix(one @ world @ right.T).magnitude() for one, right in pairs])
+    turn = world(pairs)
+    return np.degrees([Rotation.from_matrix(one.rotation @ turn @ true.rotation.T).magnitude() for one, true in pairs])
 
 
-def distance(folder: Path) -> float:
+def distance(folder: Path, pairs: list[tuple[Pose, Pose]]) -> float:
     """Mean distance of the seen texels from the true surface, over its size."""
     source, truth = fused_maps.read(folder / "fused" / "maps"), dict(np.load(folder / "truth.npz"))
     surface = Trimesh(truth["vertices"], truth["faces"], process=False)
     tree, size = cKDTree(sample_surface(surface, 400_000, seed=0)[0]), float(np.ptp(truth["vertices"], axis=0).max())
-    point = source.atlas.position[source.maps.weight[source.atlas.covered] > bench_fused_asset.LEAST_SEEN]
-    if source.atlas.mesh.metric:
-        return float(np.mean(tree.query(point)[0])) / size
-    return min(float(np.mean(tree.query(placed(point, turn, tree))[0])) for turn in range(0, 360, 30)) / size
+    point = source.atlas.position[source.maps.weight[source.atlas.covered] > bench_fused_asset.LEAST_SEEN][::TEXELS]
+    point = point if source.atlas.mesh.metric else placed(point, pairs, tree)
+    return float(np.mean(tree.query(point)[0])) / size
 
 
-def middle(point: Floats) -> Floats:
-    """Middle (3,) of the box around points (N, 3)."""
-    return np.asarray((point.min(axis=0) + point.max(axis=0)) / 2)
-
-
-def placed(point: Floats, turn: float, tree: cKDTree) -> Floats:
-    """Points placed on those of a tree by similarities, from a start that is turned by `turn` [°] about y."""
-    some, true = point[:: len(point) // 8000 + 1], np.asarray(tree.data)[::40]
-    first = Rotation.from_euler("y", turn, degrees=True).as_matrix() * np.ptp(true[:, 1]) / np.ptp(some[:, 1])
-    shift = (true.min(axis=0) + true.max(axis=0)) / 2 - (
-        (some @ first.T).min(axis=0) + (some @ first.T).max(axis=0)
-    ) / 2
-    matrix = np.vstack([np.hstack([first, shift[:, None]]), [0, 0, 0, 1]])
+def placed(point: Floats, pairs: list[tuple[Pose, Pose]], tree: cKDTree) -> Floats:
+    """Points (N, 3) placed on those of a tree by similarities, first by that of the poses."""
+    turn = world(pairs)
+    terms = np.concatenate([np.hstack([one.translation[:, None], -true.rotation]) for one, true in pairs])
+    scale, *shift = np.linalg.lstsq(terms, np.concatenate([true.translation for _, true in pairs]))[0]
+    moved = scale * point @ turn + shift
     for _ in range(ROUNDS):
-        moved = some @ matrix[:3, :3].T + matrix[:3, 3]
         away, near = tree.query(moved)
         use = away < np.quantile(away, NEAR)
-        matrix = procrustes(moved[use], tree.data[np.asarray(near)[use]], reflection=False)[0] @ matrix
-    return np.asarray(point @ matrix[:3, :3].T + matrix[:3, 3])
+        matrix = procrustes(moved[use], tree.data[np.asarray(near)[use]], reflection=False)[0]
+        moved = moved @ matrix[:3, :3].T + matrix[:3, 3]
+    return np.asarray(moved)
 
 
 if __name__ == "__main__":
