@@ -26,9 +26,9 @@ from polcap.fusion.atlas import Atlas
 from polcap.fusion.values import FusionView
 from polcap.images import Bools, Floats
 from polcap.optics import frames
+from polcap.optics.outline import fill_outward
 from polcap.optics.projection import project
 from polcap.stages import stage
-from polcap.stages.asset import fill_outward
 from polcap.synth.mesh_tracer import Tracer, Triangles
 
 _LEAST_COSINE = 0.15  # between surface and view: beyond 81° a map pixel covers seven texels

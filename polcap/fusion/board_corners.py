@@ -30,6 +30,10 @@ _LEAST_CORRELATION = 0.85  # of picture and print around a corner
 _MOST_TWINS = 2  # markers seen twice: more are a second board
 
 
+class NoBoardError(CaptureError):
+    """Error: a view does not show a board."""
+
+
 @dataclass(frozen=True)
 class BoardCorners:
     """Corners of one board in one view."""
@@ -59,8 +63,10 @@ def detect(radiance: AngleStack, color: ColorCalibration, name: str) -> BoardCor
 
     Raises
     ------
+    NoBoardError
+        No board is visible.
     CaptureError
-        No board is visible, too little of it, or two boards are.
+        Too little of the board is visible, or two boards are.
     """
     picture, scale = gray_picture(radiance, color)
     markers = _markers(picture)
@@ -99,7 +105,7 @@ def _markers(picture: Floats) -> list[tuple[int, Floats]]:
 
 
 def _one_board(markers: list[tuple[int, Floats]], name: str) -> Board:
-    """The board that the markers belong to. Raises CaptureError for none or several."""
+    """The board that the markers belong to. Raises NoBoardError for none, CaptureError for several."""
     numbers = [number for number, _ in markers]
     twins = len(numbers) - len(set(numbers))
     seen = {
@@ -108,7 +114,7 @@ def _one_board(markers: list[tuple[int, Floats]], name: str) -> Board:
     }
     there = [size for size, count in seen.items() if count >= _LEAST_MARKERS]
     if not there:
-        raise CaptureError(
+        raise NoBoardError(
             f"{name}: no board is visible ({max(seen.values())} of its markers, {_LEAST_MARKERS} are needed); "
             "shoot with the object on the board of `polcap board`, sharp and lit"
         )

@@ -147,7 +147,8 @@ def _object_like(picture: Floats, print_: _Print, light: tuple[Floats, Floats], 
     expected = print_.paper * (paper - ink) + ink
     off = (np.abs(picture - expected) > _TOLERANCE * expected + (print_.doubt + _NOISE) * paper).any(axis=-1)
     element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * (strip[0] // 2) + 1, 2 * (strip[1] // 2) + 1))
-    closed = cv2.morphologyEx(off.astype(np.uint8), cv2.MORPH_CLOSE, element)
+    broad = cv2.morphologyEx(off.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))  # no edges of the print
+    closed = cv2.morphologyEx(broad, cv2.MORPH_CLOSE, element)
     thick = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, label, stats, _ = cv2.connectedComponentsWithStats(thick)
     large = stats[:, cv2.CC_STAT_AREA] > _SPECK * boards.CELLS**2 * strip[0] * strip[1]

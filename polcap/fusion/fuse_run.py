@@ -30,6 +30,7 @@ _LODS = 2  # coarser levels, each with a quarter of the triangles
 _SIDE = 480  # px of an animation's frame
 # limits of the gates
 _MOST_RESIDUAL_PX = 0.5  # of a view's corners; a flat, sharp board leaves 0.1 to 0.2
+_MOST_FEATURE_PX = 2.0  # of a view's features, on maps of half the size; sharp ones leave 0.6 to 1
 _MOST_NORMAL_DEG = 20.0  # median angle between a view's normals and the mesh; single views err by 6 to 9°
 _LEAST_SEEN = 0.85  # share of the surface; what stands on the board is never seen
 _FEW_VIEWS = 8
@@ -54,7 +55,10 @@ def fuse(
             if not resource_limits.is_shortfall(error):
                 raise
             raise resource_limits.shortfall(error, cache.stage, views[0].mask.size) from error
-        results = replace(results, maps=_with_albedo_scale(results.maps, found))
+        mesh = replace(results.atlas.mesh, metric=found.metric)
+        results = replace(
+            results, atlas=replace(results.atlas, mesh=mesh), maps=_with_albedo_scale(results.maps, found)
+        )
         cache.begin("write")
         about = document(wanted, found, settings, results, out)
         write(out, about, results, views)
@@ -116,7 +120,7 @@ def document(
                 "k2": found.camera.k2,
             },
             "mesh": {
-                "metric": True,
+                "metric": found.metric,
                 "triangles": len(results.atlas.mesh.faces),
                 "extent": np.ptp(results.mesh.vertices, axis=0).tolist(),
                 "closed": is_closed(results.mesh),
@@ -164,10 +168,14 @@ def _gates(found: Session, results: FusionResults, rows: Sequence[Mapping[str, A
     yield _views_gate(found)
     worst = max(rows, key=lambda row: row["reprojection_px"])
     value = worst["reprojection_px"]
-    message = f"The board's corners are within {value:.2f} px (rms) in every view; the worst is {worst['name']}"
-    state: State = "pass" if value <= _MOST_RESIDUAL_PX else "fail"
-    remedy = "" if state == "pass" else "Keep the board flat, and focus and zoom unchanged"
-    yield Gate("poses", state, value, _MOST_RESIDUAL_PX, message, remedy, unit="px")
+    what, limit, remedy = (
+        ("The board's corners", _MOST_RESIDUAL_PX, "Keep the board flat, and focus and zoom unchanged")
+        if found.board
+        else ("Features of the object", _MOST_FEATURE_PX, "Turn the object on a flat table, focus and zoom unchanged")
+    )
+    message = f"{what} are within {value:.2f} px (rms) in every view; the worst is {worst['name']}"
+    state: State = "pass" if value <= limit else "fail"
+    yield Gate("poses", state, value, limit, message, "" if state == "pass" else remedy, unit="px")
     yield _agreement_gate(rows)
     for folder, share in found.shared.items():
         message = f"The first set confirms {share:.0%} of the surface of {folder}"

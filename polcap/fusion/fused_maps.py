@@ -55,7 +55,8 @@ def write(folder: Path, atlas: Atlas, maps: AtlasMaps) -> None:
         "format": FORMAT,
         "size": list(maps.mask.shape[::-1]),
         "albedo": maps_folder.albedo_scale(maps.albedo_sigma),
-        "frame": "board: origin in its middle, y up, metres",
+        "frame": "y up; origin in the middle of the board, or on the axis of the turn where there was none",
+        "unit": "m" if atlas.mesh.metric else "relative",
         "maps": {
             **{f"{name}.exr": meaning for name, meaning in _MEANINGS.items()},
             "seen.png": "8 bit, 255 where a view saw the surface; elsewhere values are filled",
@@ -115,6 +116,7 @@ def read(folder: Path) -> FusedSource:
         with np.load(folder / "mesh.npz") as stored:
             arrays = {name: stored[name] for name in _ARRAYS}
         side, percent = int(about["size"][0]), about["albedo"]["uncertainty_percent"]
+        metric = about["unit"] == "m"
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DecodeError(f"{folder} holds no fused maps of this polcap ({error}); run `polcap fuse` again") from error
     maps = AtlasMaps(
@@ -122,7 +124,7 @@ def read(folder: Path) -> FusedSource:
         mask=png.read(folder / "mask.png") > 127,
         albedo_sigma=None if percent is None else percent / 100,
     )
-    mesh = Mesh(**arrays, metric=True, frame="board")
+    mesh = Mesh(**arrays, metric=metric, frame="board")
     return FusedSource(atlases.of_mesh(mesh, side), maps)
 
 

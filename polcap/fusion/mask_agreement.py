@@ -101,8 +101,8 @@ def _uncovered(views: Sequence[Silhouette], hull: Floats, step: float) -> Floats
 def _contradicting(
     views: Sequence[Silhouette], inside: Bools, points: Floats, step: float, shares: Floats
 ) -> tuple[int, float]:
-    """The view that contradicts the others most, and the share of a mask's area by which it does; 0 for none."""
-    by = np.zeros(len(views))
+    """The view without which the others agree best, and the share of a mask's area by which it contradicts; 0: none."""
+    by, better = np.zeros(len(views)), np.zeros(len(views))
     if (shares > _MOST_UNCOVERED).any():
         for k in range(len(views)):
             others = [j for j in range(len(views)) if j != k]
@@ -111,7 +111,8 @@ def _contradicting(
             lacks = gain[-1]  # the second largest of all: a piece of the board in one other mask gives one gain
             slid = shares[k] if gain.sum() > _TRAILING else 0.0
             by[k] = max(lacks, slid)
-    worst = int(np.argmax(by))
+            better[k] = (slid + gain.sum()) * (by[k] > _MOST_UNCOVERED)
+    worst = int(np.argmax(better))
     return worst, float(by[worst])
 
 

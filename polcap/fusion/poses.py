@@ -75,8 +75,8 @@ class PosedView:
     """Pose of one view with its errors."""
 
     pose: Pose
-    corners: int  # used
-    residual_px: float  # rms of the corners, RAW px
+    corners: int  # or features, used
+    residual_px: float  # their rms, RAW px
     sigma_deg: float  # 1σ of the rotation, largest axis
 
 
@@ -87,6 +87,7 @@ class SessionPoses:
     camera: SessionCamera
     views: Mapping[str, PosedView]
     left_out: Mapping[str, str]
+    metric: bool = True  # lengths are in metres
 
 
 def solve(seen: Mapping[str, BoardCorners], capture: Capture) -> SessionPoses:

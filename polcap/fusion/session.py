@@ -1,8 +1,8 @@
-"""Processes all views of a session: one color calibration, one camera, poses from the board, masks, maps.
+"""Processes all views of a session: one color calibration, one camera, poses, masks, maps.
 
 Each view is a capture that `polcap process` takes, with its result in viewNN/polcap. A view that cannot be used is left
 out, with the reason; the others go on. Between sets of views (setA/view01 …, setB/view01 …) the object was laid on
-another side; their boards become one frame at the end.
+another side; their boards become one frame at the end. Without a board the poses come from features of the maps.
 """
 
 import traceback
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
 
 from polcap.batch.processes import UNLIMITED, Died, Limits, ProcessPool
 from polcap.config import Config
@@ -28,10 +29,10 @@ from polcap.errors import (
 )
 from polcap.formats import onnx, own_folders
 from polcap.formats.capture import layouts, reader
-from polcap.fusion import board_corners, joining, mask_agreement, poses, view_maps
-from polcap.fusion.board_corners import BoardCorners
+from polcap.fusion import board_corners, feature_poses, joining, mask_agreement, poses, view_maps
+from polcap.fusion.board_corners import BoardCorners, NoBoardError
 from polcap.fusion.board_eraser import erase
-from polcap.fusion.poses import LEAST_VIEWS, PosedView, SessionCamera
+from polcap.fusion.poses import LEAST_VIEWS, PosedView, SessionCamera, SessionPoses
 from polcap.fusion.silhouettes import Silhouette
 from polcap.fusion.values import FusionView, Pose
 from polcap.images import Bools, Capture, ChartRequest, Network
@@ -97,8 +98,15 @@ class Session:
     supplied: dict[str, UserInput] = field(default_factory=dict)
     camera: SessionCamera | None = None
     posed: Mapping[str, PosedView] = field(default_factory=dict)
+    board: bool = True  # poses come from the board
+    metric: bool = True  # lengths are in metres
     about: dict[str, dict[str, Any]] = field(default_factory=dict)  # content of report.json of each view
     shared: dict[str, float] = field(default_factory=dict)  # of each further set: share that the first one confirms
+
+    def place(self, solved: SessionPoses) -> None:
+        """Take over camera and poses, and leave out the views without."""
+        self.left_out |= {name: reason.removeprefix(f"{name}: ") for name, reason in solved.left_out.items()}
+        self.camera, self.posed, self.metric = solved.camera, solved.views, solved.metric
 
     def each(
         self, work: Callable[[T], R], tasks: Mapping[str, T], pool: ProcessPool | None, done: Report
@@ -188,13 +196,15 @@ def process(wanted: SessionInput, report: Report) -> tuple[Session, tuple[Fusion
         pool = None
         if wanted.workers > 1:
             pool = stack.enter_context(ProcessPool(wanted.workers, _RETRIES, wanted.limits))
-        boards = session.each(_find_board, _tasks(session, wanted), pool, _says(report, "exposures and board"))
-        _enough(session)
-        _solve_poses(session, boards)
-        masks = session.each(_mask_object, _mask_tasks(session, wanted, boards), pool, _says(report, "mask"))
-        _enough(session)
-        _compare_masks(session, wanted, masks)
+        boards = _find_boards(session, wanted, pool, report)
+        if boards:
+            session.place(poses.solve(boards, session.captures[session.used[0]]))
+            masks = session.each(_mask_object, _mask_tasks(session, wanted, boards), pool, _says(report, "mask"))
+            _enough(session)
+            _compare_masks(session, wanted, masks)
         session.about = session.each(_make_maps, _tasks(session, wanted), pool, _says(report, "maps"))
+        if not boards:
+            _place_by_features(session, wanted, report)
     _enough(session)
     return session, _joined(session, wanted)
 
@@ -277,17 +287,46 @@ def _calibrate_colors(session: Session, wanted: SessionInput, report: Report) ->
     session.supplied = {name: plain if name == charted else others for name in session.used}
 
 
-def _find_board(task: ViewTask) -> BoardCorners:
-    """Corners of the board in a view."""
+def _find_boards(
+    session: Session, wanted: SessionInput, pool: ProcessPool | None, report: Report
+) -> dict[str, BoardCorners]:
+    """Corners of the board by view; none if no view shows a board.
+
+    Raises
+    ------
+    CaptureError
+        No view shows a board, and there are several sets of views.
+    """
+    found = session.each(_find_board, _tasks(session, wanted), pool, _says(report, "exposures and board"))
+    boards = {name: one for name, one in found.items() if isinstance(one, BoardCorners)}
+    if found and not boards and len(session.sets) > 1:
+        raise CaptureError(
+            "no view shows a board, which several sets of views need; shoot with the object on the board of "
+            "`polcap board`, or fuse one set"
+        )
+    if boards or not found:
+        session.left_out |= {name: one for name, one in found.items() if isinstance(one, str)}
+        _enough(session)
+    return boards
+
+
+def _find_board(task: ViewTask) -> BoardCorners | str:
+    """Corners of the board in a view, or why there are none."""
     pipeline.process(task.capture, task.supplied, task.config, task.out, "align")
     results = pipeline.reopen(task.out, "align")[0]
-    return board_corners.detect(results.radiance, results.color, task.name)
+    try:
+        return board_corners.detect(results.radiance, results.color, task.name)
+    except NoBoardError as error:
+        return _reason(task.name, error)
 
 
-def _solve_poses(session: Session, corners: Mapping[str, BoardCorners]) -> None:
-    solved = poses.solve(corners, session.captures[session.used[0]])
-    session.left_out |= {name: reason.removeprefix(f"{name}: ") for name, reason in solved.left_out.items()}
-    session.camera, session.posed = solved.camera, solved.views
+def _place_by_features(session: Session, wanted: SessionInput, report: Report) -> None:
+    """Give a session without a board its poses, from features of the views' maps, and compare its masks."""
+    report("no board: poses from features of the object")
+    seen = {name: pipeline.reopen(out_of(wanted.folder, name), "infer")[0] for name in session.used}
+    session.board = False
+    session.place(feature_poses.solve(seen, session.captures[session.used[0]]))
+    _compare_masks(session, wanted, {name: np.asarray(seen[name].object_.mask) for name in session.used})
 
 
 def _mask_object(task: MaskTask) -> Bools:

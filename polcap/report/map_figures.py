@@ -4,13 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.formats import html
 from polcap.images import Bools, Floats
 from polcap.optics.color import srgb_eight_bits
+from polcap.optics.morphology import dilate
+from polcap.optics.outline import fill_outward
 from polcap.report import keys
 from polcap.report.keys import ColorKey
 from polcap.report.labels import number
@@ -120,10 +121,4 @@ def _normal_colors(vectors: Floats) -> NDArray[np.uint8]:
 
 def _extend(picture: NDArray[np.uint8], inside: Bools) -> NDArray[np.uint8]:
     """Continue a picture a few pixels beyond the object's outline, for smooth scaling; black farther out."""
-    if not inside.any():
-        return np.zeros_like(picture)
-    outside = np.where(inside, np.uint8(0), np.uint8(1))
-    distance, nearest = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    color_of = np.zeros((int(nearest.max()) + 1, picture.shape[-1]), np.uint8)
-    color_of[nearest[inside]] = picture[inside]
-    return np.where((distance <= _BORDER_PX)[..., None], color_of[nearest], np.uint8(0))
+    return np.where(dilate(inside, _BORDER_PX)[..., None], fill_outward(picture, inside), np.uint8(0))

@@ -8,7 +8,7 @@ In the order of the path:
     mask           radiance -> the object's pixels
     selfcal        gains of the shots, order and sense of the angles
     stokes         radiance, gains, transforms -> S0, S1, S2 of the crop
-    cues           Stokes parameters, matrix -> DoLP, normalised Stokes map, diffuse color, network channels
+    cues           Stokes parameters, matrix -> DoLP, normalized Stokes map, diffuse color, network channels
     infer          cues -> normal, diffuse, specular, roughness, expected error
     surface        normals -> depth and mesh
     asset          maps and mesh -> glTF textures and factors

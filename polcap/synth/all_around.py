@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from msgspec import Meta
+from msgspec import UNSET, Meta
 from scipy.spatial.transform import Rotation
 
 from polcap.errors import InputError
@@ -45,7 +45,7 @@ class AroundShoot(Shoot, frozen=True, forbid_unknown_fields=True):
     """Camera, polarizer and turntable of captures from all sides. One flat list, because users set fields by name."""
 
     focal_mm: Annotated[float, Meta(ge=1, le=10000)] = 76.0
-    board: Literal["A4", "A3", "A2"] = "A4"
+    board: Literal["A4", "A3", "A2", "none"] = "A4"
     distance_m: Annotated[float, Meta(gt=0.1, le=100)] = 0.7  # from the lens to the object's middle
     elevation_deg: Annotated[float, Meta(ge=5, le=85)] = 25.0  # of the lens above the board
     turn_error_deg: Annotated[float, Meta(ge=0, le=45)] = 0.5  # 1σ of the table's angle
@@ -161,7 +161,7 @@ def _view(scene: Scene, shoot: AroundShoot, turn: Rotation, position: Floats, pl
     place = tuple((turn.apply([0.0, placed.lift, 0.0]) + position).tolist())
     right = 0.5 * forward_camera.SENSOR_WIDTH_MM / shoot.focal_mm * shoot.distance_m - 0.053
     chart = Chart(center=(right, 0.085 * shoot.distance_m, -shoot.distance_m))
-    laid = LaidBoard(tuple(position.tolist()), vector, shoot.board)
+    laid = UNSET if shoot.board == "none" else LaidBoard(tuple(position.tolist()), vector, shoot.board)
     return msgspec.structs.replace(
         scene, turn_deg=own, position=place, chart=chart, board=laid, cast_shadows=True, shadows=True
     )

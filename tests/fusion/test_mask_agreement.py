@@ -23,8 +23,8 @@ COUNT = 8
 CAMERA = SessionCamera(FOCAL, 1.0, VIEW.center, 0.0, 0.0)
 
 
-def view(k: int, aside: Floats | None = None) -> Silhouette:
-    at = board_views.pose(360 * k / COUNT)
+def view(k: int, aside: Floats | None = None, count: int = COUNT) -> Silhouette:
+    at = board_views.pose(360 * k / count)
     mask = render.gbuffer(board_views.scene(at, SNOWMAN, aside=aside), VIEW, HEIGHT, WIDTH).mask
     return Silhouette(f"view{k + 1:02d}", mask, CAMERA, at)
 
@@ -85,6 +85,14 @@ def test_a_mask_that_lacks_a_part_of_the_object_is_left_out(views: list[Silhouet
     mask[: rows[len(rows) // 3]] = False  # the head
     _, left_out = mask_agreement.agreeing([*views[:5], replace(views[5], mask=mask), *views[6:]])
     assert list(left_out) == ["view06"]
+
+
+def test_two_masks_that_lack_the_same_part_do_not_outvote_whole_ones() -> None:
+    twelve = [view(k, count=12) for k in range(12)]
+    for k in (2, 7):
+        rows = np.flatnonzero(twelve[k].mask.any(axis=1))
+        twelve[k].mask[: rows[len(rows) // 3]] = False
+    assert sorted(mask_agreement.agreeing(twelve)[1]) == ["view03", "view08"]
 
 
 def test_a_view_in_which_the_object_had_slid_is_left_out(views: list[Silhouette]) -> None:

@@ -3,12 +3,14 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from polcap.config import Config
 from polcap.errors import CaptureError
 from polcap.formats.capture import reader
 from polcap.fusion import session as sessions
+from polcap.fusion.board_corners import BoardCorners
 from polcap.fusion.session import Session, SessionInput
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput
@@ -54,3 +56,23 @@ def test_a_view_with_swapped_angles_is_left_out_with_the_remedy(
     made = found.each(sessions._make_maps, sessions._tasks(found, wanted(tmp_path)), None, lambda _: None)
     assert found.left_out == {"view02": "90°, 45°, 0° fit better. rename the folders"}
     assert list(made) == found.used == ["view01", "view03", "view04"]
+
+
+def test_several_sets_need_the_board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [f"set{letter}/view0{k}" for letter in "AB" for k in (1, 2, 3)]
+    found = Session({name: board_views.capture() for name in names}, supplied={name: UserInput() for name in names})
+    monkeypatch.setattr(sessions, "_find_board", lambda task: "no board is visible")
+    with pytest.raises(CaptureError, match="several sets of views need"):
+        sessions._find_boards(found, wanted(tmp_path), None, lambda _: None)
+
+
+def test_a_view_without_the_board_that_others_show_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [f"view0{k}" for k in (1, 2, 3, 4)]
+    found = Session({name: board_views.capture() for name in names}, supplied={name: UserInput() for name in names})
+    corners = BoardCorners(board_views.BOARD, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)))
+    monkeypatch.setattr(
+        sessions, "_find_board", lambda task: "no board is visible" if task.name == "view03" else corners
+    )
+    boards = sessions._find_boards(found, wanted(tmp_path), None, lambda _: None)
+    assert list(boards) == found.used == ["view01", "view02", "view04"]
+    assert found.left_out == {"view03": "no board is visible"}

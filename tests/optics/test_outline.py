@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from polcap.images import Floats
 from polcap.optics import mueller, outline
@@ -54,3 +55,12 @@ def test_what_no_body_emits_weighs_no_more_than_the_most_it_can() -> None:
 def test_no_rim_tells_nothing() -> None:
     empty = outline.OutlineBand(np.zeros((3, 0)), np.zeros(0), np.zeros(0, int))
     assert outline.mean_and_sigma(*outline.phasor(empty, ANGLES)) == (0, np.pi / 2)
+
+
+def test_pixels_without_a_value_take_that_of_a_nearest_one() -> None:
+    known = np.random.default_rng(1).random((40, 60)) < 0.05
+    value = np.moveaxis(np.indices(known.shape), 0, -1).astype(np.float32)
+    out = outline.fill_outward(value, known)
+    assert np.array_equal(out[known], value[known])
+    away = np.linalg.norm(out - value, axis=-1)
+    assert np.all(away <= 1.05 * ndimage.distance_transform_edt(~known) + 1e-3)

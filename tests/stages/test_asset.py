@@ -145,12 +145,3 @@ def test_frames_are_interpolated_as_by_a_renderer() -> None:
                 assert there[number[y, x]] == pytest.approx(share @ value[face], abs=2e-4)
                 found += 1
     assert found > 60
-
-
-def test_pixels_without_a_value_take_that_of_a_nearest_one() -> None:
-    known = np.random.default_rng(1).random((40, 60)) < 0.05
-    value = np.moveaxis(np.indices(known.shape), 0, -1).astype(np.float32)
-    out = asset.fill_outward(value, known)
-    assert np.array_equal(out[known], value[known])
-    away = np.linalg.norm(out - value, axis=-1)
-    assert np.all(away <= 1.05 * ndimage.distance_transform_edt(~known) + 1e-3)

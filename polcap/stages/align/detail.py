@@ -3,7 +3,8 @@
 import cv2
 import numpy as np
 
-from polcap.images import Floats, MaskedImage, Quality
+from polcap.images import MaskedImage, Quality
+from polcap.optics import frames
 from polcap.optics.morphology import dilate
 from polcap.optics.registration import Pyramid, squared_gradient
 from polcap.optics.resize import block_means
@@ -25,9 +26,9 @@ def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
     The shot is first averaged over `step` × `step` px; `detail_px` counts these averaged pixels. A Wiener filter
     multiplies the detail by d² / (d² + σ²), d the typical detail and σ the relative noise.
     """
-    total = block_means(_sum_of_channels(shot.value), step)
+    total = block_means(frames.total(shot.value), step)
     height, width = total.shape
-    variance = _sum_of_channels(shot.variance[: height * step : step, : width * step : step])  # it changes slowly
+    variance = frames.total(shot.variance[: height * step : step, : width * step : step])  # it changes slowly
     sigma = np.sqrt(variance) / np.float32(step)
     some = (slice(None, None, 5),) * 2  # enough for a percentile
     floor = max(float(np.percentile(total[some], 99)) * _FLOOR, 2 * float(np.median(sigma[some])), 1e-9)
@@ -53,8 +54,3 @@ def shows_detail(shot: Pyramid) -> bool:
     """Whether a picture has enough detail to be registered."""
     seen = shot[0].picture[shot[0].usable]
     return len(seen) > _LEAST_PIXELS and bool(np.ptp(seen) > 0)
-
-
-def _sum_of_channels(picture: Floats) -> Floats:
-    """Sum of the channels of a picture, (H, W, 3) → (H, W)."""
-    return np.asarray(cv2.transform(np.asarray(picture, np.float32), np.ones((1, 3), np.float32)))

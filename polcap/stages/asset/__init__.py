@@ -16,6 +16,7 @@ from msgspec import Meta
 from polcap.images import Asset, Bools, Floats, Mesh, SurfaceMaps, TextureMaps, TexturePixels
 from polcap.optics import color, frames, fresnel
 from polcap.optics.morphology import dilate, erode
+from polcap.optics.outline import fill_outward
 from polcap.optics.resize import area_mean
 from polcap.optics.texture_rasterizer import rasterize_frames
 from polcap.stages import stage
@@ -136,21 +137,6 @@ def _without_outline(mask: Bools) -> Bools:
     """Erode a mask by its outermost pixels, except for parts that would vanish."""
     inner = erode(mask, 1, from_border=True)
     return np.asarray(inner | (mask & ~dilate(inner, 2)))
-
-
-def fill_outward(value: Any, known: Bools) -> Any:
-    """Fill unknown pixels of an image (H, W, C) with the value of the nearest known pixel."""
-    if known.all() or not known.any():
-        return value
-    label = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )[1].ravel()
-    inside, missing = np.flatnonzero(known), np.flatnonzero(~known)  # indices take half the time of a mask
-    source = np.empty(int(label.max()) + 1, np.intp)
-    source[label[inside]] = inside  # every known pixel is the nearest to itself
-    out = value.reshape(-1, value.shape[-1]).copy()
-    out[missing] = out.take(source[label[missing]], axis=0)
-    return out.reshape(value.shape)
 
 
 def tangent_space(maps: TextureMaps, mesh: Mesh) -> Floats:

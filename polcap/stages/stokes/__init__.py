@@ -27,7 +27,7 @@ from polcap.images import (
     StokesImage,
     View,
 )
-from polcap.optics import crossing, distortion, fresnel, mueller
+from polcap.optics import crossing, distortion, frames, fresnel, mueller
 from polcap.optics.warp import covered, warp
 from polcap.stages import stage
 from polcap.stages.stokes.reference_detail import reference_detail
@@ -274,20 +274,15 @@ def _correct_extinction(stokes: Floats, covariance: Floats, extinction: Floats) 
 
 def _with_solution_flags(stokes: Floats, covariance: Floats, quality: Bits, settings: StokesSettings) -> Bits:
     """Add quality bits (h, w) that follow from the Stokes parameters: ILL_POSED, DARK, METAL."""
-    s0, s1, s2 = (_total(plane) for plane in stokes)
-    sigma0 = np.sqrt(_total(covariance[0]))
-    sigma = np.sqrt((_total(covariance[3]) + _total(covariance[5])) / 2)
+    s0, s1, s2 = (frames.total(plane) for plane in stokes)
+    sigma0 = np.sqrt(frames.total(covariance[0]))
+    sigma = np.sqrt((frames.total(covariance[3]) + frames.total(covariance[5])) / 2)
     limit = np.float32(fresnel.greatest_diffuse_dolp(settings.greatest_ior))
     ill = (s0 <= 0) | (cv2.magnitude(s1, s2) - 3 * sigma > limit * s0)
     dark = s0 < np.float32(settings.dark_sigma) * sigma0
     for where, bit in ((ill, Quality.ILL_POSED), (dark, Quality.DARK), (_metal(stokes, covariance), Quality.METAL)):
         quality |= where.view(np.uint8) * np.uint8(bit)
     return quality
-
-
-def _total(picture: Floats) -> Floats:
-    """Sum over the channels of a picture (h, w, 3): (h, w)."""
-    return np.asarray(cv2.transform(picture, np.ones((1, 3), np.float32)))
 
 
 def _metal(stokes: Floats, covariance: Floats) -> Bools:

@@ -1,0 +1,300 @@
+"""Camera and poses of a session without a board, from features of the object (bundle adjustment of planar motion).
+
+The camera is fixed and the object turns on a flat table, so features outside the masks do not count, and all views turn
+about one axis. Features are found in the diffuse maps, which have no highlights. The measured normals of matching
+features give a first turn between two views; from features alone it is nearly ambiguous through a long lens.
+
+World frame: y is the axis, upwards as the camera sees it; the origin is on it, below the lowest features.
+
+References
+----------
+Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004. Horn, Closed-form solution of absolute
+orientation, JOSA A 1987. Golub & Pereyra, Separable nonlinear least squares, Inverse Problems 2003 (points eliminated).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.sparse import coo_matrix, csgraph
+from scipy.spatial.transform import Rotation
+
+from polcap.errors import CaptureError
+from polcap.fusion.poses import LEAST_VIEWS, PosedView, SessionCamera, SessionPoses
+from polcap.fusion.values import Pose
+from polcap.images import Bools, Capture, Floats, SurfaceMaps
+from polcap.optics import projection
+from polcap.optics.frames import dot, unit
+from polcap.results import Results
+
+_CONTRAST = 0.004  # least, of a feature; OpenCV's 0.04 is for photographs of high contrast
+_RATIO = 0.85  # of the distances of the nearest and the second descriptor
+_SAMPLES = 200  # pairs of matches that are tried as the turn between two views
+_AGREES = np.radians(15.0)  # between matching normals after the right turn; normals of single views err by 3 to 8°
+_LEAST_MATCHES = 12  # of two views, with agreeing normals, and a third of all
+_MOST_POINTS = 3000  # those that most views see are used: the time of the adjustment grows with them
+_NORMAL_SIGMA = np.radians(5.0)  # 1σ of a normal, in the first turns
+_SCALES_PX = (12.0, 6.0, 3.0, 1.5, 1.0, 1.0)  # of the Cauchy weights, by round; the first turns err by some pixels
+_FAR = 3.0  # times the last of these; features beyond are wrong matches
+_SHIFT_SIGMA = 0.02  # 1σ of an object's motion on the table besides the turn, over the distance of the lens
+_HELD = 1e-4  # 1σ of the origin's height and of the first turn, which are free
+_STEPS = 12  # of the adjustment in a round
+_WRONG = 0.01  # share of the features at the lower and at the upper end that may be wrong
+_BELOW = 0.15  # of the features' height, from the lowest of them to y = 0; the foot itself often shows none
+_Pair = tuple[int, int]  # numbers of two views
+_Matches = NDArray[np.intp]  # (M, 2) numbers of features
+
+
+@dataclass(frozen=True)
+class _Features:
+    """Features of a view."""
+
+    ray: Floats  # (N, 2) slopes X/−Z, Y/−Z in the camera frame
+    normal: Floats  # (N, 3) unit, camera frame
+    descriptor: NDArray[np.float32]  # (N, 128) unit; square roots, so that distances are Hellinger's
+
+
+@dataclass(frozen=True)
+class _Sightings:
+    """Features of points that two views or more see; a point's features are a track."""
+
+    view: NDArray[np.intp]  # (M,) number of the view
+    point: NDArray[np.intp]  # (M,) number of the track
+    ray: Floats  # (M, 2)
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """Unknowns: the axis, its place before the lens, and the motion of each view on the table."""
+
+    base: Rotation  # world to camera at turn 0, about which the axis is corrected
+    value: Floats  # (5 + 3 N,) two angles of the axis [rad], its place x, y, ln focal length; turns [rad]; shifts
+
+    def poses(self) -> tuple[Floats, Floats]:
+        """Rotations (N, 3, 3) and translations (N, 3), world to camera; the lens is 1 from the axis."""
+        tilt = Rotation.from_rotvec([self.value[0], 0.0, self.value[1]]) * self.base
+        turn, across, along = self.value[5:].reshape(3, -1)
+        shift = tilt.apply(np.stack([across, np.zeros_like(across), along], axis=-1))
+        turned = tilt * Rotation.from_rotvec(np.outer(turn, [0.0, 1.0, 0.0]))
+        return turned.as_matrix(), shift + np.array([self.value[2], self.value[3], -1.0])
+
+
+@dataclass(frozen=True)
+class _AdjustedMotion:
+    """Motion with its errors, and how well the features fit."""
+
+    seen: _Sightings
+    motion: _Motion
+    sigma: Floats  # 1σ of the unknowns
+    error: Floats  # (M, 2) slopes of the points minus those of their features
+    near: Bools  # (M,) features that are no wrong matches
+
+
+def solve(seen: Mapping[str, Results], capture: Capture) -> SessionPoses:
+    """Camera and poses of views from their maps; `capture` is one of them and states the camera's geometry.
+
+    Views without enough features in common with the others are left out. Lengths are in metres if the chart's size is
+    known; otherwise the lens is 1 from the axis.
+
+    Raises
+    ------
+    CaptureError
+        Fewer than three views have enough features in common.
+    """
+    names, first = list(seen), next(iter(seen.values()))
+    features = [_find(one.maps) for one in seen.values()]
+    pairs = {(i, j): _match(features[i], features[j]) for i, j in combinations(range(len(names)), 2)}
+    views, start = _first_motion(features, pairs)
+    posed: dict[str, PosedView] = {}
+    camera, metric = SessionCamera(capture.focal_px, 0.0, capture.principal_px, 0.0, 0.0), False
+    if len(views) >= LEAST_VIEWS:
+        sightings = _sightings(features, pairs, start, views)
+        doubt = max(*np.abs(capture.focal_doubt), 0.002 if capture.focal_known else 0.5)
+        found = _adjusted(sightings, start, first.maps.view.focal, float(doubt))
+        chart = first.color.metres_per_px
+        distance, metric = (1.0, False) if chart is None else (chart * first.radiance.view.focal, True)
+        posed = {names[views[k]]: one for k, one in _posed(found, distance, capture.focal_px).items()}
+        camera = _camera(capture, first, found)
+    if len(posed) < LEAST_VIEWS:
+        raise CaptureError(
+            f"no view shows a board, and {len(posed)} of {len(names)} views have {_LEAST_MATCHES} features of the "
+            f"object in common with others, {LEAST_VIEWS} are needed; shoot with the object on the board of "
+            "`polcap board`, or turn it by 15° or less between the views and let it fill the picture"
+        )
+    reason = f"fewer than {_LEAST_MATCHES} features of the object match those of other views; turn it by 15° or less"
+    return SessionPoses(camera, posed, {name: reason for name in names if name not in posed}, metric)
+
+
+def _camera(capture: Capture, seen: Results, found: _AdjustedMotion) -> SessionCamera:
+    """Camera with the adjusted focal length and the stated distortion, which an object in the middle does not tell."""
+    lens, change = seen.radiance.equipment.distortion, float(np.exp(found.motion.value[4]))
+    k1, k2 = (0.0, 0.0) if lens is None else (lens.k1, lens.k2)
+    focal = capture.focal_px * change
+    return SessionCamera(focal, focal * float(found.sigma[4]), capture.principal_px, k1, k2)
+
+
+def _posed(found: _AdjustedMotion, distance: float, focal_px: float) -> dict[int, PosedView]:
+    """Poses of the views with enough features, by number; the lens is `distance` from the axis."""
+    seen, motion = found.seen, found.motion
+    point = _points(seen, motion, found.near.astype(float))[0]
+    height = point[seen.point[found.near], 1]
+    foot = float(np.quantile(height, _WRONG) - _BELOW * np.ptp(np.quantile(height, [_WRONG, 1 - _WRONG])))
+    turns, shifts = motion.poses()
+    out = {}
+    for k, (turn, shift) in enumerate(zip(turns, shifts, strict=True)):
+        own = found.near & (seen.view == k)
+        if own.sum() >= _LEAST_MATCHES:
+            residual = float(np.sqrt(2 * np.mean(found.error[own] ** 2))) * focal_px
+            sigma = float(np.degrees(np.hypot(found.sigma[5 + k], found.sigma[:2].max())))
+            out[k] = PosedView(Pose(turn, distance * (shift + foot * turn[:, 1])), int(own.sum()), residual, sigma)
+    return out
+
+
+def _find(maps: SurfaceMaps) -> _Features:
+    """Features of the object in its diffuse map."""
+    gray, mask = np.asarray(maps.diffuse, np.float32).mean(axis=-1), np.asarray(maps.mask)
+    picture = 255 * np.clip(gray / max(float(np.quantile(gray[mask], 0.99)), 1e-6), 0, 1) ** (1 / 2.2)
+    finder = cv2.SIFT.create(contrastThreshold=_CONTRAST)
+    points, descriptor = finder.detectAndCompute(picture.astype(np.uint8), mask.astype(np.uint8))
+    if not points:
+        return _Features(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 128), np.float32))
+    place, index = np.unique(np.array([point.pt for point in points]), axis=0, return_index=True)
+    column, row = np.rint(place).astype(int).T
+    ray = np.stack(projection.ray_slopes(maps.view, *place.T), axis=-1)
+    roots = np.sqrt(descriptor[index] / descriptor[index].sum(axis=1, keepdims=True))
+    return _Features(ray, np.asarray(maps.normal, np.float64)[row, column], roots)
+
+
+def _match(one: _Features, other: _Features) -> _Matches:
+    """Numbers (M, 2) of features that are each other's nearest, and nearer than the second nearest."""
+    if min(len(one.ray), len(other.ray)) < _LEAST_MATCHES:
+        return np.zeros((0, 2), np.intp)
+    distance = np.sqrt(np.maximum(2 - 2 * one.descriptor @ other.descriptor.T, 0))
+    i, j = np.arange(len(distance)), distance.argmin(axis=1)
+    two = np.partition(distance, 1, axis=1)
+    good = (distance.argmin(axis=0)[j] == i) & (two[:, 0] < _RATIO * two[:, 1])
+    return np.stack([i[good], j[good]], axis=-1)
+
+
+def _first_motion(features: Sequence[_Features], pairs: Mapping[_Pair, _Matches]) -> tuple[NDArray[np.intp], _Motion]:
+    """The largest group of views that matches connect, and their motion, from normals alone."""
+    found = {
+        pair: _turn(features[pair[0]].normal[match[:, 0]], features[pair[1]].normal[match[:, 1]])
+        for pair, match in pairs.items()
+    }
+    found = {pair: one for pair, one in found.items() if one[1] >= max(_LEAST_MATCHES, len(pairs[pair]) / 3)}
+    if not found:
+        return np.zeros(0, np.intp), _Motion(Rotation.identity(), np.zeros(5))
+    (i, j), count = np.array(list(found)).T, np.array([one[1] for one in found.values()])
+    between = Rotation.concatenate([one[0] for one in found.values()])
+    vector, quaternion = between.as_rotvec(), between.as_quat()
+    axis = unit(np.sum(vector * (np.sign(vector[:, 1]) * count)[:, None], axis=0))
+    step = 2 * np.arctan2(quaternion[:, :3] @ axis, quaternion[:, 3])  # [rad] about the axis
+    distance, signed = np.zeros((2, len(features), len(features)))
+    distance[i, j], signed[i, j], signed[j, i] = 1 / count, step, -step
+    _, group = csgraph.connected_components(distance, directed=False)
+    views = np.flatnonzero(group == np.argmax(np.bincount(group)))
+    order, before = csgraph.breadth_first_order(csgraph.minimum_spanning_tree(distance), views[0], directed=False)
+    turn: Floats = np.zeros(len(features))
+    for k in order[1:]:
+        turn[k] = turn[before[k]] + signed[before[k], k]
+
+    def residuals(turn: Floats) -> Floats:
+        angle = turn[j] - turn[i] - step
+        return np.asarray((angle - 2 * np.pi * np.rint(angle / (2 * np.pi))) * np.sqrt(count) / _NORMAL_SIGMA)
+
+    turn = least_squares(residuals, turn, loss="cauchy").x[views]
+    middle = np.concatenate([features[k].ray for k in views.tolist()]).mean(axis=0)
+    base = Rotation.align_vectors([axis], [[0.0, 1.0, 0.0]])[0]
+    return views, _Motion(base, np.concatenate([[0.0, 0.0], middle, [0.0], turn, np.zeros(2 * len(views))]))
+
+
+def _turn(before: Floats, after: Floats) -> tuple[Rotation, int]:
+    """Rotation of most unit vectors `before` (N, 3) into `after`, and how many agree with it."""
+    if len(before) < _LEAST_MATCHES:
+        return Rotation.identity(), 0
+    pick = np.random.default_rng(0).integers(len(before), size=(_SAMPLES, 2))
+    tried = _frames(after[pick]) @ _frames(before[pick]).transpose(0, 2, 1)  # (S, 3, 3)
+    agree = np.einsum("sij,nj,ni->sn", tried, before, after) > np.cos(_AGREES)
+    best = agree[np.argmax(agree.sum(axis=1))]
+    if best.sum() < _LEAST_MATCHES:
+        return Rotation.identity(), 0
+    return Rotation.align_vectors(after[best], before[best])[0], int(best.sum())
+
+
+def _frames(pair: Floats) -> Floats:
+    """Orthonormal frames (S, 3, 3), in columns, of two unit vectors each (S, 2, 3)."""
+    third = unit(np.cross(pair[:, 0], pair[:, 1]) + 1e-9)
+    return np.stack([pair[:, 0], np.cross(third, pair[:, 0]), third], axis=-1)
+
+
+def _sightings(
+    features: Sequence[_Features], pairs: Mapping[_Pair, _Matches], first: _Motion, views: NDArray[np.intp]
+) -> _Sightings:
+    """Tracks of features of some views whose normals match after the first turns, one feature in each view."""
+    start = np.cumsum([0, *(len(one.ray) for one in features)])
+    normal, ray = (np.concatenate([getattr(one, name) for one in features]) for name in ("normal", "ray"))
+    view = np.repeat(np.arange(len(features)), np.diff(start))
+    turns = np.zeros((len(features), 3, 3))  # 0 for views that are not used
+    turns[views] = first.poses()[0]
+    one, other = np.concatenate([start[list(pair)] + match for pair, match in pairs.items()]).T
+    world = np.einsum("nji,nj->ni", turns[view], normal)
+    good = dot(world[one], world[other]) > np.cos(_AGREES)
+    joined = coo_matrix((good[good], (one[good], other[good])), shape=(len(view),) * 2)
+    _, track = csgraph.connected_components(joined, directed=False)
+    use = np.unique(np.stack([track, view]), axis=1, return_index=True)[1]
+    size = np.bincount(track[use])
+    longest = np.argsort(-size, kind="stable")[:_MOST_POINTS]
+    use = use[(size[track[use]] > 1) & np.isin(track[use], longest)]
+    return _Sightings(np.searchsorted(views, view[use]), np.unique(track[use], return_inverse=True)[1], ray[use])
+
+
+def _adjusted(seen: _Sightings, first: _Motion, focal_px: float, doubt: float) -> _AdjustedMotion:
+    """The motion that fits the sightings best; `doubt` is the 1σ of the logarithm of the focal length."""
+    count = (len(first.value) - 5) // 3
+    prior = np.full(len(first.value), np.inf)
+    prior[[3, 4, 5]] = _HELD, doubt, _HELD
+    prior[5 + count :] = _SHIFT_SIGMA
+    value, weight = first.value, np.ones(len(seen.view))
+    for scale in _SCALES_PX:
+
+        def residuals(value: Floats, weight: Floats = weight, scale: float = scale) -> Floats:
+            error = _errors(seen, _Motion(first.base, value), weight) * focal_px / scale
+            return np.concatenate([np.ravel(error), (value - first.value) / prior])
+
+        best = least_squares(residuals, value, x_scale="jac", loss="cauchy", max_nfev=_STEPS)
+        value = best.x
+        error = _errors(seen, _Motion(first.base, value), weight)
+        far = np.linalg.norm(error, axis=1) * focal_px / scale
+        weight = 1 / np.sqrt(1 + far**2)
+    near, jacobian = far < _FAR, np.asarray(best.jac)
+    spread = float(np.sqrt(np.mean(error[near] ** 2))) * focal_px / scale
+    sigma = spread * np.sqrt(np.abs(np.diag(np.linalg.pinv(jacobian.T @ jacobian))))
+    return _AdjustedMotion(seen, _Motion(first.base, value), sigma, error, near)
+
+
+def _points(seen: _Sightings, motion: _Motion, weight: Floats) -> tuple[Floats, Floats]:
+    """World points (P, 3) nearest to their rays, by linear least squares, and their slopes (M, 2) in the views.
+
+    A ray (x, y) of the view with rotation R and translation t says (R X + t)_x + x (R X + t)_z = 0, and so for y.
+    """
+    turn, shift = (part[seen.view] for part in motion.poses())
+    ray = seen.ray * np.exp(-motion.value[4])
+    terms = (turn[:, :2] + ray[..., None] * turn[:, 2:]) * weight[:, None, None]  # (M, 2, 3)
+    right = -(shift[:, :2] + ray * shift[:, 2:]) * weight[:, None]  # (M, 2)
+    count = int(seen.point.max()) + 1
+    square, side = np.zeros((count, 3, 3)), np.zeros((count, 3, 1))
+    np.add.at(square, seen.point, np.einsum("mki,mkj->mij", terms, terms))
+    np.add.at(side[..., 0], seen.point, np.einsum("mki,mk->mi", terms, right))
+    point = np.linalg.solve(square + 1e-9 * np.eye(3), side)[..., 0]
+    seen_at = np.einsum("mij,mj->mi", turn, point[seen.point]) + shift
+    return point, -seen_at[:, :2] / seen_at[:, 2:] * np.exp(motion.value[4])
+
+
+def _errors(seen: _Sightings, motion: _Motion, weight: Floats) -> Floats:
+    """Slopes (M, 2) of the points minus those of their features."""
+    return np.asarray(_points(seen, motion, weight)[1] - seen.ray)

@@ -1,0 +1,114 @@
+"""Poses and mesh of an object with a fine pattern, fused without a board and with one.
+
+POLCAP_DATA=FOLDER python tests/benchmarks/bench_no_board.py OUT MESH VIEWS [STEP]
+
+Renders OUT/none and OUT/A4, fuses each (every STEP-th view), and prints a row: mean and largest error of the views'
+rotations [°], rms of the features or corners [px], and mean distance of the mesh from the true surface [% of its size],
+over the texels that a view saw. Without a board the mesh is first placed on the true one, and scaled, by iterative
+closest points.
+"""
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import bench_fused_asset
+import numpy as np
+from msgspec.structs import replace
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from trimesh import Trimesh
+from trimesh.registration import procrustes
+from trimesh.sample import sample_surface
+
+from polcap import config
+from polcap.fusion import fuse_run, fused_maps, session
+from polcap.fusion.fusion_path import FusionSettings
+from polcap.fusion.session import Session, SessionInput
+from polcap.fusion.values import Pose
+from polcap.images import Floats
+from polcap.pipeline import models
+from polcap.synth import all_around, scenes
+
+PATTERN_M = 0.006  # size of the pattern
+ROUNDS, NEAR = 20, 0.9  # of the placing; share of the nearest points that it uses
+TEXELS = 10  # every tenth is compared
+
+
+def main(out: Path, mesh: str, views: int, step: int) -> None:
+    for board in ("none", "A4"):
+        folder = out / board
+        if not folder.exists():
+            render(folder, mesh, board, views)
+        for k in range(views):
+            if k % step:
+                (folder / f"view{k + 1:02d}").rename(folder / f"unused{k + 1:02d}")
+        networks = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
+        wanted = SessionInput(folder, config.load(None, []), network=networks[0], mask_network=networks[1])
+        fuse_run.fuse(wanted, FusionSettings(), folder / "fused", print, lambda *_: None)
+        found, _ = session.process(wanted, lambda _: None)
+        pairs = true_poses(folder, found)
+        turns = rotation_errors(pairs)
+        residual = np.mean([one.residual_px for one in found.posed.values()])
+        print(
+            f"| {mesh}, {len(turns)} of {views // step} views | {'board' if board != 'none' else 'features'} | "
+            f"{turns.mean():.2f}, {turns.max():.2f} | {residual:.2f} | {100 * distance(folder, pairs):.2f} |"
+        )
+
+
+def render(folder: Path, mesh: str, board: Any, views: int) -> None:
+    """Views of 1500 × 1000 px of a mesh with two fine patterns."""
+    file = Path(os.environ["POLCAP_DATA"]) / "meshes" / "test" / f"{mesh}.npz"
+    scene = scenes.with_model(scenes.random_scene(0, "bumps"), file, 0)
+    fine = zip(scene.coat.materials, ("veins", "noise"))
+    materials = tuple(replace(one, size=PATTERN_M, pattern=pattern) for one, pattern in fine)
+    shoot = all_around.AroundShoot(seed=0, width=1500, height=1000, samples=1, exposures=1, board=board)
+    all_around.write(folder, replace(scene, coat=replace(scene.coat, materials=materials)), shoot, views)
+
+
+def true_poses(folder: Path, found: Session) -> list[tuple[Pose, Pose]]:
+    """Found and true pose of each used view."""
+    views = json.loads((folder / "truth.json").read_text())["views"]
+    true = {one["name"]: Pose(np.array(one["rotation"]), np.array(one["translation"])) for one in views}
+    return [(found.posed[name].pose, true[name]) for name in found.used]
+
+
+def world(pairs: list[tuple[Pose, Pose]]) -> Floats:
+    """Rotation (3, 3) from the true world to the found one that fits the rotations of all views best."""
+    return Rotation.from_matrix([one.rotation.T @ true.rotation for one, true in pairs]).mean().as_matrix()
+
+
+def rotation_errors(pairs: list[tuple[Pose, Pose]]) -> Floats:
+    """Angles [°] between the found and the true rotations of all views, in the world frame that fits them best."""
+    turn = world(pairs)
+    return np.degrees([Rotation.from_matrix(one.rotation @ turn @ true.rotation.T).magnitude() for one, true in pairs])
+
+
+def distance(folder: Path, pairs: list[tuple[Pose, Pose]]) -> float:
+    """Mean distance of the seen texels from the true surface, over its size."""
+    source, truth = fused_maps.read(folder / "fused" / "maps"), dict(np.load(folder / "truth.npz"))
+    surface = Trimesh(truth["vertices"], truth["faces"], process=False)
+    tree, size = cKDTree(sample_surface(surface, 400_000, seed=0)[0]), float(np.ptp(truth["vertices"], axis=0).max())
+    point = source.atlas.position[source.maps.weight[source.atlas.covered] > bench_fused_asset.LEAST_SEEN][::TEXELS]
+    point = point if source.atlas.mesh.metric else placed(point, pairs, tree)
+    return float(np.mean(tree.query(point)[0])) / size
+
+
+def placed(point: Floats, pairs: list[tuple[Pose, Pose]], tree: cKDTree) -> Floats:
+    """Points (N, 3) placed on those of a tree by similarities, first by that of the poses."""
+    turn = world(pairs)
+    terms = np.concatenate([np.hstack([one.translation[:, None], -true.rotation]) for one, true in pairs])
+    scale, *shift = np.linalg.lstsq(terms, np.concatenate([true.translation for _, true in pairs]))[0]
+    moved = scale * point @ turn + shift
+    for _ in range(ROUNDS):
+        away, near = tree.query(moved)
+        use = away < np.quantile(away, NEAR)
+        matrix = procrustes(moved[use], tree.data[np.asarray(near)[use]], reflection=False)[0]
+        moved = moved @ matrix[:3, :3].T + matrix[:3, 3]
+    return np.asarray(moved)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), int(sys.argv[4]) if len(sys.argv) > 4 else 1)

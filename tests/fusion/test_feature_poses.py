@@ -1,0 +1,84 @@
+"""Poses without a board: a patterned object gives them, up to scale; one without pattern is refused."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from scipy.spatial.transform import Rotation
+
+from polcap.errors import CaptureError
+from polcap.fusion import feature_poses
+from polcap.fusion.poses import SessionPoses
+from polcap.images import View
+from polcap.synth import render, scene_materials
+from polcap.synth.distance_fields import Cluster
+from polcap.synth.scene_materials import Coat, Material
+from tests.fusion import board_views
+
+SHAPE = Cluster(((0, 0, 0, 0.03), (0.022, 0.01, 0.01, 0.02), (-0.02, -0.005, 0.012, 0.018)))
+PATTERN = Coat((Material((0.7, 0.6, 0.5), (0.2, 0.3, 0.25), "noise", size=0.004, roughness=(0.5, 0.5), seed=3),))
+VIEW = View(2600.0, board_views.VIEW.center, 1.0)
+DISTANCE = 0.7  # m
+TURNS = {f"view{k + 1:02d}": board_views.pose(15 * k) for k in range(24)}
+
+
+def maps(name: str, coat: Coat, seed: int = 0) -> Any:
+    """Traced maps of a view, with normals that err by 6°, as far as the poses need them."""
+    scene = replace(board_views.scene(TURNS[name], SHAPE), coat=coat)
+    seen = render.gbuffer(scene, VIEW, board_views.HEIGHT, board_views.WIDTH)
+    diffuse = np.zeros((*seen.mask.shape, 3))
+    diffuse[seen.mask] = scene_materials.evaluate(coat, seen.position[seen.mask], seen.facing[seen.mask])[0]
+    random = np.random.default_rng([seed, list(TURNS).index(name)])
+    diffuse += 0.003 * random.normal(size=diffuse.shape)
+    normal = seen.normal + np.radians(6.0) / np.sqrt(2) * random.normal(size=diffuse.shape)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return SimpleNamespace(mask=seen.mask, diffuse=diffuse, normal=normal, view=VIEW)
+
+
+def results(one: Any, metres_per_px: float | None = None) -> Any:
+    """Results of a view's stages with these maps."""
+    radiance = SimpleNamespace(view=VIEW, equipment=SimpleNamespace(distortion=None))
+    return SimpleNamespace(maps=one, radiance=radiance, color=SimpleNamespace(metres_per_px=metres_per_px))
+
+
+def solve(seen: dict[str, Any], metres_per_px: float | None = None) -> SessionPoses:
+    named = {name: results(one, metres_per_px) for name, one in seen.items()}
+    return feature_poses.solve(named, board_views.capture(VIEW.focal))
+
+
+@pytest.fixture(scope="module")
+def patterned() -> dict[str, Any]:
+    return {name: maps(name, PATTERN) for name in TURNS}
+
+
+def test_a_patterned_object_gives_turns_to_a_third_of_a_degree(patterned: dict[str, Any]) -> None:
+    found = solve(patterned)
+    assert not found.left_out and not found.metric
+    first = TURNS["view01"].rotation.T @ found.views["view01"].pose.rotation
+    for name, one in found.views.items():
+        wrong = Rotation.from_matrix(one.pose.rotation @ first.T @ TURNS[name].rotation.T).magnitude()
+        assert np.degrees(wrong) < 0.35, name
+        assert one.residual_px < 1.0
+
+
+def test_the_chart_gives_the_scale(patterned: dict[str, Any]) -> None:
+    some = {name: patterned[name] for name in list(TURNS)[:6]}
+    found = solve(some, DISTANCE / VIEW.focal)
+    assert found.metric
+    for one in found.views.values():
+        assert np.linalg.norm(one.pose.center) == pytest.approx(DISTANCE, rel=0.1)  # of a point on the axis
+
+
+def test_a_view_of_something_else_is_left_out(patterned: dict[str, Any]) -> None:
+    other = Coat((replace(PATTERN.materials[0], seed=77),))
+    found = solve({**{name: patterned[name] for name in list(TURNS)[:6]}, "view07": maps("view07", other)})
+    assert list(found.left_out) == ["view07"]
+    assert "turn it by 15° or less" in found.left_out["view07"]
+
+
+def test_an_object_without_pattern_is_refused() -> None:
+    plain = {name: maps(name, board_views.PALE) for name in list(TURNS)[:4]}
+    with pytest.raises(CaptureError, match=r"no view shows a board, and 0 of 4 views have 12 features"):
+        solve(plain)
