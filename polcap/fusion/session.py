@@ -202,9 +202,11 @@ def process(wanted: SessionInput, report: Report) -> tuple[Session, tuple[Fusion
             masks = session.each(_mask_object, _mask_tasks(session, wanted, boards), pool, _says(report, "mask"))
             _enough(session)
             _compare_masks(session, wanted, masks)
-        session.about = session.each(_make_maps, _tasks(session, wanted), pool, _says(report, "maps"))
-        if not boards:
+        else:
+            session.each(_make_maps, _tasks(session, wanted), pool, _says(report, "first maps"))
+            _enough(session)
             _place_by_features(session, wanted, report)
+        session.about = session.each(_make_maps, _tasks(session, wanted), pool, _says(report, "maps"))
     _enough(session)
     return session, _joined(session, wanted)
 
