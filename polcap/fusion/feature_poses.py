@@ -205,7 +205,8 @@ def _first_motion(features: Sequence[_Features], pairs: Mapping[_Pair, _Matches]
 
     def residuals(turn: Floats) -> Floats:
         angle = turn[j] - turn[i] - step
-        return np.asarray((angle - 2 * np.pi * np.rint(angle / (2 * np.pi))) * np.sqrt(count) / _NORMAL_SIGMA)
+        error = (angle - 2 * np.pi * np.rint(angle / (2 * np.pi))) * np.sqrt(count) / _NORMAL_SIGMA
+        return np.append(error, turn[views[0]])  # of the first view: 0
 
     turn = least_squares(residuals, turn, loss="cauchy").x[views]
     middle = np.concatenate([features[k].ray for k in views.tolist()]).mean(axis=0)

@@ -56,6 +56,7 @@ def patterned() -> dict[str, Any]:
 def test_a_patterned_object_gives_turns_to_a_third_of_a_degree(patterned: dict[str, Any]) -> None:
     found = solve(patterned)
     assert not found.left_out and not found.metric
+    assert found.views["view01"].pose.rotation[0, 0] > 0.99  # the frame begins at the first view
     first = TURNS["view01"].rotation.T @ found.views["view01"].pose.rotation
     for name, one in found.views.items():
         wrong = Rotation.from_matrix(one.pose.rotation @ first.T @ TURNS[name].rotation.T).magnitude()
