@@ -19,9 +19,9 @@ from polcap.stages.cues import CHANNELS, channels
 from polcap.stages.infer.highlights import REACHED
 
 OUTPUTS = {"normal": 3, "depth": 1, "diffuse": 3, "specular": 3, "roughness": 1, "sigma": 1}  # channels of each map
-_POSITIONS = tuple(
-    (quarters, mirror) for first in (0, 1) for mirror in (False, True) for quarters in (first, first + 2)
-)
+_POSITIONS = (  # quarter turns, mirrored; the first four have all turns
+    (0, False), (2, False), (1, True), (3, True), (0, True), (2, True), (1, False), (3, False),
+)  # fmt: skip
 _STEPS = 5  # of the median's iteration
 _LEAST_ERROR = 0.5  # degrees
 _NEAR_PX = 16.0  # 1σ of the means of expected errors by which the sizes are weighted
@@ -32,24 +32,24 @@ _NEAREST = 0.05  # least distance between unit vectors, about 3°: nearer ones w
 
 
 def predict(pictures: Sequence[Cues], network: Network, run: RunNetwork, symmetries: int) -> dict[str, Floats]:
-    """The network's maps (H, W[, 3]), averaged over 1, 2, 4 or 8 rotated and mirrored positions of each picture.
+    """The network's maps (H, W[, 3]), averaged over 1, 2, 4 or 8 rotated and mirrored positions.
 
-    `pictures` show the same object at different sizes; the maps have the grid of the first. The network resolves more
-    in a large picture, and understands textures and large forms better in a small one. Where it expects a smaller error
-    in one size than in another, that size counts more. The map `opposed` (H, W) is the share of all predictions in
-    which the normal leans to the other side of the ray.
+    `pictures` show the same object at different sizes, and take the positions in turns; the maps have the grid of the
+    first. In a large picture the network resolves more; in a small one it understands textures and large forms better.
+    Where it expects a smaller error in one size than in another, that size counts more. The map `opposed` (H, W) is the
+    share of the positions in which the normal leans to the other side of the ray.
     """
-    first = pictures[0]
+    first, count = pictures[0], min(len(pictures), symmetries)
+    encoded = [np.moveaxis(channels(picture), 0, -1) for picture in pictures[:count]]
     calls = [
-        partial(_predict_turned, encoded, picture, network, run, *position)
-        for picture, encoded in zip(pictures, [np.moveaxis(channels(picture), 0, -1) for picture in pictures])
-        for position in _POSITIONS[:symmetries]
+        partial(_predict_turned, encoded[k % count], pictures[k % count], network, run, *position)
+        for k, position in enumerate(_POSITIONS[:symmetries])
     ]
     predictions = [
         {name: np.asarray(cv2.resize(image, first.mask.shape[::-1])) for name, image in maps.items()}
         for maps in parallel.results(calls, network.at_once)
     ]
-    sizes = [_mean(predictions[k : k + symmetries]) for k in range(0, len(predictions), symmetries)]
+    sizes = [_mean(predictions[k::count]) for k in range(count)]
     weights = _weights([maps["sigma"] for maps in sizes], first.mask)
     maps = {
         name: np.asarray(sum(np.einsum("yx,yx...->yx...", w, of[name]) for w, of in zip(weights, sizes)), np.float32)
