@@ -8,7 +8,7 @@ import pytest
 
 from polcap.formats.capture import capture_toml
 from polcap.formats.capture import reader as captures
-from polcap.images import Role
+from polcap.images import CatalogEntry, Role
 from polcap.rig import camera_gphoto2
 from tests.conftest import ROOT, Command
 from tests.rig import virtual
@@ -125,6 +125,6 @@ def test_the_template_and_the_card_for_shooting_by_hand_are_understood(tmp_path:
     assert (
         set(capture_toml.CaptureFile.__struct_fields__) - {"frame", "rotator", "catalog"} <= keys
     )  # every key is explained
-    assert set(capture_toml.Catalog.__struct_fields__) <= keys
+    assert set(CatalogEntry.__struct_fields__) <= keys
     card = (ROOT / "examples" / "shooting-card.html").read_text()
     assert all(folder in card for folder in ("pol000", "pol045", "pol090"))
