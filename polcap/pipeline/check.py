@@ -23,7 +23,7 @@ from polcap.quality.gate import Evidence, Gate
 from polcap.results import NotReached
 
 _THREADS = 2  # frames that are decoded at a time
-_SYMMETRIES = 1  # views of the network: gates read medians of its maps, which four views move by 3 % at most
+_SYMMETRIES = 2  # positions of the network, one for each size: gates read medians of its maps only
 _ERROR_COST_DEG = 45.0  # of a stage that gives up: nothing is known of the normals
 
 

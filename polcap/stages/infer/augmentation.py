@@ -1,4 +1,4 @@
-"""Test-time augmentation: the network's predictions in turned and mirrored positions, averaged.
+"""Test-time augmentation: the network's predictions in turned and mirrored positions and at several sizes, averaged.
 
 A picture that is turned by 90° or mirrored shows a scene that is turned or mirrored. Its Stokes vectors (S1, S2) turn
 by twice the angle, its rays by the angle itself. Each prediction is transformed back before the average.

@@ -74,7 +74,7 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=17)
+@stage(version=18)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,
@@ -134,7 +134,7 @@ def solve(
         turned=angles.turned_shot(*object_gains.cells(even.light, even.inside), angle, first.sigma),
         found_sigma=found_sigma,
         crossed=crossed_light.measure(radiance, alignment, color, shots, gains.gain, angle),
-        other_orders=angles.other_orders(order.check, angle) if settings.check_order else (),
+        other_orders=angles.other_orders(order.check, angle),
     )
 
 
