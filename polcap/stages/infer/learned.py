@@ -1,6 +1,6 @@
 """Learned estimator: the network's maps of the whole object, combined with fine detail of the analytic inversion.
 
-1. The cues are reduced to the size for which the network was made.
+1. The cues are reduced to two sizes, one above and one below the network's native size.
 2. The network predicts normals, material, depth and error; half-turns of whole regions are corrected.
 3. The analytic inversion gives normals of each pixel. Their detail replaces that of the network where noise is low.
 4. The refinement network adds relief.
@@ -23,7 +23,7 @@ from polcap.stages.infer.highlights import REACHED
 _INVERSION = 4.0  # factor on the inversion's expected error in the join, for the network's input holds the inversion
 # error = min(a·statedᵇ·exp(r·roughness), c), degrees: maximum likelihood on traced training meshes (decision 28)
 _CALIBRATION = (0.515, 1.12, 0.906, 50.0)
-_SIZES = (1.5625, 0.875)  # of the network's pictures over that of its training: 400 and 224 px
+_SIZES = (1.5625, 0.875)  # of the network's pictures, over its native size: 400 and 224 px (decision 9)
 _OVERVIEWS, _OVERVIEW_POSITIONS = (0.5, 0.35), 2  # sizes of smaller pictures, evidence for the side of normals
 _TEST_SIZE = 0.35  # of the picture by which orders of the shots are compared
 _GRAZING = 0.15  # least cosine of the shading; .1 and .2 leave the same error
