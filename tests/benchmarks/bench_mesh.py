@@ -22,11 +22,10 @@ import cv2
 import msgspec
 import numpy as np
 
-from polcap.images import Floats, ReliefMesh, SurfaceMaps, View
+from polcap.images import Bools, Floats, ReliefMesh, SurfaceMaps, View
 from polcap.optics import frames
 from polcap.stages import surface
 from polcap.stages.surface.occlusion import least_step
-from polcap.stages.surface.slope_equations import Bools
 from polcap.stages.surface.triangles import boundary_edges, measure_boundary
 from polcap.synth import render, scenes, trace
 

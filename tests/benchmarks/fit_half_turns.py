@@ -94,7 +94,7 @@ def predicted(case: Case, network: Network) -> tuple[half_turns.Grid, Floats, Fl
     seen = learned._reduce(learned._limit_radiance(case.cues), 1 / shrink)
     maps = augmentation.predict([seen], network, onnx.run, 4)
     grid = half_turns.coarse(frames.to_ray_frame(frames.unit(maps["normal"]), seen.rays), seen.mask)
-    overview = learned._overview(seen, network, onnx.run)
+    overview = learned._overview(seen, 1.0, network, onnx.run)
     doubt = half_turns.NetworkDoubt(maps["sigma"], maps["opposed"], overview)
     return grid, half_turns.wrong_terms(grid, doubt, seen.mask), gain_of_turning(grid, case)
 
