@@ -22,16 +22,16 @@ PALE = Coat((Material((0.6, 0.5, 0.4), (0.6, 0.5, 0.4), "plain", roughness=(0.5,
 BOARD = boards.BOARDS["A4"]
 
 
-def pose(degrees: float, elevation: float = 28.0, aside: tuple[float, float] = (0.0, 0.0)) -> Pose:
-    """A board turned by `degrees` and moved by `aside` [m, x and z of the table]."""
+def pose(degrees: float, elevation: float = 28.0, shift: tuple[float, float] = (0.0, 0.0)) -> Pose:
+    """A board turned by `degrees` and moved by `shift` [m, x and z of the table]."""
     tilt = Rotation.from_euler("x", elevation, degrees=True)
     turn = tilt * Rotation.from_euler("y", degrees, degrees=True)
-    return Pose(turn.as_matrix(), tilt.apply([aside[0], -0.02, aside[1]]) - [0.0, 0.0, 0.7])
+    return Pose(turn.as_matrix(), tilt.apply([shift[0], -0.02, shift[1]]) - [0.0, 0.0, 0.7])
 
 
-def scene(at: Pose, shape: Cluster = BALL, size: Any = "A4", aside: Floats | None = None) -> Scene:
-    """A shape whose lowest point rests on the board, moved by `aside` (3,) [m] on it."""
-    place = np.array([0.0, 0.03, 0.0]) if aside is None else np.array([0.0, 0.03, 0.0]) + aside
+def scene(at: Pose, shape: Cluster = BALL, size: Any = "A4", shift: Floats | None = None) -> Scene:
+    """A shape whose lowest point rests on the board, moved by `shift` (3,) [m] on it."""
+    place = np.array([0.0, 0.03, 0.0]) if shift is None else np.array([0.0, 0.03, 0.0]) + shift
     vector = tuple(Rotation.from_matrix(at.rotation).as_rotvec(degrees=True).tolist())
     return Scene(
         shape=shape, coat=PALE, position=tuple((at.rotation @ place + at.translation).tolist()), turn_deg=vector,

@@ -21,7 +21,7 @@ def erased(albedo: tuple[float, float, float]) -> tuple[Floats, Floats, Bools]:
     """S0 (H, W, 3) before and after, and the true mask (H, W), of a ball that hides a part of the ring."""
     at = board_views.pose(20)
     coat = Coat((Material(albedo, albedo, "plain", roughness=(0.5, 0.5)),))
-    scene = replace(board_views.scene(at, aside=np.array([0.03, 0.0, -0.02])), coat=coat)
+    scene = replace(board_views.scene(at, shift=np.array([0.03, 0.0, -0.02])), coat=coat)
     before = board_views.picture(scene)
     after = board_eraser.erase(board_views.stack(before), STILL, COLOR, BOARD, (CAMERA, at))
     return before, 2 * np.asarray(after.value[0]), render.gbuffer(scene, VIEW, HEIGHT, WIDTH).mask
@@ -40,6 +40,6 @@ def test_the_print_becomes_dark_and_the_object_stays(albedo: tuple[float, float,
 def test_a_picture_that_shows_no_board_does_not_change() -> None:
     at = board_views.pose(0)
     stack = board_views.stack(board_views.picture(replace(board_views.scene(at), board=UNSET)))
-    away = board_views.pose(0, aside=(5.0, 0.0))
+    away = board_views.pose(0, shift=(5.0, 0.0))
     same = board_eraser.erase(stack, STILL, COLOR, BOARD, (CAMERA, away))
     assert np.array_equal(same.value, stack.value)

@@ -23,9 +23,9 @@ COUNT = 8
 CAMERA = SessionCamera(FOCAL, 1.0, VIEW.center, 0.0, 0.0)
 
 
-def view(k: int, aside: Floats | None = None, count: int = COUNT) -> Silhouette:
+def view(k: int, shift: Floats | None = None, count: int = COUNT) -> Silhouette:
     at = board_views.pose(360 * k / count)
-    mask = render.gbuffer(board_views.scene(at, SNOWMAN, aside=aside), VIEW, HEIGHT, WIDTH).mask
+    mask = render.gbuffer(board_views.scene(at, SNOWMAN, shift=shift), VIEW, HEIGHT, WIDTH).mask
     return Silhouette(f"view{k + 1:02d}", mask, CAMERA, at)
 
 

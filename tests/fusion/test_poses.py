@@ -15,7 +15,7 @@ from tests.fusion import board_views
 from tests.fusion.board_views import COLOR, FOCAL, VIEW
 
 BEND = (-0.15, 0.3)
-TRUE = {f"view{k + 1:02d}": board_views.pose(60 * k + 3, aside=(0.004, -0.003)) for k in range(6)}
+TRUE = {f"view{k + 1:02d}": board_views.pose(60 * k + 3, shift=(0.004, -0.003)) for k in range(6)}
 ON_OBJECT = np.array([[0, 0.06, 0], [0.03, 0.03, 0], [0, 0.03, 0.03], [-0.03, 0.03, 0]])
 
 

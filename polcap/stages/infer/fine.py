@@ -11,10 +11,9 @@ from functools import partial
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap import parallel
-from polcap.images import Cues, Floats, Network, RunNetwork
+from polcap.images import Bools, Cues, Floats, Network, RunNetwork
 from polcap.optics import frames
 from polcap.optics.resize import area_mean
 from polcap.stages import cues as cue_channels
@@ -76,7 +75,7 @@ def refine(cues: Cues, estimate: CoarseEstimate, network: Network, run: RunNetwo
     return frames.unit(frames.from_ray_frame(local, cues.rays))
 
 
-def _tiles(mask: NDArray[np.bool_]) -> Iterator[tuple[Window, Window]]:
+def _tiles(mask: Bools) -> Iterator[tuple[Window, Window]]:
     """Divide the object into tiles for the refinement network; yields each tile without and with its margin."""
     height, width = mask.shape
     for y in range(0, height, _TILE):
@@ -107,12 +106,12 @@ def _tile_relief(
     return relief[y : y + high, x : x + wide]
 
 
-def high_pass(image: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
+def high_pass(image: Floats, mask: Bools, shrink: float) -> Floats:
     """High-pass part of an image (H, W, 3): structure too fine for the main network; 0 outside the mask (H, W)."""
     return np.asarray((image - low_pass(image, mask, shrink)) * mask.astype(np.float32)[..., None])
 
 
-def low_pass(image: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
+def low_pass(image: Floats, mask: Bools, shrink: float) -> Floats:
     """Low-pass part of an image (H, W, 3) inside the mask (H, W): the structure that the main network resolves.
 
     The image is averaged down by the factor `shrink`, blurred, and interpolated back.

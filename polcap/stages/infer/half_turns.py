@@ -32,11 +32,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.optics import outline
 from polcap.optics.resize import area_mean, weighted_area_mean
-
-Bools = NDArray[np.bool_]
 
 _LONGEST = 128  # cells of the grid's longer side
 _OUTLINE, _INVERSION_OUTLINE, _INSIDE, _NETWORK = 1.0, 3.0, 0.015, 0.16  # weights of the terms; the neighbors' is 1

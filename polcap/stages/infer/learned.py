@@ -11,9 +11,8 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Cues, Floats, Network, OrderTest, Quality, RunNetwork, SurfaceMaps
+from polcap.images import Bools, Cues, Floats, Network, OrderTest, Quality, RunNetwork, SurfaceMaps
 from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.cues import FLOOR
@@ -106,6 +105,8 @@ def _compare_orders(cues: Cues, network: Network, run: RunNetwork) -> OrderTest 
         return None
     scale = int(network.metadata["native_size"]) / max(cues.mask.shape)
     low = _reduce(_limit_radiance(cues), _TEST_SIZE * min(scale, 1.0))
+    if not low.mask.any():  # thinner than a pixel of the small picture
+        return None
 
     def error(matrix: Floats) -> float:
         predicted = augmentation.predict([_transformed(low, matrix)], network, run, 1)
@@ -210,14 +211,14 @@ def _log_factor(light: Floats, seen: Cues) -> Floats:
     return np.where(known[..., None], near, far)
 
 
-def _smooth_gloss(image: Floats, mask: NDArray[np.bool_]) -> Floats:
+def _smooth_gloss(image: Floats, mask: Bools) -> Floats:
     """Remove the network's grid artifact of one or two pixels from a map (H, W[, 3]) inside the mask."""
     smooth = _masked_filter(image, mask, augmentation.BINOMIAL, REACHED)
     return np.where(mask if image.ndim == 2 else mask[..., None], smooth, image)
 
 
 def _masked_filter(
-    image: Floats, mask: NDArray[np.bool_], kernel: Floats, least: float, border: int = cv2.BORDER_DEFAULT
+    image: Floats, mask: Bools, kernel: Floats, least: float, border: int = cv2.BORDER_DEFAULT
 ) -> Floats:
     """Separable filter of an image (H, W[, 3]) that uses only pixels in the mask (H, W), divided by their weight.
 
@@ -232,7 +233,7 @@ def _masked_filter(
     return np.asarray(total / np.maximum(share, least)[..., *extra])
 
 
-def _add_detail(coarse: Floats, by_pixel: Floats, mask: NDArray[np.bool_], shrink: float) -> Floats:
+def _add_detail(coarse: Floats, by_pixel: Floats, mask: Bools, shrink: float) -> Floats:
     """Add to coarse normals (H, W, 3) the fine detail of the inversion's normals `by_pixel`, (H, W, 3).
 
     Interreflection, a wrong refractive index and half-turns bend the inversion's normals over whole regions. So only

@@ -312,3 +312,7 @@ def test_the_shipped_network_expects_larger_errors_in_a_wrong_order(swapped: boo
     else:
         assert order.ratio > 1.2
     assert estimate(found).order is None  # the inversion expects nothing
+    thread = np.zeros_like(found.mask)
+    thread[:, found.mask.shape[1] // 2] = found.mask[:, found.mask.shape[1] // 2]
+    thin = dataclasses.replace(found, mask=thread)
+    assert learned._compare_orders(thin, network(), run) is None  # nothing is left of it in the small picture
