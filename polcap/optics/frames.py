@@ -86,6 +86,14 @@ def lifted(m: Any) -> Any:
     return up / (dot(up, up) ** 0.5)[..., None]
 
 
+def tilted(normal: Any, slope: Any) -> Any:
+    """Normals (..., 3), not of unit length, after a height field of gradient `slope` (..., 3) is added to a surface.
+
+    `normal` (..., 3) are its unit normals before; all vectors are in one frame.
+    """
+    return normal - slope + (slope * normal).sum(axis=-1, keepdims=True) * normal
+
+
 def axis_across(angle: Any, v: Any) -> tuple[Any, Any]:
     """Project an axis in the image plane, such as a polarizer's, across each ray v (..., 3).
 

@@ -14,6 +14,7 @@ from msgspec import Meta
 
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import atomic
+from polcap.formats.capture import layouts
 from polcap.rig import capture_record, device_urls, sequence
 from polcap.rig.device_log import Log
 from polcap.rig.shooting_plan import CaptureOrder
@@ -57,8 +58,8 @@ def open_session(folder: Path, views: int | None, turntable: str | None, resume:
 
 
 def first_view(folder: Path) -> Path:
-    """Folder of the first view, whose record states the options of all."""
-    return folder / _name(0)
+    """Folder of the first view; its record states the options of all views."""
+    return folder / layouts.view_name(0)
 
 
 def shoot(
@@ -72,7 +73,7 @@ def shoot(
 ) -> list[dict[str, Any]]:
     """Shoot the views of a session that are missing; returns the summary of each.
 
-    `finished` is called with the folder of each view while the object still stands in this view.
+    `finished` is called with the folder of each view before the table turns on.
 
     Raises
     ------
@@ -88,7 +89,7 @@ def shoot(
     ):
         atomic.write_json(folder / NAME, session)
         for k in range(session.views):
-            view = folder / _name(k)
+            view = folder / layouts.view_name(k)
             if view.name in session.done:
                 continue
             table.move(360.0 * k / session.views)
@@ -100,10 +101,6 @@ def shoot(
             session.done.append(view.name)
             atomic.write_json(folder / NAME, session)
     return done
-
-
-def _name(k: int) -> str:
-    return f"view{k + 1:02d}"
 
 
 def _check_ports(turntable: str, rotator: str) -> None:

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from polcap.errors import InputError
 from polcap.formats import atomic
+from polcap.formats.capture import layouts
 from polcap.images import Floats
 from polcap.synth import forward_camera, mesh_tracer, scene_materials, shooting
 from polcap.synth.color_checker import Chart
@@ -81,8 +82,8 @@ def write(
 ) -> None:
     """Write captures of `scene`'s object from `views` sides into a new folder; the same arguments give the same bytes.
 
-    The object stands on the board, its y axis up; position and turn of `scene` are not used. All views have the
-    exposure of the first. `frame_written` is called with the number of photographs written so far and in all.
+    The object is on the board, its y axis up; position and turn of `scene` are not used. All views have the exposure
+    of the first. `frame_written` is called with the number of photographs written so far and in all.
 
     Raises
     ------
@@ -98,7 +99,7 @@ def write(
     mesh = surface(scene)
     sets = [ObjectPose(mesh, Rotation.identity())] + [ObjectPose(mesh, _LAID)] * bool(shoot.laid)
     named = [
-        (f"set{letter}/" * bool(shoot.laid) + _name(k), placed, *pose)
+        (f"set{letter}/" * bool(shoot.laid) + layouts.view_name(k), placed, *pose)
         for letter, placed, count in zip("AB", sets, (views, shoot.laid))
         for k, pose in enumerate(_poses(shoot, count, placed.middle))
     ]
@@ -137,10 +138,6 @@ def surface(scene: Scene) -> Triangles:
     return mesh_tracer.smooth(found[0] + axis[0], found[1])
 
 
-def _name(k: int) -> str:
-    return f"view{k + 1:02d}"
-
-
 def _poses(shoot: AroundShoot, views: int, target: Floats) -> Poses:
     """Turn and position [m] of the board in the camera frame of each view; the lens aims at `target` (3,)."""
     random = np.random.default_rng([shoot.seed, 0x7A61E])
@@ -168,10 +165,7 @@ def _view(scene: Scene, shoot: AroundShoot, turn: Rotation, position: Floats, pl
 
 
 def _write_surface(file: Path, scene: Scene, mesh: Triangles, lift: float) -> None:
-    facing: Floats = np.zeros(mesh.vertices.shape)
-    np.add.at(facing, mesh.faces, mesh.corner_normals)
-    facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
-    diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, mesh.vertices, facing)
+    diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, mesh.vertices, mesh.vertex_normals())
     values = {
         "vertices": mesh.vertices + np.array([0.0, lift, 0.0]), "diffuse": diffuse, "specular": specular,
         "roughness": roughness, "ior": ior,

@@ -132,17 +132,12 @@ def _boards(shoot: CalibrationShoot) -> Iterator[Floats]:
     for _ in range(shoot.boards):
         turn = random.uniform(-1, 1, 3) * (_MOST_TILT_DEG, _MOST_TILT_DEG, 15)
         share = random.uniform(-1, 1, 2) * (0.2, 0.16)
-        x, y, z = np.array([share[0] * across, share[1] * height / view.focal, -1.0]) * random.uniform(0.85, 1.1)
-        board = Chart((float(x), float(y), float(z)), tuple(turn.tolist()), pitch)
+        center = np.array([share[0] * across, share[1] * height / view.focal, -1.0]) * random.uniform(0.85, 1.1)
+        board = Chart(tuple(center.tolist()), tuple(turn.tolist()), pitch)
         total = np.zeros((height, width, 3))
-        offsets = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
-        y, x = np.mgrid[:height, :width].astype(float)
-        for dy in offsets:
-            for dx in offsets:
-                ray = frames.rays_at(view, *forward_camera.undistort(view, shoot.distortion, x + dx, y + dy)).reshape(
-                    -1, 3
-                )
-                total += _albedo(ray, board, kind).reshape(height, width, 3)
+        for x, y in forward_camera.pixel_samples(height, width, _SAMPLES):
+            ray = frames.rays_at(view, *forward_camera.undistort(view, shoot.distortion, x, y)).reshape(-1, 3)
+            total += _albedo(ray, board, kind).reshape(height, width, 3)
         yield total / _SAMPLES**2
 
 

@@ -5,7 +5,8 @@ References
 Granados et al., Optimal HDR reconstruction with linear digital cameras, CVPR 2010, §3.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,6 +38,14 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def pinhole(focal_mm: float, width: int, height: int) -> View:
     """View (focal length, principal point) of a camera without distortion, on its own RAW pixels."""
     return View(focal_mm / SENSOR_WIDTH_MM * width, ((width - 1) / 2, (height - 1) / 2), scale=1)
+
+
+def pixel_samples(height: int, width: int, side: int) -> Iterator[tuple[Floats, Floats]]:
+    """Yield positions x, y (H, W) of `side`² samples per pixel, one sample of every pixel at a time."""
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    offsets = (np.arange(side) + 0.5) / side - 0.5
+    for dy, dx in product(offsets, repeat=2):
+        yield x + dx, y + dy
 
 
 def undistort(view: View, bend: tuple[float, float], x: Floats, y: Floats) -> tuple[Floats, Floats]:

@@ -18,10 +18,10 @@ _RAYS = 48  # per vertex, distributed by their cosine
 _LIFT = 5e-4  # m above the surface, where a ray starts
 _SMOOTH = 2  # smoothing passes: each vertex takes the mean of its faces
 
-Lit = Callable[[Floats, Floats, Floats], Floats]
+DiffuseLight = Callable[[Floats, Floats, Floats], Floats]  # points, normals, directions (N, 3) -> S0 (N, 3)
 
 
-def received(tracer: Tracer, lit: Lit, camera: Floats, ior: float) -> Floats:
+def received(tracer: Tracer, lit: DiffuseLight, camera: Floats, ior: float) -> Floats:
     """Interreflected light that enters the surface at each vertex, (V, 3), relative to the light from a white plane.
 
     `lit(point, normal, towards)` computes the diffusely reflected S0 (N, 3) of points under the flash, in the direction
@@ -29,9 +29,7 @@ def received(tracer: Tracer, lit: Lit, camera: Floats, ior: float) -> Floats:
     turned to face the camera.
     """
     mesh = tracer.mesh
-    normal: Floats = np.zeros(mesh.vertices.shape)
-    np.add.at(normal, mesh.faces.ravel(), mesh.corner_normals.reshape(-1, 3))
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    normal = mesh.vertex_normals()
     towards = camera - mesh.vertices
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     normal = np.where(np.sum(normal * towards, axis=1, keepdims=True) < -0.3, -normal, normal)
@@ -44,12 +42,12 @@ def received(tracer: Tracer, lit: Lit, camera: Floats, ior: float) -> Floats:
         cosine = np.sqrt(1 - (k + 0.5) / _RAYS)
         angle = turn + k * np.pi * (3 - np.sqrt(5))
         across = np.cos(angle)[:, None] * e_x + np.sin(angle)[:, None] * e_y
-        way = cosine * normal + np.sqrt(1 - cosine**2) * across
-        met = tracer.meet(mesh.vertices + _LIFT * normal, way)
-        back = -way[met.index]
-        there = np.where(np.sum(met.normal * back, axis=1, keepdims=True) < 0, -met.normal, met.normal)
+        direction = cosine * normal + np.sqrt(1 - cosine**2) * across
+        hit = tracer.meet(mesh.vertices + _LIFT * normal, direction)
+        back = -direction[hit.index]
+        facing = np.where(np.sum(hit.normal * back, axis=1, keepdims=True) < 0, -hit.normal, hit.normal)
         entered, _ = fresnel.transmission(np.float64(cosine), ior)
-        total[met.index] += entered * lit(met.position, there, back)
+        total[hit.index] += entered * lit(hit.position, facing, back)
     return _smoothed(total / _RAYS, tracer)
 
 

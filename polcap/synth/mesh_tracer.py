@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from polcap.errors import InputError
 from polcap.formats import scene_files
 from polcap.images import Bools, Floats, GBuffer, View
 from polcap.optics import frames
+from polcap.optics.vertex_frames import area_vectors
 
 _LEAST_FACING = 0.01  # least cosine between normal and view; smoothing may turn normals away from the camera
 
@@ -26,6 +28,12 @@ class Triangles:
     vertices: Floats  # (V, 3)
     faces: NDArray[np.int32]  # (F, 3)
     corner_normals: Floats  # (F, 3, 3) unit, of each face's three corners
+
+    def vertex_normals(self) -> Floats:
+        """Means (V, 3) of the normals of the corners at each vertex, unit length."""
+        total: Floats = np.zeros(self.vertices.shape)
+        np.add.at(total, self.faces, self.corner_normals)
+        return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
 
 
 def smooth(vertices: Floats, faces: NDArray[np.integer], crease: float = 0.75) -> Triangles:
@@ -39,7 +47,7 @@ def smooth(vertices: Floats, faces: NDArray[np.integer], crease: float = 0.75) -
     _, place = np.unique(np.round(vertices / grain).astype(np.int64), axis=0, return_inverse=True)
     place = place.reshape(-1)[index]  # (F, 3)
     corner = vertices[index]
-    flat = frames.unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+    flat = frames.unit(area_vectors(vertices, index))
     total = np.zeros((place.max() + 1, 3), dtype=np.float64)
     for k in range(3):
         ahead, back = (frames.unit(corner[:, (k + j) % 3] - corner[:, k]) for j in (1, 2))
@@ -95,8 +103,7 @@ class Tracer:
         self._scene = EmbreeScene()
         TriangleMesh(self._scene, mesh.vertices, mesh.faces)
         self.size = float(np.ptp(mesh.vertices, axis=0).max())
-        corner = mesh.vertices[mesh.faces].astype(np.float64)
-        self._flat = frames.unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+        self._flat = frames.unit(area_vectors(mesh.vertices.astype(np.float64), mesh.faces))
 
     def trace(self, rotation: Floats, translation: Floats, view: View, height: int, width: int) -> GBuffer:
         """G-buffer of the mesh with vertices at rotation @ vertex + translation [m, camera frame].
@@ -114,8 +121,7 @@ class Tracer:
 
     def meet(self, origin: Floats, direction: Floats) -> MeshHits:
         """First intersections of rays (P, 3) with the mesh."""
-        start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
-        hit = self._scene.run(start, way, query="INTERSECT", output=True)
+        hit = self._intersect(origin, direction)
         index = np.flatnonzero(hit["primID"] >= 0)
         face = hit["primID"][index]
         b, c = hit["u"][index], hit["v"][index]
@@ -124,10 +130,12 @@ class Tracer:
         normal = frames.unit(np.sum(self.mesh.corner_normals[face] * weight[..., None], axis=1))
         return MeshHits(index, position, normal, face, weight)
 
-    def facing(self, origin: Floats, direction: Floats) -> tuple[Floats, Floats]:
-        """Distances (M,) to the first hits of rays, infinite without one, and normals (M, 3) that face the rays."""
-        start, way = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
-        hit = self._scene.run(start, way, query="INTERSECT", output=True)
+    def first_hits(self, origin: Floats, direction: Floats) -> tuple[Floats, Floats]:
+        """Distances (P,) to the first hits of rays (P, 3), and the triangles' normals (P, 3) there, facing the rays.
+
+        The distance is infinite where a ray hits nothing.
+        """
+        hit = self._intersect(origin, direction)
         struck = hit["primID"] >= 0
         normal = self._flat[np.where(struck, hit["primID"], 0)]
         normal = np.where(np.sum(normal * direction, axis=1, keepdims=True) > 0, -normal, normal)
@@ -135,10 +143,16 @@ class Tracer:
 
     def hidden(self, origin: Floats, target: Floats) -> Bools:
         """True where the mesh hides points (P, 3) from targets, (P, 3) or (3,)."""
-        way = target - origin
-        far = np.linalg.norm(way, axis=1)
-        ray = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, way / far[:, None], far))
+        path = target - origin
+        length = np.linalg.norm(path, axis=1)
+        ray = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, path / length[:, None], length))
         return np.asarray(self._scene.run(*ray, query="OCCLUDED") >= 0)
+
+    def _intersect(self, origin: Floats, direction: Floats) -> dict[str, Any]:
+        """Embree's answer for rays (P, 3): first triangle `primID`, −1 for none; distance `tfar`; place `u`, `v`."""
+        ray = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
+        found: dict[str, Any] = self._scene.run(*ray, query="INTERSECT", output=True)
+        return found
 
 
 @lru_cache(maxsize=2)

@@ -14,7 +14,7 @@ from msgspec import UNSET, Meta, UnsetType
 
 from polcap.formats import scene_files
 from polcap.images import Floats
-from polcap.optics import fresnel
+from polcap.optics import frames, fresnel
 
 Color = tuple[float, float, float]  # linear Rec.709
 _TEXELS = 256  # side of a texture; about one texel per pixel for 0.1 m, so that it does not alias
@@ -61,7 +61,7 @@ def add_relief(coat: Coat, position: Floats, facing: Floats) -> Floats:
     if all(material.texture is UNSET for material in coat.materials):
         return facing
     slope = _choose(coat, position, [_slope(material, position, facing) for material in coat.materials])
-    bent = facing - slope + np.sum(slope * facing, axis=-1, keepdims=True) * facing
+    bent = frames.tilted(facing, slope)
     return np.asarray(bent / np.maximum(np.linalg.norm(bent, axis=-1, keepdims=True), 1e-12))
 
 

@@ -230,13 +230,10 @@ def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats, flash_axis
 
     `back` (3, 3) maps the shot's pixels to those of the reference shot.
     """
-    y, x = np.mgrid[: shoot.height, : shoot.width].astype(np.float64)
     start = render.guide(buffer)
-    offsets = (np.arange(shoot.samples) + 0.5) / shoot.samples - 0.5
     total = np.zeros((3, shoot.height, shoot.width, 3), np.float32)
-    for dy in offsets:
-        for dx in offsets:
-            total += render.stokes(scene, shoot.view, *_reference_px(shoot, back, x + dx, y + dy), start, flash_axis)
+    for x, y in forward_camera.pixel_samples(shoot.height, shoot.width, shoot.samples):
+        total += render.stokes(scene, shoot.view, *_reference_px(shoot, back, x, y), start, flash_axis)
     return total / shoot.samples**2
 
 

@@ -2,7 +2,7 @@
 
 References
 ----------
-Deschaintre, Lin & Ghosh, CVPR 2021, table 2 (the evaluation's page has its figures beside ours).
+Deschaintre, Lin & Ghosh, CVPR 2021, table 2; the evaluation's page has its figures next to ours.
 """
 
 import time
@@ -59,6 +59,6 @@ def _cost(options: TrainingOptions, count: int, size: int) -> str:
     each = f"{options.minutes:g} min" if options.samples is None else f"{options.samples} pictures"
     whole = f", {networks * options.minutes / 60:.1f} h in all" if options.samples is None else ""
     return (
-        f"{networks} networks of {each} each{whole}; besides, the views are traced, and the networks evaluated on "
+        f"{networks} networks of {each} each{whole}; further time goes to tracing the views, and to evaluating on "
         f"{count} pictures of {size}² px"
     )

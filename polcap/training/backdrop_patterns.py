@@ -63,8 +63,8 @@ def _waves(u: Floats, w: Floats, rng: np.random.Generator, octaves: int = 3) -> 
     out = np.zeros_like(u)
     for octave in range(octaves):
         for _ in range(5):
-            way = rng.normal(size=2) * 2.2 * 2.0**octave
-            out = out + 0.6 * 0.55**octave * np.sin(way[0] * u + way[1] * w + rng.uniform(0, 6.28))
+            wave = rng.normal(size=2) * 2.2 * 2.0**octave  # wave vector
+            out = out + 0.6 * 0.55**octave * np.sin(wave[0] * u + wave[1] * w + rng.uniform(0, 6.28))
     return out
 
 

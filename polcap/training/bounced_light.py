@@ -48,52 +48,52 @@ def trace_visibility(
     mask = buffer.mask
     height, width = mask.shape
     v = frames.rays(buffer.view, height, width)
-    eye = -pose.translation @ pose.rotation
-    _, flat = tracer.facing(np.broadcast_to(eye, (int(mask.sum()), 3)), -v[mask] @ pose.rotation)
+    lens = -pose.translation @ pose.rotation
+    _, flat = tracer.first_hits(np.broadcast_to(lens, (int(mask.sum()), 3)), -v[mask] @ pose.rotation)
     lit = np.zeros_like(mask)
     lit[mask] = light_transport.flash_light(tracer, buffer.position[mask], flat, pose)[1] > 0
 
-    above = mesh_tracer.scatter(flat, np.flatnonzero(mask), mask.shape)
-    places = np.zeros_like(mask)
-    places[::COARSE, ::COARSE] = True
-    places &= mask
-    normal = frames.to_ray_frame(buffer.normal[places], v[places])
-    way = frames.from_ray_frame(_draw_directions(normal, rng), v[places][:, None])  # (M, RAYS, 3)
+    outward = mesh_tracer.scatter(flat, np.flatnonzero(mask), mask.shape)
+    traced = np.zeros_like(mask)
+    traced[::COARSE, ::COARSE] = True
+    traced &= mask
+    normal = frames.to_ray_frame(buffer.normal[traced], v[traced])
+    directions = frames.from_ray_frame(_draw_directions(normal, rng), v[traced][:, None])  # (M, RAYS, 3)
     lift = light_transport.LIFT * tracer.size
-    origin = buffer.position[places] + lift * above[places]
-    start = np.broadcast_to(origin[:, None], way.shape).reshape(-1, 3)
-    direction = way.reshape(-1, 3) @ pose.rotation
-    distance, _ = tracer.facing(start, direction)
-    met = np.flatnonzero(np.isfinite(distance) & (distance > lift))
-    there = start[met] + distance[met, None] * direction[met]
-    found = np.where(np.isfinite(distance), NOWHERE, ESCAPED).astype(np.uint16)
-    found[met] = _find_pixels(there, np.argwhere(places)[met // RAYS], buffer, pose, tracer.size)
+    origin = buffer.position[traced] + lift * outward[traced]
+    start = np.broadcast_to(origin[:, None], directions.shape).reshape(-1, 3)
+    direction = directions.reshape(-1, 3) @ pose.rotation
+    distance, _ = tracer.first_hits(start, direction)
+    hit = np.flatnonzero(np.isfinite(distance) & (distance > lift))
+    point = start[hit] + distance[hit, None] * direction[hit]
+    pixel = np.where(np.isfinite(distance), NOWHERE, ESCAPED).astype(np.uint16)
+    pixel[hit] = _find_pixels(point, np.argwhere(traced)[hit // RAYS], buffer, pose, tracer.size)
     out = np.full((height, width, RAYS), NOWHERE, np.uint16)
-    out[places] = found.reshape(-1, RAYS)
+    out[traced] = pixel.reshape(-1, RAYS)
     return lit, out[::COARSE, ::COARSE]
 
 
 def _draw_directions(normal: Floats, rng: np.random.Generator) -> Floats:
     """Draw random ray directions (M, RAYS, 3) about normals (M, 3), in ray frames, with the density `_density`."""
     turn, shift = rng.uniform(0, 1, (2, len(normal)))
-    ways = []
+    directions = []
     for number, alpha in ((_COSINE_RAYS, None), *_LOBES):
         for k in range(number):
             u = (k + shift) / number
             cosine = np.sqrt(1 - u if alpha is None else (1 - u) / (1 + (alpha**2 - 1) * u))
             azimuth = 2 * pi * (k * 0.618034 + turn)
             axis = light_transport.directions_about(normal, cosine, azimuth)
-            ways.append(axis if alpha is None else 2 * axis[:, 2:] * axis - [0, 0, 1])
-    return np.stack(ways, axis=1)
+            directions.append(axis if alpha is None else 2 * axis[:, 2:] * axis - [0, 0, 1])
+    return np.stack(directions, axis=1)
 
 
 def _find_pixels(
     place: Floats, origin: Indices, buffer: GBuffer, pose: light_transport.LitPose, size: float
 ) -> NDArray[np.uint16]:
-    """Flat index of the pixel in which the camera sees each place (N, 3) that a bounce ray hits.
+    """Flat index of the pixel in which the camera sees each `place` (N, 3) that a bounce ray hits.
 
-    NOWHERE if the camera does not see the place, or sees it next to the pixel `origin` (N, 2) that the ray came from,
-    because the grid is too coarse for the direction between neighbors.
+    `origin` (N, 2) are row and column of the pixel from which the ray started. NOWHERE if the camera does not see the
+    place, or sees it next to `origin`: the grid is too coarse for the direction between neighbors.
     """
     height, width = buffer.mask.shape
     seen = place @ pose.rotation.T + pose.translation
@@ -119,13 +119,13 @@ def bounced_stokes(pixels: Any, normal: Tensor, surface: Surface, body: Tensor) 
     here, ray = (pixels.met >= 0).nonzero(as_tuple=True)
     there = pixels.met[here, ray]
     v, light = pixels.v[here], body[there] / RAYS
-    way = frames.to_ray_frame(F.normalize(pixels.place[there] - pixels.place[here], dim=1), v)
-    irradiance = 1 / (pi * _density(frames.to_ray_frame(pixels.normal[here], v), way).clamp(min=1e-3))
+    direction = frames.to_ray_frame(F.normalize(pixels.place[there] - pixels.place[here], dim=1), v)
+    irradiance = 1 / (pi * _density(frames.to_ray_frame(pixels.normal[here], v), direction).clamp(min=1e-3))
     n, rough, ior = normal[here], surface.roughness[here].clamp(min=_MIN_ROUGHNESS), surface.ior[here]
     diffuse, specular = surface.diffuse[here] * light, surface.specular[here]
-    diffuse_part = shade.stokes(n, diffuse, 0 * specular, rough, ior, way, irradiance, surface.law.at(here))
+    diffuse_part = shade.stokes(n, diffuse, 0 * specular, rough, ior, direction, irradiance, surface.law.at(here))
     facet_ior = light_transport.facet_ior(specular.mean(dim=1), ior)
-    mirrored = shade.stokes(n, 0 * diffuse, specular * light, rough, facet_ior, way, irradiance)
+    mirrored = shade.stokes(n, 0 * diffuse, specular * light, rough, facet_ior, direction, irradiance)
     return normal.new_zeros(3, len(normal), 3).index_add(1, here, diffuse_part + mirrored)
 
 
@@ -144,16 +144,16 @@ def mirrored_surroundings(pixels: Any, flash: Tensor, normal: Tensor, surface: S
 
     albedo = torch.exp(u(*_LOG_ALBEDO)) * torch.exp(0.1 * torch.randn(count, 3, device=device)) * (u(0, 1) > 1 / 3)
     turn = u(0, 2 * pi)
-    down = torch.cat([torch.cos(turn), torch.sin(turn), 0 * turn], dim=1)  # the ground's normal points the other way
+    down = torch.cat([torch.cos(turn), torch.sin(turn), 0 * turn], dim=1)  # the ground's normal is −down
     low = (pixels.place * down[own]).sum(dim=1)  # the object lies on the ground
     ground = torch.full((count,), -9.0, device=device).scatter_reduce(0, own, low, "amax") + 9 * (u(0, 1)[:, 0] > 0.6)
     behind = 1.35 + 1.5 * u(0, 1)[:, 0] ** 2
 
     half = frames.from_ray_frame(normal, pixels.v)
-    way = 2 * normal[:, 2:] * half - pixels.v
-    to_ground = (ground[own] - low) / (way * down[own]).sum(dim=1).clamp(min=1e-4)
-    to_backdrop = (behind[own] + pixels.place[:, 2]) / (-way[:, 2]).clamp(min=1e-4)
-    place = pixels.place + torch.minimum(to_ground, to_backdrop)[:, None] * way
+    direction = 2 * normal[:, 2:] * half - pixels.v
+    to_ground = (ground[own] - low) / (direction * down[own]).sum(dim=1).clamp(min=1e-4)
+    to_backdrop = (behind[own] + pixels.place[:, 2]) / (-direction[:, 2]).clamp(min=1e-4)
+    place = pixels.place + torch.minimum(to_ground, to_backdrop)[:, None] * direction
     facing = torch.where((to_ground < to_backdrop)[:, None], -down[own], down.new_tensor([0.0, 0.0, 1.0]))
     to_flash = flash[own] - place
     far = to_flash.norm(dim=1)
@@ -167,10 +167,10 @@ def mirrored_surroundings(pixels: Any, flash: Tensor, normal: Tensor, surface: S
     return shade.stokes(normal, 0 * light, surface.specular * light, rough, ior, mirror, irradiance)
 
 
-def _density(normal: Tensor, way: Tensor) -> Tensor:
-    """Probability density [1/sr] with which `_draw_directions` draws `way` (N, 3) about `normal` (N, 3)."""
-    density = _COSINE_RAYS / RAYS * (normal * way).sum(dim=1).clamp(min=0) / pi
-    half = F.normalize(way + way.new_tensor([0.0, 0.0, 1.0]), dim=1)
+def _density(normal: Tensor, direction: Tensor) -> Tensor:
+    """Probability density [1/sr] with which `_draw_directions` draws `direction` (N, 3) about `normal` (N, 3)."""
+    density = _COSINE_RAYS / RAYS * (normal * direction).sum(dim=1).clamp(min=0) / pi
+    half = F.normalize(direction + direction.new_tensor([0.0, 0.0, 1.0]), dim=1)
     cosine = (normal * half).sum(dim=1).clamp(min=0)
     for number, alpha in _LOBES:
         facets = brdf.ggx_distribution(cosine, alpha) * cosine / (4 * half[:, 2].clamp(min=1e-3))

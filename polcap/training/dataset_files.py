@@ -87,9 +87,8 @@ def _write_sample(
         torch.manual_seed(int(rng.integers(1 << 62)))
         owner, smooth = torch.zeros(len(v), dtype=torch.long), float(recipe.law == "smooth")
         turned = torch.from_numpy(turn).float()[None]
-        surface = materials.draw_surface(library, bare, position, turned, owner, 1, smooth)
-    way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.1)
-    flash = [off * np.cos(way) * middle, off * np.sin(way) * middle, 0.0]
+        surface = materials.draw_surface(library, bare, position, turned, owner, smooth)
+    flash = [middle * offset for offset in (*traced_views.random_flash(rng), 0.0)]
     to_light = torch.tensor(flash, dtype=torch.float32) + v * (depth / v[:, 2])[:, None]
     normal, diffuse, specular = materials.reflect(surface, v, to_light, torch.full((len(v),), middle**2))
     passed = _photograph((diffuse + specular).numpy(), v.numpy(), recipe.noise, rng)
@@ -136,10 +135,10 @@ def _open_library(material: str) -> materials.MaterialLibrary:
 
 def _list_meshes(mesh: str) -> list[Path]:
     """Mesh files that the setting `mesh` names; an empty list means random shapes."""
-    if not mesh:
-        return []
     place = Path(mesh)
-    files = sorted(p for p in place.iterdir() if p.suffix != ".json") if place.is_dir() else [place]
+    if not mesh or not place.is_dir():
+        return [place] if mesh else []
+    files = sorted(p for p in place.iterdir() if p.suffix != ".json")
     if not files:
         raise InputError(f"{place} holds no mesh; give a mesh file or a folder of mesh files")
     return files

@@ -161,11 +161,11 @@ def _color(rng: np.random.Generator) -> Floats:
 def _waves(rng: np.random.Generator, low: float, high: float, count: int = 10) -> Callable[[Floats], Floats]:
     """A smooth random field of standard deviation about 1. A sum of sines of `low` to `high` cycles over the object."""
     cycles = np.exp(np.linspace(np.log(low), np.log(high), count))
-    way = rng.normal(size=(3, count))
-    way *= 2 * np.pi * cycles / np.linalg.norm(way, axis=0)
+    wave_vectors = rng.normal(size=(3, count))
+    wave_vectors *= 2 * np.pi * cycles / np.linalg.norm(wave_vectors, axis=0)
     phase, weight = rng.uniform(0, 2 * np.pi, count), cycles**-0.7
     weight *= np.sqrt(2 / (weight**2).sum())
-    return lambda p: np.sin(p @ way + phase) @ weight
+    return lambda p: np.sin(p @ wave_vectors + phase) @ weight
 
 
 def _step(x: Floats, low: float, high: float) -> Floats:

@@ -167,8 +167,8 @@ def _box(mask: Bools) -> tuple[slice, ...]:
 
 
 def _tile(picture: Picture) -> Picture:
-    way = cv2.INTER_AREA if picture.shape[0] > _TILE else cv2.INTER_NEAREST
-    return np.asarray(cv2.resize(picture, (_TILE, _TILE), interpolation=way), np.uint8)
+    kind = cv2.INTER_AREA if picture.shape[0] > _TILE else cv2.INTER_NEAREST
+    return np.asarray(cv2.resize(picture, (_TILE, _TILE), interpolation=kind), np.uint8)
 
 
 def _write(picture: Picture, text: str, x: int) -> None:

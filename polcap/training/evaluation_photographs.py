@@ -94,10 +94,10 @@ def score(folder: Path, angles: list[str], name: str, network: Network | None) -
     error = np.nan_to_num(error[inside], nan=_MISSED_DEG)
     figures = {"mean": float(error.mean()), "median": float(np.median(error))}
     figures |= {f"within {limit:g}°": float((error < limit).mean()) for limit in _LIMITS_DEG}
-    return figures | {"covered": covered, "as a body": as_a_body(found.cues, there)}
+    return figures | {"covered": covered, "diffuse direction": diffuse_direction(found.cues, there)}
 
 
-def as_a_body(cues: Cues, normal: Floats) -> float:
+def diffuse_direction(cues: Cues, normal: Floats) -> float:
     """Mean cos 2(AoLP − azimuth of `normal`) where DoLP and tilt suffice: 1 for diffuse, −1 for specular reflection."""
     use = cues.mask & (cues.dolp > _MIN_DOLP) & (np.hypot(normal[..., 0], normal[..., 1]) > _MIN_TILT)
     turned = 2 * np.arctan2(normal[..., 1], normal[..., 0])[use]
@@ -112,7 +112,7 @@ def _page(folder: Path, rows: dict[str, dict[str, Score]], table: dict[str, Scor
     return (
         f"# Photographs with measured normals: {folder.name}\n\n{grid(['', *table['ours']], body)}\n\n"
         f"Degrees, over the mask of the folder; a pixel without a normal counts as {_MISSED_DEG:g}°.\n\n"
-        "`as a body`: mean cos 2(AoLP − azimuth of the measured normals). It is 1 for diffuse reflection, as under a "
-        "flash next to the lens. Below 0 most light is mirrored from the surroundings, which polcap's inversion is not "
-        "made for.\n"
+        "`diffuse direction`: mean cos 2(AoLP − azimuth of the measured normals). It is 1 for diffuse reflection, as "
+        "under a flash next to the lens. Below 0 most light is mirrored from the surroundings; polcap's inversion does "
+        "not model it.\n"
     )

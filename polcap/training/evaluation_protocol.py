@@ -24,7 +24,6 @@ from polcap.training.camera_errors import CameraErrors, photograph
 VERSION = 1  # to be raised when a number gives other pixels
 COUNT, SIZE = 250, 512
 QUICK_COUNT, QUICK_SIZE = 50, 256
-MESHES = 6  # of the figures in polcap's pages
 LIGHTS = 20
 _SEED = 20211121
 _FIELD_OF_VIEW = 30.0  # degrees, of the side of the picture
@@ -132,9 +131,8 @@ class Protocol:
         normal = buffer.normal[inside]
         pattern = position @ frame.T + shift, normal @ turn @ frame.T  # in that frame
         sample, slope = material.at(*pattern), material.slope(*pattern) @ frame @ turn.T
-        tilted = frames.to_ray_frame(normal - slope + np.sum(slope * normal, axis=1, keepdims=True) * normal, v)
-        tilted = np.asarray(frames.lifted(tilted))
-        _, flat = tracer.facing(position + 0.01 * (v @ turn), -v @ turn)
+        tilted = np.asarray(frames.lifted(frames.to_ray_frame(frames.tilted(normal, slope), v)))
+        _, flat = tracer.first_hits(position + 0.01 * (v @ turn), -v @ turn)
         law = body_law(number) if self.protocol == 2 else SMOOTH
         places = light_transport.SurfacePoints(
             inside, position, flat, tilted, v, sample.diffuse, sample.specular, sample.roughness, material.ior, law

@@ -17,9 +17,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from polcap.formats import atomic, onnx
 from polcap.images import Floats, Network, View
+from polcap.optics import frames
 from polcap.stages import cues
 from polcap.stages.infer import fine, learned
 from polcap.training import evaluation_protocol, loop, materials, relief, traced_views, unet
@@ -51,8 +53,8 @@ def main(data: Path, model: Path, out: Path, minutes: float) -> None:
         simulator = Simulator(views, library, torch.device("cpu"), bounces=False)
         for number, path in enumerate(files):
             if not path.exists():
-                with atomic.path(path) as temporary, temporary.open("wb") as file:
-                    np.save(file, make_picture(simulator, network, number))
+                with atomic.path(path) as temporary:
+                    np.save(temporary, make_picture(simulator, network, number))
     torch.manual_seed(1)
     training = FineTraining(_RATE, files)
     training.train(minutes, out)
@@ -69,7 +71,7 @@ def make_picture(simulator: Simulator, network: Network, number: int) -> NDArray
         views = simulator.gather(np.array([view]), _SIDE, flip=False)
         pixels = views.pixels
         slope = relief.random_slopes(pixels.position.numpy(), middle / focal, rng) @ views.turn[0].numpy().T
-        normal = torch.from_numpy(relief.tilt_normals(pixels.normal.numpy(), slope))
+        normal = F.normalize(frames.tilted(pixels.normal, torch.from_numpy(slope)), dim=1)
         errors = CameraErrors.draw(1, normal.device)
         errors = replace(errors, shift=_SHIFT * errors.shift)
         photo = simulator.photograph(replace(views, pixels=replace(pixels, normal=normal)), torch.ones(1), errors)
@@ -115,15 +117,15 @@ class FineTraining(loop.PictureTraining):
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def validate(self, out: Path) -> dict[str, float]:
-        """RMS error of the estimated relief, `off`, and of zero relief, `off_without`, on held-out pictures."""
+        """RMS error of the estimated relief, and of zero relief, `rms_of_none`, on held-out pictures."""
         squares = []
         for file in self.files[: self.held_out]:
             picture = load_example(file)
             height, width = (side - side % fine.SIZE_MULTIPLE for side in picture.shape[1:])
             relief, target, known = _predict(self.average, picture[None, :, :height, :width])
             squares.append([float((((r - target) * known) ** 2).sum() / known.sum()) for r in (relief, 0 * relief)])
-        off, without = np.sqrt(np.mean(squares, axis=0))
-        return {"off": float(off), "off_without": float(without)}
+        rms, rms_of_none = np.sqrt(np.mean(squares, axis=0))
+        return {"rms": float(rms), "rms_of_none": float(rms_of_none)}
 
 
 @cache

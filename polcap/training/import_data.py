@@ -66,7 +66,7 @@ def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
 
 
 def _splits(number: int, count: int) -> tuple[str, ...]:
-    """The parts of the data to which the item of this number belongs."""
+    """The parts of the data folder, train or test, that get mesh or texture folder `number` of `count`."""
     if count == 1:
         return ("train", "test")
     return ("test",) if number % _TEST_EVERY == 0 else ("train",)
@@ -90,9 +90,10 @@ def write_mesh(path: Path, target: Path) -> None:
     corners, place = np.unique(quantized, axis=0, return_inverse=True)
     joined = place.reshape(-1)[faces]
     whole = (joined != np.roll(joined, 1, axis=1)).all(axis=1)  # without triangles that have no area
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with atomic.path(target) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, vq=corners, vmin=low, vscale=np.float32(size), faces=joined[whole].astype(np.int32))
+    with atomic.path(target) as temporary:
+        np.savez_compressed(
+            temporary, vq=corners, vmin=low, vscale=np.float32(size), faces=joined[whole].astype(np.int32)
+        )
 
 
 def write_textures(folder: Path, target: Path) -> None:

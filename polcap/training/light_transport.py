@@ -98,9 +98,9 @@ class IndirectLight:
         received: Floats = np.zeros((count, 3))
         for k in range(_HEMISPHERE_RAYS):
             cosine = np.sqrt(1 - (k + turn[:, 0]) / _HEMISPHERE_RAYS)
-            way = directions_about(places.normal, cosine, 2 * pi * (k * 0.618034 + turn[:, 1]))
-            met, incoming = self.light(way, np.arange(count))
-            received[met] += incoming * fresnel.transmission(np.maximum(cosine[met], 1e-3), places.ior)[0][:, None]
+            direction = directions_about(places.normal, cosine, 2 * pi * (k * 0.618034 + turn[:, 1]))
+            hit, incoming = self.light(direction, np.arange(count))
+            received[hit] += incoming * fresnel.transmission(np.maximum(cosine[hit], 1e-3), places.ior)[0][:, None]
         entered = fresnel.transmission(1.0, places.ior)[0]
         received = self.smooth(received / (_HEMISPHERE_RAYS * entered))
         # shaded as light along the normal, of which the share `entered` passes the surface
@@ -122,33 +122,33 @@ class IndirectLight:
             cos_h = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))
             half = directions_about(places.normal, cos_h, 2 * pi * (k * 0.618034 + turn[:, 1]))
             cos_d = half[:, 2]
-            way = 2 * cos_d[:, None] * half - [0, 0, 1]
-            possible = (cos_d > 0.01) & (np.sum(way * places.normal, axis=1) > 0.01)
-            met, incoming = self.light(way, np.flatnonzero(possible))
-            density = pi * brdf.ggx_distribution(cos_h[met], alpha[met]) * cos_h[met] / (4 * cos_d[met])
+            direction = 2 * cos_d[:, None] * half - [0, 0, 1]
+            possible = (cos_d > 0.01) & (np.sum(direction * places.normal, axis=1) > 0.01)
+            hit, incoming = self.light(direction, np.flatnonzero(possible))
+            density = pi * brdf.ggx_distribution(cos_h[hit], alpha[hit]) * cos_h[hit] / (4 * cos_d[hit])
             irradiance = 1 / np.maximum(density * _MIRROR_RAYS, 1e-9)
-            reflected = places.specular[met] * incoming
-            total[:, met] += _shade(places.take(met), 0 * incoming, reflected, ior[met], way[met], irradiance)
+            reflected = places.specular[hit] * incoming
+            total[:, hit] += _shade(places.take(hit), 0 * incoming, reflected, ior[hit], direction[hit], irradiance)
         return np.stack([self.smooth(part) for part in total])
 
-    def light(self, way: Floats, which: Indices) -> tuple[Indices, Floats]:
-        """Trace a ray from each of the points `which`; returns the points whose ray hits the mesh, and S0 (·, 3) there.
+    def light(self, directions: Floats, which: Indices) -> tuple[Indices, Floats]:
+        """Trace a ray from each of the points `which`; returns those with a ray that hits the mesh, and S0 (·, 3).
 
-        `way` (M, 3) are the directions of all points, in ray frames. S0 is the diffuse flash light that the hit place
+        `directions` (M, 3) are those of all points, in ray frames. S0 is the diffuse flash light that the hit place
         sends back along the ray.
         """
         tracer, places, pose = self.tracer, self.places, self.pose
-        direction = frames.from_ray_frame(way[which], places.rays[which]) @ pose.rotation
+        direction = frames.from_ray_frame(directions[which], places.rays[which]) @ pose.rotation
         origin = (places.position + LIFT * tracer.size * places.flat)[which]
-        distance, flat = tracer.facing(origin, direction)
-        met = np.flatnonzero(np.isfinite(distance) & (distance > LIFT * tracer.size))
-        origin, direction, distance, flat = origin[met], direction[met], distance[met, None], flat[met]
-        there = origin + distance * direction
-        to_flash, irradiance = flash_light(tracer, there, flat, pose)
+        distance, flat = tracer.first_hits(origin, direction)
+        hit = np.flatnonzero(np.isfinite(distance) & (distance > LIFT * tracer.size))
+        origin, direction, distance, flat = origin[hit], direction[hit], distance[hit, None], flat[hit]
+        point = origin + distance * direction
+        to_flash, irradiance = flash_light(tracer, point, flat, pose)
         cos_i = np.clip(np.sum(to_flash * flat, axis=1), 1e-3, 1)
         cos_o = np.clip(-np.sum(direction * flat, axis=1), 1e-2, 1)
         into, out = (fresnel.transmission(c, places.ior)[0] for c in (cos_i, cos_o))
-        return which[met], self.albedo(there, flat) * (irradiance * cos_i * into * out)[:, None]
+        return which[hit], self.albedo(point, flat) * (irradiance * cos_i * into * out)[:, None]
 
     def smooth(self, value: Floats) -> Floats:
         """Smooth bounced light (M, C) by means over nearby pixels of the object."""

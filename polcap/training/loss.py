@@ -37,7 +37,7 @@ def total(
         return (error * inside).sum() / (area * error.shape[1])
 
     cosine = (maps["normal"] * truth.normal).sum(dim=1, keepdim=True)
-    angle = torch.rad2deg(2 * torch.asin((maps["normal"] - truth.normal).norm(dim=1, keepdim=True).clamp(max=2) / 2))
+    angle = normal_error(maps["normal"], truth.normal)
     parts = {
         "normal": mean(1 - cosine) + 0.25 * mean((maps["normal"] - truth.normal).abs()),
         "region": _region(maps["normal"], truth.normal, inside),
@@ -65,11 +65,16 @@ def _region(estimate: Tensor, truth: Tensor, inside: Tensor) -> Tensor:
     for block in _BLOCKS:
         share = F.avg_pool2d(inside, block)
         estimated, true = (F.avg_pool2d(n[:, :2] * inside, block) / share.clamp(min=1e-3) for n in (estimate, truth))
-        way, true_way = (v / (v.square().sum(dim=1, keepdim=True) + _FLAT**2).sqrt() for v in (estimated, true))
-        missed = 0.5 * (way - true_way).square().sum(dim=1, keepdim=True)  # 1 − cosine
+        azimuth, true_azimuth = (v / (v.square().sum(dim=1, keepdim=True) + _FLAT**2).sqrt() for v in (estimated, true))
+        missed = 0.5 * (azimuth - true_azimuth).square().sum(dim=1, keepdim=True)  # 1 − cosine
         cost = cost + (missed * true.norm(dim=1, keepdim=True) * share).sum()
         area = area + share.sum()
     return cost / area.clamp(min=1)
+
+
+def normal_error(estimate: Tensor, truth: Tensor) -> Tensor:
+    """Angle [°] between unit normals (B, 3, H, W), (B, 1, H, W)."""
+    return torch.rad2deg(2 * torch.asin((estimate - truth).norm(dim=1, keepdim=True).clamp(max=2) / 2))
 
 
 def centered(depth: Tensor, inside: Tensor) -> Tensor:
@@ -109,8 +114,8 @@ def _rendered(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | N
 
 def _small_rotations(count: int, device: torch.device, random: torch.Generator | None) -> Tensor:
     """Random rotations (M, 3, 3) of the view by up to 0.5 rad about axes perpendicular to z."""
-    way = 2 * torch.pi * torch.rand(count, device=device, generator=random)
-    c, s = torch.cos(way), torch.sin(way)
+    azimuth = 2 * torch.pi * torch.rand(count, device=device, generator=random)
+    c, s = torch.cos(azimuth), torch.sin(azimuth)
     tilt = 0.5 * torch.rand(count, device=device, generator=random)
     ct, st = torch.cos(tilt), torch.sin(tilt)
     zero = torch.zeros_like(c)

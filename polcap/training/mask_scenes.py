@@ -65,13 +65,12 @@ def make_scene(
     owner = torch.from_numpy(np.where(on, 0, 1))
     turn = torch.stack([torch.from_numpy(view.turn).float(), torch.eye(3)])
     facing, points = (torch.from_numpy(a).float() for a in (normal, position))
-    surface = materials.draw_surface(library, facing, points, turn, owner, 2)
+    surface = materials.draw_surface(library, facing, points, turn, owner)
     surface, polarizing = _change_materials(surface, position, np.where(on, -1, plane[at]), mode, rng)
-    lit = cv2.GaussianBlur(view.lit.astype(np.float32), (0, 0), rng.uniform(0.4, 2.5)).reshape(-1)[
-        at
-    ]  # the flash has a size
+    lit = cv2.GaussianBlur(view.lit.astype(np.float32), (0, 0), rng.uniform(0.4, 2.5))  # the flash has a size
+    strength = lit.reshape(-1)[at] * view.distance**2
     image = np.zeros((3, *size, 3), np.float32)
-    image.reshape(3, -1, 3)[:, at] = _light(view, surface, v, place, lit, polarizing, rng)
+    image.reshape(3, -1, 3)[:, at] = _light(surface, v, view.flash - place, strength, polarizing, rng)
     image[0] += 1e-4 * rng.uniform(0, 1, 3)  # stray light
     chart, corners = np.zeros(size, bool), None
     if rng.random() < charted:
@@ -158,12 +157,15 @@ def _recolor(diffuse: Floats, where: Bools, level: float, contrast: float, rng: 
 
 
 def _light(
-    view: MaskView, surface: Surface, v: Floats, place: Floats, lit: Floats, polarizing: Tensor,
-    rng: np.random.Generator,
-) -> Floats:  # fmt: skip
-    """Stokes parameters (3, M, 3) of a view under the flash and weak light from the walls of the room."""
-    rays, to_flash = (torch.from_numpy(a).float() for a in (v, view.flash - place))
-    normal, diffuse, specular = materials.reflect(surface, rays, to_flash, torch.from_numpy(lit) * view.distance**2)
+    surface: Surface, v: Floats, to_flash: Floats, strength: Floats, polarizing: Tensor, rng: np.random.Generator
+) -> Floats:
+    """Stokes parameters (3, M, 3) of a surface under the flash and weak light from the walls of the room.
+
+    v (M, 3) are view rays; to_flash (M, 3) and strength (M,) are as for `materials.reflect`; polarizing (M,) is a
+    factor on S1 and S2.
+    """
+    ray, light = (torch.from_numpy(a).float() for a in (v, to_flash))
+    normal, diffuse, specular = materials.reflect(surface, ray, light, torch.from_numpy(strength))
     stokes = diffuse + specular
     stokes[1:] *= polarizing[None, :, None]
     stokes[0] += random_shapes.log_uniform(5e-4, 0.08, rng) * surface.diffuse * (0.4 + 0.6 * normal[:, 2:])

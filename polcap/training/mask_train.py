@@ -56,8 +56,8 @@ def make_pictures(out: Path, data: Path, count: int) -> None:
         if all(path.exists() for path in paths):
             continue
         for path, picture in zip(paths, _make_group(files, library, group)):
-            with atomic.path(path) as temporary, temporary.open("wb") as file:
-                np.save(file, picture)
+            with atomic.path(path) as temporary:
+                np.save(temporary, picture)
 
 
 def _make_group(files: list[Path], library: materials.MaterialLibrary, group: int) -> Iterator[Floats]:

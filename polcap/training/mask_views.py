@@ -86,8 +86,8 @@ def trace_view(tracer: Tracer, kind: ViewKind, size: tuple[int, int], rng: np.ra
     else:
         return None
     distance = float(np.linalg.norm(place))
-    off, way = rng.uniform(*kind.flash_offset) * distance, rng.normal(np.pi / 2, 0.9)
-    flash = np.array([off * np.cos(way), off * np.sin(way), 0.0])
+    offset, azimuth = rng.uniform(*kind.flash_offset) * distance, rng.normal(np.pi / 2, 0.9)
+    flash = np.array([offset * np.cos(azimuth), offset * np.sin(azimuth), 0.0])
     planes = _draw_planes(tracer.mesh.vertices @ turn.T + place, kind.backdrop, rng)
     v = frames.rays(view, *size)
     behind, _, _ = meet_planes(planes, v.reshape(-1, 3))

@@ -45,8 +45,8 @@ def reflect(surface: Surface, v: Tensor, to_flash: Tensor, strength: Tensor) -> 
     """
     normal = frames.lifted(frames.to_ray_frame(surface.normal, v))
     squared = (to_flash * to_flash).sum(dim=1)
-    way = frames.to_ray_frame(to_flash / squared.sqrt()[:, None], v)
-    nothing, lit = torch.zeros_like(surface.specular), (surface.roughness, surface.ior, way, strength / squared)
+    direction = frames.to_ray_frame(to_flash / squared.sqrt()[:, None], v)
+    nothing, lit = torch.zeros_like(surface.specular), (surface.roughness, surface.ior, direction, strength / squared)
     diffuse = shade.stokes(normal, surface.diffuse, nothing, *lit, surface.law)
     return normal, diffuse, shade.stokes(normal, nothing, surface.specular, *lit)
 
@@ -83,15 +83,15 @@ class MaterialLibrary:
 
 
 def draw_surface(
-    library: MaterialLibrary, normal: Tensor, position: Tensor, turn: Tensor, owner: Tensor, count: int,
+    library: MaterialLibrary, normal: Tensor, position: Tensor, turn: Tensor, owner: Tensor,
     smooth_share: float = gloss.SMOOTH_SHARE,
 ) -> Surface:  # fmt: skip
-    """Draw a material for each of `count` objects and evaluate it at their pixels.
+    """Draw a material for each of B objects and evaluate it at their M pixels.
 
     normal (M, 3) camera frame, position (M, 3) object frame, turn (B, 3, 3) from object to camera, owner (M,) the
     object of each pixel; smooth_share: of objects with a smooth interface (`optics/body.py`).
     """
-    device = normal.device
+    count, device = len(turn), normal.device
     frame, _ = torch.linalg.qr(torch.randn(count, 3, 3, device=device))  # from object to pattern
     inner = _rotate(frame, position, owner)
     facing = _rotate(frame @ turn.transpose(1, 2), normal, owner)
@@ -126,9 +126,9 @@ def draw_surface(
     slope = torch.where((own["from_texture"] > 0.5)[:, None], slope, relief)  # in the pattern's frame
     slope = _rotate(turn, _rotate(frame.transpose(1, 2), slope, owner), owner)
     along = (slope * normal).sum(dim=1, keepdim=True)
-    tilted = normal + own["bump"][:, None] * (slope - along * normal)
+    bumped = F.normalize(normal + own["bump"][:, None] * (slope - along * normal), dim=1)
     law = Law(law.rough, law.local, law.dolp_factor * fibers)
-    return Surface(F.normalize(tilted, dim=1), diffuse, specular, rough, own["ior"], law)
+    return Surface(bumped, diffuse, specular, rough, own["ior"], law)
 
 
 def _albedo(

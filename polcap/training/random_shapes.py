@@ -147,8 +147,8 @@ def _branch(
     t = np.linspace(0, 1, _BRANCH_RINGS)
     out = start / max(float(np.linalg.norm(start)), 1e-6)
     bend, wave = (rng.normal(size=3) * length * k for k in (0.5, 0.12))
-    way = np.outer(t, out * length) + np.outer(t**2, bend) + np.outer(np.sin(rng.uniform(3, 12) * t), wave)
-    curve, axis = start * 0.7 + way * squash, rng.normal(size=3)
+    path = np.outer(t, out * length) + np.outer(t**2, bend) + np.outer(np.sin(rng.uniform(3, 12) * t), wave)
+    curve, axis = start * 0.7 + path * squash, rng.normal(size=3)
     knots = 1 + rng.uniform(0, 0.5) * np.sin(rng.uniform(0, 40) * t)
     thickness = radius * (1 - rng.uniform(0, 0.8) * t) * knots
     thickness[[0, -1]] = 1e-4  # closed ends

@@ -75,7 +75,7 @@ def _opponent(diffuse: Tensor) -> Tensor:
 
 
 def _interpolation_weights(cosine: Tensor) -> Tensor:
-    """Weights (B, N, knots) that interpolate a curve, given by values at knots, at cosines (B, 1, N)."""
+    """Weights (B, N, knots) of a curve's values at the angles _KNOTS_DEG, to interpolate it at cosines (B, 1, N)."""
     knots = cosine.new_tensor(_KNOTS_DEG)
     angle = (torch.acos(cosine.clamp(0, 1 - 1e-6)) * (180 / pi)).transpose(1, 2)
     steps = ((angle - knots[:-1]) / (knots[1:] - knots[:-1])).clamp(0, 1)  # 0…1 from each knot to the next
@@ -100,9 +100,9 @@ def fit_mixture(color: Tensor, weight: Tensor) -> ColorMixture:
     both = torch.cat([color, color * color], dim=1)
     seen = torch.cat([both, torch.ones_like(weight)], dim=1).transpose(1, 2)
     for step in range(sum(_ROUNDS)):
-        ways = torch.cat([center / variance, -0.5 / variance], dim=2)
+        slopes = torch.cat([center / variance, -0.5 / variance], dim=2)  # of the log density, over color and its square
         level = torch.log(share) - 0.5 * (center * center / variance + torch.log(variance)).sum(dim=2, keepdim=True)
-        member = torch.softmax(ways @ both + level, dim=1)
+        member = torch.softmax(slopes @ both + level, dim=1)
         sums = (member * weight) @ seen
         area = sums[..., 6:] + 1e-3
         center = (sums[..., :3] + 1e-3 * center) / area

@@ -39,19 +39,15 @@ def random_slopes(position: Floats, px: float, rng: np.random.Generator) -> Floa
     return np.asarray(gradient * np.minimum(1, _MAX_SLOPE / np.maximum(length, 1e-9)), np.float32)
 
 
-def tilt_normals(normal: Floats, slope: Floats) -> Floats:
-    """Unit normals (M, 3) of a surface after adding a height field with gradients `slope` (M, 3); both in one frame."""
-    out = normal - slope + np.sum(slope * normal, axis=1, keepdims=True) * normal
-    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True), np.float32)
-
-
 def _waves(position: Floats, wavelength: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """A random relief of plane waves of similar length: height (M,) of standard deviation 1, and gradient (M, 3)."""
-    way = rng.normal(size=(_WAVES, 3))
-    way *= (2 * pi / wavelength * rng.uniform(0.5, 1.3, _WAVES) / np.linalg.norm(way, axis=1))[:, None]
-    phase: NDArray[np.float64] = position @ way.T + rng.uniform(0, 2 * pi, _WAVES)
+    wave_vectors = rng.normal(size=(_WAVES, 3))
+    wave_vectors *= (2 * pi / wavelength * rng.uniform(0.5, 1.3, _WAVES) / np.linalg.norm(wave_vectors, axis=1))[
+        :, None
+    ]
+    phase: NDArray[np.float64] = position @ wave_vectors.T + rng.uniform(0, 2 * pi, _WAVES)
     scale = np.sqrt(2 / _WAVES)
-    return np.asarray(scale * np.cos(phase).sum(1)), np.asarray(-scale * np.sin(phase) @ way)
+    return np.asarray(scale * np.cos(phase).sum(1)), np.asarray(-scale * np.sin(phase) @ wave_vectors)
 
 
 def _woven(position: Floats, wavelength: float, rng: np.random.Generator) -> Floats:

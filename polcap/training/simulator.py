@@ -170,7 +170,7 @@ class Simulator:
         count, height, width = views.mask.shape
         pixels = views.pixels
         own = pixels.owner
-        surface = materials.draw_surface(self.library, pixels.normal, pixels.position, views.turn, own, count)
+        surface = materials.draw_surface(self.library, pixels.normal, pixels.position, views.turn, own)
         to_flash = views.flash[own] - pixels.place
         normal, body, specular = materials.reflect(surface, pixels.v, to_flash, pixels.lit * strength[own])
         stokes = body + specular

@@ -118,14 +118,14 @@ def _build_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe, inputs: 
         shape = (total, channels) if name == "camera" else (total, size // by, size // by, channels)
         mode: Literal["r+", "w+"] = "r+" if begun else "w+"
         arrays[name] = np.lib.format.open_memmap(folder / f"{name}.npy", mode, kind, shape)
-    start = said = saved = time.monotonic()
+    start = reported = saved = time.monotonic()
     for number in range(begun, shapes):
         views = _trace_shape(number, meshes, recipe)
         for index, view in enumerate(views, _first_view(number, meshes, recipe)):
             _store(arrays, index, *view)
             now = time.monotonic()
-            if index == first or now - said > _REPORT_S:
-                said = now
+            if index == first or now - reported > _REPORT_S:
+                reported = now
                 minutes = (now - start) / (index + 1 - first) * (total - index - 1) / 60
                 report(f"{index + 1} of {total} views, {minutes:.0f} min left")
         if time.monotonic() - saved > _SAVE_S or number == shapes - 1:
@@ -152,25 +152,16 @@ def _traced_meshes(folder: Path, inputs: str) -> int:
 
 
 def _store(
-    arrays: Mapping[str, NDArray[Any]],
-    index: int,
-    buffer: GBuffer,
-    pose: light_transport.LitPose,
-    lit: Bools,
+    arrays: Mapping[str, NDArray[Any]], index: int, buffer: GBuffer, pose: light_transport.LitPose, lit: Bools,
     met: NDArray[np.uint16],
-) -> None:
+) -> None:  # fmt: skip
     """Write one view into the arrays of a cache."""
     inside = buffer.mask
     middle, unit = depth_unit(inside, buffer.depth, buffer.view.focal)
     depth = np.where(inside, (buffer.depth - middle) / unit, 0.0)
     view = {
-        "normal": buffer.normal,
-        "depth": depth,
-        "position": buffer.position,
-        "mask": inside,
-        "lit": lit,
-        "met": met,
-    }
+        "normal": buffer.normal, "depth": depth, "position": buffer.position, "mask": inside, "lit": lit, "met": met,
+    }  # fmt: skip
     for name, value in view.items():
         arrays[name][index] = value.reshape(arrays[name][index].shape)
     camera = [buffer.view.focal, *buffer.view.center, middle, unit, *pose.rotation.reshape(-1)]
@@ -217,11 +208,17 @@ def _trace_shape(
     tracer = Tracer(mesh)
     for _ in range(count):
         buffer, rotation, translation = trace_random_view(name, tracer, recipe.size, rng)
-        way, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, _MAX_OFFSET)
-        offset = (off * np.cos(way), off * np.sin(way)) if recipe.flash is None else recipe.flash
+        offset = random_flash(rng)
+        offset = offset if recipe.flash is None else recipe.flash
         middle = float(buffer.depth[buffer.mask].mean(dtype=np.float64))
         pose = light_transport.LitPose(rotation, translation, middle * np.array([*offset, 0.0]), middle**2)
         yield buffer, pose, *bounced_light.trace_visibility(tracer, buffer, pose, rng)
+
+
+def random_flash(rng: np.random.Generator) -> tuple[float, float]:
+    """Position of a random flash to the right of the lens and above it, in object distances: at most 0.1 away."""
+    azimuth, offset = rng.uniform(0, 2 * np.pi), rng.uniform(0, _MAX_OFFSET)
+    return offset * np.cos(azimuth), offset * np.sin(azimuth)
 
 
 def trace_random_view(name: str, tracer: Tracer, size: int, rng: np.random.Generator) -> tuple[GBuffer, Floats, Floats]:
@@ -251,8 +248,8 @@ def random_pose(mesh: Triangles, size: int, rng: np.random.Generator) -> tuple[F
         fill = rng.uniform(0.6, 0.95)
         angle = fill * 2 * np.tan(np.radians(rng.uniform(5, 35)) / 2)  # of the object's longer image side
         distance = max(high[0] - low[0], high[1] - low[1]) / angle
-        off, way = np.tan(np.radians(rng.uniform(0, 12))), rng.uniform(0, 2 * np.pi)
-        centre = distance * np.array([off * np.cos(way), off * np.sin(way), -1.0])
+        slope, azimuth = np.tan(np.radians(rng.uniform(0, 12))), rng.uniform(0, 2 * np.pi)
+        centre = distance * np.array([slope * np.cos(azimuth), slope * np.sin(azimuth), -1.0])
         translation = centre - (low + high) / 2
         if -(high[2] + translation[2]) > distance / 2:  # not too near the lens
             return rotation, translation, _frame_crop(turned + translation, fill, size, rng)

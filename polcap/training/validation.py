@@ -79,8 +79,7 @@ def _arrays(images: Tensor) -> Floats:
 def _errors(maps: dict[str, Tensor], batch: Batch) -> dict[str, float]:
     """Errors over the masked pixels of one batch; `·_constant` is the error of the best constant map."""
     inside = batch.mask[:, None].float()
-    half = (maps["normal"] - batch.normal).norm(dim=1).clamp(max=2) / 2
-    error = torch.rad2deg(2 * torch.asin(half))[batch.mask]
+    error = loss.normal_error(maps["normal"], batch.normal)[:, 0][batch.mask]
     depth = (loss.centered(maps["depth"], inside) - loss.centered(batch.depth, inside))[:, 0][batch.mask]
     out = {
         "normal_mean": error.mean(), "normal_median": error.median(), "depth_rmse": depth.square().mean().sqrt(),

@@ -168,7 +168,7 @@ def distance(tracer: Tracer, atlas: Any, source: fused_maps.FusedSource) -> floa
     seen = source.maps.weight[atlas.covered] > LEAST_SEEN
     point, normal = atlas.position[seen], atlas.normal[seen]
     reach = 0.1 * tracer.size
-    ahead = np.stack([np.asarray(tracer.facing(point, way * normal)[0]) for way in (1, -1)])
+    ahead = np.stack([np.asarray(tracer.first_hits(point, way * normal)[0]) for way in (1, -1)])
     return float(np.minimum(ahead.min(axis=0), reach).mean())
 
 

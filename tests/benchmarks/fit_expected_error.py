@@ -21,10 +21,11 @@ from polcap.pipeline import models
 from polcap.stages import infer
 from polcap.stages.infer import learned
 from polcap.training import evaluation_materials, evaluation_protocol, traced_views
-from polcap.training.evaluation_protocol import MESHES, PROTOCOLS, Case, Protocol
+from polcap.training.evaluation_protocol import PROTOCOLS, Case, Protocol
 from polcap.training.map_errors import angle, deciles
 
 SIZES, SAMPLE = (256, 512), 3000  # px; pixels of each picture
+MESHES = 6  # of the evaluation
 GREATEST_DEG = 60.0  # errors that count: a wrong half-turn weighs no more
 OTHER_SEEDS = 2028, 20281128  # of patterns and pictures: not the evaluation's
 _AS_STATED = (1.0, 1.0, 0.0, np.inf)

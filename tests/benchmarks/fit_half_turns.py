@@ -30,7 +30,7 @@ from polcap.optics.resize import area_mean
 from polcap.pipeline import models
 from polcap.stages.infer import analytic, augmentation, half_turns, learned
 from polcap.training import evaluation_materials, evaluation_protocol, traced_views
-from polcap.training.evaluation_protocol import MESHES, Case, Protocol
+from polcap.training.evaluation_protocol import Case, Protocol
 
 MOST_DEG = 0.5  # that one region counts for
 CLEAR_DEG = 10.0  # cells whose two sides differ by less say nothing
@@ -84,8 +84,8 @@ def pictures(data: Path, sixths: int) -> Iterator[Case]:
         with tempfile.TemporaryDirectory() as folder:
             fit_expected_error.linked(data, Path(folder), sixth, meshes)
             drawn = [Protocol(Path(folder), SIZE, which) for which in (2, 1)]
-            for number in range(MESHES):
-                yield drawn[number % 2].case(sixth * MESHES + number)
+            for number in range(fit_expected_error.MESHES):
+                yield drawn[number % 2].case(sixth * fit_expected_error.MESHES + number)
 
 
 def predicted(case: Case, network: Network) -> tuple[half_turns.Grid, Floats, Floats]:

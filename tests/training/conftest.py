@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from polcap.images import Floats
-from polcap.training import evaluation_materials, evaluation_protocol, materials, random_shapes, traced_views
+from polcap.training import evaluation_materials, materials, random_shapes, traced_views
 from polcap.training.simulator import Simulator
 
 RECIPE = traced_views.ViewsRecipe(views=6, procedural=2, size=64, seed=5, per_shape=3)
@@ -59,7 +59,7 @@ def write_textures(folder: Path, seed: int) -> None:
 def test_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """As many test meshes and texture sets as the evaluation takes."""
     folder = tmp_path_factory.mktemp("test-data")
-    for k in range(evaluation_protocol.MESHES):
+    for k in range(6):
         write_blob(folder / "meshes" / "test" / f"shape-{k}.npz", k)
     for k in range(evaluation_materials.TEXTURES):
         write_textures(folder / "materials" / "test" / f"set-{k}", k)

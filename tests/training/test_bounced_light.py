@@ -43,7 +43,7 @@ def _both(turn: Floats) -> tuple[Floats, Floats]:
     v, ones = frames.rays(view, SIZE, SIZE)[mask].astype(float), np.ones((int(mask.sum()), 3))
     normal = frames.to_ray_frame(buffer.normal[mask], v).astype(float)
     look = (ALBEDO * ones, F0 * ones, np.full(len(ones), ROUGHNESS))
-    _, flat = scene.facing(np.broadcast_to(-translation @ turn, v.shape), -v @ turn)
+    _, flat = scene.first_hits(np.broadcast_to(-translation @ turn, v.shape), -v @ turn)
     places = light_transport.SurfacePoints(mask, buffer.position[mask].astype(float), flat, normal, v, *look, ior=1.5)
     indirect = light_transport.IndirectLight(
         scene, places, pose, lambda place, facing: ALBEDO * np.ones((len(place), 3))

@@ -24,7 +24,7 @@ def _inside(
     rng = np.random.default_rng(3)
     out = rng.normal(size=(400, 3))
     out /= np.linalg.norm(out, axis=1, keepdims=True)
-    distance, flat = scene.facing(0 * out, out)
+    distance, flat = scene.first_hits(0 * out, out)
     one = np.ones((len(out), 3))
     places = light_transport.SurfacePoints(
         np.ones((20, 20), bool), out * distance[:, None], flat, np.tile([0.0, 0.0, 1.0], (len(out), 1)), -out,

@@ -13,9 +13,7 @@ def dressed() -> tuple[materials.Surface, torch.Tensor]:
     normal = torch.nn.functional.normalize(torch.randn(OBJECTS * PLACES, 3), dim=1)
     owner = torch.arange(OBJECTS).repeat_interleave(PLACES)
     library = materials.MaterialLibrary(None, torch.device("cpu"))
-    return materials.draw_surface(
-        library, normal, normal / 2, torch.eye(3).expand(OBJECTS, 3, 3), owner, OBJECTS
-    ), normal
+    return materials.draw_surface(library, normal, normal / 2, torch.eye(3).expand(OBJECTS, 3, 3), owner), normal
 
 
 def test_materials_stay_within_their_bounds() -> None:

@@ -124,6 +124,11 @@ def views(folder: Path) -> list[str]:
     return [path.name for path in named if _angle_folders(path)[0]]
 
 
+def view_name(k: int) -> str:
+    """Name of the folder of an object's view k = 0, 1, …: view01, view02 and so on."""
+    return f"view{k + 1:02d}"
+
+
 def _lossy_or_packed(folder: Path) -> str:
     """The remedy for a folder of HEIC pictures or of a ZIP archive; empty for any other folder."""
     files = [path for path in children(folder) if path.is_file()]
