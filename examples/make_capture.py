@@ -11,8 +11,9 @@ import numpy as np
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Vase
 from polcap.synth.forward_camera import Sensor
+from polcap.synth.render import Scene
 from polcap.synth.scene_materials import Coat, Material
-from polcap.synth.shooting import Scene, Shoot, write
+from polcap.synth.shooting import Shoot, write
 
 GLAZE = Material((0.03, 0.16, 0.26), (0.66, 0.62, 0.48), "veins", size=0.018, roughness=(0.20, 0.26), ior=1.54, seed=4)
 CLAY = Material((0.48, 0.19, 0.085), (0.66, 0.37, 0.19), "noise", size=0.008, roughness=(0.52, 0.62), ior=1.46, seed=9)

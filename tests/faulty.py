@@ -10,7 +10,8 @@ from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from polcap.images import Floats
 from polcap.synth import shooting as synthetic
-from polcap.synth.shooting import Shoot, Studio, Take, random_scene
+from polcap.synth.scenes import Kind, random_scene
+from polcap.synth.shooting import Shoot, Studio, Take
 
 FAULTS = {  # what went wrong: the lines of `polcap check` that tell it; none: the folder cannot be read
     "clipped": ("clipping",),
@@ -28,7 +29,7 @@ FAULTS = {  # what went wrong: the lines of `polcap check` that tell it; none: t
     "missing": (),
 }
 _ANGLES = (0.0, 45.0, 90.0)
-_KINDS: tuple[synthetic.Kind, ...] = ("bumps", "clusters", "vase")
+_KINDS: tuple[Kind, ...] = ("bumps", "clusters", "vase")
 
 
 def shoot(folder: Path, seed: int, fault: str, width: int) -> str:

@@ -20,8 +20,9 @@ from polcap.quality import gates
 from polcap.results import Results
 from polcap.synth import shooting
 from polcap.synth.distance_fields import Cluster
+from polcap.synth.render import Scene
 from polcap.synth.scene_materials import Coat, Material
-from polcap.synth.shooting import Scene, Shoot
+from polcap.synth.shooting import Shoot
 
 GLOSSY = Coat((Material((0.12, 0.08, 0.06), (0.45, 0.4, 0.3), "chequer", size=0.012, roughness=(0.3, 0.3)),))
 BALL = Scene(

@@ -7,7 +7,7 @@ D65.
 import csv
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -46,11 +46,12 @@ def read(path: Path) -> ChartReference:
     try:
         columns, rows = _cgats(text) if "BEGIN_DATA" in text else _csv(text)
         rec709 = _colors(columns, rows)
-        order, is_block = _order(columns, rows)
+        named = _named(columns, rows)
+        order, is_block = _order(named, len(rows))
     except ValueError as error:
         raise ChartError(f"whitebalance.chart = {path}: {error}") from None
     names = SG_BLOCK if is_block else tuple(str(number) for number in range(1, 25))
-    named, around = _named(columns, rows), None
+    around = None
     if is_block and all(name in named for name in SG_SURROUNDINGS):
         around = surroundings(rec709[[named[name] for name in SG_SURROUNDINGS]])
     return ChartReference(f"measured chart {path.name}", rec709[order], None, names, (), is_block, around)
@@ -144,16 +145,18 @@ def _named(columns: list[str], rows: Rows) -> dict[str, int]:
     return {}
 
 
-def _order(columns: list[str], rows: Rows) -> tuple[list[int], bool]:
-    """Rows of the 24 patches, from dark skin row by row, and whether they are the block of an SG."""
-    named = _named(columns, rows)
+def _order(named: Mapping[str, int], count: int) -> tuple[list[int], bool]:
+    """Rows of the 24 patches, from dark skin row by row, and whether they are the block of an SG.
+
+    `named` has the row of each patch by its name, `count` is the number of rows.
+    """
     for names in (_BY_ROW, _BY_COLUMN, SG_BLOCK):
-        if all(name in named for name in names) and (names is SG_BLOCK or len(rows) == len(names)):
+        if all(name in named for name in names) and (names is SG_BLOCK or count == len(names)):
             return [named[name] for name in names], names is SG_BLOCK
-    if len(rows) == 24 and not named:
+    if count == 24 and not named:
         return list(range(24)), False
     first = f" named {', '.join(list(named)[:3])}, … are not the patches of a chart" if named else " without names"
     raise ValueError(
-        f"{len(rows)} patches{first}; a Classic has 24, from dark skin or named A1 to D6, an SG at least those named "
+        f"{count} patches{first}; a Classic has 24, from dark skin or named A1 to D6, an SG at least those named "
         "E2 to J5"
     )

@@ -52,21 +52,21 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: s
     encoding, or there is no such device.
     """
     path = Path(path)
-    mark = digest(_bytes(path))
-    if mark not in {digest(file.read_bytes()) for file in shipped_data.model_files()}:
+    known = digest(_bytes(path))
+    if known not in {digest(file.read_bytes()) for file in shipped_data.model_files()}:
         try:
-            worker.call(trial, path, limit_s=_TRIAL_S, expected=mark, encoding=encoding)
+            worker.call(trial, path, limit_s=_TRIAL_S, expected=known, encoding=encoding)
         except DecodeError as error:
             raise ModelError(f"a trial run of the model failed: {error}") from error
-    session = _session(str(path), mark, device, threads)
+    session = _session(str(path), known, device, threads)
     channels, metadata = _check(path, session, encoding)
     # two runs on one thread each end sooner than one after the other on two threads
     at_once = min(threads or parallel.threads(), _AT_ONCE) if session.get_providers()[0] == CPU else 1
-    return Network(mark, channels, metadata, None, str(path), device, threads, at_once)
+    return Network(known, channels, metadata, None, str(path), device, threads, at_once)
 
 
 def digest(data: bytes) -> str:
-    """SHA-256 of a model file's bytes; enters the cache key of every stage that uses the model."""
+    """BLAKE2b digest of 128 bits of a model file's bytes; enters the cache key of every stage that uses the model."""
     return blake2b(data, digest_size=16).hexdigest()
 
 
@@ -117,10 +117,10 @@ def _session(path: str, expected: str, device: Device, threads: int) -> Any:
     data = _bytes(Path(path))
     if digest(data) != expected:
         raise ModelError(f"{path}: changed while polcap was using it; leave the file alone and run again")
-    there = CUDA in _onnxruntime().get_available_providers()
-    if device == "cuda" and not there:
+    has_cuda = CUDA in _onnxruntime().get_available_providers()
+    if device == "cuda" and not has_cuda:
         raise ModelError("--device cuda: this onnxruntime has no CUDA; install onnxruntime-gpu, or use --device cpu")
-    session = _open(Path(path), data, [CUDA, CPU] if there and device != "cpu" else [CPU], threads)
+    session = _open(Path(path), data, [CUDA, CPU] if has_cuda and device != "cpu" else [CPU], threads)
     if device == "cuda" and session.get_providers()[0] != CUDA:
         raise ModelError("--device cuda: CUDA does not start; make driver, CUDA and cuDNN fit, or use --device cpu")
     return session

@@ -40,9 +40,9 @@ class BackgroundCheck:
         self._pending[slot] = self._thread.submit(self._save_and_check, slot, read_deg, photograph)
 
     def collect(self, block: bool) -> None:
-        """Remove the frames whose check has ended from `pending`; with `block`, first wait until one has.
+        """Remove the checked frames from `pending`; with `block`, first wait until one is checked.
 
-        Raises the error of a check that failed itself.
+        Raises the error of a check that could not be made, or CaptureError for a frame rejected too often.
         """
         if block and self._pending:
             wait(self._pending.values(), return_when=FIRST_COMPLETED)

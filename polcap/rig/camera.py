@@ -16,7 +16,7 @@ class CameraFile:
     """One photograph as received from the camera: bytes, file name, exposure."""
 
     data: bytes
-    name: str  # given by the camera
+    name: str  # in the camera
     exposure: Exposure  # settings with which the camera took it
 
     @property
@@ -24,9 +24,9 @@ class CameraFile:
         """File name suffix by the file's content; the camera's suffix if the content is not recognized."""
         if suffix := file_kind.raw_suffix(self.data):
             return suffix
-        if self.data.startswith(b"\xff\xd8\xff"):
+        if self.data.startswith(file_kind.JPEG):
             return ".jpg"
-        if self.data[:4] in (b"II*\0", b"MM\0*"):
+        if self.data.startswith(file_kind.TIFF):
             if file_kind.structure(self.data).dng:
                 return ".dng"
             head = self.data[:4096].lower()

@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from polcap.errors import HardwareError, SettingError
+from polcap.formats.raw import file_kind
 from polcap.images import Role
 from polcap.rig.camera import CameraFile
 from polcap.rig.device_log import Log
@@ -36,7 +37,6 @@ _REMEDY = {
     -110: "it is busy; wait, or switch it off and on",
     -115: "its card is full; put in another",
 }
-_JPEG = b"\xff\xd8\xff"
 _SECOND_FILE_MS = 2000  # a camera that writes RAW and JPEG announces the second file within this time
 
 
@@ -96,7 +96,7 @@ class Gphoto2Camera:
     def _shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
         done = {field: self._set(field, getattr(exposure, field)) for field in _WIDGETS}
         if self._flash_off is not None and self._flash_on is not None:
-            self._turn(_FLASH_MODE, self._flash_on if flash else self._flash_off)
+            self._choose(_FLASH_MODE, self._flash_on if flash else self._flash_off)
         seconds = done["time_s"] or exposure.time_s or 0.0
         data, name = self._ask("capture", self._capture, seconds)
         return CameraFile(data, name, Exposure(**done))
@@ -124,7 +124,7 @@ class Gphoto2Camera:
             return None
         offered = {value: text for text in self._choices[name] if (value := _number(text))}
         value = nearest(field, wanted, list(offered), _WIDGETS[field][1])
-        self._turn(name, offered[value])
+        self._choose(name, offered[value])
         return value
 
     def _widget(self, field: str) -> str | None:
@@ -145,19 +145,21 @@ class Gphoto2Camera:
     def _value(self, name: str) -> str:
         return str(self._camera.get_single_config(name).get_value())
 
-    def _turn(self, name: str, text: str) -> None:
-        def turn() -> None:
+    def _choose(self, name: str, text: str) -> None:
+        """Set the camera setting `name` to one of its choices."""
+
+        def choose() -> None:
             widget = self._camera.get_single_config(name)
             widget.set_value(text)
             self._camera.set_single_config(name, widget)
 
-        self._ask(f"{name} = {text}", turn)
+        self._ask(f"{name} = {text}", choose)
 
     def _capture(self) -> tuple[bytes, str]:
         """Release the shutter and fetch the RAW file; a JPEG only if the camera writes no RAW."""
         place = self._camera.capture(self._gp.GP_CAPTURE_IMAGE)
         data = self._fetch(place)
-        while data.startswith(_JPEG):
+        while data.startswith(file_kind.JPEG):
             kind, content = self._camera.wait_for_event(_SECOND_FILE_MS)
             if kind == self._gp.GP_EVENT_TIMEOUT:
                 break

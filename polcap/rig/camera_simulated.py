@@ -12,7 +12,8 @@ from polcap.rig.camera import CameraFile
 from polcap.rig.device_log import Log
 from polcap.rig.exposure_bracket import Exposure
 from polcap.rig.motor_simulated import RING
-from polcap.synth.shooting import MIDDLE_S, Dials, Kind, Shoot, Studio, Take, random_scene
+from polcap.synth.scenes import Kind, random_scene
+from polcap.synth.shooting import MIDDLE_S, Dials, Shoot, Studio, Take
 
 FLASH_SYNC_S = 1 / 160  # shutter time under the flash
 _NUMBER_OF_ROLE = {"shot": 0, "repeat": 1000, "ambient": 2000, "chart": 3000, "cross": 4000}

@@ -51,7 +51,7 @@ class WatchFolderCamera:
         end = time.monotonic() + self._timeout_s
         unchanged: dict[tuple[Path, int], float] = {}  # time at which a file first had a size
         refused: set[tuple[Path, int]] = set()  # files that were no RAW at a size
-        why = ""
+        fault = ""  # of the last file that could not be read
         while time.monotonic() < end:
             for file in sorted(set(self._files()) - self._seen):
                 try:
@@ -66,10 +66,10 @@ class WatchFolderCamera:
                         self._log.write("camera", "<", f"{file.name}, {len(data)} bytes")
                         return CameraFile(data, file.name, exposure)
                 except (DecodeError, OSError) as error:  # removed, or damaged
-                    why = f" ({error})"
+                    fault = f" ({error})"
             time.sleep(_POLL_S)
         raise HardwareError(
-            f"no new RAW file in {self._folder} within {self._timeout_s:g} s{why}; "
+            f"no new RAW file in {self._folder} within {self._timeout_s:g} s{fault}; "
             "check that the tethering program writes RAW files there"
         )
 

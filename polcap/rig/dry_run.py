@@ -46,7 +46,7 @@ class Pace:
 
 
 def overhead_s(camera: str) -> float:
-    """Nominal time [s] per frame of a camera besides the exposure, by its name. Raises SettingError."""
+    """Nominal time [s] per frame of a camera, without the exposure, by its name. Raises SettingError."""
     return _by_kind("--camera", camera, OVERHEAD_S)
 
 

@@ -73,24 +73,23 @@ def retake_reason(
 ) -> str | None:
     """Reason for which a frame must be retaken; None for a good frame.
 
-    `wanted` and `flash` are the planned exposure, `shortest` tells that it is the shortest of its bracket. `others` are
-    the accepted frames of the capture, `sharpest` is the greatest sharpness of those with the same exposure.
+    `wanted` and `flash` are the planned exposure; `shortest`: it is the shortest of its bracket. `others` are the
+    accepted frames of the capture, `sharpest` is the greatest sharpness of those with the same exposure.
     """
     if any(facts.digest == other.digest for other in others):
         return "is the same photograph as an earlier one"
-    reason = _wrong_exposure(facts.exif, wanted)
-    if reason is None and not flash and facts.exif.flash_fired:
-        reason = "the flash fired, although it should be off"
-    if reason is None and shortest and facts.clipped > _MOST_CLIPPED:
-        reason = (
+    if fault := _wrong_exposure(facts.exif, wanted):
+        return fault
+    if facts.exif.flash_fired and not flash:
+        return "the flash fired, although it should be off"
+    if shortest and facts.clipped > _MOST_CLIPPED:
+        return (
             f"{100 * facts.clipped:.2g} % of the picture is clipped in the shortest exposure, "
             f"more than {100 * _MOST_CLIPPED:g} %; give a shorter --bracket or less light"
         )
-    if reason is None and others:
-        reason = reader.other_equipment(facts.exif, others[0].exif)
-    if reason is None and is_blurred(facts.sharpness, sharpest):
-        reason = BLURRED
-    return reason
+    if others and (difference := reader.other_equipment(facts.exif, others[0].exif)):
+        return difference
+    return BLURRED if is_blurred(facts.sharpness, sharpest) else None
 
 
 def is_blurred(sharpness: float, sharpest: float) -> bool:

@@ -30,7 +30,7 @@ class CaptureOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise SettingError(f"--angles {listed}: not all in 0 to 360 degrees; give angles modulo 360")
         if len({layouts.degrees(angle) for angle in self.angles_deg}) < len(self.angles_deg):
             raise SettingError(f"--angles {listed} names an angle twice; take a bracket again with --repeat")
-        if layouts.different(self.angles_deg) < 3:
+        if layouts.count_axes(self.angles_deg) < 3:
             raise SettingError(f"--angles {listed}: fewer than 3 different polarizer angles; give 3 or more")
         for angle in set(self.repeat_deg) - set(self.angles_deg):
             raise SettingError(f"--repeat {angle:g}: is not among --angles; give one of {listed}")

@@ -29,9 +29,6 @@ from polcap.synth import color_checker as charts
 from polcap.synth import forward_camera, render, scene_materials
 from polcap.synth.forward_camera import COLOR_MATRIX, SENSOR_WIDTH_MM, Bend, Sensor
 from polcap.synth.render import Scene
-from polcap.synth.scenes import Kind, random_scene
-
-__all__ = ["MIDDLE_S", "Dials", "Kind", "Scene", "Shoot", "Studio", "Take", "random_scene", "transform", "write"]
 
 Angle = Annotated[float, Meta(ge=0, le=360)]  # degrees, as in folder names
 MIDDLE_S = 0.02  # s, exposure time of the middle frame of a time bracket

@@ -17,7 +17,8 @@ from polcap.rig.camera import CameraFile
 from polcap.rig.camera_gphoto2 import call_within
 from polcap.rig.exposure_bracket import Exposure
 from polcap.rig.shooting_plan import CaptureOrder
-from polcap.synth.shooting import MIDDLE_S, Shoot, Studio, Take, random_scene
+from polcap.synth.scenes import random_scene
+from polcap.synth.shooting import MIDDLE_S, Shoot, Studio, Take
 from tests.raw_files import write_raw
 
 ANGLES = (0.0, 45.0, 90.0)

@@ -15,6 +15,7 @@ from polcap.rig.exposure_bracket import Exposure, parse_bracket
 from polcap.rig.motor_simulated import RING, SimulatedMotor, SimulatedMotorSettings
 from polcap.rig.shooting_plan import CaptureOrder
 from polcap.synth import shooting as synthetic
+from polcap.synth.scenes import random_scene
 from polcap.synth.shooting import Shoot
 
 SMALL = "width=96&height=72&samples=1"
@@ -32,7 +33,7 @@ def test_a_simulated_capture_is_the_synthetic_one_at_the_motors_true_angles(tmp_
     motor.halt()
     shoot = Shoot(seed=5, width=96, height=72, samples=1, angles_deg=tuple(true))
     shoot = replace(shoot, nudge_px=0, nudge_deg=0, angle_error_deg=0)
-    synthetic.write(tmp_path / "synth", synthetic.random_scene(5, "bumps"), shoot)
+    synthetic.write(tmp_path / "synth", random_scene(5, "bumps"), shoot)
     made = sorted((tmp_path / "synth").rglob("*.DNG"))
     shot = sorted((tmp_path / "rig").glob("pol*/*.dng"))
     assert len(made) == len(shot) == 9

@@ -17,8 +17,10 @@ from polcap.synth import color_checker, render, shooting
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Cluster
 from polcap.synth.forward_camera import Sensor
+from polcap.synth.render import Scene
 from polcap.synth.scene_materials import Coat, Material
-from polcap.synth.shooting import Scene, Shoot
+from polcap.synth.scenes import random_scene
+from polcap.synth.shooting import Shoot
 
 GREY = Coat((Material((0.6, 0.6, 0.6), (0.6, 0.6, 0.6), "plain", roughness=(0.5, 0.5)),))
 BALL = Scene(shape=Cluster(((0, 0, 0, 0.08),)), coat=GREY, position=(-0.08, 0.0, -0.7), light=(0.0, 0.0, 0.0))
@@ -151,7 +153,7 @@ def test_positive_roll_turns_the_picture_counter_clockwise_and_shift_is_right_an
 def test_same_seed_same_bytes(tmp_path: Path) -> None:
     shoot = Shoot(width=96, height=72, samples=1, exposures=2)
     for name in ("a", "b"):
-        shooting.write(tmp_path / name, shooting.random_scene(3, "clusters"), shoot)
+        shooting.write(tmp_path / name, random_scene(3, "clusters"), shoot)
     files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file())
     assert len(files) == 3 * 2 + 2
     for file in files:
@@ -174,7 +176,7 @@ def test_every_kind_of_bracket_steps_by_four(tmp_path: Path, bracket: str) -> No
 def test_object_and_chart_are_complete_and_separate_in_every_scene(kind: Any) -> None:
     shoot = Shoot(width=144, height=108)
     for seed in range(20):
-        scene = shooting.random_scene(seed, kind)
+        scene = random_scene(seed, kind)
         mask = render.gbuffer(scene, shoot.view, shoot.height, shoot.width).mask
         assert scene.chart is not None
         corners = projection.project(shoot.view, color_checker.corners(scene.chart))
@@ -190,7 +192,7 @@ def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
         shooting.write(tmp_path, BALL, STILL)
     assert [p.name for p in tmp_path.iterdir()] == ["holiday.jpg"]
     with pytest.raises(SettingError, match="bumps, clusters, vase"):
-        shooting.random_scene(0, "teapot")  # type: ignore[arg-type]
+        random_scene(0, "teapot")  # type: ignore[arg-type]
 
 
 def test_a_camera_that_rolls_turns_its_polarizer_with_it() -> None:

@@ -75,10 +75,10 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
         return _folders(folder, sub_folders, crossed, angles_deg)
     if found := views(folder):
         raise CaptureError(
-            f"{folder}: its sub-folders {_listed(found)} are views of one object: join them with `polcap fuse`, or "
+            f"{folder}: its sub-folders {_few_names(found)} are views of one object: join them with `polcap fuse`, or "
             "give one of them"
         )
-    pictures, notes = _list(folder)
+    pictures, notes = _list_photographs(folder)
     if not pictures:
         raise CaptureError(f"{folder}: holds no photograph that polcap reads; {_hint(folder)}")
     if stated.sensor or _is_sensor(pictures, angles_deg):
@@ -98,7 +98,7 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
 def _hint(folder: Path) -> str:
     """A sentence on the likely mistake of a user who named a folder without photographs."""
     inside = [path for path in children(folder) if path.is_dir() and not is_result(path)]
-    named = _listed([path.name for path in inside])
+    named = _few_names([path.name for path in inside])
     if remedy := _lossy_or_packed(folder):
         return remedy
     if any(_angle_folders(path)[0] for path in inside):
@@ -135,8 +135,8 @@ def _lossy_or_packed(folder: Path) -> str:
     lossy = [path.name for path in files if path.suffix.lower() in _LOSSY_SUFFIXES]
     packed = [path.name for path in files if path.suffix.lower() == ".zip"]
     if lossy:
-        return f"{_listed(lossy)} are compressed with loss: set the camera or phone to RAW or DNG, and shoot again"
-    return f"unpack {_listed(packed)} first" if packed else ""
+        return f"{_few_names(lossy)} are compressed with loss: set the camera or phone to RAW or DNG, and shoot again"
+    return f"unpack {_few_names(packed)} first" if packed else ""
 
 
 def _is_one_angle(folder: Path) -> bool:
@@ -147,7 +147,7 @@ def _is_one_angle(folder: Path) -> bool:
     return folder in siblings and len(siblings) > 1
 
 
-def _listed(names: Sequence[str]) -> str:
+def _few_names(names: Sequence[str]) -> str:
     return f"{', '.join(names[:4])}{', …' if len(names) > 4 else ''}"
 
 
@@ -212,18 +212,18 @@ def _folders(folder: Path, sub_folders: dict[float, Path], crossed: Path | None,
     groups: dict[float, list[Source]] = {}
     notes = []
     for angle, sub_folder in sub_folders.items():
-        groups[angle], found = _list(sub_folder, "shoot this angle again, or remove the folder")
+        groups[angle], found = _list_photographs(sub_folder, "shoot this angle again, or remove the folder")
         notes += [f"{sub_folder.name}: {note}" for note in found]
     others: tuple[Source, ...] = ()
     if crossed is not None:
-        pictures, _ = _list(crossed, "shoot it again, or remove the folder")
+        pictures, _ = _list_photographs(crossed, "shoot it again, or remove the folder")
         others = tuple(replace(source, role="cross", angle_deg=_degrees_of_cross(crossed)) for source in pictures)
     inside = children(folder)
     used = {*sub_folders.values(), crossed}
     unused = [path.name for path in inside if path.is_dir() and path not in used and path.name not in OURS]
     notes += [f"not used: the folders {', '.join(unused)}"] if unused else []
     loose = [path.name for path in inside if path.is_file() and path.name != capture_toml.NAME]
-    notes += [f"not used: the files {_listed(loose)}"] if loose else []
+    notes += [f"not used: the files {_few_names(loose)}"] if loose else []
     return Plan("folders", _select(folder, groups, angles_deg), others, tuple(notes))
 
 
@@ -267,7 +267,7 @@ def _degrees_by_name(names: Iterable[str]) -> dict[str, float]:
             patterns[_FOLDER_NUMBER.sub("#", name)][name] = float(numbers[0].replace(",", "."))
     for group in patterns.values():
         angles = sorted(group.values())
-        if angles[0] == 0 and angles[-1] < 180 and different(angles) == len(angles) >= 3:
+        if angles[0] == 0 and angles[-1] < 180 and count_axes(angles) == len(angles) >= 3:
             return group
     return {}
 
@@ -307,7 +307,7 @@ def _is_sensor(pictures: list[Source], angles_deg: _Order) -> bool:
 
 
 def _sensor_shots(sources: Sequence[Source], angles_deg: _Order) -> Shots:
-    groups = {angle: list(sources) for angle, _ in photo.SENSOR_DEG}
+    groups = {angle: list(sources) for angle in photo.SENSOR_CELLS}
     return _select(sources[0].path.parent, groups, angles_deg) if sources else ()
 
 
@@ -324,7 +324,7 @@ def _by_name(pictures: list[Source]) -> dict[float, list[Source]]:
     if len(columns) != 1 or any(len(text.partition(".")[0]) > 3 for text in columns[0]):
         return {}
     groups = {float(text): [source] for text, source in zip(columns[0], pictures)}
-    if max(groups) >= 180 or different(groups) < max(3, len(pictures)):
+    if max(groups) >= 180 or count_axes(groups) < max(3, len(pictures)):
         return {}
     return dict(sorted(groups.items()))
 
@@ -348,7 +348,7 @@ def _by_time(folder: Path, pictures: list[Source], angles_deg: Sequence[float]) 
         raise CaptureError(f"{folder}: {count} frames without EXIF times cannot be assigned to angles; {sort}")
     for at, source in enumerate(order):
         value, reference = source.probe.exif.relative_exposure, order[at % size].probe.exif.relative_exposure
-        if not equal(value, reference):
+        if not same_exposure(value, reference):
             times = f"{value / reference:.3g} times" if value and reference else "not stated like"
             raise CaptureError(
                 f"{source.path}: its exposure is {times} that of the same frame of the first bracket; these {count} "
@@ -358,7 +358,7 @@ def _by_time(folder: Path, pictures: list[Source], angles_deg: Sequence[float]) 
     return tuple((angle, tuple(order[k * size : (k + 1) * size])) for k, angle in enumerate(angles_deg)), note
 
 
-def equal(value: float | None, reference: float | None) -> bool:
+def same_exposure(value: float | None, reference: float | None) -> bool:
     """Whether two relative exposures (time, aperture and ISO) are the same within the rounding of cameras."""
     if not value or not reference:
         return value == reference
@@ -374,14 +374,14 @@ def _select(folder: Path, groups: dict[float, list[Source]], angles_deg: _Order)
     return tuple((angle, tuple(groups[angle])) for angle in wanted)
 
 
-def different(angles_deg: Iterable[float]) -> int:
+def count_axes(angles_deg: Iterable[float]) -> int:
     """Number of different polarizer axes among the angles; angles 180° apart are the same axis."""
     axes = sorted(angle % 180 for angle in angles_deg)
     gaps = [b - a for a, b in pairwise([*axes, axes[0] + 180])] if axes else []
     return max(sum(gap >= SEPARATION_DEG for gap in gaps), 1 if axes else 0)
 
 
-def _list(folder: Path, remedy: str = "") -> tuple[list[Source], list[str]]:
+def _list_photographs(folder: Path, remedy: str = "") -> tuple[list[Source], list[str]]:
     """List the photographs of one folder, with notes; JPEGs and the like are left out if there are RAW files.
 
     If `remedy` is not empty, a folder without photographs is a CaptureError with this remedy.

@@ -9,10 +9,12 @@ from typing import Literal
 
 import numpy as np
 
+from polcap.calibration_values import Calibration
 from polcap.errors import CaptureError
 from polcap.formats import atomic, calibrations
 from polcap.formats.capture import capture_toml, focal_length, layouts
 from polcap.formats.capture.capture_toml import CaptureFile
+from polcap.formats.capture.focal_length import FocalLength
 from polcap.formats.capture.layouts import Source
 from polcap.formats.raw import photo
 from polcap.images import Capture, Exif, Frame, FrameReading, Shot
@@ -33,18 +35,14 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
     Raises DecodeError: a file is cut short, or no decoder recognises it.
     """
     folder = Path(folder)
-    if folder.is_file():
-        if zipfile.is_zipfile(folder):
-            raise CaptureError(f"{folder} is a ZIP archive; unpack it and give the folder that it holds")
-        raise CaptureError(f"{folder} is a file; give the folder that holds all photographs of the object")
-    if not folder.is_dir():
-        raise CaptureError(f"{folder}: no such folder; give the folder that holds the photographs")
+    _check_folder(folder)
     stated = capture_toml.load(folder)
+    clockwise = clockwise or stated.clockwise
     if angles_deg is not None:
         _check_angles(folder, angles_deg, "--angles states")
     plan = layouts.plan(folder, stated, angles_deg)
     _check_angles(folder, [angle for angle, _ in plan.shots], "the shots' angles are")
-    if clockwise or stated.clockwise:
+    if clockwise:
         if plan.layout == "sensor":
             raise CaptureError(f"{folder}: clockwise is stated, but a polarization sensor has no ring; leave it out")
         plan = layouts.counted_clockwise(plan)
@@ -56,23 +54,13 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
     _check_brackets(shots)
     crossed = None if plan.layout == "sensor" else _crossed(folder, plan, stated)
     reference, first = shots[0].frames[0].exif, plan.shots[0][1][0]
-    step = 2 if plan.layout == "sensor" else 1  # a plane of a sensor mosaic has half its sides
-    width, height = (reference.width or 0) // step, (reference.height or 0) // step
-    notes = _notes(plan.layout, plan.others, first, shots, stated)
     calibration, calibration_notes = None, list[str]()
     if plan.layout != "sensor" and first.probe.kind == "raw":  # polarizer on a ring, the sensor's own counts
-        calibration, calibration_notes = calibrations.choose(reference, stated.filter, stated.focal_length_mm)
-        ring = None if calibration is None else calibration.polarizer
-        if ring is not None and ring.sense < 0 and (clockwise or stated.clockwise):
-            raise CaptureError(
-                f"{folder}: clockwise is stated, but the ring's calibration turns it already; leave it out"
-            )
-    lens = focal_length.find(reference, stated.focal_length_mm, stated.sensor_width_mm)
-    principal = ((width - 1) / 2, (height - 1) / 2)
-    geometry = calibration.geometry if calibration is not None else None
-    if geometry is not None and geometry.size_px == (width, height):
-        principal = geometry.principal_px
-        lens = focal_length.calibrated(geometry)
+        calibration, calibration_notes = _calibration(folder, reference, stated, clockwise)
+    step = 2 if plan.layout == "sensor" else 1  # a plane of a sensor mosaic has half its sides
+    size = (reference.width or 0) // step, (reference.height or 0) // step
+    lens, principal = _lens(reference, stated, calibration, size)
+    notes = _notes(plan.layout, plan.others, first, shots, stated)
     return Capture(
         name=atomic.safe_name(stated.name or Path(os.path.realpath(folder)).name),
         folder=str(folder),
@@ -82,13 +70,43 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
         focal_known=lens.known,
         focal_doubt=lens.doubt,
         principal_px=principal,
-        size_px=(width, height),
+        size_px=size,
         chart_frames=tuple(_frame(plan, stated, source, 0.0) for source in plan.others if source.role == "chart"),
         notes=(*plan.notes, *notes, *calibration_notes, f"focal length {lens.note}"),
         calibration=calibration,
         crossed=crossed,
         catalog=stated.catalog,
     )
+
+
+def _check_folder(folder: Path) -> None:
+    if folder.is_file():
+        if zipfile.is_zipfile(folder):
+            raise CaptureError(f"{folder} is a ZIP archive; unpack it and give the folder that it holds")
+        raise CaptureError(f"{folder} is a file; give the folder that holds all photographs of the object")
+    if not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder; give the folder that holds the photographs")
+
+
+def _calibration(
+    folder: Path, exif: Exif, stated: CaptureFile, clockwise: bool
+) -> tuple[Calibration | None, list[str]]:
+    """The stored calibration for this camera, lens and filter, if any, and notes on its use."""
+    found, notes = calibrations.choose(exif, stated.filter, stated.focal_length_mm)
+    if clockwise and found is not None and found.polarizer is not None and found.polarizer.sense < 0:
+        raise CaptureError(f"{folder}: clockwise is stated, but the ring's calibration turns it already; leave it out")
+    return found, notes
+
+
+def _lens(
+    exif: Exif, stated: CaptureFile, calibration: Calibration | None, size: tuple[int, int]
+) -> tuple[FocalLength, tuple[float, float]]:
+    """Focal length and principal point [px]: calibrated at this picture size, else stated, from EXIF, or assumed."""
+    geometry = None if calibration is None else calibration.geometry
+    if geometry is not None and geometry.size_px == size:
+        return focal_length.calibrated(geometry), geometry.principal_px
+    lens = focal_length.find(exif, stated.focal_length_mm, stated.sensor_width_mm)
+    return lens, ((size[0] - 1) / 2, (size[1] - 1) / 2)
 
 
 def _photographs(folder: Path, plan: layouts.Plan) -> dict[Path, Source]:
@@ -204,7 +222,7 @@ def _darkest_first(frames: Iterable[Frame]) -> tuple[Frame, ...]:
 
 
 def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
-    count = layouts.different(angles_deg)
+    count = layouts.count_axes(angles_deg)
     if count < 3:
         listed = ", ".join(f"{angle:g}" for angle in angles_deg) or "none"
         unread = ", ".join(layouts.numbered(folder))
@@ -256,7 +274,7 @@ def _check_brackets(shots: Sequence[Shot]) -> None:
                 "shoot equal brackets, or remove the surplus"
             )
         for frame, other in zip(shot.frames, model.frames):
-            if not layouts.equal(_exposure(frame), _exposure(other)):
+            if not layouts.same_exposure(_exposure(frame), _exposure(other)):
                 raise CaptureError(
                     f"{frame.path}: {_settings(frame)} where {model.name} has {_settings(other)} "
                     f"({Path(other.path).name}); shoot equal brackets at every angle"

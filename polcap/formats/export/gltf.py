@@ -89,16 +89,7 @@ def encode(
             "version": "2.0",
             "generator": f"polcap {__version__}",
             **({"copyright": facts["rights"]} if "rights" in facts else {}),
-            "extras": {
-                "unit": "metre" if asset.mesh.metric else "relative",
-                "albedo": maps_folder.albedo_scale(asset.albedo_sigma),
-                f"origin_in_{asset.mesh.frame}": origin.tolist(),
-                "pieces": asset.mesh.pieces,
-                "cuts": asset.mesh.cuts,
-                "cut_px": asset.mesh.cut_px,
-                "raggedness": asset.mesh.raggedness,
-                "textures": {f"{name}_{key}": texture.meaning for key, texture in held.items()},
-            },
+            "extras": _extras(asset, origin) | {"textures": {f"{name}_{key}": held[key].meaning for key in held}},
             "extensions": {"KHR_xmp_json_ld": {"packet": 0}},
         },
         "extensionsUsed": used + required,
@@ -132,6 +123,20 @@ def textures(asset: Asset) -> dict[str, Texture]:
         "orm": texture_set.packed(asset),
         "normal": texture_set.normal(asset),
         "specular": texture_set.relative_specular(asset),
+    }
+
+
+def _extras(asset: Asset, origin: Floats) -> dict[str, Any]:
+    """Facts of the mesh that glTF has no keys for; `origin` (3,) is the GLB's origin in the mesh's frame."""
+    mesh = asset.mesh
+    return {
+        "unit": "metre" if mesh.metric else "relative",
+        "albedo": maps_folder.albedo_scale(asset.albedo_sigma),
+        f"origin_in_{mesh.frame}": origin.tolist(),
+        "pieces": mesh.pieces,
+        "cuts": mesh.cuts,
+        "cut_px": mesh.cut_px,
+        "raggedness": mesh.raggedness,
     }
 
 

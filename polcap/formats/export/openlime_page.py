@@ -28,7 +28,7 @@ p { position: absolute; left: 12px; bottom: 0; pointer-events: none; }
 <script>
 'use strict';
 if (!window.OpenLIME) document.getElementById('words').textContent =
-  'Put the file $script of OpenLIME beside this page, and serve the folder by a web server.';
+  'Put the file $script of OpenLIME into the folder of this page, and serve the folder by a web server.';
 else {
   const view = document.getElementById('view');
   const viewer = new OpenLIME.Viewer(view);

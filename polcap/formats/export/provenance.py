@@ -55,7 +55,8 @@ def record(about: Mapping[str, Any], catalog: Mapping[str, str] | None = None) -
 
 def words(facts: Mapping[str, Any]) -> dict[str, str]:
     """The origin of a result as texts by key, for file formats that store only texts."""
-    return {key: value if isinstance(value, str) else _plain(value) for key, value in facts.items()}
+    encode = json.JSONEncoder(separators=(",", ":")).encode
+    return {key: value if isinstance(value, str) else encode(value) for key, value in facts.items()}
 
 
 def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> None:
@@ -78,7 +79,3 @@ def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> N
 def digest(file: Path) -> str:
     """SHA-256 of an exported file, as in the sidecar file."""
     return file_bytes.digest(file.read_bytes())
-
-
-def _plain(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=True, separators=(",", ":"))

@@ -7,11 +7,10 @@ import numpy as np
 
 from polcap.errors import DecodeError, StorageError
 from polcap.formats import atomic
-from polcap.formats.raw import file_bytes, photo, worker
+from polcap.formats.raw import file_bytes, file_kind, photo, worker
 from polcap.images import Floats
 
 Attribute = str | int | float | tuple[float, ...]
-_MAGIC = b"\x76\x2f\x31\x01"
 
 
 def write(
@@ -71,7 +70,7 @@ def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
 def decode(path: str) -> worker.Answer:
     """Read an EXR in the child process; result and DecodeError as for `read`."""
     data = file_bytes.load(path)
-    if data[:4] != _MAGIC:
+    if not data.startswith(file_kind.EXR):
         raise DecodeError(f"{path} is not an OpenEXR file; write it again")
     with photo.opened(path, data) as file:
         pixels = photo.every_channel(path, file)

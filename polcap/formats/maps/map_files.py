@@ -15,7 +15,7 @@ Source = Literal["maps", "mesh", "stokes", "cues"]
 
 def object_depth(maps: SurfaceMaps, mesh: ReliefMesh) -> Floats:
     """Depth map (H, W) of the mesh on the object's pixels, 0 outside."""
-    return np.where(inside(maps) & np.isfinite(mesh.depth), mesh.depth, 0.0).astype(np.float32)
+    return np.where(maps.mask & np.isfinite(mesh.depth), mesh.depth, 0.0).astype(np.float32)
 
 
 def depth_range(maps: SurfaceMaps, mesh: ReliefMesh) -> tuple[float, float, float]:
@@ -33,18 +33,8 @@ def _depth_picture(maps: SurfaceMaps, mesh: ReliefMesh) -> NDArray[np.uint16]:
 
 
 def _normal_picture(maps: SurfaceMaps) -> NDArray[np.uint16]:
-    flat = np.where(inside(maps)[..., None], maps.normal, [0.0, 0.0, 1.0])
+    flat = np.where(maps.mask[..., None], maps.normal, [0.0, 0.0, 1.0])
     return png.sixteen_bits(flat / 2 + 0.5)
-
-
-def inside(maps: SurfaceMaps) -> Bools:
-    """Mask (H, W) of the pixels that the object covers."""
-    return np.asarray(maps.mask, dtype=bool)
-
-
-def on_object(maps: SurfaceMaps, values: Floats) -> Floats:
-    """A copy of a map (H, W[, C]) with 0 outside the object."""
-    return masked(values, inside(maps))
 
 
 def masked(values: Floats, inside: Bools) -> Floats:
@@ -105,18 +95,18 @@ FLOAT_FILES = ("depth", "normal")  # .exr files of 32 bits; the others are half
 FILES: Mapping[str, tuple[tuple[Source, ...], Callable[..., Any]]] = {
     "stokes.exr": (("stokes",), _stokes_channels),
     "cues.exr": (("cues",), _cue_channels),
-    "normal.exr": (("maps",), lambda maps: _channels("RGB", on_object(maps, maps.normal))),
+    "normal.exr": (("maps",), lambda maps: _channels("RGB", masked(maps.normal, maps.mask))),
     "normal.png": (("maps",), _normal_picture),
     "photograph.png": (("cues",), lambda cues: color.srgb_eight_bits(cues.radiance)),
-    "diffuse.png": (("maps",), lambda maps: color.srgb_eight_bits(on_object(maps, maps.diffuse))),
-    "diffuse.exr": (("maps",), lambda maps: _channels("RGB", on_object(maps, maps.diffuse))),
-    "specular.png": (("maps",), lambda maps: color.srgb_eight_bits(on_object(maps, maps.specular))),
-    "specular.exr": (("maps",), lambda maps: _channels("RGB", on_object(maps, maps.specular))),
+    "diffuse.png": (("maps",), lambda maps: color.srgb_eight_bits(masked(maps.diffuse, maps.mask))),
+    "diffuse.exr": (("maps",), lambda maps: _channels("RGB", masked(maps.diffuse, maps.mask))),
+    "specular.png": (("maps",), lambda maps: color.srgb_eight_bits(masked(maps.specular, maps.mask))),
+    "specular.exr": (("maps",), lambda maps: _channels("RGB", masked(maps.specular, maps.mask))),
     "depth.exr": (("maps", "mesh"), lambda maps, mesh: {"Z": object_depth(maps, mesh)}),
     "depth.png": (("maps", "mesh"), _depth_picture),
-    "roughness.exr": (("maps",), lambda maps: {"Y": on_object(maps, maps.roughness)}),
-    "roughness.png": (("maps",), lambda maps: png.sixteen_bits(on_object(maps, maps.roughness))),
-    "confidence.exr": (("maps",), lambda maps: {"Y": on_object(maps, maps.confidence)}),
+    "roughness.exr": (("maps",), lambda maps: {"Y": masked(maps.roughness, maps.mask)}),
+    "roughness.png": (("maps",), lambda maps: png.sixteen_bits(masked(maps.roughness, maps.mask))),
+    "confidence.exr": (("maps",), lambda maps: {"Y": masked(maps.confidence, maps.mask)}),
     DETAIL: (("maps",), lambda maps: detail_levels(maps.detail)),
-    "mask.png": (("maps",), lambda maps: np.where(inside(maps), 255, 0).astype(np.uint8)),
+    "mask.png": (("maps",), lambda maps: np.where(maps.mask, 255, 0).astype(np.uint8)),
 }

@@ -1,7 +1,7 @@
 """Writes and reads the folder maps/ of a result (docs/reference/result.md)."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -102,17 +102,15 @@ def _write(file: Path, content: Callable[[], Any]) -> None:
 
 def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
     """The maps (H, W) as `read` returns them after `write`: rounded to half where the files are half."""
-    inside = map_files.inside(maps)
-    return SurfaceMaps(
-        normal=map_files.masked(maps.normal, inside),
-        diffuse=_masked_half(maps.diffuse, inside),
-        specular=_masked_half(maps.specular, inside),
-        roughness=_masked_half(maps.roughness, inside),
+    return replace(
+        maps,
+        normal=map_files.masked(maps.normal, maps.mask),
+        diffuse=_masked_half(maps.diffuse, maps.mask),
+        specular=_masked_half(maps.specular, maps.mask),
+        roughness=_masked_half(maps.roughness, maps.mask),
         depth_prior=None,
-        confidence=_masked_half(maps.confidence, inside),
-        mask=inside,
-        view=maps.view,
-        estimator=maps.estimator,
+        confidence=_masked_half(maps.confidence, maps.mask),
+        order=None,
         albedo_sigma=None if maps.albedo_sigma is None else round(maps.albedo_sigma, 3),
         detail=None if maps.detail is None else map_files.detail_of(map_files.detail_levels(maps.detail)),
     )
@@ -120,7 +118,7 @@ def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
 
 def stored_depth(maps: SurfaceMaps, mesh: ReliefMesh) -> Floats:
     """The mesh's depth (H, W) as `read` returns it after `write`; NaN outside the mask."""
-    return np.where(map_files.inside(maps), map_files.object_depth(maps, mesh), np.nan).astype(np.float32)
+    return np.where(maps.mask, map_files.object_depth(maps, mesh), np.nan).astype(np.float32)
 
 
 def _masked_half(values: Floats, inside: Bools) -> Floats:

@@ -25,13 +25,9 @@ _SOUND = b"II*\0\x08\0\0\0\x01\0\x0f\x01\x02\0\x04\0\0\0abc\0\0\0\0\0"  # a TIFF
 _TEXT_LENGTH = 100  # of a name; the rest is cut
 _HEADER = re.compile(rb"II\*\0|MM\0\*")  # of a TIFF
 _SEARCH_BYTES = 1 << 20  # from the beginning of a file
-_ISO = (
-    "ISOSpeedRatings",
-    "Tag 0x0017",
-    "RecommendedExposureIndex",
-    "StandardOutputSensitivity",
-    "ISOSpeed",
-)  # 2nd: RW2
+_ISO = (  # the second is that of Panasonic's RW2
+    "ISOSpeedRatings", "Tag 0x0017", "RecommendedExposureIndex", "StandardOutputSensitivity", "ISOSpeed",
+)  # fmt: skip
 
 logging.getLogger("exifread").setLevel(logging.CRITICAL)  # its warnings are about tags that are not used here
 

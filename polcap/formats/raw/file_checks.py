@@ -27,7 +27,6 @@ DEVELOP = (
 )
 COPY_AGAIN = "copy it from the card again"
 _MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # of a JPEG, after a scan
-_PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_SAMPLES = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # per pixel, by color type
 _DEFLATE = 1032  # greatest compression of zlib (zlib.net, Technical Details: Maximum Compression Factor)
 _CLIPPED_SHARE = 0.5  # of a picture; no useful exposure has more at the white level
@@ -55,7 +54,7 @@ def check_bytes(path: str, width: int, height: int, size: int) -> None:
 
 def check_png(path: str, data: bytes) -> None:
     """Refuse a PNG with more pixels than any camera has, or than its bytes can hold; other files pass. DecodeError."""
-    if data[:8] != _PNG or len(data) < 26:
+    if not data.startswith(file_kind.PNG) or len(data) < 26:
         return
     width, height, bits, color_type = struct.unpack_from(">IIBB", data, 16)
     check_size(path, width, height)

@@ -16,7 +16,8 @@ STRIP_OFFSETS, SAMPLES, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS = 273, 2
 DNG_VERSION, CFA_LAYOUT = 50706, 50711
 CFA, LINEAR_RAW = 32803, 34892  # values of PHOTOMETRIC
 
-_TIFF_MAGIC = (b"II*\0", b"MM\0*")
+JPEG, PNG, EXR = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"  # first bytes
+TIFF = (b"II*\0", b"MM\0*")
 _RAW_SIGNATURES = (  # offset, bytes, suffix
     (0, b"FUJIFILMCCD-RAW", ".raf"), (0, b"\0MRM", ".mrw"), (0, b"FOVb", ".x3f"), (0, b"IIU\0", ".rw2"),
     (0, b"IIRO", ".orf"), (0, b"IIRS", ".orf"), (0, b"MMOR", ".orf"), (4, b"ftypcrx ", ".cr3"),
@@ -70,11 +71,11 @@ def first(directory: Directory, tag: int, default: int = 0) -> int:
 def kind(file: BinaryIO, suffix: str) -> Kind:
     """Kind of a file by its first bytes: RAW, finished picture, other known file, or unknown."""
     head = file.read(512)
-    if head[:3] == b"\xff\xd8\xff" or head[:8] == b"\x89PNG\r\n\x1a\n" or head[:4] == b"\x76\x2f\x31\x01":
+    if head.startswith((JPEG, PNG, EXR)):
         return "photo"
     if _is_raw_magic(head):
         return "raw"
-    if head[:4] in _TIFF_MAGIC:
+    if head.startswith(TIFF):
         with mmap(file.fileno(), 0, access=ACCESS_READ) as data:  # reads the directories' pages only
             return "raw" if _is_raw(structure(data)) else "photo"
     # HEIC, AVIF or WebP next to a RAW; films; sounds
@@ -115,7 +116,7 @@ def _is_raw(tiff: TiffStructure) -> bool:
 def structure(data: bytes | mmap) -> TiffStructure:
     """Parse the image directories of a TIFF, as far as they are readable; none if the bytes are not a TIFF."""
     directories: list[Directory] = []
-    if data[:4] in _TIFF_MAGIC and len(data) >= 8:
+    if data[:4] in TIFF and len(data) >= 8:
         order = "<" if data[:2] == b"II" else ">"
         pending = deque(struct.unpack_from(order + "I", data, 4))
         seen: set[int] = set()

@@ -18,12 +18,7 @@ from polcap.images import SensorImage
 from polcap.optics import color
 
 Encoding = Literal["linear", "srgb"]
-SENSOR_DEG: tuple[tuple[float, tuple[int, int]], ...] = (  # row, column of each angle in the sensor's 2×2 cell
-    (0.0, (1, 1)),
-    (45.0, (0, 1)),
-    (90.0, (0, 0)),
-    (135.0, (1, 0)),
-)
+SENSOR_CELLS = {0.0: (1, 1), 45.0: (0, 1), 90.0: (0, 0), 135.0: (1, 0)}  # row, column of each angle [°] in a 2×2 cell
 _MOST_CHANNELS = 64  # of a layered EXR
 _COLOR_LEVELS = 0.05  # averages of neighboring 2×2 cells differ less than this on a monochrome sensor
 
@@ -72,7 +67,7 @@ def read_mosaic(
 
     Raises DecodeError: the frame is in color, or cannot be read.
     """
-    y, x = dict(SENSOR_DEG)[angle_deg]
+    y, x = SENSOR_CELLS[angle_deg]
     if kind == "photo":
         pixels, full = _pixels(path, digest)
         if pixels.shape[2] != 1:
@@ -95,7 +90,7 @@ def read_mosaic(
 
 def place_px(angle_deg: float) -> tuple[float, float]:
     """Position (x, y) of an angle's pixels in the polarization sensor's 2×2 cell: 0 or ½ px of `read_mosaic`."""
-    y, x = dict(SENSOR_DEG)[angle_deg]
+    y, x = SENSOR_CELLS[angle_deg]
     return x / 2, y / 2
 
 
@@ -160,7 +155,7 @@ def opened(path: str, data: bytes) -> Iterator[Any]:
     """
     import OpenImageIO as oiio
 
-    if data[:3] == b"\xff\xd8\xff":
+    if data.startswith(file_kind.JPEG):
         file_checks.check_jpeg(path, data)
     file_checks.check_png(path, data)
     options = oiio.ImageSpec()

@@ -100,7 +100,7 @@ def test_unreadable_pictures_are_one_error_each(tmp_path):
 def mosaic(height=32, width=40, tint=None):
     """I(θ) of S = (2000, 600, 300) under the sensor's four analyzers, each pixel its own."""
     cell = np.empty((2, 2))
-    for angle, at in photo.SENSOR_DEG:
+    for angle, at in photo.SENSOR_CELLS.items():
         twice = 2 * np.radians(angle)
         cell[at] = (2000 + 600 * np.cos(twice) + 300 * np.sin(twice)) / 2
     levels = np.tile(cell, (height // 2, width // 2))
@@ -111,7 +111,7 @@ def mosaic(height=32, width=40, tint=None):
 
 def test_sensor_planes_obey_malus_law(tmp_path):
     path = save(tmp_path / "a.png", mosaic())
-    planes = {angle: photo.read_mosaic(path, angle) for angle, _ in photo.SENSOR_DEG}
+    planes = {angle: photo.read_mosaic(path, angle) for angle in photo.SENSOR_CELLS}
     level = {angle: float(plane.value.mean()) for angle, plane in planes.items()}
     assert level == {0: 1300, 45: 1150, 90: 700, 135: 850}
     assert planes[0].value.shape == (16, 20, 3) and planes[0].cfa is None
@@ -145,7 +145,7 @@ def test_colour_sensors_are_refused(tmp_path):
 @needs_data
 def test_real_sensor_frame_balances():
     path = DATA / "real/polarization_mosaic/fruits_IMX250MZR.png"
-    planes = {angle: photo.read_mosaic(path, angle).value[..., 0] for angle, _ in photo.SENSOR_DEG}
+    planes = {angle: photo.read_mosaic(path, angle).value[..., 0] for angle in photo.SENSOR_CELLS}
     across, between = planes[0] + planes[90], planes[45] + planes[135]  # both are S0
     usable = np.max(list(planes.values()), axis=0) < 250
     blurred = [cv2.GaussianBlur(sum_, (0, 0), 2)[usable] for sum_ in (across, between)]

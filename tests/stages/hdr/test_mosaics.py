@@ -11,6 +11,7 @@ from polcap.formats.raw import frame_decoder
 from polcap.images import Quality, SensorImage
 from polcap.stages import hdr
 from polcap.synth import shooting
+from polcap.synth.scenes import random_scene
 from tests.stages.hdr.brackets import (
     BLACK,
     GAIN,
@@ -81,7 +82,7 @@ def test_x_trans_brackets_give_the_light_of_a_bayer_camera(tmp_path):
     shoot = shooting.Shoot(seed=3, width=312, height=234, nudge_px=0.0, nudge_deg=0.0, gain_jitter=0.0, samples=1)
     merged = {}
     for cfa in ("RGGB", "X-Trans"):
-        shooting.write(tmp_path / cfa, shooting.random_scene(3, "bumps"), structs.replace(shoot, cfa=cfa))
+        shooting.write(tmp_path / cfa, random_scene(3, "bumps"), structs.replace(shoot, cfa=cfa))
         capture = captures.read(tmp_path / cfa)
         merged[cfa] = hdr.merge(capture, frame_decoder.decode, hdr.HdrSettings())
         if cfa == "X-Trans":
