@@ -22,9 +22,9 @@ from polcap.training import evaluation_materials, light_transport, random_shapes
 from polcap.training.camera_errors import CameraErrors, photograph
 
 VERSION = 1  # to be raised when a number gives other pixels
-COUNT, SIZE = 250, 512
+COUNT, SIZE = 250, 512  # pictures, px
 QUICK_COUNT, QUICK_SIZE = 50, 256
-LIGHTS = 20
+LIGHTS = 20  # of the rendering error
 _SEED = 20211121
 _FIELD_OF_VIEW = 30.0  # degrees, of the side of the picture
 FLASH = 0.05  # of the distance, above the lens

@@ -1,7 +1,7 @@
 """The Muon optimizer: momentum, made orthogonal as a matrix before each step.
 
-All directions of a filter bank learn at the same rate. After 1,316 pictures from random weights, normals are off by
-15.9°, with AdamW by 20.2°.
+All directions of a filter bank learn at the same rate. After training on 1,316 pictures from random weights, the mean
+error of normals is 15.9°, with AdamW 20.2°.
 
 References
 ----------

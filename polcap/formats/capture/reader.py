@@ -186,6 +186,7 @@ def _crossed(folder: Path, plan: layouts.Plan, stated: CaptureFile) -> Shot | No
 def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: float) -> Frame:
     mosaic_deg = angle_deg if plan.layout == "sensor" else None
     kind: Literal["raw", "photo"] = "raw" if source.probe.kind == "raw" else "photo"
+    # the digest names how the file is read, because it enters the keys of the stage cache
     levels = [f"{stated.white:g}"] if stated.white else []
     levels += [f"-{stated.black:g}"] if stated.black else []
     if mosaic_deg is not None:
