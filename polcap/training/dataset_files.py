@@ -121,11 +121,6 @@ def encode(radiance: Floats) -> Floats:
     return np.asarray(np.log1p(np.clip(radiance, 0, _LARGEST) / _KNEE) / log1p(_LARGEST / _KNEE))
 
 
-def decode(code: Floats) -> Floats:
-    """Decode a picture file's value 0…1 (integer / 65535) to linear radiance: the inverse of `encode`."""
-    return np.asarray(_KNEE * np.expm1(code * log1p(_LARGEST / _KNEE)))
-
-
 def _open_library(material: str) -> materials.MaterialLibrary:
     library = materials.MaterialLibrary(Path(material) if material else None, torch.device("cpu"))
     if material and not library.has_textures:
