@@ -123,7 +123,9 @@ class CaptureLoop:
                     continue
             elif not self.check.pending:
                 return
-            self.check.collect(block=True)  # at the end, and before a person turns the ring: nobody likes to turn back
+            self.check.collect(
+                block=True
+            )  # at the end, and before a person turns the ring, who should not turn it back
 
     def _take(self, slot: Slot, missing: list[Slot]) -> None:
         if slot.angle_deg is not None:

@@ -1,1 +1,14 @@
-"""Synthetic captures: renders random scenes through a simulated camera, and writes capture folders with the truth."""
+"""Synthetic captures: renders random scenes through a simulated camera, and writes capture folders with the truth.
+
+shooting            a capture: brackets of DNGs, and the true maps
+all_around          captures of one object from all sides, on a board
+calibration_frames  calibration photographs of a known camera, lens, polarizer and flash
+scenes              random scenes
+render              Stokes parameters of a scene at any pixel position
+forward_camera      lens distortion, color mosaic, noise, DNG
+trace               rays against a shape: `distance_fields`, or a mesh by `mesh_tracer`
+scene_materials     albedo, F0, roughness and relief of the object
+interreflection     light that parts of a mesh throw on each other
+color_checker       the chart
+laid_board          the board under the object
+"""

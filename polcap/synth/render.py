@@ -30,7 +30,10 @@ _ROUGH = body.Law(rough=1.0)  # facets with the roughness of the gloss, all with
 
 
 class Scene(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An object, a chart and a board under a flash, in front of a dark backdrop; stored in truth.json."""
+    """An object, a chart and a board under a flash, in front of a dark backdrop.
+
+    truth.json has all fields but the unset ones, so that a new field does not change the files of old scenes.
+    """
 
     shape: Shape | Model
     coat: Coat

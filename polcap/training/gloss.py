@@ -42,10 +42,10 @@ FAMILIES = {
 ALL_DARK = 0.10  # share of objects that are dark gloss everywhere; other objects may have dark parts
 _DARK = (0.01, 0.06)  # albedo
 _F0, _F0_SPREAD = 0.042, 0.13  # median and 1σ of the logarithm for common dielectrics, n = 1.45–1.58
-_TAIL = (0.055, 1.5)  # least F0, and the logarithm of the greatest one over it; small ones are more frequent
-SMOOTH_SHARE = 0.5  # of objects with a smooth interface for diffuse light
-_SAME_ROUGHNESS = 0.6  # of rough interfaces that are as rough for diffuse light as for gloss; coated ones differ
-_TRANSLUCENT = 0.08  # of rough interfaces, and so depolarized
+_TAIL = (0.055, 1.5)  # higher F0: the least, and ln(greatest / least); low values are more frequent
+SMOOTH_SHARE = 0.5  # share of objects with a smooth interface for diffuse light
+_SAME_ROUGHNESS = 0.6  # share of rough interfaces with one roughness for gloss and diffuse light; coated ones have two
+_TRANSLUCENT = 0.08  # share of rough interfaces that are translucent, so that diffuse light is depolarized
 
 
 @dataclass(frozen=True)

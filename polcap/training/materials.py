@@ -194,19 +194,23 @@ def _draw_levels(library: MaterialLibrary, count: int, device: torch.device) -> 
     bump = 0.25 * torch.exp(u(-3, 0)) * torch.sign(u(-1, 1)) * (u(0, 1) < 0.7)
     bump = bump * torch.where(from_texture > 0.5, 2.5, 1.0)
     return {
-        "color": color, "color2": color2, "tint": tint, "f0_tint": f0_tint,
-        "from_texture": from_texture.float(),
-        "texture": texture.float(),
-        "shift": u(0, 2), "contrast": torch.exp(u(-0.5, 3.2)), "level": u(-1.5, 1.5),
-        "mid": color.mean(dim=-1) ** 0.45,
-        "rough": one.roughness, "follow": normal(0.3), "speckle": u(0, 0.25) * one.grained,
+        "color": color, "color2": color2,  # albedo of the two surfaces of a pattern
+        "tint": tint, "f0_tint": f0_tint,  # factors on the texture's albedo, on F0
+        "from_texture": from_texture.float(),  # 1: albedo, roughness and slopes of a texture set, else solid noise
+        "texture": texture.float(), "shift": u(0, 2),  # number of the set, and its shift
+        "contrast": torch.exp(u(-0.5, 3.2)), "level": u(-1.5, 1.5),  # of the noise in the pattern
+        "mid": color.mean(dim=-1) ** 0.45,  # mean lightness
+        "rough": one.roughness, "follow": normal(0.3),  # roughness, and its change with lightness
+        "speckle": u(0, 0.25) * one.grained,  # contrast of fine noise in roughness and F0
+        # of a texture's roughness
         "rough_gain": torch.where(one.dark, 0.1, torch.where(as_is, 1.0, u(0.5, 1.0))),
         "rough_shift": torch.where(one.dark, one.roughness - 0.05, torch.where(as_is, 0.0, u(-0.1, 0.4))),
-        "f0": one.f0, "f0_follow": normal(0.3),
+        "f0": one.f0, "f0_follow": normal(0.3),  # F0, and its relative change with lightness
+        # from the first surface of the pattern to the second
         "rough_step": two * (other.roughness - one.roughness), "f0_step": two * f0_step,
         "dolp_factor": one.dolp_factor, "dolp_step": two * (other.dolp_factor - one.dolp_factor),
-        "raised": (u(0, 1) < 0.4).float(),
-        "by_lightness": (u(0, 1) < 0.6).float(),
+        "raised": (u(0, 1) < 0.4).float(),  # 1: the pattern is in relief
+        "by_lightness": (u(0, 1) < 0.6).float(),  # 1: the pattern follows the texture's lightness
         "ior": (1.5 + normal(0.06)).clamp(1.35, 1.7), "bump": bump,
     }  # fmt: skip
 

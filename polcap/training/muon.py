@@ -1,7 +1,7 @@
 """The Muon optimizer: momentum, made orthogonal as a matrix before each step.
 
-All directions of a filter bank learn at the same rate. After 1,316 pictures from random weights, normals are off by
-15.9°, with AdamW by 20.2°.
+All directions of a filter bank learn at the same rate. After training on 1,316 pictures from random weights, the mean
+error of normals is 15.9°, with AdamW 20.2°.
 
 References
 ----------
@@ -37,7 +37,7 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without 
         for group in self.param_groups:
             by_shape: dict[torch.Size, list[tuple[Tensor, Tensor]]] = {}  # weights and directions
             for weight in group["params"]:
-                gradient = _matrix(_channels_last(weight.grad))
+                gradient = weight.grad if weight.ndim == 2 else weight.grad.permute(0, 2, 3, 1).flatten(1)
                 mean = self.state[weight].setdefault("mean", torch.zeros_like(gradient))
                 mean.lerp_(gradient, 1 - group["momentum"])
                 direction = gradient.lerp(mean, group["momentum"])  # Nesterov's momentum
@@ -66,7 +66,3 @@ def orthogonal(matrix: Tensor) -> Tensor:
 def _matrix(weight: Tensor) -> Tensor:
     """A layer's weights as a matrix (out, in) or (out, kh·kw·in) that shares their memory."""
     return weight if weight.ndim == 2 else weight.permute(0, 2, 3, 1).view(len(weight), -1)
-
-
-def _channels_last(weight: Tensor) -> Tensor:
-    return weight if weight.ndim == 2 else weight.contiguous(memory_format=torch.channels_last)

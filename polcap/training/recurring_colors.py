@@ -1,9 +1,9 @@
 """Recurring colors of a picture in the main network: they correct uncertain albedos and estimate gloss by color.
 
-An object has few colors, seen under many angles. Where a place is seen badly, near the outline or under a wide
-highlight, its albedo is probably one of the colors seen well elsewhere. A color without a highlight where it faces the
-flash is rough, even next to a glossy print. The colors are a mixture of Gaussians, fitted to each picture; only their
-use is learned.
+An object has few colors, seen under many angles. Near the outline or under a wide highlight the albedo is uncertain; it
+is probably one of the colors that are seen well elsewhere. A color without a highlight where it faces the flash is
+rough, even next to a glossy print. The colors are a mixture of Gaussians, fitted to each picture; only their use is
+learned.
 """
 
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ _OFFSET = 0.02  # added to albedo before its logarithm
 # lightness and two hues
 _AXES = ((3**-0.5, 3**-0.5, 3**-0.5), (2**-0.5, -(2**-0.5), 0.0), (6**-0.5, 6**-0.5, -2 * 6**-0.5))
 _KNOTS_DEG = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 65.0, 70.0, 75.0, 80.0, 90.0)
-_LIGHT_DOUBT = (0.4, 0.35, 0.3, 0.2, 0.17, 0.17, 0.27, 0.37, 0.48, 0.6, 0.7, 0.8)  # 1σ of log lightness at these
-_HUE_DOUBT = 0.3  # 1σ of the hues, of that
+_LIGHT_DOUBT = (0.4, 0.35, 0.3, 0.2, 0.17, 0.17, 0.27, 0.37, 0.48, 0.6, 0.7, 0.8)  # 1σ of log lightness at these angles
+_HUE_DOUBT = 0.3  # 1σ of the hues, relative to that of the lightness
 _CLIPPED = 0.5  # added to 1σ where the picture is clipped
-_MAX_CHANGE = 3.0  # of the logarithm of 1σ from its value by zenith
-_SURE = 0.2  # 1σ of lightness below which a place has full weight in the fit of the colors
+_MAX_CHANGE = 3.0  # greatest change of the logarithm of 1σ
+_SURE = 0.2  # 1σ of lightness below which a pixel has full weight in the fit of the colors
 _WIDTH = 0.2  # 1σ of all colors in the first rounds of the fit
 _MIN_WIDTH = 0.05  # 1σ of a color
-_ROUNDS = (5, 7)  # of the fit: with that width, with a width for each color
+_ROUNDS = (5, 7)  # iterations of the fit: with one width, then with a width for each color
 
 
 @dataclass(frozen=True)

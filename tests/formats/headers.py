@@ -1,4 +1,4 @@
-"""Headers of the formats of which there is no sample: built here, byte by byte, for the tests."""
+"""Headers of file formats without a sample file, built byte by byte for the tests."""
 
 import os
 import struct
@@ -16,7 +16,7 @@ SUB_IFDS, EXIF_IFD = 330, 34665
 
 
 def tiff(main, subs=None, magic=b"II*\0", order="<", image=b"", image_tag=273):
-    """A TIFF: `main` and each directory of `subs` are {tag: (form, values)}; `subs` are hung on their tag."""
+    """A TIFF: `main` and each directory of `subs` are {tag: (form, values)}; each of `subs` is at its tag."""
     subs = subs or {}
     offset = len(magic) + 4
     main = dict(main) | dict.fromkeys(subs, (4, (0,)))

@@ -38,7 +38,7 @@ def painted(boxes: np.ndarray, board: Board) -> np.ndarray:
 
 @SIZES
 @pytest.mark.parametrize("kind", ["svg", "pdf"])
-def test_corners_on_the_page_are_as_far_apart_as_in_the_world(board: Board, kind: str) -> None:
+def test_distances_of_corners_on_the_page_are_those_of_the_board(board: Board, kind: str) -> None:
     boxes = svg_boxes(board_print.svg(board)) if kind == "svg" else pdf_boxes(board_print.pdf(board))
     found, ids, _, _ = cv2.aruco.CharucoDetector(boards.charuco(board)).detectBoard(painted(boxes, board))
     numbers, place = boards.corners(board)
@@ -49,7 +49,7 @@ def test_corners_on_the_page_are_as_far_apart_as_in_the_world(board: Board, kind
     assert seen + 0.5 - 5 * CELL_PX == pytest.approx(wanted, abs=0.3)
 
 
-def test_the_ruler_is_as_long_as_it_says() -> None:
+def test_the_ruler_is_as_long_as_stated() -> None:
     boxes = svg_boxes(board_print.svg(BOARDS["A4"]))
     marks = boxes[np.isclose(boxes[:, 2], 0.2)]
     assert len(marks) == board_print.RULER_MM + 1

@@ -46,7 +46,7 @@ def test_hidden_files_are_no_calibrations(users):
     assert calibrations.choose(EXIF, None, None)[0] == KNOWN
 
 
-def test_calibration_comes_back_as_it_went(users):
+def test_a_calibration_is_read_back_unchanged(users):
     path = calibrations.write(users, KNOWN)
     assert calibrations.read(path) == KNOWN
     assert path.name.startswith("2026-11-22")
@@ -118,7 +118,7 @@ def test_a_foreign_file_is_one_clear_line(users, text):
         {"geometry": dataclasses.replace(LENS, focal_px=1e-300)},
     ],
 )
-def test_figures_that_cannot_be_are_refused(users, change):
+def test_impossible_figures_are_refused(users, change):
     calibrations.write(users, dataclasses.replace(KNOWN, **change))
     with pytest.raises(CaptureError, match="impossible"):
         calibrations.choose(EXIF, None, None)
@@ -140,7 +140,7 @@ PROFILE = ColorCalibration(
 )
 
 
-def test_profile_comes_back_as_it_went(tmp_path):
+def test_a_profile_is_read_back_unchanged(tmp_path):
     path = tmp_path / "set-up.toml"
     calibrations.write_profile(path, PROFILE)
     back = calibrations.read_profile(path)

@@ -1,4 +1,4 @@
-"""A model is used as its metadata state, or refused with the reason."""
+"""A model is used as its metadata state it, or refused with the reason."""
 
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from polcap.formats import onnx as formats_onnx
 from polcap.formats.onnx import ENCODING, load, run, run_session
 
 onnx = pytest.importorskip("onnx", reason="writing test models needs the extra [train]")
-SAID = {"channels": "s1,s2", "encoding": ENCODING, "native_size": "128", "size_multiple": "8"} | {
+METADATA = {"channels": "s1,s2", "encoding": ENCODING, "native_size": "128", "size_multiple": "8"} | {
     "licence": "Apache-2.0"
 }
 
@@ -21,7 +21,7 @@ def build(
     nodes: list[Any],
     outputs: dict[str, list[Any]],
     tensors: tuple[Any, ...] = (),
-    metadata: dict[str, str] = SAID,
+    metadata: dict[str, str] = METADATA,
     opset: int = 17,
 ) -> Path:
     """A model of two channels made of these nodes."""
@@ -43,22 +43,22 @@ def write(path: Path, metadata: dict[str, str], opset: int = 17) -> Path:
 
 
 def test_a_model_runs_and_states_its_channels(tmp_path: Path) -> None:
-    network = load(write(tmp_path / "m.onnx", SAID), "cpu", 1)
+    network = load(write(tmp_path / "m.onnx", METADATA), "cpu", 1)
     assert network.channels == ("s1", "s2") and network.metadata["licence"] == "Apache-2.0"
     x = np.random.default_rng(0).normal(size=(1, 2, 8, 16)).astype(np.float32)
     np.testing.assert_array_equal(run(network, x)["normal"], 2 * x)
 
 
 def test_digest_is_of_the_file(tmp_path: Path) -> None:
-    one, two = (load(write(tmp_path / f"{name}.onnx", {**SAID, "licence": name})) for name in ("CC0-1.0", "MIT"))
+    one, two = (load(write(tmp_path / f"{name}.onnx", {**METADATA, "licence": name})) for name in ("CC0-1.0", "MIT"))
     assert one.digest != two.digest
 
 
-@pytest.mark.parametrize("missing", SAID)
-def test_silent_metadata_is_refused(tmp_path: Path, missing: str) -> None:
-    said = {name: value for name, value in SAID.items() if name != missing}
+@pytest.mark.parametrize("missing", METADATA)
+def test_missing_metadata_is_refused(tmp_path: Path, missing: str) -> None:
+    stated = {name: value for name, value in METADATA.items() if name != missing}
     with pytest.raises(ModelError, match=f"does not state {missing}"):
-        load(write(tmp_path / "m.onnx", said))
+        load(write(tmp_path / "m.onnx", stated))
 
 
 @pytest.mark.parametrize(
@@ -71,12 +71,12 @@ def test_silent_metadata_is_refused(tmp_path: Path, missing: str) -> None:
 )
 def test_wrong_metadata_is_refused(tmp_path: Path, change: dict[str, str], words: str) -> None:
     with pytest.raises(ModelError, match=words):
-        load(write(tmp_path / "m.onnx", {**SAID, **change}))
+        load(write(tmp_path / "m.onnx", {**METADATA, **change}))
 
 
 @pytest.mark.parametrize("content", [b"", b"not a model", None], ids=["empty", "garbage", "truncated"])
 def test_broken_file_is_one_line(tmp_path: Path, content: bytes | None) -> None:
-    path = write(tmp_path / "m.onnx", SAID)
+    path = write(tmp_path / "m.onnx", METADATA)
     path.write_bytes(path.read_bytes()[:60] if content is None else content)
     with pytest.raises(ModelError) as caught:
         load(path)
@@ -87,11 +87,11 @@ def test_missing_file_and_too_new_opset(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="give the path of an ONNX model"):
         load(tmp_path / "none.onnx")
     with pytest.raises(ModelError, match="opset"):
-        load(write(tmp_path / "m.onnx", SAID, opset=99))
+        load(write(tmp_path / "m.onnx", METADATA, opset=99))
 
 
 def test_wrong_input_is_one_line(tmp_path: Path) -> None:
-    network = load(write(tmp_path / "m.onnx", SAID))
+    network = load(write(tmp_path / "m.onnx", METADATA))
     with pytest.raises(ModelError, match=r"shape \(1, 3, 8, 8\)"):
         run(network, np.zeros((1, 3, 8, 8), np.float32))
 
@@ -101,7 +101,7 @@ def test_cuda_is_never_replaced_silently(tmp_path: Path) -> None:
 
     if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
         pytest.skip("this machine's onnxruntime has CUDA")
-    path = write(tmp_path / "m.onnx", SAID)
+    path = write(tmp_path / "m.onnx", METADATA)
     with pytest.raises(ModelError, match="--device cuda"):
         load(path, "cuda")
     x = np.ones((1, 2, 8, 8), np.float32)
@@ -152,7 +152,7 @@ def test_an_answer_that_is_no_map_is_refused(tmp_path: Path, power: float, shape
 
 
 def test_metadata_that_are_no_text_are_refused(tmp_path: Path) -> None:
-    path = write(tmp_path / "m.onnx", SAID)
+    path = write(tmp_path / "m.onnx", METADATA)
     path.write_bytes(path.read_bytes().replace(b"Apache-2.0", b"Apache-\xea\x80\xff"))
     with pytest.raises(ModelError, match=r"not text|cannot be run|not a model"):
         load(path)
@@ -163,12 +163,12 @@ def test_parallel_runs_are_as_many_as_threads(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int, at_once: int
 ) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    assert load(write(tmp_path / "m.onnx", SAID), "cpu", threads).at_once == at_once
+    assert load(write(tmp_path / "m.onnx", METADATA), "cpu", threads).at_once == at_once
 
 
 def test_a_file_that_changes_after_it_was_opened_is_refused_where_it_is_opened_again(tmp_path: Path) -> None:
-    network = load(write(tmp_path / "m.onnx", SAID))
+    network = load(write(tmp_path / "m.onnx", METADATA))
     formats_onnx._session.cache_clear()  # as in another process
-    write(tmp_path / "m.onnx", {**SAID, "licence": "MIT"})
+    write(tmp_path / "m.onnx", {**METADATA, "licence": "MIT"})
     with pytest.raises(ModelError, match="changed while polcap was using it"):
         run(network, np.ones((1, 2, 8, 8), np.float32))

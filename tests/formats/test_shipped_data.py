@@ -20,7 +20,7 @@ D50, D65 = (0.3457, 0.3585), (0.3127, 0.3290)  # xy
     ],
 )
 def test_chart_has_the_makers_lab_values(kind, dark_skin, cyan, white):
-    """X-Rite states CIE Lab under D50: those are found again when the colors are adapted back from D65."""
+    """The colors, adapted back from D65 to D50, have the CIE Lab values that X-Rite states."""
     found = shipped_data.colorchecker(kind)
     assert found.rec709.shape == (24, 3) and len(found.patches) == 24
     xyz = colour.chromatic_adaptation(

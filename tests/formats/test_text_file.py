@@ -11,7 +11,7 @@ from polcap.synth.shooting import Shoot
 
 
 @pytest.mark.parametrize(
-    ("given", "kind", "words"),
+    ("data", "kind", "words"),
     [
         ({"focal_lenght_mm": 50}, CaptureFile, "focal_lenght_mm: there is no such key; did you mean focal_length_mm?"),
         ({"rotator": {"modle": ""}}, CaptureFile, "rotator.modle: there is no such key; did you mean model?"),
@@ -36,7 +36,7 @@ from polcap.synth.shooting import Shoot
         ({"sensor": {"isoo": 100}}, Shoot, "sensor.isoo: there is no such key"),
     ],
 )
-def test_fault_names_key_value_and_limit(given: dict[str, Any], kind: type[msgspec.Struct], words: str) -> None:
+def test_fault_names_key_value_and_limit(data: dict[str, Any], kind: type[msgspec.Struct], words: str) -> None:
     with pytest.raises(msgspec.ValidationError) as caught:
-        msgspec.convert(given, kind)
-    assert fault(caught.value, given, kind).startswith(words)
+        msgspec.convert(data, kind)
+    assert fault(caught.value, data, kind).startswith(words)

@@ -34,8 +34,8 @@ def test_real_balls_follow_one_roughness() -> None:
     for alphas, local in (((0.25, 0.3), 0.0), ((0.2, 0.25), 1.0)):
         for ball in measured:
             ratio = np.array([body.dolp(c, alpha, 1.5, local) / body.dolp(c, 0.0, 1.5) for alpha in alphas])
-            apart = np.sqrt(np.mean((ratio / ball - 1) ** 2, axis=1)).min()
-            assert apart < 0.11
+            difference = np.sqrt(np.mean((ratio / ball - 1) ** 2, axis=1)).min()
+            assert difference < 0.11
 
 
 @pytest.mark.parametrize("ior", [1.35, 1.5, 1.62])
@@ -43,7 +43,7 @@ def test_smooth_interface_is_the_limit(ior: float) -> None:
     c = np.linspace(0.01, 1, 200)
     plus, minus = body.leaving(c, 0.0, ior)
     np.testing.assert_allclose((plus, minus), fresnel.transmission(c, ior), rtol=1e-12, atol=1e-15)
-    away = c[(c > 0.3) & (c < 0.99)]  # from the limb
+    away = c[(c > 0.3) & (c < 0.99)]  # not near the outline
     assert np.abs(body.dolp(away, 0.02, ior) / body.dolp(away, 0.0, ior) - 1).max() < 0.04
 
 
@@ -60,16 +60,16 @@ def test_facets_drawn_at_random_agree(alpha: float, ior: float, local: float) ->
     for degrees in (25, 50, 70):
         zenith = np.radians(degrees)
         ray = np.array([np.sin(zenith), 0, np.cos(zenith)])
-        aside = np.array([0.0, 1, 0])
-        towards = np.cross(aside, ray)  # (cos, 0, −sin): away from the normal
+        across = np.array([0.0, 1, 0])
+        towards = np.cross(across, ray)  # (cos, 0, −sin): away from the normal
         seen = facet @ ray
-        weight = np.where(seen > 0, seen * area, 0)  # projected area of what stands on one patch of ground
+        weight = np.where(seen > 0, seen * area, 0)  # projected area of the facets on one patch of the plane
         seen = np.clip(seen, 1e-6, 1)
         inside = np.sqrt(1 - (1 - seen**2) / ior**2)
         through_s = 1 - ((seen - ior * inside) / (seen + ior * inside)) ** 2
         through_p = 1 - ((ior * seen - inside) / (ior * seen + inside)) ** 2
         weight = weight * (seen * (through_s + through_p) / 2) ** local
-        plane = np.stack([facet @ towards, facet @ aside], axis=1)
+        plane = np.stack([facet @ towards, facet @ across], axis=1)
         plane /= np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1e-12)
         s0 = np.sum(weight * (through_s + through_p) / 2)
         s1 = np.sum(weight * (through_p - through_s) / 2 * (plane[:, 0] ** 2 - plane[:, 1] ** 2))
@@ -82,7 +82,7 @@ def test_facets_drawn_at_random_agree(alpha: float, ior: float, local: float) ->
 
 
 def test_rough_bodies_are_flatter_than_lambert() -> None:
-    """Seen from the flash, facets that face it brighten the limb; even light spreads inside and does not."""
+    """Seen from the flash, facets that face it brighten the outline; light that is spread evenly inside does not."""
     zenith = np.radians([0, 20, 40, 60, 70])
     c = np.cos(zenith)
     for alpha in (0.2, 0.5):

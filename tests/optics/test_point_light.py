@@ -18,10 +18,10 @@ def test_light_falls_with_the_square_of_the_distance_and_the_cosine():
 
 def test_a_wall_under_a_flash_at_the_lens_darkens_as_the_cube_of_the_cosine_and_by_the_lens_as_the_seventh():
     """E = cos³ θ on a plane across the axis, × cos⁴ θ of natural falloff."""
-    aside = np.array([np.tan(0.3), 0.0, -1.0])
+    off_axis = np.array([np.tan(0.3), 0.0, -1.0])
     wall = np.array([0.0, 0.0, 1.0])
-    assert point_light.irradiance(aside, LENS, 0.0, wall) == pytest.approx(np.cos(0.3) ** 3)
-    assert point_light.irradiance(aside, LENS, 4.0, wall) == pytest.approx(np.cos(0.3) ** 7)
+    assert point_light.irradiance(off_axis, LENS, 0.0, wall) == pytest.approx(np.cos(0.3) ** 3)
+    assert point_light.irradiance(off_axis, LENS, 4.0, wall) == pytest.approx(np.cos(0.3) ** 7)
 
 
 def test_a_plane_turned_away_gets_nothing():

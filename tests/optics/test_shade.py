@@ -61,7 +61,7 @@ def test_what_faces_away_is_dark() -> None:
 def hemisphere(light: np.ndarray, **material: float) -> float:
     """Share of the light on a patch that leaves it: ∫ S0/π cos θ dω over ∫ … of the irradiance.
 
-    The renderer stands on the view ray: every outgoing direction is a turn of normal and light.
+    The camera is fixed: another outgoing direction is another rotation of normal and light.
     """
     cos_o, phi = np.meshgrid((np.arange(400) + 0.5) / 400, (np.arange(240) + 0.5) / 240 * 2 * np.pi)
     sin_o = np.sqrt(1 - cos_o**2)
@@ -100,10 +100,10 @@ def polarized(normal, light, axis_deg, **material):
     """(3,) Stokes parameters under a flash polarized along an axis of the picture."""
     axis = np.array([np.cos(np.radians(axis_deg)), np.sin(np.radians(axis_deg)), 0.0])
     across = axis - light * (axis @ light)
-    given = {"diffuse": 0.0, "specular": 0.0, **material}
+    chosen = {"diffuse": 0.0, "specular": 0.0, **material}
     color, one = np.ones(3), np.array(1.0)
     out = shade.stokes(
-        normal, given["diffuse"] * color, given["specular"] * color, 0.4 * one, 1.5 * one, light, one,
+        normal, chosen["diffuse"] * color, chosen["specular"] * color, 0.4 * one, 1.5 * one, light, one,
         axis=across / np.linalg.norm(across),
     )  # fmt: skip
     return np.asarray(out[:, 0])

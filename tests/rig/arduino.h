@@ -1,5 +1,6 @@
 // What examples/rotator_firmware needs of an Arduino, on a computer: serial is stdin and stdout, the ring a counter.
-// argv[1]: where the ring stands at first [steps], argv[2]: where its switch closes. Releasing tells stderr the step.
+// argv[1]: initial position of the ring, argv[2]: position at which its switch closes [steps]. At its release, the
+// position is written to stderr.
 #include <math.h>
 #include <poll.h>
 #include <stdio.h>

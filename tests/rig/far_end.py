@@ -9,7 +9,7 @@ pseudo-terminal, for another process.
 `fault` is one of the class's FAULTS or `late`; `at` is the first moment at which it strikes, `times` the number of
 moments (`ALWAYS`: all). The first moment is 1.
 
-    moments are answers:    no-answer, garbage, half-line, late (after `serial_port` has given it up)
+    moments are answers:    no-answer, garbage, half-line, late (after `serial_port` has stopped waiting)
     moments are movements:  busy (never ends), mechanical-timeout, wrong-position (stops 5° away, and reports that);
     (homing is one)         halfway: unplug (the port vanishes), alarm (a limit switch), restart (power lost)
 """

@@ -1,4 +1,4 @@
-"""Exposure brackets: as photographers write them, by default, and nearest to the dials."""
+"""Exposure brackets: parsed, by default, and with the camera's nearest settings."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Whatever fails: the run ends in time, no frame is lost, no angle is wrong, and resuming completes the capture."""
+"""After any fault the run ends in time, no frame is lost, no angle is wrong, and `--resume` completes the capture."""
 
 from pathlib import Path
 

@@ -48,7 +48,7 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("firmware")
     program, sketch, shim = folder / "rotator", folder / "rotator_firmware.ino", Path(__file__).with_name("arduino.h")
     text = (ROOT / "examples" / "rotator_firmware" / "rotator_firmware.ino").read_text()
-    sketch.write_text(text.replace("SPEED = 60.0", "SPEED = 600.0"))  # the ring of the test weighs nothing
+    sketch.write_text(text.replace("SPEED = 60.0", "SPEED = 600.0"))  # the simulated ring has no inertia
     flags = ["-Wall", "-Wextra", "-Werror", "-include", str(shim), "-x", "c++"]
     subprocess.run(["g++", *flags, str(sketch), "-o", str(program)], check=True, timeout=120)
     return program

@@ -12,7 +12,7 @@ from polcap.rig.shooting_plan import CaptureOrder, Slot
 from tests.rig.pool import BRACKET, ORDER
 
 
-def test_the_way_through_the_angles_is_the_shortest() -> None:
+def test_the_order_of_the_angles_turns_the_motor_least() -> None:
     bracket = (BRACKET[0],)
     for start in (0.0, 50.0, 170.0):
         slots = [Slot("shot", angle, 0, exposure) for angle in (90.0, 30.0, 150.0, 60.0) for exposure in bracket]
@@ -26,14 +26,14 @@ def _way(start: float, angles: object) -> float:
     return sum(abs(b - a) for a, b in itertools.pairwise([start, *angles]))  # type: ignore[misc]
 
 
-def test_chart_comes_first_and_what_a_person_switches_last() -> None:
+def test_the_chart_is_first_and_frames_that_need_a_person_are_last() -> None:
     slots = shooting_plan.plan_slots(msgspec.structs.replace(ORDER, chart=True), switches_flash=False)
     names = [slot.name for slot in shooting_plan.schedule(slots)]
     assert names[0] == "chart/chart" and names[-1] == "ambient/ambient"
     assert names[4:10] == [f"{place}frame_{n}" for place in ("pol045/", "repeat/pol045_") for n in (1, 2, 3)]
 
 
-def test_the_flash_s_filter_is_put_on_when_all_else_is_taken() -> None:
+def test_cross_polarized_frames_are_taken_last() -> None:
     slots = shooting_plan.plan_slots(msgspec.structs.replace(ORDER, cross=True), switches_flash=True)
     names = [slot.name for slot in shooting_plan.schedule(slots, 45.0)]
     assert names[-3:] == [f"cross/frame_{n}" for n in (1, 2, 3)]
@@ -84,7 +84,7 @@ def test_a_plan_brackets_by_the_shutter_only_under_a_steady_lamp(
         ((0.0, 45.0, 90.0), (30.0,), "--repeat 30"),
     ],
 )
-def test_an_order_no_capture_can_come_of_is_refused(
+def test_options_that_make_no_capture_are_refused(
     angles: tuple[float, ...], repeat: tuple[float, ...], words: str
 ) -> None:
     with pytest.raises(SettingError, match=words):

@@ -41,7 +41,7 @@ def test_a_simulated_capture_is_the_synthetic_one_at_the_motors_true_angles(tmp_
         assert theirs.read_bytes() == ours.read_bytes(), ours
 
 
-def test_play_shows_from_above_and_the_approach_from_below_hides_it() -> None:
+def test_backlash_appears_after_downward_movements_only() -> None:
     motor = SimulatedMotor(SimulatedMotorSettings(error=0.0, play=0.7), Log(None))
     motor.go(90.0)
     motor.go(30.0)
@@ -76,7 +76,7 @@ def test_an_unknown_setting_of_the_simulated_camera_is_named(query: str, words: 
     "bracket",
     ["1/200,1/50,1/13", "iso100,iso400,iso1600", "f/22,f/11,f/5.6", "1/160 f/11 iso100 flash1/64, flash1/16, flash1/4"],
 )
-def test_the_simulated_camera_takes_the_brackets_of_the_pages(bracket: str, tmp_path: Path) -> None:
+def test_the_simulated_camera_takes_the_brackets_of_the_documentation(bracket: str, tmp_path: Path) -> None:
     camera = open_camera(f"simulated?{SMALL}&gain_jitter=0", Log(None))
     light = []
     for step, exposure in enumerate(parse_bracket(bracket)):

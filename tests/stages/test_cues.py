@@ -151,19 +151,19 @@ def test_the_chart_is_level_with_the_middle_of_the_object(size: float):
     assert ball < factor < cone
 
 
-@pytest.mark.parametrize(("turn", "aside"), [(0.0, 0.0), (0.4, 0.0), (0.0, 0.15)])
-def test_a_turned_or_offset_chart_gets_less_light_than_the_object(turn: float, aside: float):
+@pytest.mark.parametrize(("turn", "offset"), [(0.0, 0.0), (0.4, 0.0), (0.0, 0.15)])
+def test_a_turned_or_offset_chart_gets_less_light_than_the_object(turn: float, offset: float):
     """n·l / d² of a chart under a flash at the lens: cos of its turn, or cos³ of the angle to the axis."""
     found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
-    white, normal = np.array([aside, 0.0, -1.0]), np.array([np.sin(turn), 0.0, np.cos(turn)])
+    white, normal = np.array([offset, 0.0, -1.0]), np.array([np.sin(turn), 0.0, np.cos(turn)])
     light = ChartLight(white, normal, np.zeros(3), np.zeros((5, 5)))
     facing = cues.scale.factor(found, dataclasses.replace(scenes.no_color(), source="chart"))
     factor = cues.scale.factor(found, dataclasses.replace(scenes.no_color(), source="chart", light=light))
-    assert factor / facing == pytest.approx(np.cos(turn) * np.cos(np.arctan(aside)) ** 3, rel=1e-6)
+    assert factor / facing == pytest.approx(np.cos(turn) * np.cos(np.arctan(offset)) ** 3, rel=1e-6)
 
 
 def test_the_scale_follows_a_flash_at_the_chart_s_side_and_its_doubt_widens_the_scale_s():
-    """The object stands on the axis: a flash nearer to the chart lights that more, by its distances squared."""
+    """The object is on the axis: a flash nearer to the chart lights that more, by its distances squared."""
     found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     row, column = (axis.mean() for axis in np.nonzero(found.mask))
     found = dataclasses.replace(found, view=dataclasses.replace(found.view, center=(column, row)))

@@ -44,7 +44,7 @@ def test_the_true_surface_projects_onto_the_true_mask_of_every_view(session: tup
     folder, truth = session
     with np.load(folder / "truth.npz") as surface:
         vertices, faces = surface["vertices"].astype(float), surface["faces"]
-    assert vertices[:, 1].min() == pytest.approx(0, abs=1e-6)  # it stands on the board
+    assert vertices[:, 1].min() == pytest.approx(0, abs=1e-6)  # its lowest point is on the board
     corner = vertices[faces]
     volume = np.sum(corner[:, 0] * np.cross(corner[:, 1], corner[:, 2])) / 6
     assert volume > 0.9 * 4 / 3 * np.pi * 0.04**3  # outward

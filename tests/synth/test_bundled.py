@@ -36,7 +36,7 @@ def test_bundled_capture_is_small_and_whole() -> None:
 
 
 def test_script_and_bundle_agree(script) -> None:
-    """The bytes agree on one machine; another one's sines may differ in the last bit, so the surface is compared."""
+    """Bytes agree on one machine only (the last bits of a sine differ on others), so surfaces are compared."""
     truth = json.loads((CAPTURE / "truth.json").read_text())
     assert msgspec.convert(truth["scene"], type(script.SCENE)) == script.SCENE
     assert msgspec.convert(truth["shoot"], type(script.SHOOT)) == script.SHOOT

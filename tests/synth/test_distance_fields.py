@@ -56,7 +56,7 @@ def test_rays_end_on_the_front_of_the_surface(name: str) -> None:
     assert np.abs(shape.distance(hits.local)).max() < 2e-6
     np.testing.assert_allclose(np.linalg.norm(hits.normal, axis=-1), 1.0, rtol=1e-9)
     facing = np.einsum("ni,ni->n", hits.normal, v[hits.index])
-    assert facing.min() > -0.02  # a ray that grazes within 1 µm may see the far side of the limb
+    assert facing.min() > -0.02  # a ray that grazes within 1 µm may hit just behind the outline
     np.testing.assert_allclose(hits.point, -v[hits.index] * hits.distance[:, None], atol=1e-12)
 
 

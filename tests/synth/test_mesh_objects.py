@@ -55,8 +55,8 @@ def test_points_are_in_shadow_where_the_line_to_the_flash_crosses_the_ball(model
     way = (light - wall) / np.linalg.norm(light - wall, axis=-1, keepdims=True)
     along = ((middle - wall) * way).sum(-1)
     missed = np.linalg.norm(wall + along[..., None] * way - middle, axis=-1)
-    beside = ~render.gbuffer(scene, VIEW, 72, 96).mask
-    shadow, free = beside & (missed < 0.079), beside & (missed > 0.081)
+    background = ~render.gbuffer(scene, VIEW, 72, 96).mask
+    shadow, free = background & (missed < 0.079), background & (missed > 0.081)
     assert shadow.sum() > 50
     assert (dark[shadow] == 0).all() and (dark[free] == bright[free]).all()
 

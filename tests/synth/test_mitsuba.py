@@ -50,13 +50,13 @@ def theirs(mi: Any, body: Any, reference: float) -> Floats:
             "body": body,
         }
     )
-    image = np.array(mi.render(found))[..., -12::3]  # S0.R … S3.R stand last
+    image = np.array(mi.render(found))[..., -12::3]  # S0.R … S3.R are the last channels
     assert np.abs(image[..., 3]).max() < 1e-3 * image[..., 0].max()  # no circular part
     return plastic.in_ray_frame(image, VIEW)
 
 
 def ours(which: Scene) -> tuple[Floats, Floats]:
-    """Every sample of every pixel's square: Stokes parameters (F², 3, H, W), and cos of the zenith, 0 beside."""
+    """Every sample of every pixel's square: Stokes parameters (F², 3, H, W), and cos of the zenith, 0 outside."""
     y, x = np.mgrid[:SIDE, :SIDE].astype(float)
     offsets = (np.arange(FINE) + 0.5) / FINE - 0.5
     stokes, facing = [], []
@@ -101,8 +101,8 @@ def test_stokes_parameters_are_those_of_another_renderer(mi: Any, kind: str) -> 
     other = theirs(mi, body, reference)
     fine, facing = ours(which)
     here = fine.mean(axis=0)
-    limb = np.cos(np.radians(70))
-    lit = (facing > limb).all(axis=0) & (fine[:, 0] > 0).all(axis=0)
+    least_cosine = np.cos(np.radians(70))
+    lit = (facing > least_cosine).all(axis=0) & (fine[:, 0] > 0).all(axis=0)
     assert lit.sum() > 250
     s0 = other[0][lit] / here[0][lit] - 1
     polarized = np.maximum(np.hypot(here[1], here[2]), 0.003 * here[0])  # S0·DoLP, which is 0 where n = v

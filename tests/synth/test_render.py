@@ -13,7 +13,7 @@ SIZE = 48
 
 
 @pytest.mark.parametrize(("roughness", "law"), [(0.5, "smooth"), (0.3, "rough"), (0.6, "rough")])
-def test_dolp_of_the_body_follows_the_law(roughness: float, law: str) -> None:
+def test_dolp_of_diffuse_light_follows_the_law(roughness: float, law: str) -> None:
     plain = msgspec.structs.replace(
         scenes.random_scene(3, "clusters").coat.materials[0], roughness=(roughness, roughness), specular=0.0, ior=1.5
     )

@@ -49,24 +49,26 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def test_the_outline_of_a_ball_is_bright_through_a_polarizer_along_its_azimuth(still: Any) -> None:
-    """Diffuse light vibrates along the projected normal: the right limb in 0°, the upper in 90°, up-right in 45°."""
+    """Diffuse light is polarized along the projected normal: at 0° the right edge is bright, at 90° the upper edge."""
     pictures, _, maps = still
     i0, i45, i90, i135 = (p[0::2, 1::2] for p in pictures)  # one of the greens
     n = maps["normal"][0::2, 1::2].astype(float)
-    limb = (n[..., 2] < 0.4) & (n[..., 2] > 0.2)
+    edge = (n[..., 2] < 0.4) & (n[..., 2] > 0.2)
     azimuth = np.degrees(np.arctan2(n[..., 1], n[..., 0]))
     for angle, passed, blocked in ((0, i0, i90), (45, i45, i135), (90, i90, i0), (135, i135, i45)):
-        here = limb & (np.abs(azimuth - angle) < 10)
+        here = edge & (np.abs(azimuth - angle) < 10)
         assert here.sum() > 5
         assert (passed / blocked)[here].min() > 1.1
 
 
 def test_files_hold_the_stokes_parameters_of_the_truth(still: Any) -> None:
-    """In the middle of the picture ray frame and picture frame are one; off axis the ball stays within 9°."""
+    """In the middle of the picture the ray's frame is that of the picture; the ball reaches 9° off axis."""
     pictures, truth, maps = still
     i0, i45, i90, i135 = (p[0::2, 1::2] for p in pictures)
     s0, s1, s2 = i0 + i90, i0 - i90, i45 - i135
-    np.testing.assert_allclose(i45 + i135, s0, rtol=2e-3, atol=1e-3)  # off axis 45° and 135° lean together
+    np.testing.assert_allclose(
+        i45 + i135, s0, rtol=2e-3, atol=1e-3
+    )  # off axis the axes of 45° and 135° are no longer perpendicular
     green = np.array(truth["camera_matrix_from_linear_srgb"])[1]
     t0, t1, t2 = (maps["S"].astype(float) @ green)[:, 0::2, 1::2]
     inside = maps["mask"][0::2, 1::2] & (maps["normal"][0::2, 1::2, 2] > 0.3)
@@ -105,14 +107,14 @@ def test_ball_is_where_the_projection_puts_it(still: Any) -> None:
     root = b**2 - middle @ middle + radius**2
     np.testing.assert_array_equal(maps["mask"], root > 0)
     distance = b - np.sqrt(np.where(root > 0, root, 0))
-    safe = root > 1e-5  # beside the limb, where a micrometre is a pixel
+    safe = root > 1e-5  # at the outline a micrometre is a pixel
     np.testing.assert_allclose(maps["depth"][safe], (distance * v[..., 2])[safe], atol=1e-5)
     normal = (-v * distance[..., None] - middle) / radius
     np.testing.assert_allclose(maps["normal"][safe], normal[safe], atol=2e-3)  # half precision
 
 
 def centroid(picture: np.ndarray, quad: np.ndarray) -> np.ndarray:
-    """Centroid (x, y) of the brightness around a patch, its dark surroundings taken off."""
+    """Centroid (x, y) of the brightness around a patch, minus its dark surroundings."""
     binned = picture.reshape(picture.shape[0] // 2, 2, picture.shape[1] // 2, 2).mean(axis=(1, 3))
     (x0, y0), (x1, y1) = (quad.min(axis=0) / 2 - 1).round().astype(int), (quad.max(axis=0) / 2 + 1).round().astype(int)
     part = binned[y0 : y1 + 1, x0 : x1 + 1]
@@ -196,7 +198,7 @@ def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
 
 
 def test_a_camera_that_rolls_turns_its_polarizer_with_it() -> None:
-    """A ball on the axis under a flash at the lens looks the same however the camera is rolled."""
+    """A ball on the axis under a flash at the lens has the same picture at every roll of the camera."""
     scene = Scene(shape=BALL.shape, coat=GREY, position=(0.0, 0.0, -0.7), light=(0.0, 0.0, 0.0), chart=None)
     studio = shooting.Studio(scene, replace(STILL, width=96, height=72, samples=1, blur_px=0.0))
     rolled = shooting.transform(studio.shoot, (0.0, 0.0), 20.0)

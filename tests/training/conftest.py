@@ -1,4 +1,4 @@
-"""A handful of traced views of two simple objects, enough to try the training path on."""
+"""Small training data: meshes, texture sets, and a few traced views of two simple objects."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ RECIPE = traced_views.ViewsRecipe(views=6, procedural=2, size=64, seed=5, per_sh
 
 @pytest.fixture(autouse=True)
 def seeded() -> None:
-    """What a test draws does not depend on which tests ran before it."""
+    """Random numbers of a test do not depend on earlier tests."""
     torch.manual_seed(0)
 
 
@@ -32,7 +32,7 @@ def write_mesh(path: Path, seed: int) -> None:
 
 
 def write_blob(path: Path, seed: int) -> None:
-    """A coarse lumpy ellipsoid, soon traced."""
+    """A coarse ellipsoid with waves, which is traced fast."""
     unit, faces = random_shapes._sphere(24, 32)
     rng = np.random.default_rng(seed)
     lumps = 1 + 0.15 * np.sin(unit @ rng.normal(size=(3, 3)) * 4).sum(axis=1, keepdims=True)
@@ -57,7 +57,7 @@ def write_textures(folder: Path, seed: int) -> None:
 
 @pytest.fixture(scope="session")
 def test_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """As many test meshes and texture sets as the evaluation takes."""
+    """As many test meshes and texture sets as the evaluation has in polcap's pages."""
     folder = tmp_path_factory.mktemp("test-data")
     for k in range(6):
         write_blob(folder / "meshes" / "test" / f"shape-{k}.npz", k)

@@ -1,4 +1,4 @@
-"""The table of ablations: all variants, one command, and again after a stop."""
+"""The ablation study trains and evaluates all variants by one command, and continues after a stop."""
 
 import json
 from dataclasses import replace
@@ -47,6 +47,6 @@ def test_one_command_makes_the_table_and_continues(test_data: Path, tmp_path: Pa
     assert (tmp_path / "out" / "plain skips" / "model.onnx").exists()
 
 
-def test_a_variant_of_ones_own_is_refused(tmp_path: Path) -> None:
+def test_a_chosen_variant_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="leave out --variant"):
         ablation_study.main(train.TrainingOptions(data=tmp_path, out=tmp_path, variant="plain skips"))

@@ -1,7 +1,8 @@
-"""Bounced light of training against the traced kind, on a bowl seen from inside and from outside."""
+"""Bounced light in training against that of `light_transport`, on a bowl seen from inside and from outside."""
 
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ def _bowl() -> Triangles:
 
 
 def _both(turn: Floats) -> tuple[Floats, Floats]:
-    """Once-bounced light (3, M, 3) of training, and as `light_transport.py` traces it."""
+    """Stokes parameters (3, M, 3) of one-bounce light: as in training, and as in `light_transport.py`."""
     mesh = _bowl()
     translation, view = np.array([0, 0, -4.0]), View(3.3 * SIZE, ((SIZE - 1) / 2, (SIZE - 1) / 2), 1.0)
     scene = Tracer(mesh)
@@ -42,9 +43,11 @@ def _both(turn: Floats) -> tuple[Floats, Floats]:
 
     v, ones = frames.rays(view, SIZE, SIZE)[mask].astype(float), np.ones((int(mask.sum()), 3))
     normal = frames.to_ray_frame(buffer.normal[mask], v).astype(float)
-    look = (ALBEDO * ones, F0 * ones, np.full(len(ones), ROUGHNESS))
+    material = (ALBEDO * ones, F0 * ones, np.full(len(ones), ROUGHNESS))
     _, flat = scene.first_hits(np.broadcast_to(-translation @ turn, v.shape), -v @ turn)
-    places = light_transport.SurfacePoints(mask, buffer.position[mask].astype(float), flat, normal, v, *look, ior=1.5)
+    places = light_transport.SurfacePoints(
+        mask, buffer.position[mask].astype(float), flat, normal, v, *material, ior=1.5
+    )
     indirect = light_transport.IndirectLight(
         scene, places, pose, lambda place, facing: ALBEDO * np.ones((len(place), 3))
     )
@@ -52,7 +55,7 @@ def _both(turn: Floats) -> tuple[Floats, Floats]:
 
     local = torch.from_numpy(normal).float()
     flash = frames.to_ray_frame(-seen.place / seen.place.norm(dim=1, keepdim=True), seen.v)
-    surface = Surface(local, *(torch.from_numpy(a).float() for a in (*look, np.full(len(ones), 1.5))))
+    surface = Surface(local, *(torch.from_numpy(a).float() for a in (*material, np.full(len(ones), 1.5))))
     gloss = 0 * surface.specular, surface.roughness, surface.ior
     body = shade.stokes(local, surface.diffuse, *gloss, flash, seen.lit / (seen.place**2).sum(dim=1))
     return bounced_light.bounced_stokes(seen, local, surface, body[0]).numpy(), traced
@@ -67,7 +70,7 @@ def _turned(degrees: float) -> Floats:
 def test_bounced_light_inside_a_bowl_agrees_with_tracing(degrees: float) -> None:
     trained, traced = _both(_turned(degrees))
     assert trained[0].sum() == pytest.approx(traced[0].sum(), rel=0.2)
-    for k in (1, 2):  # mirrored light is polarized: the same places, the same way, as much
+    for k in (1, 2):  # mirrored light is polarized: at the same pixels, in the same direction, as strongly
         assert np.corrcoef(trained[k].mean(axis=-1), traced[k].mean(axis=-1))[0, 1] > 0.7
         assert np.abs(trained[k]).sum() == pytest.approx(np.abs(traced[k]).sum(), rel=0.4)
 
@@ -84,7 +87,7 @@ def test_outline_of_dark_gloss_shows_the_backdrop_polarized_across_the_normal() 
     ones = torch.ones(60)
     surface = Surface(normal, 0.03 * torch.ones(60, 3), 0.04 * torch.ones(60, 3), 0.2 * ones, 1.5 * ones)
     place, flash = 0.2 * normal - v, torch.zeros(1, 3)
-    seen = SimpleNamespace(v=v, owner=torch.zeros(60).long(), place=place, open=ones)
+    seen: Any = SimpleNamespace(v=v, owner=torch.zeros(60).long(), place=place, open=ones)
     mirrored = partial(bounced_light.mirrored_surroundings, seen, flash, normal, surface, torch.ones(1))
     torch.manual_seed(1)
     rooms = torch.stack([mirrored() for _ in range(40)])

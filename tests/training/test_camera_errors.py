@@ -1,4 +1,4 @@
-"""The camera of training against Malus's law and the statistics it promises."""
+"""The simulated camera of training follows Malus's law, and its noise has the stated variance."""
 
 from dataclasses import replace
 
@@ -35,14 +35,16 @@ def test_perfect_camera_returns_the_stokes_parameters() -> None:
 
 
 def test_polarizer_angles_are_projected_on_oblique_rays() -> None:
-    """Light that vibrates along what the polarizer at 45° is on an oblique ray passes it whole."""
+    """Light polarized along the axis at 45°, projected across an oblique ray, passes completely."""
     stokes, diffuse, mask, _ = scene()
     rays = torch.nn.functional.normalize(torch.tensor([0.2, 0.15, 1.0]), dim=0).expand(B, S, S, 3)
     axis = frames.axis_on_ray(torch.tensor(torch.pi / 4), rays)
     stokes[1], stokes[2] = (0.5 * f(2 * axis)[..., None] for f in (torch.cos, torch.sin))
     measured, _, _ = shoot(CameraErrors.none(B, CPU), stokes, diffuse, mask, rays)
     through_45 = (measured[0] + measured[2]) / 2
-    torch.testing.assert_close(through_45, torch.full_like(through_45, 0.5), atol=2e-4, rtol=0)  # 9σ of the noise left
+    torch.testing.assert_close(
+        through_45, torch.full_like(through_45, 0.5), atol=2e-4, rtol=0
+    )  # 9σ of the remaining noise
 
 
 def test_noise_has_the_variance_it_states() -> None:

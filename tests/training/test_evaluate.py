@@ -1,4 +1,4 @@
-"""The evaluation from end to end: all columns, resumed runs, the command, and the shipped model held to its card."""
+"""The evaluation from end to end: all columns, resumed runs, the command, and errors of the shipped model."""
 
 import json
 import os
@@ -47,16 +47,16 @@ def test_the_command_evaluates_all_columns(test_data: Path, networks: Path, tmp_
 
 @shipped
 def test_a_stopped_run_continues(test_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And judging by several processes changes nothing."""
+    """Several processes give the same result as one."""
     params = evaluate.EvaluationOptions(MODEL, test_data, tmp_path, count=2, size=64)
     whole = evaluate.main(params)
     journal = tmp_path / "pictures.jsonl"
     head, first, second = journal.read_text().splitlines()
-    kept = json.loads(first)
-    kept["scores"]["ours"]["normal_mean"] += 10
-    journal.write_text("\n".join([head, json.dumps(kept), second[:50]]))
+    changed = json.loads(first)
+    changed["scores"]["ours"]["normal_mean"] += 10
+    journal.write_text("\n".join([head, json.dumps(changed), second[:50]]))
     assert evaluate.main(params)["ours"]["normal_mean"] == pytest.approx(whole["ours"]["normal_mean"] + 5)
-    journal.write_text("\n".join(["another run", json.dumps(kept)]))
+    journal.write_text("\n".join(["another run", json.dumps(changed)]))
     monkeypatch.setattr(evaluate, "_MIN_SHARE", 1)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     assert evaluate.main(params) == whole

@@ -25,13 +25,13 @@ def test_materials_are_those_of_the_protocol(
     library: list[evaluation_materials.TestMaterial], places: tuple[Floats, Floats]
 ) -> None:
     assert len(library) == 30 and len({m.name for m in library}) == 30
-    looks = [material.at(*places) for material in library]
-    assert np.std([look.specular for look in looks]) > 0.04
+    samples = [material.at(*places) for material in library]
+    assert np.std([sample.specular for sample in samples]) > 0.04
     assert min(m.ior for m in library) >= 1.4 and max(m.ior for m in library) <= 1.6
-    for look in looks:
-        assert look.diffuse.min() >= 0.005 and look.diffuse.max() <= 0.95
-        assert look.roughness.min() >= 0.12 and look.roughness.max() <= 1
-        assert look.specular.min() > 0.015 and look.specular.max() < 0.41
+    for sample in samples:
+        assert sample.diffuse.min() >= 0.005 and sample.diffuse.max() <= 0.95
+        assert sample.roughness.min() >= 0.12 and sample.roughness.max() <= 1
+        assert sample.specular.min() > 0.015 and sample.specular.max() < 0.41
 
 
 def test_a_materials_maps_follow_one_pattern(
@@ -39,9 +39,9 @@ def test_a_materials_maps_follow_one_pattern(
 ) -> None:
     related = 0
     for material in library[evaluation_materials.TEXTURES :]:
-        look = material.at(*places)
-        assert look.diffuse.std(axis=0).max() > 0.002, material.name
-        related += abs(np.corrcoef(look.diffuse.mean(axis=1), look.roughness)[0, 1]) > 0.4
+        sample = material.at(*places)
+        assert sample.diffuse.std(axis=0).max() > 0.002, material.name
+        related += abs(np.corrcoef(sample.diffuse.mean(axis=1), sample.roughness)[0, 1]) > 0.4
     assert related >= 15
 
 

@@ -1,4 +1,4 @@
-"""Photographs with normals: a ball in that layout is scored, and what is missing is named."""
+"""Errors of normals from photographs of a ball; missing files are named."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ SIZE, RADIUS = 160, 60
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A ball under a flash at the lens of a long lens, 16 bit."""
+    """Photographs (16 bits) of a ball by a distant camera with the flash at the lens, mask and normals."""
     place = tmp_path_factory.mktemp("real")
     y, x = np.mgrid[:SIZE, :SIZE]
     nx, ny = (x - SIZE / 2) / RADIUS, (SIZE / 2 - y) / RADIUS
@@ -45,9 +45,9 @@ def test_normals_of_a_ball_are_evaluated(folder: Path, tmp_path: Path, monkeypat
     monkeypatch.setattr(models, "open_network", lambda path: network())
     monkeypatch.setattr(onnx, "run", fake_network.run)
     table = evaluation_photographs.main(folder, Path("model.onnx"), tmp_path)
-    # the lens is not stated, 50 mm is assumed: rays of the ball's side are off by 13°
+    # the lens is not stated, 50 mm is assumed: so view rays at the ball's side are wrong by 13°
     assert table["analytic"]["mean"] < 9 and table["analytic"]["covered"] > 0.97
-    assert table["analytic"]["diffuse direction"] > 0.95  # as the ball above is lit
+    assert table["analytic"]["diffuse direction"] > 0.95  # the light of this ball is diffuse
     assert table["ours"]["mean"] > 20  # this network takes the other half-turn on half of the ball
     page = (tmp_path / "real.md").read_text()
     assert "| ball.png, ours |" in page and "counts as 90°" in page

@@ -1,4 +1,4 @@
-"""The fixed pictures: complete, reproducible one by one, and under the stated conditions."""
+"""The pictures of the evaluation: complete, each determined by its number, under the stated conditions."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ def made(test_data: Path) -> Protocol:
     return Protocol(test_data, 96)
 
 
-def test_each_material_on_each_mesh_before_any_comes_again() -> None:
+def test_all_pairs_of_mesh_and_material_come_before_any_repeats() -> None:
     pairs = [evaluation_protocol.combination(k, 6, 30) for k in range(evaluation_protocol.COUNT)]
     assert len(set(pairs[:180])) == 180
     for first in range(0, 240, 30):
@@ -26,7 +26,7 @@ def test_each_material_on_each_mesh_before_any_comes_again() -> None:
         assert all(meshes.count(mesh) == 5 for mesh in range(6))
 
 
-def test_all_pairs_of_own_meshes_and_materials_come() -> None:
+def test_all_pairs_come_for_other_numbers_of_meshes_and_materials() -> None:
     assert len({evaluation_protocol.combination(k, 4, 22) for k in range(88)}) == 88
 
 
@@ -47,7 +47,7 @@ def test_object_fills_the_stated_share_of_30_degrees(made: Protocol) -> None:
 
 
 def test_clean_cues_carry_the_polarization_of_the_truth(made: Protocol) -> None:
-    """Most of what is lit directly and diffusely is polarized along the normal's azimuth, as Fresnel says."""
+    """Most direct diffuse light is polarized along the normal's azimuth (Fresnel)."""
     case = made.case(3)
     mask = case.truth.mask
     local = frames.to_ray_frame(case.truth.normal[mask], case.clean.rays[mask])
@@ -57,8 +57,8 @@ def test_clean_cues_carry_the_polarization_of_the_truth(made: Protocol) -> None:
     assert np.median(agreement[tilted]) > 0.97
 
 
-def test_bodies_of_the_second_protocol_polarize_as_rough_ones(made: Protocol, test_data: Path) -> None:
-    """Same places, same shapes; the DoLP of what is lit well falls by the ratio that roughness means."""
+def test_diffuse_light_of_the_second_protocol_has_the_dolp_of_rough_interfaces(made: Protocol, test_data: Path) -> None:
+    """On equal shapes the DoLP of well lit pixels falls by the ratio of the rough law to the smooth one."""
     second = Protocol(test_data, 96, protocol=2)
     ratios = []
     for number in (2, 3):
@@ -83,10 +83,10 @@ def test_f0_of_the_second_protocol_is_that_of_everyday_objects(test_data: Path) 
 
 
 def test_noise_is_that_of_the_stated_camera(made: Protocol) -> None:
-    """1σ of S1/S0 and S2/S0, their mean square: 1/√(electrons of a shot), read noise adding a little."""
+    """The RMS of the 1σ of S1/S0 and S2/S0 is 1/√(electrons of a shot); read noise adds a little."""
     case = made.case(3)
     mask = case.truth.mask & (case.cues.radiance.max(-1) < 0.4) & (case.cues.radiance.min(-1) > 0.05)
-    electrons = case.cues.radiance[mask].sum(-1) / 2 * 2e4 * (1 / 4 + 1 + 4)  # of three exposures ×4 apart
+    electrons = case.cues.radiance[mask].sum(-1) / 2 * 2e4 * (1 / 4 + 1 + 4)  # of three exposures at ratios of 4
     assert 1.0 < np.median(case.cues.ratio_sigma[mask] * np.sqrt(electrons)) < 1.03
 
 

@@ -1,4 +1,4 @@
-"""Training of the refinement network: tiles turn with their vectors, the loss falls, the model is exported."""
+"""Training of the refinement network: tiles rotate with their vectors, the loss falls, the model is exported."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ COUNT = len(fine.CHANNELS)
 
 @pytest.fixture
 def picture() -> NDArray[np.float16]:
-    """Waves that the first network saw and that the normals so far lack."""
+    """A picture file with waves in the channel `smooth_x` and in the true normals, but not in the first normals."""
     rng = np.random.default_rng(2)
     out = np.zeros((COUNT + 4, 160, 200), np.float32)
     wave = 0.3 * np.sin(np.arange(200) * 2 * np.pi / 8 + rng.uniform(0, 6, (160, 1)))

@@ -1,4 +1,4 @@
-"""Light over zenith: what the profile says is what was rendered."""
+"""Gloss profiles of a rendered ball follow the reflection law."""
 
 from pathlib import Path
 
@@ -36,10 +36,10 @@ def profile(specular: float) -> torch.Tensor:
     return table.reshape(gloss_profiles._BINS, gloss_profiles._FIGURES)
 
 
-def test_a_matte_ball_has_no_excess_and_its_whole_polarization() -> None:
+def test_a_matte_ball_has_no_excess_light_and_no_missing_polarization() -> None:
     table = profile(0.0)
     assert table[:8, 2].abs().max() < 0.05  # excess
-    assert table[7:, 5].abs().max() < 0.12  # missing DoLP, where there is any to miss
+    assert table[7:, 5].abs().max() < 0.12  # missing DoLP, at zeniths where diffuse light is polarized
 
 
 def test_excess_light_at_normal_incidence_is_the_specular_lobe() -> None:
@@ -55,7 +55,7 @@ def test_excess_light_at_normal_incidence_is_the_specular_lobe() -> None:
     assert float(found[0]) > float(found[1]) > float(found[2]) > float(found[4])
 
 
-class Alone(torch.nn.Module):  # type: ignore[misc]
+class ProfileModel(torch.nn.Module):  # type: ignore[misc]
     """`profile` as a model of its own: 14 channels are the groups, the figures and the cosine."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -67,7 +67,7 @@ def test_exported_sums_are_the_same_whatever_the_number_of_threads(tmp_path: Pat
     ort = pytest.importorskip("onnxruntime")
     inputs = torch.rand(1, 14, 128, 112)
     file = tmp_path / "profile.onnx"
-    torch.onnx.export(Alone(), (inputs,), str(file), opset_version=17, dynamo=False)
+    torch.onnx.export(ProfileModel(), (inputs,), str(file), opset_version=17, dynamo=False)
     found = []
     for threads in (1, 2, 3):
         options = ort.SessionOptions()

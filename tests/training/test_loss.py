@@ -1,4 +1,4 @@
-"""The loss: nothing at the truth, and least where each output means what it says."""
+"""The loss is 0 at the truth; that of the expected error is least at the actual error."""
 
 import pytest
 import torch
@@ -23,7 +23,7 @@ def parts(maps: dict[str, Tensor], batch: Batch) -> dict[str, float]:
     return loss.total(maps, batch, torch.Generator().manual_seed(0))[1]
 
 
-def test_truth_costs_nothing(batch: Batch) -> None:
+def test_loss_of_the_truth_is_zero(batch: Batch) -> None:
     cost = parts(maps_of(batch), batch)
     for name in ("normal", "depth", "diffuse", "specular", "roughness", "highlight", "render", "degrees"):
         assert cost[name] == pytest.approx(0, abs=1e-4 if name != "degrees" else 0.05), name
@@ -37,7 +37,7 @@ def test_rendering_loss_depends_on_every_map(batch: Batch, name: str) -> None:
     assert parts(maps, batch)["render"] > 1e-4
 
 
-def test_depth_may_lie_anywhere_along_the_axis(batch: Batch) -> None:
+def test_a_shift_of_all_depths_has_no_loss(batch: Batch) -> None:
     maps = maps_of(batch)
     maps["depth"] = maps["depth"] + torch.tensor([3.0, -1.0, 0.5]).view(3, 1, 1, 1)
     assert parts(maps, batch)["depth"] == pytest.approx(0, abs=1e-4)

@@ -1,4 +1,4 @@
-"""The network: any size, outputs in their units, and ready to learn."""
+"""The main network: pictures of any size, outputs in their ranges, gradients for all weights."""
 
 import pytest
 import torch
@@ -48,7 +48,7 @@ def test_attention_connects_all_cells_of_the_object() -> None:
     x, inside = torch.randn(1, 16, 4, 4), torch.ones(1, 1, 4, 4)
     inside[..., 3] = 0
     before = context(x, inside)
-    for column, seen in ((0, True), (3, False)):  # of the object, beside it
+    for column, seen in ((0, True), (3, False)):  # on the object, outside it
         changed = x.clone()
         changed[..., 0, column] += 1
         moved = (context(changed, inside) - before)[..., 3, 1].abs().max()
@@ -56,7 +56,7 @@ def test_attention_connects_all_cells_of_the_object() -> None:
 
 
 def test_groups_depend_on_features_not_on_position() -> None:
-    """What `LinearAttention` adds depends on a place's own features and the whole picture's, not on where it lies."""
+    """The output of `LinearAttention` at a pixel depends on the features of all pixels, not on its position."""
     torch.manual_seed(3)
     share = main_network.LinearAttention(16, heads=2, groups=4)
     torch.nn.init.normal_(share.proj.weight)
@@ -70,7 +70,7 @@ def test_groups_depend_on_features_not_on_position() -> None:
 
 @pytest.mark.parametrize("name", [name for name, v in VARIANTS.items() if v.inputs is not VARIANTS["ours"].inputs])
 def test_variants_see_no_more_than_their_inputs(name: str) -> None:
-    """Without polarization, changing it changes nothing; the published inputs do not hold DoLP beyond the pictures."""
+    """Channels that a variant does not use have no effect on its output."""
     torch.manual_seed(5)
     x = inputs(32, 32)
     changed = x.clone()
@@ -83,7 +83,7 @@ def test_variants_see_no_more_than_their_inputs(name: str) -> None:
 
 
 def test_published_inputs_obey_malus_law() -> None:
-    """Malus: the pictures at 0° and 90° add up to S0, and their difference is S1."""
+    """The sum of the pictures at 0° and 90° is S0, their difference S1."""
     x = inputs(32, 32)
     at = {name: x[:, CHANNELS.index(name)] for name in CHANNELS}
     seen = VARIANTS["published inputs"].inputs(x)

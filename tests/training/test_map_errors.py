@@ -38,7 +38,7 @@ def test_known_errors_are_measured(case: Case) -> None:
     expected = np.degrees(2 * np.arcsin(zenith * np.sin(np.radians(7.5)))).mean()
     assert figures["normal_mean"] == pytest.approx(expected, rel=1e-3)
     assert figures["roughness"] == pytest.approx(0.1, rel=1e-4)
-    share = case.truth.mask.mean()  # beside the object nothing is wrong
+    share = case.truth.mask.mean()  # outside the object the error is 0
     assert figures["roughness_picture"] == pytest.approx(0.1 * np.sqrt(share), rel=1e-4)
     assert figures["roughness_l1_picture"] == pytest.approx(0.1 * share, rel=1e-4)
     inside = case.depth[case.truth.mask]
@@ -72,7 +72,7 @@ def test_clipped_highlights_have_their_own_error(case: Case) -> None:
 
 
 def test_rendering_error_ignores_clipped_light_only(case: Case) -> None:
-    """Half the albedo of a matte picture halves its renderings: an error of half their level, at most ½."""
+    """Half the albedo of a matte picture halves its renderings, so the error is half of their level."""
     matte = replace(case.truth, specular=0 * case.truth.specular)
     judge = Judge(replace(case, truth=matte))
     figures = judge.score(replace(matte, diffuse=matte.diffuse / 2))

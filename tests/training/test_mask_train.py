@@ -16,7 +16,7 @@ SIZE = (72, 96)
 
 @pytest.fixture(scope="module")
 def traced() -> mask_views.MaskView:
-    """A ball on a wall: what lies where is known."""
+    """A ball in front of a wall."""
     unit, faces = random_shapes._sphere(32, 48)
     kind = mask_views.ViewKind("whole", "wall", (0.1, 0.2))
     found = mask_views.trace_view(Tracer(smooth(0.5 * unit, faces)), kind, SIZE, np.random.default_rng(3))
@@ -31,7 +31,7 @@ def picture(traced: mask_views.MaskView) -> mask_scenes.MaskScene:
     return mask_scenes.make_scene(traced, library, "black", np.random.default_rng(1), charted=0.0)
 
 
-def test_the_object_touches_no_edge_and_throws_its_shadow_away_from_the_flash(traced: mask_views.MaskView) -> None:
+def test_the_object_touches_no_edge_and_its_shadow_is_opposite_the_flash(traced: mask_views.MaskView) -> None:
     mask = traced.object.mask
     assert mask.any() and not mask[[0, -1]].any() and not mask[:, [0, -1]].any()
     shadow, object_ = (np.argwhere(a).mean(0) for a in (~traced.lit & ~mask, mask))  # row, column
@@ -53,8 +53,8 @@ def test_mirroring_negates_s2(tmp_path: Path, picture: mask_scenes.MaskScene) ->
     np.save(tmp_path / "0.npy", held)
     signs = set()
     for seed in range(12):
-        look, truth = mask_train.load_varied(tmp_path / "0.npy", np.random.default_rng(seed))
-        _, s1, s2 = (float(part.sum()) for part in look.stokes)
+        varied, truth = mask_train.load_varied(tmp_path / "0.npy", np.random.default_rng(seed))
+        _, s1, s2 = (float(part.sum()) for part in varied.stokes)
         as_is = np.array_equal(truth, held[..., 5].astype(np.float32))
         mirrored = np.array_equal(truth, held[:, ::-1, 5].astype(np.float32))
         signs.add((as_is, s2 > 0))

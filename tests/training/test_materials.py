@@ -1,4 +1,4 @@
-"""What random materials are like: within bounds, and with the correlations that real ones have."""
+"""Random materials are within their bounds, and as correlated as real ones."""
 
 import torch
 
@@ -7,7 +7,7 @@ from polcap.training import materials
 OBJECTS, PLACES = 150, 1500
 
 
-def dressed() -> tuple[materials.Surface, torch.Tensor]:
+def draw_spheres() -> tuple[materials.Surface, torch.Tensor]:
     """Spheres in random materials of solid noise, and their own normals."""
     torch.manual_seed(0)
     normal = torch.nn.functional.normalize(torch.randn(OBJECTS * PLACES, 3), dim=1)
@@ -17,7 +17,7 @@ def dressed() -> tuple[materials.Surface, torch.Tensor]:
 
 
 def test_materials_stay_within_their_bounds() -> None:
-    surface, normal = dressed()
+    surface, normal = draw_spheres()
     assert surface.diffuse.min() >= 0.005 and surface.diffuse.max() <= 0.95
     assert surface.specular.min() >= 0.015 and surface.specular.max() <= 0.4
     assert surface.roughness.min() >= 0.05 and surface.roughness.max() <= 1
@@ -27,7 +27,7 @@ def test_materials_stay_within_their_bounds() -> None:
 
 
 def test_levels_spread_between_objects_and_gloss_follows_the_pattern_on_many() -> None:
-    surface, _ = dressed()
+    surface, _ = draw_spheres()
     rough, f0 = surface.roughness.view(OBJECTS, PLACES), surface.specular.mean(dim=1).view(OBJECTS, PLACES)
     light = surface.diffuse.mean(dim=1).log().view(OBJECTS, PLACES)
     assert rough.mean(dim=1).std() > 0.12 and f0.mean(dim=1).std() > 0.015
@@ -45,7 +45,7 @@ def test_some_colors_leave_a_channel_dark_and_most_do_not() -> None:
 
 
 def test_an_eighth_of_all_objects_is_dark_gloss_everywhere_or_for_the_most_part() -> None:
-    surface, _ = dressed()
+    surface, _ = draw_spheres()
     albedo = surface.diffuse.mean(dim=1).view(OBJECTS, PLACES)
     dark = (albedo < 0.08) & (surface.roughness.view(OBJECTS, PLACES) < 0.4)
     share = dark.float().mean(dim=1)

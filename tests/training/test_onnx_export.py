@@ -1,4 +1,4 @@
-"""The model file: what torch computes, onnxruntime computes, at any size; and it says what it is."""
+"""An exported model gives the maps of the torch network, at any size, and states its metadata."""
 
 import os
 import subprocess

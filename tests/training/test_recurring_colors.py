@@ -1,4 +1,4 @@
-"""The colors of a picture: found, used where a place is seen badly, and asked for their gloss."""
+"""Recurring colors of a picture are found, correct uncertain albedo, and are described for the gloss estimate."""
 
 import torch
 
@@ -8,7 +8,7 @@ RED, BLUE = (0.6, 0.1, 0.1), (0.1, 0.1, 0.6)
 
 
 def print_of(colors: list[tuple[float, float, float]], side: int = 24) -> tuple[torch.Tensor, torch.Tensor]:
-    """A print (1, 3, H, W) whose squares take the colors in turn, 5 % uneven, and which color each pixel has (H, W)."""
+    """A print (1, 3, H, W) of squares in these colors, 5 % uneven, and the number of each pixel's color (H, W)."""
     torch.manual_seed(0)
     square = torch.arange(side) // 3
     which = (square[:, None] + square) % len(colors)
@@ -29,7 +29,7 @@ def albedo(colors: recurring_colors.ColorMixture) -> torch.Tensor:
 def recolored(
     picture: torch.Tensor, cosine: float | torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, recurring_colors.ColorMixture]:
-    """With the doubt that the zenith lets expect, all of it inside and unclipped."""
+    """Output of `Recolor` for the expected uncertainty at this zenith; all pixels are inside and unclipped."""
     one = torch.ones_like(picture[:, :1])
     none = torch.zeros(1, 2, *picture.shape[2:])
     with torch.no_grad():
@@ -50,20 +50,20 @@ def test_one_color_is_found_once() -> None:
 
 
 def test_uncertain_albedo_moves_to_a_color_seen_well() -> None:
-    """Towards the limb a third of the places come out 40 % too dark; hue tells whose they are."""
+    """A third of the pixels, steeply tilted, are 40 % too dark; their hue identifies the color."""
     truth, which = print_of([RED, BLUE])
-    limb = torch.arange(which.numel()).reshape(which.shape) % 24 < 8
-    seen = torch.where(limb, 0.6 * truth, truth)
-    cosine = torch.where(limb, 0.2, 0.8)[None, None]
+    steep = torch.arange(which.numel()).reshape(which.shape) % 24 < 8
+    seen = torch.where(steep, 0.6 * truth, truth)
+    cosine = torch.where(steep, 0.2, 0.8)[None, None]
     got = recolored(seen, cosine)[0]
     before, after = ((x / truth).log().abs()[0].mean(dim=0) for x in (seen, got))
-    assert after[limb].mean() < 0.3 * before[limb].mean()
-    assert after[~limb].mean() < 0.06
-    assert (got / truth).log().abs()[..., limb].mean() < 0.15  # in every channel: no red has become blue
+    assert after[steep].mean() < 0.3 * before[steep].mean()
+    assert after[~steep].mean() < 0.06
+    assert (got / truth).log().abs()[..., steep].mean() < 0.15  # in every channel: no red has become blue
 
 
 def test_well_seen_shades_are_preserved() -> None:
-    """A smooth run of colors from dark to light, three stops, is not made into steps."""
+    """A gradient of three stops from dark to light stays smooth."""
     run = torch.exp(torch.linspace(-2.5, -0.4, 64 * 64)).reshape(1, 1, 64, 64).expand(1, 3, 64, 64)
     assert (recolored(run, 0.8)[0] / run).log().abs().max() < 0.15
 

@@ -1,4 +1,4 @@
-"""Batches: the same cues as a capture's, and views whose mirroring keeps geometry whole."""
+"""Training batches have the cues of the stage, and mirrored views keep their geometry."""
 
 import numpy as np
 import pytest
@@ -51,16 +51,16 @@ def test_mirrored_views_are_still_views_of_the_object(simulator: Simulator, seed
 @pytest.mark.parametrize("flip", [False, True])
 @pytest.mark.parametrize("size", [32, 64])
 def test_pixels_that_see_each_other_face_each_other(simulator: Simulator, size: int, flip: bool) -> None:
-    """Rays leave on the outside and arrive on the outside, whatever the size and the mirroring."""
+    """Rays leave and arrive on the outside of the surface, at any size, mirrored or not."""
     torch.manual_seed(3)
     seen = simulator.gather(np.arange(12), size, flip=flip).pixels
     here, ray = (seen.met >= 0).nonzero(as_tuple=True)
     there = seen.met[here, ray]
     assert len(here) > 100 and (seen.owner[here] == seen.owner[there]).all()
-    way = seen.place[there] - seen.place[here]
-    far = way.norm(dim=1) > 6 / size  # nearer ones are decided by the grid
-    leaves = (way * seen.normal[here]).sum(dim=1)[far] > 0
-    arrives = (way * seen.normal[there]).sum(dim=1)[far] < 0
+    direction = seen.place[there] - seen.place[here]
+    far = direction.norm(dim=1) > 6 / size  # nearer ones are decided by the grid
+    leaves = (direction * seen.normal[here]).sum(dim=1)[far] > 0
+    arrives = (direction * seen.normal[there]).sum(dim=1)[far] < 0
     assert leaves.float().mean() > 0.85 and arrives.float().mean() > 0.85  # of a wrong pixel: half
 
 

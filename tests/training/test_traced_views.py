@@ -1,4 +1,4 @@
-"""The cache of views: whole, reproducible, and true to its own conventions."""
+"""The cache of traced views is complete, reproducible, and follows its conventions."""
 
 from collections import namedtuple
 from dataclasses import replace
@@ -77,7 +77,7 @@ def test_depth_is_centered_and_in_units_of_the_equivalent_disc(cache: dict[str, 
         assert camera[4] == pytest.approx(np.sqrt(mask.sum() / np.pi) * camera[3] / camera[0], rel=1e-5)
 
 
-def test_objects_lie_inside_the_frame_and_turns_are_rotations(cache: dict[str, Any]) -> None:
+def test_objects_are_inside_the_picture_and_turns_are_rotations(cache: dict[str, Any]) -> None:
     border = np.ones((64, 64), bool)
     border[1:-1, 1:-1] = False
     assert (cache["mask"][..., 0] & border).mean() < 0.002

@@ -1,4 +1,4 @@
-"""A folder that is being filled is reported once it rests, and not before."""
+"""A folder that is being filled is reported when its files stop changing, not before."""
 
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> SleepClock:
     return clock
 
 
-def test_a_folder_that_rests_after_a_change_is_reported(
+def test_a_folder_is_reported_when_its_changes_have_ended(
     tmp_path: Path, clock: SleepClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = tmp_path / "polcap"
@@ -49,7 +49,7 @@ def test_a_removed_file_is_reported(tmp_path: Path, clock: SleepClock) -> None:
     assert not (tmp_path / "a.dng").exists()
 
 
-def test_an_edited_file_rests_at_once_unless_photographs_arrive(tmp_path: Path, clock: SleepClock) -> None:
+def test_an_edit_is_reported_at_once_unless_photographs_arrive(tmp_path: Path, clock: SleepClock) -> None:
     folder, settings = tmp_path / "capture", tmp_path / "settings.toml"
     folder.mkdir()
     moments = arrivals.settled(folder, folder / "polcap", still_s=2.0, edited=[settings])

@@ -15,15 +15,15 @@ def test_sensor_table_makes_a_stated_focal_length_known() -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(6000, 4000), (4000, 3000), (3000, 4000)])
 def test_an_equivalent_has_the_diagonal_of_full_frame(width: int, height: int) -> None:
-    """CIPA DCG-001: equal diagonals, whatever the sides' ratio; the whole angle of a 50 mm lens is 46.8°."""
+    """CIPA DCG-001: equal diagonals at any ratio of the sides; the whole angle of a 50 mm lens is 46.8°."""
     found = focal_length.find(Exif(focal_length_35mm=50.0, width=width, height=height), None, None)
     assert 2 * math.degrees(math.atan(math.hypot(width, height) / 2 / found.px)) == pytest.approx(46.79, abs=0.01)
 
 
-def test_stated_focal_length_that_contradicts_the_photographs_is_no_knowledge() -> None:
+def test_a_stated_focal_length_that_contradicts_exif_is_not_known() -> None:
     exif = Exif(model="NIKON D90", focal_length_mm=50.0, width=4310, height=2868)
     found = focal_length.find(exif, 24.0, None)
-    shorter, longer = found.doubt  # it may be as long as they say, and no shorter
+    shorter, longer = found.doubt  # EXIF states a longer one
     assert shorter == 0.0 and longer == pytest.approx(math.log(50 / 24))
     assert not found.known and "50 mm" in found.note
     assert found.px == pytest.approx(24 / 23.6 * 4310)  # the user's statement is used

@@ -1,4 +1,4 @@
-"""Capture folders: the meaning of each layout, and one clear line for each fault."""
+"""Capture folders: every layout is understood, and every fault is one clear line."""
 
 import re
 import shutil
@@ -38,7 +38,7 @@ def folders(root, angles=("000", "045", "090"), times=(1 / 200, 1 / 50)):
 
 def flat(root, shots=3, times=(1 / 200, 1 / 50)):
     for number in range(shots * len(times)):
-        name = f"IMG_{(number + 9998) % 10000:04d}.dng"  # the counter runs over
+        name = f"IMG_{(number + 9998) % 10000:04d}.dng"  # the camera's counter starts again at 0
         shoot(root / name, times[number % len(times)], f"00:{number:02d}:00")
     return root
 
@@ -80,7 +80,7 @@ def test_sub_folders_state_the_angles(tmp_path):
         ("Filter 0°", "Filter 45°", "Filter 90°"),
     ],
 )
-def test_folders_whose_names_differ_in_the_angle_only_state_it(tmp_path, listed):
+def test_angles_are_read_from_folder_names_that_differ_in_one_number(tmp_path, listed):
     for name in listed:
         shoot(tmp_path / name / "a.dng")
     (tmp_path / "notes 7").mkdir()
@@ -102,7 +102,7 @@ def test_numbered_folders_of_objects_are_not_angles(tmp_path, listed):
         capture.read(tmp_path)
 
 
-def test_a_batch_tells_angle_folders_from_numbered_captures(tmp_path):
+def test_a_batch_distinguishes_angle_folders_from_numbered_captures(tmp_path):
     assert layouts.looks_like_a_capture(tmp_path, ("0 Grad", "45 Grad", "90 Grad"), ())
     assert not layouts.looks_like_a_capture(tmp_path, ("10", "20", "30"), ())
 
@@ -145,7 +145,7 @@ def test_flat_folder_follows_the_stated_order(tmp_path):
     assert degrees(capture.read(flat(tmp_path, shots=4), (135.0, 90.0, 45.0, 0.0))) == [135, 90, 45, 0]
 
 
-def test_names_of_pictures_carry_angles(tmp_path):
+def test_angles_are_read_from_names_of_pictures(tmp_path):
     folder = pictures(tmp_path, [f"scene2_filter_{angle}_done.tif" for angle in (135, 0, 90, 45)])
     understood = capture.read(folder)
     assert understood.layout == "flat" and degrees(understood) == [0, 45, 90, 135]
@@ -159,7 +159,7 @@ def test_counters_are_not_angles(tmp_path, listed):
     assert any("by name taken as 3 brackets of 1" in note for note in understood.notes)
 
 
-def test_sensor_frame_is_four_shots(tmp_path):
+def test_the_frame_of_a_polarization_sensor_is_four_shots(tmp_path):
     save(tmp_path / "frame.png", mosaic())
     understood = capture.read(tmp_path)
     assert understood.layout == "sensor" and degrees(understood) == [0, 45, 90, 135]
@@ -198,7 +198,7 @@ def test_capture_toml_may_come_from_windows(tmp_path):
     for angle in (0, 45, 90):
         shoot(tmp_path / f"pol{angle:03d}" / "a.dng")
         text += f"[[frame]]\r\nfile = 'pol{angle:03d}\\a.dng'\r\nangle = {angle}\r\n"
-    (tmp_path / "capture.toml").write_bytes(b"\xef\xbb\xbf" + text.encode())  # with the mark that its editor sets
+    (tmp_path / "capture.toml").write_bytes(b"\xef\xbb\xbf" + text.encode())  # with a byte order mark
     understood = capture.read(tmp_path)
     assert (understood.name, degrees(understood)) == ("bowl", [0, 45, 90])
 
@@ -216,7 +216,7 @@ def test_a_folder_of_captures_is_named_as_such(tmp_path):
 
 
 def test_views_of_one_object_are_for_fuse(tmp_path):
-    """Other files next to the views, such as a truth, do not hide the remedy; the fused result is no capture."""
+    """Other files and the fused result next to the views do not hide the remedy."""
     folders(tmp_path / "view01")
     (tmp_path / "truth.npz").write_bytes(b"PK\x05\x06" + bytes(18))
     (tmp_path / "fused" / "maps").mkdir(parents=True)
@@ -225,7 +225,7 @@ def test_views_of_one_object_are_for_fuse(tmp_path):
 
 
 def test_untimed_brackets_in_one_folder_are_to_be_sorted(tmp_path):
-    """No order of angles can separate them, so the message asks for none."""
+    """No order of the angles can separate the brackets, so the message does not mention --angles."""
     folder = pictures(tmp_path, [f"krug_{angle}_grad_{number}.png" for angle in (0, 45, 90) for number in range(3)])
     for angles in (None, (0.0, 45.0, 90.0)):
         with pytest.raises(CaptureError, match="cannot be assigned to angles; sort the frames into pol000") as caught:
@@ -234,7 +234,7 @@ def test_untimed_brackets_in_one_folder_are_to_be_sorted(tmp_path):
 
 
 def test_a_repeat_is_a_shot_of_its_own_at_about_its_angle(tmp_path):
-    """A motor that comes back to 45° reads 45.02°; and 179.99° for 0°."""
+    """A motor that returns to 45° may report 45.02°; at 0° it may report 179.99°."""
     text = ""
     for name, angle in {"a": 0, "b": 45, "c": 90, "d": 45.02, "e": 179.99, "f": 60}.items():
         shoot(tmp_path / f"{name}.dng")
@@ -258,7 +258,7 @@ def test_capture_toml_without_frames_only_adds_facts(tmp_path):
     assert assumed.shots[0].frames[0].digest != stated.shots[0].frames[0].digest  # other values, other key
 
 
-def test_raw_wins_over_its_jpeg_and_sidecars_are_passed_over(tmp_path):
+def test_raw_wins_over_its_jpeg_and_sidecars_are_ignored(tmp_path):
     folder = folders(tmp_path, times=(1 / 50,))
     for angle in ("000", "045", "090"):
         save(folder / f"pol{angle}" / "IMG_0.jpg", np.full((8, 8, 3), 90, np.uint8))
@@ -287,7 +287,7 @@ def test_a_folder_of_jpegs_is_read_and_asks_for_raw(tmp_path):
         ({"focal": 0}, False, 50 / 43.2666 * np.hypot(48, 32)),
     ],
 )
-def test_focal_length_is_found_or_assumed_aloud(tmp_path, settings, known, focal_px):
+def test_focal_length_is_found_or_assumed_with_a_note(tmp_path, settings, known, focal_px):
     model = settings.pop("model", b"Z1")
     for angle in ("000", "045", "090"):
         shoot(tmp_path / f"pol{angle}" / "a.dng", model=model, **settings)
@@ -346,7 +346,7 @@ def empty(folder):
 
 FRAME = "pol045/IMG_1.dng"
 TOO_FEW = "2 different polarizer angles where 3 are needed"
-SPOILS = {
+FAULTS = {
     "missing angle": (lambda vase: shutil.rmtree(vase / "pol045"), rf"angles are 0, 90: {TOO_FEW}"),
     "name of an angle": (
         lambda vase: (vase / "pol045").rename(vase / "angle45"),
@@ -394,10 +394,10 @@ SPOILS = {
 }
 
 
-@pytest.mark.parametrize("fault", SPOILS)
+@pytest.mark.parametrize("fault", FAULTS)
 def test_an_inconsistent_capture_is_one_clear_line(tmp_path, fault):
     folder = folders(tmp_path / "vase")
-    spoil, message = SPOILS[fault]
+    spoil, message = FAULTS[fault]
     spoil(folder)
     with pytest.raises((CaptureError, DecodeError), match=message) as caught:
         capture.read(folder)
@@ -414,7 +414,7 @@ def test_unreadable_file_is_one_clear_line(tmp_path):
         capture.read(folder)
 
 
-def test_flat_folder_that_does_not_divide_is_refused(tmp_path):
+def test_a_flat_folder_that_does_not_divide_into_equal_brackets_is_refused(tmp_path):
     with pytest.raises(CaptureError, match=r"4 frames do not make 3 equal brackets.*--angles"):
         capture.read(flat(tmp_path, shots=2))
 

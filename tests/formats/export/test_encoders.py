@@ -16,7 +16,7 @@ def picture(channels: int = 3) -> Texture:
     return Texture(np.random.default_rng(2).integers(0, 255, (40, 30, channels), np.uint8), True, "a color")
 
 
-def test_a_picture_is_encoded_once_whoever_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_picture_is_encoded_once_for_several_files(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
     whole = encoders.encode
 
@@ -33,14 +33,14 @@ def test_a_picture_is_encoded_once_whoever_asks(monkeypatch: pytest.MonkeyPatch)
     assert encoder(texture, "webp") == whole(texture, "webp")
 
 
-def test_words_go_into_the_loose_file_alone() -> None:
+def test_the_meaning_is_stored_in_loose_files_only() -> None:
     texture, encoder = picture(), TextureEncoder()
-    plain, said = encoder(texture, "png"), encoder(texture, "png", text=True)
-    assert b"a color" in said and b"a color" not in plain
-    assert said == png.described(plain, {"Description": "a color"})
+    plain, with_text = encoder(texture, "png"), encoder(texture, "png", text=True)
+    assert b"a color" in with_text and b"a color" not in plain
+    assert with_text == png.described(plain, {"Description": "a color"})
 
 
-def test_two_kinds_of_one_picture_are_two() -> None:
+def test_each_kind_of_file_is_encoded_for_itself() -> None:
     texture, encoder = picture(), TextureEncoder()
     data = Texture(texture.pixels, False, "numbers")
     assert encoder(texture, "jpeg") != encoder(data, "jpeg")

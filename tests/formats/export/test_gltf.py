@@ -1,4 +1,4 @@
-"""GLB: judged by the Khronos validator and by a second reader, not by its writer."""
+"""GLB, checked by the Khronos validator and a second reader."""
 
 import json
 import shutil
@@ -67,13 +67,13 @@ def test_second_reader_finds_the_same_geometry(asset: Asset, tmp_path: Path) -> 
 
 
 def test_extensions_carry_index_and_reflectance(asset: Asset) -> None:
-    said = document(gltf.encode(asset, "ball"))
-    extensions = said["materials"][0]["extensions"]
+    parsed = document(gltf.encode(asset, "ball"))
+    extensions = parsed["materials"][0]["extensions"]
     assert extensions["KHR_materials_ior"] == {"ior": 1.5}
     factor = extensions["KHR_materials_specular"]["specularColorFactor"]
     assert np.allclose(factor, 0.05 / 0.04, rtol=1e-5)  # F0 = 0.04 · factor; may exceed 1
-    assert said["asset"]["extras"]["unit"] == "metre"
-    assert said["asset"]["extras"]["origin_in_camera"][2] < -0.5
+    assert parsed["asset"]["extras"]["unit"] == "metre"
+    assert parsed["asset"]["extras"]["origin_in_camera"][2] < -0.5
 
 
 def test_same_asset_gives_the_same_bytes(asset: Asset) -> None:
@@ -85,25 +85,27 @@ def test_names_outside_ascii_survive(asset: Asset) -> None:
 
 
 def test_provenance_is_in_the_packet(asset: Asset) -> None:
-    said = document(gltf.encode(asset, "ball", provenance={"settings": "{}"}))
-    packet = said["extensions"]["KHR_xmp_json_ld"]["packets"][said["asset"]["extensions"]["KHR_xmp_json_ld"]["packet"]]
+    parsed = document(gltf.encode(asset, "ball", provenance={"settings": "{}"}))
+    packet = parsed["extensions"]["KHR_xmp_json_ld"]["packets"][
+        parsed["asset"]["extensions"]["KHR_xmp_json_ld"]["packet"]
+    ]
     assert packet["polcap:settings"] == "{}" and packet["dc:title"]["rdf:_1"]["@value"] == "ball"
     assert packet["@context"]["dc"] == "http://purl.org/dc/elements/1.1/"
 
 
 def test_catalog_entry_is_in_dublin_core_and_in_the_copyright(asset: Asset) -> None:
     stated = {"title": "Krug", "creator": "Haus", "rights": "© Haus", "license": "CC0", "object_number": "7"}
-    said = document(gltf.encode(asset, "ball", provenance=stated))
-    packet = said["extensions"]["KHR_xmp_json_ld"]["packets"][0]
+    parsed = document(gltf.encode(asset, "ball", provenance=stated))
+    packet = parsed["extensions"]["KHR_xmp_json_ld"]["packets"][0]
     assert packet["dc:title"]["rdf:_1"]["@value"] == "Krug" and packet["dc:creator"] == {"@list": ["Haus"]}
-    assert packet["dc:rights"]["rdf:_1"]["@value"] == said["asset"]["copyright"] == "© Haus"
+    assert packet["dc:rights"]["rdf:_1"]["@value"] == parsed["asset"]["copyright"] == "© Haus"
     assert packet["dc:identifier"] == "7"
 
 
 def test_only_the_address_of_a_license_is_a_web_statement(asset: Asset) -> None:
     def packet(text: str) -> dict[str, Any]:
-        said = document(gltf.encode(asset, "ball", provenance={"license": text}))
-        found: dict[str, Any] = said["extensions"]["KHR_xmp_json_ld"]["packets"][0]
+        parsed = document(gltf.encode(asset, "ball", provenance={"license": text}))
+        found: dict[str, Any] = parsed["extensions"]["KHR_xmp_json_ld"]["packets"][0]
         return found
 
     address = "https://creativecommons.org/licenses/by/4.0/"
@@ -112,7 +114,7 @@ def test_only_the_address_of_a_license_is_a_web_statement(asset: Asset) -> None:
     assert named["xmpRights:UsageTerms"]["rdf:_1"]["@value"] == "CC BY 4.0" and "xmpRights:WebStatement" not in named
 
 
-def test_open_surface_is_seen_from_behind_too(asset: Asset) -> None:
+def test_an_open_surface_is_double_sided(asset: Asset) -> None:
     assert document(gltf.encode(asset, "ball"))["materials"][0]["doubleSided"] is True
     tetrahedron = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]], dtype=np.int32)
     assert gltf.is_open(tetrahedron[:3]) and not gltf.is_open(tetrahedron)
@@ -125,7 +127,7 @@ def test_a_lost_triangle_opens_a_closed_surface_wherever_its_vertices_are_listed
     assert not gltf.is_open(ball) and gltf.is_open(np.delete(ball, lost, axis=0))
 
 
-def test_draco_needs_its_package_and_says_so(asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_draco_without_its_package_is_one_line(asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "DracoPy", None)
     with pytest.raises(SettingError, match=r"pip install 'polcap\[draco\]'"):
         gltf.encode(asset, "ball", gltf.GlbOptions(geometry="draco"))
@@ -139,7 +141,9 @@ def test_packed_mesh_is_smaller_and_names_its_extension(asset: Asset, geometry: 
     held = {}
     for one in (geometry, "float"):
         data = gltf.encode(asset, "ball", gltf.GlbOptions(geometry=one))
-        said = document(data)
-        held[one] = len(data) - sum(said["bufferViews"][image["bufferView"]]["byteLength"] for image in said["images"])
-        assert set(glb_geometry.EXTENSIONS[one]) == set(said.get("extensionsRequired", []))
+        parsed = document(data)
+        held[one] = len(data) - sum(
+            parsed["bufferViews"][image["bufferView"]]["byteLength"] for image in parsed["images"]
+        )
+        assert set(glb_geometry.EXTENSIONS[one]) == set(parsed.get("extensionsRequired", []))
     assert held[geometry] < share * held["float"]

@@ -1,4 +1,4 @@
-"""The IIIF folder: every picture that it promises is there, and Ward's law shows it as polcap shades the maps."""
+"""The IIIF folder has every picture of its manifest, and Ward's law shades it as polcap shades the maps."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""OBJ and MTL as a second reader and their letters have them."""
+"""OBJ and MTL, checked by a second reader and by their keywords."""
 
 from pathlib import Path
 
@@ -51,7 +51,7 @@ def test_material_names_files_that_are_there(asset: Asset, tmp_path: Path) -> No
     assert float(lines["Ni"]) == 1.5 and float(lines["Ns"]) == pytest.approx(30, rel=0.05)  # α = ¼
 
 
-def test_data_lies_in_files_that_no_reader_takes_for_srgb(asset: Asset, tmp_path: Path) -> None:
+def test_data_are_in_files_that_no_reader_takes_for_srgb(asset: Asset, tmp_path: Path) -> None:
     obj.write(tmp_path / "ball.obj", asset, "ball", FILES)
     lines = dict(line.split(" ", 1) for line in (tmp_path / "ball.mtl").read_text().splitlines())
     roughness, _ = exr.read(tmp_path / lines["map_Pr"])

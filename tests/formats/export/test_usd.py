@@ -1,4 +1,4 @@
-"""USD and MaterialX: judged by OpenUSD's validators and by the MaterialX library, not by their writers."""
+"""USD and MaterialX, checked by OpenUSD's validators and the MaterialX library."""
 
 import zipfile
 from pathlib import Path
@@ -161,6 +161,6 @@ def test_without_usd_core_one_line_names_the_package(monkeypatch: pytest.MonkeyP
         usd.require()
 
 
-@pytest.mark.parametrize(("name", "said"), [("Krug “ø” 1", "Krug_____1"), ("3 cups", "_3_cups")])
-def test_names_become_identifiers(name: str, said: str) -> None:
-    assert materialx.identifier(name) == said
+@pytest.mark.parametrize(("name", "identifier"), [("Krug “ø” 1", "Krug_____1"), ("3 cups", "_3_cups")])
+def test_names_become_identifiers(name: str, identifier: str) -> None:
+    assert materialx.identifier(name) == identifier

@@ -54,7 +54,7 @@ def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
     result: Result, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: str
 ) -> None:
-    """Its error comes out, and no file of the new result is there."""
+    """The error is raised, and no file of the new result exists."""
     monkeypatch.setenv("OMP_NUM_THREADS", threads)
     maps.write(tmp_path / "maps", *result)
     before = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "maps").iterdir()}
@@ -92,25 +92,25 @@ def test_detail_of_raw_pixels_comes_back_and_maps_json_states_its_size(result: R
 
 def test_every_promised_file_is_there_and_described(folder: Path) -> None:
     assert {path.name for path in folder.iterdir()} == FILES
-    said = json.loads((folder / "maps.json").read_text("utf-8"))
-    assert set(said["maps"]) == FILES - {"maps.json"}
+    described = json.loads((folder / "maps.json").read_text("utf-8"))
+    assert set(described["maps"]) == FILES - {"maps.json"}
 
 
 def test_crop_is_in_visible_raw_pixels(folder: Path) -> None:
-    said = json.loads((folder / "maps.json").read_text("utf-8"))
-    assert said["crop"] == [600, 400, 600 + 2 * surfaces.WIDTH, 400 + 2 * surfaces.HEIGHT]
-    assert said["size"] == [surfaces.WIDTH, surfaces.HEIGHT] and said["scale"] == 2
-    assert said["camera"]["focal_px"] == 400 and said["depth"]["unit"] == "m"
+    described = json.loads((folder / "maps.json").read_text("utf-8"))
+    assert described["crop"] == [600, 400, 600 + 2 * surfaces.WIDTH, 400 + 2 * surfaces.HEIGHT]
+    assert described["size"] == [surfaces.WIDTH, surfaces.HEIGHT] and described["scale"] == 2
+    assert described["camera"]["focal_px"] == 400 and described["depth"]["unit"] == "m"
 
 
 def test_pictures_hold_the_values_that_maps_json_describes(folder: Path, result: Result) -> None:
     of, mesh, *_ = result
-    said = json.loads((folder / "maps.json").read_text("utf-8"))
+    described = json.loads((folder / "maps.json").read_text("utf-8"))
     inside = of.mask
     normal = png.read(folder / "normal.png")
     assert normal.dtype == np.uint16
     assert np.allclose(normal[inside] / 65535 * 2 - 1, of.normal[inside], atol=2e-5)
-    near, far = said["depth"]["near"], said["depth"]["far"]
+    near, far = described["depth"]["near"], described["depth"]["far"]
     depth = png.read(folder / "depth.png")[inside] / 65535 * (far - near) + near
     assert np.allclose(depth, mesh.depth[inside], atol=(far - near) * 1e-5)
     assert np.allclose(png.read(folder / "roughness.png")[inside] / 65535, 0.4, atol=1e-5)
@@ -163,7 +163,7 @@ def test_maps_as_stored_equal_the_maps_read(folder: Path, result: Result) -> Non
         assert np.array_equal(value, other) if isinstance(value, np.ndarray) else value == other, name
 
 
-def test_relative_depth_is_called_so(result: Result, tmp_path: Path) -> None:
+def test_relative_depth_is_described_as_relative(result: Result, tmp_path: Path) -> None:
     of, mesh, stokes, cue = result
     maps.write(tmp_path, of, replace(mesh, metric=False), stokes, cue)
     assert json.loads((tmp_path / "maps.json").read_text("utf-8"))["depth"]["unit"] == "relative"

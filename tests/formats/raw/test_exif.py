@@ -1,4 +1,4 @@
-"""EXIF by content: headers of every maker built here, real files where they are at hand."""
+"""EXIF of every maker: headers built here, and real files where available."""
 
 from types import SimpleNamespace
 
@@ -75,8 +75,8 @@ def test_iso_beyond_sixteen_bits_and_of_a_pair_after_zero_is_read(tags, iso):
     assert exif.tags(headers.dng(np.zeros((32, 32)), photo=PHOTO | tags)).iso == iso
 
 
-def test_iso_that_no_tag_states_is_asked_of_the_decoder(tmp_path, monkeypatch):
-    """Nikon's first bodies state it in their maker's tags, old Kodaks have only one; standard tags come first."""
+def test_iso_without_a_tag_comes_from_the_decoder(tmp_path, monkeypatch):
+    """Nikon's first cameras state it in tags of their own, old Kodaks have one ISO; standard tags have priority."""
     raw_directory = {file_kind.PHOTOMETRIC: (file_kind.CFA,)}
     of_a_maker = SimpleNamespace(dng=False, truncated=False, directories=(raw_directory,))
     monkeypatch.setattr(file_kind, "structure", lambda data: of_a_maker)
@@ -143,7 +143,7 @@ def test_pictures_without_exif_give_their_size_alone(tmp_path):
 
 def test_damaged_exif_counts_as_none(tmp_path):
     body = bytearray(headers.dng(np.zeros((32, 32))))
-    for seed in range(40):  # whatever exifread makes of it, no exception escapes
+    for seed in range(40):  # exifread may fail, but no exception is raised
         broken = body.copy()
         for at in np.random.default_rng(seed).integers(8, 600, 20):
             broken[at] ^= 0xFF

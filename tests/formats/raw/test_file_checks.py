@@ -25,7 +25,7 @@ def test_a_jpeg_cut_anywhere_is_refused(tmp_path, rng):
         assert photo.read(written(tmp_path, whole, "a.jpg")).value.shape == (64, 96, 3)
         assert probe.read(written(tmp_path, whole + b"a maker's trailer", "a.jpg")).kind == "photo"
         for length in (*range(4, len(whole) - 1, max(1, len(whole) // 9)), len(whole) - 2, len(whole) - 1):
-            for tail in (b"", bytes(len(whole) - length)):  # cut, or filled with zeros as a broken copy leaves it
+            for tail in (b"", bytes(len(whole) - length)):  # cut, or filled with zeros as after a broken copy
                 path = written(tmp_path, whole[:length] + tail, "a.jpg")
                 with pytest.raises(DecodeError, match=r"a\.jpg"):
                     probe.read(path)
@@ -55,7 +55,7 @@ def test_a_raw_of_cut_jpeg_data_is_refused(rng):
 def test_a_stripped_dng_is_refused(tmp_path):
     whole = bytearray(headers.dng(MOSAIC, black=BLACK))
     assert raw.read(written(tmp_path, bytes(whole))).value.shape == MOSAIC.shape
-    for tag in (273, 279, 262):  # without places, lengths, or the word that it is a sensor's image
+    for tag in (273, 279, 262):  # without offsets, lengths, or photometric interpretation
         at = whole.index(tag.to_bytes(2, "little"), 8)
         bare = whole.copy()
         bare[at : at + 2] = (65000).to_bytes(2, "little")
@@ -109,7 +109,7 @@ def test_a_white_level_below_the_counts_is_refused(tmp_path, rng):
     with pytest.raises(DecodeError, match=r"white level is 255, but its counts reach 6\d{4}"):
         raw.read(path)
     hot = MOSAIC.copy()
-    hot[3, 5] = 60000  # one hot pixel beyond the white level is none of that
+    hot[3, 5] = 60000  # one hot pixel above the white level is accepted
     assert raw.read(written(tmp_path, headers.dng(hot, black=BLACK, white=16383))).white == 16383
 
 
@@ -122,7 +122,7 @@ def test_rows_that_were_never_written_are_refused(tmp_path):
         raw.read(written(tmp_path, headers.dng(0 * cut, black=BLACK)))
 
 
-def test_a_raw_that_begins_with_text_is_not_taken_for_a_note(tmp_path, rng):
+def test_a_raw_that_begins_with_text_is_not_taken_for_text(tmp_path, rng):
     """A Rollei's file begins with lines of text; LibRaw knows it by its first word."""
     head = b"DSC-Image\nHDR=1024\nX=84\nY=60\nTX=8\nTY=8\nEOHD\n".ljust(1024, b" ")
     data = head + rng.integers(0, 255, 84 * 60 * 10 // 8 + 64, dtype=np.uint8).tobytes()

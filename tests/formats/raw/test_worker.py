@@ -40,7 +40,7 @@ FUNCTIONS = """
         raise ChartError(path + ": no chart")
 
     def spin(path):
-        sum(range(10**15))  # one call into C that never lets go of the interpreter
+        sum(range(10**15))  # one call into C that never releases the interpreter
 
     def objects(path):
         return {}, {"pointers": np.array([None])}
@@ -90,7 +90,7 @@ def test_one_child_serves_several_files(worker):
     assert pid(worker) == pid(worker)
 
 
-def test_a_child_does_not_look_for_modules_inside_a_package(worker, tmp_path, monkeypatch):
+def test_a_child_imports_no_modules_from_inside_a_package(worker, tmp_path, monkeypatch):
     package = tmp_path / "package"
     package.mkdir()
     (package / "__init__.py").touch()
