@@ -46,15 +46,12 @@ def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
     textures = sorted({path.parent for path in source.rglob("*") if path.suffix.lower() in _PICTURES})
     textures = [folder for folder in textures if {"albedo", "roughness"} <= _pictures(folder).keys()]
     counts = [0, 0]
-    for kind, found in enumerate((meshes, textures)):
+    jobs = (meshes, write_mesh, "meshes", ".npz"), (textures, write_textures, "materials", "")
+    for kind, (found, convert, place, suffix) in enumerate(jobs):
         for number, path in enumerate(found):
             try:
                 for split in _splits(number, len(found)):
-                    name = _name(path.relative_to(source))
-                    if kind == 0:
-                        write_mesh(path, data / "meshes" / split / f"{name}.npz")
-                    else:
-                        write_textures(path, data / "materials" / split / name)
+                    convert(path, data / place / split / f"{_name(path.relative_to(source))}{suffix}")
                 counts[kind] += 1
             except DecodeError as error:
                 report(f"left out: {error}")
