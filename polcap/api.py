@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from polcap import resource_limits
 from polcap.config import Config
 from polcap.errors import SettingError
+from polcap.formats import own_folders
 from polcap.formats.capture import reader as captures
 from polcap.images import Bools, ChartRequest, Device
 from polcap.pipeline import models
@@ -52,7 +53,7 @@ def process(
     clockwise: bool = False,
     chart: ChartRequest = AUTO,
     mask: Bools | None = None,
-    estimator: Literal["network", "analytic"] | None = None,
+    estimator: models.Estimator | None = None,
     model: str | Path | None = None,
     device: Device = "cpu",
     threads: int = 0,
@@ -99,7 +100,7 @@ def process(
     """
     _check_types(config, chart, mask)
     folder = Path(capture)
-    target = folder / "polcap" if out is None else Path(out)
+    target = folder / own_folders.OUTPUT if out is None else Path(out)
     resource_limits.set_threads(threads)
     resource_limits.set_memory(memory)
     network = models.load_network(estimator, None if model is None else Path(model), device, threads)
