@@ -57,9 +57,9 @@ def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
     if not any(counts):
         kinds = ", ".join(sorted(_MESHES))
         raise InputError(f"{source}: holds no mesh ({kinds}) and no folder with pictures of albedo and roughness")
-    for what, count in zip(("mesh", "texture folder"), counts):
+    for noun, count in zip(("mesh", "texture folder"), counts):
         if count == 1:
-            report(f"the only {what} is for training and for tests: errors on it are too small; add others")
+            report(f"the only {noun} is for training and for tests: errors on it are too small; add others")
     report(f"{counts[0]} meshes and {counts[1]} texture folders in {data}")
     return counts[0], counts[1]
 
