@@ -8,7 +8,7 @@ import shlex
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Literal, TextIO
@@ -138,6 +138,12 @@ def print_data(data: Any) -> None:
     print(printable(text), flush=True)
 
 
+def print_written(files: "Sequence[Path]", json: bool) -> None:
+    """Print the paths of the files that a command has written."""
+    names = [str(file) for file in files]
+    print_data({"written": names} if json else "\n".join(names))
+
+
 def preview(drawn: "list[Path]") -> None:
     """Show pictures on a color terminal, two pixels per character, on stderr."""
     if not sys.stderr.isatty() or os.environ.get("TERM") in (None, "dumb"):
@@ -182,15 +188,13 @@ def open_page(file: "Path") -> None:
 
 def print_gates(about: dict[str, Any]) -> None:
     """Print failed gates and warnings. Raises GateError where a gate failed."""
-    failed = 0
+    words: dict[str, tuple[str, _Level]] = {"fail": ("gate failed", "ERROR"), "warn": ("warning", "WARNING")}
     for gate in about["gates"]:
-        if gate["state"] in ("fail", "warn"):
-            word = "gate failed" if gate["state"] == "fail" else "warning"
+        if gate["state"] in words:
+            word, level = words[gate["state"]]
             cost = f", costs about {gate['cost_deg']:.0f}°" if gate["cost_deg"] >= 1 else ""
-            text = f"polcap: {word}: {gate['name']}: {gate['says']}{cost}. {gate['remedy']}."
-            print_message(text, "ERROR" if gate["state"] == "fail" else "WARNING")
-            failed += gate["state"] == "fail"
-    if failed:
+            print_message(f"polcap: {word}: {gate['name']}: {gate['says']}{cost}. {gate['remedy']}.", level)
+    if failed := sum(gate["state"] == "fail" for gate in about["gates"]):
         raise GateError(f"{failed} of {len(about['gates'])} gates failed; the asset was written, see report.html")
 
 
@@ -203,19 +207,19 @@ class Steps:
     def stage(self, name: str, seconds: float | None, cached: bool) -> None:
         """Report that a stage begins (no seconds) or has ended."""
         if seconds is not None:
-            print_progress(self._stage(name, seconds, cached))
+            print_progress(self._stage_text(name, seconds, cached))
 
     def frame(self, done: int, total: int) -> None:
         """Report that `done` of `total` photographs are done."""
         now = time.monotonic()
         if now - self._last > _FRAMES_S or _verbosity > 0:
             self._last = now
-            print_progress(self._frames(done, total, now))
+            print_progress(self._frames_text(done, total, now))
 
-    def _stage(self, name: str, seconds: float, cached: bool) -> str:
+    def _stage_text(self, name: str, seconds: float, cached: bool) -> str:
         return f"{name:14}{'cached' if cached else f'{seconds:.2f} s'}"
 
-    def _frames(self, done: int, total: int, now: float) -> str:
+    def _frames_text(self, done: int, total: int, now: float) -> str:
         seconds = (now - self._begun) / done * (total - done)
         left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
         return f"{done} of {total} frames, {left} left"
@@ -232,11 +236,11 @@ class Bar(Steps):
         """Report that a stage begins (no seconds) or has ended."""
         self._bar.update(self._task, description=name, advance=0 if seconds is None else 1)
         if seconds is not None:
-            log(self._stage(name, seconds, cached))
+            log(self._stage_text(name, seconds, cached))
 
     def frame(self, done: int, total: int) -> None:
         """Report that `done` of `total` photographs are done."""
-        self._bar.update(self._task, description=self._frames(done, total, time.monotonic()))
+        self._bar.update(self._task, description=self._frames_text(done, total, time.monotonic()))
 
 
 @contextmanager

@@ -69,7 +69,8 @@ def _gather(
         running[future] = unit, attempt
         return future
 
-    client.run(prepare, options)  # workers that join later use the settings they were started with
+    # workers that join later use the settings they were started with
+    client.run(prepare, options.threads, options.memory_gb)
     running: dict[Any, tuple[Unit, int]] = {}
     ended = distributed.as_completed([submit(unit, 1) for unit in wanted])
     for future in ended:

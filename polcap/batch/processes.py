@@ -136,7 +136,7 @@ def _serve(pipe: connection.Connection, limits: Limits) -> None:
     """Main function of a child process: execute calls until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    prepare(limits)
+    prepare(limits.threads, limits.memory_gb)
     while True:
         try:
             function, arguments = pipe.recv()
@@ -153,7 +153,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def prepare(limits: Limits | ProcessOptions) -> None:
-    """Limit the threads and the memory of a process."""
-    resource_limits.set_threads(limits.threads)
-    resource_limits.set_memory(limits.memory_gb)
+def prepare(threads: int, memory_gb: float) -> None:
+    """Limit the threads and the memory [GB] of this process; 0: no limit."""
+    resource_limits.set_threads(threads)
+    resource_limits.set_memory(memory_gb)

@@ -26,7 +26,7 @@ from polcap.config import Config
 from polcap.errors import InputError, PolcapError, StorageError
 from polcap.formats import atomic, own_folders
 from polcap.formats.capture import reader
-from polcap.images import ChartRequest, Network
+from polcap.images import ChartRequest, Device, Network
 from polcap.pipeline import models, unchanged
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.cache import fingerprint
@@ -68,9 +68,9 @@ class ProcessOptions:
 
     settings: dict[str, Any]  # of polcap.config.Config, as plain data
     chart: ChartRequest = field(default_factory=lambda: ChartRequest("auto"))
-    estimator: Literal["network", "analytic"] | None = None
+    estimator: models.Estimator | None = None
     model: str | None = None
-    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    device: Device = "cpu"
     threads: int = 0
     memory_gb: float = 0.0
     angles_deg: tuple[float, ...] | None = None
@@ -140,7 +140,9 @@ def _outcome(unit: Unit, about: dict[str, Any]) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=1)
-def _networks(estimator: Any, model: str | None, device: Any, threads: int) -> tuple[Network | None, Network | None]:
+def _networks(
+    estimator: models.Estimator | None, model: str | None, device: Device, threads: int
+) -> tuple[Network | None, Network | None]:
     """The networks of the estimator and of the mask, loaded once per process."""
     file = None if model is None else Path(model)
     return models.load_network(estimator, file, device, threads), models.load_mask_network(threads)

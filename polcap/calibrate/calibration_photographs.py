@@ -15,6 +15,7 @@ from polcap.images import Exif, Floats, SensorImage
 from polcap.optics import sensor
 
 CLIP = 0.95  # of the white level; nothing is measured above
+_MOST_CLIPPED = 0.01  # share of a picture's middle
 _ANGLE = re.compile(r"(\d{1,3}(?:\.\d+)?)")
 
 
@@ -77,3 +78,11 @@ def center(image: SensorImage) -> tuple[Floats, float]:
     h, w = value.shape[:2]
     part = (slice(h // 3, h - h // 3), slice(w // 3, w - w // 3))
     return value[part].mean(axis=(0, 1), dtype=np.float64), float(np.mean(~usable[part]))
+
+
+def exposed_center(one: Photograph) -> Floats:
+    """Mean signal (C,) of the picture's middle ninth. Raises CaptureError if it is over-exposed."""
+    mean, clipped = center(one.image())
+    if clipped > _MOST_CLIPPED:
+        raise CaptureError(f"{one.path}: {100 * clipped:.0f} % of its middle is over-exposed; take less light")
+    return mean

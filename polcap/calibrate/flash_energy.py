@@ -2,12 +2,11 @@
 
 import numpy as np
 
-from polcap.calibrate.calibration_photographs import Photograph, by_setting, center
+from polcap.calibrate.calibration_photographs import Photograph, by_setting, exposed_center
 from polcap.calibration_values import FlashEnergy
 from polcap.errors import CaptureError
 
 _LEAST = 4  # pops
-_CLIPPED = 0.01
 
 
 def measure(photographs: list[Photograph]) -> FlashEnergy:
@@ -21,12 +20,7 @@ def measure(photographs: list[Photograph]) -> FlashEnergy:
             f"{group[0].path.parent}: {len(group)} frames of one setting; take {_LEAST} or more, "
             "twenty give the spread to 16 %"
         )
-    light = []
-    for one in group:
-        mean, clipped = center(one.image())
-        if clipped > _CLIPPED:
-            raise CaptureError(f"{one.path}: {100 * clipped:.0f} % of its middle is over-exposed; take less light")
-        light.append(float(mean.mean()))
+    light = [float(exposed_center(one).mean()) for one in group]
     energy = np.array(light) / np.mean(light)
     order = np.arange(len(energy)) - (len(energy) - 1) / 2
     drift = float(order @ energy / (order @ order))

@@ -23,7 +23,8 @@ def measure(flat: list[Photograph]) -> Falloff:
 
     Raises CaptureError if every flat frame is clipped or dark.
     """
-    for group in sorted(by_setting(flat).values(), key=_exposure, reverse=True):
+    groups = sorted(by_setting(flat).values(), key=lambda one: one[0].exif.relative_exposure or 0.0, reverse=True)
+    for group in groups:
         images = [one.image() for one in group]
         if all(sensor.usable(image, CLIP).mean() > 0.999 for image in images):
             mean = np.mean([sensor.signal(image) for image in images], axis=0)
@@ -39,10 +40,6 @@ def measure(flat: list[Photograph]) -> Falloff:
         f_number=group[0].exif.f_number,
         focal_length_mm=group[0].exif.focal_length_mm,
     )
-
-
-def _exposure(group: list[Photograph]) -> float:
-    return group[0].exif.relative_exposure or 0.0
 
 
 def _fit(picture: Floats) -> tuple[Floats, Floats]:

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polcap.calibrate.calibration_photographs import Photograph, center
+from polcap.calibrate.calibration_photographs import Photograph, exposed_center
 from polcap.calibration_values import Polarizer
 from polcap.errors import CaptureError
 from polcap.images import Floats
 
 _LEAST = 5  # angles of the ring, for three unknowns and a scatter
-_CLIPPED = 0.01
 _LAMP = 1e-3  # 1σ of a steady lamp from frame to frame, relative
 _RING_DEG = 0.1  # 1σ of a ring's angle; lamp and ring only weight the frames, the error comes from their scatter
 _SPAN_DEG = 90.0  # least range of ring angles
@@ -82,12 +81,7 @@ def _fit_axis(shots: list[PolarizerShot]) -> _MalusFit:
             f"{where}: {len(angles)} angles of the ring over {np.ptp(angles):.0f}°; take {_LEAST} or more over 180°, "
             "best every 15°"
         )
-    light = []
-    for shot in shots:
-        mean, clipped = center(shot.photograph.image())
-        if clipped > _CLIPPED:
-            raise CaptureError(f"{shot.photograph.path}: over-exposed in the middle; take less light, at all angles")
-        light.append(mean)
+    light = [exposed_center(shot.photograph) for shot in shots]
     solved = [_fit_wave(ring, channel) for channel in np.array(light).T]
     wave, covariance = (np.array(values) for values in zip(*solved))  # (C, 3), (C, 3, 3)
     length = np.hypot(wave[:, 1], wave[:, 2])

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from typer import Argument, Context, Exit, Option
 
@@ -10,6 +10,7 @@ from polcap import resource_limits, terminal
 from polcap.cli import options
 from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimator, Json, Model, NoChart, choice
 
+# as batch.job_files.Scheduler, which is not imported at start
 JobKind = Literal["slurm", "openjd", "opencue", "snakemake", "kubernetes"]
 
 
@@ -37,8 +38,8 @@ def batch(
     jobs: Annotated[int, Option(min=0, help="Shards of the job file; 0 is one per capture, 1000 at most.")] = 0,
     json: Json = False,
     device: Device = "cpu",
-    threads: Annotated[int, Option(min=0, help="Threads per capture; 0 is all.")] = 0,
-    memory: Annotated[float, Option(min=0, help="Most memory per process, GB; 0 is no limit.")] = 0,
+    threads: options.ProcessThreads = 0,
+    memory: options.ProcessMemory = 0,
     angles: Angles = None,
     chart: Annotated[Path | None, Option(metavar="FILE", help="Color profile for all captures.")] = None,
     no_chart: NoChart = False,
@@ -50,18 +51,14 @@ def batch(
 
     from polcap import batch as batches
     from polcap import config as settings
-    from polcap.batch import job_files, shards, unit
+    from polcap.batch import shards, unit
+    from polcap.pipeline import models
 
     resource_limits.check_memory(memory)
-    if model is not None or estimator == "network":
-        _check_model(estimator, model)
+    if model is not None or estimator == "network":  # refuse an unusable model before any capture is processed
+        models.load_network(estimator, model, "cpu", 1)  # the GPU may be in other machines
     if write_jobs is not None:
-        found = batches.find(root, out)
-        command = job_files.batch_command(root, context.params)
-        job = job_files.BatchJob(command, root.resolve(), jobs or min(len(found), 1000), memory_gb=memory or 4.0)
-        file = job_files.write(write_jobs, job, (out or root).resolve() / unit.FOLDER)
-        terminal.print_message(f"To start it: {job_files.submit_hint(write_jobs, file)}")
-        terminal.print_data({"file": str(file), "shards": job.shards} if json else str(file))
+        _write_jobs(write_jobs, root, out, context.params)
         return
     process_options = unit.ProcessOptions(
         settings=msgspec.to_builtins(settings.load(config, assignments or ())),
@@ -81,11 +78,14 @@ def batch(
         raise Exit(code)
 
 
-def _check_model(estimator: Literal["network", "analytic"] | None, model: Path | None) -> None:
-    """Refuse an unusable model before any capture is processed. Raises ModelError, SettingError.
+def _write_jobs(kind: JobKind, root: Path, out: Path | None, stated: dict[str, Any]) -> None:
+    """Write the job file of a batch; `stated` are the options of `batch` by name. Prints the file's path."""
+    from polcap import batch as batches
+    from polcap.batch import job_files, unit
 
-    The model is tried on the CPU, because the GPU may be in other machines.
-    """
-    from polcap.pipeline import models
-
-    models.load_network(estimator, model, "cpu", 1)
+    shards = stated["jobs"] or min(len(batches.find(root, out)), 1000)
+    command = job_files.batch_command(root, stated)
+    job = job_files.BatchJob(command, root.resolve(), shards, memory_gb=stated["memory"] or 4.0)
+    file = job_files.write(kind, job, (out or root).resolve() / unit.FOLDER)
+    terminal.print_message(f"To start it: {job_files.submit_hint(kind, file)}")
+    terminal.print_data({"file": str(file), "shards": shards} if stated["json"] else str(file))

@@ -26,4 +26,4 @@ def board(
     written = [folder / f"board-{size}{suffix}" for suffix in files]
     for file, content in zip(written, files.values(), strict=True):
         atomic.write(file, content)
-    terminal.print_data({"written": [str(file) for file in written]} if json else "\n".join(map(str, written)))
+    terminal.print_written(written, json)

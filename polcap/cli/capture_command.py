@@ -65,28 +65,19 @@ def capture(
         planned = plans.dry_run(wanted)
         terminal.print_data(planned if json else plans.table(planned))
         return
-    if session is not None:
-        _shoot_session(folder, session, wanted, tries, not no_check, json)
-        return
-    done = sequence.shoot(folder, wanted, resume=resume, tries=tries, report=terminal.print_progress)
-    verdict = None if no_check else _verdict(folder)
-    terminal.print_data(done | {"check": verdict} if json else str(folder))
-    if verdict and verdict["verdict"] != "keep":
-        raise Exit(GateError.exit_code)
-
-
-def _shoot_session(folder: Path, session: Any, wanted: Any, tries: int, judged: bool, json: bool) -> None:
-    """Shoot all views of a session, and judge each before the object turns."""
-    from polcap.rig import turntable as tables
-
     verdicts: dict[str, Any] = {}
 
-    def judge(view: Path) -> None:
-        verdicts[view.name] = _verdict(view) if judged else None
+    def judge(finished: Path) -> None:
+        verdicts[finished.name] = None if no_check else _verdict(finished)
 
     report = terminal.print_progress
-    done = tables.shoot(folder, session, wanted, tries=tries, report=report, finished=judge)
-    summary = {"folder": str(folder), "views": done, "check": verdicts}
+    if session is None:
+        summary = sequence.shoot(folder, wanted, resume=resume, tries=tries, report=report)
+        judge(folder)
+        summary["check"] = verdicts[folder.name]
+    else:  # each view is judged before the object turns
+        done = tables.shoot(folder, session, wanted, tries=tries, report=report, finished=judge)
+        summary = {"folder": str(folder), "views": done, "check": verdicts}
     terminal.print_data(summary if json else str(folder))
     if any(verdict and verdict["verdict"] != "keep" for verdict in verdicts.values()):
         raise Exit(GateError.exit_code)

@@ -88,8 +88,7 @@ def export(
     write = fuse_run.export if fused_maps.is_fused(result) else pipeline.export
     files = write(result, *wanted)
     options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
-    written = [str(file) for file in files]
-    terminal.print_data({"written": written} if json else "\n".join(written))
+    terminal.print_written(files, json)
 
 
 def _extra_textures(named: Sequence[str]) -> "tuple[Extra, ...]":

@@ -66,6 +66,8 @@ Until = Annotated[Stage | None, choice("Stop after this stage.", "STAGE")]
 Force = Annotated[Stage | None, choice("Compute this stage and all after it again.", "STAGE")]
 Threads = Annotated[int, Option("--threads", "-j", min=0, help="Threads to use; 0 is all.")]
 Memory = Annotated[float, Option(min=0, help="Most memory to take, GB; 0 is no limit.")]
+ProcessThreads = Annotated[int, Option("--threads", min=0, help="Threads per process; 0 is all.")]  # -j: --workers
+ProcessMemory = Annotated[float, Option("--memory", min=0, help="Most memory per process, GB; 0 is no limit.")]
 
 
 def angles_deg(text: str | None) -> tuple[float, ...] | None:

@@ -9,6 +9,7 @@ from typer import Context, Option
 from polcap import resource_limits, terminal
 from polcap.cli import options
 from polcap.cli.watch import at_every_change
+from polcap.formats import own_folders
 
 _NO_EFFECT = ("capture", "out", "json", "dry_run", "watch", "open_", "threads", "memory")  # on the bytes of a result
 
@@ -42,7 +43,7 @@ def process(
     from polcap.pipeline import unchanged
 
     stated = {**context.params, "capture": capture, "config": config, "mask": mask, "model": model}  # paths, not text
-    target = out or capture / "polcap"
+    target = out or capture / own_folders.OUTPUT
     request = None
     if not (until or force or dry_run or watch):
         asked = {name: value for name, value in stated.items() if name not in _NO_EFFECT}

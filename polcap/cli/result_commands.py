@@ -10,6 +10,7 @@ from polcap import terminal
 from polcap.cli import options
 from polcap.cli.options import Json, Result
 from polcap.errors import SettingError
+from polcap.formats import own_folders
 
 
 def show(
@@ -37,7 +38,7 @@ def show(
         drawn = pipeline.animate(result, animate)
     else:
         drawn = pipeline.show(result, STAGES if stage is None else (stage,))
-    terminal.print_data({"written": [str(file) for file in drawn]} if json else "\n".join(map(str, drawn)))
+    terminal.print_written(drawn, json)
     terminal.preview(drawn)
 
 
@@ -54,7 +55,7 @@ def status(context: Context, result: Result, json: Json = False) -> None:
         lines = [f"{r['stage']:14}{r['seconds']:8.2f} s {r['bytes'] / 1e6:9.2f} MB   {r['key'][:12]}" for r in rows]
         lines.append("complete" if complete else "not complete: run `polcap process` to go on")
         terminal.print_data({"stages": rows, "complete": complete} if json else "\n".join(lines))
-    elif (result / "polcap-batch").is_dir():
+    elif (result / own_folders.BATCH).is_dir():
         from polcap import batch as batches
 
         about = batches.status(batches.reopen(result))
@@ -73,24 +74,8 @@ def report(
     open_: options.OpenPage = False,
 ) -> None:
     """Judge a result again from its stage cache, or compare it with another."""
-    from polcap import report as reports
-
     if compare is not None:
-        from polcap.report import compare as pairs
-
-        abouts = reports.read(result), reports.read(compare)
-        file = result / "compare.html"
-        pairs.write(file, (result, compare), abouts)
-        rows = pairs.rows(*abouts)
-        named = [{"name": name, "here": here, "there": there} for name, here, there in rows]
-        lines = [f"{title}: {here}  |  {there}" for title, here, there in map(pairs.labelled, rows)]
-        if json or rows:
-            terminal.print_data(named if json else "\n".join(lines))
-        if not rows:
-            terminal.print_message("polcap: no figure and no setting differs")
-        terminal.print_message(f"polcap: comparison: {file}")
-        if open_:
-            terminal.open_page(file)
+        _compare(result, compare, json, open_)
         return
     from polcap.pipeline import run as pipeline
 
@@ -100,6 +85,27 @@ def report(
     if open_:
         terminal.open_page(result / "report.html")
     terminal.print_gates(about)
+
+
+def _compare(result: Path, other: Path, json: bool, open_: bool) -> None:
+    """Write the page compare.html into a result folder, and print the figures and settings that differ."""
+    from polcap import report as reports
+    from polcap.report import compare as pairs
+
+    abouts = reports.read(result), reports.read(other)
+    file = result / "compare.html"
+    pairs.write(file, (result, other), abouts)
+    rows = pairs.rows(*abouts)
+    if json:
+        terminal.print_data([{"name": name, "here": here, "there": there} for name, here, there in rows])
+    elif rows:
+        labelled = map(pairs.labelled, rows)
+        terminal.print_data("\n".join(f"{title}: {here}  |  {there}" for title, here, there in labelled))
+    if not rows:
+        terminal.print_message("polcap: no figure and no setting differs")
+    terminal.print_message(f"polcap: comparison: {file}")
+    if open_:
+        terminal.open_page(file)
 
 
 def clean(
@@ -133,7 +139,7 @@ def _check_single(result: Path, command: str) -> None:
 
 def _results(named: Path) -> Iterator[Path]:
     """The result folder that was named, or the finished and begun results of a batch."""
-    if not (named / "polcap-batch").is_dir() or (named / "work").is_dir():
+    if not (named / own_folders.BATCH).is_dir() or (named / "work").is_dir():
         yield named
         return
     from polcap import batch as batches

@@ -1,7 +1,8 @@
 """`polcap synth`: render RAW brackets with their truth, calibration photographs or a data set."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Context, Option
 
@@ -9,6 +10,9 @@ from polcap import terminal
 from polcap.cli import options
 from polcap.cli.options import Json, choice
 from polcap.errors import SettingError
+
+if TYPE_CHECKING:
+    from polcap.synth.render import Scene
 
 
 def synth(
@@ -43,11 +47,7 @@ def synth(
     json: Json = False,
 ) -> None:
     """Render a capture of an object that does not exist, with its truth."""
-    from msgspec.structs import replace
-
     from polcap import config as settings
-    from polcap.synth import all_around, scenes
-    from polcap.synth import shooting as synthetic
 
     made = folder
     if dataset is not None:
@@ -63,19 +63,30 @@ def synth(
     elif interreflection and mesh is None:
         raise SettingError("--interreflection needs a mesh; name one with --mesh")
     else:
-        kind = synthetic.Shoot if views is None else all_around.AroundShoot
-        shoot = settings.fill(kind, {"seed": seed}, assignments or ())
+        from msgspec.structs import replace
+
+        from polcap.synth import scenes
+
         chosen = scenes.random_scene(seed, scene)
         chosen = chosen if mesh is None else scenes.with_model(chosen, mesh, seed)
         chosen = chosen if material is None else scenes.with_textures(chosen, material)
         changes: dict[str, Any] = {"law": law} if law == "rough" else {}
         changes |= {"cast_shadows": True} if cast_shadow else {}
         changes |= {"interreflection": True} if interreflection else {}
-        chosen = replace(chosen, **changes)
-        captures = views + shoot.laid if isinstance(shoot, all_around.AroundShoot) and views is not None else 1
-        with terminal.progress(captures * len(shoot.angles_deg) * shoot.exposures) as bar:
-            if isinstance(shoot, all_around.AroundShoot) and views is not None:
-                all_around.write(folder, chosen, shoot, views, bar.frame)
-            else:
-                synthetic.write(folder, chosen, shoot, bar.frame)
-    terminal.print_data({"written": [str(made)]} if json else str(made))
+        _render(folder, replace(chosen, **changes), seed, assignments or (), views)
+    terminal.print_written([made], json)
+
+
+def _render(folder: Path, scene: "Scene", seed: int, assignments: Sequence[str], views: int | None) -> None:
+    """Render one capture of a scene, or `views` captures from all sides; `assignments` set camera and shooting."""
+    from polcap import config as settings
+    from polcap.synth import all_around, shooting
+
+    if views is None:
+        shoot = settings.fill(shooting.Shoot, {"seed": seed}, assignments)
+        with terminal.progress(len(shoot.angles_deg) * shoot.exposures) as bar:
+            shooting.write(folder, scene, shoot, bar.frame)
+    else:
+        around = settings.fill(all_around.AroundShoot, {"seed": seed}, assignments)
+        with terminal.progress((views + around.laid) * len(around.angles_deg) * around.exposures) as bar:
+            all_around.write(folder, scene, around, views, bar.frame)

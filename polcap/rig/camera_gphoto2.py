@@ -1,7 +1,7 @@
 """Camera driver for `gphoto2`: a camera on a USB cable. Sets the exposure, releases, and fetches the RAW file.
 
-Only this module imports gphoto2. Settings have the names of libgphoto2's drivers; a setting that the
-camera lacks is skipped.
+Only this module imports gphoto2. Settings have the names of libgphoto2's drivers; a setting that the camera lacks is
+skipped.
 """
 
 import re

@@ -103,19 +103,19 @@ def write(
         for letter, placed, count in zip("AB", sets, (views, shoot.laid))
         for k, pose in enumerate(_poses(shoot, count, placed.middle))
     ]
-    each = len(shoot.angles_deg) * shoot.exposures + shoot.exposures * shoot.cross
-    middle = None
+    frames = shoot.exposures * (len(shoot.angles_deg) + shoot.cross)  # of a view
+    exposure = None
     with atomic.folder(folder) as place:
         for k, (name, placed, turn, position) in enumerate(named):
-            seen, done = _view(scene, shoot, turn, position, placed), k * each
-            own = msgspec.structs.replace(shoot, seed=shoot.seed + 1000 * k)
+            view = _view(scene, shoot, turn, position, placed)
 
-            def report(written: int, _: int, done: int = done) -> None:
+            def report(written: int, _: int, before: int = k * frames) -> None:
                 if frame_written is not None:
-                    frame_written(done + written, len(named) * each)
+                    frame_written(before + written, len(named) * frames)
 
-            studio = Studio(seen if k == 0 else msgspec.structs.replace(seen, chart=None), own, middle)
-            middle = studio.middle
+            view = view if k == 0 else msgspec.structs.replace(view, chart=None)
+            studio = Studio(view, msgspec.structs.replace(shoot, seed=shoot.seed + 1000 * k), exposure)
+            exposure = studio.middle
             shooting.write_capture(place / name, studio, report)
         _write_surface(place / "truth.npz", scene, mesh, sets[0].lift)
         _write_poses(place / "truth.json", scene, shoot, {name: (turn, at) for name, _, turn, at in named}, sets)

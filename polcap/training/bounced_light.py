@@ -7,8 +7,8 @@ pixels they hit. `bounced_stokes` computes the light along these rays for the ma
 Neglected, as in `light_transport.py`: further bounces, and the weak polarization of the light that arrives.
 """
 
+from dataclasses import dataclass
 from math import log, pi
-from typing import Any
 
 import numpy as np
 import torch
@@ -36,6 +36,22 @@ _SAME_PLACE = 2  # px of the cache: hits nearer than this are the place itself
 _MAX_DISTANCE = 0.01  # sides of the object between a hit and the place that its pixel shows
 
 _LOG_ALBEDO = (log(0.01), log(0.5))  # of backdrop and ground: dark cloth to paper
+
+
+@dataclass(frozen=True)
+class ObjectPixels:
+    """The M pixels of all objects of a batch of views, one object after the other."""
+
+    index: Tensor  # (M,) into B·H·W
+    owner: Tensor  # (M,) number of the object
+    v: Tensor  # (M, 3) ray, camera frame, surface to camera
+    normal: Tensor  # (M, 3) camera frame, without bumps
+    position: Tensor  # (M, 3) object frame
+    place: Tensor  # (M, 3) camera frame, in units of the object's distance
+    depth: Tensor  # (M,) units of traced_views.depth_unit, mean 0
+    lit: Tensor  # (M,) 1 where the flash reaches, else 0
+    met: Tensor  # (M, RAYS) number, among the M, of the pixel that each ray meets; −1 for none
+    open: Tensor  # (M,) share of the rays near the mirror direction that leave the object
 
 
 def trace_visibility(
@@ -105,12 +121,12 @@ def _find_pixels(
     return np.where(inside & buffer.mask[y, x], y * width + x, NOWHERE).astype(np.uint16)
 
 
-def bounced_stokes(pixels: Any, normal: Tensor, surface: Surface, body: Tensor) -> Tensor:
+def bounced_stokes(pixels: ObjectPixels, normal: Tensor, surface: Surface, body: Tensor) -> Tensor:
     """Stokes parameters (3, M, 3) of the flash light that each pixel reflects after one bounce on the object.
 
-    `pixels` are `simulator.ObjectPixels`; normal (M, 3) has bumps and is in the frames of the rays; body (M, 3) is
-    diffuse S0 under the flash alone. All rays are used for diffuse and for mirrored light, weighted by the balance
-    heuristic. The result is noisy; `smooth` follows.
+    normal (M, 3) has bumps and is in the frames of the rays; body (M, 3) is diffuse S0 under the flash alone. All rays
+    are used for diffuse and for mirrored light, weighted by the balance heuristic. The result is noisy; `smooth`
+    follows.
 
     References
     ----------
@@ -129,7 +145,9 @@ def bounced_stokes(pixels: Any, normal: Tensor, surface: Surface, body: Tensor) 
     return normal.new_zeros(3, len(normal), 3).index_add(1, here, diffuse_part + mirrored)
 
 
-def mirrored_surroundings(pixels: Any, flash: Tensor, normal: Tensor, surface: Surface, strength: Tensor) -> Tensor:
+def mirrored_surroundings(
+    pixels: ObjectPixels, flash: Tensor, normal: Tensor, surface: Surface, strength: Tensor
+) -> Tensor:
     """Stokes parameters (3, M, 3) of the specular reflection of backdrop and ground in the object's surface.
 
     Near the outline this is most of the light: reflectance tends to 1 there, and the mirrored ray points away from the

@@ -82,22 +82,22 @@ def _write_sample(
     mask, view = buffer.mask, buffer.view
     middle, unit = traced_views.depth_unit(mask, buffer.depth, view.focal)
     images = frames.rays(view, *mask.shape), buffer.normal, buffer.position, buffer.depth
-    v, bare, position, depth = (torch.from_numpy(image[mask]) for image in images)
+    v, unbumped, position, depth = (torch.from_numpy(image[mask]) for image in images)
     with torch.random.fork_rng():
         torch.manual_seed(int(rng.integers(1 << 62)))
         owner, smooth = torch.zeros(len(v), dtype=torch.long), float(recipe.law == "smooth")
-        turned = torch.from_numpy(turn).float()[None]
-        surface = materials.draw_surface(library, bare, position, turned, owner, smooth)
+        turns = torch.from_numpy(turn).float()[None]
+        surface = materials.draw_surface(library, unbumped, position, turns, owner, smooth)
     flash = [middle * offset for offset in (*traced_views.random_flash(rng), 0.0)]
     to_light = torch.tensor(flash, dtype=torch.float32) + v * (depth / v[:, 2])[:, None]
     normal, diffuse, specular = materials.reflect(surface, v, to_light, torch.full((len(v),), middle**2))
-    passed = _photograph((diffuse + specular).numpy(), v.numpy(), recipe.noise, rng)
-    i0, i45, i90, i135 = passed
-    stokes = np.stack([passed.sum(axis=0) / 2, i0 - i90, i45 - i135])
+    photographs = _photograph((diffuse + specular).numpy(), v.numpy(), recipe.noise, rng)
+    i0, i45, i90, i135 = photographs
+    stokes = np.stack([photographs.sum(axis=0) / 2, i0 - i90, i45 - i135])
     cos, sin = cues.polarization(stokes, np.zeros((6, *stokes.shape[1:])))[3]
     near, far = float(depth.min()), float(depth.max())
     pictures = {
-        **{f"I{angle:03d}": encode(picture) for angle, picture in zip(ANGLES_DEG, passed)},
+        **{f"I{angle:03d}": encode(picture) for angle, picture in zip(ANGLES_DEG, photographs)},
         "stokes": np.stack([0 * cos, cos, sin], axis=1) / 2 + 0.5,  # S0's slot first, as in the paper
         "diffuse_color": cues.least_intensity_color(stokes, np.eye(3)),
         "normal": frames.from_ray_frame(normal, v).numpy() / 2 + 0.5,
@@ -109,21 +109,16 @@ def _write_sample(
     for name, value in pictures.items():
         png.write(folder / f"{name}.png", png.sixteen_bits(traced_views.fill(mask, value)))
     png.write(folder / "mask.png", np.where(mask, 255, 0).astype(np.uint8))
-    about = {
+    facts = {
         "focal_px": view.focal, "center_px": view.center, "flash": flash, "depth": {"near": near, "far": far},
         "middle": middle, "depth_unit": unit, "ior": float(surface.ior.mean()),
     }  # fmt: skip
-    (folder / "sample.json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    atomic.write_json(folder / "sample.json", facts, synced=False)  # the whole folder is synced
 
 
 def encode(radiance: Floats) -> Floats:
     """Encode linear radiance for a picture file as 0…1: ln(1 + x/k)/ln(1 + m/k), m = 16, k = 0.01; clipped."""
     return np.asarray(np.log1p(np.clip(radiance, 0, _LARGEST) / _KNEE) / log1p(_LARGEST / _KNEE))
-
-
-def decode(code: Floats) -> Floats:
-    """Decode a picture file's value 0…1 (integer / 65535) to linear radiance: the inverse of `encode`."""
-    return np.asarray(_KNEE * np.expm1(code * log1p(_LARGEST / _KNEE)))
 
 
 def _open_library(material: str) -> materials.MaterialLibrary:
@@ -146,12 +141,13 @@ def _list_meshes(mesh: str) -> list[Path]:
 
 def _photograph(light: Floats, rays: Floats, noise: float, rng: np.random.Generator) -> Floats:
     """Simulate photographs (4, M, 3) of Stokes parameters through a polarizer at 0, 45, 90 and 135°, with noise."""
-    passed = []
+    photographs = []
     for angle in np.radians(ANGLES_DEG):
         weights = mueller.analyzer(frames.axis_on_ray(np.asarray(angle), rays), np.inf)
-        one = np.einsum("ms,smc->mc", weights, light)
-        passed.append(one + noise * np.hypot(np.sqrt(np.maximum(one, 0)), 0.1) * rng.normal(size=one.shape))
-    return np.stack(passed)
+        passed = np.einsum("ms,smc->mc", weights, light)
+        sigma = noise * np.hypot(np.sqrt(np.maximum(passed, 0)), 0.1)
+        photographs.append(passed + sigma * rng.normal(size=passed.shape))
+    return np.stack(photographs)
 
 
 def _describe(out: Path, recipe: DatasetRecipe) -> None:

@@ -60,12 +60,12 @@ def main(options: EvaluationOptions, report: Report = silent) -> dict[str, Score
     """
     torch.set_num_threads(1)
     network = models.open_network(options.model)
-    made = Protocol(options.data, options.size, options.protocol)
-    head = _head(options, network, made.subjects)
-    rows = _evaluate_pictures(options, evaluation_baselines.mean_maps(made, options.count), head, report)
+    protocol = Protocol(options.data, options.size, options.protocol)
+    head = _head(options, network, protocol.subjects)
+    rows = _evaluate_pictures(options, evaluation_baselines.mean_maps(protocol, options.count), head, report)
     result = _summary(head, rows)
-    shown = (made.case(number) for number in range(min(_PANEL, options.count)))
-    strips = [evaluation_page.make_row(case, _estimate(case.cues, network)) for case in shown]
+    cases = (protocol.case(number) for number in range(min(_PANEL, options.count)))
+    strips = [evaluation_page.make_row(case, _estimate(case.cues, network)) for case in cases]
     png.write(options.out / "panel.png", evaluation_page.make_sheet(strips))
     atomic.write_json(options.out / "evaluation.json", result)
     atomic.write(options.out / "evaluation.md", evaluation_page.make_page(result))
@@ -154,9 +154,9 @@ def _open(options: EvaluationOptions, means: Means) -> tuple[Protocol, dict[str,
 
 def evaluate_picture(options: EvaluationOptions, means: Means, number: int) -> Row:
     """Evaluate all estimators on one picture: scores, seconds, a sample of expected errors, moments of F0."""
-    made, columns = _open(options, means)
+    protocol, columns = _open(options, means)
     before = time.monotonic()
-    case = made.case(number)
+    case = protocol.case(number)
     seconds, scores = {"making the picture": time.monotonic() - before}, {}
     mask, judge, maps = case.truth.mask, Judge(case), {}
     for name, estimator in columns.items():

@@ -11,7 +11,7 @@ from polcap.report import stage_pictures as pictures
 from polcap.report.stage_pictures import Picture
 from polcap.training import traced_views
 from polcap.training.evaluation_protocol import Case
-from polcap.training.map_errors import angle, render_intensity
+from polcap.training.map_errors import LIMITS_DEG, angle, render_intensity
 
 # Deschaintre, Lin & Ghosh, CVPR 2021, tables 1 and 2, on the authors' own test set
 _FIGURES = ("normal_mean", "diffuse", "roughness", "specular", "depth", "rendering")
@@ -32,9 +32,7 @@ def _row_names() -> dict[str, str]:
     names: dict[str, str] = {}
     for end, core in (("", ""), ("_core", ", eroded mask")):
         names |= {f"normal_{kind}{end}": f"normal, {kind}{core} [°]" for kind in ("mean", "median")}
-        names |= {
-            f"normal_within_{limit}{end}": f"normal under {limit}°{core} [%]" for limit in ("11.25", "22.5", "30")
-        }
+        names |= {f"normal_within_{one:g}{end}": f"normal under {one:g}°{core} [%]" for one in LIMITS_DEG}
     errors = {"": "RMSE", "_l1": "L1", "_picture": "RMSE, whole picture", "_l1_picture": "L1, whole picture"}
     for image in ("diffuse", "roughness", "specular", "rendering"):
         names |= {image + end: f"{image} {name}" for end, name in errors.items()}

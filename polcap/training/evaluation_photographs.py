@@ -26,10 +26,9 @@ from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
 from polcap.training.evaluation_page import grid
-from polcap.training.map_errors import Score
+from polcap.training.map_errors import LIMITS_DEG, Score
 
 _MISSED_DEG = 90.0  # error of a pixel of the object without an estimated normal
-_LIMITS_DEG = (11.25, 22.5, 30.0)
 _MIN_DOLP, _MIN_TILT = 0.03, 0.3  # for the comparison of AoLP and azimuth; tilt: sine of the zenith
 
 
@@ -93,7 +92,7 @@ def score(folder: Path, angles: list[str], name: str, network: Network | None) -
     covered = float(np.isfinite(error[inside]).mean())
     error = np.nan_to_num(error[inside], nan=_MISSED_DEG)
     figures = {"mean": float(error.mean()), "median": float(np.median(error))}
-    figures |= {f"within {limit:g}°": float((error < limit).mean()) for limit in _LIMITS_DEG}
+    figures |= {f"within {limit:g}°": float((error < limit).mean()) for limit in LIMITS_DEG}
     return figures | {"covered": covered, "diffuse direction": diffuse_direction(found.cues, there)}
 
 

@@ -78,7 +78,8 @@ class Protocol:
 
     def case(self, number: int) -> Case:
         """Simulate the evaluation picture with this number."""
-        subject, (mesh, material) = self._subject(number, self.size), self._combination(number)
+        subject = self._subject(number, self.size)
+        mesh, material = combination(number, len(self.names), len(self.materials))
         rng = np.random.default_rng([_SEED, number, 1])
         light = light_transport.stokes(self.tracers[mesh], subject.places, subject.pose, subject.albedo, rng)
         with torch.random.fork_rng():
@@ -101,15 +102,12 @@ class Protocol:
         """Number of test meshes and test materials, in words."""
         return f"{len(self.names)} test meshes × {len(self.materials)} test materials"
 
-    def _combination(self, number: int) -> tuple[int, int]:
-        return combination(number, len(self.names), len(self.materials))
-
     def truth(self, number: int, size: int) -> SurfaceMaps:
         """True maps of an evaluation picture, without simulating light."""
         return self._subject(number, size).truth
 
     def _subject(self, number: int, size: int) -> _Subject:
-        index, which = self._combination(number)
+        index, which = combination(number, len(self.names), len(self.materials))
         tracer, material = self.tracers[index], self.materials[which]
         rng = np.random.default_rng([_SEED, number])
         focal = size / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))

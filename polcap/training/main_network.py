@@ -92,32 +92,33 @@ class MainNetwork(nn.Module):  # type: ignore[misc]  # torch comes without types
             features.append(level(down(features[-1])))
         inside, clipped = (x[:, at : at + 1].clamp(0, 1) for at in (_MASK, _CLIPPED))
         features[-1] = self.context(features[-1], F.avg_pool2d(inside, SIZE_MULTIPLE))
-        shape, color = (branch(features, seen, inside).float() for branch in (self.geometry, self.color))
+        geometry, color = (decoder(features, seen, inside).float() for decoder in (self.geometry, self.color))
         level = x[:, COLOR].float()
-        normal = F.normalize(shape[:, :3] + shape.new_tensor([0.0, 0.0, 0.5]).view(1, 3, 1, 1), dim=1, eps=1e-6)
-        own = torch.sigmoid(level + color[:, :3] + 0.7)
+        facing = geometry.new_tensor([0.0, 0.0, 0.5]).view(1, 3, 1, 1)  # the initial normals face the camera
+        normal = F.normalize(geometry[:, :3] + facing, dim=1, eps=1e-6)
+        albedo = torch.sigmoid(level + color[:, :3] + 0.7)
         cosine, usable = normal[:, 2:].detach(), inside * (1 - clipped)
         with torch.autocast(x.device.type, enabled=False):
-            diffuse, member, colors = self.recolor(own, color[:, 3:], cosine, inside.float(), clipped.float())
+            diffuse, member, colors = self.recolor(albedo, color[:, 3:], cosine, inside.float(), clipped.float())
         body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + FLOOR)  # log S0 of diffuse light alone
         figures = figures_of(level, self.sees_dolp * x[:, _RATIO].float() / 10, normal, diffuse)
         hints = torch.cat([normal, diffuse, level - body, figures[:, -1:]], dim=1).detach() * inside
         thinned = GlossEvidence(*(part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], diffuse, usable)))
         parts = [self.shape.gloss[1], _GLOSS_OUTPUTS]
         readings, direct = self.profiles(features[1], features[0], thinned).split(parts, dim=1)
-        shown = torch.cat([seen, hints.to(seen.dtype)], dim=1)
-        gloss = self.gloss(features, shown, inside, F.avg_pool2d(readings, 2)).float()
+        hinted = torch.cat([seen, hints.to(seen.dtype)], dim=1)
+        gloss = self.gloss(features, hinted, inside, F.avg_pool2d(readings, 2)).float()
         gloss = gloss + F.interpolate(direct, scale_factor=2.0, mode="bilinear", align_corners=False)
         with torch.autocast(x.device.type, enabled=False):
             corrected = self.color_gloss(thinned, gloss[:, :, ::2, ::2], member[:, :, ::2, ::2].detach(), colors)
         gloss = gloss + F.interpolate(corrected, scale_factor=2.0, mode="bilinear", align_corners=False)
         return {
             "normal": normal,
-            "depth": shape[:, 3:4],
+            "depth": geometry[:, 3:4],
             "diffuse": diffuse,
             "specular": 0.4 * torch.sigmoid(gloss[:, :3] - 1.7),
             "roughness": torch.sigmoid(gloss[:, 3:4]),
-            "sigma": 60 * torch.sigmoid(shape[:, 4:5] - 1.5),
+            "sigma": 60 * torch.sigmoid(geometry[:, 4:5] - 1.5),
             "highlight": torch.sigmoid(gloss[:, 4:5] - 1.0),
         }
 

@@ -12,6 +12,7 @@ from polcap.stages import surface
 from polcap.training.evaluation_protocol import Case, render_lights
 
 MAPS = ("diffuse", "specular", "roughness")
+LIMITS_DEG = (11.25, 22.5, 30.0)  # of the shares of pixels with a smaller normal error
 _IOR = 1.5  # for renderings; it is not among the maps
 _MAX_PIXELS = 20_000  # of a rendering: every second, third … pixel of the mask
 _INTEGRATED = 128  # px, approximate side for integration, which takes too long at 512²
@@ -46,7 +47,7 @@ class Judge:
         for suffix, inside in (("", mask), ("_core", self.core)):
             out[f"normal_mean{suffix}"] = float(error[inside].mean())
             out[f"normal_median{suffix}"] = float(np.median(error[inside]))
-            for limit in (11.25, 22.5, 30.0):
+            for limit in LIMITS_DEG:
                 out[f"normal_within_{limit:g}{suffix}"] = float((error[inside] < limit).mean())
         share = float(mask.mean())
         differences = {name: (getattr(maps, name) - getattr(case.truth, name))[mask] for name in MAPS}

@@ -52,20 +52,20 @@ def make_scene(
     mask = view.object.mask
     size = mask.shape
     v = frames.rays(view.object.view, *size).reshape(-1, 3)
-    behind, facing, plane = meet_planes(view.planes, v)
-    at = np.flatnonzero(mask.reshape(-1) | np.isfinite(behind))  # pixels of the object or of the backdrop
-    on, v = mask.reshape(-1)[at], v[at]
+    to_plane, plane_normal, plane = meet_planes(view.planes, v)
+    at = np.flatnonzero(mask.reshape(-1) | np.isfinite(to_plane))  # pixels of the object or of the backdrop
+    on, v = mask.reshape(-1)[at], v[at]  # on: pixels of the object
     traced = view.object
     depth, normal, position = (
-        image.reshape(len(behind), -1)[at] for image in (traced.depth, traced.normal, traced.position)
+        image.reshape(len(to_plane), -1)[at] for image in (traced.depth, traced.normal, traced.position)
     )
-    place = -v * np.where(on, depth[:, 0] / v[:, 2], behind[at])[:, None]
-    normal = np.where(on[:, None], normal, facing[at])
+    place = -v * np.where(on, depth[:, 0] / v[:, 2], to_plane[at])[:, None]  # camera frame
+    normal = np.where(on[:, None], normal, plane_normal[at])
     position = np.where(on[:, None], position, place)
     owner = torch.from_numpy(np.where(on, 0, 1))
     turn = torch.stack([torch.from_numpy(view.turn).float(), torch.eye(3)])
-    facing, points = (torch.from_numpy(a).float() for a in (normal, position))
-    surface = materials.draw_surface(library, facing, points, turn, owner)
+    normals, positions = (torch.from_numpy(a).float() for a in (normal, position))
+    surface = materials.draw_surface(library, normals, positions, turn, owner)
     surface, polarizing = _change_materials(surface, position, np.where(on, -1, plane[at]), mode, rng)
     lit = cv2.GaussianBlur(view.lit.astype(np.float32), (0, 0), rng.uniform(0.4, 2.5))  # the flash has a size
     strength = lit.reshape(-1)[at] * view.distance**2

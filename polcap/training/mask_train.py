@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from polcap.formats import atomic
-from polcap.images import Bools, Floats
+from polcap.images import Floats
 from polcap.optics.resize import area_mean, block_means
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, ReducedPicture, brightness, encode
 from polcap.synth.mesh_tracer import Tracer, Triangles, centred
@@ -187,7 +187,8 @@ class MaskTraining(loop.PictureTraining):
             chance = torch.sigmoid(self.average(_stack_channels([channels])))[0, 0].numpy()
             hint = cv2.resize(chance[: channels.shape[1], : channels.shape[2]], truth.shape[::-1])
             logit = self.average(_stack_channels([encode(picture, brightness(picture.color), hint)]))[0, 0].numpy()
-            rows.append([_iou(found, truth > 0.5) for found in (hint > 0.5, logit > 0)])
+            object_ = truth > 0.5
+            rows.append([(m & object_).sum() / max((m | object_).sum(), 1) for m in (hint > 0.5, logit > 0)])
         coarse, fine = np.array(rows).T
         return {"iou_whole": float(coarse.mean()), "iou": float(fine.mean()), "iou_least": float(fine.min())}
 
@@ -259,10 +260,6 @@ def _stack_channels(channels: list[Floats]) -> Tensor:
 
 def _stack(truths: list[Floats]) -> Tensor:
     return torch.from_numpy(np.stack(truths)[:, None].astype(np.float32))
-
-
-def _iou(found: Bools, truth: Bools) -> float:
-    return float((found & truth).sum() / max((found | truth).sum(), 1))
 
 
 if __name__ == "__main__":

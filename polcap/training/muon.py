@@ -37,7 +37,7 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without 
         for group in self.param_groups:
             by_shape: dict[torch.Size, list[tuple[Tensor, Tensor]]] = {}  # weights and directions
             for weight in group["params"]:
-                gradient = _matrix(_channels_last(weight.grad))
+                gradient = weight.grad if weight.ndim == 2 else weight.grad.permute(0, 2, 3, 1).flatten(1)
                 mean = self.state[weight].setdefault("mean", torch.zeros_like(gradient))
                 mean.lerp_(gradient, 1 - group["momentum"])
                 direction = gradient.lerp(mean, group["momentum"])  # Nesterov's momentum
@@ -66,7 +66,3 @@ def orthogonal(matrix: Tensor) -> Tensor:
 def _matrix(weight: Tensor) -> Tensor:
     """A layer's weights as a matrix (out, in) or (out, kh·kw·in) that shares their memory."""
     return weight if weight.ndim == 2 else weight.permute(0, 2, 3, 1).view(len(weight), -1)
-
-
-def _channels_last(weight: Tensor) -> Tensor:
-    return weight if weight.ndim == 2 else weight.contiguous(memory_format=torch.channels_last)

@@ -17,6 +17,7 @@ from torch.nn import functional as F
 from polcap.images import Bools, Indices, Quality
 from polcap.stages import cues
 from polcap.training import bounced_light, materials, traced_views
+from polcap.training.bounced_light import ObjectPixels
 from polcap.training.camera_errors import CameraErrors, photograph
 
 
@@ -50,22 +51,6 @@ class SimulatedPhotographs:
 
 
 @dataclass(frozen=True)
-class ObjectPixels:
-    """The M pixels of all objects of a `ViewBatch`, one object after the other."""
-
-    index: Tensor  # (M,) into B·H·W
-    owner: Tensor  # (M,) number of the object
-    v: Tensor  # (M, 3) ray, camera frame, surface to camera
-    normal: Tensor  # (M, 3) camera frame, without bumps
-    position: Tensor  # (M, 3) object frame
-    place: Tensor  # (M, 3) camera frame, in units of the object's distance
-    depth: Tensor  # (M,) units of traced_views.depth_unit, mean 0
-    lit: Tensor  # (M,) 1 where the flash reaches, else 0
-    met: Tensor  # (M, bounced_light.RAYS) number, among the M, of the pixel that each ray meets; −1 for none
-    open: Tensor  # (M,) share of the rays near the mirror direction that leave the object
-
-
-@dataclass(frozen=True)
 class ViewBatch:
     """Traced views of B objects at one size, before materials and light."""
 
@@ -73,7 +58,7 @@ class ViewBatch:
     rays: Tensor  # (B, H, W, 3) camera frame, surface to camera
     turn: Tensor  # (B, 3, 3) rotation from the object's frame to the camera's
     flash: Tensor  # (B, 3) camera frame, in units of the object's distance
-    pixels: ObjectPixels
+    pixels: ObjectPixels  # of all objects
 
 
 class Simulator:

@@ -53,7 +53,7 @@ def test_light_follows_the_pointer(page: devtools.Page, tmp_path: Path) -> None:
     assert left[0] > 1.5 * left[1] and right[1] > 1.5 * right[0]
 
 
-def test_moving_light_is_drawn_smaller_where_that_takes_long_and_whole_at_rest(page: devtools.Page) -> None:
+def test_a_moving_light_is_drawn_smaller_on_a_slow_machine_and_in_full_at_rest(page: devtools.Page) -> None:
     size = "[relight.canvas.width, relight.canvas.height]"
     whole = page.evaluate(f"(relight.draw(), {size})")
     small = page.evaluate(f"(relight.share = 1 / 4, relight.follow(), {size})")
@@ -77,11 +77,11 @@ def test_light_obeys_the_law_of_the_maps(
     law = shade.stokes(normal, stored.diffuse, stored.specular, stored.roughness, ior * one, local, one)[0]
     expected = 255 * color.encode_srgb(np.clip(exposure * law, 0, 1))
     inside = stored.mask & (normal[..., 2] > 0.3) & (expected.max(axis=-1) < 250)
-    apart = np.abs(drawn - expected)[inside]
-    assert np.median(apart) < 2 and np.percentile(apart, 95) < 12  # of 255: 8-bit normals, albedos as JPEG
+    difference = np.abs(drawn - expected)[inside]
+    assert np.median(difference) < 2 and np.percentile(difference, 95) < 12  # of 255: 8-bit normals, albedos as JPEG
 
 
-def test_surface_turns_and_changes_its_clothes(page: devtools.Page, tmp_path: Path) -> None:
+def test_the_mesh_turns_and_shows_its_normals(page: devtools.Page, tmp_path: Path) -> None:
     page.evaluate("solid.turn = [0, 0]; solid.draw()")
     front = seen(page, "solid", tmp_path)
     page.evaluate("solid.rotate(0.8, 0); solid.draw()")

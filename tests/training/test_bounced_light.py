@@ -2,6 +2,7 @@
 
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,7 +87,7 @@ def test_outline_of_dark_gloss_shows_the_backdrop_polarized_across_the_normal() 
     ones = torch.ones(60)
     surface = Surface(normal, 0.03 * torch.ones(60, 3), 0.04 * torch.ones(60, 3), 0.2 * ones, 1.5 * ones)
     place, flash = 0.2 * normal - v, torch.zeros(1, 3)
-    seen = SimpleNamespace(v=v, owner=torch.zeros(60).long(), place=place, open=ones)
+    seen: Any = SimpleNamespace(v=v, owner=torch.zeros(60).long(), place=place, open=ones)
     mirrored = partial(bounced_light.mirrored_surroundings, seen, flash, normal, surface, torch.ones(1))
     torch.manual_seed(1)
     rooms = torch.stack([mirrored() for _ in range(40)])

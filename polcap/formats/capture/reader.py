@@ -7,8 +7,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from polcap.calibration_values import Calibration
 from polcap.errors import CaptureError
 from polcap.formats import atomic, calibrations
@@ -53,14 +51,13 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
     shots = tuple(_shot(plan, stated, angle, bracket) for angle, bracket in plan.shots)
     _check_brackets(shots)
     crossed = None if plan.layout == "sensor" else _crossed(folder, plan, stated)
-    reference, first = shots[0].frames[0].exif, plan.shots[0][1][0]
+    reference = shots[0].frames[0].exif
     calibration, calibration_notes = None, list[str]()
-    if plan.layout != "sensor" and first.probe.kind == "raw":  # polarizer on a ring, the sensor's own counts
+    if plan.layout != "sensor" and plan.shots[0][1][0].probe.kind == "raw":  # a polarizer on a ring, sensor counts
         calibration, calibration_notes = _calibration(folder, reference, stated, clockwise)
     step = 2 if plan.layout == "sensor" else 1  # a plane of a sensor mosaic has half its sides
     size = (reference.width or 0) // step, (reference.height or 0) // step
     lens, principal = _lens(reference, stated, calibration, size)
-    notes = _notes(plan.layout, plan.others, first, shots, stated)
     return Capture(
         name=atomic.safe_name(stated.name or Path(os.path.realpath(folder)).name),
         folder=str(folder),
@@ -72,7 +69,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
         principal_px=principal,
         size_px=size,
         chart_frames=tuple(_frame(plan, stated, source, 0.0) for source in plan.others if source.role == "chart"),
-        notes=(*plan.notes, *notes, *calibration_notes, f"focal length {lens.note}"),
+        notes=(*plan.notes, *_notes(plan, shots, stated), *calibration_notes, f"focal length {lens.note}"),
         calibration=calibration,
         crossed=crossed,
         catalog=stated.catalog,
@@ -290,26 +287,20 @@ def _settings(frame: Frame) -> str:
     return " ".join(parts) if fact.exposure_time else "no exposure in EXIF"
 
 
-def _notes(
-    layout: str, others: Sequence[Source], reference: Source, shots: Sequence[Shot], stated: CaptureFile
-) -> list[str]:
-    notes = []
-    cross = sum(source.role == "cross" for source in others)
-    if cross and layout == "sensor":
+def _notes(plan: layouts.Plan, shots: Sequence[Shot], stated: CaptureFile) -> list[str]:
+    notes, first = [], plan.shots[0][1][0].probe
+    cross = sum(source.role == "cross" for source in plan.others)
+    if cross and plan.layout == "sensor":
         notes.append(f"not used: {cross} cross-polarized frames, which a polarization sensor cannot take")
-    if layout != "sensor" and reference.probe.kind == "photo":
-        bits = reference.probe.bits
-        encoding = photo.encoding_of(bits, stated.encoding)
-        notes.append(f"finished pictures of {bits} bits, taken as {encoding}" + (LOSS + _SHOOT_RAW) * (bits == 8))
-    if reference.probe.lossy:
+    if plan.layout != "sensor" and first.kind == "photo":
+        encoding = photo.encoding_of(first.bits, stated.encoding)
+        loss = (LOSS + _SHOOT_RAW) * (first.bits == 8)
+        notes.append(f"finished pictures of {first.bits} bits, taken as {encoding}{loss}")
+    if first.lossy:
         notes.append("lossy DNG" + LOSS)
     if stated.rotator:
         notes.append(f"rotator {stated.rotator.model or 'of unknown model'}, log {stated.rotator.log or 'none'}")
-    exposures = [_exposure(frame) for frame in shots[0].frames]
-    if (
-        len(exposures) > 1
-        and None not in exposures
-        and np.ptp(np.log2(np.array(exposures, float))) < layouts.EQUAL_STOPS
-    ):
+    exposures = [exposure for frame in shots[0].frames if (exposure := _exposure(frame))]
+    if len(exposures) == len(shots[0].frames) > 1 and layouts.same_exposure(max(exposures), min(exposures)):
         notes.append("all frames of a bracket state the same exposure; their ratios are measured from the pixels")
     return notes

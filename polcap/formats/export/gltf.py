@@ -1,12 +1,11 @@
 """Encodes an asset as binary glTF 2.0 (GLB).
 
-The camera frame is that of glTF: right-handed, y up, the viewer on +z, metres. The object is moved
-to the origin; its place in the mesh's frame is in `asset.extras`. The provenance is in an XMP packet.
+The camera frame is that of glTF: right-handed, y up, the viewer on +z, metres. The object is moved to the origin; its
+place in the mesh's frame is in `asset.extras`. The provenance is in an XMP packet.
 
 References
 ----------
-Khronos, glTF 2.0; KHR_materials_specular; KHR_materials_ior; KHR_xmp_json_ld; EXT_texture_webp;
-KHR_texture_basisu.
+Khronos, glTF 2.0; KHR_materials_specular; KHR_materials_ior; KHR_xmp_json_ld; EXT_texture_webp; KHR_texture_basisu.
 """
 
 import json

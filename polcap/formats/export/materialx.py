@@ -6,8 +6,8 @@ tints.
 
 References
 ----------
-Andersson et al., OpenPBR Surface specification 1.1 (specular_weight scales F0 through the index, so
-that reflection at grazing stays 1); MaterialX 1.39, standard nodes.
+Andersson et al., OpenPBR Surface specification 1.1 (specular_weight scales F0 through the index, so that reflection at
+grazing stays 1); MaterialX 1.39, standard nodes.
 """
 
 import re

@@ -31,7 +31,7 @@ class Texture:
 
 def base_color(asset: Asset) -> Texture:
     """Base color texture: diffuse color as glTF defines it."""
-    return Texture(asset.base_color, True, "base colour, sRGB-encoded Rec.709")
+    return Texture(asset.base_color, True, "base color, sRGB-encoded Rec.709")
 
 
 def normal(asset: Asset, *, up: bool = True) -> Texture:
@@ -158,6 +158,5 @@ def _level(asset: Asset) -> Floats:
 
 
 def _quantized(value: Floats, like: TexturePixels) -> TexturePixels:
-    if like.dtype == np.uint8:
-        return np.rint(value * 255).astype(np.uint8)
-    return np.rint(value * 65535).astype(np.uint16)
+    """Integers of the type of `like` from values 0…1 of any shape."""
+    return np.rint(value * np.iinfo(like.dtype).max).astype(like.dtype)

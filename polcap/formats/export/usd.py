@@ -1,10 +1,9 @@
 """Writes an asset as USD: the mesh, and its material as OpenPBR and as UsdPreviewSurface.
 
-Renderers that read MaterialX use `outputs:mtlx:surface`; all others read the UsdPreviewSurface. Its specular
-workflow takes F0 from a texture. Blender reads that texture as a tint of F0 in either workflow. So
-the mesh is bound twice: for every purpose to the material in the specular workflow, and for the purpose
-`full`, which Blender prefers, to a copy with F0 as a tint. USDZ, for phones, has the first of these materials, without
-OpenPBR. Needs usd-core (extra [usd]).
+Renderers that read MaterialX use `outputs:mtlx:surface`; all others read the UsdPreviewSurface. Its specular workflow
+takes F0 from a texture. Blender reads that texture as a tint of F0 in either workflow. So the mesh is bound twice: for
+every purpose to the material in the specular workflow, and for the purpose `full`, which Blender prefers, to a copy
+with F0 as a tint. USDZ, for phones, has the first of these materials, without OpenPBR. Needs usd-core (extra [usd]).
 
 References
 ----------

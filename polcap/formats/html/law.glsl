@@ -1,11 +1,11 @@
-// optics/shade.py on a graphics chip: a dielectric under one unpolarized light, what the eye sees of it (S0).
+// optics/shade.py on a graphics chip: S0 of a dielectric under one unpolarized light.
 // n, v, l: unit vectors to the outside, the eye and the light; diffuse rho_d and specular F0 linear;
 // roughness perceptual, alpha = roughness^2. A white Lambertian plane that faces the light gives 1.
 precision highp float;
 
 float refracted(float c, float ior) { return sqrt(ior * ior - 1.0 + c * c); }
 
-float transmitted(float c, float ior) {  // T+, through the surface either way
+float transmitted(float c, float ior) {  // T+, the same in both directions
   float g = refracted(c, ior), n2 = ior * ior;
   float s = c + g, p = n2 * c + g;
   return 2.0 * c * g * (1.0 / (s * s) + n2 / (p * p));

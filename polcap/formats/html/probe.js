@@ -16,6 +16,14 @@ function linear(code) {
   return x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4;
 }
 
+function pixels(image) {  // RGBA of a decoded image element
+  const canvas = document.createElement('canvas');
+  [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+  const context = canvas.getContext('2d', { willReadFrequently: true });
+  context.drawImage(image, 0, 0);
+  return context.getImageData(0, 0, canvas.width, canvas.height);
+}
+
 class Probe {
   constructor(figure) {
     this.figure = figure;
@@ -34,16 +42,8 @@ class Probe {
     box.addEventListener('pointerleave', () => point(-1, -1));
   }
 
-  read() {
-    const canvas = document.createElement('canvas');
-    [canvas.width, canvas.height] = [this.image.naturalWidth, this.image.naturalHeight];
-    const context = canvas.getContext('2d', { willReadFrequently: true });
-    context.drawImage(this.image, 0, 0);
-    this.pixels = context.getImageData(0, 0, canvas.width, canvas.height);
-  }
-
   value(u, v) {  // text
-    if (!this.pixels) this.read();
+    this.pixels ??= pixels(this.image);
     const { width, height, data } = this.pixels;
     const k = 4 * (Math.min(height - 1, Math.floor(v * height)) * width + Math.min(width - 1, Math.floor(u * width)));
     const [r, g, b, a] = data.subarray(k, k + 4), { kind, unit, digits } = this.about;

@@ -1,5 +1,5 @@
 'use strict';
-// The maps under a light that the pointer moves, and the surface from where the pointer takes the eye.
+// The maps under a light from the direction of the pointer, and the mesh, which the pointer turns.
 const FLAT = `attribute vec2 corner; varying vec2 at;
 void main() { at = vec2(corner.x, 1.0 - corner.y); gl_Position = vec4(2.0 * corner - 1.0, 0.0, 1.0); }`;
 const SOLID = `attribute vec3 position; attribute vec2 uv; uniform mat4 view; uniform vec3 low, extent;
@@ -31,7 +31,7 @@ void main() {
   vec3 diffuse = clay ? vec3(0.6) : inner.rgb * inner.rgb, specular = clay ? vec3(0.0) : top * root * root;
   vec3 seen = shade(n, v, l, diffuse, specular, clay ? 1.0 : max(outer.a, 0.02), ior);
 #ifdef SOLID
-  seen += 0.04 * diffuse;  // so that the dark side can be told from the backdrop
+  seen += 0.04 * diffuse;  // so that the dark side differs from the backdrop
   if (!gl_FrontFacing) seen = vec3(0.02);
 #endif
   gl_FragColor = vec4(encoded(seen * (clay ? 1.0 : exposure)), 1.0);
@@ -67,7 +67,7 @@ class Painter {
     gl.activeTexture(gl.TEXTURE0 + slot);
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, source.width, source.height, 0, gl.RGBA, gl.UNSIGNED_BYTE, source.data);
-    const filter = this.solid ? gl.LINEAR : gl.NEAREST;  // the flat picture has a pixel for each of the maps
+    const filter = this.solid ? gl.LINEAR : gl.NEAREST;  // the flat picture has the pixels of the maps
     for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
     for (const end of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, end, filter);
     gl.uniform1i(this.place(name), slot);
@@ -90,7 +90,7 @@ class Painter {
   }
 }
 
-class Later {  // draws at most once a frame
+class Redraw {  // draws at most once a frame
   constructor(draw) { this.draw = draw; this.due = false; }
 
   ask() {
@@ -100,19 +100,21 @@ class Later {  // draws at most once a frame
   }
 }
 
-const BUDGET = 25, REST = 250;  // ms: of 33, so that 30 pictures a second are left; without a move
+const BUDGET = 25;  // ms for a picture, so that 30 are drawn in a second
+const REST = 250;  // ms without a move, after which the picture is drawn at its full size
+const ARROWS = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
 
 class Relight {
   constructor(canvas, sources) {
     this.canvas = canvas;
-    this.light = [0, 0, 0];  // none: the flash, beside the lens
+    this.light = [0, 0, 0];  // none: the flash, next to the lens
     this.size = DATA.view.size;
-    this.share = 1;  // of its sides that is drawn while the light moves
+    this.share = 1;  // of the picture's sides that is drawn while the light moves
     canvas.style.aspectRatio = this.size.join(' / ');
     this.painter = new Painter(canvas, FLAT, '', false);
     this.painter.maps(sources);
     this.painter.buffer('corner', 2, this.painter.gl.FLOAT, false, new Float32Array([0, 0, 1, 0, 0, 1, 1, 1]));
-    this.later = new Later(() => this.follow());
+    this.redraw = new Redraw(() => this.follow());
     for (const kind of ['pointermove', 'pointerdown']) canvas.addEventListener(kind, (event) => this.move(event));
     canvas.addEventListener('keydown', (event) => this.step(event));
     this.draw();
@@ -126,20 +128,20 @@ class Relight {
   aim(x, y) {  // −1…1 across the picture: a hemisphere of directions
     const far = Math.hypot(x, y), most = 0.97, shrink = far > most ? most / far : 1;
     this.light = [x * shrink, y * shrink, Math.sqrt(1 - (Math.min(far, most)) ** 2)];
-    this.later.ask();
+    this.redraw.ask();
   }
 
   step(event) {
-    const by = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
+    const by = ARROWS[event.key];
     if (!by) return;
     event.preventDefault();
     this.aim(this.light[0] + by[0], this.light[1] + by[1]);
   }
 
-  follow() {  // while the light moves, the largest picture that is drawn within BUDGET ms; whole once it rests
+  follow() {  // while the light moves, draws the largest picture that takes less than BUDGET ms
     const start = performance.now(), gl = this.painter.gl;
     this.draw(this.share);
-    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));  // waits for it
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));  // waits for the drawing
     const whole = (performance.now() - start) / this.share ** 2;
     this.share = [1, 1 / 2].find((share) => whole * share ** 2 < BUDGET) ?? 1 / 4;
     clearTimeout(this.rest);
@@ -163,10 +165,10 @@ class Solid {
   constructor(canvas, sources, mesh) {
     this.canvas = canvas;
     this.turn = [0.35, 0.15];  // rad about the upright axis, then up
-    this.near = 1;  // of the distance at which the surface just fits into the picture
+    this.near = 1;  // distance of the eye, relative to that at which the mesh fills the picture
     this.mode = 0;
     this.pointers = new Map();
-    this.apart = 0;  // between two fingers, px
+    this.spread = 0;  // distance of two fingers, px
     [canvas.width, canvas.height] = [960, 600];
     const painter = this.painter = new Painter(canvas, SOLID, '#define SOLID\n', true), gl = painter.gl;
     if (mesh.wide && !gl.getExtension('OES_element_index_uint')) throw new Error('no 32-bit indices');
@@ -181,7 +183,7 @@ class Solid {
     this.count = mesh.faces.length;
     this.middle = mesh.low.map((low, k) => low + mesh.extent[k] / 2);
     this.radius = Math.hypot(...mesh.extent) / 2;
-    this.later = new Later(() => this.draw());
+    this.redraw = new Redraw(() => this.draw());
     this.listen();
     this.draw();
   }
@@ -191,10 +193,10 @@ class Solid {
     canvas.addEventListener('pointerdown', (event) => {
       canvas.setPointerCapture(event.pointerId);
       this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
-      this.apart = 0;
+      this.spread = 0;
     });
     for (const kind of ['pointerup', 'pointercancel']) {
-      canvas.addEventListener(kind, (event) => { this.pointers.delete(event.pointerId); this.apart = 0; });
+      canvas.addEventListener(kind, (event) => { this.pointers.delete(event.pointerId); this.spread = 0; });
     }
     canvas.addEventListener('pointermove', (event) => this.drag(event));
     canvas.addEventListener('wheel', (event) => { event.preventDefault(); this.zoom(event.deltaY / 600); },
@@ -206,7 +208,7 @@ class Solid {
         for (const other of document.querySelectorAll('[data-mode]')) {
           other.setAttribute('aria-pressed', String(other === button));
         }
-        this.later.ask();
+        this.redraw.ask();
       });
     }
   }
@@ -216,16 +218,16 @@ class Solid {
     if (!last) return;
     this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
     if (this.pointers.size === 2) {
-      const [a, b] = [...this.pointers.values()], apart = Math.hypot(a[0] - b[0], a[1] - b[1]);
-      if (this.apart) this.zoom(Math.log(this.apart / apart));
-      this.apart = apart;
+      const [a, b] = [...this.pointers.values()], spread = Math.hypot(a[0] - b[0], a[1] - b[1]);
+      if (this.spread) this.zoom(Math.log(this.spread / spread));
+      this.spread = spread;
       return;
     }
     this.rotate((event.clientX - last[0]) * 0.008, (event.clientY - last[1]) * 0.008);
   }
 
   step(event) {
-    const by = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
+    const by = ARROWS[event.key];
     if (!by) return;
     event.preventDefault();
     this.rotate(...by);
@@ -234,12 +236,12 @@ class Solid {
   rotate(right, up) {
     const within = (x, most) => Math.max(-most, Math.min(most, x));
     this.turn = [within(this.turn[0] + right, 1.5), within(this.turn[1] + up, 1.4)];
-    this.later.ask();
+    this.redraw.ask();
   }
 
   zoom(by) {
     this.near = Math.max(0.3, Math.min(3, this.near * Math.exp(by)));
-    this.later.ask();
+    this.redraw.ask();
   }
 
   draw() {
@@ -258,7 +260,7 @@ class Solid {
       view.set([f / aspect * x, f * y, (far + near) / (near - far) * z + 2 * far * near / (near - far) * w, -z], 4 * k);
     }
     const eye = [0, 1, 2].map((k) => -rows.reduce((sum, row, j) => sum + row[k] * moved[j], 0));
-    // the light stays beside the eye, a little above and to the left
+    // the light moves with the eye: above it and to the left
     const light = [0, 1, 2].map((k) => -0.45 * rows[0][k] + 0.5 * rows[1][k] + 0.75 * rows[2][k]);
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
     gl.clearColor(0.05, 0.05, 0.06, 1);
@@ -283,15 +285,7 @@ async function meshed({ position, uv, faces, low, extent }) {
   return { position: new Uint16Array(p), uv: new Uint16Array(t), faces: new Uint32Array(index.buffer), low, extent, wide: true };
 }
 
-function pixels(image) {
-  const canvas = document.createElement('canvas');
-  [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
-  const context = canvas.getContext('2d', { willReadFrequently: true });
-  context.drawImage(image, 0, 0);
-  return context.getImageData(0, 0, canvas.width, canvas.height);
-}
-
-// what the shader samples; roots of linear light need no power to undo and keep dark colors apart
+// textures of the shader; it squares the roots of linear light, which in 8 bits resolve dark colors
 function textures({ normal, diffuse, specular, roughness }) {
   const [n, d, s, r] = [normal, diffuse, specular, roughness].map(pixels), { width, height } = n;
   const root = Uint8Array.from({ length: 256 }, (_, code) => Math.round(255 * Math.sqrt(linear(code))));

@@ -1,7 +1,7 @@
 """Reads and writes PNG files of 8 or 16 bits.
 
-No gamma or color chunk is written: glTF ignores them, and viewers disagree on them. The meaning of the
-numbers is written elsewhere (maps.json, the material).
+No gamma or color chunk is written: glTF ignores them, and viewers disagree on them. maps.json or the material states
+the meaning of the numbers.
 """
 
 import struct

@@ -73,7 +73,8 @@ def kind(file: BinaryIO, suffix: str) -> Kind:
     head = file.read(512)
     if head.startswith((JPEG, PNG, EXR)):
         return "photo"
-    if _is_raw_magic(head):
+    is_raw_tiff = head[:2] in (b"II", b"MM") and (head[8:10] == b"CR" or head[8:12] in (b"IIII", b"MMMM"))  # CR2, IIQ
+    if is_raw_tiff or raw_suffix(head) is not None:
         return "raw"
     if head.startswith(TIFF):
         with mmap(file.fileno(), 0, access=ACCESS_READ) as data:  # reads the directories' pages only
@@ -96,11 +97,6 @@ def _is_text(file: BinaryIO) -> bool:
 def raw_suffix(head: bytes) -> str | None:
     """File name suffix of a RAW file that is not an ordinary TIFF, by its first bytes; None for other files."""
     return next((suffix for at, signature, suffix in _RAW_SIGNATURES if head.startswith(signature, at)), None)
-
-
-def _is_raw_magic(head: bytes) -> bool:
-    tiff = head[:2] in (b"II", b"MM") and (head[8:10] == b"CR" or head[8:12] in (b"IIII", b"MMMM"))  # CR2, IIQ
-    return tiff or raw_suffix(head) is not None
 
 
 def _is_raw(tiff: TiffStructure) -> bool:

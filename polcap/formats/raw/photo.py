@@ -1,7 +1,7 @@
 """Decodes a finished picture (TIFF, PNG, EXR, JPEG) to linear values, by OpenImageIO in the child process.
 
-16-bit and floating-point files are taken as linear, 8-bit files as sRGB-encoded, unless the
-caller states the encoding. RAW files go to `libraw`: OpenImageIO opens a DNG as its thumbnail.
+16-bit and floating-point files are taken as linear, 8-bit files as sRGB-encoded, unless the caller states the encoding.
+RAW files go to `libraw`: OpenImageIO opens a DNG as its thumbnail.
 """
 
 from collections.abc import Iterator

@@ -1,0 +1,47 @@
+"""Small capture folders of DNGs and pictures, for the tests."""
+
+from itertools import count
+
+import numpy as np
+
+from tests.formats import headers
+from tests.formats.raw.test_photo import save
+
+_serial = count()
+
+
+def shoot(path, time=1 / 50, clock="00:00:00", model=b"Z1", lens=b"Macro 60", size=(32, 48), **settings):
+    """A small DNG of its own pixels."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    photo = headers.settings(time=time, **settings) | {36867: (2, f"2026:01:02 {clock}".encode()), 42036: (2, lens)}
+    pixels = np.random.default_rng(next(_serial)).integers(500, 4000, size)
+    path.write_bytes(headers.dng(pixels, photo=photo, maker=headers.camera(model=model)))
+    return path
+
+
+def folders(root, angles=("000", "045", "090"), times=(1 / 200, 1 / 50)):
+    for angle in angles:
+        for number, time in enumerate(reversed(times)):  # brightest first, to be sorted
+            shoot(root / f"pol{angle}" / f"IMG_{number}.dng", time)
+    return root
+
+
+def flat(root, shots=3, times=(1 / 200, 1 / 50)):
+    for number in range(shots * len(times)):
+        name = f"IMG_{(number + 9998) % 10000:04d}.dng"  # the camera's counter starts again at 0
+        shoot(root / name, times[number % len(times)], f"00:{number:02d}:00")
+    return root
+
+
+def pictures(root, names):
+    for number, name in enumerate(names):
+        save(root / name, np.full((8, 10, 3), 300 + number, np.uint16))
+    return root
+
+
+def degrees(understood):
+    return np.degrees(understood.angle).round(6).tolist()
+
+
+def names(shot):
+    return [frame.path.rpartition("/")[2] for frame in shot.frames]
