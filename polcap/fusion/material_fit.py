@@ -35,7 +35,7 @@ from scipy.optimize import minimize_scalar
 
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, Sight, on_atlas, sights
-from polcap.fusion.highlights import ALPHAS, LobeProfile, LobeSamples, flash_place, profile
+from polcap.fusion.lobe_profiles import ALPHAS, LobeProfile, LobeSamples, flash_place, profile
 from polcap.fusion.values import FusionView
 from polcap.images import Floats
 from polcap.optics import color, frames
