@@ -371,7 +371,7 @@ class ColorCalibration:
     cost: float = float("nan")  # of the chart's detector; NaN without it
     metres_per_px: float | None = None  # at the chart's distance, on this grid; None without a known chart size
     place: ChartPlace | None = None  # None without a chart in the picture
-    light: ChartLight | None = None  # None without a chart in the picture
+    light: ChartLight | None = None  # None without a chart under this capture's light
     patches: PatchColors | None = None  # None without a chart in this capture or in that of the color profile
 
 

@@ -1,4 +1,4 @@
-"""F0 and roughness per material, from the highlights of all views and from their maps together.
+"""F0, roughness and scale of the albedo per material, from the radiance in all views and from their maps together.
 
 Each view shows a point of the surface under another half-angle, so all views together sample the lobe of the gloss,
 which one view cannot. Texels of like albedo are taken for one material. Its radiance S0 under the flash is
@@ -14,7 +14,8 @@ which follows from the differences between the views' normals and the baked ones
 F0 and roughness of the views' maps have a weight in the fit, by their errors. They are medians over the views, because
 the errors of one view are alike everywhere. Dielectrics of one object have nearly the same F0, so one F0 is fitted to
 all materials, and each may deviate a little from it. The flash's place near the lens is found first, as the one for
-which the half-angle explains the radiance best.
+which the half-angle explains the radiance best. Where a chart gives the scale of radiance, the albedo of a material
+becomes that of its radiance without the gloss.
 
 References
 ----------
@@ -73,12 +74,13 @@ class Lobe:
 
     f0: float
     alpha: float
+    gain: float  # of the albedo, with which the radiance agrees
     misfit: float  # sum of squared errors, in units of the expected ones
 
 
-@stage(version=5)
+@stage(version=6)
 def fit(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps, settings: MaterialSettings) -> AtlasMaps:
-    """Refine F0 and roughness by the highlights of all views; without S0 in the views the maps stay as they are."""
+    """Refine F0, roughness and albedo by the radiance in all views; without S0 the maps stay as they are."""
     lit = [view for view in views if view.s0 is not None]
     if not lit:
         return maps
@@ -89,7 +91,7 @@ def fit(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps, settings: 
     profiles = [None if one is None else profile(one, flash) for one in samples]
     widening = 2 * _normal_sigma(lit, seen, atlas, maps) ** 2
     lobes = _lobes(profiles, widening, settings)
-    return _blended(atlas, maps, share, lobes)
+    return _blended(atlas, maps, share, lobes, all(view.white_distance is not None for view in lit))
 
 
 def _materials(maps: AtlasMaps, atlas: Atlas, count: int) -> Floats:
@@ -121,7 +123,7 @@ def _samples(
         to_lens = frames.unit(-point)
         local = frames.to_ray_frame(normal[one.texel[steep]] @ view.pose.rotation.T, to_lens)
         far = float(np.linalg.norm(view.pose.rotation @ middle + view.pose.translation))
-        light = irradiance(point, view.light[:2], 0.0) * far**2
+        light = irradiance(point, view.light[:2], 0.0) * (far * (view.white_distance or 1)) ** 2
         radiance = color.luminance(one.sample(view.s0))[steep] / light
         parts.append((radiance, albedo[one.texel[steep]], local, point, one.weight[steep], one.texel[steep]))
     radiance, base, local, point, weight, texel = (np.concatenate(column) for column in zip(*parts))
@@ -208,7 +210,9 @@ def _lobe(profile: LobeProfile, f0: float, widening: float, roughness_sigma: flo
     bend = before - 2 * least + after
     place = best + float(np.clip((before - after) / (2 * bend), -1, 1) if bend > 0 else 0)  # between steps of α
     f0_there, alpha = (float(np.interp(place, range(len(ALPHAS)), part)) for part in (amplitude[:, 0], narrower))
-    return Lobe(f0_there, alpha, float(least))
+    diffuse = terms[best, :, 1]
+    gain = float(diffuse @ (radiance - amplitude[best, 0] * terms[best, :, 0]) / (diffuse @ diffuse))
+    return Lobe(f0_there, alpha, gain, float(least))
 
 
 def _amplitudes(terms: Floats, radiance: Floats, expected: Floats, sigma: Floats) -> Floats:
@@ -219,22 +223,20 @@ def _amplitudes(terms: Floats, radiance: Floats, expected: Floats, sigma: Floats
     return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
 
 
-def _blended(atlas: Atlas, maps: AtlasMaps, share: Floats, lobes: Sequence[Lobe | None]) -> AtlasMaps:
-    """Maps with the F0 and roughness of the lobes; a material without a lobe has the means of its maps."""
+def _blended(atlas: Atlas, maps: AtlasMaps, share: Floats, lobes: Sequence[Lobe | None], scaled: bool) -> AtlasMaps:
+    """Maps with F0 and roughness of the lobes and, if `scaled`, the albedo with which the radiance agrees.
+
+    A material without a lobe has the means of its maps.
+    """
     specular, roughness = maps.specular[atlas.covered].astype(np.float64), maps.roughness[atlas.covered]
     seen = maps.weight[atlas.covered]
-    target = np.zeros((len(share), 2))
-    for k, lobe in enumerate(lobes):
-        weight = share[:, k] * seen
-        mean_f0 = float((weight * color.luminance(specular)).sum() / max(weight.sum(), 1e-9))
-        mean_rough = float((weight * roughness).sum() / max(weight.sum(), 1e-9))
-        if lobe is None:
-            target += share[:, k, None] * [mean_f0, mean_rough]
-            continue
-        target += share[:, k, None] * [lobe.f0, np.sqrt(lobe.alpha)]
-    gray = np.maximum(color.luminance(specular), 1e-6)
-    new_specular = specular * (target[:, 0] / gray)[:, None]
-    values = np.concatenate(
-        [maps.normal[atlas.covered], maps.diffuse[atlas.covered], new_specular, target[:, 1:], seen[:, None]], axis=-1
-    )
-    return replace(on_atlas(atlas, values), albedo_sigma=maps.albedo_sigma)
+    each = np.empty((len(lobes), 3))  # F0, roughness, gain of the albedo
+    for row, part, lobe in zip(each, share.T, lobes):
+        weight = part * seen / max(float(part @ seen), 1e-9)
+        row[:] = weight @ color.luminance(specular), weight @ roughness, 1
+        if lobe is not None:
+            row[:] = lobe.f0, np.sqrt(lobe.alpha), lobe.gain if scaled else 1
+    f0, rough, gain = (share @ each).T[..., None]
+    specular *= f0 / np.maximum(color.luminance(specular), 1e-6)[:, None]
+    values = [maps.normal[atlas.covered], gain * maps.diffuse[atlas.covered], specular, rough, seen[:, None]]
+    return replace(on_atlas(atlas, np.concatenate(values, axis=-1)), albedo_sigma=maps.albedo_sigma)

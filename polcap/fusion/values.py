@@ -40,6 +40,7 @@ class FusionView:
     specular: Floats  # (H, W, 3) F0
     roughness: Floats  # (H, W) perceptual
     s0: Floats | None = None  # (H, W, 3) white-balanced radiance under the flash; for highlights and residuals
+    white_distance: float | None = None  # where a white plane has S0 = 1, over the object's distance; None: unknown
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from polcap.fusion.values import FusionView, Pose
 from polcap.images import Distortion, Floats, View
 from polcap.optics import distortion, frames
 from polcap.results import Results
+from polcap.stages.cues import scale
 
 _LEAST_SHIFT_PX = 0.02  # of the map: below, a lens counts as free of distortion and nothing is resampled
 
@@ -36,6 +37,7 @@ def fusion_view(name: str, results: Results, camera: SessionCamera, pose: Pose, 
         specular=np.asarray(maps.specular, np.float32),
         roughness=np.asarray(maps.roughness, np.float32),
         s0=np.asarray(results.cues.radiance, np.float32),
+        white_distance=scale.surface_distance(maps.mask, maps.view) if scale.is_known(results.color) else None,
     )
     if max(np.abs(source_x - x).max(), np.abs(source_y - y).max()) < _LEAST_SHIFT_PX:
         return found

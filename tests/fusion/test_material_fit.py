@@ -33,6 +33,15 @@ def test_the_lobe_is_found_from_the_highlights_of_all_views(atlas: Atlas, baked:
     assert np.median(found.roughness[seen]) == pytest.approx(ellipsoid.ROUGHNESS, abs=0.03)
 
 
+def test_the_albedo_becomes_that_of_the_radiance(atlas: Atlas, baked: AtlasMaps) -> None:
+    """Maps that are a tenth too dark, under a light whose strength a chart has given."""
+    views = tuple(replace(view, white_distance=1.0, diffuse=0.9 * view.diffuse) for view in RING)
+    found = material_fit.fit(views, atlas, replace(baked, diffuse=0.9 * baked.diffuse), MaterialSettings())
+    seen = baked.weight[atlas.covered] > 0.5
+    ratio = found.diffuse[atlas.covered][seen] / baked.diffuse[atlas.covered][seen]
+    assert np.median(ratio) == pytest.approx(1, abs=0.03)
+
+
 def test_views_without_photographs_keep_their_maps(atlas: Atlas, baked: AtlasMaps) -> None:
     views = tuple(replace(view, s0=None) for view in RING)
     assert material_fit.fit(views, atlas, baked, MaterialSettings()) is baked

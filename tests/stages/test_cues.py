@@ -151,6 +151,18 @@ def test_the_chart_is_level_with_the_middle_of_the_object(size: float):
     assert ball < factor < cone
 
 
+def test_a_profile_with_its_charts_light_has_the_charts_scale():
+    """The views of one session share chart, flash and camera: albedo must not depend on which view shows the chart."""
+    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
+    light = ChartLight(np.array([0.1, 0.0, -1.0]), np.array([0.0, 0.0, 1.0]), np.zeros(3), np.zeros((5, 5)))
+    shown, shared = (
+        cues.compute(found, dataclasses.replace(scenes.no_color(), source=source, light=light))
+        for source in ("chart", "profile")
+    )
+    assert np.array_equal(shown.radiance, shared.radiance)
+    assert shown.scale_sigma == shared.scale_sigma is not None
+
+
 @pytest.mark.parametrize(("turn", "offset"), [(0.0, 0.0), (0.4, 0.0), (0.0, 0.15)])
 def test_a_turned_or_offset_chart_gets_less_light_than_the_object(turn: float, offset: float):
     """n·l / d² of a chart under a flash at the lens: cos of its turn, or cos³ of the angle to the axis."""

@@ -25,7 +25,7 @@ CHANNELS = (
 FLOOR = 0.02  # added to a radiance before its logarithm, in the channels and in their inverse
 
 
-@stage(version=7, keep=False)
+@stage(version=8, keep=False)
 def compute(stokes: StokesImage, color: ColorCalibration, other_orders: tuple[OtherOrder, ...] = ()) -> Cues:
     """Compute all cues (radiance, DoLP, AoLP, diffuse color…) of a crop (H, W) from its Stokes parameters.
 
@@ -38,7 +38,7 @@ def compute(stokes: StokesImage, color: ColorCalibration, other_orders: tuple[Ot
     ratio, sigma, dolp, normalized = polarization(stokes.stokes, stokes.covariance)
     radiance = np.asarray(stokes.stokes[0] @ color.matrix.T, dtype=np.float32)
     factor = 1.0
-    if color.source in ("chart", "corners"):
+    if scale.is_known(color):
         factor = scale.factor(stokes, color)
     if color.source in ("camera", "none") and stokes.mask.any():
         factor = 0.8 / max(float(np.percentile(radiance[stokes.mask], 99)), 1e-9)

@@ -10,7 +10,7 @@ from math import exp, hypot, log, pi, sqrt
 
 import numpy as np
 
-from polcap.images import ChartLight, ColorCalibration, Floats, StokesImage
+from polcap.images import Bools, ChartLight, ColorCalibration, Floats, StokesImage, View
 from polcap.optics import point_light
 from polcap.optics.projection import back_project
 
@@ -25,28 +25,38 @@ _HALF, _ODDS = log(2), 1 / 6
 _STEP = 1e-4
 
 
+def is_known(color: ColorCalibration) -> bool:
+    """Whether a chart gives the scale: one in this picture, or in another with the same camera and flash in place."""
+    return color.source in ("chart", "corners") or color.light is not None
+
+
+def surface_distance(mask: Bools, view: View) -> float:
+    """Distance of the visible surface over that of the object's middle, with which the chart is level."""
+    return 1 - _BULGE * _radius(mask, view)
+
+
 def factor(stokes: StokesImage, color: ColorCalibration) -> float:
     """Factor on radiance after which a white plane that faces the flash has 1, on the axis at the object's distance.
 
     The light still falls off over the object, with distance and to the sides, as in the training pictures.
     """
-    ahead = 1 - _BULGE * _radius(stokes)
+    ahead = surface_distance(stokes.mask, stokes.view)
     if color.light is None:
         return ahead**2
     return float(np.exp(_log_factor(color.light, _middle(stokes, ahead))))
 
 
 def sigma(stokes: StokesImage, color: ColorCalibration, radiance: Floats) -> float | None:
-    """Relative error (1σ) of the scale of all albedos; None without a chart in the picture.
+    """Relative error (1σ) of the scale of all albedos; None where no chart gives it.
 
     Light falls with the square of the distance: a chart at the object's front makes the albedo too dark, a chart
     behind the object too bright. The position of the flash comes from the slope of the light across the chart.
     `radiance` (H, W, 3) is relative to a white plane, as `factor` makes it.
     """
-    if color.source not in ("chart", "corners"):
+    if not is_known(color):
         return None
-    radius = _radius(stokes)
-    ahead = 1 - _BULGE * radius
+    radius = _radius(stokes.mask, stokes.view)
+    ahead = surface_distance(stokes.mask, stokes.view)
     depth = hypot(2 * radius * hypot(_BULGE_SPREAD, _CHART_SPREAD) / ahead, _far_chart(radiance[stokes.mask]))
     if color.light is None:
         return depth
@@ -88,6 +98,6 @@ def _middle(stokes: StokesImage, distance: float) -> Floats:
     return distance * back_project(stokes.view, np.array(column), np.array(row))
 
 
-def _radius(stokes: StokesImage) -> float:
+def _radius(mask: Bools, view: View) -> float:
     """Radius of the object relative to its distance: that of a disc with as many pixels."""
-    return min(sqrt(stokes.mask.sum() / pi) / stokes.view.focal, _LARGEST_RADIUS)
+    return min(sqrt(mask.sum() / pi) / view.focal, _LARGEST_RADIUS)
