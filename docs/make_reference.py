@@ -66,6 +66,11 @@ def api_page() -> str:
         "```python", "import polcap", "", 'result = polcap.process("CAPTURE")', "print(result.verdict)",
         "maps = polcap.read_maps(result.folder)", "print(maps.normal.shape, maps.depth.shape)", "```", "",
         "`examples/from_python.py` is a complete program. Names are imported at their first use. The package is typed.",
+        "",
+        "**Single stages.** `examples/stage_by_stage.py` calls the stages one after the other and uses their values.",
+        "`polcap.pipeline.run.reopen(folder)[0]` reads the values that an earlier `process` stored in a result folder:",
+        "`radiance`, `color`, `alignment`, `object_`, `selfcal`, `stokes`, `cues`, `maps`, `mesh`. They are read-only",
+        "arrays, and `polcap clean` removes them. The values and the calls of stages may change between versions.",
     ]  # fmt: skip
     for name in sorted(polcap.__all__, key=lambda name: (name[0].isupper(), name)):
         source = inspect.getsource(getattr(polcap, name))

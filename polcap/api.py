@@ -4,8 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from polcap import resource_limits
 from polcap.config import Config
+from polcap.errors import SettingError
 from polcap.formats import own_folders
 from polcap.formats.capture import reader as captures
 from polcap.images import Bools, ChartRequest, Device
@@ -95,6 +98,7 @@ def process(
     PolcapError
         Its message is one line: the thing, its value, the limit and the remedy.
     """
+    _check_types(config, chart, mask)
     folder = Path(capture)
     target = folder / own_folders.OUTPUT if out is None else Path(out)
     resource_limits.set_threads(threads)
@@ -106,3 +110,20 @@ def process(
     about = pipeline.process(found, supplied, config or Config(), target, progress=progress)
     assert about is not None  # only `until` leaves it out
     return Result(target, about)
+
+
+def _check_types(config: object, chart: object, mask: object) -> None:
+    """Refuse values of other types before anything is written.
+
+    Raises
+    ------
+    SettingError
+        A value has another type.
+    """
+    for name, value, usable, remedy in (
+        ("config", config, config is None or isinstance(config, Config), "give that of polcap.load_config(…)"),
+        ("chart", chart, isinstance(chart, ChartRequest), 'give polcap.ChartRequest("none") or another one'),
+        ("mask", mask, mask is None or np.ndim(np.asarray(mask)) == 2, "give an array (H, W), true on the object"),
+    ):
+        if not usable:
+            raise SettingError(f"{name} = {value!r:.60}: cannot be used; {remedy}")

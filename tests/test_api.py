@@ -66,6 +66,16 @@ def test_an_unknown_device_or_estimator_is_refused(tmp_path: Path, name: str, va
         polcap.process(tmp_path, **option)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("config", {"hdr.clip": 0.9}), ("chart", "none"), ("mask", "mask.png"), ("mask", np.ones(9))]
+)
+def test_values_of_another_type_are_refused_before_anything_is_written(tmp_path: Path, name: str, value: Any) -> None:
+    option: dict[str, Any] = {name: value}
+    with pytest.raises(SettingError, match=f"{name} = .*: cannot be used; give "):
+        polcap.process(tmp_path, **option)
+    assert not list(tmp_path.iterdir())
+
+
 def test_results_and_values_have_a_short_repr(tmp_path: Path) -> None:
     made = Result(tmp_path / "polcap", {"verdict": "pass", "gates": [{}] * 99})
     assert repr(made) == f"Result({str(tmp_path / 'polcap')!r}, verdict pass)"

@@ -46,8 +46,9 @@ def fuse(
     InputError
         Anything at fault with the user's input.
     """
+    found = session.read(wanted)  # first: a folder without views stays as it is
     with result_folder.locked(out):
-        found, views = session.process(wanted, report)
+        views = session.process(found, wanted, report)
         cache = StageCache(out, progress)
         try:
             results = path(views, settings, cache)
@@ -75,6 +76,8 @@ def export(out: Path, *wanted: ExportRequest) -> list[Path]:
                 f"--{flag} is for results of one view, not for a fused object; "
                 "leave it out (and --preset archive), and use maps/"
             )
+        if "displacement" in one.extras:
+            raise SettingError("--extra displacement is for results of one view: a closed mesh has none; leave it out")
     about = reports.read(out)
     with result_folder.locked(out):
         source = fused_maps.read(out / "maps")
@@ -84,7 +87,7 @@ def export(out: Path, *wanted: ExportRequest) -> list[Path]:
 
 def _with_albedo_scale(maps: AtlasMaps, found: Session) -> AtlasMaps:
     """The maps with the doubt of their scale: that of the view that knows it best."""
-    stated = [about["figures"].get("maps", {}).get("albedo_sigma") for about in found.about.values()]
+    stated = [about["figures"]["chart"]["scale_doubt"] for about in found.about.values()]
     known = [float(one) for one in stated if one is not None]
     return replace(maps, albedo_sigma=min(known) if known else None)
 

@@ -29,8 +29,17 @@ def write(folder: Path, about: Mapping[str, Any], results: FusionResults) -> Non
         "rows": [_row(row) for row in about["figures"]["views"].values()],
         "left_out": list(about["figures"]["left_out"].items()),
         "asset": f"asset/{name}.glb",
+        "size": _size(about["figures"]["mesh"]),
     }
     page.render("fused.html", folder / "report.html", f"{name}: polcap report", content)
+
+
+def _size(mesh: Mapping[str, Any]) -> str:
+    """Sentences on the object's size and its unit."""
+    unit, factor = ("mm", 1000.0) if mesh["metric"] else ("in a relative unit", 1.0)
+    sides = " × ".join(labels.number(factor * side, 3) for side in mesh["extent"])
+    scale = "in metres" if mesh["metric"] else "relative, because the scale is unknown"
+    return f"Width, height, depth: {sides} {unit}. Lengths in the files are {scale}."
 
 
 def _row(row: Mapping[str, Any]) -> tuple[str, ...]:

@@ -182,15 +182,14 @@ def out_of(folder: Path, name: str) -> Path:
     return folder / name / own_folders.OUTPUT
 
 
-def process(wanted: SessionInput, report: Report) -> tuple[Session, tuple[FusionView, ...]]:
-    """Process all views below a folder; returns the session and the views' maps.
+def process(session: Session, wanted: SessionInput, report: Report) -> tuple[FusionView, ...]:
+    """Process all views of a session, which is changed; returns the views' maps.
 
     Raises
     ------
     CaptureError
-        There are too few views, or too few of them can be used.
+        Too few views can be used.
     """
-    session = _read(wanted)
     _calibrate_colors(session, wanted, report)
     with ExitStack() as stack:
         pool = None
@@ -208,7 +207,7 @@ def process(wanted: SessionInput, report: Report) -> tuple[Session, tuple[Fusion
             _place_by_features(session, wanted, report)
         session.about = session.each(_make_maps, _tasks(session, wanted), pool, _says(report, "maps"))
     _enough(session)
-    return session, _joined(session, wanted)
+    return _joined(session, wanted)
 
 
 def _says(report: Report, what: str) -> Report:
@@ -216,8 +215,14 @@ def _says(report: Report, what: str) -> Report:
     return lambda name: report(f"{name}: {what}")
 
 
-def _read(wanted: SessionInput) -> Session:
-    """Read the captures of all folders view…/ and set…/view…/."""
+def read(wanted: SessionInput) -> Session:
+    """Read the captures of all folders view…/ and set…/view…/; nothing is written.
+
+    Raises
+    ------
+    CaptureError
+        There are too few views.
+    """
     folders = [*wanted.folder.glob("view*/"), *wanted.folder.glob("set*/view*/")]
     names = sorted((folder.relative_to(wanted.folder).as_posix() for folder in folders), key=layouts.natural)
     if not names:

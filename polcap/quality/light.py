@@ -24,6 +24,8 @@ _BRIGHTER = 1.08  # times S0: the greatest that scale and registration explain; 
 _EDGE_PX = 2.0  # 1σ of the blur before two shots are compared, so that misaligned edges of a print do not count
 _STILL_CLIPPED = 0.5  # share of highlights that a crossed filter should have stopped
 _FEW = 20  # px
+_MISFIRE = 0.2  # change of one frame's light that fails; smaller ones are measured and corrected
+_CLIPPED_HIGHLIGHTS = 0.001  # of the object: from .002 on roughness errs by .06 more (docs/benchmarks/gates.md)
 _DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame for all angles: 1 to 2° at 15 %
 _LEAST_ALBEDO = 0.02  # sum of the channels
 _TOWARDS_CAMERA = float(np.cos(np.radians(30)))  # cosine; lamps 45° to the side are mirrored at 22°
@@ -168,18 +170,14 @@ def albedo_scale(found: Evidence, limits: GateLimits) -> Gate:
 def clipping(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on the share of the object that is clipped in the shortest exposure."""
     clipped, limit = found.clipped[:, :, found.object_.mask].mean(2).min(1), limits.max_clipped
-    k = int(np.argmax(clipped))
-    message = f"{100 * clipped[k]:.1f} % of the object is clipped in the shortest exposure of the {found.names[k]} shot"
+    share, few = float(clipped.max()), min(_CLIPPED_HIGHLIGHTS, limits.max_clipped)
+    name = found.names[int(np.argmax(clipped))]
+    message = f"{100 * share:.1f} % of the object is clipped in the shortest exposure of the {name} shot"
     remedy = "Add a darker exposure or use less light"
-    return at_most(
-        "clipping",
-        float(clipped[k]),
-        limit,
-        message,
-        remedy,
-        blamed(found.names, clipped > limit),
-        20 * float(clipped[k]),
-    )
+    if few < share <= limit:
+        message += ": highlights, without which roughness and specular are uncertain"
+        return at_most("clipping", share, few, message, remedy, blamed(found.names, clipped > few), beyond="warn")
+    return at_most("clipping", share, limit, message, remedy, blamed(found.names, clipped > limit), 20 * share)
 
 
 def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
@@ -204,7 +202,9 @@ def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     message = f"Frame {e + 1} of {names[k]} was {abs(100 * change):.1f} % {_compared(change)} than its bracket"
     bad = blamed(names, np.abs(drift).max(1) > limit)
     remedy = remedy.replace("between shots", "within a bracket")
-    yield at_most("energy", abs(change), limit, message, remedy, bad)
+    yield at_most(
+        "energy", abs(change), limit, message, remedy, bad, beyond="fail" if abs(change) > _MISFIRE else "warn"
+    )
 
 
 def _compared(change: float) -> str:

@@ -33,6 +33,7 @@ class MapFigure:
     colors: tuple[str, ...] = ()  # CSS colors of bar or wheel
     ticks: tuple[tuple[float, str], ...] = ()  # place 0…1 and text; none: a wheel
     ball: str = ""  # data URL
+    outline: str = ""  # data URL, opaque on the object; "": the image is transparent outside
 
 
 def of_result(small: PageMaps, metric: bool) -> list[MapFigure]:
@@ -98,6 +99,7 @@ def normal(name: str, title: str, vectors: Floats, inside: Bools) -> MapFigure:
         html.lossless(_extend(_normal_colors(vectors), inside)),
         {"kind": "normal", "unit": "", "digits": 2},
         ball=html.lossless(ball),
+        outline=_outline(inside),
     )
 
 
@@ -112,7 +114,12 @@ def _albedo(name: str, title: str, note: str, linear: Floats, inside: Bools, top
     bar = srgb_eight_bits(np.linspace(0, 1, 17))[:, None].repeat(3, axis=1)
     ticks = tuple((share, number(top * share)) for share in (0, 0.25, 0.5, 0.75, 1))
     probe = {"kind": "color", "top": top, "unit": "", "digits": 2 if top == 1 else 3}
-    return MapFigure(name, title, note, image, probe, css_colors(bar), ticks)
+    return MapFigure(name, title, note, image, probe, css_colors(bar), ticks, outline=_outline(inside))
+
+
+def _outline(inside: Bools) -> str:
+    """The object's mask as a picture; it hides the border of an extended picture on the page."""
+    return html.indexed(inside.astype(np.uint8), np.zeros((keys.LEVELS, 3), np.uint8))
 
 
 def _normal_colors(vectors: Floats) -> NDArray[np.uint8]:

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from polcap.formats import atomic, onnx
 from polcap.images import Floats, Network, View
@@ -71,7 +70,7 @@ def make_picture(simulator: Simulator, network: Network, number: int) -> NDArray
         views = simulator.gather(np.array([view]), _SIDE, flip=False)
         pixels = views.pixels
         slope = relief.random_slopes(pixels.position.numpy(), middle / focal, rng) @ views.turn[0].numpy().T
-        normal = F.normalize(frames.tilted(pixels.normal, torch.from_numpy(slope)), dim=1)
+        normal = torch.from_numpy(frames.unit(frames.tilted(pixels.normal.numpy(), slope)))
         errors = CameraErrors.draw(1, normal.device)
         errors = replace(errors, shift=_SHIFT * errors.shift)
         photo = simulator.photograph(replace(views, pixels=replace(pixels, normal=normal)), torch.ones(1), errors)

@@ -43,8 +43,7 @@ def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; give the one that holds your meshes and textures")
     meshes = sorted(path for path in source.rglob("*") if path.suffix.lower() in _MESHES and path.is_file())
-    textures = sorted({path.parent for path in source.rglob("*") if path.suffix.lower() in _PICTURES})
-    textures = [folder for folder in textures if {"albedo", "roughness"} <= _pictures(folder).keys()]
+    textures = _texture_folders(source, report)
     counts = [0, 0]
     jobs = (meshes, write_mesh, "meshes", ".npz"), (textures, write_textures, "materials", "")
     for kind, (found, convert, place, suffix) in enumerate(jobs):
@@ -58,8 +57,23 @@ def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
     if not any(counts):
         kinds = ", ".join(sorted(_MESHES))
         raise InputError(f"{source}: holds no mesh ({kinds}) and no folder with pictures of albedo and roughness")
+    for noun, count in zip(("mesh", "texture folder"), counts):
+        if count == 1:
+            report(f"the only {noun} is for training and for tests: errors on it are too small; add others")
     report(f"{counts[0]} meshes and {counts[1]} texture folders in {data}")
     return counts[0], counts[1]
+
+
+def _texture_folders(source: Path, report: Report) -> list[Path]:
+    """The folders with a picture of albedo and one of roughness; a folder with only one of them is reported."""
+    complete = []
+    for folder in sorted({path.parent for path in source.rglob("*") if path.suffix.lower() in _PICTURES}):
+        missing = sorted({"albedo", "roughness"} - _pictures(folder).keys())
+        if not missing:
+            complete.append(folder)
+        elif len(missing) == 1:
+            report(f"left out: {folder} has no picture with {missing[0]} in its name; rename or add it")
+    return complete
 
 
 def _splits(number: int, count: int) -> tuple[str, ...]:

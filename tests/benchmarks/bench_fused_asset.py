@@ -74,7 +74,8 @@ def joined(folder: Path) -> str:
     """Table row on the join of two sets."""
     network, mask_network = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
     wanted = SessionInput(folder, config.load(None, []), network=network, mask_network=mask_network)
-    found, views = session.process(wanted, lambda _: None)
+    found = session.read(wanted)
+    views = session.process(found, wanted, lambda _: None)
     truth, about = dict(np.load(folder / "truth.npz")), json.loads((folder / "truth.json").read_text())
     surface = Trimesh(truth["vertices"], truth["faces"], process=False)
     point, size = sample_surface(surface, 30_000, seed=0)[0], float(np.ptp(truth["vertices"], axis=0).max())

@@ -39,6 +39,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     "two softboxes": ("body", "other light", "lighting"),
     "two flashes": ("body", "other light", "lighting"),
     "all out of focus by 3 px": ("focus",),
+    "overexposed 12 times": ("clipping",),
     "black level wrong by 2": ("stillness",),
     "vignetting of wide apertures": ("stillness",),
     "ambient frame": ("ambient",),
@@ -147,6 +148,8 @@ def _plant(plan: Plan, kind: str, random: Random) -> None:
             plan.lamps = tuple(boxes)
     elif kind == "all out of focus by 3 px":
         plan.after = lambda light, k, e: gaussian_filter(light, 3.0, axes=(0, 1))
+    elif kind == "overexposed 12 times":
+        plan.shoot = replace(shoot, exposure_factor=12.0)
     elif kind == "one frame blurred":
         frame = int(random.integers(3))
         plan.after = lambda light, k, e: (

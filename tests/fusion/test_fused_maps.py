@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from polcap.errors import DecodeError, SettingError
 from polcap.formats.export import gltf
+from polcap.formats.maps import result_maps
 from polcap.fusion import atlas as atlases
-from polcap.fusion import baking, filling, fused_maps
+from polcap.fusion import baking, filling, fuse_run, fused_maps
 from polcap.fusion.baking import BakingSettings
 from polcap.fusion.closed_mesh import is_closed
 from polcap.fusion.fused_maps import FusedSource
@@ -30,6 +32,17 @@ def test_maps_and_mesh_come_back_as_written(source: FusedSource, tmp_path: Path)
     assert np.array_equal(back.atlas.mesh.vertices, source.atlas.mesh.vertices)
     assert np.array_equal(back.maps.normal, source.maps.normal)
     assert back.maps.diffuse == pytest.approx(source.maps.diffuse, abs=1e-3)  # half floats
+
+
+def test_a_reader_of_one_view_and_an_export_refuse_what_a_fused_object_lacks(
+    source: FusedSource, tmp_path: Path
+) -> None:
+    fused_maps.write(tmp_path / "fused" / "maps", source.atlas, source.maps)
+    for place in (tmp_path, tmp_path / "fused"):
+        with pytest.raises(DecodeError, match=r"textures of a fused object.*give one of its views"):
+            result_maps.read(place)
+    with pytest.raises(SettingError, match="a closed mesh has none"):
+        fuse_run.export(tmp_path / "fused", ExportRequest(extras=("displacement",)))
 
 
 def test_the_glb_is_closed_when_it_is_read_back(source: FusedSource, tmp_path: Path) -> None:

@@ -9,10 +9,13 @@ import pytest
 from polcap.config import Config
 from polcap.errors import CaptureError
 from polcap.formats.capture import reader
+from polcap.fusion import fuse_run
 from polcap.fusion import session as sessions
 from polcap.fusion.board_corners import BoardCorners
+from polcap.fusion.fusion_path import FusionSettings
 from polcap.fusion.session import Session, SessionInput
 from polcap.pipeline import run as pipeline
+from polcap.pipeline.cache import silent
 from polcap.pipeline.path import UserInput
 from tests.fusion import board_views
 
@@ -32,7 +35,7 @@ def test_a_view_that_lacks_a_shot_is_left_out_with_the_reason(tmp_path: Path, mo
         return board_views.capture()
 
     monkeypatch.setattr(reader, "read", read)
-    found = sessions._read(wanted(tmp_path, "view01", "view02", "view03", "view05"))  # view04 was never shot
+    found = sessions.read(wanted(tmp_path, "view01", "view02", "view03", "view05"))  # view04 was never shot
     assert found.used == ["view01", "view02", "view05"]
     assert found.left_out == {"view03": "2 different polarizer angles where 3 are needed; add the missing shot"}
 
@@ -40,7 +43,14 @@ def test_a_view_that_lacks_a_shot_is_left_out_with_the_reason(tmp_path: Path, mo
 def test_three_views_are_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reader, "read", lambda *_: board_views.capture())
     with pytest.raises(CaptureError, match="2 views can be used, 3 are needed"):
-        sessions._read(wanted(tmp_path, "view01", "view02"))
+        sessions.read(wanted(tmp_path, "view01", "view02"))
+
+
+def test_a_folder_without_views_stays_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "pol000").mkdir()
+    with pytest.raises(CaptureError, match="holds no views"):
+        fuse_run.fuse(wanted(tmp_path), FusionSettings(), tmp_path / "fused", lambda _: None, silent)
+    assert [path.name for path in tmp_path.iterdir()] == ["pol000"]
 
 
 def test_a_view_with_swapped_angles_is_left_out_with_the_remedy(

@@ -12,6 +12,7 @@ import bench_fused_asset
 import numpy as np
 import pytest
 
+import polcap
 from polcap.fusion import fused_maps
 from polcap.fusion.closed_mesh import is_closed
 from tests.conftest import ROOT, shell
@@ -34,6 +35,9 @@ def test_twelve_raw_views_become_a_closed_object_that_is_like_the_true_one(tmp_p
     assert done.returncode == 0, done.stderr
     about = json.loads((folder / "fused" / "report.json").read_text())
     assert len(about["figures"]["views"]) == 12 and not about["figures"]["left_out"]
+    stored = json.loads((folder / "fused" / "maps" / "maps.json").read_text())["albedo"]
+    charted = polcap.read_maps(folder / "view01").albedo_sigma  # it gives the scale to all views
+    assert charted and stored["uncertainty_percent"] == pytest.approx(100 * charted, abs=0.1)
     mesh = fused_maps.closed(fused_maps.read(folder / "fused" / "maps").atlas.mesh)
     assert is_closed(mesh)
     with np.load(folder / "truth.npz") as truth:

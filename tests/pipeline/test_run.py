@@ -19,6 +19,7 @@ from polcap.config import Config
 from polcap.errors import ObjectError, StorageError
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import maps_folder as maps
+from polcap.formats.maps.result_maps import read_cues
 from polcap.images import AngleStack, ColorCalibration, View, single_frames
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
@@ -305,6 +306,14 @@ def test_the_example_from_python_runs(copy: Path, example: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, script, example, copy], env=environment, capture_output=True, text=True)
     assert done.returncode == 0 and "stillness pass" in done.stdout, done.stderr
+
+
+def test_the_example_of_single_stages_gives_the_cues_of_a_result(copy: Path, example: Path) -> None:
+    script = ROOT / "examples" / "stage_by_stage.py"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, script, example], env=environment, capture_output=True, text=True)
+    dolp = read_cues(copy)["dolp"][maps.read(copy / "maps").mask]
+    assert done.returncode == 0 and f"DoLP, median: {np.median(dolp):.3f}" in done.stdout, done.stdout + done.stderr
 
 
 def test_the_example_against_the_truth_runs(copy: Path, example: Path) -> None:

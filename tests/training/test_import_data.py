@@ -39,9 +39,14 @@ def test_a_folder_becomes_the_layout_of_training(tmp_path: Path) -> None:
         save(tmp_path / "in" / "a set", f"mesh {number:02d}.ply")
     write_textures(tmp_path / "in" / "Bricks", 1)
     (tmp_path / "in" / "broken.obj").write_text("nothing")
+    write_textures(tmp_path / "in" / "Rock", 2)
+    next((tmp_path / "in" / "Rock").glob("*ough*")).unlink()
     left_out: list[str] = []
     assert import_data.main(tmp_path / "in", tmp_path / "data", left_out.append) == (12, 1)
-    assert left_out[0].startswith("left out: ") and "broken.obj" in left_out[0]
+    incomplete, broken, single, _ = left_out
+    assert incomplete.startswith("left out: ") and "Rock has no picture with roughness" in incomplete
+    assert broken.startswith("left out: ") and "broken.obj" in broken
+    assert "only texture folder is for training and for tests" in single
     meshes = traced_views.training_meshes(tmp_path / "data")
     tests = sorted((tmp_path / "data" / "meshes" / "test").glob("*.npz"))
     assert len(meshes) == 10 and len(tests) == 2 and "a_set_mesh_01" in {mesh.stem for mesh in meshes}

@@ -9,7 +9,7 @@ from polcap.formats.export import iiif
 
 SCRIPT = "openlime.min.js"
 
-# colour space 1 is sRGB; OpenLIME makes Ward's parameter of gloss g and limits (a, b) as (b^¼ + g (a^¼ - b^¼))⁴
+# color space 1 is sRGB; OpenLIME makes Ward's parameter of gloss g and limits (a, b) as (b^¼ + g (a^¼ - b^¼))⁴
 _PAGE = Template(
     """<!doctype html>
 <html lang="en">

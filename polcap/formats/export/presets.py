@@ -59,7 +59,7 @@ PRESETS: Mapping[str, ExportPreset] = {
     ),
     "web": ExportPreset(
         formats=("gltf",),
-        description="one small GLB: quantized mesh; colours lossy, data lossless WebP (EXT_texture_webp); normals +Y",
+        description="one small GLB: quantized mesh; colors lossy, data lossless WebP (EXT_texture_webp); normals +Y",
         images="webp",
         geometry="quantized",
         triangles=50_000,

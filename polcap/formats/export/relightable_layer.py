@@ -30,7 +30,7 @@ def pictures(asset: Asset) -> dict[str, Texture]:
     rough = encoders.eight_bits(texture_set.roughness(asset))
     gloss = np.rint(255 - np.sqrt(255.0 * np.arange(256))).astype(np.uint8)[rough]
     made = {
-        "albedo": Texture(asset.base_color, True, "base colour, sRGB-encoded Rec.709"),
+        "albedo": Texture(asset.base_color, True, "base color, sRGB-encoded Rec.709"),
         "specular": Texture(color.srgb_eight_bits(texture_set.reflectance(asset)), True, "F0, sRGB-encoded"),
         "normal": texture_set.object_normal(asset),
         "gloss": Texture(gloss, False, "gloss, linear: 1 - square root of the perceptual roughness"),

@@ -31,7 +31,7 @@ class Texture:
 
 def base_color(asset: Asset) -> Texture:
     """Base color texture: diffuse color as glTF defines it."""
-    return Texture(asset.base_color, True, "base colour, sRGB-encoded Rec.709")
+    return Texture(asset.base_color, True, "base color, sRGB-encoded Rec.709")
 
 
 def normal(asset: Asset, *, up: bool = True) -> Texture:

@@ -23,7 +23,7 @@ CONVENTIONS = {
     "raw_pixel": "map pixel (i, j) is centred on visible RAW pixel crop[0:2] + scale * (i, j) + (scale - 1) / 2",
     "point": "map pixel (i, j) at depth d is d * ((i - cx) / f, -(j - cy) / f, -1), f and (cx, cy) of camera",
     "angles": "polarizer and AoLP from image x toward image up, counter-clockwise as the photographer sees it",
-    "color": "linear Rec.709, D65; PNG of colours is sRGB-encoded",
+    "color": "linear Rec.709, D65; PNG of colors is sRGB-encoded",
     "outside": "values outside mask.png mean nothing; they are 0, and (0, 0, 1) in normal.png",
 }
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from polcap.errors import DecodeError
+from polcap.formats import own_folders
 from polcap.formats.maps import exr, maps_folder
 from polcap.formats.maps.maps_folder import ResultMaps
 from polcap.images import Floats
@@ -13,7 +14,7 @@ from polcap.images import Floats
 def read(result: str | Path) -> ResultMaps:
     """Read all maps of a result: a result folder, its folder maps/, or the capture folder that holds the result.
 
-    Raises DecodeError: a file is missing, damaged, or not of the size in maps.json.
+    Raises DecodeError: a file is missing, damaged, or not of the size in maps.json; or the object is a fused one.
     """
     return maps_folder.read(_folder(result))
 
@@ -48,8 +49,14 @@ def read_cues(result: str | Path) -> dict[str, Floats]:
 def _folder(result: str | Path) -> Path:
     """The folder of the maps."""
     named = Path(result)
-    places = [named, named / "maps", named / "polcap" / "maps"]
-    return next((place for place in places if (place / "maps.json").exists()), named)
+    places = [named, *(named / part / "maps" for part in ("", own_folders.OUTPUT, own_folders.FUSED))]
+    found = next((place for place in places if (place / "maps.json").exists()), named)
+    if (found / "mesh.npz").exists():
+        raise DecodeError(
+            f"{found} holds the textures of a fused object, not the maps of a picture; give one of its views, "
+            "or read the files listed in its maps.json"
+        )
+    return found
 
 
 def _channels(file: Path, names: list[str]) -> list[Floats]:
