@@ -1,6 +1,7 @@
 """What several tests share: the bundled capture, the `polcap` command, and one finished run of the two."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -69,12 +70,21 @@ def example() -> Path:
     return EXAMPLE
 
 
+def environment() -> dict[str, str]:
+    """Environment of a child process that imports this polcap."""
+    return {**os.environ, "PYTHONPATH": str(ROOT)}
+
+
+def python(*arguments: object) -> Done:
+    """`python …` in a process of its own."""
+    command = [sys.executable, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=500)
+    return Done(done.returncode, done.stdout, done.stderr)
+
+
 def shell(*arguments: object) -> Done:
     """`polcap …` as a user's shell runs it, in a process of its own."""
-    command = [sys.executable, "-m", "polcap", *map(str, arguments)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=500)
-    return Done(done.returncode, done.stdout, done.stderr)
+    return python("-m", "polcap", *arguments)
 
 
 @pytest.fixture
@@ -102,3 +112,9 @@ def result(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
             done = shell("process", EXAMPLE, "--out", folder, "--estimator", "analytic")
             assert done.returncode == 0, done.stderr
     return folder
+
+
+@pytest.fixture
+def copy(result: Path, tmp_path: Path) -> Path:
+    """A copy of that result folder, to be changed."""
+    return Path(shutil.copytree(result, tmp_path / "copy"))
