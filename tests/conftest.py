@@ -1,4 +1,4 @@
-"""What several tests share: the bundled capture, the `polcap` command, and one finished run of the two."""
+"""Fixtures of several tests: the bundled capture, the `polcap` command, and one finished run of the two."""
 
 import os
 import shutil
@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run beside each other; OpenBLAS asks when NumPy is loaded
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run in parallel; OpenBLAS reads it when NumPy is loaded
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # some tests import onnxruntime themselves
 
 import numpy as np
@@ -24,13 +24,13 @@ EXAMPLE = ROOT / "examples" / "capture"
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """With POLCAP_SKIPPED_TO=FILE, what this machine skipped is listed there, for a richer one to run with `@FILE`."""
+    """With POLCAP_SKIPPED_TO=FILE, list the tests that this machine skips; another one runs them with `@FILE`."""
     if (file := os.environ.get("POLCAP_SKIPPED_TO")) and not hasattr(config, "workerinput"):
         config.pluginmanager.register(SkippedList(Path(file)))
 
 
 class SkippedList:
-    """Collects what was skipped, whole files and tests with all their parameters, which may be others elsewhere."""
+    """Collects skipped files and tests, without parameters, which may differ between machines."""
 
     def __init__(self, file: Path) -> None:
         self._file, self._names = file, set[str]()
@@ -48,7 +48,7 @@ class SkippedList:
 
 
 class Done(NamedTuple):
-    """What a command left."""
+    """Exit code and output of a command."""
 
     returncode: int
     stdout: str
