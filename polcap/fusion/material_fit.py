@@ -3,16 +3,18 @@
 Each view shows a point of the surface under another half-angle, so all views together sample the lobe of the gloss,
 which one view cannot. Texels of like albedo are taken for one material. Its radiance S0 under the flash is
 
-    S0 = E (g ρ_d D(n, l, v) + F0 S(n, l, v, α))
+    S0 = E ((g + c (1 − cos θ)) ρ_d D(n, l, v) + F0 S(n, l, v, α))
 
-with the diffuse and the specular law of `optics/shade.py`, and E the flash's light at the distance of the point. For
-each α, g and F0 follow from weighted least squares; the α with the least residual is the fit. Errors of the normals
-widen the lobe: α² is less by twice their variance. The flash's place near the lens is found first, as the one for
-which all materials fit best.
+with the diffuse and the specular law of `optics/shade.py`, E the flash's light at the distance of the point, θ the
+zenith angle, and c the error of the diffuse law. The samples of a material are averaged in bins of the half-angle, so
+that the few samples of a highlight count as much as the many others. For each α, weighted least squares give F0, g and
+c; the α with the least misfit is the fit. Errors of the normals widen the lobe: α² is less by twice their variance,
+which follows from the differences between the views' normals and the baked ones.
 
-The brightness of a highlight gives F0/α², and its width gives α. F0 and roughness of the views' maps have a weight in
-the fit, in proportion to the residual. They are medians over the views, because the errors of one view are alike
-everywhere.
+F0 and roughness of the views' maps have a weight in the fit, by their errors. They are medians over the views, because
+the errors of one view are alike everywhere. Dielectrics of one object have nearly the same F0, so one F0 is fitted to
+all materials, and each may deviate a little from it. The flash's place near the lens is found first, as the one for
+which the half-angle explains the radiance best.
 
 References
 ----------
@@ -29,66 +31,40 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
-from scipy.optimize import minimize, minimize_scalar
+from scipy.optimize import minimize_scalar
 
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, Sight, on_atlas, sights
+from polcap.fusion.lobe_profiles import ALPHAS, LobeProfile, LobeSamples, flash_place, profile
 from polcap.fusion.values import FusionView
 from polcap.images import Floats
-from polcap.optics import color, frames, shade
+from polcap.optics import color, frames
 from polcap.optics.point_light import irradiance
 from polcap.stages import stage
 
-_ALPHAS = np.geomspace(0.01, 1.0, 14)
-_ALPHA_ERROR = 0.01  # relative; F0 changes by twice as much, because the brightness F0/α² at the highlight is fixed
+_F0S = np.linspace(0.012, 0.09, 14)
+_F0_ERROR = 0.0003
+_LEAST_F0, _FIXED_SIGMA = 0.005, 0.0005  # where the fit has less, F0 is held there
 _SAMPLES = 6000  # of a material, at most
 _LEAST_SAMPLES = 300  # of a material, below which its maps are left as they are
 _LEAST_SHARE = 0.02  # of the weight in the view that sees most of a material, for a view's maps to count
 _LEAST_COSINE = 0.3  # between normal and view: flatter views show errors of the normals
-_FLOOR = 0.02  # of the median radiance: error of every sample, with `_RELATIVE`
-_RELATIVE = 0.08
-_ROUNDS = 3  # of reweighting
-_GAIN_SIGMA, _ROUGHNESS_SIGMA = 0.1, 0.16  # errors of the maps over a material
-_F0_SIGMA = 0.012  # the same, at most
-_F0_SIGMA_ROUGH = 0.0002  # over α²: errors of the diffuse light change the F0 of a highlight by 4 α² times as much
-_FARTHEST_FLASH = 0.15  # m from the lens
-_INDEX = 1.5  # refractive index of the diffuse law and of the Fresnel term
+# the numbers below: docs/benchmarks/fusion.md, "Gloss from the highlights of all views"
+_GAIN_SIGMA, _LAW_SIGMA = 0.15, 0.1  # of g and c
+_OWN_F0_SIGMA = 0.004  # of a material's F0 about the F0 of all
+_BROAD_ALPHA, _BROAD_POWER = 0.35, 4  # beyond, a highlight is so like the shading that F0 stays near that of the maps
+_NORMAL_FACING = 0.9  # cosine between surface and view, from which on views' and baked normals are compared
+_NORMAL_ERROR = 1.3  # standard deviation over that of the views' differences; errors have longer tails
 
 
 class MaterialSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of the stage `material_fit` of the fusion."""
 
     materials: Annotated[int, Meta(ge=1, le=32, description="most materials, by albedo [1]")] = 12
-    normal_sigma_deg: Annotated[
-        float, Meta(ge=0, le=20, description="error of the baked normals, per axis, which widens the lobes [°]")
-    ] = 3.0
-    map_weight: Annotated[
-        float, Meta(ge=0, le=10, description="weight of the views' own maps against the fit of the highlights [1]")
-    ] = 0.15
-
-
-@dataclass(frozen=True)
-class LobeSamples:
-    """Radiance of points of one material in all views, and what the maps say of its gloss."""
-
-    radiance: Floats  # (P,) luminance of S0 over the light that the point receives
-    albedo: Floats  # (P,) luminance of the baked albedo
-    normal: Floats  # (P, 3) baked, in the frame of the ray
-    point: Floats  # (P, 3) m, camera frame
-    weight: Floats  # (P,)
-    f0: float
-    alpha: float
-
-    def take(self, index: NDArray[np.intp] | slice) -> "LobeSamples":
-        """Some of the samples."""
-        return replace(
-            self,
-            radiance=self.radiance[index],
-            albedo=self.albedo[index],
-            normal=self.normal[index],
-            point=self.point[index],
-            weight=self.weight[index],
-        )
+    f0_sigma: Annotated[
+        float, Meta(gt=0, le=1, description="error of F0 in the views' maps, where highlights are narrow [1]")
+    ] = 0.025
+    roughness_sigma: Annotated[float, Meta(gt=0, le=1, description="error of roughness in the views' maps [1]")] = 0.06
 
 
 @dataclass(frozen=True)
@@ -97,20 +73,22 @@ class Lobe:
 
     f0: float
     alpha: float
-    gain: float  # of the albedo
-    residual: float  # weighted mean of ln(1 + error²), in units of the expected error, and the prior's part
+    misfit: float  # sum of squared errors, in units of the expected ones
 
 
-@stage(version=4)
+@stage(version=5)
 def fit(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps, settings: MaterialSettings) -> AtlasMaps:
     """Refine F0 and roughness by the highlights of all views; without S0 in the views the maps stay as they are."""
     lit = [view for view in views if view.s0 is not None]
     if not lit:
         return maps
     share = _materials(maps, atlas, settings.materials)  # (N, K)
-    samples = _samples(lit, sights(lit, atlas), atlas, maps, share)
-    light = _flash(samples, settings)
-    lobes = [None if one is None else _lobe(one, light, settings) for one in samples]
+    seen = sights(lit, atlas)
+    samples = _samples(lit, seen, atlas, maps, share)
+    flash = flash_place([one for one in samples if one is not None])
+    profiles = [None if one is None else profile(one, flash) for one in samples]
+    widening = 2 * _normal_sigma(lit, seen, atlas, maps) ** 2
+    lobes = _lobes(profiles, widening, settings)
     return _blended(atlas, maps, share, lobes)
 
 
@@ -156,7 +134,7 @@ def _samples(
             found.append(None)
             continue
         mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), _SAMPLES)).astype(int)]
-        found.append(LobeSamples(radiance, base, local, point, weight, f0, max(rough**2, _ALPHAS[0])).take(mine))
+        found.append(LobeSamples(radiance, base, local, point, weight, f0, max(rough**2, ALPHAS[0])).take(mine))
     return found
 
 
@@ -174,69 +152,71 @@ def _typical_gloss(
             for k in range(count)]  # fmt: skip
 
 
-def _flash(samples: Sequence[LobeSamples | None], settings: MaterialSettings) -> Floats:
-    """Place (3,) of the flash in the camera frame for which all materials fit best."""
-    few = [one.take(slice(None, None, 8)) for one in samples if one is not None]
-    if not few:
-        return np.zeros(3)
-
-    def misfit(place: Floats) -> float:
-        far = max(float(np.hypot(*place)) / _FARTHEST_FLASH - 1, 0)
-        return sum(_lobe(one, np.append(place, 0.0), settings).residual for one in few) + 10 * far
-
-    simplex = np.array([[0.0, 0.0], [0.03, 0.0], [0.0, 0.03]])
-    best = minimize(misfit, np.zeros(2), method="Nelder-Mead",
-                    options={"initial_simplex": simplex, "maxfev": 40, "xatol": 0.002, "fatol": 1e-4})  # fmt: skip
-    return np.append(best.x, 0.0)
+def _normal_sigma(views: Sequence[FusionView], seen: Sequence[Sight], atlas: Atlas, maps: AtlasMaps) -> float:
+    """Error of the baked normals per axis [rad], from the angles between them and the views' normals."""
+    normal, angles = maps.normal[atlas.covered], []
+    for view, one in zip(views, seen):
+        facing = np.flatnonzero(one.cosine > _NORMAL_FACING)
+        own = frames.unit(one.sample(view.normal)[facing]) @ view.pose.rotation
+        angles.append(np.arccos(np.clip(frames.dot(own, normal[one.texel[facing]]), -1, 1)))
+    angle = np.concatenate(angles)
+    return _NORMAL_ERROR * float(np.median(angle)) / np.sqrt(2 * np.log(2)) if len(angle) else 0.0  # Rayleigh's law
 
 
-def _lobe(samples: LobeSamples, light: Floats, settings: MaterialSettings) -> Lobe:
-    """The lobe that fits the samples best for a flash at `light` (3,) [m, camera frame]."""
-    to_lens = frames.unit(-samples.point)
-    to_light = frames.to_ray_frame(frames.unit(light - samples.point), to_lens)
-    ones, white, none = np.ones(len(to_light)), np.ones((len(to_light), 1)), np.zeros((len(to_light), 1))
-    body = shade.stokes(samples.normal, white, none, 0.5 * ones, _INDEX * ones, to_light, ones)[0][:, 0]
-    diffuse = samples.albedo * body
-    floor = _FLOOR * float(np.median(samples.radiance))
-    widened = 2 * np.radians(settings.normal_sigma_deg) ** 2
+def _lobes(profiles: Sequence[LobeProfile | None], widening: float, settings: MaterialSettings) -> list[Lobe | None]:
+    """Lobe of each material that has a profile, with nearly the same F0.
 
-    def lobe(log_alpha: float, prior: float) -> Lobe:
-        alpha = np.exp(log_alpha)
-        gloss = shade.stokes(samples.normal, none, white, np.sqrt(alpha) * ones, _INDEX * ones, to_light, ones)[0][:, 0]
-        gain, f0, residual = _amplitudes(samples, diffuse, gloss, floor, prior)
-        narrower = np.sqrt(max(alpha**2 - widened, _ALPHAS[0] ** 2))  # the lobe without the errors of the normals
-        residual += prior * ((np.sqrt(narrower) - np.sqrt(samples.alpha)) / _ROUGHNESS_SIGMA) ** 2
-        return Lobe(f0, float(narrower), gain, residual)
+    Errors of all materials are alike, so together they count as one: their misfits are averaged. A material whose law
+    is another adds little.
+    """
+    known = [one for one in profiles if one is not None]
+    if not known:
+        return [None] * len(profiles)
+    weight = [one.weight for one in known]
+    of_maps, alpha = (float(np.average(part, weights=weight)) for part in zip(*((one.f0, one.alpha) for one in known)))
+    sigma = settings.f0_sigma * min(1.0, (_BROAD_ALPHA / alpha) ** _BROAD_POWER)
 
-    of_maps = lobe(0.5 * float(np.log(samples.alpha**2 + widened)), settings.map_weight)
-    prior = settings.map_weight * of_maps.residual  # the residual is the noise of the highlights
-    steps = np.log(_ALPHAS)
-    best = int(np.argmin([lobe(one, prior).residual for one in steps]))
-    around = steps[max(best - 1, 0)], steps[min(best + 1, len(steps) - 1)]
-    found = minimize_scalar(lambda one: lobe(one, prior).residual, bounds=around, options={"xatol": _ALPHA_ERROR})
-    return lobe(float(found.x), prior)
+    def misfit(f0: float) -> float:
+        each = [_lobe(one, f0, widening, settings.roughness_sigma).misfit for one in known]
+        robust = [len(one.radiance) * np.log1p(value / len(one.radiance)) for one, value in zip(known, each)]
+        return float(np.average(robust, weights=weight)) + ((f0 - of_maps) / sigma) ** 2
+
+    best = int(np.argmin([misfit(float(f0)) for f0 in _F0S]))
+    around = _F0S[max(best - 1, 0)], _F0S[min(best + 1, len(_F0S) - 1)]
+    f0 = float(minimize_scalar(misfit, bounds=around, options={"xatol": _F0_ERROR}).x)
+    return [None if one is None else _lobe(one, f0, widening, settings.roughness_sigma) for one in profiles]
 
 
-def _amplitudes(
-    samples: LobeSamples, diffuse: Floats, gloss: Floats, floor: float, prior: float
-) -> tuple[float, float, float]:
-    """Gain of the albedo, F0 and the mean residual, by reweighted least squares around the maps."""
-    terms = np.stack([diffuse, gloss], axis=-1)
-    scale = floor + _RELATIVE * np.maximum(samples.radiance, 0)
-    robust = np.ones(len(scale))
-    f0_sigma = min(_F0_SIGMA, _F0_SIGMA_ROUGH / samples.alpha**2)
-    expected, tie = np.array([1.0, samples.f0]), prior / np.array([_GAIN_SIGMA, f0_sigma]) ** 2
-    for _ in range(_ROUNDS):
-        w = samples.weight * robust / scale**2 / samples.weight.sum()
-        normal = terms.T @ (w[:, None] * terms) + np.diag(tie)
-        amplitude = np.linalg.solve(normal, terms.T @ (w * samples.radiance) + tie * expected)
-        if amplitude[1] < 0:  # no highlight at all
-            amplitude = np.array([(w * diffuse) @ samples.radiance / max(float((w * diffuse) @ diffuse), 1e-12), 0.0])
-        error = (samples.radiance - terms @ amplitude) / scale
-        robust = 1 / (1 + error**2)
-    loss = float((samples.weight * np.log1p(error**2)).sum() / samples.weight.sum())
-    loss += float(tie @ (amplitude - expected) ** 2)
-    return float(amplitude[0]), float(amplitude[1]), loss
+def _lobe(profile: LobeProfile, f0: float, widening: float, roughness_sigma: float) -> Lobe:
+    """The lobe that fits a profile best, with an F0 near `f0`; `widening`: of α² by the errors of the normals."""
+    terms = np.empty((len(ALPHAS), len(profile.radiance), 3))
+    terms[..., 0], terms[..., 1:] = profile.gloss, profile.diffuse
+    terms /= profile.error[:, None]
+    radiance = profile.radiance / profile.error
+    sigma = np.tile([_OWN_F0_SIGMA, _GAIN_SIGMA, _LAW_SIGMA], (len(ALPHAS), 1))
+    expected = np.tile([f0, 1.0, 0.0], (len(ALPHAS), 1))
+    amplitude = _amplitudes(terms, radiance, expected, sigma)
+    low = amplitude[:, 0] < _LEAST_F0
+    expected[low, 0], sigma[low, 0] = _LEAST_F0, _FIXED_SIGMA
+    amplitude = _amplitudes(terms, radiance, expected, sigma)
+    narrower = np.sqrt(np.maximum(ALPHAS**2 - widening, ALPHAS[0] ** 2))  # without the errors of the normals
+    misfit = np.sum((radiance - np.einsum("abt,at->ab", terms, amplitude)) ** 2, axis=-1)
+    misfit += np.sum(((amplitude - expected) / sigma) ** 2, axis=-1)
+    misfit += ((np.sqrt(narrower) - np.sqrt(profile.alpha)) / roughness_sigma) ** 2
+    best = int(np.clip(np.argmin(misfit), 1, len(ALPHAS) - 2))
+    before, least, after = misfit[best - 1 : best + 2]
+    bend = before - 2 * least + after
+    place = best + float(np.clip((before - after) / (2 * bend), -1, 1) if bend > 0 else 0)  # between steps of α
+    f0_there, alpha = (float(np.interp(place, range(len(ALPHAS)), part)) for part in (amplitude[:, 0], narrower))
+    return Lobe(f0_there, alpha, float(least))
+
+
+def _amplitudes(terms: Floats, radiance: Floats, expected: Floats, sigma: Floats) -> Floats:
+    """F0, g and c (A, 3) by least squares around the expected values."""
+    tie = sigma**-2
+    normal = np.einsum("abs,abt->ast", terms, terms) + tie[..., None] * np.eye(3)
+    right = np.einsum("abt,b->at", terms, radiance) + tie * expected
+    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
 
 
 def _blended(atlas: Atlas, maps: AtlasMaps, share: Floats, lobes: Sequence[Lobe | None]) -> AtlasMaps:

@@ -41,19 +41,8 @@ from polcap.stages import asset, surface
 
 _Writer = Callable[[], list[Path]]  # returns the files that it has written
 _NEEDED: tuple[Extra, ...] = ("object-normal",)  # by the format `iiif`
-_SUFFIXES = {
-    ".glb",
-    ".obj",
-    ".mtl",
-    ".ply",
-    ".stl",
-    ".usdc",
-    ".usdz",
-    ".mtlx",
-    ".exr",
-    ".png",
-    ".html",
-}  # of exported files
+# of exported files
+_SUFFIXES = {".glb", ".obj", ".mtl", ".ply", ".stl", ".usdc", ".usdz", ".mtlx", ".exr", ".png", ".html"}
 _SHARING = {"obj", "usd", "materialx"}  # formats that share texture files
 
 
@@ -210,10 +199,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     name = atomic.safe_name(str(about["capture"].get("name")))  # files stay in the folder, whatever name the report has
     stem = preset.name.format(obj.stem(name) if preset.textures else name)
     shared: dict[Key, str] = {key: f"{obj.stem(stem)}_{key}.{preset.shared}" for key in texture_set.LOOSE}
-    loose = _loose_textures(preset, wanted, whole, obj.stem(name))
-    if _SHARING.intersection(preset.formats):
-        made = {file: texture_set.LOOSE[key](whole) for key, file in shared.items()}
-        loose |= {file: texture_set.linear(one) for file, one in made.items()} if preset.shared == "exr" else made
+    loose = _loose_textures(preset, wanted.extras, whole, obj.stem(name), shared)
     folder = out / "asset" / (wanted.preset or "")
     options = gltf.GlbOptions(preset.images, preset.geometry, gltf.center(mesh.vertices))
     unit, encoder = "m" if mesh.metric else "relative", TextureEncoder()
@@ -223,12 +209,12 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     writers: dict[Format, _Writer] = {
         "gltf": partial(_write_glb, folder / f"{stem}.glb", whole, options, words, encoder),
         "obj": partial(obj.write, folder / f"{stem}.obj", whole, stem, shared, comment),
-        "ply": partial(_write_mesh, folder / f"{stem}.ply", whole),
-        "stl": partial(_write_mesh, folder / f"{stem}.stl", whole),
-        "usd": partial(_write_usd, folder / f"{stem}.usdc", whole, shared, words),
+        "ply": partial(_write_one, ply_stl.write, folder / f"{stem}.ply", whole),
+        "stl": partial(_write_one, ply_stl.write, folder / f"{stem}.stl", whole),
+        "usd": partial(_write_one, usd.write, folder / f"{stem}.usdc", whole, stem, shared, words),
         "usdz": partial(_write_usdz, folder / f"{stem}.usdz", whole, words, encoder),
         "materialx": partial(_write_materialx, folder / f"{stem}.mtlx", whole, shared, comment),
-        "exr": partial(_write_exr, folder / f"{stem}_layers.exr", out / "maps", wanted.color, words),
+        "exr": partial(_write_one, exr_layers.write, folder / f"{stem}_layers.exr", out / "maps", wanted.color, words),
         "iiif": partial(_write_iiif, folder / f"{stem}_iiif", whole, words, wanted.iiif or ""),
     }
     coarser = {folder / f"{stem}_lod{k}.glb": level for k, level in enumerate(found[1:], 1)}
@@ -255,12 +241,21 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     return [*written, sidecar]
 
 
-def _loose_textures(preset: ExportPreset, wanted: ExportRequest, whole: Asset, stem: str) -> dict[str, Texture]:
-    """The PNG textures of a preset and of options, by file name; a closed mesh has no displacement."""
+def _loose_textures(
+    preset: ExportPreset, extras: Sequence[Extra], whole: Asset, stem: str, shared: Mapping[Key, str]
+) -> dict[str, Texture]:
+    """Texture files of a preset, of --extra, and those that OBJ, USD and MaterialX share, by file name.
+
+    A closed mesh has no displacement.
+    """
     makers = {f"{pattern.format(stem)}.png": make for pattern, make in preset.textures.items()}
-    makers |= {f"{stem}_{key.replace('-', '')}.png": texture_set.EXTRAS[key] for key in wanted.extras}
+    makers |= {f"{stem}_{key.replace('-', '')}.png": texture_set.EXTRAS[key] for key in extras}
     known = whole.displacement is not None
-    return {file: make(whole) for file, make in makers.items() if known or make is not texture_set.displacement}
+    found = {file: make(whole) for file, make in makers.items() if known or make is not texture_set.displacement}
+    if _SHARING.intersection(preset.formats):
+        made = {file: texture_set.LOOSE[key](whole) for key, file in shared.items()}
+        found |= {file: texture_set.linear(one) for file, one in made.items()} if preset.shared == "exr" else made
+    return found
 
 
 def sidecars(out: Path) -> list[Path]:
@@ -309,13 +304,8 @@ def _write_glb(
     return [file]
 
 
-def _write_mesh(file: Path, content: Asset) -> list[Path]:
-    ply_stl.write(file, content)
-    return [file]
-
-
-def _write_usd(file: Path, content: Asset, textures: Mapping[Key, str], words: Mapping[str, str]) -> list[Path]:
-    usd.write(file, content, file.stem, textures, words)
+def _write_one(write_file: Callable[..., None], file: Path, *arguments: Any) -> list[Path]:
+    write_file(file, *arguments)
     return [file]
 
 
@@ -327,11 +317,6 @@ def _write_usdz(file: Path, content: Asset, words: Mapping[str, str], encoder: T
 
 def _write_materialx(file: Path, content: Asset, textures: Mapping[Key, str], comment: str) -> list[Path]:
     atomic.write(file, materialx.document(content, file.stem, textures, comment))
-    return [file]
-
-
-def _write_exr(file: Path, maps: Path, color: str, words: Mapping[str, str]) -> list[Path]:
-    exr_layers.write(file, maps, color, words)
     return [file]
 
 

@@ -12,7 +12,7 @@ from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean
 from polcap.optics.sharpness import TILE
-from polcap.quality import object_turn
+from polcap.quality import object_turn, rim
 from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, blamed
 from polcap.quality.limits import GateLimits
 from polcap.stages.align import AlignSettings, object_motion
@@ -115,9 +115,7 @@ def mask(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on the object's mask: a chart inside, uncertain pixels, contact with the picture's border, parts, holes."""
     object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
-    charted = 0.0
-    if found.color.place is None:
-        charted = _charted(found)
+    charted = _charted(found) if found.color.place is None else 0.0
     if charted:
         faults.append((f"{charted:.0%} of the object's mask looks like a color chart that was not found", charted, 0))
     doubted = doubt is not None and doubt > limit
@@ -151,7 +149,7 @@ def _charted(found: Evidence) -> float:
     return float(chart_in_mask.share(found.radiance, found.object_.mask, shipped_data.colorchecker()))
 
 
-def mesh(of: Mesh, limits: GateLimits) -> Gate:
+def mesh(surface: Mesh, limits: GateLimits) -> Gate:
     """Gate on the mesh: number of pieces, cuts, jagged boundary.
 
     The surface is cut where one part hides another, and where the normals are wrong. A jagged boundary is smoothed
@@ -159,28 +157,28 @@ def mesh(of: Mesh, limits: GateLimits) -> Gate:
     """
     faults: list[tuple[str, float, float, Unit]] = []  # in words, its figure, its limit
     remedies = []
-    pieces, cuts, rim = limits.max_mesh_pieces, limits.max_mesh_cuts, limits.max_mesh_raggedness
-    if of.pieces > pieces:
-        faults.append((f"The mesh has {of.pieces} pieces, more than {pieces}", of.pieces, pieces, ""))
-    if of.cuts > cuts:
-        message = f"Cuts of {of.cut_px:.0f} px are {of.cuts:.0%} of the outline's length, more than {cuts:.0%}"
-        faults.append((message, of.cuts, cuts, "1"))
+    pieces, cuts, ragged = limits.max_mesh_pieces, limits.max_mesh_cuts, limits.max_mesh_raggedness
+    if surface.pieces > pieces:
+        faults.append((f"The mesh has {surface.pieces} pieces, more than {pieces}", surface.pieces, pieces, ""))
+    if surface.cuts > cuts:
+        message = (
+            f"Cuts of {surface.cut_px:.0f} px are {surface.cuts:.0%} of the outline's length, more than {cuts:.0%}"
+        )
+        faults.append((message, surface.cuts, cuts, "1"))
     state: State = "fail" if faults else "warn"
     if faults:
         remedies.append("See the error of the normals: they fit no surface; --set surface.stiffness=0 closes all cuts")
-    if of.raggedness > rim:
-        message = f"The boundary is {of.raggedness:.0%} longer than when smoothed, more than {rim:.0%}"
-        faults.append((message, of.raggedness, rim, "1"))
+    if surface.raggedness > ragged:
+        message = f"The boundary is {surface.raggedness:.0%} longer than when smoothed, more than {ragged:.0%}"
+        faults.append((message, surface.raggedness, ragged, "1"))
         remedies.append("If the mask's outline is jagged, use --mask PNG")
     if faults:
         _, value, limit, unit = faults[0]
-        said = "; ".join(fault[0] for fault in faults)
-        return Gate("mesh", state, round(value, 4), limit, said, "; ".join(remedies), unit=unit)
-    message = f"{of.pieces} {'piece' if of.pieces == 1 else 'pieces'}, "
-    message += (
-        f"cut along {of.cut_px:.0f} px, at occlusions or where the normals are wrong" if of.cut_px else "without a cut"
-    )
-    return Gate("mesh", "pass", round(of.cuts, 4), cuts, message)
+        message = "; ".join(fault[0] for fault in faults)
+        return Gate("mesh", state, round(value, 4), limit, message, "; ".join(remedies), unit=unit)
+    message = f"{surface.pieces} {'piece' if surface.pieces == 1 else 'pieces'}, "
+    where = f"cut along {surface.cut_px:.0f} px, at occlusions or where the normals are wrong"
+    return Gate("mesh", "pass", round(surface.cuts, 4), cuts, message + (where if surface.cut_px else "without a cut"))
 
 
 def sharpness(found: Evidence, limits: GateLimits) -> Gate:
@@ -267,9 +265,7 @@ def _inward_share(maps: SurfaceMaps) -> float:
     mask = area_mean(maps.mask, shape) > 0.99
     lean = area_mean((across * maps.mask[..., None]).astype(np.float32), shape)
     away, _slope = outline.outward(mask.astype(np.float32), _OUTLINE_BLUR_PX)
-    band = mask & (outline.depth(mask) <= _OUTLINE_PX)
-    for edge in (band[:3], band[-3:], band[:, :3], band[:, -3:]):  # where a picture ends is no outline
-        edge[:] = False
+    band = rim.off_border(mask & (outline.depth(mask) <= _OUTLINE_PX))
     outwards = (lean[..., 0] * away[0] + lean[..., 1] * away[1])[band]
     return float((outwards < -_INWARD).mean()) if outwards.size else 0.0
 

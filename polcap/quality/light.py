@@ -1,7 +1,7 @@
 """Gates of the light: bracket, tone curve, chart, gains, clipping, ambient light."""
 
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass
 
 import cv2
 import msgspec
@@ -71,16 +71,14 @@ def tone(found: Evidence, limits: GateLimits) -> Gate:
     curved = np.abs(radiance.bracket.curvature)
     within = float(np.nanmedian(np.nanmax(curved, axis=-1))) if np.isfinite(curved).any() else 0.0
     worst, reason = within, "The ratio of two exposures changes from shadows to highlights"
-    power = _power(radiance)
+    power = _exposure_power(radiance)
     if radiance.equipment.light == "steady" and abs(power - 1) > worst:
         worst, reason = abs(power - 1), f"Exposures follow the stated ones to the power {power:.2f}, not 1"
     slope, chart_light = found.selfcal.gains.grey_slope, found.color.light
     evenly = found.color.place is not None and (chart_light is None or chart_light.uneven < limits.max_scale_doubt / 2)
-    if evenly and np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens greys too
-        worst, reason = (
-            abs(slope - 1) / 2,
-            f"The chart's grays follow their reflectance to the power {slope:.2f}, not 1",
-        )
+    if evenly and np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens grays too
+        worst = abs(slope - 1) / 2
+        reason = f"The chart's grays follow their reflectance to the power {slope:.2f}, not 1"
     message = reason if worst > limit else "Pixel values are linear"
     remedy = "Use the RAW files, or develop them linearly to 16 bits, without tone curve, denoising or lens profile"
     return at_most("tone curve", worst, limit, message, remedy, cost_deg=60 * worst, unit="")
@@ -258,25 +256,29 @@ def crossed(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
         yield Gate("crossed", "warn", None, limit, message, "Put a ColorChecker next to the object, or expose more")
         return
     seen = _crossed(found.stokes)
-    share = 100 * seen["mirrored"]
+    share = 100 * seen.mirrored
     message = f"{share:.1f} % of the object's light is mirrored at its surface; it is removed from the albedo"
-    if seen["left"] > _STILL_CLIPPED and seen["clipped"] > _FEW:
-        message = f"{100 * seen['left']:.0f} % of the clipped highlights are also clipped in the cross-polarized shot"
-        yield Gate("crossed", "warn", round(seen["left"], 3), _STILL_CLIPPED, message, remedy)
+    if seen.left > _STILL_CLIPPED and seen.clipped > _FEW:
+        message = f"{100 * seen.left:.0f} % of the clipped highlights are also clipped in the cross-polarized shot"
+        yield Gate("crossed", "warn", round(seen.left, 3), _STILL_CLIPPED, message, remedy)
         return
-    if seen["over"] > limit:
-        message = f"{100 * seen['over']:.0f} % of the object is brighter in the cross-polarized shot than is possible"
-    yield at_most("crossed", seen["over"], limit, message, remedy, beyond="warn")
+    if seen.over > limit:
+        message = f"{100 * seen.over:.0f} % of the object is brighter in the cross-polarized shot than is possible"
+    yield at_most("crossed", seen.over, limit, message, remedy, beyond="warn")
 
 
-def _crossed(image: StokesImage) -> dict[str, Any]:
-    """Compare the cross-polarized shot with S0.
+@dataclass(frozen=True)
+class CrossedFigures:
+    """Comparison of the cross-polarized shot with S0."""
 
-    left      share of the clipped highlights of S0 that are clipped in the crossed shot too
-    clipped   number of clipped pixels of S0
-    over      share of pixels that are brighter in the crossed shot than in S0, which is not possible
-    mirrored  share of the object's light that the crossed filter removes: specular reflection
-    """
+    left: float  # share of the clipped highlights of S0 that are clipped in the crossed shot too
+    clipped: int  # number of clipped pixels of S0
+    over: float  # share of pixels that are brighter in the crossed shot than in S0, which is not possible
+    mirrored: float  # share of the object's light that the crossed filter removes: specular reflection
+
+
+def _crossed(image: StokesImage) -> CrossedFigures:
+    """Compare the cross-polarized shot with S0."""
     assert image.body is not None
     known = image.mask & (image.body.quality == 0)
     sound = known & ((image.quality & int(Quality.CLIPPED)) == 0)
@@ -288,7 +290,7 @@ def _crossed(image: StokesImage) -> dict[str, Any]:
     inner = erode(sound, 2)
     over = float((smooth > _BRIGHTER * whole)[inner].mean()) if inner.any() else 1.0
     mirrored = float(np.maximum(total - body, 0)[sound].sum() / max(float(total[sound].sum()), 1e-9))
-    return {"left": left, "clipped": int(clipped.sum()), "over": over, "mirrored": mirrored}
+    return CrossedFigures(left, int(clipped.sum()), over, mirrored)
 
 
 def ambient(found: Evidence, limits: GateLimits) -> Gate:
@@ -372,7 +374,7 @@ def _promised_steps(radiance: AngleStack) -> float:
     return float((stated[1:] / stated[:-1]).min()) if np.isfinite(stated).all() and len(stated) > 1 else float("nan")
 
 
-def _power(radiance: AngleStack) -> float:
+def _exposure_power(radiance: AngleStack) -> float:
     """Power law between measured and stated exposures: slope of their logarithms; 1 without metadata or steps."""
     ratio = radiance.bracket.exif_ratio[0]
     stated: Floats = np.log(ratio) if np.isfinite(ratio).all() else np.zeros(1)

@@ -7,7 +7,17 @@ from typing import TypeGuard
 import msgspec
 import numpy as np
 
-from polcap.images import Floats, OrderTest, Quality, SelfCalibration, ShotOrder, StokesImage, SurfaceMaps, TurnedShot
+from polcap.images import (
+    Bools,
+    Floats,
+    OrderTest,
+    Quality,
+    SelfCalibration,
+    ShotOrder,
+    StokesImage,
+    SurfaceMaps,
+    TurnedShot,
+)
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
@@ -304,7 +314,7 @@ def _medians(maps: SurfaceMaps) -> tuple[float, float, float]:
     return float(np.degrees(np.arccos(np.clip(facing, -1, 1)))), float(roughness), float(albedo)
 
 
-def _reduced(image: StokesImage, angle: Floats) -> tuple[Floats, rim.Bools, rim.Bools]:
+def _reduced(image: StokesImage, angle: Floats) -> tuple[Floats, Bools, Bools]:
     """Reduced pictures: light of the shots (K, h, w) from the Stokes parameters, object (h, w), valid pixels (h, w)."""
     step = int(np.ceil(np.sqrt(max(image.mask.size / _MOST_PIXELS, 1))))
     doubtful = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST

@@ -26,7 +26,7 @@ def baked(atlas: Atlas) -> AtlasMaps:
 
 
 def test_the_lobe_is_found_from_the_highlights_of_all_views(atlas: Atlas, baked: AtlasMaps) -> None:
-    settings = MaterialSettings(normal_sigma_deg=0, map_weight=1e-6)
+    settings = MaterialSettings(f0_sigma=1, roughness_sigma=1)
     found = material_fit.fit(RING, atlas, baked, settings)
     seen = found.seen & atlas.covered
     assert np.median(found.specular[seen]) == pytest.approx(ellipsoid.F0, rel=0.1)
@@ -40,7 +40,7 @@ def test_views_without_photographs_keep_their_maps(atlas: Atlas, baked: AtlasMap
 
 def test_the_fit_brings_the_rendering_nearer_to_the_photographs(atlas: Atlas, baked: AtlasMaps) -> None:
     views = tuple(replace(view, light=ellipsoid.FLASH) for view in RING)
-    fitted = material_fit.fit(RING, atlas, baked, MaterialSettings(normal_sigma_deg=0))
+    fitted = material_fit.fit(RING, atlas, baked, MaterialSettings())
     before, after = (comparison.compare(views, atlas, maps).views for maps in (baked, fitted))
     assert np.mean([one.residual for one in after]) < 0.7 * np.mean([one.residual for one in before])
 
