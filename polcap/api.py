@@ -35,7 +35,7 @@ class Result:
 
     @property
     def expected_error_deg(self) -> float | None:
-        """Median of the expected error of the normals, degrees; None where it was not measured."""
+        """Median expected error of the normals with the costs of all checks, degrees; None: it was not measured."""
         return None if self.report["expected_error_deg"] is None else float(self.report["expected_error_deg"])
 
     @property

@@ -132,6 +132,8 @@ def check(wanted: ExportRequest) -> None:
         raise SettingError(
             "--images and --geometry change the GLB, which is not written; leave them out, or add --gltf"
         )
+    if wanted.bits == 16 and not _has_png(preset):
+        raise SettingError("--bits 16 is for PNG textures, and none is written; add --images png, or leave it out")
     if not {"usd", "usdz"}.isdisjoint(preset.formats):
         usd.require()
     glb_geometry.require(preset.geometry)
@@ -141,10 +143,17 @@ def check(wanted: ExportRequest) -> None:
             raise SettingError("--iiif keeps the proportions of the photographs; leave out --texture-size")
     if wanted.page is not None:
         web_page.read_script(wanted.page)
-        if "gltf" not in preset.formats or preset.geometry == "draco":
-            raise SettingError(
-                "--page shows a GLB without Draco, whose decoder is not in the page; choose --preset web"
-            )
+        if "gltf" not in preset.formats:
+            raise SettingError("--page shows the GLB, which is not written; choose --preset web")
+        if preset.geometry == "draco":
+            raise SettingError("--page holds no decoder of Draco; leave out --geometry draco")
+
+
+def _has_png(preset: ExportPreset) -> bool:
+    """Whether an export writes a PNG texture, next to the GLB or in it."""
+    inside = preset.images == "png" and "gltf" in preset.formats
+    beside = preset.shared == "png" and not {"obj", "usd", "usdz", "materialx"}.isdisjoint(preset.formats)
+    return inside or beside or bool(preset.textures or preset.extras)
 
 
 def read(folder: Path, config: Config) -> ReliefSource:

@@ -128,6 +128,8 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, own: P
         (["--preset", "web", "--obj"], "write --obj by a second export"),
         (["--preset", "maya", "--color", "ACEScg"], "converts the colors of the layered EXR only"),
         (["--obj", "--geometry", "draco"], "change the GLB, which is not written"),
+        (["--preset", "web", "--bits", "16"], "--bits 16 is for PNG textures, and none is written; add --images png"),
+        (["--ply", "--bits", "16"], "--bits 16 is for PNG textures"),
         (["--about", "title"], "--about title: write FACT=TEXT"),
         (["--about", "author=me"], "--about author: there is no such fact; there are title, creator"),
         (["--obj", "--page", ROOT / "README.md"], "README.md is not model-viewer"),
