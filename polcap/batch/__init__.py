@@ -79,11 +79,8 @@ def _without_capture(root: Path, found: Sequence[Unit]) -> list[str]:
         return []
     used |= {parent for path in used for parent in path.parents}
     others = [path for path in layouts.children(root) if path.is_dir() and path not in used]
-    return [path.name for path in others if path.name not in own_folders.OURS and not _holds_result(path)]
-
-
-def _holds_result(folder: Path) -> bool:
-    return any(layouts.is_result(Path(inside)) for inside, _, _ in os.walk(folder))
+    unused = [path for path in others if path.name not in own_folders.OURS]
+    return [path.name for path in unused if not any(layouts.is_result(Path(inside)) for inside, _, _ in os.walk(path))]
 
 
 def _unit(root: Path, folder: Path, out: Path | None, batch_folder: str) -> Unit:

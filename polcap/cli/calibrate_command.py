@@ -7,6 +7,7 @@ from typer import Argument, Context, Option
 
 from polcap import terminal
 from polcap.cli.options import Json
+from polcap.errors import SettingError
 
 if TYPE_CHECKING:
     from polcap.calibration_values import Calibration
@@ -45,8 +46,6 @@ def squares(board: str) -> tuple[int, int]:
     """Parse the size of a checkerboard, such as `9x6`, as two numbers. Raises SettingError."""
     across, _, down = board.partition("x")
     if not (across.isdecimal() and down.isdecimal() and 3 <= int(across) <= 99 and 3 <= int(down) <= 99):
-        from polcap.errors import SettingError
-
         raise SettingError(f"--board {board}: give the inner corners across and down, 3 to 99 each, such as 9x6")
     return int(across), int(down)
 

@@ -7,17 +7,7 @@ from typing import TypeGuard
 import msgspec
 import numpy as np
 
-from polcap.images import (
-    Bools,
-    Floats,
-    OrderTest,
-    Quality,
-    SelfCalibration,
-    ShotOrder,
-    StokesImage,
-    SurfaceMaps,
-    TurnedShot,
-)
+from polcap.images import Bools, Floats, OrderTest, Quality, SelfCalibration, ShotOrder, StokesImage, SurfaceMaps
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
@@ -179,7 +169,7 @@ def _angles(
         remedy = "Set the ring's zero to the horizontal, or state the true angles"
         return Gate("angles", "fail", round(common, 1), limit, message, remedy, abs(common), unit="°")
     if selfcal.turned.shots and abs(np.degrees(selfcal.turned.angle)) > limit:
-        return _not_closing(selfcal.turned, names, limit)
+        return _not_closing(selfcal, names, limit)
     fit = limits.max_turn_fit * (1.0 if known else 0.75)  # guessed gains look like turns
     if found.misfit >= fit or found.sigmas < _SURE or found.shot is None:
         return Gate("angles", "pass", 0.0, limit, "No other angle fits the outline clearly better", unit="°")
@@ -200,8 +190,9 @@ def _angles(
     return Gate("angles", state, round(degrees, 1), limit, message, remedy, cost, (names[found.shot],), "°")
 
 
-def _not_closing(turned: TurnedShot, names: list[str], limit: float) -> Gate:
+def _not_closing(selfcal: SelfCalibration, names: list[str], limit: float) -> Gate:
     """Gate on the polarizer angle of one shot that contradicts those of three or more other shots."""
+    turned = selfcal.turned
     degrees, doubt = np.degrees([turned.angle, turned.sigma])
     shots = tuple(names[k] for k in turned.shots)
     which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])}, by as much or less)"

@@ -43,15 +43,8 @@ def write(file: Path, folders: tuple[Path, Path], abouts: tuple[Mapping[str, Any
     results = []
     for name, about in zip(names, abouts):
         headline, expected_error = page.verdict(about)
-        results.append(
-            {
-                "name": name,
-                "verdict": about["verdict"],
-                "headline": headline,
-                "expected_error": expected_error,
-                "checks": page.checks(about["gates"]),
-            }
-        )
+        heading = {"name": name, "verdict": about["verdict"], "headline": headline, "expected_error": expected_error}
+        results.append({**heading, "checks": page.checks(about["gates"])})
     found = rows(*abouts)
     content = {
         "results": results,
