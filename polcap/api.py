@@ -90,7 +90,7 @@ def process(
     memory
         Most memory to take, GB; 0 is no limit. It applies to this Python process and stays set.
     progress
-        Called at the begin and the end of each stage, with its name, seconds (None at the begin) and whether it was
+        Called at the start and the end of each stage, with its name, seconds (None at the start) and whether it was
         cached.
 
     Raises

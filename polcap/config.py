@@ -93,7 +93,7 @@ def fill_sections(kind: type[S], file: Path | None, assignments: Sequence[str]) 
         raise SettingError("--set: a value is not UTF-8 text; write it in ASCII") from error
 
 
-def restored(about: Mapping[str, Any], file: Path) -> Config:
+def restore(about: Mapping[str, Any], file: Path) -> Config:
     """Settings of an earlier run, from `about`, the content of its file.
 
     Raises

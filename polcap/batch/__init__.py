@@ -101,7 +101,7 @@ def run(
     batch_folder = Path(found[0].batch_folder)
     places = {"root": str(root.resolve()), "out": None if out is None else str(out.resolve())}
     atomic.write_json(batch_folder / "batch.json", places)  # for `reopen`
-    records = {unit: record for unit in mine if (record := units.finished(unit, options)) is not None}
+    records = {unit: record for unit in mine if (record := units.find_finished(unit, options)) is not None}
     wanted = [unit for unit in mine if unit not in records]
     print_line(f"{len(found)} captures, shard {plan.shard}: {len(mine)}, finished before: {len(records)}")
     if empty := _without_capture(root, found):

@@ -213,27 +213,27 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     options = gltf.GlbOptions(preset.images, preset.geometry, gltf.center(mesh.vertices))
     unit, encoder = "m" if mesh.metric else "relative", TextureEncoder()
     record = provenance.record(about, wanted.catalog)
-    words = {"unit": unit, "normals": "+Y (OpenGL)", **provenance.words(record)}
+    facts = {"unit": unit, "normals": "+Y (OpenGL)", **provenance.words(record)}
     comment = f"polcap; unit of length: {unit}; normals +Y (OpenGL); made from: {stem}.provenance.json"
     writers: dict[Format, _Writer] = {
-        "gltf": partial(_write_glb, folder / f"{stem}.glb", whole, options, words, encoder),
+        "gltf": partial(_write_glb, folder / f"{stem}.glb", whole, options, facts, encoder),
         "obj": partial(obj.write, folder / f"{stem}.obj", whole, stem, shared, comment),
         "ply": partial(_write_one, ply_stl.write, folder / f"{stem}.ply", whole),
         "stl": partial(_write_one, ply_stl.write, folder / f"{stem}.stl", whole),
-        "usd": partial(_write_one, usd.write, folder / f"{stem}.usdc", whole, stem, shared, words),
-        "usdz": partial(_write_usdz, folder / f"{stem}.usdz", whole, words, encoder),
+        "usd": partial(_write_one, usd.write, folder / f"{stem}.usdc", whole, stem, shared, facts),
+        "usdz": partial(_write_usdz, folder / f"{stem}.usdz", whole, facts, encoder),
         "materialx": partial(_write_materialx, folder / f"{stem}.mtlx", whole, shared, comment),
-        "exr": partial(_write_one, exr_layers.write, folder / f"{stem}_layers.exr", out / "maps", wanted.color, words),
-        "iiif": partial(_write_iiif, folder / f"{stem}_iiif", whole, words, wanted.iiif or ""),
+        "exr": partial(_write_one, exr_layers.write, folder / f"{stem}_layers.exr", out / "maps", wanted.color, facts),
+        "iiif": partial(_write_iiif, folder / f"{stem}_iiif", whole, facts, wanted.iiif or ""),
     }
     coarser = {folder / f"{stem}_lod{k}.glb": level for k, level in enumerate(found[1:], 1)}
     tasks = [writers[one] for one in preset.formats]
-    tasks += [partial(_write_glb, file, level.asset, options, words, encoder) for file, level in coarser.items()]
+    tasks += [partial(_write_glb, file, level.asset, options, facts, encoder) for file, level in coarser.items()]
     tasks += [partial(_write_texture, folder / file, texture, encoder) for file, texture in loose.items()]
     written = [file for files in parallel.results(tasks) for file in files]  # pictures are encoded on threads
     if wanted.page is not None:
         page, glb = folder / f"{stem}.html", folder / f"{stem}.glb"
-        web_page.write(page, glb, web_page.read_script(wanted.page), words.get("title", stem))
+        web_page.write(page, glb, web_page.read_script(wanted.page), facts.get("title", stem))
         written.append(page)
     sidecar = folder / f"{stem}.provenance.json"
     digests = {file.relative_to(folder).as_posix(): provenance.digest(file) for file in written}
@@ -272,7 +272,7 @@ def sidecars(out: Path) -> list[Path]:
     return sorted((out / "asset").glob("**/*.provenance.json"))
 
 
-def outdated(records: Sequence[Path], keys: Mapping[str, str]) -> list[Path]:
+def find_outdated(records: Sequence[Path], keys: Mapping[str, str]) -> list[Path]:
     """Exports of other maps than those of the result with these cache keys: whole folders, then single files.
 
     `records` are sidecars. A folder has one; a file that it does not list was exported with another record.
@@ -307,9 +307,9 @@ def effective(wanted: ExportRequest) -> ExportPreset:
 
 
 def _write_glb(
-    file: Path, content: Asset, options: gltf.GlbOptions, words: Mapping[str, str], encoder: TextureEncoder
+    file: Path, content: Asset, options: gltf.GlbOptions, facts: Mapping[str, str], encoder: TextureEncoder
 ) -> list[Path]:
-    atomic.write(file, gltf.encode(content, file.stem, options, words, encoder))
+    atomic.write(file, gltf.encode(content, file.stem, options, facts, encoder))
     return [file]
 
 
@@ -318,9 +318,9 @@ def _write_one(write_file: Callable[..., None], file: Path, *arguments: Any) -> 
     return [file]
 
 
-def _write_usdz(file: Path, content: Asset, words: Mapping[str, str], encoder: TextureEncoder) -> list[Path]:
+def _write_usdz(file: Path, content: Asset, facts: Mapping[str, str], encoder: TextureEncoder) -> list[Path]:
     textures = {key: encoder(make(content), "png") for key, make in texture_set.LOOSE.items()}
-    usd.package(file, content, file.stem, textures, words)
+    usd.package(file, content, file.stem, textures, facts)
     return [file]
 
 
@@ -329,10 +329,10 @@ def _write_materialx(file: Path, content: Asset, textures: Mapping[Key, str], co
     return [file]
 
 
-def _write_iiif(folder: Path, content: Asset, words: Mapping[str, str], address: str) -> list[Path]:
+def _write_iiif(folder: Path, content: Asset, facts: Mapping[str, str], address: str) -> list[Path]:
     page = folder / "index.html"
-    openlime_page.write(page, words.get("title") or words["name"], words.get("rights", ""))
-    return [page, *iiif.write(folder, relightable_layer.pictures(content), words, address)]
+    openlime_page.write(page, facts.get("title") or facts["name"], facts.get("rights", ""))
+    return [page, *iiif.write(folder, relightable_layer.pictures(content), facts, address)]
 
 
 def _write_texture(file: Path, texture: Texture, encoder: TextureEncoder) -> list[Path]:

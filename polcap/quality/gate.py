@@ -87,6 +87,6 @@ def at_most(
     )
 
 
-def blamed(names: list[str], bad: Bools) -> tuple[str, ...]:
+def bad_shots(names: list[str], bad: Bools) -> tuple[str, ...]:
     """Names of the shots to take again, those where `bad` (K,) is true."""
     return tuple(name for name, one in zip(names, bad) if one)

@@ -12,7 +12,7 @@ from polcap.optics import mueller
 from polcap.optics.frames import dot, rays
 from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
-from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, blamed
+from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots
 from polcap.quality.limits import GateLimits
 from polcap.stages.whitebalance import patches
 
@@ -114,7 +114,7 @@ def stillness(found: Evidence, limits: GateLimits) -> Gate:
     k = int(np.argmax(fraction))
     message = f"{100 * fraction[k]:.2f} % of the object differs between the exposures of the {found.names[k]} shot"
     remedy = "Take the bracket again: something moved, or the light changed"
-    bad = blamed(found.names, fraction > limits.max_ghost)
+    bad = bad_shots(found.names, fraction > limits.max_ghost)
     blurred = np.nan_to_num(found.blur_px).max() > limits.max_blur_px  # `sharpness` judges this
     state: State = "warn" if blurred else "fail"
     return at_most(
@@ -176,8 +176,8 @@ def clipping(found: Evidence, limits: GateLimits) -> Gate:
     remedy = "Add a darker exposure or use less light"
     if few < share <= limit:
         message += ": highlights, without which roughness and specular are uncertain"
-        return at_most("clipping", share, few, message, remedy, blamed(found.names, clipped > few), beyond="warn")
-    return at_most("clipping", share, limit, message, remedy, blamed(found.names, clipped > limit), 20 * share)
+        return at_most("clipping", share, few, message, remedy, bad_shots(found.names, clipped > few), beyond="warn")
+    return at_most("clipping", share, limit, message, remedy, bad_shots(found.names, clipped > limit), 20 * share)
 
 
 def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
@@ -192,22 +192,22 @@ def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     remedy = "Wait longer between flashes: this one misfired or had not recycled"
     if radiance.equipment.light == "steady":
         remedy = "Shoot again under constant light: the lamp or daylight changed between shots"
-    message = f"The {names[k]} shot was {abs(100 * each[k]):.1f} % {_compared(each[k])} than the others"
-    yield at_most("gains", float(abs(each[k])), limit, message, remedy, blamed(names, np.abs(each) > limit), 3)
+    message = f"The {names[k]} shot was {abs(100 * each[k]):.1f} % {_comparative(each[k])} than the others"
+    yield at_most("gains", float(abs(each[k])), limit, message, remedy, bad_shots(names, np.abs(each) > limit), 3)
     yield _gain_doubt(found, limits)
     drift = off - each[:, None]
     k, e = (int(i) for i in np.unravel_index(int(np.argmax(np.abs(drift))), drift.shape))
     limit = limits.max_energy_drift
     change = float(drift[k, e])
-    message = f"Frame {e + 1} of {names[k]} was {abs(100 * change):.1f} % {_compared(change)} than its bracket"
-    bad = blamed(names, np.abs(drift).max(1) > limit)
+    message = f"Frame {e + 1} of {names[k]} was {abs(100 * change):.1f} % {_comparative(change)} than its bracket"
+    bad = bad_shots(names, np.abs(drift).max(1) > limit)
     remedy = remedy.replace("between shots", "within a bracket")
     yield at_most(
         "energy", abs(change), limit, message, remedy, bad, beyond="fail" if abs(change) > _MISFIRE else "warn"
     )
 
 
-def _compared(change: float) -> str:
+def _comparative(change: float) -> str:
     return "darker" if change < 0 else "brighter"
 
 
@@ -255,7 +255,7 @@ def crossed(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
         message = "The brightness of the cross-polarized shot relative to the others is unknown; it is not used"
         yield Gate("crossed", "warn", None, limit, message, "Put a ColorChecker next to the object, or expose more")
         return
-    seen = _crossed(found.stokes)
+    seen = _compare_crossed(found.stokes)
     share = 100 * seen.mirrored
     message = f"{share:.1f} % of the object's light is mirrored at its surface; it is removed from the albedo"
     if seen.left > _STILL_CLIPPED and seen.clipped > _FEW:
@@ -277,7 +277,7 @@ class CrossedFigures:
     mirrored: float  # share of the object's light that the crossed filter removes: specular reflection
 
 
-def _crossed(image: StokesImage) -> CrossedFigures:
+def _compare_crossed(image: StokesImage) -> CrossedFigures:
     """Compare the cross-polarized shot with S0."""
     assert image.body is not None
     known = image.mask & (image.body.quality == 0)

@@ -231,10 +231,10 @@ def test_texture_size_and_levels_of_detail(own: Path) -> None:
 def test_exports_of_earlier_maps_are_named(own: Path, polcap: Command) -> None:
     assert polcap("export", own, "--preset", "unreal", "--lod", 2, "--texture-size", 64).stderr == ""
     asset, about = own / "asset", json.loads((own / "report.json").read_text())
-    assert asset_export.outdated(asset_export.sidecars(own), about["keys"]) == []
+    assert asset_export.find_outdated(asset_export.sidecars(own), about["keys"]) == []
     about["keys"]["surface"] = "of other maps"
     (own / "report.json").write_text(json.dumps(about))
-    assert asset_export.outdated(asset_export.sidecars(own), about["keys"]) == [asset, asset / "unreal"]
+    assert asset_export.find_outdated(asset_export.sidecars(own), about["keys"]) == [asset, asset / "unreal"]
     again = polcap("export", own, "--preset", "unreal", "--lod", 1, "--texture-size", 64)
     assert again.returncode == 0 and "asset/unreal/SM_capture_lod2.glb in" in again.stderr
 

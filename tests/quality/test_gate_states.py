@@ -55,9 +55,9 @@ FIGURES = {
 }  # fmt: skip
 MEASURES = {  # the function that measures each figure
     "surroundings": (light, "_surroundings_dolp"), "highlight": (light, "_highlight_dolp"),
-    "pushed": (geometry, "_pushed"), "turn": (geometry, "_turn"), "edge_blur": (geometry, "_edge_blur"),
-    "charted": (geometry, "_charted"), "lean": (geometry, "_lean"),
-    "noise": (light, "_noise"), "crossed": (light, "_crossed"), "ill_posed": (polarization, "_ill_posed"),
+    "pushed": (geometry, "_measure_shift"), "turn": (geometry, "_measure_turn"), "edge_blur": (geometry, "_edge_blur"),
+    "charted": (geometry, "_chart_share"), "lean": (geometry, "_lean"),
+    "noise": (light, "_noise"), "crossed": (light, "_compare_crossed"), "ill_posed": (polarization, "_ill_posed"),
     "medians": (polarization, "_medians"), "outline": (polarization, "_outline"),
     "normal_error": (gates, "_own_error"), "inward_outline": (geometry, "_inward_share"),
 }  # fmt: skip
