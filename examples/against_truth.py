@@ -27,7 +27,9 @@ both = found.mask & (truth("mask") == 1)
 normal = truth("normal")[both]
 normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
 angle = np.degrees(np.arccos(np.clip(np.sum(normal * found.normal[both], axis=-1), -1, 1)))
-expected = found.confidence[both].mean()
-print(f"normals: mean {angle.mean():.2f}°, median {np.median(angle):.2f}°, expected mean {expected:.2f}°")
+expected = found.confidence[both]
+print(f"normals: mean {angle.mean():.2f}°, median {np.median(angle):.2f}°, expected mean {expected.mean():.2f}°")
+below, twice = np.mean(angle < expected), np.mean(angle < 2 * expected)
+print(f"below the expected error: {below:.0%} of the pixels; below twice of it: {twice:.0%}")
 for name, estimate in {"diffuse": found.diffuse, "specular": found.specular, "roughness": found.roughness}.items():
     print(f"{name}: RMSE {np.sqrt(np.mean((truth(name)[both] - estimate[both]) ** 2)):.4f}")

@@ -26,27 +26,10 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
-    "Asset",
-    "Capture",
-    "ChartRequest",
-    "Config",
-    "Cues",
-    "Frame",
-    "Mesh",
-    "PolcapError",
-    "Result",
-    "ResultMaps",
-    "Shot",
-    "StokesImage",
-    "SurfaceMaps",
-    "View",
-    "load_config",
-    "process",
-    "read_capture",
-    "read_cues",
-    "read_maps",
+    "Asset", "Capture", "ChartRequest", "Config", "Cues", "Frame", "Mesh", "PolcapError", "Result", "ResultMaps",
+    "Shot", "StokesImage", "SurfaceMaps", "View", "load_config", "process", "read_capture", "read_cues", "read_maps",
     "read_stokes",
-]
+]  # fmt: skip
 _HOME = {  # public name → module and its name there; the others are values of `polcap.images`
     "process": ("polcap.api", "process"),
     "Result": ("polcap.api", "Result"),

@@ -35,7 +35,7 @@ class Result:
 
     @property
     def expected_error_deg(self) -> float | None:
-        """Median of the expected error of the normals, degrees; None where it was not measured."""
+        """Median expected error of the normals with the costs of all checks, degrees; None: it was not measured."""
         return None if self.report["expected_error_deg"] is None else float(self.report["expected_error_deg"])
 
     @property
@@ -90,7 +90,7 @@ def process(
     memory
         Most memory to take, GB; 0 is no limit. It applies to this Python process and stays set.
     progress
-        Called at the begin and the end of each stage, with its name, seconds (None at the begin) and whether it was
+        Called at the start and the end of each stage, with its name, seconds (None at the start) and whether it was
         cached.
 
     Raises

@@ -93,7 +93,7 @@ def fill_sections(kind: type[S], file: Path | None, assignments: Sequence[str]) 
         raise SettingError("--set: a value is not UTF-8 text; write it in ASCII") from error
 
 
-def restored(about: Mapping[str, Any], file: Path) -> Config:
+def restore(about: Mapping[str, Any], file: Path) -> Config:
     """Settings of an earlier run, from `about`, the content of its file.
 
     Raises
@@ -134,14 +134,13 @@ def fill(kind: type[S], stated: dict[str, Any], assignments: Sequence[str]) -> S
 def settings(kind: type[msgspec.Struct] = Config) -> Iterator[Setting]:
     """All settings of a struct of sections, in the order of the stages, for the settings reference."""
     for section in msgspec.structs.fields(kind):
-        hints = get_type_hints(section.type, include_extras=True)
+        annotated, plain = get_type_hints(section.type, include_extras=True), get_type_hints(section.type)
         for field in msgspec.structs.fields(section.type):
-            hint = hints[field.name]
-            arms = [hint] if get_origin(hint) is Annotated else [*get_args(hint)] or [hint]
+            hint, type_ = annotated[field.name], plain[field.name]
+            arms = [hint] if get_origin(hint) is Annotated else [*get_args(hint)] or [hint]  # of a union with None
             meta = next((extra for arm in arms for extra in get_args(arm)[1:] if isinstance(extra, Meta)), Meta())
-            kind = get_type_hints(section.type)[field.name]
-            choices = get_origin(kind) is Literal
-            word = str(kind).replace("typing.", "") if choices else (*get_args(kind), kind)[0].__name__  # without None
+            choices = get_origin(type_) is Literal
+            word = str(type_).replace("typing.", "") if choices else (*get_args(type_), type_)[0].__name__
             yield Setting(f"{section.name}.{field.name}", word, field.default, _limits(meta), meta.description or "")
 
 

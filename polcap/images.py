@@ -376,6 +376,15 @@ class ColorCalibration:
 
 
 @dataclass(frozen=True)
+class ChartRequest:
+    """The user's choice of the color calibration: search the chart, given corners, a stored profile, or none."""
+
+    mode: Literal["auto", "corners", "profile", "none"]
+    corners: Floats | None = None  # (4, 2) outer patch corners, visible RAW px, dark-skin corner first, clockwise
+    profile: ColorCalibration | None = None  # from another capture with the same equipment
+
+
+@dataclass(frozen=True)
 class Alignment:
     """Registration of each shot to the reference shot."""
 
@@ -618,15 +627,6 @@ class Asset(ArrayValue):
     displacement: TexturePixels | None = None  # (H, W) 0 at the farthest point, 1 at the nearest
     object_normal: TexturePixels | None = None  # (H, W, 3) camera frame, n * 0.5 + 0.5
     albedo_sigma: float | None = None  # as in `SurfaceMaps`
-
-
-@dataclass(frozen=True)
-class ChartRequest:
-    """The user's choice of the color calibration: search the chart, given corners, a stored profile, or none."""
-
-    mode: Literal["auto", "corners", "profile", "none"]
-    corners: Floats | None = None  # (4, 2) outer patch corners, visible RAW px, dark-skin corner first, clockwise
-    profile: ColorCalibration | None = None  # from another capture with the same equipment
 
 
 @dataclass(frozen=True, repr=False)

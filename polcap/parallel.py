@@ -34,8 +34,8 @@ def results(functions: Iterable[Callable[[], T]], most: int | None = None) -> li
         pool.shutdown(cancel_futures=True)
 
 
-def both(first: Callable[[], A], second: Callable[[], B], most: int | None = None) -> tuple[A, B]:
+def both(first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
     """Run two functions at the same time on threads and return both results; see `results`."""
     calls: list[Callable[[], Any]] = [first, second]
-    one, other = results(calls, most)
+    one, other = results(calls)
     return cast(A, one), cast(B, other)

@@ -74,7 +74,7 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
         except (Exception, KeyboardInterrupt) as error:
             if context.obj and isinstance(error, Exception):  # --debug
                 print_message("".join(traceback.format_exception(error)).rstrip())
-            text, code = _explained(error, context.obj, kwargs.get("resume") is False)
+            text, code = _explain(error, context.obj, kwargs.get("resume") is False)
             print_message(f"polcap: {text}", "ERROR")
             if code == 1 and not context.obj:
                 log("".join(traceback.format_exception(error)), "ERROR")
@@ -85,7 +85,7 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def _explained(error: BaseException, debug: bool, resumable: bool) -> tuple[str, int]:
+def _explain(error: BaseException, debug: bool, resumable: bool) -> tuple[str, int]:
     """Message and exit code for an error of a command."""
     if isinstance(error, KeyboardInterrupt):
         return f"interrupted; run the same command again{' with --resume' if resumable else ''} to go on", 130

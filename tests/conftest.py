@@ -1,6 +1,7 @@
-"""What several tests share: the bundled capture, the `polcap` command, and one finished run of the two."""
+"""Fixtures of several tests: the bundled capture, the `polcap` command, and one finished run of the two."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -8,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run beside each other; OpenBLAS asks when NumPy is loaded
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run in parallel; OpenBLAS reads it when NumPy is loaded
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # some tests import onnxruntime themselves
 
 import numpy as np
@@ -23,13 +24,13 @@ EXAMPLE = ROOT / "examples" / "capture"
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """With POLCAP_SKIPPED_TO=FILE, what this machine skipped is listed there, for a richer one to run with `@FILE`."""
+    """With POLCAP_SKIPPED_TO=FILE, list the tests that this machine skips; another one runs them with `@FILE`."""
     if (file := os.environ.get("POLCAP_SKIPPED_TO")) and not hasattr(config, "workerinput"):
         config.pluginmanager.register(SkippedList(Path(file)))
 
 
 class SkippedList:
-    """Collects what was skipped, whole files and tests with all their parameters, which may be others elsewhere."""
+    """Collects skipped files and tests, without parameters, which may differ between machines."""
 
     def __init__(self, file: Path) -> None:
         self._file, self._names = file, set[str]()
@@ -47,7 +48,7 @@ class SkippedList:
 
 
 class Done(NamedTuple):
-    """What a command left."""
+    """Exit code and output of a command."""
 
     returncode: int
     stdout: str
@@ -69,12 +70,21 @@ def example() -> Path:
     return EXAMPLE
 
 
+def environment() -> dict[str, str]:
+    """Environment of a child process that imports this polcap."""
+    return {**os.environ, "PYTHONPATH": str(ROOT)}
+
+
+def python(*arguments: object) -> Done:
+    """`python …` in a process of its own."""
+    command = [sys.executable, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=500)
+    return Done(done.returncode, done.stdout, done.stderr)
+
+
 def shell(*arguments: object) -> Done:
     """`polcap …` as a user's shell runs it, in a process of its own."""
-    command = [sys.executable, "-m", "polcap", *map(str, arguments)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=500)
-    return Done(done.returncode, done.stdout, done.stderr)
+    return python("-m", "polcap", *arguments)
 
 
 @pytest.fixture
@@ -102,3 +112,9 @@ def result(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
             done = shell("process", EXAMPLE, "--out", folder, "--estimator", "analytic")
             assert done.returncode == 0, done.stderr
     return folder
+
+
+@pytest.fixture
+def copy(result: Path, tmp_path: Path) -> Path:
+    """A copy of that result folder, to be changed."""
+    return Path(shutil.copytree(result, tmp_path / "copy"))

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from polcap.images import Floats
-from polcap.synth import shooting as synthetic
 from polcap.synth.scenes import Kind, random_scene
-from polcap.synth.shooting import Shoot, Studio, Take
+from polcap.synth.shooting import Shoot, ShotPose, Studio, Take
 
 FAULTS = {  # what went wrong: the lines of `polcap check` that tell it; none: the folder cannot be read
     "clipped": ("clipping",),
@@ -95,12 +94,7 @@ def shoot(folder: Path, seed: int, fault: str, width: int) -> str:
         change = lambda light, k, e: light + extra if k == victim else light  # noqa: E731
         done = f"shot {victim}, 15 % more light from one side"
     for k in range(3):
-        pose = {
-            "actual_deg": actual[k],
-            "rot_deg": roll[k],
-            "transform": synthetic.transform(how, (shift[k, 0], shift[k, 1]), roll[k]).tolist(),
-        }
-        radiance = studio.radiance(pose)
+        radiance = studio.radiance(ShotPose(actual[k], (shift[k, 0], shift[k, 1]), roll[k]))
         for e in range(3):
             stops = how.step ** (e - 1)
             file = folder / f"pol{_ANGLES[names[k]]:03.0f}" / f"IMG_{3 * k + e + 1:04d}.DNG"

@@ -37,9 +37,7 @@ def test_help_imports_nothing_heavy() -> None:
     assert not {"numpy", "cv2", "scipy", "colour", "onnxruntime", "torch", "trimesh"} & set(done.stdout.split())
 
 
-def test_stdout_carries_data_only(result: Path, example: Path, polcap: Command, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(result, copy)
+def test_stdout_carries_data_only(copy: Path, example: Path, polcap: Command) -> None:
     plain = polcap("process", example, "--out", copy, "--estimator", "analytic")
     assert plain.stdout == f"{copy / 'asset' / 'capture.glb'}\n"
     document = json.loads(polcap("process", example, "--out", copy, "--estimator", "analytic", "--json").stdout)
@@ -123,11 +121,7 @@ def test_bug_is_exit_1_with_a_traceback_only_under_debug(
     assert ended.value.code == 1 and message.startswith("Traceback") and message.endswith("lines above report it\n")
 
 
-def test_failed_gate_is_exit_3_after_everything_is_written(
-    result: Path, example: Path, polcap: Command, tmp_path: Path
-) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(result, copy)
+def test_failed_gate_is_exit_3_after_everything_is_written(copy: Path, example: Path, polcap: Command) -> None:
     (copy / "asset" / "capture.glb").unlink()
     options = ("--estimator", "analytic", "--set", "gates.max_normal_error_deg=0.1")
     done = polcap("process", example, "--out", copy, *options)
@@ -136,22 +130,17 @@ def test_failed_gate_is_exit_3_after_everything_is_written(
     assert json.loads((copy / "report.json").read_text())["verdict"] == "fail"
 
 
-def test_open_shows_the_report_but_not_in_ci(
-    result: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_open_shows_the_report_but_not_in_ci(copy: Path, polcap: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[str] = []
     monkeypatch.setattr("webbrowser.open", lambda url: not shown.append(url))  # type: ignore[func-returns-value]
-    shutil.copytree(result, tmp_path / "copy")
     monkeypatch.setenv("CI", "true")
-    assert "no browser was opened" in polcap("report", tmp_path / "copy", "--open").stderr
+    assert "no browser was opened" in polcap("report", copy, "--open").stderr
     monkeypatch.delenv("CI")
-    polcap("report", tmp_path / "copy", "--open")
-    assert shown == [(tmp_path / "copy" / "report.html").as_uri()]
+    polcap("report", copy, "--open")
+    assert shown == [(copy / "report.html").as_uri()]
 
 
-def test_clean_removes_the_stage_cache_only(result: Path, polcap: Command, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(result, copy)
+def test_clean_removes_the_stage_cache_only(result: Path, copy: Path, polcap: Command, tmp_path: Path) -> None:
     (copy / "work" / "photograph.dng").touch()
     before = {file for file in copy.rglob("*") if file.is_file()}
     dry = json.loads(polcap("clean", copy, "--dry-run", "--json").stdout)
@@ -177,16 +166,12 @@ def test_a_fused_object_is_refused_where_only_one_view_will_do(polcap: Command, 
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_every_stage_can_be_shown(result: Path, tmp_path: Path, stage: str) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(result, copy)
+def test_every_stage_can_be_shown(copy: Path, stage: str) -> None:
     picture = cv2.imread(str(pipeline.show(copy, [stage])[0]))
     assert picture is not None and picture.std() > 5  # there is something to see
 
 
-def test_show_draws_all_stages_or_moves_the_light(result: Path, polcap: Command, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(result, copy)
+def test_show_draws_all_stages_or_moves_the_light(copy: Path, polcap: Command) -> None:
     drawn = polcap("show", copy, "--all").stdout.split()
     assert [Path(file).stem for file in drawn] == list(STAGES) and all(Path(file).exists() for file in drawn)
     for motion in ("light", "turntable"):
@@ -203,9 +188,7 @@ def test_show_wants_one_thing(result: Path, polcap: Command, options: tuple[str,
     assert done.returncode == 2 and "give one of a stage" in done.stderr
 
 
-def test_export_needs_only_the_maps_and_prints_the_written_files(result: Path, polcap: Command, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(result, copy)
+def test_export_needs_only_the_maps_and_prints_the_written_files(copy: Path, polcap: Command) -> None:
     shutil.rmtree(copy / "work")
     shutil.rmtree(copy / "asset")
     done = polcap("export", copy, "--gltf")
@@ -214,11 +197,9 @@ def test_export_needs_only_the_maps_and_prints_the_written_files(result: Path, p
     assert sorted(str(file) for file in (copy / "asset").iterdir()) == written
 
 
-def test_status_and_report_print_json(result: Path, polcap: Command, tmp_path: Path) -> None:
+def test_status_and_report_print_json(result: Path, copy: Path, polcap: Command) -> None:
     about = json.loads(polcap("status", result, "--json").stdout)
     assert about["complete"] and about["stages"][0]["stage"] == "hdr"
-    copy = tmp_path / "copy"
-    shutil.copytree(result, copy)
     again = json.loads(polcap("report", copy, "--json").stdout)
     assert again == json.loads((result / "report.json").read_text())
     same = polcap("report", copy, "--compare", result)
@@ -242,9 +223,8 @@ def test_a_capture_names_the_result_in_it(result: Path, polcap: Command, tmp_pat
     assert polcap("report", tmp_path / "capture" / "polcap", "--compare", tmp_path / "capture").returncode == 0
 
 
-def test_user_mask_replaces_the_search(result: Path, example: Path, polcap: Command, tmp_path: Path) -> None:
-    copy, drawn = tmp_path / "copy", np.zeros((432, 576), np.uint8)
-    shutil.copytree(result, copy)
+def test_user_mask_replaces_the_search(copy: Path, example: Path, polcap: Command, tmp_path: Path) -> None:
+    drawn = np.zeros((432, 576), np.uint8)
     drawn[120:300, 105:240] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), drawn)
     done = polcap("process", example, "--out", copy, "--mask", tmp_path / "mask.png", "--until", "mask", "--json")

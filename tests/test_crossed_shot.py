@@ -73,9 +73,9 @@ def test_what_is_scattered_and_what_is_mirrored_are_told_apart(results: tuple[Re
     assert cues.body is not None and cues.body_known is not None
     mirrored = np.clip(1 - cues.body.sum(-1) / cues.radiance.sum(-1), 0, 1)
     clipped = cues.mask & ((cues.quality & Quality.CLIPPED) > 0)
-    limb = cues.mask & (np.hypot(*results[1].cues.ratio) > 0.08)
+    rim = cues.mask & (np.hypot(*results[1].cues.ratio) > 0.08)
     assert clipped.sum() > 30 and cues.body_known[clipped].mean() > 0.95
-    assert np.median(mirrored[clipped]) > 0.3 and np.median(mirrored[limb]) < 0.05
+    assert np.median(mirrored[clipped]) > 0.3 and np.median(mirrored[rim]) < 0.05
 
 
 def test_the_albedo_in_clipped_highlights_is_at_least_twice_as_right(

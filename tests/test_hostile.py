@@ -22,12 +22,6 @@ def capture(example: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(example, tmp_path / "capture", ignore=shutil.ignore_patterns("polcap")))
 
 
-@pytest.fixture
-def spoilt(result: Path, tmp_path: Path) -> Path:
-    """A copy of a finished result, to be spoilt."""
-    return Path(shutil.copytree(result, tmp_path / "result"))
-
-
 def refused(done: Done, *words: str) -> None:
     """Exit code 2 and one line of error that holds the words."""
     lines = [line for line in done.stderr.splitlines() if line.startswith("polcap: ")]
@@ -67,12 +61,10 @@ def test_a_result_folder_whose_name_is_no_text_is_refused_before_work(nameless: 
     assert not (nameless / "polcap").exists()
 
 
-def test_a_capture_whose_name_is_no_text_gets_its_result_elsewhere(
-    polcap: Command, nameless: Path, spoilt: Path
-) -> None:
-    done = polcap("process", nameless, "--out", spoilt, "--estimator", "analytic")
+def test_a_capture_whose_name_is_no_text_gets_its_result_elsewhere(polcap: Command, nameless: Path, copy: Path) -> None:
+    done = polcap("process", nameless, "--out", copy, "--estimator", "analytic")
     assert done.returncode == 0, done.stderr
-    assert json.loads((spoilt / "report.json").read_text())["capture"]["folder"] == str(nameless)
+    assert json.loads((copy / "report.json").read_text())["capture"]["folder"] == str(nameless)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
@@ -137,14 +129,14 @@ def test_terminal_escapes_in_names_stay_out_of_the_terminal(polcap: Command, cap
     assert done.returncode == 0 and "\x1b" not in done.stdout + done.stderr
 
 
-def test_a_report_does_not_lead_an_export_elsewhere(polcap: Command, spoilt: Path) -> None:
-    about = json.loads((spoilt / "report.json").read_text("utf-8"))
+def test_a_report_does_not_lead_an_export_elsewhere(polcap: Command, copy: Path) -> None:
+    about = json.loads((copy / "report.json").read_text("utf-8"))
     about["capture"]["name"] = "../../evil"
-    (spoilt / "report.json").write_text(json.dumps(about), "utf-8")
-    before = {path for path in spoilt.parent.rglob("*") if spoilt not in path.parents}
-    assert polcap("export", spoilt, "--gltf").returncode == 0
-    assert {path for path in spoilt.parent.rglob("*") if spoilt not in path.parents} == before
-    assert (spoilt / "asset" / "_.._evil.glb").exists()
+    (copy / "report.json").write_text(json.dumps(about), "utf-8")
+    before = {path for path in copy.parent.rglob("*") if copy not in path.parents}
+    assert polcap("export", copy, "--gltf").returncode == 0
+    assert {path for path in copy.parent.rglob("*") if copy not in path.parents} == before
+    assert (copy / "asset" / "_.._evil.glb").exists()
 
 
 @pytest.mark.parametrize(
@@ -155,12 +147,12 @@ def test_a_report_does_not_lead_an_export_elsewhere(polcap: Command, spoilt: Pat
         ('"estimator"', '"nobody"'), ("{", NESTED),
     ],
 )  # fmt: skip
-def test_a_hostile_maps_json_is_one_line(polcap: Command, spoilt: Path, old: str, new: str) -> None:
-    file = spoilt / "maps" / "maps.json"
+def test_a_hostile_maps_json_is_one_line(polcap: Command, copy: Path, old: str, new: str) -> None:
+    file = copy / "maps" / "maps.json"
     text = file.read_text("utf-8")
     assert old in text
     file.write_text(text.replace(old, new, 1), "utf-8")
-    done = polcap("export", spoilt, "--gltf")
+    done = polcap("export", copy, "--gltf")
     if new == '"unit": 3':  # nobody reads it back
         assert done.returncode == 0
     else:
@@ -168,8 +160,8 @@ def test_a_hostile_maps_json_is_one_line(polcap: Command, spoilt: Path, old: str
 
 
 @pytest.mark.parametrize("harm", ["cut", "empty", "nan", "other size", "gone"])
-def test_a_damaged_map_is_one_line(polcap: Command, spoilt: Path, harm: str) -> None:
-    file = spoilt / "maps" / "normal.exr"
+def test_a_damaged_map_is_one_line(polcap: Command, copy: Path, harm: str) -> None:
+    file = copy / "maps" / "normal.exr"
     whole = file.read_bytes()
     if harm == "gone":
         file.unlink()
@@ -179,24 +171,24 @@ def test_a_damaged_map_is_one_line(polcap: Command, spoilt: Path, harm: str) -> 
         found = exr.read(file)[0]
         shape = (4, 4) if harm == "other size" else found["R"].shape
         exr.write(file, {name: np.full(shape, np.nan if harm == "nan" else 1.0) for name in "RGB"})
-    refused(polcap("export", spoilt, "--gltf"), "normal.exr")
+    refused(polcap("export", copy, "--gltf"), "normal.exr")
 
 
 @pytest.mark.parametrize("text", ["", "null", "[]", "{}", NESTED, '{"figures": null}', '{"settings": {"hdr": 3}}'])
-def test_a_hostile_report_is_one_line(polcap: Command, spoilt: Path, text: str) -> None:
-    (spoilt / "report.json").write_text(text, "utf-8")
-    refused(polcap("export", spoilt), "report.json")
-    refused(polcap("report", spoilt, "--compare", spoilt), "report.json")
+def test_a_hostile_report_is_one_line(polcap: Command, copy: Path, text: str) -> None:
+    (copy / "report.json").write_text(text, "utf-8")
+    refused(polcap("export", copy), "report.json")
+    refused(polcap("report", copy, "--compare", copy), "report.json")
 
 
 @pytest.mark.parametrize("name", ["run.json", "01-hdr/manifest.json", "07-cues/manifest.json"])
-def test_an_edited_cache_is_one_line(polcap: Command, spoilt: Path, name: str) -> None:
-    file = spoilt / "work" / name
+def test_an_edited_cache_is_one_line(polcap: Command, copy: Path, name: str) -> None:
+    file = copy / "work" / name
     if not file.exists():
         pytest.skip("this stage is not cached")
     text = file.read_text("utf-8")
     file.write_text(text.replace('"focal', '"local', 1) if '"focal' in text else text[:-9], "utf-8")
-    refused(polcap("report", spoilt), "polcap process")
+    refused(polcap("report", copy), "polcap process")
 
 
 @pytest.mark.parametrize("role", ["photograph", "mask"])

@@ -61,12 +61,12 @@ def test_a_lack_of_memory_names_the_stage_what_it_would_take_and_the_remedy(
     capture = read_capture(example)
     with pytest.raises(SettingError) as caught:
         pipeline.process(capture, UserInput(), Config(), tmp_path, until="align")
-    said = str(caught.value)
-    assert said.startswith("align: out of memory with 2.00 GB used and 3.2 GB more requested; a capture of 0.995 MP")
-    assert said.endswith("takes about 5.8 GB in all: raise --memory from 4 to that, or leave it out")
+    message = str(caught.value)
+    assert message.startswith("align: out of memory with 2.00 GB used and 3.2 GB more requested; a capture of 0.995 MP")
+    assert message.endswith("takes about 5.8 GB in all: raise --memory from 4 to that, or leave it out")
 
 
 def test_without_a_limit_the_remedy_is_another(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planes, "process_memory", lambda: (0, None))
-    said = str(resource_limits.shortfall(MemoryError(), "surface", 24_000_000))
-    assert said.startswith("surface: out of memory; a capture of 24 MP takes about 1.8 GB in all: free that much")
+    message = str(resource_limits.shortfall(MemoryError(), "surface", 24_000_000))
+    assert message.startswith("surface: out of memory; a capture of 24 MP takes about 1.8 GB in all: free that much")

@@ -79,11 +79,8 @@ def _without_capture(root: Path, found: Sequence[Unit]) -> list[str]:
         return []
     used |= {parent for path in used for parent in path.parents}
     others = [path for path in layouts.children(root) if path.is_dir() and path not in used]
-    return [path.name for path in others if path.name not in own_folders.OURS and not _holds_result(path)]
-
-
-def _holds_result(folder: Path) -> bool:
-    return any(layouts.is_result(Path(inside)) for inside, _, _ in os.walk(folder))
+    unused = [path for path in others if path.name not in own_folders.OURS]
+    return [path.name for path in unused if not any(layouts.is_result(Path(inside)) for inside, _, _ in os.walk(path))]
 
 
 def _unit(root: Path, folder: Path, out: Path | None, batch_folder: str) -> Unit:
@@ -104,7 +101,7 @@ def run(
     batch_folder = Path(found[0].batch_folder)
     places = {"root": str(root.resolve()), "out": None if out is None else str(out.resolve())}
     atomic.write_json(batch_folder / "batch.json", places)  # for `reopen`
-    records = {unit: record for unit in mine if (record := units.finished(unit, options)) is not None}
+    records = {unit: record for unit in mine if (record := units.find_finished(unit, options)) is not None}
     wanted = [unit for unit in mine if unit not in records]
     print_line(f"{len(found)} captures, shard {plan.shard}: {len(mine)}, finished before: {len(records)}")
     if empty := _without_capture(root, found):

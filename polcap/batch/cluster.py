@@ -81,4 +81,4 @@ def _gather(
             ended.add(submit(unit, attempt + 1))
         else:
             message = f"its workers died ({future.exception()}); give them more memory, or remove it from the batch"
-            yield units.crashed(unit, " ".join(message.split()), attempt)
+            yield units.record_crash(unit, " ".join(message.split()), attempt)

@@ -123,7 +123,7 @@ def run(wanted: Sequence[Unit], options: ProcessOptions, workers: int, retries: 
     with ProcessPool(workers, retries, limits) as pool:
         for unit, outcome in pool.run(partial(_process, options), wanted):
             if isinstance(outcome, Died):
-                yield units.crashed(unit, _DIED.format(attempts=outcome.attempts), outcome.attempts)
+                yield units.record_crash(unit, _DIED.format(attempts=outcome.attempts), outcome.attempts)
             else:
                 yield outcome
 

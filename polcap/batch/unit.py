@@ -158,7 +158,7 @@ def request(unit: Unit, options: ProcessOptions) -> str | None:
     return unchanged.request(stated, Path(unit.capture), Path(unit.out), files)
 
 
-def finished(unit: Unit, options: ProcessOptions) -> UnitRecord | None:
+def find_finished(unit: Unit, options: ProcessOptions) -> UnitRecord | None:
     """The record of a capture's earlier run, if its result still exists and nothing has changed; otherwise None."""
     record = read_record(unit)
     if record.state not in FINISHED or unchanged.find(Path(unit.out), request(unit, options)) is None:
@@ -184,7 +184,7 @@ def write_record(unit: Unit, record: UnitRecord) -> None:
     atomic.write_json(unit.record_file, record, synced=False)
 
 
-def crashed(unit: Unit, message: str, attempt: int) -> UnitRecord:
+def record_crash(unit: Unit, message: str, attempt: int) -> UnitRecord:
     """Write and return a record for a capture after the process that handled it died."""
     record = UnitRecord(unit.name, "crashed", message, 0.0, socket.gethostname(), 0, attempt)
     write_record(unit, record)

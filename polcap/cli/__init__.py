@@ -2,22 +2,8 @@
 
 stdout carries data only; progress and messages go to stderr. Exit codes: 0 done, 2 the input or a
 setting is at fault, 3 the asset was written but a gate failed, 4 hardware, 130 interrupted (run again
-to go on), 1 a bug. Heavy imports happen inside the commands, so that `--help` answers at once.
-
-process_command    the path over one capture
-batch_command      the path over many captures
-fuse_command       several captures of one object to one mesh
-export_command     the asset of a result in other formats
-result_commands    show, status, report, clean
-check_command      keep a capture or reshoot it
-calibrate_command  measurement of camera, lens, polarizer and flash
-doctor_command     check of this machine or of one photograph
-settings_command   list of all settings
-synth_command      synthetic captures
-board_command      the board to print, for captures from all sides
-capture_command    shooting with a rig
-training_commands  train, evaluate
-options            options that several commands share
+to go on), 1 a bug. Heavy imports happen inside the commands, so that `--help` answers at once. `options` declares the
+options of several commands.
 """
 
 import os

@@ -7,6 +7,7 @@ from typer import Argument, Context, Option
 
 from polcap import terminal
 from polcap.cli.options import Json
+from polcap.errors import SettingError
 
 if TYPE_CHECKING:
     from polcap.calibration_values import Calibration
@@ -35,18 +36,16 @@ def calibrate(
     from polcap.formats import calibrations, own_folders
 
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    found = calibration.measure(folder, made, lens_filter, axis, squares(board))
+    found = calibration.measure(folder, made, lens_filter, axis, parse_board(board))
     path = calibrations.write(out or own_folders.calibrations(), found)
     terminal.print_progress("\n".join(lines(found)))
     terminal.print_data({"file": str(path), "calibration": msgspec.to_builtins(found)} if json else str(path))
 
 
-def squares(board: str) -> tuple[int, int]:
+def parse_board(board: str) -> tuple[int, int]:
     """Parse the size of a checkerboard, such as `9x6`, as two numbers. Raises SettingError."""
     across, _, down = board.partition("x")
     if not (across.isdecimal() and down.isdecimal() and 3 <= int(across) <= 99 and 3 <= int(down) <= 99):
-        from polcap.errors import SettingError
-
         raise SettingError(f"--board {board}: give the inner corners across and down, 3 to 99 each, such as 9x6")
     return int(across), int(down)
 
@@ -56,14 +55,14 @@ def lines(found: "Calibration") -> list[str]:
     rows = [" · ".join(part for part in (found.camera, found.lens, found.filter) if part)]
     for line in found.noise:
         doubt = 100 * max(sigma / slope for sigma, slope in zip(line.slope_sigma, line.slope, strict=True))
-        electrons, read = _listed(line.electrons_at_white, ".0f"), _listed(line.read_noise_electrons, ".1f")
+        electrons, read = _join_numbers(line.electrons_at_white, ".0f"), _join_numbers(line.read_noise_electrons, ".1f")
         if line.read_noise_sigma:
             read += f" ± {max(line.read_noise_sigma):.1f}"
         source = "a bracket" if line.source == "bracket" else line.source
         text = f"{electrons} e⁻ at white ± {doubt:.1f} %, read noise {read} e⁻, from {source}"
         rows.append(f"noise      ISO {line.iso:g}: {text}")
     if (levels := found.levels) is not None:
-        black, stated = _listed(levels.black, ".2f"), _listed(levels.black_stated, "g")
+        black, stated = _join_numbers(levels.black, ".2f"), _join_numbers(levels.black_stated, "g")
         white = "no frame saturates" if levels.white is None else f"white {levels.white:g}"
         rows.append(f"levels     black {black} (stated {stated}), {white} (stated {levels.white_stated:g})")
     if (curve := found.linearity) is not None:
@@ -71,7 +70,7 @@ def lines(found: "Calibration") -> list[str]:
         span = f"from {100 * curve.darkest:.0f} to {100 * curve.brightest:.0f} % of white"
         rows.append(f"linearity  {power}, within {100 * curve.greatest_deviation:.2f} % {span}")
     if (light := found.falloff) is not None:
-        rows.append(f"falloff    corners {_listed(light.corner, '.3f')} of the middle")
+        rows.append(f"falloff    corners {_join_numbers(light.corner, '.3f')} of the middle")
     if (lens := found.geometry) is not None:
         rows.append(
             f"lens       {lens.focal_px:.1f} ± {lens.focal_sigma_px:.1f} px, k1 {lens.k1:+.4f} ± {lens.k1_sigma:.4f}, "
@@ -82,7 +81,7 @@ def lines(found: "Calibration") -> list[str]:
         sense = "counter-clockwise" if ring.sense > 0 else "clockwise"
         sense = f"counts {sense}" if ring.sense_known else "sense unknown: photograph light of a second axis"
         doubt = max(sigma / ratio for sigma, ratio in zip(ring.extinction_sigma, ring.extinction, strict=True))
-        extinction = f"extinction {_listed(ring.extinction, '.0f')} ± {100 * doubt:.0f} %"
+        extinction = f"extinction {_join_numbers(ring.extinction, '.0f')} ± {100 * doubt:.0f} %"
         rows.append(f"polarizer  zero {ring.zero_deg:+.2f}° ± {ring.zero_sigma_deg:.2f}°, {sense}, {extinction}")
     if (flash := found.flash) is not None:
         drift = f"drift {100 * flash.drift_per_pop:+.3f} % ± {100 * flash.drift_sigma:.3f} % a pop"
@@ -91,5 +90,5 @@ def lines(found: "Calibration") -> list[str]:
     return rows
 
 
-def _listed(values: tuple[float, ...], form: str) -> str:
+def _join_numbers(values: tuple[float, ...], form: str) -> str:
     return ", ".join(format(value, form) for value in values)

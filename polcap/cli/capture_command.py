@@ -95,4 +95,4 @@ def _verdict(folder: Path) -> dict[str, Any] | None:
         terminal.print_message(f"polcap: not judged: {terminal.line(error)}")
         return None
     terminal.print_progress(checks.table(verdict))
-    return checks.shown(verdict)
+    return checks.to_json(verdict)

@@ -35,7 +35,7 @@ def doctor(
         cameras = camera_gphoto2.connected_cameras
         rig = doctors.Rig(serial_port.serial_ports, may_write, device_urls.probe, cameras)
         findings = doctors.examine(rig, Path.cwd())
-    terminal.print_data(doctors.shown(findings) if json else doctors.table(findings))
+    terminal.print_data(doctors.to_json(findings) if json else doctors.table(findings))
     if any(finding.state == "fault" for finding in findings):
         raise Exit(SettingError.exit_code)
 

@@ -109,7 +109,7 @@ def _process(stated: dict[str, Any], target: Path, request: str | None) -> None:
     table = captures.table(capture)
     terminal.print_progress(table)
     with terminal.progress(len(STAGES) + 1) as bar:
-        supplied = replace(supplied, decode=pipeline.counted(capture, bar.frame))
+        supplied = replace(supplied, decode=pipeline.decode_with_progress(capture, bar.frame))
         about = pipeline.process(capture, supplied, config, target, stated["until"], stated["force"], bar.stage)
     if about is None:
         work = str(target / "work")

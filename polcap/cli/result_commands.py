@@ -99,7 +99,7 @@ def _compare(result: Path, other: Path, json: bool, open_: bool) -> None:
     if json:
         terminal.print_data([{"name": name, "here": here, "there": there} for name, here, there in rows])
     elif rows:
-        labelled = map(pairs.labelled, rows)
+        labelled = map(pairs.label_row, rows)
         terminal.print_data("\n".join(f"{title}: {here}  |  {there}" for title, here, there in labelled))
     if not rows:
         terminal.print_message("polcap: no figure and no setting differs")

@@ -72,7 +72,7 @@ def table(found: Iterable[Finding]) -> str:
     return "\n".join(rows)
 
 
-def shown(found: Iterable[Finding]) -> dict[str, object]:
+def to_json(found: Iterable[Finding]) -> dict[str, object]:
     """The findings of `polcap doctor` as data for JSON."""
     works = all(one.state != "fault" for one in found)
     return {"polcap": __version__, "process_works": works, "findings": msgspec.to_builtins(found)}

@@ -41,19 +41,8 @@ from polcap.stages import asset, surface
 
 _Writer = Callable[[], list[Path]]  # returns the files that it has written
 _NEEDED: tuple[Extra, ...] = ("object-normal",)  # by the format `iiif`
-_SUFFIXES = {
-    ".glb",
-    ".obj",
-    ".mtl",
-    ".ply",
-    ".stl",
-    ".usdc",
-    ".usdz",
-    ".mtlx",
-    ".exr",
-    ".png",
-    ".html",
-}  # of exported files
+# of exported files
+_SUFFIXES = {".glb", ".obj", ".mtl", ".ply", ".stl", ".usdc", ".usdz", ".mtlx", ".exr", ".png", ".html"}
 _SHARING = {"obj", "usd", "materialx"}  # formats that share texture files
 
 
@@ -143,6 +132,8 @@ def check(wanted: ExportRequest) -> None:
         raise SettingError(
             "--images and --geometry change the GLB, which is not written; leave them out, or add --gltf"
         )
+    if wanted.bits == 16 and not _has_png(preset):
+        raise SettingError("--bits 16 is for PNG textures, and none is written; add --images png, or leave it out")
     if not {"usd", "usdz"}.isdisjoint(preset.formats):
         usd.require()
     glb_geometry.require(preset.geometry)
@@ -152,10 +143,17 @@ def check(wanted: ExportRequest) -> None:
             raise SettingError("--iiif keeps the proportions of the photographs; leave out --texture-size")
     if wanted.page is not None:
         web_page.read_script(wanted.page)
-        if "gltf" not in preset.formats or preset.geometry == "draco":
-            raise SettingError(
-                "--page shows a GLB without Draco, whose decoder is not in the page; choose --preset web"
-            )
+        if "gltf" not in preset.formats:
+            raise SettingError("--page shows the GLB, which is not written; choose --preset web")
+        if preset.geometry == "draco":
+            raise SettingError("--page holds no decoder of Draco; leave out --geometry draco")
+
+
+def _has_png(preset: ExportPreset) -> bool:
+    """Whether an export writes a PNG texture, next to the GLB or in it."""
+    inside = preset.images == "png" and "gltf" in preset.formats
+    beside = preset.shared == "png" and not {"obj", "usd", "usdz", "materialx"}.isdisjoint(preset.formats)
+    return inside or beside or bool(preset.textures or preset.extras)
 
 
 def read(folder: Path, config: Config) -> ReliefSource:
@@ -210,35 +208,32 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     name = atomic.safe_name(str(about["capture"].get("name")))  # files stay in the folder, whatever name the report has
     stem = preset.name.format(obj.stem(name) if preset.textures else name)
     shared: dict[Key, str] = {key: f"{obj.stem(stem)}_{key}.{preset.shared}" for key in texture_set.LOOSE}
-    loose = _loose_textures(preset, wanted, whole, obj.stem(name))
-    if _SHARING.intersection(preset.formats):
-        made = {file: texture_set.LOOSE[key](whole) for key, file in shared.items()}
-        loose |= {file: texture_set.linear(one) for file, one in made.items()} if preset.shared == "exr" else made
+    loose = _loose_textures(preset, wanted.extras, whole, obj.stem(name), shared)
     folder = out / "asset" / (wanted.preset or "")
     options = gltf.GlbOptions(preset.images, preset.geometry, gltf.center(mesh.vertices))
     unit, encoder = "m" if mesh.metric else "relative", TextureEncoder()
     record = provenance.record(about, wanted.catalog)
-    words = {"unit": unit, "normals": "+Y (OpenGL)", **provenance.words(record)}
+    facts = {"unit": unit, "normals": "+Y (OpenGL)", **provenance.words(record)}
     comment = f"polcap; unit of length: {unit}; normals +Y (OpenGL); made from: {stem}.provenance.json"
     writers: dict[Format, _Writer] = {
-        "gltf": partial(_write_glb, folder / f"{stem}.glb", whole, options, words, encoder),
+        "gltf": partial(_write_glb, folder / f"{stem}.glb", whole, options, facts, encoder),
         "obj": partial(obj.write, folder / f"{stem}.obj", whole, stem, shared, comment),
-        "ply": partial(_write_mesh, folder / f"{stem}.ply", whole),
-        "stl": partial(_write_mesh, folder / f"{stem}.stl", whole),
-        "usd": partial(_write_usd, folder / f"{stem}.usdc", whole, shared, words),
-        "usdz": partial(_write_usdz, folder / f"{stem}.usdz", whole, words, encoder),
+        "ply": partial(_write_one, ply_stl.write, folder / f"{stem}.ply", whole),
+        "stl": partial(_write_one, ply_stl.write, folder / f"{stem}.stl", whole),
+        "usd": partial(_write_one, usd.write, folder / f"{stem}.usdc", whole, stem, shared, facts),
+        "usdz": partial(_write_usdz, folder / f"{stem}.usdz", whole, facts, encoder),
         "materialx": partial(_write_materialx, folder / f"{stem}.mtlx", whole, shared, comment),
-        "exr": partial(_write_exr, folder / f"{stem}_layers.exr", out / "maps", wanted.color, words),
-        "iiif": partial(_write_iiif, folder / f"{stem}_iiif", whole, words, wanted.iiif or ""),
+        "exr": partial(_write_one, exr_layers.write, folder / f"{stem}_layers.exr", out / "maps", wanted.color, facts),
+        "iiif": partial(_write_iiif, folder / f"{stem}_iiif", whole, facts, wanted.iiif or ""),
     }
     coarser = {folder / f"{stem}_lod{k}.glb": level for k, level in enumerate(found[1:], 1)}
     tasks = [writers[one] for one in preset.formats]
-    tasks += [partial(_write_glb, file, level.asset, options, words, encoder) for file, level in coarser.items()]
+    tasks += [partial(_write_glb, file, level.asset, options, facts, encoder) for file, level in coarser.items()]
     tasks += [partial(_write_texture, folder / file, texture, encoder) for file, texture in loose.items()]
     written = [file for files in parallel.results(tasks) for file in files]  # pictures are encoded on threads
     if wanted.page is not None:
         page, glb = folder / f"{stem}.html", folder / f"{stem}.glb"
-        web_page.write(page, glb, web_page.read_script(wanted.page), words.get("title", stem))
+        web_page.write(page, glb, web_page.read_script(wanted.page), facts.get("title", stem))
         written.append(page)
     sidecar = folder / f"{stem}.provenance.json"
     digests = {file.relative_to(folder).as_posix(): provenance.digest(file) for file in written}
@@ -255,12 +250,21 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     return [*written, sidecar]
 
 
-def _loose_textures(preset: ExportPreset, wanted: ExportRequest, whole: Asset, stem: str) -> dict[str, Texture]:
-    """The PNG textures of a preset and of options, by file name; a closed mesh has no displacement."""
+def _loose_textures(
+    preset: ExportPreset, extras: Sequence[Extra], whole: Asset, stem: str, shared: Mapping[Key, str]
+) -> dict[str, Texture]:
+    """Texture files of a preset, of --extra, and those that OBJ, USD and MaterialX share, by file name.
+
+    A closed mesh has no displacement.
+    """
     makers = {f"{pattern.format(stem)}.png": make for pattern, make in preset.textures.items()}
-    makers |= {f"{stem}_{key.replace('-', '')}.png": texture_set.EXTRAS[key] for key in wanted.extras}
+    makers |= {f"{stem}_{key.replace('-', '')}.png": texture_set.EXTRAS[key] for key in extras}
     known = whole.displacement is not None
-    return {file: make(whole) for file, make in makers.items() if known or make is not texture_set.displacement}
+    found = {file: make(whole) for file, make in makers.items() if known or make is not texture_set.displacement}
+    if _SHARING.intersection(preset.formats):
+        made = {file: texture_set.LOOSE[key](whole) for key, file in shared.items()}
+        found |= {file: texture_set.linear(one) for file, one in made.items()} if preset.shared == "exr" else made
+    return found
 
 
 def sidecars(out: Path) -> list[Path]:
@@ -268,7 +272,7 @@ def sidecars(out: Path) -> list[Path]:
     return sorted((out / "asset").glob("**/*.provenance.json"))
 
 
-def outdated(records: Sequence[Path], keys: Mapping[str, str]) -> list[Path]:
+def find_outdated(records: Sequence[Path], keys: Mapping[str, str]) -> list[Path]:
     """Exports of other maps than those of the result with these cache keys: whole folders, then single files.
 
     `records` are sidecars. A folder has one; a file that it does not list was exported with another record.
@@ -303,25 +307,20 @@ def effective(wanted: ExportRequest) -> ExportPreset:
 
 
 def _write_glb(
-    file: Path, content: Asset, options: gltf.GlbOptions, words: Mapping[str, str], encoder: TextureEncoder
+    file: Path, content: Asset, options: gltf.GlbOptions, facts: Mapping[str, str], encoder: TextureEncoder
 ) -> list[Path]:
-    atomic.write(file, gltf.encode(content, file.stem, options, words, encoder))
+    atomic.write(file, gltf.encode(content, file.stem, options, facts, encoder))
     return [file]
 
 
-def _write_mesh(file: Path, content: Asset) -> list[Path]:
-    ply_stl.write(file, content)
+def _write_one(write_file: Callable[..., None], file: Path, *arguments: Any) -> list[Path]:
+    write_file(file, *arguments)
     return [file]
 
 
-def _write_usd(file: Path, content: Asset, textures: Mapping[Key, str], words: Mapping[str, str]) -> list[Path]:
-    usd.write(file, content, file.stem, textures, words)
-    return [file]
-
-
-def _write_usdz(file: Path, content: Asset, words: Mapping[str, str], encoder: TextureEncoder) -> list[Path]:
+def _write_usdz(file: Path, content: Asset, facts: Mapping[str, str], encoder: TextureEncoder) -> list[Path]:
     textures = {key: encoder(make(content), "png") for key, make in texture_set.LOOSE.items()}
-    usd.package(file, content, file.stem, textures, words)
+    usd.package(file, content, file.stem, textures, facts)
     return [file]
 
 
@@ -330,15 +329,10 @@ def _write_materialx(file: Path, content: Asset, textures: Mapping[Key, str], co
     return [file]
 
 
-def _write_exr(file: Path, maps: Path, color: str, words: Mapping[str, str]) -> list[Path]:
-    exr_layers.write(file, maps, color, words)
-    return [file]
-
-
-def _write_iiif(folder: Path, content: Asset, words: Mapping[str, str], address: str) -> list[Path]:
+def _write_iiif(folder: Path, content: Asset, facts: Mapping[str, str], address: str) -> list[Path]:
     page = folder / "index.html"
-    openlime_page.write(page, words.get("title") or words["name"], words.get("rights", ""))
-    return [page, *iiif.write(folder, relightable_layer.pictures(content), words, address)]
+    openlime_page.write(page, facts.get("title") or facts["name"], facts.get("rights", ""))
+    return [page, *iiif.write(folder, relightable_layer.pictures(content), facts, address)]
 
 
 def _write_texture(file: Path, texture: Texture, encoder: TextureEncoder) -> list[Path]:

@@ -63,8 +63,8 @@ def inspect(
     with ThreadPoolExecutor(_THREADS) as pool:
         try:
             small = small_capture.reduce(capture, config.hdr.clip, pool)
-            supplied = UserInput(_moved(chart, small.step), None, *networks(), small.decode)
-            lines = tuple(_judged(capture, small, supplied, config))
+            supplied = UserInput(_scale_chart(chart, small.step), None, *networks(), small.decode)
+            lines = tuple(_judge(capture, small, supplied, config))
         finally:
             pool.shutdown(cancel_futures=True)
     bad = [line for line in lines if line.state == "fail"]
@@ -75,7 +75,7 @@ def inspect(
     return Verdict(not bad, shots, lines, capture.name, seconds, "--no-chart" if missing else "")
 
 
-def _judged(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config) -> list[Gate]:
+def _judge(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config) -> list[Gate]:
     """Judge the reduced capture by the gates, in the order of the path; an error of a stage is the last gate."""
     cache, failure, chart_missing = MemoryCache(until="infer"), None, ""
     try:
@@ -144,7 +144,7 @@ def _settings(config: Config, step: int) -> Config:
     )
 
 
-def _moved(chart: ChartRequest, step: int) -> ChartRequest:
+def _scale_chart(chart: ChartRequest, step: int) -> ChartRequest:
     """Convert the chart's corners from the user to the reduced pictures, with pixels of `step` × `step` RAW pixels."""
     return chart if chart.corners is None else replace(chart, corners=(chart.corners - (step - 1) / 2) / step)
 
@@ -169,6 +169,6 @@ def table(verdict: Verdict) -> str:
     return "\n".join(rows)
 
 
-def shown(verdict: Verdict) -> dict[str, object]:
+def to_json(verdict: Verdict) -> dict[str, object]:
     """The verdict as data for JSON."""
     return {"verdict": "keep" if verdict.keep else "reshoot", **msgspec.to_builtins(verdict)}

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from polcap import parallel, report, resource_limits
-from polcap.config import Config, restored
+from polcap.config import Config, restore
 from polcap.errors import SettingError
 from polcap.formats import calibrations
 from polcap.formats.export import encoders, provenance
@@ -90,7 +90,7 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
     return about
 
 
-def counted(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
+def decode_with_progress(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
     """A decode function that reports progress by `frame_read`: numbers of decoded and of all photographs."""
     brackets = capture.all_shots
     total, number = sum(len(shot.frames) for shot in brackets), count(1)
@@ -122,7 +122,7 @@ def export(out: Path, *wanted: ExportRequest) -> list[Path]:
         asset_export.check(one)
     about = report.read(out)
     with result_folder.locked(out):
-        source = asset_export.read(out / "maps", restored(about, out / "report.json"))
+        source = asset_export.read(out / "maps", restore(about, out / "report.json"))
         exports = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in wanted)
         return [file for files in exports for file in files]
 
@@ -136,7 +136,7 @@ def reopen(out: Path, until: str = "surface") -> tuple[Results, dict[str, Any]]:
         `out` has no stage cache, or the result of a stage is missing.
     """
     about = result_folder.read_run(out)
-    config = restored(about, out / "work" / "run.json")
+    config = restore(about, out / "work" / "run.json")
     return path(None, UserInput(), config, ArchiveCache(out, until=until)), about
 
 
@@ -171,7 +171,7 @@ def judge_again(out: Path) -> dict[str, Any]:
     """Judge a finished result again from the stage cache: writes report.json and report.html."""
     results, facts = reopen(out)
     with result_folder.locked(out):
-        about = report.document(facts, results, restored(facts, out / "work" / "run.json"), timings(out))
+        about = report.document(facts, results, restore(facts, out / "work" / "run.json"), timings(out))
         if (out / "report.json").exists():
             about["keys"] = report.read(out).get("keys", {})
         report.write(out, about, results)

@@ -72,7 +72,7 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
     first = capture.shots[0].frames[(len(capture.shots[0].frames) - 1) // 2]
     meta, arrays = frame_decoder.apply(first, reduce_first, clip=clip, most_pixels=_MOST_PIXELS)
     times, half, corners = int(meta["times"]), int(meta["superpixel"]), arrays["corners"].tolist()
-    reduced = {first: pool.submit(_joined, meta, arrays)}
+    reduced = {first: pool.submit(_build_frame, meta, arrays)}
     for frame in (frame for shot in capture.all_shots for frame in (*shot.frames, *shot.ambient) if frame != first):
         reduced[frame] = pool.submit(_decode_reduced, frame, clip, times, corners)
     step = half * times
@@ -90,10 +90,10 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
 
 
 def _decode_reduced(frame: Frame, clip: float, times: int, corners: list[list[int]]) -> ReducedFrame:
-    return _joined(*frame_decoder.apply(frame, reduce_frame, clip=clip, times=times, corners=corners))
+    return _build_frame(*frame_decoder.apply(frame, reduce_frame, clip=clip, times=times, corners=corners))
 
 
-def _joined(meta: dict[str, Any], arrays: Arrays) -> ReducedFrame:
+def _build_frame(meta: dict[str, Any], arrays: Arrays) -> ReducedFrame:
     """Build a `ReducedFrame` from the answer of the child process."""
     picture = SensorImage(
         value=arrays["value"],

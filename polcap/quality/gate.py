@@ -5,9 +5,8 @@ from typing import Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Floats, Quality
+from polcap.images import Bools, Floats, Quality
 from polcap.results import Results
 
 State = Literal["pass", "warn", "fail", "not measured"]
@@ -61,8 +60,6 @@ def full_size(results: Results, focal_doubt: tuple[float, float]) -> Evidence:
         focal_doubt=focal_doubt,
         clipped=((radiance.quality & int(Quality.CLIPPED)) > 0)[:, None],
         blur_px=radiance.bracket.blur_px,
-        grid_px=1.0,
-        chart_missing="",
     )
 
 
@@ -90,6 +87,6 @@ def at_most(
     )
 
 
-def blamed(names: list[str], bad: NDArray[np.bool_]) -> tuple[str, ...]:
+def bad_shots(names: list[str], bad: Bools) -> tuple[str, ...]:
     """Names of the shots to take again, those where `bad` (K,) is true."""
     return tuple(name for name, one in zip(names, bad) if one)

@@ -11,11 +11,9 @@ import numpy as np
 
 from polcap.images import SurfaceMaps
 from polcap.quality import geometry, light, polarization
-from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, Unit
+from polcap.quality.gate import MOST_DEG, Evidence, Gate, State
 from polcap.quality.limits import GateLimits
 from polcap.stages.align import AlignSettings
-
-__all__ = ["Evidence", "Gate", "State", "Unit", "judge", "verdict"]
 
 
 def judge(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iterator[Gate]:

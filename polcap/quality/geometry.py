@@ -12,8 +12,8 @@ from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean
 from polcap.optics.sharpness import TILE
-from polcap.quality import object_turn
-from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, blamed
+from polcap.quality import object_turn, rim
+from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, bad_shots
 from polcap.quality.limits import GateLimits
 from polcap.stages.align import AlignSettings, object_motion
 from polcap.stages.whitebalance import chart_in_mask
@@ -55,30 +55,30 @@ def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate
         figure, limit = float(doubt[worst]), limits.max_align_residual_px * max(found.grid_px, 1)
     value = round(figure, 3) if np.isfinite(figure) else None
     if not bad.any():
-        of_object = _object_moved(found, limits)
+        of_object = _shift_gate(found, limits)
         if of_object.state != "pass":
             return of_object
         return Gate("alignment", "pass", value, limit, message, cost_deg=of_object.cost_deg, unit="px")
     remedy = "Lock the camera, do not touch the object, and take that shot again"
-    return Gate("alignment", "fail", value, limit, message, remedy, 10.0, blamed(names, bad), unit)
+    return Gate("alignment", "fail", value, limit, message, remedy, 10.0, bad_shots(names, bad), unit)
 
 
-def _object_moved(found: Evidence, limits: GateLimits) -> Gate:
+def _shift_gate(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on movement of the object relative to its surroundings: a push over the object's radius, or a turn.
 
     A push within its error does not count; it fails if it exceeds its limit by more than its error.
     """
-    names, pushed, limit = found.names, _pushed(found), limits.max_object_shift_px
+    names, pushed, limit = found.names, _measure_shift(found), limits.max_object_shift_px
     length, sigma = np.nan_to_num(pushed.length, posinf=np.inf) * found.grid_px, pushed.sigma * found.grid_px
     sure = length - _SIGMAS * sigma
     radius = max(outline.disc_radius(found.object_.mask) * found.grid_px, 1.0)
-    least, turned = limits.min_object_shift * radius, _object_turned(found, limits)
+    least, turned = limits.min_object_shift * radius, _turn_gate(found, limits)
     true = np.sqrt(np.maximum(length**2 - sigma**2, 0))
     cost = float(np.hypot(_DEGREES_PER_PUSH * true.max() / radius, turned.cost_deg))
     k = int(np.argmax(sure))
     figure = round(float(length[k]), 3)
     message = f"The object moved by {figure:.1f} ± {sigma[k]:.1f} px against its surroundings in {names[k]}"
-    bad, moved = blamed(names, sure > limit), blamed(names, (sure > 0) & (length > least))
+    bad, moved = bad_shots(names, sure > limit), bad_shots(names, (sure > 0) & (length > least))
     if np.isinf(length[k]):
         message = f"The {names[k]} shot shows another object in the same surroundings"
         return Gate("alignment", "fail", None, limit, message, _HOLD_STILL, 45.0, bad, "px")
@@ -89,9 +89,9 @@ def _object_moved(found: Evidence, limits: GateLimits) -> Gate:
     return msgspec.structs.replace(turned, cost_deg=cost)
 
 
-def _object_turned(found: Evidence, limits: GateLimits) -> Gate:
+def _turn_gate(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on a turn of the object between shots, beyond twice its error."""
-    turn, names, limit = _turn(found), found.names, limits.max_object_turn_deg
+    turn, names, limit = _measure_turn(found), found.names, limits.max_object_turn_deg
     least = turn.degrees - 2 * turn.sigma
     k = int(np.argmax(least))
     true = np.sqrt(np.maximum(turn.degrees**2 - turn.sigma**2 - _FALSE_TURN_DEG**2, 0))
@@ -99,14 +99,14 @@ def _object_turned(found: Evidence, limits: GateLimits) -> Gate:
     message = f"The object turned by {figure:.1f}° ± {turn.sigma[k]:.1f}° in {names[k]}, as its visible detail shows"
     if least[k] <= limit:
         return Gate("alignment", "pass", figure, limit, message, cost_deg=cost, unit="°")
-    return Gate("alignment", "warn", figure, limit, message, _HOLD_STILL, cost, blamed(names, least > limit), "°")
+    return Gate("alignment", "warn", figure, limit, message, _HOLD_STILL, cost, bad_shots(names, least > limit), "°")
 
 
-def _pushed(found: Evidence) -> object_motion.ObjectShift:
+def _measure_shift(found: Evidence) -> object_motion.ObjectShift:
     return object_motion.measure(found.radiance, found.alignment, found.object_)
 
 
-def _turn(found: Evidence) -> object_turn.ObjectTurn:
+def _measure_turn(found: Evidence) -> object_turn.ObjectTurn:
     maps = found.maps if hasattr(found, "maps") else None
     return object_turn.measure(found.radiance, found.alignment, found.object_, maps)
 
@@ -115,9 +115,7 @@ def mask(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on the object's mask: a chart inside, uncertain pixels, contact with the picture's border, parts, holes."""
     object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
-    charted = 0.0
-    if found.color.place is None:
-        charted = _charted(found)
+    charted = _chart_share(found) if found.color.place is None else 0.0
     if charted:
         faults.append((f"{charted:.0%} of the object's mask looks like a color chart that was not found", charted, 0))
     doubted = doubt is not None and doubt > limit
@@ -147,11 +145,11 @@ def mask(found: Evidence, limits: GateLimits) -> Gate:
     return Gate("mask", state, round(value, 5), most, "; ".join(fault[0] for fault in faults), remedy, cost)
 
 
-def _charted(found: Evidence) -> float:
+def _chart_share(found: Evidence) -> float:
     return float(chart_in_mask.share(found.radiance, found.object_.mask, shipped_data.colorchecker()))
 
 
-def mesh(of: Mesh, limits: GateLimits) -> Gate:
+def mesh(surface: Mesh, limits: GateLimits) -> Gate:
     """Gate on the mesh: number of pieces, cuts, jagged boundary.
 
     The surface is cut where one part hides another, and where the normals are wrong. A jagged boundary is smoothed
@@ -159,28 +157,28 @@ def mesh(of: Mesh, limits: GateLimits) -> Gate:
     """
     faults: list[tuple[str, float, float, Unit]] = []  # in words, its figure, its limit
     remedies = []
-    pieces, cuts, rim = limits.max_mesh_pieces, limits.max_mesh_cuts, limits.max_mesh_raggedness
-    if of.pieces > pieces:
-        faults.append((f"The mesh has {of.pieces} pieces, more than {pieces}", of.pieces, pieces, ""))
-    if of.cuts > cuts:
-        message = f"Cuts of {of.cut_px:.0f} px are {of.cuts:.0%} of the outline's length, more than {cuts:.0%}"
-        faults.append((message, of.cuts, cuts, "1"))
+    pieces, cuts, ragged = limits.max_mesh_pieces, limits.max_mesh_cuts, limits.max_mesh_raggedness
+    if surface.pieces > pieces:
+        faults.append((f"The mesh has {surface.pieces} pieces, more than {pieces}", surface.pieces, pieces, ""))
+    if surface.cuts > cuts:
+        message = (
+            f"Cuts of {surface.cut_px:.0f} px are {surface.cuts:.0%} of the outline's length, more than {cuts:.0%}"
+        )
+        faults.append((message, surface.cuts, cuts, "1"))
     state: State = "fail" if faults else "warn"
     if faults:
         remedies.append("See the error of the normals: they fit no surface; --set surface.stiffness=0 closes all cuts")
-    if of.raggedness > rim:
-        message = f"The boundary is {of.raggedness:.0%} longer than when smoothed, more than {rim:.0%}"
-        faults.append((message, of.raggedness, rim, "1"))
+    if surface.raggedness > ragged:
+        message = f"The boundary is {surface.raggedness:.0%} longer than when smoothed, more than {ragged:.0%}"
+        faults.append((message, surface.raggedness, ragged, "1"))
         remedies.append("If the mask's outline is jagged, use --mask PNG")
     if faults:
         _, value, limit, unit = faults[0]
-        said = "; ".join(fault[0] for fault in faults)
-        return Gate("mesh", state, round(value, 4), limit, said, "; ".join(remedies), unit=unit)
-    message = f"{of.pieces} {'piece' if of.pieces == 1 else 'pieces'}, "
-    message += (
-        f"cut along {of.cut_px:.0f} px, at occlusions or where the normals are wrong" if of.cut_px else "without a cut"
-    )
-    return Gate("mesh", "pass", round(of.cuts, 4), cuts, message)
+        message = "; ".join(fault[0] for fault in faults)
+        return Gate("mesh", state, round(value, 4), limit, message, "; ".join(remedies), unit=unit)
+    message = f"{surface.pieces} {'piece' if surface.pieces == 1 else 'pieces'}, "
+    where = f"cut along {surface.cut_px:.0f} px, at occlusions or where the normals are wrong"
+    return Gate("mesh", "pass", round(surface.cuts, 4), cuts, message + (where if surface.cut_px else "without a cut"))
 
 
 def sharpness(found: Evidence, limits: GateLimits) -> Gate:
@@ -193,7 +191,7 @@ def sharpness(found: Evidence, limits: GateLimits) -> Gate:
         return Gate("sharpness", "not measured", None, limit, "The shots show different places", unit="px")
     k, e = (int(i) for i in np.unravel_index(int(np.nanargmax(blur)), blur.shape))
     message = f"Frame {e + 1} of the {found.names[k]} shot is blurred by {blur[k, e]:.1f} px more than the sharpest"
-    bad = blamed(found.names, np.nanmax(np.nan_to_num(blur), axis=1) > limit)
+    bad = bad_shots(found.names, np.nanmax(np.nan_to_num(blur), axis=1) > limit)
     remedy = "Focus by hand and tape the ring, use a remote release, and take it again"
     of_shot = float(np.nan_to_num(blur).mean(axis=1).max())  # a single frame is only a part of its shot
     state: State = "fail" if of_shot > limit else "warn"
@@ -267,9 +265,7 @@ def _inward_share(maps: SurfaceMaps) -> float:
     mask = area_mean(maps.mask, shape) > 0.99
     lean = area_mean((across * maps.mask[..., None]).astype(np.float32), shape)
     away, _slope = outline.outward(mask.astype(np.float32), _OUTLINE_BLUR_PX)
-    band = mask & (outline.depth(mask) <= _OUTLINE_PX)
-    for edge in (band[:3], band[-3:], band[:, :3], band[:, -3:]):  # where a picture ends is no outline
-        edge[:] = False
+    band = rim.off_border(mask & (outline.depth(mask) <= _OUTLINE_PX))
     outwards = (lean[..., 0] * away[0] + lean[..., 1] * away[1])[band]
     return float((outwards < -_INWARD).mean()) if outwards.size else 0.0
 

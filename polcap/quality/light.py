@@ -1,7 +1,7 @@
 """Gates of the light: bracket, tone curve, chart, gains, clipping, ambient light."""
 
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass
 
 import cv2
 import msgspec
@@ -12,7 +12,7 @@ from polcap.optics import mueller
 from polcap.optics.frames import dot, rays
 from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
-from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, blamed
+from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots
 from polcap.quality.limits import GateLimits
 from polcap.stages.whitebalance import patches
 
@@ -71,16 +71,14 @@ def tone(found: Evidence, limits: GateLimits) -> Gate:
     curved = np.abs(radiance.bracket.curvature)
     within = float(np.nanmedian(np.nanmax(curved, axis=-1))) if np.isfinite(curved).any() else 0.0
     worst, reason = within, "The ratio of two exposures changes from shadows to highlights"
-    power = _power(radiance)
+    power = _exposure_power(radiance)
     if radiance.equipment.light == "steady" and abs(power - 1) > worst:
         worst, reason = abs(power - 1), f"Exposures follow the stated ones to the power {power:.2f}, not 1"
     slope, chart_light = found.selfcal.gains.grey_slope, found.color.light
     evenly = found.color.place is not None and (chart_light is None or chart_light.uneven < limits.max_scale_doubt / 2)
-    if evenly and np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens greys too
-        worst, reason = (
-            abs(slope - 1) / 2,
-            f"The chart's grays follow their reflectance to the power {slope:.2f}, not 1",
-        )
+    if evenly and np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens grays too
+        worst = abs(slope - 1) / 2
+        reason = f"The chart's grays follow their reflectance to the power {slope:.2f}, not 1"
     message = reason if worst > limit else "Pixel values are linear"
     remedy = "Use the RAW files, or develop them linearly to 16 bits, without tone curve, denoising or lens profile"
     return at_most("tone curve", worst, limit, message, remedy, cost_deg=60 * worst, unit="")
@@ -116,7 +114,7 @@ def stillness(found: Evidence, limits: GateLimits) -> Gate:
     k = int(np.argmax(fraction))
     message = f"{100 * fraction[k]:.2f} % of the object differs between the exposures of the {found.names[k]} shot"
     remedy = "Take the bracket again: something moved, or the light changed"
-    bad = blamed(found.names, fraction > limits.max_ghost)
+    bad = bad_shots(found.names, fraction > limits.max_ghost)
     blurred = np.nan_to_num(found.blur_px).max() > limits.max_blur_px  # `sharpness` judges this
     state: State = "warn" if blurred else "fail"
     return at_most(
@@ -178,8 +176,8 @@ def clipping(found: Evidence, limits: GateLimits) -> Gate:
     remedy = "Add a darker exposure or use less light"
     if few < share <= limit:
         message += ": highlights, without which roughness and specular are uncertain"
-        return at_most("clipping", share, few, message, remedy, blamed(found.names, clipped > few), beyond="warn")
-    return at_most("clipping", share, limit, message, remedy, blamed(found.names, clipped > limit), 20 * share)
+        return at_most("clipping", share, few, message, remedy, bad_shots(found.names, clipped > few), beyond="warn")
+    return at_most("clipping", share, limit, message, remedy, bad_shots(found.names, clipped > limit), 20 * share)
 
 
 def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
@@ -194,22 +192,22 @@ def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     remedy = "Wait longer between flashes: this one misfired or had not recycled"
     if radiance.equipment.light == "steady":
         remedy = "Shoot again under constant light: the lamp or daylight changed between shots"
-    message = f"The {names[k]} shot was {abs(100 * each[k]):.1f} % {_compared(each[k])} than the others"
-    yield at_most("gains", float(abs(each[k])), limit, message, remedy, blamed(names, np.abs(each) > limit), 3)
+    message = f"The {names[k]} shot was {abs(100 * each[k]):.1f} % {_comparative(each[k])} than the others"
+    yield at_most("gains", float(abs(each[k])), limit, message, remedy, bad_shots(names, np.abs(each) > limit), 3)
     yield _gain_doubt(found, limits)
     drift = off - each[:, None]
     k, e = (int(i) for i in np.unravel_index(int(np.argmax(np.abs(drift))), drift.shape))
     limit = limits.max_energy_drift
     change = float(drift[k, e])
-    message = f"Frame {e + 1} of {names[k]} was {abs(100 * change):.1f} % {_compared(change)} than its bracket"
-    bad = blamed(names, np.abs(drift).max(1) > limit)
+    message = f"Frame {e + 1} of {names[k]} was {abs(100 * change):.1f} % {_comparative(change)} than its bracket"
+    bad = bad_shots(names, np.abs(drift).max(1) > limit)
     remedy = remedy.replace("between shots", "within a bracket")
     yield at_most(
         "energy", abs(change), limit, message, remedy, bad, beyond="fail" if abs(change) > _MISFIRE else "warn"
     )
 
 
-def _compared(change: float) -> str:
+def _comparative(change: float) -> str:
     return "darker" if change < 0 else "brighter"
 
 
@@ -257,26 +255,30 @@ def crossed(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
         message = "The brightness of the cross-polarized shot relative to the others is unknown; it is not used"
         yield Gate("crossed", "warn", None, limit, message, "Put a ColorChecker next to the object, or expose more")
         return
-    seen = _crossed(found.stokes)
-    share = 100 * seen["mirrored"]
+    seen = _compare_crossed(found.stokes)
+    share = 100 * seen.mirrored
     message = f"{share:.1f} % of the object's light is mirrored at its surface; it is removed from the albedo"
-    if seen["left"] > _STILL_CLIPPED and seen["clipped"] > _FEW:
-        message = f"{100 * seen['left']:.0f} % of the clipped highlights are also clipped in the cross-polarized shot"
-        yield Gate("crossed", "warn", round(seen["left"], 3), _STILL_CLIPPED, message, remedy)
+    if seen.left > _STILL_CLIPPED and seen.clipped > _FEW:
+        message = f"{100 * seen.left:.0f} % of the clipped highlights are also clipped in the cross-polarized shot"
+        yield Gate("crossed", "warn", round(seen.left, 3), _STILL_CLIPPED, message, remedy)
         return
-    if seen["over"] > limit:
-        message = f"{100 * seen['over']:.0f} % of the object is brighter in the cross-polarized shot than is possible"
-    yield at_most("crossed", seen["over"], limit, message, remedy, beyond="warn")
+    if seen.over > limit:
+        message = f"{100 * seen.over:.0f} % of the object is brighter in the cross-polarized shot than is possible"
+    yield at_most("crossed", seen.over, limit, message, remedy, beyond="warn")
 
 
-def _crossed(image: StokesImage) -> dict[str, Any]:
-    """Compare the cross-polarized shot with S0.
+@dataclass(frozen=True)
+class CrossedFigures:
+    """Comparison of the cross-polarized shot with S0."""
 
-    left      share of the clipped highlights of S0 that are clipped in the crossed shot too
-    clipped   number of clipped pixels of S0
-    over      share of pixels that are brighter in the crossed shot than in S0, which is not possible
-    mirrored  share of the object's light that the crossed filter removes: specular reflection
-    """
+    left: float  # share of the clipped highlights of S0 that are clipped in the crossed shot too
+    clipped: int  # number of clipped pixels of S0
+    over: float  # share of pixels that are brighter in the crossed shot than in S0, which is not possible
+    mirrored: float  # share of the object's light that the crossed filter removes: specular reflection
+
+
+def _compare_crossed(image: StokesImage) -> CrossedFigures:
+    """Compare the cross-polarized shot with S0."""
     assert image.body is not None
     known = image.mask & (image.body.quality == 0)
     sound = known & ((image.quality & int(Quality.CLIPPED)) == 0)
@@ -288,7 +290,7 @@ def _crossed(image: StokesImage) -> dict[str, Any]:
     inner = erode(sound, 2)
     over = float((smooth > _BRIGHTER * whole)[inner].mean()) if inner.any() else 1.0
     mirrored = float(np.maximum(total - body, 0)[sound].sum() / max(float(total[sound].sum()), 1e-9))
-    return {"left": left, "clipped": int(clipped.sum()), "over": over, "mirrored": mirrored}
+    return CrossedFigures(left, int(clipped.sum()), over, mirrored)
 
 
 def ambient(found: Evidence, limits: GateLimits) -> Gate:
@@ -372,7 +374,7 @@ def _promised_steps(radiance: AngleStack) -> float:
     return float((stated[1:] / stated[:-1]).min()) if np.isfinite(stated).all() and len(stated) > 1 else float("nan")
 
 
-def _power(radiance: AngleStack) -> float:
+def _exposure_power(radiance: AngleStack) -> float:
     """Power law between measured and stated exposures: slope of their logarithms; 1 without metadata or steps."""
     ratio = radiance.bracket.exif_ratio[0]
     stated: Floats = np.log(ratio) if np.isfinite(ratio).all() else np.zeros(1)

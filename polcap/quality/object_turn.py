@@ -103,22 +103,22 @@ def _fit(
     reference: list[Floats], moved: list[Floats], field: Floats, inside: Bools, cell: Floats
 ) -> tuple[Floats, Floats]:
     """Motion (6,) between signals by robust least squares on their differences, and its covariance (6, 6)."""
-    design, missing = [], []
+    design, change = [], []
     for first, other in zip(reference, moved):
         slope = np.array(np.gradient((first + other) / 2))[::-1, inside].T  # (N, 2), x before y
         difference = (first - other)[inside]
         design.append((slope[:, None] @ field)[:, 0])
-        missing.append(difference - np.median(difference))
-    of_signal = np.stack(missing).shape
-    a, b = np.concatenate(design).astype(np.float64), np.concatenate(missing)
-    rest = b
+        change.append(difference - np.median(difference))
+    signals, pixels = len(change), len(cell)
+    a, b = np.concatenate(design).astype(np.float64), np.concatenate(change)
+    residual = b
     for _ in range(_STEPS):
-        scale = 1.4826 * np.median(np.abs(rest.reshape(of_signal)), axis=1) + 1e-9
-        scale = np.repeat(scale, of_signal[1])
-        weighted = a.T / (scale**2 + (rest / _CAUCHY) ** 2)
+        scale = 1.4826 * np.median(np.abs(residual.reshape(signals, pixels)), axis=1) + 1e-9
+        scale = np.repeat(scale, pixels)
+        weighted = a.T / (scale**2 + (residual / _CAUCHY) ** 2)
         inverse = np.linalg.inv(weighted @ a + np.diag(_PRIOR**-2))
         motion = inverse @ weighted @ b
-        rest = b - a @ motion
-    score = weighted * rest
-    of_cell = np.stack([np.bincount(np.tile(cell, of_signal[0]), row) for row in score])  # (6, cells)
+        residual = b - a @ motion
+    score = weighted * residual
+    of_cell = np.stack([np.bincount(np.tile(cell, signals), row) for row in score])  # (6, cells)
     return np.asarray(motion), np.asarray(inverse @ of_cell @ of_cell.T @ inverse)

@@ -7,7 +7,7 @@ from typing import TypeGuard
 import msgspec
 import numpy as np
 
-from polcap.images import Floats, OrderTest, Quality, SelfCalibration, ShotOrder, StokesImage, SurfaceMaps, TurnedShot
+from polcap.images import Bools, Floats, OrderTest, Quality, SelfCalibration, ShotOrder, StokesImage, SurfaceMaps
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
@@ -51,15 +51,15 @@ def order(found: Evidence) -> Gate:
     elif test is not None and test.ratio < 1 / _LIKELIER:
         better, because = test.rival, f"The network expects {1 / test.ratio:.1f} times smaller errors for"
     if better is not None:
-        message = f"{because} the order {_named(better, names)} rather than the stated one"
+        message = f"{because} the order {_order_text(better, names)} rather than the stated one"
         steps = better.remedy(names)
         remedy = f"{steps[:1].upper()}{steps[1:]}; or take the shots again in order"
-        return Gate("order", "fail", _named(better, names), "as stated", message, remedy, 45.0, unit="")
+        return Gate("order", "fail", _order_text(better, names), "as stated", message, remedy, 45.0, unit="")
     message = f"The outline supports the stated order (fit {outline.concentration:.2f} of 1)"
-    if _confirmed(test):
+    if _is_confirmed(test):
         message = f"In any other order, the network expects errors that are at least {test.ratio:.1f} times as large"
     elif outline.rival is not None:
-        other = _named(outline.rival, names)
+        other = _order_text(outline.rival, names)
         message = f"The outline fits the order {other} as well as the stated one (fit {outline.concentration:.2f} of 1)"
         surer = "a rounded object or a chart" + ("" if len(names) > 3 else " or four angles")
         remedy = f"Check folders and ring yourself; {surer} would decide"
@@ -72,12 +72,12 @@ def _test(found: Evidence) -> OrderTest | None:
     return found.maps.order if hasattr(found, "maps") else None
 
 
-def _confirmed(test: OrderTest | None) -> TypeGuard[OrderTest]:
+def _is_confirmed(test: OrderTest | None) -> TypeGuard[OrderTest]:
     """Whether the network expects clearly larger errors in any other order: the object is polarized as it should be."""
     return test is not None and test.ratio > _LIKELIER
 
 
-def _named(order: ShotOrder, names: list[str]) -> str:
+def _order_text(order: ShotOrder, names: list[str]) -> str:
     return ", ".join(names[i] for i in order.shots) + (", counted clockwise" if order.mirrored else "")
 
 
@@ -125,7 +125,7 @@ def _outline(found: Evidence, limit_deg: float, angle: Floats) -> OutlineFigures
 
     Angle errors smaller than `limit_deg` are not fitted.
     """
-    band = rim.sample(*_reduced(found.stokes, angle))
+    band = rim.sample(*_reduce(found.stokes, angle))
     if len(band.azimuth) < _LEAST_RIM:
         return None
     turn = rim.fit_angle_error(band, angle, np.radians(limit_deg))
@@ -169,7 +169,7 @@ def _angles(
         remedy = "Set the ring's zero to the horizontal, or state the true angles"
         return Gate("angles", "fail", round(common, 1), limit, message, remedy, abs(common), unit="°")
     if selfcal.turned.shots and abs(np.degrees(selfcal.turned.angle)) > limit:
-        return _not_closing(selfcal.turned, names, limit)
+        return _not_closing(selfcal, names, limit)
     fit = limits.max_turn_fit * (1.0 if known else 0.75)  # guessed gains look like turns
     if found.misfit >= fit or found.sigmas < _SURE or found.shot is None:
         return Gate("angles", "pass", 0.0, limit, "No other angle fits the outline clearly better", unit="°")
@@ -190,8 +190,9 @@ def _angles(
     return Gate("angles", state, round(degrees, 1), limit, message, remedy, cost, (names[found.shot],), "°")
 
 
-def _not_closing(turned: TurnedShot, names: list[str], limit: float) -> Gate:
+def _not_closing(selfcal: SelfCalibration, names: list[str], limit: float) -> Gate:
     """Gate on the polarizer angle of one shot that contradicts those of three or more other shots."""
+    turned = selfcal.turned
     degrees, doubt = np.degrees([turned.angle, turned.sigma])
     shots = tuple(names[k] for k in turned.shots)
     which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])}, by as much or less)"
@@ -239,7 +240,7 @@ def _light_of_body(body: rim.RimFigures, found: Evidence, limits: GateLimits) ->
     limit = limits.min_outline_dolp
     remedy = "Darken the room, keep the flash next to the lens, and photograph an ambient frame"
     zenith, roughness, albedo = _medians(found.maps)
-    confirmed = _confirmed(_test(found))
+    confirmed = _is_confirmed(_test(found))
     if body.along < _ALONG and not (confirmed and albedo < _DARK):  # dark gloss reflects itself
         return _along_contour(body.along, albedo, remedy)
     flat, dimmed = zenith < limits.min_zenith_deg, body.brightness < _DIMMED
@@ -304,7 +305,7 @@ def _medians(maps: SurfaceMaps) -> tuple[float, float, float]:
     return float(np.degrees(np.arccos(np.clip(facing, -1, 1)))), float(roughness), float(albedo)
 
 
-def _reduced(image: StokesImage, angle: Floats) -> tuple[Floats, rim.Bools, rim.Bools]:
+def _reduce(image: StokesImage, angle: Floats) -> tuple[Floats, Bools, Bools]:
     """Reduced pictures: light of the shots (K, h, w) from the Stokes parameters, object (h, w), valid pixels (h, w)."""
     step = int(np.ceil(np.sqrt(max(image.mask.size / _MOST_PIXELS, 1))))
     doubtful = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST

@@ -10,16 +10,14 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.optics import outline
 from polcap.optics.robust import jackknife
 
-Bools = NDArray[np.bool_]
-
 _INNER_PX, _DEPTH = 3.0, 0.08  # the band: px from the outline, and up to this share of the object's radius
 _SMOOTH_PX = 1.0
+_BORDER_PX = 3  # along the picture's border, where the mask ends without an outline
 _LEAST_SECTORS = 8  # of 24: a third of the outline
 _STEP_DEG, _MOST_DEG = 3.0, 48.0  # step and limit of the angles tried; larger errors mean a wrong order or sense
 
@@ -66,11 +64,9 @@ def sample(light: Floats, mask: Bools, usable: Bools) -> Rim:
     weight = cv2.GaussianBlur(ok, (0, 0), _SMOOTH_PX) + 1e-6
     smooth = np.stack([cv2.GaussianBlur(shot.astype(np.float32) * ok, (0, 0), _SMOOTH_PX) / weight for shot in light])
     depth = outline.depth(mask)
-    reach = max(_DEPTH * float(np.sqrt(mask.sum() / np.pi)), _INNER_PX + 3)
+    reach = max(_DEPTH * outline.disc_radius(mask), _INNER_PX + 3)
     out, slope = outline.outward(mask.astype(np.float32), max(3.0, reach / 2))
-    band = (depth > _INNER_PX) & (depth < reach) & (ok > 0) & (slope > 1e-4)
-    for edge in (band[:3], band[-3:], band[:, :3], band[:, -3:]):  # the picture's border is not an outline
-        edge[:] = False
+    band = off_border((depth > _INNER_PX) & (depth < reach) & (ok > 0) & (slope > 1e-4))
     inside = smooth[:, band]
     total = inside.mean(0)
     level = float(smooth.mean(0)[ok > 0].mean()) if (ok > 0).any() else 1.0
@@ -80,6 +76,14 @@ def sample(light: Floats, mask: Bools, usable: Bools) -> Rim:
         outline.sectors(band),
         total / max(level, 1e-9),
     )
+
+
+def off_border(band: Bools) -> Bools:
+    """A band (H, W) along the outline without the pixels at the picture's border, which is no outline."""
+    inner = np.zeros_like(band)
+    middle = slice(_BORDER_PX, -_BORDER_PX)
+    inner[middle, middle] = band[middle, middle]
+    return inner
 
 
 def fit_angle_error(at: Rim, angle: Floats, least: float) -> AngleError:
@@ -120,13 +124,13 @@ def _sigmas(at: Rim, angle: Floats, way: Floats) -> float:
     power = np.maximum((wave * wave).sum(0), 1e-9)
     share = (wave * light).sum(0) / power
     slope = slope - (wave * slope).sum(0) / power * wave
-    asked = np.bincount(at.sector, (slope * (light - share * wave)).sum(0))
-    room = np.bincount(at.sector, (slope * slope).sum(0)) * float(np.median(share))
-    used = np.flatnonzero(room)
+    moment = np.bincount(at.sector, (slope * (light - share * wave)).sum(0))
+    weight = np.bincount(at.sector, (slope * slope).sum(0)) * float(np.median(share))
+    used = np.flatnonzero(weight)
     if len(used) < _LEAST_SECTORS:
         return 0.0
-    without = (asked.sum() - asked[used]) / (room.sum() - room[used])
-    return float(asked.sum() / room.sum() / max(float(jackknife(without)), 1e-9))
+    without = (moment.sum() - moment[used]) / (weight.sum() - weight[used])  # the estimate without each sector
+    return float(moment.sum() / weight.sum() / max(float(jackknife(without)), 1e-9))
 
 
 def summarize(at: Rim, angle: Floats) -> RimFigures:

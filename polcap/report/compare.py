@@ -24,7 +24,7 @@ def rows(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Row]:
     return [(name, first.get(name), second.get(name)) for name in names if first.get(name) != second.get(name)]
 
 
-def labelled(row: Row) -> tuple[str, str, str]:
+def label_row(row: Row) -> tuple[str, str, str]:
     """A differing figure for a page: label, and both values with units, as text."""
     kind, _, name = row[0].partition(".")
     title = f"{labels.part(name.partition('.')[0])}: {labels.label(name)}" if kind == "figures" else name
@@ -43,21 +43,14 @@ def write(file: Path, folders: tuple[Path, Path], abouts: tuple[Mapping[str, Any
     results = []
     for name, about in zip(names, abouts):
         headline, expected_error = page.verdict(about)
-        results.append(
-            {
-                "name": name,
-                "verdict": about["verdict"],
-                "headline": headline,
-                "expected_error": expected_error,
-                "checks": page.checks(about["gates"]),
-            }
-        )
+        heading = {"name": name, "verdict": about["verdict"], "headline": headline, "expected_error": expected_error}
+        results.append({**heading, "checks": page.checks(about["gates"])})
     found = rows(*abouts)
     content = {
         "results": results,
         **_maps(folders, names),
         "differences": [
-            (f"{kind} that differ", [labelled(row) for row in found if row[0].startswith(kind.lower())])
+            (f"{kind} that differ", [label_row(row) for row in found if row[0].startswith(kind.lower())])
             for kind in ("Figures", "Settings")
         ],
     }

@@ -108,7 +108,7 @@ def label(name: str) -> str:
 def text(name: str, value: Any) -> str:
     """Value of a figure as text with its unit; lists of lists row by row."""
     unit = LABELS.get(name, ("", ""))[1]
-    words = _plain(value, _FACTORS.get(unit, 1.0))
+    words = _value_text(value, _FACTORS.get(unit, 1.0))
     if value is None or isinstance(value, (str, bool)) or not unit:
         return words
     return f"{words}{'' if unit == '°' else ' '}{unit}"
@@ -127,7 +127,7 @@ def number(value: float, digits: int = 4) -> str:
     return short.rstrip("0").rstrip(".") if "." in short else short
 
 
-def _plain(value: Any, factor: float) -> str:
+def _value_text(value: Any, factor: float) -> str:
     if value is None:
         return "not measured"
     if isinstance(value, bool):
@@ -135,10 +135,10 @@ def _plain(value: Any, factor: float) -> str:
     if isinstance(value, (int, float)):
         return number(value * factor)
     if isinstance(value, dict):
-        return ", ".join(f"{_words(str(key))} {_plain(item, factor)}" for key, item in value.items()) or "none"
+        return ", ".join(f"{_words(str(key))} {_value_text(item, factor)}" for key, item in value.items()) or "none"
     if isinstance(value, (list, tuple)):
         separator = " / " if any(isinstance(item, (list, tuple)) for item in value) else ", "
-        return separator.join(_plain(item, factor) for item in value) or "none"
+        return separator.join(_value_text(item, factor) for item in value) or "none"
     return str(value)
 
 

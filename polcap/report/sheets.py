@@ -28,7 +28,7 @@ class Tile:
 
 def sheet(tiles: list[Tile]) -> Picture:
     """Arrange tiles in one picture, three in a row, each with its caption above and its color key below."""
-    framed = [_framed(tile) for tile in tiles]
+    framed = [_frame(tile) for tile in tiles]
     rows = []
     for start in range(0, len(framed), 3):
         row = framed[start : start + 3]
@@ -46,7 +46,7 @@ def write(picture: Picture, words: str, at: tuple[int, int], paint: tuple[int, i
     cv2.putText(picture, words, at, paint, _LETTERS, size, 400)
 
 
-def _framed(tile: Tile) -> Picture:
+def _frame(tile: Tile) -> Picture:
     """Draw a tile: picture, caption, and the color bar with ticks or the note."""
     height = max(1, round(tile.picture.shape[0] * WIDTH / tile.picture.shape[1]))
     framed = np.full((_HEAD + height + _FOOT, WIDTH, 3), _GROUND, np.uint8)

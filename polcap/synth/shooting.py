@@ -9,7 +9,7 @@
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timedelta
 from math import sqrt
 from pathlib import Path
@@ -105,16 +105,26 @@ def write_capture(folder: Path, studio: "Studio", frame_written: Callable[[int, 
         if shoot.cross:
             shots.append(("cross", shoot.angles_deg[0]))
         for shot, (kind, angle) in enumerate(shots):
-            pose = _pose(shoot, shot)
+            pose = _draw_pose(shoot, shot)
             radiance = studio.radiance(pose, crossed=kind == "cross")
+            matrix = transform(shoot, pose.shift_px, pose.rot_deg).tolist()
             for frame in range(shoot.exposures):
                 name = f"{kind}{layouts.degrees(angle)}/IMG_{shot * shoot.exposures + frame + 1:04d}.DNG"
                 stops = float(shoot.step ** (frame - shoot.exposures // 2))
                 taken = studio.photograph(place / name, radiance, Take(shot, frame, stops))
-                files.append({"file": name, "nominal_deg": angle, **pose, **taken})
+                files.append({"file": name, "nominal_deg": angle, **asdict(pose), "transform": matrix, **taken})
                 if frame_written is not None:
                     frame_written(len(files), len(shots) * shoot.exposures)
         _write_truth(place, studio, files)
+
+
+@dataclass(frozen=True)
+class ShotPose:
+    """True polarizer angle of a shot, and the camera's movement since the reference shot."""
+
+    actual_deg: float
+    shift_px: tuple[float, float] = (0.0, 0.0)  # of the picture, right and down
+    rot_deg: float = 0.0  # of the picture, counter-clockwise as displayed
 
 
 @dataclass(frozen=True)
@@ -153,15 +163,15 @@ class Studio:
 
     def through(self, angle_deg: float, crossed: bool = False) -> Floats:
         """Light through the polarizer at this angle, as of `radiance`, for a camera that does not move."""
-        return self.radiance({"actual_deg": angle_deg, "rot_deg": 0.0, "transform": np.eye(3)}, crossed)
+        return self.radiance(ShotPose(angle_deg), crossed)
 
-    def radiance(self, pose: dict[str, Any], crossed: bool = False) -> Floats:
-        """Light after polarizer and lens, (H, W, 3) camera channels, for a camera movement and angle `pose`.
+    def radiance(self, pose: ShotPose, crossed: bool = False) -> Floats:
+        """Light after polarizer and lens, (H, W, 3) camera channels.
 
         A camera that rolls turns its polarizer too. `crossed`: the flash is polarized at right angles to the first
         angle; its polarizer takes half the light.
         """
-        shoot, back = self.shoot, np.linalg.inv(np.array(pose["transform"]))
+        shoot, back = self.shoot, np.linalg.inv(transform(self.shoot, pose.shift_px, pose.rot_deg))
         moved = not np.array_equal(back, np.eye(3))
         stokes = _light(self.scene, shoot, self.buffer, back) if moved else self.reference
         if crossed:
@@ -171,7 +181,7 @@ class Studio:
             stokes = 0.5 * (degree * polarized + (1 - degree) * stokes)
         y, x = np.mgrid[: shoot.height, : shoot.width].astype(np.float64)
         v = frames.rays_at(shoot.view, *_reference_px(shoot, back, x, y))
-        axis = frames.axis_on_ray(np.radians(pose["actual_deg"] - pose["rot_deg"]), v)
+        axis = frames.axis_on_ray(np.radians(pose.actual_deg - pose.rot_deg), v)
         weights = mueller.analyzer(axis, shoot.extinction_ratio).astype(np.float32)  # (H, W, 3)
         return np.asarray(_blur(shoot, np.einsum("hws,shwc->hwc", weights, stokes)) @ self.to_camera.T)
 
@@ -210,16 +220,14 @@ def transform(shoot: Shoot, shift_px: tuple[float, float], rot_deg: float) -> Fl
     return out
 
 
-def _pose(shoot: Shoot, shot: int) -> dict[str, Any]:
+def _draw_pose(shoot: Shoot, shot: int) -> ShotPose:
     """Random camera movement and polarizer angle of one shot; the first shot does not move."""
     random = np.random.default_rng([shoot.seed, 0, shot])
     x, y, roll = (random.uniform(-1, 1, 3) if shot else np.zeros(3)).tolist()
     shift = x * shoot.nudge_px, y * shoot.nudge_px
     roll *= shoot.nudge_deg
     nominal = shoot.angles_deg[shot % len(shoot.angles_deg)]  # the crossed shot, after the last, has the first angle
-    actual = float(nominal + shoot.angle_error_deg * random.normal())
-    matrix = transform(shoot, shift, roll).tolist()
-    return {"actual_deg": actual, "shift_px": shift, "rot_deg": roll, "transform": matrix}
+    return ShotPose(float(nominal + shoot.angle_error_deg * random.normal()), shift, roll)
 
 
 def _light(scene: Scene, shoot: Shoot, buffer: GBuffer, back: Floats, flash_axis: float | None = None) -> Floats:

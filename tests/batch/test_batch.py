@@ -130,7 +130,7 @@ def test_second_run_opens_no_finished_capture(captures: Path, finished: Path, po
 def test_a_changed_setting_is_processed_again(captures: Path, finished: Path) -> None:
     units = [unit for unit in batch.find(captures, finished) if unit.name == "obj0"]
     options = one.ProcessOptions({"hdr": {}})
-    assert one.finished(units[0], options) is None
+    assert one.find_finished(units[0], options) is None
     assert one.request(units[0], options) != one.request(units[0], one.ProcessOptions({"hdr": {"clip": 0.9}}))
 
 

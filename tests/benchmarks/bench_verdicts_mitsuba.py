@@ -31,7 +31,7 @@ from polcap.images import Bools, ChartRequest, Floats
 from polcap.pipeline import path
 from polcap.pipeline.cache import MemoryCache
 from polcap.quality import gates
-from polcap.quality.gate import full_size
+from polcap.quality.gate import Gate, full_size
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Cluster
 from polcap.synth.forward_camera import SENSOR_WIDTH_MM
@@ -141,7 +141,7 @@ def _enlarged(image: Floats | Bools, how: int) -> Floats:
     return np.asarray(cv2.resize(image.astype(np.float32), (TIMES * width, TIMES * height), interpolation=how))
 
 
-def judged(place: Path, scene: dict[str, Any], corner: tuple[int, int]) -> tuple[list[gates.Gate], float]:
+def judged(place: Path, scene: dict[str, Any], corner: tuple[int, int]) -> tuple[list[Gate], float]:
     """All gates of the capture, and the median error of its normals in degrees."""
     capture = captures.read(place)
     user = path.UserInput(ChartRequest("auto"), None, *networks())

@@ -15,10 +15,9 @@ from scipy.ndimage import gaussian_filter
 from polcap.formats.maps import png
 from polcap.images import Floats
 from polcap.optics import mueller
-from polcap.synth import shooting as synthetic
 from polcap.synth.color_checker import Chart
 from polcap.synth.scenes import random_scene
-from polcap.synth.shooting import Shoot, Studio, Take
+from polcap.synth.shooting import Shoot, ShotPose, Studio, Take
 
 Random = np.random.Generator
 
@@ -85,12 +84,7 @@ def shoot(folder: Path, seed: int, kind: str, width: int) -> dict[str, Any]:
     for k, name in enumerate(planned.names):
         roll = how.nudge_deg * float(random.uniform(-1, 1)) * (k > 0)
         shift = float(planned.shifts[k, 0]), float(planned.shifts[k, 1])
-        pose = {
-            "actual_deg": planned.actual[k],
-            "rot_deg": roll,
-            "transform": synthetic.transform(how, shift, roll).tolist(),
-        }
-        radiance = planned.studio.radiance(pose)
+        radiance = planned.studio.radiance(ShotPose(planned.actual[k], shift, roll))
         for e in range(3):
             stops = how.step ** (e - 1)
             suffix = "png" if kind in ("tone curve", "lossy") else "DNG"

@@ -21,7 +21,7 @@ from polcap.synth import shooting as synthetic
 from polcap.synth.distance_fields import Cluster
 from polcap.synth.render import Scene
 from polcap.synth.scenes import random_scene
-from polcap.synth.shooting import Shoot, Studio, Take
+from polcap.synth.shooting import Shoot, ShotPose, Studio, Take
 
 Random = np.random.Generator
 Light = Callable[[Floats, int, int], Floats]  # light of frame e of shot k behind the polarizer, after the fault
@@ -78,8 +78,7 @@ def write(folder: Path, seed: int, kind: str, width: int = 640) -> None:
     numbers = iter(range(1, 100))
     actual = np.array(ANGLES) + plan.shoot.angle_error_deg * random.normal(size=len(ANGLES))
     for k, name in enumerate(ANGLES):
-        matrix = synthetic.transform(plan.shoot, (float(plan.shift[k, 0]), float(plan.shift[k, 1])), 0.0)
-        pose = {"actual_deg": float(actual[k]), "rot_deg": 0.0, "transform": matrix.tolist()}
+        pose = ShotPose(float(actual[k]), (float(plan.shift[k, 0]), float(plan.shift[k, 1])))
         scene = plan.of_shot(plan.scene, k)
         shot = studio
         if scene is not plan.scene:

@@ -92,4 +92,4 @@ def test_too_few_boards_are_an_error(folder, tmp_path):
 @pytest.mark.parametrize("board", ["9", "9x", "1x6", "axb", "9x6x3", "200x6"])
 def test_a_wrong_board_option_is_an_error(board):
     with pytest.raises(SettingError, match="inner corners across and down"):
-        calibrate_command.squares(board)
+        calibrate_command.parse_board(board)

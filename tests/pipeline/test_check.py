@@ -205,13 +205,13 @@ def test_a_reduced_picture_has_the_same_middle_and_clipped_pixels(
 def test_corners_of_the_chart_are_moved_to_the_reduced_picture() -> None:
     """The outer edges of a block of RAW pixels are the outer edges of its pixel."""
     edges = np.array([[-0.5, -0.5], [39.5, -0.5], [39.5, 23.5], [-0.5, 23.5]])
-    moved = check._moved(ChartRequest("corners", corners=edges), 4)
+    moved = check._scale_chart(ChartRequest("corners", corners=edges), 4)
     np.testing.assert_allclose(moved.corners, [[-0.5, -0.5], [9.5, -0.5], [9.5, 5.5], [-0.5, 5.5]])
 
 
 def test_shares_are_per_cent_on_the_terminal_and_shares_in_json() -> None:
     verdict = Verdict(True, (), (Gate("mask", "pass", 0.03, 0.25, "About 3 % of the outline may be wrong"),), "bowl", 1)
     assert "(limit 25 %)" in check.table(verdict)
-    (line,) = json.loads(json.dumps(check.shown(verdict)))["lines"]
+    (line,) = json.loads(json.dumps(check.to_json(verdict)))["lines"]
     assert (line["value"], line["limit"], line["unit"]) == (0.03, 0.25, "1")
     assert page.check(line)["limit"] == "25 %"

@@ -17,7 +17,7 @@ from polcap.formats.maps import exr, png
 from polcap.pipeline import asset_export
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.asset_export import ExportRequest
-from tests.conftest import ROOT, Command, shell
+from tests.conftest import ROOT, Command, python, shell
 from tests.formats.export.test_gltf import NODE, document
 
 
@@ -53,9 +53,9 @@ def test_validator_finds_no_error_and_no_warning(exported: Path, preset: str) ->
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_maps_json_and_the_files_say_what_they_hold(exported: Path, preset: str) -> None:
-    said = json.loads((exported / "maps" / "maps.json").read_text())["exports"][f"asset/{preset}"]
-    assert said["unit"] in ("m", "relative") and "+Y" in said["for"]
-    for name, meaning in said["textures"].items():
+    stated = json.loads((exported / "maps" / "maps.json").read_text())["exports"][f"asset/{preset}"]
+    assert stated["unit"] in ("m", "relative") and "+Y" in stated["for"]
+    for name, meaning in stated["textures"].items():
         if name.endswith(".exr"):
             assert meaning == exr.read(exported / "asset" / preset / name)[1]["polcap:meaning"]
             continue
@@ -63,13 +63,13 @@ def test_maps_json_and_the_files_say_what_they_hold(exported: Path, preset: str)
 
 
 def test_maps_json_and_report_json_agree_and_state_units(exported: Path) -> None:
-    said = json.loads((exported / "maps" / "maps.json").read_text())
+    stated = json.loads((exported / "maps" / "maps.json").read_text())
     about = json.loads((exported / "report.json").read_text())
-    assert about["figures"]["object"]["crop"] == said["crop"] and about["units"]["object.crop"] == "RAW px"
-    assert about["figures"]["maps"]["estimator"] == said["estimator"]
-    assert about["units"]["mesh.extent"] == said["depth"]["unit"]
-    assert about["capture"]["focal_known"] == said["camera"]["focal_known"]
-    assert about["capture"]["focal_px"] == pytest.approx(said["camera"]["focal_px"] * said["scale"])
+    assert about["figures"]["object"]["crop"] == stated["crop"] and about["units"]["object.crop"] == "RAW px"
+    assert about["figures"]["maps"]["estimator"] == stated["estimator"]
+    assert about["units"]["mesh.extent"] == stated["depth"]["unit"]
+    assert about["capture"]["focal_known"] == stated["camera"]["focal_known"]
+    assert about["capture"]["focal_px"] == pytest.approx(stated["camera"]["focal_px"] * stated["scale"])
 
 
 def test_unreal_gets_green_down_and_unity_smoothness(exported: Path) -> None:
@@ -122,12 +122,14 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, own: P
 
 
 @pytest.mark.parametrize(
-    ("flags", "says"),
+    ("flags", "words"),
     [
         (["--preset", "max"], f"--preset max is none of {', '.join(PRESETS)}"),
         (["--preset", "web", "--obj"], "write --obj by a second export"),
         (["--preset", "maya", "--color", "ACEScg"], "converts the colors of the layered EXR only"),
         (["--obj", "--geometry", "draco"], "change the GLB, which is not written"),
+        (["--preset", "web", "--bits", "16"], "--bits 16 is for PNG textures, and none is written; add --images png"),
+        (["--ply", "--bits", "16"], "--bits 16 is for PNG textures"),
         (["--about", "title"], "--about title: write FACT=TEXT"),
         (["--about", "author=me"], "--about author: there is no such fact; there are title, creator"),
         (["--obj", "--page", ROOT / "README.md"], "README.md is not model-viewer"),
@@ -136,9 +138,9 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, own: P
         (["--exr", "--color", "ACEScq"], "--color ACEScq is not a color space or role"),
     ],
 )
-def test_what_does_not_exist_is_one_line(own: Path, polcap: Command, flags: list[str], says: str) -> None:
+def test_what_does_not_exist_is_one_line(own: Path, polcap: Command, flags: list[str], words: str) -> None:
     done = polcap("export", own, *flags)
-    assert done.returncode == 2 and done.stderr.count("\n") == 1 and says in done.stderr
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and words in done.stderr
 
 
 def test_relightable_layer_has_the_facts_of_the_catalog_and_is_in_the_sidecar(own: Path, polcap: Command) -> None:
@@ -179,18 +181,16 @@ def test_encoder_on_the_path_makes_ktx2_textures(
     monkeypatch.delitem(encoders._KTX2, "ktx")
     done = polcap("export", own, "--gltf", "--images", "ktx2")
     assert done.returncode == 0, done.stderr
-    said = document((own / "asset" / "capture.glb").read_bytes())
-    assert said["extensionsRequired"] == ["KHR_texture_basisu"]
-    assert {image["mimeType"] for image in said["images"]} == {"image/ktx2"}
-    assert all("KHR_texture_basisu" in texture["extensions"] for texture in said["textures"])
+    written = document((own / "asset" / "capture.glb").read_bytes())
+    assert written["extensionsRequired"] == ["KHR_texture_basisu"]
+    assert {image["mimeType"] for image in written["images"]} == {"image/ktx2"}
+    assert all("KHR_texture_basisu" in texture["extensions"] for texture in written["textures"])
     calls = Path(f"{encoder}.log").read_text().splitlines()
     assert sorted("--assign_oetf srgb" in call for call in calls) == [False, False, True, True]  # data, colours
 
 
 def test_the_example_of_presets_runs(own: Path) -> None:
-    script = ROOT / "examples" / "export_presets.py"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, script, own], capture_output=True, text=True, env=environment, timeout=300)
+    done = python(ROOT / "examples" / "export_presets.py", own)
     assert done.returncode == 0, done.stderr
     assert "T_capture_N.png: tangent-space normal n * 0.5 + 0.5, -Y" in done.stdout
 
@@ -231,19 +231,19 @@ def test_texture_size_and_levels_of_detail(own: Path) -> None:
 def test_exports_of_earlier_maps_are_named(own: Path, polcap: Command) -> None:
     assert polcap("export", own, "--preset", "unreal", "--lod", 2, "--texture-size", 64).stderr == ""
     asset, about = own / "asset", json.loads((own / "report.json").read_text())
-    assert asset_export.outdated(asset_export.sidecars(own), about["keys"]) == []
+    assert asset_export.find_outdated(asset_export.sidecars(own), about["keys"]) == []
     about["keys"]["surface"] = "of other maps"
     (own / "report.json").write_text(json.dumps(about))
-    assert asset_export.outdated(asset_export.sidecars(own), about["keys"]) == [asset, asset / "unreal"]
+    assert asset_export.find_outdated(asset_export.sidecars(own), about["keys"]) == [asset, asset / "unreal"]
     again = polcap("export", own, "--preset", "unreal", "--lod", 1, "--texture-size", 64)
     assert again.returncode == 0 and "asset/unreal/SM_capture_lod2.glb in" in again.stderr
 
 
 def test_presets_of_one_command_each_get_their_folder(own: Path, polcap: Command) -> None:
     assert polcap("export", own, "--preset", "web", "--preset", "unreal", "--triangles", 3000).returncode == 0
-    said = json.loads((own / "maps" / "maps.json").read_text())["exports"]
+    stated = json.loads((own / "maps" / "maps.json").read_text())["exports"]
     for preset in ("web", "unreal"):
-        assert said[f"asset/{preset}"]["mesh"]["triangles"] == pytest.approx(3000, rel=0.01)
+        assert stated[f"asset/{preset}"]["mesh"]["triangles"] == pytest.approx(3000, rel=0.01)
     assert "KHR_mesh_quantization" in document((own / "asset/web/capture.glb").read_bytes())["extensionsRequired"]
 
 
@@ -270,8 +270,10 @@ def test_a_second_export_adds_to_the_records_of_the_first(own: Path) -> None:
     pipeline.export(own, ExportRequest(formats=("exr",)))
     after = json.loads(sidecar.read_text())["files"]
     assert set(after) == {*before, "capture_layers.exr"} and after["capture.obj"] == before["capture.obj"]
-    said = json.loads((own / "maps" / "maps.json").read_text())["exports"]["asset"]
-    assert {"capture_basecolor", "capture_normal"} <= set(said["glb"]) and "capture_roughness.png" in said["textures"]
+    stated = json.loads((own / "maps" / "maps.json").read_text())["exports"]["asset"]
+    assert {"capture_basecolor", "capture_normal"} <= set(stated["glb"]) and "capture_roughness.png" in stated[
+        "textures"
+    ]
 
 
 def test_a_sidecar_of_other_maps_is_replaced(own: Path) -> None:

@@ -26,7 +26,7 @@ from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import STAGES, UserInput, distance_m, on_grid
 from polcap.synth.scenes import random_scene
 from polcap.synth.shooting import Shoot, write
-from tests.conftest import ROOT, Command
+from tests.conftest import ROOT, Command, environment, python
 
 
 def product(folder: Path) -> dict[str, bytes]:
@@ -74,13 +74,6 @@ def test_normals_of_the_bundled_capture_are_near_the_truth(result: Path, example
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean() < 12
 
 
-@pytest.fixture
-def copy(result: Path, tmp_path: Path) -> Path:
-    """A copy of the result, to be changed."""
-    shutil.copytree(result, tmp_path / "copy")
-    return tmp_path / "copy"
-
-
 def test_running_again_computes_nothing_and_gives_the_same_bytes(
     result: Path, copy: Path, example: Path, polcap: Command
 ) -> None:
@@ -117,10 +110,9 @@ def test_late_changes_end_as_a_first_run_with_these_settings_does(
 def test_killed_run_resumes_and_gives_the_same_bytes(result: Path, example: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "polcap", "process", str(example), "--out", str(tmp_path)]
     command += ["--estimator", "analytic"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     random = np.random.default_rng(0)
     for _ in range(3):
-        process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+        process = subprocess.Popen(command, env=environment(), stderr=subprocess.PIPE, text=True)
         assert process.stderr is not None
         for line in process.stderr:  # killed a moment after a stage that this run had to compute
             if line.rstrip().endswith(" s"):
@@ -129,7 +121,7 @@ def test_killed_run_resumes_and_gives_the_same_bytes(result: Path, example: Path
         process.send_signal(signal.SIGKILL)
         process.wait()
         process.stderr.close()
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    done = python(*command[1:])
     assert done.returncode == 0, done.stderr
     assert product(tmp_path) == product(result)
     assert partial(tmp_path) == []
@@ -137,8 +129,7 @@ def test_killed_run_resumes_and_gives_the_same_bytes(result: Path, example: Path
 
 def test_interrupted_run_ends_with_130_and_one_line(example: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "polcap", "process", str(example), "--out", str(tmp_path)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, env=environment(), stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
     seen = []
     for line in process.stderr:
@@ -217,7 +208,7 @@ def test_full_disk_is_one_clear_line_and_leaves_no_partial_file(example: Path, t
     try:
         done = subprocess.run(
             [sys.executable, "-m", "polcap", "process", str(example), "--out", str(disk / "out")],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            env=environment(),
             capture_output=True,
             text=True,
             preexec_fn=limit,
@@ -302,24 +293,18 @@ def test_distance_follows_from_the_size_of_the_chart() -> None:
 
 
 def test_the_example_from_python_runs(copy: Path, example: Path) -> None:
-    script = ROOT / "examples" / "from_python.py"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, script, example, copy], env=environment, capture_output=True, text=True)
+    done = python(ROOT / "examples" / "from_python.py", example, copy)
     assert done.returncode == 0 and "stillness pass" in done.stdout, done.stderr
 
 
 def test_the_example_of_single_stages_gives_the_cues_of_a_result(copy: Path, example: Path) -> None:
-    script = ROOT / "examples" / "stage_by_stage.py"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, script, example], env=environment, capture_output=True, text=True)
+    done = python(ROOT / "examples" / "stage_by_stage.py", example)
     dolp = read_cues(copy)["dolp"][maps.read(copy / "maps").mask]
     assert done.returncode == 0 and f"DoLP, median: {np.median(dolp):.3f}" in done.stdout, done.stdout + done.stderr
 
 
 def test_the_example_against_the_truth_runs(copy: Path, example: Path) -> None:
-    script = ROOT / "examples" / "against_truth.py"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, script, example, copy], env=environment, capture_output=True, text=True)
+    done = python(ROOT / "examples" / "against_truth.py", example, copy)
     assert done.returncode == 0, done.stderr
     mean = float(done.stdout.split("mean ")[1].split("°")[0])
     assert 0 < mean < 5 and "roughness: RMSE" in done.stdout
@@ -327,8 +312,7 @@ def test_the_example_against_the_truth_runs(copy: Path, example: Path) -> None:
 
 def test_the_gallery_shows_each_result_and_stands_alone(copy: Path, tmp_path: Path) -> None:
     page = tmp_path / "gallery.html"
-    command = [sys.executable, *map(str, (ROOT / "examples" / "gallery.py", page, copy, copy))]
-    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
+    done = python(ROOT / "examples" / "gallery.py", page, copy, copy)
     assert done.returncode == 0, done.stderr
     text = page.read_text()
     assert text.count("data:image/webp") == 2 and text.count('<a href="copy/report.html">') == 2

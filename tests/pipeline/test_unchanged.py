@@ -2,14 +2,12 @@
 
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from polcap.pipeline import unchanged
-from tests.conftest import ROOT, Command
+from tests.conftest import Command, python
 
 OLD_NS = 1_000_000_000 * 10**9
 ASKED = {"angles": None}
@@ -79,19 +77,16 @@ def test_result_that_was_touched_is_no_answer(capture: Path) -> None:
     assert unchanged.find(out, "asked") is None
 
 
-def test_run_with_nothing_to_do_loads_no_library(result: Path, example: Path, polcap: Command, tmp_path: Path) -> None:
-    capture, out = tmp_path / "capture", tmp_path / "out"
+def test_run_with_nothing_to_do_loads_no_library(copy: Path, example: Path, polcap: Command, tmp_path: Path) -> None:
+    capture = tmp_path / "capture"
     shutil.copytree(example, capture)
     for file in capture.rglob("*.*"):
         os.utime(file, ns=(OLD_NS, OLD_NS))
-    shutil.copytree(result, out)
-    options = ["process", str(capture), "--out", str(out), "--estimator", "analytic"]
+    options = ["process", str(capture), "--out", str(copy), "--estimator", "analytic"]
     first = polcap(*options)
     heavy = ("numpy", "scipy", "cv2", "onnxruntime")
     code = f"import atexit, sys; from polcap import cli; sys.argv[1:] = {options}\n"
     code += f"atexit.register(lambda: print('loaded', *sys.modules.keys() & {heavy}))\ncli.main()"
-    again = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)}
-    )
+    again = python("-c", code)
     assert again.stdout == first.stdout + "loaded\n"
     assert again.returncode == first.returncode and again.stderr.splitlines()[:3] == first.stderr.splitlines()[:3]

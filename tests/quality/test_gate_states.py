@@ -4,7 +4,7 @@ import ast
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -51,13 +51,13 @@ FIGURES = {
     "pushed": pushed(0.1, 0.1), "turn": ObjectTurn(np.array([0.0, 0.2, 0.1]), np.full(3, 0.1)),
     "edge_blur": 0.8,
     "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "medians": [45.0, 0.2, 0.3],
-    "normal_error": 4.0, "lean": 2.0, "crossed": {"left": 0.0, "clipped": 0, "over": 0.0, "mirrored": 0.1},
+    "normal_error": 4.0, "lean": 2.0, "crossed": light.CrossedFigures(0.0, 0, 0.0, 0.1),
 }  # fmt: skip
 MEASURES = {  # the function that measures each figure
     "surroundings": (light, "_surroundings_dolp"), "highlight": (light, "_highlight_dolp"),
-    "pushed": (geometry, "_pushed"), "turn": (geometry, "_turn"), "edge_blur": (geometry, "_edge_blur"),
-    "charted": (geometry, "_charted"), "lean": (geometry, "_lean"),
-    "noise": (light, "_noise"), "crossed": (light, "_crossed"), "ill_posed": (polarization, "_ill_posed"),
+    "pushed": (geometry, "_measure_shift"), "turn": (geometry, "_measure_turn"), "edge_blur": (geometry, "_edge_blur"),
+    "charted": (geometry, "_chart_share"), "lean": (geometry, "_lean"),
+    "noise": (light, "_noise"), "crossed": (light, "_compare_crossed"), "ill_posed": (polarization, "_ill_posed"),
     "medians": (polarization, "_medians"), "outline": (polarization, "_outline"),
     "normal_error": (gates, "_own_error"), "inward_outline": (geometry, "_inward_share"),
 }  # fmt: skip
@@ -80,6 +80,8 @@ def in_numpy(value: Any) -> Any:
         return type(value)(in_numpy(one) for one in value)
     if isinstance(value, float):
         return np.float64(value)
+    if is_dataclass(value):
+        return fields_in_numpy(value)
     return np.int64(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
@@ -209,9 +211,9 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("crossed", "pass", {"radiance": {"crossed": True}}),
     ("crossed", "warn", {"radiance": {"crossed": True}, "stokes": SimpleNamespace(body=None)}),
     ("crossed", "warn", {"radiance": {"crossed": True},
-                         "figures": {"crossed": {"left": 0.9, "clipped": 99, "over": 0.0, "mirrored": 0.1}}}),
+                         "figures": {"crossed": light.CrossedFigures(0.9, 99, 0.0, 0.1)}}),
     ("crossed", "warn", {"radiance": {"crossed": True},
-                         "figures": {"crossed": {"left": 0.0, "clipped": 0, "over": 0.9, "mirrored": 0.1}}}),
+                         "figures": {"crossed": light.CrossedFigures(0.0, 0, 0.9, 0.1)}}),
     ("ill-posed", "pass", {}),
     ("ill-posed", "fail", {"figures": {"ill_posed": 0.5}}),
     ("outline", "pass", {}),

@@ -21,8 +21,7 @@ from polcap.images import (
 )
 from polcap.optics import frames
 from polcap.quality import gates
-from polcap.quality.gate import Evidence
-from polcap.quality.gates import Gate
+from polcap.quality.gate import Evidence, Gate
 from polcap.stages import cues, selfcal, stokes
 from tests import scenes
 

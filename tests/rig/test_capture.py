@@ -41,7 +41,7 @@ def test_the_verdict_ends_a_capture(
 ) -> None:
     monkeypatch.setattr("polcap.pipeline.check.inspect", lambda found, *_: found.shots[2].name)
     monkeypatch.setattr("polcap.pipeline.check.table", lambda judged: f"{verdict} {judged}")
-    monkeypatch.setattr("polcap.pipeline.check.shown", lambda judged: {"verdict": verdict})
+    monkeypatch.setattr("polcap.pipeline.check.to_json", lambda judged: {"verdict": verdict})
     done = polcap("capture", tmp_path / "c", *SIMULATED[:4], "--json")
     assert done.returncode == (0 if verdict == "keep" else 3)
     assert json.loads(done.stdout)["check"] == {"verdict": verdict} and f"{verdict} 90°" in done.stderr

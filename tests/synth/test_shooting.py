@@ -201,9 +201,7 @@ def test_a_camera_that_rolls_turns_its_polarizer_with_it() -> None:
     """A ball on the axis under a flash at the lens has the same picture at every roll of the camera."""
     scene = Scene(shape=BALL.shape, coat=GREY, position=(0.0, 0.0, -0.7), light=(0.0, 0.0, 0.0), chart=None)
     studio = shooting.Studio(scene, replace(STILL, width=96, height=72, samples=1, blur_px=0.0))
-    rolled = shooting.transform(studio.shoot, (0.0, 0.0), 20.0)
-    pose = {"actual_deg": 30.0, "rot_deg": 20.0, "transform": rolled.tolist()}
     upright, other = studio.through(30.0), studio.through(70.0)
-    found = studio.radiance(pose)
+    found = studio.radiance(shooting.ShotPose(30.0, rot_deg=20.0))
     inside = studio.buffer.mask & (studio.buffer.normal[..., 2] > 0.35)
     assert np.abs(found - upright)[inside].max() < 0.02 * np.abs(other - upright)[inside].max()

@@ -16,10 +16,10 @@ def decode(frame: Frame) -> SensorImage:
     """
     path, digest, reading = frame.path, _file_digest(frame), frame.reading
     if reading.sensor_deg is not None:
-        return photo.read_mosaic(path, reading.sensor_deg, reading.white, reading.black, digest, reading.kind)
+        return photo.read_mosaic(path, reading.sensor_deg, reading, digest)
     if reading.kind == "raw":
         return libraw.read(path, digest)
-    return photo.read(path, reading.encoding, reading.white, reading.black, digest)
+    return photo.read(path, reading, digest)
 
 
 def apply(frame: Frame, function: Callable[..., worker.Answer], **options: Any) -> worker.Answer:

@@ -14,37 +14,33 @@ from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
 from polcap.formats.raw import file_bytes, file_checks, file_kind, libraw, worker
-from polcap.images import SensorImage
+from polcap.images import FrameReading, SensorImage
 from polcap.optics import color
 
 Encoding = Literal["linear", "srgb"]
 SENSOR_CELLS = {0.0: (1, 1), 45.0: (0, 1), 90.0: (0, 0), 135.0: (1, 0)}  # row, column of each angle [°] in a 2×2 cell
 _MOST_CHANNELS = 64  # of a layered EXR
+_DEFAULT = FrameReading("photo")
 _COLOR_LEVELS = 0.05  # averages of neighboring 2×2 cells differ less than this on a monochrome sensor
 
 
-def read(
-    path: str | Path,
-    encoding: Encoding | None = None,
-    white: float | None = None,
-    black: float = 0.0,
-    digest: str | None = None,
-) -> SensorImage:
+def read(path: str | Path, reading: FrameReading = _DEFAULT, digest: str | None = None) -> SensorImage:
     """Decode a finished picture as linear values (H, W, 3); a gray picture is repeated in all three channels.
 
     Linear integers stay counts; for floating point, white is 1. An sRGB-encoded picture becomes linear 0…1. It and
-    every 8-bit picture are marked `lossy`. By default `encoding` is sRGB for 8 bits, else linear, and `white` is the
-    greatest value of the type. With the `digest` of `probe.read`, the file must still have the bytes that were probed.
+    every 8-bit picture are marked `lossy`. With the `digest` of `probe.read`, the file must still have the bytes that
+    were probed.
 
     Raises DecodeError: not a picture, damaged, or changed since it was probed.
     """
     pixels, full = _pixels(path, digest)
     lossy = pixels.dtype == np.uint8
-    encoding = encoding_of(8 * pixels.itemsize, encoding)
+    encoding = encoding_of(8 * pixels.itemsize, reading.encoding)
     if pixels.shape[2] == 1:
         pixels = np.repeat(pixels, 3, axis=2)
     if encoding == "linear":
-        return SensorImage(_counts(pixels), np.full((1, 1), black), white or full, None, lossy=lossy)
+        white = reading.white or full
+        return SensorImage(_counts(pixels), np.full((1, 1), reading.black), white, None, lossy=lossy)
     if pixels.dtype.kind == "f":
         value = color.decode_srgb(pixels).astype(np.float32)
     else:
@@ -53,39 +49,33 @@ def read(
 
 
 def read_mosaic(
-    path: str | Path,
-    angle_deg: float,
-    white: float | None = None,
-    black: float = 0.0,
-    digest: str | None = None,
-    kind: file_kind.Kind = "photo",
+    path: str | Path, angle_deg: float, reading: FrameReading = _DEFAULT, digest: str | None = None
 ) -> SensorImage:
     """One angle (0, 45, 90 or 135°) of a polarization sensor's raw frame, (H/2, W/2, 3), linear.
 
-    The frame's 2×2 cell is 90 45 / 135 0 degrees. `white` and `black` are counts; by default those that the file
-    states, or the greatest value of the type and 0. `kind` is the file's kind; `digest` as in `read`.
+    The frame's 2×2 cell is 90 45 / 135 0 degrees. `digest` is as in `read`.
 
     Raises DecodeError: the frame is in color, or cannot be read.
     """
     y, x = SENSOR_CELLS[angle_deg]
-    if kind == "photo":
+    if reading.kind == "photo":
         pixels, full = _pixels(path, digest)
         if pixels.shape[2] != 1:
             raise DecodeError(
                 f"{path}: has {pixels.shape[2]} channels, but the frame of a polarization sensor has one; "
                 "save the camera's raw frame, or give one picture per angle"
             )
-        mosaic, lossy, level = pixels[..., 0], pixels.dtype == np.uint8, black
+        mosaic, lossy, level = pixels[..., 0], pixels.dtype == np.uint8, reading.black
     else:
         sensor = libraw.read(path, digest)
         mosaic = sensor.value if sensor.value.ndim == 2 else sensor.value[..., 0]
         lossy, full = False, sensor.white
-        level = black or float(np.broadcast_to(sensor.black, (2, 2))[y, x])
+        level = reading.black or float(np.broadcast_to(sensor.black, (2, 2))[y, x])
     _check_monochrome(path, mosaic)
     height, width = mosaic.shape
     plane = mosaic[y : height // 2 * 2 : 2, x : width // 2 * 2 : 2]
     value = np.repeat(_counts(plane)[..., None], 3, axis=2)
-    return SensorImage(value, np.full((1, 1), level), white or full, None, lossy=lossy)
+    return SensorImage(value, np.full((1, 1), level), reading.white or full, None, lossy=lossy)
 
 
 def place_px(angle_deg: float) -> tuple[float, float]:

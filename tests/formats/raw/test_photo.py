@@ -7,6 +7,7 @@ import pytest
 
 from polcap.errors import DecodeError
 from polcap.formats.raw import photo
+from polcap.images import FrameReading
 from polcap.optics import color
 from tests.formats import headers
 from tests.formats.headers import DATA, needs_data
@@ -55,13 +56,13 @@ def test_eight_bits_are_srgb_with_a_loss(tmp_path):
 
 
 def test_encoding_and_levels_may_be_stated(tmp_path):
-    linear = photo.read(save(tmp_path / "a.png", EIGHT), encoding="linear", white=240, black=4)
+    linear = photo.read(save(tmp_path / "a.png", EIGHT), FrameReading("photo", "linear", 240, 4))
     np.testing.assert_array_equal(linear.value, EIGHT)
     assert (linear.white, linear.black.tolist(), linear.lossy) == (240, [[4]], True)
-    encoded = photo.read(save(tmp_path / "b.tif", SIXTEEN), encoding="srgb")
+    encoded = photo.read(save(tmp_path / "b.tif", SIXTEEN), FrameReading("photo", "srgb"))
     np.testing.assert_allclose(encoded.value, color.decode_srgb(SIXTEEN / 65535), atol=1e-6)
     assert encoded.lossy
-    floats = photo.read(save(tmp_path / "c.exr", (SIXTEEN / 65535).astype(np.float32)), encoding="srgb")
+    floats = photo.read(save(tmp_path / "c.exr", (SIXTEEN / 65535).astype(np.float32)), FrameReading("photo", "srgb"))
     np.testing.assert_allclose(floats.value, encoded.value, atol=1e-6)
 
 
@@ -129,7 +130,7 @@ def test_sensor_pixel_is_the_one_of_its_angle(tmp_path):
 def test_sensor_frame_may_be_raw(tmp_path):
     path = tmp_path / "a.dng"
     path.write_bytes(headers.dng(mosaic() + 100, photometric=34892, black=[[100]], white=4000))
-    plane = photo.read_mosaic(path, 45, kind="raw")
+    plane = photo.read_mosaic(path, 45, FrameReading("raw"))
     assert (plane.value.mean(), plane.black.tolist(), plane.white) == (1250, [[100]], 4000)
 
 
