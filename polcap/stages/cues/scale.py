@@ -31,7 +31,7 @@ def is_known(color: ColorCalibration) -> bool:
 
 
 def surface_distance(mask: Bools, view: View) -> float:
-    """Distance of the visible surface over that of the object's middle, with which the chart is level."""
+    """Distance of the visible surface over that of the object's middle, with which the chart is level; mask (H, W)."""
     return 1 - _BULGE * _radius(mask, view)
 
 
