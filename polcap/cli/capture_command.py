@@ -1,7 +1,7 @@
 """`polcap capture`: shoot a capture with a motorized polarizer and a camera."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Context, Exit, Option
 
@@ -9,6 +9,10 @@ from polcap import terminal
 from polcap.cli import options
 from polcap.cli.options import Json
 from polcap.errors import GateError, InputError
+
+if TYPE_CHECKING:
+    from polcap.rig.shooting_plan import CaptureOrder
+    from polcap.rig.turntable import SessionFile
 
 
 def capture(
@@ -45,7 +49,7 @@ def capture(
 ) -> None:
     """Shoot a capture: turn the polarizer, take the brackets, check every frame."""
     from polcap.rig import dry_run as plans
-    from polcap.rig import exposure_bracket, sequence
+    from polcap.rig import exposure_bracket
     from polcap.rig import turntable as tables
     from polcap.rig.resume import complete_order
 
@@ -65,22 +69,33 @@ def capture(
         planned = plans.dry_run(wanted)
         terminal.print_data(planned if json else plans.table(planned))
         return
-    verdicts: dict[str, Any] = {}
+    summary, verdicts = _shoot(folder, session, wanted, resume=resume, tries=tries, judged=not no_check)
+    terminal.print_data(summary if json else str(folder))
+    if any(verdict and verdict["verdict"] != "keep" for verdict in verdicts):
+        raise Exit(GateError.exit_code)
+
+
+def _shoot(
+    folder: Path, session: "SessionFile | None", wanted: "CaptureOrder", *, resume: bool, tries: int, judged: bool
+) -> tuple[dict[str, Any], list[dict[str, Any] | None]]:
+    """Shoot one capture, or the views of a session; returns the summary for --json, and the verdict of each capture.
+
+    Each view is judged before the object turns. Without `judged`, all verdicts are None.
+    """
+    from polcap.rig import sequence
+    from polcap.rig import turntable as tables
+
+    report, verdicts = terminal.print_progress, dict[str, dict[str, Any] | None]()  # by the name of the folder
 
     def judge(finished: Path) -> None:
-        verdicts[finished.name] = None if no_check else _verdict(finished)
+        verdicts[finished.name] = _verdict(finished) if judged else None
 
-    report = terminal.print_progress
     if session is None:
         summary = sequence.shoot(folder, wanted, resume=resume, tries=tries, report=report)
         judge(folder)
-        summary["check"] = verdicts[folder.name]
-    else:  # each view is judged before the object turns
-        done = tables.shoot(folder, session, wanted, tries=tries, report=report, finished=judge)
-        summary = {"folder": str(folder), "views": done, "check": verdicts}
-    terminal.print_data(summary if json else str(folder))
-    if any(verdict and verdict["verdict"] != "keep" for verdict in verdicts.values()):
-        raise Exit(GateError.exit_code)
+        return {**summary, "check": verdicts[folder.name]}, list(verdicts.values())
+    views = tables.shoot(folder, session, wanted, tries=tries, report=report, finished=judge)
+    return {"folder": str(folder), "views": views, "check": verdicts}, list(verdicts.values())
 
 
 def _verdict(folder: Path) -> dict[str, Any] | None:
