@@ -45,8 +45,9 @@ def test_twelve_raw_views_become_a_closed_object_that_is_like_the_true_one(tmp_p
     assert np.ptp(mesh.vertices, axis=0) == pytest.approx(extent, rel=0.02)  # true scale; a pixel is 0.7 % of the width
     errors = bench_fused_asset.errors(folder)
     assert errors.distance < 0.01  # of the size; a pixel and a half
-    normal, albedo, specular, roughness = errors.fused / errors.single
-    assert normal < 1.2 and albedo < 1.0 and specular < 0.8 and roughness < 0.8
+    normal, albedo, _, roughness = errors.fused / errors.single
+    assert normal < 1.2 and albedo < 1.1 and roughness < 0.6
+    assert errors.fused[2] < 0.008  # F0 of .049, which the single views happen to read right to .003
 
 
 def killed(folder: Path, *options: str, after: str) -> None:
