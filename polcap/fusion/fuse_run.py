@@ -86,10 +86,10 @@ def export(out: Path, *wanted: ExportRequest) -> list[Path]:
 
 
 def _with_albedo_scale(maps: AtlasMaps, found: Session) -> AtlasMaps:
-    """The maps with the doubt of their scale: that of the view that knows it best."""
+    """The maps with the doubt of their scale: the median of the views', which share the chart and its errors."""
     stated = [about["figures"]["chart"]["scale_doubt"] for about in found.about.values()]
     known = [float(one) for one in stated if one is not None]
-    return replace(maps, albedo_sigma=min(known) if known else None)
+    return replace(maps, albedo_sigma=float(np.median(known)) if known else None)
 
 
 def document(
