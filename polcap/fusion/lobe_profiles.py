@@ -21,7 +21,7 @@ _LEAST_IN_BIN, _LEAST_BINS = 10, 8
 _OUTLIERS = 0.02  # share of the darkest and of the brightest samples of a bin, which are left out
 _RELATIVE = 0.03  # error of a bin's mean radiance, with `_PER_TANGENT`
 _PER_TANGENT = 0.05  # the same over the tangent of the zenith angle: radiance goes with the cosine
-_FLASH_BIN_DEG, _FLASH_SCATTER = 2.0, 0.2
+_FLASH_BIN_DEG, _FLASH_SCATTER = 2.0, 0.2  # half-angle; relative scatter beyond which samples count less
 _FARTHEST_FLASH = 0.15  # m from the lens
 _INDEX = 1.5  # refractive index of the diffuse law and of the Fresnel term
 

@@ -40,7 +40,7 @@ def around(atlas: Atlas, maps: AtlasMaps, count: int, side: int) -> list[Picture
 
 
 def render(atlas: Atlas, maps: AtlasMaps, tracer: Tracer, pose: Pose, view: View, side: int) -> Floats:
-    """Radiance (side, side, 3) of the object under a distant lamp beside the camera and a gray sky."""
+    """Radiance (side, side, 3) of the object under a distant lamp next to the camera and a gray sky."""
     v = frames.rays(view, side, side).reshape(-1, 3)
     origin = np.broadcast_to(pose.center, v.shape)
     met = tracer.meet(origin, -v @ pose.rotation)

@@ -152,8 +152,8 @@ def check(wanted: ExportRequest) -> None:
 def _has_png(preset: ExportPreset) -> bool:
     """Whether an export writes a PNG texture, next to the GLB or in it."""
     inside = preset.images == "png" and "gltf" in preset.formats
-    beside = preset.shared == "png" and not {"obj", "usd", "usdz", "materialx"}.isdisjoint(preset.formats)
-    return inside or beside or bool(preset.textures or preset.extras)
+    separate = preset.shared == "png" and not {"obj", "usd", "usdz", "materialx"}.isdisjoint(preset.formats)
+    return inside or separate or bool(preset.textures or preset.extras)
 
 
 def read(folder: Path, config: Config) -> ReliefSource:

@@ -96,7 +96,7 @@ def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
         return
     of_shots = _angles(seen.turn, body, angle, found.selfcal, found.names, limits)
     closed = found.object_.border <= limits.max_mask_border
-    if of_shots.state == "fail" and not closed:  # a third of an outline can fit a turned shot by chance
+    if of_shots.state == "fail" and not closed:  # a part of an outline can fit a turned shot by chance
         of_shots = msgspec.structs.replace(of_shots, state="warn")
     yield _with_ring(of_shots, body, found.selfcal, limits)
     yield _light_of_body(body, found, limits)

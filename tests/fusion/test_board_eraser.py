@@ -42,8 +42,8 @@ def test_the_print_becomes_dark_under_warm_light_and_a_quarter_of_a_pixel_aside(
     at = board_views.pose(20)
     scene = board_views.scene(at)
     before = board_views.picture(scene) * [1.3, 1.0, 0.6]
-    aside = SessionCamera(FOCAL, 1.0, (VIEW.center[0] + 0.25, VIEW.center[1] - 0.25), 0.0, 0.0)
-    after = board_eraser.erase(board_views.stack(before), STILL, COLOR, BOARD, (aside, at))
+    shifted = SessionCamera(FOCAL, 1.0, (VIEW.center[0] + 0.25, VIEW.center[1] - 0.25), 0.0, 0.0)
+    after = board_eraser.erase(board_views.stack(before), STILL, COLOR, BOARD, (shifted, at))
     bright = ~render.gbuffer(scene, VIEW, HEIGHT, WIDTH).mask & (before.mean(axis=-1) > 0.2)
     assert (2 * np.asarray(after.value[0])[bright].mean(axis=-1) < 0.1).mean() > 0.97
 
