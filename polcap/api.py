@@ -115,10 +115,7 @@ def process(
 def _check_types(config: object, chart: object, mask: object) -> None:
     """Refuse values of other types before anything is written.
 
-    Raises
-    ------
-    SettingError
-        A value has another type.
+    Raises SettingError: a value has another type.
     """
     for name, value, usable, remedy in (
         ("config", config, config is None or isinstance(config, Config), "give that of polcap.load_config(…)"),

@@ -65,10 +65,7 @@ def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
 def fill_sections(kind: type[S], file: Path | None, assignments: Sequence[str]) -> S:
     """Fill a struct of settings sections from a TOML file and assignments of the form section.name=value.
 
-    Raises
-    ------
-    SettingError
-        The file is not TOML, or a key is unknown, of the wrong type or out of its range.
+    Raises SettingError: the file is not TOML, or a key is unknown, of the wrong type or out of its range.
     """
     stated = _read(file) if file else {}
     for section, values in stated.items():
@@ -96,10 +93,7 @@ def fill_sections(kind: type[S], file: Path | None, assignments: Sequence[str]) 
 def restore(about: Mapping[str, Any], file: Path) -> Config:
     """Settings of an earlier run, from `about`, the content of its file.
 
-    Raises
-    ------
-    StorageError
-        The settings are missing or belong to another version of polcap.
+    Raises StorageError: the settings are missing or belong to another version of polcap.
     """
     try:
         return msgspec.convert(about["settings"], Config)
@@ -110,10 +104,7 @@ def restore(about: Mapping[str, Any], file: Path) -> Config:
 def fill(kind: type[S], stated: dict[str, Any], assignments: Sequence[str]) -> S:
     """Fill a settings struct from values and name=value assignments, checked as strictly as by `load`.
 
-    Raises
-    ------
-    SettingError
-        A name is unknown, or a value has the wrong type or is out of range.
+    Raises SettingError: a name is unknown, or a value has the wrong type or is out of range.
     """
     for assignment in assignments:
         name, equals, text = assignment.partition("=")

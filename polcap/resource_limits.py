@@ -33,10 +33,7 @@ def set_threads(count: int) -> None:
 def check_memory(gigabytes: float) -> None:
     """Check that `set_memory` can set this limit.
 
-    Raises
-    ------
-    SettingError
-        It is not a valid amount, less than any capture needs, or the system has no such limit.
+    Raises SettingError: it is not a valid amount, less than any capture needs, or the system has no such limit.
     """
     if not 0 <= gigabytes <= _MOST_GB:
         raise SettingError(f"--memory {gigabytes:g}: give a number of GB up to {_MOST_GB:g}, or leave it out")
@@ -52,10 +49,7 @@ def check_memory(gigabytes: float) -> None:
 def set_memory(gigabytes: float) -> None:
     """Limit the private memory of the process, so that larger allocations fail; 0 sets no limit.
 
-    Raises
-    ------
-    SettingError
-        See `check_memory`.
+    Raises SettingError: see `check_memory`.
     """
     check_memory(gigabytes)
     if not gigabytes:

@@ -57,10 +57,7 @@ def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSetti
     The mesh is reduced to a triangle for four pixels of the views' maps: smaller ones would cut it into charts of a few
     texels. Without a set size, the side is the least power of two whose texels are no larger than these pixels.
 
-    Raises
-    ------
-    SettingError
-        The package uvunwrap is missing, or the charts do not fit into a texture of this size.
+    Raises SettingError: the package uvunwrap is missing, or the charts do not fit into a texture of this size.
     """
     pixel = _pixel(mesh, views)
     mesh = levels(mesh, [max(int(_area(mesh) / (_TRIANGLE * pixel**2)), _FEWEST)])[0]
@@ -77,10 +74,7 @@ def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSetti
 def charted(mesh: ClosedMesh, side: int, margin: int) -> Atlas:
     """Cut a closed mesh into charts, and pack them into a texture of `side` px, with `margin` px between them.
 
-    Raises
-    ------
-    SettingError
-        The package uvunwrap is missing, or the charts do not fit into a texture of this size.
+    Raises SettingError: the package uvunwrap is missing, or the charts do not fit into a texture of this size.
     """
     uv, corner, faces = _charts(mesh, side, margin)
     normals = vertex_normals(mesh.vertices.astype(np.float64), mesh.faces)[corner]

@@ -61,12 +61,7 @@ def gray_picture(radiance: AngleStack, color: ColorCalibration) -> tuple[Floats,
 def detect(radiance: AngleStack, color: ColorCalibration, name: str) -> BoardCorners:
     """Detect the board in a view called `name`.
 
-    Raises
-    ------
-    NoBoardError
-        No board is visible.
-    CaptureError
-        Too little of the board is visible, or two boards are.
+    Raises NoBoardError: no board is visible. CaptureError: too little of the board is visible, or two boards are.
     """
     picture, scale = gray_picture(radiance, color)
     markers = _markers(picture)

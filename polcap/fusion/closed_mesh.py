@@ -42,10 +42,7 @@ def is_closed(mesh: ClosedMesh) -> bool:
 def solid(mesh: ClosedMesh, floor: float | None = None) -> ClosedMesh:
     """The mesh as manifold3d writes it: manifold, outward, its largest body alone, above the height `floor` [m].
 
-    Raises
-    ------
-    ObjectError
-        The mesh is not the border of a body.
+    Raises ObjectError: the mesh is not the border of a body.
     """
     import manifold3d
 
@@ -64,10 +61,7 @@ def solid(mesh: ClosedMesh, floor: float | None = None) -> ClosedMesh:
 def levels(mesh: ClosedMesh, counts: Sequence[int]) -> list[ClosedMesh]:
     """The mesh with about as many triangles as each of `counts`, each level closed and manifold.
 
-    Raises
-    ------
-    ObjectError
-        A level has too few triangles to enclose a body.
+    Raises ObjectError: a level has too few triangles to enclose a body.
     """
     return [_decimated(mesh, count) for count in counts]
 

@@ -100,10 +100,7 @@ def solve(seen: Mapping[str, Results], capture: Capture) -> SessionPoses:
     Views without enough features in common with the others are left out. Lengths are in metres if the chart's size is
     known; otherwise the lens is 1 from the axis.
 
-    Raises
-    ------
-    CaptureError
-        Fewer than three views have enough features in common.
+    Raises CaptureError: fewer than three views have enough features in common.
     """
     names, first = list(seen), next(iter(seen.values()))
     features = [_find(one.maps) for one in seen.values()]

@@ -41,10 +41,7 @@ def fuse(
 ) -> dict[str, Any]:
     """Fuse the views below a folder into the result folder `out`; returns the content of report.json.
 
-    Raises
-    ------
-    InputError
-        Anything at fault with the user's input.
+    Raises InputError: anything at fault with the user's input.
     """
     found = session.read(wanted)  # first: a folder without views stays as it is
     with result_folder.locked(out):

@@ -106,10 +106,7 @@ class FusedSource:
 def read(folder: Path) -> FusedSource:
     """Read the folder maps/ of a fused result.
 
-    Raises
-    ------
-    DecodeError
-        A file is missing or damaged.
+    Raises DecodeError: a file is missing or damaged.
     """
     try:
         about: Mapping[str, Any] = text_file.read_json(folder / "maps.json")

@@ -56,10 +56,7 @@ class DistanceGrid:
 def visual_hull(views: Sequence[SmallView], steps: int = GRID) -> DistanceGrid:
     """Signed distance from the visual hull: the largest over the views; one body, without specks and false handles.
 
-    Raises
-    ------
-    ObjectError
-        The silhouettes have no point in common.
+    Raises ObjectError: the silhouettes have no point in common.
     """
     fine = _object_grid(views, steps)
     distance = _largest_distance(views, fine)

@@ -36,11 +36,8 @@ _MOST_TRIMMED = 1 / 2  # of the views may be left out, or hold more than the obj
 def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, str]]:
     """The views whose masks agree, without what the others do not confirm, and why the others are left out, by name.
 
-    Raises
-    ------
-    CaptureError
-        More than a third of the views contradict the others, fewer than three are left, or the masks have too little
-        in common.
+    Raises CaptureError: more than a third of the views contradict the others, fewer than three are left, or the masks
+    have too little in common.
     """
     points, step = grid_around(views)
     used = _without_slits(views, points, step)

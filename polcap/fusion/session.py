@@ -185,10 +185,7 @@ def out_of(folder: Path, name: str) -> Path:
 def process(session: Session, wanted: SessionInput, report: Report) -> tuple[FusionView, ...]:
     """Process all views of a session, which is changed; returns the views' maps.
 
-    Raises
-    ------
-    CaptureError
-        Too few views can be used.
+    Raises CaptureError: too few views can be used.
     """
     _calibrate_colors(session, wanted, report)
     with ExitStack() as stack:
@@ -218,10 +215,7 @@ def _says(report: Report, what: str) -> Report:
 def read(wanted: SessionInput) -> Session:
     """Read the captures of all folders view…/ and set…/view…/; nothing is written.
 
-    Raises
-    ------
-    CaptureError
-        There are too few views.
+    Raises CaptureError: there are too few views.
     """
     folders = [*wanted.folder.glob("view*/"), *wanted.folder.glob("set*/view*/")]
     names = sorted((folder.relative_to(wanted.folder).as_posix() for folder in folders), key=layouts.natural)
@@ -268,10 +262,7 @@ def _mask_tasks(session: Session, wanted: SessionInput, boards: Mapping[str, Boa
 def _calibrate_colors(session: Session, wanted: SessionInput, report: Report) -> None:
     """Give every view the color calibration of the first view that shows the chart, as a profile.
 
-    Raises
-    ------
-    ChartError
-        No view shows the chart.
+    Raises ChartError: no view shows the chart.
     """
     plain = UserInput(wanted.chart, None, wanted.network, wanted.mask_network)
     charted, others = "", plain
@@ -299,10 +290,7 @@ def _find_boards(
 ) -> dict[str, BoardCorners]:
     """Corners of the board by view; none if no view shows a board.
 
-    Raises
-    ------
-    CaptureError
-        No view shows a board, and there are several sets of views.
+    Raises CaptureError: no view shows a board, and there are several sets of views.
     """
     found = session.each(_find_board, _tasks(session, wanted), pool, _says(report, "exposures and board"))
     boards = {name: one for name, one in found.items() if isinstance(one, BoardCorners)}
@@ -385,10 +373,7 @@ def _view(name: str, session: Session, wanted: SessionInput) -> FusionView:
 def _joined(session: Session, wanted: SessionInput) -> tuple[FusionView, ...]:
     """The maps of all used views, in the frame of the first set's board.
 
-    Raises
-    ------
-    CaptureError
-        A set does not show the object of the first one.
+    Raises CaptureError: a set does not show the object of the first one.
     """
     first, *others = ([_view(name, session, wanted) for name in names] for names in session.sets.values())
     out = list(first)

@@ -28,10 +28,7 @@ class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def fuse_shape(views: Sequence[FusionView], settings: ShapeSettings) -> ClosedMesh:
     """Join views of one object into a closed, manifold, outward mesh in the world frame.
 
-    Raises
-    ------
-    ObjectError
-        The silhouettes have no point in common, or enclose no body.
+    Raises ObjectError: the silhouettes have no point in common, or enclose no body.
     """
     small = reduce_views(views)
     hull = visual_hull(small, settings.grid)

@@ -159,12 +159,7 @@ def _has_png(preset: ExportPreset) -> bool:
 def read(folder: Path, config: Config) -> ReliefSource:
     """Read the maps of a result and build the full mesh and asset from them.
 
-    Raises
-    ------
-    DecodeError
-        A map is missing or damaged.
-    ObjectError
-        No triangle fits into the mask.
+    Raises DecodeError: a map is missing or damaged. ObjectError: no triangle fits into the mask.
     """
     maps = maps_folder.read(folder)
     mesh = surface.triangulate(maps.depth, maps, maps.metric, config.surface)
@@ -174,10 +169,7 @@ def read(folder: Path, config: Config) -> ReliefSource:
 def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
     """Build an export's levels of detail: first the asset with at most the requested triangles and texture size.
 
-    Raises
-    ------
-    ObjectError
-        A level has too few triangles.
+    Raises ObjectError: a level has too few triangles.
     """
     preset, full = effective(wanted), source.triangles
     whole = source.whole(preset.bits, preset.extras)
@@ -196,12 +188,8 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     Without a preset the files go to asset/, with one to asset/PRESET/. `about` is report.json's content. All GLBs have
     the origin of the first level. The records of an earlier export of the same maps into the same folder are merged.
 
-    Raises
-    ------
-    SettingError
-        No such preset or color space, or an encoder is missing.
-    StorageError
-        A file cannot be written.
+    Raises SettingError: no such preset or color space, or an encoder is missing. StorageError: a file cannot be
+    written.
     """
     whole = found[0].asset
     preset, mesh = effective(wanted), whole.mesh

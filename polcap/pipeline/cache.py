@@ -65,10 +65,7 @@ class MemoryCache:
     def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
         """The result of a stage, from the cache or computed. Inputs are other results, plain values or functions.
 
-        Raises
-        ------
-        StageReached
-            This was the stage at which the path was to stop.
+        Raises StageReached: this was the stage at which the path was to stop.
         """
         about = _about(stage, inputs, config)
         self._forced = self._forced or stage.name == self._force
@@ -177,10 +174,7 @@ class ArchiveCache(StageCache):
     def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
         """The stored result of a stage; a result that is never stored is computed.
 
-        Raises
-        ------
-        StorageError
-            The result is missing or damaged.
+        Raises StorageError: the result is missing or damaged.
         """
         if not stage.keep:
             return super().run(stage, *inputs, config=config)
@@ -225,10 +219,7 @@ def seal(about: Mapping[str, Any]) -> str:
 def read(place: Path, stage: Stage[..., T], check: bool = True) -> T:
     """Read a stored stage result, its arrays as read-only memory maps; `check` compares digests.
 
-    Raises
-    ------
-    StorageError
-        There is no result of this cache format, a file is missing, or a file was changed.
+    Raises StorageError: there is no result of this cache format, a file is missing, or a file was changed.
     """
     about = manifest(place)
     if not about:

@@ -54,10 +54,7 @@ def inspect(
     `networks` opens those of estimator and mask while frames are decoded. Without the first, the errors of the
     analytic estimator are expected; without the second, the object is found by its contrast to the backdrop.
 
-    Raises
-    ------
-    InputError
-        A frame cannot be decoded, or a chart was named and cannot be read.
+    Raises InputError: a frame cannot be decoded, or a chart was named and cannot be read.
     """
     start = perf_counter()
     with ThreadPoolExecutor(_THREADS) as pool:

@@ -20,12 +20,8 @@ def load_network(
 
     `device` and `threads` are those of `onnx.load`.
 
-    Raises
-    ------
-    ModelError
-        A network is required and there is none, or it cannot be used.
-    SettingError
-        A model was named for the analytic estimator.
+    Raises ModelError: a network is required and there is none, or it cannot be used. SettingError: a model was named
+    for the analytic estimator.
     """
     for name, value, known in (
         ("estimator", estimator, (*get_args(Estimator), None)),

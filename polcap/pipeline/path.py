@@ -89,10 +89,7 @@ def on_grid(drawn: Bools | None, radiance: AngleStack) -> Bools | None:
 
     The user may draw it on that grid, or on the pixels of the RAW or of the mosaic.
 
-    Raises
-    ------
-    ObjectError
-        The mask has none of these sizes.
+    Raises ObjectError: the mask has none of these sizes.
     """
     if drawn is None:
         return None

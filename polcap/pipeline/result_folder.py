@@ -24,10 +24,7 @@ _WORK_FILES = ("run.json", "unchanged.json", *(f"{stage}.png" for stage in STAGE
 def check(out: Path, photographs: Path) -> None:
     """Refuse a result folder inside the photographs' folders, or with a name that no OpenEXR file can have.
 
-    Raises
-    ------
-    SettingError
-        Choose another --out.
+    Raises SettingError: the folder is one of these, or its name is no UTF-8 text.
     """
     try:
         os.fspath(out).encode()
@@ -47,10 +44,7 @@ def locked(out: Path) -> Iterator[None]:
 
     The operating system removes the lock when the process ends, so there are no stale locks.
 
-    Raises
-    ------
-    StorageError
-        Another process works here, or the folder cannot be written.
+    Raises StorageError: another process works here, or the folder cannot be written.
     """
     work = out / "work"
     lock, owner = FileLock(work / "lock", timeout=0), work / "owner"
@@ -77,10 +71,7 @@ def clean(out: Path, dry_run: bool = False) -> int:
 
     All other files in work/ stay. With `dry_run`, nothing is removed.
 
-    Raises
-    ------
-    StorageError
-        There is no folder work/, another process works here, or a file cannot be removed.
+    Raises StorageError: there is no folder work/, another process works here, or a file cannot be removed.
     """
     work = out / "work"
     if not work.is_dir():
@@ -105,10 +96,7 @@ def clean(out: Path, dry_run: bool = False) -> int:
 def write_run(out: Path, about: Mapping[str, Any]) -> None:
     """Write work/run.json: facts of a run that `show` and `report` need when the photographs are missing.
 
-    Raises
-    ------
-    StorageError
-        It cannot be written.
+    Raises StorageError: it cannot be written.
     """
     atomic.write_json(out / "work" / "run.json", {**about, "digest": seal(about)}, synced=False)
 
@@ -116,10 +104,7 @@ def write_run(out: Path, about: Mapping[str, Any]) -> None:
 def read_run(out: Path) -> dict[str, Any]:
     """Read work/run.json of a result folder.
 
-    Raises
-    ------
-    StorageError
-        There is none, or it is damaged.
+    Raises StorageError: there is none, or it is damaged.
     """
     file = out / "work" / "run.json"
     try:

@@ -41,10 +41,7 @@ def process(
 ) -> dict[str, Any] | None:
     """Process a capture into the result folder `out`; returns the content of report.json, or None with `until`.
 
-    Raises
-    ------
-    InputError
-        The user's input is wrong; the stage that found it raises the error.
+    Raises InputError: the user's input is wrong; the stage that found it raises the error.
     """
     result_folder.check(out, Path(capture.folder))
     cache = StageCache(out, progress, force, until)
@@ -113,10 +110,7 @@ def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force
 def export(out: Path, *wanted: ExportRequest) -> list[Path]:
     """Write the asset of a finished result again for each request, from maps/ and report.json; returns the files.
 
-    Raises
-    ------
-    SettingError
-        A preset or color space does not exist, or a package or encoder is missing.
+    Raises SettingError: a preset or color space does not exist, or a package or encoder is missing.
     """
     for one in wanted:
         asset_export.check(one)
@@ -130,10 +124,7 @@ def export(out: Path, *wanted: ExportRequest) -> list[Path]:
 def reopen(out: Path, until: str = "surface") -> tuple[Results, dict[str, Any]]:
     """Read the results of an earlier run up to a stage, without its photographs, and the facts in work/run.json.
 
-    Raises
-    ------
-    StorageError
-        `out` has no stage cache, or the result of a stage is missing.
+    Raises StorageError: `out` has no stage cache, or the result of a stage is missing.
     """
     about = result_folder.read_run(out)
     config = restore(about, out / "work" / "run.json")

@@ -64,10 +64,7 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
     The reference frame is first: it determines the reduction, and the tiles in which sharpness is measured. The others
     follow in the order of the merge. Counts from `clip` [white level] on are clipped.
 
-    Raises
-    ------
-    DecodeError
-        Of the reference frame immediately, of another frame when it is used.
+    Raises DecodeError: of the reference frame immediately, of another frame when it is used.
     """
     first = capture.shots[0].frames[(len(capture.shots[0].frames) - 1) // 2]
     meta, arrays = frame_decoder.apply(first, reduce_first, clip=clip, most_pixels=_MOST_PIXELS)

@@ -61,10 +61,7 @@ def find(out: Path, asked: str | None) -> Finished | None:
 def remember(out: Path, asked: str | None, table: str = "") -> None:
     """Record the request digest that the result folder now answers; does nothing if it is None.
 
-    Raises
-    ------
-    StorageError
-        The result folder cannot be written.
+    Raises StorageError: the result folder cannot be written.
     """
     if asked is not None:
         content = {"request": asked, "table": table, "result": _result(out)}
@@ -89,10 +86,7 @@ def _result(out: Path) -> dict[str, Stat]:
 def _stats(folder: Path, except_: str = "") -> dict[str, Stat]:
     """Size and times of every file below a folder, except those in the folder `except_`; empty if it is missing.
 
-    Raises
-    ------
-    OSError
-        A folder is a link, which is not followed.
+    Raises OSError: a folder is a link, which is not followed.
     """
     found: dict[str, Stat] = {}
     for place, folders, files in os.walk(folder):

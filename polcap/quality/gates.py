@@ -19,10 +19,7 @@ from polcap.stages.align import AlignSettings
 def judge(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iterator[Gate]:
     """Judge a capture: yield all quality gates, in the order of the path.
 
-    Raises
-    ------
-    NotReached
-        The path ended before a stage that the next gate judges.
+    Raises NotReached: the path ended before a stage that the next gate judges.
     """
     judged: list[Gate] = []
     for gate in _in_order(found, limits, align):

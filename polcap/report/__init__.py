@@ -125,10 +125,7 @@ def model_facts(network: Network | None) -> dict[str, str] | None:
 def write(folder: Path, about: dict[str, Any], results: Results) -> None:
     """Write report.json and report.html into a result folder.
 
-    Raises
-    ------
-    StorageError
-        The folder cannot be written.
+    Raises StorageError: the folder cannot be written.
     """
     atomic.write_json(folder / "report.json", about)
     page.write(folder, about, results)
@@ -137,10 +134,7 @@ def write(folder: Path, about: dict[str, Any], results: Results) -> None:
 def read(folder: Path) -> dict[str, Any]:
     """Read the report.json of a result folder.
 
-    Raises
-    ------
-    StorageError
-        The file is missing, or it is not a report of this version.
+    Raises StorageError: the file is missing, or it is not a report of this version.
     """
     try:
         about: dict[str, Any] = text_file.read_json(folder / "report.json")

@@ -31,10 +31,7 @@ _ORDER = ("fail", "warn", "pass", "not measured")  # of the checks in their tabl
 def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
     """Write report.html, the page of a result for people, into a result folder.
 
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
+    Raises StorageError: the file cannot be written.
     """
     drawn, view = _maps(about, results)
     headline, expected_error = verdict(about)
@@ -60,10 +57,7 @@ def render(
 ) -> None:
     """Write a page from one of the HTML templates; `data` is for the scripts of the page.
 
-    Raises
-    ------
-    StorageError
-        The file cannot be written.
+    Raises StorageError: the file cannot be written.
     """
     import jinja2  # not needed by most commands
 

@@ -43,14 +43,8 @@ def shoot(
 
     `tries` is how often a rejected frame is retaken; `report` is called with lines of text about the progress.
 
-    Raises
-    ------
-    CaptureError
-        `folder` is not empty, or a frame is rejected too often.
-    HardwareError
-        A device failed. The frames so far stay, and `resume` continues.
-    StorageError
-        The disk is full, or too small.
+    Raises CaptureError: `folder` is not empty, or a frame is rejected too often. HardwareError: a device failed. The
+    frames so far stay, and `resume` continues. StorageError: the disk is full, or too small.
     """
     start = time.monotonic()
     content = open_folder(folder, resume)

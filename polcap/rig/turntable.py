@@ -33,12 +33,7 @@ class SessionFile(msgspec.Struct):
 def open_session(folder: Path, views: int | None, turntable: str | None, resume: bool) -> SessionFile | None:
     """The session of `--views` and `--turntable`, or with `resume` the one begun; None for a single capture.
 
-    Raises
-    ------
-    SettingError
-        One of the two is missing.
-    CaptureError
-        The folder holds another session, or other files.
+    Raises SettingError: one of the two is missing. CaptureError: the folder holds another session, or other files.
     """
     file = folder / NAME
     if resume and file.exists():
@@ -75,10 +70,8 @@ def shoot(
 
     `finished` is called with the folder of each view before the table turns on.
 
-    Raises
-    ------
-    CaptureError, HardwareError, StorageError
-        As for one capture, or of the turntable. The frames so far stay, and `--resume` continues.
+    Raises CaptureError, HardwareError, StorageError: as for one capture, or of the turntable. The frames so far stay,
+    and `--resume` continues.
     """
     folder.mkdir(parents=True, exist_ok=True)
     _check_ports(session.turntable, order.rotator)

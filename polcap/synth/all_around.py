@@ -85,12 +85,8 @@ def write(
     The object is on the board, its y axis up; position and turn of `scene` are not used. All views have the exposure
     of the first. `frame_written` is called with the number of photographs written so far and in all.
 
-    Raises
-    ------
-    CaptureError
-        The folder holds something already.
-    StorageError
-        The folder cannot be written; then it is removed.
+    Raises CaptureError: the folder holds something already. StorageError: the folder cannot be written; then it is
+    removed.
     """
     forward_camera.require_empty(folder)
     if isinstance(scene.shape, Model):

@@ -85,12 +85,8 @@ def write(folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int
 
     `frame_written` is called with the number of photographs written so far and in all.
 
-    Raises
-    ------
-    CaptureError
-        The folder holds something already.
-    StorageError
-        The folder cannot be written; then it is removed.
+    Raises CaptureError: the folder holds something already. StorageError: the folder cannot be written; then it is
+    removed.
     """
     forward_camera.require_empty(folder)
     write_capture(folder, Studio(scene, shoot), frame_written)

@@ -26,10 +26,7 @@ def main(
 
     Returns the page out/evaluation.md. `report` is called with lines of text; the first states the cost.
 
-    Raises
-    ------
-    InputError
-        As in `train.main`; or the options choose a variant or a model to start with.
+    Raises InputError: as in `train.main`; or the options choose a variant or a model to start with.
     """
     if options.variant != "ours" or options.start:
         raise InputError("--ablation trains all variants from random weights; leave out --variant and --start")

@@ -35,10 +35,7 @@ _MIN_DOLP, _MIN_TILT = 0.03, 0.3  # for the comparison of AoLP and azimuth; tilt
 def main(folder: Path, model: Path, out: Path) -> dict[str, Score]:
     """Evaluate every photograph set with and without the network; writes real.json and real.md to `out`.
 
-    Raises
-    ------
-    InputError
-        The folder does not have this layout.
+    Raises InputError: the folder does not have this layout.
     """
     names, angles = _list_pictures(folder)
     network = models.open_network(model)

@@ -35,10 +35,7 @@ _SIDE = 1024  # px, largest side of a texture; training uses 256
 def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
     """Convert all meshes and texture folders below `source`; returns their numbers. Unusable ones are reported.
 
-    Raises
-    ------
-    InputError
-        Nothing usable was found.
+    Raises InputError: nothing usable was found.
     """
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; give the one that holds your meshes and textures")

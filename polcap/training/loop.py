@@ -121,10 +121,7 @@ class PictureTraining(Trainee):
     def train(self, minutes: float, out: Path) -> None:
         """Train until `minutes` are spent, earlier parts of a continued run included; continues from out/last.pt.
 
-        Raises
-        ------
-        InputError
-            There are too few pictures to hold some out.
+        Raises InputError: there are too few pictures to hold some out.
         """
         if len(self.files) <= self.held_out:
             raise InputError(f"{len(self.files)} pictures; training needs more than the {self.held_out} held out")

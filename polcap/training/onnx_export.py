@@ -61,10 +61,7 @@ def export_network(network: nn.Module, path: Path, outputs: tuple[str, ...], met
 def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read the weights and metadata of a model that `export_main` wrote; weights by name, as the network's state.
 
-    Raises
-    ------
-    InputError
-        The file does not exist or is no ONNX model.
+    Raises InputError: the file does not exist or is no ONNX model.
     """
     try:
         graph = onnx.load(str(path))

@@ -64,10 +64,7 @@ def open_cache(
     depth [m]; depth unit [m]; rotation from object to camera (9); flash to the right of the lens and above it [middle
     depths]. index.json is written last, so that an interrupted cache is recognized, and continued.
 
-    Raises
-    ------
-    InputError
-        The folder holds views of other meshes or another recipe.
+    Raises InputError: the folder holds views of other meshes or another recipe.
     """
     index = folder / "index.json"
     inputs = json.dumps(asdict(recipe) | {"meshes": [mesh.stem for mesh in meshes]})
@@ -92,10 +89,7 @@ def cache_bytes(views: int, size: int) -> int:
 def _build_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe, inputs: str, report: Report) -> None:
     """Trace all views of a recipe and write their arrays; an interrupted cache continues after its last mesh.
 
-    Raises
-    ------
-    StorageError
-        The disk has too little space.
+    Raises StorageError: the disk has too little space.
     """
     folder.mkdir(parents=True, exist_ok=True)
     shapes, size = len(meshes) + recipe.procedural, recipe.size
@@ -224,10 +218,7 @@ def random_flash(rng: np.random.Generator) -> tuple[float, float]:
 def trace_random_view(name: str, tracer: Tracer, size: int, rng: np.random.Generator) -> tuple[GBuffer, Floats, Floats]:
     """Trace the mesh from a random side: G-buffer, rotation (3, 3) and translation (3,).
 
-    Raises
-    ------
-    InputError
-        The mesh is too thin: it covers too little of the picture from all sides.
+    Raises InputError: the mesh is too thin: it covers too little of the picture from all sides.
     """
     for _ in range(_TRIES):
         rotation, translation, view = random_pose(tracer.mesh, size, rng)

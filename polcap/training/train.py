@@ -77,10 +77,8 @@ def main(options: TrainingOptions, report: Report = silent) -> Path:
 
     `report` is called with lines of text about the progress.
 
-    Raises
-    ------
-    InputError
-        An option is unknown, or contradicts another one or the content of `out`; or there are no test meshes.
+    Raises InputError: an option is unknown, or contradicts another one or the content of `out`; or there are no test
+    meshes.
     """
     _check(options)
     preset = PRESETS[options.preset]
@@ -219,10 +217,7 @@ class NetworkTraining(loop.Trainee):
 
         With a budget of pictures, `done` of them count as spent, and the schedule continues from there.
 
-        Raises
-        ------
-        InputError
-            The model is that of another network.
+        Raises InputError: the model is that of another network.
         """
         weights, metadata = onnx_export.read_weights(path)
         try:

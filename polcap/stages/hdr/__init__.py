@@ -77,10 +77,8 @@ def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack
     are used only where pixels do not suffice and no flash fired. Ambient frames are subtracted in proportion to the
     exposure by their settings; they are not registered.
 
-    Raises
-    ------
-    CaptureError
-        Brackets of unequal length, frames of different size, unknown exposure ratios or too much motion.
+    Raises CaptureError: brackets of unequal length, frames of different size, unknown exposure ratios or too much
+    motion.
     """
     _check_counts(capture.shots)
     read = Reader(

@@ -56,10 +56,8 @@ class ComparedBracket:
 def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float) -> ComparedBracket:
     """Compare every frame of a bracket with its reference frame; the noise of their ISO is added to `lines`.
 
-    Raises
-    ------
-    CaptureError
-        Motion of more than `limit_px` visible RAW px, unknown exposure ratios, or frames of different size.
+    Raises CaptureError: motion of more than `limit_px` visible RAW px, unknown exposure ratios, or frames of different
+    size.
     """
     source = _BracketSignals(bracket, lines, read)
     still = source.signals(bracket.reference)
@@ -177,10 +175,7 @@ def brightness_pyramid(frame: Signals) -> Pyramid:
 def measure_motion(name: str, still: Pyramid, other: Pyramid, limit_px: float) -> Floats | None:
     """Measure the motion of a frame relative to the reference frame: (3, 3), reference px → frame px; None: no motion.
 
-    Raises
-    ------
-    CaptureError
-        The frame `name` moved by more than `limit_px` px of the pyramids.
+    Raises CaptureError: the frame `name` moved by more than `limit_px` px of the pyramids.
     """
     found = register(still, other)
     if found.shift_px > limit_px:
@@ -196,10 +191,7 @@ def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool
 
     `full`: on the grid of the photosites instead of the superpixels.
 
-    Raises
-    ------
-    CaptureError
-        The frames have different sizes.
+    Raises CaptureError: the frames have different sizes.
     """
     shot, reference = bracket.shot, bracket.shot.frames[bracket.reference]
     if not shot.ambient:

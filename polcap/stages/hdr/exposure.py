@@ -88,10 +88,7 @@ def measured_or_stated(name: str, measured: Ratio | None, channels: int, frame: 
 
     A ratio from EXIF does not count if the flash fired.
 
-    Raises
-    ------
-    CaptureError
-        The frame `name` has neither a measured nor a stated ratio.
+    Raises CaptureError: the frame `name` has neither a measured nor a stated ratio.
     """
     if measured is not None:
         return measured.value.astype(np.float32)

@@ -137,10 +137,7 @@ def plan_memory(shots: int, frames: int, pixels: int, frame_bytes: int) -> Memor
 
     There are `shots` of `frames` frames each. A decoded frame has `frame_bytes`; the merged picture has `pixels`.
 
-    Raises
-    ------
-    SettingError
-        The merge needs more than the limit.
+    Raises SettingError: the merge needs more than the limit.
     """
     taken, limit = process_memory()
     if limit is None:

@@ -63,10 +63,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Estimate normal, diffuse, specular, roughness and expected error from cues; without a network by inversion.
 
-    Raises
-    ------
-    ModelError
-        The network was made for other channels.
+    Raises ModelError: the network was made for other channels.
     """
     if network is None:
         maps = analytic.estimate(cues, settings.ior)

@@ -166,10 +166,7 @@ def run_network(
     `names` are the names of the channels, which the network must expect. `outputs` gives the number of channels C of
     each map. The picture is padded to the size multiple that the network needs.
 
-    Raises
-    ------
-    ModelError
-        The network was made for other channels, or returns other maps.
+    Raises ModelError: the network was made for other channels, or returns other maps.
     """
     if network.channels != names:
         raise ModelError(

@@ -60,10 +60,7 @@ def encode(cues: Cues, estimate: CoarseEstimate) -> Floats:
 def refine(cues: Cues, estimate: CoarseEstimate, network: Network, run: RunNetwork) -> Floats:
     """Normals (H, W, 3), camera frame, with fine relief added by the refinement network.
 
-    Raises
-    ------
-    ModelError
-        The network was made for other channels, or returns other maps.
+    Raises ModelError: the network was made for other channels, or returns other maps.
     """
     relief = np.zeros((*cues.mask.shape, 3), np.float32)
     tiles = list(_tiles(cues.mask))

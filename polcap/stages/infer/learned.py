@@ -37,10 +37,7 @@ def estimate(
     `network` takes the channels of `stages.cues`; `run` runs a network; `ior` is the refractive index of the inversion;
     `fine_pass` adds relief by the refinement network, if there is one.
 
-    Raises
-    ------
-    ModelError
-        A network was made for other channels, or returns other maps.
+    Raises ModelError: a network was made for other channels, or returns other maps.
     """
     maps, coarse, stated = estimate_coarse(cues, network, run, ior, symmetries)
     normal = fine.refine(cues, coarse, network.fine, run) if fine_pass and network.fine else coarse.normal

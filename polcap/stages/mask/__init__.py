@@ -52,10 +52,7 @@ def segment(
 
     `user_mask` (H, W) replaces the search. Without a network the object is found by its difference from the backdrop.
 
-    Raises
-    ------
-    ObjectError
-        No object is found, or the user's mask is empty or has another size.
+    Raises ObjectError: no object is found, or the user's mask is empty or has another size.
     """
     if user_mask is not None:
         height, width = radiance.value.shape[1:3]

@@ -58,10 +58,7 @@ def find_object(picture: Floats, chart: Bits, min_area: float) -> Bools:
 
     The zone of the `chart` (H, W) is left out.
 
-    Raises
-    ------
-    ObjectError
-        The object covers a share of the picture smaller than `min_area`.
+    Raises ObjectError: the object covers a share of the picture smaller than `min_area`.
     """
     small, outside = graph_cut.reduce_picture(picture, chart)
     seed = (probability(small, outside) > 0.5).astype(np.uint8)

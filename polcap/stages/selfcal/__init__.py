@@ -86,10 +86,7 @@ def solve(
 
     The shots (K, H, W, 3) are compared in the object's crop and on the chart's grey patches, if any.
 
-    Raises
-    ------
-    CaptureError
-        The outline contradicts the order or sense of the angles, or unknown angles cannot be found.
+    Raises CaptureError: the outline contradicts the order or sense of the angles, or unknown angles cannot be found.
     """
     shots = object_gains.register(radiance, alignment, object_)
     greys = grey_patches.measure(radiance, alignment, color)

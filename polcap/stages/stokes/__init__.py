@@ -71,10 +71,7 @@ def solve(
     The rows of A are `mueller.analyzer`, W holds the inverse variances of the intensities I. The covariance is
     (AᵀWA)⁻¹. Three angles are solved exactly; with more, the mean residual is stored as a check.
 
-    Raises
-    ------
-    CaptureError
-        The angles do not determine all Stokes parameters.
+    Raises CaptureError: the angles do not determine all Stokes parameters.
 
     References
     ----------

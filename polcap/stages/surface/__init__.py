@@ -75,10 +75,7 @@ def integrate(maps: SurfaceMaps, distance_m: float | None, settings: SurfaceSett
 
     The median depth is `distance_m`, the object's distance along the optical axis [m], or 1 where it is unknown.
 
-    Raises
-    ------
-    ObjectError
-        The mask has fewer than 16 pixels, or not one of them has a neighbor.
+    Raises ObjectError: the mask has fewer than 16 pixels, or not one of them has a neighbor.
     """
     count = int(maps.mask.sum())
     if count < 16:
@@ -94,10 +91,7 @@ def integrate(maps: SurfaceMaps, distance_m: float | None, settings: SurfaceSett
 def triangulate(depth: Floats, maps: SurfaceMaps, metric: bool, settings: SurfaceSettings) -> ReliefMesh:
     """Make the mesh of a depth map (H, W), NaN outside the object; `metric` tells that depths are in metres.
 
-    Raises
-    ------
-    ObjectError
-        No triangle fits into the mask.
+    Raises ObjectError: no triangle fits into the mask.
     """
     height, width = maps.mask.shape
     mask = np.asarray(maps.mask & np.isfinite(depth), dtype=bool)

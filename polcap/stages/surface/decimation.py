@@ -39,10 +39,7 @@ def decimate(front: ReliefMesh, view: View, count: int, back: Back) -> Decimated
     front: the walls of a full mesh are slivers, which no collapse removes. Triangles of the front that face away from
     the camera are removed.
 
-    Raises
-    ------
-    ObjectError
-        Too few triangles would be left.
+    Raises ObjectError: too few triangles would be left.
     """
     if count < _FEWEST:
         raise ObjectError(f"a mesh of {count} triangles is under {_FEWEST}; ask for more triangles or fewer levels")
