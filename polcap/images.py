@@ -207,6 +207,11 @@ class View:
     origin: tuple[float, float] = (0.0, 0.0)  # position of this grid's pixel (0, 0) on the full-frame grid
     known: bool = True  # False: the focal length is an assumption
 
+    @property
+    def intrinsic(self) -> Floats:
+        """Matrix (3, 3) from points of the frame x right, y down, z ahead to homogeneous pixels."""
+        return np.array([[self.focal, 0, self.center[0]], [0, self.focal, self.center[1]], [0, 0, 1]])
+
 
 @dataclass(frozen=True)
 class Distortion:

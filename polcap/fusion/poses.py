@@ -95,10 +95,7 @@ def solve(seen: Mapping[str, BoardCorners], capture: Capture) -> SessionPoses:
 
     A view whose corners do not fit is left out, and the others are solved again.
 
-    Raises
-    ------
-    CaptureError
-        Fewer than three views can be posed, or views show boards of several sizes.
+    Raises CaptureError: fewer than three views can be posed, or views show boards of several sizes.
     """
     sizes = {corners.board.name for corners in seen.values()}
     if len(sizes) > 1:
@@ -160,9 +157,10 @@ def _place(k: int) -> slice:
 
 
 def _first_pose(corners: BoardCorners, view: View) -> Floats:
-    matrix = np.array([[view.focal, 0, view.center[0]], [0, view.focal, view.center[1]], [0, 0, 1]])
     flat = corners.world @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # into the plane z = 0, right-handed
-    count, turns, shifts, errors = cv2.solvePnPGeneric(flat, corners.seen, matrix, None, flags=cv2.SOLVEPNP_IPPE)
+    count, turns, shifts, errors = cv2.solvePnPGeneric(
+        flat, corners.seen, view.intrinsic, None, flags=cv2.SOLVEPNP_IPPE
+    )
     best = min(range(count), key=lambda k: float(np.ravel(errors[k])[0]))
     turn = cv2.Rodrigues(turns[best])[0] @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).T
     vector = Rotation.from_matrix(_TO_CV @ turn).as_rotvec()

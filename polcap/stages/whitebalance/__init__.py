@@ -78,10 +78,8 @@ def measure(
     patch receives than a surface that faces the flash; `cues` corrects for it. `delta_e` is NaN for patches that were
     left out. `metres_per_px` needs `settings.chart_width_m`: the chart's size is not assumed.
 
-    Raises
-    ------
-    ChartError
-        No ColorChecker is found, or it is not visible at the corners from the user, or it is over-exposed.
+    Raises ChartError: no ColorChecker is found, or it is not visible at the corners from the user, or it is
+    over-exposed.
     """
     monochrome = (radiance.value[0] == radiance.value[0, ..., :1]).all()
     if request.mode == "none" or (request.mode == "auto" and monochrome):
@@ -229,11 +227,8 @@ def _at_corners(
 ) -> _Find:
     """Locate the chart at corners (4, 2) RAW px from the user, refined in the picture where that is plausible.
 
-    Raises
-    ------
-    ChartError
-        There are not four corners; they are not clockwise, outside the picture, or too close together; or the colors
-        between them are not those of a chart.
+    Raises ChartError: there are not four corners; they are not clockwise, outside the picture, or too close together;
+    or the colors between them are not those of a chart.
     """
     if corners_px is None or np.shape(corners_px) != (4, 2):
         raise ChartError("--chart needs the four outer corners of the patches x0,y0,…,x3,y3, clockwise from dark skin")
@@ -328,8 +323,7 @@ def _scale(place: Placement, view: View, width_m: float | None) -> float | None:
     """
     if width_m is None:
         return None
-    camera = np.array([[view.focal, 0, view.center[0]], [0, view.focal, view.center[1]], [0, 0, 1]])
     middle = np.array([[1.0, 0, chart.COLUMNS / 2], [0, 1, chart.ROWS / 2], [0, 0, 1]])
-    pose = np.linalg.solve(camera, place.homography @ middle)
+    pose = np.linalg.solve(view.intrinsic, place.homography @ middle)
     pitch_m = width_m / (chart.COLUMNS - 1 + place.patch)
     return float(pitch_m * abs(pose[2, 2]) / np.linalg.norm(pose[:, 0]) / view.focal)

@@ -86,8 +86,7 @@ def _slope(outlined: _ChartPlane, state: Floats) -> Floats:
 
 def _plane(place: Placement, view: View) -> tuple[Floats, Floats]:
     """Chart plane in the camera frame: patch centers (24, 3) in units of the chart's distance, and normal (3,)."""
-    camera = np.array([[view.focal, 0, view.center[0]], [0, view.focal, view.center[1]], [0, 0, 1]])
-    pose = np.diag([1.0, -1.0, -1.0]) @ np.linalg.solve(camera, place.homography)
+    pose = np.diag([1.0, -1.0, -1.0]) @ np.linalg.solve(view.intrinsic, place.homography)
     pose = -pose / (pose[2] @ [chart.COLUMNS / 2, chart.ROWS / 2, 1])
     normal = np.cross(pose[:, 1], pose[:, 0])
     at = chart.centers()

@@ -64,10 +64,7 @@ class PatchSamples:
 def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
     """Fit the color matrix (3, 3) from the patches of one shot to the known colors of the chart.
 
-    Raises
-    ------
-    ChartError
-        Fewer than 12 patches are usable.
+    Raises ChartError: fewer than 12 patches are usable.
     """
     seen, use = samples.color, samples.use
     used = int((use == PatchUse.USED).sum())
