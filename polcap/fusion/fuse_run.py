@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from polcap import __version__, resource_limits
+from polcap import __version__
 from polcap import report as reports
 from polcap.errors import SettingError
 from polcap.formats.export import encoders, provenance
@@ -47,12 +47,8 @@ def fuse(
     with result_folder.locked(out):
         views = session.process(found, wanted, report)
         cache = StageCache(out, progress)
-        try:
+        with cache.memory_explained(views[0].mask.size):
             results = path(views, settings, cache)
-        except Exception as error:
-            if not resource_limits.is_shortfall(error):
-                raise
-            raise resource_limits.shortfall(error, cache.stage, views[0].mask.size) from error
         mesh = replace(results.atlas.mesh, metric=found.metric)
         results = replace(
             results, atlas=replace(results.atlas, mesh=mesh), maps=_with_albedo_scale(results.maps, found)

@@ -9,8 +9,9 @@ returns arrays as read-only memory maps, whether the result was computed or read
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from hashlib import blake2b, sha256
@@ -20,7 +21,7 @@ from typing import Any, Generic, TypeVar, get_type_hints
 import msgspec
 import numpy as np
 
-from polcap import parallel
+from polcap import parallel, resource_limits
 from polcap.errors import StorageError
 from polcap.formats import atomic, npy_folder
 from polcap.stages import Stage
@@ -86,6 +87,16 @@ class MemoryCache:
     def end(self) -> None:
         """Report to the progress display that work on the current stage has ended."""
         self.progress(self.stage, time.perf_counter() - self._began, False)
+
+    @contextmanager
+    def memory_explained(self, pixels: int) -> Iterator[None]:
+        """Context manager: lack of memory becomes a SettingError that names the stage; `pixels` of a RAW frame."""
+        try:
+            yield
+        except Exception as error:
+            if not resource_limits.is_shortfall(error):
+                raise
+            raise resource_limits.shortfall(error, self.stage, pixels) from error
 
     def _value(
         self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None, about: dict[str, Any]

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from polcap import parallel, report, resource_limits
+from polcap import parallel, report
 from polcap.config import Config, restore
 from polcap.errors import SettingError
 from polcap.formats import calibrations
@@ -51,20 +51,15 @@ def process(
         "model": report.model_facts(supplied.network),
         "versions": provenance.versions(),
     }
-    try:
-        with result_folder.locked(out):
-            result_folder.write_run(out, facts)
-            results = path(capture, supplied, config, cache)
-            if until is not None:
-                return None
-            cache.begin("write")
-            about = _write(out, results, facts, config)
-            cache.end()
-            return about
-    except Exception as error:
-        if not resource_limits.is_shortfall(error):
-            raise
-        raise resource_limits.shortfall(error, cache.stage, capture.size_px[0] * capture.size_px[1]) from error
+    with cache.memory_explained(capture.size_px[0] * capture.size_px[1]), result_folder.locked(out):
+        result_folder.write_run(out, facts)
+        results = path(capture, supplied, config, cache)
+        if until is not None:
+            return None
+        cache.begin("write")
+        about = _write(out, results, facts, config)
+        cache.end()
+        return about
 
 
 def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -> dict[str, Any]:
