@@ -105,11 +105,11 @@ def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path, monk
         whitebalance.measure(merged, shipped_data.colorchecker(), AUTO, Config().whitebalance)
 
     def fail(*_: object) -> None:
-        raise ChartError("no chart (the best (cost 0.05) is none); give its corners")
+        raise ChartError("no chart (the best (cost 0.05) is none); give its corners", "the best (cost 0.05) is none")
 
     monkeypatch.setattr(check, "_colors_at_full_size", fail)
     again = next(line for line in verdict(tmp_path / "small").lines if line.name == "chart")
-    assert "(the best (cost 0.05) is none);" in again.message  # the whole reason
+    assert "(the best (cost 0.05) is none);" in again.message
     asked = check.inspect(capture, Config(), ChartRequest("none"), lambda: (None, None))
     assert asked.needs == "" and next(line for line in asked.lines if line.name == "chart").state == "not measured"
 
@@ -127,7 +127,7 @@ def test_a_small_chart_is_judged_as_process_judges_it(
     try:
         whitebalance.measure(merged, shipped_data.colorchecker(), AUTO, Config().whitebalance)
     except ChartError as error:
-        reason = str(error).partition("(")[2].partition(")")[0]
+        reason = error.reason
     line = next(line for line in verdict(tmp_path / "small").lines if line.name == "chart")
     assert reason in line.message and (line.state == "warn") is bool(reason) is (width == 200)
 

@@ -174,7 +174,7 @@ def _search(radiance: AngleStack, reference: ChartReference, settings: Whitebala
     else:
         why = f"the best candidate (cost {cheapest:.3f}) does not show 6 × 4 patches on a dark card"
     name = "ColorChecker SG" if reference.is_block else "ColorChecker Classic"
-    raise ChartError(f"no {name} in the reference shot, at any scale or exposure ({why}); {_REMEDY}")
+    raise ChartError(f"no {name} in the reference shot, at any scale or exposure ({why}); {_REMEDY}", why)
 
 
 def _read(

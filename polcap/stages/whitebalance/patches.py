@@ -70,11 +70,11 @@ def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
     used = int((use == PatchUse.USED).sum())
     if used < _LEAST:
         clipped, uneven = (int((use == reason).sum()) for reason in (PatchUse.CLIPPED, PatchUse.UNEVEN))
-        raise ChartError(
+        why = (
             f"{24 - used} of the chart's 24 patches cannot be used ({clipped} over-exposed, "
-            f"{uneven} partly hidden or in shade), more than the {24 - _LEAST} allowed; add a shorter exposure to the "
-            "bracket, or show the whole chart"
+            f"{uneven} partly hidden or in shade), more than the {24 - _LEAST} allowed"
         )
+        raise ChartError(f"{why}; add a shorter exposure to the bracket, or show the whole chart", why)
     error = color.trimmed_residuals(seen, reference.rec709, position(), use == PatchUse.USED)
     odd = error > max(_LEAST_ODD, _ODD * float(np.median(error[use == PatchUse.USED])))
     use = np.where((use == PatchUse.USED) & odd, PatchUse.ODD, use).astype(np.uint8)
