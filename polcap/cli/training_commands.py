@@ -70,7 +70,7 @@ def evaluate(
     if (data is None) == (real is None):
         raise SettingError("evaluate takes DATA, a folder with meshes/ and materials/, or --real DIR; give one of them")
     if real is not None:
-        options.training("evaluation_photographs").main(real, model, out)
+        options.training("evaluation_photographs").main(real, model, out, terminal.print_progress)
         terminal.print_data(str(out / "real.md"))
         return
     judge, fixed = options.training("evaluate"), options.training("evaluation_protocol")

@@ -27,22 +27,26 @@ from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
 from polcap.training.evaluation_page import grid
 from polcap.training.map_errors import LIMITS_DEG, Score
+from polcap.training.progress import Report, silent
 
 _MISSED_DEG = 90.0  # error of a pixel of the object without an estimated normal
 _MIN_DOLP, _MIN_TILT = 0.03, 0.3  # for the comparison of AoLP and azimuth; tilt: sine of the zenith
 
 
-def main(folder: Path, model: Path, out: Path) -> dict[str, Score]:
+def main(folder: Path, model: Path, out: Path, report: Report = silent) -> dict[str, Score]:
     """Evaluate every photograph set with and without the network; writes real.json and real.md to `out`.
+
+    `report` is called with a line of text per set.
 
     Raises InputError: the folder does not have this layout.
     """
     names, angles = _list_pictures(folder)
     network = models.open_network(model)
-    rows = {
-        name: {"ours": score(folder, angles, name, network), "analytic": score(folder, angles, name, None)}
-        for name in names
-    }
+    rows = {}
+    for k, name in enumerate(names, 1):
+        rows[name] = {"ours": score(folder, angles, name, network), "analytic": score(folder, angles, name, None)}
+        mean, analytic = (rows[name][column]["mean"] for column in ("ours", "analytic"))
+        report(f"{k}/{len(names)}  {name}: normals {mean:.2f}°, by the analytic estimator {analytic:.2f}°")
     table = {
         column: {row: float(np.mean([both[column][row] for both in rows.values()])) for row in rows[names[0]][column]}
         for column in ("ours", "analytic")

@@ -44,11 +44,13 @@ def _write(file: Path, picture: Floats) -> None:
 def test_normals_of_a_ball_are_evaluated(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(models, "open_network", lambda path: network())
     monkeypatch.setattr(onnx, "run", fake_network.run)
-    table = evaluation_photographs.main(folder, Path("model.onnx"), tmp_path)
+    lines: list[str] = []
+    table = evaluation_photographs.main(folder, Path("model.onnx"), tmp_path, lines.append)
     # the lens is not stated, 50 mm is assumed: so view rays at the ball's side are wrong by 13°
     assert table["analytic"]["mean"] < 9 and table["analytic"]["covered"] > 0.97
     assert table["analytic"]["diffuse direction"] > 0.95  # the light of this ball is diffuse
     assert table["ours"]["mean"] > 20  # this network takes the other half-turn on half of the ball
+    assert [line.partition(":")[0] for line in lines] == ["1/1  ball.png"]
     page = (tmp_path / "real.md").read_text()
     assert "| ball.png, ours |" in page and "counts as 90°" in page
 
