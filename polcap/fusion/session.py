@@ -217,8 +217,7 @@ def read(wanted: SessionInput) -> Session:
 
     Raises CaptureError: there are too few views.
     """
-    folders = [*wanted.folder.glob("view*/"), *wanted.folder.glob("set*/view*/")]
-    names = sorted((folder.relative_to(wanted.folder).as_posix() for folder in folders), key=layouts.natural)
+    names = layouts.session_views(wanted.folder)
     if not names:
         raise CaptureError(f"{wanted.folder} holds no views; put each capture into a folder view01, view02, …")
     session = Session({})

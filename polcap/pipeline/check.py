@@ -7,12 +7,14 @@ averaging hides (clipping, sharpness) are measured at full size while frames are
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from time import perf_counter
 
 import msgspec
 
 from polcap.config import Config
 from polcap.errors import ChartError, DecodeError, InputError
+from polcap.formats.capture import layouts
 from polcap.images import Capture, ChartRequest, ColorCalibration, Network
 from polcap.pipeline import models, small_capture
 from polcap.pipeline.cache import MemoryCache
@@ -89,6 +91,7 @@ def _judge(capture: Capture, small: SmallCapture, supplied: UserInput, config: C
         blur_px=small.blur_px,
         grid_px=small.step / (small.merged_px if config.hdr.demosaic == "superpixel" else 1),
         chart_missing=chart_missing,
+        later_view=layouts.is_later_view(Path(capture.folder)),
     )
     lines = []
     try:
@@ -118,7 +121,7 @@ def _run_path(capture: Capture, small: SmallCapture, supplied: UserInput, config
         try:
             request = ChartRequest("profile", profile=_colors_at_full_size(capture, config))
         except ChartError as error:
-            missing = str(error).partition(" (")[2].rpartition("); ")[0] or str(error)
+            missing = error.reason
         path(small.capture, replace(supplied, chart=request), settings, cache)
     return missing
 

@@ -49,6 +49,7 @@ class Evidence(Results):
     blur_px: Floats  # (K, E) beyond the sharpest frame of the same exposure, 1σ [visible RAW px]
     grid_px: float = 1.0  # px of the picture that `process` works on per px of these
     chart_missing: str = ""  # the reason, where a chart was expected and none was found
+    later_view: bool = False  # of a session whose first view shows the chart
 
 
 def full_size(results: Results, focal_doubt: tuple[float, float]) -> Evidence:

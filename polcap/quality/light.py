@@ -125,6 +125,9 @@ def stillness(found: Evidence, limits: GateLimits) -> Gate:
 def chart(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on the chart: whether it was found, and the mean color error of its patches."""
     limit = limits.max_delta_e
+    if found.chart_missing and found.later_view:
+        message = "This view shows no chart; `polcap fuse` takes the colors of the view that does"
+        return Gate("chart", "not measured", None, limit, message, unit="ΔE2000")
     if found.chart_missing:
         remedy = (
             "Shoot again with the whole chart visible and lit, or name its corners with --chart; with --no-chart "
@@ -136,7 +139,8 @@ def chart(found: Evidence, limits: GateLimits) -> Gate:
     if colors is None:
         return Gate("chart", "not measured", None, limit, "No chart was used", unit="ΔE2000")
     mean = float(np.nanmean(colors.delta_e))
-    message = f"Chart colors match within ΔE {mean:.1f}"
+    where = "" if found.color.place else " in the capture that shows it"
+    message = f"Chart colors match within ΔE {mean:.1f}{where}"
     if colors.predicted is not None:
         message += f" ({float(np.nanmean(colors.predicted)):.1f} when cross-checked)"
     if colors.use is not None and colors.use.any():
@@ -152,7 +156,12 @@ def chart(found: Evidence, limits: GateLimits) -> Gate:
 def albedo_scale(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on the common scale of all albedos: its uncertainty; without a chart the scale is unknown."""
     sigma, limit, source = found.maps.albedo_sigma, limits.max_scale_doubt, found.color.source
-    remedy = "Put a ColorChecker next to the middle of the object, facing the lens, where only the flash lights it"
+    if found.chart_missing and found.later_view:
+        message = "The view that shows the chart gives the albedos of this view their scale"
+        return Gate("albedo scale", "not measured", None, limit, message)
+    of_session = source == "profile" and sigma is not None
+    put = "In the view that shows the ColorChecker, put it" if of_session else "Put a ColorChecker"
+    remedy = f"{put} next to the middle of the object, facing the lens, where only the flash lights it"
     if sigma is None:
         message = "The albedos are relative: without a chart in the picture their scale is unknown"
         if source == "profile":
@@ -163,7 +172,7 @@ def albedo_scale(found: Evidence, limits: GateLimits) -> Gate:
     if sigma > limit and light is not None and light.uneven > limit / 2:
         message += ": the chart is lit unevenly, by another lamp or through a lens that darkens the corners"
     elif sigma > limit:
-        message += ": they are higher than usual, so the chart may get less light than the object"
+        message += ": they are higher than usual, as of a very bright object or a chart with less light"
     return at_most("albedo scale", sigma, limit, message, remedy, beyond="warn")
 
 

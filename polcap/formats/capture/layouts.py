@@ -129,6 +129,22 @@ def view_name(k: int) -> str:
     return f"view{k + 1:02d}"
 
 
+def session_views(folder: Path) -> list[str]:
+    """Names of a session's views in their order: view01, view02, or setA/view01, setB/view01, and so on."""
+    found = [*folder.glob("view*/"), *folder.glob("set*/view*/")]
+    return sorted((path.relative_to(folder).as_posix() for path in found), key=natural)
+
+
+def is_later_view(folder: Path) -> bool:
+    """Whether a capture's folder is a view of a session, but not the first one, which shows the chart."""
+    place = Path(os.path.abspath(folder))
+    for session in (place.parent.parent, place.parent):
+        names = session_views(session)
+        if place.relative_to(session).as_posix() in names[1:]:
+            return True
+    return False
+
+
 def _lossy_or_packed(folder: Path) -> str:
     """The remedy for a folder of HEIC pictures or of a ZIP archive; empty for any other folder."""
     files = [path for path in children(folder) if path.is_file()]

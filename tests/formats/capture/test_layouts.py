@@ -135,6 +135,13 @@ def test_views_of_one_object_are_for_fuse(tmp_path):
         capture.read(tmp_path)
 
 
+def test_only_the_first_view_of_a_session_must_show_the_chart(tmp_path):
+    for name in ("vase/view01", "vase/view02", "mug/setA/view01", "mug/setB/view01", "alone"):
+        (tmp_path / name).mkdir(parents=True)
+    later = {name.relative_to(tmp_path).as_posix() for name in tmp_path.glob("**/") if layouts.is_later_view(name)}
+    assert later == {"vase/view02", "mug/setB/view01"}
+
+
 def test_untimed_brackets_in_one_folder_are_to_be_sorted(tmp_path):
     """No order of the angles can separate the brackets, so the message does not mention --angles."""
     folder = pictures(tmp_path, [f"krug_{angle}_grad_{number}.png" for angle in (0, 45, 90) for number in range(3)])
