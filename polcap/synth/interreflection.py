@@ -1,9 +1,10 @@
-"""Interreflection between the parts of a mesh in synthetic captures: one diffuse bounce, computed at the vertices.
+"""Interreflection between the parts of a mesh: flash light that reaches a place by one diffuse bounce elsewhere.
 
-All shots use the same interpolated values, so sampling noise adds no false polarization. Neglected: specular
-reflection, and the slight polarization of the bounced light. There are two other simulations of this light:
-`training/light_transport.py` works per pixel and includes specular reflection; `training/bounced_light.py` reuses
-traced paths while the materials change during training.
+`flash_light` and `diffuse_light` are the law of this bounce. Synthetic captures gather it at the vertices (`received`):
+all shots use the same interpolated values, so sampling noise adds no false polarization. The evaluation's pictures
+gather it per pixel, also in specular reflection (`training/light_transport.py`). Both neglect further bounces and the
+slight polarization of this light. Training has another simulation, `training/bounced_light.py`. It computes light with
+torch along paths that were traced before, because materials change with each step.
 """
 
 from collections.abc import Callable
@@ -14,11 +15,35 @@ from polcap.images import Floats
 from polcap.optics import fresnel
 from polcap.synth.mesh_tracer import Tracer
 
+LIFT = 1e-3  # longest sides of the mesh, from the surface to the start of a ray; nearer hits are the place itself
 _RAYS = 48  # per vertex, distributed by their cosine
-_LIFT = 5e-4  # m above the surface, where a ray starts
 _SMOOTH = 2  # smoothing passes: each vertex takes the mean of its faces
 
 DiffuseLight = Callable[[Floats, Floats, Floats], Floats]  # points, normals, directions (N, 3) -> S0 (N, 3)
+
+
+def flash_light(tracer: Tracer, place: Floats, normal: Floats, flash: Floats, strength: float) -> tuple[Floats, Floats]:
+    """Direct flash light at points of a mesh: unit vectors to the flash (M, 3), and irradiance (M,), 0 in shadow.
+
+    All vectors are in the frame of the mesh. The irradiance is S0 of a white plane that faces the flash; `strength` is
+    that at distance 1.
+    """
+    far = np.linalg.norm(flash - place, axis=1)
+    to_flash, lift = (flash - place) / far[:, None], LIFT * tracer.size
+    start = place + lift * normal
+    hidden = tracer.hidden(start, start + to_flash * (far - lift)[:, None])
+    return to_flash, np.where(hidden, 0, strength / far**2)
+
+
+def diffuse_light(
+    lit: tuple[Floats, Floats], normal: Floats, towards: Floats, albedo: Floats, ior: Floats | float
+) -> Floats:
+    """Diffusely reflected S0 (M, 3) of places under the flash, `lit` by `flash_light`, in directions (M, 3)."""
+    to_flash, irradiance = lit
+    cos_i = np.clip(np.sum(to_flash * normal, axis=1), 1e-3, 1)
+    cos_o = np.clip(np.sum(towards * normal, axis=1), 1e-2, 1)
+    into, out = (fresnel.transmission(cosine, ior)[0] for cosine in (cos_i, cos_o))
+    return np.asarray(albedo * (irradiance * cos_i * into * out)[:, None])
 
 
 def received(tracer: Tracer, lit: DiffuseLight, camera: Floats, ior: float) -> Floats:
@@ -43,7 +68,7 @@ def received(tracer: Tracer, lit: DiffuseLight, camera: Floats, ior: float) -> F
         angle = turn + k * np.pi * (3 - np.sqrt(5))
         across = np.cos(angle)[:, None] * e_x + np.sin(angle)[:, None] * e_y
         direction = cosine * normal + np.sqrt(1 - cosine**2) * across
-        hit = tracer.meet(mesh.vertices + _LIFT * normal, direction)
+        hit = tracer.meet(mesh.vertices + LIFT * tracer.size * normal, direction)
         back = -direction[hit.index]
         facing = np.where(np.sum(hit.normal * back, axis=1, keepdims=True) < 0, -hit.normal, hit.normal)
         entered, _ = fresnel.transmission(np.float64(cosine), ior)

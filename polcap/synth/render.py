@@ -189,18 +189,12 @@ def _bounced(scene: Scene) -> Floats:
     if not isinstance(scene.shape, Model):
         raise SettingError("interreflection needs triangles; give the object as a mesh")
     tracer = mesh_tracer.tracer(scene.shape.file, scene.shape.radius)
-    source, lens = (scene.turn.inv().apply(np.array(at) - scene.position) for at in (scene.light, (0.0, 0.0, 0.0)))
-    reference = np.sum((np.array(scene.light) - scene.position) ** 2)
+    flash, lens = (scene.turn.inv().apply(np.array(at) - scene.position) for at in (scene.light, (0.0, 0.0, 0.0)))
 
     def lit(point: Floats, normal: Floats, towards: Floats) -> Floats:
-        to_light = source - point
-        squared = np.sum(to_light**2, axis=1)
-        cos_i = np.sum(to_light * normal, axis=1) / np.sqrt(squared)
-        hidden = tracer.hidden(point + trace.LIFT * normal, source) | (cos_i <= 0)
         diffuse, _, _, ior = scene_materials.evaluate(scene.coat, point, normal)
-        into, _ = fresnel.transmission(np.clip(cos_i, 1e-3, 1), ior)
-        out, _ = fresnel.transmission(np.clip(np.sum(towards * normal, axis=1), 1e-2, 1), ior)
-        return diffuse * np.where(hidden, 0, reference / squared * cos_i * into * out)[:, None]
+        light = interreflection.flash_light(tracer, point, normal, flash, float(flash @ flash))
+        return interreflection.diffuse_light(light, normal, towards, diffuse, ior)
 
     ior = scene.coat.materials[0].ior
     return np.asarray(interreflection.received(tracer, lit, lens, ior)[tracer.mesh.faces])

@@ -4,7 +4,7 @@ The flash is next to the lens, so the camera sees the places that the flash ligh
 of the same picture. `trace_visibility` traces a few rays from every second pixel of every second row, and stores which
 pixels they hit. `bounced_stokes` computes the light along these rays for the materials of a training step.
 `mirrored_surroundings` adds the mirror image of a backdrop and of the ground where no part of the object hides them.
-Neglected, as in `light_transport.py`: further bounces, and the weak polarization of the light that arrives.
+`synth/interreflection.py` compares it with the other simulation of this light.
 """
 
 from dataclasses import dataclass
@@ -20,6 +20,7 @@ from polcap.images import Bools, Floats, GBuffer, Indices
 from polcap.optics import brdf, frames, shade
 from polcap.optics.projection import project
 from polcap.synth import mesh_tracer
+from polcap.synth.interreflection import LIFT
 from polcap.synth.mesh_tracer import Tracer
 from polcap.training import light_transport
 from polcap.training.materials import Surface
@@ -75,7 +76,7 @@ def trace_visibility(
     traced &= mask
     normal = frames.to_ray_frame(buffer.normal[traced], v[traced])
     directions = frames.from_ray_frame(_draw_directions(normal, rng), v[traced][:, None])  # (M, RAYS, 3)
-    lift = light_transport.LIFT * tracer.size
+    lift = LIFT * tracer.size
     origin = buffer.position[traced] + lift * outward[traced]
     start = np.broadcast_to(origin[:, None], directions.shape).reshape(-1, 3)
     direction = directions.reshape(-1, 3) @ pose.rotation

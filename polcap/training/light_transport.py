@@ -1,7 +1,7 @@
 """Traced flash light on a mesh, for the evaluation's pictures: direct, with shadows, and after one diffuse bounce.
 
-Rays find the points that the flash reaches, and the diffuse light that each point receives from other points. A point
-reflects this light diffusely and by its facets. Neglected: further bounces, and the weak polarization of this light.
+Rays find the points that the flash reaches, and the diffuse light that each point receives from other points
+(`synth/interreflection.py`). A point reflects this light diffusely and by its facets.
 """
 
 from collections.abc import Callable
@@ -16,9 +16,10 @@ from polcap.images import Bools, Floats, Indices
 from polcap.optics import brdf, frames, fresnel, shade
 from polcap.optics.body import SMOOTH, Law
 from polcap.optics.namespace import array_namespace
+from polcap.synth import interreflection
+from polcap.synth.interreflection import LIFT
 from polcap.synth.mesh_tracer import Tracer
 
-LIFT = 1e-3  # longest sides of the mesh, from the surface to the start of a ray; nearer hits are the place itself
 _HEMISPHERE_RAYS, _MIRROR_RAYS = 12, 6  # per place: over the hemisphere, and about the mirror direction
 _SMOOTH = 0.004  # 1σ of the average of traced light, picture sides
 
@@ -57,16 +58,9 @@ class SurfacePoints:
 
 
 def flash_light(tracer: Tracer, place: Floats, flat: Floats, pose: LitPose) -> tuple[Floats, Floats]:
-    """Direct flash light at points of a mesh: unit vectors to the flash (M, 3), and irradiance (M,), 0 in shadow.
-
-    All vectors are in the frame of the mesh. The irradiance is S0 of a white plane that faces the flash.
-    """
+    """Direct flash light at points (M, 3) of a mesh in its frame, as of `interreflection.flash_light`."""
     flash = (pose.flash - pose.translation) @ pose.rotation
-    far = np.linalg.norm(flash - place, axis=1)
-    to_flash, lift = (flash - place) / far[:, None], LIFT * tracer.size
-    start = place + lift * flat
-    hidden = tracer.hidden(start, start + to_flash * (far - lift)[:, None])
-    return to_flash, np.where(hidden, 0, pose.strength / far**2)
+    return interreflection.flash_light(tracer, place, flat, flash, pose.strength)
 
 
 def stokes(tracer: Tracer, places: SurfacePoints, pose: LitPose, albedo: Albedo, rng: np.random.Generator) -> Floats:
@@ -144,11 +138,8 @@ class IndirectLight:
         hit = np.flatnonzero(np.isfinite(distance) & (distance > LIFT * tracer.size))
         origin, direction, distance, flat = origin[hit], direction[hit], distance[hit, None], flat[hit]
         point = origin + distance * direction
-        to_flash, irradiance = flash_light(tracer, point, flat, pose)
-        cos_i = np.clip(np.sum(to_flash * flat, axis=1), 1e-3, 1)
-        cos_o = np.clip(-np.sum(direction * flat, axis=1), 1e-2, 1)
-        into, out = (fresnel.transmission(c, places.ior)[0] for c in (cos_i, cos_o))
-        return which[hit], self.albedo(point, flat) * (irradiance * cos_i * into * out)[:, None]
+        lit = flash_light(tracer, point, flat, pose)
+        return which[hit], interreflection.diffuse_light(lit, flat, -direction, self.albedo(point, flat), places.ior)
 
     def smooth(self, value: Floats) -> Floats:
         """Smooth bounced light (M, C) by means over nearby pixels of the object."""
