@@ -102,7 +102,7 @@ def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
     """Parse --chart and --no-chart: corners, a profile or no chart; by default the chart is searched for."""
     import numpy as np
 
-    from polcap.formats import calibrations
+    from polcap.formats import color_profile
     from polcap.images import ChartRequest
 
     if text is None:
@@ -110,7 +110,7 @@ def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
     if no_chart:
         raise SettingError("--chart and --no-chart exclude each other; leave one out")
     if Path(text).suffix == ".toml":
-        return ChartRequest("profile", profile=calibrations.read_profile(Path(text)))
+        return ChartRequest("profile", profile=color_profile.read(Path(text)))
     corners = numbers("--chart", text, "give 8 numbers, or a color profile that ends in .toml")
     if len(corners) != 8:
         raise SettingError(f"--chart gives {len(corners)} numbers; four corners have 8, a profile ends in .toml")

@@ -7,6 +7,7 @@ export/         assets for other programs
 html/           the report's page
 onnx            opens and runs networks
 calibrations    measurements of the user
+color_profile   color matrix of a chart, for captures without one
 shipped_data    data that ship with polcap
 scene_files     meshes and texture sets for synthetic scenes
 npy_folder      a value as JSON and arrays in a folder

@@ -1,23 +1,19 @@
-"""Reads, writes and chooses the user's calibrations of camera, lens and filter (TOML), and color profiles of a chart.
+"""Reads, writes and chooses the user's calibrations of camera, lens and filter (TOML).
 
 `polcap calibrate` writes dated files into the user's folder, $POLCAP_CALIB or the system's folder for settings; a
-capture uses the newest that fits it. Each result keeps its color profile for captures without a chart.
+capture uses the newest that fits it.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-import tomli_w
-from msgspec import Meta
 
 from polcap.calibration_values import Calibration, LensGeometry
-from polcap.errors import CaptureError, ChartError
+from polcap.errors import CaptureError
 from polcap.formats import atomic, own_folders, text_file
-from polcap.images import ChartPlace, ColorCalibration, Distortion, Exif, PatchColors
+from polcap.images import Distortion, Exif
 from polcap.optics import distortion
 
 _FULL_TURN = 360.0  # degrees
@@ -47,7 +43,7 @@ def write(place: Path, found: Calibration) -> Path:
 
 def text(found: Calibration) -> str:
     """TOML text of a calibration, as `write` puts it into the file."""
-    return _HEAD + tomli_w.dumps(_plain(msgspec.to_builtins(found)))
+    return _HEAD + text_file.to_toml(msgspec.to_builtins(found))
 
 
 def read(path: Path) -> Calibration:
@@ -157,100 +153,3 @@ def _possible_lens(lens: LensGeometry) -> bool:
 def _lights_corners(law: tuple[float, float, float]) -> bool:
     """Whether the lens falloff 1 + a r² + b r⁴ + c r⁶ stays positive up to the corners of the picture."""
     return bool(np.min(np.polyval([*reversed(law), 1], np.linspace(0, 1, 17))) > _LEAST_LIGHT)
-
-
-def _plain(tree: Any) -> Any:
-    """Convert a calibration to types that TOML has: None is left out, arrays become lists, numbers get nine digits."""
-    if isinstance(tree, dict):
-        return {key: _plain(value) for key, value in tree.items() if value is not None}
-    if isinstance(tree, np.ndarray):
-        return _plain(tree.tolist())
-    if isinstance(tree, Sequence) and not isinstance(tree, str):
-        return [_plain(value) for value in tree]
-    return float(f"{tree:.9g}") if isinstance(tree, float) else tree
-
-
-_Point = tuple[float, float]
-_Quad = tuple[_Point, _Point, _Point, _Point]
-_OfPatches = Meta(min_length=24, max_length=24)
-_Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
-
-
-class _Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Keys of a color profile file: a `ColorCalibration` with its place and patches written as single keys."""
-
-    matrix: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
-    source: Literal["chart", "corners", "profile", "camera", "none"]
-    cost: float = float("nan")
-    delta_e: Annotated[list[float], _OfPatches] | None = None
-    metres_per_px: _Finite | None = None
-    quads: Annotated[list[_Quad], _OfPatches] | None = None
-    corners: _Quad | None = None
-    falloff: tuple[_Finite, _Finite] = (0.0, 0.0)
-    glare: _Finite = 0.0
-    predicted: Annotated[list[float], _OfPatches] | None = None
-    patch_use: Annotated[list[Annotated[int, Meta(ge=0, le=255)]], _OfPatches] | None = None
-
-
-def write_profile(path: Path, color: ColorCalibration) -> None:
-    """Write a color matrix as a profile file for other captures of the same camera, light and exposure.
-
-    Raises StorageError.
-    """
-    place, patches = color.place, color.patches
-    document: dict[str, Any] = {
-        "matrix": color.matrix,
-        "source": color.source,
-        "cost": float(color.cost),
-        "metres_per_px": color.metres_per_px,
-        "quads": place and place.quads,
-        "corners": place and place.corners,
-    }
-    if patches is not None:
-        document |= {
-            "delta_e": patches.delta_e,
-            "falloff": patches.falloff,
-            "glare": patches.glare,
-            "predicted": patches.predicted,
-            "patch_use": patches.use,
-        }
-    head = (
-        "# polcap color profile. matrix: camera radiance (I0 + I90) -> linear Rec.709 reflectance.\n"
-        "# quads, corners: px of the grid it was measured on. metres_per_px: at the chart's distance.\n"
-    )
-    atomic.write(path, head + tomli_w.dumps(_plain(document)))
-
-
-def read_profile(path: Path) -> ColorCalibration:
-    """Read a color profile that `write_profile` wrote.
-
-    Raises ChartError: the file is missing, not a profile, or its matrix cannot be inverted.
-    """
-    document: dict[str, Any] = {}
-    try:
-        document = text_file.read_toml(path, finite=False)
-        profile = msgspec.convert(document, _Profile)
-    except OSError as error:
-        raise ChartError(f"{path}: cannot be read ({error.strerror}); give a profile's path") from error
-    except ValueError as error:
-        fault: object = error
-        if isinstance(error, msgspec.ValidationError):
-            fault = text_file.fault(error, document, _Profile)
-        raise ChartError(f"{path}: not a polcap color profile ({fault}); write the profile again") from error
-    matrix = np.array(profile.matrix)
-    if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix, rtol=1e-6) < 3:
-        raise ChartError(f"{path}: its color matrix cannot be inverted; write the profile again")
-    quads, corners, delta_e, predicted = (
-        None if values is None else np.array(values, np.float64)
-        for values in (profile.quads, profile.corners, profile.delta_e, profile.predicted)
-    )
-    use = None if profile.patch_use is None else np.array(profile.patch_use, np.uint8)
-    patches = delta_e is not None and PatchColors(delta_e, use, predicted, profile.falloff, profile.glare)
-    return ColorCalibration(
-        matrix=matrix,
-        source=profile.source,
-        cost=profile.cost,
-        metres_per_px=profile.metres_per_px,
-        place=None if quads is None or corners is None else ChartPlace(quads, corners),
-        patches=patches or None,
-    )

@@ -1,4 +1,4 @@
-"""Reads TOML and JSON files from untrusted sources, and explains errors in their keys.
+"""Reads TOML and JSON files from untrusted sources, explains errors in their keys, and makes TOML text.
 
 Files are UTF-8, with or without a byte order mark. The functions return plain data, or raise an `OSError` or a
 `ValueError` with a message of one line. A pipe, a huge file, deep nesting and infinite numbers are refused.
@@ -72,6 +72,23 @@ def parse_json(text: str) -> Any:
         return json.loads(text, parse_constant=_refuse, parse_float=_finite)
     except RecursionError:
         raise ValueError("nested too deeply") from None
+
+
+def to_toml(tree: dict[str, Any]) -> str:
+    """TOML text of a table: None is left out, arrays become lists, numbers get nine digits."""
+    import tomli_w
+
+    return tomli_w.dumps(_plain(tree))
+
+
+def _plain(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return {key: _plain(value) for key, value in tree.items() if value is not None}
+    if hasattr(tree, "tolist"):
+        return _plain(tree.tolist())
+    if isinstance(tree, (list, tuple)):
+        return [_plain(value) for value in tree]
+    return float(f"{tree:.9g}") if isinstance(tree, float) else tree
 
 
 def check_finite(value: Any, name: str = "") -> None:

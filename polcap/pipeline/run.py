@@ -14,7 +14,7 @@ import msgspec
 from polcap import parallel, report
 from polcap.config import Config, restore
 from polcap.errors import SettingError
-from polcap.formats import calibrations
+from polcap.formats import color_profile
 from polcap.formats.export import encoders, provenance
 from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
@@ -76,7 +76,7 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
         partial(asset_export.write, out, about, ExportRequest(), [DetailLevel(results.asset)]),
     )
     if results.color.source in ("chart", "corners"):
-        calibrations.write_profile(out / PROFILE, results.color)
+        color_profile.write(out / PROFILE, results.color)
     else:
         (out / PROFILE).unlink(missing_ok=True)
     return about

@@ -29,7 +29,7 @@ from polcap.calibration_values import (
     Polarizer,
 )
 from polcap.errors import PolcapError
-from polcap.formats import atomic, calibrations, npy_folder, text_file
+from polcap.formats import atomic, calibrations, color_profile, npy_folder, text_file
 from polcap.formats.capture import capture_toml
 from polcap.formats.maps import maps_folder as maps
 from polcap.formats.raw import exif, file_checks, file_kind
@@ -191,7 +191,7 @@ PARSERS = {
     "capture.toml": Target(
         (_CAPTURE,), _file(capture_toml.NAME, lambda file: capture_toml.load(file.parent)), share=0.4
     ),
-    "color profile": Target((_PROFILE,), _file("profile.toml", calibrations.read_profile), share=0.4),
+    "color profile": Target((_PROFILE,), _file("profile.toml", color_profile.read), share=0.4),
     "calibration (TOML)": Target((_CALIBRATION,), _file("calib/bench.toml", _calibration_file), share=0.4),
     "maps.json": Target(
         (json.dumps(_MAPS).encode(),),

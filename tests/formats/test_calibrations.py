@@ -1,17 +1,16 @@
-"""The newest calibration that fits is used, an impossible one is refused; color profiles are read back complete."""
+"""The newest calibration that fits is used, an impossible one is refused."""
 
 import dataclasses
-from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from polcap.calibration_values import Calibration, Falloff, FlashEnergy, LensGeometry, Levels, NoiseLine, Polarizer
-from polcap.errors import CaptureError, ChartError
+from polcap.errors import CaptureError
 from polcap.formats import calibrations
 from polcap.formats.capture import reader as capture
-from polcap.images import ChartPlace, ColorCalibration, Exif, PatchColors
+from polcap.images import Exif
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "capture"
 EXIF = Exif(make="Polcap", model="Synthetic", lens="Synthetic 60mm", f_number=11.0, focal_length_mm=60.0)
@@ -122,65 +121,3 @@ def test_impossible_figures_are_refused(users, change):
     calibrations.write(users, dataclasses.replace(KNOWN, **change))
     with pytest.raises(CaptureError, match="impossible"):
         calibrations.choose(EXIF, None, None)
-
-
-PROFILE = ColorCalibration(
-    matrix=np.array([[2.1, -0.4, 0.1], [-0.2, 1.5, -0.3], [0.05, -0.6, 1.9]]),
-    source="chart",
-    cost=0.004,
-    metres_per_px=0.00072,
-    place=ChartPlace(np.arange(192.0).reshape(24, 4, 2), np.array([[1.0, 2], [30, 2], [30, 22], [1, 22]])),
-    patches=PatchColors(
-        delta_e=np.where(np.arange(24) == 18, np.nan, 1.25),
-        use=np.where(np.arange(24) == 18, 1, 0).astype(np.uint8),
-        predicted=np.where(np.arange(24) == 18, np.nan, 1.5),
-        falloff=(0.01, -0.02),
-        glare=0.015,
-    ),
-)
-
-
-def test_a_profile_is_read_back_unchanged(tmp_path):
-    path = tmp_path / "set-up.toml"
-    calibrations.write_profile(path, PROFILE)
-    back = calibrations.read_profile(path)
-    for part, names in (
-        ("", ["matrix", "cost", "metres_per_px"]),
-        ("place.", ["quads", "corners"]),
-        ("patches.", ["delta_e", "use", "predicted", "falloff", "glare"]),
-    ):
-        for name in names:
-            found, expected = (attrgetter(part + name)(profile) for profile in (back, PROFILE))
-            np.testing.assert_allclose(found, expected, atol=1e-8)  # NaN equals NaN
-    assert back.source == "chart"
-
-
-def test_profile_without_a_chart_comes_back_without(tmp_path):
-    bare = ColorCalibration(PROFILE.matrix, "camera")
-    calibrations.write_profile(tmp_path / "p.toml", bare)
-    back = calibrations.read_profile(tmp_path / "p.toml")
-    assert (back.place, back.patches, back.metres_per_px) == (None, None, None)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("matrix = 3", "not a polcap color profile"),
-        ("\x00\x01", "not a polcap color profile"),
-        ('source = "chart"\nmatrix = [[1.0,0,0],[0,1,0],[1,1,0]]', "cannot be inverted"),
-        ('source = "magic"\nmatrix = [[1.0,0,0],[0,1,0],[0,0,1]]', "magic"),
-        ('source = "chart"\nmatrix = [[1.0,0,0],[0,1,0],[0,0,1]]\ndelta_e = [1.0]', "delta_e"),
-        ('source = "chart"\nmatrix = [[1.0,0,0],[0,1,0],[0,0,1]]\ncorners = [[1.0], [1.0, 2.0]]', "corners"),
-    ],
-)
-def test_foreign_profile_is_one_clear_line(tmp_path: Path, text: str, message: str):
-    path = tmp_path / "p.toml"
-    path.write_text(text)
-    with pytest.raises(ChartError, match=message) as error:
-        calibrations.read_profile(path)
-    assert str(path) in str(error.value)
-
-
-def test_missing_profile_is_one_clear_line(tmp_path):
-    with pytest.raises(ChartError, match="nowhere"):
-        calibrations.read_profile(tmp_path / "nowhere.toml")
