@@ -40,18 +40,10 @@ def warp(
 
     A pixel of the output is mapped by `lens`, then by `transform`, to a position in the image.
 
-    Parameters
-    ----------
-    image
-        (H, W) or (H, W, C).
-    transform
-        (3, 3), output px (x, y, 1) → image px, homogeneous.
-    box
-        x0, y0, x1, y1 of the output in its own px (end exclusive); the image's own frame by default.
-    order
-        3: cubic splines, for values; 1: linear, for weights and masks. Outside the image its edge pixels repeat.
-    lens
-        Distortion of the output's grid; the output is then the picture of a pinhole camera.
+    image is (H, W) or (H, W, C); transform (3, 3) maps output px (x, y, 1) to image px, homogeneous. The output is the
+    `box` x0, y0, x1, y1 of its own px (end exclusive), by default the image's own frame. order 3 is for values: cubic
+    splines; 1, linear, is for weights and masks. Outside the image its edge pixels repeat. With `lens`, the distortion
+    of the output's grid, the output is the picture of a pinhole camera.
     """
     x0, y0, x1, y1 = (int(v) for v in box or (0, 0, image.shape[1], image.shape[0]))
     inside = x0 >= 0 and y0 >= 0 and x1 <= image.shape[1] and y1 <= image.shape[0]

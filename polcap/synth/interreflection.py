@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from polcap.images import Floats
-from polcap.optics import fresnel
+from polcap.optics import frames, fresnel
 from polcap.synth.mesh_tracer import Tracer
 
 LIFT = 1e-3  # longest sides of the mesh, from the surface to the start of a ray; nearer hits are the place itself
@@ -55,11 +55,9 @@ def received(tracer: Tracer, lit: DiffuseLight, camera: Floats, ior: float) -> F
     """
     mesh = tracer.mesh
     normal = mesh.vertex_normals()
-    towards = camera - mesh.vertices
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    towards = frames.unit(camera - mesh.vertices)
     normal = np.where(np.sum(normal * towards, axis=1, keepdims=True) < -0.3, -normal, normal)
-    e_x = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
-    e_x /= np.maximum(np.linalg.norm(e_x, axis=1, keepdims=True), 1e-12)
+    e_x = frames.unit(np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])))
     e_y = np.cross(normal, e_x)
     turn = np.random.default_rng(0).uniform(0, 2 * np.pi, len(normal))
     total: Floats = np.zeros(normal.shape)

@@ -43,17 +43,9 @@ _STRAIN, _STRAIN_RATIO = 1.0, 1.4  # excess of the residual that condemns a cut:
 def log_depth(field: NormalField, stiffness: float, iterations: int, tolerance: float, jump: float) -> Floats:
     """Integrate normals to the scaled log depth z (N,) [px] of the object's pixels.
 
-    Parameters
-    ----------
-    field
-        Normals, weights and prior of N pixels.
-    stiffness
-        How exclusively a pixel trusts one neighbor; 0 = plain least squares.
-    iterations, tolerance
-        Bilateral iterations on the coarsest grid end after this number, or when the relative change of the energy is
-        below the tolerance.
-    jump
-        Least depth step that cuts the mesh, over the object's radius; the integration cuts at half of it.
+    `stiffness` is how exclusively a pixel trusts one neighbor; 0 is plain least squares. Bilateral iterations on the
+    coarsest grid end after `iterations`, or when the relative change of the energy is below `tolerance`. `jump` is the
+    least depth step that cuts the mesh, over the object's radius; the integration cuts at half of it.
     """
     fields = [field]
     while len(fields[-1].normal) > _DECISION_PIXELS:

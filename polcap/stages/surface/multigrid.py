@@ -128,12 +128,8 @@ class MultigridLevel:
 class Multigrid:
     """Algebraic multigrid preconditioner: one V-cycle for a symmetric positive definite matrix.
 
-    Parameters
-    ----------
-    matrix
-        (N, N) CSR, float64, off-diagonals ≤ 0.
-    cell
-        (N, 2) whole-number pixel positions of the unknowns.
+    The matrix (N, N) is CSR, float64, with off-diagonals ≤ 0. `cell` (N, 2) has the whole-number pixel positions of the
+    unknowns.
     """
 
     def __init__(self, matrix: Any, cell: NDArray[np.int64]) -> None:
@@ -207,14 +203,8 @@ class TwoGrid:
     The coarse grid has one unknown per block of 2×2 pixels, and a preconditioner of its own. Both grids weight a link
     by the same law, so the coarse correction is added to all pixels of a block without a factor.
 
-    Parameters
-    ----------
-    matrix
-        (N, N) CSR.
-    block
-        (N,) number of each unknown's block.
-    coarse
-        Preconditioner of the blocks' matrix.
+    The matrix (N, N) is CSR; `block` (N,) is the number of each unknown's block, `coarse` the preconditioner of the
+    blocks' matrix.
     """
 
     def __init__(self, matrix: Any, block: NDArray[np.intp], coarse: Callable[[Floats], Floats]) -> None:

@@ -126,16 +126,8 @@ def least_step(mask: Bools, share: float) -> float:
 def depth_steps(z: Floats, slope: tuple[Floats, Floats], mask: Bools, least: float) -> OcclusionMap:
     """Find the occlusions of an integrated depth.
 
-    Parameters
-    ----------
-    z
-        (H, W) scaled log depth [px]; any value outside the mask.
-    slope
-        ∂z to the right and down by the normals, (H, W) each.
-    mask
-        (H, W).
-    least
-        Least step beyond the slopes at both ends of a link [px].
+    z (H, W) is the scaled log depth [px], with any value outside the mask (H, W); `slope` is ∂z to the right and down
+    by the normals, (H, W) each; `least` is the least step beyond the slopes at both ends of a link [px].
     """
     beyond = tuple(_excess(z, of, mask, axis) for axis, of in zip((1, 0), slope))
     highest = np.zeros(mask.shape, dtype=np.float32)  # of a pixel's links
@@ -183,16 +175,8 @@ def _nearer_lean(on: Bools, beyond: tuple[Floats, ...], slope: tuple[Floats, Flo
 def contact_links(grid: PixelGrid, separate: Bools, excess: Floats, radius: float) -> Bools:
     """Find links (L,) across which two separated parts of the surface touch.
 
-    Parameters
-    ----------
-    grid
-        N pixels and their L links.
-    separate
-        (L,) links across an occlusion.
-    excess
-        (L,) depth step beyond the slopes at both ends, positive where the depth grows to the right or down [px].
-    radius
-        Radius of the object [px].
+    Of the L links of the grid, `separate` (L,) are across an occlusion, and `excess` (L,) is the depth step beyond the
+    slopes at both ends [px], positive where the depth grows to the right or down; `radius` is the object's [px].
     """
     part = _parts(grid, ~separate)
     first, second = part[grid.p], part[grid.q]
