@@ -36,7 +36,7 @@ def summary(records: Sequence[UnitRecord]) -> dict[str, Any]:
 
 
 def write(batch_folder: Path, units: Sequence[Unit], records: Sequence[UnitRecord]) -> None:
-    """Write summary.html, summary.csv and summary.json into the batch's folder. Raises StorageError."""
+    """Write summary.html, summary.csv and summary.json into the batch's folder."""
     totals = summary(records)
     text = io.StringIO()
     table = csv.DictWriter(text, _COLUMNS, extrasaction="ignore")

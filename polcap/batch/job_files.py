@@ -88,7 +88,7 @@ def submit_hint(scheduler: Scheduler, file: Path) -> str:
 
 
 def write(scheduler: Scheduler, job: BatchJob, folder: Path) -> Path:
-    """Write a job file from the scheduler's template; returns its path. Raises StorageError."""
+    """Write a job file from the scheduler's template; returns its path."""
     template = files("polcap.batch").joinpath("templates", _FILES[scheduler]).read_text(encoding="utf-8")
     text = Template(template).substitute(_fields(scheduler, job, folder))
     atomic.write(folder / _FILES[scheduler], text)

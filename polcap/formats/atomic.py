@@ -2,6 +2,7 @@
 
 A file is written under a temporary name, synced to the disk and renamed. So the final name always leads to a complete
 file. The new name reaches the disk with the system's next journal write; after a power cut the old file may be there.
+All functions of polcap that write files raise StorageError where a file or folder cannot be written.
 """
 
 import errno

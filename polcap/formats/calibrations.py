@@ -31,10 +31,7 @@ _HEAD = """\
 
 
 def write(place: Path, found: Calibration) -> Path:
-    """Write a calibration as a dated TOML file into the folder `place` and return the file's path.
-
-    Raises StorageError.
-    """
+    """Write a calibration as a dated TOML file into the folder `place` and return the file's path."""
     parts = [found.made[:19].replace(":", ""), found.camera, found.lens, found.filter]
     path = place / (atomic.safe_name(" ".join(part for part in parts if part)) + ".toml")
     atomic.write(path, text(found))

@@ -33,10 +33,7 @@ class _Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def write(path: Path, color: ColorCalibration) -> None:
-    """Write a color matrix as a profile file for other captures of the same camera, light and exposure.
-
-    Raises StorageError.
-    """
+    """Write a color matrix as a profile file for other captures of the same camera, light and exposure."""
     patches = color.patches
     document: dict[str, Any] = {
         "matrix": color.matrix,

@@ -188,8 +188,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     Without a preset the files go to asset/, with one to asset/PRESET/. `about` is report.json's content. All GLBs have
     the origin of the first level. The records of an earlier export of the same maps into the same folder are merged.
 
-    Raises SettingError: no such preset or color space, or an encoder is missing. StorageError: a file cannot be
-    written.
+    Raises SettingError: no such preset or color space, or an encoder is missing.
     """
     whole = found[0].asset
     preset, mesh = effective(wanted), whole.mesh

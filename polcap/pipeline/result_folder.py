@@ -94,10 +94,7 @@ def clean(out: Path, dry_run: bool = False) -> int:
 
 
 def write_run(out: Path, about: Mapping[str, Any]) -> None:
-    """Write work/run.json: facts of a run that `show` and `report` need when the photographs are missing.
-
-    Raises StorageError: it cannot be written.
-    """
+    """Write work/run.json: facts of a run that `show` and `report` need when the photographs are missing."""
     atomic.write_json(out / "work" / "run.json", {**about, "digest": seal(about)}, synced=False)
 
 

@@ -59,10 +59,7 @@ def find(out: Path, asked: str | None) -> Finished | None:
 
 
 def remember(out: Path, asked: str | None, table: str = "") -> None:
-    """Record the request digest that the result folder now answers; does nothing if it is None.
-
-    Raises StorageError: the result folder cannot be written.
-    """
+    """Record the request digest that the result folder now answers; does nothing if it is None."""
     if asked is not None:
         content = {"request": asked, "table": table, "result": _result(out)}
         atomic.write_json(out / "work" / _FILE, content, synced=False)

@@ -123,10 +123,7 @@ def model_facts(network: Network | None) -> dict[str, str] | None:
 
 
 def write(folder: Path, about: dict[str, Any], results: Results) -> None:
-    """Write report.json and report.html into a result folder.
-
-    Raises StorageError: the folder cannot be written.
-    """
+    """Write report.json and report.html into a result folder."""
     atomic.write_json(folder / "report.json", about)
     page.write(folder, about, results)
 

@@ -32,10 +32,7 @@ def label_row(row: Row) -> tuple[str, str, str]:
 
 
 def write(file: Path, folders: tuple[Path, Path], abouts: tuple[Mapping[str, Any], Mapping[str, Any]]) -> None:
-    """Write a page that shows two results next to each other.
-
-    Raises StorageError: the file cannot be written.
-    """
+    """Write a page that shows two results next to each other."""
     names = _names(folders)
     results = []
     for name, about in zip(names, abouts):

@@ -29,10 +29,7 @@ _ORDER = ("fail", "warn", "pass", "not measured")  # of the checks in their tabl
 
 
 def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
-    """Write report.html, the page of a result for people, into a result folder.
-
-    Raises StorageError: the file cannot be written.
-    """
+    """Write report.html, the page of a result for people, into a result folder."""
     drawn, view = _maps(about, results)
     headline, expected_error = verdict(about)
     content = {
@@ -55,10 +52,7 @@ def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
 def render(
     template: str, file: Path, title: str, content: Mapping[str, Any], data: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a page from one of the HTML templates; `data` is for the scripts of the page.
-
-    Raises StorageError: the file cannot be written.
-    """
+    """Write a page from one of the HTML templates; `data` is for the scripts of the page."""
     import jinja2  # not needed by most commands
 
     loader = jinja2.FileSystemLoader(Path(__file__).parent / "templates")

@@ -16,10 +16,7 @@ _FADE = 0.02  # of the brightest, below which no angle is drawn
 
 
 def write(folder: Path, angle_deg: Sequence[float], small: Sequence[Floats]) -> Path:
-    """Write FOLDER/preview.png with S0, DoLP and AoLP side by side, from small pictures (K, h, w).
-
-    Raises StorageError.
-    """
+    """Write FOLDER/preview.png with S0, DoLP and AoLP side by side, from small pictures (K, h, w)."""
     light = np.stack(small)  # (K, h, w)
     weights = mueller.analyzer(np.radians(angle_deg))  # (K, 3)
     s0, s1, s2 = np.tensordot(np.linalg.pinv(weights), light, axes=1)

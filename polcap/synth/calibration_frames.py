@@ -64,7 +64,7 @@ class CalibrationShoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def write(folder: Path, shoot: CalibrationShoot) -> None:
     """Write simulated calibration photographs into a new folder; the same arguments give the same bytes.
 
-    Raises CaptureError: the folder holds something already. StorageError: the folder cannot be written.
+    Raises CaptureError: the folder holds something already.
     """
     forward_camera.require_empty(folder)
     actual = msgspec.structs.replace(shoot.sensor, black=shoot.sensor.black + shoot.black_error)

@@ -99,7 +99,7 @@ def expose(radiance: Floats, sensor: Sensor, amplification: float, random: np.ra
 def write_dng(
     path: Path, counts: NDArray[np.uint16], sensor: Sensor, cfa: Bits, color_matrix: Sequence[float], exif: Exif
 ) -> None:
-    """Write the counts of one simulated photograph as a DNG. Raises StorageError."""
+    """Write the counts of one simulated photograph as a DNG."""
     dng.write(
         path,
         counts,

@@ -182,7 +182,7 @@ class Studio:
         return np.asarray(_blur(shoot, np.einsum("hws,shwc->hwc", weights, stokes)) @ self.to_camera.T)
 
     def photograph(self, path: Path, radiance: Floats, take: Take) -> dict[str, Any]:
-        """Write one DNG of `radiance` (H, W, 3); returns its exposure for truth.json. Raises StorageError."""
+        """Write one DNG of `radiance` (H, W, 3); returns its exposure for truth.json."""
         shoot, sensor = self.shoot, self.shoot.sensor
         exif, light, amplification = _exposure(shoot, take, self.middle)
         light *= take.lit

@@ -87,7 +87,7 @@ class Trainee(ABC):
         return norm
 
     def save(self, path: Path) -> None:
-        """Write a checkpoint. Raises StorageError."""
+        """Write a checkpoint."""
         state = {
             "network": self.network.state_dict(), "average": self.average.state_dict(), "step": self.step,
             "samples": self.samples, "elapsed": self.elapsed,

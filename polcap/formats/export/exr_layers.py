@@ -51,7 +51,6 @@ def write(path: Path, maps: Path, color: str, header: Mapping[str, str]) -> None
 
     Raises SettingError: there is no such space.
     Raises DecodeError: a map is missing or damaged.
-    Raises StorageError: the file cannot be written.
     """
     space = find_space(color)
     layers: dict[str, Floats] = {}

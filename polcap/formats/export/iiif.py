@@ -35,8 +35,6 @@ def write(folder: Path, pictures: Mapping[str, Texture], facts: Mapping[str, str
 
     `facts` are fields of `CatalogEntry` and the capture's `name`. Returns the manifest, the descriptions and the whole
     pictures; tiles are parts of these.
-
-    Raises StorageError: a file cannot be written.
     """
     address = address.rstrip("/")
     written = [folder / "manifest.json"]

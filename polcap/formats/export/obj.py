@@ -31,8 +31,6 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], comment
     """Write a mesh as `path` (.obj), its .mtl and two EXR textures; returns the paths.
 
     `files` are the names of the PNG textures in the same folder, by kind.
-
-    Raises StorageError: a file cannot be written.
     """
     base = stem(path.stem)
     written = [path, *(path.with_name(f"{base}{ending}") for ending in (".mtl", "_roughness.exr", "_normal.exr"))]

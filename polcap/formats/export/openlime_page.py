@@ -53,6 +53,6 @@ else {
 
 
 def write(path: Path, title: str, rights: str) -> None:
-    """Write the page into the folder that contains the folders of the pictures. Raises StorageError."""
+    """Write the page into the folder that contains the folders of the pictures."""
     page = _PAGE.substitute(title=escape(title), rights=escape(rights), script=SCRIPT, full=iiif.FULL)
     atomic.write(path, page)

@@ -15,8 +15,6 @@ def write(path: Path, asset: Asset) -> None:
     """Write a mesh as PLY or STL, by the suffix of `path`; the origin is that of the GLB.
 
     PLY has the unit of the GLB. STL is in mm where the mesh is metric.
-
-    Raises StorageError: the file cannot be written.
     """
     import trimesh
 

@@ -63,8 +63,6 @@ def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> N
     """Write the sidecar file of an export: its origin (`facts`) and the digest of each exported file.
 
     The sidecar of an earlier export with the same record also listed its files; those that exist stay in the list.
-
-    Raises StorageError: the file cannot be written.
     """
     earlier: dict[str, Any] = {}
     with suppress(OSError, ValueError):

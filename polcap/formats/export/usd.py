@@ -46,7 +46,6 @@ def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], facts: 
     `facts` go into the layer's custom data.
 
     Raises SettingError: usd-core is not installed.
-    Raises StorageError: the file cannot be written.
     """
     _export(_stage(asset, name, files, facts, phone=False), path)
 

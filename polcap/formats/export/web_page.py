@@ -44,10 +44,7 @@ def read_script(file: Path) -> str:
 
 
 def write(path: Path, glb: Path, script: str, title: str) -> None:
-    """Write the page of a GLB without Draco, with the text of model-viewer's script.
-
-    Raises StorageError: the file cannot be written.
-    """
+    """Write the page of a GLB without Draco, with the text of model-viewer's script."""
     page = _PAGE.substitute(
         title=escape(title),
         glb=base64.b64encode(glb.read_bytes()).decode(),

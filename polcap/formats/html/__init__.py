@@ -27,10 +27,7 @@ _SCRIPTS = ("probe.js", "relight.js")
 
 
 def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, Any]) -> None:
-    """Write a page of HTML fragments with escaped texts; its scripts read `data` as JSON.
-
-    Raises StorageError: the file cannot be written.
-    """
+    """Write a page of HTML fragments with escaped texts; its scripts read `data` as JSON."""
     here = files(__name__)
     style = here.joinpath("page.css").read_text("utf-8")
     scripts = "\n".join(here.joinpath(name).read_text("utf-8") for name in _SCRIPTS)

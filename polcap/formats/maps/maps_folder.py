@@ -77,8 +77,6 @@ def write(folder: Path, maps: SurfaceMaps, mesh: ReliefMesh, stokes: StokesImage
 
     Of the mesh its depth (H, W) is written. All images are on the crop (H, W) of `maps`. Files are encoded on
     threads. The folder is replaced as a whole: if one file fails, the folder of an earlier run stays.
-
-    Raises StorageError: a file cannot be written.
     """
     made = {"maps": maps, "mesh": mesh, "stokes": stokes, "cues": cues}
     near, median, far = map_files.depth_range(maps, mesh)
@@ -178,10 +176,7 @@ def _read_detail(folder: Path, size: tuple[int, int]) -> Floats:
 
 
 def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
-    """Add a record `about` an export to maps.json, merged with earlier records of the folder `where`.
-
-    Raises StorageError: the file cannot be written.
-    """
+    """Add a record `about` an export to maps.json, merged with earlier records of the folder `where`."""
     file = folder / "maps.json"
     known = text_file.read_json(file)
     exports = known.get("exports", {})

@@ -27,10 +27,7 @@ _HEADER = 33  # bytes of the signature and IHDR, which comes first
 
 
 def write(path: Path, array: Pixels) -> None:
-    """Write a uint8 or uint16 image (H, W), (H, W, 3) RGB or (H, W, 4) RGBA as PNG; same array, same bytes.
-
-    Raises StorageError: the file cannot be written.
-    """
+    """Write a uint8 or uint16 image (H, W), (H, W, 3) RGB or (H, W, 4) RGBA as PNG; same array, same bytes."""
     atomic.write(path, encode(array))
 
 

@@ -43,7 +43,6 @@ def write(
     exif : camera settings; width, height and color_matrix in it are not used.
 
     Raises ValueError: the mosaic is not uint16, or its sides are odd.
-    Raises StorageError: the file cannot be written.
     """
     height, width = mosaic.shape
     if mosaic.dtype != np.uint16 or height % 2 or width % 2:
