@@ -46,11 +46,8 @@ def encode(array: Pixels) -> bytes:
 
 def described(data: bytes, text: Mapping[str, str]) -> bytes:
     """Add texts to the bytes of a PNG: one tEXt chunk (Latin-1) per keyword of `text`."""
-    return b"".join([data[:_HEADER], *(_chunk(b"tEXt", _text(*item)) for item in text.items()), data[_HEADER:]])
-
-
-def _text(key: str, value: str) -> bytes:
-    return key.encode("latin-1") + b"\0" + value.encode("latin-1", "replace")
+    texts = [f"{key}\0{value}".encode("latin-1", "replace") for key, value in text.items()]
+    return b"".join([data[:_HEADER], *(_chunk(b"tEXt", one) for one in texts), data[_HEADER:]])
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
