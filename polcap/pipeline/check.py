@@ -14,7 +14,7 @@ import msgspec
 
 from polcap.config import Config
 from polcap.errors import ChartError, DecodeError, InputError
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.images import Capture, ChartRequest, ColorCalibration, Network
 from polcap.optics.projection import to_grid
 from polcap.pipeline import models, small_capture
@@ -92,7 +92,7 @@ def _judge(capture: Capture, small: SmallCapture, supplied: UserInput, config: C
         blur_px=small.blur_px,
         grid_px=small.step / (small.merged_px if config.hdr.demosaic == "superpixel" else 1),
         chart_missing=chart_missing,
-        later_view=layouts.is_later_view(Path(capture.folder)),
+        later_view=folder_names.is_later_view(Path(capture.folder)),
     )
     lines = []
     try:
