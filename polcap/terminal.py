@@ -144,27 +144,6 @@ def print_written(files: "Sequence[Path]", json: bool) -> None:
     print_data({"written": names} if json else "\n".join(names))
 
 
-def preview(drawn: "list[Path]") -> None:
-    """Show pictures on a color terminal, two pixels per character, on stderr."""
-    if not sys.stderr.isatty() or os.environ.get("TERM") in (None, "dumb"):
-        return
-    from rich.console import Console
-    from rich.text import Text
-
-    from polcap.formats.maps import png
-
-    console = Console(stderr=True)
-    for file in drawn:
-        if file.suffix != ".png":
-            continue
-        picture = png.fitted(png.read(file), console.width)
-        for upper, lower in zip(picture[::2], picture[1::2], strict=True):
-            line_ = Text(no_wrap=True)
-            for above, below in zip(upper.tolist(), lower.tolist(), strict=True):
-                line_.append("▀", f"rgb({above[0]},{above[1]},{above[2]}) on rgb({below[0]},{below[1]},{below[2]})")
-            console.print(line_)
-
-
 def print_result(about: dict[str, Any], out: "Path", json: bool, open_: bool) -> None:
     """Print the asset's path or the report, and the verdict. Raises GateError where a gate failed."""
     asset = str(out / "asset" / f"{about['capture']['name']}.glb")

@@ -14,7 +14,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from polcap.errors import ObjectError, SettingError
-from polcap.fusion.closed_mesh import levels
+from polcap.fusion.closed_mesh import decimate
 from polcap.fusion.values import ClosedMesh, FusionView
 from polcap.images import Bools, Floats, Mesh
 from polcap.optics import frames
@@ -60,7 +60,7 @@ def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSetti
     Raises SettingError: the package uvunwrap is missing, or the charts do not fit into a texture of this size.
     """
     pixel = _pixel(mesh, views)
-    mesh = levels(mesh, [max(int(_area(mesh) / (_TRIANGLE * pixel**2)), _FEWEST)])[0]
+    mesh = decimate(mesh, max(int(_area(mesh) / (_TRIANGLE * pixel**2)), _FEWEST))
     if settings.size:
         return charted(mesh, settings.size, settings.margin)
     side = _side(mesh, pixel)

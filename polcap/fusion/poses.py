@@ -23,6 +23,7 @@ from polcap.fusion.board_corners import BoardCorners
 from polcap.fusion.values import Pose
 from polcap.images import Capture, Distortion, Floats, View
 from polcap.optics import distortion, projection
+from polcap.optics.robust import MAD_TO_SIGMA
 
 LEAST_VIEWS = 3
 _MOST_RESIDUAL = 1.0  # px rms of a view's corners; a flat, sharp board leaves 0.02 to 0.1
@@ -59,7 +60,7 @@ class SessionCamera:
 
     def reduced(self, scale: float) -> "SessionCamera":
         """The camera on a grid whose pixels are `scale` RAW pixels wide."""
-        x, y = ((principal - (scale - 1) / 2) / scale for principal in self.principal_px)
+        x, y = (projection.to_grid(at, scale) for at in self.principal_px)
         return replace(
             self, focal_px=self.focal_px / scale, focal_sigma_px=self.focal_sigma_px / scale, principal_px=(x, y)
         )
@@ -137,7 +138,7 @@ def _adjust(seen: Sequence[BoardCorners], capture: Capture) -> _Adjusted:
     start = np.concatenate([np.zeros(_CAMERA), *(_first_pose(one, stated) for one in seen)])
     found = _minimize(seen, capture, start)
     error = [_residual(one, _camera(capture, found.x), found.x[_place(k)]) for k, one in enumerate(seen)]
-    far = max(_OUTLIER * 1.48 * float(np.median(np.abs(np.concatenate(error)))), _LEAST_OUTLIER)
+    far = max(_OUTLIER * MAD_TO_SIGMA * float(np.median(np.abs(np.concatenate(error)))), _LEAST_OUTLIER)
     used = [_without(one, np.linalg.norm(e, axis=1) > far) for one, e in zip(seen, error, strict=True)]
     found = _minimize(used, capture, found.x)
     return _with_errors(used, capture, found)

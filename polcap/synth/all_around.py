@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from polcap.errors import InputError
 from polcap.formats import atomic
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.images import Floats
 from polcap.synth import forward_camera, mesh_tracer, scene_materials, shooting
 from polcap.synth.color_checker import Chart
@@ -95,7 +95,7 @@ def write(
     mesh = surface(scene)
     sets = [ObjectPose(mesh, Rotation.identity())] + [ObjectPose(mesh, _LAID)] * bool(shoot.laid)
     named = [
-        (f"set{letter}/" * bool(shoot.laid) + layouts.view_name(k), placed, *pose)
+        (f"set{letter}/" * bool(shoot.laid) + folder_names.view_name(k), placed, *pose)
         for letter, placed, count in zip("AB", sets, (views, shoot.laid))
         for k, pose in enumerate(_poses(shoot, count, placed.middle))
     ]

@@ -10,7 +10,7 @@ from typing import Literal
 from polcap.calibration_values import Calibration
 from polcap.errors import CaptureError
 from polcap.formats import atomic, calibrations
-from polcap.formats.capture import capture_toml, focal_length, layouts
+from polcap.formats.capture import capture_toml, focal_length, folder_names, layouts
 from polcap.formats.capture.capture_toml import CaptureFile
 from polcap.formats.capture.focal_length import FocalLength
 from polcap.formats.capture.layouts import Source
@@ -212,7 +212,7 @@ def _exposure(frame: Frame) -> float | None:
 
 
 def _darkest_first(frames: Iterable[Frame]) -> tuple[Frame, ...]:
-    listed = sorted(frames, key=lambda frame: layouts.natural(Path(frame.path).name))
+    listed = sorted(frames, key=lambda frame: folder_names.natural(Path(frame.path).name))
     exposures = [_exposure(frame) for frame in listed]
     if None in exposures:
         return tuple(listed)
@@ -220,10 +220,10 @@ def _darkest_first(frames: Iterable[Frame]) -> tuple[Frame, ...]:
 
 
 def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
-    count = layouts.count_axes(angles_deg)
+    count = folder_names.count_axes(angles_deg)
     if count < 3:
         listed = ", ".join(f"{angle:g}" for angle in angles_deg) or "none"
-        unread = ", ".join(layouts.numbered(folder))
+        unread = ", ".join(folder_names.numbered(folder))
         remedy = "add the missing shot"
         if unread:
             remedy += f", or name {unread} as polcap reads it: pol000, pol045, …"
