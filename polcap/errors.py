@@ -62,3 +62,8 @@ class GateError(PolcapError):
 
 class HardwareError(PolcapError):
     exit_code = 4
+
+
+def one_line(error: BaseException) -> str:
+    """The message of any error on one line."""
+    return " ".join(str(error).split())

@@ -6,8 +6,8 @@ If a worker is lost, the scheduler passes its capture to another one, which cont
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from polcap import resource_limits
 from polcap.batch import unit as units
-from polcap.batch.processes import prepare
 from polcap.batch.unit import ProcessOptions, Unit, UnitRecord
 from polcap.errors import SettingError
 
@@ -70,7 +70,7 @@ def _gather(
         return future
 
     # workers that join later use the settings they were started with
-    client.run(prepare, options.threads, options.memory_gb)
+    client.run(resource_limits.set_limits, options.threads, options.memory_gb)
     running: dict[Any, tuple[Unit, int]] = {}
     ended = distributed.as_completed([submit(unit, 1) for unit in wanted])
     for future in ended:
