@@ -9,7 +9,7 @@ from typing import Any
 from polcap import resource_limits
 from polcap.batch import unit as units
 from polcap.batch.unit import ProcessOptions, Unit, UnitRecord
-from polcap.errors import SettingError
+from polcap.errors import SettingError, package_for
 
 _SETTINGS = {
     "distributed.worker.profile.enabled": False,  # costs 6 % of a small capture's time
@@ -34,11 +34,9 @@ def run(
 
     Raises SettingError: Dask is not installed, or no scheduler answers at the address.
     """
-    try:
+    with package_for("--scheduler", "Dask", "batch"):
         import dask
         import distributed
-    except ModuleNotFoundError as error:
-        raise SettingError(f"{error.name} is not installed; pip install 'polcap[batch]'") from error
     resources = {"GPU": 1.0} if options.device == "cuda" else None
     with dask.config.set({"distributed.scheduler.allowed-failures": retries, **_SETTINGS}):
         target: Any = address
