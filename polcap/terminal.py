@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO
 import typer
 
 from polcap import resource_limits
-from polcap.errors import GateError, PolcapError, SettingError
+from polcap.errors import GateError, PolcapError, SettingError, one_line
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -109,7 +109,7 @@ def print_error_document(options: dict[str, Any], error: BaseException, text: st
 
 def line(error: BaseException) -> str:
     """Text of an error on one line of at most 600 characters."""
-    text = " ".join(str(error).split())
+    text = one_line(error)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 100]} … {text[-100:]}"
 
 

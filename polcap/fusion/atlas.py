@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from polcap.errors import ObjectError, SettingError
+from polcap.errors import ObjectError, SettingError, package_for
 from polcap.fusion.closed_mesh import decimate
 from polcap.fusion.values import ClosedMesh, FusionView
 from polcap.images import Bools, Floats, Mesh
@@ -99,10 +99,8 @@ def of_mesh(mesh: Mesh, side: int) -> Atlas:
 
 def _charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.int32]]:
     """Texture coordinates (W, 2) with v down, the mesh's vertex of each (W,), and faces (F, 3) in their numbers."""
-    try:
+    with package_for("a texture atlas", "uvunwrap", "fusion"):
         import uvunwrap
-    except ModuleNotFoundError:
-        raise SettingError("a texture atlas needs uvunwrap: pip install 'polcap[fusion]'") from None
     surface = uvunwrap.Mesh(mesh.vertices.astype(np.float32).ravel().tolist(), mesh.faces.ravel().tolist())
     try:
         packed = uvunwrap.generate([surface], page_size=side, padding=margin)

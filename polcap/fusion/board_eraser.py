@@ -19,7 +19,6 @@ from polcap.optics import board as boards
 from polcap.optics import distortion
 from polcap.optics.board import Board
 from polcap.optics.projection import back_project, from_grid
-from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages.mask import mean_picture
 
 _SAMPLES = 4  # per pixel side, for the share of paper
@@ -110,7 +109,7 @@ def _fit(picture: Floats, print_: _Print) -> tuple[tuple[Floats, Floats], Floats
     for _ in range(_ROUNDS):
         weight, *_ = np.linalg.lstsq(terms[use], gray[use], rcond=None)
         error = np.abs(terms @ weight - gray)
-        use = error < max(3 * MAD_TO_SIGMA * float(np.median(error)), 1e-9)
+        use = error < max(3 * 1.48 * float(np.median(error)), 1e-9)
     everywhere = _quadratic(np.clip(print_.place, -1.5, 1.5))
     paper, ink = everywhere @ weight[:6], everywhere[..., :3] @ weight[6:]
     light = float(np.median(gray[use & (share > 0.8)])) if (use & (share > 0.8)).any() else float(gray.max())

@@ -23,7 +23,6 @@ from polcap.fusion.board_corners import BoardCorners
 from polcap.fusion.values import Pose
 from polcap.images import Capture, Distortion, Floats, View
 from polcap.optics import distortion, projection
-from polcap.optics.robust import MAD_TO_SIGMA
 
 LEAST_VIEWS = 3
 _MOST_RESIDUAL = 1.0  # px rms of a view's corners; a flat, sharp board leaves 0.02 to 0.1
@@ -138,7 +137,7 @@ def _adjust(seen: Sequence[BoardCorners], capture: Capture) -> _Adjusted:
     start = np.concatenate([np.zeros(_CAMERA), *(_first_pose(one, stated) for one in seen)])
     found = _minimize(seen, capture, start)
     error = [_residual(one, _camera(capture, found.x), found.x[_place(k)]) for k, one in enumerate(seen)]
-    far = max(_OUTLIER * MAD_TO_SIGMA * float(np.median(np.abs(np.concatenate(error)))), _LEAST_OUTLIER)
+    far = max(_OUTLIER * 1.48 * float(np.median(np.abs(np.concatenate(error)))), _LEAST_OUTLIER)
     used = [_without(one, np.linalg.norm(e, axis=1) > far) for one, e in zip(seen, error, strict=True)]
     found = _minimize(used, capture, found.x)
     return _with_errors(used, capture, found)

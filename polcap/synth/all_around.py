@@ -20,7 +20,7 @@ import numpy as np
 from msgspec import UNSET, Meta
 from scipy.spatial.transform import Rotation
 
-from polcap.errors import InputError
+from polcap.errors import package_for
 from polcap.formats import atomic
 from polcap.formats.capture import folder_names
 from polcap.images import Floats
@@ -124,10 +124,8 @@ def surface(scene: Scene) -> Triangles:
     """
     if isinstance(scene.shape, Model):
         return mesh_tracer.tracer(scene.shape.file, scene.shape.radius).mesh
-    try:
+    with package_for("--views", "scikit-image", "fusion", ", or give a --mesh"):
         from skimage import measure
-    except ImportError:
-        raise InputError("--views needs scikit-image, or an object by --mesh; pip install 'polcap[fusion]'") from None
     axis = np.linspace(-scene.shape.radius, scene.shape.radius, _GRID)
     field = scene.shape.distance(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1))
     found: Any = measure.marching_cubes(field, 0.0, spacing=(axis[1] - axis[0],) * 3)
