@@ -1,4 +1,6 @@
-"""Surface inside the hull that has the measured normals and touches the silhouettes.
+"""Surface that has the measured normals and touches the silhouettes; it begins as the hull's.
+
+It may leave the hull, which is too small: where a mask lacks a border, the hull lacks it, whatever other masks say.
 
 Each round moves every vertex along its normal, by sparse least squares: the edges of each triangle lie square to the
 mean of the normals that the views measured there, and rims stay on their silhouettes.
@@ -38,6 +40,7 @@ _FACET_POWER = 4  # of the cosine between a triangle and its target, in the tria
 _MOST_MOVE = 1.0  # steps that a vertex may move in a round; more would fold the surface
 _DAMPING = 0.02  # weight of the equations displacement = 0
 _SMOOTHNESS = 0.03  # weight of the equations displacement = that of the neighbor
+_UNKNOWN_SMOOTHNESS = 0.1  # more of it where no view sees the surface, or views contradict each other
 _RELAXATION = 0.5  # share of the way to the neighbors' middle, along the surface
 _UNFOLDING = 1.0  # the same along the vertex's normal, if the normal is square to its target
 
@@ -105,7 +108,7 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
         move = _displacements(vertices, faces, outward, target, [rims, carved])
         move = np.clip(move, -_MOST_MOVE * step, _MOST_MOVE * step)
         moved = _unfolded(vertices + outward * move[:, None], faces, neighbors, target)
-        vertices = _inside(_relaxed(moved, faces, neighbors), hull)
+        vertices = _relaxed(moved, faces, neighbors)
     return FittedSurface(vertices, faces, target.agreement, neighbors)
 
 
@@ -201,7 +204,8 @@ def _displacements(
     t, w2 = np.tile(tilt, (3, 1)), np.tile(share**2, 3)
     a_i, a_j = dot(t, outward[i]), dot(t, outward[j])
     b = -dot(t, vertices[j] - vertices[i])
-    smooth2 = _SMOOTHNESS**2
+    known = target.weight * target.agreement
+    smooth2 = (_SMOOTHNESS + _UNKNOWN_SMOOTHNESS * (1 - (known[i] + known[j]) / 2)) ** 2
     diagonal = np.full(count, _DAMPING**2)
     diagonal += np.bincount(i, w2 * a_i**2 + smooth2, count) + np.bincount(j, w2 * a_j**2 + smooth2, count)
     right = np.bincount(j, w2 * a_j * b, count) - np.bincount(i, w2 * a_i * b, count)
@@ -212,17 +216,6 @@ def _displacements(
     matrix = beside + beside.T + sparse.diags(diagonal)
     move, _ = cg(matrix, right, rtol=1e-3, maxiter=200, M=sparse.diags(1 / diagonal))
     return np.asarray(move)
-
-
-def _inside(vertices: Floats, hull: DistanceGrid) -> Floats:
-    """Vertices outside the hull moved back onto it."""
-    distance = hull.at(vertices)
-    out = np.flatnonzero(distance > 0)
-    steps = np.eye(3) * hull.grid.step / 2
-    slope = [hull.at(vertices[out] + one) - hull.at(vertices[out] - one) for one in steps]
-    moved = vertices.copy()
-    moved[out] -= distance[out, None] * unit(np.stack(slope, axis=-1))
-    return moved
 
 
 def _neighbor_means(faces: NDArray[np.int32], count: int) -> sparse.csr_matrix:
