@@ -85,7 +85,9 @@ def fill_sections(kind: type[S], file: Path | None, assignments: Sequence[str]) 
     try:
         return msgspec.convert(stated, kind)
     except msgspec.ValidationError as error:
-        raise _explain(error, stated, known) from error
+        fault = text_file.fault(error, stated, kind)
+        about = next((one.description for key, one in known.items() if re.match(rf"{key}\b", fault)), "")
+        raise SettingError(f"{fault} ({about})") from error
     except UnicodeError as error:
         raise SettingError("--set: a value is not UTF-8 text; write it in ASCII") from error
 
@@ -174,16 +176,3 @@ def _check_known(key: str, value: Any, known: dict[str, Setting]) -> None:
     sections = dict.fromkeys(name.partition(".")[0] for name in known)
     hint = f"; did you mean {near[0]}?" if near else f"; sections are {', '.join(sections)}"
     raise SettingError(f"{key} = {value!r}: there is no such setting{hint}")
-
-
-def _explain(error: msgspec.ValidationError, stated: dict[str, Any], known: dict[str, Setting]) -> SettingError:
-    message, _, path = str(error).partition(" - at `$.")
-    key = path.rstrip("`").split("[")[0]
-    section, _, name = key.partition(".")
-    value = stated.get(section, {}).get(name)
-    about = known[key].description if key in known else ""
-    if message.startswith("Invalid enum value"):
-        message = f"not one of {known[key].kind.removeprefix('Literal').strip('[]')}"
-    if "matching regex" in message:
-        message = "no such choice"
-    return SettingError(f"{key} = {value!r}: {message[:1].lower()}{message[1:]} ({about})")

@@ -18,6 +18,9 @@
 A message is one line: the thing, its value, the limit and the remedy.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class PolcapError(Exception):
     """An error with a message of one line: the thing, its value, the limit and the remedy."""
@@ -62,3 +65,17 @@ class GateError(PolcapError):
 
 class HardwareError(PolcapError):
     exit_code = 4
+
+
+def one_line(error: BaseException) -> str:
+    """The message of any error on one line."""
+    return " ".join(str(error).split())
+
+
+@contextmanager
+def package_for(purpose: str, package: str, extra: str, instead: str = "") -> Iterator[None]:
+    """Context manager for an import of `polcap[extra]`: a SettingError names the `package` that is missing."""
+    try:
+        yield
+    except ImportError:
+        raise SettingError(f"{purpose} needs {package}; pip install 'polcap[{extra}]'{instead}") from None

@@ -71,6 +71,10 @@ class Exif:
     color_matrix: tuple[float, ...] | None = None  # 9, XYZ (D65 or the nearest stated illuminant) → camera
 
     @property
+    def camera(self) -> str:
+        return f"{self.make} {self.model}".strip()
+
+    @property
     def relative_exposure(self) -> float | None:
         """Exposure by the camera settings [s · ISO/100 / f-number²]; not valid under flash."""
         if self.exposure_time is None:

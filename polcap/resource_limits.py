@@ -20,6 +20,12 @@ _ASKED = re.compile(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)")  # numpy, OpenCV
 _BYTES = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
 
+def set_limits(threads: int, gigabytes: float) -> None:
+    """Limit the threads and the memory [GB] of this process; 0: no limit. Raises SettingError as `check_memory`."""
+    set_threads(threads)
+    set_memory(gigabytes)
+
+
 def set_threads(count: int) -> None:
     """Set the number of threads before any numerical library starts its own; 0 leaves it to them."""
     if count:

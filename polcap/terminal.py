@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO
 import typer
 
 from polcap import resource_limits
-from polcap.errors import GateError, PolcapError, SettingError
+from polcap.errors import GateError, PolcapError, SettingError, one_line
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -109,7 +109,7 @@ def print_error_document(options: dict[str, Any], error: BaseException, text: st
 
 def line(error: BaseException) -> str:
     """Text of an error on one line of at most 600 characters."""
-    text = " ".join(str(error).split())
+    text = one_line(error)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 100]} … {text[-100:]}"
 
 
@@ -142,27 +142,6 @@ def print_written(files: "Sequence[Path]", json: bool) -> None:
     """Print the paths of the files that a command has written."""
     names = [str(file) for file in files]
     print_data({"written": names} if json else "\n".join(names))
-
-
-def preview(drawn: "list[Path]") -> None:
-    """Show pictures on a color terminal, two pixels per character, on stderr."""
-    if not sys.stderr.isatty() or os.environ.get("TERM") in (None, "dumb"):
-        return
-    from rich.console import Console
-    from rich.text import Text
-
-    from polcap.formats.maps import png
-
-    console = Console(stderr=True)
-    for file in drawn:
-        if file.suffix != ".png":
-            continue
-        picture = png.fitted(png.read(file), console.width)
-        for upper, lower in zip(picture[::2], picture[1::2], strict=True):
-            line_ = Text(no_wrap=True)
-            for above, below in zip(upper.tolist(), lower.tolist(), strict=True):
-                line_.append("▀", f"rgb({above[0]},{above[1]},{above[2]}) on rgb({below[0]},{below[1]},{below[2]})")
-            console.print(line_)
 
 
 def print_result(about: dict[str, Any], out: "Path", json: bool, open_: bool) -> None:

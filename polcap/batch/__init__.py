@@ -20,7 +20,7 @@ from polcap.batch.shards import WHOLE, Shard
 from polcap.batch.unit import FINISHED, FOLDER, ProcessOptions, Unit, UnitRecord
 from polcap.errors import CaptureError
 from polcap.formats import atomic, own_folders
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.formats.own_folders import FUSED
 
 
@@ -49,7 +49,7 @@ def find(root: Path, out: Path | None = None) -> list[Unit]:
             f"{root} holds no capture: no folders pol000, pol045, …, no capture.toml, no photographs "
             "(views of a fused object do not count)"
         )
-    return sorted(found, key=lambda unit: layouts.natural(unit.name))
+    return sorted(found, key=lambda unit: folder_names.natural(unit.name))
 
 
 def reopen(place: Path) -> list[Unit]:
@@ -63,9 +63,9 @@ def reopen(place: Path) -> list[Unit]:
 
 def _captures(root: Path) -> Iterator[str]:
     for folder, inside, files in os.walk(root):
-        if layouts.is_result(Path(folder)) or layouts.is_result(Path(folder, FUSED)):
+        if folder_names.is_result(Path(folder)) or folder_names.is_result(Path(folder, FUSED)):
             inside.clear()  # maps are no photographs, and the views of a fused object are processed
-        elif layouts.looks_like_a_capture(Path(folder), inside, files):
+        elif folder_names.looks_like_a_capture(Path(folder), inside, files):
             inside.clear()
             yield folder
         else:
@@ -78,9 +78,11 @@ def _without_capture(root: Path, found: Sequence[Unit]) -> list[str]:
     if root in used:  # the batch is one capture
         return []
     used |= {parent for path in used for parent in path.parents}
-    others = [path for path in layouts.children(root) if path.is_dir() and path not in used]
+    others = [path for path in folder_names.children(root) if path.is_dir() and path not in used]
     unused = [path for path in others if path.name not in own_folders.OURS]
-    return [path.name for path in unused if not any(layouts.is_result(Path(inside)) for inside, _, _ in os.walk(path))]
+    return [
+        path.name for path in unused if not any(folder_names.is_result(Path(inside)) for inside, _, _ in os.walk(path))
+    ]
 
 
 def _unit(root: Path, folder: Path, out: Path | None, batch_folder: str) -> Unit:
@@ -107,7 +109,7 @@ def run(
     if empty := _without_capture(root, found):
         print_line(f"no capture in {', '.join(empty)}: no folders pol000, pol045, …, and no photographs")
     for folder in sorted({Path(unit.capture).parent for unit in found}):
-        if len(views := layouts.views(folder)) > 1:
+        if len(views := folder_names.views(folder)) > 1:
             print_line(f"{folder}: {views[0]} to {views[-1]} are views of one object; `polcap fuse` joins them")
     by_name = {unit.name: unit for unit in wanted}
     start = time.monotonic()

@@ -6,10 +6,10 @@ If a worker is lost, the scheduler passes its capture to another one, which cont
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from polcap import resource_limits
 from polcap.batch import unit as units
-from polcap.batch.processes import prepare
 from polcap.batch.unit import ProcessOptions, Unit, UnitRecord
-from polcap.errors import SettingError
+from polcap.errors import SettingError, package_for
 
 _SETTINGS = {
     "distributed.worker.profile.enabled": False,  # costs 6 % of a small capture's time
@@ -34,11 +34,9 @@ def run(
 
     Raises SettingError: Dask is not installed, or no scheduler answers at the address.
     """
-    try:
+    with package_for("--scheduler", "Dask", "batch"):
         import dask
         import distributed
-    except ModuleNotFoundError as error:
-        raise SettingError(f"{error.name} is not installed; pip install 'polcap[batch]'") from error
     resources = {"GPU": 1.0} if options.device == "cuda" else None
     with dask.config.set({"distributed.scheduler.allowed-failures": retries, **_SETTINGS}):
         target: Any = address
@@ -70,7 +68,7 @@ def _gather(
         return future
 
     # workers that join later use the settings they were started with
-    client.run(prepare, options.threads, options.memory_gb)
+    client.run(resource_limits.set_limits, options.threads, options.memory_gb)
     running: dict[Any, tuple[Unit, int]] = {}
     ended = distributed.as_completed([submit(unit, 1) for unit in wanted])
     for future in ended:

@@ -136,7 +136,7 @@ def _serve(pipe: connection.Connection, limits: Limits) -> None:
     """Main function of a child process: execute calls until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    prepare(limits.threads, limits.memory_gb)
+    resource_limits.set_limits(limits.threads, limits.memory_gb)
     while True:
         try:
             function, arguments = pipe.recv()
@@ -151,9 +151,3 @@ def _end_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
-
-
-def prepare(threads: int, memory_gb: float) -> None:
-    """Limit the threads and the memory [GB] of this process; 0: no limit."""
-    resource_limits.set_threads(threads)
-    resource_limits.set_memory(memory_gb)

@@ -23,7 +23,7 @@ from msgspec.structs import replace
 from polcap import resource_limits
 from polcap.batch import thumbnail
 from polcap.config import Config
-from polcap.errors import InputError, PolcapError, StorageError
+from polcap.errors import InputError, PolcapError, StorageError, one_line
 from polcap.formats import atomic, own_folders
 from polcap.formats.capture import reader
 from polcap.images import ChartRequest, Device, Network
@@ -103,18 +103,18 @@ def run(unit: Unit, options: ProcessOptions, attempt: int = 1) -> UnitRecord:
         message = " ".join(f"{gate['name']}: {gate['says']}. {gate['remedy']}." for gate in failed)
         record = replace(record, state="gates" if failed else "done", message=message, **_outcome(unit, about))
     except (PolcapError, OSError) as error:
-        record = replace(record, state="failed", message=_line(error))
+        record = replace(record, state="failed", message=one_line(error))
     except Exception as error:
         if resource_limits.is_shortfall(error):
             record = replace(record, state="failed", message="out of memory; raise --memory or run fewer workers")
         else:
-            message = f"{type(error).__name__}: {_line(error)}; {_write_traceback(unit)}"
+            message = f"{type(error).__name__}: {one_line(error)}; {_write_traceback(unit)}"
             record = replace(record, state="bug", message=message)
     record = replace(record, seconds=round(time.perf_counter() - start, 3))
     try:
         write_record(unit, record)
     except StorageError as error:
-        record = replace(record, state="failed", message=_line(error))
+        record = replace(record, state="failed", message=one_line(error))
     return record
 
 
@@ -210,9 +210,5 @@ def _write_traceback(unit: Unit) -> str:
     try:
         atomic.write(file, text)
     except InputError as error:
-        return f"the traceback could not be written: {_line(error)}"
+        return f"the traceback could not be written: {one_line(error)}"
     return f"the traceback is in {file}"
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())

@@ -69,7 +69,7 @@ def measure(
     exif = photographs[0].exif
     return Calibration(
         made=made,
-        camera=f"{exif.make} {exif.model}".strip(),
+        camera=exif.camera,
         lens=exif.lens,
         filter=lens_filter,
         noise=_noise(flat, dark, brackets),

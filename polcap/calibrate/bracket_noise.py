@@ -20,7 +20,7 @@ from polcap.calibrate import photon_transfer
 from polcap.calibrate.calibration_photographs import CLIP, Photograph, photographs_in
 from polcap.calibration_values import NoiseLine
 from polcap.errors import CaptureError
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.images import Bools, Floats
 from polcap.optics import robust
 from polcap.stages.hdr import bracket, exposure, noise, planes
@@ -48,7 +48,7 @@ def brackets(folder: Path) -> list[list[Photograph]]:
 
     Raises CaptureError if there is none.
     """
-    children = layouts.children(folder)
+    children = folder_names.children(folder)
     folders = [path for path in children if path.is_dir()]
     folders += [folder] if len(folders) < len(children) else []
     if not folders:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from polcap.errors import CaptureError
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.formats.raw import libraw as raw
 from polcap.formats.raw import probe
 from polcap.images import Exif, Floats, SensorImage
@@ -43,7 +43,8 @@ def photographs_in(folder: Path) -> list[Photograph]:
     Raises CaptureError if there is none, or the folder cannot be listed.
     """
     paths = sorted(
-        (path for path in layouts.children(folder) if path.is_file()), key=lambda one: layouts.natural(one.name)
+        (path for path in folder_names.children(folder) if path.is_file()),
+        key=lambda one: folder_names.natural(one.name),
     )
     files = [(path, probe.read(path)) for path in paths]
     photographs = [Photograph(path, file.exif, file.digest) for path, file in files if file.kind == "raw"]
@@ -54,7 +55,7 @@ def photographs_in(folder: Path) -> list[Photograph]:
 
 def angle_folders(folder: Path, prefix: str) -> list[tuple[float, Path]]:
     """Sub-folders named by an angle, such as pol022.5, in order: angle [degrees] and path."""
-    folders = [(angle_of(path.name, prefix), path) for path in layouts.children(folder) if path.is_dir()]
+    folders = [(angle_of(path.name, prefix), path) for path in folder_names.children(folder) if path.is_dir()]
     return sorted((angle, path) for angle, path in folders if angle is not None)
 
 

@@ -21,7 +21,7 @@ from polcap.errors import CaptureError, ChartError
 from polcap.formats import shipped_data
 from polcap.images import AngleStack, ChartRequest, ColorSensor, Distortion, Floats, SensorImage, View, single_frames
 from polcap.optics import distortion, sensor
-from polcap.optics.projection import transform_points
+from polcap.optics.projection import from_grid, transform_points
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import WhitebalanceSettings, chart
 
@@ -234,5 +234,4 @@ def _as_stack(value: Floats, image: SensorImage) -> AngleStack:
 
 def _on_raw(points: Floats, image: SensorImage) -> Floats:
     """Convert points (N, 2) from binned px to visible RAW px, float32 for cv2."""
-    side = image.superpixel
-    return np.asarray(side * points + (side - 1) / 2, np.float32)
+    return np.asarray(from_grid(points, image.superpixel), np.float32)

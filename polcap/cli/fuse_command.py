@@ -41,8 +41,7 @@ def fuse(
     from polcap.fusion.session import SessionInput
     from polcap.pipeline import models
 
-    resource_limits.set_threads(threads)
-    resource_limits.set_memory(memory)
+    resource_limits.set_limits(threads, memory)
     if missing := [name for name in _NEEDED if find_spec(name) is None]:
         raise SettingError(f"polcap fuse needs {', '.join(missing)}: pip install 'polcap[fusion]'")
     if not folder.is_dir():

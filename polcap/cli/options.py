@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from typer import Argument, Option
 
 from polcap import terminal
-from polcap.errors import SettingError
+from polcap.errors import SettingError, package_for
 from polcap.formats import own_folders
 
 if TYPE_CHECKING:
@@ -141,7 +141,5 @@ def user_mask(file: Path) -> Any:
 
 def training(module: str) -> Any:
     """Import a module of polcap.training. Raises SettingError where torch is not installed."""
-    try:
+    with package_for("training", "PyTorch, onnx, embreex and Pillow", "train"):
         return import_module(f"polcap.training.{module}")
-    except ModuleNotFoundError as error:
-        raise SettingError(f"{error.name} is not installed; pip install 'polcap[train]'") from error

@@ -54,8 +54,7 @@ def process(
         terminal.print_progress(f"{finished.table}\nNothing has changed since the last run.")
         terminal.print_result(finished.report, target, json, open_)
         return
-    resource_limits.set_threads(threads)  # before the libraries that start them
-    resource_limits.set_memory(memory)
+    resource_limits.set_limits(threads, memory)  # before the libraries start threads
     once = partial(_plan, stated, target) if dry_run else partial(_process, stated, target, request)
     if watch:
         at_every_change(capture, target, config, once)

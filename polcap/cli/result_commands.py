@@ -27,7 +27,7 @@ def show(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Draw a stage's result; prints the picture's path, and shows it on a terminal."""
+    """Draw a stage's result and print the picture's path."""
     from polcap.pipeline import run as pipeline
     from polcap.pipeline.path import STAGES
 
@@ -39,7 +39,6 @@ def show(
     else:
         drawn = pipeline.show(result, STAGES if stage is None else (stage,))
     terminal.print_written(drawn, json)
-    terminal.preview(drawn)
 
 
 def status(context: Context, result: Result, json: Json = False) -> None:

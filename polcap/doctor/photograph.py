@@ -45,9 +45,8 @@ def examine_file(path: Path) -> Iterator[Finding]:
 
 
 def _metadata(exif: Exif) -> Iterator[Finding]:
-    camera = f"{exif.make} {exif.model}".strip()
-    if camera:
-        message = f"{camera}, {exif.lens or 'lens not stated'}, taken {exif.taken or 'at no stated time'}"
+    if exif.camera:
+        message = f"{exif.camera}, {exif.lens or 'lens not stated'}, taken {exif.taken or 'at no stated time'}"
         yield Finding("camera", "ok", message)
     else:
         yield Finding("camera", "warning", "not stated", "copy the file without a program that strips EXIF")

@@ -67,11 +67,10 @@ def choose(exif: Exif, lens_filter: str | None, focal_length_mm: float | None) -
 
     Raises CaptureError: a file in the folder is not a calibration.
     """
-    camera = f"{exif.make} {exif.model}".strip()
     fitting = []
     for path in own_folders.calibration_files():
         found = read(path)
-        if camera and found.camera == camera and (not found.lens or not exif.lens or found.lens == exif.lens):
+        if exif.camera and found.camera == exif.camera and (not found.lens or not exif.lens or found.lens == exif.lens):
             fitting.append((found, path))
     if not fitting:
         return None, []

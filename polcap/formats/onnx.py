@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from polcap import parallel
-from polcap.errors import DecodeError, ModelError
+from polcap.errors import DecodeError, ModelError, one_line
 from polcap.formats import shipped_data, text_file
 from polcap.formats.raw import worker
 from polcap.images import Device, Floats, Network
@@ -97,7 +97,7 @@ def run_session(session: Any, path: Path, inputs: Floats, limit_s: float = _RUN_
         if options.terminate:
             raise ModelError(f"{path} did not end within {limit_s:g} s; use another model") from error
         raise ModelError(
-            f"{path} failed on an input of shape {inputs.shape}: {_line(error)}; use another model"
+            f"{path} failed on an input of shape {inputs.shape}: {one_line(error)[:200]}; use another model"
         ) from error
     finally:
         overdue.cancel()
@@ -170,7 +170,7 @@ def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
         return onnxruntime.InferenceSession(data, options, providers=providers)
     except _failures() as error:
         raise ModelError(
-            f"{path} is not a model that onnxruntime {onnxruntime.__version__} can run: {_line(error)}; "
+            f"{path} is not a model that onnxruntime {onnxruntime.__version__} can run: {one_line(error)[:200]}; "
             "use a complete ONNX file of opset ≤ 18"
         ) from error
 
@@ -222,7 +222,3 @@ def _failures() -> tuple[type[Exception], ...]:
     state = vars(_onnxruntime().capi.onnxruntime_pybind11_state)
     own = [kind for kind in state.values() if isinstance(kind, type) and issubclass(kind, Exception)]
     return (*own, ValueError, RuntimeError)
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]

@@ -126,6 +126,8 @@ def fault(error: msgspec.ValidationError, data: Any, kind: type[msgspec.Struct])
         return f"{f'{where}.' if where else ''}{unknown[1]}: there is no such key; {hint}"
     if message.startswith("Invalid enum value"):
         message = f"not one of {', '.join(map(str, _of(form, inspect.LiteralType).values))}"
+    elif "matching regex" in message:
+        message = "no such choice"
     elif message.startswith("Expected `str`"):
         message = "is not text; put it in quotes"
     text = f"{message[:1].lower()}{message[1:]}"

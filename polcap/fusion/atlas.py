@@ -13,8 +13,8 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from polcap.errors import ObjectError, SettingError
-from polcap.fusion.closed_mesh import levels
+from polcap.errors import ObjectError, SettingError, package_for
+from polcap.fusion.closed_mesh import decimate
 from polcap.fusion.values import ClosedMesh, FusionView
 from polcap.images import Bools, Floats, Mesh
 from polcap.optics import frames
@@ -60,7 +60,7 @@ def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSetti
     Raises SettingError: the package uvunwrap is missing, or the charts do not fit into a texture of this size.
     """
     pixel = _pixel(mesh, views)
-    mesh = levels(mesh, [max(int(_area(mesh) / (_TRIANGLE * pixel**2)), _FEWEST)])[0]
+    mesh = decimate(mesh, max(int(_area(mesh) / (_TRIANGLE * pixel**2)), _FEWEST))
     if settings.size:
         return charted(mesh, settings.size, settings.margin)
     side = _side(mesh, pixel)
@@ -99,10 +99,8 @@ def of_mesh(mesh: Mesh, side: int) -> Atlas:
 
 def _charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.int32]]:
     """Texture coordinates (W, 2) with v down, the mesh's vertex of each (W,), and faces (F, 3) in their numbers."""
-    try:
+    with package_for("a texture atlas", "uvunwrap", "fusion"):
         import uvunwrap
-    except ModuleNotFoundError:
-        raise SettingError("a texture atlas needs uvunwrap: pip install 'polcap[fusion]'") from None
     surface = uvunwrap.Mesh(mesh.vertices.astype(np.float32).ravel().tolist(), mesh.faces.ravel().tolist())
     try:
         packed = uvunwrap.generate([surface], page_size=side, padding=margin)

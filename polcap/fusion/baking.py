@@ -26,6 +26,7 @@ from polcap.fusion.atlas import Atlas
 from polcap.fusion.values import FusionView
 from polcap.images import Bools, Floats
 from polcap.optics import frames
+from polcap.optics.morphology import masked_mean
 from polcap.optics.outline import fill_outward
 from polcap.optics.projection import project
 from polcap.stages import stage
@@ -225,10 +226,8 @@ def _typical(samples: Sequence[Floats]) -> float:
 def _bands(image: Floats, inside: Bools, sigma: float) -> Floats:
     """Smooth band of an image (H, W, C) inside a mask, and the rest: (H, W, 2C)."""
     inner = inside[..., None]
-    held = np.where(inner, image, 0).astype(np.float32)
-    share = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), sigma)[..., None]
-    smooth = cv2.GaussianBlur(held, (0, 0), sigma).reshape(held.shape) / np.maximum(share, 1e-6)
-    return np.concatenate([smooth, np.where(inner, held - smooth, 0)], axis=-1)
+    smooth = masked_mean(image, inside, sigma)
+    return np.concatenate([smooth, np.where(inner, image.astype(np.float32) - smooth, 0)], axis=-1)
 
 
 def _reweighted(

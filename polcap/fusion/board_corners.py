@@ -16,7 +16,7 @@ from polcap.errors import CaptureError
 from polcap.images import AngleStack, ColorCalibration, Floats
 from polcap.optics import board as boards
 from polcap.optics.board import BOARDS, Board
-from polcap.optics.projection import transform_points
+from polcap.optics.projection import from_grid, transform_points
 
 _DETECTOR_PX = 2400  # longer side of the picture in which markers are searched
 _LEAST_MARKERS = 3  # of a board; fewer may be false
@@ -81,7 +81,7 @@ def detect(radiance: AngleStack, color: ColorCalibration, name: str) -> BoardCor
             f"{name}: {good.sum()} of {len(number)} corners of the board are visible, {_LEAST_CORNERS} are needed; "
             "let object and chart hide less of the board, and show it sharp"
         )
-    return BoardCorners(board, number[good], world[good], scale * moved[good] + (scale - 1) / 2)
+    return BoardCorners(board, number[good], world[good], from_grid(moved[good], scale))
 
 
 def _markers(picture: Floats) -> list[tuple[int, Floats]]:

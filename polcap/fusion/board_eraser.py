@@ -18,8 +18,8 @@ from polcap.images import Alignment, AngleStack, Bools, ColorCalibration, Floats
 from polcap.optics import board as boards
 from polcap.optics import distortion
 from polcap.optics.board import Board
-from polcap.optics.projection import back_project
-from polcap.optics.warp import warp
+from polcap.optics.projection import back_project, from_grid
+from polcap.stages.mask import mean_picture
 
 _SAMPLES = 4  # per pixel side, for the share of paper
 _SITE_PX = 0.8  # side of the area that a channel's photosites and the lens's blur average over
@@ -53,7 +53,7 @@ def erase(
     Where the board is not in the picture, or hidden, nothing changes.
     """
     print_ = _project(radiance, board, *posed)
-    picture = _mean_picture(radiance, alignment, color)
+    picture = mean_picture(radiance, alignment, color)
     covered = np.abs(print_.place).max(axis=-1) <= _BEYOND * board.page_m[0] / board.side_m
     if not covered.any():
         return radiance
@@ -65,16 +65,10 @@ def erase(
     return replace(radiance, value=value, mosaic=None)
 
 
-def _mean_picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> Floats:
-    """S0 (H, W, 3) of the registered shots in linear Rec.709, as for unpolarized light."""
-    shots = [warp(shot, transform, order=1) for shot, transform in zip(radiance.value, alignment.transform)]
-    return np.asarray(cv2.transform(np.mean(shots, axis=0), 2 * np.asarray(color.matrix)), np.float32)
-
-
 def _project(radiance: AngleStack, board: Board, camera: SessionCamera, pose: Pose) -> _Print:
     height, width = radiance.value.shape[1:3]
     scale = radiance.view.scale
-    y, x = (scale * axis + (scale - 1) / 2 for axis in np.mgrid[:height, :width].astype(np.float64))
+    y, x = (from_grid(axis, scale) for axis in np.mgrid[:height, :width].astype(np.float64))
     place = _on_board(camera, pose, x, y)
     near = np.abs(place).max(axis=-1) <= board.page_m[0] / 2
     down, across = (np.gradient(place, axis=axis)[near] for axis in (0, 1))  # m on the board per pixel

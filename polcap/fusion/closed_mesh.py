@@ -1,6 +1,4 @@
-"""Closed meshes: from signed distances, checked, decimated to levels, and made manifold."""
-
-from collections.abc import Sequence
+"""Closed meshes: from signed distances, checked, decimated, and made manifold."""
 
 import numpy as np
 
@@ -17,18 +15,6 @@ def iso_surface(of: DistanceGrid) -> ClosedMesh:
 
     vertices, faces, _, _ = marching_cubes(of.distance, 0.0, spacing=(of.grid.step,) * 3, gradient_direction="descent")
     return ClosedMesh(vertices + of.grid.origin, faces.astype(np.int32))
-
-
-def volume(mesh: ClosedMesh) -> float:
-    """Enclosed volume [m³]; negative if the triangles face inwards."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    return float(np.sum(a * np.cross(b, c)) / 6)
-
-
-def euler_number(mesh: ClosedMesh) -> int:
-    """Vertices − edges + triangles: 2 for a body like a ball, 0 for one with a handle."""
-    used = len(np.unique(mesh.faces))
-    return used - len(mesh.faces) // 2
 
 
 def is_closed(mesh: ClosedMesh) -> bool:
@@ -58,15 +44,11 @@ def solid(mesh: ClosedMesh, floor: float | None = None) -> ClosedMesh:
     return ClosedMesh(np.array(written.vert_properties[:, :3]), np.array(written.tri_verts, np.int32))
 
 
-def levels(mesh: ClosedMesh, counts: Sequence[int]) -> list[ClosedMesh]:
-    """The mesh with about as many triangles as each of `counts`, each level closed and manifold.
+def decimate(mesh: ClosedMesh, count: int) -> ClosedMesh:
+    """The mesh with about `count` triangles, closed and manifold.
 
-    Raises ObjectError: a level has too few triangles to enclose a body.
+    Raises ObjectError: these are too few triangles to enclose a body.
     """
-    return [_decimated(mesh, count) for count in counts]
-
-
-def _decimated(mesh: ClosedMesh, count: int) -> ClosedMesh:
     import fast_simplification
 
     if count < _FEWEST:

@@ -217,7 +217,5 @@ def write(out: Path, about: dict[str, Any], results: FusionResults, views: Seque
     request = ExportRequest(lod=_LODS if source.triangles > 16 * 4**_LODS else 0)
     asset_export.write(out, about, request, asset_export.levels(source, request))
     turning = object_pictures.around(results.atlas, results.maps, object_pictures.FRAMES, _SIDE)
-    encoders.webp(out / "asset" / "turntable.webp", turning, animation.SECONDS)
-    if encoders.ffmpeg():
-        encoders.mp4(out / "asset" / "turntable.mp4", turning, animation.SECONDS)
+    encoders.animate(out / "asset" / "turntable", turning, animation.SECONDS)
     fused_page.write(out, about, results)

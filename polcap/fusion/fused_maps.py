@@ -16,7 +16,7 @@ from polcap.formats.maps import exr, maps_folder, png
 from polcap.fusion import atlas as atlases
 from polcap.fusion.atlas import Atlas, AtlasSettings
 from polcap.fusion.baking import AtlasMaps, on_atlas
-from polcap.fusion.closed_mesh import levels
+from polcap.fusion.closed_mesh import decimate
 from polcap.fusion.values import ClosedMesh
 from polcap.images import Asset, Floats, Mesh
 from polcap.optics import color
@@ -93,7 +93,7 @@ class FusedSource:
 
     def decimated(self, whole: Asset, triangles: int) -> DetailLevel:
         """The asset with about so many triangles, an atlas of its own, and the textures of the full mesh."""
-        (coarse,) = levels(closed(self.atlas.mesh), [triangles])
+        coarse = decimate(closed(self.atlas.mesh), triangles)
         side = self.maps.mask.shape[0]
         atlas = atlases.charted(coarse, side, AtlasSettings().margin)
         maps = transferred(self.atlas, self.maps, atlas)

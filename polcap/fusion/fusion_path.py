@@ -27,9 +27,6 @@ class FusionSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     material_fit: MaterialSettings = MaterialSettings()
 
 
-STAGES = ("shape", "atlas", "baking", "material_fit", "filling", "comparison")
-
-
 @dataclass(frozen=True)
 class FusionResults:
     """One value per stage, and the cache keys."""

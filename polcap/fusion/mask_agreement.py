@@ -23,6 +23,7 @@ from polcap.errors import CaptureError
 from polcap.fusion.poses import LEAST_VIEWS
 from polcap.fusion.silhouettes import Silhouette, grid_around, halved
 from polcap.images import Bools, Floats
+from polcap.optics.outline import disc_radius
 
 _SLIT = 0.05  # of the object's diameter in a view; wider gaps in a mask are gaps between the object's parts
 _MOST_UNCOVERED = 0.01  # of a mask's area; masks whose outlines err by one cell of the grid leave 0.000
@@ -69,7 +70,7 @@ def _without_slits(views: Sequence[Silhouette], points: Floats, step: float) -> 
     votes = inside.sum(axis=0)
     out = []
     for view, own in zip(views, inside, strict=True):
-        reach = max(round(_SLIT / 2 * view.diameter_px), 1)
+        reach = max(round(_SLIT * disc_radius(view.mask)), 1)
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         framed = np.pad(view.mask.astype(np.uint8), reach)
         closed = cv2.morphologyEx(framed, cv2.MORPH_CLOSE, disc)[reach:-reach, reach:-reach] > 0

@@ -59,7 +59,7 @@ class SessionCamera:
 
     def reduced(self, scale: float) -> "SessionCamera":
         """The camera on a grid whose pixels are `scale` RAW pixels wide."""
-        x, y = ((principal - (scale - 1) / 2) / scale for principal in self.principal_px)
+        x, y = (projection.to_grid(at, scale) for at in self.principal_px)
         return replace(
             self, focal_px=self.focal_px / scale, focal_sigma_px=self.focal_sigma_px / scale, principal_px=(x, y)
         )

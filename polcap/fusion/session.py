@@ -28,7 +28,7 @@ from polcap.errors import (
     SettingError,
 )
 from polcap.formats import onnx, own_folders
-from polcap.formats.capture import layouts, reader
+from polcap.formats.capture import folder_names, reader
 from polcap.fusion import board_corners, feature_poses, joining, mask_agreement, poses, view_maps
 from polcap.fusion.board_corners import BoardCorners, NoBoardError
 from polcap.fusion.board_eraser import erase
@@ -217,7 +217,7 @@ def read(wanted: SessionInput) -> Session:
 
     Raises CaptureError: there are too few views.
     """
-    names = layouts.session_views(wanted.folder)
+    names = folder_names.session_views(wanted.folder)
     if not names:
         raise CaptureError(f"{wanted.folder} holds no views; put each capture into a folder view01, view02, …")
     session = Session({})

@@ -29,11 +29,6 @@ class Silhouette:
         """Distance of the board's middle along the optical axis [m]."""
         return float(-self.pose.translation[2])
 
-    @property
-    def diameter_px(self) -> float:
-        """Diameter of a disk with the mask's area, px."""
-        return float(np.sqrt(4 * self.mask.sum() / np.pi))
-
     def cell_px(self, step: float) -> float:
         """Size in the mask of a step [m] at the board's distance, px."""
         return step * self.camera.focal_px / self.distance

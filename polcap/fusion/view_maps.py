@@ -8,7 +8,7 @@ import numpy as np
 from polcap.fusion.poses import SessionCamera
 from polcap.fusion.values import FusionView, Pose
 from polcap.images import Distortion, Floats, View
-from polcap.optics import distortion, frames
+from polcap.optics import distortion, frames, projection
 from polcap.results import Results
 from polcap.stages.cues import scale
 
@@ -23,7 +23,8 @@ def fusion_view(name: str, results: Results, camera: SessionCamera, pose: Pose, 
     maps, height, width = results.maps, *results.maps.mask.shape
     view = on_grid(camera, maps.view)
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    source_x, source_y = (x, y) if undistorted else distortion.distort(_lens(camera, view), x, y)
+    lens = Distortion(view.focal, view.center, camera.k1, camera.k2)
+    source_x, source_y = (x, y) if undistorted else distortion.distort(lens, x, y)
     normal = _turned(maps.normal, maps.view, view, (source_x, source_y))
     found = FusionView(
         name=name,
@@ -46,15 +47,8 @@ def fusion_view(name: str, results: Results, camera: SessionCamera, pose: Pose, 
 
 def on_grid(camera: SessionCamera, grid: View) -> View:
     """The session's camera on the pixel grid of maps: map pixel i shows RAW pixels about scale·(origin + i)."""
-    center = [
-        (principal - (grid.scale - 1) / 2) / grid.scale - start
-        for principal, start in zip(camera.principal_px, grid.origin)
-    ]
-    return View(camera.focal_px / grid.scale, (center[0], center[1]), grid.scale, grid.origin)
-
-
-def _lens(camera: SessionCamera, view: View) -> Distortion:
-    return Distortion(view.focal, view.center, camera.k1, camera.k2)
+    x, y = (projection.to_grid(at, grid.scale) - start for at, start in zip(camera.principal_px, grid.origin))
+    return View(camera.focal_px / grid.scale, (x, y), grid.scale, grid.origin)
 
 
 def _turned(normal: Floats, before: View, after: View, source: tuple[Floats, Floats]) -> Floats:

@@ -23,6 +23,16 @@ def coordinates(matrix: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     return u, v
 
 
+def to_grid(px: Any, scale: float) -> Any:
+    """Positions (any shape) px on a grid whose pixels are `scale` px wide; pixel centers are whole numbers on both."""
+    return (px - (scale - 1) / 2) / scale
+
+
+def from_grid(px: Any, scale: float) -> Any:
+    """Positions (any shape) from a grid whose pixels are `scale` px wide; inverse of `to_grid`."""
+    return scale * px + (scale - 1) / 2
+
+
 def picture_corners(width: int, height: int) -> Floats:
     """Centers x, y (4, 2) of the four corner pixels."""
     return np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], float)

@@ -203,19 +203,20 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     facts = {"unit": unit, "normals": "+Y (OpenGL)", **provenance.words(record)}
     comment = f"polcap; unit of length: {unit}; normals +Y (OpenGL); made from: {stem}.provenance.json"
     writers: dict[Format, _Writer] = {
-        "gltf": partial(_write_glb, folder / f"{stem}.glb", whole, options, facts, encoder),
+        "gltf": partial(_write_named, gltf.encode, folder / f"{stem}.glb", whole, options, facts, encoder),
         "obj": partial(obj.write, folder / f"{stem}.obj", whole, stem, shared, comment),
         "ply": partial(_write_one, ply_stl.write, folder / f"{stem}.ply", whole),
         "stl": partial(_write_one, ply_stl.write, folder / f"{stem}.stl", whole),
         "usd": partial(_write_one, usd.write, folder / f"{stem}.usdc", whole, stem, shared, facts),
         "usdz": partial(_write_usdz, folder / f"{stem}.usdz", whole, facts, encoder),
-        "materialx": partial(_write_materialx, folder / f"{stem}.mtlx", whole, shared, comment),
+        "materialx": partial(_write_named, materialx.document, folder / f"{stem}.mtlx", whole, shared, comment),
         "exr": partial(_write_one, exr_layers.write, folder / f"{stem}_layers.exr", out / "maps", wanted.color, facts),
         "iiif": partial(_write_iiif, folder / f"{stem}_iiif", whole, facts, wanted.iiif or ""),
     }
     coarser = {folder / f"{stem}_lod{k}.glb": level for k, level in enumerate(found[1:], 1)}
     tasks = [writers[one] for one in preset.formats]
-    tasks += [partial(_write_glb, file, level.asset, options, facts, encoder) for file, level in coarser.items()]
+    write_glb = partial(_write_named, gltf.encode)
+    tasks += [partial(write_glb, file, level.asset, options, facts, encoder) for file, level in coarser.items()]
     tasks += [partial(_write_texture, folder / file, texture, encoder) for file, texture in loose.items()]
     written = [file for files in parallel.results(tasks) for file in files]  # pictures are encoded on threads
     if wanted.page is not None:
@@ -293,26 +294,19 @@ def effective(wanted: ExportRequest) -> ExportPreset:
     )
 
 
-def _write_glb(
-    file: Path, content: Asset, options: gltf.GlbOptions, facts: Mapping[str, str], encoder: TextureEncoder
-) -> list[Path]:
-    atomic.write(file, gltf.encode(content, file.stem, options, facts, encoder))
+def _write_one(write_file: Callable[..., None], file: Path, *arguments: Any) -> list[Path]:
+    write_file(file, *arguments)
     return [file]
 
 
-def _write_one(write_file: Callable[..., None], file: Path, *arguments: Any) -> list[Path]:
-    write_file(file, *arguments)
+def _write_named(make: Callable[..., str | bytes], file: Path, content: Asset, *arguments: Any) -> list[Path]:
+    atomic.write(file, make(content, file.stem, *arguments))
     return [file]
 
 
 def _write_usdz(file: Path, content: Asset, facts: Mapping[str, str], encoder: TextureEncoder) -> list[Path]:
     textures = {key: encoder(make(content), "png") for key, make in texture_set.LOOSE.items()}
     usd.package(file, content, file.stem, textures, facts)
-    return [file]
-
-
-def _write_materialx(file: Path, content: Asset, textures: Mapping[Key, str], comment: str) -> list[Path]:
-    atomic.write(file, materialx.document(content, file.stem, textures, comment))
     return [file]
 
 

@@ -14,8 +14,9 @@ import msgspec
 
 from polcap.config import Config
 from polcap.errors import ChartError, DecodeError, InputError
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.images import Capture, ChartRequest, ColorCalibration, Network
+from polcap.optics.projection import to_grid
 from polcap.pipeline import models, small_capture
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import AUTO, UserInput, path, results_of
@@ -91,7 +92,7 @@ def _judge(capture: Capture, small: SmallCapture, supplied: UserInput, config: C
         blur_px=small.blur_px,
         grid_px=small.step / (small.merged_px if config.hdr.demosaic == "superpixel" else 1),
         chart_missing=chart_missing,
-        later_view=layouts.is_later_view(Path(capture.folder)),
+        later_view=folder_names.is_later_view(Path(capture.folder)),
     )
     lines = []
     try:
@@ -146,7 +147,7 @@ def _settings(config: Config, step: int) -> Config:
 
 def _scale_chart(chart: ChartRequest, step: int) -> ChartRequest:
     """Convert the chart's corners from the user to the reduced pictures, with pixels of `step` × `step` RAW pixels."""
-    return chart if chart.corners is None else replace(chart, corners=(chart.corners - (step - 1) / 2) / step)
+    return chart if chart.corners is None else replace(chart, corners=to_grid(chart.corners, step))
 
 
 def table(verdict: Verdict) -> str:

@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 
 from polcap.errors import SettingError, StorageError
 from polcap.formats import atomic, own_folders, text_file
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.pipeline.cache import seal
 from polcap.pipeline.path import STAGES
 
@@ -34,7 +34,8 @@ def check(out: Path, photographs: Path) -> None:
     inside = here.relative_to(there).parts if here.is_relative_to(there) else ("elsewhere",)
     if not inside:
         raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")
-    if any(layouts.is_angle_folder(name) for name in inside) or inside[0] in layouts.angle_folder_names(there):
+    of_angle = any(folder_names.is_angle_folder(name) for name in inside)
+    if of_angle or inside[0] in folder_names.angle_folder_names(there):
         raise SettingError(f"--out {out} lies among the capture's shots; choose {photographs / own_folders.OUTPUT}")
 
 

@@ -145,12 +145,7 @@ def animate(out: Path, motion: animation.Motion) -> list[Path]:
     ior = float(about["settings"]["infer"]["ior"])
     turning = motion == "turntable"
     frames = animation.turntable(results.maps, results.mesh, ior) if turning else animation.light(results.maps, ior)
-    written = [out / "work" / f"{motion}.webp"]
-    encoders.webp(written[0], frames, animation.SECONDS)
-    if encoders.ffmpeg():
-        written.append(out / "work" / f"{motion}.mp4")
-        encoders.mp4(written[1], frames, animation.SECONDS)
-    return written
+    return encoders.animate(out / "work" / motion, frames, animation.SECONDS)
 
 
 def judge_again(out: Path) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from polcap.formats.raw import frame_decoder
 from polcap.images import Capture, Floats, Frame, SensorImage
 from polcap.optics import sensor, sharpness
+from polcap.optics.projection import to_grid
 from polcap.optics.resize import block_means
 
 _MOST_PIXELS = 0.6e6  # of the pictures that the stages process
@@ -73,7 +74,7 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
     for frame in (frame for shot in capture.all_shots for frame in (*shot.frames, *shot.ambient) if frame != first):
         reduced[frame] = pool.submit(_decode_reduced, frame, clip, times, corners)
     step = half * times
-    x, y = ((edge - (step - 1) / 2) / step for edge in capture.principal_px)
+    x, y = (to_grid(at, step) for at in capture.principal_px)
     width, height = (side // step for side in capture.size_px)
     calibration = capture.calibration and replace(capture.calibration, noise=())  # it is of pixels, not of means
     small = replace(

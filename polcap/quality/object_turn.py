@@ -19,6 +19,7 @@ from polcap.images import Alignment, AngleStack, Bools, Floats, MaskedImage, Obj
 from polcap.optics import outline, registration
 from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
+from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.optics.warp import warp
 from polcap.stages.align.detail import averaging_step, detail
 
@@ -113,7 +114,7 @@ def _fit(
     a, b = np.concatenate(design).astype(np.float64), np.concatenate(change)
     residual = b
     for _ in range(_STEPS):
-        scale = 1.4826 * np.median(np.abs(residual.reshape(signals, pixels)), axis=1) + 1e-9
+        scale = MAD_TO_SIGMA * np.median(np.abs(residual.reshape(signals, pixels)), axis=1) + 1e-9
         scale = np.repeat(scale, pixels)
         weighted = a.T / (scale**2 + (residual / _CAUCHY) ** 2)
         inverse = np.linalg.inv(weighted @ a + np.diag(_PRIOR**-2))

@@ -8,11 +8,11 @@ follows the true outline. Pixels at the picture's border are left out.
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from polcap.images import Bools, Floats
 from polcap.optics import outline
+from polcap.optics.morphology import masked_mean
 from polcap.optics.robust import jackknife
 
 _INNER_PX, _DEPTH = 3.0, 0.08  # the band: px from the outline, and up to this share of the object's radius
@@ -60,16 +60,15 @@ def sample(light: Floats, mask: Bools, usable: Bools) -> Rim:
     `light` (K, H, W) is the light at each polarizer angle, computed from the Stokes parameters. `mask` (H, W) is the
     object, `usable` (H, W) are the pixels without defects.
     """
-    ok = (mask & usable).astype(np.float32)
-    weight = cv2.GaussianBlur(ok, (0, 0), _SMOOTH_PX) + 1e-6
-    smooth = np.stack([cv2.GaussianBlur(shot.astype(np.float32) * ok, (0, 0), _SMOOTH_PX) / weight for shot in light])
+    ok = mask & usable
+    smooth = np.stack([masked_mean(shot, ok, _SMOOTH_PX) for shot in light])
     depth = outline.depth(mask)
     reach = max(_DEPTH * outline.disc_radius(mask), _INNER_PX + 3)
     out, slope = outline.outward(mask.astype(np.float32), max(3.0, reach / 2))
-    band = off_border((depth > _INNER_PX) & (depth < reach) & (ok > 0) & (slope > 1e-4))
+    band = off_border((depth > _INNER_PX) & (depth < reach) & ok & (slope > 1e-4))
     inside = smooth[:, band]
     total = inside.mean(0)
-    level = float(smooth.mean(0)[ok > 0].mean()) if (ok > 0).any() else 1.0
+    level = float(smooth.mean(0)[ok].mean()) if ok.any() else 1.0
     return Rim(
         inside / np.maximum(total, 1e-9),
         np.arctan2(out[1], out[0])[band],

@@ -58,12 +58,11 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
     for shot in capture.shots:
         frames = [_frame_facts(frame, Path(capture.folder)) for frame in shot.frames]
         shots.append({"angle_deg": round(float(np.degrees(shot.angle)), 6), "frames": frames})
-    camera = capture.shots[0].frames[0].exif
     return {
         "name": capture.name,
         "folder": capture.folder,
         "layout": capture.layout,
-        "camera": f"{camera.make} {camera.model}".strip(),
+        "camera": capture.shots[0].frames[0].exif.camera,
         "size_px": list(capture.size_px),
         "focal_px": capture.focal_px,
         "focal_known": capture.focal_known,

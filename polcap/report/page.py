@@ -9,6 +9,7 @@ import numpy as np
 
 from polcap.config import Config
 from polcap.formats import html, shipped_data
+from polcap.formats.capture import reader
 from polcap.formats.maps import png
 from polcap.optics.color import srgb_eight_bits
 from polcap.report import keys, labels, map_figures, page_data, plots
@@ -196,7 +197,7 @@ def _tables(about: Mapping[str, Any]) -> dict[str, Any]:
             (
                 f"{labels.number(shot['angle_deg'])}°",
                 frame["file"],
-                _shutter(frame["exposure_time"]),
+                reader.shutter(frame["exposure_time"]),
                 frame["digest"][:12],
             )
             for shot in about["capture"]["shots"]
@@ -210,9 +211,3 @@ def _rows(sections: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
     """Full name, and value as text, of all figures or settings in these sections."""
     names = [(f"{section}.{name}", value) for section, values in sections.items() for name, value in values.items()]
     return [(name, labels.text(name, value)) for name, value in names]
-
-
-def _shutter(seconds: float | None) -> str:
-    if not seconds:
-        return "not stated"
-    return f"1/{1 / seconds:.0f} s" if seconds < 0.4 else f"{labels.number(seconds)} s"

@@ -12,7 +12,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Any, TypeVar
 
-from polcap.errors import HardwareError, SettingError
+from polcap.errors import HardwareError, SettingError, package_for
 from polcap.formats.raw import file_kind
 from polcap.images import Role
 from polcap.rig.camera import CameraFile
@@ -215,10 +215,8 @@ def connected_cameras() -> list[tuple[str, str]]:
 
 
 def _gphoto2() -> Any:
-    try:
+    with package_for("a camera on a cable", "gphoto2", "rig"):
         import gphoto2
-    except ModuleNotFoundError:
-        raise SettingError("gphoto2 is not installed; pip install 'polcap[rig]'") from None
     return gphoto2
 
 

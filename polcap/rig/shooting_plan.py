@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import msgspec
 
 from polcap.errors import SettingError
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.images import Role
 from polcap.rig.exposure_bracket import Exposure
 
@@ -28,9 +28,9 @@ class CaptureOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         listed = ",".join(f"{angle:g}" for angle in self.angles_deg)
         if not all(0 <= angle < 360 for angle in self.angles_deg):
             raise SettingError(f"--angles {listed}: not all in 0 to 360 degrees; give angles modulo 360")
-        if len({layouts.degrees(angle) for angle in self.angles_deg}) < len(self.angles_deg):
+        if len({folder_names.degrees(angle) for angle in self.angles_deg}) < len(self.angles_deg):
             raise SettingError(f"--angles {listed} names an angle twice; take a bracket again with --repeat")
-        if layouts.count_axes(self.angles_deg) < 3:
+        if folder_names.count_axes(self.angles_deg) < 3:
             raise SettingError(f"--angles {listed}: fewer than 3 different polarizer angles; give 3 or more")
         for angle in set(self.repeat_deg) - set(self.angles_deg):
             raise SettingError(f"--repeat {angle:g}: is not among --angles; give one of {listed}")
@@ -49,7 +49,7 @@ class Slot:
     @property
     def name(self) -> str:
         """Path of the frame's file in the capture folder, without suffix."""
-        at = "" if self.angle_deg is None else f"pol{layouts.degrees(self.angle_deg)}"
+        at = "" if self.angle_deg is None else f"pol{folder_names.degrees(self.angle_deg)}"
         frame = f"frame_{self.step + 1}"
         names = {"shot": f"{at}/{frame}", "repeat": f"repeat/{at}_{frame}", "cross": f"cross/{frame}"}
         return names.get(self.role, f"{self.role}/{at or self.role}")

@@ -14,7 +14,7 @@ from msgspec import Meta
 
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import atomic
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.rig import capture_record, device_urls, sequence
 from polcap.rig.device_log import Log
 from polcap.rig.shooting_plan import CaptureOrder
@@ -54,7 +54,7 @@ def open_session(folder: Path, views: int | None, turntable: str | None, resume:
 
 def first_view(folder: Path) -> Path:
     """Folder of the first view; its record states the options of all views."""
-    return folder / layouts.view_name(0)
+    return folder / folder_names.view_name(0)
 
 
 def shoot(
@@ -82,7 +82,7 @@ def shoot(
     ):
         atomic.write_json(folder / NAME, session)
         for k in range(session.views):
-            view = folder / layouts.view_name(k)
+            view = folder / folder_names.view_name(k)
             if view.name in session.done:
                 continue
             table.move(360.0 * k / session.views)

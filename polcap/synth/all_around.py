@@ -20,9 +20,9 @@ import numpy as np
 from msgspec import UNSET, Meta
 from scipy.spatial.transform import Rotation
 
-from polcap.errors import InputError
+from polcap.errors import package_for
 from polcap.formats import atomic
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.images import Floats
 from polcap.synth import forward_camera, mesh_tracer, scene_materials, shooting
 from polcap.synth.color_checker import Chart
@@ -95,7 +95,7 @@ def write(
     mesh = surface(scene)
     sets = [ObjectPose(mesh, Rotation.identity())] + [ObjectPose(mesh, _LAID)] * bool(shoot.laid)
     named = [
-        (f"set{letter}/" * bool(shoot.laid) + layouts.view_name(k), placed, *pose)
+        (f"set{letter}/" * bool(shoot.laid) + folder_names.view_name(k), placed, *pose)
         for letter, placed, count in zip("AB", sets, (views, shoot.laid))
         for k, pose in enumerate(_poses(shoot, count, placed.middle))
     ]
@@ -124,10 +124,8 @@ def surface(scene: Scene) -> Triangles:
     """
     if isinstance(scene.shape, Model):
         return mesh_tracer.tracer(scene.shape.file, scene.shape.radius).mesh
-    try:
+    with package_for("--views", "scikit-image", "fusion", ", or give a --mesh"):
         from skimage import measure
-    except ImportError:
-        raise InputError("--views needs scikit-image, or an object by --mesh; pip install 'polcap[fusion]'") from None
     axis = np.linspace(-scene.shape.radius, scene.shape.radius, _GRID)
     field = scene.shape.distance(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1))
     found: Any = measure.marching_cubes(field, 0.0, spacing=(axis[1] - axis[0],) * 3)

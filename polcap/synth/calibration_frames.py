@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.formats import atomic
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.images import Exif, Floats, View
 from polcap.optics import frames
 from polcap.synth import color_checker, forward_camera
@@ -103,7 +103,7 @@ def _photographs(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, 
             actual = shoot.sense * (ring + shoot.ring_error_deg * random.normal()) + shoot.zero_deg
             passed = 0.5 * (1 + contrast * np.cos(2 * np.radians(actual - axis)))
             jitter = 1 + shoot.lamp_jitter * random.normal()
-            name = f"polarizer/axis{layouts.degrees(axis)}/pol{layouts.degrees(ring)}"
+            name = f"polarizer/axis{folder_names.degrees(axis)}/pol{folder_names.degrees(ring)}"
             yield name, light * (0.8 * jitter) * passed, 100.0, 0.05
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.errors import InputError
+from polcap.errors import InputError, package_for
 from polcap.formats import scene_files
 from polcap.images import Bools, Floats, GBuffer, View
 from polcap.optics import frames
@@ -94,11 +94,9 @@ class Tracer:
     """A mesh prepared for ray tracing by Embree."""
 
     def __init__(self, mesh: Triangles) -> None:
-        try:
+        with package_for("tracing of meshes", "embreex", "train"):
             from embreex.mesh_construction import TriangleMesh
             from embreex.rtcore_scene import EmbreeScene
-        except ImportError:
-            raise InputError("tracing meshes needs embreex; pip install 'polcap[train]'") from None
         self.mesh = mesh
         self._scene = EmbreeScene()
         TriangleMesh(self._scene, mesh.vertices, mesh.faces)

@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter
 
 from polcap.errors import CaptureError
 from polcap.formats import atomic
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.images import Exif, Floats, GBuffer, View
 from polcap.optics import frames, mueller, projection
 from polcap.synth import color_checker as charts
@@ -105,7 +105,7 @@ def write_capture(folder: Path, studio: "Studio", frame_written: Callable[[int, 
             radiance = studio.radiance(pose, crossed=kind == "cross")
             matrix = transform(shoot, pose.shift_px, pose.rot_deg).tolist()
             for frame in range(shoot.exposures):
-                name = f"{kind}{layouts.degrees(angle)}/IMG_{shot * shoot.exposures + frame + 1:04d}.DNG"
+                name = f"{kind}{folder_names.degrees(angle)}/IMG_{shot * shoot.exposures + frame + 1:04d}.DNG"
                 stops = float(shoot.step ** (frame - shoot.exposures // 2))
                 taken = studio.photograph(place / name, radiance, Take(shot, frame, stops))
                 files.append({"file": name, "nominal_deg": angle, **asdict(pose), "transform": matrix, **taken})

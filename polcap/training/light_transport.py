@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from math import pi
 from typing import Any
 
-import cv2
 import numpy as np
 
 from polcap.images import Bools, Floats, Indices
 from polcap.optics import brdf, frames, fresnel, shade
 from polcap.optics.body import SMOOTH, Law
+from polcap.optics.morphology import masked_mean
 from polcap.optics.namespace import array_namespace
 from polcap.synth import interreflection
 from polcap.synth.interreflection import LIFT
@@ -144,11 +144,9 @@ class IndirectLight:
     def smooth(self, value: Floats) -> Floats:
         """Smooth bounced light (M, C) by means over nearby pixels of the object."""
         mask = self.places.mask
-        sigma = _SMOOTH * max(mask.shape)
         image = np.zeros((*mask.shape, value.shape[1]), np.float32)
         image[mask] = value
-        weight = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), sigma)
-        return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma)[mask] / weight[mask][:, None])
+        return np.asarray(masked_mean(image, mask, _SMOOTH * max(mask.shape))[mask])
 
 
 def directions_about(normal: Floats, cosine: Floats, azimuth: Floats) -> Floats:

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from trimesh import Trimesh, triangles
 
 from polcap.formats.scene_files import read_mesh
-from polcap.fusion.closed_mesh import euler_number, is_closed, iso_surface, volume
+from polcap.fusion.closed_mesh import is_closed, iso_surface
 from polcap.fusion.hull import visual_hull
 from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.small_views import reduce_views
@@ -37,6 +37,7 @@ from tests.fusion.traced_views import (
     into_the_opening,
     mean_error_deg,
     ring,
+    solid,
     stand,
     with_errors,
 )  # fmt: skip
@@ -76,13 +77,13 @@ def row(name: str, count: int, pictures: Path | None) -> str:
     seconds = time.process_time() - start
     hull = iso_surface(visual_hull(reduce_views(views)))
     percent = [100 * mean_distance(mesh, point) / body.size for mesh in (hull, fused)]
-    closed = "yes" if is_closed(fused) and volume(fused) > 0 else "no"
+    closed = "yes" if is_closed(fused) and solid(fused).volume > 0 else "no"
     if pictures:
         cv2.imwrite(str(pictures / f"{name}{count}.png"), picture(fused))
     return (
         f"| {count} | {name} | {off:.1f} | {percent[0]:.2f} | {percent[1]:.2f} | {true_euler(vertices, faces)} | "
-        f"{euler_number(hull)} | {euler_number(fused)} | {closed} | {seconds:.0f} | {len(fused.vertices)} | "
-        f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000:.0f} |"
+        f"{solid(hull).euler_number} | {solid(fused).euler_number} | {closed} | {seconds:.0f} | "
+        f"{len(fused.vertices)} | {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000:.0f} |"
     )
 
 

@@ -21,7 +21,7 @@ from make_mitsuba import shoot
 
 from polcap.formats import atomic, onnx
 from polcap.formats.scene_files import read_mesh
-from polcap.fusion.closed_mesh import euler_number, is_closed, iso_surface
+from polcap.fusion.closed_mesh import is_closed, iso_surface
 from polcap.fusion.fusion_path import FusionResults, FusionSettings, path
 from polcap.fusion.hull import visual_hull
 from polcap.fusion.small_views import reduce_views
@@ -32,7 +32,7 @@ from polcap.optics.frames import dot
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.stages import infer
-from tests.fusion.traced_views import Body, all_around, capture, stand
+from tests.fusion.traced_views import Body, all_around, capture, solid, stand
 
 OBJECTS = ("spot", "demosthenes")
 PIXELS, DEPTH = 256, 5
@@ -67,8 +67,8 @@ def row(name: str, count: int, scenes: Path, network: Network) -> str:
     percent = [100 * mean_distance(mesh, point) / body.size for mesh in (hull, results.mesh)]
     cells = [f"{one:.3g} → {both:.3g}" for one, both in zip(single, fused_errors(results, body, files[0]))]
     return (
-        f"| {name} | {percent[0]:.2f} | {percent[1]:.2f} | {euler_number(results.mesh)} | {is_closed(results.mesh)} | "
-        f"{' | '.join(cells)} |"
+        f"| {name} | {percent[0]:.2f} | {percent[1]:.2f} | {solid(results.mesh).euler_number} | "
+        f"{is_closed(results.mesh)} | {' | '.join(cells)} |"
     )
 
 

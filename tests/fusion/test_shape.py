@@ -11,7 +11,7 @@ pytest.importorskip("manifold3d")
 pytest.importorskip("embreex")
 
 from polcap.errors import ObjectError
-from polcap.fusion.closed_mesh import euler_number, is_closed, iso_surface, levels, volume
+from polcap.fusion.closed_mesh import decimate, is_closed, iso_surface
 from polcap.fusion.hull import DistanceGrid, VoxelGrid, plain_body
 from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.small_views import reduce_views
@@ -25,6 +25,7 @@ from tests.fusion.traced_views import (
     disturbed,
     into_the_opening,
     ring,
+    solid,
     stand,
     with_errors,
 )
@@ -53,14 +54,15 @@ def test_a_ball_has_its_radius_where_normals_and_poses_err(ball: Body, fused_bal
 
 def test_the_mesh_is_closed_manifold_and_outward(fused_ball: ClosedMesh) -> None:
     assert is_closed(fused_ball)
-    assert euler_number(fused_ball) == 2
-    assert volume(fused_ball) == pytest.approx(np.pi / 6 * SIZE**3, rel=0.02)
-    assert trimesh.Trimesh(fused_ball.vertices, fused_ball.faces, process=False).is_volume
+    assert solid(fused_ball).euler_number == 2
+    assert solid(fused_ball).volume == pytest.approx(np.pi / 6 * SIZE**3, rel=0.02)
+    assert solid(fused_ball).is_volume
 
 
 def test_levels_are_closed_and_have_their_number_of_triangles(fused_ball: ClosedMesh) -> None:
-    for level, count in zip(levels(fused_ball, [2000, 500]), [2000, 500]):
-        assert is_closed(level) and volume(level) > 0
+    for count in (2000, 500):
+        level = decimate(fused_ball, count)
+        assert is_closed(level) and solid(level).volume > 0
         assert len(level.faces) == pytest.approx(count, rel=0.02)
 
 
@@ -83,7 +85,7 @@ def test_a_torus_keeps_its_hole() -> None:
     body = stand(torus.vertices, torus.faces)  # upright
     views = [capture(body, pose, 128) for pose in ring(body, 12)]
     fused = fuse_shape(views, ShapeSettings(grid=GRID))
-    assert euler_number(fused) == 0 and is_closed(fused)
+    assert solid(fused).euler_number == 0 and is_closed(fused)
 
 
 def test_a_dent_that_no_silhouette_shows_has_its_depth() -> None:
@@ -107,7 +109,7 @@ def test_parts_that_touch_by_an_edge_alone_are_not_joined() -> None:
     body = plain_body(distance, 1.0)
     assert body[4, 5, 3] < 0 and body[4, 4, 5] < 0
     mesh = iso_surface(DistanceGrid(VoxelGrid(np.zeros(3), 1.0, (9, 9, 9)), body))
-    assert is_closed(mesh) and euler_number(mesh) == 2
+    assert is_closed(mesh) and solid(mesh).euler_number == 2
 
 
 def test_a_thin_wall_with_a_window_is_no_handle() -> None:
@@ -130,7 +132,7 @@ def test_a_bowl_is_hollow() -> None:
     true = abs(turned.volume) * scale**3
     assert is_closed(fused)
     assert true < 0.5 * filled
-    assert volume(fused) == pytest.approx(true, abs=0.2 * filled)
+    assert solid(fused).volume == pytest.approx(true, abs=0.2 * filled)
 
 
 def test_views_that_look_past_each_other_are_refused(ball: Body) -> None:

@@ -4,10 +4,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from polcap.fusion.values import FusionView, Pose
+from polcap.fusion.values import ClosedMesh, FusionView, Pose
 from polcap.images import Floats, View
 from polcap.optics import frames
 from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
@@ -138,3 +139,8 @@ def mean_error_deg(a: FusionView, b: FusionView) -> float:
     """Mean angle between the normals of two views of the same pixels."""
     cosine = frames.dot(a.normal, b.normal)[a.mask & b.mask]
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
+
+
+def solid(mesh: ClosedMesh) -> trimesh.Trimesh:
+    """A fused mesh for trimesh, which knows its volume and Euler number."""
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from polcap.optics.morphology import dilate, erode
+from polcap.optics.morphology import dilate, erode, masked_mean
 
 MASK = np.zeros((9, 12), bool)
 MASK[4, 5] = MASK[0, 0] = True
@@ -26,3 +26,12 @@ def test_only_erosion_from_the_border_removes_pixels_at_the_edge() -> None:
     assert np.array_equal(
         np.argwhere(erode(full, 2, from_border=True)), [[2, 2], [2, 3], [2, 4], [3, 2], [3, 3], [3, 4]]
     )
+
+
+def test_a_masked_mean_ignores_pixels_outside() -> None:
+    """An even picture stays even up to the mask's edge, whatever is outside, also NaN."""
+    inside = np.zeros((20, 20), bool)
+    inside[5:15, 4:12] = True
+    even = np.where(inside[..., None], [2.0, 3.0], np.nan)
+    np.testing.assert_allclose(masked_mean(even, inside, 2.0)[inside], np.tile([2.0, 3.0], (80, 1)), rtol=1e-5)
+    np.testing.assert_allclose(masked_mean(even[..., 1], inside, 2.0)[inside], 3.0, rtol=1e-5)

@@ -7,7 +7,7 @@ import pytest
 
 from polcap.config import fill
 from polcap.errors import SettingError
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.synth import scenes, shooting
 from polcap.synth.calibration_frames import CalibrationShoot
 from polcap.synth.shooting import Shoot
@@ -35,4 +35,4 @@ def test_folder_names_state_the_angle(tmp_path: Path) -> None:
     shooting.write(tmp_path / "capture", scenes.random_scene(0, "bumps"), shoot)
     names = sorted(path.name for path in (tmp_path / "capture").iterdir() if path.is_dir())
     assert names == ["cross022.25", "pol022.25", "pol067.5", "pol112.125"]
-    assert [layouts.degrees(angle) for angle in (0, 45.0, 359.9996)] == ["000", "045", "360"]
+    assert [folder_names.degrees(angle) for angle in (0, 45.0, 359.9996)] == ["000", "045", "360"]

@@ -1,6 +1,7 @@
 """Capture folders: which photograph was taken at which angle, and with which camera.
 
 reader          reads a folder as a `Capture`, and prints it as a table
+folder_names    what folders hold, by their names
 layouts         the four layouts of a folder: angle folders, capture.toml, flat, polarization sensor
 capture_toml    the keys of capture.toml
 focal_length    focal length in pixels, from EXIF or as stated

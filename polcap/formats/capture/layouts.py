@@ -5,12 +5,10 @@ Folders pol000, pol045, …; capture.toml; one flat folder; frames of a polariza
 """
 
 import os
-import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -18,19 +16,27 @@ from polcap import parallel
 from polcap.errors import CaptureError
 from polcap.formats.capture import capture_toml
 from polcap.formats.capture.capture_toml import CaptureFile
+from polcap.formats.capture.folder_names import (
+    NUMBER,
+    SEPARATION_DEG,
+    angle_folders,
+    children,
+    count_axes,
+    degrees_of_cross,
+    few_names,
+    is_one_angle,
+    is_result,
+    natural,
+    views,
+)
 from polcap.formats.own_folders import OURS
 from polcap.formats.raw import photo, probe
 from polcap.formats.raw.probe import Probe
 from polcap.images import Role
 
 DEFAULT_DEG = (0.0, 45.0, 90.0)
-SEPARATION_DEG = 5.0  # closer angles count as one
 EQUAL_STOPS = 0.15  # EXIF rounds exposure times to a sixth of a stop at most
-_FOLDER = re.compile(r"pol[ _-]?(?P<pol>\d+(?:\.\d+)?)|cross(?:[ _-]?(?P<cross>\d+(?:\.\d+)?))?", re.IGNORECASE)
 _AT_ONCE = 2  # files read in parallel: as many child processes as decode them later
-_NUMBER = re.compile(r"\d+(?:\.\d+)?")
-_VIEW = re.compile(r"view[ _-]?\d+", re.IGNORECASE)
-_FOLDER_NUMBER = re.compile(r"\d+(?:[.,]\d+)?")
 _LOSSY_SUFFIXES = {".heic", ".heif", ".hif", ".avif", ".webp"}  # of phones and small cameras; not decoded
 
 
@@ -70,12 +76,12 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     """
     if stated.frame:
         return _toml(folder, stated, angles_deg)
-    sub_folders, crossed = _angle_folders(folder)
+    sub_folders, crossed = angle_folders(folder)
     if sub_folders:
         return _folders(folder, sub_folders, crossed, angles_deg)
     if found := views(folder):
         raise CaptureError(
-            f"{folder}: its sub-folders {_few_names(found)} are views of one object: join them with `polcap fuse`, or "
+            f"{folder}: its sub-folders {few_names(found)} are views of one object: join them with `polcap fuse`, or "
             "give one of them"
         )
     pictures, notes = _list_photographs(folder)
@@ -85,7 +91,7 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
         notes.append("frames taken as a polarization sensor's, 90 45 / 135 0")
         return Plan("sensor", _sensor_shots(pictures, angles_deg), notes=tuple(notes))
     whole = Path(os.path.abspath(folder))
-    if _is_one_angle(whole):
+    if is_one_angle(whole):
         raise CaptureError(f"{folder}: holds one angle of a capture; give the folder of all, {whole.parent}")
     groups = _by_name(pictures)
     if groups:
@@ -98,10 +104,10 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
 def _hint(folder: Path) -> str:
     """A sentence on the likely mistake of a user who named a folder without photographs."""
     inside = [path for path in children(folder) if path.is_dir() and not is_result(path)]
-    named = _few_names([path.name for path in inside])
+    named = few_names([path.name for path in inside])
     if remedy := _lossy_or_packed(folder):
         return remedy
-    if any(_angle_folders(path)[0] for path in inside):
+    if any(angle_folders(path)[0] for path in inside):
         return (
             f"its sub-folders {named} hold captures: give one of them, or run `polcap batch` on the folder; for views "
             "of one object, name them view01, view02, … and run `polcap fuse`"
@@ -113,70 +119,14 @@ def _hint(folder: Path) -> str:
     return "give the folder that holds the photographs"
 
 
-def is_result(folder: Path) -> bool:
-    """Whether a folder is a result of `polcap process` or `polcap fuse`."""
-    return (folder / "report.json").is_file() and (folder / "maps").is_dir()
-
-
-def views(folder: Path) -> list[str]:
-    """Sub-folders view01, view02, … that hold captures: those that `polcap fuse` joins."""
-    named = [path for path in children(folder) if path.is_dir() and _VIEW.fullmatch(path.name)]
-    return [path.name for path in named if _angle_folders(path)[0]]
-
-
-def view_name(k: int) -> str:
-    """Name of the folder of an object's view k = 0, 1, …: view01, view02 and so on."""
-    return f"view{k + 1:02d}"
-
-
-def session_views(folder: Path) -> list[str]:
-    """Names of a session's views in their order: view01, view02, or setA/view01, setB/view01, and so on."""
-    found = [*folder.glob("view*/"), *folder.glob("set*/view*/")]
-    return sorted((path.relative_to(folder).as_posix() for path in found), key=natural)
-
-
-def is_later_view(folder: Path) -> bool:
-    """Whether a capture's folder is a view of a session, but not the first one, which shows the chart."""
-    place = Path(os.path.abspath(folder))
-    for session in (place.parent.parent, place.parent):
-        names = session_views(session)
-        if place.relative_to(session).as_posix() in names[1:]:
-            return True
-    return False
-
-
 def _lossy_or_packed(folder: Path) -> str:
     """The remedy for a folder of HEIC pictures or of a ZIP archive; empty for any other folder."""
     files = [path for path in children(folder) if path.is_file()]
     lossy = [path.name for path in files if path.suffix.lower() in _LOSSY_SUFFIXES]
     packed = [path.name for path in files if path.suffix.lower() == ".zip"]
     if lossy:
-        return f"{_few_names(lossy)} are compressed with loss: set the camera or phone to RAW or DNG, and shoot again"
-    return f"unpack {_few_names(packed)} first" if packed else ""
-
-
-def _is_one_angle(folder: Path) -> bool:
-    """Whether a folder is one of the angle folders of a capture."""
-    if not _FOLDER_NUMBER.search(folder.name) or not os.access(folder.parent, os.R_OK):
-        return False
-    siblings = _angle_folders(folder.parent)[0].values()
-    return folder in siblings and len(siblings) > 1
-
-
-def _few_names(names: Sequence[str]) -> str:
-    return f"{', '.join(names[:4])}{', …' if len(names) > 4 else ''}"
-
-
-def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[str]) -> bool:
-    """Whether a folder with these sub-folders `inside` and `files` is one capture, judged by names and first bytes.
-
-    Photographs next to sub-folders do not count (they document the session), unless there is a capture.toml.
-    """
-    if capture_toml.NAME in files or _degrees_by_name(inside):
-        return True
-    if any(name not in OURS and not name.startswith(".") for name in inside):
-        return False
-    return any(probe.kind(folder / name) in ("raw", "photo") for name in sorted(files) if not name.startswith("."))
+        return f"{few_names(lossy)} are compressed with loss: set the camera or phone to RAW or DNG, and shoot again"
+    return f"unpack {few_names(packed)} first" if packed else ""
 
 
 def counted_clockwise(plan: Plan) -> Plan:
@@ -233,87 +183,14 @@ def _folders(folder: Path, sub_folders: dict[float, Path], crossed: Path | None,
     others: tuple[Source, ...] = ()
     if crossed is not None:
         pictures, _ = _list_photographs(crossed, "shoot it again, or remove the folder")
-        others = tuple(replace(source, role="cross", angle_deg=_degrees_of_cross(crossed)) for source in pictures)
+        others = tuple(replace(source, role="cross", angle_deg=degrees_of_cross(crossed)) for source in pictures)
     inside = children(folder)
     used = {*sub_folders.values(), crossed}
     unused = [path.name for path in inside if path.is_dir() and path not in used and path.name not in OURS]
     notes += [f"not used: the folders {', '.join(unused)}"] if unused else []
     loose = [path.name for path in inside if path.is_file() and path.name != capture_toml.NAME]
-    notes += [f"not used: the files {_few_names(loose)}"] if loose else []
+    notes += [f"not used: the files {few_names(loose)}"] if loose else []
     return Plan("folders", _select(folder, groups, angles_deg), others, tuple(notes))
-
-
-def numbered(folder: Path) -> list[str]:
-    """Sub-folders with a number in their names that is not read as a polarizer angle."""
-    inside = [path.name for path in children(folder) if path.is_dir() and path.name not in OURS]
-    read = _degrees_by_name(inside)
-    return [name for name in inside if name not in read and not is_angle_folder(name) and _NUMBER.search(name)]
-
-
-def degrees(angle_deg: float) -> str:
-    """Text of a polarizer angle 0…360° as used in names of shot folders: 045, 022.5; rounded to a thousandth."""
-    whole, _, rest = f"{angle_deg:.3f}".partition(".")
-    return f"{int(whole):03d}" + (f".{rest.rstrip('0')}" if rest.strip("0") else "")
-
-
-def angle_folder_names(folder: Path) -> set[str]:
-    """Names of the sub-folders that hold the shots of one angle each: pol000, or 0, 45, 90."""
-    return set(_degrees_by_name(path.name for path in children(folder) if path.is_dir())) if folder.is_dir() else set()
-
-
-def is_angle_folder(name: str) -> bool:
-    """Whether a folder of this name inside a capture holds the shots of one angle, or the crossed one."""
-    return _FOLDER.fullmatch(name) is not None
-
-
-def _degrees_by_name(names: Iterable[str]) -> dict[str, float]:
-    """Angle [degrees] by folder name: of pol000, pol045, …, otherwise of names that differ in one number only.
-
-    0, 45, 90; "0 Grad", "45 Grad", "90 Grad"; 角度0, 角度45, 角度90: at least three different axes below 180°, one of
-    them 0°.
-    """
-    names = [name for name in names if name not in OURS and not name.startswith(".")]
-    found = {name: float(match["pol"]) for name in names if (match := _FOLDER.fullmatch(name)) and match["pol"]}
-    if found:
-        return found
-    patterns: dict[str, dict[str, float]] = defaultdict(dict)
-    for name in names:
-        numbers = _FOLDER_NUMBER.findall(name)
-        if len(numbers) == 1:
-            patterns[_FOLDER_NUMBER.sub("#", name)][name] = float(numbers[0].replace(",", "."))
-    for group in patterns.values():
-        angles = sorted(group.values())
-        if angles[0] == 0 and angles[-1] < 180 and count_axes(angles) == len(angles) >= 3:
-            return group
-    return {}
-
-
-def _angle_folders(folder: Path) -> tuple[dict[float, Path], Path | None]:
-    """Folders pol000, pol045, … by angle [degrees], and the folder of the cross-polarized shot, if any."""
-    inside = [path for path in children(folder) if path.is_dir()]
-    crossed = [path for path in inside if (match := _FOLDER.fullmatch(path.name)) and not match["pol"]]
-    if len(crossed) > 1:
-        raise CaptureError(f"{crossed[1]}: {crossed[0].name} holds a cross-polarized shot too; remove one of the two")
-    stated = _degrees_by_name(path.name for path in inside)
-    found: dict[float, Path] = {}
-    for path in inside:
-        angle = stated.get(path.name, _degrees_of_cross(path) if path in crossed else None)
-        if angle is not None and angle > 360:
-            raise CaptureError(
-                f"{path}: {angle:g}° is not an angle of a polarizer; rename the folder to 0 to 360 degrees"
-            )
-        if angle is None or path in crossed:
-            continue
-        if angle in found:
-            raise CaptureError(f"{path}: {angle:g}° is also in {found[angle].name}; remove one of the two folders")
-        found[angle] = path
-    return dict(sorted(found.items())), next(iter(crossed), None)
-
-
-def _degrees_of_cross(path: Path) -> float | None:
-    """Angle [degrees] of the lens's polarizer in a folder name such as cross045; None for cross."""
-    match = _FOLDER.fullmatch(path.name)
-    return float(match["cross"]) if match and match["cross"] else None
 
 
 def _is_sensor(pictures: list[Source], angles_deg: _Order) -> bool:
@@ -334,9 +211,9 @@ def _by_name(pictures: list[Source]) -> dict[float, list[Source]]:
     """
     stems = [source.path.stem for source in pictures]
     raw = any(source.probe.kind == "raw" for source in pictures)  # numbers of a camera's counter
-    if raw or len({_NUMBER.sub("#", stem) for stem in stems}) != 1:
+    if raw or len({NUMBER.sub("#", stem) for stem in stems}) != 1:
         return {}
-    columns = [column for column in zip(*(_NUMBER.findall(stem) for stem in stems)) if len(set(column)) > 1]
+    columns = [column for column in zip(*(NUMBER.findall(stem) for stem in stems)) if len(set(column)) > 1]
     if len(columns) != 1 or any(len(text.partition(".")[0]) > 3 for text in columns[0]):
         return {}
     groups = {float(text): [source] for text, source in zip(columns[0], pictures)}
@@ -390,13 +267,6 @@ def _select(folder: Path, groups: dict[float, list[Source]], angles_deg: _Order)
     return tuple((angle, tuple(groups[angle])) for angle in wanted)
 
 
-def count_axes(angles_deg: Iterable[float]) -> int:
-    """Number of different polarizer axes among the angles; angles 180° apart are the same axis."""
-    axes = sorted(angle % 180 for angle in angles_deg)
-    gaps = [b - a for a, b in pairwise([*axes, axes[0] + 180])] if axes else []
-    return max(sum(gap >= SEPARATION_DEG for gap in gaps), 1 if axes else 0)
-
-
 def _list_photographs(folder: Path, remedy: str = "") -> tuple[list[Source], list[str]]:
     """List the photographs of one folder, with notes; JPEGs and the like are left out if there are RAW files.
 
@@ -426,19 +296,3 @@ def _probe(path: Path) -> Probe:
     if found.kind == "unknown":
         raise CaptureError(f"{path}: not a picture, a RAW that LibRaw knows, or text; restore the file, or remove it")
     return found
-
-
-def children(folder: Path) -> list[Path]:
-    """Files and folders in a folder, sorted by name, without hidden ones (.DS_Store, ._DSC0001.NEF).
-
-    Raises CaptureError.
-    """
-    try:
-        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    except OSError as error:
-        raise CaptureError(f"{folder}: cannot be listed ({error.strerror}); check the folder") from None
-
-
-def natural(name: str) -> tuple[tuple[int, str], ...]:
-    """Sorting key for file names with numbers: frame 9 before frame 10."""
-    return tuple((int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name))

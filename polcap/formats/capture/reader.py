@@ -10,7 +10,7 @@ from typing import Literal
 from polcap.calibration_values import Calibration
 from polcap.errors import CaptureError
 from polcap.formats import atomic, calibrations
-from polcap.formats.capture import capture_toml, focal_length, layouts
+from polcap.formats.capture import capture_toml, focal_length, folder_names, layouts
 from polcap.formats.capture.capture_toml import CaptureFile
 from polcap.formats.capture.focal_length import FocalLength
 from polcap.formats.capture.layouts import Source
@@ -134,7 +134,7 @@ def table(capture: Capture) -> str:
     lines += [
         "",
         f"capture  {capture.name} ({capture.layout}): {len(capture.shots)} shots, {frames} frames",
-        f"camera   {' '.join(filter(None, (fact.make, fact.model))) or 'not stated'}, {width}×{height} px",
+        f"camera   {fact.camera or 'not stated'}, {width}×{height} px",
         f"lens     {fact.lens or 'not stated'}",
         f"focal    {capture.focal_px:.0f} px" + ("" if capture.focal_known else " (assumed)"),
     ]
@@ -146,12 +146,13 @@ def _row(frame: Frame, folder: str) -> list[str]:
     path = Path(frame.path)
     name = str(path.relative_to(folder)) if path.is_relative_to(folder) else frame.path
     flash = {True: "fired", False: "off", None: "?"}[fact.flash_fired]
-    stated = f"{frame.exposure:.4g} (stated)" if frame.exposure else _seconds(fact.exposure_time)
+    stated = f"{frame.exposure:.4g} (stated)" if frame.exposure else shutter(fact.exposure_time)
     numbers = [f"{value:g}" if value else "?" for value in (fact.iso, fact.f_number)]
     return [name, frame.role, stated, *numbers, flash, fact.taken.replace("T", " ") or "?"]
 
 
-def _seconds(time: float | None) -> str:
+def shutter(time: float | None) -> str:
+    """A shutter time [s] as text, such as 1/200 s."""
     if not time:
         return "?"
     return f"1/{1 / time:.0f} s" if time < 0.3 else f"{time:.3g} s"
@@ -212,7 +213,7 @@ def _exposure(frame: Frame) -> float | None:
 
 
 def _darkest_first(frames: Iterable[Frame]) -> tuple[Frame, ...]:
-    listed = sorted(frames, key=lambda frame: layouts.natural(Path(frame.path).name))
+    listed = sorted(frames, key=lambda frame: folder_names.natural(Path(frame.path).name))
     exposures = [_exposure(frame) for frame in listed]
     if None in exposures:
         return tuple(listed)
@@ -220,10 +221,10 @@ def _darkest_first(frames: Iterable[Frame]) -> tuple[Frame, ...]:
 
 
 def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
-    count = layouts.count_axes(angles_deg)
+    count = folder_names.count_axes(angles_deg)
     if count < 3:
         listed = ", ".join(f"{angle:g}" for angle in angles_deg) or "none"
-        unread = ", ".join(layouts.numbered(folder))
+        unread = ", ".join(folder_names.numbered(folder))
         remedy = "add the missing shot"
         if unread:
             remedy += f", or name {unread} as polcap reads it: pol000, pol045, …"
@@ -235,7 +236,7 @@ def other_equipment(fact: Exif, first: Exif) -> str | None:
     lengths = fact.focal_length_mm, first.focal_length_mm
     zoomed = lengths[0] and lengths[1] and abs(lengths[0] / lengths[1] - 1) > _ZOOM
     rows = (
-        ("was taken with", f"{fact.make} {fact.model}", f"{first.make} {first.model}"),
+        ("was taken with", fact.camera, first.camera),
         ("was taken through", fact.lens or first.lens, first.lens or fact.lens),
         ("has", f"{fact.width}×{fact.height} px", f"{first.width}×{first.height} px"),
         ("was taken at", f"{lengths[0]:g} mm" if zoomed else "", f"{lengths[1]:g} mm" if zoomed else ""),
@@ -283,7 +284,7 @@ def _settings(frame: Frame) -> str:
     if frame.exposure:
         return f"exposure {frame.exposure:.4g} stated"
     fact = frame.exif
-    parts = [_seconds(fact.exposure_time), f"f/{fact.f_number or '?'}", f"ISO {fact.iso or '?'}"]
+    parts = [shutter(fact.exposure_time), f"f/{fact.f_number or '?'}", f"ISO {fact.iso or '?'}"]
     return " ".join(parts) if fact.exposure_time else "no exposure in EXIF"
 
 

@@ -125,33 +125,29 @@ def eight_bits(texture: Texture) -> NDArray[np.uint8]:
     return np.asarray(np.rint(texture.pixels / 257.0), dtype=np.uint8)
 
 
-def webp(path: Path, frames: Frames, seconds: float) -> None:
-    """Write sRGB frames (H, W, 3) as an animated WebP that lasts `seconds` and repeats.
+def animate(path: Path, frames: Frames, seconds: float) -> list[Path]:
+    """Write sRGB frames (H, W, 3) as path.webp, which repeats, and with FFmpeg as path.mp4; returns the files.
 
-    Raises StorageError: the file cannot be written, or OpenCV was built without WebP.
+    Both last `seconds`.
+
+    Raises StorageError: OpenCV was built without WebP, or FFmpeg fails.
     """
+    files = [path.with_suffix(".webp")]
     moving = cv2.Animation()
     moving.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
     moving.durations = [round(1000 * seconds / len(frames))] * len(frames)
     done, data = cv2.imencodeanimation(".webp", moving, [cv2.IMWRITE_WEBP_QUALITY, _ANIMATION_QUALITY])
     if not done:
-        raise StorageError(f"{path}: this OpenCV writes no WebP; install opencv-contrib-python-headless from PyPI")
-    atomic.write(path, data.tobytes())
+        raise StorageError(f"{files[0]}: this OpenCV writes no WebP; install opencv-contrib-python-headless from PyPI")
+    atomic.write(files[0], data.tobytes())
+    if program := shutil.which("ffmpeg"):
+        files.append(path.with_suffix(".mp4"))
+        _write_mp4(program, files[1], frames, seconds)
+    return files
 
 
-def ffmpeg() -> str | None:
-    """Path of an installed FFmpeg, or None."""
-    return shutil.which("ffmpeg")
-
-
-def mp4(path: Path, frames: Frames, seconds: float) -> None:
-    """Write 8-bit sRGB frames (H, W, 3) as an MP4 video (H.264) that lasts `seconds`, by FFmpeg.
-
-    Raises StorageError: FFmpeg is missing, or fails.
-    """
-    program = ffmpeg()
-    if program is None:
-        raise StorageError(f"{path}: needs FFmpeg on the PATH; install it")
+def _write_mp4(program: str, path: Path, frames: Frames, seconds: float) -> None:
+    """Write 8-bit sRGB frames (H, W, 3) as an MP4 video (H.264) by FFmpeg."""
     height, width = (edge - edge % 2 for edge in frames[0].shape[:2])  # H.264 stores colors at half size
     command = [
         program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.errors import SettingError, StorageError
+from polcap.errors import StorageError, package_for
 from polcap.images import Floats, Mesh
 
 Geometry = Literal["float", "quantized", "draco"]
@@ -85,12 +85,8 @@ class Blob:
 def require(geometry: Geometry) -> None:
     """Raise a SettingError where `geometry` needs DracoPy and it is not installed."""
     if geometry == "draco":
-        try:
+        with package_for("--geometry draco", "DracoPy", "draco", ", or choose quantized"):
             import DracoPy  # noqa: F401
-        except ModuleNotFoundError:
-            raise SettingError(
-                "--geometry draco needs DracoPy: pip install 'polcap[draco]', or choose quantized"
-            ) from None
 
 
 def add(blob: Blob, mesh: Mesh, origin: Floats, geometry: Geometry) -> tuple[dict[str, Any], dict[str, Any]]:

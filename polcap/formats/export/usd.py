@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from polcap.errors import SettingError
+from polcap.errors import package_for
 from polcap.formats import atomic
 from polcap.formats.export import gltf, materialx
 from polcap.formats.export.texture_set import SPECULAR_RANGE, Key
@@ -31,13 +31,9 @@ _FIXED_TIME = 473_385_600  # s, 1985: times of the files in a USDZ, so that the 
 
 def require() -> None:
     """Raise a SettingError if the package usd-core is not installed."""
-    try:
+    presets = "USD, and with it --preset archive, maya or houdini,"
+    with package_for(presets, "usd-core", "usd", ", or name other formats"):
         from pxr import Usd  # noqa: F401
-    except ModuleNotFoundError:
-        raise SettingError(
-            "USD, and with it --preset archive, maya or houdini, needs usd-core: pip install 'polcap[usd]', "
-            "or name other formats"
-        ) from None
 
 
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], facts: Mapping[str, str]) -> None:

@@ -18,7 +18,6 @@ from polcap.errors import DecodeError, StorageError
 from polcap.formats import atomic
 from polcap.formats.raw import file_bytes, file_kind, photo, worker
 from polcap.images import Floats
-from polcap.optics.resize import area_mean
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 _LEVEL = 2  # of compression; 4 is a third slower, 1 to 4 % smaller
@@ -47,11 +46,8 @@ def encode(array: Pixels) -> bytes:
 
 def described(data: bytes, text: Mapping[str, str]) -> bytes:
     """Add texts to the bytes of a PNG: one tEXt chunk (Latin-1) per keyword of `text`."""
-    return b"".join([data[:_HEADER], *(_chunk(b"tEXt", _text(*item)) for item in text.items()), data[_HEADER:]])
-
-
-def _text(key: str, value: str) -> bytes:
-    return key.encode("latin-1") + b"\0" + value.encode("latin-1", "replace")
+    texts = [f"{key}\0{value}".encode("latin-1", "replace") for key, value in text.items()]
+    return b"".join([data[:_HEADER], *(_chunk(b"tEXt", one) for one in texts), data[_HEADER:]])
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
@@ -94,13 +90,6 @@ def decode(path: str) -> worker.Answer:
     with photo.opened(path, data) as file:
         pixels = photo.every_channel(path, file)
     return {}, {"pixels": pixels[..., 0] if pixels.shape[2] < 3 else pixels}  # grey, its alpha left out
-
-
-def fitted(picture: Pixels, width: int) -> NDArray[np.uint8]:
-    """Reduce an 8-bit picture (H, W, 3) to at most `width` px, with an even number of rows (video encoders need it)."""
-    width = min(width, picture.shape[1])
-    height = max(2, 2 * round(picture.shape[0] * width / picture.shape[1] / 2))
-    return np.asarray(area_mean(picture, (height, width)), np.uint8)
 
 
 def sixteen_bits(value: Floats) -> NDArray[np.uint16]:

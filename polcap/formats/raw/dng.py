@@ -99,7 +99,7 @@ def _camera_tags(exif: Exif) -> list[_Entry]:
         (272, _ASCII, exif.model),
         (305, _ASCII, "polcap"),
         (306, _ASCII, _stamp(exif, "%Y:%m:%d %H:%M:%S")),
-        (50708, _ASCII, f"{exif.make} {exif.model}".strip() or "unknown"),
+        (50708, _ASCII, exif.camera or "unknown"),
     ]
 
 

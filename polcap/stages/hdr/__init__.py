@@ -42,6 +42,7 @@ from polcap.images import (
     View,
 )
 from polcap.optics import sharpness
+from polcap.optics.projection import to_grid
 from polcap.stages import stage
 from polcap.stages.hdr import exposure, noise, photosites, planes, weights
 from polcap.stages.hdr.bracket import Bracket, compare
@@ -223,9 +224,8 @@ def _sensor(capture: Capture, image: SensorImage, settings: HdrSettings) -> Colo
 def _view(capture: Capture, image: SensorImage, settings: HdrSettings) -> View:
     """The pinhole camera (`View`) of the merged picture; its pixel (0, 0) is the center of a superpixel."""
     scale = 1.0 if settings.demosaic == "full" else float(image.superpixel)
-    x, y = capture.principal_px
-    center = (x - (scale - 1) / 2) / scale, (y - (scale - 1) / 2) / scale
-    return View(capture.focal_px / scale, center, scale, known=capture.focal_known)
+    x, y = (to_grid(at, scale) for at in capture.principal_px)
+    return View(capture.focal_px / scale, (x, y), scale, known=capture.focal_known)
 
 
 def _empty(shots: int, shape: tuple[int, int, int]) -> MaskedImage:

@@ -26,11 +26,10 @@ import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMaps
 from polcap.optics import brdf, frames
-from polcap.optics.morphology import erode
+from polcap.optics.morphology import erode, masked_mean
 from polcap.optics.resize import area_mean
 from polcap.stages import stage
 from polcap.stages.infer import analytic, highlights, learned
@@ -86,8 +85,8 @@ def _select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:
     solid = cues.mask & ((cues.quality & np.uint8(_DEFECTS)) == 0)
     inside = erode(solid, _EDGE_PX, from_border=True)
     height, width = inside.shape
-    explained = _mean(_power_of_shading(cues, maps) + _NOISE * cues.ratio_sigma**2, cues.mask, _DETAIL_AROUND)
-    power = _mean(area_mean(np.square(detail, dtype=np.float32), (height, width)), inside, _DETAIL_AROUND)
+    explained = masked_mean(_power_of_shading(cues, maps) + _NOISE * cues.ratio_sigma**2, cues.mask, _DETAIL_AROUND)
+    power = masked_mean(area_mean(np.square(detail, dtype=np.float32), (height, width)), inside, _DETAIL_AROUND)
     share = np.clip(1 - explained / np.maximum(power, 1e-9), 0, 1) * inside
     selected = cv2.resize(share.astype(np.float32), (2 * width, 2 * height))
     selected *= detail
@@ -96,7 +95,7 @@ def _select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:
 
 def _power_of_shading(cues: Cues, maps: SurfaceMaps) -> Floats:
     """Squared logarithm (H, W) of the fine shading that the normals show, and that their error may hide."""
-    albedo = np.maximum(_mean(maps.diffuse.mean(axis=-1), cues.mask, _DETAIL_AROUND), _DARKEST)
+    albedo = np.maximum(masked_mean(maps.diffuse.mean(axis=-1), cues.mask, _DETAIL_AROUND), _DARKEST)
     gloss, alpha = maps.specular.mean(axis=-1), np.maximum(maps.roughness**2, _DARKEST)
 
     def log_light(zenith: Floats) -> Floats:
@@ -108,13 +107,6 @@ def _power_of_shading(cues: Cues, maps: SurfaceMaps) -> Floats:
     zenith = np.arccos(np.clip(frames.dot(maps.normal, cues.rays), 0, 1))
     error = np.radians(maps.confidence)
     light = log_light(zenith)
-    fine = light - _mean(light, cues.mask, _BAND)
+    fine = light - masked_mean(light, cues.mask, _BAND)
     doubt = (log_light(np.maximum(zenith - error, 0)) - log_light(zenith + error)) / 2
     return np.asarray(_SHADING * fine**2 + _UNCERTAIN * doubt**2)
-
-
-def _mean(image: Floats, inside: NDArray[np.bool_], sigma: float) -> Floats:
-    """Gaussian mean (H, W) of the pixels inside a mask."""
-    weight = inside.astype(np.float32)
-    total, share = (cv2.GaussianBlur(part, (0, 0), sigma) for part in (image.astype(np.float32) * weight, weight))
-    return np.asarray(total / np.maximum(share, 1e-3))

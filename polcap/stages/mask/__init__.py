@@ -64,7 +64,7 @@ def segment(
         if not user_mask.any():
             raise ObjectError("the mask is empty: no pixel is 128 or brighter; paint the object white")
         return _object(user_mask, "user", None, settings)
-    picture, zone = _mean_picture(radiance, alignment, color), _chart_zone(radiance, color, settings.chart_margin)
+    picture, zone = mean_picture(radiance, alignment, color), _chart_zone(radiance, color, settings.chart_margin)
     if network is None:
         return _object(backdrop.find_object(picture, zone, settings.min_area), "automatic", None, settings)
     patches = _chart_zone(radiance, color, 0.0)
@@ -95,8 +95,8 @@ def _object(
     return ObjectMask(mask, crop, source, doubt, *regions.measure_shape(mask))
 
 
-def _mean_picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> Floats:
-    """Mean picture of the registered shots in linear Rec.709, (H, W, 3)."""
+def mean_picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> Floats:
+    """Mean picture (H, W, 3) of the registered shots in linear Rec.709, on the scale of S0."""
     total = sum(warp(radiance.value[k], alignment.transform[k], order=1) for k in range(len(radiance.angle)))
     return np.asarray(cv2.transform(total, 2 / len(radiance.angle) * color.matrix), np.float32)
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Bools, Floats, RingZero
 from polcap.optics import mueller, outline
+from polcap.optics.morphology import masked_mean
 from polcap.optics.resize import area_mean
 from polcap.optics.robust import jackknife
 from polcap.stages.selfcal import integrability
@@ -69,7 +70,8 @@ def by_outline(
     radius = outline.disc_radius(mask)
     if leaves_picture or int((mask & (depth < 2 * _RIM_PX)).sum()) < _LEAST_RIM_PX:
         return UNKNOWN
-    s0, s1, s2 = np.linalg.pinv(mueller.analyzer(angle)) @ _smoothed(light, mask & sound)[:, inside & sound]
+    smooth = np.stack([masked_mean(shot, mask & sound, _SMOOTH_PX) for shot in light])
+    s0, s1, s2 = np.linalg.pinv(mueller.analyzer(angle)) @ smooth[:, inside & sound]
     seen = inside & sound
     lit = s0 > 0
     seen[seen] = lit
@@ -98,13 +100,6 @@ def by_outline(
         + (gain_sigma * lopsided / 2) ** 2
     )
     return RingZero(-rim, min(float(np.sqrt(variance)), np.pi / 2))
-
-
-def _smoothed(light: Floats, used: Bools) -> Floats:
-    """Blur shots (K, H, W) over the used pixels only."""
-    ok = used.astype(np.float32)
-    share = cv2.GaussianBlur(ok, (0, 0), _SMOOTH_PX) + 1e-6
-    return np.stack([cv2.GaussianBlur((shot * ok).astype(np.float32), (0, 0), _SMOOTH_PX) / share for shot in light])
 
 
 def _outward(inside: Floats | Bools, sigma: float) -> Complexes:

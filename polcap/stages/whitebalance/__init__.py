@@ -29,6 +29,7 @@ from polcap.images import (
     PatchColors,
     View,
 )
+from polcap.optics.projection import to_grid
 from polcap.stages import stage
 from polcap.stages.whitebalance import chart, chart_light, chart_search, patches
 from polcap.stages.whitebalance.chart import Placement
@@ -234,7 +235,7 @@ def _at_corners(
         raise ChartError("--chart needs the four outer corners of the patches x0,y0,…,x3,y3, clockwise from dark skin")
     height, width = radiance.value.shape[1:3]
     scale = radiance.view.scale
-    corners = (np.asarray(corners_px, np.float64) - (scale - 1) / 2) / scale
+    corners = to_grid(np.asarray(corners_px, np.float64), scale)
     placement = chart.from_corners(corners)
     if reference.surroundings is not None and _shows_more(radiance, corners, reference, settings):
         placement = chart.from_sg_corners(corners)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names
 from polcap.formats.capture import reader as capture
 from polcap.formats.raw import frame_decoder
 from tests.formats.capture.capture_folders import degrees, flat, folders, names, pictures, shoot
@@ -56,8 +56,8 @@ def test_numbered_folders_of_objects_are_not_angles(tmp_path, listed):
 
 
 def test_a_batch_distinguishes_angle_folders_from_numbered_captures(tmp_path):
-    assert layouts.looks_like_a_capture(tmp_path, ("0 Grad", "45 Grad", "90 Grad"), ())
-    assert not layouts.looks_like_a_capture(tmp_path, ("10", "20", "30"), ())
+    assert folder_names.looks_like_a_capture(tmp_path, ("0 Grad", "45 Grad", "90 Grad"), ())
+    assert not folder_names.looks_like_a_capture(tmp_path, ("10", "20", "30"), ())
 
 
 def test_a_polarization_sensor_is_never_clockwise(tmp_path):
@@ -138,7 +138,7 @@ def test_views_of_one_object_are_for_fuse(tmp_path):
 def test_only_the_first_view_of_a_session_must_show_the_chart(tmp_path):
     for name in ("vase/view01", "vase/view02", "mug/setA/view01", "mug/setB/view01", "alone"):
         (tmp_path / name).mkdir(parents=True)
-    later = {name.relative_to(tmp_path).as_posix() for name in tmp_path.glob("**/") if layouts.is_later_view(name)}
+    later = {name.relative_to(tmp_path).as_posix() for name in tmp_path.glob("**/") if folder_names.is_later_view(name)}
     assert later == {"vase/view02", "mug/setB/view01"}
 
 

@@ -157,7 +157,7 @@ def test_without_usd_core_one_line_names_the_package(monkeypatch: pytest.MonkeyP
     import sys
 
     monkeypatch.setitem(sys.modules, "pxr", None)
-    with pytest.raises(SettingError, match=r"usd-core: pip install 'polcap\[usd\]'"):
+    with pytest.raises(SettingError, match=r"usd-core; pip install 'polcap\[usd\]'"):
         usd.require()
 
 

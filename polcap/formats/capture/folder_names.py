@@ -1,0 +1,178 @@
+"""Folders of photographs by their names: shots of one angle, views of an object, captures, results.
+
+Nothing but names and first bytes is read; `layouts` assigns the photographs themselves.
+"""
+
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+from polcap.errors import CaptureError
+from polcap.formats.capture import capture_toml
+from polcap.formats.own_folders import OURS
+from polcap.formats.raw import probe
+
+SEPARATION_DEG = 5.0  # closer angles count as one
+NUMBER = re.compile(r"\d+(?:\.\d+)?")
+_FOLDER_NUMBER = re.compile(r"\d+(?:[.,]\d+)?")
+_FOLDER = re.compile(r"pol[ _-]?(?P<pol>\d+(?:\.\d+)?)|cross(?:[ _-]?(?P<cross>\d+(?:\.\d+)?))?", re.IGNORECASE)
+_VIEW = re.compile(r"view[ _-]?\d+", re.IGNORECASE)
+
+
+def children(folder: Path) -> list[Path]:
+    """Files and folders in a folder, sorted by name, without hidden ones (.DS_Store, ._DSC0001.NEF).
+
+    Raises CaptureError.
+    """
+    try:
+        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    except OSError as error:
+        raise CaptureError(f"{folder}: cannot be listed ({error.strerror}); check the folder") from None
+
+
+def natural(name: str) -> tuple[tuple[int, str], ...]:
+    """Sorting key for file names with numbers: frame 9 before frame 10."""
+    return tuple((int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name))
+
+
+def few_names(names: Sequence[str]) -> str:
+    """The first four names of a list for a message."""
+    return f"{', '.join(names[:4])}{', …' if len(names) > 4 else ''}"
+
+
+def is_result(folder: Path) -> bool:
+    """Whether a folder is a result of `polcap process` or `polcap fuse`."""
+    return (folder / "report.json").is_file() and (folder / "maps").is_dir()
+
+
+def views(folder: Path) -> list[str]:
+    """Sub-folders view01, view02, … that hold captures: those that `polcap fuse` joins."""
+    named = [path for path in children(folder) if path.is_dir() and _VIEW.fullmatch(path.name)]
+    return [path.name for path in named if angle_folders(path)[0]]
+
+
+def view_name(k: int) -> str:
+    """Name of the folder of an object's view k = 0, 1, …: view01, view02 and so on."""
+    return f"view{k + 1:02d}"
+
+
+def session_views(folder: Path) -> list[str]:
+    """Names of a session's views in their order: view01, view02, or setA/view01, setB/view01, and so on."""
+    found = [*folder.glob("view*/"), *folder.glob("set*/view*/")]
+    return sorted((path.relative_to(folder).as_posix() for path in found), key=natural)
+
+
+def is_later_view(folder: Path) -> bool:
+    """Whether a capture's folder is a view of a session, but not the first one, which shows the chart."""
+    place = Path(os.path.abspath(folder))
+    for session in (place.parent.parent, place.parent):
+        names = session_views(session)
+        if place.relative_to(session).as_posix() in names[1:]:
+            return True
+    return False
+
+
+def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[str]) -> bool:
+    """Whether a folder with these sub-folders `inside` and `files` is one capture, judged by names and first bytes.
+
+    Photographs next to sub-folders do not count (they document the session), unless there is a capture.toml.
+    """
+    if capture_toml.NAME in files or _degrees_by_name(inside):
+        return True
+    if any(name not in OURS and not name.startswith(".") for name in inside):
+        return False
+    return any(probe.kind(folder / name) in ("raw", "photo") for name in sorted(files) if not name.startswith("."))
+
+
+def is_one_angle(folder: Path) -> bool:
+    """Whether a folder is one of the angle folders of a capture."""
+    if not _FOLDER_NUMBER.search(folder.name) or not os.access(folder.parent, os.R_OK):
+        return False
+    siblings = angle_folders(folder.parent)[0].values()
+    return folder in siblings and len(siblings) > 1
+
+
+def angle_folder_names(folder: Path) -> set[str]:
+    """Names of the sub-folders that hold the shots of one angle each: pol000, or 0, 45, 90."""
+    return set(_degrees_by_name(path.name for path in children(folder) if path.is_dir())) if folder.is_dir() else set()
+
+
+def is_angle_folder(name: str) -> bool:
+    """Whether a folder of this name inside a capture holds the shots of one angle, or the crossed one."""
+    return _FOLDER.fullmatch(name) is not None
+
+
+def degrees(angle_deg: float) -> str:
+    """Text of a polarizer angle 0…360° as used in names of shot folders: 045, 022.5; rounded to a thousandth."""
+    whole, _, rest = f"{angle_deg:.3f}".partition(".")
+    return f"{int(whole):03d}" + (f".{rest.rstrip('0')}" if rest.strip("0") else "")
+
+
+def numbered(folder: Path) -> list[str]:
+    """Sub-folders with a number in their names that is not read as a polarizer angle."""
+    inside = [path.name for path in children(folder) if path.is_dir() and path.name not in OURS]
+    read = _degrees_by_name(inside)
+    return [name for name in inside if name not in read and not is_angle_folder(name) and NUMBER.search(name)]
+
+
+def _degrees_by_name(names: Iterable[str]) -> dict[str, float]:
+    """Angle [degrees] by folder name: of pol000, pol045, …, otherwise of names that differ in one number only.
+
+    0, 45, 90; "0 Grad", "45 Grad", "90 Grad"; 角度0, 角度45, 角度90: at least three different axes below 180°, one of
+    them 0°.
+    """
+    names = [name for name in names if name not in OURS and not name.startswith(".")]
+    found = {name: float(match["pol"]) for name in names if (match := _FOLDER.fullmatch(name)) and match["pol"]}
+    if found:
+        return found
+    patterns: dict[str, dict[str, float]] = defaultdict(dict)
+    for name in names:
+        numbers = _FOLDER_NUMBER.findall(name)
+        if len(numbers) == 1:
+            patterns[_FOLDER_NUMBER.sub("#", name)][name] = float(numbers[0].replace(",", "."))
+    for group in patterns.values():
+        angles = sorted(group.values())
+        if angles[0] == 0 and angles[-1] < 180 and count_axes(angles) == len(angles) >= 3:
+            return group
+    return {}
+
+
+def angle_folders(folder: Path) -> tuple[dict[float, Path], Path | None]:
+    """Folders pol000, pol045, … by angle [degrees], and the folder of the cross-polarized shot, if any.
+
+    Raises CaptureError: two folders have one angle, or an angle is beyond 360°.
+    """
+    inside = [path for path in children(folder) if path.is_dir()]
+    crossed = [path for path in inside if (match := _FOLDER.fullmatch(path.name)) and not match["pol"]]
+    if len(crossed) > 1:
+        raise CaptureError(f"{crossed[1]}: {crossed[0].name} holds a cross-polarized shot too; remove one of the two")
+    stated = _degrees_by_name(path.name for path in inside)
+    found: dict[float, Path] = {}
+    for path in inside:
+        angle = stated.get(path.name, degrees_of_cross(path) if path in crossed else None)
+        if angle is not None and angle > 360:
+            raise CaptureError(
+                f"{path}: {angle:g}° is not an angle of a polarizer; rename the folder to 0 to 360 degrees"
+            )
+        if angle is None or path in crossed:
+            continue
+        if angle in found:
+            raise CaptureError(f"{path}: {angle:g}° is also in {found[angle].name}; remove one of the two folders")
+        found[angle] = path
+    return dict(sorted(found.items())), next(iter(crossed), None)
+
+
+def degrees_of_cross(path: Path) -> float | None:
+    """Angle [degrees] of the lens's polarizer in a folder name such as cross045; None for cross."""
+    match = _FOLDER.fullmatch(path.name)
+    return float(match["cross"]) if match and match["cross"] else None
+
+
+def count_axes(angles_deg: Iterable[float]) -> int:
+    """Number of different polarizer axes among the angles; angles 180° apart are the same axis."""
+    axes = sorted(angle % 180 for angle in angles_deg)
+    gaps = [b - a for a, b in pairwise([*axes, axes[0] + 180])] if axes else []
+    return max(sum(gap >= SEPARATION_DEG for gap in gaps), 1 if axes else 0)
