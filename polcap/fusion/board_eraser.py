@@ -141,7 +141,8 @@ def _object_like(picture: Floats, print_: _Print, light: tuple[Floats, Floats], 
     expected = print_.paper * (paper - ink) + ink
     off = (np.abs(picture - expected) > _TOLERANCE * expected + (print_.doubt + _NOISE) * paper).any(axis=-1)
     element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * (strip[0] // 2) + 1, 2 * (strip[1] // 2) + 1))
-    broad = cv2.morphologyEx(off.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))  # no edges of the print
+    pair = np.ones((2, 2), np.uint8)  # removes edges of the print; with one anchor for both, the result would shift
+    broad = cv2.dilate(cv2.erode(off.astype(np.uint8), pair, anchor=(0, 0)), pair, anchor=(1, 1))
     closed = cv2.morphologyEx(broad, cv2.MORPH_CLOSE, element)
     thick = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, label, stats, _ = cv2.connectedComponentsWithStats(thick)

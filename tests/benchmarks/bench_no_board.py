@@ -24,12 +24,13 @@ from trimesh.registration import procrustes
 from trimesh.sample import sample_surface
 
 from polcap import config
-from polcap.fusion import fuse_run, fused_maps, session
-from polcap.fusion.fusion_path import FusionSettings
+from polcap.fusion import session
+from polcap.fusion.fusion_path import FusionResults, FusionSettings, path
 from polcap.fusion.session import Session, SessionInput
 from polcap.fusion.values import Pose
 from polcap.images import Floats
 from polcap.pipeline import models
+from polcap.pipeline.cache import MemoryCache
 from polcap.synth import all_around, scenes
 
 PATTERN_M = 0.006  # size of the pattern
@@ -42,20 +43,18 @@ def main(out: Path, mesh: str, views: int, step: int) -> None:
         folder = out / board
         if not folder.exists():
             render(folder, mesh, board, views)
-        for k in range(views):
-            if k % step:
-                (folder / f"view{k + 1:02d}").rename(folder / f"unused{k + 1:02d}")
         networks = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
         wanted = SessionInput(folder, config.load(None, []), network=networks[0], mask_network=networks[1])
-        fuse_run.fuse(wanted, FusionSettings(), folder / "fused", print, lambda *_: None)
         found = session.read(wanted)
-        session.process(found, wanted, lambda _: None)
+        found.captures = dict(list(found.captures.items())[::step])
+        results = path(session.process(found, wanted, print), FusionSettings(), MemoryCache())
         pairs = true_poses(folder, found)
         turns = rotation_errors(pairs)
         residual = np.mean([one.residual_px for one in found.posed.values()])
+        away = 100 * distance(folder, results, found.metric, pairs)
         print(
-            f"| {mesh}, {len(turns)} of {views // step} views | {'board' if board != 'none' else 'features'} | "
-            f"{turns.mean():.2f}, {turns.max():.2f} | {residual:.2f} | {100 * distance(folder, pairs):.2f} |"
+            f"| {mesh}, {len(turns)} of {len(found.captures)} views | {'board' if board != 'none' else 'features'} | "
+            f"{turns.mean():.2f}, {turns.max():.2f} | {residual:.2f} | {away:.2f} |"
         )
 
 
@@ -87,13 +86,13 @@ def rotation_errors(pairs: list[tuple[Pose, Pose]]) -> Floats:
     return np.degrees([Rotation.from_matrix(one.rotation @ turn @ true.rotation.T).magnitude() for one, true in pairs])
 
 
-def distance(folder: Path, pairs: list[tuple[Pose, Pose]]) -> float:
+def distance(folder: Path, results: FusionResults, metric: bool, pairs: list[tuple[Pose, Pose]]) -> float:
     """Mean distance of the seen texels from the true surface, over its size."""
-    source, truth = fused_maps.read(folder / "fused" / "maps"), dict(np.load(folder / "truth.npz"))
+    atlas, truth = results.atlas, dict(np.load(folder / "truth.npz"))
     surface = Trimesh(truth["vertices"], truth["faces"], process=False)
     tree, size = cKDTree(sample_surface(surface, 400_000, seed=0)[0]), float(np.ptp(truth["vertices"], axis=0).max())
-    point = source.atlas.position[source.maps.weight[source.atlas.covered] > bench_fused_asset.LEAST_SEEN][::TEXELS]
-    point = point if source.atlas.mesh.metric else placed(point, pairs, tree)
+    point = atlas.position[results.maps.weight[atlas.covered] > bench_fused_asset.LEAST_SEEN][::TEXELS]
+    point = point if metric else placed(point, pairs, tree)
     return float(np.mean(tree.query(point)[0])) / size
 
 
