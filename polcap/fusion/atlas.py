@@ -25,6 +25,7 @@ from polcap.stages import stage
 _FILLED = 0.4  # share of the texture that charts cover, about; uvunwrap reaches .4 to .63
 _TRIANGLE = 4  # map pixels to a triangle of the mesh; docs/benchmarks/fusion.md
 _FEWEST = 2000  # triangles
+_SHARES = (1.0, 0.9, 0.8)  # of the triangles, in turn until the mesh can be charted
 _SIDES = (512, 4096)  # px, least and greatest side of a texture whose size is not set
 
 
@@ -57,10 +58,25 @@ def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSetti
     The mesh is reduced to a triangle for four pixels of the views' maps: smaller ones would cut it into charts of a few
     texels. Without a set size, the side is the least power of two whose texels are no larger than these pixels.
 
+    A mesh that cannot be charted is reduced further.
+
     Raises SettingError: the package uvunwrap is missing, or the charts do not fit into a texture of this size.
+    Raises ObjectError: the mesh has no charts.
     """
     pixel = _pixel(mesh, views)
-    mesh = decimate(mesh, max(int(_area(mesh) / (_TRIANGLE * pixel**2)), _FEWEST))
+    count = min(int(_area(mesh) / (_TRIANGLE * pixel**2)), len(mesh.faces))
+    failure: ObjectError | None = None
+    for share in _SHARES:
+        try:
+            return _sized(decimate(mesh, max(int(share * count), _FEWEST)), pixel, settings)
+        except ObjectError as error:
+            failure = error
+    assert failure is not None
+    raise failure
+
+
+def _sized(mesh: ClosedMesh, pixel: float, settings: AtlasSettings) -> Atlas:
+    """The atlas in the size of the settings, or in one whose texels are no larger than `pixel` [m]."""
     if settings.size:
         return charted(mesh, settings.size, settings.margin)
     side = _side(mesh, pixel)
@@ -104,7 +120,10 @@ def _charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[n
     surface = uvunwrap.Mesh(mesh.vertices.astype(np.float32).ravel().tolist(), mesh.faces.ravel().tolist())
     try:
         packed = uvunwrap.generate([surface], page_size=side, padding=margin)
-    except uvunwrap.UnwrapError as error:
+    except BaseException as error:
+        # its solver (faer 0.22) fails on some charts at random, with a panic of Rust that is no Exception
+        if not isinstance(error, uvunwrap.UnwrapError) and type(error).__name__ != "PanicException":
+            raise
         raise ObjectError(f"the mesh of {len(mesh.faces)} triangles has no texture atlas ({error})") from error
     if packed.page_count != 1:
         raise SettingError(f"the charts do not fit into {side} px; raise fusion.atlas.size")

@@ -1,6 +1,7 @@
 """The atlas: charts without overlap, one point of the surface for each texel."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -58,3 +59,22 @@ def test_a_dense_mesh_is_reduced_to_what_the_maps_resolve() -> None:
     views = tuple(replace(one, view=replace(one.view, focal=one.view.focal / 4)) for one in views)
     found = atlases.unwrap(dense, views, AtlasSettings())
     assert 1900 < len(found.mesh.faces) < len(dense.faces)
+
+
+def test_a_mesh_on_which_the_solver_fails_is_reduced_further(monkeypatch: pytest.MonkeyPatch) -> None:
+    class PanicException(BaseException):  # as Rust's panics are named in Python
+        pass
+
+    uvunwrap = pytest.importorskip("uvunwrap")
+    views, generate, calls = ellipsoid.views(1), uvunwrap.generate, list[int]()
+
+    def failing(meshes: list[Any], **options: Any) -> Any:
+        calls.append(len(meshes))
+        if len(calls) == 1:
+            raise PanicException("index out of bounds")
+        return generate(meshes, **options)
+
+    whole = atlases.unwrap(ellipsoid.mesh(), views, AtlasSettings())
+    monkeypatch.setattr(uvunwrap, "generate", failing)
+    found = atlases.unwrap(ellipsoid.mesh(), views, AtlasSettings())
+    assert 0.85 < len(found.mesh.faces) / len(whole.mesh.faces) < 0.95
