@@ -77,5 +77,5 @@ def package_for(purpose: str, package: str, extra: str, instead: str = "") -> It
     """Context manager for an import of `polcap[extra]`: a SettingError names the `package` that is missing."""
     try:
         yield
-    except ImportError:
+    except ModuleNotFoundError:
         raise SettingError(f"{purpose} needs {package}; pip install 'polcap[{extra}]'{instead}") from None

@@ -1,6 +1,6 @@
 """Surface that has the measured normals and touches the silhouettes; it begins as the hull's.
 
-It may leave the hull, which is too small: where a mask lacks a border, the hull lacks it, whatever other masks say.
+It may leave the hull. The hull is too small wherever a single mask is too narrow.
 
 Each round moves every vertex along its normal, by sparse least squares: the edges of each triangle lie square to the
 mean of the normals that the views measured there, and rims stay on their silhouettes.

@@ -36,9 +36,9 @@ def test_the_print_becomes_dark_and_the_object_stays(albedo: tuple[float, float,
     assert (after[bright].mean(axis=-1) < 0.1).mean() > 0.97
     changed = np.abs(after - before).max(axis=-1) > 1e-3
     assert changed[mask].mean() < 0.04
-    beside = dilate(mask, 4) & bright
-    assert beside.sum() > 200
-    assert changed[beside].mean() > 0.98  # the part that stays is not shifted against the object
+    around = dilate(mask, 4) & bright
+    assert around.sum() > 200
+    assert changed[around].mean() > 0.98  # the part that stays is not shifted against the object
 
 
 def test_the_print_becomes_dark_under_warm_light_and_a_quarter_of_a_pixel_aside() -> None:
