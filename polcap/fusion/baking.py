@@ -26,11 +26,11 @@ from polcap.fusion.atlas import Atlas
 from polcap.fusion.values import FusionView
 from polcap.images import Bools, Floats
 from polcap.optics import frames
+from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.optics.morphology import masked_mean
 from polcap.optics.outline import fill_outward
 from polcap.optics.projection import project
 from polcap.stages import stage
-from polcap.synth.mesh_tracer import Tracer, Triangles
 
 _LEAST_COSINE = 0.15  # between surface and view: beyond 81° a map pixel covers seven texels
 _FADE = 0.04  # of the object's diameter: distance from an edge over which a view's weight rises to 1

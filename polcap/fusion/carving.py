@@ -27,9 +27,9 @@ from polcap.fusion.normal_surface import FittedSurface, visible
 from polcap.fusion.small_views import SmallView, sample
 from polcap.images import Bools, Floats
 from polcap.optics.frames import dot, unit
+from polcap.optics.mesh_tracer import Tracer
 from polcap.optics.projection import back_project
 from polcap.optics.vertex_frames import vertex_normals
-from polcap.synth.mesh_tracer import Tracer
 
 _DOUBT = 0.4  # share of the views' weight that contradicts the mean normal; this and below: docs/benchmarks/fusion.md
 _SPREAD = 6  # rounds of averaging of the doubt over neighbors

@@ -24,8 +24,8 @@ from polcap.fusion.small_views import SmallView, sample
 from polcap.fusion.values import ClosedMesh
 from polcap.images import Bools, Floats
 from polcap.optics.frames import dot, unit
+from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.optics.vertex_frames import area_vectors, vertex_normals
-from polcap.synth.mesh_tracer import Tracer, Triangles
 
 _LIFT = 0.3  # steps off the surface where rays towards the lenses start; the numbers: docs/benchmarks/fusion.md
 _FACING = 0.1  # least cosine between a vertex's normal and the direction to a lens that sees it
@@ -91,7 +91,8 @@ class FittedSurface:
 def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid, rounds: int) -> FittedSurface:
     """Surface with the views' normals, from a mesh of the hull or of the carved hull; same triangles.
 
-    Rims hold the surface at the silhouettes. Hollows have none, so they are held where they were carved.
+    Rims hold the surface at the silhouettes. Hollows have none, so they are held where they were carved. `rounds`
+    is at least 1.
     """
     step, faces = hull.grid.step, mesh.faces
     start: Floats = mesh.vertices.astype(np.float64)
@@ -150,9 +151,10 @@ def mean_normals(vertices: Floats, outward: Floats, seen: Bools, views: Sequence
         agreeing = w / (1 + _angle2(n, mean) / _CAUCHY**2)
         mean = unit(np.sum(agreeing[..., None] * n, axis=0))
     close, total = np.sum(agreeing, axis=0), np.sum(w, axis=0)
-    count = close / np.maximum(w.max(axis=0), 1e-12)  # of the agreeing views
+    agreeing_views = close / np.maximum(w.max(axis=0), 1e-12)  # their number
     agreement = np.where(total > 0, close / np.maximum(total, 1e-12), 1.0)
-    return SurfaceNormals(np.where(count[:, None] > 0, mean, outward), count / (1 + count), agreement)
+    normal = np.where(agreeing_views[:, None] > 0, mean, outward)
+    return SurfaceNormals(normal, agreeing_views / (1 + agreeing_views), agreement)
 
 
 def _angle2(a: Floats, b: Floats) -> Floats:
@@ -209,11 +211,12 @@ def _displacements(
     diagonal = np.full(count, _DAMPING**2)
     diagonal += np.bincount(i, w2 * a_i**2 + smooth2, count) + np.bincount(j, w2 * a_j**2 + smooth2, count)
     right = np.bincount(j, w2 * a_j * b, count) - np.bincount(i, w2 * a_i * b, count)
-    for of in anchors:
-        diagonal += np.bincount(of.vertex, of.weight**2 * of.slope**2, count)
-        right += np.bincount(of.vertex, of.weight**2 * of.slope * of.distance, count)
-    beside = sparse.coo_matrix((-w2 * a_i * a_j - smooth2, (i, j)), shape=(count, count)).tocsr()
-    matrix = beside + beside.T + sparse.diags(diagonal)
+    for held in anchors:
+        diagonal += np.bincount(held.vertex, held.weight**2 * held.slope**2, count)
+        right += np.bincount(held.vertex, held.weight**2 * held.slope * held.distance, count)
+    coupling = sparse.coo_matrix((-w2 * a_i * a_j - smooth2, (i, j)), shape=(count, count)).tocsr()
+    matrix = coupling + coupling.T + sparse.diags(diagonal)
+    # a ball on the finest grid (300) needs 160 steps; a solution cut short is a shorter move, the next round goes on
     move, _ = cg(matrix, right, rtol=1e-3, maxiter=200, M=sparse.diags(1 / diagonal))
     return np.asarray(move)
 

@@ -10,8 +10,8 @@ from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.values import Pose
 from polcap.images import Floats, View
 from polcap.optics import color, frames, shade
+from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.report.sheets import Picture
-from polcap.synth.mesh_tracer import Tracer, Triangles
 
 FRAMES = 48  # of the turntable
 _INDEX = 1.5

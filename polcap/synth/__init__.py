@@ -6,7 +6,7 @@ calibration_frames  calibration photographs of a known camera, lens, polarizer a
 scenes              random scenes
 render              Stokes parameters of a scene at any pixel position
 forward_camera      lens distortion, color mosaic, noise, DNG
-trace               rays against a shape: `distance_fields`, or a mesh by `mesh_tracer`
+trace               rays against a shape: `distance_fields`, or a mesh by `optics.mesh_tracer`
 scene_materials     albedo, F0, roughness and relief of the object
 interreflection     light that parts of a mesh throw on each other
 color_checker       the chart

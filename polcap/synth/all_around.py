@@ -24,11 +24,11 @@ from polcap.errors import package_for
 from polcap.formats import atomic
 from polcap.formats.capture import folder_names
 from polcap.images import Floats
-from polcap.synth import forward_camera, mesh_tracer, scene_materials, shooting
+from polcap.optics.mesh_tracer import Triangles, smooth
+from polcap.synth import forward_camera, scene_materials, shooting, trace
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Model
 from polcap.synth.laid_board import LaidBoard
-from polcap.synth.mesh_tracer import Triangles
 from polcap.synth.render import Scene
 from polcap.synth.shooting import Shoot, Studio
 
@@ -123,13 +123,13 @@ def surface(scene: Scene) -> Triangles:
     Raises InputError where scikit-image is missing; a mesh does not need it.
     """
     if isinstance(scene.shape, Model):
-        return mesh_tracer.tracer(scene.shape.file, scene.shape.radius).mesh
+        return trace.model_tracer(scene.shape).mesh
     with package_for("--views", "scikit-image", "fusion", ", or give a --mesh"):
         from skimage import measure
     axis = np.linspace(-scene.shape.radius, scene.shape.radius, _GRID)
     field = scene.shape.distance(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1))
     found: Any = measure.marching_cubes(field, 0.0, spacing=(axis[1] - axis[0],) * 3)
-    return mesh_tracer.smooth(found[0] + axis[0], found[1])
+    return smooth(found[0] + axis[0], found[1])
 
 
 def _poses(shoot: AroundShoot, views: int, target: Floats) -> Poses:

@@ -81,7 +81,7 @@ class Vase(msgspec.Struct, frozen=True, tag="vase", forbid_unknown_fields=True):
 
 
 class Model(msgspec.Struct, frozen=True, tag="model", forbid_unknown_fields=True):
-    """Shape from a mesh file, centered at the origin. It has no distance field; `mesh_tracer.py` traces it."""
+    """Shape from a mesh file, centered at the origin. It has no distance field; `optics/mesh_tracer.py` traces it."""
 
     file: str
     radius: float  # m, of the smallest sphere about the origin that contains it

@@ -13,7 +13,7 @@ import numpy as np
 
 from polcap.images import Floats
 from polcap.optics import frames, fresnel
-from polcap.synth.mesh_tracer import Tracer
+from polcap.optics.mesh_tracer import Tracer
 
 LIFT = 1e-3  # longest sides of the mesh, from the surface to the start of a ray; nearer hits are the place itself
 _RAYS = 48  # per vertex, distributed by their cosine

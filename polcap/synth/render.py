@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from polcap.errors import SettingError
 from polcap.images import Floats, GBuffer, Indices, View
-from polcap.optics import body, frames, fresnel, shade
+from polcap.optics import body, frames, fresnel, mesh_tracer, shade
 from polcap.synth import color_checker as charts
-from polcap.synth import interreflection, laid_board, mesh_tracer, scene_materials, trace
+from polcap.synth import interreflection, laid_board, scene_materials, trace
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Model, Shape
 from polcap.synth.laid_board import LaidBoard
@@ -188,7 +188,7 @@ def _bounced(scene: Scene) -> Floats:
     """Interreflected light (F, 3, 3) at the three corners of each face of the scene's mesh."""
     if not isinstance(scene.shape, Model):
         raise SettingError("interreflection needs triangles; give the object as a mesh")
-    tracer = mesh_tracer.tracer(scene.shape.file, scene.shape.radius)
+    tracer = trace.model_tracer(scene.shape)
     flash, lens = (scene.turn.inv().apply(np.array(at) - scene.position) for at in (scene.light, (0.0, 0.0, 0.0)))
 
     def lit(point: Floats, normal: Floats, towards: Floats) -> Floats:

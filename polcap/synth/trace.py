@@ -6,12 +6,16 @@ Hart, Sphere tracing, The Visual Computer 1996.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from polcap.errors import InputError
+from polcap.formats import scene_files
 from polcap.images import Bools, Floats, Indices
-from polcap.synth import mesh_tracer
+from polcap.optics.mesh_tracer import Tracer, face_camera, smooth
 from polcap.synth.distance_fields import Model, Shape
 
 Vector = tuple[float, float, float]
@@ -37,6 +41,18 @@ class Hits:
         return Hits(*(value[which] for value in vars(self).values()))
 
 
+@lru_cache(maxsize=2)
+def model_tracer(model: Model) -> Tracer:
+    """Tracer of a model's mesh, centered and scaled to fill its sphere."""
+    vertices, faces = scene_files.read_mesh(Path(model.file))
+    used = vertices[np.unique(faces)]
+    vertices = vertices - (used.min(axis=0) + used.max(axis=0)) / 2
+    largest = np.linalg.norm(vertices[np.unique(faces)], axis=1).max()
+    if not largest > 0:
+        raise InputError(f"{model.file} has no extent; give a mesh that is not one point")
+    return Tracer(smooth(vertices * (model.radius / largest), faces))
+
+
 def trace(shape: Shape | Model, position: Vector, turn: Rotation, v: Floats, start: Floats | None = None) -> Hits:
     """First intersections of rays from the lens along −v (P, 3) with a shape turned by `turn` at `position` [m].
 
@@ -50,10 +66,10 @@ def trace(shape: Shape | Model, position: Vector, turn: Rotation, v: Floats, sta
     direction = turn.inv().apply(-v[candidates])
     origin = turn.inv().apply(-np.array(position))
     if isinstance(shape, Model):
-        met = mesh_tracer.tracer(shape.file, shape.radius).meet(np.broadcast_to(origin, direction.shape), direction)
+        met = model_tracer(shape).meet(np.broadcast_to(origin, direction.shape), direction)
         at = candidates[met.index]
         point = turn.apply(met.position) + position
-        normal = mesh_tracer.face_camera(turn.apply(met.normal), v[at])
+        normal = face_camera(turn.apply(met.normal), v[at])
         return Hits(at, np.linalg.norm(point, axis=1), point, met.position, normal, met.face, met.weight)
     first = 0.0 if start is None else start[candidates]
     index, distance = _march(shape, np.broadcast_to(origin, direction.shape), direction, first)
@@ -67,7 +83,7 @@ def in_shadow(shape: Shape | Model, position: Vector, turn: Rotation, point: Flo
     """True for points (N, 3) off the shape [m, camera frame] that it hides from a light outside it."""
     origin, source = (turn.inv().apply(np.array(at) - np.array(position)) for at in (point, light))
     if isinstance(shape, Model):
-        return mesh_tracer.tracer(shape.file, shape.radius).hidden(origin, source)
+        return model_tracer(shape).hidden(origin, source)
     direction = source - origin
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     out = np.zeros(len(origin), bool)

@@ -17,11 +17,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from polcap.images import Bools, Floats, GBuffer, Indices
-from polcap.optics import brdf, frames, shade
+from polcap.optics import brdf, frames, mesh_tracer, shade
+from polcap.optics.mesh_tracer import Tracer
 from polcap.optics.projection import project
-from polcap.synth import mesh_tracer
 from polcap.synth.interreflection import LIFT
-from polcap.synth.mesh_tracer import Tracer
 from polcap.training import light_transport
 from polcap.training.materials import Surface
 

@@ -32,8 +32,8 @@ from polcap.formats import atomic
 from polcap.formats.maps import png
 from polcap.images import Floats
 from polcap.optics import frames, mueller
+from polcap.optics.mesh_tracer import Tracer, centred
 from polcap.stages import cues
-from polcap.synth.mesh_tracer import Tracer, centred
 from polcap.training import materials, random_shapes, traced_views
 from polcap.training.progress import Report, silent
 

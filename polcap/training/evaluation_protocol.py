@@ -16,8 +16,8 @@ from polcap.errors import InputError
 from polcap.images import Bits, Bools, ColorCalibration, Cues, Floats, Indices, Quality, StokesImage, SurfaceMaps, View
 from polcap.optics import frames, resize
 from polcap.optics.body import SMOOTH, Law
+from polcap.optics.mesh_tracer import Tracer, Triangles, centred
 from polcap.stages import cues
-from polcap.synth.mesh_tracer import Tracer, Triangles, centred
 from polcap.training import evaluation_materials, light_transport, random_shapes, traced_views
 from polcap.training.camera_errors import CameraErrors, photograph
 

@@ -14,11 +14,11 @@ import numpy as np
 from polcap.images import Bools, Floats, Indices
 from polcap.optics import brdf, frames, fresnel, shade
 from polcap.optics.body import SMOOTH, Law
+from polcap.optics.mesh_tracer import Tracer
 from polcap.optics.morphology import masked_mean
 from polcap.optics.namespace import array_namespace
 from polcap.synth import interreflection
 from polcap.synth.interreflection import LIFT
-from polcap.synth.mesh_tracer import Tracer
 
 _HEMISPHERE_RAYS, _MIRROR_RAYS = 12, 6  # per place: over the hemisphere, and about the mirror direction
 _SMOOTH = 0.004  # 1σ of the average of traced light, picture sides

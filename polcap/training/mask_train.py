@@ -19,9 +19,9 @@ from torch.nn import functional as F
 
 from polcap.formats import atomic
 from polcap.images import Floats
+from polcap.optics.mesh_tracer import Tracer, Triangles, centred
 from polcap.optics.resize import area_mean, block_means
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, ReducedPicture, brightness, encode
-from polcap.synth.mesh_tracer import Tracer, Triangles, centred
 from polcap.training import loop, mask_scenes, mask_views, materials, random_shapes, traced_views, unet
 
 _PICTURES, _SIZE = 1600, (288, 384)  # H, W, traced; files have half of it

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from polcap.images import Bools, Floats, GBuffer, View
 from polcap.optics import frames
-from polcap.synth.mesh_tracer import Tracer, Triangles, centred, union
+from polcap.optics.mesh_tracer import Tracer, Triangles, centred, union
 from polcap.training import random_shapes
 
 Framing = Literal["whole", "small", "cut", "full"]

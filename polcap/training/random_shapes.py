@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polcap.images import Faces, Floats
-from polcap.synth.mesh_tracer import Triangles, centred, smooth, union
+from polcap.optics.mesh_tracer import Triangles, centred, smooth, union
 
 _RINGS, _SECTORS = 96, 128  # vertices of a body
 _BRANCH_RINGS, _BRANCH_SECTORS = 24, 14  # vertices of a branch

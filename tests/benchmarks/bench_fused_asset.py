@@ -31,9 +31,9 @@ from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.values import Pose
 from polcap.images import Floats
 from polcap.optics import color
+from polcap.optics.mesh_tracer import Tracer, Triangles, smooth
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
-from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
 
 LEAST_SEEN = 0.02  # weight of a texel
 

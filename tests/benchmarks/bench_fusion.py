@@ -29,7 +29,7 @@ from polcap.fusion.small_views import reduce_views
 from polcap.fusion.values import ClosedMesh, FusionView
 from polcap.images import Floats
 from polcap.optics.frames import dot, unit
-from polcap.synth.mesh_tracer import Tracer, smooth
+from polcap.optics.mesh_tracer import Tracer, smooth
 from tests.fusion.traced_views import (
     Body,
     all_around,

@@ -28,9 +28,9 @@ from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.values import Pose
 from polcap.images import Bools, Floats, Mesh, SurfaceMaps, View
 from polcap.optics import color, frames, shade
+from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.pipeline import run
 from polcap.synth import render, trace
-from polcap.synth.mesh_tracer import Tracer, Triangles
 from polcap.synth.render import Scene
 
 LIGHT = np.array([0.3, 0.15, 0.0])  # m, camera frame

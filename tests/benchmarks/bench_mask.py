@@ -31,9 +31,9 @@ from polcap.images import (
     single_frames,
 )
 from polcap.optics import mueller
+from polcap.optics.mesh_tracer import Tracer, Triangles, centred
 from polcap.stages import mask
 from polcap.stages.mask.mask_channels import ENCODING
-from polcap.synth.mesh_tracer import Tracer, Triangles, centred
 from polcap.training import mask_scenes, mask_views, materials, traced_views
 from polcap.training.mask_views import ViewKind
 

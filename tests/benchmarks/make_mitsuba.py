@@ -27,8 +27,8 @@ import trimesh
 from polcap.formats import atomic, scene_files
 from polcap.images import Floats, View
 from polcap.optics import frames, fresnel
+from polcap.optics.mesh_tracer import Triangles
 from polcap.synth import scene_materials
-from polcap.synth.mesh_tracer import Triangles
 from polcap.training import traced_views
 
 FACES = 100_000  # at least, after subdivision: each has one colour

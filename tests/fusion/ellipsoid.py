@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from polcap.fusion.values import ClosedMesh, FusionView, Pose
 from polcap.images import Bools, Floats, View
 from polcap.optics import frames, shade
+from polcap.optics.mesh_tracer import Tracer, smooth
 from polcap.optics.projection import back_project
-from polcap.synth.mesh_tracer import Tracer, smooth
 
 AXES = np.array([0.05, 0.035, 0.04])  # m
 DISTANCE, PIXELS = 0.6, 160

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from polcap.fusion import joining
 from polcap.fusion.session import LEAST_SHARED
 from polcap.fusion.values import FusionView
-from polcap.synth.mesh_tracer import Tracer, smooth
+from polcap.optics.mesh_tracer import Tracer, smooth
 from tests.fusion.traced_views import Body, capture, ring, solid_texture, stand, with_errors
 
 trimesh = pytest.importorskip("trimesh")

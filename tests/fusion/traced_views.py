@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from polcap.fusion.values import ClosedMesh, FusionView, Pose
 from polcap.images import Floats, View
 from polcap.optics import frames
-from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
+from polcap.optics.mesh_tracer import Tracer, Triangles, smooth
 
 DISTANCE = 0.6  # m from the lens to the object's middle
 SIZE = 0.16  # m, the object's longest side

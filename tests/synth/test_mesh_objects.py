@@ -12,8 +12,8 @@ pytest.importorskip("embreex")
 
 from polcap.errors import DecodeError, SettingError
 from polcap.images import Floats, View
-from polcap.optics import frames
-from polcap.synth import interreflection, mesh_tracer, render
+from polcap.optics import frames, mesh_tracer
+from polcap.synth import interreflection, render
 from polcap.synth.distance_fields import Cluster, Model
 from polcap.synth.render import Scene
 from polcap.synth.scene_materials import Coat, Material, add_relief, evaluate

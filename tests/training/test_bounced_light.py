@@ -10,7 +10,7 @@ import torch
 
 from polcap.images import Floats, View
 from polcap.optics import frames, shade
-from polcap.synth.mesh_tracer import Tracer, Triangles, smooth, union
+from polcap.optics.mesh_tracer import Tracer, Triangles, smooth, union
 from polcap.training import bounced_light, light_transport, random_shapes, traced_views
 from polcap.training.materials import Surface
 from polcap.training.simulator import Simulator

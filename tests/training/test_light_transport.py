@@ -5,7 +5,7 @@ import pytest
 
 from polcap.images import Floats
 from polcap.optics import fresnel
-from polcap.synth.mesh_tracer import Tracer, Triangles, smooth
+from polcap.optics.mesh_tracer import Tracer, Triangles, smooth
 from polcap.training import light_transport, random_shapes
 
 _RADIUS, _ALBEDO = 0.5, 0.6

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from polcap.formats import onnx
+from polcap.optics.mesh_tracer import Tracer, smooth
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING
-from polcap.synth.mesh_tracer import Tracer, smooth
 from polcap.training import backdrop_patterns, mask_scenes, mask_train, mask_views, materials, random_shapes
 
 SIZE = (72, 96)

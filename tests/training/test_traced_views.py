@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import InputError, StorageError
-from polcap.synth.mesh_tracer import Tracer, Triangles
+from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.training import traced_views
 from tests.training.conftest import RECIPE
 

@@ -6,8 +6,7 @@ import pytest
 pytest.importorskip("embreex")
 
 from polcap.images import Floats, View
-from polcap.optics import frames
-from polcap.synth import mesh_tracer
+from polcap.optics import frames, mesh_tracer
 from polcap.training import random_shapes
 
 SIZE = 96

@@ -5,15 +5,12 @@ Closed meshes that overlap render as their union.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import InputError, package_for
-from polcap.formats import scene_files
 from polcap.images import Bools, Floats, GBuffer, View
 from polcap.optics import frames
 from polcap.optics.vertex_frames import area_vectors
@@ -151,18 +148,6 @@ class Tracer:
         ray = (np.ascontiguousarray(a, dtype=np.float32) for a in (origin, direction))
         found: dict[str, Any] = self._scene.run(*ray, query="INTERSECT", output=True)
         return found
-
-
-@lru_cache(maxsize=2)
-def tracer(file: str, radius: float) -> Tracer:
-    """Tracer of a mesh file, centered and scaled to fill a sphere of `radius`."""
-    vertices, faces = scene_files.read_mesh(Path(file))
-    used = vertices[np.unique(faces)]
-    vertices = vertices - (used.min(axis=0) + used.max(axis=0)) / 2
-    largest = np.linalg.norm(vertices[np.unique(faces)], axis=1).max()
-    if not largest > 0:
-        raise InputError(f"{file} has no extent; give a mesh that is not one point")
-    return Tracer(smooth(vertices * (radius / largest), faces))
 
 
 def face_camera(normal: Floats, v: Floats) -> Floats:
