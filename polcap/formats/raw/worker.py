@@ -19,9 +19,11 @@ import tempfile
 import threading
 import traceback
 from collections.abc import Callable
-from typing import IO, Any, cast
+from typing import IO, Annotated, Any, cast
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from polcap import errors
@@ -40,6 +42,17 @@ _READY = b"ready"  # the child has imported the function's module: its time star
 _CHILD = (
     "import sys; sys.path[:] = sys.argv[2:]; from polcap.formats.raw import worker; worker.serve(float(sys.argv[1]))"
 )
+
+
+class _Head(msgspec.Struct):
+    """The child's answer without the values of its arrays: a result, a refusal of the file, or a defect of polcap."""
+
+    meta: dict[str, Any] | None = None
+    arrays: list[tuple[str, str, tuple[Annotated[int, Meta(ge=0, lt=2**31)], ...]]] = []  # name, type, shape
+    error: str | None = None
+    kind: str = ""  # class of the error; "" for `DecodeError`
+    bug: str | None = None
+    traceback: str = ""
 
 
 class ChildBug(RuntimeError):
@@ -80,24 +93,24 @@ class Worker:
         with self._lock:
             try:
                 head, arrays = self._exchange(name, request, limit)
-            except (ValueError, TypeError, KeyError) as error:
+            except (ValueError, TypeError, RecursionError) as error:
                 self.close()
                 raise errors.DecodeError(f"{name}: the decoder's answer is damaged ({error})") from error
             except BaseException:  # Ctrl-C in the middle of an answer: the rest of it would be taken for the next one
                 self.close()
                 raise
-        if "bug" in head:
-            bug = ChildBug(f"{name}: {head['bug']}")
-            bug.add_note(str(head["traceback"]))
+        if head.bug is not None:
+            bug = ChildBug(f"{name}: {head.bug}")
+            bug.add_note(head.traceback)
             raise bug
-        if "error" in head:
-            kind = getattr(errors, str(head["kind"]), None)
+        if head.error is not None:
+            kind = getattr(errors, head.kind, None)
             if isinstance(kind, type) and issubclass(kind, errors.InputError):
-                raise kind(head["error"])
-            raise errors.DecodeError(f"{name}: {head['error']}")
-        return head["meta"], arrays
+                raise kind(head.error)
+            raise errors.DecodeError(f"{name}: {head.error}")
+        return cast(dict[str, Any], head.meta), arrays
 
-    def _exchange(self, name: str, request: list[Any], limit_s: float) -> Answer:
+    def _exchange(self, name: str, request: list[Any], limit_s: float) -> tuple[_Head, Arrays]:
         """Send a request to the child process, wait until it is ready, and return its answer."""
         child = self._child if self._child and self._child.poll() is None else self._spawn()
         pipe = cast(IO[bytes], child.stdout)
@@ -126,20 +139,20 @@ class Worker:
         finally:
             timer.cancel()
 
-    def _answer(self, pipe: IO[bytes]) -> Answer:
+    def _answer(self, pipe: IO[bytes]) -> tuple[_Head, Arrays]:
         """Read the child process's answer from the pipe: JSON, then arrays.
 
-        Raises ValueError: the answer is too large, or an array is not numeric.
+        Raises ValueError, TypeError or RecursionError: the answer is too large or malformed, or an array not numeric.
         """
-        head = json.loads(_receive(pipe, _HEAD_BYTES))
-        if not head.keys() & {"meta", "error", "bug"}:
+        head = msgspec.convert(json.loads(_receive(pipe, _HEAD_BYTES)), _Head)
+        if head.meta is None and head.error is None and head.bug is None:
             raise ValueError("it is empty")
         arrays: Arrays = {}
         left = int(self.memory_gib * 2**30)
-        for name, dtype, shape in head.get("arrays", ()):
+        for name, dtype, shape in head.arrays:
             kind = np.dtype(dtype)
             size = kind.itemsize * int(np.prod(shape, dtype=object))
-            if kind.kind not in "biuf" or not 0 <= size <= left:
+            if kind.kind not in "biuf" or size > left:
                 raise ValueError(f"{name} is {dtype} of {shape}")
             left -= size
             arrays[name] = np.empty(shape, kind)
@@ -182,11 +195,13 @@ class Worker:
     def _cause_of_death(self, code: int, limit_s: float, overdue: bool) -> str:
         if overdue:
             return f"not decoded within {limit_s:g} s; the file is damaged or far too large"
+        if code == -9:  # by the kernel or by a person
+            return "the system ended the decoder, most often for lack of memory; close other programs and run again"
         last = ""
         if self._log:
             self._log.seek(max(0, self._log.seek(0, os.SEEK_END) - _LOG_BYTES))
             last = self._log.read().decode(errors="replace").strip().rsplit("\n", 1)[-1].strip()
-        memory = "MemoryError" in last or "bad_alloc" in last or code == -9
+        memory = "MemoryError" in last or "bad_alloc" in last
         cause = f"ran out of memory ({self.memory_gib:g} GiB)" if memory else f"crashed (exit {code}) {last}"
         return f"the decoder {cause.strip()}; the file is damaged, copy it from the card again"
 

@@ -18,6 +18,7 @@ FUNCTIONS = """
     import os, time
     import numpy as np
     from polcap.errors import ChartError
+    from polcap.formats.raw import worker
 
     def ramp(path, count=12):
         print("a library chatters on stdout")
@@ -53,6 +54,14 @@ FUNCTIONS = """
 
     def mistake(path):
         raise RuntimeError("a defect")
+
+    def answer(path, text):
+        send = worker._send
+        worker._send = lambda pipe, message: send(pipe, text.encode())
+        return {}, {}
+
+    def stopped(path):
+        os.kill(os.getpid(), 9)
 """
 
 
@@ -108,12 +117,39 @@ def test_a_child_imports_no_modules_from_inside_a_package(worker, tmp_path, monk
         ("objects", None, "damaged"),
         ("huge", None, "damaged"),
         ("much_text", None, "damaged"),
+        ("stopped", None, "the system ended the decoder, most often for lack of memory"),
     ],
 )
 def test_a_failure_names_the_file_and_the_next_file_is_read(worker, function, limit_s, message):
     with pytest.raises(DecodeError, match=rf"broken\.raw: .*{message}"):
         worker.call(getattr(worker.module, function), "broken.raw", limit_s=limit_s)
     assert pid(worker)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        "[" * 10**5,
+        '{"error": 1}',
+        '{"meta": []}',
+        '{"meta": {}, "arrays": [["a"]]}',
+        '{"meta": {}, "arrays": [["a", "<u2", [1.5]]]}',
+        '{"meta": {}, "arrays": [["a", "<u2", [0, 1180591620717411303424]]]}',
+        '{"meta": {}, "arrays": [["a", "nothing", [1]]]}',
+    ],
+)
+def test_a_malformed_answer_is_an_error_of_the_file(worker, text):
+    with pytest.raises(DecodeError, match=r"broken\.raw: the decoder's answer is damaged"):
+        worker.call(worker.module.answer, "broken.raw", text=text)
+    assert pid(worker)
+
+
+def test_an_error_without_a_class_is_an_error_of_the_file(worker):
+    with pytest.raises(DecodeError, match=r"broken\.raw: no picture"):
+        worker.call(worker.module.answer, "broken.raw", text='{"error": "no picture"}')
 
 
 def test_an_error_of_the_function_keeps_its_class_and_its_child(worker):
