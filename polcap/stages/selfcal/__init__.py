@@ -4,9 +4,9 @@ An error of 1 % in flash energy gives a surface that faces the camera the polari
 a whole object it costs about 6° of the normals on average. A matt grey patch is unpolarized, so its brightness must be
 the same in every shot (`grey_patches`). Without a chart, the gains come from the object (`object_gains`,
 `integrability`), averaged with the known repeatability of lamps and flashes. One exposure of a polarization mosaic has
-one gain. `angles` checks the order and sense of the angles at the outline, detects one turned shot among more than
-three, and finds unknown angles. `ring_zero` measures the zero of the polarizer's ring. Its error is corrected if it is
-significant; a calibrated zero is averaged with it by the errors of both.
+one gain. `angles` checks the order and sense of the angles at the outline, and detects one turned shot among more than
+three. `unknown_angles` finds angles that nobody noted. `ring_zero` measures the zero of the polarizer's ring. Its error
+is corrected if it is significant; a calibrated zero is averaged with it by the errors of both.
 """
 
 from dataclasses import replace
@@ -23,7 +23,15 @@ from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Gains
 from polcap.optics import frames
 from polcap.optics.outline import OutlineBand
 from polcap.stages import stage
-from polcap.stages.selfcal import angles, crossed_light, grey_patches, integrability, object_gains, ring_zero
+from polcap.stages.selfcal import (
+    angles,
+    crossed_light,
+    grey_patches,
+    integrability,
+    object_gains,
+    ring_zero,
+    unknown_angles,
+)
 from polcap.stages.selfcal.grey_patches import GreyPatches
 from polcap.stages.selfcal.object_gains import GainEstimate, ObjectShots
 
@@ -74,7 +82,7 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=18)
+@stage(version=19)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,
@@ -188,7 +196,7 @@ def _find_angles(
             f"the flash energy of the shots is {known}; to find unknown angles, {100 * _MOST_GAIN:g} % is needed: "
             f"put a color chart next to the object, {otherwise}"
         )
-    found, sigma = angles.find(band, *object_gains.cells(even.light, even.inside))
+    found, sigma = unknown_angles.find_angles(band, *object_gains.cells(even.light, even.inside))
     sigma_deg = float(np.degrees(sigma))
     if sigma_deg > settings.max_unknown_sigma_deg:
         raise CaptureError(

@@ -1,4 +1,4 @@
-"""Checks the polarizer angles (order, sense, one turned shot) and finds unknown angles.
+"""Checks the stated polarizer angles: order, sense, one turned shot.
 
 Order and sense are checked at the outline, where diffuse reflection is polarized across the contour. Orders with the
 same analyzers are the same order: (0°, 120°, 60°) clockwise is (0°, 60°, 120°). A common turn of all angles does not
@@ -8,13 +8,6 @@ One turned shot is found among K > 3 shots with known gains g. The intensities I
 column space of A = ½ (1, cos 2θ, sin 2θ). With N spanning its complement, N·(I/g) = 0. Shot k turned by δ leaves the
 residual N_k δ dI_k/dθ, proportional to the polarization. A gain with error ε leaves N_j ε I_j, proportional to the
 light. Errors of the gains can imitate a turn, so the gains are fitted too, with their errors as prior.
-
-Unknown angles need four shots with well known gains. Shots at angles θ are I = A(θ) S, of rank three. Another A′ = A B
-explains them equally well if its rows have the form (1, cos, sin): an affine map then takes points of the unit circle
-to points of the unit circle. Five points determine an ellipse, so five shots determine θ up to a common turn and the
-sense; with four shots one more parameter is free. The outline determines the rest: light there is polarized along the
-contour's normal φ, so I is in the span of 1 and cos 2(φ − θ) in every part of it. `ring_zero.by_slopes` finds the
-remaining common turn.
 """
 
 from dataclasses import dataclass, replace
@@ -48,18 +41,6 @@ _ALIKE = 0.9  # of the best shot's reduction of the misfit; shots above cannot b
 _FAR = np.radians(np.arange(20.0, 91.0, 5.0))  # large turns, beyond the linear fit: a ring that was not turned at all
 _MOST_LEFT = 0.25  # largest residual after a large turn, over that with the stated angles
 _ANGLE_ERROR = np.radians(0.5)  # 1σ of each angle, set by hand or motor
-# Unknown angles.
-_BINS = 36  # of φ, 10° each
-_LEAST_BINS = 24  # bins with light; fewer do not determine turn and sense
-_STARTS = 20  # random starts, the same every time
-_COARSE, _FINE = 1e-3, 1e-7  # relative change of the misfit that ends a search: from all starts, from the best ones
-_POLISHED = 4  # number of best starts
-_AS_GOOD = 1.3  # of the least misfit; solutions up to here are possible too
-_LAW = 0.012  # relative 1σ of the outline's light from ideal diffuse reflection
-_OTHER_LAWS = (0.004, 0.03)  # the range of this 1σ: parts of an outline differ by up to 3 %
-_SIDES = 8  # parts of the outline and of the inside, left out one at a time
-_INSIDE = 0.0001  # relative 1σ inside, by interpolation and gains
-_FLOOR = np.radians(0.3)  # least 1σ (200 simulated cases)
 
 
 def rim(shots: ObjectShots) -> OutlineBand:
@@ -101,15 +82,15 @@ def check_order(band: OutlineBand, angle: Floats, margin: float, least_score: fl
         misfit = _misfit(band, turned)
         if order == stated or misfit > _CLOSES * here:
             continue
-        closes_alone = _CLOSES * misfit < here > _ROUGH  # more than three shots agree in this order only
-        least = 0.0 if closes_alone else margin
+        closes_alone = _CLOSES * misfit < here and here > _ROUGH  # more than three shots agree in this order only
         other, others = outline.phasor(band, turned)
         score = float(other.sum().real / max(others.sum(), 1e-9))
         sigma = _sigma_of_difference(other.real, others, along, weight)
-        if score > _LEAST_RIVAL and least and score - abs(mean) > max(nearest, -_AHEAD * sigma):
-            rival, nearest = order, score - abs(mean)
-        needed = max(least, _BETTER * sigma * (least > 0))
-        if score > max(best_score, least_score) and score - abs(mean) > needed:
+        lead = score - abs(mean)
+        if score > _LEAST_RIVAL and not closes_alone and lead > max(nearest, -_AHEAD * sigma):
+            rival, nearest = order, lead
+        needed = 0.0 if closes_alone else max(margin, _BETTER * sigma)
+        if score > max(best_score, least_score) and lead > needed:
             best, best_score = order, score
     return OrderFit(OutlineCheck(best, abs(mean), rival, mean.real), best_score)
 
@@ -240,7 +221,7 @@ def _fit_turn(k: int, start: float, light: Floats, angle: Floats, part: NDArray[
     weight: Floats = np.ones(residual.shape[1])
     ridge = 1e-12 * np.eye(columns.shape[2])
 
-    def equations(weight: Floats) -> tuple[Floats, Floats]:
+    def equations(weight: Floats, noise: float) -> tuple[Floats, Floats]:
         weighted = columns * weight[:, None]
         square = np.einsum("npi,npj->ij", weighted, columns, optimize=True) + ridge
         square[:-1, :-1] += prior * noise
@@ -248,102 +229,13 @@ def _fit_turn(k: int, start: float, light: Floats, angle: Floats, part: NDArray[
 
     for _ in range(4):  # biweights: moved edges and highlights fit no angle
         noise = float((weight * (residual**2).sum(0)).sum() / max(weight.sum(), 1e-9))
-        square, right = equations(weight)
+        square, right = equations(weight, noise)
         found, used = np.linalg.solve(square, right), weight
         off = np.linalg.norm(residual - columns @ found, axis=0)
         weight = biweight(off, spread(off))
     total = float((weight * (residual**2).sum(0)).sum())
     stated = total - float(right[:-1] @ np.linalg.solve(square[:-1, :-1], right[:-1]))
-    without = [np.linalg.solve(*equations(used * (part != p)))[-1] for p in np.unique(part)]
+    without = [np.linalg.solve(*equations(used * (part != p), noise))[-1] for p in np.unique(part)]
     by_noise = np.sqrt(noise * np.linalg.inv(square)[-1, -1])
     sigma = float(np.hypot(jackknife(np.array(without)), by_noise))
     return _TurnFit(start + float(found[-1]), sigma, stated, total - float(right @ found))
-
-
-def find(band: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> tuple[Floats, float]:
-    """Find the unknown polarizer angles (K,) in 0…π rad of four or more shots, and their common 1σ [rad].
-
-    `band` is the object's outline; cells (K, P) are means of small blocks of its inside, row (P,) is the row of each
-    block. All are divided by the gains. The outline is averaged over bins of φ. The residual of the inside is its
-    distance from the column space of A(θ). Both are weighted by their scatter. The 1σ combines a jackknife over parts
-    of outline and inside, the change with the assumed 1σ of the outline, and the distance to other solutions that fit
-    equally well. It is π/2 if nothing is known.
-    """
-    shots = len(cells)
-    around, part = _by_direction(band)
-    lit = around.min(axis=1) > 0
-    if lit.sum() < _LEAST_BINS or cells.shape[1] < 10 * shots:
-        return np.zeros(shots), np.pi / 2
-    around, part = around[lit], part[lit]
-    inside = _condensed(cells)
-    random = np.random.default_rng(outline.SECTORS)
-    ends = [_solve(around, part, inside, random.uniform(0, np.pi, shots), _COARSE) for _ in range(_STARTS)]
-    ends = [_solve(around, part, inside, start, _FINE) for _, start in sorted(ends, key=lambda end: end[0])[:_POLISHED]]
-    cost, angle = min(ends, key=lambda end: end[0])
-    elsewhere = max(float(np.abs(_difference(other, angle)).max()) for left, other in ends if left < _AS_GOOD * cost)
-    side = np.arange(len(part)) * _SIDES // len(part)
-    place = np.argsort(np.argsort(row, kind="stable")) * _SIDES // len(row)
-    by_side = [_solve(around[side != s], part[side != s], inside, angle, _FINE)[1] for s in range(_SIDES)]
-    by_place = [_solve(around, part, _condensed(cells[:, place != s]), angle, _FINE)[1] for s in range(_SIDES)]
-    by_law = [_difference(_solve(around, part, inside, angle, _FINE, law)[1], angle) for law in _OTHER_LAWS]
-    variance = np.mean(np.square(by_law), axis=0)  # (K,)
-    for without in (by_side, by_place):
-        variance = variance + jackknife(np.array([_difference(one, angle) for one in without]), about=0.0) ** 2
-    return angle % np.pi, min(float(np.sqrt(_FLOOR**2 + variance.max() + elsewhere**2)), np.pi / 2)
-
-
-def _by_direction(band: OutlineBand) -> tuple[Floats, Floats]:
-    """Light of the outline averaged in bins of its direction, (B, K), and the mean directions (B,) rad."""
-    number = np.floor(band.azimuth / (2 * np.pi) * _BINS).astype(int) % _BINS
-    light = np.stack([np.bincount(number, shot, _BINS) for shot in band.light], axis=1).astype(np.float64)
-    weight = band.light.sum(axis=0)
-    sums = [np.bincount(number, weight * wave, _BINS) for wave in (np.cos(band.azimuth), np.sin(band.azimuth))]
-    return light, np.arctan2(sums[1], sums[0])
-
-
-def _condensed(cells: Floats) -> Floats:
-    """Condense cells (K, P) to a matrix (K, K) with the same sum of squared distances from any subspace.
-
-    Each cell is divided by its mean light. The mean over all cells is subtracted, because errors of the gains change
-    it.
-    """
-    relative = cells / cells.mean(axis=0)
-    relative = relative - relative.mean(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(relative @ relative.T / relative.shape[1])
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
-
-
-def _solve(
-    around: Floats, part: Floats, inside: Floats, start: Floats, until: float, law: float = _LAW
-) -> tuple[float, Floats]:
-    """Fit polarizer angles (K,) from a start; returns misfit and angles.
-
-    Two solutions 90° apart fit equally well; the result is that of diffuse reflection.
-    """
-    relative = around / around.mean(axis=1, keepdims=True)
-    from scipy.optimize import least_squares  # here: the import takes 0.3 s
-
-    end = least_squares(_residual, start, args=(relative, part, inside, law), method="lm", ftol=until, max_nfev=150)
-    along = np.cos(2 * (part[:, None] - end.x))
-    along -= along.mean(axis=1, keepdims=True)
-    angle = end.x if float((along * relative).sum()) > 0 else end.x + np.pi / 2
-    return float(end.cost), np.asarray(angle)
-
-
-def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats, law: float) -> Floats:
-    """Residuals for polarizer angles, over their 1σ: outline from the span of 1 and cos 2(φ − θ), inside from A(θ)."""
-    ones = np.ones(len(angle)) / np.sqrt(len(angle))
-    wave = np.cos(2 * (part[:, None] - angle))
-    wave = wave - (wave @ ones)[:, None] * ones
-    wave = wave / np.maximum(np.linalg.norm(wave, axis=1, keepdims=True), 1e-9)
-    left = relative - (relative @ ones)[:, None] * ones
-    left = left - (left * wave).sum(axis=1, keepdims=True) * wave
-    rows = np.stack([np.ones_like(angle), np.cos(2 * angle), np.sin(2 * angle)], axis=1)
-    basis, _ = np.linalg.qr(rows)
-    out = inside - basis @ (basis.T @ inside)
-    return np.concatenate([left.ravel() / law / np.sqrt(len(part)), out.ravel() / _INSIDE])
-
-
-def _difference(a: Floats, b: Floats) -> Floats:
-    """Angle from axis b to axis a, −π/2…π/2 rad; axes have no direction."""
-    return np.asarray((a - b + np.pi / 2) % np.pi - np.pi / 2)
