@@ -34,7 +34,7 @@ class Triangles:
 
 
 def smooth(vertices: Floats, faces: NDArray[np.integer], crease: float = 0.75) -> Triangles:
-    """Mesh with shading normals, angle-weighted, smooth across edges with an angle below `crease` rad.
+    """Mesh (V, 3), (F, 3) with shading normals, angle-weighted, smooth across edges with an angle below `crease` rad.
 
     Vertices at the same position count as one, so that seams of a texture atlas stay invisible.
     """
