@@ -91,3 +91,8 @@ def at_most(
 def bad_shots(names: list[str], bad: Bools) -> tuple[str, ...]:
     """Names of the shots to take again, those where `bad` (K,) is true."""
     return tuple(name for name, one in zip(names, bad) if one)
+
+
+def grade(cost_deg: float) -> State:
+    """State of a gate beyond its limit, by its cost in degrees of the normals."""
+    return "fail" if cost_deg > 15 else "warn"

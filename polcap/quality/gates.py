@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from polcap.images import SurfaceMaps
-from polcap.quality import geometry, light, polarization
+from polcap.quality import geometry, light, polarization, shot_exposure
 from polcap.quality.gate import MOST_DEG, Evidence, Gate, State
 from polcap.quality.limits import GateLimits
 from polcap.stages.align import AlignSettings
@@ -39,20 +39,20 @@ def verdict(gates: Iterable[Gate]) -> State:
 
 
 def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iterator[Gate]:
-    yield light.bracket(found)
-    yield light.tone(found, limits)
-    yield light.source(found)
+    yield shot_exposure.exposures(found)
+    yield shot_exposure.tone(found, limits)
+    yield shot_exposure.source(found)
     yield light.chart(found, limits)
     yield geometry.alignment(found, limits, align)
     yield geometry.mask(found, limits)
-    yield light.stillness(found, limits)
-    yield light.clipping(found, limits)
+    yield shot_exposure.stillness(found, limits)
+    yield shot_exposure.clipping(found, limits)
     yield geometry.sharpness(found, limits)
     yield geometry.focus(found, limits)
-    yield from light.gains(found, limits)
+    yield from shot_exposure.gains(found, limits)
     yield polarization.order(found)
     yield from polarization.of_outline(found, limits)
-    yield light.noise(found, limits)
+    yield shot_exposure.noise(found, limits)
     yield light.ambient(found, limits)
     yield from light.polarized_light(found, limits)
     yield from light.crossed(found, limits)

@@ -13,7 +13,7 @@ from polcap.errors import ChartError
 from polcap.formats import shipped_data
 from polcap.images import AngleStack, ColorCalibration
 from polcap.pipeline.path import AUTO
-from polcap.quality import light
+from polcap.quality import shot_exposure
 from polcap.quality.gate import Evidence
 from polcap.quality.limits import GateLimits
 from polcap.stages import selfcal, whitebalance
@@ -46,7 +46,7 @@ def main() -> None:
         settings = selfcal.SelfcalSettings(check_order=False)
         found = selfcal.solve(radiance, scenes.still(len(angle)), object_, color, settings)
         evidence = Evidence.partial(selfcal=found, radiance=radiance, names=stated.angles.split(","))
-        states.append(light._gain_doubt(evidence, GateLimits()).state)
+        states.append(shot_exposure.gain_doubt(evidence, GateLimits()).state)
         errors.append(float(np.abs(found.gains.gain.mean(1) / true - 1).max()))
         sigma = float(found.gains.sigma.max())
         rows.append((seed, case.finish, f"{100 * errors[-1]:.2f} %", f"{100 * sigma:.2f} %", states[-1]))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.images import Bits, ChartPlace, ColorCalibration, PatchColors
-from polcap.quality import light
+from polcap.quality import shot_exposure
 from polcap.quality.gate import Evidence
 from polcap.quality.limits import GateLimits
 from polcap.stages.selfcal import grey_patches
@@ -60,9 +60,9 @@ def test_grey_patches_with_a_large_error_are_doubted():
     found = solve(SHOTS, board())
     gains = replace(found.gains, gain=found.gains.gain * [[1], [1.11], [1.13]], sigma=np.full((3, 3), 0.31))
     vague = Evidence.partial(selfcal=replace(found, gains=replace(gains, disagreement=0.0)))
-    gate = light._gain_doubt(vague, GateLimits())
+    gate = shot_exposure.gain_doubt(vague, GateLimits())
     assert gate.state == "fail" and gate.value == pytest.approx(0.31) and gate.limit == GateLimits().max_gain_doubt
-    assert light._gain_doubt(Evidence.partial(selfcal=found), GateLimits()).state == "pass"
+    assert shot_exposure.gain_doubt(Evidence.partial(selfcal=found), GateLimits()).state == "pass"
 
 
 def test_a_polarized_chart_disagrees_with_the_object():
