@@ -46,7 +46,7 @@ def settings_page() -> str:
     """The page of all settings with type, default, range and meaning."""
     lines = [
         "# Settings", "", _MADE, "",
-        "`--config FILE.toml` (a section per stage) overrides the defaults; `--set stage.name=value` overrides both.",
+        "`--config FILE.toml` (sections as below) overrides the defaults; `--set stage.name=value` overrides both.",
         "An unknown name or a value outside its range is an error that names it.", "",
     ]  # fmt: skip
     for name, rows in groupby(settings(), lambda setting: setting.key.partition(".")[0]):

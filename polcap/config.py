@@ -1,7 +1,7 @@
 """Settings of a run: from defaults, a TOML file and `--set` assignments; later ones override earlier ones.
 
-Each stage declares its own settings; `Config` has one section per stage. An unknown key or a value out of range is an
-error that names the key, the value and the limit.
+Each stage declares its own settings; `Config` has a section for each stage with settings, and one for the gates. An
+unknown key or a value out of range is an error that names the key, the value and the limit.
 """
 
 import difflib
@@ -33,7 +33,7 @@ _BARE_POINT = re.compile(r"(?<![\w.])\.(?=\d)")  # of a number without a leading
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """All settings of a run, one section per stage."""
+    """All settings of a run: a section for each stage with settings, and one for the gates."""
 
     hdr: HdrSettings = HdrSettings()
     whitebalance: WhitebalanceSettings = WhitebalanceSettings()

@@ -16,7 +16,7 @@ from polcap.images import Exif, SensorImage
 from polcap.optics import sensor
 from polcap.stages import hdr
 
-_CLIP = hdr.HdrSettings().clip
+_CLIP = hdr.HdrSettings().clip  # the default: `doctor` takes no settings
 
 
 def examine_file(path: Path) -> Iterator[Finding]:

@@ -26,13 +26,13 @@ from polcap.images import (
     TurnedShot,
 )
 from polcap.quality import gate as gate_module
-from polcap.quality import gates, geometry, light, polarization, rim
+from polcap.quality import gates, geometry, light, polarization, rim, shot_exposure
 from polcap.quality.gate import Evidence, Gate
 from polcap.quality.object_turn import ObjectTurn
 from polcap.stages.align.object_motion import ObjectShift
 from tests import scenes
 
-MODULES: tuple[ModuleType, ...] = (gates, gate_module, light, geometry, polarization)
+MODULES: tuple[ModuleType, ...] = (gates, gate_module, shot_exposure, light, geometry, polarization)
 MAKERS = ("Gate", "at_most")
 NAN = float("nan")
 
@@ -57,8 +57,8 @@ MEASURES = {  # the function that measures each figure
     "surroundings": (light, "_surroundings_dolp"), "highlight": (light, "_highlight_dolp"),
     "pushed": (geometry, "_measure_shift"), "turn": (geometry, "_measure_turn"), "edge_blur": (geometry, "_edge_blur"),
     "charted": (geometry, "_chart_share"), "lean": (geometry, "_lean"),
-    "noise": (light, "_noise"), "crossed": (light, "_compare_crossed"), "ill_posed": (polarization, "_ill_posed"),
-    "medians": (polarization, "_medians"), "outline": (polarization, "_outline"),
+    "noise": (shot_exposure, "_noise"), "crossed": (light, "_compare_crossed"),
+    "ill_posed": (polarization, "_ill_posed"), "medians": (polarization, "_medians"), "outline": (polarization, "_outline"),
     "normal_error": (gates, "_own_error"), "inward_outline": (geometry, "_inward_share"),
 }  # fmt: skip
 MESH = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
