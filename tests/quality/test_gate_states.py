@@ -58,7 +58,8 @@ MEASURES = {  # the function that measures each figure
     "pushed": (geometry, "_measure_shift"), "turn": (geometry, "_measure_turn"), "edge_blur": (geometry, "_edge_blur"),
     "charted": (geometry, "_chart_share"), "lean": (geometry, "_lean"),
     "noise": (shot_exposure, "_noise"), "crossed": (light, "_compare_crossed"),
-    "ill_posed": (polarization, "_ill_posed"), "medians": (polarization, "_medians"), "outline": (polarization, "_outline"),
+    "ill_posed": (polarization, "_ill_posed"), "medians": (polarization, "_medians"),
+    "outline": (polarization, "_outline"),
     "normal_error": (gates, "_own_error"), "inward_outline": (geometry, "_inward_share"),
 }  # fmt: skip
 MESH = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
