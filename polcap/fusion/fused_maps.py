@@ -14,7 +14,7 @@ from polcap.formats import atomic, text_file
 from polcap.formats.export.texture_set import Extra
 from polcap.formats.maps import exr, maps_folder, png
 from polcap.fusion import atlas as atlases
-from polcap.fusion.atlas import Atlas, AtlasSettings
+from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, on_atlas
 from polcap.fusion.closed_mesh import decimate
 from polcap.fusion.values import ClosedMesh
@@ -54,6 +54,7 @@ def write(folder: Path, atlas: Atlas, maps: AtlasMaps) -> None:
     about = {
         "format": FORMAT,
         "size": list(maps.mask.shape[::-1]),
+        "margin": atlas.margin,
         "albedo": maps_folder.albedo_scale(maps.albedo_sigma),
         "frame": "y up; origin in the middle of the board, or on the axis of the turn where there was none",
         "unit": "m" if atlas.mesh.metric else "relative",
@@ -95,7 +96,7 @@ class FusedSource:
         """The asset with about so many triangles, an atlas of its own, and the textures of the full mesh."""
         coarse = decimate(closed(self.atlas.mesh), triangles)
         side = self.maps.mask.shape[0]
-        atlas = atlases.charted(coarse, side, AtlasSettings().margin)
+        atlas = atlases.charted(coarse, side, self.atlas.margin, self.atlas.mesh.metric)
         maps = transferred(self.atlas, self.maps, atlas)
         bits: Literal[8, 16] = 8 if whole.normal.dtype == np.uint8 else 16
         extras: tuple[Extra, ...] = () if whole.object_normal is None else ("object-normal",)
@@ -112,7 +113,7 @@ def read(folder: Path) -> FusedSource:
         about: Mapping[str, Any] = text_file.read_json(folder / "maps.json")
         with np.load(folder / "mesh.npz") as stored:
             arrays = {name: stored[name] for name in _ARRAYS}
-        side, percent = int(about["size"][0]), about["albedo"]["uncertainty_percent"]
+        side, margin, percent = int(about["size"][0]), int(about["margin"]), about["albedo"]["uncertainty_percent"]
         metric = about["unit"] == "m"
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DecodeError(f"{folder} holds no fused maps of this polcap ({error}); run `polcap fuse` again") from error
@@ -122,7 +123,7 @@ def read(folder: Path) -> FusedSource:
         albedo_sigma=None if percent is None else percent / 100,
     )
     mesh = Mesh(**arrays, metric=metric, frame="board")
-    return FusedSource(atlases.of_mesh(mesh, side), maps)
+    return FusedSource(atlases.of_mesh(mesh, side, margin), maps)
 
 
 def _map(folder: Path, name: str) -> Floats:
