@@ -17,6 +17,7 @@ from polcap.fusion import atlas as atlases
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, on_atlas
 from polcap.fusion.closed_mesh import decimate
+from polcap.fusion.mesh_occlusion import ambient_occlusion
 from polcap.fusion.values import ClosedMesh
 from polcap.images import Asset, Floats, Mesh
 from polcap.optics import color
@@ -89,7 +90,7 @@ class FusedSource:
         return len(self.atlas.mesh.faces)
 
     def whole(self, bits: Literal[8, 16], extras: tuple[Extra, ...]) -> Asset:
-        """The asset with the full mesh; of the extra textures a closed mesh has only `object-normal`."""
+        """The asset with the full mesh; a closed mesh has no displacement."""
         return _asset(self.atlas, self.maps, bits, extras)
 
     def decimated(self, whole: Asset, triangles: int) -> DetailLevel:
@@ -99,7 +100,9 @@ class FusedSource:
         atlas = atlases.charted(coarse, side, self.atlas.margin, self.atlas.mesh.metric)
         maps = transferred(self.atlas, self.maps, atlas)
         bits: Literal[8, 16] = 8 if whole.normal.dtype == np.uint8 else 16
-        extras: tuple[Extra, ...] = () if whole.object_normal is None else ("object-normal",)
+        occluded = np.ptp(whole.occlusion_roughness_metallic[..., 0]) > 0
+        extras: tuple[Extra, ...] = ("occlusion",) if occluded else ()
+        extras += () if whole.object_normal is None else ("object-normal",)
         error = _distance(self.atlas.mesh.vertices, atlas)
         return DetailLevel(_asset(atlas, maps, bits, extras), DecimatedMesh(atlas.mesh, error, error / atlas.texel))
 
@@ -152,10 +155,14 @@ def transferred(source: Atlas, maps: AtlasMaps, target: Atlas) -> AtlasMaps:
 
 def _asset(atlas: Atlas, maps: AtlasMaps, bits: Literal[8, 16], extras: tuple[Extra, ...]) -> Asset:
     built = asset.build(maps, atlas.mesh, asset.AssetSettings(), bits)
-    if "object-normal" not in extras:
-        return built
-    top = np.iinfo(built.normal.dtype).max
-    return replace(built, object_normal=np.rint((maps.normal / 2 + 0.5) * top).astype(built.normal.dtype))
+    top, kind = np.iinfo(built.normal.dtype).max, built.normal.dtype
+    if "object-normal" in extras:
+        built = replace(built, object_normal=np.rint((maps.normal / 2 + 0.5) * top).astype(kind))
+    if "occlusion" in extras:
+        packed = built.occlusion_roughness_metallic.copy()
+        packed[..., 0] = np.rint(ambient_occlusion(atlas) * top)
+        built = replace(built, occlusion_roughness_metallic=packed)
+    return built
 
 
 def _distance(vertices: Floats, coarse: Atlas) -> float:
