@@ -5,6 +5,7 @@ unknown key or a value out of range is an error that names the key, the value an
 """
 
 import difflib
+import functools
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -71,17 +72,19 @@ def fill_sections(kind: type[S], file: Path | None, assignments: Sequence[str]) 
     for section, values in stated.items():
         if not isinstance(values, dict):
             raise SettingError(f"{file}: `{section}` is not a section; write [stage], and name = value below it")
+    values = dict(_by_key(stated))
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
-        section, dot, name = key.strip().partition(".")
-        if not equals or not dot:
+        if not equals or "." not in key:
             raise SettingError(f"--set {assignment}: write stage.name=value, for example hdr.clip=0.95")
-        stated.setdefault(section, {})[name] = _parse(text.strip())
-    _check_finite(stated)
+        values[key.strip()] = _parse(text.strip())
+    _check_finite(values)
     known = {setting.key: setting for setting in settings(kind)}
-    for section, values in stated.items():
-        for name, value in values.items():
-            _check_known(f"{section}.{name}", value, known)
+    stated = {}
+    for key, value in values.items():
+        _check_known(key, value, known)
+        *sections, name = key.split(".")
+        functools.reduce(lambda table, section: table.setdefault(section, {}), sections, stated)[name] = value
     try:
         return msgspec.convert(stated, kind)
     except msgspec.ValidationError as error:
@@ -124,22 +127,33 @@ def fill(kind: type[S], stated: dict[str, Any], assignments: Sequence[str]) -> S
         raise SettingError(f"--set {text_file.fault(error, stated, kind)}") from error
 
 
-def settings(kind: type[msgspec.Struct] = Config) -> Iterator[Setting]:
+def settings(kind: type[msgspec.Struct] = Config, prefix: str = "") -> Iterator[Setting]:
     """All settings of a struct of sections, in the order of the stages, for the settings reference."""
-    for section in msgspec.structs.fields(kind):
-        annotated, plain = get_type_hints(section.type, include_extras=True), get_type_hints(section.type)
-        for field in msgspec.structs.fields(section.type):
-            hint, type_ = annotated[field.name], plain[field.name]
-            arms = [hint] if get_origin(hint) is Annotated else [*get_args(hint)] or [hint]  # of a union with None
-            meta = next((extra for arm in arms for extra in get_args(arm)[1:] if isinstance(extra, Meta)), Meta())
-            choices = get_origin(type_) is Literal
-            word = str(type_).replace("typing.", "") if choices else (*get_args(type_), type_)[0].__name__
-            yield Setting(f"{section.name}.{field.name}", word, field.default, _limits(meta), meta.description or "")
+    annotated, plain = get_type_hints(kind, include_extras=True), get_type_hints(kind)
+    for field in msgspec.structs.fields(kind):
+        key, hint, type_ = f"{prefix}{field.name}", annotated[field.name], plain[field.name]
+        if isinstance(type_, type) and issubclass(type_, msgspec.Struct):
+            yield from settings(type_, f"{key}.")
+            continue
+        arms = [hint] if get_origin(hint) is Annotated else [*get_args(hint)] or [hint]  # of a union with None
+        meta = next((extra for arm in arms for extra in get_args(arm)[1:] if isinstance(extra, Meta)), Meta())
+        choices = get_origin(type_) is Literal
+        word = str(type_).replace("typing.", "") if choices else (*get_args(type_), type_)[0].__name__
+        yield Setting(key, word, field.default, _limits(meta), meta.description or "")
 
 
 def _limits(meta: Meta) -> str:
     signs = {"gt": "> ", "ge": "≥ ", "lt": "< ", "le": "≤ ", "multiple_of": "multiple of "}
     return ", ".join(f"{sign}{getattr(meta, name)}" for name, sign in signs.items() if getattr(meta, name) is not None)
+
+
+def _by_key(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Keys such as hdr.clip and values of nested tables."""
+    for name, value in table.items():
+        if isinstance(value, dict):
+            yield from _by_key(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def _read(file: Path) -> dict[str, Any]:
