@@ -40,9 +40,8 @@ _FACET_POWER = 4  # of the cosine between a triangle and its target, in the tria
 _MOST_MOVE = 1.0  # steps that a vertex may move in a round; more would fold the surface
 _DAMPING = 0.02  # weight of the equations displacement = 0
 _SMOOTHNESS = 0.03  # weight of the equations displacement = that of the neighbor
-_UNKNOWN_SMOOTHNESS = 0.1  # more of it where no view sees the surface, or views contradict each other
-_RELAXATION = 0.5  # share of the way to the neighbors' middle, along the surface
-_UNFOLDING = 1.0  # the same along the vertex's normal, if the normal is square to its target
+_PASSES = 5  # of smoothing in a round
+_RELAXATION = 0.5  # share of the way to the neighbors' middle, along the surface, where this has the measured normals
 
 
 @dataclass(frozen=True)
@@ -98,7 +97,7 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
     start: Floats = mesh.vertices.astype(np.float64)
     hollow = np.flatnonzero(hull.at(start) < -_HOLLOW_DEPTH * step)
     neighbors = _neighbor_means(faces, len(start))
-    vertices = _relaxed(start, faces, neighbors)
+    vertices = start
     for _ in range(rounds):
         outward = vertex_normals(vertices, faces)
         seen = visible(vertices, faces, outward, views, step)
@@ -108,8 +107,7 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
         carved = Anchors(hollow, np.ones(len(hollow)), sunk, np.full(len(hollow), _HOLLOW_WEIGHT))
         move = _displacements(vertices, faces, outward, target, [rims, carved])
         move = np.clip(move, -_MOST_MOVE * step, _MOST_MOVE * step)
-        moved = _unfolded(vertices + outward * move[:, None], faces, neighbors, target)
-        vertices = _relaxed(moved, faces, neighbors)
+        vertices = _smoothed(vertices + outward * move[:, None], faces, neighbors, target)
     return FittedSurface(vertices, faces, target.agreement, neighbors)
 
 
@@ -206,15 +204,13 @@ def _displacements(
     t, w2 = np.tile(tilt, (3, 1)), np.tile(share**2, 3)
     a_i, a_j = dot(t, outward[i]), dot(t, outward[j])
     b = -dot(t, vertices[j] - vertices[i])
-    known = target.weight * target.agreement
-    smooth2 = (_SMOOTHNESS + _UNKNOWN_SMOOTHNESS * (1 - (known[i] + known[j]) / 2)) ** 2
     diagonal = np.full(count, _DAMPING**2)
-    diagonal += np.bincount(i, w2 * a_i**2 + smooth2, count) + np.bincount(j, w2 * a_j**2 + smooth2, count)
+    diagonal += np.bincount(i, w2 * a_i**2 + _SMOOTHNESS**2, count) + np.bincount(j, w2 * a_j**2 + _SMOOTHNESS**2, count)
     right = np.bincount(j, w2 * a_j * b, count) - np.bincount(i, w2 * a_i * b, count)
     for held in anchors:
         diagonal += np.bincount(held.vertex, held.weight**2 * held.slope**2, count)
         right += np.bincount(held.vertex, held.weight**2 * held.slope * held.distance, count)
-    coupling = sparse.coo_matrix((-w2 * a_i * a_j - smooth2, (i, j)), shape=(count, count)).tocsr()
+    coupling = sparse.coo_matrix((-w2 * a_i * a_j - _SMOOTHNESS**2, (i, j)), shape=(count, count)).tocsr()
     matrix = coupling + coupling.T + sparse.diags(diagonal)
     # a ball on the finest grid (300) needs 160 steps; a solution cut short is a shorter move, the next round goes on
     move, _ = cg(matrix, right, rtol=1e-3, maxiter=200, M=sparse.diags(1 / diagonal))
@@ -228,21 +224,17 @@ def _neighbor_means(faces: NDArray[np.int32], count: int) -> sparse.csr_matrix:
     return sparse.csr_matrix(sparse.diags(1 / np.asarray(joined.sum(axis=1)).ravel()) @ joined)
 
 
-def _relaxed(vertices: Floats, faces: NDArray[np.int32], neighbors: sparse.csr_matrix) -> Floats:
-    """Vertices moved along the surface towards their neighbors' middle, so that triangles stay even."""
-    way = neighbors @ vertices - vertices
-    outward = vertex_normals(vertices, faces)
-    return np.asarray(vertices + _RELAXATION * (way - outward * dot(way, outward)[:, None]))
-
-
-def _unfolded(
+def _smoothed(
     vertices: Floats, faces: NDArray[np.int32], neighbors: sparse.csr_matrix, target: SurfaceNormals
 ) -> Floats:
-    """Vertices moved along their normals towards the middle of their neighbors.
+    """Vertices moved to the middle of their neighbors, but not off a surface that has the measured normals.
 
-    The more a vertex's normal differs from its target, the farther the vertex moves. This removes folds.
+    This removes folds, smooths what no view sees, and draws tight what only the hull fills, e.g. between fingers.
     """
-    outward = vertex_normals(vertices, faces)
-    facing = np.maximum(dot(outward, target.normal), 0)
-    share = _UNFOLDING * (1 - facing**_FACET_POWER) * (target.weight > 0)
-    return np.asarray(vertices + outward * (share * dot(neighbors @ vertices - vertices, outward))[:, None])
+    for _ in range(_PASSES):
+        outward = vertex_normals(vertices, faces)
+        right = np.maximum(dot(outward, target.normal), 0) ** _FACET_POWER * target.agreement * (target.weight > 0)
+        way = neighbors @ vertices - vertices
+        along = way - outward * dot(way, outward)[:, None]
+        vertices = vertices + (1 - right)[:, None] * way + _RELAXATION * right[:, None] * along
+    return np.asarray(vertices)

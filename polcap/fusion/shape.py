@@ -14,8 +14,8 @@ from polcap.fusion.small_views import reduce_views
 from polcap.fusion.values import ClosedMesh, FusionView
 from polcap.stages import stage
 
-_ROUNDS = 7  # of the surface's fit; docs/benchmarks/fusion.md
-_FIRST_ROUNDS = 1  # of these before hollows are searched: a surface that sinks into a hollow hides that views disagree
+_ROUNDS = 12  # of the surface's fit; docs/benchmarks/fusion.md
+_FIRST_ROUNDS = 1  # before hollows are searched: a surface that sinks into a hollow hides that views disagree
 
 
 class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -24,7 +24,7 @@ class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     grid: Annotated[int, Meta(ge=40, le=300, description="steps along the object's longest side")] = 140
 
 
-@stage(version=7)
+@stage(version=8)
 def fuse_shape(views: Sequence[FusionView], settings: ShapeSettings) -> ClosedMesh:
     """Join views of one object into a closed, manifold, outward mesh in the world frame.
 
@@ -33,9 +33,5 @@ def fuse_shape(views: Sequence[FusionView], settings: ShapeSettings) -> ClosedMe
     small = reduce_views(views)
     hull = visual_hull(small, settings.grid)
     surface = fit_normals(iso_surface(hull), small, hull, _FIRST_ROUNDS)
-    carved = carve(hull, surface, small)
-    if carved is not hull:
-        surface = fit_normals(iso_surface(carved), small, hull, _ROUNDS)
-    else:
-        surface = fit_normals(surface.mesh, small, hull, _ROUNDS - _FIRST_ROUNDS)
+    surface = fit_normals(iso_surface(carve(hull, surface, small)), small, hull, _ROUNDS)
     return solid(surface.mesh, floor=0.0)  # views from above do not bound the object below the board
