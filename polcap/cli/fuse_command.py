@@ -46,7 +46,7 @@ def fuse(
         raise SettingError(f"polcap fuse needs {', '.join(missing)}: pip install 'polcap[fusion]'")
     if not folder.is_dir():
         raise SettingError(f"{folder}: no such folder; give the folder that holds view01, view02, …")
-    stated = settings.fill_sections(SessionConfig, config, assignments or [])
+    stated = settings.fill(SessionConfig, settings.read(config), assignments or [])
     wanted = SessionInput(
         folder=folder,
         config=stated.of_views,

@@ -100,8 +100,7 @@ class FusedSource:
         atlas = atlases.charted(coarse, side, self.atlas.margin, self.atlas.mesh.metric)
         maps = transferred(self.atlas, self.maps, atlas)
         bits: Literal[8, 16] = 8 if whole.normal.dtype == np.uint8 else 16
-        occluded = np.ptp(whole.occlusion_roughness_metallic[..., 0]) > 0
-        extras: tuple[Extra, ...] = ("occlusion",) if occluded else ()
+        extras: tuple[Extra, ...] = ("occlusion",) if whole.has_occlusion else ()
         extras += () if whole.object_normal is None else ("object-normal",)
         error = _distance(self.atlas.mesh.vertices, atlas)
         return DetailLevel(_asset(atlas, maps, bits, extras), DecimatedMesh(atlas.mesh, error, error / atlas.texel))
