@@ -31,7 +31,10 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_gain_change: Annotated[
         float,
         Meta(
-            gt=0, le=1, description="allowed change of the light from shot to shot; a flash usually repeats better [1]"
+            gt=0,
+            le=1,
+            description="allowed change of the light from shot to shot, as a flash usually repeats better; more only "
+            "warns, because the change is measured and corrected [1]",
         ),
     ] = 0.1
     max_energy_drift: Annotated[

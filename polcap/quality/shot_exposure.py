@@ -142,7 +142,8 @@ def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     if radiance.equipment.light == "steady":
         remedy = "Shoot again under constant light: the lamp or daylight changed between shots"
     message = f"The {names[k]} shot was {abs(100 * each[k]):.1f} % {_comparative(each[k])} than the others"
-    yield at_most("gains", float(abs(each[k])), limit, message, remedy, bad_shots(names, np.abs(each) > limit), 3)
+    bad = bad_shots(names, np.abs(each) > limit)
+    yield at_most("gains", float(abs(each[k])), limit, f"{message}, which is corrected", remedy, bad, beyond="warn")
     yield gain_doubt(found, limits)
     drift = off - each[:, None]
     k, e = (int(i) for i in np.unravel_index(int(np.argmax(np.abs(drift))), drift.shape))

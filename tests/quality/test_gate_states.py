@@ -160,7 +160,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("focus", "pass", {}),
     ("focus", "warn", {"figures": {"edge_blur": 2.5}}),
     ("gains", "pass", {}),
-    ("gains", "fail", gains(gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3]))),
+    ("gains", "warn", gains(gain=np.array([[1.0] * 3, [1.0] * 3, [0.75] * 3]))),
     ("energy", "pass", {}),
     ("energy", "warn", {"bracket": {"exposure_ratio": np.array([[[1.0], [4.0]], [[1.0], [4.0]], [[1.0], [4.8]]])}}),
     ("energy", "fail", {"bracket": {"exposure_ratio": np.array([[[1.0], [4.0]], [[1.0], [4.0]], [[1.0], [6.0]]])}}),
