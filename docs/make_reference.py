@@ -14,6 +14,7 @@ from typer.main import get_command
 import polcap
 from polcap.cli import app
 from polcap.config import settings
+from polcap.fusion.fusion_path import SessionConfig
 
 REFERENCE = Path(__file__).parent / "reference"
 _OPTIONS = re.compile(r"(<!-- options of (\w+) -->\n).*?(<!-- end -->)", re.S)
@@ -47,9 +48,10 @@ def settings_page() -> str:
     lines = [
         "# Settings", "", _MADE, "",
         "`--config FILE.toml` (sections as below) overrides the defaults; `--set stage.name=value` overrides both.",
-        "An unknown name or a value outside its range is an error that names it.", "",
+        "An unknown name or a value outside its range is an error that names it.",
+        "In a file, `fusion.shape.grid` is `grid` below `[fusion.shape]`. Only `polcap fuse` takes `fusion.…`.", "",
     ]  # fmt: skip
-    for name, rows in groupby(settings(), lambda setting: setting.key.partition(".")[0]):
+    for name, rows in groupby(settings(SessionConfig), lambda setting: setting.key.partition(".")[0]):
         lines += ["", f"## {name}", "", "| setting | type | default | range | meaning [unit] |"]
         lines += ["| --- | --- | --- | --- | --- |"]
         for row in rows:

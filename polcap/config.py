@@ -5,6 +5,7 @@ unknown key or a value out of range is an error that names the key, the value an
 """
 
 import difflib
+import functools
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -58,36 +59,44 @@ class Setting(NamedTuple):
 
 
 def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
-    """Settings from a TOML file and assignments of the form stage.name=value; see `fill_sections`."""
-    return fill_sections(Config, file, assignments)
+    """Settings of a run from a TOML file and assignments of the form stage.name=value; see `fill`."""
+    return fill(Config, read(file), assignments)
 
 
-def fill_sections(kind: type[S], file: Path | None, assignments: Sequence[str]) -> S:
-    """Fill a struct of settings sections from a TOML file and assignments of the form section.name=value.
+def read(file: Path | None) -> dict[str, Any]:
+    """Read a TOML file of settings; empty without a file. Raises SettingError: it cannot be read, or is not TOML."""
+    try:
+        return {} if file is None else text_file.read_toml(file)
+    except OSError as error:
+        raise SettingError(f"--config {file}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise SettingError(f"--config {file} is not TOML: {error}") from error
 
-    Raises SettingError: the file is not TOML, or a key is unknown, of the wrong type or out of its range.
+
+def fill(kind: type[S], stated: Mapping[str, Any], assignments: Sequence[str]) -> S:
+    """Fill a struct of settings from a table and from assignments of the form name=value or section.name=value.
+
+    Raises SettingError: a key is unknown, of the wrong type or out of its range.
     """
-    stated = _read(file) if file else {}
-    for section, values in stated.items():
-        if not isinstance(values, dict):
-            raise SettingError(f"{file}: `{section}` is not a section; write [stage], and name = value below it")
+    known = {setting.key: setting for setting in settings(kind)}
+    values = dict(_by_key(stated))
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
-        section, dot, name = key.strip().partition(".")
-        if not equals or not dot:
-            raise SettingError(f"--set {assignment}: write stage.name=value, for example hdr.clip=0.95")
-        stated.setdefault(section, {})[name] = _parse(text.strip())
-    _check_finite(stated)
-    known = {setting.key: setting for setting in settings(kind)}
-    for section, values in stated.items():
-        for name, value in values.items():
-            _check_known(f"{section}.{name}", value, known)
+        if not equals:
+            raise SettingError(f"--set {assignment}: give a value, as in {next(iter(known))}=VALUE")
+        values |= _by_key({key.strip(): _parse(text.strip())})
+    _check_finite(values)
+    table: dict[str, Any] = {}
+    for key, value in values.items():
+        _check_known(key, value, known)
+        *sections, name = key.split(".")
+        functools.reduce(lambda inner, section: inner.setdefault(section, {}), sections, table)[name] = value
     try:
-        return msgspec.convert(stated, kind)
+        return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
-        fault = text_file.fault(error, stated, kind)
+        fault = text_file.fault(error, table, kind)
         about = next((one.description for key, one in known.items() if re.match(rf"{key}\b", fault)), "")
-        raise SettingError(f"{fault} ({about})") from error
+        raise SettingError(f"{fault} ({about})" if about else fault) from error
     except UnicodeError as error:
         raise SettingError("--set: a value is not UTF-8 text; write it in ASCII") from error
 
@@ -103,38 +112,19 @@ def restore(about: Mapping[str, Any], file: Path) -> Config:
         raise StorageError(f"{file}: its settings are of another polcap ({error}); run `polcap process`") from error
 
 
-def fill(kind: type[S], stated: dict[str, Any], assignments: Sequence[str]) -> S:
-    """Fill a settings struct from values and name=value assignments, checked as strictly as by `load`.
-
-    Raises SettingError: a name is unknown, or a value has the wrong type or is out of range.
-    """
-    for assignment in assignments:
-        name, equals, text = assignment.partition("=")
-        if not equals or name not in kind.__struct_fields__:
-            near = difflib.get_close_matches(name, kind.__struct_fields__, n=1, cutoff=0.5) if equals else []
-            hint = (
-                f"did you mean {near[0]}?" if near else f"give one of {', '.join(kind.__struct_fields__)} as name=value"
-            )
-            raise SettingError(f"--set {assignment}: {hint}")
-        stated = {**stated, name: _parse(text.strip())}
-    _check_finite(stated)
-    try:
-        return msgspec.convert(stated, kind)
-    except msgspec.ValidationError as error:
-        raise SettingError(f"--set {text_file.fault(error, stated, kind)}") from error
-
-
-def settings(kind: type[msgspec.Struct] = Config) -> Iterator[Setting]:
+def settings(kind: type[msgspec.Struct] = Config, prefix: str = "") -> Iterator[Setting]:
     """All settings of a struct of sections, in the order of the stages, for the settings reference."""
-    for section in msgspec.structs.fields(kind):
-        annotated, plain = get_type_hints(section.type, include_extras=True), get_type_hints(section.type)
-        for field in msgspec.structs.fields(section.type):
-            hint, type_ = annotated[field.name], plain[field.name]
-            arms = [hint] if get_origin(hint) is Annotated else [*get_args(hint)] or [hint]  # of a union with None
-            meta = next((extra for arm in arms for extra in get_args(arm)[1:] if isinstance(extra, Meta)), Meta())
-            choices = get_origin(type_) is Literal
-            word = str(type_).replace("typing.", "") if choices else (*get_args(type_), type_)[0].__name__
-            yield Setting(f"{section.name}.{field.name}", word, field.default, _limits(meta), meta.description or "")
+    annotated, plain = get_type_hints(kind, include_extras=True), get_type_hints(kind)
+    for field in msgspec.structs.fields(kind):
+        key, hint, type_ = f"{prefix}{field.name}", annotated[field.name], plain[field.name]
+        if isinstance(type_, type) and issubclass(type_, msgspec.Struct):
+            yield from settings(type_, f"{key}.")
+            continue
+        arms = [hint] if get_origin(hint) is Annotated else [*get_args(hint)] or [hint]  # of a union with None
+        meta = next((extra for arm in arms for extra in get_args(arm)[1:] if isinstance(extra, Meta)), Meta())
+        choices = get_origin(type_) is Literal
+        word = str(type_).replace("typing.", "") if choices else (*get_args(type_), type_)[0].__name__
+        yield Setting(key, word, field.default, _limits(meta), meta.description or "")
 
 
 def _limits(meta: Meta) -> str:
@@ -142,13 +132,13 @@ def _limits(meta: Meta) -> str:
     return ", ".join(f"{sign}{getattr(meta, name)}" for name, sign in signs.items() if getattr(meta, name) is not None)
 
 
-def _read(file: Path) -> dict[str, Any]:
-    try:
-        return text_file.read_toml(file)
-    except OSError as error:
-        raise SettingError(f"--config {file}: {error.strerror or error}") from error
-    except ValueError as error:
-        raise SettingError(f"--config {file} is not TOML: {error}") from error
+def _by_key(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Keys such as hdr.clip and values of nested tables."""
+    for name, value in table.items():
+        if isinstance(value, dict):
+            yield from _by_key(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def _parse(text: str) -> Any:
@@ -174,5 +164,5 @@ def _check_known(key: str, value: Any, known: dict[str, Setting]) -> None:
         return
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
     sections = dict.fromkeys(name.partition(".")[0] for name in known)
-    hint = f"; did you mean {near[0]}?" if near else f"; sections are {', '.join(sections)}"
+    hint = f"; did you mean {near[0]}?" if near else f"; there are {', '.join(sections)}"
     raise SettingError(f"{key} = {value!r}: there is no such setting{hint}")

@@ -173,7 +173,7 @@ class Capture:
     principal_px: tuple[float, float]  # in visible RAW pixels
     size_px: tuple[int, int]  # width, height, visible RAW pixels
     chart_frames: tuple[Frame, ...] = ()
-    notes: tuple[str, ...] = field(default=(), metadata=NOT_IN_KEY)  # assumptions, one line each
+    notes: tuple[str, ...] = field(default=(), metadata=NOT_IN_KEY)  # on how the folder was read, one line each
     focal_doubt: tuple[float, float] = field(
         default=(0.0, 0.0), metadata=NOT_IN_KEY
     )  # ln of least, largest focal length / focal_px
@@ -636,6 +636,11 @@ class Asset(ArrayValue):
     displacement: TexturePixels | None = None  # (H, W) 0 at the farthest point, 1 at the nearest
     object_normal: TexturePixels | None = None  # (H, W, 3) camera frame, n * 0.5 + 0.5
     albedo_sigma: float | None = None  # as in `SurfaceMaps`
+
+    @property
+    def has_occlusion(self) -> bool:
+        """Whether ambient occlusion was computed; else its channel is 1."""
+        return bool(np.ptp(self.occlusion_roughness_metallic[..., 0]))
 
 
 @dataclass(frozen=True, repr=False)

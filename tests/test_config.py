@@ -5,8 +5,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from polcap.config import Config, fill, load, settings
+from polcap.config import Config, fill, load, read, settings
 from polcap.errors import SettingError
+from polcap.fusion.fusion_path import SessionConfig
 from polcap.synth.shooting import Shoot
 
 
@@ -30,8 +31,8 @@ def test_assignment_beats_file_beats_default(tmp_path: Path) -> None:
         ("hrd.clip=0.9", ["hrd.clip", "no such setting"]),
         ("hdr.clip=much", ["hdr.clip", "much", "float"]),
         ("align.model=affine", ["align.model", "affine"]),
-        ("hdr.clip", ["stage.name=value"]),
-        ("clip=0.9", ["stage.name=value"]),
+        ("hdr.clip", ["hdr.clip=VALUE"]),
+        ("clip=0.9", ["did you mean hdr.clip"]),
     ],
 )
 def test_wrong_assignment_is_named_with_value_and_limit(assignment: str, words: list[str]) -> None:
@@ -45,7 +46,7 @@ def test_wrong_assignment_is_named_with_value_and_limit(assignment: str, words: 
     [
         ("infer.symmetries=3", "not one of 1, 2, 4, 8"),
         ("[hdr]\nclip = 2", "hdr.clip = 2"),
-        ("clip = 0.9", "not a section"),
+        ("clip = 0.9", "did you mean hdr.clip"),
         ("[hdr", "not TOML"),
         ("[colour]\nx = 1", "colour.x"),
         ("[hdr]\nclip = '0.9'", "hdr.clip"),
@@ -62,7 +63,20 @@ def test_wrong_or_missing_file_is_one_line(tmp_path: Path, text: str | None, wor
 
 
 def test_every_setting_is_described() -> None:
-    assert [setting.key for setting in settings() if not setting.description] == []
+    assert [setting.key for setting in settings(SessionConfig) if not setting.description] == []
+
+
+def test_settings_of_the_fusion_are_a_section_with_sections(tmp_path: Path) -> None:
+    file = tmp_path / "polcap.toml"
+    file.write_text("[hdr]\nclip = 0.9\n[fusion.atlas]\nsize = 2048\nmargin = 8\n")
+    config = fill(SessionConfig, read(file), ["fusion.atlas.size=1024"])
+    assert (config.fusion.atlas.size, config.fusion.atlas.margin, config.hdr.clip) == (1024, 8, 0.9)
+    assert config.of_views == load(None, ["hdr.clip=0.9"])
+    for wrong, words in (("atlas.sice=1", "did you mean fusion.atlas.size"), ("atlas.size=9000", "≤ 8192|<= 8192")):
+        with pytest.raises(SettingError, match=words):
+            fill(SessionConfig, {}, [f"fusion.{wrong}"])
+    with pytest.raises(SettingError, match=r"fusion\.atlas\.size = 2048: there is no such setting"):
+        load(file)
 
 
 def test_config_survives_its_own_dump() -> None:

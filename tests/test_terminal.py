@@ -14,6 +14,7 @@ import pytest
 
 from polcap import __version__, cli, config, terminal
 from polcap.cli import options
+from polcap.fusion.fusion_path import SessionConfig
 from polcap.pipeline import run as pipeline
 from tests.conftest import Command
 
@@ -34,9 +35,10 @@ def test_help_has_complete_summaries_and_explains_a_command(polcap: Command) -> 
 
 def test_settings_are_listed_with_default_range_and_meaning(polcap: Command) -> None:
     every = json.loads(polcap("settings", "--json").stdout)
-    assert [row["name"] for row in every] == [setting.key for setting in config.settings()]
+    assert [row["name"] for row in every] == [setting.key for setting in config.settings(SessionConfig)]
     of_stage = json.loads(polcap("settings", "hdr", "--json").stdout)
     assert of_stage == [row for row in every if row["name"].startswith("hdr.")]
+    assert "fusion.atlas.size = 0  (≥ 0, ≤ 8192)" in polcap("settings", "fusion").stdout
     assert "hdr.clip = 0.98  (≥ 0.5, ≤ 1.0)\n    clipping threshold" in polcap("settings", "hdr").stdout
     assert "stokes.undistort = true\n" in polcap("settings", "stokes").stdout
     assert "choose one of hdr, whitebalance" in polcap("settings", "polish").stderr

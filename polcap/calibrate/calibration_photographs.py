@@ -14,7 +14,7 @@ from polcap.formats.raw import probe
 from polcap.images import Exif, Floats, SensorImage
 from polcap.optics import sensor
 
-CLIP = 0.95  # of the white level; nothing is measured above
+CLIP = 0.95  # of the saturated count; nothing is measured above
 _MOST_CLIPPED = 0.01  # share of a picture's middle
 _ANGLE = re.compile(r"(\d{1,3}(?:\.\d+)?)")
 

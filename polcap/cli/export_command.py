@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 PRESETS = ("blender", "unreal", "unity", "web", "substance", "maya", "houdini", "archive")
 EXTRAS = ("displacement", "occlusion", "object-normal")
 _PRESET = f"Files for one program in asset/NAME/: {', '.join(PRESETS)}; repeatable."
-_EXTRA = "A further texture: displacement, occlusion or object-normal; repeatable."
+_EXTRA = f"A further texture: {', '.join(EXTRAS)}; repeatable."
 _ABOUT = "A fact for catalogs: title, creator, rights, license or object_number; repeatable."
 _IIIF = "asset/NAME_iiif/, a relightable layer for museums; URL is where this folder will be served."
 _PAGE = "Web page that shows the GLB with this model-viewer.min.js, without a network."

@@ -37,7 +37,7 @@ def fuse(
     from polcap import config as settings
     from polcap.batch.processes import Limits
     from polcap.fusion import fuse_run
-    from polcap.fusion.fusion_path import FusionSettings
+    from polcap.fusion.fusion_path import SessionConfig
     from polcap.fusion.session import SessionInput
     from polcap.pipeline import models
 
@@ -46,11 +46,10 @@ def fuse(
         raise SettingError(f"polcap fuse needs {', '.join(missing)}: pip install 'polcap[fusion]'")
     if not folder.is_dir():
         raise SettingError(f"{folder}: no such folder; give the folder that holds view01, view02, …")
-    stated = assignments or []
-    own = [one.removeprefix("fusion.") for one in stated if one.startswith("fusion.")]
+    stated = settings.fill(SessionConfig, settings.read(config), assignments or [])
     wanted = SessionInput(
         folder=folder,
-        config=settings.load(config, [one for one in stated if not one.startswith("fusion.")]),
+        config=stated.of_views,
         chart=options.chart_request(chart, no_chart),
         network=models.load_network(estimator, model, device, threads),
         mask_network=models.load_mask_network(threads),
@@ -60,7 +59,6 @@ def fuse(
         limits=Limits(threads, memory),
     )
     target = out or folder / own_folders.FUSED
-    chosen = settings.fill_sections(FusionSettings, None, own)
     steps = terminal.Steps()
-    about = fuse_run.fuse(wanted, chosen, target, terminal.print_progress, steps.stage)
+    about = fuse_run.fuse(wanted, stated.fusion, target, terminal.print_progress, steps.stage)
     terminal.print_result(about, target, json, open_)

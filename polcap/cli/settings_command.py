@@ -13,13 +13,16 @@ from polcap.errors import SettingError
 
 def settings(
     context: Context,
-    stage: Annotated[str | None, Argument(metavar="[STAGE]", help="Only this stage, such as hdr; or gates.")] = None,
+    stage: Annotated[
+        str | None, Argument(metavar="[STAGE]", help="Only this stage, such as hdr, gates or fusion.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """List the settings of all stages with default, range and meaning; --set and --config take them."""
     from polcap import config
+    from polcap.fusion.fusion_path import SessionConfig
 
-    rows = list(config.settings())
+    rows = list(config.settings(SessionConfig))
     stages = dict.fromkeys(row.key.partition(".")[0] for row in rows)
     if stage not in (None, *stages):
         raise SettingError(f"settings {stage}: no such stage; choose one of {', '.join(stages)}")

@@ -44,6 +44,7 @@ class Atlas:
     covered: Bools  # (S, S) texels with a surface point
     position: Floats  # (N, 3) m, board frame
     normal: Floats  # (N, 3) unit, of the mesh
+    margin: int  # px between charts
 
     @property
     def texel(self) -> float:
@@ -51,7 +52,7 @@ class Atlas:
         return float(np.sqrt(_area(self.mesh) / max(len(self.position), 1)))
 
 
-@stage(version=2)
+@stage(version=3)
 def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSettings) -> Atlas:
     """Cut a closed mesh into charts, and pack them into a square texture.
 
@@ -68,27 +69,29 @@ def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSetti
     failure: ObjectError | None = None
     for share in _SHARES:
         try:
-            return _sized(decimate(mesh, max(int(share * count), _FEWEST)), pixel, settings)
+            return _sized(decimate(mesh, max(int(share * count), _FEWEST)), pixel, settings, views[0].metric)
         except ObjectError as error:
             failure = error
     assert failure is not None
     raise failure
 
 
-def _sized(mesh: ClosedMesh, pixel: float, settings: AtlasSettings) -> Atlas:
+def _sized(mesh: ClosedMesh, pixel: float, settings: AtlasSettings, metric: bool) -> Atlas:
     """The atlas in the size of the settings, or in one whose texels are no larger than `pixel` [m]."""
     if settings.size:
-        return charted(mesh, settings.size, settings.margin)
+        return charted(mesh, settings.size, settings.margin, metric)
     side = _side(mesh, pixel)
-    found = charted(mesh, side, settings.margin)
+    found = charted(mesh, side, settings.margin, metric)
     while found.texel > pixel and side < _SIDES[1]:  # the margins of the charts need room, too
         side *= 2
-        found = charted(mesh, side, settings.margin)
+        found = charted(mesh, side, settings.margin, metric)
     return found
 
 
-def charted(mesh: ClosedMesh, side: int, margin: int) -> Atlas:
+def charted(mesh: ClosedMesh, side: int, margin: int, metric: bool = True) -> Atlas:
     """Cut a closed mesh into charts, and pack them into a texture of `side` px, with `margin` px between them.
+
+    `metric`: the mesh is in metres.
 
     Raises SettingError: the package uvunwrap is missing, or the charts do not fit into a texture of this size.
     """
@@ -101,16 +104,17 @@ def charted(mesh: ClosedMesh, side: int, margin: int) -> Atlas:
         uv=uv.astype(np.float32),
         tangents=vertex_tangents(vertices, uv, faces, normals).astype(np.float32),
         faces=faces,
-        metric=True,
+        metric=metric,
         frame="board",
     )
-    return of_mesh(unwrapped, side)
+    return of_mesh(unwrapped, side, margin)
 
 
-def of_mesh(mesh: Mesh, side: int) -> Atlas:
+def of_mesh(mesh: Mesh, side: int, margin: int) -> Atlas:
     """The atlas of a mesh that has texture coordinates, with `side` px."""
     points = rasterize(mesh.uv, mesh.faces, side, side)
-    return Atlas(mesh, points.covered, points.interpolate(mesh.vertices), frames.unit(points.interpolate(mesh.normals)))
+    normal = frames.unit(points.interpolate(mesh.normals))
+    return Atlas(mesh, points.covered, points.interpolate(mesh.vertices), normal, margin)
 
 
 def _charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.int32]]:

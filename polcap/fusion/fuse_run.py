@@ -49,10 +49,7 @@ def fuse(
         cache = StageCache(out, progress)
         with cache.memory_explained(views[0].mask.size):
             results = path(views, settings, cache)
-        mesh = replace(results.atlas.mesh, metric=found.metric)
-        results = replace(
-            results, atlas=replace(results.atlas, mesh=mesh), maps=_with_albedo_scale(results.maps, found)
-        )
+        results = replace(results, maps=_with_albedo_scale(results.maps, found))
         cache.begin("write")
         about = document(wanted, found, settings, results, out)
         write(out, about, results, views)

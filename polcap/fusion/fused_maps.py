@@ -14,9 +14,10 @@ from polcap.formats import atomic, text_file
 from polcap.formats.export.texture_set import Extra
 from polcap.formats.maps import exr, maps_folder, png
 from polcap.fusion import atlas as atlases
-from polcap.fusion.atlas import Atlas, AtlasSettings
+from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, on_atlas
 from polcap.fusion.closed_mesh import decimate
+from polcap.fusion.mesh_occlusion import ambient_occlusion
 from polcap.fusion.values import ClosedMesh
 from polcap.images import Asset, Floats, Mesh
 from polcap.optics import color
@@ -54,6 +55,7 @@ def write(folder: Path, atlas: Atlas, maps: AtlasMaps) -> None:
     about = {
         "format": FORMAT,
         "size": list(maps.mask.shape[::-1]),
+        "margin": atlas.margin,
         "albedo": maps_folder.albedo_scale(maps.albedo_sigma),
         "frame": "y up; origin in the middle of the board, or on the axis of the turn where there was none",
         "unit": "m" if atlas.mesh.metric else "relative",
@@ -88,17 +90,18 @@ class FusedSource:
         return len(self.atlas.mesh.faces)
 
     def whole(self, bits: Literal[8, 16], extras: tuple[Extra, ...]) -> Asset:
-        """The asset with the full mesh; of the extra textures a closed mesh has only `object-normal`."""
+        """The asset with the full mesh; a closed mesh has no displacement."""
         return _asset(self.atlas, self.maps, bits, extras)
 
     def decimated(self, whole: Asset, triangles: int) -> DetailLevel:
         """The asset with about so many triangles, an atlas of its own, and the textures of the full mesh."""
         coarse = decimate(closed(self.atlas.mesh), triangles)
         side = self.maps.mask.shape[0]
-        atlas = atlases.charted(coarse, side, AtlasSettings().margin)
+        atlas = atlases.charted(coarse, side, self.atlas.margin, self.atlas.mesh.metric)
         maps = transferred(self.atlas, self.maps, atlas)
         bits: Literal[8, 16] = 8 if whole.normal.dtype == np.uint8 else 16
-        extras: tuple[Extra, ...] = () if whole.object_normal is None else ("object-normal",)
+        extras: tuple[Extra, ...] = ("occlusion",) if whole.has_occlusion else ()
+        extras += () if whole.object_normal is None else ("object-normal",)
         error = _distance(self.atlas.mesh.vertices, atlas)
         return DetailLevel(_asset(atlas, maps, bits, extras), DecimatedMesh(atlas.mesh, error, error / atlas.texel))
 
@@ -112,7 +115,7 @@ def read(folder: Path) -> FusedSource:
         about: Mapping[str, Any] = text_file.read_json(folder / "maps.json")
         with np.load(folder / "mesh.npz") as stored:
             arrays = {name: stored[name] for name in _ARRAYS}
-        side, percent = int(about["size"][0]), about["albedo"]["uncertainty_percent"]
+        side, margin, percent = int(about["size"][0]), int(about["margin"]), about["albedo"]["uncertainty_percent"]
         metric = about["unit"] == "m"
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DecodeError(f"{folder} holds no fused maps of this polcap ({error}); run `polcap fuse` again") from error
@@ -122,7 +125,7 @@ def read(folder: Path) -> FusedSource:
         albedo_sigma=None if percent is None else percent / 100,
     )
     mesh = Mesh(**arrays, metric=metric, frame="board")
-    return FusedSource(atlases.of_mesh(mesh, side), maps)
+    return FusedSource(atlases.of_mesh(mesh, side, margin), maps)
 
 
 def _map(folder: Path, name: str) -> Floats:
@@ -151,10 +154,14 @@ def transferred(source: Atlas, maps: AtlasMaps, target: Atlas) -> AtlasMaps:
 
 def _asset(atlas: Atlas, maps: AtlasMaps, bits: Literal[8, 16], extras: tuple[Extra, ...]) -> Asset:
     built = asset.build(maps, atlas.mesh, asset.AssetSettings(), bits)
-    if "object-normal" not in extras:
-        return built
-    top = np.iinfo(built.normal.dtype).max
-    return replace(built, object_normal=np.rint((maps.normal / 2 + 0.5) * top).astype(built.normal.dtype))
+    top, kind = np.iinfo(built.normal.dtype).max, built.normal.dtype
+    if "object-normal" in extras:
+        built = replace(built, object_normal=np.rint((maps.normal / 2 + 0.5) * top).astype(kind))
+    if "occlusion" in extras:
+        packed = built.occlusion_roughness_metallic.copy()
+        packed[..., 0] = np.rint(ambient_occlusion(atlas) * top)
+        built = replace(built, occlusion_roughness_metallic=packed)
+    return built
 
 
 def _distance(vertices: Floats, coarse: Atlas) -> float:

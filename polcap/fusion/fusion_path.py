@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import msgspec
 
+from polcap.config import Config
 from polcap.fusion import atlas, baking, comparison, filling, material_fit, shape
 from polcap.fusion.atlas import Atlas, AtlasSettings
 from polcap.fusion.baking import AtlasMaps, BakingSettings
@@ -25,6 +26,17 @@ class FusionSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     atlas: AtlasSettings = AtlasSettings()
     baking: BakingSettings = BakingSettings()
     material_fit: MaterialSettings = MaterialSettings()
+
+
+class SessionConfig(Config, frozen=True, forbid_unknown_fields=True):
+    """Settings of `polcap fuse`: those of its views, and in the section `fusion` those of the fusion."""
+
+    fusion: FusionSettings = FusionSettings()
+
+    @property
+    def of_views(self) -> Config:
+        """The settings of the views."""
+        return msgspec.convert(self, Config, from_attributes=True)
 
 
 @dataclass(frozen=True)

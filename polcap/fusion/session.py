@@ -366,7 +366,8 @@ def _view(name: str, session: Session, wanted: SessionInput) -> FusionView:
     results = pipeline.reopen(out_of(wanted.folder, name), "infer")[0]
     assert session.camera is not None
     undistorted = results.radiance.equipment.distortion is not None and wanted.config.stokes.undistort
-    return view_maps.fusion_view(name, results, session.camera, session.posed[name].pose, undistorted)
+    found = view_maps.fusion_view(name, results, session.camera, session.posed[name].pose, undistorted)
+    return replace(found, metric=session.metric)
 
 
 def _joined(session: Session, wanted: SessionInput) -> tuple[FusionView, ...]:

@@ -41,6 +41,7 @@ class FusionView:
     roughness: Floats  # (H, W) perceptual
     s0: Floats | None = None  # (H, W, 3) white-balanced radiance under the flash; for highlights and residuals
     white_distance: float | None = None  # where a white plane has S0 = 1, over the object's distance; None: unknown
+    metric: bool = True  # the pose is in metres; else in an unknown unit
 
 
 @dataclass(frozen=True)

@@ -57,8 +57,9 @@ def usable(image: SensorImage, clip: float, full: bool = False) -> Bools:
 
     Raw counts of whole superpixels are compared, so all colors of a pixel are treated alike. One clipped photosite
     excludes its surroundings, so pixels near the limit are not selected by their noise.
+    `clip` is as in `clip_count`.
     """
-    return below(image, clip * saturation(image), full)
+    return below(image, clip_count(image, clip), full)
 
 
 def below(image: SensorImage, level: float, full: bool = False) -> Bools:
@@ -84,6 +85,16 @@ def _at_least(value: Floats | NDArray[np.uint16], level: float) -> Bools:
         least = math.ceil(level)
         return np.zeros(value.shape, bool) if least > 65535 else np.asarray(value >= np.uint16(least))
     return np.asarray(value >= level)
+
+
+def clipped_share(image: SensorImage, clip: float) -> float:
+    """Share of an image's counts that are clipped; see `clip_count`."""
+    return float(np.mean(_at_least(image.value, clip_count(image, clip))))
+
+
+def clip_count(image: SensorImage, clip: float) -> float:
+    """Count from which photosites are clipped: the share `clip` of the count at which they saturate."""
+    return clip * saturation(image)
 
 
 def saturation(image: SensorImage) -> float:

@@ -45,8 +45,7 @@ def places(image: SensorImage, clip: float) -> NDArray[np.int64]:
 def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
     """Cut tiles out of one decoded photograph, and find which are bright enough and unclipped.
 
-    `corners` (T, 2) are (row, column) in binned px, as `places` returns them. Photosites are clipped from `clip` [white
-    level] on.
+    `corners` (T, 2) are (row, column) in binned px, as `places` returns them; `clip` is as in `sensor.clip_count`.
     """
     step = image.superpixel
     margin = 1 if image.cfa is None else len(image.cfa)  # a clipped photosite makes its neighbors unusable
@@ -64,7 +63,7 @@ def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
     shape = (len(corners), TILE + 2 * spare, TILE + 2 * spare)
     inner = np.s_[:, spare:-spare, spare:-spare]
     light = _whole_light(strip).reshape(shape)[inner]
-    sound = sensor.below(strip, clip * sensor.saturation(image)).reshape(shape)[inner].all((1, 2))
+    sound = sensor.below(strip, sensor.clip_count(image, clip)).reshape(shape)[inner].all((1, 2))
     return Tiles(light, sound & (light.mean((1, 2)) > _LEAST_LIGHT))
 
 

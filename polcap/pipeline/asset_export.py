@@ -57,7 +57,7 @@ class ExportRequest:
     triangles: int | None = None  # at most; by default the preset's, or those of the full mesh
     color: str = exr_layers.LINEAR_REC709  # color space or role of the colors in the layered EXR
     bits: Literal[8, 16] | None = None  # of a texture's channel; by default the preset's, or 8
-    extras: tuple[Extra, ...] = ()  # textures to make, in addition to the preset's
+    extras: tuple[Extra, ...] = ()  # channels to compute, and to write as a file each
     texture_size: int | None = None  # px of the longer side; by default each texture's own
     page: Path | None = None  # file with model-viewer's script, for a web page that shows the GLB
     iiif: str | None = None  # address where the folder of the format `iiif` will be served

@@ -157,6 +157,7 @@ def table(verdict: Verdict) -> str:
         head += f": {', '.join(line.name for line in verdict.lines if line.state == 'fail')}"
     if verdict.keep and verdict.needs:
         head += f", and process it with {verdict.needs}"
+    width = max((len(line.name) for line in verdict.lines), default=0) + 2
     rows = [f"{head}   ({verdict.capture}, {verdict.seconds:.1f} s)"]
     for line in verdict.lines:
         limit = ""
@@ -164,9 +165,9 @@ def table(verdict: Verdict) -> str:
             number, unit = (100 * line.limit, "%") if line.unit == "1" else (line.limit, line.unit)
             limit = f" (limit {number:g} {unit})".replace(" )", ")")
         cost = f", costs about {line.cost_deg:.0f}°" if line.cost_deg >= 1 and line.state in ("warn", "fail") else ""
-        rows.append(f"{line.state:13}{line.name:14}{line.message}{limit}{cost}")
+        rows.append(f"{line.state:13}{line.name:{width}}{line.message}{limit}{cost}")
         if line.remedy:
-            rows.append(f"{'':27}→ {line.remedy}")
+            rows.append(f"{'':{13 + width}}→ {line.remedy}")
     return "\n".join(rows)
 
 

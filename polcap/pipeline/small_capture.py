@@ -63,7 +63,7 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
     """Start to decode and reduce every frame of a capture once, on the threads of the pool.
 
     The reference frame is first: it determines the reduction, and the tiles in which sharpness is measured. The others
-    follow in the order of the merge. Counts from `clip` [white level] on are clipped.
+    follow in the order of the merge. `clip` is as in `sensor.clip_count`.
 
     Raises DecodeError: of the reference frame immediately, of another frame when it is used.
     """

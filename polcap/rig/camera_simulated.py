@@ -101,7 +101,7 @@ def parse_query(query: str) -> SimulatedCameraSettings:
     try:
         shoot = config.fill(SimulatedCameraSettings, defaults, assignments)
     except SettingError as error:
-        raise SettingError(f"--camera simulated?{query}: {str(error).removeprefix('--set ')}") from None
+        raise SettingError(f"--camera simulated?{query}: {error}") from None
     if shoot.bracket != "time":
         raise SettingError(f"--camera simulated?bracket={shoot.bracket}: only time is simulated; leave it out")
     return shoot

@@ -15,13 +15,14 @@ from polcap.formats.capture import reader
 from polcap.formats.raw import libraw as raw
 from polcap.formats.raw import probe, worker
 from polcap.images import Exif, Floats
+from polcap.optics import sensor
 from polcap.optics.resize import area_mean, block_means
 from polcap.rig.exposure_bracket import Exposure
 
 BLURRED = "is less sharp than its neighbors; wait until the tripod is steady"
 PREVIEW_PX = 480  # width of the small picture
 _DIAL_STOPS = 0.34  # EXIF rounds an exposure by up to one step of the dial
-_SATURATED = 0.98  # of the white level
+_CLIP = 0.98  # of the saturated count, as `hdr.clip`
 _MOST_CLIPPED = 0.01  # share of the picture, in the shortest exposure
 _LEAST_SHARPNESS = 0.75  # of that of the sharpest frame of the same exposure
 
@@ -31,7 +32,7 @@ class FrameFacts(msgspec.Struct, frozen=True):
 
     exif: Exif
     digest: str  # of the file's bytes
-    clipped: float  # share of saturated pixels
+    clipped: float  # share of clipped counts
     sharpness: float  # contrast of fine detail over contrast of coarse detail
 
 
@@ -49,16 +50,13 @@ def inspect(path: Path) -> tuple[FrameFacts, Floats]:
 
 def measure(path: str) -> worker.Answer:
     """In the child process: clipped share, sharpness and small picture of one RAW file."""
-    meta, arrays = raw.decode(path)
-    value, white = arrays["value"], meta["white"]
-    black = float(np.mean(meta["black"]))
-    clipped = float(np.mean(value >= black + _SATURATED * (white - black)))
+    image = raw.image(*raw.decode(path))
+    value, black = image.value, float(image.black.mean())
     grey = value if value.ndim == 2 else value.mean(-1, dtype=np.float32)
-    block = 3 if arrays.get("cfa", grey).shape == (6, 6) else 2  # one cell has all colors
-    light = (block_means(np.asarray(grey, np.float32), block) - black) / (white - black)
+    light = (block_means(np.asarray(grey, np.float32), max(image.superpixel, 2)) - black) / (image.white - black)
     height, width = light.shape
     small = area_mean(light, (round(height * min(width, PREVIEW_PX) / width), min(width, PREVIEW_PX)))
-    return {"clipped": clipped, "sharpness": _sharpness(light)}, {"small": small}
+    return {"clipped": sensor.clipped_share(image, _CLIP), "sharpness": _sharpness(light)}, {"small": small}
 
 
 def _sharpness(light: Floats) -> float:

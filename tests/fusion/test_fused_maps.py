@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from polcap.errors import DecodeError, SettingError
-from polcap.formats.export import gltf
+from polcap.formats.export import gltf, texture_set
 from polcap.formats.maps import result_maps
 from polcap.fusion import atlas as atlases
-from polcap.fusion import baking, filling, fuse_run, fused_maps
+from polcap.fusion import baking, closed_mesh, filling, fuse_run, fused_maps
 from polcap.fusion.baking import BakingSettings
 from polcap.fusion.closed_mesh import is_closed
 from polcap.fusion.fused_maps import FusedSource
@@ -32,6 +32,24 @@ def test_maps_and_mesh_come_back_as_written(source: FusedSource, tmp_path: Path)
     assert np.array_equal(back.atlas.mesh.vertices, source.atlas.mesh.vertices)
     assert np.array_equal(back.maps.normal, source.maps.normal)
     assert back.maps.diffuse == pytest.approx(source.maps.diffuse, abs=1e-3)  # half floats
+
+
+def test_coarser_levels_have_the_unit_and_the_margin_of_the_full_mesh(source: FusedSource, tmp_path: Path) -> None:
+    atlas = atlases.charted(ellipsoid.mesh(), 256, 16, metric=False)
+    fused_maps.write(tmp_path, atlas, fused_maps.transferred(source.atlas, source.maps, atlas))
+    level = asset_export.levels(fused_maps.read(tmp_path), ExportRequest(lod=1))[1].asset.mesh
+    coarse = fused_maps.closed(atlas.mesh)
+    again = atlases.charted(closed_mesh.decimate(coarse, round(len(coarse.faces) / 4)), 256, 16)
+    assert not level.metric and np.array_equal(level.uv, again.mesh.uv)
+
+
+def test_occlusion_is_of_the_mesh_in_all_levels(source: FusedSource, monkeypatch: pytest.MonkeyPatch) -> None:
+    half = np.tile(np.linspace(0, 1, 256), (256, 1))
+    monkeypatch.setattr(fused_maps, "ambient_occlusion", lambda atlas: half)
+    for level in asset_export.levels(source, ExportRequest(extras=("occlusion",), lod=1)):
+        assert texture_set.occlusion(level.asset).pixels == pytest.approx(255 * half, abs=0.5)
+    plain = asset_export.levels(source, ExportRequest(lod=1))
+    assert all((texture_set.occlusion(level.asset).pixels == 255).all() for level in plain)
 
 
 def test_a_reader_of_one_view_and_an_export_refuse_what_a_fused_object_lacks(

@@ -6,7 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import FunctionType
 from typing import Annotated, Any, Literal
@@ -244,6 +244,15 @@ def test_key_follows_the_bytes_of_the_photographs_not_their_place(tmp_path: Path
     turned = replace(capture, shots=(images.Shot(0.1, (frame,)),))
     key = [DryRunCache(tmp_path).run(DOUBLE, c, config=Settings()).key for c in (capture, moved, other, turned)]
     assert key[0] == key[1] and len(set(key)) == 3
+
+
+def test_only_facts_that_change_pixels_enter_the_key() -> None:
+    """For a new field: mark it NOT_IN_KEY, or list it here, if the same photographs give other pixels with it."""
+    capture = {"shots", "layout", "focal_px", "focal_known", "principal_px", "size_px", "chart_frames", "crossed"}
+    capture |= {"calibration"}
+    frame = {"exif", "role", "digest", "exposure"}
+    for kind, expected in ((images.Capture, capture), (images.Frame, frame)):
+        assert {one.name for one in fields(kind) if one.metadata.get("in_key", True)} == expected
 
 
 def test_force_computes_the_stage_and_what_follows(tmp_path: Path) -> None:

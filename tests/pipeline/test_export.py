@@ -204,7 +204,7 @@ def test_usd_without_its_package_is_one_line_with_the_remedy(
 
 
 def test_number_of_threads_changes_no_byte(example: Path, tmp_path: Path) -> None:
-    """Two whole runs; the network's own sums are tested with it (tests/training/test_profiles.py)."""
+    """Two whole runs; the network's own threads are tested in tests/stages/test_golden.py."""
     found = []
     for threads in (1, 2):
         out = tmp_path / str(threads)
@@ -261,6 +261,8 @@ def test_extra_textures_and_sixteen_bits(own: Path, polcap: Command) -> None:
     assert 0.5 < occlusion.mean() < 1 and occlusion.min() < 0.9
     material = document((own / "asset/capture.glb").read_bytes())["materials"][0]
     assert material["occlusionTexture"] == {"index": 1}
+    stated = json.loads((own / "maps" / "maps.json").read_text())["exports"]["asset"]["glb"]
+    assert stated["capture_orm"].startswith("R ambient occlusion, G")
 
 
 def test_a_second_export_adds_to_the_records_of_the_first(own: Path) -> None:

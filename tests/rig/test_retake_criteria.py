@@ -85,6 +85,13 @@ def test_clipped_share_is_counted(tmp_path: Path) -> None:
     assert small.shape == (20, 30) and small[15, 20] == pytest.approx((3000 - 512) / (15871 - 512), rel=1e-4)
 
 
+def test_a_camera_that_saturates_below_its_white_level_clips(tmp_path: Path) -> None:
+    mosaic = np.full((400, 600), 3000, np.uint16)
+    mosaic[:100, :300] = 12000
+    write_raw(tmp_path / "x.dng", mosaic, Exif(make="Polcap"))
+    assert retake_criteria.inspect(tmp_path / "x.dng")[0].clipped == pytest.approx(1 / 8)
+
+
 def test_another_file_or_half_a_raw_is_refused(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "x.jpg"), np.zeros((20, 20, 3), np.uint8))
     with pytest.raises(DecodeError, match="set the camera to RAW"):

@@ -9,7 +9,7 @@ web_page      a page that shows the GLB without a network
 materialx     MaterialX 1.39, and the OpenPBR node graph
 exr_layers    all maps as layers of one EXR, in a chosen color space
 texture_set   the textures, packed for each kind of program
-presets       files and names for Blender, Unreal, Unity, the web, archives
+presets       files, names and packing for one program each
 encoders      PNG, JPEG, WebP, KTX2; animated WebP and MP4
 provenance    the origin of an asset, as a sidecar file
 """

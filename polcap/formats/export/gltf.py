@@ -119,7 +119,7 @@ def textures(asset: Asset) -> dict[str, Texture]:
     """The textures that a GLB embeds, by name suffix, in the order of the glTF material."""
     return {
         "basecolor": texture_set.base_color(asset),
-        "orm": texture_set.packed(asset),
+        "orm": texture_set.occlusion_roughness_metallic(asset),
         "normal": texture_set.normal(asset),
         "specular": texture_set.relative_specular(asset),
     }
@@ -150,7 +150,7 @@ def _material(asset: Asset, name: str) -> dict[str, Any]:
             "roughnessFactor": 1.0,
         },
         "normalTexture": {"index": 2},
-        **({"occlusionTexture": {"index": 1}} if np.ptp(asset.occlusion_roughness_metallic[..., 0]) else {}),
+        **({"occlusionTexture": {"index": 1}} if asset.has_occlusion else {}),
         "extensions": {
             "KHR_materials_specular": {
                 "specularColorFactor": list(asset.specular_factor),

@@ -27,7 +27,7 @@ class ExportPreset:
     triangles: int | None = None  # at most; by default those of the full mesh
     bits: Literal[8, 16] = 8  # of a texture's channel
     shared: Literal["png", "exr"] = "png"  # files of the textures of OBJ, USD and MaterialX
-    extras: tuple[Extra, ...] = ()  # textures to make
+    extras: tuple[Extra, ...] = ()  # channels to compute; `--extra` also writes each as a file
     textures: Mapping[str, Callable[[Asset], Texture]] = field(default_factory=dict)  # PNG files next to the asset
 
 
@@ -43,7 +43,7 @@ PRESETS: Mapping[str, ExportPreset] = {
         textures={
             "T_{}_BC": texture_set.base_color,
             "T_{}_N": partial(texture_set.normal, up=False),
-            "T_{}_ORM": texture_set.packed,
+            "T_{}_ORM": texture_set.occlusion_roughness_metallic,
             "T_{}_S": texture_set.specular_level,
         },
     ),

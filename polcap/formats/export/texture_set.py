@@ -17,7 +17,7 @@ from polcap.optics import color, fresnel
 SPECULAR_RANGE = 0.08  # F0 of white in the loose specular textures: Disney's, Blender's and Unreal's "specular"
 
 Key = Literal["basecolor", "roughness", "normal", "specular"]  # the texture files of OBJ, USD and MaterialX
-Extra = Literal["displacement", "occlusion", "object-normal"]  # textures that are made by option
+Extra = Literal["displacement", "occlusion", "object-normal"]  # channels that are computed on request
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,9 @@ def object_normal(asset: Asset) -> Texture:
     return Texture(asset.object_normal, False, "object-space normal n * 0.5 + 0.5: R right, G up, B toward the camera")
 
 
-def packed(asset: Asset) -> Texture:
+def occlusion_roughness_metallic(asset: Asset) -> Texture:
     """Texture of occlusion (R), roughness (G) and metallic (B), as glTF packs them."""
-    meaning = "R occlusion (1 everywhere unless exported with it), G perceptual roughness, B metallic (0); linear"
+    meaning = f"R {_occlusion(asset)}, G perceptual roughness, B metallic (0); linear"
     return Texture(asset.occlusion_roughness_metallic, False, meaning)
 
 
@@ -100,7 +100,8 @@ def unity_mask(asset: Asset) -> Texture:
     orm = asset.occlusion_roughness_metallic
     top = np.iinfo(orm.dtype).max
     channels = [orm[..., 2], orm[..., 0], np.zeros_like(orm[..., 0]), top - orm[..., 1]]
-    meaning = "R metallic (0), G occlusion (1), B detail mask (0), A smoothness = 1 - perceptual roughness; linear"
+    smooth = "A smoothness = 1 - perceptual roughness"
+    meaning = f"R metallic (0), G {_occlusion(asset)}, B detail mask (0), {smooth}; linear"
     return Texture(np.stack(channels, axis=-1), False, meaning)
 
 
@@ -145,6 +146,10 @@ def reflectance(asset: Asset) -> Floats:
     """F0 (reflectance at normal incidence) of each texel, (H, W, 3), linear."""
     relative = color.decode_srgb(asset.specular_color / np.float64(np.iinfo(asset.specular_color.dtype).max))
     return np.asarray(relative * np.array(asset.specular_factor) * _index_reflectance(asset))
+
+
+def _occlusion(asset: Asset) -> str:
+    return "ambient occlusion" if asset.has_occlusion else "occlusion (1, not computed)"
 
 
 def _index_reflectance(asset: Asset) -> float:

@@ -54,7 +54,15 @@ _LEAST_PX = 48  # least side of a merged picture: noise and motion are measured 
 class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of the stage `hdr`, the section `hdr` of a settings file: how brackets are merged."""
 
-    clip: Annotated[float, Meta(ge=0.5, le=1.0, description="clipping threshold [white level]")] = 0.98
+    clip: Annotated[
+        float,
+        Meta(
+            ge=0.5,
+            le=1.0,
+            description="clipping threshold: share of the count at which the sensor saturates "
+            "(measured, else the stated white level) [1]",
+        ),
+    ] = 0.98
     demosaic: Annotated[
         Literal["superpixel", "full"],
         Meta(description="a pixel per 2×2 quad (X-Trans 3×3), or Bayer interpolated to full size"),
@@ -67,7 +75,7 @@ class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=15)
+@stage(version=16)
 def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack:
     """Merge every bracket: radiance (K, H, W, 3) of all shots, on the scale of each shot's reference frame.
 

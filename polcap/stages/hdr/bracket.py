@@ -14,7 +14,7 @@ from polcap.optics import sensor
 from polcap.optics.registration import Pyramid, register
 from polcap.stages.hdr import exposure, noise
 from polcap.stages.hdr.ghosts import Anchor, RegisteredFrame, first_estimate
-from polcap.stages.hdr.planes import Reader, Signals, blocks, in_memory, planar, resample, same_size, signals
+from polcap.stages.hdr.planes import Reader, Signals, blocks, in_memory, planar, resample, same_size
 
 _SMOOTH = cv2.getGaussianKernel(7, 0.8, cv2.CV_32F)
 _STILL_PX = 0.05  # frames that moved less are not resampled
@@ -93,7 +93,7 @@ class _BracketSignals:
 
     def __init__(self, bracket: Bracket, lines: noise.Lines, read: Reader) -> None:
         self.frames, self.reference = bracket.shot.frames, bracket.reference
-        self._shot, self._lines, self._read = bracket.shot, lines, read
+        self._lines, self._read = lines, read
         self.name = f"shot {bracket.shot.name}"
         self._iso = [frame.exif.iso or f"frame {e}" for e, frame in enumerate(self.frames)]
         still = read(self.frames[self.reference])
@@ -103,12 +103,13 @@ class _BracketSignals:
 
     def signals(self, e: int) -> Signals:
         """Signals of frame e of the bracket, with its ambient light subtracted."""
-        found = self._read.signals(self._shot, e)
+        found = self._read.signals(self.frames[e])
         if self.ambient is None:
             return found
         if not self.settled(e):
             self.learn(e, noise.sample_frame(found))
-        return in_memory(found.rows(slice(None)) - self._ambient_exposure(e) * self.ambient.value, found.usable)
+        value = found.rows(slice(None)) - self._ambient_exposure(e) * self.ambient.value
+        return in_memory(value, found.usable, found.clip)
 
     def line(self, e: int) -> noise.Noise:
         """Noise line of frame e, including the noise of the ambient light that was subtracted."""
@@ -210,7 +211,7 @@ def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool
         image = read(frame)
         iso = frame.exif.iso or "ambient"
         if not lines.knows(iso):
-            lines.learn(iso, noise.sample_frame(signals(image, read.clip)))
+            lines.learn(iso, noise.sample_frame(read.signals(frame)))
         line = lines.line(iso, sensor.rounding_variance(image) / 2)
         level = np.stack([cv2.blur(plane, (5, 5)) for plane in value]) * np.float32(one)
         variance += noise.of_pixels(level, line, image.cfa if full else None) / np.float32(sum(share) ** 2)

@@ -16,7 +16,7 @@ import numpy as np
 
 from polcap import parallel
 from polcap.errors import CaptureError, SettingError
-from polcap.images import Bools, Decode, Floats, Frame, SensorImage, Shot
+from polcap.images import Bools, Decode, Floats, Frame, SensorImage
 from polcap.optics import sensor
 from polcap.optics.projection import coordinates
 from polcap.optics.resize import block_means
@@ -36,35 +36,37 @@ class Signals:
 
     shape: tuple[int, int, int]  # C, H, W
     usable: Bools  # (H, W)
+    clip: float  # pixels are clipped from this signal on
     rows: Callable[[slice], Floats]  # some rows (C, h, W) float32; the result must not be changed
 
 
-def in_memory(value: Floats, usable: Bools) -> Signals:
+def in_memory(value: Floats, usable: Bools, clip: float) -> Signals:
     """Wrap an array (C, H, W) float32 as `Signals` that are held in memory."""
     channels, height, width = value.shape
-    return Signals((channels, height, width), usable, lambda rows: value[:, rows])
+    return Signals((channels, height, width), usable, clip, lambda rows: value[:, rows])
 
 
 def signals(image: SensorImage, clip: float, full: bool = False, planes_bytes: float = math.inf) -> Signals:
-    """Linear signals of a decoded frame; pixels with counts from `clip` [white level] on are not usable.
+    """Linear signals of a decoded frame; clipped pixels are not usable, with `clip` as in `sensor.clip_count`.
 
     A mosaic is binned by superpixels, or interpolated with `full`. Binned signals of more than `planes_bytes` are
     computed from the counts whenever rows are read, in a third of the memory.
     """
-    usable = sensor.usable(image, clip, full)
+    count, black = sensor.clip_count(image, clip), float(image.black.mean())
+    usable, level = sensor.below(image, count, full), (count - black) / (image.white - black)
     if image.cfa is None or full:
-        return in_memory(planar(sensor.signal(image, full)), usable)
+        return in_memory(planar(sensor.signal(image, full)), usable, level)
     shape = (3, *usable.shape)
     read = partial(sensor.binned_planes, image)
     if 4 * math.prod(shape) > planes_bytes:
-        return Signals(shape, usable, read)
+        return Signals(shape, usable, level, read)
     value = np.empty(shape, np.float32)
 
     def bin_rows(rows: slice) -> None:
         value[:, rows] = read(rows)
 
     parallel.results(partial(bin_rows, rows) for rows, _, _ in blocks(usable.shape[0]))
-    return in_memory(value, usable)
+    return in_memory(value, usable, level)
 
 
 def planar(picture: Floats) -> Floats:
@@ -111,7 +113,7 @@ def resample(signals: Signals, matrix: Floats) -> tuple[Signals, Floats]:
         px, py = coordinates(matrix, x, y)
         gain[rows] = table[((px - np.floor(px)) * _FRACTIONS + 0.5).astype(np.int8)]
         gain[rows] *= table[((py - np.floor(py)) * _FRACTIONS + 0.5).astype(np.int8)]
-    return in_memory(value, seen), gain
+    return in_memory(value, seen, signals.clip), gain
 
 
 @lru_cache(maxsize=1)
@@ -128,8 +130,8 @@ def _kernel_gain() -> Floats:
 class MemoryPlan:
     """Memory that the merge may use for signals and decoded frames, bytes."""
 
-    planes: int = _PLANES_BYTES
-    frames: int = _HELD_BYTES
+    planes: int = _PLANES_BYTES  # of one frame's signals
+    frames: int = _HELD_BYTES  # of all decoded frames
 
 
 def plan_memory(shots: int, frames: int, pixels: int, frame_bytes: int) -> MemoryPlan:
@@ -141,7 +143,7 @@ def plan_memory(shots: int, frames: int, pixels: int, frame_bytes: int) -> Memor
     """
     taken, limit = process_memory()
     if limit is None:
-        return MemoryPlan()
+        return MemoryPlan(_PLANES_BYTES // frames)
     sample = np.dtype(np.float32).itemsize
     stack = pixels * (shots * (6 * sample + 1) + _MOSAIC_BYTES)
     one_shot = frames * (frame_bytes + pixels) + pixels * _WORK_BYTES
@@ -153,7 +155,7 @@ def plan_memory(shots: int, frames: int, pixels: int, frame_bytes: int) -> Memor
         )
     planes = 3 * sample * pixels * frames
     held = min(_PLANES_BYTES, left) if planes <= left else 0
-    return MemoryPlan(held, min(_HELD_BYTES, left - min(planes, held)))
+    return MemoryPlan(held // frames, min(_HELD_BYTES, left - min(planes, held)))
 
 
 def process_memory() -> tuple[int, int | None]:
@@ -173,8 +175,8 @@ class Reader:
     """Decodes frames in advance; the last few frames stay in memory."""
 
     def __init__(self, coming: Iterable[Frame], decode: Decode, clip: float) -> None:
-        """Frames in the order in which they will be read; counts from `clip` [white level] on are clipped."""
-        self.clip = clip
+        """Frames in the order in which they will be read; `clip` is as in `sensor.clip_count`."""
+        self._clip = clip
         self._decode = decode
         self.lossy = False
         self.plan = MemoryPlan()
@@ -199,16 +201,16 @@ class Reader:
         self.lossy |= image.lossy
         return image
 
-    def signals(self, shot: Shot, e: int, full: bool = False) -> Signals:
-        """Linear signals of frame e of a bracket, with the same channels as the first frame read."""
-        found = signals(self(shot.frames[e]), self.clip, full, self.plan.planes / len(shot.frames))
+    def signals(self, frame: Frame, full: bool = False) -> Signals:
+        """Linear signals of a frame, with the same channels as the first frame read."""
+        found = signals(self(frame), self._clip, full, self.plan.planes)
         self._channels = self._channels or found.shape[0]
         if found.shape[0] == self._channels:
             return found
         value = found.rows(slice(None))
         uniform = np.ptp(value) == 0  # fully clipped: its number of channels is that of the other frames
         if uniform or len(value) == 1:  # a grey picture among colored ones
-            return in_memory(np.repeat(value[:1], self._channels, axis=0), found.usable)
+            return in_memory(np.repeat(value[:1], self._channels, axis=0), found.usable, found.clip)
         return found
 
     def forget(self, frames: Iterable[Frame]) -> None:

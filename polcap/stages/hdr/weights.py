@@ -16,14 +16,14 @@ import numpy as np
 
 from polcap import parallel
 from polcap.calibration_values import Falloff
-from polcap.images import Bits, Bools, Floats, MaskedImage, Quality, Shot, View
+from polcap.images import Bits, Bools, Floats, Frame, MaskedImage, Quality, View
 from polcap.optics.registration import scaled, squared_gradient
 from polcap.stages.hdr import exposure, noise
 from polcap.stages.hdr.bracket import AmbientLight, Bracket, ComparedBracket, ambient_light
 from polcap.stages.hdr.ghosts import RegisteredFrame
 from polcap.stages.hdr.planes import Reader, blocks, resample
 
-_FALL = 0.05  # [white level] range below saturation in which a frame's weight falls from 1 to _LEAST
+_FALL = 0.05  # [signal] range below clipping in which a frame's weight falls from 1 to _LEAST
 _LEAST = 1e-3
 _BLOCK_PX = 64_000  # px of a block and channel: all planes of a block then fit a core's cache
 _SOME = 1e-9  # weight of the reference frame where no frame is usable, so that every pixel has a value
@@ -52,7 +52,6 @@ class WeightedBracket:
     ghost: Bools  # (H, W)
     ambient: AmbientLight | None
     served: Bools  # (H, W) pixels with at least one usable frame
-    clip: float
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -116,7 +115,9 @@ class WeightedBracket:
         if one.last:
             return trust
         peak = np.maximum.reduce([plane * ratio for plane, ratio in zip(estimate, one.frame.ratio)])
-        ramp = (np.float32(self.clip) - peak) * np.float32(1 / _FALL)
+        if self.ambient is not None:
+            peak += one.ambient * self.ambient.value[:, rows].max(axis=0)
+        ramp = (np.float32(one.frame.signals.clip) - peak) * np.float32(1 / _FALL)
         return np.asarray(trust * np.clip(ramp, np.float32(_LEAST), 1))
 
     def _noise(self, one: WeightedFrame, rows: slice, light: Floats, steep: Floats | None) -> Floats:
@@ -152,7 +153,7 @@ def prepare(
     for e in [bracket.reference, *bracket.others]:
         frame = compared.frames[e]
         if full or ambient is not None:
-            frame = _read_again(bracket.shot, e, frame, read, full)
+            frame = _read_again(bracket.shot.frames[e], frame, read, full)
         last, usable = bright[e] < _AS_DARK * bright[darkest], frame.signals.usable
         serves = usable if frame.motion is not None or not last else np.ones_like(usable)
         if e == bracket.reference:
@@ -170,12 +171,12 @@ def prepare(
                 least=np.float32(_SOME if e == bracket.reference else 0),
             )
         )
-    return WeightedBracket(frames, estimate, ghost, ambient, served, read.clip)
+    return WeightedBracket(frames, estimate, ghost, ambient, served)
 
 
-def _read_again(shot: Shot, e: int, frame: RegisteredFrame, read: Reader, full: bool) -> RegisteredFrame:
-    """Read frame e again for the merge, with its ambient light; `full`: on the grid of the photosites."""
-    signals, gain = read.signals(shot, e, full), None
+def _read_again(source: Frame, frame: RegisteredFrame, read: Reader, full: bool) -> RegisteredFrame:
+    """Read a frame again for the merge, with its ambient light; `full`: on the grid of the photosites."""
+    signals, gain = read.signals(source, full), None
     if frame.motion is not None:
         signals, gain = resample(signals, scaled(frame.motion, 2) if full else frame.motion)
     return replace(frame, signals=signals, gain=gain, misfit=frame.misfit * (4 if full else 1))

@@ -4,8 +4,8 @@
 2. Pixels of high probability become a mask without specks (`regions`).
 3. The outline is moved to edges of color, where the probabilities allow it (`graph_cut`).
 
-Without a network, or if it finds nothing, the object is found by its difference from the `backdrop`. A mask drawn by
-the user is not changed.
+Without a network, or if it finds nothing, the object is found by its difference from the `backdrop`. Of a mask drawn by
+the user only the part is chosen (`mask.part`).
 """
 
 import contextlib

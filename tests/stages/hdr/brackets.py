@@ -52,7 +52,7 @@ def expose(quads, exposure, rng, iso=100.0):
 def planes(picture, usable=None):
     """A picture (H, W, C) as the merge sees it; usable (H, W), everywhere by default."""
     everywhere = np.ones(picture.shape[:2], bool)
-    return in_memory(planar(picture.astype(np.float32)), everywhere if usable is None else usable)
+    return in_memory(planar(picture.astype(np.float32)), everywhere if usable is None else usable, 0.98)
 
 
 def frame(image, **exif):

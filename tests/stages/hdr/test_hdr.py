@@ -96,6 +96,24 @@ def test_no_seam_where_a_frame_drops_out():
     assert np.abs(z).max() < 5.5  # 1500 columns and channels; ratios are known to 0.01 %
 
 
+@pytest.mark.parametrize("room", [0.0, 0.05])
+def test_variance_has_no_step_where_a_frame_drops_out(room):
+    """The weight of a frame falls before it clips, also below the stated white level, and with ambient light."""
+    full = 0.8 * WHITE  # counts at which the sensor saturates
+    light = np.broadcast_to(np.linspace(0.4, 1.1, 1024), (512, 1024)) / 4  # of full
+
+    def early(value, exposure):
+        counts = np.clip(np.round(BLACK + (full - BLACK) * value), 0, full).astype(np.uint16)
+        return frame(SensorImage(counts, np.full((2, 2), BLACK), WHITE, RGGB), iso=100.0, exposure=exposure)
+
+    ambient = [early(np.full_like(light, room), 1)] if room else []
+    frames = [early(e * (light + room), e) for e in (1, 4)]
+    stack = merge(capture(frames, ambient=ambient), hdr.HdrSettings())
+    sigma2 = stack.variance[0][128, :, 1]
+    assert sigma2[-1] > 3 * sigma2[0]
+    assert np.abs(np.diff(np.log(sigma2))).max() < 0.5
+
+
 def test_flash_makes_the_shutter_time_a_lie():
     """EXIF promises 1 : 4 : 16; the pops were equal; the frames are averaged as the repeats they are."""
     quads = ramp(256, 384, high=2e4)
