@@ -143,7 +143,10 @@ def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
         remedy = "Shoot again under constant light: the lamp or daylight changed between shots"
     message = f"The {names[k]} shot was {abs(100 * each[k]):.1f} % {_comparative(each[k])} than the others"
     bad = bad_shots(names, np.abs(each) > limit)
-    yield at_most("gains", float(abs(each[k])), limit, f"{message}, which is corrected", remedy, bad, beyond="warn")
+    darker = bool(each[k] < 0)  # a brighter shot may show another lamp, which no gain corrects
+    message += ", which is corrected" if darker else ""
+    state: State = "warn" if darker else "fail"
+    yield at_most("gains", float(abs(each[k])), limit, message, remedy, bad, 0 if darker else 3, beyond=state)
     yield gain_doubt(found, limits)
     drift = off - each[:, None]
     k, e = (int(i) for i in np.unravel_index(int(np.argmax(np.abs(drift))), drift.shape))
