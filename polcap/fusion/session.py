@@ -346,7 +346,7 @@ def _compare_masks(session: Session, wanted: SessionInput, masks: Mapping[str, B
 
 
 def _silhouette(name: str, found: Bools, session: Session, wanted: SessionInput) -> Silhouette:
-    """The mask of a view, which is on the grid of the merged picture, with the session's camera on this grid."""
+    """The mask of a view, which is on its merged picture, with the session's camera in merged px."""
     assert session.camera is not None
     scale = pipeline.reopen(out_of(wanted.folder, name), "align")[0].radiance.view.scale
     return Silhouette(name, found, session.camera.reduced(scale), session.posed[name].pose)
