@@ -180,20 +180,25 @@ class Reader:
         self._clip = clip
         self._decode = decode
         self.lossy = False
-        self.plan = MemoryPlan()
+        self.plan = MemoryPlan(frames=0)  # no frame is decoded in advance before `start`
         self._channels = 0  # of the first frame
         self._coming = deque(coming)
         self._held: OrderedDict[int, SensorImage] = OrderedDict()
         self._pool = ThreadPoolExecutor(_DECODERS)
         self._decoding: dict[int, Future[SensorImage]] = {}
-        self._room = 1  # frames that fit in memory
+        self._frame_bytes = 1  # of the frame decoded last
+
+    def start(self, plan: MemoryPlan) -> None:
+        """Decode frames in advance from now on, within the limits of `plan`."""
+        self.plan = plan
+        self._look_ahead()
 
     def __call__(self, frame: Frame) -> SensorImage:
         """Decode a frame, or return it from memory; raises DecodeError."""
         if id(frame) not in self._held:
             decoding = self._decoding.pop(id(frame), None) or self._pool.submit(self._decode, frame)
             image = decoding.result()
-            self._room = max(1, self.plan.frames // max(image.value.nbytes, 1))
+            self._frame_bytes = max(image.value.nbytes, 1)
             while len(self._held) >= self._room:
                 self._held.popitem(last=False)
             self._held[id(frame)] = image
@@ -221,6 +226,11 @@ class Reader:
         for frame in frames:
             self._held.pop(id(frame), None)
         self._look_ahead()
+
+    @property
+    def _room(self) -> int:
+        """Number of decoded frames that fit in memory."""
+        return max(1, self.plan.frames // self._frame_bytes)
 
     def close(self) -> None:
         """Stop decoding in advance."""
