@@ -1,1 +1,41 @@
-"""Several captures of one object, turned on a board before a fixed camera, joined into one closed, relightable mesh."""
+"""Several captures of one object, turned on a board before a fixed camera, joined into one closed, relightable mesh.
+
+In the order of use:
+
+    fuse_run          `polcap fuse`: processes the views, runs the path, writes maps, asset, report and verdict
+    session           processes the views: one color calibration, one camera, poses, masks, maps
+    fusion_path       the stages from the views' maps to the textures: read it first
+    values            views, poses, closed meshes
+
+  Poses
+    board_corners     corners of the board in a view
+    poses             camera and poses from the corners in all views
+    feature_poses     the same without a board, from features of the object
+    view_maps         maps of a view for the session's camera, with the pose
+    joining           one frame for sets of views between which the object was laid on another side
+
+  Masks
+    board_eraser      a picture without the board, in which the object is searched
+    silhouettes       masks before a grid of points
+    mask_agreement    removes from a mask what no other view confirms, and finds views whose masks are wrong
+
+  Shape
+    shape             masks and normals -> closed mesh
+    small_views       views at the resolution of the shape
+    hull              largest body that all silhouettes allow
+    carving           hollows that no silhouette shows
+    normal_surface    surface with the measured normals
+    closed_mesh       signed distances -> closed mesh; decimation
+
+  Textures
+    atlas             charts, and the point of the surface at each texel
+    baking            means of the views' maps at each texel
+    material_fit      F0, roughness and scale of the albedo by material
+    lobe_profiles     radiance of a material by half-angle
+    filling           values where no view saw the surface
+    comparison        normals and photographs of each view against the fused object
+    fused_maps        the folder maps/, and the source of exports
+    mesh_occlusion    ambient occlusion of a closed mesh
+    object_pictures   pictures of the object from any side
+    fused_page        report.json and report.html
+"""

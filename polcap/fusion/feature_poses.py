@@ -45,6 +45,11 @@ _HELD = 1e-4  # 1σ of the origin's height and of the first turn, which are free
 _STEPS = 12  # of the adjustment in a round
 _WRONG = 0.01  # share of the features at the lower and at the upper end that may be wrong
 _BELOW = 0.15  # of the features' height, from the lowest of them to y = 0; the foot itself often shows none
+# places of the unknowns in `_Motion.value`
+_TILT = slice(0, 2)  # of the axis about x and z [rad]
+_AXIS_X, _AXIS_Y = 2, 3  # of the axis before the lens
+_FOCAL = 4  # ln of the change of the focal length
+_TURNS = 5  # first of the N turns [rad]; then N shifts along x of the table, and N along z
 _Pair = tuple[int, int]  # numbers of two views
 _Matches = NDArray[np.intp]  # (M, 2) numbers of features
 
@@ -72,15 +77,21 @@ class _Motion:
     """Unknowns: the axis, its place before the lens, and the motion of each view on the table."""
 
     base: Rotation  # world to camera at turn 0, about which the axis is corrected
-    value: Floats  # (5 + 3 N,) two angles of the axis [rad], its place x, y, ln focal length; turns [rad]; shifts
+    value: Floats  # (5 + 3 N,) in the places above
 
     def poses(self) -> tuple[Floats, Floats]:
         """Rotations (N, 3, 3) and translations (N, 3), world to camera; the lens is 1 from the axis."""
-        tilt = Rotation.from_rotvec([self.value[0], 0.0, self.value[1]]) * self.base
-        turn, across, along = self.value[5:].reshape(3, -1)
+        about_x, about_z = self.value[_TILT]
+        tilt = Rotation.from_rotvec([about_x, 0.0, about_z]) * self.base
+        turn, across, along = self.value[_TURNS:].reshape(3, -1)
         shift = tilt.apply(np.stack([across, np.zeros_like(across), along], axis=-1))
         turned = tilt * Rotation.from_rotvec(np.outer(turn, [0.0, 1.0, 0.0]))
-        return turned.as_matrix(), shift + np.array([self.value[2], self.value[3], -1.0])
+        return turned.as_matrix(), shift + np.array([self.value[_AXIS_X], self.value[_AXIS_Y], -1.0])
+
+    @property
+    def focal_change(self) -> float:
+        """Focal length over the stated one."""
+        return float(np.exp(self.value[_FOCAL]))
 
 
 @dataclass(frozen=True)
@@ -128,10 +139,10 @@ def solve(seen: Mapping[str, Results], capture: Capture) -> SessionPoses:
 
 def _camera(capture: Capture, seen: Results, found: _AdjustedMotion) -> SessionCamera:
     """Camera with the adjusted focal length and the stated distortion, which an object in the middle does not tell."""
-    lens, change = seen.radiance.equipment.distortion, float(np.exp(found.motion.value[4]))
+    lens = seen.radiance.equipment.distortion
     k1, k2 = (0.0, 0.0) if lens is None else (lens.k1, lens.k2)
-    focal = capture.focal_px * change
-    return SessionCamera(focal, focal * float(found.sigma[4]), capture.principal_px, k1, k2)
+    focal = capture.focal_px * found.motion.focal_change
+    return SessionCamera(focal, focal * float(found.sigma[_FOCAL]), capture.principal_px, k1, k2)
 
 
 def _posed(found: _AdjustedMotion, distance: float, focal_px: float) -> dict[int, PosedView]:
@@ -146,7 +157,7 @@ def _posed(found: _AdjustedMotion, distance: float, focal_px: float) -> dict[int
         own = found.near & (seen.view == k)
         if own.sum() >= _LEAST_MATCHES:
             residual = float(np.sqrt(2 * np.mean(found.error[own] ** 2))) * focal_px
-            sigma = float(np.degrees(np.hypot(found.sigma[5 + k], found.sigma[:2].max())))
+            sigma = float(np.degrees(np.hypot(found.sigma[_TURNS + k], found.sigma[_TILT].max())))
             out[k] = PosedView(Pose(turn, distance * (shift + foot * turn[:, 1])), int(own.sum()), residual, sigma)
     return out
 
@@ -185,7 +196,7 @@ def _first_motion(features: Sequence[_Features], pairs: Mapping[_Pair, _Matches]
     }
     found = {pair: one for pair, one in found.items() if one[1] >= max(_LEAST_MATCHES, len(pairs[pair]) / 3)}
     if not found:
-        return np.zeros(0, np.intp), _Motion(Rotation.identity(), np.zeros(5))
+        return np.zeros(0, np.intp), _Motion(Rotation.identity(), np.zeros(_TURNS))
     (i, j), count = np.array(list(found)).T, np.array([one[1] for one in found.values()])
     between = Rotation.concatenate([one[0] for one in found.values()])
     vector, quaternion = between.as_rotvec(), between.as_quat()
@@ -253,10 +264,10 @@ def _sightings(
 
 def _adjusted(seen: _Sightings, first: _Motion, focal_px: float, doubt: float) -> _AdjustedMotion:
     """The motion that fits the sightings best; `doubt` is the 1σ of the logarithm of the focal length."""
-    count = (len(first.value) - 5) // 3
+    count = (len(first.value) - _TURNS) // 3
     prior = np.full(len(first.value), np.inf)
-    prior[[3, 4, 5]] = _HELD, doubt, _HELD
-    prior[5 + count :] = _SHIFT_SIGMA
+    prior[_AXIS_Y], prior[_FOCAL], prior[_TURNS] = _HELD, doubt, _HELD
+    prior[_TURNS + count :] = _SHIFT_SIGMA
     value, weight = first.value, np.ones(len(seen.view))
     for scale in _SCALES_PX:
 
@@ -281,7 +292,7 @@ def _points(seen: _Sightings, motion: _Motion, weight: Floats) -> tuple[Floats, 
     A ray (x, y) of the view with rotation R and translation t says (R X + t)_x + x (R X + t)_z = 0, and so for y.
     """
     turn, shift = (part[seen.view] for part in motion.poses())
-    ray = seen.ray * np.exp(-motion.value[4])
+    ray = seen.ray / motion.focal_change
     terms = (turn[:, :2] + ray[..., None] * turn[:, 2:]) * weight[:, None, None]  # (M, 2, 3)
     right = -(shift[:, :2] + ray * shift[:, 2:]) * weight[:, None]  # (M, 2)
     count = int(seen.point.max()) + 1
@@ -290,7 +301,7 @@ def _points(seen: _Sightings, motion: _Motion, weight: Floats) -> tuple[Floats, 
     np.add.at(side[..., 0], seen.point, np.einsum("mki,mk->mi", terms, right))
     point = np.linalg.solve(square + 1e-9 * np.eye(3), side)[..., 0]
     seen_at = np.einsum("mij,mj->mi", turn, point[seen.point]) + shift
-    return point, -seen_at[:, :2] / seen_at[:, 2:] * np.exp(motion.value[4])
+    return point, -seen_at[:, :2] / seen_at[:, 2:] * motion.focal_change
 
 
 def _errors(seen: _Sightings, motion: _Motion, weight: Floats) -> Floats:

@@ -1,6 +1,7 @@
 """READ FIRST. The path of a session, one line per stage: from the maps of its views to the textures of a closed mesh.
 
-`session.py` makes the maps and poses of the views. Each line's work is the module of the same name in this folder.
+`session.py` makes the maps and poses of the views. Each stage is in the module of its name in this folder; `shape` uses
+five more. The docstring of the package lists all modules.
 `cache.run` finds a stored result, or computes it, as for a single capture (`pipeline/path.py`).
 """
 

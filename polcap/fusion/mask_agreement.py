@@ -27,9 +27,9 @@ from polcap.optics.outline import disc_radius
 
 _SLIT = 0.05  # of the object's diameter in a view; wider gaps in a mask are gaps between the object's parts
 _MOST_UNCOVERED = 0.01  # of a mask's area; masks whose outlines err by one cell of the grid leave 0.000
-# of the masks' areas, in sum: part of the other masks that a slid object leaves uncovered, without the mask that loses
-# most: this one may hold a piece of the board
-_TRAILING = 0.002
+# An object that slid uncovers small parts of several other masks: the sum of their shares. The greatest share is not
+# counted, since that mask may hold a piece of the board.
+_SLIDE = 0.002
 _MOST_LEFT_OUT = 1 / 3  # of the views; where more contradict, nobody knows which are right
 _MOST_TRIMMED = 1 / 2  # of the views may be left out, or hold more than the object
 
@@ -100,18 +100,19 @@ def _contradicting(
     views: Sequence[Silhouette], inside: Bools, points: Floats, step: float, shares: Floats
 ) -> tuple[int, float]:
     """The view without which the others agree best, and the share of a mask's area by which it contradicts; 0: none."""
-    by, better = np.zeros(len(views)), np.zeros(len(views))
+    contradiction, improvement = np.zeros(len(views)), np.zeros(len(views))
     if (shares > _MOST_UNCOVERED).any():
         for k in range(len(views)):
             others = [j for j in range(len(views)) if j != k]
             rest = _uncovered([views[j] for j in others], points[inside[others].all(axis=0)], step)
-            gain = np.sort(shares[others] - rest)[:-1]  # of area that is covered without this view
-            lacks = gain[-1]  # the second largest of all: a piece of the board in one other mask gives one gain
-            slid = shares[k] if gain.sum() > _TRAILING else 0.0
-            by[k] = max(lacks, slid)
-            better[k] = (slid + gain.sum()) * (by[k] > _MOST_UNCOVERED)
-    worst = int(np.argmax(better))
-    return worst, float(by[worst])
+            newly_covered = np.sort(shares[others] - rest)[:-1]  # without the greatest
+            missing_share = newly_covered[-1]  # the second: a piece of the board in one other mask gives the greatest
+            slide_share = shares[k] if newly_covered.sum() > _SLIDE else 0.0
+            contradiction[k] = max(missing_share, slide_share)
+            if contradiction[k] > _MOST_UNCOVERED:
+                improvement[k] = slide_share + newly_covered.sum()
+    worst = int(np.argmax(improvement))
+    return worst, float(contradiction[worst])
 
 
 def _trimmed(views: Sequence[Silhouette], hull: Floats, step: float) -> list[Silhouette]:

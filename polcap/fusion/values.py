@@ -1,7 +1,9 @@
 """Values of the fusion: views with their poses, and the closed mesh.
 
 World frame: that of the board. The origin is the board's middle, y points up out of the board, x and z lie in it,
-right-handed, metres. Camera frame: x right, y up, z towards the camera.
+right-handed, metres. Without a board, y is the axis of the object's turn, and the origin is on it below the object; if
+the scale is unknown, the unit is the distance of the lens from this axis. Camera frame: x right, y up, z towards the
+camera.
 """
 
 from dataclasses import dataclass
@@ -41,7 +43,7 @@ class FusionView:
     roughness: Floats  # (H, W) perceptual
     s0: Floats | None = None  # (H, W, 3) white-balanced radiance under the flash; for highlights and residuals
     white_distance: float | None = None  # where a white plane has S0 = 1, over the object's distance; None: unknown
-    metric: bool = True  # the pose is in metres; else in an unknown unit
+    metric: bool = True  # the pose is in metres; else its unit is the distance of the lens
 
 
 @dataclass(frozen=True)

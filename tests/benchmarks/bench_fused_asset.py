@@ -124,11 +124,9 @@ def single(view: Path) -> Floats:
         return part.reshape(height, step, width, step, *part.shape[2:]).mean(axis=(1, 3))
 
     inside = maps.mask & (on_grid("mask") == 1)
-    normal = on_grid("normal")[inside]
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     return np.array(
         [
-            angle(maps.normal[inside], normal).mean(),
+            mean_angle_deg(maps.normal[inside], on_grid("normal")[inside]),
             np.abs(color.luminance(maps.diffuse[inside]) - color.luminance(on_grid("diffuse")[inside])).mean(),
             np.abs(color.luminance(maps.specular[inside]) - color.luminance(on_grid("specular")[inside])).mean(),
             np.abs(maps.roughness[inside] - on_grid("roughness")[inside]).mean(),
@@ -150,13 +148,11 @@ def against_truth(source: fused_maps.FusedSource | FusionResults, surface: Trian
         parts = np.einsum("sk,fkc->fsc", share, values.reshape(len(surface.vertices), -1)[surface.faces])
         return np.asarray(parts.reshape(len(sample), -1)[cKDTree(sample).query(point)[1]])
 
-    normal = at(normals)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     maps = {name: getattr(source.maps, name)[source.atlas.covered][seen] for name in ("normal", "diffuse", "specular")}
     roughness = source.maps.roughness[source.atlas.covered][seen]
     return np.array(
         [
-            angle(maps["normal"], normal).mean(),
+            mean_angle_deg(maps["normal"], at(normals)),
             np.abs(color.luminance(maps["diffuse"]) - color.luminance(at(truth["diffuse"]))).mean(),
             np.abs(color.luminance(maps["specular"]) - color.luminance(at(truth["specular"]))).mean(),
             np.abs(roughness - at(truth["roughness"])[:, 0]).mean(),
@@ -173,8 +169,12 @@ def distance(tracer: Tracer, atlas: Any, source: fused_maps.FusedSource) -> floa
     return float(np.minimum(ahead.min(axis=0), reach).mean())
 
 
-def angle(one: Floats, other: Floats) -> Floats:
-    return np.asarray(np.degrees(np.arccos(np.clip(np.sum(one * other, axis=-1), -1, 1))))
+def mean_angle_deg(normal: Floats, truth: Floats) -> float:
+    """Mean angle of unit vectors (N, 3) and vectors (N, 3), without those of length 0, as on folded triangles."""
+    length = np.linalg.norm(truth, axis=-1)
+    there = length > 0
+    cosine = np.sum(normal[there] * truth[there], axis=-1) / length[there]
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
 
 
 if __name__ == "__main__":
