@@ -47,7 +47,7 @@ def fuse(
     if not folder.is_dir():
         raise SettingError(f"{folder}: no such folder; give the folder that holds view01, view02, …")
     stated = settings.fill(SessionConfig, settings.read(config), assignments or [])
-    wanted = SessionInput(
+    session_input = SessionInput(
         folder=folder,
         config=stated.of_views,
         chart=options.chart_request(chart, no_chart),
@@ -60,5 +60,5 @@ def fuse(
     )
     target = out or folder / own_folders.FUSED
     steps = terminal.Steps()
-    about = fuse_run.fuse(wanted, stated.fusion, target, terminal.print_progress, steps.stage)
+    about = fuse_run.fuse(session_input, stated.fusion, target, terminal.print_progress, steps.stage)
     terminal.print_result(about, target, json, open_)
