@@ -208,7 +208,7 @@ class View:
     focal: float  # px of this grid
     center: tuple[float, float]  # (x, y) px of this grid
     scale: float  # visible RAW pixels per pixel of this grid (2 after superpixel binning)
-    origin: tuple[float, float] = (0.0, 0.0)  # position of this grid's pixel (0, 0) on the full-frame grid
+    origin: tuple[float, float] = (0.0, 0.0)  # position of this grid's pixel (0, 0) before cropping
     known: bool = True  # False: the focal length is an assumption
 
     @property
@@ -352,7 +352,7 @@ class ChartLight:
 
 @dataclass(frozen=True)
 class ChartPlace:
-    """Position of a chart in the reference shot, on the full-frame grid."""
+    """Position of a chart in the merged picture of the reference shot."""
 
     quads: Floats  # (24, 4, 2) corners x, y of the inner part of each patch, px
     corners: Floats  # (4, 2) outer patch corners, px
@@ -397,18 +397,18 @@ class ChartRequest:
 class Alignment:
     """Registration of each shot to the reference shot."""
 
-    transform: Floats  # (K, 3, 3) reference grid px → shot grid px, homogeneous (x, y, 1)
-    residual_px: Floats  # (K,) estimated 1σ error of the transform over the object
+    transform: Floats  # (K, 3, 3) merged px of the reference shot → of each shot, homogeneous (x, y, 1)
+    residual_px: Floats  # (K,) estimated 1σ error of the transform over the object, merged px
     correlation: Floats  # (K,) correlation of the detail after registration, zero mean; 1: equal
-    crossed: Floats | None = None  # (3, 3) reference grid px → crossed shot's grid px; None without one
+    crossed: Floats | None = None  # (3, 3) the same to the crossed shot; None without one
 
 
 @dataclass(frozen=True, repr=False)
 class ObjectMask(ArrayValue):
-    """Mask of the object's pixels on the full-frame grid, the crop around them, and figures on the mask's quality."""
+    """Mask of the object in the merged picture of the reference shot, the crop around it, and the mask's quality."""
 
-    mask: Bools  # (H, W) full-frame grid
-    crop: tuple[int, int, int, int]  # x0, y0, x1, y1 full-frame grid px, end exclusive
+    mask: Bools  # (H, W)
+    crop: tuple[int, int, int, int]  # x0, y0, x1, y1 merged px, end exclusive
     source: Literal["automatic", "user"]
     doubt: float | None = None  # 1 − the expected IoU with the true mask; None without a network
     islands: float = 0.0  # share of the mask outside its largest connected part

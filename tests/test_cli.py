@@ -17,6 +17,7 @@ from polcap import cli
 from polcap.cli import export_command, options
 from polcap.formats.export import presets, texture_set
 from polcap.fusion import fused_maps
+from polcap.images import CatalogEntry
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import STAGES
 from tests.conftest import Command, shell
@@ -26,6 +27,7 @@ def test_names_in_the_help_are_those_of_modules_that_are_not_imported_at_start()
     assert tuple(presets.PRESETS) == export_command.PRESETS
     assert tuple(texture_set.EXTRAS) == export_command.EXTRAS
     assert get_args(options.Stage) == STAGES
+    assert all(name in export_command._ABOUT for name in CatalogEntry.__struct_fields__)
 
 
 def test_help_answers_in_a_quarter_of_a_second() -> None:

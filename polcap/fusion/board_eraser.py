@@ -34,7 +34,7 @@ _STRIP = 1 / boards.CELLS  # width of the strips of paper, in squares
 
 @dataclass(frozen=True)
 class _Print:
-    """The board as a view's camera sees it, on the grid of the merged picture."""
+    """The board in the merged picture of a view."""
 
     place: Floats  # (H, W, 2) x, z on the board, in half sides: −1…1 is printed
     paper: Floats  # (H, W, 3) share of paper in a pixel of each channel, whose photosites lie side by side

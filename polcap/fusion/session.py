@@ -358,7 +358,7 @@ def _compare_masks(
 
 
 def _silhouette(name: str, found: Bools, session_input: SessionInput, solved: SessionPoses) -> Silhouette:
-    """The mask of a view, which is on the grid of the merged picture, with the session's camera on this grid."""
+    """The mask of a view, which is on its merged picture, with the session's camera in merged px."""
     scale = _reopen(name, session_input, "align").radiance.view.scale
     return Silhouette(name, found, solved.camera.reduced(scale), solved.views[name].pose)
 

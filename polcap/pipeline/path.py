@@ -49,7 +49,7 @@ class UserInput:
     """Inputs of the path besides the photographs: chart, mask, networks, decoder."""
 
     chart: ChartRequest = AUTO
-    mask: Bools | None = None  # on the RAW pixels or on the grid of the merged picture
+    mask: Bools | None = None  # on the RAW pixels or on the merged picture
     network: Network | None = None  # None: the analytic estimator
     mask_network: Network | None = None  # None: the object is found by its contrast to the backdrop
     decode: Decode = frame_decoder.decode  # the pixels of a photograph
@@ -85,9 +85,9 @@ def results_of(made: Mapping[str, StageResult[Any]]) -> Results:
 
 
 def on_grid(drawn: Bools | None, radiance: AngleStack) -> Bools | None:
-    """Convert the user's mask to the grid of the merged picture (H, W).
+    """Convert the user's mask to the size of the merged picture (H, W).
 
-    The user may draw it on that grid, or on the pixels of the RAW or of the mosaic.
+    The user may draw it in that size, or on the pixels of the RAW or of the mosaic.
 
     Raises ObjectError: the mask has none of these sizes.
     """

@@ -171,8 +171,11 @@ def polarized_light(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     share, limit = _highlight_dolp(found), limits.max_highlight_dolp
     message = f"The brightest parts that face the camera share a polarization of {100 * share:.1f} %"
     if share > limit:
-        message += ": light from the sides (two flashes, softboxes, a window), which bends normals and roughness"
-    remedy = "Use one flash next to the lens, and darken the room"
+        message += (
+            ": light from the sides (two flashes, softboxes, a window), or light that changed across the picture "
+        )
+        message += "between shots (the flash moved, the lamp drifted); it bends normals and roughness"
+    remedy = "Use one flash next to the lens, leave it where it is, and darken the room"
     cost = float(_DEGREES_PER_ROOT_OF_HIGHLIGHT_DOLP * np.sqrt(max(np.nan_to_num(share) - _FALSE_HIGHLIGHT_DOLP, 0.0)))
     gate = at_most("lighting", share, limit, message, remedy, beyond=grade(cost))
     yield msgspec.structs.replace(gate, cost_deg=round(cost, 1))

@@ -142,7 +142,11 @@ def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     if radiance.equipment.light == "steady":
         remedy = "Shoot again under constant light: the lamp or daylight changed between shots"
     message = f"The {names[k]} shot was {abs(100 * each[k]):.1f} % {_comparative(each[k])} than the others"
-    yield at_most("gains", float(abs(each[k])), limit, message, remedy, bad_shots(names, np.abs(each) > limit), 3)
+    bad = bad_shots(names, np.abs(each) > limit)
+    darker = bool(each[k] < 0)  # a brighter shot may show another lamp, which no gain corrects
+    message += ", which is corrected" if darker else ""
+    state: State = "warn" if darker else "fail"
+    yield at_most("gains", float(abs(each[k])), limit, message, remedy, bad, 0 if darker else 3, beyond=state)
     yield gain_doubt(found, limits)
     drift = off - each[:, None]
     k, e = (int(i) for i in np.unravel_index(int(np.argmax(np.abs(drift))), drift.shape))

@@ -50,7 +50,7 @@ def against_polanalyser(folder: Path) -> None:
     found = path(capture, supplied, Config(), MemoryCache(until="stokes"))
     gains, alignment, image = found.selfcal.gains, found.alignment, found.stokes
     print(f"gains all 1: {bool((gains.gain == 1).all())} ({gains.source})")
-    print(f"offsets [grid px]: {(-alignment.transform[:, :2, 2]).tolist()}")
+    print(f"offsets [merged px]: {(-alignment.transform[:, :2, 2]).tolist()}")
     (x0, y0), (height, width) = (round(at) for at in image.view.origin), image.mask.shape
     counts = np.uint16(257) * png.read(Path(capture.shots[0].frames[0].path))  # their means are rounded to integers
     here = np.s_[

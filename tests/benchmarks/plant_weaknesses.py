@@ -38,6 +38,8 @@ KINDS: dict[str, tuple[str, ...]] = {
     "pushed 1 px": ("alignment",),
     "two softboxes": ("body", "other light", "lighting"),
     "two flashes": ("body", "other light", "lighting"),
+    "one shot 25 % dimmer": ("gains",),
+    "one shot lit unevenly by 2 %": ("lighting",),
     "all out of focus by 3 px": ("focus",),
     "overexposed 12 times": ("clipping",),
     "black level wrong by 2": ("stillness",),
@@ -145,6 +147,11 @@ def _plant(plan: Plan, kind: str, random: Random) -> None:
         else:
             boxes = [(side * 0.6, up, z + 0.6) for side in (-1, 1) for up in (-0.15, 0.15)]
             plan.lamps = tuple(boxes)
+    elif kind == "one shot 25 % dimmer":
+        plan.after = lambda light, k, e: 0.75 * light if k == victim else light
+    elif kind == "one shot lit unevenly by 2 %":
+        ramp = np.linspace(0.99, 1.01, shoot.width)[:, None]
+        plan.after = lambda light, k, e: ramp * light if k == victim else light
     elif kind == "all out of focus by 3 px":
         plan.after = lambda light, k, e: gaussian_filter(light, 3.0, axes=(0, 1))
     elif kind == "overexposed 12 times":

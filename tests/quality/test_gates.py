@@ -102,7 +102,7 @@ def test_each_gate_fails_alone(good: Evidence) -> None:
         "alignment": {"alignment": replace(still, transform=away)},
         "clipping": {"clipped": clipped(0.03)},
         "sharpness": {"blur_px": np.array([[0.0], [2.0], [0.1]])},
-        "gains": with_gains(good, gain=np.array([[1.0] * 3, [1.0] * 3, [0.7] * 3])),
+        "gains": with_gains(good, gain=np.array([[1.0] * 3, [1.0] * 3, [1.3] * 3])),
         "gain doubt": with_gains(good, disagreement=0.05),
         "normal error": {"maps": replace(maps, confidence=np.full_like(maps.confidence, 25.0))},
     }

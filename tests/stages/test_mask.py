@@ -88,6 +88,19 @@ def test_channels_do_not_depend_on_exposure():
     np.testing.assert_allclose(made[0], made[1], atol=2e-5)
 
 
+@pytest.mark.parametrize("shot", range(3))
+def test_channels_do_not_depend_on_the_flash_energy_of_a_shot(shot):
+    radiance, box = scenes.stack(), (0, 0, 320, 240)
+    energy = np.where(np.arange(3) == shot, 0.7, 1.0).astype(np.float32)[:, None, None, None]
+    chart = np.zeros((240, 320), np.uint8)
+    one, other = (
+        mask_network.reduced_picture(shown, scenes.still(), scenes.no_color(), chart, box, 160).stokes
+        for shown in (radiance, dataclasses.replace(radiance, value=radiance.value * energy))
+    )
+    bright = one[0] > 0.1 * one[0].max()
+    np.testing.assert_allclose((other[1:] / other[0])[:, bright], (one[1:] / one[0])[:, bright], atol=0.03)
+
+
 def test_channels_hold_the_polarization_of_the_aligned_shots():
     """S1 and S2 of a ball in shots that are shifted by up to three pixels."""
     moved = np.tile(np.eye(3), (3, 1, 1))

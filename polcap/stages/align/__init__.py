@@ -32,20 +32,20 @@ class AlignSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Meta(description="motion model between shots; none: the camera was locked"),
     ] = "similarity"
     max_shift_px: Annotated[
-        float, Meta(ge=0.5, le=500, description="greatest accepted movement of any shot [grid px]")
+        float, Meta(ge=0.5, le=500, description="greatest accepted movement of any shot [merged px]")
     ] = 40.0
     min_correlation: Annotated[
         float, Meta(ge=0, le=1, description="least correlation of detail after registration")
     ] = 0.5
     detail_px: Annotated[
         float,
-        Meta(ge=1, le=50, description="structure coarser than this Gaussian sigma is ignored [grid px]"),
+        Meta(ge=1, le=50, description="structure coarser than this Gaussian sigma is ignored [merged px]"),
     ] = 4.0
 
 
 @stage(version=9)
 def register(radiance: AngleStack, color: ColorCalibration, settings: AlignSettings) -> Alignment:
-    """Register every shot with the reference shot: transforms (K, 3, 3) from the reference grid to each shot's, px.
+    """Register every shot with the reference shot: transforms (K, 3, 3) from its merged px to those of each shot.
 
     Raises AlignmentError, which names the shot: it moved too far, or shows another scene.
     """
@@ -79,7 +79,7 @@ def _of_mosaic(offset_px: Floats) -> Alignment:
 def _register_shot(
     name: str, reference: Pyramid, shot: Pyramid, step: int, settings: AlignSettings
 ) -> tuple[Floats, float, float]:
-    """Register one shot: transform (3, 3) and its 1σ in full-grid px, and the correlation of detail.
+    """Register one shot: transform (3, 3) and its 1σ in merged px, and the correlation of detail.
 
     Raises AlignmentError.
     """

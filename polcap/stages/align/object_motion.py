@@ -33,8 +33,8 @@ class ObjectShift:
     hardly tells where the object's middle should be.
     """
 
-    length: Floats  # (K,) grid px
-    sigma: Floats  # (K,) rms length of its error [grid px]
+    length: Floats  # (K,) merged px
+    sigma: Floats  # (K,) rms length of its error [merged px]
 
 
 def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> ObjectShift:

@@ -20,6 +20,7 @@ _CLOSE_UP_PX = 256  # greatest longer side of a close-up
 _CLOSE_UPS = 2  # passes over the part with the object; the second adds parts that the first estimate lacked
 _ROOM = 0.12  # margin around that part, of its longer side
 _LIKELY = 0.3  # least probability of pixels that a close-up must include
+_POLARIZED = 0.08  # change of a shot's light that polarized surroundings may cause; from .25 on masks were wrong
 _MIRRORS = ((), (0,), (1,), (0, 1))  # axes of the mirror images that are averaged (decision 15)
 
 
@@ -62,7 +63,7 @@ def reduced_picture(
     for value, transform in zip(radiance.value, alignment.transform):
         small = area_mean(value[y0:y1, x0:x1].astype(np.float32), (height, width))
         shots.append(warp(small, np.linalg.inv(to_grid) @ transform @ to_grid, order=1))
-    solve = np.linalg.pinv(mueller.analyzer(np.asarray(radiance.angle, np.float64)))  # (3, K)
+    solve = np.linalg.pinv(mueller.analyzer(np.asarray(radiance.angle, np.float64))) / _coarse_gains(radiance)  # (3, K)
     stokes = np.einsum("sk,khwc->shwc", solve, np.stack(shots)).astype(np.float32)
     sums = stokes @ color.matrix.sum(axis=0).astype(np.float32)  # of linear Rec.709's channels
     full_height, full_width = chart.shape
@@ -74,6 +75,14 @@ def reduced_picture(
         chart=area_mean(chart[y0:y1, x0:x1].astype(np.float32), (height, width)) > 0.5,
         place=np.stack(np.meshgrid(x, y)).astype(np.float32),
     )
+
+
+def _coarse_gains(radiance: AngleStack) -> Floats:
+    """Gains (K,) of the shots, median over the brighter half of the picture; 1 where polarization may be the cause."""
+    light = radiance.value[:, ::8, ::8].sum(-1, dtype=np.float64)
+    light = light[:, light[0] > max(np.median(light[0]), 0)]
+    gain = np.median(light / light[0], axis=1) if light.size else np.ones(len(light))
+    return np.where(np.abs(gain - 1) > _POLARIZED, gain, 1)
 
 
 def _run(network: Network, run: RunNetwork, channels: Floats) -> Floats:

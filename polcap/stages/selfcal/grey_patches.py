@@ -72,7 +72,7 @@ def _means(picture: MaskedImage, transform: Floats, color: ColorCalibration) -> 
     """Mean light of each grey patch in a shot, and variances of the means: (2, 6, 3); NaN for unusable patches.
 
     A patch cannot be used if white balance excluded it, if it is clipped in this shot, or if fewer than nine of its
-    pixels are half a pixel or more from its edge. `transform` maps px of the reference grid to px of the shot.
+    pixels are half a pixel or more from its edge. `transform` maps px of the reference shot to px of the shot.
     """
     assert color.place is not None
     found = np.full((2, len(_GREYS), 3), np.nan)

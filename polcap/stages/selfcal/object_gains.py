@@ -68,12 +68,12 @@ class ObjectShots:
     quality: Bits  # (h, w) 0: unflagged in every shot
     mask: Bools  # (h, w)
     inside: Bools  # (h, w) the object's unflagged pixels, away from its edge if there are enough
-    crop: tuple[int, int, int, int]  # x0, y0, x1, y1 on the reference grid, px
-    full: tuple[int, int]  # (H, W) of that grid
+    crop: tuple[int, int, int, int]  # x0, y0, x1, y1, merged px of the reference shot
+    full: tuple[int, int]  # (H, W) of the merged picture
 
 
 def register(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> ObjectShots:
-    """Resample all shots to the reference grid, on the object's crop."""
+    """Resample all shots onto the reference shot, on the object's crop."""
     x0, y0, x1, y1 = crop = object_.crop
     value = np.stack([warp(v, t, crop, order=1) for v, t in zip(radiance.value, alignment.transform)])
     flagged = [warp(q.astype(np.float32), t, crop, order=1) > 0 for q, t in zip(radiance.quality, alignment.transform)]

@@ -40,7 +40,7 @@ _LEAST_ROWS, _BLOCK = 64, 200_000  # rows and pixels of a block: its planes fit 
 _LEAST_VARIANCE = np.float32(1e-14)
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # Stokes indices of a covariance's six rows
 
-Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px of the reference grid
+Box = tuple[int, int, int, int]  # x0, y0, x1, y1 merged px of the reference shot
 
 
 class StokesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -120,7 +120,7 @@ def _check_condition(analyzers: Floats, angle: Floats) -> None:
 
 @dataclass(frozen=True)
 class _Shots:
-    """All shots with their gains and the mapping from the reference grid to each."""
+    """All shots with their gains and the mapping from the reference shot to each."""
 
     radiance: AngleStack
     transform: Floats  # (K, 3, 3)
@@ -195,7 +195,7 @@ def _defects(
 
 
 def _register(shots: _Shots, flags: list[list[tuple[Quality, Bits]]], box: Box) -> tuple[Floats, Floats, Bits]:
-    """Resample all shots on a box of the reference grid, divided by their gains.
+    """Resample all shots on a box of the reference shot, divided by their gains.
 
     Returns values and variances (K, h, w, 3), and the quality (h, w).
     """
@@ -225,7 +225,7 @@ def _rows(picture: Floats) -> Floats:
 
 
 def _resampled(shots: _Shots, picture: Floats, transform: Floats, box: Box) -> Floats:
-    """Resample a shot (H, W, 3) on a box (h, w, 3) of the reference grid, each channel from its own photosites."""
+    """Resample a shot (H, W, 3) on a box (h, w, 3) of the reference shot, each channel from its own photosites."""
     site_px = shots.radiance.sensor.site_px
     if site_px is None or not site_px.any():
         return warp(picture, transform, box, lens=shots.lens)
