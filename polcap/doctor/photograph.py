@@ -6,8 +6,6 @@ Reports kind, metadata, mosaic pattern and levels.
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from polcap.doctor import Finding
 from polcap.errors import DecodeError
 from polcap.formats.capture import focal_length
@@ -83,7 +81,7 @@ def _pixels(image: SensorImage, exif: Exif) -> Iterator[Finding]:
         yield Finding("size", "warning", message, "send this report in")
     black, white = float(image.black.mean()), image.white
     least, most = float(image.value.min()), float(image.value.max())
-    clipped = float(np.mean(image.value >= _CLIP * sensor.saturation(image)))
+    clipped = sensor.clipped_share(image, _CLIP)
     message = f"black {black:g}, white {white:g}; counts {least:g} … {most:g}, {100 * clipped:.2f} % clipped"
     if most > 1.001 * white or white <= black:
         yield Finding("levels", "warning", message, "the white level does not fit the counts: send this report in")

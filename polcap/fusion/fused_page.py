@@ -22,8 +22,8 @@ def write(folder: Path, about: Mapping[str, Any], results: FusionResults) -> Non
     content = {
         "about": about,
         "headline": headline,
-        "advice": [page.check(gate) for gate in about["gates"] if gate["state"] in ("fail", "warn")],
-        "checks": page.checks(about["gates"]),
+        "advice": [page.gate_row(gate) for gate in about["gates"] if gate["state"] in ("fail", "warn")],
+        "gates": page.gate_rows(about["gates"]),
         "sides": [(f"{k * 360 // _SIDES}°", html.jpeg(picture)) for k, picture in enumerate(drawn)],
         "seen": html.jpeg(object_pictures.seen_picture(results.maps)),
         "rows": [_row(row) for row in about["figures"]["views"].values()],

@@ -1,1 +1,1 @@
-"""Quality gates: checks of a capture, each with limit, cost in degrees of normal error, and remedy."""
+"""Quality gates: figures of a capture against limits, with finding, cost in degrees of normal error, and remedy."""

@@ -77,7 +77,7 @@ def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Ga
     if expected <= limit:
         return Gate("normal error", "pass", round(expected, 2), limit, message, unit="°")
     more = "" if len(found.names) > 3 else " four angles,"
-    remedy = "See the checks named" if because else f"Use more light or frames,{more} or a darker room"
+    remedy = "See these gates" if because else f"Use more light or frames,{more} or a darker room"
     return Gate("normal error", "fail", round(expected, 2), limit, message, remedy, unit="°")
 
 

@@ -1,5 +1,7 @@
 """Gates of geometry: alignment, mask, mesh, outline, sharpness, focal length."""
 
+from functools import partial
+
 import cv2
 import msgspec
 import numpy as np
@@ -25,56 +27,61 @@ _DEGREES_PER_TURN = 5.0  # error of the normals per degree by which the object t
 _FALSE_TURN_DEG = 0.2  # 1σ of a turn that polarization imitates
 _SHARP_PX, _DEGREES_PER_BLUR_PX = 1.2, 2.5  # greatest blur of sharp edges; error of the normals per px beyond it
 _EDGE_FLOOR = 0.1  # of the object's median light: dark backdrops differ by less
+_LOCK = "Lock the camera, do not touch the object, and take that shot again"
 _HOLD_STILL = "Fix the object, do not touch it between shots, and take that shot again"
 _INWARD = 0.2  # sine of the zenith from which a normal leans inward
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
 
 
 def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate:
-    """Gate on movement of camera or object between shots, and on its 1σ error, in px of the full picture."""
-    measured, names = found.alignment, found.names
+    """Gate on movement between shots: of the camera, of the object against its surroundings, and turns of the object.
+
+    The object is judged only if the camera passes. The first of the three that does not pass is the gate.
+    """
+    camera = _judge_camera(found, limits, align)
+    if camera.state != "pass":
+        return camera
+    shift, turn = _judge_shift(found, limits), _judge_turn(found, limits)
+    worst = next((gate for gate in (shift, turn) if gate.state != "pass"), camera)
+    return msgspec.structs.replace(worst, cost_deg=float(np.hypot(shift.cost_deg, turn.cost_deg)))
+
+
+def _judge_camera(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate:
+    """Gate on the movement of each shot, on its 1σ error and on the correlation of its detail with the first shot's."""
+    measured, names, correlation = found.alignment, found.names, found.alignment.correlation
     height, width = found.radiance.value.shape[1:3]
     corners = picture_corners(width, height)
     moved = np.stack([transform_points(matrix, corners) for matrix in measured.transform])  # (K, 4, 2)
-    shift = np.abs(moved - corners).max((1, 2)) * found.grid_px
-    limit = align.max_shift_px
-    lost = (measured.correlation < align.min_correlation) | ~np.isfinite(shift)
-    doubt = measured.residual_px * found.grid_px
-    unsure = doubt > limits.max_align_residual_px * max(found.grid_px, 1)
-    bad = lost | (shift > limit) | unsure
-    worst = int(np.argmax(np.where(bad, 1e9, 0) + np.nan_to_num(shift)))
-    message = f"The {names[worst]} shot moved by {shift[worst]:.1f} ± {doubt[worst]:.2f} px"
-    figure = float(shift[worst])
-    unit: Unit = "px"
-    if lost[worst]:
-        message = f"The {names[worst]} shot shows another scene, or it moved too far to be registered"
-        if shift[worst] <= limit:
-            figure, limit, unit = float(measured.correlation[worst]), align.min_correlation, ""
-    elif unsure[worst] and shift[worst] <= limit:
-        message = f"The {names[worst]} shot moved by {shift[worst]:.1f} ± {doubt[worst]:.2f} px: too little texture"
-        figure, limit = float(doubt[worst]), limits.max_align_residual_px * max(found.grid_px, 1)
-    value = round(figure, 3) if np.isfinite(figure) else None
+    shift, doubt = np.abs(moved - corners).max((1, 2)) * found.grid_px, measured.residual_px * found.grid_px
+    most, most_doubt = align.max_shift_px, limits.max_align_residual_px * max(found.grid_px, 1)
+    far, unlike, unsure = ~(shift <= most), correlation < align.min_correlation, doubt > most_doubt
+    bad = far | unlike | unsure
+    k = int(np.argmax(np.where(bad, 1e9, 0) + np.nan_to_num(shift)))
+    message, value = f"The {names[k]} shot moved by {shift[k]:.1f} ± {doubt[k]:.2f} px", round(float(shift[k]), 3)
     if not bad.any():
-        of_object = _shift_gate(found, limits)
-        if of_object.state != "pass":
-            return of_object
-        return Gate("alignment", "pass", value, limit, message, cost_deg=of_object.cost_deg, unit="px")
-    remedy = "Lock the camera, do not touch the object, and take that shot again"
-    return Gate("alignment", "fail", value, limit, message, remedy, 10.0, bad_shots(names, bad), unit)
+        return Gate("alignment", "pass", value, most, message, unit="px")
+    failed = partial(Gate, "alignment", "fail", remedy=_LOCK, cost_deg=10.0, shots=bad_shots(names, bad))
+    if unlike[k] or not np.isfinite(shift[k]):
+        message = f"The {names[k]} shot shows another scene, or it moved too far to be registered"
+    if far[k]:
+        return failed(value if np.isfinite(shift[k]) else None, most, message, unit="px")
+    if unlike[k]:
+        return failed(round(float(correlation[k]), 3), align.min_correlation, message, unit="")
+    return failed(round(float(doubt[k]), 3), most_doubt, f"{message}: too little texture", unit="px")
 
 
-def _shift_gate(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on movement of the object relative to its surroundings: a push over the object's radius, or a turn.
+def _judge_shift(found: Evidence, limits: GateLimits) -> Gate:
+    """Gate on a shift of the object against its surroundings, beyond its error.
 
-    A push within its error does not count; it fails if it exceeds its limit by more than its error.
+    It warns from a share of the object's radius on, and fails beyond a limit in px.
     """
-    names, pushed, limit = found.names, _measure_shift(found), limits.max_object_shift_px
-    length, sigma = np.nan_to_num(pushed.length, posinf=np.inf) * found.grid_px, pushed.sigma * found.grid_px
+    names, measured, limit = found.names, _measure_shift(found), limits.max_object_shift_px
+    length, sigma = np.nan_to_num(measured.length, posinf=np.inf) * found.grid_px, measured.sigma * found.grid_px
     sure = length - _SIGMAS * sigma
     radius = max(outline.disc_radius(found.object_.mask) * found.grid_px, 1.0)
-    least, turned = limits.min_object_shift * radius, _turn_gate(found, limits)
+    least = limits.min_object_shift * radius
     true = np.sqrt(np.maximum(length**2 - sigma**2, 0))
-    cost = float(np.hypot(_DEGREES_PER_PUSH * true.max() / radius, turned.cost_deg))
+    cost = _DEGREES_PER_PUSH * float(true.max()) / radius
     k = int(np.argmax(sure))
     figure = round(float(length[k]), 3)
     message = f"The object moved by {figure:.1f} ± {sigma[k]:.1f} px against its surroundings in {names[k]}"
@@ -86,17 +93,19 @@ def _shift_gate(found: Evidence, limits: GateLimits) -> Gate:
         return Gate("alignment", "fail", figure, limit, message, _HOLD_STILL, max(cost, 5.0), bad, "px")
     if moved:
         return Gate("alignment", "warn", figure, least, message, _HOLD_STILL, cost, moved, "px")
-    return msgspec.structs.replace(turned, cost_deg=cost)
+    return Gate("alignment", "pass", figure, limit, message, cost_deg=cost, unit="px")
 
 
-def _turn_gate(found: Evidence, limits: GateLimits) -> Gate:
+def _judge_turn(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on a turn of the object between shots, beyond twice its error."""
-    turn, names, limit = _measure_turn(found), found.names, limits.max_object_turn_deg
-    least = turn.degrees - 2 * turn.sigma
+    measured, names, limit = _measure_turn(found), found.names, limits.max_object_turn_deg
+    least = measured.degrees - 2 * measured.sigma
     k = int(np.argmax(least))
-    true = np.sqrt(np.maximum(turn.degrees**2 - turn.sigma**2 - _FALSE_TURN_DEG**2, 0))
-    figure, cost = round(float(turn.degrees[k]), 3), _DEGREES_PER_TURN * float(true.max())
-    message = f"The object turned by {figure:.1f}° ± {turn.sigma[k]:.1f}° in {names[k]}, as its visible detail shows"
+    true = np.sqrt(np.maximum(measured.degrees**2 - measured.sigma**2 - _FALSE_TURN_DEG**2, 0))
+    figure, cost = round(float(measured.degrees[k]), 3), _DEGREES_PER_TURN * float(true.max())
+    message = (
+        f"The object turned by {figure:.1f}° ± {measured.sigma[k]:.1f}° in {names[k]}, as its visible detail shows"
+    )
     if least[k] <= limit:
         return Gate("alignment", "pass", figure, limit, message, cost_deg=cost, unit="°")
     return Gate("alignment", "warn", figure, limit, message, _HOLD_STILL, cost, bad_shots(names, least > limit), "°")
@@ -199,8 +208,10 @@ def sharpness(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def focus(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on focus: blur of the sharpest edges on the object and its outline, in px of the merged picture."""
+    """Gate on focus: blur of the sharpest edges on the object and its outline, merged px."""
     blur, limit = _edge_blur(found), limits.max_edge_blur_px
+    if found.grid_px > 1:
+        return Gate("focus", "not measured", None, limit, "Only `process` measures this", unit="px")
     message = f"The sharpest edges of the object are blurred by {blur:.1f} px (1σ)"
     if blur > limit:
         message += ": all shots are out of focus, which costs about 0.04 of roughness"

@@ -41,14 +41,14 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(gt=0, le=1, description="allowed change of one frame's light against its bracket [1]")
     ] = 0.06
     max_align_residual_px: Annotated[
-        float, Meta(gt=0, description="allowed 1σ error of a shot's registration [px of the merged picture]")
+        float, Meta(gt=0, description="allowed 1σ error of a shot's registration [merged px]")
     ] = 0.15
     min_object_shift: Annotated[
         float, Meta(gt=0, le=1, description="least movement of the object that is reported [radius of the object]")
     ] = 0.01
     max_object_shift_px: Annotated[
         float,
-        Meta(gt=0, description="allowed movement of the object against its surroundings [px of the merged picture]"),
+        Meta(gt=0, description="allowed movement of the object against its surroundings [merged px]"),
     ] = 1.5
     max_object_turn_deg: Annotated[
         float,
@@ -75,7 +75,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 1.2
     max_edge_blur_px: Annotated[
         float,
-        Meta(gt=0, le=20, description="allowed 1σ blur of the object's sharpest edges [px of the merged picture]"),
+        Meta(gt=0, le=20, description="allowed 1σ blur of the object's sharpest edges [merged px]"),
     ] = 1.4
     max_turn_deg: Annotated[
         float,

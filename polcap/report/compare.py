@@ -38,7 +38,7 @@ def write(file: Path, folders: tuple[Path, Path], abouts: tuple[Mapping[str, Any
     for name, about in zip(names, abouts):
         headline, expected_error = page.verdict(about)
         heading = {"name": name, "verdict": about["verdict"], "headline": headline, "expected_error": expected_error}
-        results.append({**heading, "checks": page.checks(about["gates"])})
+        results.append({**heading, "gates": page.gate_rows(about["gates"])})
     found = rows(*abouts)
     content = {
         "results": results,

@@ -26,7 +26,7 @@ _HEADLINE = {
     "warn": "Good to use, but check an assumption",
     "fail": "Check the result before you use it",
 }
-_ORDER = ("fail", "warn", "pass", "not measured")  # of the checks in their table
+_ORDER = ("fail", "warn", "pass", "not measured")  # of the gates in their table
 
 
 def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
@@ -40,8 +40,8 @@ def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
         "about": about,
         "headline": headline,
         "expected_error": expected_error,
-        "advice": [check(gate) for gate in about["gates"] if gate["state"] in ("fail", "warn")],
-        "checks": checks(about["gates"]),
+        "advice": [gate_row(gate) for gate in about["gates"] if gate["state"] in ("fail", "warn")],
+        "gates": gate_rows(about["gates"]),
         "metric": results.mesh.metric,
         "asset": f"asset/{about['capture']['name']}.glb",
         "pictures": list(_pictures(results)),
@@ -71,21 +71,21 @@ def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
     failed = [gate for gate in gates if gate["state"] == "fail"]
     headline = _HEADLINE[about["verdict"]]
     if failed:
-        headline += f": {len(failed)} of {len(gates)} checks failed"
+        headline += f": {len(failed)} of {len(gates)} gates failed"
     judged = [gate for gate in gates if gate["name"] == "normal error" and gate["value"] is not None]
     if not judged:  # the shots are out of order, or there is no object
         return headline, ""
     within = f"For half of the normals, the expected error is below {_gate_number(judged[0], 'value')}"
     because = judged[0]["says"].partition(", mostly due to: ")[2]
-    return headline, f"{within}; mostly due to these checks: {because}." if because else f"{within}."
+    return headline, f"{within}; mostly due to these gates: {because}." if because else f"{within}."
 
 
-def checks(gates: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+def gate_rows(gates: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """The quality gates as texts for a table, failed ones first."""
-    return [check(gate) for gate in sorted(gates, key=lambda gate: _ORDER.index(gate["state"]))]
+    return [gate_row(gate) for gate in sorted(gates, key=lambda gate: _ORDER.index(gate["state"]))]
 
 
-def check(gate: Mapping[str, Any]) -> dict[str, str]:
+def gate_row(gate: Mapping[str, Any]) -> dict[str, str]:
     """One quality gate as texts for a table: finding, value, limit, cost and remedy.
 
     The cost is the normal error that the defect causes; it is empty below one degree.

@@ -214,4 +214,4 @@ def test_shares_are_per_cent_on_the_terminal_and_shares_in_json() -> None:
     assert "(limit 25 %)" in check.table(verdict)
     (line,) = json.loads(json.dumps(check.to_json(verdict)))["lines"]
     assert (line["value"], line["limit"], line["unit"]) == (0.03, 0.25, "1")
-    assert page.check(line)["limit"] == "25 %"
+    assert page.gate_row(line)["limit"] == "25 %"

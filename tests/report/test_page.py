@@ -11,12 +11,12 @@ from polcap.pipeline import run as pipeline
 from polcap.report import keys, labels, page
 
 
-def test_the_page_opens_with_the_error_that_its_checks_judge(result: Path) -> None:
+def test_the_page_opens_with_the_error_that_its_gates_judge(result: Path) -> None:
     about = report.read(result)
     gate = next(gate for gate in about["gates"] if gate["name"] == "normal error")
     assert f"the expected error is below {labels.number(gate['value'])}°." in page.verdict(about)[1]
     gate |= {"value": 31.74, "says": "Expected error of the normals: 31.7° (median), mostly due to: body"}
-    assert page.verdict(about)[1].endswith("the expected error is below 31.74°; mostly due to these checks: body.")
+    assert page.verdict(about)[1].endswith("the expected error is below 31.74°; mostly due to these gates: body.")
     about["gates"].remove(gate)  # as where the shots are out of order
     assert page.verdict(about)[1] == ""
 

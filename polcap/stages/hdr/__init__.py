@@ -101,7 +101,7 @@ def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack
 
 def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     shots, count, first = capture.all_shots, len(capture.shots), capture.shots[0]
-    read.start(_memory_plan(capture, read(first.frames[0]), settings))
+    read.plan = _memory_plan(capture, read(first.frames[0]), settings)
     order = _by_brightness(first, read)
     image = read(first.frames[_middle(order)])
     _check_grid(first.frames[_middle(order)], image, settings)

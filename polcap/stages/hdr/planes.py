@@ -22,8 +22,7 @@ from polcap.optics.projection import coordinates
 from polcap.optics.resize import block_means
 
 _ROWS = 64  # of a block: one channel of a 24 MP picture then fits a core's cache
-_DECODERS = 2  # threads that each wait for a decoding process
-_AHEAD = 6  # frames decoded ahead of the merge: the next two shots of three; with 2, decoding stops during a merge
+_AHEAD = 2  # frames decoded ahead of the merge; each thread waits for a decoding process
 _PLANES_BYTES = 400_000_000  # most for a shot's signals; with more they are computed again for every pass
 _HELD_BYTES = 1_100_000_000  # most for decoded frames; others are decoded again when needed
 _WORK_BYTES = 60  # per pixel, for the first estimate, registration, masks and blocks
@@ -180,30 +179,23 @@ class Reader:
         self._clip = clip
         self._decode = decode
         self.lossy = False
-        self.plan = MemoryPlan(frames=0)  # no frame is decoded in advance before `start`
+        self.plan = MemoryPlan()
         self._channels = 0  # of the first frame
         self._coming = deque(coming)
         self._held: OrderedDict[int, SensorImage] = OrderedDict()
-        self._pool = ThreadPoolExecutor(_DECODERS)
+        self._pool = ThreadPoolExecutor(_AHEAD)
         self._decoding: dict[int, Future[SensorImage]] = {}
-        self._frame_bytes = 1  # of the frame decoded last
-
-    def start(self, plan: MemoryPlan) -> None:
-        """Decode frames in advance from now on, within the limits of `plan`."""
-        self.plan = plan
-        self._look_ahead()
 
     def __call__(self, frame: Frame) -> SensorImage:
         """Decode a frame, or return it from memory; raises DecodeError."""
         if id(frame) not in self._held:
             decoding = self._decoding.pop(id(frame), None) or self._pool.submit(self._decode, frame)
             image = decoding.result()
-            self._frame_bytes = max(image.value.nbytes, 1)
-            while len(self._held) >= self._room:
+            room = max(1, self.plan.frames // max(image.value.nbytes, 1))
+            while len(self._held) >= room:
                 self._held.popitem(last=False)
             self._held[id(frame)] = image
-            self._coming = deque(one for one in self._coming if one is not frame)
-            self._look_ahead()
+            self._look_ahead(frame, room)
         self._held.move_to_end(id(frame))
         image = self._held[id(frame)]
         self.lossy |= image.lossy
@@ -225,20 +217,16 @@ class Reader:
         """Free frames that are no longer needed."""
         for frame in frames:
             self._held.pop(id(frame), None)
-        self._look_ahead()
-
-    @property
-    def _room(self) -> int:
-        """Number of decoded frames that fit in memory."""
-        return max(1, self.plan.frames // self._frame_bytes)
+        self._look_ahead(None, len(self._held) + 2 * _AHEAD)
 
     def close(self) -> None:
         """Stop decoding in advance."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
-    def _look_ahead(self) -> None:
+    def _look_ahead(self, now: Frame | None, room: int) -> None:
         """Start to decode the next frames in advance, as many as fit in memory."""
-        while self._coming and len(self._decoding) < _AHEAD and len(self._held) + len(self._decoding) < self._room:
+        self._coming = deque(frame for frame in self._coming if frame is not now)
+        while self._coming and len(self._decoding) < _AHEAD and len(self._held) + len(self._decoding) < room:
             following = self._coming.popleft()
             if id(following) not in self._held:
                 self._decoding[id(following)] = self._pool.submit(self._decode, following)

@@ -48,7 +48,7 @@ def segment(
     run: RunNetwork,
     settings: MaskSettings,
 ) -> ObjectMask:
-    """Segment the object: its mask (H, W) on the reference grid, and a crop around it.
+    """Segment the object: its mask (H, W) in the reference shot, and a crop around it.
 
     `user_mask` (H, W) replaces the search. Without a network the object is found by its difference from the backdrop.
 

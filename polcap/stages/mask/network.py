@@ -28,7 +28,7 @@ def object_probability(
     radiance: AngleStack, alignment: Alignment, color: ColorCalibration, chart: Bits, network: Network,
     run: RunNetwork,
 ) -> Floats:  # fmt: skip
-    """Probability (H, W) 0…1 that a pixel of the reference grid is the object; `chart` (H, W) is 1 on the chart."""
+    """Probability (H, W) 0…1 that a pixel of the reference shot is the object; `chart` (H, W) is 1 on the chart."""
     height, width = chart.shape
     whole = (0, 0, width, height)
     picture = reduced_picture(radiance, alignment, color, chart, whole, int(network.metadata["native_size"]))
@@ -50,7 +50,7 @@ def object_probability(
 def reduced_picture(
     radiance: AngleStack, alignment: Alignment, color: ColorCalibration, chart: Bits, box: Box, longest: int
 ) -> ReducedPicture:
-    """Input picture of the mask network: a box of the reference grid, averaged down to at most `longest` px a side.
+    """Input picture of the mask network: a box of the reference shot, averaged down to at most `longest` px a side.
 
     `chart` (H, W) is 1 on the chart.
     """
@@ -58,7 +58,7 @@ def reduced_picture(
     scale = max(1.0, max(x1 - x0, y1 - y0) / longest)
     width, height = round((x1 - x0) / scale), round((y1 - y0) / scale)
     sx, sy = (x1 - x0) / width, (y1 - y0) / height
-    to_grid = np.array([[sx, 0, x0 + (sx - 1) / 2], [0, sy, y0 + (sy - 1) / 2], [0, 0, 1]])  # reduced px → grid px
+    to_grid = np.array([[sx, 0, x0 + (sx - 1) / 2], [0, sy, y0 + (sy - 1) / 2], [0, 0, 1]])  # reduced px → merged px
     shots = []
     for value, transform in zip(radiance.value, alignment.transform):
         small = area_mean(value[y0:y1, x0:x1].astype(np.float32), (height, width))
