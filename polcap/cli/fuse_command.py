@@ -34,6 +34,14 @@ def fuse(
     model: options.Model = None,
 ) -> None:
     """Join several captures of one object into a closed asset. Run again, it goes on where it was stopped."""
+    from polcap.pipeline import unchanged
+
+    target = out or folder / own_folders.FUSED
+    request = options.request_digest({**context.params, "config": config, "model": model}, folder, target)
+    if (finished := unchanged.find(target, request)) is not None:
+        terminal.print_progress("Nothing has changed since the last run.")
+        terminal.print_result(finished.report, target, json, open_)
+        return
     from polcap import config as settings
     from polcap.batch.processes import Limits
     from polcap.fusion import fuse_run
@@ -47,7 +55,7 @@ def fuse(
     if not folder.is_dir():
         raise SettingError(f"{folder}: no such folder; give the folder that holds view01, view02, …")
     stated = settings.fill(SessionConfig, settings.read(config), assignments or [])
-    wanted = SessionInput(
+    session_input = SessionInput(
         folder=folder,
         config=stated.of_views,
         chart=options.chart_request(chart, no_chart),
@@ -58,7 +66,7 @@ def fuse(
         workers=workers,
         limits=Limits(threads, memory),
     )
-    target = out or folder / own_folders.FUSED
     steps = terminal.Steps()
-    about = fuse_run.fuse(wanted, stated.fusion, target, terminal.print_progress, steps.stage)
+    about = fuse_run.fuse(session_input, stated.fusion, target, terminal.print_progress, steps.stage)
+    unchanged.remember(target, request)
     terminal.print_result(about, target, json, open_)

@@ -1,7 +1,7 @@
 """Options that several commands share, and the functions that parse them."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 
 _NAMED = 5  # outdated exports that a warning lists
+# options without effect on the bytes of a result
+_NO_EFFECT = ("capture", "folder", "out", "json", "dry_run", "watch", "open_", "workers", "threads", "memory")
 
 
 def result_folder(named: Path | None) -> Path | None:
@@ -115,6 +117,17 @@ def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
     if len(corners) != 8:
         raise SettingError(f"--chart gives {len(corners)} numbers; four corners have 8, a profile ends in .toml")
     return ChartRequest("corners", corners=np.reshape(corners, (4, 2)))
+
+
+def request_digest(stated: Mapping[str, Any], folder: Path, out: Path) -> str | None:
+    """Digest of a run on the photographs of a folder for `unchanged.find`, from its options by name."""
+    from polcap.pipeline import unchanged
+
+    asked = {name: value for name, value in stated.items() if name not in _NO_EFFECT}
+    named = [stated.get(name) for name in ("config", "mask", "model", "chart")]
+    named.append(measured_chart(stated["config"], stated["assignments"]))
+    files = [Path(name) for name in named if name is not None and Path(name).is_file()]
+    return unchanged.request(asked, folder, out, files)
 
 
 def measured_chart(config: Path | None, assignments: list[str] | None) -> str | None:

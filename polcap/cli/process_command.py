@@ -11,8 +11,6 @@ from polcap.cli import options
 from polcap.cli.watch import at_every_change
 from polcap.formats import own_folders
 
-_NO_EFFECT = ("capture", "out", "json", "dry_run", "watch", "open_", "threads", "memory")  # on the bytes of a result
-
 
 def process(
     context: Context,
@@ -44,12 +42,7 @@ def process(
 
     stated = {**context.params, "capture": capture, "config": config, "mask": mask, "model": model}  # paths, not text
     target = out or capture / own_folders.OUTPUT
-    request = None
-    if not (until or force or dry_run or watch):
-        asked = {name: value for name, value in stated.items() if name not in _NO_EFFECT}
-        named = (config, mask, model, chart, options.measured_chart(config, assignments))
-        files = [Path(name) for name in named if name is not None and Path(name).is_file()]
-        request = unchanged.request(asked, capture, target, files)
+    request = None if until or force or dry_run or watch else options.request_digest(stated, capture, target)
     if (finished := unchanged.find(target, request)) is not None:
         terminal.print_progress(f"{finished.table}\nNothing has changed since the last run.")
         terminal.print_result(finished.report, target, json, open_)

@@ -77,7 +77,7 @@ class AtlasMaps:
 
 
 @dataclass(frozen=True)
-class Sight:
+class VisibleTexels:
     """The M texels that one view sees, and how well."""
 
     texel: NDArray[np.intp]  # (M,) index among the atlas's N texels
@@ -98,15 +98,15 @@ class Sight:
 @stage(version=2)
 def bake(views: tuple[FusionView, ...], atlas: Atlas, settings: BakingSettings) -> AtlasMaps:
     """Bake the maps of all views into the atlas; values where no view sees the surface are those of no light, 0."""
-    seen = sights(views, atlas)
+    visible = visible_texels(views, atlas)
     count = len(atlas.position)
-    normal = _bake_normals(views, seen, atlas, settings)
-    diffuse = _bake_bands([view.diffuse for view in views], views, seen, count, settings.smooth)
+    normal = _bake_normals(views, visible, atlas, settings)
+    diffuse = _bake_bands([view.diffuse for view in views], views, visible, count, settings.smooth)
     gloss = [np.concatenate([view.specular, view.roughness[..., None]], axis=-1) for view in views]
-    samples, plain = [one.sample(image) for one, image in zip(seen, gloss)], [one.weight for one in seen]
-    specular_roughness, _ = _reweighted(samples, plain, seen, count, _OUTLIER * _typical(samples))
+    samples, plain = [one.sample(image) for one, image in zip(visible, gloss)], [one.weight for one in visible]
+    specular_roughness, _ = _reweighted(samples, plain, visible, count, _OUTLIER * _typical(samples))
     total = np.zeros(count)
-    for one in seen:
+    for one in visible:
         total[one.texel] += one.weight
     values = np.concatenate([normal, diffuse, specular_roughness, total[:, None]], axis=-1, dtype=np.float32)
     return on_atlas(atlas, values)
@@ -123,14 +123,14 @@ def on_atlas(atlas: Atlas, values: Floats) -> AtlasMaps:
     return AtlasMaps(normal, diffuse, specular, image[..., 9].copy(), mask, image[..., 10].copy())
 
 
-def sights(views: Sequence[FusionView], atlas: Atlas) -> list[Sight]:
+def visible_texels(views: Sequence[FusionView], atlas: Atlas) -> list[VisibleTexels]:
     """The texels that each view sees."""
     mesh = atlas.mesh
     tracer = Tracer(Triangles(mesh.vertices, mesh.faces, mesh.normals[mesh.faces]))
-    return [_sight(view, atlas, tracer) for view in views]
+    return [_visible(view, atlas, tracer) for view in views]
 
 
-def _sight(view: FusionView, atlas: Atlas, tracer: Tracer) -> Sight:
+def _visible(view: FusionView, atlas: Atlas, tracer: Tracer) -> VisibleTexels:
     rotation, translation = view.pose.rotation, view.pose.translation
     height, width = view.mask.shape
     surface = tracer.trace(rotation, translation, view.view, height, width)
@@ -142,12 +142,12 @@ def _sight(view: FusionView, atlas: Atlas, tracer: Tracer) -> Sight:
     texel = np.flatnonzero(inside & (point[:, 2] < 0))
     row, column, cosine = row[texel], column[texel], cosine[texel]
     slack = _BEHIND / view.view.focal / cosine
-    visible = -point[texel, 2] <= surface.depth[row, column] * (1 + slack)  # false where the surface is missed
+    in_front = -point[texel, 2] <= surface.depth[row, column] * (1 + slack)  # false where the surface is missed
     fade = _distance_from_edges(view, surface.depth)[row, column]
-    weight = np.where(visible, cosine**2 * fade, 0)
+    weight = np.where(in_front, cosine**2 * fade, 0)
     kept = np.flatnonzero(weight > 0)
     texel = texel[kept]
-    return Sight(
+    return VisibleTexels(
         texel,
         pixel[texel].astype(np.float32),
         cosine[kept].astype(np.float32),
@@ -176,21 +176,25 @@ def diameter_px(view: FusionView) -> float:
     return float(np.sqrt(4 * max(int(view.mask.sum()), 1) / np.pi))
 
 
-def _bake_normals(views: Sequence[FusionView], seen: Sequence[Sight], atlas: Atlas, settings: BakingSettings) -> Floats:
+def _bake_normals(
+    views: Sequence[FusionView], visible: Sequence[VisibleTexels], atlas: Atlas, settings: BakingSettings
+) -> Floats:
     """Unit normals (N, 3) in the board frame: those of the mesh plus the mean differences of the views from it."""
     differences = []
-    for view, one in zip(views, seen):
+    for view, one in zip(views, visible):
         both = view.mask & (frames.dot(one.mesh_normal, one.mesh_normal) > 0.5)
         difference = np.where(both[..., None], view.normal - one.mesh_normal, 0).astype(np.float32)
         bands = one.sample(_bands(difference, both, settings.smooth * diameter_px(view)))
         differences.append(np.concatenate([bands[:, k : k + 3] @ view.pose.rotation for k in (0, 3)], axis=-1))
     count = len(atlas.position)
     prior = (settings.mesh_sigma_deg or _mesh_sigma_deg(differences)) ** -2
-    weights = [one.weight / (one.sample(view.sigma_deg)[:, 0] ** 2 + _FLOOR_DEG**2) for one, view in zip(seen, views)]
+    weights = [
+        one.weight / (one.sample(view.sigma_deg)[:, 0] ** 2 + _FLOOR_DEG**2) for one, view in zip(visible, views)
+    ]
     smooth, weights = _reweighted(
-        [one[:, :3] for one in differences], weights, seen, count, float(np.radians(_OUTLIER_DEG)), prior
+        [one[:, :3] for one in differences], weights, visible, count, float(np.radians(_OUTLIER_DEG)), prior
     )
-    fine, _ = _mean([one[:, 3:] for one in differences], [w**_SHARPNESS for w in weights], seen, count)
+    fine, _ = _mean([one[:, 3:] for one in differences], [w**_SHARPNESS for w in weights], visible, count)
     return frames.unit(atlas.normal + smooth + fine)
 
 
@@ -204,18 +208,18 @@ def _mesh_sigma_deg(differences: Sequence[Floats]) -> float:
 
 
 def _bake_bands(
-    images: Sequence[Floats], views: Sequence[FusionView], seen: Sequence[Sight], count: int, smooth: float
+    images: Sequence[Floats], views: Sequence[FusionView], visible: Sequence[VisibleTexels], count: int, smooth: float
 ) -> Floats:
     """Robust mean (N, C) of images (H, W, C) of the views: smooth band from all, fine band from the best."""
     bands = [
         one.sample(_bands(image, view.mask, smooth * diameter_px(view)))
-        for one, image, view in zip(seen, images, views)
+        for one, image, view in zip(visible, images, views)
     ]
     channels = images[0].shape[-1]
-    weights = [one.weight for one in seen]
+    weights = [one.weight for one in visible]
     low = [one[:, :channels] for one in bands]
-    mean, weights = _reweighted(low, weights, seen, count, _OUTLIER * _typical(low))
-    fine, _ = _mean([one[:, channels:] for one in bands], [w**_SHARPNESS for w in weights], seen, count)
+    mean, weights = _reweighted(low, weights, visible, count, _OUTLIER * _typical(low))
+    fine, _ = _mean([one[:, channels:] for one in bands], [w**_SHARPNESS for w in weights], visible, count)
     return np.maximum(mean + fine, 0)
 
 
@@ -233,7 +237,7 @@ def _bands(image: Floats, inside: Bools, sigma: float) -> Floats:
 def _reweighted(
     samples: Sequence[Floats],
     weights: Sequence[Floats],
-    seen: Sequence[Sight],
+    visible: Sequence[VisibleTexels],
     count: int,
     scale: float,
     prior: float = 0.0,
@@ -244,20 +248,24 @@ def _reweighted(
     """
     robust = list(weights)
     for _ in range(_ROUNDS):
-        mean, _ = _mean(samples, robust, seen, count, prior)
+        mean, _ = _mean(samples, robust, visible, count, prior)
         robust = [
             w / (1 + np.sum((value - mean[one.texel]) ** 2, axis=-1) / scale**2)
-            for value, w, one in zip(samples, weights, seen)
+            for value, w, one in zip(samples, weights, visible)
         ]
-    return _mean(samples, robust, seen, count, prior)[0], robust
+    return _mean(samples, robust, visible, count, prior)[0], robust
 
 
 def _mean(
-    samples: Sequence[Floats], weights: Sequence[Floats], seen: Sequence[Sight], count: int, prior: float = 0.0
+    samples: Sequence[Floats],
+    weights: Sequence[Floats],
+    visible: Sequence[VisibleTexels],
+    count: int,
+    prior: float = 0.0,
 ) -> tuple[Floats, Floats]:
     """Weighted mean (N, C) over the views, 0 where none has weight, and the total weight (N,)."""
     total, mean = np.full(count, prior), np.zeros((count, samples[0].shape[-1]))
-    for value, weight, one in zip(samples, weights, seen):
+    for value, weight, one in zip(samples, weights, visible):
         total[one.texel] += weight
         mean[one.texel] += weight[:, None] * value
     return mean / np.maximum(total, 1e-30)[:, None], total

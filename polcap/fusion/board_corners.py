@@ -41,7 +41,7 @@ class BoardCorners:
     board: Board
     number: NDArray[np.int64]  # (N,) OpenCV's
     world: Floats  # (N, 3) m
-    seen: Floats  # (N, 2) x, y in visible RAW px of the reference shot
+    measured_px: Floats  # (N, 2) x, y in visible RAW px of the reference shot
 
 
 def gray_picture(radiance: AngleStack, color: ColorCalibration) -> tuple[Floats, float]:

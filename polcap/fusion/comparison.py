@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from polcap.fusion.atlas import Atlas
-from polcap.fusion.baking import AtlasMaps, Sight, sights
+from polcap.fusion.baking import AtlasMaps, VisibleTexels, visible_texels
 from polcap.fusion.values import FusionView
 from polcap.images import Floats
 from polcap.optics import frames, shade
@@ -34,29 +34,31 @@ class Comparison:
 @stage(version=2)
 def compare(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps) -> Comparison:
     """Compare each view with the fused mesh and its textures."""
-    return Comparison(tuple(_agreement(view, one, atlas, maps) for view, one in zip(views, sights(views, atlas))))
+    return Comparison(
+        tuple(_agreement(view, one, atlas, maps) for view, one in zip(views, visible_texels(views, atlas)))
+    )
 
 
-def _agreement(view: FusionView, sight: Sight, atlas: Atlas, maps: AtlasMaps) -> ViewAgreement:
-    both = view.mask & (frames.dot(sight.mesh_normal, sight.mesh_normal) > 0.5)
-    cosine = np.clip(frames.dot(view.normal, sight.mesh_normal)[both], -1, 1)
+def _agreement(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: AtlasMaps) -> ViewAgreement:
+    both = view.mask & (frames.dot(visible.mesh_normal, visible.mesh_normal) > 0.5)
+    cosine = np.clip(frames.dot(view.normal, visible.mesh_normal)[both], -1, 1)
     angle_deg = float(np.median(np.degrees(np.arccos(cosine)))) if both.any() else 90.0
-    if view.s0 is None or not len(sight.texel):
+    if view.s0 is None or not len(visible.texel):
         return ViewAgreement(view.name, angle_deg, None)
-    photograph, drawn = sight.sample(view.s0), rendered(view, sight, atlas, maps)
-    weight = sight.weight[:, None]
+    photograph, drawn = visible.sample(view.s0), rendered(view, visible, atlas, maps)
+    weight = visible.weight[:, None]
     drawn = drawn * float((weight * drawn * photograph).sum() / max((weight * drawn * drawn).sum(), 1e-12))
     error = (weight * (photograph - drawn) ** 2).sum() / max((weight * photograph**2).sum(), 1e-12)
     return ViewAgreement(view.name, angle_deg, float(np.sqrt(error)))
 
 
-def rendered(view: FusionView, sight: Sight, atlas: Atlas, maps: AtlasMaps) -> Floats:
+def rendered(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: AtlasMaps) -> Floats:
     """S0 (M, 3) of the texels that a view sees, under its light; 1 on a white plane at the object's distance."""
     rotation, translation = view.pose.rotation, view.pose.translation
-    point = atlas.position[sight.texel] @ rotation.T + translation
+    point = atlas.position[visible.texel] @ rotation.T + translation
     to_lens = frames.unit(-point)
     normal, diffuse, specular, roughness = (
-        part[atlas.covered][sight.texel].astype(np.float64)
+        part[atlas.covered][visible.texel].astype(np.float64)
         for part in (maps.normal, maps.diffuse, maps.specular, maps.roughness)
     )
     far = float(np.linalg.norm(rotation @ atlas.position.mean(axis=0) + translation))

@@ -64,7 +64,7 @@ class _Features:
 
 
 @dataclass(frozen=True)
-class _Sightings:
+class _FeatureTracks:
     """Features of points that two views or more see; a point's features are a track."""
 
     view: NDArray[np.intp]  # (M,) number of the view
@@ -98,14 +98,14 @@ class _Motion:
 class _AdjustedMotion:
     """Motion with its errors, and how well the features fit."""
 
-    seen: _Sightings
+    tracks: _FeatureTracks
     motion: _Motion
     sigma: Floats  # 1σ of the unknowns
     error: Floats  # (M, 2) slopes of the points minus those of their features
     near: Bools  # (M,) features that are no wrong matches
 
 
-def solve(seen: Mapping[str, Results], capture: Capture) -> SessionPoses:
+def solve(results: Mapping[str, Results], capture: Capture) -> SessionPoses:
     """Camera and poses of views from their maps; `capture` is one of them and states the camera's geometry.
 
     Views without enough features in common with the others are left out. Lengths are in metres if the chart's size is
@@ -113,16 +113,16 @@ def solve(seen: Mapping[str, Results], capture: Capture) -> SessionPoses:
 
     Raises CaptureError: fewer than three views have enough features in common.
     """
-    names, first = list(seen), next(iter(seen.values()))
-    features = [_find(one.maps) for one in seen.values()]
+    names, first = list(results), next(iter(results.values()))
+    features = [_find(one.maps) for one in results.values()]
     pairs = {(i, j): _match(features[i], features[j]) for i, j in combinations(range(len(names)), 2)}
     views, start = _first_motion(features, pairs)
     posed: dict[str, PosedView] = {}
     camera, metric = SessionCamera(capture.focal_px, 0.0, capture.principal_px, 0.0, 0.0), False
     if len(views) >= LEAST_VIEWS:
-        sightings = _sightings(features, pairs, start, views)
+        tracks = _tracks(features, pairs, start, views)
         doubt = max(*np.abs(capture.focal_doubt), 0.002 if capture.focal_known else 0.5)
-        found = _adjusted(sightings, start, first.maps.view.focal, float(doubt))
+        found = _adjusted(tracks, start, first.maps.view.focal, float(doubt))
         chart = first.color.metres_per_px
         distance, metric = (1.0, False) if chart is None else (chart * first.radiance.view.focal, True)
         posed = {names[views[k]]: one for k, one in _posed(found, distance, capture.focal_px).items()}
@@ -134,12 +134,12 @@ def solve(seen: Mapping[str, Results], capture: Capture) -> SessionPoses:
             "`polcap board`, or turn it by 15° or less between the views and let it fill the picture"
         )
     reason = f"fewer than {_LEAST_MATCHES} features of the object match those of other views; turn it by 15° or less"
-    return SessionPoses(camera, posed, {name: reason for name in names if name not in posed}, metric)
+    return SessionPoses(camera, posed, {name: reason for name in names if name not in posed}, metric, board=False)
 
 
-def _camera(capture: Capture, seen: Results, found: _AdjustedMotion) -> SessionCamera:
+def _camera(capture: Capture, view: Results, found: _AdjustedMotion) -> SessionCamera:
     """Camera with the adjusted focal length and the stated distortion, which an object in the middle does not tell."""
-    lens = seen.radiance.equipment.distortion
+    lens = view.radiance.equipment.distortion
     k1, k2 = (0.0, 0.0) if lens is None else (lens.k1, lens.k2)
     focal = capture.focal_px * found.motion.focal_change
     return SessionCamera(focal, focal * float(found.sigma[_FOCAL]), capture.principal_px, k1, k2)
@@ -147,14 +147,14 @@ def _camera(capture: Capture, seen: Results, found: _AdjustedMotion) -> SessionC
 
 def _posed(found: _AdjustedMotion, distance: float, focal_px: float) -> dict[int, PosedView]:
     """Poses of the views with enough features, by number; the lens is `distance` from the axis."""
-    seen, motion = found.seen, found.motion
-    point = _points(seen, motion, found.near.astype(float))[0]
-    height = point[seen.point[found.near], 1]
+    tracks, motion = found.tracks, found.motion
+    point = _points(tracks, motion, found.near.astype(float))[0]
+    height = point[tracks.point[found.near], 1]
     foot = float(np.quantile(height, _WRONG) - _BELOW * np.ptp(np.quantile(height, [_WRONG, 1 - _WRONG])))
     turns, shifts = motion.poses()
     out = {}
     for k, (turn, shift) in enumerate(zip(turns, shifts, strict=True)):
-        own = found.near & (seen.view == k)
+        own = found.near & (tracks.view == k)
         if own.sum() >= _LEAST_MATCHES:
             residual = float(np.sqrt(2 * np.mean(found.error[own] ** 2))) * focal_px
             sigma = float(np.degrees(np.hypot(found.sigma[_TURNS + k], found.sigma[_TILT].max())))
@@ -241,9 +241,9 @@ def _frames(pair: Floats) -> Floats:
     return np.stack([pair[:, 0], np.cross(third, pair[:, 0]), third], axis=-1)
 
 
-def _sightings(
+def _tracks(
     features: Sequence[_Features], pairs: Mapping[_Pair, _Matches], first: _Motion, views: NDArray[np.intp]
-) -> _Sightings:
+) -> _FeatureTracks:
     """Tracks of features of some views whose normals match after the first turns, one feature in each view."""
     start = np.cumsum([0, *(len(one.ray) for one in features)])
     normal, ray = (np.concatenate([getattr(one, name) for one in features]) for name in ("normal", "ray"))
@@ -259,51 +259,51 @@ def _sightings(
     size = np.bincount(track[use])
     longest = np.argsort(-size, kind="stable")[:_MOST_POINTS]
     use = use[(size[track[use]] > 1) & np.isin(track[use], longest)]
-    return _Sightings(np.searchsorted(views, view[use]), np.unique(track[use], return_inverse=True)[1], ray[use])
+    return _FeatureTracks(np.searchsorted(views, view[use]), np.unique(track[use], return_inverse=True)[1], ray[use])
 
 
-def _adjusted(seen: _Sightings, first: _Motion, focal_px: float, doubt: float) -> _AdjustedMotion:
-    """The motion that fits the sightings best; `doubt` is the 1σ of the logarithm of the focal length."""
+def _adjusted(tracks: _FeatureTracks, first: _Motion, focal_px: float, doubt: float) -> _AdjustedMotion:
+    """The motion that fits the tracks best; `doubt` is the 1σ of the logarithm of the focal length."""
     count = (len(first.value) - _TURNS) // 3
     prior = np.full(len(first.value), np.inf)
     prior[_AXIS_Y], prior[_FOCAL], prior[_TURNS] = _HELD, doubt, _HELD
     prior[_TURNS + count :] = _SHIFT_SIGMA
-    value, weight = first.value, np.ones(len(seen.view))
+    value, weight = first.value, np.ones(len(tracks.view))
     for scale in _SCALES_PX:
 
         def residuals(value: Floats, weight: Floats = weight, scale: float = scale) -> Floats:
-            error = _errors(seen, _Motion(first.base, value), weight) * focal_px / scale
+            error = _errors(tracks, _Motion(first.base, value), weight) * focal_px / scale
             return np.concatenate([np.ravel(error), (value - first.value) / prior])
 
         best = least_squares(residuals, value, x_scale="jac", loss="cauchy", max_nfev=_STEPS)
         value = best.x
-        error = _errors(seen, _Motion(first.base, value), weight)
+        error = _errors(tracks, _Motion(first.base, value), weight)
         far = np.linalg.norm(error, axis=1) * focal_px / scale
         weight = 1 / np.sqrt(1 + far**2)
     near, jacobian = far < _FAR, np.asarray(best.jac)
     spread = float(np.sqrt(np.mean(error[near] ** 2))) * focal_px / scale
     sigma = spread * np.sqrt(np.abs(np.diag(np.linalg.pinv(jacobian.T @ jacobian))))
-    return _AdjustedMotion(seen, _Motion(first.base, value), sigma, error, near)
+    return _AdjustedMotion(tracks, _Motion(first.base, value), sigma, error, near)
 
 
-def _points(seen: _Sightings, motion: _Motion, weight: Floats) -> tuple[Floats, Floats]:
+def _points(tracks: _FeatureTracks, motion: _Motion, weight: Floats) -> tuple[Floats, Floats]:
     """World points (P, 3) nearest to their rays, by linear least squares, and their slopes (M, 2) in the views.
 
     A ray (x, y) of the view with rotation R and translation t says (R X + t)_x + x (R X + t)_z = 0, and so for y.
     """
-    turn, shift = (part[seen.view] for part in motion.poses())
-    ray = seen.ray / motion.focal_change
+    turn, shift = (part[tracks.view] for part in motion.poses())
+    ray = tracks.ray / motion.focal_change
     terms = (turn[:, :2] + ray[..., None] * turn[:, 2:]) * weight[:, None, None]  # (M, 2, 3)
     right = -(shift[:, :2] + ray * shift[:, 2:]) * weight[:, None]  # (M, 2)
-    count = int(seen.point.max()) + 1
+    count = int(tracks.point.max()) + 1
     square, side = np.zeros((count, 3, 3)), np.zeros((count, 3, 1))
-    np.add.at(square, seen.point, np.einsum("mki,mkj->mij", terms, terms))
-    np.add.at(side[..., 0], seen.point, np.einsum("mki,mk->mi", terms, right))
+    np.add.at(square, tracks.point, np.einsum("mki,mkj->mij", terms, terms))
+    np.add.at(side[..., 0], tracks.point, np.einsum("mki,mk->mi", terms, right))
     point = np.linalg.solve(square + 1e-9 * np.eye(3), side)[..., 0]
-    seen_at = np.einsum("mij,mj->mi", turn, point[seen.point]) + shift
-    return point, -seen_at[:, :2] / seen_at[:, 2:] * motion.focal_change
+    in_camera = np.einsum("mij,mj->mi", turn, point[tracks.point]) + shift
+    return point, -in_camera[:, :2] / in_camera[:, 2:] * motion.focal_change
 
 
-def _errors(seen: _Sightings, motion: _Motion, weight: Floats) -> Floats:
+def _errors(tracks: _FeatureTracks, motion: _Motion, weight: Floats) -> Floats:
     """Slopes (M, 2) of the points minus those of their features."""
-    return np.asarray(_points(seen, motion, weight)[1] - seen.ray)
+    return np.asarray(_points(tracks, motion, weight)[1] - tracks.ray)

@@ -1,7 +1,7 @@
 """Fuses a session: processes its views, runs the path, writes maps, asset, animation, report and verdict."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +12,17 @@ from polcap import __version__
 from polcap import report as reports
 from polcap.errors import SettingError
 from polcap.formats.export import encoders, provenance
-from polcap.fusion import fused_maps, fused_page, object_pictures, session
+from polcap.fusion import fused_maps, fused_page, joining, object_pictures
+from polcap.fusion import session as sessions
 from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.closed_mesh import is_closed
 from polcap.fusion.fused_maps import FusedSource
 from polcap.fusion.fusion_path import FusionResults, FusionSettings, path
-from polcap.fusion.session import Report, Session, SessionInput
-from polcap.fusion.values import FusionView
+from polcap.fusion.session import Notify, ProcessedSession, SessionInput
 from polcap.pipeline import asset_export, result_folder
 from polcap.pipeline.asset_export import ExportRequest
-from polcap.pipeline.cache import Progress, StageCache, contents
+from polcap.pipeline.cache import Progress, StageCache
+from polcap.pipeline.run import timings
 from polcap.quality import gates
 from polcap.quality.gate import Gate, State
 from polcap.report import animation
@@ -37,101 +38,100 @@ _FEW_VIEWS = 8
 
 
 def fuse(
-    wanted: SessionInput, settings: FusionSettings, out: Path, report: Report, progress: Progress
+    session_input: SessionInput, settings: FusionSettings, out: Path, notify: Notify, progress: Progress
 ) -> dict[str, Any]:
     """Fuse the views below a folder into the result folder `out`; returns the content of report.json.
 
     Raises InputError: anything at fault with the user's input.
     """
-    found = session.read(wanted)  # first: a folder without views stays as it is
+    session = sessions.read(session_input)  # first: a folder without views stays as it is
     with result_folder.locked(out):
-        views = session.process(found, wanted, report)
+        processed = sessions.process(session, session_input, notify)
         cache = StageCache(out, progress)
-        with cache.memory_explained(views[0].mask.size):
-            results = path(views, settings, cache)
-        results = replace(results, maps=_with_albedo_scale(results.maps, found))
+        with cache.memory_explained(processed.views[0].mask.size):
+            results = path(processed.views, settings, cache)
+        results = replace(results, maps=_with_albedo_scale(results.maps, processed))
         cache.begin("write")
-        about = document(wanted, found, settings, results, out)
-        write(out, about, results, views)
+        name = session_input.folder.resolve().name
+        about = document(name, processed, settings, results, timings(out))
+        write(out, about, results)
         cache.end()
         return about
 
 
-def export(out: Path, *wanted: ExportRequest) -> list[Path]:
+def export(out: Path, *requests: ExportRequest) -> list[Path]:
     """Write the asset of a fused result again for each request, from maps/ and report.json; returns the files."""
-    for one in wanted:
-        asset_export.check(one)
-        for flag in {"exr", "iiif"} & set(asset_export.effective(one).formats):
+    for request in requests:
+        asset_export.check(request)
+        for flag in {"exr", "iiif"} & set(asset_export.effective(request).formats):
             raise SettingError(
                 f"--{flag} is for results of one view, not for a fused object; "
                 "leave it out (and --preset archive), and use maps/"
             )
-        if "displacement" in one.extras:
+        if "displacement" in request.extras:
             raise SettingError("--extra displacement is for results of one view: a closed mesh has none; leave it out")
     about = reports.read(out)
     with result_folder.locked(out):
         source = fused_maps.read(out / "maps")
-        made = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in wanted)
-        return [file for files in made for file in files]
+        exports = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in requests)
+        return [file for files in exports for file in files]
 
 
-def _with_albedo_scale(maps: AtlasMaps, found: Session) -> AtlasMaps:
+def _with_albedo_scale(maps: AtlasMaps, processed: ProcessedSession) -> AtlasMaps:
     """The maps with the doubt of their scale: the median of the views', which share the chart and its errors."""
-    stated = [about["figures"]["chart"]["scale_doubt"] for about in found.about.values()]
+    stated = [report["figures"]["chart"]["scale_doubt"] for report in processed.reports.values()]
     known = [float(one) for one in stated if one is not None]
     return replace(maps, albedo_sigma=float(np.median(known)) if known else None)
 
 
 def document(
-    wanted: SessionInput, found: Session, settings: FusionSettings, results: FusionResults, out: Path
+    name: str,
+    processed: ProcessedSession,
+    settings: FusionSettings,
+    results: FusionResults,
+    seconds: Mapping[str, float],
 ) -> dict[str, Any]:
-    """The content of report.json: facts, figures by view, gates."""
-    rows = _rows(found, results)
-    judged = list(_gates(found, results, rows))
-    first = found.about[found.used[0]]
+    """The content of report.json: facts, figures by view, gates; `seconds` are those of the stages."""
+    rows = _rows(processed, results)
+    judged = list(_gates(processed, results, rows))
+    reports, camera = processed.reports, processed.poses.camera
+    first = next(iter(reports.values()))
     shots = [
-        {**shot, "frames": [{**frame, "file": f"{name}/{frame['file']}"} for frame in shot["frames"]]}
-        for name in found.used
-        for shot in found.about[name]["capture"]["shots"]
+        {**shot, "frames": [{**frame, "file": f"{view}/{frame['file']}"} for frame in shot["frames"]]}
+        for view, report in reports.items()
+        for shot in report["capture"]["shots"]
     ]
-    assert found.camera is not None
     return {
         "polcap": __version__,
         "versions": provenance.versions(),
         "verdict": gates.verdict(judged),
-        "capture": {**first["capture"], "name": wanted.folder.resolve().name, "shots": shots},
+        "capture": {**first["capture"], "name": name, "shots": shots},
         "gates": msgspec.to_builtins(judged),
         "figures": {
             "views": {row["name"]: row for row in rows},
-            "left_out": dict(found.left_out),
-            "sets": dict(found.shared),
-            "camera": {
-                "focal_px": found.camera.focal_px,
-                "focal_sigma_px": found.camera.focal_sigma_px,
-                "principal_px": list(found.camera.principal_px),
-                "k1": found.camera.k1,
-                "k2": found.camera.k2,
-            },
+            "left_out": dict(processed.left_out),
+            "sets": {one.folder: one.shared for one in results.joined},
+            "camera": asdict(camera),
             "mesh": {
-                "metric": found.metric,
+                "metric": processed.poses.metric,
                 "triangles": len(results.atlas.mesh.faces),
                 "extent": np.ptp(results.mesh.vertices, axis=0).tolist(),
-                "closed": is_closed(results.mesh),
+                "closed": _closed(results),
                 "seen": _seen(results),
             },
         },
-        "timings": {one["stage"]: one["seconds"] for one in contents(out)},
+        "timings": dict(seconds),
         "model": first["model"],
-        "keys": {**results.keys, **{f"{name} infer": found.about[name]["keys"]["infer"] for name in found.used}},
+        "keys": {**results.keys, **{f"{view} infer": report["keys"]["infer"] for view, report in reports.items()}},
         "settings": {**first["settings"], "fusion": msgspec.to_builtins(settings)},
     }
 
 
-def _rows(found: Session, results: FusionResults) -> list[dict[str, Any]]:
+def _rows(processed: ProcessedSession, results: FusionResults) -> list[dict[str, Any]]:
     """Figures of each view."""
     rows = []
     for one in results.comparison.views:
-        posed = found.posed[one.name]
+        posed = processed.poses.views[one.name]
         rows.append(
             {
                 "name": one.name,
@@ -140,7 +140,7 @@ def _rows(found: Session, results: FusionResults) -> list[dict[str, Any]]:
                 "pose_sigma_deg": posed.sigma_deg,
                 "normal_deg": one.normal_deg,
                 "residual": one.residual,
-                "verdict": _verdict(found.about[one.name]),
+                "verdict": _verdict(processed.reports[one.name]),
             }
         )
     return rows
@@ -157,34 +157,39 @@ def _seen(results: FusionResults) -> float:
     return float(results.maps.seen[results.atlas.covered].mean())
 
 
-def _gates(found: Session, results: FusionResults, rows: Sequence[Mapping[str, Any]]) -> Iterator[Gate]:
-    yield _views_gate(found)
+def _closed(results: FusionResults) -> bool:
+    """Whether every edge of the mesh, as it is written, belongs to two triangles."""
+    return is_closed(fused_maps.closed(results.atlas.mesh))
+
+
+def _gates(processed: ProcessedSession, results: FusionResults, rows: Sequence[Mapping[str, Any]]) -> Iterator[Gate]:
+    yield _views_gate(processed)
     worst = max(rows, key=lambda row: row["reprojection_px"])
     value = worst["reprojection_px"]
     what, limit, remedy = (
         ("The board's corners", _MOST_RESIDUAL_PX, "Keep the board flat, and focus and zoom unchanged")
-        if found.board
+        if processed.poses.board
         else ("Features of the object", _MOST_FEATURE_PX, "Turn the object on a flat table, focus and zoom unchanged")
     )
     message = f"{what} are within {value:.2f} px (rms) in every view; the worst is {worst['name']}"
     state: State = "pass" if value <= limit else "fail"
     yield Gate("poses", state, value, limit, message, "" if state == "pass" else remedy, unit="px")
     yield _agreement_gate(rows)
-    for folder, share in found.shared.items():
-        message = f"The first set confirms {share:.0%} of the surface of {folder}"
-        yield Gate(f"join {folder}", "pass", share, session.LEAST_SHARED, message)
+    for one in results.joined:
+        message = f"The first set confirms {one.shared:.0%} of the surface of {one.folder}"
+        yield Gate(f"join {one.folder}", "pass", one.shared, joining.LEAST_SHARED, message)
     seen, state, remedy = _seen(results), "pass", ""
     if seen < _LEAST_SEEN:
-        few = len(found.used) < _FEW_VIEWS
+        few = len(processed.views) < _FEW_VIEWS
         state, remedy = "warn", "Shoot more views" if few else "Take a second ring of views from higher up"
     yield Gate("seen", state, seen, _LEAST_SEEN, f"Views saw {seen:.0%} of the surface; the rest is filled", remedy)
-    whole = is_closed(results.mesh)
+    whole = _closed(results)
     message = "Every edge of the mesh belongs to two triangles" if whole else "The mesh has open edges"
     yield Gate("closed", "pass" if whole else "fail", None, None, message, "" if whole else "Report this as a bug")
 
 
-def _views_gate(found: Session) -> Gate:
-    used, missing = len(found.used), found.left_out
+def _views_gate(processed: ProcessedSession) -> Gate:
+    used, missing = len(processed.views), processed.left_out
     if missing:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in missing.items())
         message = f"{len(missing)} of {used + len(missing)} views are left out: {reasons}"
@@ -207,7 +212,7 @@ def _agreement_gate(rows: Sequence[Mapping[str, Any]]) -> Gate:
     return Gate("agreement", "pass", value, _MOST_NORMAL_DEG, message, unit="°")
 
 
-def write(out: Path, about: dict[str, Any], results: FusionResults, views: Sequence[FusionView]) -> None:
+def write(out: Path, about: dict[str, Any], results: FusionResults) -> None:
     """Write maps/, asset/, the turntable and the report of a fused result; StorageError."""
     fused_maps.write(out / "maps", results.atlas, results.maps)
     source: FusedSource = fused_maps.read(out / "maps")  # as stored, so that `polcap export` makes the same bytes

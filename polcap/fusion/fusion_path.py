@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import msgspec
 
 from polcap.config import Config
-from polcap.fusion import atlas, baking, comparison, filling, material_fit, shape
+from polcap.fusion import atlas, baking, comparison, filling, joining, material_fit, shape
 from polcap.fusion.atlas import Atlas, AtlasSettings
 from polcap.fusion.baking import AtlasMaps, BakingSettings
 from polcap.fusion.comparison import Comparison
+from polcap.fusion.joining import JoinedSet
 from polcap.fusion.material_fit import MaterialSettings
 from polcap.fusion.shape import ShapeSettings
 from polcap.fusion.values import ClosedMesh, FusionView
@@ -44,6 +45,7 @@ class SessionConfig(Config, frozen=True, forbid_unknown_fields=True):
 class FusionResults:
     """One value per stage, and the cache keys."""
 
+    joined: tuple[JoinedSet, ...]  # sets of views after the first
     mesh: ClosedMesh
     atlas: Atlas
     maps: AtlasMaps
@@ -54,11 +56,13 @@ class FusionResults:
 def path(views: tuple[FusionView, ...], settings: FusionSettings, cache: MemoryCache) -> FusionResults:
     """Run the stages in order."""
     given = StageResult(digest(fingerprint(views)), views)  # hashed once
-    mesh = cache.run(shape.fuse_shape, given, config=settings.shape)
-    atlas_ = cache.run(atlas.unwrap, mesh, given, config=settings.atlas)
-    baked = cache.run(baking.bake, given, atlas_, config=settings.baking)
-    fitted = cache.run(material_fit.fit, given, atlas_, baked, config=settings.material_fit)
+    joined = cache.run(joining.join, given)
+    placed = cache.derive(joining.place, given, joined)
+    mesh = cache.run(shape.fuse_shape, placed, config=settings.shape)
+    atlas_ = cache.run(atlas.unwrap, mesh, placed, config=settings.atlas)
+    baked = cache.run(baking.bake, placed, atlas_, config=settings.baking)
+    fitted = cache.run(material_fit.fit, placed, atlas_, baked, config=settings.material_fit)
     maps = cache.run(filling.fill, fitted, atlas_)
-    compared = cache.run(comparison.compare, given, atlas_, maps)
+    compared = cache.run(comparison.compare, placed, atlas_, maps)
     keys = {name: result.key for name, result in cache.results.items()}
-    return FusionResults(mesh.value, atlas_.value, maps.value, compared.value, keys)
+    return FusionResults(joined.value, mesh.value, atlas_.value, maps.value, compared.value, keys)

@@ -17,7 +17,6 @@ from polcap.errors import ObjectError
 from polcap.fusion.small_views import SmallView
 from polcap.images import Bools, Floats
 
-GRID = 140  # steps along the object's longest side; docs/benchmarks/fusion.md
 _COARSE = 48  # steps of the grid that finds the object's box
 _MARGIN = 3  # steps around the object
 _NEAR = 3.5  # steps from the surface within which distances are exact; two points lie at most √3 steps apart
@@ -53,8 +52,10 @@ class DistanceGrid:
         return np.asarray(ndimage.map_coordinates(self.distance, index.T, order=1, mode="nearest"))
 
 
-def visual_hull(views: Sequence[SmallView], steps: int = GRID) -> DistanceGrid:
+def visual_hull(views: Sequence[SmallView], steps: int) -> DistanceGrid:
     """Signed distance from the visual hull: the largest over the views; one body, without specks and false handles.
+
+    The grid has `steps` along the object's longest side.
 
     Raises ObjectError: the silhouettes have no point in common.
     """

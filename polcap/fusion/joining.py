@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from polcap.errors import CaptureError
 from polcap.fusion.normal_surface import visible
 from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.small_views import reduce_views, sample
@@ -23,7 +24,10 @@ from polcap.fusion.values import FusionView, Pose
 from polcap.images import Floats
 from polcap.optics.frames import dot
 from polcap.optics.vertex_frames import vertex_normals
+from polcap.stages import stage
 
+# share of a set's surface that the first set confirms: correctly joined .84 or more, other objects mostly .5 or less
+LEAST_SHARED = 0.7
 _GRID = 80  # steps along a set's own mesh, which is for this registration alone
 _LEAST_SEEN = 0.3  # sum of the cosines to the views of a point that they know
 _TURNS = 3000  # sampled: every turn is within about 15° of one of them
@@ -39,7 +43,7 @@ _ALONG = 0.1  # weight of distances along the surface over that of distances fro
 
 
 @dataclass(frozen=True)
-class SeenSurface:
+class ObservedSurface:
     """Points that a set of views saw, in the frame of its board."""
 
     point: Floats  # (P, 3) m
@@ -52,10 +56,10 @@ class SeenSurface:
         """Longest side of the points' box, m."""
         return float(np.ptp(self.point, axis=0).max())
 
-    def some(self, count: int, random: np.random.Generator) -> "SeenSurface":
+    def some(self, count: int, random: np.random.Generator) -> "ObservedSurface":
         """About `count` of the points."""
         index = random.choice(len(self.point), min(count, len(self.point)), replace=False)
-        return SeenSurface(self.point[index], self.normal[index], self.albedo[index], self.middle)
+        return ObservedSurface(self.point[index], self.normal[index], self.albedo[index], self.middle)
 
     def features(self, close: float) -> Floats:
         """Positions, normals and albedos (P, 9) in units of their 1σ; `close` is that of positions, m."""
@@ -69,11 +73,11 @@ class Motion:
     rotation: Floats  # (3, 3)
     translation: Floats  # (3,) m
 
-    def apply(self, surface: SeenSurface) -> SeenSurface:
+    def apply(self, surface: ObservedSurface) -> ObservedSurface:
         """The moved surface."""
         point = surface.point @ self.rotation.T + self.translation
         middle = self.rotation @ surface.middle + self.translation
-        return SeenSurface(point, surface.normal @ self.rotation.T, surface.albedo, middle)
+        return ObservedSurface(point, surface.normal @ self.rotation.T, surface.albedo, middle)
 
     def pose(self, before: Pose) -> Pose:
         """The pose of a view after the object and its board were moved."""
@@ -81,14 +85,49 @@ class Motion:
         return Pose(rotation, before.translation - rotation @ self.translation)
 
 
-def join(fixed: Sequence[FusionView], moving: Sequence[FusionView]) -> tuple[list[FusionView], float]:
-    """The views of a set in the frame of another, and the share of their surface that the other confirms."""
-    motion, share = register(seen_surface(moving), seen_surface(fixed))
-    return [replace(view, pose=motion.pose(view.pose)) for view in moving], share
+@dataclass(frozen=True)
+class JoinedSet:
+    """Motion of a further set of views onto the first one."""
+
+    folder: str
+    motion: Motion
+    shared: float  # share of the set's surface that the first one confirms
 
 
-def seen_surface(views: Sequence[FusionView]) -> SeenSurface:
-    """What one set of views shows of the object."""
+@stage(version=1)
+def join(views: tuple[FusionView, ...]) -> tuple[JoinedSet, ...]:
+    """Find the motions of all further sets of views, each in a folder of its own, onto the first one.
+
+    Raises CaptureError: a set does not show the object of the first one.
+    """
+    sets: dict[str, list[FusionView]] = {}
+    for view in views:
+        sets.setdefault(view.folder, []).append(view)
+    first, *others = sets
+    if not others:
+        return ()
+    fixed, joined = observed_surface(sets[first]), []
+    for folder in others:
+        motion, shared = register(observed_surface(sets[folder]), fixed)
+        if shared < LEAST_SHARED:
+            raise CaptureError(
+                f"{folder}: the first set confirms {shared:.0%} of this set's surface, {LEAST_SHARED:.0%} are needed; "
+                "show the same object, with some sides in both sets"
+            )
+        joined.append(JoinedSet(folder, motion, shared))
+    return tuple(joined)
+
+
+def place(views: tuple[FusionView, ...], joined: tuple[JoinedSet, ...]) -> tuple[FusionView, ...]:
+    """The views of all sets in the frame of the first set's board."""
+    motions = {one.folder: one.motion for one in joined}
+    return tuple(
+        replace(view, pose=motions[view.folder].pose(view.pose)) if view.folder in motions else view for view in views
+    )
+
+
+def observed_surface(views: Sequence[FusionView]) -> ObservedSurface:
+    """Points of the object that a set of views saw."""
     mesh, small = fuse_shape(views, ShapeSettings(grid=_GRID)), reduce_views(views)
     outward = vertex_normals(mesh.vertices, mesh.faces)
     step = float(np.ptp(mesh.vertices, axis=0).max()) / _GRID
@@ -99,10 +138,10 @@ def seen_surface(views: Sequence[FusionView]) -> SeenSurface:
     total = weight.sum(axis=0)
     there = np.flatnonzero(total > _LEAST_SEEN)
     albedo = np.einsum("nv,nvc->vc", weight[:, there], diffuse[:, there]) / total[there, None]
-    return SeenSurface(mesh.vertices[there], outward[there], albedo, mesh.vertices.mean(axis=0))
+    return ObservedSurface(mesh.vertices[there], outward[there], albedo, mesh.vertices.mean(axis=0))
 
 
-def register(moving: SeenSurface, fixed: SeenSurface) -> tuple[Motion, float]:
+def register(moving: ObservedSurface, fixed: ObservedSurface) -> tuple[Motion, float]:
     """The motion of one surface onto another, and the share of its points that then have a partner there."""
     random = np.random.default_rng(0)
     few, coarse = moving.some(_FEW, random), fixed.some(10 * _FEW, random)
@@ -114,7 +153,7 @@ def register(moving: SeenSurface, fixed: SeenSurface) -> tuple[Motion, float]:
     return motion, float(np.isfinite(partner).mean())
 
 
-def _likely_turns(moving: SeenSurface, fixed: SeenSurface) -> list[Motion]:
+def _likely_turns(moving: ObservedSurface, fixed: ObservedSurface) -> list[Motion]:
     """Motions by the best of many sampled turns, middle onto middle and then shifted, by points nearest in space."""
     tree, close = cKDTree(fixed.point), _CLOSE[0] * fixed.size
     features = fixed.features(close)
@@ -132,19 +171,19 @@ def _likely_turns(moving: SeenSurface, fixed: SeenSurface) -> list[Motion]:
     return [motion for _, motion in sorted(found, key=lambda one: one[0])[:_TRIED]]
 
 
-def _difference(moved: SeenSurface, fixed: SeenSurface, close: float) -> float:
+def _difference(moved: ObservedSurface, fixed: ObservedSurface, close: float) -> float:
     """Mean squared difference of points from their partners, σ²."""
     away, _ = _partners(moved, cKDTree(fixed.features(close * fixed.size)), close * fixed.size)
     return float(np.mean(np.minimum(away, _FAR) ** 2))
 
 
-def _partners(moved: SeenSurface, tree: "cKDTree[None]", close: float) -> tuple[Floats, Floats]:
+def _partners(moved: ObservedSurface, tree: "cKDTree[None]", close: float) -> tuple[Floats, Floats]:
     """Differences (P,) σ of points from the most alike ones of a tree of features, infinite beyond _FAR; indices."""
     away, index = tree.query(moved.features(close), distance_upper_bound=_FAR)
     return np.asarray(away), np.asarray(index)
 
 
-def _refined(motion: Motion, moving: SeenSurface, fixed: SeenSurface, steps: Sequence[float]) -> Motion:
+def _refined(motion: Motion, moving: ObservedSurface, fixed: ObservedSurface, steps: Sequence[float]) -> Motion:
     """A motion improved by iterated closest points, closer at each of `steps` [sizes]."""
     for close in steps:
         tree = cKDTree(fixed.features(close * fixed.size))

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from polcap.fusion.atlas import Atlas
-from polcap.fusion.baking import AtlasMaps, Sight, on_atlas, sights
+from polcap.fusion.baking import AtlasMaps, VisibleTexels, on_atlas, visible_texels
 from polcap.fusion.lobe_profiles import ALPHAS, LobeProfile, LobeSamples, flash_place, profile
 from polcap.fusion.values import FusionView
 from polcap.images import Floats
@@ -85,11 +85,11 @@ def fit(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps, settings: 
     if not lit:
         return maps
     share = _materials(maps, atlas, settings.materials)  # (N, K)
-    seen = sights(lit, atlas)
-    samples = _samples(lit, seen, atlas, maps, share)
+    visible = visible_texels(lit, atlas)
+    samples = _samples(lit, visible, atlas, maps, share)
     flash = flash_place([one for one in samples if one is not None])
     profiles = [None if one is None else profile(one, flash) for one in samples]
-    widening = 2 * _normal_sigma(lit, seen, atlas, maps) ** 2
+    widening = 2 * _normal_sigma(lit, visible, atlas, maps) ** 2
     lobes = _lobes(profiles, widening, settings)
     return _blended(atlas, maps, share, lobes, all(view.white_distance is not None for view in lit))
 
@@ -110,13 +110,13 @@ def _materials(maps: AtlasMaps, atlas: Atlas, count: int) -> Floats:
 
 
 def _samples(
-    views: Sequence[FusionView], seen: Sequence[Sight], atlas: Atlas, maps: AtlasMaps, share: Floats
+    views: Sequence[FusionView], visible: Sequence[VisibleTexels], atlas: Atlas, maps: AtlasMaps, share: Floats
 ) -> list[LobeSamples | None]:
     """Samples of each material; None where it has too few."""
     normal, albedo = maps.normal[atlas.covered], color.luminance(maps.diffuse[atlas.covered])
     parts = []
     middle = atlas.position.mean(axis=0)
-    for view, one in zip(views, seen):
+    for view, one in zip(views, visible):
         assert view.s0 is not None
         steep = np.flatnonzero(one.cosine > _LEAST_COSINE)
         point = atlas.position[one.texel[steep]] @ view.pose.rotation.T + view.pose.translation
@@ -128,7 +128,7 @@ def _samples(
         parts.append((radiance, albedo[one.texel[steep]], local, point, one.weight[steep], one.texel[steep]))
     radiance, base, local, point, weight, texel = (np.concatenate(column) for column in zip(*parts))
     best = share.argmax(axis=1)
-    material, gloss = best[texel], _typical_gloss(views, seen, best, share.shape[1])
+    material, gloss = best[texel], _typical_gloss(views, visible, best, share.shape[1])
     found: list[LobeSamples | None] = []
     for k, (f0, rough) in enumerate(gloss):
         mine = np.flatnonzero((material == k) & (weight > 0))
@@ -141,11 +141,11 @@ def _samples(
 
 
 def _typical_gloss(
-    views: Sequence[FusionView], seen: Sequence[Sight], material: NDArray[np.intp], count: int
+    views: Sequence[FusionView], visible: Sequence[VisibleTexels], material: NDArray[np.intp], count: int
 ) -> list[tuple[float, float]]:
     """F0 and roughness of each material in the maps: medians over the views that see enough of it."""
     rows = np.zeros((len(views), count, 3))  # means of F0 and roughness, weight
-    for row, view, one in zip(rows, views, seen):
+    for row, view, one in zip(rows, views, visible):
         gloss = color.luminance(one.sample(view.specular)), one.sample(view.roughness)[:, 0], np.ones(len(one.texel))
         row[:] = np.stack([np.bincount(material[one.texel], one.weight * x, count) for x in gloss], axis=-1)
         row[:, :2] /= np.maximum(row[:, 2:], 1e-9)
@@ -154,10 +154,12 @@ def _typical_gloss(
             for k in range(count)]  # fmt: skip
 
 
-def _normal_sigma(views: Sequence[FusionView], seen: Sequence[Sight], atlas: Atlas, maps: AtlasMaps) -> float:
+def _normal_sigma(
+    views: Sequence[FusionView], visible: Sequence[VisibleTexels], atlas: Atlas, maps: AtlasMaps
+) -> float:
     """Error of the baked normals per axis [rad], from the angles between them and the views' normals."""
     normal, angles = maps.normal[atlas.covered], []
-    for view, one in zip(views, seen):
+    for view, one in zip(views, visible):
         facing = np.flatnonzero(one.cosine > _NORMAL_FACING)
         own = frames.unit(one.sample(view.normal)[facing]) @ view.pose.rotation
         angles.append(np.arccos(np.clip(frames.dot(own, normal[one.texel[facing]]), -1, 1)))

@@ -1,6 +1,6 @@
 """One camera and a pose of the board per view, from the board's corners in all views (bundle adjustment).
 
-Focal length, distortion k₁ and k₂, and six numbers per view minimize the distances between seen and projected
+Focal length, distortion k₁ and k₂, and six numbers per view minimize the distances between measured and projected
 corners. Turns of one plane about its normal do not determine the principal point, so it is held near the stated one.
 
 References
@@ -88,19 +88,20 @@ class SessionPoses:
     views: Mapping[str, PosedView]
     left_out: Mapping[str, str]
     metric: bool = True  # lengths are in metres
+    board: bool = True  # from the board; else from features of the object
 
 
-def solve(seen: Mapping[str, BoardCorners], capture: Capture) -> SessionPoses:
+def solve(boards: Mapping[str, BoardCorners], capture: Capture) -> SessionPoses:
     """Camera and poses of all views of a session; `capture` is one of them and states the camera's geometry.
 
     A view whose corners do not fit is left out, and the others are solved again.
 
     Raises CaptureError: fewer than three views can be posed, or views show boards of several sizes.
     """
-    sizes = {corners.board.name for corners in seen.values()}
+    sizes = {corners.board.name for corners in boards.values()}
     if len(sizes) > 1:
         raise CaptureError(f"the views show boards of sizes {' and '.join(sorted(sizes))}; use one board for all")
-    names = list(seen)
+    names = list(boards)
     left_out: dict[str, str] = {}
     while True:
         if len(names) < LEAST_VIEWS:
@@ -109,7 +110,7 @@ def solve(seen: Mapping[str, BoardCorners], capture: Capture) -> SessionPoses:
                 f"{len(names)} views can be posed, {LEAST_VIEWS} are needed; show the board in more views"
                 + (f" ({reasons})" if reasons else "")
             )
-        solved = _adjust([seen[name] for name in names], capture)
+        solved = _adjust([boards[name] for name in names], capture)
         worst = max(range(len(names)), key=lambda k: solved.residual[k])
         if solved.residual[worst] <= _MOST_RESIDUAL:
             break
@@ -131,14 +132,14 @@ class _Adjusted:
         return [one.residual_px for one in self.posed]
 
 
-def _adjust(seen: Sequence[BoardCorners], capture: Capture) -> _Adjusted:
+def _adjust(boards: Sequence[BoardCorners], capture: Capture) -> _Adjusted:
     """Bundle adjustment, twice: the second time without corners far from the first solution."""
     stated = View(capture.focal_px, capture.principal_px, 1.0)
-    start = np.concatenate([np.zeros(_CAMERA), *(_first_pose(one, stated) for one in seen)])
-    found = _minimize(seen, capture, start)
-    error = [_residual(one, _camera(capture, found.x), found.x[_place(k)]) for k, one in enumerate(seen)]
+    start = np.concatenate([np.zeros(_CAMERA), *(_first_pose(one, stated) for one in boards)])
+    found = _minimize(boards, capture, start)
+    error = [_residual(one, _camera(capture, found.x), found.x[_place(k)]) for k, one in enumerate(boards)]
     far = max(_OUTLIER * 1.48 * float(np.median(np.abs(np.concatenate(error)))), _LEAST_OUTLIER)
-    used = [_without(one, np.linalg.norm(e, axis=1) > far) for one, e in zip(seen, error, strict=True)]
+    used = [_without(one, np.linalg.norm(e, axis=1) > far) for one, e in zip(boards, error, strict=True)]
     found = _minimize(used, capture, found.x)
     return _with_errors(used, capture, found)
 
@@ -148,7 +149,9 @@ def _without(corners: BoardCorners, bad: Floats) -> BoardCorners:
     keep = ~np.asarray(bad, bool)
     if keep.sum() < _LEAST_KEPT * len(keep):
         return corners
-    return replace(corners, number=corners.number[keep], world=corners.world[keep], seen=corners.seen[keep])
+    return replace(
+        corners, number=corners.number[keep], world=corners.world[keep], measured_px=corners.measured_px[keep]
+    )
 
 
 def _place(k: int) -> slice:
@@ -159,7 +162,7 @@ def _place(k: int) -> slice:
 def _first_pose(corners: BoardCorners, view: View) -> Floats:
     flat = corners.world @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # into the plane z = 0, right-handed
     count, turns, shifts, errors = cv2.solvePnPGeneric(
-        flat, corners.seen, view.intrinsic, None, flags=cv2.SOLVEPNP_IPPE
+        flat, corners.measured_px, view.intrinsic, None, flags=cv2.SOLVEPNP_IPPE
     )
     best = min(range(count), key=lambda k: float(np.ravel(errors[k])[0]))
     turn = cv2.Rodrigues(turns[best])[0] @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).T
@@ -180,22 +183,22 @@ def _pose(unknown: Floats) -> Pose:
 
 
 def _residual(corners: BoardCorners, camera: SessionCamera, unknown: Floats) -> Floats:
-    """Projected minus seen corners (N, 2) px."""
-    return camera.project(_pose(unknown), corners.world) - corners.seen
+    """Projected minus measured corners (N, 2) px."""
+    return camera.project(_pose(unknown), corners.world) - corners.measured_px
 
 
-def _minimize(seen: Sequence[BoardCorners], capture: Capture, start: Floats) -> OptimizeResult:
+def _minimize(boards: Sequence[BoardCorners], capture: Capture, start: Floats) -> OptimizeResult:
     width = capture.size_px[0]
     doubt = max(abs(capture.focal_doubt[0]), abs(capture.focal_doubt[1]), 0.05 if capture.focal_known else 0.5)
     weak = np.array([doubt, *[_PRINCIPAL_SIGMA * width] * 2, *_BEND_SIGMA])
 
-    counts = np.cumsum([_CAMERA, *(2 * len(one.number) for one in seen)])
+    counts = np.cumsum([_CAMERA, *(2 * len(one.number) for one in boards)])
 
     def part(k: int, camera: Floats, place: Floats) -> Floats:
-        return _residual(seen[k], _camera(capture, camera), place).ravel() / _CORNER_SIGMA
+        return _residual(boards[k], _camera(capture, camera), place).ravel() / _CORNER_SIGMA
 
     def residuals(unknown: Floats) -> Floats:
-        parts = [part(k, unknown[:_CAMERA], unknown[_place(k)]) for k in range(len(seen))]
+        parts = [part(k, unknown[:_CAMERA], unknown[_place(k)]) for k in range(len(boards))]
         return np.concatenate([unknown[:_CAMERA] / weak, *parts])
 
     def jacobian(unknown: Floats) -> Floats:
@@ -214,10 +217,10 @@ def _minimize(seen: Sequence[BoardCorners], capture: Capture, start: Floats) -> 
     )
 
 
-def _with_errors(seen: Sequence[BoardCorners], capture: Capture, found: OptimizeResult) -> _Adjusted:
+def _with_errors(boards: Sequence[BoardCorners], capture: Capture, found: OptimizeResult) -> _Adjusted:
     """Camera and poses with their errors, from the curvature at the solution and the actual residuals."""
     camera = _camera(capture, found.x)
-    error = [_residual(one, camera, found.x[_place(k)]) for k, one in enumerate(seen)]
+    error = [_residual(one, camera, found.x[_place(k)]) for k, one in enumerate(boards)]
     scale = float(np.sqrt(np.mean(np.concatenate(error) ** 2))) / _CORNER_SIGMA
     jacobian = found.jac
     sigma = max(scale, 0.1) * np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)))
@@ -228,6 +231,6 @@ def _with_errors(seen: Sequence[BoardCorners], capture: Capture, found: Optimize
             residual_px=float(np.sqrt(2 * np.mean(e**2))),
             sigma_deg=float(np.degrees(sigma[_place(k)][:3].max())),
         )
-        for k, (one, e) in enumerate(zip(seen, error, strict=True))
+        for k, (one, e) in enumerate(zip(boards, error, strict=True))
     ]
     return _Adjusted(_camera(capture, found.x, float(sigma[0])), posed)

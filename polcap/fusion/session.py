@@ -2,7 +2,7 @@
 
 Each view is a capture that `polcap process` takes, with its result in viewNN/polcap. A view that cannot be used is left
 out, with the reason; the others go on. Between sets of views (setA/view01 …, setB/view01 …) the object was laid on
-another side; their boards become one frame at the end. Without a board the poses come from features of the maps.
+another side; `joining.py` gives them one frame later. Without a board the poses come from features of the maps.
 """
 
 import traceback
@@ -29,26 +29,25 @@ from polcap.errors import (
 )
 from polcap.formats import onnx, own_folders
 from polcap.formats.capture import folder_names, reader
-from polcap.fusion import board_corners, feature_poses, joining, mask_agreement, poses, view_maps
+from polcap.fusion import board_corners, feature_poses, mask_agreement, poses, view_maps
 from polcap.fusion.board_corners import BoardCorners, NoBoardError
 from polcap.fusion.board_eraser import erase
-from polcap.fusion.poses import LEAST_VIEWS, PosedView, SessionCamera, SessionPoses
+from polcap.fusion.poses import LEAST_VIEWS, SessionCamera, SessionPoses
 from polcap.fusion.silhouettes import Silhouette
 from polcap.fusion.values import FusionView, Pose
 from polcap.images import Bools, Capture, ChartRequest, Network
 from polcap.optics.board import Board
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import AUTO, UserInput
+from polcap.results import Results
 from polcap.stages import mask
 from polcap.stages.mask import regions
 
 _REFUSED = ("order",)  # gates of a view whose failure makes its normals wrong everywhere
-# share of a set's surface that the first set confirms: correctly joined .84 or more, other objects mostly .5 or less
-LEAST_SHARED = 0.7
 _RETRIES = 1  # of a view, if its process died
 # faults of a view, without which the others go on; settings, models and the disk are common to all
 _FAULTS = (CaptureError, DecodeError, ChartError, AlignmentError, ObjectError)
-Report = Callable[[str], None]  # of what is done
+Notify = Callable[[str], None]  # is called with a line on the step that is done
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -91,25 +90,33 @@ class MaskTask:
 
 @dataclass
 class Session:
-    """The views of a session, as far as they are processed."""
+    """The captures of a session, what is supplied to each, and which views are left out."""
 
     captures: dict[str, Capture]  # by name of the view
     left_out: dict[str, str] = field(default_factory=dict)  # reason, by name of the view
-    supplied: dict[str, UserInput] = field(default_factory=dict)
-    camera: SessionCamera | None = None
-    posed: Mapping[str, PosedView] = field(default_factory=dict)
-    board: bool = True  # poses come from the board
-    metric: bool = True  # lengths are in metres
-    about: dict[str, dict[str, Any]] = field(default_factory=dict)  # content of report.json of each view
-    shared: dict[str, float] = field(default_factory=dict)  # of each further set: share that the first one confirms
+    supplied: dict[str, UserInput] = field(default_factory=dict)  # color calibration, networks and, at the end, mask
 
-    def place(self, solved: SessionPoses) -> None:
-        """Take over camera and poses, and leave out the views without."""
-        self.left_out |= {name: reason.removeprefix(f"{name}: ") for name, reason in solved.left_out.items()}
-        self.camera, self.posed, self.metric = solved.camera, solved.views, solved.metric
+    def leave_out(self, reasons: Mapping[str, str]) -> None:
+        """Leave out views, by name.
+
+        Raises CaptureError: too few are left.
+        """
+        self.left_out |= {name: reason.removeprefix(f"{name}: ") for name, reason in reasons.items()}
+        self.require_views()
+
+    def require_views(self) -> None:
+        """Raise a CaptureError if too few views of a set can be used."""
+        for folder, used in self.sets.items():
+            if len(used) < LEAST_VIEWS:
+                reasons = "; ".join(f"{name}: {reason}" for name, reason in self.left_out.items())
+                raise CaptureError(
+                    f"{len(used)} views {f'of {folder} ' * bool(folder)}can be used, {LEAST_VIEWS} are needed"
+                    + (f" ({reasons})" if reasons else "")
+                    + "; shoot more, 12 for a simple shape"
+                )
 
     def each(
-        self, work: Callable[[T], R], tasks: Mapping[str, T], pool: ProcessPool | None, done: Report
+        self, work: Callable[[T], R], tasks: Mapping[str, T], pool: ProcessPool | None, done: Notify
     ) -> dict[str, R]:
         """Do some work on views, by name; a view for which it fails is left out. `done` is called with each name."""
         outcomes = {}
@@ -148,6 +155,16 @@ class Session:
         return found
 
 
+@dataclass(frozen=True)
+class ProcessedSession:
+    """Maps and reports of the used views of a session, and their camera and poses."""
+
+    views: tuple[FusionView, ...]
+    poses: SessionPoses
+    reports: Mapping[str, Mapping[str, Any]]  # content of report.json, by view
+    left_out: Mapping[str, str]  # reason, by view
+
+
 def _outcomes(
     work: Callable[[T], R], tasks: Mapping[str, T], pool: ProcessPool | None
 ) -> Iterator[tuple[str, R | Exception | Died]]:
@@ -182,94 +199,97 @@ def out_of(folder: Path, name: str) -> Path:
     return folder / name / own_folders.OUTPUT
 
 
-def process(session: Session, wanted: SessionInput, report: Report) -> tuple[FusionView, ...]:
-    """Process all views of a session, which is changed; returns the views' maps.
+def process(session: Session, session_input: SessionInput, notify: Notify) -> ProcessedSession:
+    """Process all views of a session, which notes the views that are left out.
 
     Raises CaptureError: too few views can be used.
     """
-    _calibrate_colors(session, wanted, report)
+    _calibrate_colors(session, session_input, notify)
     with ExitStack() as stack:
         pool = None
-        if wanted.workers > 1:
-            pool = stack.enter_context(ProcessPool(wanted.workers, _RETRIES, wanted.limits))
-        boards = _find_boards(session, wanted, pool, report)
+        if session_input.workers > 1:
+            pool = stack.enter_context(ProcessPool(session_input.workers, _RETRIES, session_input.limits))
+        boards = _find_boards(session, session_input, pool, notify)
         if boards:
-            session.place(poses.solve(boards, session.captures[session.used[0]]))
-            masks = session.each(_mask_object, _mask_tasks(session, wanted, boards), pool, _says(report, "mask"))
-            _enough(session)
-            _compare_masks(session, wanted, masks)
+            solved = poses.solve(boards, session.captures[session.used[0]])
+            session.leave_out(solved.left_out)
+            tasks = _mask_tasks(session, session_input, boards, solved)
+            masks = session.each(_mask_object, tasks, pool, _notify_of(notify, "mask"))
+            session.require_views()
         else:
-            session.each(_make_maps, _tasks(session, wanted), pool, _says(report, "first maps"))
-            _enough(session)
-            _place_by_features(session, wanted, report)
-        session.about = session.each(_make_maps, _tasks(session, wanted), pool, _says(report, "maps"))
-    _enough(session)
-    return _joined(session, wanted)
+            session.each(_make_maps, _tasks(session, session_input), pool, _notify_of(notify, "first maps"))
+            session.require_views()
+            notify("no board: poses from features of the object")
+            results = {name: _reopen(name, session_input, "infer") for name in session.used}
+            solved = feature_poses.solve(results, session.captures[session.used[0]])
+            session.leave_out(solved.left_out)
+            masks = {name: np.asarray(results[name].object_.mask) for name in session.used}
+        _compare_masks(session, session_input, masks, solved)
+        reports = session.each(_make_maps, _tasks(session, session_input), pool, _notify_of(notify, "maps"))
+    session.require_views()
+    views = tuple(_view(name, session_input, solved) for name in session.used)
+    return ProcessedSession(views, solved, reports, session.left_out)
 
 
-def _says(report: Report, what: str) -> Report:
-    """A function that reports that something of a named view is done."""
-    return lambda name: report(f"{name}: {what}")
+def _notify_of(notify: Notify, step: str) -> Notify:
+    """A function that notes that a step of a named view is done."""
+    return lambda name: notify(f"{name}: {step}")
 
 
-def read(wanted: SessionInput) -> Session:
+def read(session_input: SessionInput) -> Session:
     """Read the captures of all folders view…/ and set…/view…/; nothing is written.
 
     Raises CaptureError: there are too few views.
     """
-    names = folder_names.session_views(wanted.folder)
+    folder = session_input.folder
+    names = folder_names.session_views(folder)
     if not names:
-        raise CaptureError(f"{wanted.folder} holds no views; put each capture into a folder view01, view02, …")
+        raise CaptureError(f"{folder} holds no views; put each capture into a folder view01, view02, …")
     session = Session({})
     for name in names:
-        folder = wanted.folder / name
         try:
-            session.captures[name] = reader.read(folder, wanted.angles_deg, wanted.clockwise)
+            session.captures[name] = reader.read(folder / name, session_input.angles_deg, session_input.clockwise)
         except _FAULTS as error:
-            session.left_out[name] = _reason(str(folder), error)
-    _enough(session)
+            session.left_out[name] = _reason(str(folder / name), error)
+    session.require_views()
     return session
 
 
-def _enough(session: Session) -> None:
-    for folder, used in session.sets.items():
-        if len(used) < LEAST_VIEWS:
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in session.left_out.items())
-            raise CaptureError(
-                f"{len(used)} views {f'of {folder} ' * bool(folder)}can be used, {LEAST_VIEWS} are needed"
-                + (f" ({reasons})" if reasons else "")
-                + "; shoot more, 12 for a simple shape"
-            )
-
-
-def _tasks(session: Session, wanted: SessionInput) -> dict[str, ViewTask]:
+def _tasks(session: Session, session_input: SessionInput) -> dict[str, ViewTask]:
     """Tasks of the views that are not left out, by name."""
     return {
-        name: ViewTask(name, session.captures[name], session.supplied[name], wanted.config, out_of(wanted.folder, name))
+        name: ViewTask(
+            name,
+            session.captures[name],
+            session.supplied[name],
+            session_input.config,
+            out_of(session_input.folder, name),
+        )
         for name in session.used
     }
 
 
-def _mask_tasks(session: Session, wanted: SessionInput, boards: Mapping[str, BoardCorners]) -> dict[str, MaskTask]:
-    assert session.camera is not None
+def _mask_tasks(
+    session: Session, session_input: SessionInput, boards: Mapping[str, BoardCorners], solved: SessionPoses
+) -> dict[str, MaskTask]:
     return {
-        name: MaskTask(task, boards[name].board, session.camera, session.posed[name].pose)
-        for name, task in _tasks(session, wanted).items()
+        name: MaskTask(task, boards[name].board, solved.camera, solved.views[name].pose)
+        for name, task in _tasks(session, session_input).items()
     }
 
 
-def _calibrate_colors(session: Session, wanted: SessionInput, report: Report) -> None:
+def _calibrate_colors(session: Session, session_input: SessionInput, notify: Notify) -> None:
     """Give every view the color calibration of the first view that shows the chart, as a profile.
 
     Raises ChartError: no view shows the chart.
     """
-    plain = UserInput(wanted.chart, None, wanted.network, wanted.mask_network)
+    plain = UserInput(session_input.chart, None, session_input.network, session_input.mask_network)
     charted, others = "", plain
-    for name in session.used if wanted.chart.mode == "auto" else ():
-        report(f"{name}: chart")
-        out = out_of(wanted.folder, name)
+    for name in session.used if session_input.chart.mode == "auto" else ():
+        notify(f"{name}: chart")
+        out = out_of(session_input.folder, name)
         try:
-            pipeline.process(session.captures[name], plain, wanted.config, out, "whitebalance")
+            pipeline.process(session.captures[name], plain, session_input.config, out, "whitebalance")
             color = pipeline.reopen(out, "whitebalance")[0].color
         except ChartError:
             continue
@@ -277,7 +297,7 @@ def _calibrate_colors(session: Session, wanted: SessionInput, report: Report) ->
         charted, others = name, replace(plain, chart=ChartRequest("profile", profile=profile))
         break
     else:
-        if wanted.chart.mode == "auto":
+        if session_input.chart.mode == "auto":
             raise ChartError(
                 "no view shows the ColorChecker; show it in one view, give a color profile with --chart, or --no-chart"
             )
@@ -285,13 +305,13 @@ def _calibrate_colors(session: Session, wanted: SessionInput, report: Report) ->
 
 
 def _find_boards(
-    session: Session, wanted: SessionInput, pool: ProcessPool | None, report: Report
+    session: Session, session_input: SessionInput, pool: ProcessPool | None, notify: Notify
 ) -> dict[str, BoardCorners]:
     """Corners of the board by view; none if no view shows a board.
 
     Raises CaptureError: no view shows a board, and there are several sets of views.
     """
-    found = session.each(_find_board, _tasks(session, wanted), pool, _says(report, "exposures and board"))
+    found = session.each(_find_board, _tasks(session, session_input), pool, _notify_of(notify, "exposures and board"))
     boards = {name: one for name, one in found.items() if isinstance(one, BoardCorners)}
     if found and not boards and len(session.sets) > 1:
         raise CaptureError(
@@ -299,8 +319,7 @@ def _find_boards(
             "`polcap board`, or fuse one set"
         )
     if boards or not found:
-        session.left_out |= {name: one for name, one in found.items() if isinstance(one, str)}
-        _enough(session)
+        session.leave_out({name: one for name, one in found.items() if isinstance(one, str)})
     return boards
 
 
@@ -314,15 +333,6 @@ def _find_board(task: ViewTask) -> BoardCorners | str:
         return _reason(task.name, error)
 
 
-def _place_by_features(session: Session, wanted: SessionInput, report: Report) -> None:
-    """Give a session without a board its poses, from features of the views' maps, and compare its masks."""
-    report("no board: poses from features of the object")
-    seen = {name: pipeline.reopen(out_of(wanted.folder, name), "infer")[0] for name in session.used}
-    session.board = False
-    session.place(feature_poses.solve(seen, session.captures[session.used[0]]))
-    _compare_masks(session, wanted, {name: np.asarray(seen[name].object_.mask) for name in session.used})
-
-
 def _mask_object(task: MaskTask) -> Bools:
     """Find the object's mask of a view on its picture without the board."""
     view = task.view
@@ -334,10 +344,12 @@ def _mask_object(task: MaskTask) -> Bools:
     ).mask
 
 
-def _compare_masks(session: Session, wanted: SessionInput, masks: Mapping[str, Bools]) -> None:
+def _compare_masks(
+    session: Session, session_input: SessionInput, masks: Mapping[str, Bools], solved: SessionPoses
+) -> None:
     """Remove from the masks what no other view confirms, and leave out views whose masks contradict the others."""
     for names in session.sets.values():
-        views = [_silhouette(name, masks[name], session, wanted) for name in names]
+        views = [_silhouette(name, masks[name], session_input, solved) for name in names]
         used, contradicting = mask_agreement.agreeing(views)
         session.left_out |= contradicting
         for view in used:
@@ -345,11 +357,15 @@ def _compare_masks(session: Session, wanted: SessionInput, masks: Mapping[str, B
             session.supplied[view.name] = replace(session.supplied[view.name], mask=largest)
 
 
-def _silhouette(name: str, found: Bools, session: Session, wanted: SessionInput) -> Silhouette:
+def _silhouette(name: str, found: Bools, session_input: SessionInput, solved: SessionPoses) -> Silhouette:
     """The mask of a view, which is on its merged picture, with the session's camera in merged px."""
-    assert session.camera is not None
-    scale = pipeline.reopen(out_of(wanted.folder, name), "align")[0].radiance.view.scale
-    return Silhouette(name, found, session.camera.reduced(scale), session.posed[name].pose)
+    scale = _reopen(name, session_input, "align").radiance.view.scale
+    return Silhouette(name, found, solved.camera.reduced(scale), solved.views[name].pose)
+
+
+def _reopen(name: str, session_input: SessionInput, until: str) -> Results:
+    """Results of a view up to a stage."""
+    return pipeline.reopen(out_of(session_input.folder, name), until)[0]
 
 
 def _make_maps(task: ViewTask) -> dict[str, Any]:
@@ -362,27 +378,9 @@ def _make_maps(task: ViewTask) -> dict[str, Any]:
     return about
 
 
-def _view(name: str, session: Session, wanted: SessionInput) -> FusionView:
-    results = pipeline.reopen(out_of(wanted.folder, name), "infer")[0]
-    assert session.camera is not None
-    undistorted = results.radiance.equipment.distortion is not None and wanted.config.stokes.undistort
-    found = view_maps.fusion_view(name, results, session.camera, session.posed[name].pose, undistorted)
-    return replace(found, metric=session.metric)
-
-
-def _joined(session: Session, wanted: SessionInput) -> tuple[FusionView, ...]:
-    """The maps of all used views, in the frame of the first set's board.
-
-    Raises CaptureError: a set does not show the object of the first one.
-    """
-    first, *others = ([_view(name, session, wanted) for name in names] for names in session.sets.values())
-    out = list(first)
-    for folder, views in zip(list(session.sets)[1:], others, strict=True):
-        joined, session.shared[folder] = joining.join(first, views)
-        if session.shared[folder] < LEAST_SHARED:
-            raise CaptureError(
-                f"{folder}: the first set confirms {session.shared[folder]:.0%} of this set's surface, "
-                f"{LEAST_SHARED:.0%} are needed; show the same object, with some sides in both sets"
-            )
-        out += joined
-    return tuple(out)
+def _view(name: str, session_input: SessionInput, solved: SessionPoses) -> FusionView:
+    """Maps of a view, with its pose."""
+    results = _reopen(name, session_input, "infer")
+    undistorted = results.radiance.equipment.distortion is not None and session_input.config.stokes.undistort
+    view = view_maps.fusion_view(name, results, solved.camera, solved.views[name].pose, undistorted)
+    return replace(view, metric=solved.metric)

@@ -1,4 +1,7 @@
-"""Views reduced to the resolution of the shape: silhouette distances and world normals, and their values at points."""
+"""Views reduced to the resolution of the shape: silhouette distances and world normals, and their values at points.
+
+`Silhouette` is another value: the whole mask before there are maps, with the lens's distortion.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

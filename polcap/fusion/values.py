@@ -45,6 +45,11 @@ class FusionView:
     white_distance: float | None = None  # where a white plane has S0 = 1, over the object's distance; None: unknown
     metric: bool = True  # the pose is in metres; else its unit is the distance of the lens
 
+    @property
+    def folder(self) -> str:
+        """Folder of the view's set, such as setA; empty for views without one."""
+        return self.name.rpartition("/")[0]
+
 
 @dataclass(frozen=True)
 class ClosedMesh:

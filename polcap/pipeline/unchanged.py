@@ -81,13 +81,13 @@ def _result(out: Path) -> dict[str, Stat]:
 
 
 def _stats(folder: Path, except_: str = "") -> dict[str, Stat]:
-    """Size and times of every file below a folder, except those in the folder `except_`; empty if it is missing.
+    """Size and times of every file below a folder, except in the folder `except_` and in our own; empty if missing.
 
     Raises OSError: a folder is a link, which is not followed.
     """
     found: dict[str, Stat] = {}
     for place, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if name not in ("__pycache__", own_folders.BATCH)]
+        folders[:] = [name for name in folders if name not in ("__pycache__", *own_folders.OURS)]
         folders[:] = [name for name in folders if os.path.realpath(os.path.join(place, name)) != except_]
         if any(os.path.islink(os.path.join(place, name)) for name in folders):
             raise OSError(f"{place}: a folder is a link")

@@ -65,7 +65,7 @@ def main(session: Path) -> None:
     for one in truth["views"]:
         name, turn, shift = one["name"], np.array(one["rotation"]), np.array(one["translation"])
         corners, view, result = seen[name], solved.views[name], results[name]
-        error = corners.seen - projection.project(camera, corners.world @ turn.T + shift)
+        error = corners.measured_px - projection.project(camera, corners.world @ turn.T + shift)
         true_px = projection.project(camera, _AROUND @ turn.T + shift)
         moved = solved.camera.project(view.pose, _AROUND) - true_px
         cosine = (np.trace(view.pose.rotation @ turn.T) - 1) / 2

@@ -24,7 +24,7 @@ from trimesh.sample import sample_surface
 
 import polcap
 from polcap import config
-from polcap.fusion import fused_maps, session
+from polcap.fusion import fused_maps, joining, session
 from polcap.fusion.fusion_path import FusionResults, FusionSettings, path
 from polcap.fusion.session import SessionInput
 from polcap.fusion.shape import ShapeSettings, fuse_shape
@@ -73,28 +73,29 @@ def errors(folder: Path) -> Errors:
 def joined(folder: Path) -> str:
     """Table row on the join of two sets."""
     network, mask_network = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
-    wanted = SessionInput(folder, config.load(None, []), network=network, mask_network=mask_network)
-    found = session.read(wanted)
-    views = session.process(found, wanted, lambda _: None)
+    session_input = SessionInput(folder, config.load(None, []), network=network, mask_network=mask_network)
+    views = session.process(session.read(session_input), session_input, lambda _: None).views
+    both = path(views, FusionSettings(), MemoryCache())
+    placed = joining.place(views, both.joined)
     truth, about = dict(np.load(folder / "truth.npz")), json.loads((folder / "truth.json").read_text())
     surface = Trimesh(truth["vertices"], truth["faces"], process=False)
     point, size = sample_surface(surface, 30_000, seed=0)[0], float(np.ptp(truth["vertices"], axis=0).max())
     laid = Pose(*(np.array(about["laid"][part]) for part in ("rotation", "translation")))
     boards = {one["name"]: Pose(np.array(one["rotation"]), np.array(one["translation"])) for one in about["views"]}
-    first, second = ([view for view in views if view.name.startswith(name)] for name in ("setA", "setB"))
+    first, second = ([view for view in placed if view.folder == name] for name in ("setA", "setB"))
     true = [after(laid, boards[view.name]) for view in second]
     pairs = [(view.pose, pose) for view, pose in zip(second, true)]
     turns = [Rotation.from_matrix(one.rotation @ other.rotation.T).magnitude() for one, other in pairs]
     middle = (point.min(axis=0) + point.max(axis=0)) / 2
     places = [np.linalg.norm(move(one, middle) - move(other, middle)) for one, other in pairs]
-    results = [path(tuple(some), FusionSettings(), MemoryCache()) for some in (first, views)]
+    results = [path(tuple(first), FusionSettings(), MemoryCache()), both]
     seen = [one.maps.seen[one.atlas.covered].mean() for one in results]
     right = first + [replace(view, pose=pose) for view, pose in zip(second, true)]
     meshes = [*(one.mesh for one in results), fuse_shape(right, ShapeSettings())]
     away = [100 * mean_distance(mesh, point) / size for mesh in meshes]
     return (
         f"| {folder.name} | {np.degrees(np.mean(turns)):.2f} | {100 * np.mean(places) / size:.2f} | "
-        f"{found.shared['setB']:.2f} | {seen[0]:.2f} → {seen[1]:.2f} | {away[0]:.2f} → {away[1]:.2f} | {away[2]:.2f} |"
+        f"{both.joined[0].shared:.2f} | {seen[0]:.2f} → {seen[1]:.2f} | {away[0]:.2f} → {away[1]:.2f} | {away[2]:.2f} |"
     )
 
 

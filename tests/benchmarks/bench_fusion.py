@@ -75,7 +75,7 @@ def row(name: str, count: int, pictures: Path | None) -> str:
     start = time.process_time()
     fused = fuse_shape(views, ShapeSettings())
     seconds = time.process_time() - start
-    hull = iso_surface(visual_hull(reduce_views(views)))
+    hull = iso_surface(visual_hull(reduce_views(views), ShapeSettings().grid))
     percent = [100 * mean_distance(mesh, point) / body.size for mesh in (hull, fused)]
     closed = "yes" if is_closed(fused) and solid(fused).volume > 0 else "no"
     if pictures:

@@ -63,7 +63,7 @@ def row(name: str, count: int, scenes: Path, network: Network) -> str:
     views = tuple(view for view, _ in pairs)
     results = path(views, FusionSettings(), MemoryCache())
     point = seen_points(body, [capture(body, pose) for pose in poses])
-    hull = iso_surface(visual_hull(reduce_views(list(views))))
+    hull = iso_surface(visual_hull(reduce_views(list(views)), FusionSettings().shape.grid))
     percent = [100 * mean_distance(mesh, point) / body.size for mesh in (hull, results.mesh)]
     cells = [f"{one:.3g} → {both:.3g}" for one, both in zip(single, fused_errors(results, body, files[0]))]
     return (

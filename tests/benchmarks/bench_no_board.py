@@ -11,6 +11,7 @@ closest points.
 import json
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,8 @@ from trimesh.sample import sample_surface
 from polcap import config
 from polcap.fusion import session
 from polcap.fusion.fusion_path import FusionResults, FusionSettings, path
-from polcap.fusion.session import Session, SessionInput
-from polcap.fusion.values import Pose
+from polcap.fusion.session import SessionInput
+from polcap.fusion.values import FusionView, Pose
 from polcap.images import Floats
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
@@ -44,14 +45,15 @@ def main(out: Path, mesh: str, views: int, step: int) -> None:
         if not folder.exists():
             render(folder, mesh, board, views)
         networks = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
-        wanted = SessionInput(folder, config.load(None, []), network=networks[0], mask_network=networks[1])
-        found = session.read(wanted)
+        session_input = SessionInput(folder, config.load(None, []), network=networks[0], mask_network=networks[1])
+        found = session.read(session_input)
         found.captures = dict(list(found.captures.items())[::step])
-        results = path(session.process(found, wanted, print), FusionSettings(), MemoryCache())
-        pairs = true_poses(folder, found)
+        processed = session.process(found, session_input, print)
+        results = path(processed.views, FusionSettings(), MemoryCache())
+        pairs = true_poses(folder, processed.views)
         turns = rotation_errors(pairs)
-        residual = np.mean([one.residual_px for one in found.posed.values()])
-        away = 100 * distance(folder, results, found.metric, pairs)
+        residual = np.mean([one.residual_px for one in processed.poses.views.values()])
+        away = 100 * distance(folder, results, processed.poses.metric, pairs)
         print(
             f"| {mesh}, {len(turns)} of {len(found.captures)} views | {'board' if board != 'none' else 'features'} | "
             f"{turns.mean():.2f}, {turns.max():.2f} | {residual:.2f} | {away:.2f} |"
@@ -68,11 +70,11 @@ def render(folder: Path, mesh: str, board: Any, views: int) -> None:
     all_around.write(folder, replace(scene, coat=replace(scene.coat, materials=materials)), shoot, views)
 
 
-def true_poses(folder: Path, found: Session) -> list[tuple[Pose, Pose]]:
+def true_poses(folder: Path, views: Sequence[FusionView]) -> list[tuple[Pose, Pose]]:
     """Found and true pose of each used view."""
-    views = json.loads((folder / "truth.json").read_text())["views"]
-    true = {one["name"]: Pose(np.array(one["rotation"]), np.array(one["translation"])) for one in views}
-    return [(found.posed[name].pose, true[name]) for name in found.used]
+    stated = json.loads((folder / "truth.json").read_text())["views"]
+    true = {one["name"]: Pose(np.array(one["rotation"]), np.array(one["translation"])) for one in stated}
+    return [(view.pose, true[view.name]) for view in views]
 
 
 def world(pairs: list[tuple[Pose, Pose]]) -> Floats:

@@ -62,17 +62,17 @@ def test_a_part_behind_another_takes_nothing_from_the_view() -> None:
     )
     atlas = atlases.charted(both, 256, 6)
     (view,) = ellipsoid.views(1, elevation_deg=0)
-    (sight,) = baking.sights([view], atlas)
-    assert len(sight.texel) > 1000
-    assert (atlas.position[sight.texel, 2] > -0.06).all()
+    (visible,) = baking.visible_texels([view], atlas)
+    assert len(visible.texel) > 1000
+    assert (atlas.position[visible.texel, 2] > -0.06).all()
 
 
 def test_a_views_weight_fades_out_at_its_outline(atlas: Atlas) -> None:
-    (sight,) = baking.sights(RING[:1], atlas)
+    (visible,) = baking.visible_texels(RING[:1], atlas)
     middle = (np.array([ellipsoid.PIXELS] * 2) - 1) / 2
-    away = np.linalg.norm(sight.pixel - middle, axis=-1)
-    assert sight.weight[away > away.max() - 2].max() < 0.05
-    assert sight.weight[away < 10].min() > 0.8
+    away = np.linalg.norm(visible.pixel - middle, axis=-1)
+    assert visible.weight[away > away.max() - 2].max() < 0.05
+    assert visible.weight[away < 10].min() > 0.8
 
 
 def test_the_asset_stage_turns_the_atlas_into_tangent_space(atlas: Atlas) -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from polcap.errors import CaptureError
 from polcap.fusion import joining
-from polcap.fusion.session import LEAST_SHARED
 from polcap.fusion.values import FusionView
 from polcap.optics.mesh_tracer import Tracer, smooth
 from tests.fusion.traced_views import Body, capture, ring, solid_texture, stand, with_errors
@@ -47,14 +47,22 @@ def views(body: Body, shift: np.ndarray | None, rng: np.random.Generator) -> lis
     return out
 
 
+def named(some: list[FusionView], folder: str) -> tuple[FusionView, ...]:
+    """The views with names in the folder of a set."""
+    return tuple(replace(view, name=f"{folder}/view{k:02d}".lstrip("/")) for k, view in enumerate(some, 1))
+
+
 def test_a_laid_object_is_turned_back(rng: np.random.Generator) -> None:
     body = pear()
     other, shift = laid(body)
     first, second = views(body, None, rng), views(other, shift, rng)
-    joined, shared = joining.join(first, second)
-    assert shared > 0.85
+    views_ = named(first, "setA") + named(second, "setB")
+    (joined,) = joining.join(views_)
+    assert joined.folder == "setB" and joined.shared > 0.85
+    placed = joining.place(views_, (joined,))
+    assert placed[: len(first)] == views_[: len(first)]
     true = [joining.Motion(TIP.inv().as_matrix(), -TIP.inv().apply(shift)).pose(view.pose) for view in second]
-    for view, pose in zip(joined, true, strict=True):
+    for view, pose in zip(placed[len(first) :], true, strict=True):
         turn = Rotation.from_matrix(view.pose.rotation @ pose.rotation.T).magnitude()
         assert np.degrees(turn) < 1.0  # a pixel of these views at the object's rim
         away = (view.pose.rotation - pose.rotation) @ body.middle + view.pose.translation - pose.translation
@@ -64,5 +72,10 @@ def test_a_laid_object_is_turned_back(rng: np.random.Generator) -> None:
 def test_another_object_is_recognized(rng: np.random.Generator) -> None:
     torus = trimesh.creation.torus(1.0, 0.35, 48, 24)
     other = stand(torus.vertices, torus.faces)
-    _, shared = joining.join(views(pear(), None, rng), views(other, None, rng))
-    assert shared < LEAST_SHARED
+    with pytest.raises(CaptureError, match=r"setB: the first set confirms .* of this set's surface, 70% are needed"):
+        joining.join(named(views(pear(), None, rng), "setA") + named(views(other, None, rng), "setB"))
+
+
+def test_a_single_set_needs_no_joining(rng: np.random.Generator) -> None:
+    alone = named(views(pear(), None, rng), "")
+    assert joining.join(alone) == () and joining.place(alone, ()) == alone

@@ -105,7 +105,7 @@ def test_two_boards_in_view_are_named(pictures: dict[str, np.ndarray]) -> None:
 
 def test_a_bent_board_is_left_out(corners: dict[str, BoardCorners]) -> None:
     other = corners["view04"]
-    bent = replace(other, seen=other.seen + np.array([0.0, 6.0]) * np.abs(other.world[:, :1]) / 0.072)
+    bent = replace(other, measured_px=other.measured_px + np.array([0.0, 6.0]) * np.abs(other.world[:, :1]) / 0.072)
     found = poses.solve({**corners, "view04": bent}, board_views.capture())
     assert list(found.left_out) == ["view04"]
     assert "view04: its corners are" in found.left_out["view04"]

@@ -22,7 +22,7 @@ from tests.fusion import board_views
 SWAPPED = {"name": "order", "state": "fail", "says": "90°, 45°, 0° fit better", "remedy": "rename the folders"}
 
 
-def wanted(folder: Path, *names: str) -> SessionInput:
+def session_of(folder: Path, *names: str) -> SessionInput:
     for name in names:
         (folder / name).mkdir()
     return SessionInput(folder, Config())
@@ -35,7 +35,7 @@ def test_a_view_that_lacks_a_shot_is_left_out_with_the_reason(tmp_path: Path, mo
         return board_views.capture()
 
     monkeypatch.setattr(reader, "read", read)
-    found = sessions.read(wanted(tmp_path, "view01", "view02", "view03", "view05"))  # view04 was never shot
+    found = sessions.read(session_of(tmp_path, "view01", "view02", "view03", "view05"))  # view04 was never shot
     assert found.used == ["view01", "view02", "view05"]
     assert found.left_out == {"view03": "2 different polarizer angles where 3 are needed; add the missing shot"}
 
@@ -43,13 +43,13 @@ def test_a_view_that_lacks_a_shot_is_left_out_with_the_reason(tmp_path: Path, mo
 def test_three_views_are_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reader, "read", lambda *_: board_views.capture())
     with pytest.raises(CaptureError, match="2 views can be used, 3 are needed"):
-        sessions.read(wanted(tmp_path, "view01", "view02"))
+        sessions.read(session_of(tmp_path, "view01", "view02"))
 
 
 def test_a_folder_without_views_stays_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "pol000").mkdir()
     with pytest.raises(CaptureError, match="holds no views"):
-        fuse_run.fuse(wanted(tmp_path), FusionSettings(), tmp_path / "fused", lambda _: None, silent)
+        fuse_run.fuse(session_of(tmp_path), FusionSettings(), tmp_path / "fused", lambda _: None, silent)
     assert [path.name for path in tmp_path.iterdir()] == ["pol000"]
 
 
@@ -63,7 +63,7 @@ def test_a_view_with_swapped_angles_is_left_out_with_the_remedy(
         return {"gates": [SWAPPED] if out.parent.name == "view02" else []}
 
     monkeypatch.setattr(pipeline, "process", process)
-    made = found.each(sessions._make_maps, sessions._tasks(found, wanted(tmp_path)), None, lambda _: None)
+    made = found.each(sessions._make_maps, sessions._tasks(found, session_of(tmp_path)), None, lambda _: None)
     assert found.left_out == {"view02": "90°, 45°, 0° fit better. rename the folders"}
     assert list(made) == found.used == ["view01", "view03", "view04"]
 
@@ -73,7 +73,7 @@ def test_several_sets_need_the_board(tmp_path: Path, monkeypatch: pytest.MonkeyP
     found = Session({name: board_views.capture() for name in names}, supplied={name: UserInput() for name in names})
     monkeypatch.setattr(sessions, "_find_board", lambda task: "no board is visible")
     with pytest.raises(CaptureError, match="several sets of views need"):
-        sessions._find_boards(found, wanted(tmp_path), None, lambda _: None)
+        sessions._find_boards(found, session_of(tmp_path), None, lambda _: None)
 
 
 def test_a_view_without_the_board_that_others_show_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,6 +83,6 @@ def test_a_view_without_the_board_that_others_show_is_left_out(tmp_path: Path, m
     monkeypatch.setattr(
         sessions, "_find_board", lambda task: "no board is visible" if task.name == "view03" else corners
     )
-    boards = sessions._find_boards(found, wanted(tmp_path), None, lambda _: None)
+    boards = sessions._find_boards(found, session_of(tmp_path), None, lambda _: None)
     assert list(boards) == found.used == ["view01", "view02", "view04"]
     assert found.left_out == {"view03": "no board is visible"}

@@ -87,6 +87,8 @@ def test_a_fusion_that_was_killed_twice_ends_as_one_that_was_not(tmp_path: Path)
     done = shell("fuse", folder, *coarse)
     assert done.returncode == 0, done.stderr
     assert finished(folder).items() >= before.items()
+    same = shell("fuse", folder, *coarse)
+    assert "Nothing has changed" in same.stderr and same.stdout == done.stdout
     assert written(folder, "**/*").keys() == written(whole, "**/*").keys()  # nothing partial is left
     assert written(folder, "view*/polcap/maps/*") == written(whole, "view*/polcap/maps/*")
     again, once = (fused_maps.read(one / "fused/maps") for one in (folder, whole))
