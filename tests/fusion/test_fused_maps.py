@@ -43,11 +43,13 @@ def test_coarser_levels_have_the_unit_and_the_margin_of_the_full_mesh(source: Fu
     assert not level.metric and np.array_equal(level.uv, again.mesh.uv)
 
 
-def test_occlusion_is_of_the_mesh_in_all_levels(source: FusedSource, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_extra_textures_are_of_the_mesh(source: FusedSource, monkeypatch: pytest.MonkeyPatch) -> None:
     half = np.tile(np.linspace(0, 1, 256), (256, 1))
     monkeypatch.setattr(fused_maps, "ambient_occlusion", lambda atlas: half)
     for level in asset_export.levels(source, ExportRequest(extras=("occlusion",), lod=1)):
         assert texture_set.occlusion(level.asset).pixels == pytest.approx(255 * half, abs=0.5)
+    (turned,) = asset_export.levels(source, ExportRequest(extras=("object-normal",)))
+    assert "camera" not in texture_set.object_normal(turned.asset).meaning  # the object has no side of its own
     plain = asset_export.levels(source, ExportRequest(lod=1))
     assert all((texture_set.occlusion(level.asset).pixels == 255).all() for level in plain)
 

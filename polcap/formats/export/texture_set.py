@@ -62,9 +62,10 @@ def occlusion(asset: Asset) -> Texture:
 
 
 def object_normal(asset: Asset) -> Texture:
-    """Normals in the frame of the object, which is that of the camera."""
+    """Normals in the frame of the mesh: that of the camera, or of a fused object."""
     assert asset.object_normal is not None
-    return Texture(asset.object_normal, False, "object-space normal n * 0.5 + 0.5: R right, G up, B toward the camera")
+    axes = "R right, G up, B toward the camera" if asset.mesh.frame == "camera" else "R x, G y (up), B z of the mesh"
+    return Texture(asset.object_normal, False, f"object-space normal n * 0.5 + 0.5: {axes}")
 
 
 def occlusion_roughness_metallic(asset: Asset) -> Texture:
