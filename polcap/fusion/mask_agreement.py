@@ -53,8 +53,8 @@ def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, s
         inside = np.delete(inside, worst, axis=0)
         left_out[view.name] = (
             f"its mask and those of the other views differ by {100 * share:.0f} % of their area, the limit is "
-            f"{100 * _MOST_UNCOVERED:g} %: the mask is wrong, or the object moved on the board; look at its mask.png, "
-            "and shoot the view again"
+            f"{100 * _MOST_UNCOVERED:g} %: the mask is wrong, or the object moved on the board; look at its "
+            "polcap/mask.png, and shoot the view again"
         )
         if len(left_out) > _MOST_LEFT_OUT * len(views) or len(used) < LEAST_VIEWS:
             raise _contradiction(list(left_out), len(views))
@@ -82,8 +82,8 @@ def _without_slits(views: Sequence[Silhouette], points: Floats, step: float) -> 
 def _contradiction(names: Sequence[str], count: int) -> CaptureError:
     return CaptureError(
         f"the masks of {len(names)} of {count} views contradict the others ({', '.join(names)}): the object moved on "
-        "the board between the views, or masks are wrong; look at each mask.png, fix the object to the board, and "
-        "shoot again"
+        "the board between the views, or masks are wrong; look at polcap/mask.png of each, "
+        "fix the object to the board, and shoot again"
     )
 
 

@@ -205,7 +205,9 @@ def _displacements(
     a_i, a_j = dot(t, outward[i]), dot(t, outward[j])
     b = -dot(t, vertices[j] - vertices[i])
     diagonal = np.full(count, _DAMPING**2)
-    diagonal += np.bincount(i, w2 * a_i**2 + _SMOOTHNESS**2, count) + np.bincount(j, w2 * a_j**2 + _SMOOTHNESS**2, count)
+    diagonal += np.bincount(i, w2 * a_i**2 + _SMOOTHNESS**2, count) + np.bincount(
+        j, w2 * a_j**2 + _SMOOTHNESS**2, count
+    )
     right = np.bincount(j, w2 * a_j * b, count) - np.bincount(i, w2 * a_i * b, count)
     for held in anchors:
         diagonal += np.bincount(held.vertex, held.weight**2 * held.slope**2, count)

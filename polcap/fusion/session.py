@@ -29,7 +29,8 @@ from polcap.errors import (
 )
 from polcap.formats import onnx, own_folders
 from polcap.formats.capture import folder_names, reader
-from polcap.fusion import board_corners, feature_poses, mask_agreement, poses, view_maps
+from polcap.formats.maps import png
+from polcap.fusion import board_corners, feature_poses, mask_agreement, mask_border, poses, view_maps
 from polcap.fusion.board_corners import BoardCorners, NoBoardError
 from polcap.fusion.board_eraser import erase
 from polcap.fusion.poses import LEAST_VIEWS, SessionCamera, SessionPoses
@@ -339,9 +340,8 @@ def _mask_object(task: MaskTask) -> Bools:
     results = pipeline.reopen(view.out, "align")[0]
     erased = erase(results.radiance, results.alignment, results.color, task.board, (task.camera, task.pose))
     settings = msgspec.structs.replace(view.config.mask, part=0)  # remains of the board are found in the next step
-    return mask.segment(
-        erased, results.alignment, results.color, None, view.supplied.mask_network, onnx.run, settings
-    ).mask
+    found = mask.segment(erased, results.alignment, results.color, None, view.supplied.mask_network, onnx.run, settings)
+    return mask_border.refine(mask.mean_picture(erased, results.alignment, results.color), found.mask)
 
 
 def _compare_masks(
@@ -350,6 +350,10 @@ def _compare_masks(
     """Remove from the masks what no other view confirms, and leave out views whose masks contradict the others."""
     for names in session.sets.values():
         views = [_silhouette(name, masks[name], session_input, solved) for name in names]
+        for view in views:  # for the user, where it contradicts the others
+            png.write(
+                out_of(session_input.folder, view.name) / "mask.png", np.where(view.mask, 255, 0).astype(np.uint8)
+            )
         used, contradicting = mask_agreement.agreeing(views)
         session.left_out |= contradicting
         for view in used:

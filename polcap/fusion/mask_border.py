@@ -1,0 +1,50 @@
+"""Pixels on the outline of a mask: each belongs to the object if the object covers enough of it.
+
+Silhouettes need it. The maps of a single capture do not: their roughness is better without mixed pixels.
+"""
+
+import cv2
+import numpy as np
+
+from polcap.images import Bits, Bools, Floats
+from polcap.stages.mask.regions import box_around
+
+_REACH = 3  # px from the outline: object and backdrop that mix in its pixels
+_WINDOW = 7  # px over which object and backdrop are averaged
+# least share of the object in a pixel's brightness; below .5, because objects darken towards the outline, where they
+# turn away from the flash; docs/benchmarks/fusion.md
+_COVERED = 0.25
+_CONTRAST = 0.25  # least difference of object and backdrop, of their sum; pixels with less stay as they are
+
+
+def refine(picture: Floats, mask: Bools) -> Bools:
+    """Decide on the two rows of pixels along the outline of a mask (H, W), by the linear picture (H, W, 3)."""
+    refined = mask.copy()
+    box = box_around(mask, 0.0, least=_REACH + _WINDOW)
+    if box is not None:
+        part = np.s_[box[1] : box[3], box[0] : box[2]]
+        refined[part] = _covered(picture[part], mask[part])
+    return refined
+
+
+def _covered(picture: Floats, mask: Bools) -> Bools:
+    display = np.sqrt(np.maximum(picture, 0, dtype=np.float32))
+    inside = mask.astype(np.uint8)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    border = cv2.morphologyEx(inside, cv2.MORPH_GRADIENT, cross) > 0
+    object_, object_there = _mean_near_outline(display, inside)
+    backdrop, backdrop_there = _mean_near_outline(display, 1 - inside)
+    step = object_ - backdrop
+    squared = np.sum(step**2, axis=-1)
+    share = np.sum(step * (display - backdrop), axis=-1) / np.maximum(squared, 1e-12)
+    clear = squared > _CONTRAST**2 * np.sum((object_ + backdrop) ** 2, axis=-1)
+    return np.where(border & object_there & backdrop_there & clear, share > _COVERED, mask)
+
+
+def _mean_near_outline(display: Floats, side: Bits) -> tuple[Floats, Bools]:
+    """Mean (H, W, 3) of pixels near the outline on one side (H, W), without those on it; and where there are any."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _REACH + 1,) * 2)
+    near = (cv2.erode(side, np.ones((3, 3), np.uint8)) - cv2.erode(side, disc)).astype(np.float32)
+    weight = cv2.blur(near, (_WINDOW, _WINDOW))
+    mean = cv2.blur(display * near[..., None], (_WINDOW, _WINDOW)) / np.maximum(weight, 1e-6)[..., None]
+    return np.asarray(mean), np.asarray(weight > 0)
