@@ -43,7 +43,7 @@ class AlignSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 4.0
 
 
-@stage(version=9)
+@stage(version=10)
 def register(radiance: AngleStack, color: ColorCalibration, settings: AlignSettings) -> Alignment:
     """Register every shot with the reference shot: transforms (K, 3, 3) from its merged px to those of each shot.
 

@@ -11,6 +11,8 @@ from polcap.optics.resize import block_means
 
 _BLUR_PX = 0.7  # both shots need one resolution; interpolation changes it
 _FLOOR = 0.01  # of the 99th percentile: keeps the logarithm of a dark background from amplifying its noise
+_HOT = 1.2  # times the brightest of its eight neighbors: a brighter pixel is hot, and moves with the sensor
+_NEIGHBORS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 _TYPICAL_DETAIL = 0.02  # relative; where noise exceeds it, detail is weighted down
 _LEAST_PIXELS = 30
 
@@ -26,7 +28,8 @@ def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
     The shot is first averaged over `step` × `step` px; `detail_px` counts these averaged pixels. A Wiener filter
     multiplies the detail by d² / (d² + σ²), d the typical detail and σ the relative noise.
     """
-    total = block_means(frames.total(shot.value), step)
+    total = frames.total(shot.value)
+    total = block_means(np.minimum(total, np.float32(_HOT) * cv2.dilate(total, _NEIGHBORS)), step)
     height, width = total.shape
     variance = frames.total(shot.variance[: height * step : step, : width * step : step])  # it changes slowly
     sigma = np.sqrt(variance) / np.float32(step)

@@ -41,6 +41,16 @@ def test_polarized_textured_shots_are_registered_to_a_twentieth_of_a_pixel(seed)
     assert error.max() < 0.15
 
 
+def test_hot_pixels_do_not_hold_the_shots_in_place():
+    """Two thousandths of the pixels are bright at the same places of every shot."""
+    true, rng = [np.eye(3), pose(5, 0, 0), pose(0, -5, 0)], np.random.default_rng(0)
+    radiance = scenes.stack(true, noise=0.004)
+    hot = np.where(rng.random((240, 320, 1)) < 0.002, rng.uniform(0.1, 1, (240, 320, 1)), 0).astype(np.float32)
+    radiance = dataclasses.replace(radiance, value=radiance.value + hot)
+    found = align.register(radiance, scenes.no_color(), align.AlignSettings())
+    assert max(errors_px(found.transform[k], true[k]).max() for k in (1, 2)) < 0.1
+
+
 def test_a_shift_of_a_quarter_pixel_is_not_pulled_to_a_whole_one():
     true = [np.eye(3), pose(0.25, -0.25, 0), pose(-0.25, 0.25, 0)]
     found = align.register(scenes.stack(true, noise=0.002), scenes.no_color(), align.AlignSettings())
