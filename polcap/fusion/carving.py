@@ -43,10 +43,10 @@ _WINDOW = 5  # px of the sweep over which scores are averaged
 _LEAST_SCORE = 0.45
 _SUPPORT = 3.0  # steps within which another view confirms a depth
 _TRUNCATION = 2.5  # steps
-_SOLID = 0.1  # votes for solid at every point
+_SOLID = 0.1  # weight of a vote for solid at every point, so that points without depths stay
 _SMOOTHING = 1.0  # steps, 1σ
-_WALL = 1.5  # steps behind surface through which no view looks that are never carved
-_OPEN = 0.2  # share of open vertices around a vertex, from which on it is no wall
+_WALL = 1.5  # steps; thickness that stays behind a wall, which is surface through which no view looks
+_OPEN = 0.2  # a vertex with a larger share of vertices around it through which views look is no wall
 
 
 @dataclass(frozen=True)

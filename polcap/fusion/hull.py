@@ -122,7 +122,8 @@ def plain_body(distance: Floats, step: float) -> Floats:
     body = ndimage.binary_fill_holes(_largest_part(body))
     near = 0.05 * step  # where the body was changed, its surface lies beside the changed points
     changed = np.where(body, np.minimum(distance, -near), np.maximum(distance, near))
-    changed[_touches_by_an_edge(body)] = -_LOOSE * step  # so that marching cubes does not join them; nor does `_euler`
+    # marching cubes would join two cubes that share an edge alone, which `_euler` counts as separate
+    changed[_touches_by_an_edge(body)] = -_LOOSE * step
     return changed.astype(np.float32)
 
 

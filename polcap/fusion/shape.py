@@ -14,8 +14,8 @@ from polcap.fusion.small_views import reduce_views
 from polcap.fusion.values import ClosedMesh, FusionView
 from polcap.stages import stage
 
-_ROUNDS = 12  # of the surface's fit; docs/benchmarks/fusion.md
-_FIRST_ROUNDS = 1  # before hollows are searched: a surface that sinks into a hollow hides that views disagree
+_ROUNDS = 20  # of the surface's fit; docs/benchmarks/fusion.md
+_FIRST_ROUNDS = 6  # before hollows are searched: on the bare hull views disagree at flat hollows, too
 
 
 class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -24,7 +24,7 @@ class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     grid: Annotated[int, Meta(ge=40, le=300, description="steps along the object's longest side")] = 140
 
 
-@stage(version=8)
+@stage(version=9)
 def fuse_shape(views: Sequence[FusionView], settings: ShapeSettings) -> ClosedMesh:
     """Join views of one object into a closed, manifold, outward mesh in the world frame.
 

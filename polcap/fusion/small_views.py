@@ -18,7 +18,7 @@ from polcap.optics.frames import dot, unit
 from polcap.optics.projection import project
 from polcap.optics.resize import area_mean, weighted_area_mean
 
-SIDE = 420  # px of the object's box in a small view, at most; three to a grid step
+SIDE = 420  # px of the object's box in a small view, at most: three to a step of the default grid
 _MARGIN = 3  # px around the box
 _LEAST_SIGMA = 1.0  # deg
 _ROW = 1024  # points that cv2.remap takes in a row
