@@ -135,7 +135,7 @@ def _limits(meta: Meta) -> str:
 def _by_key(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Keys such as hdr.clip and values of nested tables."""
     for name, value in table.items():
-        if isinstance(value, dict):
+        if isinstance(value, dict) and value:
             yield from _by_key(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value
@@ -160,9 +160,9 @@ def _check_finite(stated: dict[str, Any]) -> None:
 
 
 def _check_known(key: str, value: Any, known: dict[str, Setting]) -> None:
-    if key in known:
+    if key in known or (value == {} and any(name.startswith(f"{key}.") for name in known)):
         return
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
     sections = dict.fromkeys(name.partition(".")[0] for name in known)
-    hint = f"; did you mean {near[0]}?" if near else f"; there are {', '.join(sections)}"
+    hint = f"; did you mean {near[0]}?" if near else f"; the sections are {', '.join(sections)}"
     raise SettingError(f"{key} = {value!r}: there is no such setting{hint}")

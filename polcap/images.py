@@ -639,7 +639,7 @@ class Asset(ArrayValue):
 
     @property
     def has_occlusion(self) -> bool:
-        """Whether ambient occlusion was computed; else its channel is 1."""
+        """Whether ambient occlusion darkens any texel; else its channel is 1."""
         return bool(np.ptp(self.occlusion_roughness_metallic[..., 0]))
 
 

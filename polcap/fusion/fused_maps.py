@@ -115,7 +115,11 @@ def read(folder: Path) -> FusedSource:
         about: Mapping[str, Any] = text_file.read_json(folder / "maps.json")
         with np.load(folder / "mesh.npz") as stored:
             arrays = {name: stored[name] for name in _ARRAYS}
-        side, margin, percent = int(about["size"][0]), int(about["margin"]), about["albedo"]["uncertainty_percent"]
+        side, margin, percent = (
+            int(about["size"][0]),
+            int(about.get("margin", atlases.AtlasSettings().margin)),
+            about["albedo"]["uncertainty_percent"],
+        )
         metric = about["unit"] == "m"
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DecodeError(f"{folder} holds no fused maps of this polcap ({error}); run `polcap fuse` again") from error

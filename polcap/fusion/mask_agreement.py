@@ -54,7 +54,7 @@ def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, s
         left_out[view.name] = (
             f"its mask and those of the other views differ by {100 * share:.0f} % of their area, the limit is "
             f"{100 * _MOST_UNCOVERED:g} %: the mask is wrong, or the object moved on the board; look at its "
-            "polcap/mask.png, and shoot the view again"
+            "polcap/work/compared_mask.png, and shoot the view again"
         )
         if len(left_out) > _MOST_LEFT_OUT * len(views) or len(used) < LEAST_VIEWS:
             raise _contradiction(list(left_out), len(views))
@@ -82,7 +82,8 @@ def _without_slits(views: Sequence[Silhouette], points: Floats, step: float) -> 
 def _contradiction(names: Sequence[str], count: int) -> CaptureError:
     return CaptureError(
         f"the masks of {len(names)} of {count} views contradict the others ({', '.join(names)}): the object moved on "
-        "the board between the views, or masks are wrong; look at polcap/mask.png of each, "
+        "the board between the views, or masks are wrong; look at "
+        "polcap/work/compared_mask.png of each, "
         "fix the object to the board, and shoot again"
     )
 
@@ -105,8 +106,9 @@ def _contradicting(
         for k in range(len(views)):
             others = [j for j in range(len(views)) if j != k]
             rest = _uncovered([views[j] for j in others], points[inside[others].all(axis=0)], step)
-            newly_covered = np.sort(shares[others] - rest)[:-1]  # without the greatest
-            missing_share = newly_covered[-1]  # the second: a piece of the board in one other mask gives the greatest
+            # without the largest, which a piece of the board in one other mask would cause
+            newly_covered = np.sort(shares[others] - rest)[:-1]
+            missing_share = newly_covered[-1]
             slide_share = shares[k] if newly_covered.sum() > _SLIDE else 0.0
             contradiction[k] = max(missing_share, slide_share)
             if contradiction[k] > _MOST_UNCOVERED:

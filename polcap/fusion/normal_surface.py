@@ -235,8 +235,8 @@ def _smoothed(
     """
     for _ in range(_PASSES):
         outward = vertex_normals(vertices, faces)
-        right = np.maximum(dot(outward, target.normal), 0) ** _FACET_POWER * target.agreement * (target.weight > 0)
+        measured = np.maximum(dot(outward, target.normal), 0) ** _FACET_POWER * target.agreement * (target.weight > 0)
         way = neighbors @ vertices - vertices
         along = way - outward * dot(way, outward)[:, None]
-        vertices = vertices + (1 - right)[:, None] * way + _RELAXATION * right[:, None] * along
+        vertices = vertices + (1 - measured)[:, None] * way + _RELAXATION * measured[:, None] * along
     return np.asarray(vertices)

@@ -221,15 +221,20 @@ def process(session: Session, session_input: SessionInput, notify: Notify) -> Pr
             session.each(_make_maps, _tasks(session, session_input), pool, _notify_of(notify, "first maps"))
             session.require_views()
             notify("no board: poses from features of the object")
-            results = {name: _reopen(name, session_input, "infer") for name in session.used}
-            solved = feature_poses.solve(results, session.captures[session.used[0]])
+            solved, masks = _solve_by_features(session, session_input)
             session.leave_out(solved.left_out)
-            masks = {name: np.asarray(results[name].object_.mask) for name in session.used}
         _compare_masks(session, session_input, masks, solved)
         reports = session.each(_make_maps, _tasks(session, session_input), pool, _notify_of(notify, "maps"))
     session.require_views()
     views = tuple(_view(name, session_input, solved) for name in session.used)
     return ProcessedSession(views, solved, reports, session.left_out)
+
+
+def _solve_by_features(session: Session, session_input: SessionInput) -> tuple[SessionPoses, dict[str, Bools]]:
+    """Poses from features of the views' first maps, and copies of the masks of these maps."""
+    results = {name: _reopen(name, session_input, "infer") for name in session.used}
+    solved = feature_poses.solve(results, session.captures[session.used[0]])
+    return solved, {name: np.array(found.object_.mask) for name, found in results.items()}
 
 
 def _notify_of(notify: Notify, step: str) -> Notify:
@@ -351,9 +356,8 @@ def _compare_masks(
     for names in session.sets.values():
         views = [_silhouette(name, masks[name], session_input, solved) for name in names]
         for view in views:  # for the user, where it contradicts the others
-            png.write(
-                out_of(session_input.folder, view.name) / "mask.png", np.where(view.mask, 255, 0).astype(np.uint8)
-            )
+            file = out_of(session_input.folder, view.name) / "work" / "compared_mask.png"
+            png.write(file, np.where(view.mask, 255, 0).astype(np.uint8))
         used, contradicting = mask_agreement.agreeing(views)
         session.left_out |= contradicting
         for view in used:

@@ -91,7 +91,7 @@ class Tracer:
     """A mesh prepared for ray tracing by Embree."""
 
     def __init__(self, mesh: Triangles) -> None:
-        with package_for("tracing of meshes", "embreex", "train"):
+        with package_for("tracing of meshes", "embreex", "fusion"):
             from embreex.mesh_construction import TriangleMesh
             from embreex.rtcore_scene import EmbreeScene
         self.mesh = mesh

@@ -37,7 +37,7 @@ def request(options: Mapping[str, Any], capture: Path, out: Path, files: Iterabl
     `options` is plain data. The user's calibrations count as input files. None if these do not determine the result.
     """
     try:
-        photographs = _stats(capture, except_=os.path.realpath(out))
+        photographs = _stats(capture, os.path.realpath(out), own_folders.OURS)
         others = {os.path.abspath(file): _stat(file) for file in (*files, *own_folders.calibration_files())}
     except OSError:
         return None
@@ -80,14 +80,14 @@ def _result(out: Path) -> dict[str, Stat]:
     return {name: stat for name, stat in _stats(out).items() if name not in _OF_A_RUN}
 
 
-def _stats(folder: Path, except_: str = "") -> dict[str, Stat]:
-    """Size and times of every file below a folder, except in the folder `except_` and in our own; empty if missing.
+def _stats(folder: Path, except_: str = "", ignored: tuple[str, ...] = (own_folders.BATCH,)) -> dict[str, Stat]:
+    """Size and times of every file below a folder, except in the folder `except_` and in those of a name in `ignored`.
 
     Raises OSError: a folder is a link, which is not followed.
     """
     found: dict[str, Stat] = {}
     for place, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if name not in ("__pycache__", *own_folders.OURS)]
+        folders[:] = [name for name in folders if name not in ("__pycache__", *ignored)]
         folders[:] = [name for name in folders if os.path.realpath(os.path.join(place, name)) != except_]
         if any(os.path.islink(os.path.join(place, name)) for name in folders):
             raise OSError(f"{place}: a folder is a link")

@@ -146,7 +146,9 @@ def mask(found: Evidence, limits: GateLimits) -> Gate:
         message = "The mask is the user's" if known else "The doubt of this mask is unknown"
         return Gate("mask", "pass" if known else "not measured", None, limit, message)
     state: State = "fail" if charted or doubted else "warn"
-    remedy = "Look at mask.png; where it is wrong, draw one and use --mask PNG, or show backdrop all around the object"
+    remedy = (
+        "Look at maps/mask.png; where it is wrong, draw one and use --mask PNG, or show backdrop all around the object"
+    )
     if object_.islands > limits.max_mask_islands:
         remedy = f"Which object is it? --set mask.part=1 takes the largest, mask.part=2 the next. {remedy}"
     cost = 10 * object_.border if state == "warn" else 5.0

@@ -33,8 +33,8 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Meta(
             gt=0,
             le=1,
-            description="allowed change of the light from shot to shot, as a flash usually repeats better; a darker "
-            "shot only warns, as this is measured and corrected; in a brighter one another lamp may have been on [1]",
+            description="allowed change of the light from shot to shot. A darker shot only warns: its gain is measured "
+            "and corrected. A brighter shot fails: another lamp may have been on [1]",
         ),
     ] = 0.1
     max_energy_drift: Annotated[

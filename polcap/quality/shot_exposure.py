@@ -136,17 +136,17 @@ def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     light = shot[:, None] * radiance.bracket.exposure_ratio.mean(2)  # (K, E)
     off = light / np.median(light, axis=0) - 1
     each = np.median(off, axis=1)
-    k = int(np.argmax(np.abs(each)))
     limit = limits.max_gain_change
+    brighter = each > limit  # it may show another lamp, which no gain corrects
+    k = int(np.argmax(np.where(brighter.any() & ~brighter, 0, np.abs(each))))
     remedy = "Wait longer between flashes: this one misfired or had not recycled"
     if radiance.equipment.light == "steady":
         remedy = "Shoot again under constant light: the lamp or daylight changed between shots"
     message = f"The {names[k]} shot was {abs(100 * each[k]):.1f} % {_comparative(each[k])} than the others"
-    bad = bad_shots(names, np.abs(each) > limit)
-    darker = bool(each[k] < 0)  # a brighter shot may show another lamp, which no gain corrects
-    message += ", which is corrected" if darker else ""
-    state: State = "warn" if darker else "fail"
-    yield at_most("gains", float(abs(each[k])), limit, message, remedy, bad, 0 if darker else 3, beyond=state)
+    message += ", which is corrected" if -each[k] > limit else ""
+    bad = bad_shots(names, brighter if brighter.any() else -each > limit)
+    state: State = "fail" if brighter.any() else "warn"
+    yield at_most("gains", float(abs(each[k])), limit, message, remedy, bad, 3 if each[k] > 0 else 0, beyond=state)
     yield gain_doubt(found, limits)
     drift = off - each[:, None]
     k, e = (int(i) for i in np.unravel_index(int(np.argmax(np.abs(drift))), drift.shape))

@@ -160,6 +160,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("gains", "pass", {}),
     ("gains", "warn", gains(gain=np.array([[1.0] * 3, [1.0] * 3, [0.75] * 3]))),
     ("gains", "fail", gains(gain=np.array([[1.0] * 3, [1.0] * 3, [1.25] * 3]))),
+    ("gains", "fail", gains(gain=np.array([[1.0] * 3, [0.7] * 3, [1.2] * 3]))),
     ("energy", "pass", {}),
     ("energy", "warn", {"bracket": {"exposure_ratio": np.array([[[1.0], [4.0]], [[1.0], [4.0]], [[1.0], [4.8]]])}}),
     ("energy", "fail", {"bracket": {"exposure_ratio": np.array([[[1.0], [4.0]], [[1.0], [4.0]], [[1.0], [6.0]]])}}),

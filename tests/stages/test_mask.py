@@ -101,6 +101,14 @@ def test_channels_do_not_depend_on_the_flash_energy_of_a_shot(shot):
     np.testing.assert_allclose((other[1:] / other[0])[:, bright], (one[1:] / one[0])[:, bright], atol=0.03)
 
 
+def test_a_black_shot_leaves_the_channels_finite():
+    radiance, chart, box = scenes.stack(), np.zeros((240, 320), np.uint8), (0, 0, 320, 240)
+    value = radiance.value * np.array([1, 1, 0], np.float32)[:, None, None, None]
+    dark = dataclasses.replace(radiance, value=value)
+    picture = mask_network.reduced_picture(dark, scenes.still(), scenes.no_color(), chart, box, 160)
+    assert np.isfinite(picture.stokes).all()
+
+
 def test_channels_hold_the_polarization_of_the_aligned_shots():
     """S1 and S2 of a ball in shots that are shifted by up to three pixels."""
     moved = np.tile(np.eye(3), (3, 1, 1))

@@ -150,7 +150,7 @@ def reflectance(asset: Asset) -> Floats:
 
 
 def _occlusion(asset: Asset) -> str:
-    return "ambient occlusion" if asset.has_occlusion else "occlusion (1, not computed)"
+    return "ambient occlusion" if asset.has_occlusion else "occlusion (1 everywhere)"
 
 
 def _index_reflectance(asset: Asset) -> float:

@@ -48,7 +48,13 @@ class _Head(msgspec.Struct):
     """The child's answer without the values of its arrays: a result, a refusal of the file, or a defect of polcap."""
 
     meta: dict[str, Any] | None = None
-    arrays: list[tuple[str, str, tuple[Annotated[int, Meta(ge=0, lt=2**31)], ...]]] = []  # name, type, shape
+    arrays: list[
+        tuple[
+            str,
+            Annotated[str, Meta(pattern=r"^[<>|=]?[biuf]\d{1,2}$")],
+            tuple[Annotated[int, Meta(ge=0, lt=2**31)], ...],
+        ]
+    ] = []  # name, type, shape
     error: str | None = None
     kind: str = ""  # class of the error; "" for `DecodeError`
     bug: str | None = None

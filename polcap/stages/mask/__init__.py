@@ -38,7 +38,7 @@ class MaskSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.7
 
 
-@stage(version=8)
+@stage(version=9)
 def segment(
     radiance: AngleStack,
     alignment: Alignment,

@@ -20,6 +20,7 @@ _CLOSE_UP_PX = 256  # greatest longer side of a close-up
 _CLOSE_UPS = 2  # passes over the part with the object; the second adds parts that the first estimate lacked
 _ROOM = 0.12  # margin around that part, of its longer side
 _LIKELY = 0.3  # least probability of pixels that a close-up must include
+_LEAST_GAIN = 0.02  # a darker shot shows nothing but its noise
 _POLARIZED = 0.08  # change of a shot's light that polarized surroundings may cause; from .25 on masks were wrong
 _MIRRORS = ((), (0,), (1,), (0, 1))  # axes of the mirror images that are averaged (decision 15)
 
@@ -78,11 +79,16 @@ def reduced_picture(
 
 
 def _coarse_gains(radiance: AngleStack) -> Floats:
-    """Gains (K,) of the shots, median over the brighter half of the picture; 1 where polarization may be the cause."""
+    """Gains (K,) of the shots, median over the brighter half of the picture; 1 where there is none.
+
+    Small changes may be polarization. A black shot has no gain, nor have angles of one exposure.
+    """
+    if radiance.offset_px is not None:
+        return np.ones(len(radiance.value))
     light = radiance.value[:, ::8, ::8].sum(-1, dtype=np.float64)
     light = light[:, light[0] > max(np.median(light[0]), 0)]
     gain = np.median(light / light[0], axis=1) if light.size else np.ones(len(light))
-    return np.where(np.abs(gain - 1) > _POLARIZED, gain, 1)
+    return np.where((np.abs(gain - 1) > _POLARIZED) & (gain > _LEAST_GAIN), gain, 1)
 
 
 def _run(network: Network, run: RunNetwork, channels: Floats) -> Floats:

@@ -139,6 +139,7 @@ def test_a_failure_names_the_file_and_the_next_file_is_read(worker, function, li
         '{"meta": {}, "arrays": [["a", "<u2", [1.5]]]}',
         '{"meta": {}, "arrays": [["a", "<u2", [0, 1180591620717411303424]]]}',
         '{"meta": {}, "arrays": [["a", "nothing", [1]]]}',
+        '{"meta": {}, "arrays": [["a", "f4,(", [1]]]}',
     ],
 )
 def test_a_malformed_answer_is_an_error_of_the_file(worker, text):
