@@ -25,6 +25,7 @@ from polcap.fusion.silhouettes import Silhouette, grid_around, halved
 from polcap.images import Bools, Floats
 from polcap.optics.outline import disc_radius
 
+COMPARED = "work/compared_mask.png"  # in the result of a view: its mask, as it was compared
 _SLIT = 0.05  # of the object's diameter in a view; wider gaps in a mask are gaps between the object's parts
 _MOST_UNCOVERED = 0.01  # of a mask's area; masks whose outlines err by one cell of the grid leave 0.000
 # An object that slid uncovers small parts of several other masks: the sum of their shares. The greatest share is not
@@ -53,8 +54,8 @@ def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, s
         inside = np.delete(inside, worst, axis=0)
         left_out[view.name] = (
             f"its mask and those of the other views differ by {100 * share:.0f} % of their area, the limit is "
-            f"{100 * _MOST_UNCOVERED:g} %: the mask is wrong, or the object moved on the board; look at its "
-            "polcap/work/compared_mask.png, and shoot the view again"
+            f"{100 * _MOST_UNCOVERED:g} %: the mask is wrong, or the object moved on the board; look at "
+            f"{COMPARED} in its polcap folder, and shoot the view again"
         )
         if len(left_out) > _MOST_LEFT_OUT * len(views) or len(used) < LEAST_VIEWS:
             raise _contradiction(list(left_out), len(views))
@@ -82,8 +83,7 @@ def _without_slits(views: Sequence[Silhouette], points: Floats, step: float) -> 
 def _contradiction(names: Sequence[str], count: int) -> CaptureError:
     return CaptureError(
         f"the masks of {len(names)} of {count} views contradict the others ({', '.join(names)}): the object moved on "
-        "the board between the views, or masks are wrong; look at "
-        "polcap/work/compared_mask.png of each, "
+        f"the board between the views, or masks are wrong; look at {COMPARED} in their polcap folders, "
         "fix the object to the board, and shoot again"
     )
 

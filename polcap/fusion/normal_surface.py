@@ -1,9 +1,10 @@
-"""Surface that has the measured normals and touches the silhouettes; it begins as the hull's.
+"""Surface that has the measured normals and touches the silhouettes; the first one is the hull's.
 
-It may leave the hull. The hull is too small wherever a single mask is too narrow.
+It may leave the hull, which is too small wherever a single mask is too narrow.
 
 Each round moves every vertex along its normal, by sparse least squares: the edges of each triangle lie square to the
-mean of the normals that the views measured there, and rims stay on their silhouettes.
+mean of the normals that the views measured there, and rims stay on their silhouettes. Then the surface is smoothed
+where it contradicts these normals, where views contradict each other, and where no view sees it.
 
 References
 ----------
@@ -36,7 +37,7 @@ _RIM_SIGMA = np.radians(6.0)  # 1σ of the angle between a rim's mean normal and
 _RIM_LIMIT = 3.0  # 1σ; vertices beyond are no rims
 _HOLLOW_WEIGHT = 0.5  # of the equation that holds a carved vertex
 _HOLLOW_DEPTH = 2.0  # steps inside the hull from where on the surface was carved
-_FACET_POWER = 4  # of the cosine between a triangle and its target, in the triangle's weight
+_FACET_POWER = 4  # of the cosine between a mesh's normal and the measured one, in the weight of the measured one
 _MOST_MOVE = 1.0  # steps that a vertex may move in a round; more would fold the surface
 _DAMPING = 0.02  # weight of the equations displacement = 0
 _SMOOTHNESS = 0.03  # weight of the equations displacement = that of the neighbor
@@ -205,14 +206,13 @@ def _displacements(
     a_i, a_j = dot(t, outward[i]), dot(t, outward[j])
     b = -dot(t, vertices[j] - vertices[i])
     diagonal = np.full(count, _DAMPING**2)
-    diagonal += np.bincount(i, w2 * a_i**2 + _SMOOTHNESS**2, count) + np.bincount(
-        j, w2 * a_j**2 + _SMOOTHNESS**2, count
-    )
+    smooth2 = _SMOOTHNESS**2
+    diagonal += np.bincount(i, w2 * a_i**2 + smooth2, count) + np.bincount(j, w2 * a_j**2 + smooth2, count)
     right = np.bincount(j, w2 * a_j * b, count) - np.bincount(i, w2 * a_i * b, count)
     for held in anchors:
         diagonal += np.bincount(held.vertex, held.weight**2 * held.slope**2, count)
         right += np.bincount(held.vertex, held.weight**2 * held.slope * held.distance, count)
-    coupling = sparse.coo_matrix((-w2 * a_i * a_j - _SMOOTHNESS**2, (i, j)), shape=(count, count)).tocsr()
+    coupling = sparse.coo_matrix((-w2 * a_i * a_j - smooth2, (i, j)), shape=(count, count)).tocsr()
     matrix = coupling + coupling.T + sparse.diags(diagonal)
     # a ball on the finest grid (300) needs 160 steps; a solution cut short is a shorter move, the next round goes on
     move, _ = cg(matrix, right, rtol=1e-3, maxiter=200, M=sparse.diags(1 / diagonal))

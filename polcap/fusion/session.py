@@ -356,7 +356,7 @@ def _compare_masks(
     for names in session.sets.values():
         views = [_silhouette(name, masks[name], session_input, solved) for name in names]
         for view in views:  # for the user, where it contradicts the others
-            file = out_of(session_input.folder, view.name) / "work" / "compared_mask.png"
+            file = out_of(session_input.folder, view.name) / mask_agreement.COMPARED
             png.write(file, np.where(view.mask, 255, 0).astype(np.uint8))
         used, contradicting = mask_agreement.agreeing(views)
         session.left_out |= contradicting

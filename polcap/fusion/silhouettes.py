@@ -1,4 +1,4 @@
-"""Masks of the views before a grid of points: which points lie inside them, and which pixels the points cover.
+"""Masks of the views and a grid of points: which points lie inside a mask, and which of its pixels they cover.
 
 This is for the masks' comparison, before there are maps: whole masks with the lens's distortion, on a grid of cells.
 The shape is made later from `SmallView` on the grid of `hull.py`, which holds signed distances without distortion.

@@ -18,7 +18,13 @@ from polcap.pipeline.cache import seal
 from polcap.pipeline.path import STAGES
 
 _ANIMATIONS = [f"{motion}.{kind}" for motion in ("light", "turntable") for kind in ("webp", "mp4")]
-_WORK_FILES = ("run.json", "unchanged.json", *(f"{stage}.png" for stage in STAGES), *_ANIMATIONS)  # beside the stages
+_WORK_FILES = (
+    "run.json",
+    "unchanged.json",
+    "compared_mask.png",
+    *(f"{stage}.png" for stage in STAGES),
+    *_ANIMATIONS,
+)  # beside the stages
 
 
 def check(out: Path, photographs: Path) -> None:

@@ -87,7 +87,7 @@ def _solve(
 ) -> tuple[float, Floats]:
     """Fit polarizer angles (K,) from a start; returns misfit and angles.
 
-    Two solutions 90° apart fit equally well; the result is that of diffuse reflection.
+    Two solutions that differ by 90° fit equally well; the result is that of diffuse reflection.
     """
     relative = around / around.mean(axis=1, keepdims=True)
     from scipy.optimize import least_squares  # here: the import takes 0.3 s
