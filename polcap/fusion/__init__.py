@@ -16,6 +16,7 @@ In the order of use:
 
   Masks
     board_eraser      a picture without the board, in which the object is searched
+    bright_parts      parts that a mask lacks
     mask_border       pixels on the outline of a mask
     silhouettes       which points of a grid lie inside a mask, and which of its pixels they cover
     mask_agreement    removes from a mask what no other view confirms, and finds views whose masks are wrong

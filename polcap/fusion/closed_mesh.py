@@ -1,12 +1,15 @@
 """Closed meshes: from signed distances, checked, decimated, and made manifold."""
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
 
 from polcap.errors import ObjectError
 from polcap.fusion.hull import DistanceGrid
 from polcap.fusion.values import ClosedMesh
 
 _FEWEST = 16  # triangles of a level
+_APART = 1e-3  # of the way to the neighbors' middle, by which vertices at one place are moved
 
 
 def iso_surface(of: DistanceGrid) -> ClosedMesh:
@@ -41,7 +44,18 @@ def solid(mesh: ClosedMesh, floor: float | None = None) -> ClosedMesh:
         body = body.trim_by_plane((0.0, 1.0, 0.0), floor)
     parts = body.decompose()
     written = max(parts, key=lambda part: part.volume()).to_mesh64()
-    return ClosedMesh(np.array(written.vert_properties[:, :3]), np.array(written.tri_verts, np.int32))
+    return _apart(ClosedMesh(np.array(written.vert_properties[:, :3]), np.array(written.tri_verts, np.int32)))
+
+
+def _apart(mesh: ClosedMesh) -> ClosedMesh:
+    """The mesh with vertices at one place moved a little towards their neighbors, so that programs do not join them."""
+    _, place, count = np.unique(mesh.vertices.astype(np.float32), axis=0, return_inverse=True, return_counts=True)
+    shared = count[place.reshape(-1)] > 1
+    if not shared.any():
+        return mesh
+    middle = neighbor_means(mesh.faces, len(mesh.vertices)) @ mesh.vertices
+    vertices = np.where(shared[:, None], mesh.vertices + _APART * (middle - mesh.vertices), mesh.vertices)
+    return ClosedMesh(vertices, mesh.faces)
 
 
 def decimate(mesh: ClosedMesh, count: int) -> ClosedMesh:
@@ -59,3 +73,10 @@ def decimate(mesh: ClosedMesh, count: int) -> ClosedMesh:
         np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.int32), target_count=count
     )
     return solid(ClosedMesh(np.asarray(points, np.float64), np.asarray(faces, np.int32)))
+
+
+def neighbor_means(faces: NDArray[np.int32], count: int) -> sparse.csr_matrix:
+    """Matrix (V, V) that replaces values at vertices by the mean of their neighbors'."""
+    i, j = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
+    joined = sparse.coo_matrix((np.ones(2 * len(i)), (np.r_[i, j], np.r_[j, i])), shape=(count, count)).tocsr()
+    return sparse.csr_matrix(sparse.diags(1 / np.asarray(joined.sum(axis=1)).ravel()) @ joined)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
+from polcap.fusion.closed_mesh import neighbor_means
 from polcap.fusion.hull import DistanceGrid
 from polcap.fusion.small_views import SmallView, sample
 from polcap.fusion.values import ClosedMesh
@@ -97,7 +98,7 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
     step, faces = hull.grid.step, mesh.faces
     start: Floats = mesh.vertices.astype(np.float64)
     hollow = np.flatnonzero(hull.at(start) < -_HOLLOW_DEPTH * step)
-    neighbors = _neighbor_means(faces, len(start))
+    neighbors = neighbor_means(faces, len(start))
     vertices = start
     for _ in range(rounds):
         outward = vertex_normals(vertices, faces)
@@ -217,13 +218,6 @@ def _displacements(
     # a ball on the finest grid (300) needs 160 steps; a solution cut short is a shorter move, the next round goes on
     move, _ = cg(matrix, right, rtol=1e-3, maxiter=200, M=sparse.diags(1 / diagonal))
     return np.asarray(move)
-
-
-def _neighbor_means(faces: NDArray[np.int32], count: int) -> sparse.csr_matrix:
-    """Matrix (V, V) that replaces values at vertices by the mean of their neighbors'."""
-    i, j = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
-    joined = sparse.coo_matrix((np.ones(2 * len(i)), (np.r_[i, j], np.r_[j, i])), shape=(count, count)).tocsr()
-    return sparse.csr_matrix(sparse.diags(1 / np.asarray(joined.sum(axis=1)).ravel()) @ joined)
 
 
 def _smoothed(

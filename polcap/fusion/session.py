@@ -30,7 +30,7 @@ from polcap.errors import (
 from polcap.formats import onnx, own_folders
 from polcap.formats.capture import folder_names, reader
 from polcap.formats.maps import png
-from polcap.fusion import board_corners, feature_poses, mask_agreement, mask_border, poses, view_maps
+from polcap.fusion import board_corners, bright_parts, feature_poses, mask_agreement, mask_border, poses, view_maps
 from polcap.fusion.board_corners import BoardCorners, NoBoardError
 from polcap.fusion.board_eraser import erase
 from polcap.fusion.poses import LEAST_VIEWS, SessionCamera, SessionPoses
@@ -346,7 +346,8 @@ def _mask_object(task: MaskTask) -> Bools:
     erased = erase(results.radiance, results.alignment, results.color, task.board, (task.camera, task.pose))
     settings = msgspec.structs.replace(view.config.mask, part=0)  # remains of the board are found in the next step
     found = mask.segment(erased, results.alignment, results.color, None, view.supplied.mask_network, onnx.run, settings)
-    return mask_border.refine(mask.mean_picture(erased, results.alignment, results.color), found.mask)
+    picture = mask.mean_picture(erased, results.alignment, results.color)
+    return mask_border.refine(picture, bright_parts.add(picture, found.mask))
 
 
 def _compare_masks(

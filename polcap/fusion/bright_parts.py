@@ -1,0 +1,36 @@
+"""Parts of the object that a view's mask lacks, such as thin legs: bright before the dark backdrop, joined to the mask.
+
+Only sessions with a board know that their backdrop is dark: its print is erased.
+"""
+
+import cv2
+import numpy as np
+
+from polcap.images import Bools, Floats
+from polcap.stages.mask.regions import box_around
+
+_REACH = 0.3  # of the mask's longer side: parts are searched as far from it
+_BRIGHT = 4.0  # times the backdrop; docs/benchmarks/fusion.md
+_BEYOND = 4  # px by which a part stands out from the mask; what is nearer is a matter of the outline
+
+
+def add(picture: Floats, mask: Bools) -> Bools:
+    """The mask (H, W) with the bright parts that it lacks, by the linear picture (H, W, 3) without the board."""
+    box = box_around(mask, _REACH, least=2 * _BEYOND)
+    if box is None:
+        return mask
+    part = np.s_[box[1] : box[3], box[0] : box[2]]
+    brightness, inside = picture[part].mean(axis=-1), mask[part].astype(np.uint8)
+    beyond = cv2.dilate(inside, _disc(_BEYOND)) == 0
+    if not beyond.any():
+        return mask
+    bright = brightness > _BRIGHT * np.median(brightness[beyond])
+    standing_out = cv2.dilate((bright & beyond).astype(np.uint8), _disc(_BEYOND + 2)) > 0
+    _, label = cv2.connectedComponents(np.where(bright & standing_out, 1, inside))
+    grown = mask.copy()
+    grown[part] = np.isin(label, np.unique(label[inside > 0]))
+    return grown
+
+
+def _disc(radius: int) -> Floats:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
