@@ -3,7 +3,7 @@
 polcap synth FOLDER --views 12 && polcap fuse FOLDER
 python tests/benchmarks/bench_fused_asset.py FOLDER
 
-Of a folder with a second set (`--set laid=8`) prints how well the sets are joined: errors of the turn [degrees] and,
+Of a folder with a second set (`--set laid=8`) also prints how well the sets are joined: errors of the turn [degrees] and,
 at the object's middle, of the place [% of its size]; the share of the second set's surface that the first confirms; the
 share of the mesh that views saw, and the mean distance of the whole true surface from it [%], from the first set and
 from both; and this distance from a mesh of both with the true turn.
@@ -47,15 +47,14 @@ class Errors(NamedTuple):
 
 
 def main(folder: Path) -> None:
-    if (folder / "setB").exists():
-        print(joined(folder))
-        return
     found = errors(folder)
     print(f"{'':10}{'normal':>9}{'albedo':>9}{'F0':>9}{'roughness':>11}")
     print_row("single", found.single)
     print_row("fused", found.fused)
     print("reduction " + "".join(f"{100 * one:8.0f}%" for one in 1 - found.fused / found.single))
     print(f"distance of the mesh from the seen truth: {100 * found.distance:.2f} % of the size")
+    if (folder / "setB").exists():
+        print(joined(folder))
 
 
 def errors(folder: Path) -> Errors:
