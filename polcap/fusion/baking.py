@@ -44,7 +44,7 @@ _OUTLIER = 0.15  # the same of albedo, F0 and roughness, over the median
 _FLOOR_DEG = 2.0  # error of every normal, added to the expected one
 _ROUNDS = 3  # of reweighting
 _SEEN = 0.02  # least total weight of a seen texel; that of a view along the normal, far from any edge, is 1
-_MARGIN_PX = 2  # around the charts, filled from their borders
+_MARGIN_PX = 2  # around the charts, which belongs to the mask
 
 
 class BakingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -115,14 +115,18 @@ def bake(views: tuple[FusionView, ...], atlas: Atlas, settings: BakingSettings) 
 
 
 def on_atlas(atlas: Atlas, values: Floats) -> AtlasMaps:
-    """Maps from values (N, 11) of the texels: normal, diffuse, specular, roughness, weight; charts get a margin."""
+    """Maps from values (N, 11) of the texels: normal, diffuse, specular, roughness, weight.
+
+    Between the charts they have the values of the nearest texel, for reduced textures, and for charts so small that
+    they cover no texel's middle.
+    """
     image = np.zeros((*atlas.covered.shape, 11), np.float32)
     image[atlas.covered] = values
     size = np.ones((2 * _MARGIN_PX + 1,) * 2, np.uint8)
     mask = cv2.dilate(atlas.covered.astype(np.uint8), size) > 0
-    image = np.where(mask[..., None], fill_outward(image, atlas.covered), 0)
+    image = fill_outward(image, atlas.covered)
     normal, diffuse, specular = (np.ascontiguousarray(image[..., start : start + 3]) for start in (0, 3, 6))
-    return AtlasMaps(normal, diffuse, specular, image[..., 9].copy(), mask, image[..., 10].copy())
+    return AtlasMaps(normal, diffuse, specular, image[..., 9].copy(), mask, np.where(mask, image[..., 10], 0))
 
 
 def visible_texels(views: Sequence[FusionView], atlas: Atlas) -> list[VisibleTexels]:
