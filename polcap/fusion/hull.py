@@ -22,6 +22,7 @@ _MARGIN = 3  # steps around the object
 _NEAR = 3.5  # steps from the surface within which distances are exact; two points lie at most √3 steps apart
 _THIN = 2  # steps; handles and tunnels up to twice as thick are taken for false
 _LARGEST_CUT = 0.002  # of the body's volume; a larger thin part with loops is no handle, but a wall with holes
+_BELOW = 2  # steps below the board, to which the body may reach; at the end it is cut at the board
 _LOOSE = 0.01  # steps inside the surface, of points that touch others of the body by an edge alone
 
 
@@ -106,9 +107,9 @@ def _largest_distance(views: Sequence[SmallView], grid: VoxelGrid) -> Floats:
 
 
 def _largest(views: Sequence[SmallView], grid: VoxelGrid, index: NDArray[np.integer]) -> Floats:
-    """Largest signed distance (N,) m at the grid's points with indices (N, 3)."""
+    """Largest signed distance (N,) m at the grid's points with indices (N, 3), from the silhouettes and the board."""
     point = (grid.origin + grid.step * index).astype(np.float32)
-    distance = np.full(len(point), -np.inf, np.float32)
+    distance = np.float32(-_BELOW * grid.step) - point[:, 1]  # views from above do not bound the object from below
     for view in views:
         np.maximum(distance, view.distance(point), out=distance)
     return distance
