@@ -12,7 +12,7 @@ pytest.importorskip("embreex")
 
 from polcap.errors import ObjectError
 from polcap.fusion.closed_mesh import decimate, is_closed, iso_surface
-from polcap.fusion.hull import DistanceGrid, VoxelGrid, plain_body
+from polcap.fusion.hull import DistanceGrid, VoxelGrid, plain_body, visual_hull
 from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.small_views import reduce_views
 from polcap.fusion.values import ClosedMesh
@@ -50,6 +50,13 @@ def test_a_ball_has_its_radius_where_normals_and_poses_err(ball: Body, fused_bal
     radius = np.linalg.norm(fused_ball.vertices - ball.middle, axis=1)
     assert abs(radius.mean() - SIZE / 2) < 0.003 * SIZE  # ¼ px of these views, and the errors of their poses
     assert radius.std() < 0.006 * SIZE
+
+
+def test_the_hull_of_views_from_far_above_is_closed_and_ends_at_the_board(ball: Body) -> None:
+    hull = visual_hull(reduce_views([capture(ball, pose, 128) for pose in ring(ball, 6, elevation_deg=60)]), GRID)
+    mesh = iso_surface(hull)
+    assert is_closed(mesh)
+    assert mesh.vertices[:, 1].min() > -3 * hull.grid.step
 
 
 def test_the_mesh_is_closed_manifold_and_outward(fused_ball: ClosedMesh) -> None:
