@@ -6,7 +6,7 @@ Only sessions with a board know that their backdrop is dark: its print is erased
 import cv2
 import numpy as np
 
-from polcap.images import Bools, Floats
+from polcap.images import Bits, Bools, Floats
 from polcap.stages.mask.regions import box_around
 
 _REACH = 0.3  # of the mask's longer side: parts are searched as far from it
@@ -32,5 +32,5 @@ def add(picture: Floats, mask: Bools) -> Bools:
     return grown
 
 
-def _disc(radius: int) -> Floats:
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+def _disc(radius: int) -> Bits:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)))

@@ -3,10 +3,10 @@
 polcap synth FOLDER --views 12 && polcap fuse FOLDER
 python tests/benchmarks/bench_fused_asset.py FOLDER
 
-Of a folder with a second set (`--set laid=8`) also prints how well the sets are joined: errors of the turn [degrees] and,
-at the object's middle, of the place [% of its size]; the share of the second set's surface that the first confirms; the
-share of the mesh that views saw, and the mean distance of the whole true surface from it [%], from the first set and
-from both; and this distance from a mesh of both with the true turn.
+Of a folder with a second set (`--set laid=8`) also prints how well the sets are joined: errors of the turn [degrees]
+and, at the object's middle, of the place [% of its size]; the share of the second set's surface that the first
+confirms; the share of the mesh that views saw, and the mean distance of the whole true surface from it [%], from the
+first set and from both; and this distance from a mesh of both with the true turn.
 """
 
 import json
