@@ -1,8 +1,9 @@
 """Textures of the atlas from all views: which view sees which texel, how much it counts, and robust means.
 
 A view counts more where it looks squarely at the surface, where its maps expect small errors, and far from the
-object's outline and from edges of parts that hide others. Weights fade to 0 there, so that no seam shows. It does not
-count where its normals contradict the mesh: what it shows there lies elsewhere, e.g. behind space that the hull fills.
+object's outline and from edges of parts that hide others. Weights fade to 0 there, so that no seam shows. A view
+does not count where its normals contradict the mesh: what it shows lies elsewhere, e.g. behind space that the hull
+fills.
 
 Every picture is parted into a smooth and a fine band. The smooth band is a mean over all views. The fine band comes
 from the best views: a mean of views whose poses err by a pixel would blur it. Normals are baked as differences from

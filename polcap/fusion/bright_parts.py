@@ -6,7 +6,8 @@ Only sessions with a board know that their backdrop is dark: its print is erased
 import cv2
 import numpy as np
 
-from polcap.images import Bits, Bools, Floats
+from polcap.images import Bools, Floats
+from polcap.optics.morphology import dilate
 from polcap.stages.mask.regions import box_around
 
 _REACH = 0.3  # of the mask's longer side: parts are searched as far from it
@@ -20,17 +21,13 @@ def add(picture: Floats, mask: Bools) -> Bools:
     if box is None:
         return mask
     part = np.s_[box[1] : box[3], box[0] : box[2]]
-    brightness, inside = picture[part].mean(axis=-1), mask[part].astype(np.uint8)
-    beyond = cv2.dilate(inside, _disc(_BEYOND)) == 0
+    brightness, inside = picture[part].mean(axis=-1), mask[part]
+    beyond = ~dilate(inside, _BEYOND)
     if not beyond.any():
         return mask
     bright = brightness > _BRIGHT * np.median(brightness[beyond])
-    standing_out = cv2.dilate((bright & beyond).astype(np.uint8), _disc(_BEYOND + 2)) > 0
-    _, label = cv2.connectedComponents(np.where(bright & standing_out, 1, inside))
+    standing_out = bright & dilate(bright & beyond, _BEYOND + 2)
+    _, label = cv2.connectedComponents((inside | standing_out).astype(np.uint8))
     grown = mask.copy()
-    grown[part] = np.isin(label, np.unique(label[inside > 0]))
+    grown[part] = np.isin(label, np.unique(label[inside]))
     return grown
-
-
-def _disc(radius: int) -> Bits:
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)))
