@@ -1,9 +1,7 @@
 """Textures of the atlas from all views: which view sees which texel, how much it counts, and robust means.
 
 A view counts more where it looks squarely at the surface, where its maps expect small errors, and far from the
-object's outline and from edges of parts that hide others. Weights fade to 0 there, so that no seam shows. A view
-does not count where its normals contradict the mesh: what it shows lies elsewhere, e.g. behind space that the hull
-fills.
+object's outline and from edges of parts that hide others. Weights fade to 0 there, so that no seam shows.
 
 Every picture is parted into a smooth and a fine band. The smooth band is a mean over all views. The fine band comes
 from the best views: a mean of views whose poses err by a pixel would blur it. Normals are baked as differences from
@@ -37,7 +35,6 @@ from polcap.stages import stage
 _LEAST_COSINE = 0.15  # between surface and view: beyond 81° a map pixel covers seven texels
 _FADE = 0.04  # of the object's diameter: distance from an edge over which a view's weight rises to 1
 _EDGE = 8.0  # depth step between pixels that counts as an edge, in pixels' widths; that of a slope of 83°
-_CONTRADICTION_DEG = (20.0, 45.0)  # between the normals of view and mesh, over which a view's weight falls to 0
 _BEHIND = 3.0  # a texel this far behind the traced surface is hidden, in pixels' widths over the cosine
 _SHARPNESS = 4  # power of the weights for the fine band
 _OUTLIER_DEG = 12.0  # scale of Cauchy's weight of a normal
@@ -98,7 +95,7 @@ class VisibleTexels:
         return np.concatenate(found, axis=1).reshape(len(self.pixel), -1) if found else np.zeros((0, 1), np.float32)
 
 
-@stage(version=3)
+@stage(version=4)
 def bake(views: tuple[FusionView, ...], atlas: Atlas, settings: BakingSettings) -> AtlasMaps:
     """Bake the maps of all views into the atlas; values where no view sees the surface are those of no light, 0."""
     visible = visible_texels(views, atlas)
@@ -151,10 +148,7 @@ def _visible(view: FusionView, atlas: Atlas, tracer: Tracer) -> VisibleTexels:
     slack = _BEHIND / view.view.focal / cosine
     in_front = -point[texel, 2] <= surface.depth[row, column] * (1 + slack)  # false where the surface is missed
     fade = _distance_from_edges(view, surface.depth)[row, column]
-    measured = frames.unit(view.normal[row, column] @ rotation)
-    low, high = np.cos(np.radians(_CONTRADICTION_DEG[::-1]))
-    confirmed = _smooth_step((frames.dot(measured, atlas.normal[texel]) - low) / (high - low))
-    weight = np.where(in_front, cosine**2 * fade * confirmed, 0)
+    weight = np.where(in_front, cosine**2 * fade, 0)
     kept = np.flatnonzero(weight > 0)
     texel = texel[kept]
     return VisibleTexels(
@@ -177,12 +171,7 @@ def _distance_from_edges(view: FusionView, depth: Floats) -> Floats:
             pad = [(0, 1), (0, 0)] if axis == 0 else [(0, 0), (0, 1)]
             inside &= ~(np.pad(jump, pad) | np.pad(jump, [side[::-1] for side in pad]))
     distance = cv2.distanceTransform(np.pad(inside, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
-    return _smooth_step(distance / (_FADE * diameter_px(view)))
-
-
-def _smooth_step(value: Floats) -> Floats:
-    """0 below 0, 1 above 1, and a smooth rise between."""
-    share = np.clip(value, 0, 1)
+    share = np.clip(distance / (_FADE * diameter_px(view)), 0, 1)
     return np.asarray(share * share * (3 - 2 * share))
 
 
