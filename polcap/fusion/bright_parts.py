@@ -12,7 +12,7 @@ from polcap.stages.mask.regions import box_around
 
 _REACH = 0.3  # of the mask's longer side: parts are searched as far from it
 _BRIGHT = 4.0  # times the backdrop; docs/benchmarks/fusion.md
-_BEYOND = 4  # px by which a part stands out from the mask; what is nearer is a matter of the outline
+_BEYOND = 4  # px from the mask that a part must reach; nearer pixels are left to `mask_border`
 
 
 def add(picture: Floats, mask: Bools) -> Bools:
@@ -26,8 +26,8 @@ def add(picture: Floats, mask: Bools) -> Bools:
     if not beyond.any():
         return mask
     bright = brightness > _BRIGHT * np.median(brightness[beyond])
-    standing_out = bright & dilate(bright & beyond, _BEYOND + 2)
-    _, label = cv2.connectedComponents((inside | standing_out).astype(np.uint8))
+    protruding = bright & dilate(bright & beyond, _BEYOND + 2)
+    _, label = cv2.connectedComponents((inside | protruding).astype(np.uint8))
     grown = mask.copy()
     grown[part] = np.isin(label, np.unique(label[inside]))
     return grown

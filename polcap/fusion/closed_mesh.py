@@ -9,7 +9,7 @@ from polcap.fusion.hull import DistanceGrid
 from polcap.fusion.values import ClosedMesh
 
 _FEWEST = 16  # triangles of a level
-_APART = 1e-3  # of the way to the neighbors' middle, by which vertices at one place are moved
+_SEPARATION = 1e-3  # of the way to the neighbors' middle, by which coincident vertices are moved
 
 
 def iso_surface(of: DistanceGrid) -> ClosedMesh:
@@ -44,17 +44,17 @@ def solid(mesh: ClosedMesh, floor: float | None = None) -> ClosedMesh:
         body = body.trim_by_plane((0.0, 1.0, 0.0), floor)
     parts = body.decompose()
     written = max(parts, key=lambda part: part.volume()).to_mesh64()
-    return _apart(ClosedMesh(np.array(written.vert_properties[:, :3]), np.array(written.tri_verts, np.int32)))
+    return _separated(ClosedMesh(np.array(written.vert_properties[:, :3]), np.array(written.tri_verts, np.int32)))
 
 
-def _apart(mesh: ClosedMesh) -> ClosedMesh:
-    """The mesh with vertices at one place moved a little towards their neighbors, so that programs do not join them."""
+def _separated(mesh: ClosedMesh) -> ClosedMesh:
+    """The mesh with coincident vertices moved a little towards their neighbors, so that programs do not merge them."""
     _, place, count = np.unique(mesh.vertices.astype(np.float32), axis=0, return_inverse=True, return_counts=True)
     shared = count[place.reshape(-1)] > 1
     if not shared.any():
         return mesh
     middle = neighbor_means(mesh.faces, len(mesh.vertices)) @ mesh.vertices
-    vertices = np.where(shared[:, None], mesh.vertices + _APART * (middle - mesh.vertices), mesh.vertices)
+    vertices = np.where(shared[:, None], mesh.vertices + _SEPARATION * (middle - mesh.vertices), mesh.vertices)
     return ClosedMesh(vertices, mesh.faces)
 
 

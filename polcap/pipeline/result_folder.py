@@ -24,7 +24,7 @@ _WORK_FILES = (
     "compared_mask.png",
     *(f"{stage}.png" for stage in STAGES),
     *_ANIMATIONS,
-)  # beside the stages
+)  # outside the folders of the stages
 
 
 def check(out: Path, photographs: Path) -> None:
