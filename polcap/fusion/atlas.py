@@ -5,6 +5,7 @@ References
 uvunwrap (segmentation into charts of low distortion, packing by shape).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -65,11 +66,20 @@ def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSetti
     Raises ObjectError: the mesh has no charts.
     """
     pixel = _pixel(mesh, views)
-    count = min(int(_area(mesh) / (_TRIANGLE * pixel**2)), len(mesh.faces))
+    count = max(min(int(_area(mesh) / (_TRIANGLE * pixel**2)), len(mesh.faces)), _FEWEST)
+    return reduced(mesh, count, lambda coarse: _sized(coarse, pixel, settings, views[0].metric))
+
+
+def reduced(mesh: ClosedMesh, count: int, chart: Callable[[ClosedMesh], Atlas]) -> Atlas:
+    """The atlas that `chart` makes of a mesh with about `count` triangles, or with fewer if it fails on these.
+
+    Raises ObjectError: it fails on all, or these are too few triangles to enclose a body.
+    """
     failure: ObjectError | None = None
     for share in _SHARES:
+        coarse = decimate(mesh, int(share * count))
         try:
-            return _sized(decimate(mesh, max(int(share * count), _FEWEST)), pixel, settings, views[0].metric)
+            return chart(coarse)
         except ObjectError as error:
             failure = error
     assert failure is not None

@@ -16,7 +16,6 @@ from polcap.formats.maps import exr, maps_folder, png
 from polcap.fusion import atlas as atlases
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, on_atlas
-from polcap.fusion.closed_mesh import decimate
 from polcap.fusion.mesh_occlusion import ambient_occlusion
 from polcap.fusion.values import ClosedMesh
 from polcap.images import Asset, Floats, Mesh
@@ -95,9 +94,10 @@ class FusedSource:
 
     def decimated(self, whole: Asset, triangles: int) -> DetailLevel:
         """The asset with about so many triangles, an atlas of its own, and the textures of the full mesh."""
-        coarse = decimate(closed(self.atlas.mesh), triangles)
-        side = self.maps.mask.shape[0]
-        atlas = atlases.charted(coarse, side, self.atlas.margin, self.atlas.mesh.metric)
+        side, margin, metric = self.maps.mask.shape[0], self.atlas.margin, self.atlas.mesh.metric
+        atlas = atlases.reduced(
+            closed(self.atlas.mesh), triangles, lambda coarse: atlases.charted(coarse, side, margin, metric)
+        )
         maps = transferred(self.atlas, self.maps, atlas)
         bits: Literal[8, 16] = 8 if whole.normal.dtype == np.uint8 else 16
         extras: tuple[Extra, ...] = ("occlusion",) if whole.has_occlusion else ()

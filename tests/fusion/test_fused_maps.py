@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap.errors import DecodeError, SettingError
+from polcap.errors import DecodeError, ObjectError, SettingError
 from polcap.formats.export import gltf, texture_set
 from polcap.formats.maps import result_maps
 from polcap.fusion import atlas as atlases
@@ -14,6 +14,7 @@ from polcap.fusion import baking, closed_mesh, filling, fuse_run, fused_maps
 from polcap.fusion.baking import BakingSettings
 from polcap.fusion.closed_mesh import is_closed
 from polcap.fusion.fused_maps import FusedSource
+from polcap.fusion.values import ClosedMesh
 from polcap.pipeline import asset_export
 from polcap.pipeline.asset_export import ExportRequest
 from tests.fusion import ellipsoid
@@ -41,6 +42,23 @@ def test_coarser_levels_have_the_unit_and_the_margin_of_the_full_mesh(source: Fu
     coarse = fused_maps.closed(atlas.mesh)
     again = atlases.charted(closed_mesh.decimate(coarse, round(len(coarse.faces) / 4)), 256, 16)
     assert not level.metric and np.array_equal(level.uv, again.mesh.uv)
+
+
+def test_a_coarser_level_that_cannot_be_charted_is_reduced_further(
+    source: FusedSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, level = (one.asset.mesh for one in asset_export.levels(source, ExportRequest(lod=1)))
+    charted, calls = atlases.charted, list[int]()
+
+    def failing(mesh: ClosedMesh, side: int, margin: int, metric: bool) -> atlases.Atlas:
+        calls.append(len(mesh.faces))
+        if len(calls) == 1:
+            raise ObjectError("no texture atlas")
+        return charted(mesh, side, margin, metric)
+
+    monkeypatch.setattr(atlases, "charted", failing)
+    again = asset_export.levels(source, ExportRequest(lod=1))[1].asset.mesh
+    assert 0.85 < len(again.faces) / len(level.faces) < 0.95 and len(level.faces) < len(whole.faces)
 
 
 def test_extra_textures_are_of_the_mesh(source: FusedSource, monkeypatch: pytest.MonkeyPatch) -> None:
