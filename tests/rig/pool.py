@@ -1,5 +1,6 @@
 """A camera that returns prepared photographs, with a planted fault; much faster than rendering each."""
 
+import gc
 import resource
 import signal
 import tempfile
@@ -58,6 +59,7 @@ def tiny(path: Path, **exif: object) -> bytes:
 def virtual_gphoto2(monkeypatch: pytest.MonkeyPatch, card: Path) -> None:
     """Connect libgphoto2's virtual camera, which photographs the file `card`/x.jpg; skips without gphoto2."""
     gphoto2 = pytest.importorskip("gphoto2")
+    gc.collect()  # while an earlier virtual camera exists in this process, a new one photographs the earlier one's card
     monkeypatch.setenv("IOLIBS", str(Path(gphoto2.__file__).parent / "libgphoto2" / "vusb"))
     monkeypatch.setenv("VCAMERADIR", f"{card}/")
 
