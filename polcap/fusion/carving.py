@@ -22,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from polcap import parallel
+from polcap.fusion.closed_mesh import iso_surface
 from polcap.fusion.hull import DistanceGrid, plain_body
 from polcap.fusion.normal_surface import FittedSurface, visible
 from polcap.fusion.small_views import SmallView, sample
@@ -67,8 +68,9 @@ def carve(hull: DistanceGrid, surface: FittedSurface, views: Sequence[SmallView]
     sweeps = [partial(_sweep, k, views, tracer, doubtful, hull) for k in range(len(views))]
     depths = _confirmed(parallel.results(sweeps), hull.grid.step)
     free = _mean_distance(hull, depths)
-    walls = surface.vertices[_is_wall(surface, depths, hull.grid.step)]
-    carved = np.maximum(hull.distance, _behind_walls(hull, walls, free))
+    wall = _is_wall(surface, depths, hull.grid.step)
+    inner = iso_surface(hull).vertices[wall]  # where masks are too narrow, the fitted surface lies outside the hull
+    carved = np.maximum(hull.distance, _behind_walls(hull, np.concatenate([surface.vertices[wall], inner]), free))
     height = hull.grid.origin[1] + hull.grid.step * np.arange(hull.grid.shape[1])
     floor = height < _WALL * hull.grid.step  # the board is behind it
     carved[:, floor] = hull.distance[:, floor]
