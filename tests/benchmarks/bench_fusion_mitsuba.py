@@ -1,112 +1,120 @@
-"""Benchmark of the fusion on views that Mitsuba path-traces, under the polarization law of rough surfaces.
+"""Benchmark of `polcap fuse` on RAW photographs of objects that Mitsuba path-traces, under the rough polarization law.
 
-    POLCAP_DATA=FOLDER python tests/benchmarks/bench_fusion_mitsuba.py SCENES [--views 12] [--only NAME…]
+    POLCAP_DATA=FOLDER python tests/benchmarks/bench_fusion_mitsuba.py OUT [--views 12] [--only NAME…]
 
-Poses as in `bench_fusion.py`, but exact. Each view is one scene of `make_mitsuba.py` of the material "rough" (one
-albedo, roughness and F0), with the camera errors of `polcap evaluate`; the stages `cues` and `infer` make its maps.
-SCENES keeps the scenes, so that a stopped run continues. Prints for each object the mean distance of the seen true
-surface from hull and fused mesh, % of the object's size, and mean errors of single views and of the fused maps.
+Sessions as of `polcap synth --views`, with board and chart, but the object's pixels are traced by `make_mitsuba.py`,
+with interreflection: material "rough" (one albedo, roughness and F0). OUT has scenes, sessions and results, so that a
+stopped run continues. Prints for each object the mean errors of single views and of the fused maps, and the mean
+distance of the mesh from the seen truth, % of the object's size.
 """
 
 import argparse
 import json
 import os
+import subprocess
+import sys
+import zlib
+from functools import partial
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
+import bench_fused_asset
+import msgspec
 import numpy as np
-from bench_fused_asset import against_truth
-from bench_fusion import mean_distance, seen_points
-from bench_mitsuba import read
-from make_mitsuba import shoot
+from bench_mitsuba import scene_light
+from make_mitsuba import MATERIALS, plain, shoot
 
-from polcap.formats import atomic, onnx
-from polcap.formats.scene_files import read_mesh
-from polcap.fusion.closed_mesh import is_closed, iso_surface
-from polcap.fusion.fusion_path import FusionResults, FusionSettings, path
-from polcap.fusion.hull import visual_hull
-from polcap.fusion.small_views import reduce_views
-from polcap.fusion.values import FusionView, Pose
-from polcap.images import Floats, Network
-from polcap.optics.color import luminance
-from polcap.optics.frames import dot
-from polcap.pipeline import models
-from polcap.pipeline.cache import MemoryCache
-from polcap.stages import infer
-from tests.fusion.traced_views import Body, all_around, capture, solid, stand
+from polcap.formats import atomic
+from polcap.images import Floats, View
+from polcap.optics import frames
+from polcap.synth import all_around, forward_camera, render, trace
+from polcap.synth.all_around import AroundShoot
+from polcap.synth.distance_fields import Model
+from polcap.synth.render import Scene
+from polcap.synth.scene_materials import Coat, Material
 
 OBJECTS = ("spot", "demosthenes")
-PIXELS, DEPTH = 256, 5
+SHOOT = AroundShoot(width=960, height=720, samples=1, exposures=1, nudge_px=0, nudge_deg=0)  # all shots, same pixels
+SEED, DEPTH = 2026, 5  # of the material; longest path
+MARGIN = 4  # px around the object
+SIDE = 4  # rays per pixel side for the share that the object covers
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", type=Path)
+    parser.add_argument("out", type=Path)
     parser.add_argument("--views", type=int, default=12)
     parser.add_argument("--only", nargs="*", default=OBJECTS)
     options = parser.parse_args()
-    network = models.load_network("network", None, "cpu", 1)
-    assert network is not None
-    print("| object | hull % | fused % | Euler | closed | normals ° | diffuse | F0 | roughness |", "\n|", "--- |" * 9)
+    print("| object | views | normals ° | albedo | F0 | roughness | mesh % |", "\n|", "--- |" * 7)
     for name in options.only:
-        print(row(name, options.views, options.scenes, network), flush=True)
+        folder = options.out / f"{name}_{options.views}"
+        if not folder.exists():
+            write(folder, name, options.views, options.out / "scenes")
+        subprocess.run([sys.executable, "-m", "polcap", "fuse", str(folder)], check=True, stdout=subprocess.DEVNULL)
+        errors = bench_fused_asset.errors(folder)
+        cells = [f"{one:.3g} → {both:.3g}" for one, both in zip(errors.single, errors.fused)]
+        print(f"| {name} | {options.views} | {' | '.join(cells)} | {100 * errors.distance:.2f} |", flush=True)
 
 
-def row(name: str, count: int, scenes: Path, network: Network) -> str:
-    body = stand(*read_mesh(Path(os.environ["POLCAP_DATA"]) / "meshes/test" / f"{name}.npz"))
-    poses = all_around(body, count)
-    files = [scenes / f"{name}_{k:02d}_of_{count}.npz" for k in range(count)]
-    for file, pose in zip(files, poses):
-        if not file.exists():
-            trace(body, pose, file)
-    pairs = [maps_of(file, pose, network, seed) for seed, (file, pose) in enumerate(zip(files, poses))]
-    single = np.mean([errors for _, errors in pairs], axis=0)
-    views = tuple(view for view, _ in pairs)
-    results = path(views, FusionSettings(), MemoryCache())
-    point = seen_points(body, [capture(body, pose) for pose in poses])
-    hull = iso_surface(visual_hull(reduce_views(list(views)), FusionSettings().shape.grid))
-    percent = [100 * mean_distance(mesh, point) / body.size for mesh in (hull, results.mesh)]
-    cells = [f"{one:.3g} → {both:.3g}" for one, both in zip(single, fused_errors(results, body, files[0]))]
-    return (
-        f"| {name} | {percent[0]:.2f} | {percent[1]:.2f} | {solid(results.mesh).euler_number} | "
-        f"{is_closed(results.mesh)} | {' | '.join(cells)} |"
-    )
+def write(folder: Path, name: str, views: int, traced: Path) -> None:
+    """Write the RAW files of a session and its truth; `traced` caches Mitsuba's scenes."""
+    mesh = Path(os.environ["POLCAP_DATA"]) / "meshes/test" / f"{name}.npz"
+    scene = Scene(Model(str(mesh), SHOOT.radius_m), Coat((material(),)), law="rough")
+    traced.mkdir(parents=True, exist_ok=True)
+    with patch.object(render, "stokes", partial(path_traced, traced, render.stokes)):
+        all_around.write(folder, scene, SHOOT, views)
 
 
-def trace(body: Body, pose: Pose, file: Path) -> None:
-    """Render a view; all views of an object draw the same material."""
+def material() -> Material:
+    """The material that `make_mitsuba.shoot` draws with this seed, as one of polcap's renderer."""
+    drawn = plain(np.zeros((1, 3, 3)), MATERIALS["rough"], None, np.random.default_rng(SEED))
+    color, grade = (float(drawn["r"][0]), float(drawn["g"][0]), float(drawn["b"][0])), drawn["grades"][0]
+    rough = grade["alpha"] ** 0.5
+    return Material(color, color, "plain", roughness=(rough, rough), specular=grade["strength"], ior=grade["ior"])
+
+
+def path_traced(traced: Path, stokes: Any, scene: Scene, view: View, x: Floats, y: Floats, *others: Any) -> Floats:
+    """Stokes parameters (3, H, W, 3) of `render.stokes`, with the object's pixels by Mitsuba."""
+    out: Floats = stokes(scene, view, x, y, *others)
+    mask = render.gbuffer(scene, view, *x.shape).mask
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    top, left = int(rows[0]) - MARGIN, int(columns[0]) - MARGIN
+    size = max(int(rows[-1]) - top, int(columns[-1]) - left) + 1 + MARGIN
+    crop = View(view.focal, (view.center[0] - left, view.center[1] - top), 1.0)
+    file = traced / f"{zlib.crc32(msgspec.json.encode(scene)):08x}.npz"
+    if not file.exists():
+        render_scene(file, scene, crop, size)
+    with np.load(file) as stored:
+        made = {name: stored[name] for name in stored.files}
+    inside = np.s_[top : top + size, left : left + size]
+    at = mask[inside]
+    squared = np.sum((np.array(scene.light) - np.array(scene.position)) ** 2)  # m², where polcap's white has S0 = 1
+    light = scene_light(made) * (squared / made["middle"] ** 2) / covered(scene, crop, size)[..., None]
+    out[:, *inside][:, at] = light[:, at]
+    return out
+
+
+def render_scene(file: Path, scene: Scene, view: View, size: int) -> None:
+    """Path-trace a view; all views draw the same material."""
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_mono_polarized")
-    view = capture(body, pose, PIXELS).view
-    placed = pose.rotation, pose.translation, view
-    made, about = shoot(mi, body.triangles, placed, "rough", None, PIXELS, DEPTH, np.random.default_rng(2026))
-    file.parent.mkdir(parents=True, exist_ok=True)
+    pose = scene.turn.as_matrix(), np.array(scene.position), view
+    random, flash = np.random.default_rng(SEED), list(scene.light)
+    made, about = shoot(mi, all_around.surface(scene), pose, "rough", None, size, DEPTH, random, flash)
     with atomic.path(file) as temporary:
         np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(about)), **made)
 
 
-def maps_of(file: Path, pose: Pose, network: Network, seed: int) -> tuple[FusionView, list[float]]:
-    """A view's maps, and their mean errors: normals [degrees], diffuse, F0, roughness."""
-    case, _ = read(file, clean=False, rough=False, seed=seed)
-    maps, truth = infer.estimate(case.cues, network, onnx.run, infer.InferSettings()), case.truth
-    both = maps.mask & truth.mask
-    off = np.degrees(np.arccos(np.clip(dot(maps.normal, truth.normal), -1, 1)))
-    colors = [luminance(a) - luminance(b) for a, b in ((maps.diffuse, truth.diffuse), (maps.specular, truth.specular))]
-    errors = [float(np.abs(one[both]).mean()) for one in (off, *colors, maps.roughness - truth.roughness)]
-    light = np.array(json.loads(str(np.load(file)["about"]))["light"])
-    view = FusionView(
-        file.stem, pose, maps.view, light, maps.mask, maps.normal, maps.confidence, maps.diffuse, maps.specular,
-        maps.roughness, case.cues.radiance,
-    )  # fmt: skip
-    return view, errors
-
-
-def fused_errors(results: FusionResults, body: Body, file: Path) -> Floats:
-    """Mean errors of the fused maps on what views saw, as in `maps_of`; the true material is the same everywhere."""
-    with np.load(file) as made:
-        truth = {name: made[name][made["mask"]].mean(axis=0) for name in ("diffuse", "specular", "roughness")}
-    count = len(body.triangles.vertices)
-    return against_truth(results, body.triangles, {name: np.tile(value, (count, 1)) for name, value in truth.items()})
+def covered(scene: Scene, view: View, size: int) -> Floats:
+    """Share (H, W) of each pixel that the object covers; Mitsuba's pixels are means over their areas."""
+    out = np.zeros(size * size)
+    for x, y in forward_camera.pixel_samples(size, size, SIDE):
+        rays = frames.rays_at(view, x, y).reshape(-1, 3)
+        out[trace.trace(scene.shape, scene.position, scene.turn, rays).index] += 1 / SIDE**2
+    return np.maximum(out, 1 / SIDE**2).reshape(size, size)
 
 
 if __name__ == "__main__":

@@ -110,9 +110,12 @@ def build(
 
 def shoot(
     mi: Any, mesh: Triangles, pose: tuple[Floats, Floats, View], name: str, texture: Path | None, size: int, depth: int,
-    random: np.random.Generator,
+    random: np.random.Generator, light: list[float] | None = None,
 ) -> tuple[dict[str, Floats], dict[str, Any]]:  # fmt: skip
-    """What `build` returns, of a mesh with a rotation and a translation (object to camera) before a camera."""
+    """What `build` returns, of a mesh with a rotation and a translation (object to camera) before a camera.
+
+    `light` (3,) m: the flash in the camera frame; None: above the lens by 5 % of the distance.
+    """
     rotation, translation, view = pose
     corner, normal = subdivided(mesh)
     material = MATERIALS.get(name)
@@ -120,7 +123,7 @@ def shoot(
     if not trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight:
         corner, normal = facing(corner, normal, -translation @ rotation)
     far = float(-translation[2] - np.mean(corner @ rotation[2]))
-    light = [0.0, 0.05 * far, 0.0]
+    light = light or [0.0, 0.05 * far, 0.0]
     parts = [
         {
             "position": corner[which] @ rotation.T + translation,
