@@ -15,8 +15,11 @@ _BRIGHT = 4.0  # times the backdrop; docs/benchmarks/fusion.md
 _BEYOND = 4  # px from the mask that a part must reach; nearer pixels are left to `mask_border`
 
 
-def add(picture: Floats, mask: Bools) -> Bools:
-    """The mask (H, W) with the bright parts that it lacks, by the linear picture (H, W, 3) without the board."""
+def add(picture: Floats, mask: Bools, board: Bools) -> Bools:
+    """The mask (H, W) with the bright parts that it lacks, by the linear picture (H, W, 3) without the board.
+
+    `board` (H, W) are the pixels from which the board's print was erased; they are never added.
+    """
     box = box_around(mask, _REACH, least=2 * _BEYOND)
     if box is None:
         return mask
@@ -25,7 +28,7 @@ def add(picture: Floats, mask: Bools) -> Bools:
     beyond = ~dilate(inside, _BEYOND)
     if not beyond.any():
         return mask
-    bright = brightness > _BRIGHT * np.median(brightness[beyond])
+    bright = (brightness > _BRIGHT * np.median(brightness[beyond])) & ~board[part]
     protruding = bright & dilate(bright & beyond, _BEYOND + 2)
     _, label = cv2.connectedComponents((inside | protruding).astype(np.uint8))
     grown = mask.copy()

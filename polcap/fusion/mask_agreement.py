@@ -53,7 +53,7 @@ def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, s
         view = used.pop(worst)
         inside = np.delete(inside, worst, axis=0)
         left_out[view.name] = (
-            f"its mask and those of the other views differ by {100 * share:.0f} % of their area, the limit is "
+            f"its mask and those of the other views differ by {100 * share:.1f} % of their area, the limit is "
             f"{100 * _MOST_UNCOVERED:g} %: the mask is wrong, or the object moved on the board; look at "
             f"{COMPARED} in its polcap folder, and shoot the view again"
         )

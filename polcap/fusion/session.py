@@ -347,7 +347,8 @@ def _mask_object(task: MaskTask) -> Bools:
     settings = msgspec.structs.replace(view.config.mask, part=0)  # remains of the board are found in the next step
     found = mask.segment(erased, results.alignment, results.color, None, view.supplied.mask_network, onnx.run, settings)
     picture = mask.mean_picture(erased, results.alignment, results.color)
-    return mask_border.refine(picture, bright_parts.add(picture, found.mask))
+    board = np.any(erased.value != results.radiance.value, axis=(0, -1))
+    return mask_border.refine(picture, bright_parts.add(picture, found.mask, board))
 
 
 def _compare_masks(

@@ -1,4 +1,4 @@
-"""Faults of one view in a fusion: each is named, the view is left out or the session refused; none spoils the mesh.
+"""Faults of one view in a fusion: what the report names, which views are left out, and errors of the fused object.
 
 python tests/benchmarks/bench_fusion_faults.py FOLDER
 
@@ -106,17 +106,14 @@ def swap_angles(view: Path) -> None:
     (view / "pol").rename(view / "pol090")
 
 
-def hide_left_half(view: Path) -> None:
-    studio = studio_of(view, scene_of(view))
-    studio.hidden[:, : SHOOT.width // 2] = True
-    write(view, studio)
+def hide_left_half(object_too: bool) -> Callable[[Path], None]:
+    def change(view: Path) -> None:
+        studio = studio_of(view, scene_of(view))
+        studio.hidden = ~studio.buffer.mask | object_too
+        studio.hidden[:, SHOOT.width // 2 :] = False
+        write(view, studio)
 
-
-def hide_left_half_of_board(view: Path) -> None:
-    """As if a dark thing lay on the board beside the object."""
-    studio = studio_of(view, scene_of(view))
-    studio.hidden[:, : SHOOT.width // 2] = ~studio.buffer.mask[:, : SHOOT.width // 2]
-    write(view, studio)
+    return change
 
 
 def hide_board(view: Path) -> None:
@@ -148,9 +145,8 @@ def page(studio: Studio, margin_m: float) -> Bools:
 
 
 def backwards(scene: Scene) -> Floats:
-    """Unit vector (3,) on the board, away from the lens; camera frame."""
-    across = np.array([1.0, 0.0, 0.0])  # the camera does not roll
-    return np.cross(board_of(scene).normal, across)
+    """Unit vector (3,) on the board, away from the lens, before a camera that does not roll; camera frame."""
+    return np.cross(board_of(scene).normal, [1.0, 0.0, 0.0])
 
 
 def slide(share: float, away: bool) -> Callable[[Path], None]:
@@ -184,8 +180,8 @@ FAULTS: dict[str, Callable[[Path], None]] = {
     "view missing": shutil.rmtree,
     "shot missing": lambda view: shutil.rmtree(view / "pol045"),
     "angles swapped": swap_angles,
-    "left half black": hide_left_half,
-    "left half black but for the object": hide_left_half_of_board,
+    "left half black": hide_left_half(object_too=True),
+    "left half black but for the object": hide_left_half(object_too=False),
     "board hidden but for its edges": hide_board,
     "second board": add_board,
     "slid by 13 % across": slide(0.13, away=False),
