@@ -11,6 +11,7 @@ import numpy as np
 from polcap import __version__
 from polcap import report as reports
 from polcap.errors import SettingError
+from polcap.formats.capture import folder_names
 from polcap.formats.export import encoders, provenance
 from polcap.fusion import fused_maps, fused_page, joining, object_pictures
 from polcap.fusion import session as sessions
@@ -189,15 +190,17 @@ def _gates(processed: ProcessedSession, results: FusionResults, rows: Sequence[M
 
 
 def _views_gate(processed: ProcessedSession) -> Gate:
-    used, missing = len(processed.views), processed.left_out
-    if missing:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in missing.items())
-        message = f"{len(missing)} of {used + len(missing)} views are left out: {reasons}"
+    used, left_out = len(processed.views), processed.left_out
+    missing = folder_names.missing_views([*(view.name for view in processed.views), *left_out])
+    absent = f"; no folder {folder_names.few_names(missing)}" if missing else ""
+    if left_out:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
+        message = f"{len(left_out)} of {used + len(left_out)} views are left out: {reasons}{absent}"
         return Gate("views", "warn", used, _FEW_VIEWS, message, "Shoot these views again, or delete them", unit="")
     if used < _FEW_VIEWS:
-        message = f"{used} views are few: parts between them are guessed from outlines"
+        message = f"{used} views are few: parts between them are guessed from outlines{absent}"
         return Gate("views", "warn", used, _FEW_VIEWS, message, "Shoot 12 views or more", unit="")
-    return Gate("views", "pass", used, _FEW_VIEWS, f"All {used} views are used", unit="")
+    return Gate("views", "pass", used, _FEW_VIEWS, f"All {used} views are used{absent}", unit="")
 
 
 def _agreement_gate(rows: Sequence[Mapping[str, Any]]) -> Gate:

@@ -252,11 +252,19 @@ def read(session_input: SessionInput) -> Session:
     if not names:
         raise CaptureError(f"{folder} holds no views; put each capture into a folder view01, view02, …")
     session = Session({})
+    views: dict[str, str] = {}  # by digest of a photograph
     for name in names:
         try:
-            session.captures[name] = reader.read(folder / name, session_input.angles_deg, session_input.clockwise)
+            capture = reader.read(folder / name, session_input.angles_deg, session_input.clockwise)
         except _FAULTS as error:
             session.left_out[name] = _reason(str(folder / name), error)
+            continue
+        photographs = [frame.digest for shot in capture.shots for frame in shot.frames]
+        if earlier := next((views[digest] for digest in photographs if digest in views), None):
+            session.left_out[name] = f"holds photographs of {earlier}"
+            continue
+        session.captures[name] = capture
+        views |= dict.fromkeys(photographs, name)
     session.require_views()
     return session
 

@@ -3,6 +3,9 @@
 polcap synth FOLDER --views 12 && polcap fuse FOLDER
 python tests/benchmarks/bench_fused_asset.py FOLDER
 
+Two distances, % of the object's size: of the true surface, where some view sees it, from the mesh; and of the texels
+that a view saw from the true surface.
+
 Of a folder with a second set (`--set laid=8`) also prints how well the sets are joined: errors of the turn [degrees]
 and, at the object's middle, of the place [% of its size]; the share of the second set's surface that the first
 confirms; the share of the mesh that views saw, and the mean distance of the whole true surface from it [%], from the
@@ -16,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from bench_fusion import mean_distance
+from bench_fusion import mean_distance, seen_points
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from trimesh import Trimesh
@@ -36,14 +39,16 @@ from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 
 LEAST_SEEN = 0.02  # weight of a texel
+SAMPLES = 400_000  # of the true surface
 
 
 class Errors(NamedTuple):
-    """Mean errors: normal [°], luminance of albedo and of F0, roughness; and the distance of the mesh."""
+    """Mean errors: normal [°], luminance of albedo and of F0, roughness; and distances, shares of the object's size."""
 
     single: Floats  # (4,) mean over the views
     fused: Floats  # (4,) of the texels that a view saw
-    distance: float  # of the mesh from the seen truth, share of the object's size
+    distance: float  # of the seen truth from the mesh
+    excess: float  # of the texels that a view saw from the truth
 
 
 def main(folder: Path) -> None:
@@ -52,7 +57,7 @@ def main(folder: Path) -> None:
     print_row("single", found.single)
     print_row("fused", found.fused)
     print("reduction " + "".join(f"{100 * one:8.0f}%" for one in 1 - found.fused / found.single))
-    print(f"distance of the mesh from the seen truth: {100 * found.distance:.2f} % of the size")
+    print(f"seen truth to mesh {100 * found.distance:.2f} %, seen texels to truth {100 * found.excess:.2f} %")
     if (folder / "setB").exists():
         print(joined(folder))
 
@@ -65,8 +70,23 @@ def errors(folder: Path) -> Errors:
     size = float(np.ptp(surface.vertices, axis=0).max())
     views = sorted([*folder.glob("view*/"), *folder.glob("set*/view*/")])
     singles = [single(view) for view in views if (view / "polcap" / "report.json").exists()]
-    away = distance(Tracer(surface), source.atlas, source) / size
-    return Errors(np.mean(singles, axis=0), against_truth(source, surface, truth), away)
+    point = seen_points(Tracer(surface), true_lenses(folder))
+    away = mean_distance(fused_maps.closed(source.atlas.mesh), point) / size
+    excess = texel_distance(surface, source) / size
+    return Errors(np.mean(singles, axis=0), against_truth(source, surface, truth), away, excess)
+
+
+def true_lenses(folder: Path) -> list[Floats]:
+    """Places (3,) m of the lens in the frame of the first set."""
+    about = json.loads((folder / "truth.json").read_text())
+    boards = [(one["name"], pose_of(one)) for one in about["views"]]
+    laid = pose_of(about["laid"]) if "laid" in about else None
+    return [(after(laid, pose) if laid and name.startswith("setB") else pose).center for name, pose in boards]
+
+
+def pose_of(stated: dict[str, Any]) -> Pose:
+    """A pose of truth.json."""
+    return Pose(np.array(stated["rotation"]), np.array(stated["translation"]))
 
 
 def joined(folder: Path) -> str:
@@ -79,8 +99,8 @@ def joined(folder: Path) -> str:
     truth, about = dict(np.load(folder / "truth.npz")), json.loads((folder / "truth.json").read_text())
     surface = Trimesh(truth["vertices"], truth["faces"], process=False)
     point, size = sample_surface(surface, 30_000, seed=0)[0], float(np.ptp(truth["vertices"], axis=0).max())
-    laid = Pose(*(np.array(about["laid"][part]) for part in ("rotation", "translation")))
-    boards = {one["name"]: Pose(np.array(one["rotation"]), np.array(one["translation"])) for one in about["views"]}
+    laid = pose_of(about["laid"])
+    boards = {one["name"]: pose_of(one) for one in about["views"]}
     first, second = ([view for view in placed if view.folder == name] for name in ("setA", "setB"))
     true = [after(laid, boards[view.name]) for view in second]
     pairs = [(view.pose, pose) for view, pose in zip(second, true)]
@@ -160,13 +180,13 @@ def against_truth(source: fused_maps.FusedSource | FusionResults, surface: Trian
     )
 
 
-def distance(tracer: Tracer, atlas: Any, source: fused_maps.FusedSource) -> float:
-    """Mean distance [m] of the seen texels from the true surface."""
-    seen = source.maps.weight[atlas.covered] > LEAST_SEEN
-    point, normal = atlas.position[seen], atlas.normal[seen]
-    reach = 0.1 * tracer.size
-    ahead = np.stack([np.asarray(tracer.first_hits(point, way * normal)[0]) for way in (1, -1)])
-    return float(np.minimum(ahead.min(axis=0), reach).mean())
+def texel_distance(surface: Triangles, source: fused_maps.FusedSource) -> float:
+    """Mean distance [m] of the texels that a view saw from the true surface, by the planes of its nearest samples."""
+    truth = Trimesh(surface.vertices, surface.faces, process=False)
+    sample, face = sample_surface(truth, SAMPLES, seed=0)
+    point = source.atlas.position[source.maps.weight[source.atlas.covered] > LEAST_SEEN]
+    near = cKDTree(sample).query(point)[1]
+    return float(np.abs(np.sum((point - sample[near]) * truth.face_normals[face[near]], axis=1)).mean())
 
 
 def mean_angle_deg(normal: Floats, truth: Floats) -> float:

@@ -12,6 +12,7 @@ import argparse
 import os
 import resource
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -26,7 +27,7 @@ from polcap.fusion.closed_mesh import is_closed, iso_surface
 from polcap.fusion.hull import visual_hull
 from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.small_views import reduce_views
-from polcap.fusion.values import ClosedMesh, FusionView
+from polcap.fusion.values import ClosedMesh
 from polcap.images import Floats
 from polcap.optics.frames import dot, unit
 from polcap.optics.mesh_tracer import Tracer, smooth
@@ -71,7 +72,7 @@ def row(name: str, count: int, pictures: Path | None) -> str:
     true = [capture(body, pose) for pose in poses]
     views = [with_errors(body, view, rng) for view in true]
     off = np.mean([mean_error_deg(*pair) for pair in zip(true, views)])
-    point = seen_points(body, true)
+    point = seen_points(body.tracer, [pose.center for pose in poses])
     start = time.process_time()
     fused = fuse_shape(views, ShapeSettings())
     seconds = time.process_time() - start
@@ -94,20 +95,19 @@ def true_euler(vertices: Floats, faces: NDArray[np.int64]) -> int:
     return int(mesh.euler_number)
 
 
-def seen_points(body: Body, views: list[FusionView]) -> Floats:
-    """Points (N, 3) m, even over the parts of the true surface that some view sees."""
+def seen_points(surface: Tracer, lenses: Sequence[Floats]) -> Floats:
+    """Points (N, 3) m, even over the parts of the true surface that are seen from some of the lenses (3,)."""
     rng = np.random.default_rng(1)
-    corner = body.triangles.vertices[body.triangles.faces].astype(np.float64)
+    corner = surface.mesh.vertices[surface.mesh.faces].astype(np.float64)
     area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     size = np.linalg.norm(area, axis=1)
     face = rng.choice(len(corner), POINTS, p=size / size.sum())
     point = np.einsum("nk,nkc->nc", rng.dirichlet(np.ones(3), POINTS), corner[face])
     seen = np.zeros(POINTS, bool)
-    for view in views:
-        way = view.pose.center - point
-        facing = dot(unit(area[face]), unit(way))
-        start = point + unit(way) * (1e-4 * body.size)
-        seen |= (facing > FACING) & ~body.tracer.hidden(start, view.pose.center)
+    for lens in lenses:
+        way = unit(lens - point)
+        facing = dot(unit(area[face]), way)
+        seen |= (facing > FACING) & ~surface.hidden(point + way * (1e-4 * surface.size), lens)
     return np.asarray(point[seen])
 
 

@@ -5,7 +5,7 @@
 Sessions as of `polcap synth --views`, with board and chart, but the object's pixels are traced by `make_mitsuba.py`,
 with interreflection: material "rough" (one albedo, roughness and F0). OUT has scenes, sessions and results, so that a
 stopped run continues. Prints for each object the mean errors of single views and of the fused maps, and the mean
-distance of the mesh from the seen truth, % of the object's size.
+distance of the seen truth from the mesh, % of the object's size.
 """
 
 import argparse

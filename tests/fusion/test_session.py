@@ -1,8 +1,10 @@
 """A session goes on without the views that cannot be used, and says why each is left out."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -38,6 +40,18 @@ def test_a_view_that_lacks_a_shot_is_left_out_with_the_reason(tmp_path: Path, mo
     found = sessions.read(session_of(tmp_path, "view01", "view02", "view03", "view05"))  # view04 was never shot
     assert found.used == ["view01", "view02", "view05"]
     assert found.left_out == {"view03": "2 different polarizer angles where 3 are needed; add the missing shot"}
+
+
+def test_a_copy_of_a_view_is_left_out(tmp_path: Path) -> None:
+    for view in (1, 2, 3, 4):
+        for angle in (0, 45, 90):
+            photo = tmp_path / f"view{view:02d}/pol{angle:03d}/photo.png"
+            photo.parent.mkdir(parents=True)
+            photo.write_bytes(cv2.imencode(".png", np.full((8, 8, 3), view + angle, np.uint16))[1].tobytes())
+    shutil.copytree(tmp_path / "view02", tmp_path / "view05")
+    found = sessions.read(SessionInput(tmp_path, Config()))
+    assert found.used == ["view01", "view02", "view03", "view04"]
+    assert found.left_out == {"view05": "holds photographs of view02"}
 
 
 def test_three_views_are_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

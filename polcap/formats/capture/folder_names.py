@@ -65,6 +65,27 @@ def session_views(folder: Path) -> list[str]:
     return sorted((path.relative_to(folder).as_posix() for path in found), key=natural)
 
 
+def missing_views(names: Iterable[str]) -> list[str]:
+    """Views that the numbers of a session's views skip: of view01, setA/view02, setA/view04 these are setA/view03.
+
+    None where most numbers are missing, as in names by degrees (view000, view030).
+    """
+    numbers: dict[str, set[int]] = defaultdict(set)
+    width: dict[str, int] = {}
+    for name in names:
+        prefix = name.rstrip("0123456789")
+        if digits := name.removeprefix(prefix):
+            numbers[prefix].add(int(digits))
+            width[prefix] = len(digits)
+    return [
+        f"{prefix}{number:0{width[prefix]}d}"
+        for prefix, used in numbers.items()
+        if max(used) <= 2 * len(used)
+        for number in range(1, max(used))
+        if number not in used
+    ]
+
+
 def is_later_view(folder: Path) -> bool:
     """Whether a capture's folder is a view of a session, but not the first one, which shows the chart."""
     place = Path(os.path.abspath(folder))

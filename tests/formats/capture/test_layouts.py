@@ -142,6 +142,20 @@ def test_only_the_first_view_of_a_session_must_show_the_chart(tmp_path):
     assert later == {"vase/view02", "mug/setB/view01"}
 
 
+@pytest.mark.parametrize(
+    ("names", "missing"),
+    [
+        (["view01", "view02", "view03"], []),
+        (["view01", "view03", "view05"], ["view02", "view04"]),
+        (["setA/view2", "setA/view3", "setB/view1"], ["setA/view1"]),
+        (["view000", "view030", "view060"], []),  # degrees
+        (["view", "view_b"], []),
+    ],
+)
+def test_missing_numbers_of_views_are_named(names, missing):
+    assert folder_names.missing_views(names) == missing
+
+
 def test_untimed_brackets_in_one_folder_are_to_be_sorted(tmp_path):
     """No order of the angles can separate the brackets, so the message does not mention --angles."""
     folder = pictures(tmp_path, [f"krug_{angle}_grad_{number}.png" for angle in (0, 45, 90) for number in range(3)])
