@@ -164,7 +164,7 @@ def _closed(results: FusionResults) -> bool:
 
 
 def _gates(processed: ProcessedSession, results: FusionResults, rows: Sequence[Mapping[str, Any]]) -> Iterator[Gate]:
-    yield _views_gate(processed)
+    yield _views_gate([view.name for view in processed.views], processed.left_out)
     worst = max(rows, key=lambda row: row["reprojection_px"])
     value = worst["reprojection_px"]
     what, limit, remedy = (
@@ -189,9 +189,9 @@ def _gates(processed: ProcessedSession, results: FusionResults, rows: Sequence[M
     yield Gate("closed", "pass" if whole else "fail", None, None, message, "" if whole else "Report this as a bug")
 
 
-def _views_gate(processed: ProcessedSession) -> Gate:
-    used, left_out = len(processed.views), processed.left_out
-    missing = folder_names.missing_views([*(view.name for view in processed.views), *left_out])
+def _views_gate(names: Sequence[str], left_out: Mapping[str, str]) -> Gate:
+    """Gate on the number of used views, which names those that are left out, and numbers that no folder has."""
+    used, missing = len(names), folder_names.missing_views([*names, *left_out])
     absent = f"; no folder {folder_names.few_names(missing)}" if missing else ""
     if left_out:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())

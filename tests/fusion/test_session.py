@@ -54,6 +54,11 @@ def test_a_copy_of_a_view_is_left_out(tmp_path: Path) -> None:
     assert found.left_out == {"view05": "holds photographs of view02"}
 
 
+def test_a_missing_number_of_a_view_is_in_the_report() -> None:
+    gate = fuse_run._views_gate([f"view{number:02d}" for number in range(1, 13) if number != 5], {})
+    assert gate.message == "All 11 views are used; no folder view05"
+
+
 def test_three_views_are_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reader, "read", lambda *_: board_views.capture())
     with pytest.raises(CaptureError, match="2 views can be used, 3 are needed"):
