@@ -5,8 +5,8 @@ Where the hull leaves a part of one mask uncovered, this mask holds the board's 
 the part is removed. Where it leaves parts of several masks uncovered that it covers without one view, this view's mask
 lacks a part of the object. If the object slid, its mask shows one side too far out, and lacks the other side.
 
-A slit in one mask, such as a narrow shadow, cuts through the whole hull. So slits are closed first, where the hull of
-the other masks is solid.
+A slit in one mask, such as a narrow shadow, cuts through the whole hull, and so does a hole. So slits and small holes
+are closed first, where the hull of the other masks is solid.
 
 References
 ----------
@@ -24,9 +24,11 @@ from polcap.fusion.poses import LEAST_VIEWS
 from polcap.fusion.silhouettes import Silhouette, grid_around, halved
 from polcap.images import Bools, Floats
 from polcap.optics.outline import disc_radius
+from polcap.stages.mask.regions import fill_holes
 
 COMPARED = "work/compared_mask.png"  # in the result of a view: its mask, as it was compared
 _SLIT = 0.05  # of the object's diameter in a view; wider gaps in a mask are gaps between the object's parts
+_HOLE = 0.01  # of a mask's area; larger holes are holes of the object
 _MOST_UNCOVERED = 0.01  # of a mask's area; masks whose outlines err by one cell of the grid leave 0.000
 # An object that slid uncovers small parts of several other masks: the sum of their shares. The greatest share is not
 # counted, since that mask may hold a piece of the board.
@@ -66,7 +68,7 @@ def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, s
 
 
 def _without_slits(views: Sequence[Silhouette], points: Floats, step: float) -> list[Silhouette]:
-    """The views with the narrow gaps of their masks closed where all other masks have a point in common."""
+    """The views with narrow gaps and small holes of their masks closed where all other masks have a point in common."""
     inside = np.stack([view.inside(points, step) for view in views])
     votes = inside.sum(axis=0)
     out = []
@@ -74,7 +76,7 @@ def _without_slits(views: Sequence[Silhouette], points: Floats, step: float) -> 
         reach = max(round(_SLIT * disc_radius(view.mask)), 1)
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         framed = np.pad(view.mask.astype(np.uint8), reach)
-        closed = cv2.morphologyEx(framed, cv2.MORPH_CLOSE, disc)[reach:-reach, reach:-reach] > 0
+        closed = fill_holes(cv2.morphologyEx(framed, cv2.MORPH_CLOSE, disc)[reach:-reach, reach:-reach], _HOLE)
         solid = view.near(points[votes - own == len(views) - 1], step)
         out.append(replace(view, mask=view.mask | closed & solid))
     return out

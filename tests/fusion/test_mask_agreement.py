@@ -74,6 +74,18 @@ def test_a_slit_of_one_mask_is_closed(views: list[Silhouette]) -> None:
     assert overlap(used[3].mask, views[3].mask) > 0.99
 
 
+def test_a_small_hole_of_one_mask_is_filled(views: list[Silhouette]) -> None:
+    mask = views[3].mask.copy()
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    side = round(np.sqrt(0.008 * mask.sum()))
+    top, left = rows[len(rows) * 2 // 3], columns[len(columns) // 2]
+    mask[top : top + side, left : left + side] = False
+    used, left_out = mask_agreement.agreeing([*views[:3], replace(views[3], mask=mask), *views[4:]])
+    assert not left_out
+    assert used[3].mask[top : top + side, left : left + side].all()
+    assert all(overlap(one.mask, whole.mask) > 0.99 for one, whole in zip(used, views))
+
+
 def test_masks_without_errors_stay_as_they_are(views: list[Silhouette]) -> None:
     used, _ = mask_agreement.agreeing(views)
     assert all(overlap(found.mask, right.mask) > 0.99 for right, found in zip(views, used, strict=True))
