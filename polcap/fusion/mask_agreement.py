@@ -28,7 +28,7 @@ from polcap.stages.mask.regions import fill_holes
 
 COMPARED = "work/compared_mask.png"  # in the result of a view: its mask, as it was compared
 _SLIT = 0.05  # of the object's diameter in a view; wider gaps in a mask are gaps between the object's parts
-_HOLE = 0.01  # of a mask's area; larger holes are holes of the object
+_HOLE = 0.01  # of a mask's area; larger holes may be holes of the object
 _MOST_UNCOVERED = 0.01  # of a mask's area; masks whose outlines err by one cell of the grid leave 0.000
 # An object that slid uncovers small parts of several other masks: the sum of their shares. The greatest share is not
 # counted, since that mask may hold a piece of the board.
@@ -44,7 +44,7 @@ def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, s
     have too little in common.
     """
     points, step = grid_around(views)
-    used = _without_slits(views, points, step)
+    used = _without_gaps(views, points, step)
     left_out: dict[str, str] = {}
     inside = np.stack([view.inside(points, step) for view in used])  # (N, P)
     while True:
@@ -67,8 +67,8 @@ def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, s
     return _trimmed(used, points[inside.all(axis=0)], step), left_out
 
 
-def _without_slits(views: Sequence[Silhouette], points: Floats, step: float) -> list[Silhouette]:
-    """The views with narrow gaps and small holes of their masks closed where all other masks have a point in common."""
+def _without_gaps(views: Sequence[Silhouette], points: Floats, step: float) -> list[Silhouette]:
+    """The views with slits and small holes of their masks closed where all other masks have a point in common."""
     inside = np.stack([view.inside(points, step) for view in views])
     votes = inside.sum(axis=0)
     out = []
