@@ -1,8 +1,7 @@
 """Batch processing: all captures below a folder, with one summary; a failed capture does not stop the others.
 
 `shards` selects the captures of this process, `unit` processes one capture, `processes` or `cluster` several at a
-time, `contact_sheet` writes the summary, and `job_files` writes job files for a render farm. A capture that is
-processed again continues from its stage cache.
+time, and `contact_sheet` writes the summary. A capture that is processed again continues from its stage cache.
 """
 
 import json

@@ -46,8 +46,7 @@ def parse(text: str) -> Shard:
 def from_environment(environment: Mapping[str, str]) -> Shard:
     """The shard assigned by Slurm, AWS Batch, Kubernetes or PBS; `WHOLE` without such a scheduler.
 
-    Kubernetes indexed jobs and PBS arrays do not state the number of tasks: `POLCAP_SHARDS` must hold it. Job files
-    written by polcap set it.
+    Kubernetes indexed jobs and PBS arrays do not state the number of tasks: `POLCAP_SHARDS` must hold it.
 
     Raises SettingError: the number of tasks is missing, or the index is not below it.
     """

@@ -35,7 +35,7 @@ from polcap.pipeline.path import UserInput
 State = Literal["todo", "running", "interrupted", "done", "gates", "failed", "bug", "crashed"]
 WORDS: dict[State, str] = {**{state: state for state in get_args(State)}, "gates": "gate failed"}  # for people
 FINISHED: tuple[State, ...] = ("done", "gates")  # the asset is there
-FOLDER = own_folders.BATCH  # in ROOT or --out: records, thumbnails, summary, job files; safe to delete
+FOLDER = own_folders.BATCH  # in ROOT or --out: records, thumbnails, summary; safe to delete
 
 
 @dataclass(frozen=True)

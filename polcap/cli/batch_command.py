@@ -1,17 +1,14 @@
-"""`polcap batch`: process every capture below a folder, or write a job file for a farm."""
+"""`polcap batch`: process every capture below a folder."""
 
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
 from typer import Argument, Context, Exit, Option
 
 from polcap import resource_limits, terminal
 from polcap.cli import options
-from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimator, Json, Model, NoChart, choice
-
-# as batch.job_files.Scheduler, which is not imported at start
-JobKind = Literal["slurm", "openjd", "opencue", "snakemake", "kubernetes"]
+from polcap.cli.options import Angles, Assignments, ConfigFile, Device, Estimator, Json, Model, NoChart
 
 
 def batch(
@@ -34,8 +31,6 @@ def batch(
     keep_going: Annotated[
         bool, Option("--keep-going/--fail-fast", help="Go on after a failure, or stop at the first.")
     ] = True,
-    write_jobs: Annotated[JobKind | None, choice("Only write the job file for a farm.")] = None,
-    jobs: Annotated[int, Option(min=0, help="Shards of the job file; 0 is one per capture, 1000 at most.")] = 0,
     json: Json = False,
     device: Device = "cpu",
     threads: options.ProcessThreads = 0,
@@ -57,9 +52,6 @@ def batch(
     resource_limits.check_memory(memory)
     if model is not None or estimator == "network":  # refuse an unusable model before any capture is processed
         models.load_network(estimator, model, "cpu", 1)  # the GPU may be in other machines
-    if write_jobs is not None:
-        _write_jobs(write_jobs, root, out, context.params)
-        return
     process_options = unit.ProcessOptions(
         settings=msgspec.to_builtins(settings.load(config, assignments or ())),
         chart=options.chart_request(None if chart is None else str(chart), no_chart),
@@ -76,16 +68,3 @@ def batch(
     terminal.print_data(summary if json else str((out or root) / unit.FOLDER / "summary.html"))
     if code := batches.exit_code(summary):
         raise Exit(code)
-
-
-def _write_jobs(kind: JobKind, root: Path, out: Path | None, stated: dict[str, Any]) -> None:
-    """Write the job file of a batch; `stated` are the options of `batch` by name. Prints the file's path."""
-    from polcap import batch as batches
-    from polcap.batch import job_files, unit
-
-    shards = stated["jobs"] or min(len(batches.find(root, out)), 1000)
-    command = job_files.batch_command(root, stated)
-    job = job_files.BatchJob(command, root.resolve(), shards, memory_gb=stated["memory"] or 4.0)
-    file = job_files.write(kind, job, (out or root).resolve() / unit.FOLDER)
-    terminal.print_message(f"To start it: {job_files.submit_hint(kind, file)}")
-    terminal.print_data({"file": str(file), "shards": shards} if stated["json"] else str(file))

@@ -43,7 +43,6 @@ def test_results_of_process_are_no_captures(captures: Path, tmp_path: Path) -> N
     assert [unit.name for unit in batch.find(root)] == ["obj0"]
 
 
-@pytest.mark.parametrize("more", [(), ("--write-jobs", "slurm")], ids=["run", "job file"])
 @pytest.mark.parametrize(
     ("model", "estimator", "words"),
     [
@@ -53,12 +52,12 @@ def test_results_of_process_are_no_captures(captures: Path, tmp_path: Path) -> N
     ],
 )
 def test_an_unusable_model_is_refused_before_any_capture(
-    tmp_path: Path, polcap: Command, model: str, estimator: str, words: str, more: tuple[str, ...]
+    tmp_path: Path, polcap: Command, model: str, estimator: str, words: str
 ) -> None:
     (tmp_path / "captures" / "obj" / "pol000").mkdir(parents=True)
     (tmp_path / "noise.onnx").write_bytes(b"no model")
     order = ("--out", tmp_path / "out", "--model", tmp_path / model, "--estimator", estimator)
-    done = polcap("batch", tmp_path / "captures", *order, *more)
+    done = polcap("batch", tmp_path / "captures", *order)
     assert done.returncode == 2 and done.stdout == ""
     (line,) = done.stderr.splitlines()
     assert words in line
