@@ -23,6 +23,8 @@ _SYNCED_AT_ONCE = 8  # files; the system then writes its journal once for all of
 _FORBIDDEN = set('/\\:*?"<>|')  # path separators, and characters that Windows refuses
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{n}" for port in ("COM", "LPT") for n in range(10))}  # of Windows
 _NAME_BYTES = 60  # Windows allows 260 characters for the whole path
+_MISSING = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.ENODEV)  # of network drives
+_UNSYNCED = {*_MISSING, errno.EINVAL, errno.EBADF, errno.EISDIR, errno.EACCES, errno.EPERM}  # likewise, of fsync
 REASONS = {
     errno.ENOSPC: "the disk is full; free some space",
     errno.EDQUOT: "the disk quota is used up; free some space",
@@ -34,6 +36,7 @@ REASONS = {
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
     errno.EFBIG: "the file is larger than the file system allows; choose another folder",
     errno.EIO: "the disk reports an input/output error; check the disk",
+    **dict.fromkeys(_MISSING, "its drive lacks a function that polcap needs; choose a folder on a local disk with -o"),
 }
 
 
@@ -115,14 +118,21 @@ def folder(final: str | Path, synced: bool = True) -> Iterator[Path]:
 
 
 def sync(target: Path) -> None:
-    """Force the content of a file, or the list of names in a folder, from memory onto the disk (fsync)."""
+    """Force the content of a file, or the list of names in a folder, from memory onto the disk (fsync).
+
+    Does nothing on a drive without this function. Raises OSError: the disk is full or faulty.
+    """
     if os.name == "nt" and target.is_dir():  # Windows cannot sync a folder
         return
-    handle = os.open(target, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
     try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        handle = os.open(target, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        if error.errno not in _UNSYNCED:
+            raise
 
 
 def discard(target: Path) -> None:

@@ -6,6 +6,7 @@ The JSON holds the scalars and the names of the array files. A value that does n
 
 import io
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from enum import Enum, IntEnum, IntFlag
 from hashlib import file_digest, sha256
@@ -128,11 +129,14 @@ def save(file: Path, array: NDArray[Any]) -> list[Any]:
 def load(file: Path) -> NDArray[Any]:
     """Open an array of any shape from an .npy file: as a read-only memory map if large, else read into memory.
 
+    Large files too are read into memory if their drive has no memory maps.
+
     Raises StorageError: the file is missing or no .npy.
     """
     try:
         if file.stat().st_size > _MAPPED:
-            return np.asarray(np.load(file, mmap_mode="r", allow_pickle=False))
+            with suppress(OSError):
+                return np.asarray(np.load(file, mmap_mode="r", allow_pickle=False))
         array: NDArray[Any] = np.load(file, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise StorageError(f"{file} cannot be read; delete {file.parent} and run again") from error

@@ -12,7 +12,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from polcap.errors import SettingError, StorageError
-from polcap.formats import atomic, own_folders, text_file
+from polcap.formats import atomic, folder_lock, own_folders, text_file
 from polcap.formats.capture import folder_names
 from polcap.pipeline.cache import seal
 from polcap.pipeline.path import STAGES
@@ -57,7 +57,7 @@ def locked(out: Path) -> Iterator[None]:
     lock, owner = FileLock(work / "lock", timeout=0), work / "owner"
     try:
         work.mkdir(parents=True, exist_ok=True)
-        lock.acquire()
+        folder_lock.acquire(lock)
     except Timeout as error:
         other = owner.read_text(encoding="utf-8", errors="replace")[:20].strip() if owner.exists() else "unknown"
         raise StorageError(f"{out}: process {other} is working here; wait for it or choose another --out") from error

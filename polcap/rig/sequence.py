@@ -17,6 +17,7 @@ import msgspec
 from filelock import FileLock, Timeout
 
 from polcap.errors import PolcapError, SettingError, StorageError
+from polcap.formats import folder_lock
 from polcap.formats.capture import reader as captures
 from polcap.rig import capture_record, device_urls, dry_run, person, preview, retake_criteria, shooting_plan
 from polcap.rig.background_check import MOST_PENDING, BackgroundCheck
@@ -215,7 +216,7 @@ def _check_person(missing: list[Slot], camera: Camera) -> None:
 def _locked(folder: Path) -> AbstractContextManager[Any]:
     """Lock the capture folder against another polcap; the system releases the lock when the process dies."""
     try:
-        return FileLock(folder / ".lock", timeout=0).acquire()
+        return folder_lock.acquire(FileLock(folder / ".lock", timeout=0))
     except Timeout as error:
         raise StorageError(f"{folder}: another polcap is shooting into it; wait until it has finished") from error
 

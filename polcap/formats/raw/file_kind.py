@@ -77,11 +77,19 @@ def kind(file: BinaryIO, suffix: str) -> Kind:
     if is_raw_tiff or raw_suffix(head) is not None:
         return "raw"
     if head.startswith(TIFF):
-        with mmap(file.fileno(), 0, access=ACCESS_READ) as data:  # reads the directories' pages only
-            return "raw" if _is_raw(structure(data)) else "photo"
+        return "raw" if _is_raw(structure(_mapped(file))) else "photo"
     # HEIC, AVIF or WebP next to a RAW; films; sounds
     known = head[4:8] == b"ftyp" or head[:4] == b"RIFF" or suffix.lower() in _SIDECARS
     return "other" if known or _is_text(file) else "unknown"
+
+
+def _mapped(file: BinaryIO) -> bytes | mmap:
+    """Bytes of a file as a memory map, so that only the pages in use are read; on a drive without maps, all bytes."""
+    try:
+        return mmap(file.fileno(), 0, access=ACCESS_READ)
+    except OSError:
+        file.seek(0)
+        return file.read()
 
 
 def _is_text(file: BinaryIO) -> bool:
