@@ -43,7 +43,11 @@ def run(
         try:
             if address == "local":
                 target = distributed.LocalCluster(
-                    n_workers=workers, threads_per_worker=1, processes=True, resources=resources, dashboard_address=":0"
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    processes=True,
+                    resources=resources,
+                    dashboard_address="127.0.0.1:0",  # a host that is left out means all networks
                 )
             client = distributed.Client(target, timeout="10s")
         except (OSError, TimeoutError, ValueError) as error:
@@ -70,6 +74,7 @@ def _gather(
     # workers that join later use the settings they were started with
     client.run(resource_limits.set_limits, options.threads, options.memory_gb)
     running: dict[Any, tuple[Unit, int]] = {}
+    before = {unit: units.read_record(unit) for unit in wanted}
     ended = distributed.as_completed([submit(unit, 1) for unit in wanted])
     for future in ended:
         unit, attempt = running.pop(future)
@@ -79,4 +84,4 @@ def _gather(
             ended.add(submit(unit, attempt + 1))
         else:
             message = f"its workers died ({future.exception()}); give them more memory, or remove it from the batch"
-            yield units.record_crash(unit, " ".join(message.split()), attempt)
+            yield units.record_crash(unit, before[unit], " ".join(message.split()), attempt)

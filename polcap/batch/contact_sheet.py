@@ -4,7 +4,6 @@ import csv
 import io
 from collections import Counter
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -15,11 +14,30 @@ from polcap.batch.unit import FINISHED, FOLDER, WORDS, Unit, UnitRecord
 from polcap.formats import atomic
 
 _COLUMNS = ("name", "state", "verdict", "expected_error_deg", "seconds", "attempts", "asset", "report", "says")
-_STYLE = """
+_FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # first characters of cells that spreadsheets compute
+_PAGE = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>{{ folder }}</title><style>
 body { font: 14px/1.4 system-ui, sans-serif; margin: 1.5em; color: #222 } img { background: #000; display: block }
 table { border-collapse: collapse } td, th { text-align: left; padding: .2em .8em .2em 0; vertical-align: top }
 .sheet { display: grid; grid-template-columns: repeat(auto-fill, 256px); gap: 12px } figcaption { font-size: 12px }
 .done { color: #176617 } .gates { color: #9a5b00 } .failed, .bug, .crashed { color: #b00000; font-weight: bold }
+</style>
+<h1>{{ finished }} of {{ captures }} captures finished ({{ states }})</h1>
+{% if wrong %}
+<table><tr><th>capture</th><th></th><th>reason and remedy</th></tr>
+{% for one in wrong %}
+<tr><td>{{ one.name }}</td><td class="{{ one.state }}">{{ words[one.state] }}</td><td>{{ one.message }}</td></tr>
+{% endfor %}
+</table>
+{% endif %}
+<div class="sheet">
+{% for slug, one in drawn %}
+<figure><a href="{{ link(one.report) }}"><img loading="lazy" width="256" height="128" alt=""
+ src="{{ link('thumbnails/' ~ slug ~ '.jpg') }}"></a><figcaption><span class="{{ one.state }}">{{ one.name }}</span>
+{{ one.verdict }}{% if one.expected_error_deg is not none %}, normals {{ "%.1f" % one.expected_error_deg }}°{% endif %},
+{{ "%.1f" % one.seconds }} s, <a href="{{ link(one.asset) }}">GLB</a></figcaption></figure>
+{% endfor %}
+</div></html>
 """
 
 
@@ -41,33 +59,33 @@ def write(batch_folder: Path, units: Sequence[Unit], records: Sequence[UnitRecor
     text = io.StringIO()
     table = csv.DictWriter(text, _COLUMNS, extrasaction="ignore")
     table.writeheader()
-    table.writerows(totals["rows"])
+    table.writerows({name: _cell(value) for name, value in row.items()} for row in totals["rows"])
     atomic.write_json(batch_folder / "summary.json", totals)
     atomic.write(batch_folder / "summary.csv", text.getvalue())
     atomic.write(batch_folder / "summary.html", _page(totals, units, records))
 
 
+def _cell(value: Any) -> Any:
+    """A value for a CSV table; text that a spreadsheet would compute gets an apostrophe in front."""
+    return f"'{value}" if isinstance(value, str) and value.lstrip(" ").startswith(_FORMULA) else value
+
+
 def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[UnitRecord]) -> str:
-    states = ", ".join(f"{count} {WORDS[state]}" for state, count in totals["states"].items())
-    lines = [
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{FOLDER}</title><style>{_STYLE}</style>',
-        f"<h1>{totals['finished']} of {totals['captures']} captures finished ({escape(states)})</h1>",
-    ]
-    wrong = [record for record in records if record.state != "done"]
-    if wrong:
-        lines.append("<table><tr><th>capture</th><th></th><th>reason and remedy</th></tr>")
-        lines += [
-            f'<tr><td>{escape(r.name)}</td><td class="{r.state}">{WORDS[r.state]}</td><td>{escape(r.message)}</td></tr>'
-            for r in wrong
-        ]
-        lines.append("</table>")
-    lines.append('<div class="sheet">')
-    for unit, record in zip(units, records, strict=True):
-        if unit.thumbnail_file.exists():
-            picture = f'<img loading="lazy" width="256" height="128" src="thumbnails/{quote(unit.slug)}.jpg" alt="">'
-            error = "" if record.expected_error_deg is None else f", normals {record.expected_error_deg:.1f}°"
-            caption = f'<span class="{record.state}">{escape(record.name)}</span> {record.verdict}{error}'
-            caption += f', {record.seconds:.1f} s, <a href="{quote(record.asset)}">GLB</a>'
-            page = f'<a href="{quote(record.report)}">{picture}</a>'
-            lines.append(f"<figure>{page}<figcaption>{caption}</figcaption></figure>")
-    return "\n".join([*lines, "</div></html>", ""])
+    """The page summary.html: counts, captures that are not done, and a picture of each result."""
+    import jinja2  # not needed by most commands
+
+    page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(_PAGE)
+    pairs = zip(units, records, strict=True)
+    return page.render(
+        **totals | {"states": ", ".join(f"{count} {WORDS[state]}" for state, count in totals["states"].items())},
+        folder=FOLDER,
+        wrong=[record for record in records if record.state != "done"],
+        drawn=[(unit.slug, record) for unit, record in pairs if unit.thumbnail_file.exists()],
+        words=WORDS,
+        link=_link,
+    )
+
+
+def _link(path: str) -> str:
+    """Address of a file on the page; it never leads to another server."""
+    return "./" + quote(path.encode("utf-8", "backslashreplace"))

@@ -120,10 +120,12 @@ class ProcessPool:
 def run(wanted: Sequence[Unit], options: ProcessOptions, workers: int, retries: int) -> Iterator[UnitRecord]:
     """Process captures in several child processes; yields records in the order in which captures end."""
     limits = Limits(options.threads, options.memory_gb)
+    before = {unit: units.read_record(unit) for unit in wanted}
     with ProcessPool(workers, retries, limits) as pool:
         for unit, outcome in pool.run(partial(_process, options), wanted):
             if isinstance(outcome, Died):
-                yield units.record_crash(unit, _DIED.format(attempts=outcome.attempts), outcome.attempts)
+                message = _DIED.format(attempts=outcome.attempts)
+                yield units.record_crash(unit, before[unit], message, outcome.attempts)
             else:
                 yield outcome
 

@@ -5,7 +5,6 @@ An interrupted unit continues from its stage cache; a finished one is recognized
 
 import dataclasses
 import hashlib
-import json
 import os
 import socket
 import subprocess
@@ -24,7 +23,7 @@ from polcap import resource_limits
 from polcap.batch import thumbnail
 from polcap.config import Config
 from polcap.errors import InputError, PolcapError, StorageError, one_line
-from polcap.formats import atomic, own_folders
+from polcap.formats import atomic, own_folders, text_file
 from polcap.formats.capture import reader
 from polcap.images import ChartRequest, Device, Network
 from polcap.pipeline import models, unchanged
@@ -93,7 +92,12 @@ class UnitRecord(msgspec.Struct, frozen=True):
 
 
 def run(unit: Unit, options: ProcessOptions, attempt: int = 1) -> UnitRecord:
-    """Process one capture of a batch. Errors are not raised, but written into the record."""
+    """Process one capture of a batch. Errors are not raised, but written into the record.
+
+    Dask calls it again if the worker died after the capture was finished: the record of that stays.
+    """
+    if (finished := find_finished(unit, options)) is not None:
+        return finished
     start = time.perf_counter()
     record = UnitRecord(unit.name, "running", "", 0.0, socket.gethostname(), os.getpid(), attempt)
     try:
@@ -172,8 +176,8 @@ def read_record(unit: Unit) -> UnitRecord:
     The state "running" becomes "interrupted" if the process no longer exists on this machine.
     """
     try:
-        record = msgspec.convert(json.loads(unit.record_file.read_text(encoding="utf-8")), UnitRecord)
-    except (OSError, ValueError, msgspec.ValidationError):
+        record = msgspec.convert(text_file.read_json(unit.record_file), UnitRecord)
+    except (OSError, ValueError):
         return UnitRecord(unit.name)
     if record.state == "running" and record.host == socket.gethostname() and not _alive(record.pid):
         return replace(record, state="interrupted")
@@ -184,8 +188,14 @@ def write_record(unit: Unit, record: UnitRecord) -> None:
     atomic.write_json(unit.record_file, record, synced=False)
 
 
-def record_crash(unit: Unit, message: str, attempt: int) -> UnitRecord:
-    """Write and return a record for a capture after the process that handled it died."""
+def record_crash(unit: Unit, before: UnitRecord, message: str, attempt: int) -> UnitRecord:
+    """Write and return a record for a capture after the process that handled it died.
+
+    If the process had finished the capture first, its record stays; `before` is the record from before it began.
+    """
+    record = read_record(unit)
+    if record.state in FINISHED and record != before:
+        return record
     record = UnitRecord(unit.name, "crashed", message, 0.0, socket.gethostname(), 0, attempt)
     write_record(unit, record)
     return record

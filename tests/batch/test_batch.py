@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from urllib.parse import unquote
@@ -17,9 +18,11 @@ import numpy as np
 import pytest
 
 from polcap import batch
+from polcap.batch import cluster
 from polcap.batch import unit as one
 from polcap.errors import CaptureError
 from polcap.formats.maps import png
+from polcap.images import ChartRequest
 from tests.batch.conftest import OPTIONS
 from tests.conftest import ROOT, Command, shell
 
@@ -191,3 +194,40 @@ def test_scheduler_that_does_not_answer_is_named(captures: Path, tmp_path: Path,
     pytest.importorskip("distributed")
     done = polcap("batch", captures, "--out", tmp_path, *OPTIONS, "--scheduler", "tcp://127.0.0.1:9")
     assert done.returncode == 2 and "tcp://127.0.0.1:9: no scheduler answers there" in done.stderr
+
+
+def finish_and_die(unit: one.Unit, options: one.ProcessOptions, attempt: int) -> None:
+    """Process a capture, and kill the worker before it reports."""
+    one.run(unit, options, attempt)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_capture_stays_done_if_its_dask_worker_dies_afterwards(
+    captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    (unit,) = [unit for unit in batch.find(captures, tmp_path) if unit.name == "obj0"]
+    options = one.ProcessOptions({}, ChartRequest("none"), "analytic")
+    monkeypatch.setattr("polcap.batch.cluster.units.run", finish_and_die)
+    (record,) = cluster.run([unit], options, "local", 1, 0, lambda line: None)
+    assert record.state in one.FINISHED and one.read_record(unit) == record
+    written = unit.record_file.stat().st_mtime_ns
+    monkeypatch.undo()
+    assert one.run(unit, options) == record  # as Dask repeats a task that a dead worker had ended
+    assert unit.record_file.stat().st_mtime_ns == written
+
+
+def test_a_local_cluster_listens_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    psutil = pytest.importorskip("psutil")
+    hosts = list[str]()
+
+    def note(*_: object) -> Iterator[one.UnitRecord]:
+        family = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        ports = [port for process in family for port in process.net_connections("inet")]
+        hosts.extend(port.laddr.ip for port in ports if port.status == psutil.CONN_LISTEN)
+        return iter(())
+
+    monkeypatch.setattr(cluster, "_gather", note)
+    assert list(cluster.run([], one.ProcessOptions({}), "local", 1, 0, lambda line: None)) == []
+    assert len(hosts) >= 3 and set(hosts) == {"127.0.0.1"}  # scheduler, dashboard, worker

@@ -1,12 +1,15 @@
 """A capture of any name gets a record, and the record knows whether its process still runs."""
 
+import csv
 import json
 import os
 import socket
 import subprocess
 import sys
+from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -65,3 +68,75 @@ def test_the_record_of_a_bug_states_where_its_traceback_is(
     record = one.run(unit, ANALYTIC)
     assert record.state == "bug" and record.message.startswith("ZeroDivisionError: division by zero; the traceback ")
     assert record.message.endswith(f"is in {file}") != blocked and file.is_file() != blocked
+
+
+class Elements(HTMLParser):
+    """The elements of a page and their attributes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names, self.attributes = set[str](), set[str]()
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        self.names.add(tag)
+        self.attributes |= {name for name, _ in attrs}
+
+
+@pytest.mark.parametrize("text", ["<script>alert(1)</script>", '" onerror="alert(1)', "'><img src=x>", "&lt;b&gt;"])
+def test_no_text_of_a_record_becomes_an_element_of_the_summary(tmp_path: Path, text: str) -> None:
+    unit = only_unit(tmp_path, "obj")
+    unit.thumbnail_file.parent.mkdir(parents=True)
+    unit.thumbnail_file.touch()
+    pages = []
+    for shown in ("obj", text):
+        record = one.UnitRecord(shown, "gates", shown, verdict=shown, expected_error_deg=3.0, asset=shown, report=shown)
+        contact_sheet.write(Path(unit.batch_folder), [unit], [record])
+        pages.append(Elements())
+        pages[-1].feed((Path(unit.batch_folder) / "summary.html").read_text(encoding="utf-8"))
+    assert pages[1].names == pages[0].names and pages[1].attributes == pages[0].attributes
+
+
+@pytest.mark.parametrize(
+    "address", ["//elsewhere.example/x", "https://elsewhere.example", "javascript:alert(1)", "\ud800"]
+)
+def test_the_links_of_the_summary_stay_on_this_machine(tmp_path: Path, address: str) -> None:
+    unit = only_unit(tmp_path, "obj")
+    unit.thumbnail_file.parent.mkdir(parents=True)
+    unit.thumbnail_file.touch()
+    contact_sheet.write(Path(unit.batch_folder), [unit], [one.UnitRecord("obj", "done", asset=address, report=address)])
+    page = (Path(unit.batch_folder) / "summary.html").read_text(encoding="utf-8")
+    assert page.count('href="./') == page.count("href=") == 2
+
+
+@pytest.mark.parametrize(
+    "text", ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", "\n=1", " =1", "＝1", "=cmd|'/c calc'!A0"]
+)
+def test_no_cell_of_the_table_is_a_formula(tmp_path: Path, text: str) -> None:
+    unit = only_unit(tmp_path, "obj")
+    record = one.UnitRecord(text, "todo", text, seconds=2.5, verdict=text, asset=text, report=text)
+    contact_sheet.write(Path(unit.batch_folder), [unit], [record])
+    with (Path(unit.batch_folder) / "summary.csv").open(encoding="utf-8", newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert {row[name] for name in ("name", "says", "verdict", "asset", "report")} == {f"'{text}"}
+    assert row["seconds"] == "2.5"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", "null", "7", "[" * 30_000, '{"name": 3}', '{"seconds": 1}', '{"name": "obj", "state": "odd"}',
+     '{"name": "obj", "seconds": NaN}', '{"name": "obj", "seconds": 1e999}',
+     '{"name": "obj", "expected_error_deg": Infinity}'],
+)  # fmt: skip
+def test_a_record_of_another_shape_is_none(tmp_path: Path, text: str) -> None:
+    unit = only_unit(tmp_path, "obj")
+    unit.record_file.parent.mkdir(parents=True)
+    unit.record_file.write_text(text)
+    assert one.read_record(unit) == one.UnitRecord("obj")
+
+
+def test_a_capture_that_was_finished_before_its_process_died_stays_finished(tmp_path: Path) -> None:
+    unit = only_unit(tmp_path, "obj")
+    before = one.read_record(unit)
+    one.write_record(unit, done := one.UnitRecord("obj", "done", seconds=3.0))
+    assert one.record_crash(unit, before, "its process died", 3) == one.read_record(unit) == done
+    assert one.record_crash(unit, done, "its process died", 3).state == "crashed"  # of an earlier batch
