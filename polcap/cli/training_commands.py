@@ -33,7 +33,7 @@ def train(
     rate: Annotated[float, Option(min=0, help="Learning rate of Muon; lower for trained weights.")] = 1e-3,
     views: Annotated[int | None, Option(min=1, help="Views of each mesh.")] = None,
     procedural: Annotated[int | None, Option(min=0, help="Random shapes, six views each.")] = None,
-    threads: Annotated[int, Option("--threads", "-j", min=1, help="Batches learned from at a time.")] = 2,
+    threads: Annotated[int, Option("--threads", "-j", min=1, help="Batches computed at a time.")] = 2,
     seed: Annotated[int, Option(min=0, help="Of views, batches and first weights.")] = 1,
 ) -> None:
     """Train the main network (extra [train])."""
@@ -60,7 +60,8 @@ def evaluate(
     count: Annotated[int | None, Option(min=1, help="Number of pictures.")] = None,
     size: Annotated[int | None, Option(min=64, help="Side of the pictures, px.")] = None,
     protocol: Annotated[
-        int, Option(min=1, max=2, help="1: smooth bodies, high F0 in half of the materials; 2: rough bodies, usual F0.")
+        int,
+        Option(min=1, max=2, help="1: smooth surfaces, high F0 in half of the materials; 2: rough surfaces, usual F0."),
     ] = 1,
     real: Annotated[
         Path | None, Option(metavar="DIR", help="Photographs with normals instead: pol000/ … mask/ normal/.")

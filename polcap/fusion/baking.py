@@ -53,7 +53,7 @@ class BakingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Meta(ge=0, le=90, description="error of the mesh's normals; 0: twice their median angle to the views' [°]"),
     ] = 0.0
     smooth: Annotated[
-        float, Meta(gt=0, le=0.5, description="1σ of the Gaussian that parts smooth from fine [object's diameter]")
+        float, Meta(gt=0, le=0.5, description="1σ of the Gaussian between coarse and fine detail [object's diameter]")
     ] = 0.03
 
 

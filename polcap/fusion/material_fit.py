@@ -61,7 +61,7 @@ _NORMAL_ERROR = 1.3  # standard deviation over that of the views' differences; e
 class MaterialSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of the stage `material_fit` of the fusion."""
 
-    materials: Annotated[int, Meta(ge=1, le=32, description="most materials, by albedo [1]")] = 8
+    materials: Annotated[int, Meta(ge=1, le=32, description="greatest number of materials, grouped by albedo [1]")] = 8
     f0_sigma: Annotated[
         float, Meta(gt=0, le=1, description="error of F0 in the views' maps, where highlights are narrow [1]")
     ] = 0.025

@@ -22,7 +22,9 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_gain_disagreement: Annotated[
         float,
         Meta(
-            gt=0, le=1, description="allowed disagreement of chart and object on a shot's light beyond both errors [1]"
+            gt=0,
+            le=1,
+            description="allowed difference of a shot's gain by chart and by object, beyond both errors [1]",
         ),
     ] = 0.03
     max_gain_doubt: Annotated[
@@ -87,7 +89,11 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 3.0
     max_turn_fit: Annotated[
         float,
-        Meta(gt=0, lt=1, description="allowed ratio of the outline's misfit with a turn to that without [1]"),
+        Meta(
+            gt=0,
+            lt=1,
+            description="misfit of the outline with a turn over that without, from which no turn is reported [1]",
+        ),
     ] = 0.68
     min_outline_dolp: Annotated[
         float, Meta(ge=0, le=1, description="least allowed median polarization of the outline [1]")
@@ -97,7 +103,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Meta(
             ge=0,
             le=90,
-            description="least allowed median tilt of a weakly polarized shape; below it is flattened [degrees]",
+            description="least allowed median tilt of the normals, for a weakly polarized object [degrees]",
         ),
     ] = 33.0
     max_inward_outline: Annotated[
@@ -124,7 +130,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.08
     max_highlight_dolp: Annotated[
         float,
-        Meta(gt=0, le=1, description="allowed polarization that the brightest parts which face the camera share [1]"),
+        Meta(gt=0, le=1, description="allowed polarization common to the brightest parts that face the camera [1]"),
     ] = 0.004
     max_room_dolp: Annotated[
         float, Meta(gt=0, le=1, description="allowed polarization of the surroundings, common to all of them [1]")
@@ -149,7 +155,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 20.0
     max_mesh_pieces: Annotated[int, Meta(ge=1, description="allowed number of pieces of the mesh")] = 10
     max_mesh_cuts: Annotated[
-        float, Meta(ge=0, description="allowed length of the cuts, both sides, over the outline's [1]")
+        float, Meta(ge=0, description="allowed length of both sides of all cuts, relative to the outline [1]")
     ] = 2.0
     max_mesh_raggedness: Annotated[
         float, Meta(ge=0, description="allowed excess length of the mesh's boundary over its smoothed curve [1]")

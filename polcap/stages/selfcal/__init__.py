@@ -62,14 +62,22 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = True
     order_margin: Annotated[
         float,
-        Meta(ge=0, le=2, description="least lead of another order's fit of the outline over the stated one's"),
+        Meta(
+            ge=0,
+            le=2,
+            description="an order of the angles is refused if another one fits the outline better by this score",
+        ),
     ] = 0.2
     correct_ring: Annotated[
         bool, Meta(description="correct all angles by the measured error of the ring's zero, if it is significant")
     ] = True
     ring_sigmas: Annotated[
         float,
-        Meta(ge=1, le=20, description="least error of the ring's zero that is corrected, over its own error [1σ]"),
+        Meta(
+            ge=1,
+            le=20,
+            description="the ring's zero is corrected if it is off by this many times its uncertainty or more [1σ]",
+        ),
     ] = 3.0
     max_ring_sigma_deg: Annotated[
         float, Meta(gt=0, le=5, description="greatest 1σ of a correction of the ring's zero [degrees]")

@@ -147,7 +147,12 @@ def closure(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
 
 
 def outline(rim: OutlineBand, angle: Floats) -> GainEstimate:
-    """Gains (K,) with which the outline is polarized across the contour; `rim.light` is not yet divided by gains."""
+    """Gains (K,) from the outline, whose diffuse light is polarized along its normal of azimuth α.
+
+    Divided by the gains, the light of a pixel in shot k is a + b cos 2(θ_k − α), with any a and b. So 1/gain is the
+    null vector of the matrices P diag(light), stacked over all pixels, where P removes a and b. `rim.light` is not yet
+    divided by gains.
+    """
     shots = len(angle)
     parts = np.unique(rim.sector)
     if len(rim.azimuth) < _LEAST_RIM or len(parts) < _PARTS // 2:
