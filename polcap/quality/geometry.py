@@ -243,15 +243,18 @@ def _edge_blur(found: Evidence) -> float:
 
 
 def focal_length(found: Evidence) -> Gate:
-    """Gate on the focal length: an unknown or wrong one tilts view rays and normals."""
+    """Gate on the focal length: an unknown or contradicted one tilts view rays and normals."""
     least, most = found.focal_doubt
     if not most - least:
         return Gate("focal length", "pass", "known", "known", "The focal length is known", unit="")
     cost = _lean(found.maps, least, most)
     times = np.exp(max(most, -least))
-    message = f"The focal length is assumed and may be wrong by a factor of {times:.1f}, which bends shape and depth"
-    remedy = "State focal_length_mm and sensor_width_mm in capture.toml, a text file in the capture's folder"
-    return Gate("focal length", "warn", "assumed", "known", message, remedy, round(cost, 1), unit="")
+    message = f"The focal length is in doubt and may be wrong by a factor of {times:.1f}, which bends shape and depth"
+    remedy = (
+        "State or correct focal_length_mm and sensor_width_mm in capture.toml, a text file in the capture's folder, "
+        "or measure the lens with `polcap calibrate`"
+    )
+    return Gate("focal length", "warn", "in doubt", "known", message, remedy, round(cost, 1), unit="")
 
 
 def inward_outline(found: Evidence, limits: GateLimits) -> Gate:

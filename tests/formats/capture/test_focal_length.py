@@ -1,6 +1,7 @@
 """The focal length in pixels, and whether it is known."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -28,6 +29,50 @@ def test_a_stated_focal_length_that_contradicts_exif_is_not_known() -> None:
     assert not found.known and "50 mm" in found.note
     assert found.px == pytest.approx(24 / 23.6 * 4310)  # the user's statement is used
     assert focal_length.find(exif, 51.0, None).known
+
+
+CROPPED = Exif(model="Canon EOS 6D Mark II", focal_length_mm=40.0, width=4000, height=2667)  # a table width of 35.9 mm
+PITCH_UM, TABLE_MM = 24e3 / 4000, 35.9  # of a picture 24 mm wide
+
+
+@pytest.mark.parametrize(
+    ("exif", "stated_width_mm", "width_mm", "other_mm"),
+    [
+        (replace(CROPPED, pixel_pitch_um=PITCH_UM), None, TABLE_MM, 24.0),
+        (replace(CROPPED, focal_length_35mm=60.0), None, 24.0, TABLE_MM),
+        (replace(CROPPED, pixel_pitch_um=PITCH_UM, focal_length_35mm=60.0), None, 24.0, TABLE_MM),
+        (replace(CROPPED, pixel_pitch_um=PITCH_UM, focal_length_35mm=40.0), None, TABLE_MM, 24.0),
+        (replace(CROPPED, pixel_pitch_um=2 * PITCH_UM), None, TABLE_MM, 48.0),
+        (replace(CROPPED, model="", pixel_pitch_um=PITCH_UM, focal_length_35mm=40.0), None, 36.0, 24.0),
+        (CROPPED, 24.0, 24.0, TABLE_MM),
+        (replace(CROPPED, model="", pixel_pitch_um=PITCH_UM), 36.0, 36.0, 24.0),
+    ],
+)
+def test_sources_that_contradict_each_other_leave_a_doubt(
+    exif: Exif, stated_width_mm: float | None, width_mm: float, other_mm: float
+) -> None:
+    """The user's statement, or the source that most others confirm, decides; the doubt reaches to the others."""
+    found = focal_length.find(exif, None, stated_width_mm)
+    assert found.px == pytest.approx(40 / width_mm * 4000, rel=0.02)
+    other = math.log(width_mm / other_mm)
+    assert found.doubt == (pytest.approx(min(other, 0.0), abs=0.02), pytest.approx(max(other, 0.0), abs=0.02))
+    assert not found.known and " but " in found.note
+
+
+def test_sources_that_differ_by_less_than_a_tenth_agree() -> None:
+    found = focal_length.find(replace(CROPPED, pixel_pitch_um=35e3 / 4000, focal_length_35mm=41.0), None, None)
+    assert found.known and found.px == pytest.approx(40 / 35.0 * 4000)  # the most precise of them
+
+
+def test_a_statement_that_a_source_confirms_is_known() -> None:
+    """The user has decided between two sources of the file."""
+    found = focal_length.find(replace(CROPPED, pixel_pitch_um=PITCH_UM), None, 36.0)
+    assert found.known and found.px == pytest.approx(40 / 36 * 4000) and "24.0 mm" in found.note
+
+
+def test_doubts_on_focal_length_and_sensor_add_up() -> None:
+    found = focal_length.find(replace(CROPPED, pixel_pitch_um=PITCH_UM), 80.0, None)
+    assert found.doubt == (pytest.approx(math.log(40 / 80)), pytest.approx(math.log(TABLE_MM / 24)))
 
 
 def test_every_sensor_width_is_one_that_cameras_have() -> None:
