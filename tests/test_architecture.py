@@ -156,6 +156,14 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
         assert (page.parent / target).exists(), target
 
 
+def test_benchmark_pages_are_short_enough_to_read() -> None:
+    """Results of today; history is in the repository. A word has a letter or a digit, so marks of tables are none."""
+    pages = {page.name: page.read_text(encoding="utf-8").split() for page in ROOT.glob("docs/benchmarks/*.md")}
+    words = {name: sum(any(map(str.isalnum, word)) for word in text) for name, text in pages.items()}
+    assert {name: count for name, count in words.items() if count > 1500} == {}
+    assert sum(words.values()) <= 15_000
+
+
 def test_one_licence() -> None:
     assert (
         "Apache License" in (ROOT / "LICENSE").read_text()
