@@ -49,7 +49,8 @@ def settings_page() -> str:
         "# Settings", "", _MADE, "",
         "`--config FILE.toml` (sections as below) overrides the defaults; `--set stage.name=value` overrides both.",
         "An unknown name or a value outside its range is an error that names it.",
-        "In a file, `fusion.shape.grid` is `grid` below `[fusion.shape]`. Only `polcap fuse` takes `fusion.…`.", "",
+        "In a file, `fusion.shape.grid` is `grid` below `[fusion.shape]`. Only `polcap fuse` takes `fusion.…`;",
+        "it refuses `surface.…`, `mask.part` and `asset.raw_pixels`, which would not change a fused object.", "",
     ]  # fmt: skip
     for name, rows in groupby(settings(SessionConfig), lambda setting: setting.key.partition(".")[0]):
         lines += ["", f"## {name}", "", "| setting | type | default | range | meaning [unit] |"]

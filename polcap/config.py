@@ -101,13 +101,13 @@ def fill(kind: type[S], stated: Mapping[str, Any], assignments: Sequence[str]) -
         raise SettingError("--set: a value is not UTF-8 text; write it in ASCII") from error
 
 
-def restore(about: Mapping[str, Any], file: Path) -> Config:
+def restore(kind: type[S], about: Mapping[str, Any], file: Path) -> S:
     """Settings of an earlier run, from `about`, the content of its file.
 
     Raises StorageError: the settings are missing or belong to another version of polcap.
     """
     try:
-        return msgspec.convert(about["settings"], Config)
+        return msgspec.convert(about["settings"], kind)
     except (msgspec.ValidationError, KeyError) as error:
         raise StorageError(f"{file}: its settings are of another polcap ({error}); run `polcap process`") from error
 

@@ -54,10 +54,9 @@ def fuse(
         raise SettingError(f"polcap fuse needs {', '.join(missing)}: pip install 'polcap[fusion]'")
     if not folder.is_dir():
         raise SettingError(f"{folder}: no such folder; give the folder that holds view01, view02, …")
-    stated = settings.fill(SessionConfig, settings.read(config), assignments or [])
     session_input = SessionInput(
         folder=folder,
-        config=stated.of_views,
+        config=settings.fill(SessionConfig, settings.read(config), assignments or []),
         chart=options.chart_request(chart, no_chart),
         network=models.load_network(estimator, model, device, threads),
         mask_network=models.load_mask_network(threads),
@@ -67,6 +66,6 @@ def fuse(
         limits=Limits(threads, memory),
     )
     steps = terminal.Steps()
-    about = fuse_run.fuse(session_input, stated.fusion, target, terminal.print_progress, steps.stage)
+    about = fuse_run.fuse(session_input, target, terminal.print_progress, steps.stage)
     unchanged.remember(target, request)
     terminal.print_result(about, target, json, open_)

@@ -10,52 +10,46 @@ import numpy as np
 
 from polcap import __version__
 from polcap import report as reports
+from polcap.config import restore
 from polcap.errors import SettingError
-from polcap.formats.capture import folder_names
 from polcap.formats.export import encoders, provenance
-from polcap.fusion import fused_maps, fused_page, joining, object_pictures
+from polcap.fusion import fused_maps, fused_page, object_pictures
 from polcap.fusion import session as sessions
 from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.closed_mesh import is_closed
-from polcap.fusion.fused_maps import FusedSource
-from polcap.fusion.fusion_path import FusionResults, FusionSettings, path
+from polcap.fusion.fusion_path import FusionResults, SessionConfig, path
 from polcap.fusion.session import Notify, ProcessedSession, SessionInput
 from polcap.pipeline import asset_export, result_folder
 from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import Progress, StageCache
 from polcap.pipeline.run import timings
-from polcap.quality import gates
-from polcap.quality.gate import Gate, State
+from polcap.quality import fused_object, gates
+from polcap.quality.gate import Gate
+from polcap.quality.limits import FusedGateLimits
 from polcap.report import animation
 
 _LODS = 2  # coarser levels, each with a quarter of the triangles
 _SIDE = 480  # px of an animation's frame
-# limits of the gates
-_MOST_RESIDUAL_PX = 0.5  # of a view's corners; a flat, sharp board leaves 0.1 to 0.2
-_MOST_FEATURE_PX = 2.0  # of a view's features, on maps of half the size; sharp ones leave 0.6 to 1
-_MOST_NORMAL_DEG = 20.0  # median angle between a view's normals and the mesh; single views err by 6 to 9°
-_LEAST_SEEN = 0.85  # share of the surface; what stands on the board is never seen
-_FEW_VIEWS = 8
 
 
-def fuse(
-    session_input: SessionInput, settings: FusionSettings, out: Path, notify: Notify, progress: Progress
-) -> dict[str, Any]:
+def fuse(session_input: SessionInput, out: Path, notify: Notify, progress: Progress) -> dict[str, Any]:
     """Fuse the views below a folder into the result folder `out`; returns the content of report.json.
 
     Raises InputError: anything at fault with the user's input.
     """
+    config = session_input.config
+    config.check()
     session = sessions.read(session_input)  # first: a folder without views stays as it is
     with result_folder.locked(out):
         processed = sessions.process(session, session_input, notify)
         cache = StageCache(out, progress)
         with cache.memory_explained(processed.views[0].mask.size):
-            results = path(processed.views, settings, cache)
+            results = path(processed.views, config.fusion, cache)
         results = replace(results, maps=_with_albedo_scale(results.maps, processed))
         cache.begin("write")
         name = session_input.folder.resolve().name
-        about = document(name, processed, settings, results, timings(out))
-        write(out, about, results)
+        about = document(name, processed, config, results, timings(out))
+        write(out, about, results, config)
         cache.end()
         return about
 
@@ -73,7 +67,7 @@ def export(out: Path, *requests: ExportRequest) -> list[Path]:
             raise SettingError("--extra displacement is for results of one view: a closed mesh has none; leave it out")
     about = reports.read(out)
     with result_folder.locked(out):
-        source = fused_maps.read(out / "maps")
+        source = fused_maps.read(out / "maps", restore(SessionConfig, about, out / "report.json").asset)
         exports = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in requests)
         return [file for files in exports for file in files]
 
@@ -88,13 +82,13 @@ def _with_albedo_scale(maps: AtlasMaps, processed: ProcessedSession) -> AtlasMap
 def document(
     name: str,
     processed: ProcessedSession,
-    settings: FusionSettings,
+    config: SessionConfig,
     results: FusionResults,
     seconds: Mapping[str, float],
 ) -> dict[str, Any]:
     """The content of report.json: facts, figures by view, gates; `seconds` are those of the stages."""
     rows = _rows(processed, results)
-    judged = list(_gates(processed, results, rows))
+    judged = list(_gates(processed, results, rows, config.fusion.gates))
     reports, camera = processed.reports, processed.poses.camera
     first = next(iter(reports.values()))
     shots = [
@@ -124,7 +118,7 @@ def document(
         "timings": dict(seconds),
         "model": first["model"],
         "keys": {**results.keys, **{f"{view} infer": report["keys"]["infer"] for view, report in reports.items()}},
-        "settings": {**first["settings"], "fusion": msgspec.to_builtins(settings)},
+        "settings": msgspec.to_builtins(config),
     }
 
 
@@ -163,62 +157,23 @@ def _closed(results: FusionResults) -> bool:
     return is_closed(fused_maps.closed(results.atlas.mesh))
 
 
-def _gates(processed: ProcessedSession, results: FusionResults, rows: Sequence[Mapping[str, Any]]) -> Iterator[Gate]:
-    yield _views_gate([view.name for view in processed.views], processed.left_out)
-    worst = max(rows, key=lambda row: row["reprojection_px"])
-    value = worst["reprojection_px"]
-    what, limit, remedy = (
-        ("The board's corners", _MOST_RESIDUAL_PX, "Keep the board flat, and focus and zoom unchanged")
-        if processed.poses.board
-        else ("Features of the object", _MOST_FEATURE_PX, "Turn the object on a flat table, focus and zoom unchanged")
-    )
-    message = f"{what} are within {value:.2f} px (rms) in every view; the worst is {worst['name']}"
-    state: State = "pass" if value <= limit else "fail"
-    yield Gate("poses", state, value, limit, message, "" if state == "pass" else remedy, unit="px")
-    yield _agreement_gate(rows)
+def _gates(
+    processed: ProcessedSession, results: FusionResults, rows: Sequence[Mapping[str, Any]], limits: FusedGateLimits
+) -> Iterator[Gate]:
+    """All gates of a fused object."""
+    yield fused_object.views([view.name for view in processed.views], processed.left_out, limits)
+    yield fused_object.poses({row["name"]: row["reprojection_px"] for row in rows}, processed.poses.board, limits)
+    yield fused_object.agreement({row["name"]: row["normal_deg"] for row in rows}, limits)
     for one in results.joined:
-        message = f"The first set confirms {one.shared:.0%} of the surface of {one.folder}"
-        yield Gate(f"join {one.folder}", "pass", one.shared, joining.LEAST_SHARED, message)
-    seen, state, remedy = _seen(results), "pass", ""
-    if seen < _LEAST_SEEN:
-        few = len(processed.views) < _FEW_VIEWS
-        state, remedy = "warn", "Shoot more views" if few else "Take a second ring of views from higher up"
-    yield Gate("seen", state, seen, _LEAST_SEEN, f"Views saw {seen:.0%} of the surface; the rest is filled", remedy)
-    whole = _closed(results)
-    message = "Every edge of the mesh belongs to two triangles" if whole else "The mesh has open edges"
-    yield Gate("closed", "pass" if whole else "fail", None, None, message, "" if whole else "Report this as a bug")
+        yield fused_object.join(one.folder, one.shared, limits)
+    yield fused_object.seen(_seen(results), len(processed.views), limits)
+    yield fused_object.closed(_closed(results))
 
 
-def _views_gate(names: Sequence[str], left_out: Mapping[str, str]) -> Gate:
-    """Gate on the number of used views, which names those that are left out, and numbers that no folder has."""
-    used, missing = len(names), folder_names.missing_views([*names, *left_out])
-    absent = f"; no folder {folder_names.few_names(missing)}" if missing else ""
-    if left_out:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
-        message = f"{len(left_out)} of {used + len(left_out)} views are left out: {reasons}{absent}"
-        return Gate("views", "warn", used, _FEW_VIEWS, message, "Shoot these views again, or delete them", unit="")
-    if used < _FEW_VIEWS:
-        message = f"{used} views are few: parts between them are guessed from outlines{absent}"
-        return Gate("views", "warn", used, _FEW_VIEWS, message, "Shoot 12 views or more", unit="")
-    return Gate("views", "pass", used, _FEW_VIEWS, f"All {used} views are used{absent}", unit="")
-
-
-def _agreement_gate(rows: Sequence[Mapping[str, Any]]) -> Gate:
-    """Gate on the views whose normals contradict the fused mesh, as after a swap of polarizer angles."""
-    worst = max(rows, key=lambda row: row["normal_deg"])
-    value, bad = worst["normal_deg"], [row["name"] for row in rows if row["normal_deg"] > _MOST_NORMAL_DEG]
-    if bad:
-        message = f"The normals of {', '.join(bad)} contradict the mesh, by {value:.0f}° in the worst view"
-        remedy = f"Check the polarizer angles of {', '.join(bad)}, or delete them and fuse again"
-        return Gate("agreement", "fail", value, _MOST_NORMAL_DEG, message, remedy, unit="°")
-    message = f"Normals of all views are within {value:.0f}° of the mesh (median); the worst is {worst['name']}"
-    return Gate("agreement", "pass", value, _MOST_NORMAL_DEG, message, unit="°")
-
-
-def write(out: Path, about: dict[str, Any], results: FusionResults) -> None:
+def write(out: Path, about: dict[str, Any], results: FusionResults, config: SessionConfig) -> None:
     """Write maps/, asset/, the turntable and the report of a fused result; StorageError."""
     fused_maps.write(out / "maps", results.atlas, results.maps)
-    source: FusedSource = fused_maps.read(out / "maps")  # as stored, so that `polcap export` makes the same bytes
+    source = fused_maps.read(out / "maps", config.asset)  # as stored, so that `polcap export` makes the same bytes
     request = ExportRequest(lod=_LODS if source.triangles > 16 * 4**_LODS else 0)
     asset_export.write(out, about, request, asset_export.levels(source, request))
     turning = object_pictures.around(results.atlas, results.maps, object_pictures.FRAMES, _SIDE)

@@ -22,6 +22,7 @@ from polcap.images import Asset, Floats, Mesh
 from polcap.optics import color
 from polcap.pipeline.asset_export import DetailLevel
 from polcap.stages import asset
+from polcap.stages.asset import AssetSettings
 from polcap.stages.surface import DecimatedMesh
 
 FORMAT = "polcap fused maps 1"
@@ -82,6 +83,7 @@ class FusedSource:
 
     atlas: Atlas
     maps: AtlasMaps
+    settings: AssetSettings
 
     @property
     def triangles(self) -> int:
@@ -90,7 +92,7 @@ class FusedSource:
 
     def whole(self, bits: Literal[8, 16], extras: tuple[Extra, ...]) -> Asset:
         """The asset with the full mesh; a closed mesh has no displacement."""
-        return _asset(self.atlas, self.maps, bits, extras)
+        return _asset(self.atlas, self.maps, self.settings, bits, extras)
 
     def decimated(self, whole: Asset, triangles: int) -> DetailLevel:
         """The asset with about so many triangles, an atlas of its own, and the textures of the full mesh."""
@@ -103,11 +105,13 @@ class FusedSource:
         extras: tuple[Extra, ...] = ("occlusion",) if whole.has_occlusion else ()
         extras += () if whole.object_normal is None else ("object-normal",)
         error = _distance(self.atlas.mesh.vertices, atlas)
-        return DetailLevel(_asset(atlas, maps, bits, extras), DecimatedMesh(atlas.mesh, error, error / atlas.texel))
+        return DetailLevel(
+            _asset(atlas, maps, self.settings, bits, extras), DecimatedMesh(atlas.mesh, error, error / atlas.texel)
+        )
 
 
-def read(folder: Path) -> FusedSource:
-    """Read the folder maps/ of a fused result.
+def read(folder: Path, settings: AssetSettings) -> FusedSource:
+    """Read the folder maps/ of a fused result; `settings` are those of its assets.
 
     Raises DecodeError: a file is missing or damaged.
     """
@@ -129,7 +133,7 @@ def read(folder: Path) -> FusedSource:
         albedo_sigma=None if percent is None else percent / 100,
     )
     mesh = Mesh(**arrays, metric=metric, frame="board")
-    return FusedSource(atlases.of_mesh(mesh, side, margin), maps)
+    return FusedSource(atlases.of_mesh(mesh, side, margin), maps, settings)
 
 
 def _map(folder: Path, name: str) -> Floats:
@@ -156,8 +160,10 @@ def transferred(source: Atlas, maps: AtlasMaps, target: Atlas) -> AtlasMaps:
     return replace(on_atlas(target, mixed), albedo_sigma=maps.albedo_sigma)
 
 
-def _asset(atlas: Atlas, maps: AtlasMaps, bits: Literal[8, 16], extras: tuple[Extra, ...]) -> Asset:
-    built = asset.build(maps, atlas.mesh, asset.AssetSettings(), bits)
+def _asset(
+    atlas: Atlas, maps: AtlasMaps, settings: AssetSettings, bits: Literal[8, 16], extras: tuple[Extra, ...]
+) -> Asset:
+    built = asset.build(maps, atlas.mesh, settings, bits)
     top, kind = np.iinfo(built.normal.dtype).max, built.normal.dtype
     if "object-normal" in extras:
         built = replace(built, object_normal=np.rint((maps.normal / 2 + 0.5) * top).astype(kind))

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 
 import msgspec
 
+from polcap import config as settings_
 from polcap.config import Config
+from polcap.errors import SettingError
 from polcap.fusion import atlas, baking, comparison, filling, joining, material_fit, shape
 from polcap.fusion.atlas import Atlas, AtlasSettings
 from polcap.fusion.baking import AtlasMaps, BakingSettings
@@ -19,15 +21,24 @@ from polcap.fusion.material_fit import MaterialSettings
 from polcap.fusion.shape import ShapeSettings
 from polcap.fusion.values import ClosedMesh, FusionView
 from polcap.pipeline.cache import MemoryCache, StageResult, digest, fingerprint
+from polcap.quality.limits import FusedGateLimits
+
+# settings of `polcap process` that would not change a fused object, by the beginning of their keys
+_WITHOUT_EFFECT = {
+    "surface.": "its mesh is of all views: set fusion.shape.grid",
+    "mask.part": "it is the largest part of the masks of all views",
+    "asset.raw_pixels": "its textures are means of all views: set fusion.atlas.size",
+}
 
 
 class FusionSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Settings of the fusion, one section per stage."""
+    """Settings of the fusion: a section for each stage with settings, and one for the gates."""
 
     shape: ShapeSettings = ShapeSettings()
     atlas: AtlasSettings = AtlasSettings()
     baking: BakingSettings = BakingSettings()
     material_fit: MaterialSettings = MaterialSettings()
+    gates: FusedGateLimits = FusedGateLimits()
 
 
 class SessionConfig(Config, frozen=True, forbid_unknown_fields=True):
@@ -39,6 +50,20 @@ class SessionConfig(Config, frozen=True, forbid_unknown_fields=True):
     def of_views(self) -> Config:
         """The settings of the views."""
         return msgspec.convert(self, Config, from_attributes=True)
+
+    def check(self) -> None:
+        """Refuse settings that would not change a fused object.
+
+        Raises SettingError: one of them differs from its default.
+        """
+        for setting in settings_.settings(Config):
+            section, name = setting.key.split(".")
+            value = getattr(getattr(self, section), name)
+            reason = next((why for key, why in _WITHOUT_EFFECT.items() if setting.key.startswith(key)), None)
+            if reason and value != setting.default:
+                raise SettingError(
+                    f"{setting.key} = {value} has no effect on a fused object; {reason}, and leave this one out"
+                )
 
 
 @dataclass(frozen=True)
@@ -54,9 +79,13 @@ class FusionResults:
 
 
 def path(views: tuple[FusionView, ...], settings: FusionSettings, cache: MemoryCache) -> FusionResults:
-    """Run the stages in order."""
+    """Run the stages in order.
+
+    Raises CaptureError: a set of views does not show the object of the first one.
+    """
     given = StageResult(digest(fingerprint(views)), views)  # hashed once
     joined = cache.run(joining.join, given)
+    joining.require_shared(joined.value, settings.gates.min_shared)
     placed = cache.derive(joining.place, given, joined)
     mesh = cache.run(shape.fuse_shape, placed, config=settings.shape)
     atlas_ = cache.run(atlas.unwrap, mesh, placed, config=settings.atlas)

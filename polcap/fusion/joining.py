@@ -26,8 +26,6 @@ from polcap.optics.frames import dot
 from polcap.optics.vertex_frames import vertex_normals
 from polcap.stages import stage
 
-# share of a set's surface that the first set confirms: correctly joined .84 or more, other objects mostly .5 or less
-LEAST_SHARED = 0.7
 _GRID = 80  # steps along a set's own mesh, which is for this registration alone
 _LEAST_SEEN = 0.3  # sum of the cosines to the views of a point that they know
 _TURNS = 3000  # sampled: every turn is within about 15° of one of them
@@ -96,26 +94,28 @@ class JoinedSet:
 
 @stage(version=4)
 def join(views: tuple[FusionView, ...]) -> tuple[JoinedSet, ...]:
-    """Find the motions of all further sets of views, each in a folder of its own, onto the first one.
-
-    Raises CaptureError: a set does not show the object of the first one.
-    """
+    """Find the motions of all further sets of views, each in a folder of its own, onto the first one."""
     sets: dict[str, list[FusionView]] = {}
     for view in views:
         sets.setdefault(view.folder, []).append(view)
     first, *others = sets
     if not others:
         return ()
-    fixed, joined = observed_surface(sets[first]), []
-    for folder in others:
-        motion, shared = register(observed_surface(sets[folder]), fixed)
-        if shared < LEAST_SHARED:
+    fixed = observed_surface(sets[first])
+    return tuple(JoinedSet(folder, *register(observed_surface(sets[folder]), fixed)) for folder in others)
+
+
+def require_shared(joined: Sequence[JoinedSet], least: float) -> None:
+    """Check that the sets of views show one object: the first confirms a share `least` of the surface of each other.
+
+    Raises CaptureError: a set does not show the object of the first one.
+    """
+    for one in joined:
+        if one.shared < least:
             raise CaptureError(
-                f"{folder}: the first set confirms {shared:.0%} of this set's surface, {LEAST_SHARED:.0%} are needed; "
-                "show the same object, with some sides in both sets"
+                f"{one.folder}: the first set confirms {one.shared:.0%} of this set's surface, "
+                f"fusion.gates.min_shared = {least:.0%} is needed; show the same object, with some sides in both sets"
             )
-        joined.append(JoinedSet(folder, motion, shared))
-    return tuple(joined)
 
 
 def place(views: tuple[FusionView, ...], joined: tuple[JoinedSet, ...]) -> tuple[FusionView, ...]:

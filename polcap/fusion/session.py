@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import msgspec
 import numpy as np
 
 from polcap.batch.processes import UNLIMITED, Died, Limits, ProcessPool
@@ -33,6 +32,7 @@ from polcap.formats.maps import png
 from polcap.fusion import board_corners, bright_parts, feature_poses, mask_agreement, mask_border, poses, view_maps
 from polcap.fusion.board_corners import BoardCorners, NoBoardError
 from polcap.fusion.board_eraser import erase
+from polcap.fusion.fusion_path import SessionConfig
 from polcap.fusion.poses import LEAST_VIEWS, SessionCamera, SessionPoses
 from polcap.fusion.silhouettes import Silhouette
 from polcap.fusion.values import FusionView, Pose
@@ -58,7 +58,7 @@ class SessionInput:
     """A session's folder, and options for all its views."""
 
     folder: Path
-    config: Config
+    config: SessionConfig
     chart: ChartRequest = AUTO
     network: Network | None = None
     mask_network: Network | None = None
@@ -276,7 +276,7 @@ def _tasks(session: Session, session_input: SessionInput) -> dict[str, ViewTask]
             name,
             session.captures[name],
             session.supplied[name],
-            session_input.config,
+            session_input.config.of_views,
             out_of(session_input.folder, name),
         )
         for name in session.used
@@ -303,7 +303,7 @@ def _calibrate_colors(session: Session, session_input: SessionInput, notify: Not
         notify(f"{name}: chart")
         out = out_of(session_input.folder, name)
         try:
-            pipeline.process(session.captures[name], plain, session_input.config, out, "whitebalance")
+            pipeline.process(session.captures[name], plain, session_input.config.of_views, out, "whitebalance")
             color = pipeline.reopen(out, "whitebalance")[0].color
         except ChartError:
             continue
@@ -352,7 +352,7 @@ def _mask_object(task: MaskTask) -> Bools:
     view = task.view
     results = pipeline.reopen(view.out, "align")[0]
     erased = erase(results.radiance, results.alignment, results.color, task.board, (task.camera, task.pose))
-    settings = msgspec.structs.replace(view.config.mask, part=0)  # remains of the board are found in the next step
+    settings = view.config.mask
     found = mask.segment(erased, results.alignment, results.color, None, view.supplied.mask_network, onnx.run, settings)
     picture = mask.mean_picture(erased, results.alignment, results.color)
     board = np.any(erased.value != results.radiance.value, axis=(0, -1))

@@ -111,7 +111,7 @@ def export(out: Path, *wanted: ExportRequest) -> list[Path]:
         asset_export.check(one)
     about = report.read(out)
     with result_folder.locked(out):
-        source = asset_export.read(out / "maps", restore(about, out / "report.json"))
+        source = asset_export.read(out / "maps", restore(Config, about, out / "report.json"))
         exports = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in wanted)
         return [file for files in exports for file in files]
 
@@ -122,7 +122,7 @@ def reopen(out: Path, until: str = "surface") -> tuple[Results, dict[str, Any]]:
     Raises StorageError: `out` has no stage cache, or the result of a stage is missing.
     """
     about = result_folder.read_run(out)
-    config = restore(about, out / "work" / "run.json")
+    config = restore(Config, about, out / "work" / "run.json")
     return path(None, UserInput(), config, ArchiveCache(out, until=until)), about
 
 
@@ -152,7 +152,7 @@ def judge_again(out: Path) -> dict[str, Any]:
     """Judge a finished result again from the stage cache: writes report.json and report.html."""
     results, facts = reopen(out)
     with result_folder.locked(out):
-        about = report.document(facts, results, restore(facts, out / "work" / "run.json"), timings(out))
+        about = report.document(facts, results, restore(Config, facts, out / "work" / "run.json"), timings(out))
         if (out / "report.json").exists():
             about["keys"] = report.read(out).get("keys", {})
         report.write(out, about, results)

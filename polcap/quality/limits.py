@@ -160,3 +160,31 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_mesh_raggedness: Annotated[
         float, Meta(ge=0, description="allowed excess length of the mesh's boundary over its smoothed curve [1]")
     ] = 0.25
+
+
+class FusedGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Limits of the gates of a fused object, the section `fusion.gates`."""
+
+    min_views: Annotated[int, Meta(ge=3, le=999, description="number of views from which on they are not few")] = 8
+    max_corner_px: Annotated[
+        float,
+        Meta(gt=0, description="allowed rms distance of a view's board corners from its pose; 0.1 to 0.2 [RAW px]"),
+    ] = 0.5
+    max_feature_px: Annotated[
+        float,
+        Meta(gt=0, description="the same of features, where there is no board; sharp ones leave 0.6 to 1 [RAW px]"),
+    ] = 2.0
+    max_normal_deg: Annotated[
+        float,
+        Meta(gt=0, le=90, description="allowed median angle of a view's normals to the mesh; views err by 6 to 9 [°]"),
+    ] = 20.0
+    min_shared: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=1,
+            description="least share of a further set's surface that the first set confirms; less ends the run. "
+            "Sets of one object have .84 or more, of two objects mostly .5 or less [1]",
+        ),
+    ] = 0.7
+    min_seen: Annotated[float, Meta(ge=0, le=1, description="least share of the surface that a view saw [1]")] = 0.85

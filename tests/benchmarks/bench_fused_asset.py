@@ -26,9 +26,8 @@ from trimesh import Trimesh
 from trimesh.sample import sample_surface
 
 import polcap
-from polcap import config
 from polcap.fusion import fused_maps, joining, session
-from polcap.fusion.fusion_path import FusionResults, FusionSettings, path
+from polcap.fusion.fusion_path import FusionResults, FusionSettings, SessionConfig, path
 from polcap.fusion.session import SessionInput
 from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.values import Pose
@@ -37,6 +36,7 @@ from polcap.optics import color
 from polcap.optics.mesh_tracer import Tracer, Triangles, smooth
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
+from polcap.stages.asset import AssetSettings
 
 LEAST_SEEN = 0.02  # weight of a texel
 SAMPLES = 400_000  # of the true surface
@@ -66,7 +66,7 @@ def errors(folder: Path) -> Errors:
     """Errors of the object that was fused in a folder of `polcap synth --views`."""
     truth = dict(np.load(folder / "truth.npz"))
     surface = smooth(truth["vertices"], truth["faces"])
-    source = fused_maps.read(folder / "fused" / "maps")
+    source = fused_maps.read(folder / "fused" / "maps", AssetSettings())
     size = float(np.ptp(surface.vertices, axis=0).max())
     views = sorted([*folder.glob("view*/"), *folder.glob("set*/view*/")])
     singles = [single(view) for view in views if (view / "polcap" / "report.json").exists()]
@@ -92,7 +92,7 @@ def pose_of(stated: dict[str, Any]) -> Pose:
 def joined(folder: Path) -> str:
     """Table row on the join of two sets."""
     network, mask_network = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
-    session_input = SessionInput(folder, config.load(None, []), network=network, mask_network=mask_network)
+    session_input = SessionInput(folder, SessionConfig(), network=network, mask_network=mask_network)
     views = session.process(session.read(session_input), session_input, lambda _: None).views
     both = path(views, FusionSettings(), MemoryCache())
     placed = joining.place(views, both.joined)

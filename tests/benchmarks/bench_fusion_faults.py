@@ -19,10 +19,9 @@ import cv2
 import msgspec
 import numpy as np
 
-from polcap import config
 from polcap.errors import InputError
 from polcap.fusion import fuse_run
-from polcap.fusion.fusion_path import FusionSettings
+from polcap.fusion.fusion_path import SessionConfig
 from polcap.fusion.session import SessionInput
 from polcap.images import Bools, Floats
 from polcap.optics import projection
@@ -66,9 +65,9 @@ def main(folder: Path) -> None:
 def outcome(folder: Path) -> str:
     """Cells of a session's row."""
     network, mask_network = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
-    session_input = SessionInput(folder, config.load(None, []), network=network, mask_network=mask_network)
+    session_input = SessionInput(folder, SessionConfig(), network=network, mask_network=mask_network)
     try:
-        about = fuse_run.fuse(session_input, FusionSettings(), folder / "fused", lambda _: None, silent)
+        about = fuse_run.fuse(session_input, folder / "fused", lambda _: None, silent)
     except InputError as error:
         return f"– | – | – | refused: {error}"
     found = bench_fused_asset.errors(folder)

@@ -30,6 +30,7 @@ from polcap.images import Bools, Floats, Mesh, SurfaceMaps, View
 from polcap.optics import color, frames, shade
 from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.pipeline import run
+from polcap.stages.asset import AssetSettings
 from polcap.synth import render, trace
 from polcap.synth.render import Scene
 
@@ -55,7 +56,7 @@ def main() -> None:
     poses = {one["name"]: Pose(np.array(one["rotation"]), np.array(one["translation"])) for one in about["views"]}
     print("| view | shown by the single view | error there % | fused better | error % | fused better |")
     print("| --- " * 6 + "|")
-    source = fused_maps.read(options.folder / "fused" / "maps")
+    source = fused_maps.read(options.folder / "fused" / "maps", AssetSettings())
     for first in (0, len(poses) // 2):
         (name, near), (_, beyond) = list(poses.items())[first : first + 2]
         pose = between(near, beyond)

@@ -24,9 +24,8 @@ from trimesh import Trimesh
 from trimesh.registration import procrustes
 from trimesh.sample import sample_surface
 
-from polcap import config
 from polcap.fusion import session
-from polcap.fusion.fusion_path import FusionResults, FusionSettings, path
+from polcap.fusion.fusion_path import FusionResults, FusionSettings, SessionConfig, path
 from polcap.fusion.session import SessionInput
 from polcap.fusion.values import FusionView, Pose
 from polcap.images import Floats
@@ -45,7 +44,7 @@ def main(out: Path, mesh: str, views: int, step: int) -> None:
         if not folder.exists():
             render(folder, mesh, board, views)
         networks = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
-        session_input = SessionInput(folder, config.load(None, []), network=networks[0], mask_network=networks[1])
+        session_input = SessionInput(folder, SessionConfig(), network=networks[0], mask_network=networks[1])
         found = session.read(session_input)
         found.captures = dict(list(found.captures.items())[::step])
         processed = session.process(found, session_input, print)

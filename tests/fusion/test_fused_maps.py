@@ -17,18 +17,21 @@ from polcap.fusion.fused_maps import FusedSource
 from polcap.fusion.values import ClosedMesh
 from polcap.pipeline import asset_export
 from polcap.pipeline.asset_export import ExportRequest
+from polcap.stages.asset import AssetSettings
 from tests.fusion import ellipsoid
 
 
 @pytest.fixture(scope="module")
 def source() -> FusedSource:
     atlas = atlases.charted(ellipsoid.mesh(), 256, 6)
-    return FusedSource(atlas, filling.fill(baking.bake(ellipsoid.views(8), atlas, BakingSettings()), atlas))
+    return FusedSource(
+        atlas, filling.fill(baking.bake(ellipsoid.views(8), atlas, BakingSettings()), atlas), AssetSettings()
+    )
 
 
 def test_maps_and_mesh_come_back_as_written(source: FusedSource, tmp_path: Path) -> None:
     fused_maps.write(tmp_path / "maps", source.atlas, source.maps)
-    back = fused_maps.read(tmp_path / "maps")
+    back = fused_maps.read(tmp_path / "maps", AssetSettings())
     assert fused_maps.is_fused(tmp_path) and not fused_maps.is_fused(tmp_path / "maps")
     assert np.array_equal(back.atlas.mesh.vertices, source.atlas.mesh.vertices)
     assert np.array_equal(back.maps.normal, source.maps.normal)
@@ -38,7 +41,7 @@ def test_maps_and_mesh_come_back_as_written(source: FusedSource, tmp_path: Path)
 def test_coarser_levels_have_the_unit_and_the_margin_of_the_full_mesh(source: FusedSource, tmp_path: Path) -> None:
     atlas = atlases.charted(ellipsoid.mesh(), 256, 16, metric=False)
     fused_maps.write(tmp_path, atlas, fused_maps.transferred(source.atlas, source.maps, atlas))
-    level = asset_export.levels(fused_maps.read(tmp_path), ExportRequest(lod=1))[1].asset.mesh
+    level = asset_export.levels(fused_maps.read(tmp_path, AssetSettings()), ExportRequest(lod=1))[1].asset.mesh
     coarse = fused_maps.closed(atlas.mesh)
     again = atlases.charted(closed_mesh.decimate(coarse, round(len(coarse.faces) / 4)), 256, 16)
     assert not level.metric and np.array_equal(level.uv, again.mesh.uv)

@@ -10,6 +10,7 @@ from polcap.errors import CaptureError
 from polcap.fusion import joining
 from polcap.fusion.values import FusionView
 from polcap.optics.mesh_tracer import Tracer, smooth
+from polcap.quality.limits import FusedGateLimits
 from tests.fusion.traced_views import Body, capture, ring, solid_texture, stand, with_errors
 
 trimesh = pytest.importorskip("trimesh")
@@ -72,8 +73,10 @@ def test_a_laid_object_is_turned_back(rng: np.random.Generator) -> None:
 def test_another_object_is_recognized(rng: np.random.Generator) -> None:
     torus = trimesh.creation.torus(1.0, 0.35, 48, 24)
     other = stand(torus.vertices, torus.faces)
-    with pytest.raises(CaptureError, match=r"setB: the first set confirms .* of this set's surface, 70% are needed"):
-        joining.join(named(views(pear(), None, rng), "setA") + named(views(other, None, rng), "setB"))
+    joined = joining.join(named(views(pear(), None, rng), "setA") + named(views(other, None, rng), "setB"))
+    with pytest.raises(CaptureError, match=r"setB: the first set confirms .* fusion.gates.min_shared = 70% is needed"):
+        joining.require_shared(joined, FusedGateLimits().min_shared)
+    joining.require_shared(joined, 0.0)
 
 
 def test_a_single_set_needs_no_joining(rng: np.random.Generator) -> None:

@@ -12,6 +12,7 @@ from scipy.spatial.distance import pdist
 from polcap.fusion import fused_maps
 from polcap.fusion.closed_mesh import is_closed
 from polcap.images import Floats
+from polcap.stages.asset import AssetSettings
 from polcap.synth import all_around, scenes
 from tests.conftest import shell
 
@@ -36,7 +37,7 @@ def test_views_without_a_board_become_a_closed_object_of_relative_size(tmp_path:
     assert len(about["figures"]["views"]) >= 15  # of 17
     assert not about["figures"]["mesh"]["metric"]
     assert json.loads((folder / "fused" / "maps" / "maps.json").read_text())["unit"] == "relative"
-    mesh = fused_maps.closed(fused_maps.read(folder / "fused" / "maps").atlas.mesh)
+    mesh = fused_maps.closed(fused_maps.read(folder / "fused" / "maps", AssetSettings()).atlas.mesh)
     assert is_closed(mesh)
     with np.load(folder / "truth.npz") as truth:
         true = width(truth["vertices"])

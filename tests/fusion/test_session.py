@@ -8,17 +8,18 @@ import cv2
 import numpy as np
 import pytest
 
-from polcap.config import Config
 from polcap.errors import CaptureError
 from polcap.formats.capture import reader
 from polcap.fusion import fuse_run
 from polcap.fusion import session as sessions
 from polcap.fusion.board_corners import BoardCorners
-from polcap.fusion.fusion_path import FusionSettings
+from polcap.fusion.fusion_path import SessionConfig
 from polcap.fusion.session import Session, SessionInput
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.cache import silent
 from polcap.pipeline.path import UserInput
+from polcap.quality import fused_object
+from polcap.quality.limits import FusedGateLimits
 from tests.fusion import board_views
 
 SWAPPED = {"name": "order", "state": "fail", "says": "90°, 45°, 0° fit better", "remedy": "rename the folders"}
@@ -27,7 +28,7 @@ SWAPPED = {"name": "order", "state": "fail", "says": "90°, 45°, 0° fit better
 def session_of(folder: Path, *names: str) -> SessionInput:
     for name in names:
         (folder / name).mkdir()
-    return SessionInput(folder, Config())
+    return SessionInput(folder, SessionConfig())
 
 
 def test_a_view_that_lacks_a_shot_is_left_out_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -49,13 +50,13 @@ def test_a_copy_of_a_view_is_left_out(tmp_path: Path) -> None:
             photo.parent.mkdir(parents=True)
             photo.write_bytes(cv2.imencode(".png", np.full((8, 8, 3), view + angle, np.uint16))[1].tobytes())
     shutil.copytree(tmp_path / "view02", tmp_path / "view05")
-    found = sessions.read(SessionInput(tmp_path, Config()))
+    found = sessions.read(SessionInput(tmp_path, SessionConfig()))
     assert found.used == ["view01", "view02", "view03", "view04"]
     assert found.left_out == {"view05": "holds photographs of view02"}
 
 
 def test_a_missing_number_of_a_view_is_in_the_report() -> None:
-    gate = fuse_run._views_gate([f"view{number:02d}" for number in range(1, 13) if number != 5], {})
+    gate = fused_object.views([f"view{number:02d}" for number in range(1, 13) if number != 5], {}, FusedGateLimits())
     assert gate.message == "All 11 views are used; no folder view05"
 
 
@@ -68,7 +69,7 @@ def test_three_views_are_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_a_folder_without_views_stays_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "pol000").mkdir()
     with pytest.raises(CaptureError, match="holds no views"):
-        fuse_run.fuse(session_of(tmp_path), FusionSettings(), tmp_path / "fused", lambda _: None, silent)
+        fuse_run.fuse(session_of(tmp_path), tmp_path / "fused", lambda _: None, silent)
     assert [path.name for path in tmp_path.iterdir()] == ["pol000"]
 
 

@@ -15,6 +15,7 @@ import pytest
 import polcap
 from polcap.fusion import fused_maps
 from polcap.fusion.closed_mesh import is_closed
+from polcap.stages.asset import AssetSettings
 from tests.conftest import ROOT, shell
 
 pytest.importorskip("embreex")
@@ -38,7 +39,7 @@ def test_twelve_raw_views_become_a_closed_object_that_is_like_the_true_one(tmp_p
     stored = json.loads((folder / "fused" / "maps" / "maps.json").read_text())["albedo"]
     charted = [polcap.read_maps(view).albedo_sigma for view in sorted(folder.glob("view*"))]  # by one chart
     assert None not in charted and stored["uncertainty_percent"] == pytest.approx(100 * np.median(charted), abs=0.1)
-    mesh = fused_maps.closed(fused_maps.read(folder / "fused" / "maps").atlas.mesh)
+    mesh = fused_maps.closed(fused_maps.read(folder / "fused" / "maps", AssetSettings()).atlas.mesh)
     assert is_closed(mesh)
     with np.load(folder / "truth.npz") as truth:
         extent = np.ptp(truth["vertices"], axis=0)
@@ -92,7 +93,7 @@ def test_a_fusion_that_was_killed_twice_ends_as_one_that_was_not(tmp_path: Path)
     record = {str(Path("fused", "work", "unchanged.json"))}  # is not written if the photographs are newer than 3 s
     assert written(folder, "**/*").keys() - record == written(whole, "**/*").keys() - record  # nothing partial is left
     assert written(folder, "view*/polcap/maps/*") == written(whole, "view*/polcap/maps/*")
-    again, once = (fused_maps.read(one / "fused/maps") for one in (folder, whole))
+    again, once = (fused_maps.read(one / "fused/maps", AssetSettings()) for one in (folder, whole))
     assert again.atlas.mesh.vertices == pytest.approx(once.atlas.mesh.vertices, abs=1e-6)  # m
     difference = np.abs(again.maps.normal - once.maps.normal)
     assert np.quantile(difference, 0.999) < 1e-3  # the last bits of a sum could decide which views a few texels see

@@ -1,0 +1,69 @@
+"""Gates of a fused object: its views, their poses and normals, joined sets, the seen share, the closed mesh."""
+
+from collections.abc import Mapping, Sequence
+
+from polcap.formats.capture import folder_names
+from polcap.quality.gate import Gate
+from polcap.quality.limits import FusedGateLimits
+
+
+def views(used: Sequence[str], left_out: Mapping[str, str], limits: FusedGateLimits) -> Gate:
+    """Gate on the number of used views. It names views that are left out, and numbers that no folder has."""
+    count, limit = len(used), limits.min_views
+    missing = folder_names.missing_views([*used, *left_out])
+    absent = f"; no folder {folder_names.few_names(missing)}" if missing else ""
+    if left_out:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
+        message = f"{len(left_out)} of {count + len(left_out)} views are left out: {reasons}{absent}"
+        return Gate("views", "warn", count, limit, message, "Shoot these views again, or delete them", unit="")
+    if count < limit:
+        message = f"{count} views are few: parts between them are guessed from outlines{absent}"
+        return Gate("views", "warn", count, limit, message, "Shoot 12 views or more", unit="")
+    return Gate("views", "pass", count, limit, f"All {count} views are used{absent}", unit="")
+
+
+def poses(residual_px: Mapping[str, float], board: bool, limits: FusedGateLimits) -> Gate:
+    """Gate on the rms distance of a view's board corners, or features, from where its pose projects them."""
+    worst = max(residual_px, key=lambda name: residual_px[name])
+    value, limit = residual_px[worst], limits.max_corner_px if board else limits.max_feature_px
+    points = "The board's corners" if board else "Features of the object"
+    message = f"{points} are within {value:.2f} px (rms) in every view; the worst is {worst}"
+    if value <= limit:
+        return Gate("poses", "pass", value, limit, message, unit="px")
+    support = "Keep the board flat, and" if board else "Turn the object on a flat table,"
+    return Gate("poses", "fail", value, limit, message, f"{support} focus and zoom unchanged", unit="px")
+
+
+def agreement(normal_deg: Mapping[str, float], limits: FusedGateLimits) -> Gate:
+    """Gate on the views whose normals contradict the fused mesh, as after a swap of polarizer angles."""
+    worst, limit = max(normal_deg, key=lambda name: normal_deg[name]), limits.max_normal_deg
+    value, bad = normal_deg[worst], ", ".join(name for name, angle in normal_deg.items() if angle > limit)
+    if bad:
+        message = f"The normals of {bad} contradict the mesh, by {value:.0f}° in the worst view"
+        remedy = f"Check the polarizer angles of {bad}, or delete them and fuse again"
+        return Gate("agreement", "fail", value, limit, message, remedy, unit="°")
+    message = f"Normals of all views are within {value:.0f}° of the mesh (median); the worst is {worst}"
+    return Gate("agreement", "pass", value, limit, message, unit="°")
+
+
+def join(folder: str, shared: float, limits: FusedGateLimits) -> Gate:
+    """Gate on the share of a further set's surface that the first set confirms; below the limit, `fuse` has ended."""
+    message = f"The first set confirms {shared:.0%} of the surface of {folder}"
+    return Gate(f"join {folder}", "pass", shared, limits.min_shared, message)
+
+
+def seen(share: float, view_count: int, limits: FusedGateLimits) -> Gate:
+    """Gate on the share of the surface that a view saw."""
+    message, limit = f"Views saw {share:.0%} of the surface; the rest is filled", limits.min_seen
+    if share >= limit:
+        return Gate("seen", "pass", share, limit, message)
+    few = view_count < limits.min_views
+    remedy = "Shoot more views" if few else "Take a second ring of views from higher up"
+    return Gate("seen", "warn", share, limit, message, remedy)
+
+
+def closed(every_edge: bool) -> Gate:
+    """Gate on whether every edge of the mesh belongs to two triangles."""
+    if every_edge:
+        return Gate("closed", "pass", None, None, "Every edge of the mesh belongs to two triangles")
+    return Gate("closed", "fail", None, None, "The mesh has open edges", "Report this as a bug")
