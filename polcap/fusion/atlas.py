@@ -34,7 +34,7 @@ class AtlasSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of the stage `atlas` of the fusion."""
 
     size: Annotated[int, Meta(ge=0, le=8192, description="side of the textures; 0: a texel is one map pixel [px]")] = 0
-    margin: Annotated[int, Meta(ge=1, le=32, description="distance between UV charts, filled from their borders [px]")] = 6
+    margin: Annotated[int, Meta(ge=1, le=32, description="distance of UV charts, filled from their borders [px]")] = 6
 
 
 @dataclass(frozen=True)
