@@ -165,18 +165,24 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class FusedGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Limits of the gates of a fused object, the section `fusion.gates`."""
 
-    min_views: Annotated[int, Meta(ge=3, le=999, description="number of views from which on they are not few")] = 8
+    min_views: Annotated[int, Meta(ge=3, le=999, description="least number of views without a warning")] = 8
     max_corner_px: Annotated[
         float,
-        Meta(gt=0, description="allowed rms distance of a view's board corners from its pose; 0.1 to 0.2 [RAW px]"),
+        Meta(
+            gt=0,
+            description="allowed rms distance of board corners from the pose; usually 0.1 to 0.2 [RAW px]",
+        ),
     ] = 0.5
     max_feature_px: Annotated[
         float,
-        Meta(gt=0, description="the same of features, where there is no board; sharp ones leave 0.6 to 1 [RAW px]"),
+        Meta(
+            gt=0,
+            description="without a board: allowed rms distance of features from the pose; usually 0.6 to 1 [RAW px]",
+        ),
     ] = 2.0
     max_normal_deg: Annotated[
         float,
-        Meta(gt=0, le=90, description="allowed median angle of a view's normals to the mesh; views err by 6 to 9 [°]"),
+        Meta(gt=0, le=90, description="allowed median angle between a view's normals and the mesh; usually 6 to 9 [°]"),
     ] = 20.0
     min_shared: Annotated[
         float,
