@@ -1,7 +1,8 @@
 """Batch processing: all captures below a folder, with one summary; a failed capture does not stop the others.
 
-`shards` selects the captures of this process, `unit` processes one capture, `processes` or `cluster` several at a
-time, and `contact_sheet` writes the summary. A capture that is processed again continues from its stage cache.
+`capture_search` finds the captures, `shards` selects those of this process, `unit` processes one capture, `processes`
+or `cluster` several at a time, and `contact_sheet` writes the summary. A capture that is processed again continues from
+its stage cache.
 """
 
 import json
@@ -13,14 +14,14 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from polcap.batch import contact_sheet, processes
+from polcap.batch import capture_search, contact_sheet, processes
 from polcap.batch import unit as units
+from polcap.batch.capture_search import Candidate
 from polcap.batch.shards import WHOLE, Shard
 from polcap.batch.unit import FINISHED, FOLDER, ProcessOptions, Unit, UnitRecord
 from polcap.errors import CaptureError
 from polcap.formats import atomic, own_folders
 from polcap.formats.capture import folder_names
-from polcap.formats.own_folders import FUSED
 
 
 @dataclass(frozen=True)
@@ -39,16 +40,24 @@ def find(root: Path, out: Path | None = None) -> list[Unit]:
 
     Raises CaptureError: there is no capture.
     """
+    return _units(root, out, _search(root))
+
+
+def _search(root: Path) -> list[Candidate]:
     if not root.is_dir():
         raise CaptureError(f"{root}: no such folder; give the folder that holds the captures")
-    batch_folder = str((out or root) / FOLDER)
-    found = [_unit(root, Path(folder), out, batch_folder) for folder in _captures(root)]
-    if not found:
-        raise CaptureError(
-            f"{root} holds no capture: no folders pol000, pol045, …, no capture.toml, no photographs "
-            "(views of a fused object do not count)"
-        )
-    return sorted(found, key=lambda unit: folder_names.natural(unit.name))
+    return capture_search.search(root)
+
+
+def _units(root: Path, out: Path | None, found: Sequence[Candidate]) -> list[Unit]:
+    folders = sorted((each.folder for each in found if not each.reason), key=Path.is_symlink, reverse=True)
+    once = {os.path.realpath(folder): folder for folder in folders}  # a folder before links to it
+    captures = [_unit(root, folder, out) for folder in once.values()]
+    if not captures:
+        reasons = "; ".join(f"{candidate.folder}: {candidate.reason}" for candidate in found)
+        nothing = "no folders pol000, pol045, …, no capture.toml, no photographs (views of a fused object do not count)"
+        raise CaptureError(f"{root} holds no capture: {reasons or nothing}")
+    return sorted(captures, key=lambda unit: folder_names.natural(unit.name))
 
 
 def reopen(place: Path) -> list[Unit]:
@@ -60,20 +69,9 @@ def reopen(place: Path) -> list[Unit]:
         return find(place)
 
 
-def _captures(root: Path) -> Iterator[str]:
-    for folder, inside, files in os.walk(root):
-        if folder_names.is_result(Path(folder)) or folder_names.is_result(Path(folder, FUSED)):
-            inside.clear()  # maps are no photographs, and the views of a fused object are processed
-        elif folder_names.looks_like_a_capture(Path(folder), inside, files):
-            inside.clear()
-            yield folder
-        else:
-            inside[:] = [name for name in inside if not name.startswith(".") and name not in own_folders.OURS]
-
-
-def _without_capture(root: Path, found: Sequence[Unit]) -> list[str]:
-    """Names of the sub-folders of a batch's root that hold neither a capture nor a result."""
-    used = {Path(unit.capture) for unit in found}
+def _without_capture(root: Path, found: Sequence[Candidate]) -> list[str]:
+    """Names of the sub-folders of a batch's root that hold neither photographs nor a result."""
+    used = {candidate.folder for candidate in found}
     if root in used:  # the batch is one capture
         return []
     used |= {parent for path in used for parent in path.parents}
@@ -84,10 +82,10 @@ def _without_capture(root: Path, found: Sequence[Unit]) -> list[str]:
     ]
 
 
-def _unit(root: Path, folder: Path, out: Path | None, batch_folder: str) -> Unit:
+def _unit(root: Path, folder: Path, out: Path | None) -> Unit:
     name = folder.relative_to(root).as_posix() if folder != root else folder.resolve().name
     target = folder / own_folders.OUTPUT if out is None else out / name
-    return Unit(name, str(folder), str(target), batch_folder)
+    return Unit(name, str(folder), str(target), str((out or root) / FOLDER))
 
 
 def run(
@@ -97,7 +95,8 @@ def run(
 
     The summary files in `polcap-batch` list all captures, including those of other shards.
     """
-    found = find(root, out)
+    candidates = _search(root)
+    found = _units(root, out, candidates)
     mine = plan.shard.of(found)
     batch_folder = Path(found[0].batch_folder)
     places = {"root": str(root.resolve()), "out": None if out is None else str(out.resolve())}
@@ -105,7 +104,10 @@ def run(
     records = {unit: record for unit in mine if (record := units.find_finished(unit, options)) is not None}
     wanted = [unit for unit in mine if unit not in records]
     print_line(f"{len(found)} captures, shard {plan.shard}: {len(mine)}, finished before: {len(records)}")
-    if empty := _without_capture(root, found):
+    for candidate in candidates:
+        if candidate.reason:
+            print_line(f"no capture in {candidate.folder}: {candidate.reason}")
+    if empty := _without_capture(root, candidates):
         print_line(f"no capture in {', '.join(empty)}: no folders pol000, pol045, …, and no photographs")
     for folder in sorted({Path(unit.capture).parent for unit in found}):
         if len(views := folder_names.views(folder)) > 1:

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from polcap.errors import CaptureError
-from polcap.formats.capture import folder_names
+from polcap.formats.capture import folder_names, photograph_files
 from polcap.formats.raw import libraw as raw
-from polcap.formats.raw import probe
 from polcap.images import Exif, Floats, SensorImage
 from polcap.optics import sensor
 
@@ -42,12 +41,10 @@ def photographs_in(folder: Path) -> list[Photograph]:
 
     Raises CaptureError if there is none, or the folder cannot be listed.
     """
-    paths = sorted(
-        (path for path in folder_names.children(folder) if path.is_file()),
-        key=lambda one: folder_names.natural(one.name),
-    )
-    files = [(path, probe.read(path)) for path in paths]
-    photographs = [Photograph(path, file.exif, file.digest) for path, file in files if file.kind == "raw"]
+    files, _ = photograph_files.read_all(folder)
+    raws = {path: file for path, file in files.items() if file.kind == "raw"}
+    ordered = sorted(raws, key=lambda path: folder_names.natural(path.name))
+    photographs = [Photograph(path, raws[path].exif, raws[path].digest) for path in ordered]
     if not photographs:
         raise CaptureError(f"{folder}: holds no RAW photograph; take some, or remove the folder")
     return photographs

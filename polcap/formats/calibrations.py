@@ -6,6 +6,7 @@ capture uses the newest that fits it.
 
 from dataclasses import replace
 from pathlib import Path
+from unicodedata import normalize
 
 import msgspec
 import numpy as np
@@ -79,7 +80,7 @@ def choose(exif: Exif, lens_filter: str | None, focal_length_mm: float | None) -
         listed = ", ".join(name or "(none)" for name in names)
         return None, [f"calibration: several filters are known ({listed}); state filter in capture.toml to use one"]
     wanted = names[0] if lens_filter is None else lens_filter
-    of_filter = [pair for pair in fitting if pair[0].filter == wanted]
+    of_filter = [pair for pair in fitting if normalize("NFC", pair[0].filter) == normalize("NFC", wanted)]
     if not of_filter:
         return None, [f'calibration: none of filter "{wanted}" for this camera and lens']
     found, path = max(of_filter, key=lambda pair: pair[0].made)

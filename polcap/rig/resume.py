@@ -7,7 +7,7 @@ import msgspec
 
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import atomic
-from polcap.formats.capture import layouts
+from polcap.formats.capture import folder_names, layouts
 from polcap.rig import capture_record
 from polcap.rig.capture_record import RigFile
 from polcap.rig.shooting_plan import CaptureOrder
@@ -49,7 +49,7 @@ def open_folder(folder: Path, resume: bool) -> RigFile | None:
         return content
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+        names = [path.name for path in folder_names.children(folder)]
     except OSError as error:
         raise atomic.failure(folder, error) from error
     if capture_record.NAME in names:

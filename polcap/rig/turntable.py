@@ -47,7 +47,7 @@ def open_session(folder: Path, views: int | None, turntable: str | None, resume:
         raise SettingError("--views and --turntable belong together; give both, such as --views 12 --turntable manual")
     if resume:
         raise CaptureError(f"{folder} holds no session that was begun: there is nothing to resume; leave out --resume")
-    if folder.exists() and any(path.name != LOG for path in folder.iterdir()):
+    if folder.exists() and any(path.name != LOG for path in folder_names.children(folder)):
         raise CaptureError(f"{folder} is not empty; continue with --resume, or choose another folder")
     return SessionFile(views, turntable)
 

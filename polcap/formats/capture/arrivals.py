@@ -5,6 +5,8 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+from polcap.formats.capture.foreign_files import is_ignored_file, is_ignored_folder
+
 _POLL_S = 0.1
 
 FileStates = dict[str, tuple[int, int]]  # size and time of change by path
@@ -13,7 +15,7 @@ FileStates = dict[str, tuple[int, int]]  # size and time of change by path
 def settled(folder: Path, ignored: Path, still_s: float = 2.0, edited: Sequence[Path] = ()) -> Iterator[None]:
     """Watch a folder: yield at once, then each time files changed and nothing has changed for `still_s` seconds since.
 
-    The folder `ignored` (of results) and names that begin with a dot are not watched. An editor saves the files
+    The folder `ignored` (of results) and the names of `foreign_files` are not watched. An editor saves the files
     `edited` in one step, so their changes count as ended at the next poll.
     """
     folder, ignored = folder.resolve(), ignored.resolve()
@@ -37,8 +39,8 @@ def _seen(folder: Path, ignored: Path) -> FileStates:
     found: FileStates = {}
     for root, folders, files in os.walk(folder):
         here = Path(root)
-        folders[:] = [name for name in folders if not name.startswith(".") and (here / name) != ignored]
-        found |= _stats(here / name for name in files if not name.startswith("."))
+        folders[:] = [name for name in folders if not is_ignored_folder(name) and (here / name) != ignored]
+        found |= _stats(here / name for name in files if not is_ignored_file(name))
     return found
 
 

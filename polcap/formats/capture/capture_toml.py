@@ -1,7 +1,8 @@
 """Reads capture.toml, the facts that a user states about a capture; a misspelt key is an error."""
 
 import os
-from pathlib import Path
+import unicodedata
+from pathlib import Path, PurePath
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -70,6 +71,30 @@ def load(folder: Path) -> CaptureFile:
             raise CaptureError(f"{path}: {entry.file} has role {entry.role} and no angle; give its angle in degrees")
         if entry.exposure and entry.flash_energy:
             raise CaptureError(f"{path}: {entry.file} states both exposure and flash_energy; give one of them")
-    if stated.rotator and stated.rotator.log and not (folder / stated.rotator.log).is_file():
+    if stated.rotator and stated.rotator.log and not locate(folder, stated.rotator.log).is_file():
         raise CaptureError(f"{path}: no rotator log {stated.rotator.log}; correct or remove the line")
     return stated
+
+
+def locate(folder: Path, name: str) -> Path:
+    """Path of a file that capture.toml names; it may not exist.
+
+    Backslashes are separators, as on Windows; a name in another Unicode form, as of macOS, is found.
+
+    Raises CaptureError: the file lies outside the folder.
+    """
+    if not os.path.exists(folder / name):
+        name = name.replace("\\", "/")
+    if not Path(os.path.abspath(folder / name)).is_relative_to(os.path.abspath(folder)):
+        raise CaptureError(f"{folder / NAME}: {name} lies outside the folder; move it inside")
+    place = folder
+    for part in PurePath(name).parts:
+        place = place / part if os.path.exists(place / part) else _in_other_form(place, part)
+    return place
+
+
+def _in_other_form(folder: Path, name: str) -> Path:
+    """Path of the file or folder whose name has the same characters, composed or decomposed; else of `name` itself."""
+    form = unicodedata.normalize("NFC", name)
+    listed = os.listdir(folder) if folder.is_dir() else []
+    return folder / next((other for other in listed if unicodedata.normalize("NFC", other) == form), name)

@@ -1,19 +1,19 @@
 """Folders of photographs by their names: shots of one angle, views of an object, captures, results.
 
-Nothing but names and first bytes is read; `layouts` assigns the photographs themselves.
+Nothing but names is read; `layouts` assigns the photographs themselves.
 """
 
 import os
 import re
+import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 
 from polcap.errors import CaptureError
-from polcap.formats.capture import capture_toml
+from polcap.formats.capture import foreign_files
 from polcap.formats.own_folders import OURS
-from polcap.formats.raw import probe
 
 SEPARATION_DEG = 5.0  # closer angles count as one
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
@@ -23,14 +23,20 @@ _VIEW = re.compile(r"view[ _-]?\d+", re.IGNORECASE)
 
 
 def children(folder: Path) -> list[Path]:
-    """Files and folders in a folder, sorted by name, without hidden ones (.DS_Store, ._DSC0001.NEF).
+    """Files and folders in a folder, sorted by name, without those that `foreign_files` ignores.
 
     Raises CaptureError.
     """
     try:
-        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+        return sorted(path for path in folder.iterdir() if not _is_ignored(path))
     except OSError as error:
         raise CaptureError(f"{folder}: cannot be listed ({error.strerror}); check the folder") from None
+
+
+def _is_ignored(path: Path) -> bool:
+    if path.is_dir():
+        return foreign_files.is_ignored_folder(path.name)
+    return foreign_files.is_ignored_file(path.name)
 
 
 def natural(name: str) -> tuple[tuple[int, str], ...]:
@@ -51,7 +57,7 @@ def is_result(folder: Path) -> bool:
 def views(folder: Path) -> list[str]:
     """Sub-folders view01, view02, … that hold captures: those that `polcap fuse` joins."""
     named = [path for path in children(folder) if path.is_dir() and _VIEW.fullmatch(path.name)]
-    return [path.name for path in named if angle_folders(path)[0]]
+    return [path.name for path in named if angle_folder_names(path)]
 
 
 def view_name(k: int) -> str:
@@ -96,16 +102,9 @@ def is_later_view(folder: Path) -> bool:
     return False
 
 
-def looks_like_a_capture(folder: Path, inside: Iterable[str], files: Iterable[str]) -> bool:
-    """Whether a folder with these sub-folders `inside` and `files` is one capture, judged by names and first bytes.
-
-    Photographs next to sub-folders do not count (they document the session), unless there is a capture.toml.
-    """
-    if capture_toml.NAME in files or _degrees_by_name(inside):
-        return True
-    if any(name not in OURS and not name.startswith(".") for name in inside):
-        return False
-    return any(probe.kind(folder / name) in ("raw", "photo") for name in sorted(files) if not name.startswith("."))
+def states_angles(names: Iterable[str]) -> bool:
+    """Whether the names of a folder's sub-folders state polarizer angles, so that it is a capture."""
+    return bool(_degrees_by_name(names))
 
 
 def is_one_angle(folder: Path) -> bool:
@@ -145,7 +144,7 @@ def _degrees_by_name(names: Iterable[str]) -> dict[str, float]:
     0, 45, 90; "0 Grad", "45 Grad", "90 Grad"; 角度0, 角度45, 角度90: at least three different axes below 180°, one of
     them 0°.
     """
-    names = [name for name in names if name not in OURS and not name.startswith(".")]
+    names = [name for name in names if name not in OURS and not foreign_files.is_ignored_folder(name)]
     found = {name: float(match["pol"]) for name in names if (match := _FOLDER.fullmatch(name)) and match["pol"]}
     if found:
         return found
@@ -153,7 +152,9 @@ def _degrees_by_name(names: Iterable[str]) -> dict[str, float]:
     for name in names:
         numbers = _FOLDER_NUMBER.findall(name)
         if len(numbers) == 1:
-            patterns[_FOLDER_NUMBER.sub("#", name)][name] = float(numbers[0].replace(",", "."))
+            patterns[unicodedata.normalize("NFC", _FOLDER_NUMBER.sub("#", name))][name] = float(
+                numbers[0].replace(",", ".")
+            )
     for group in patterns.values():
         angles = sorted(group.values())
         if angles[0] == 0 and angles[-1] < 180 and count_axes(angles) == len(angles) >= 3:
@@ -170,7 +171,11 @@ def angle_folders(folder: Path) -> tuple[dict[float, Path], Path | None]:
     crossed = [path for path in inside if (match := _FOLDER.fullmatch(path.name)) and not match["pol"]]
     if len(crossed) > 1:
         raise CaptureError(f"{crossed[1]}: {crossed[0].name} holds a cross-polarized shot too; remove one of the two")
-    stated = _degrees_by_name(path.name for path in inside)
+    broken = [path for path in children(folder) if path.is_symlink() and not path.exists()]
+    stated = _degrees_by_name(path.name for path in [*inside, *broken])
+    for path in broken:
+        if path.name in stated:
+            raise CaptureError(f"{path}: is a link to a missing folder; restore the folder, or remove the link")
     found: dict[float, Path] = {}
     for path in inside:
         angle = stated.get(path.name, degrees_of_cross(path) if path in crossed else None)

@@ -8,17 +8,16 @@ import os
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from polcap import parallel
 from polcap.errors import CaptureError
-from polcap.formats.capture import capture_toml
+from polcap.formats.capture import capture_toml, photograph_files
 from polcap.formats.capture.capture_toml import CaptureFile
 from polcap.formats.capture.folder_names import (
     NUMBER,
     SEPARATION_DEG,
+    angle_folder_names,
     angle_folders,
     children,
     count_axes,
@@ -30,13 +29,12 @@ from polcap.formats.capture.folder_names import (
     views,
 )
 from polcap.formats.own_folders import OURS
-from polcap.formats.raw import photo, probe
+from polcap.formats.raw import photo
 from polcap.formats.raw.probe import Probe
 from polcap.images import Role
 
 DEFAULT_DEG = (0.0, 45.0, 90.0)
 EQUAL_STOPS = 0.15  # EXIF rounds exposure times to a sixth of a stop at most
-_AT_ONCE = 2  # files read in parallel: as many child processes as decode them later
 _LOSSY_SUFFIXES = {".heic", ".heif", ".hif", ".avif", ".webp"}  # of phones and small cameras; not decoded
 
 
@@ -107,7 +105,7 @@ def _hint(folder: Path) -> str:
     named = few_names([path.name for path in inside])
     if remedy := _lossy_or_packed(folder):
         return remedy
-    if any(angle_folders(path)[0] for path in inside):
+    if any(map(angle_folder_names, inside)):
         return (
             f"its sub-folders {named} hold captures: give one of them, or run `polcap batch` on the folder; for views "
             "of one object, name them view01, view02, … and run `polcap fuse`"
@@ -141,14 +139,10 @@ def counted_clockwise(plan: Plan) -> Plan:
 def _toml(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     sources = []
     for entry in stated.frame:
-        path = folder / entry.file
-        if not path.exists():
-            path = folder / entry.file.replace("\\", "/")  # as Windows writes it
-        if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
-            raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} lies outside the folder; move it inside")
-        if not path.is_file():
+        path = capture_toml.locate(folder, entry.file)
+        if not os.path.lexists(path):
             raise CaptureError(f"{folder / capture_toml.NAME}: no file {entry.file}; correct or remove its entry")
-        found = _probe(path)
+        found = photograph_files.read(path)
         if found.kind == "other":
             raise CaptureError(f"{folder / capture_toml.NAME}: {entry.file} is not a photograph; remove its entry")
         sources.append(Source(path, found, entry.role, entry.angle, entry.exposure, entry.flash_energy))
@@ -272,27 +266,18 @@ def _list_photographs(folder: Path, remedy: str = "") -> tuple[list[Source], lis
 
     If `remedy` is not empty, a folder without photographs is a CaptureError with this remedy.
     """
-    files = [path for path in children(folder) if path.is_file()]
-    probes = parallel.results([partial(_probe, path) for path in files], min(_AT_ONCE, parallel.threads()))
-    found = list(map(Source, files, probes))
+    probes, unread = photograph_files.read_all(folder)
+    found = [Source(path, one) for path, one in probes.items()]
     raws = [source for source in found if source.probe.kind == "raw"]
     extra = [source for source in found if source.probe.kind == "photo"]
     if remedy and not raws and not extra:
         raise CaptureError(f"{folder}: holds no photograph that polcap reads; {_lossy_or_packed(folder) or remedy}")
-    notes = []
+    notes = [f"not used: {few_names(unread)}, of other programs"] if unread else []
     if raws and extra:
-        stems = {source.path.stem.lower() for source in raws}
-        paired = sum(source.path.stem.lower() in stems for source in extra)
+        stems = {photograph_files.stem(source.path) for source in raws}
+        paired = sum(photograph_files.stem(source.path) in stems for source in extra)
         if paired:
             notes.append(f"{paired} pictures have a RAW of the same name: the RAW is used")
         if paired < len(extra):
             notes.append(f"not used: {len(extra) - paired} finished pictures among RAW files")
     return sorted(raws or extra, key=lambda source: natural(source.path.name)), notes
-
-
-def _probe(path: Path) -> Probe:
-    """Metadata of a photograph. Raises CaptureError if no decoder can read it."""
-    found = probe.read(path)
-    if found.kind == "unknown":
-        raise CaptureError(f"{path}: not a picture, a RAW that LibRaw knows, or text; restore the file, or remove it")
-    return found

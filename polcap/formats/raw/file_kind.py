@@ -31,7 +31,7 @@ _TAGS_READ = {
 }  # fmt: skip
 _INTEGERS = {1: "B", 3: "H", 4: "I", 13: "I"}
 _MAX_DIRECTORIES, _MAX_VALUES = 64, 1 << 18  # per file: stops at a loop or a forged count
-_SIDECARS = {".db", ".cos", ".thm", ".pdf", ".zip", ".txt", ".xmp"}  # binary, or text in UTF-16
+_SIDECARS = {".pdf", ".zip", ".txt"}  # binary, or text in UTF-16; `foreign_files` has those of photographs
 _TEXT_BYTES = 1 << 16  # some makers put lines of text in front of their pixels
 
 Directory = dict[int, tuple[int, ...]]

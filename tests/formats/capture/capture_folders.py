@@ -34,6 +34,7 @@ def flat(root, shots=3, times=(1 / 200, 1 / 50)):
 
 
 def pictures(root, names):
+    root.mkdir(parents=True, exist_ok=True)
     for number, name in enumerate(names):
         save(root / name, np.full((8, 10, 3), 300 + number, np.uint16))
     return root

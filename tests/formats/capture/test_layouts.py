@@ -55,9 +55,9 @@ def test_numbered_folders_of_objects_are_not_angles(tmp_path, listed):
         capture.read(tmp_path)
 
 
-def test_a_batch_distinguishes_angle_folders_from_numbered_captures(tmp_path):
-    assert folder_names.looks_like_a_capture(tmp_path, ("0 Grad", "45 Grad", "90 Grad"), ())
-    assert not folder_names.looks_like_a_capture(tmp_path, ("10", "20", "30"), ())
+def test_a_batch_distinguishes_angle_folders_from_numbered_captures():
+    assert folder_names.states_angles(("0 Grad", "45 Grad", "90 Grad"))
+    assert not folder_names.states_angles(("10", "20", "30"))
 
 
 def test_a_polarization_sensor_is_never_clockwise(tmp_path):
