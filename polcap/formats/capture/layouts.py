@@ -140,7 +140,7 @@ def _toml(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     sources = []
     for entry in stated.frame:
         path = capture_toml.locate(folder, entry.file)
-        if not os.path.lexists(path):
+        if path.is_dir() or not os.path.lexists(path):
             raise CaptureError(f"{folder / capture_toml.NAME}: no file {entry.file}; correct or remove its entry")
         found = photograph_files.read(path)
         if found.kind == "other":

@@ -3,6 +3,7 @@
 import os
 import unicodedata
 from pathlib import Path
+from typing import Literal
 
 import pytest
 
@@ -12,6 +13,7 @@ from polcap.formats.capture import arrivals, reader
 from polcap.images import Capture
 from tests.formats.capture.capture_folders import flat, folders, names, pictures, shoot
 
+Form = Literal["NFC", "NFD"]
 BINARY = b"\0\1\2\377"
 SILENT = {
     **dict.fromkeys(["IMG_0.acr", "IMG_0.vrd", "IMG_0.DR4", "IMG_0.dng.dop", "ZbThumbnail.info", "Thumbs.db"], BINARY),
@@ -91,7 +93,7 @@ def test_a_pipe_named_as_a_photograph_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("on_disk", "stated"), [("NFD", "NFC"), ("NFC", "NFD")])
-def test_names_in_another_unicode_form_are_found(tmp_path: Path, on_disk: str, stated: str) -> None:
+def test_names_in_another_unicode_form_are_found(tmp_path: Path, on_disk: Form, stated: Form) -> None:
     entries = ['rotator = { log = "drehwinkel ä.txt" }']
     (tmp_path / unicodedata.normalize(on_disk, "drehwinkel ä.txt")).touch()
     for angle in (0, 45, 90):
@@ -102,7 +104,8 @@ def test_names_in_another_unicode_form_are_found(tmp_path: Path, on_disk: str, s
 
 
 def test_angle_folders_in_two_unicode_forms_belong_together(tmp_path: Path) -> None:
-    for angle, form in ((0, "NFC"), (45, "NFD"), (90, "NFC")):
+    forms: dict[int, Form] = {0: "NFC", 45: "NFD", 90: "NFC"}
+    for angle, form in forms.items():
         shoot(tmp_path / unicodedata.normalize(form, f"Öffnung {angle}") / "a.dng")
     assert len(reader.read(tmp_path).shots) == 3
 
