@@ -1,5 +1,6 @@
 """Output of the commands: data on stdout, messages and progress on stderr, exit codes."""
 
+import errno
 import functools
 import json
 import os
@@ -45,10 +46,19 @@ def open_log(file: "Path | None") -> None:
     if file is not None:
         from polcap.formats.export import provenance
 
+        if file.is_file() and not _is_log(file):
+            raise FileExistsError(errno.EEXIST, "is there, and is no log of polcap")
         _log_file = file.open("a", encoding="utf-8", errors="backslashreplace")
         log(f"polcap {shlex.join(sys.argv[1:])}")
         versions = {"Python": platform.python_version(), **provenance.versions()}
         log(f"{', '.join(map(' '.join, versions.items()))}; {platform.platform()}")
+
+
+def _is_log(file: "Path") -> bool:
+    """Whether a file is empty, or begins with a message of `log`."""
+    with file.open("rb") as begun:
+        first = begun.readline(_LONGEST)
+    return not first or b" INFO    polcap " in first
 
 
 def log(text: str, level: _Level = "INFO") -> None:

@@ -75,4 +75,4 @@ def test_what_is_written_below_a_result_is_short_however_long_the_captures_name(
     assert done.returncode == 0, done.stderr
     longest = max(len(str(file.relative_to(copy))) for file in copy.rglob("*"))
     page = (ROOT / "docs" / "reference" / "result.md").read_text(encoding="utf-8")
-    assert longest + len("archive/") + len(".4194304.part") <= 120 and "120 characters" in page
+    assert longest + len("archive/") + len(".4194304-0123abcd.part") <= 120 and "120 characters" in page

@@ -20,7 +20,7 @@ from polcap.batch.capture_search import Candidate
 from polcap.batch.shards import WHOLE, Shard
 from polcap.batch.unit import FINISHED, FOLDER, ProcessOptions, Unit, UnitRecord
 from polcap.errors import CaptureError
-from polcap.formats import atomic, own_folders
+from polcap.formats import atomic, own_files, own_folders
 from polcap.formats.capture import folder_names
 
 
@@ -97,10 +97,25 @@ def run(
     """
     candidates = _search(root)
     found = _units(root, out, candidates)
-    mine = plan.shard.of(found)
     batch_folder = Path(found[0].batch_folder)
     places = {"root": str(root.resolve()), "out": None if out is None else str(out.resolve())}
-    atomic.write_json(batch_folder / "batch.json", places)  # for `reopen`
+    names = [path.name for path in batch_folder.iterdir()] if batch_folder.is_dir() else []
+    own_files.claim(batch_folder, names)
+    with own_files.opened(batch_folder):
+        atomic.write_json(batch_folder / "batch.json", places)  # for `reopen`
+        return _run(root, candidates, found, options, plan, print_line)
+
+
+def _run(
+    root: Path,
+    candidates: Sequence[Candidate],
+    found: list[Unit],
+    options: ProcessOptions,
+    plan: BatchPlan,
+    print_line: Callable[[str], None],
+) -> dict[str, Any]:
+    """Process the unfinished captures of this shard and write the summary files."""
+    mine, batch_folder = plan.shard.of(found), Path(found[0].batch_folder)
     records = {unit: record for unit in mine if (record := units.find_finished(unit, options)) is not None}
     wanted = [unit for unit in mine if unit not in records]
     print_line(f"{len(found)} captures, shard {plan.shard}: {len(mine)}, finished before: {len(records)}")

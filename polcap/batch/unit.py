@@ -23,7 +23,7 @@ from polcap import resource_limits
 from polcap.batch import thumbnail
 from polcap.config import Config
 from polcap.errors import InputError, PolcapError, StorageError, one_line
-from polcap.formats import atomic, own_folders, text_file
+from polcap.formats import atomic, own_files, own_folders, text_file
 from polcap.formats.capture import reader
 from polcap.images import ChartRequest, Device, Network
 from polcap.pipeline import models, unchanged
@@ -100,6 +100,11 @@ def run(unit: Unit, options: ProcessOptions, attempt: int = 1) -> UnitRecord:
         return finished
     start = time.perf_counter()
     record = UnitRecord(unit.name, "running", "", 0.0, socket.gethostname(), os.getpid(), attempt)
+    with own_files.opened(Path(unit.batch_folder)):
+        return _run(unit, options, record, start)
+
+
+def _run(unit: Unit, options: ProcessOptions, record: UnitRecord, start: float) -> UnitRecord:
     try:
         write_record(unit, record)
         about = _process(unit, options)

@@ -18,12 +18,16 @@ def board(
     json: Json = False,
 ) -> None:
     """Write the board for captures from all sides, as SVG and PDF at true scale."""
+    from polcap.errors import SettingError
     from polcap.formats import atomic, board_print
     from polcap.optics.board import BOARDS
 
     chosen = BOARDS[size]
     files = {".svg": board_print.svg(chosen).encode(), ".pdf": board_print.pdf(chosen)}
     written = [folder / f"board-{size}{suffix}" for suffix in files]
+    for file, content in zip(written, files.values(), strict=True):
+        if file.exists() and file.read_bytes() != content:
+            raise SettingError(f"{file} exists and is another file; move it away, or name another folder")
     for file, content in zip(written, files.values(), strict=True):
         atomic.write(file, content)
     terminal.print_written(written, json)

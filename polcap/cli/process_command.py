@@ -9,7 +9,8 @@ from typer import Context, Option
 from polcap import resource_limits, terminal
 from polcap.cli import options
 from polcap.cli.watch import at_every_change
-from polcap.formats import own_folders
+from polcap.errors import SettingError
+from polcap.formats import own_files, own_folders
 
 
 def process(
@@ -42,6 +43,8 @@ def process(
 
     stated = {**context.params, "capture": capture, "config": config, "mask": mask, "model": model}  # paths, not text
     target = out or capture / own_folders.OUTPUT
+    if mask is not None and own_files.wrote(target, mask):
+        raise SettingError(f"--mask {mask} is part of the result that this run replaces; copy it elsewhere first")
     request = None if until or force or dry_run or watch else options.request_digest(stated, capture, target)
     if (finished := unchanged.find(target, request)) is not None:
         terminal.print_progress(f"{finished.table}\nNothing has changed since the last run.")

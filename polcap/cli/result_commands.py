@@ -10,7 +10,7 @@ from polcap import terminal
 from polcap.cli import options
 from polcap.cli.options import Json, Result
 from polcap.errors import SettingError
-from polcap.formats import own_folders
+from polcap.formats import own_files, own_folders
 
 
 def show(
@@ -89,11 +89,13 @@ def report(
 def _compare(result: Path, other: Path, json: bool, open_: bool) -> None:
     """Write the page compare.html into a result folder, and print the figures and settings that differ."""
     from polcap import report as reports
+    from polcap.pipeline import result_folder
     from polcap.report import compare as pairs
 
     abouts = reports.read(result), reports.read(other)
     file = result / "compare.html"
-    pairs.write(file, (result, other), abouts)
+    with result_folder.opened(result):
+        pairs.write(file, (result, other), abouts)
     rows = pairs.rows(*abouts)
     if json:
         terminal.print_data([{"name": name, "here": here, "there": there} for name, here, there in rows])
@@ -137,12 +139,14 @@ def _check_single(result: Path, command: str) -> None:
 
 
 def _results(named: Path) -> Iterator[Path]:
-    """The result folder that was named, or the finished and begun results of a batch."""
+    """The result folder that was named, or the finished and begun results of a batch that lie in its folder."""
     if not (named / own_folders.BATCH).is_dir() or (named / "work").is_dir():
         yield named
         return
     from polcap import batch as batches
 
     for unit in batches.reopen(named):
-        if (Path(unit.out) / "work").is_dir():
+        if not Path(unit.out).resolve().is_relative_to(named.resolve()):
+            terminal.print_message(f"polcap: {unit.out} lies outside {named} and stays; clean it by its own name")
+        elif (Path(unit.out) / "work").is_dir() and own_files.is_claimed(Path(unit.out)):
             yield Path(unit.out)

@@ -1,5 +1,7 @@
 """Writes a file or folder completely or not at all (temporary name, then rename); turns any text into a safe file name.
 
+In a folder that `own_files` has opened, such as a result, only polcap's own files are replaced, and links are refused.
+
 A file is written under a temporary name, synced to the disk and renamed. So the final name always leads to a complete
 file. The new name reaches the disk with the system's next journal write; after a power cut the old file may be there.
 All functions of polcap that write files raise StorageError where a file or folder cannot be written.
@@ -8,19 +10,23 @@ All functions of polcap that write files raise StorageError where a file or fold
 import errno
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from secrets import token_hex
 from typing import Any
 
 import msgspec
 
 from polcap.errors import StorageError
+from polcap.formats import own_files
 
 _SYNCED_AT_ONCE = 8  # files; the system then writes its journal once for all of them
 _FORBIDDEN = set('/\\:*?"<>|')  # path separators, and characters that Windows refuses
+_TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.part(\.\w+)?")  # process id and random number
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{n}" for port in ("COM", "LPT") for n in range(10))}  # of Windows
 _NAME_BYTES = 60  # Windows allows 260 characters for the whole path
 _MISSING = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.ENODEV)  # of network drives
@@ -67,19 +73,28 @@ def write_json(final: str | Path, content: Any, synced: bool = True) -> None:
 def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
     """Context manager: a temporary path to write to, renamed to `final` when the block ends without an exception.
 
-    Parent folders are made. The temporary name has the same suffix, for writers that choose a format by it. On any
-    exception it is removed, and an old file under `final` is untouched. Without `synced` the file may be incomplete
-    after a power cut: for files that their reader checks.
+    Parent folders are made. The temporary file is new and empty; its random name has the same suffix, for writers that
+    choose a format by it. On any exception it is removed, and an old file under `final` is untouched. Without `synced`
+    the file may be incomplete after a power cut: for files that their reader checks.
 
-    Raises StorageError: any OSError of making, writing, syncing or renaming, inside the block too.
+    Raises StorageError: any OSError of making, writing, syncing or renaming, inside the block too; a file that polcap
+    did not write is in the place of `final`, or a link leads there.
     """
     final = Path(final)
-    temporary = final.with_name(f".{final.stem}.{os.getpid()}.part{final.suffix}")
+    own = None if is_temporary(final.parent.name) else own_files.owner(final)
+    temporary = _temporary(final, final.suffix)
     try:
+        if own is not None:
+            own.check(final)
+        if final.is_symlink():
+            raise StorageError(f"cannot write {final}: it is a link; remove it, or choose another path")
         final.parent.mkdir(parents=True, exist_ok=True)
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
         if synced:
             sync(temporary)
+        if own is not None:
+            own.record([final])
         os.replace(temporary, final)
     except OSError as error:
         raise failure(final, error) from error
@@ -88,33 +103,77 @@ def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
 
 
 @contextmanager
-def folder(final: str | Path, synced: bool = True) -> Iterator[Path]:
-    """Context manager: a temporary folder to fill, renamed to `final` at the end; an old folder `final` is replaced.
+def new_folder(final: str | Path) -> Iterator[Path]:
+    """Context manager: a temporary folder to fill, renamed to `final` at the end; `final` may be an empty folder.
 
-    Raises StorageError: any OSError of making, writing, syncing or renaming, inside the block too.
+    Raises StorageError: any OSError of making, writing, syncing or renaming, inside the block too; `final` holds files.
+    """
+    with _temporary_folder(Path(final)) as temporary:
+        yield temporary
+        _sync_all(temporary)
+        if os.name == "nt" and Path(final).is_dir():  # Windows does not rename onto an empty folder
+            Path(final).rmdir()
+        os.replace(temporary, final)
+
+
+@contextmanager
+def folder_of_files(final: str | Path, index: str, synced: bool = True) -> Iterator[Path]:
+    """Context manager: a temporary folder to fill with files, which are moved into the folder `final` at the end.
+
+    Files of polcap that `final` held before are replaced or removed; others stay. `index` is the file without which
+    readers do not accept the folder: it is removed first and moved last, so they never see files of two generations.
+
+    Raises StorageError: as `path`, for any of the files.
     """
     final = Path(final)
-    temporary = final.with_name(f".{final.name}.{os.getpid()}.part")
-    old = final.with_name(f".{final.name}.{os.getpid()}.old")
+    with _temporary_folder(final) as temporary:
+        yield temporary
+        if synced:
+            _sync_all(temporary)
+        own = own_files.owner(final)
+        names = sorted((file.name for file in temporary.iterdir()), key=lambda name: name == index)
+        if own is not None:
+            for name in names:
+                own.check(final / name)
+        final.mkdir(exist_ok=True)
+        if own is not None:
+            own.record(final / name for name in names)
+            for old in (final / index, *own.below(final)):
+                if old.name == index or old.name not in names:
+                    own.remove(old)
+        for name in names:
+            os.replace(temporary / name, final / name)
+
+
+@contextmanager
+def _temporary_folder(final: Path) -> Iterator[Path]:
+    """Context manager: a temporary folder next to `final`, removed at the end if it is still there."""
+    temporary = _temporary(final, "")
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
         temporary.mkdir()
         yield temporary
-        if synced:
-            with ThreadPoolExecutor(_SYNCED_AT_ONCE) as pool:
-                list(pool.map(sync, [*sorted(temporary.rglob("*")), temporary]))
-        if final.exists():
-            os.replace(final, old)
-        os.replace(temporary, final)
     except OSError as error:
-        if old.exists() and not final.exists():
-            os.replace(old, final)
         raise failure(final, error) from error
     except StorageError as error:  # of a file inside: named as in `final`
         raise StorageError(str(error).replace(str(temporary), str(final))) from error
     finally:
         discard(temporary)
-        discard(old)
+
+
+def _temporary(final: Path, suffix: str) -> Path:
+    """A temporary name in the folder of `final` that no other program can foresee."""
+    return final.with_name(f".{final.stem if suffix else final.name}.{os.getpid()}-{token_hex(4)}.part{suffix}")
+
+
+def is_temporary(name: str) -> bool:
+    """Whether a file or folder has a temporary name of this module, as after a killed run."""
+    return _TEMPORARY.fullmatch(name) is not None
+
+
+def _sync_all(folder: Path) -> None:
+    with ThreadPoolExecutor(_SYNCED_AT_ONCE) as pool:
+        list(pool.map(sync, [*sorted(folder.rglob("*")), folder]))
 
 
 def sync(target: Path) -> None:

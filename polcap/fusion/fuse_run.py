@@ -12,6 +12,7 @@ from polcap import __version__
 from polcap import report as reports
 from polcap.config import restore
 from polcap.errors import SettingError
+from polcap.formats.capture import folder_names
 from polcap.formats.export import encoders, provenance
 from polcap.fusion import fused_maps, fused_page, object_pictures
 from polcap.fusion import session as sessions
@@ -40,6 +41,8 @@ def fuse(session_input: SessionInput, out: Path, notify: Notify, progress: Progr
     config = session_input.config
     config.check()
     session = sessions.read(session_input)  # first: a folder without views stays as it is
+    for view in folder_names.session_views(session_input.folder):
+        result_folder.check(out, session_input.folder / view)
     with result_folder.locked(out):
         processed = sessions.process(session, session_input, notify)
         cache = StageCache(out, progress)

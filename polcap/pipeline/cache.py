@@ -150,7 +150,7 @@ class StageCache(MemoryCache):
             npy_folder.freeze(value)
             return value
         place = self.place(stage)
-        with atomic.folder(place, synced=False) as temporary:
+        with atomic.folder_of_files(place, "manifest.json", synced=False) as temporary:
             arrays: npy_folder.Arrays = {}
             tree = npy_folder.encode(value, "value", arrays)
             saves = [partial(npy_folder.save, temporary / f"{name}.npy", array) for name, array in arrays.items()]

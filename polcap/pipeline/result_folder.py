@@ -1,4 +1,4 @@
-"""A result folder: its lock, the removal of temporary files and of the stage cache, and work/run.json.
+"""A result folder: which folders it may be, its lock, the removal of the stage cache, and work/run.json.
 
 A result is opened again from work/run.json.
 """
@@ -11,92 +11,130 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from polcap.errors import SettingError, StorageError
-from polcap.formats import atomic, folder_lock, own_folders, text_file
-from polcap.formats.capture import folder_names
+from polcap.errors import CaptureError, SettingError, StorageError
+from polcap.formats import atomic, folder_lock, own_files, own_folders, text_file
+from polcap.formats.capture import capture_toml, folder_names
+from polcap.formats.raw import probe
 from polcap.pipeline.cache import seal
-from polcap.pipeline.path import STAGES
 
-_ANIMATIONS = [f"{motion}.{kind}" for motion in ("light", "turntable") for kind in ("webp", "mp4")]
-_WORK_FILES = (
-    "run.json",
-    "unchanged.json",
-    "compared_mask.png",
-    *(f"{stage}.png" for stage in STAGES),
-    *_ANIMATIONS,
-)  # outside the folders of the stages
+_HELD = ("lock", "owner")  # files in work/ that an open result needs
+_PARTS = ("maps", "asset", "work", "report.html", "report.json", "color.toml", "compare.html")  # of a result
 
 
 def check(out: Path, photographs: Path) -> None:
-    """Refuse a result folder inside the photographs' folders, or with a name that no OpenEXR file can have.
+    """Refuse a result folder that contains photographs, lies among those of a capture, or that no OpenEXR can have.
 
-    Raises SettingError: the folder is one of these, or its name is no UTF-8 text.
+    Raises SettingError: the folder is one of these.
     """
     try:
         os.fspath(out).encode()
     except UnicodeEncodeError:
         raise SettingError(f"--out {out} is no UTF-8 text, as OpenEXR wants it; name another with --out") from None
     here, there = Path(os.path.realpath(out)), Path(os.path.realpath(photographs))
-    inside = here.relative_to(there).parts if here.is_relative_to(there) else ("elsewhere",)
-    if not inside:
+    if here == there:
         raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")
-    of_angle = any(folder_names.is_angle_folder(name) for name in inside)
-    if of_angle or inside[0] in folder_names.angle_folder_names(there):
-        raise SettingError(f"--out {out} lies among the capture's shots; choose {photographs / own_folders.OUTPUT}")
+    if there.is_relative_to(here):
+        raise SettingError(f"--out {out} contains the capture {photographs}; choose a folder of its own")
+    if out.is_symlink() and here.parent != there and Path(os.path.realpath(out.parent)) == there:
+        raise SettingError(f"--out {out} is a link; name the folder that it leads to")
+    inside = here.relative_to(there).parts[:1] if here.is_relative_to(there) else ()
+    names = folder_names.angle_folder_names(there)
+    among = any(name in names or folder_names.is_angle_folder(name) for name in inside)
+    if among or any(map(_holds_shots, (here, *here.parents))):
+        raise SettingError(f"--out {out} lies among a capture's shots; choose {photographs / own_folders.OUTPUT}")
+
+
+def _holds_shots(folder: Path) -> bool:
+    """Whether a folder holds photographs of a capture: it is named for their angle, or a capture.toml lists them."""
+    if folder_names.is_angle_folder(folder.name) or folder_names.is_one_angle(folder):
+        return any(probe.kind(path) in ("raw", "photo") for path in folder_names.children(folder) if path.is_file())
+    return any(_lists_files_in(folder, above) for above in folder.parents if (above / capture_toml.NAME).is_file())
+
+
+def _lists_files_in(folder: Path, capture: Path) -> bool:
+    """Whether the capture.toml of a capture lists a file in one of its sub-folders."""
+    with suppress(CaptureError):  # it is no capture.toml of polcap
+        return any((capture / frame.file).parent == folder for frame in capture_toml.load(capture).frame)
+    return False
+
+
+@contextmanager
+def opened(out: Path) -> Iterator[None]:
+    """Context manager: files are written into a result folder, which gets its record if it has none.
+
+    Raises StorageError: the folder holds maps or other parts of a result that are not in a record of polcap.
+    """
+    own_files.claim(out, _PARTS)
+    with own_files.opened(out):
+        yield
 
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Context manager that locks a result folder for this process and removes temporary files of a killed run.
+    """Context manager that locks and opens a result folder for this process; removes temporary files of a killed run.
 
     The operating system removes the lock when the process ends, so there are no stale locks.
 
-    Raises StorageError: another process works here, or the folder cannot be written.
+    Raises StorageError: another process works here, the folder cannot be written, or as `opened`.
     """
     work = out / "work"
     lock, owner = FileLock(work / "lock", timeout=0), work / "owner"
-    try:
-        work.mkdir(parents=True, exist_ok=True)
-        folder_lock.acquire(lock)
-    except Timeout as error:
-        other = owner.read_text(encoding="utf-8", errors="replace")[:20].strip() if owner.exists() else "unknown"
-        raise StorageError(f"{out}: process {other} is working here; wait for it or choose another --out") from error
-    except OSError as error:
-        raise atomic.failure(work / "lock", error) from error
-    try:
-        atomic.write(owner, f"{os.getpid()}\n", synced=False)
-        for place in (work, out, out / "maps", out / "asset", *(out / "asset").glob("*/")):
-            for left in [*place.glob(".*.part*"), *place.glob(".*.old")]:
-                atomic.discard(left)
-        yield
-    finally:
-        lock.release()
+    with opened(out), own_files.opened(out) as own:
+        own.check(work / "lock")
+        try:
+            work.mkdir(parents=True, exist_ok=True)
+            own.record([work / "lock"])
+            folder_lock.acquire(lock)
+        except Timeout as error:
+            other = owner.read_text(encoding="utf-8", errors="replace")[:20].strip() if owner.exists() else "unknown"
+            raise StorageError(
+                f"{out}: process {other} is working here; wait for it or choose another --out"
+            ) from error
+        except OSError as error:
+            raise atomic.failure(work / "lock", error) from error
+        try:
+            atomic.write(owner, f"{os.getpid()}\n", synced=False)
+            _remove_temporary(out)
+            yield
+        finally:
+            lock.release()
+
+
+def _remove_temporary(out: Path) -> None:
+    """Remove files and folders with temporary names, as a killed run leaves them, from the folders of a result."""
+    asset = out / "asset"
+    presets = [] if asset.is_symlink() or not asset.is_dir() else [path for path in asset.iterdir() if path.is_dir()]
+    for place in (out, out / "work", out / "maps", asset, *presets):
+        if place == out or not place.is_symlink():
+            for left in place.glob(".*.part*"):
+                if atomic.is_temporary(left.name):
+                    atomic.discard(left)
 
 
 def clean(out: Path, dry_run: bool = False) -> int:
-    """Remove the stage cache and the pictures of `show` from work/; returns their size in bytes.
+    """Remove polcap's files from work/: the stage cache and the pictures of `show`; returns their size in bytes.
 
     All other files in work/ stay. With `dry_run`, nothing is removed.
 
     Raises StorageError: there is no folder work/, another process works here, or a file cannot be removed.
     """
     work = out / "work"
-    if not work.is_dir():
+    if not work.is_dir() or not own_files.is_claimed(out):
         raise StorageError(f"{out} holds no stage cache; give the result folder of `polcap process`")
-    stages = [manifest.parent for manifest in work.glob("[0-9][0-9]-*/manifest.json")]
-    cached = [file for stage in stages for file in stage.iterdir() if file.suffix in (".npy", ".json")]
-    files = [*cached, *(work / name for name in _WORK_FILES if (work / name).is_file())]
-    size = sum(file.stat().st_size for file in files)
-    if not dry_run:
+    with own_files.opened(out) as own:
+        files = [file for file in own.below(work) if file.name not in _HELD]
+        size = sum(file.stat().st_size for file in files)
+        if dry_run:
+            return size
         with locked(out):
             try:
                 for file in files:
-                    file.unlink(missing_ok=True)
+                    own.remove(file)
             except OSError as error:
                 raise StorageError(f"{error.filename} cannot be removed: {error.strerror}") from error
-            for stage in stages:
-                with suppress(OSError):  # it holds a file of another program
-                    stage.rmdir()
+        for folder in {file.parent for file in files if file.parent != work}:
+            with suppress(OSError):  # it holds a file of another program
+                folder.rmdir()
     return size
 
 

@@ -14,7 +14,7 @@ import msgspec
 from polcap import parallel, report
 from polcap.config import Config, restore
 from polcap.errors import SettingError
-from polcap.formats import color_profile
+from polcap.formats import color_profile, own_files
 from polcap.formats.export import encoders, provenance
 from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
@@ -77,8 +77,8 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
     )
     if results.color.source in ("chart", "corners"):
         color_profile.write(out / PROFILE, results.color)
-    else:
-        (out / PROFILE).unlink(missing_ok=True)
+    elif results.color.source != "profile" and (own := own_files.owner(out / PROFILE)):  # a profile may be this file
+        own.remove(out / PROFILE)
     return about
 
 
@@ -133,9 +133,10 @@ def show(out: Path, stages: Sequence[str]) -> list[Path]:
             raise SettingError(f"{stage!r} is no stage; choose one of {', '.join(STAGES)}")
     results, _ = reopen(out, max(stages, key=STAGES.index))
     drawn = []
-    for stage in stages:
-        drawn.append(out / "work" / f"{stage}.png")
-        png.write(drawn[-1], pictures.of_stage(results, stage))
+    with result_folder.opened(out):
+        for stage in stages:
+            drawn.append(out / "work" / f"{stage}.png")
+            png.write(drawn[-1], pictures.of_stage(results, stage))
     return drawn
 
 
@@ -145,7 +146,8 @@ def animate(out: Path, motion: animation.Motion) -> list[Path]:
     ior = float(about["settings"]["infer"]["ior"])
     turning = motion == "turntable"
     frames = animation.turntable(results.maps, results.mesh, ior) if turning else animation.light(results.maps, ior)
-    return encoders.animate(out / "work" / motion, frames, animation.SECONDS)
+    with result_folder.opened(out):
+        return encoders.animate(out / "work" / motion, frames, animation.SECONDS)
 
 
 def judge_again(out: Path) -> dict[str, Any]:

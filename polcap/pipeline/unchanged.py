@@ -14,7 +14,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from polcap.formats import atomic, own_folders, text_file
+from polcap.formats import atomic, own_files, own_folders, text_file
 from polcap.formats.export import provenance
 
 _FILE = "unchanged.json"
@@ -62,7 +62,8 @@ def remember(out: Path, asked: str | None, table: str = "") -> None:
     """Record the request digest that the result folder now answers; does nothing if it is None."""
     if asked is not None:
         content = {"request": asked, "table": table, "result": _result(out)}
-        atomic.write_json(out / "work" / _FILE, content, synced=False)
+        with own_files.opened(out):
+            atomic.write_json(out / "work" / _FILE, content, synced=False)
 
 
 @cache

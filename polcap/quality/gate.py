@@ -30,10 +30,12 @@ class Gate(msgspec.Struct, frozen=True):
     unit: Unit = "1"  # a share or a number, as in report.json's units
 
     def __post_init__(self) -> None:
-        """Replace NumPy scalars by Python numbers, for JSON."""
+        """Replace NumPy scalars by Python numbers, and a value that is not finite by None, for JSON."""
         for name in ("value", "limit", "cost_deg"):
             if isinstance(number := getattr(self, name), np.generic):
                 msgspec.structs.force_setattr(self, name, number.item())
+        if isinstance(self.value, float) and not np.isfinite(self.value):
+            msgspec.structs.force_setattr(self, "value", None)
 
 
 @dataclass(frozen=True)

@@ -92,8 +92,8 @@ def timings(seconds: Mapping[str, float]) -> RowPlot:
 
 def shifts(found: Alignment, names: Sequence[str]) -> dict[str, Any]:
     """Plot of the image shift of each shot relative to the first: a line per shot, 1σ as a circle."""
-    moved = found.transform[:, :2, 2]
-    span = max(0.5, 1.2 * float(np.abs(moved).max() + found.residual_px.max()))
+    moved, sigmas = found.transform[:, :2, 2], np.where(np.isfinite(found.residual_px), found.residual_px, 0)
+    span = max(0.5, 1.2 * float(np.abs(moved).max() + sigmas.max()))
     shots = [
         {
             "name": name,
@@ -102,7 +102,7 @@ def shifts(found: Alignment, names: Sequence[str]) -> dict[str, Any]:
             "error": float(sigma / span),
             "title": f"{name}: {x:+.2f}, {y:+.2f} px ± {sigma:.3f}",
         }
-        for name, (x, y), sigma in zip(names, moved, found.residual_px)
+        for name, (x, y), sigma in zip(names, moved, sigmas)
     ]
     note = "relative to the first, in pixels of the merged picture; circles are 1σ"
     title = "Shift of the shots"

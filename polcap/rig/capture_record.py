@@ -127,7 +127,8 @@ class CaptureRecord:
                     relative = file.relative_to(self.folder)
                     messages.append(f"{relative}: was not checked before the interruption; the frame is taken again")
         for temporary in self.folder.rglob(".*.part*"):
-            atomic.discard(temporary)
+            if atomic.is_temporary(temporary.name):
+                atomic.discard(temporary)
         return messages
 
     def write(self) -> None:

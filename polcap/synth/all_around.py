@@ -101,7 +101,7 @@ def write(
     ]
     frames = shoot.exposures * (len(shoot.angles_deg) + shoot.cross)  # of a view
     exposure = None
-    with atomic.folder(folder) as place:
+    with atomic.new_folder(folder) as place:
         for k, (name, placed, turn, position) in enumerate(named):
             view = _view(scene, shoot, turn, position, placed)
 

@@ -72,7 +72,7 @@ def write(folder: Path, shoot: CalibrationShoot) -> None:
         make="Polcap", model="Synthetic", lens="Synthetic 60mm", f_number=11.0, focal_length_mm=shoot.focal_mm,
         taken="2026-03-14T12:00:00.000",
     )  # fmt: skip
-    with atomic.folder(folder) as place:
+    with atomic.new_folder(folder) as place:
         for number, (name, radiance, iso, time) in enumerate(_photographs(shoot)):
             random = np.random.default_rng([shoot.seed, 8, number])
             counts = forward_camera.expose(forward_camera.mosaic(radiance, _CFA), actual, iso / 100, random)

@@ -95,7 +95,7 @@ def write(folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int
 def write_capture(folder: Path, studio: "Studio", frame_written: Callable[[int, int], None] | None = None) -> None:
     """Write the capture that a studio is prepared for; see `write`."""
     shoot = studio.shoot
-    with atomic.folder(folder) as place:
+    with atomic.new_folder(folder) as place:
         files = []
         shots = [("pol", angle) for angle in shoot.angles_deg]
         if shoot.cross:

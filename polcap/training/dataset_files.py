@@ -64,7 +64,7 @@ def main(out: Path, count: int, recipe: DatasetRecipe, report: Report = silent) 
         place = out / f"{number:06d}"
         if place.exists():
             continue
-        with atomic.folder(place) as folder:
+        with atomic.new_folder(place) as folder:
             _write_sample(folder, recipe, library, files, number)
         made += 1
         report(f"{number + 1} of {count} samples")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from polcap.errors import StorageError
-from polcap.formats import atomic
+from polcap.formats import atomic, own_files
 
 
 def names(folder: Path) -> list[str]:
@@ -59,24 +59,46 @@ def test_file_in_place_of_a_folder_is_named(tmp_path: Path) -> None:
         temporary.write_bytes(b"abc")
 
 
-def test_folder_replaces_the_old_one_as_a_whole(tmp_path: Path) -> None:
-    final = tmp_path / "stage"
-    for text in ("one", "two"):
-        with atomic.folder(final) as temporary:
-            (temporary / text).write_text(text)
-    assert names(final) == ["two"]
-    assert names(tmp_path) == ["stage"]
+def test_files_of_an_old_folder_are_replaced_and_removed(tmp_path: Path) -> None:
+    own_files.claim(tmp_path, ["stage"])
+    with own_files.opened(tmp_path):
+        for text in ("one", "two"):
+            with atomic.folder_of_files(tmp_path / "stage", "index") as temporary:
+                (temporary / text).write_text(text)
+                (temporary / "index").write_text(text)
+            (tmp_path / "stage" / "foreign").write_text("stays")
+    assert names(tmp_path / "stage") == ["foreign", "index", "two"]
+    assert names(tmp_path) == [own_files.RECORD, "stage"]
 
 
 def test_failed_folder_leaves_the_old_one(tmp_path: Path) -> None:
     final = tmp_path / "stage"
-    with atomic.folder(final) as temporary:
+    with atomic.folder_of_files(final, "one") as temporary:
         (temporary / "one").write_text("1")
-    with pytest.raises(StorageError), atomic.folder(final) as temporary:
+    with pytest.raises(StorageError), atomic.folder_of_files(final, "one") as temporary:
         (temporary / "two").write_text("2")
         raise OSError(errno.ENOSPC, "No space left on device")
     assert names(final) == ["one"]
     assert names(tmp_path) == ["stage"]
+
+
+def test_a_new_folder_never_replaces_files(tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "foreign").write_text("stays")
+    (tmp_path / "empty").mkdir()
+    with atomic.new_folder(tmp_path / "empty") as temporary:
+        (temporary / "one").write_text("1")
+    with pytest.raises(StorageError, match="full"), atomic.new_folder(tmp_path / "full") as temporary:
+        (temporary / "one").write_text("1")
+    assert names(tmp_path / "empty") == ["one"] and names(tmp_path / "full") == ["foreign"]
+
+
+def test_no_link_is_written_through_or_replaced(tmp_path: Path) -> None:
+    (tmp_path / "photograph").write_bytes(b"RAW")
+    (tmp_path / "report.json").symlink_to(tmp_path / "photograph")
+    with pytest.raises(StorageError, match="is a link"):
+        atomic.write(tmp_path / "report.json", "new")
+    assert (tmp_path / "report.json").is_symlink() and (tmp_path / "photograph").read_bytes() == b"RAW"
 
 
 def test_bytes_reach_the_disk_before_their_name_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,7 +114,7 @@ def test_bytes_reach_the_disk_before_their_name_does(tmp_path: Path, monkeypatch
         temporary.write_bytes(b"abc")
     assert [name for name, _ in named] == [temporary.name] and "a.bin" not in named[0][1]
     named.clear()
-    with atomic.folder(tmp_path / "stage") as folder:
+    with atomic.new_folder(tmp_path / "stage") as folder:
         (folder / "one").write_text("1")
         (folder / "two").write_text("2")
     assert sorted(name for name, _ in named) == sorted(["one", "two", folder.name])

@@ -76,12 +76,12 @@ def write(folder: Path, maps: SurfaceMaps, mesh: ReliefMesh, stokes: StokesImage
     """Write the folder maps/ of a result: every map as EXR, the main ones as PNG too, and maps.json.
 
     Of the mesh its depth (H, W) is written. All images are on the crop (H, W) of `maps`. Files are encoded on
-    threads. The folder is replaced as a whole: if one file fails, the folder of an earlier run stays.
+    threads. If one cannot be written, all files of an earlier run stay.
     """
     made = {"maps": maps, "mesh": mesh, "stokes": stokes, "cues": cues}
     near, median, far = map_files.depth_range(maps, mesh)
     depth = {"unit": "m" if mesh.metric else "relative", "near": near, "median": median, "far": far}
-    with atomic.folder(folder) as temporary:
+    with atomic.folder_of_files(folder, "maps.json") as temporary:
         parallel.results(
             partial(_write, temporary / name, partial(encode, *(made[source] for source in sources)))
             for name, (sources, encode) in map_files.FILES.items()

@@ -1,0 +1,132 @@
+"""Files that polcap wrote into a folder, such as a result: it replaces and removes only these.
+
+`polcap-files.txt` in the folder lists them, one path per line, relative to the folder. A path is recorded before the
+file gets its name, so a killed run leaves no file without a record. Links inside the folder are never followed.
+"""
+
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from polcap.errors import StorageError
+from polcap.formats import text_file
+
+RECORD = "polcap-files.txt"
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+_opened: dict[str, "OwnFiles"] = {}  # by absolute path of the folder; polcap writes into these now
+
+
+class OwnFiles:
+    """The recorded files of one folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(os.path.abspath(folder))
+        self.names: set[str] = set()
+        self._read()
+
+    def owns(self, file: Path) -> bool:
+        """Whether polcap wrote this file; another process may have recorded it meanwhile."""
+        name = self._name(file)
+        if name not in self.names:
+            self._read()
+        return name in self.names
+
+    def check(self, file: Path) -> None:
+        """Raise a StorageError if `file` exists and is not polcap's, or if it or a folder above it is a link."""
+        place = self.folder
+        for part in Path(self._name(file)).parts:
+            place /= part
+            if place.is_symlink():
+                raise StorageError(f"cannot write {file}: {place} is a link; remove it, or choose another --out")
+        if place.is_dir() or (os.path.lexists(place) and not self.owns(file)):
+            raise StorageError(f"cannot write {file}: polcap did not write the file that is there; move it away")
+
+    def record(self, files: Iterable[Path]) -> None:
+        """Add files to the record. Raises OSError."""
+        fresh = [name for name in map(self._name, files) if name not in self.names]
+        if fresh:
+            handle = os.open(self.folder / RECORD, os.O_APPEND | os.O_CREAT | os.O_WRONLY | _NO_LINK, 0o666)
+            with os.fdopen(handle, "wb") as record:
+                record.write("".join(f"{name}\n" for name in fresh).encode(errors="surrogateescape"))
+            self.names.update(fresh)
+
+    def below(self, folder: Path) -> list[Path]:
+        """The recorded files below a folder that exist and to which no link leads, by name."""
+        self._read()
+        found = [self.folder / name for name in sorted(self.names) if name.startswith(f"{self._name(folder)}/")]
+        return [file for file in found if file.is_file() and not self._is_linked(file)]
+
+    def remove(self, file: Path) -> None:
+        """Remove a file if polcap wrote it and no link leads to it. Raises OSError."""
+        if self.owns(file) and not self._is_linked(file):
+            Path(os.path.abspath(file)).unlink(missing_ok=True)
+
+    def _is_linked(self, file: Path) -> bool:
+        parts = Path(self._name(file)).parts
+        return any(self.folder.joinpath(*parts[: k + 1]).is_symlink() for k in range(len(parts)))
+
+    def _name(self, file: Path) -> str:
+        return Path(os.path.abspath(file)).relative_to(self.folder).as_posix()
+
+    def _read(self) -> None:
+        with suppress(OSError, ValueError):  # there is none yet
+            content = text_file.read_bytes(self.folder / RECORD, text_file.TEXT_BYTES)
+            self.names.update(content.decode(errors="surrogateescape").splitlines())
+
+
+def is_claimed(folder: Path) -> bool:
+    """Whether a folder has a record of polcap's files."""
+    record = folder / RECORD
+    return record.is_file() and not record.is_symlink()
+
+
+def wrote(folder: Path, file: Path) -> bool:
+    """Whether polcap wrote a file into a folder of its own."""
+    inside = Path(os.path.abspath(file)).is_relative_to(os.path.abspath(folder))
+    return inside and is_claimed(folder) and OwnFiles(folder).owns(file)
+
+
+def claim(folder: Path, uses: Iterable[str]) -> None:
+    """Make a folder polcap's own: creates it and its record, unless it has one.
+
+    `uses` are the names of files and folders that polcap writes directly into it.
+
+    Raises StorageError: one of these is there already without a record, or a link is in the record's place.
+    """
+    if is_claimed(folder):
+        return
+    record = folder / RECORD
+    if record.is_symlink():
+        raise StorageError(f"{record} is a link; remove it, or choose another --out")
+    for name in uses:
+        if os.path.lexists(folder / name):
+            raise StorageError(
+                f"{folder} holds {name}, but no {RECORD}: polcap did not write it, or the record was removed; "
+                "choose another --out"
+            )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with suppress(FileExistsError):  # another process was faster
+            os.close(os.open(record, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    except OSError as error:
+        raise StorageError(f"cannot write {record}: {error.strerror}; choose another folder") from error
+
+
+@contextmanager
+def opened(folder: Path) -> Iterator[OwnFiles]:
+    """Context manager: files that are written into the folder are checked against its record, and recorded."""
+    own = OwnFiles(folder)
+    before = _opened.get(str(own.folder))
+    own = _opened[str(own.folder)] = before or own
+    try:
+        yield own
+    finally:
+        if before is None:
+            del _opened[str(own.folder)]
+
+
+def owner(file: Path) -> OwnFiles | None:
+    """The innermost opened folder that holds a file; None: the file is in no folder of polcap."""
+    parents = Path(os.path.abspath(file)).parents
+    return next((_opened[str(parent)] for parent in parents if str(parent) in _opened), None)

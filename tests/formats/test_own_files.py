@@ -1,0 +1,80 @@
+"""polcap replaces and removes only files that it has recorded."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from polcap.errors import StorageError
+from polcap.formats import atomic, own_files
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    own_files.claim(tmp_path / "result", ["maps"])
+    return tmp_path / "result"
+
+
+def test_a_folder_with_parts_of_a_result_but_no_record_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "maps").mkdir()
+    with pytest.raises(StorageError, match=r"holds maps, but no polcap-files\.txt"):
+        own_files.claim(tmp_path, ["maps", "work"])
+    own_files.claim(tmp_path, ["work"])  # a folder with other files may hold a result
+    own_files.claim(tmp_path, ["maps"])  # it is polcap's now
+
+
+def test_only_recorded_files_are_replaced(folder: Path) -> None:
+    (folder / "foreign.txt").write_text("stays")
+    with own_files.opened(folder):
+        for text in ("one", "two"):
+            atomic.write(folder / "maps" / "own.txt", text)
+        with pytest.raises(StorageError, match="polcap did not write"):
+            atomic.write(folder / "foreign.txt", "lost")
+    assert (folder / "foreign.txt").read_text() == "stays"
+    assert (folder / "maps" / "own.txt").read_text() == "two"
+    assert (folder / own_files.RECORD).read_text() == "maps/own.txt\n"
+
+
+@pytest.mark.parametrize("name", ["maps", "maps/own.txt", own_files.RECORD])
+def test_links_inside_the_folder_are_refused(folder: Path, tmp_path: Path, name: str) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "own.txt").write_text("stays")
+    link = folder / name
+    if name == own_files.RECORD:
+        link.unlink()
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(elsewhere if name == "maps" else elsewhere / "own.txt")
+    with pytest.raises(StorageError, match="is a link"):
+        own_files.claim(folder, [])
+        with own_files.opened(folder):
+            atomic.write(folder / "maps" / "own.txt", "lost")
+    assert os.listdir(elsewhere) == ["own.txt"] and (elsewhere / "own.txt").read_text() == "stays"
+
+
+def test_a_file_is_recorded_before_it_gets_its_name(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", killed)
+    with pytest.raises(KeyboardInterrupt), own_files.opened(folder):
+        atomic.write(folder / "own.txt", "text")
+    assert (folder / own_files.RECORD).read_text() == "own.txt\n"
+
+
+def test_another_process_may_record_files_meanwhile(folder: Path) -> None:
+    with own_files.opened(folder) as own:
+        (folder / "own.txt").write_text("of the other process")
+        with (folder / own_files.RECORD).open("a") as record:
+            record.write("own.txt\n")
+        assert own.owns(folder / "own.txt")
+
+
+def test_a_recorded_file_is_not_removed_through_a_link(folder: Path, tmp_path: Path) -> None:
+    with own_files.opened(folder) as own:
+        atomic.write(folder / "maps" / "own.txt", "text")
+        (folder / "maps").rename(tmp_path / "moved")
+        (folder / "maps").symlink_to(tmp_path / "moved")
+        own.remove(folder / "maps" / "own.txt")
+        assert own.below(folder / "maps") == []
+    assert (tmp_path / "moved" / "own.txt").exists()

@@ -1,0 +1,156 @@
+"""A user's files are sacred: no command deletes, replaces or follows a link to what polcap did not write."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.campaigns.users_files import make_template, sequence
+from tests.conftest import Command
+
+QUICK = ("--no-chart", "--estimator", "analytic")
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small capture C with its finished result C/polcap; read only."""
+    folder = tmp_path_factory.mktemp("template")
+    make_template(folder)
+    return folder
+
+
+@pytest.fixture
+def capture(template: Path, tmp_path: Path) -> Path:
+    """A copy of that capture, to be changed."""
+    return Path(shutil.copytree(template / "C", tmp_path / "C"))
+
+
+def photographs(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.rglob("*.DNG")}
+
+
+@pytest.mark.parametrize("place", ["maps", "work/01-hdr", "asset", "deep/er"])
+def test_a_capture_inside_the_result_folder_stays(capture: Path, polcap: Command, tmp_path: Path, place: str) -> None:
+    shutil.rmtree(capture / "polcap")
+    before = photographs(capture)
+    inside = tmp_path / "out" / place
+    inside.parent.mkdir(parents=True)
+    capture.rename(inside)
+    done = polcap("process", inside, "--out", tmp_path / "out", *QUICK)
+    assert done.returncode == 2 and "contains the capture" in done.stderr
+    assert photographs(inside) == before
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_a_result_is_refused_among_the_shots_of_any_capture(
+    capture: Path, polcap: Command, tmp_path: Path, listed: bool
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(capture, other, ignore=shutil.ignore_patterns("polcap"))
+    place = other / "pol045"
+    if listed:
+        place = place.rename(other / "frames")
+        file = next(place.iterdir())
+        (other / "capture.toml").write_text(f'[[frame]]\nfile = "frames/{file.name}"\nangle = 45\n')
+    done = polcap("process", capture, "--out", place / "result", *QUICK)
+    assert done.returncode == 2 and "lies among a capture's shots" in done.stderr
+    assert not (place / "result").exists()
+
+
+@pytest.mark.parametrize("name", ["maps", "work", "asset", "report.json", "color.toml"])
+def test_a_folder_that_holds_parts_of_a_result_without_record_is_refused(
+    capture: Path, polcap: Command, tmp_path: Path, name: str
+) -> None:
+    out = tmp_path / "home"
+    (out / name).mkdir(parents=True)
+    (out / name / "photograph.dng").write_bytes(b"RAW")
+    done = polcap("process", capture, "--out", out, *QUICK)
+    assert done.returncode == 2 and f"holds {name}" in done.stderr
+    assert [path.name for path in out.rglob("*") if path.is_file()] == ["photograph.dng"]
+
+
+def test_foreign_files_in_a_result_survive_every_command(capture: Path, polcap: Command) -> None:
+    result = capture / "polcap"
+    places = ("maps/notes.txt", "maps/IMG.DNG", "work/01-hdr/x.npy", "work/10-app/manifest.json", ".bashrc.old",
+              ".ssh.old/key", "asset/.C.7.part.glb", "color.toml", "compare.html", "work/light.webp")  # fmt: skip
+    for name in places:
+        (result / name).parent.mkdir(exist_ok=True)
+        (result / name).write_bytes(name.encode())
+    for words in (
+        ("process", capture, *QUICK, "--set", "asset.ior=1.4"), ("export", result, "--obj"), ("report", result),
+        ("report", result, "--compare", result), ("show", result, "--animate", "light"), ("clean", result),
+        ("process", capture, *QUICK, "--force", "hdr"),
+    ):  # fmt: skip
+        assert polcap(*words).returncode != 1
+    assert {name: (result / name).read_bytes() for name in places} == {name: name.encode() for name in places}
+
+
+@pytest.mark.parametrize("name", ["maps", "asset", "work", "work/01-hdr", "report.json", "asset/C.glb"])
+def test_links_in_a_result_are_not_written_through(capture: Path, polcap: Command, tmp_path: Path, name: str) -> None:
+    link, target = capture / "polcap" / name, tmp_path / "elsewhere"
+    link.rename(target)
+    link.symlink_to(target)
+    before = {path: path.read_bytes() for path in [target, *target.rglob("*")] if path.is_file()}
+    done = polcap("process", capture, *QUICK, "--force", "hdr")
+    assert done.returncode == 2 and "is a link" in done.stderr
+    polcap("clean", capture)
+    assert link.is_symlink() and {path: path.read_bytes() for path in before} == before
+
+
+def test_a_linked_default_result_is_refused_and_a_named_one_is_used(
+    capture: Path, polcap: Command, tmp_path: Path
+) -> None:
+    target = tmp_path / "disk"
+    (capture / "polcap").rename(target)
+    (capture / "polcap").symlink_to(target)
+    assert "is a link" in polcap("process", capture, *QUICK, "--force", "asset").stderr
+    (tmp_path / "named").symlink_to(target)
+    assert polcap("process", capture, "--out", tmp_path / "named", *QUICK, "--force", "asset").returncode in (0, 3)
+
+
+def test_a_chart_profile_in_the_result_is_used_and_stays(capture: Path, polcap: Command) -> None:
+    profile = capture / "polcap" / "color.toml"
+    profile.write_text('matrix = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\nsource = "chart"\n')
+    for _ in range(2):
+        assert polcap("process", capture, "--chart", profile, "--estimator", "analytic").returncode in (0, 3)
+        assert profile.read_text().startswith("matrix = [[1")
+
+
+def test_an_input_that_the_run_would_replace_is_refused(capture: Path, polcap: Command) -> None:
+    mask = capture / "polcap" / "maps" / "mask.png"
+    before = mask.read_bytes()
+    done = polcap("process", capture, "--mask", mask, *QUICK)
+    assert done.returncode == 2 and "part of the result" in done.stderr
+    assert mask.read_bytes() == before
+
+
+def test_clean_stays_in_the_named_folder(template: Path, capture: Path, polcap: Command, tmp_path: Path) -> None:
+    """Also if the batch.json of a stranger names another tree."""
+    batch = tmp_path / "batch" / "polcap-batch"
+    batch.mkdir(parents=True)
+    (batch / "batch.json").write_text(f'{{"root": "{tmp_path}", "out": null}}')
+    done = polcap("clean", batch.parent)
+    assert "lies outside" in done.stderr
+    assert sorted((capture / "polcap" / "work").rglob("*.npy"))
+    assert polcap("clean", tmp_path).returncode == 2
+
+
+def test_an_existing_file_is_no_log(polcap: Command, tmp_path: Path) -> None:
+    file = tmp_path / "IMG.DNG"
+    file.write_bytes(b"RAW")
+    assert polcap("settings", "hdr", "--log", file).returncode == 2
+    assert file.read_bytes() == b"RAW"
+    log = tmp_path / "new.log"
+    for _ in range(2):
+        assert polcap("settings", "hdr", "--log", log).returncode == 0
+
+
+def test_a_board_replaces_no_file(polcap: Command, tmp_path: Path) -> None:
+    (tmp_path / "board-A4.pdf").write_bytes(b"mine")
+    assert polcap("board", tmp_path).returncode == 2
+    assert (tmp_path / "board-A4.pdf").read_bytes() == b"mine" and not (tmp_path / "board-A4.svg").exists()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_sequences_of_commands_leave_every_foreign_byte(template: Path, seed: int) -> None:
+    assert sequence(template, seed) == []
