@@ -44,7 +44,12 @@ _POLL_S = 0.1  # between two questions for its state
 _RESET = "\x18"
 _BANNER = re.compile(r"Grbl(?:HAL)? (1\.1\S*) .*")
 _STORED = re.compile(r"\$(\d{1,9})=(\d{1,9}(?:\.\d+)?)(?: .*)?")
-_STATUS = re.compile(r"<(\w+)(?::\d+)?\|MPos:(-?\d{1,9}\.?\d*),(-?\d{1,9}\.?\d*),(-?\d{1,9}\.?\d*).*>")
+_XYZ = r"(-?\d{1,9}\.?\d*),(-?\d{1,9}\.?\d*),(-?\d{1,9}\.?\d*)"
+_STATUS = re.compile(rf"<(\w+)(?::\d+)?\|([MW])Pos:{_XYZ}[|,>].*")
+_OFFSET = re.compile(rf"\|WCO:{_XYZ}")  # work position = machine position - offset
+_REPORT_INCHES = 13  # number of the setting; GRBL stores its other settings in mm
+_MM_PER_INCH = 25.4
+_OFFSET_EVERY = 40  # reports; GRBL 1.1 states the offset in the first one and in one of 30 at least
 
 
 class GrblSettings(RotatorSettings, frozen=True):
@@ -66,7 +71,8 @@ class GrblMotor:
         self._port = port
         self._settings = settings
         self._axis = "XYZ".index(settings.axis)
-        self._zero = 0.0  # machine units
+        self._zero = 0.0  # machine position, units
+        self._offset: float | None = None  # of work positions, units; None: not reported since the last reset
         self.model = f"GRBL {self._reset()}"
         matches = [match for line in self._command("$$") if (match := _STORED.fullmatch(line))]
         stored = {int(match[1]): float(match[2]) for match in matches}
@@ -74,6 +80,7 @@ class GrblMotor:
             if not stored.get(key, 0.0) > 0.0:
                 raise NoAnswer(f"{self.model} on {port.url} stated no ${key} above 0; set it in GRBL, or try again")
         steps_per_unit, units_per_minute = stored[100 + self._axis], stored[110 + self._axis]
+        self._reported_unit = _MM_PER_INCH if stored.get(_REPORT_INCHES) else 1.0  # units; GRBL's unit is the mm
         self._units_per_degree = 1.0 if settings.steps is None else settings.steps / steps_per_unit
         self.speed_deg_s = units_per_minute / 60.0 / self._units_per_degree
 
@@ -108,6 +115,7 @@ class GrblMotor:
 
     def _reset(self) -> str:
         """Reset the board; returns its version. Raises NoAnswer where no GRBL answers."""
+        self._offset = None
         self._port.send(_RESET)
         end = time.monotonic() + _START_S
         while (left := end - time.monotonic()) > 0:
@@ -166,14 +174,23 @@ class GrblMotor:
         raise self._too_slow("the last movement")
 
     def _state(self) -> tuple[str, float]:
-        """State of the board (Idle, Run, Alarm…) and machine position of the axis."""
-        self._port.send("?")
-        lines = self._port.read_lines()
-        while (match := _STATUS.fullmatch(line := next(lines))) is None:
-            if "|WPos:" in line:
-                raise self._failed("reports work positions; set $10=1")
-            self._is_ok(line)  # raises on errors
-        return match[1], float(match[2 + self._axis])
+        """State of the board (Idle, Run, Alarm…) and machine position [units] of the axis.
+
+        With $10=0 GRBL reports the work position, and only in some reports its offset; with $13=1 both are in inches.
+        """
+        for _ in range(_OFFSET_EVERY):
+            self._port.send("?")
+            lines = self._port.read_lines()
+            while (match := _STATUS.fullmatch(line := next(lines))) is None:
+                self._is_ok(line)  # raises on errors
+            position = float(match[3 + self._axis]) * self._reported_unit
+            if offset := _OFFSET.search(line):
+                self._offset = float(offset[1 + self._axis]) * self._reported_unit
+            if match[2] == "M":
+                return match[1], position
+            if self._offset is not None:
+                return match[1], position + self._offset
+        raise self._failed("reports work positions without their offset (WCO); set $10=1")
 
     def _is_ok(self, line: str) -> bool:
         """Whether a received line ends a command; status reports and messages do not.

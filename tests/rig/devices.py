@@ -93,16 +93,38 @@ class Elliptec(Device):
 
 
 class Grbl(Device):
-    """GRBL 1.1: one axis, X, in units of which `$100` states the steps; `homing` wires a switch."""
+    """GRBL 1.1: one axis, X, in units of which `$100` states the steps; `homing` wires a switch.
+
+    `$10` 0 reports work positions (G54 has an offset of 7 units), stating the offset in one of 30 reports; `$13` 1
+    reports inches (gnea/grbl, grbl/report.c).
+    """
 
     FAULTS = (*SPOKEN, "busy", "wrong-position", "unplug", "alarm", "restart")
     BANNER = "Grbl 1.1h ['$' for help]"
     HOMED_AT = -499.0  # units: travel 500 to the negative side, pull-off 1
 
-    def __init__(self, *, homing: bool = True, steps: float = 10.0, degrees: float = 1.0, **planted: object) -> None:
-        """`degrees` per unit: where the unit is not a degree."""
+    WORK_OFFSET = 7.0  # units
+
+    def __init__(
+        self,
+        *,
+        homing: bool = True,
+        steps: float = 10.0,
+        degrees: float = 1.0,
+        mask: int = 1,
+        inches: bool = False,
+        **planted: object,
+    ) -> None:
+        """`degrees` per unit: where the unit is not a degree. `mask`: $10. `inches`: $13."""
         super().__init__(**planted)  # type: ignore[arg-type]
-        self.settings = {10: 1.0, 22: float(homing), 100: steps, 110: self.speed_deg_s * 60 / degrees, 130: 500.0}
+        self.settings = {
+            10: float(mask),
+            13: float(inches),
+            22: float(homing),
+            100: steps,
+            110: self.speed_deg_s * 60 / degrees,
+            130: 500.0,
+        }
         self.degrees = degrees
         self.state = "Alarm" if homing else "Idle"
         self._critical = False  # a limit switch was hit: only reset helps
@@ -112,6 +134,7 @@ class Grbl(Device):
     def _forget(self) -> None:
         """Empty the buffers, as at a reset."""
         self._input = b""
+        self._reports = 0
         self._lines: list[str] = []
         self._planned: list[float] = []  # ring degrees
         self._waiting = False  # for the ring to stop, before it answers ok
@@ -206,8 +229,13 @@ class Grbl(Device):
             self.say("[MSG:'$H'|'$X' to unlock]")
 
     def report(self) -> None:
-        position = (self.angle_deg - self._zero_deg) / self.degrees
-        self.say(f"<{self.state.replace('Hold', 'Hold:0')}|MPos:{position:.3f},0.000,0.000|FS:0,0>")
+        position, offset = (self.angle_deg - self._zero_deg) / self.degrees, self.WORK_OFFSET
+        in_work = not int(self.settings[10]) & 1
+        scale, decimals = (1 / 25.4, 4) if self.settings[13] else (1.0, 3)
+        values = f"{'W' if in_work else 'M'}Pos:{(position - offset * in_work) * scale:.{decimals}f},0.000,0.000"
+        stated = f"|WCO:{offset * scale:.{decimals}f},0.000,0.000" if self._reports % 30 == 0 else ""
+        self._reports += 1
+        self.say(f"<{self.state.replace('Hold', 'Hold:0')}|{values}|FS:0,0{stated}>")
 
 
 class Line(Device):

@@ -117,7 +117,21 @@ def test_only_version_1_1_is_accepted(banner: str, error: type[Exception] | None
             assert motor(device).model == "GRBL 1.1f"
 
 
-def test_work_positions_are_refused() -> None:
+@pytest.mark.parametrize("inches", [False, True])
+@pytest.mark.parametrize("mask", [0, 1, 2, 3, 511])
+def test_settings_that_change_the_meaning_of_a_position_are_read(mask: int, inches: bool) -> None:
+    with Grbl(mask=mask, inches=inches, degrees=4.5, steps=80, speed_deg_s=900, start_deg=33) as device:
+        board = motor(device, steps=80 / 4.5)
+        board.home()
+        for angle in (45, 90):
+            board.go(angle)
+            assert board.position() == pytest.approx(angle, abs=0.02)
+            assert device.angle_deg == pytest.approx(angle, abs=0.02)
+        board.home()  # a reset: the offset is asked again
+        assert board.position() == pytest.approx(0, abs=0.02)
+
+
+def test_work_positions_without_their_offset_are_refused() -> None:
     class Work(Grbl):
         def report(self) -> None:
             self.say("<Idle|WPos:0.000,0.000,0.000|FS:0,0>")
