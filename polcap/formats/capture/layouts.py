@@ -8,6 +8,8 @@ import os
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -35,6 +37,8 @@ from polcap.images import Role
 
 DEFAULT_DEG = (0.0, 45.0, 90.0)
 EQUAL_STOPS = 0.15  # EXIF rounds exposure times to a sixth of a stop at most
+_COUNTER = 9999  # greatest file number of a camera
+_JUMP_S = 600.0  # between two frames: the clock was set, or the photographer had a long break
 _LOSSY_SUFFIXES = {".heic", ".heif", ".hif", ".avif", ".webp"}  # of phones and small cameras; not decoded
 
 
@@ -221,28 +225,66 @@ def _by_time(folder: Path, pictures: list[Source], angles_deg: Sequence[float]) 
 
     Also returns a note on the assumed order.
     """
-    timed = all(source.probe.exif.taken for source in pictures)
-    order = sorted(pictures, key=lambda one: (one.probe.exif.taken if timed else "", natural(one.path.name)))
-    count, shots = len(order), len(angles_deg)
-    by = "by their EXIF times" if timed else "by name"
+    count, shots = len(pictures), len(angles_deg)
     listed = ", ".join(f"{angle:g}" for angle in angles_deg)
     sort = "sort the frames into pol000, pol045, …, or list them in capture.toml"
     remedy = f"give the order with --angles, or {sort}"
     if count % shots:
         raise CaptureError(f"{folder}: {count} frames do not make {shots} equal brackets (angles {listed}); {remedy}")
     size = count // shots
-    if not timed and size > 1:
+    if size > 1 and not all(source.probe.exif.taken for source in pictures):
         raise CaptureError(f"{folder}: {count} frames without EXIF times cannot be assigned to angles; {sort}")
-    for at, source in enumerate(order):
-        value, reference = source.probe.exif.relative_exposure, order[at % size].probe.exif.relative_exposure
-        if not same_exposure(value, reference):
-            times = f"{value / reference:.3g} times" if value and reference else "not stated like"
-            raise CaptureError(
-                f"{source.path}: its exposure is {times} that of the same frame of the first bracket; these {count} "
-                f"frames {by} are not {shots} equal brackets ({angles_deg[at // size]:g}°); {remedy}"
-            )
+    order, by = _in_order(pictures, size)
+    if (at := _first_unequal(order, size)) is not None:
+        value, reference = (one.probe.exif.relative_exposure for one in (order[at], order[at % size]))
+        times = f"{value / reference:.3g} times" if value and reference else "not stated like"
+        raise CaptureError(
+            f"{order[at].path}: its exposure is {times} that of the same frame of the first bracket; these {count} "
+            f"frames {by} are not {shots} equal brackets ({angles_deg[at // size]:g}°); {remedy}"
+        )
     note = f"{count} frames {by} taken as {shots} brackets of {size}, in the order {listed}°"
     return tuple((angle, tuple(order[k * size : (k + 1) * size])) for k, angle in enumerate(angles_deg)), note
+
+
+def _in_order(pictures: list[Source], size: int) -> tuple[list[Source], str]:
+    """Pictures in the order of their exposure, by clock or by number, and a phrase on the source.
+
+    Where both make different brackets of `size` frames, the one decides that makes equal brackets. If both do, it is
+    the clock, unless it jumped.
+    """
+    by_number, times = _by_number(pictures), {source.probe.exif.taken for source in pictures}
+    if "" in times or len(times) == 1:
+        return by_number, "by name"
+    by_clock = sorted(by_number, key=lambda one: one.probe.exif.taken)
+    if len({NUMBER.sub("#", source.path.stem) for source in pictures}) > 1 or all(
+        set(map(id, by_clock[at : at + size])) == set(map(id, by_number[at : at + size]))
+        for at in range(0, len(pictures), size)
+    ):
+        return by_clock, "by their EXIF times"
+    fits_clock, fits_number = (_first_unequal(order, size) is None for order in (by_clock, by_number))
+    if fits_number and (not fits_clock or _jumped(by_clock)):
+        return by_number, "by the numbers in their names (their EXIF times contradict: was the clock set?)"
+    return by_clock, "by their EXIF times (the numbers in their names contradict: were they renamed?)"
+
+
+def _by_number(pictures: list[Source]) -> list[Source]:
+    """Pictures by the numbers in their names; a camera's counter of four digits may begin again in between."""
+    order = sorted(pictures, key=lambda source: natural(source.path.name))
+    numbers = [int((NUMBER.findall(source.path.stem) or ["0"])[-1].partition(".")[0]) for source in order]
+    gaps = [after - before for before, after in pairwise(numbers)]
+    start = gaps.index(max(gaps)) + 1 if max(gaps, default=0) > _COUNTER // 2 else 0
+    return order[start:] + order[:start]
+
+
+def _first_unequal(order: Sequence[Source], size: int) -> int | None:
+    """Index of the first picture that is not exposed like the same one of the first bracket of `size` frames."""
+    exposure = [source.probe.exif.relative_exposure for source in order]
+    return next((at for at, value in enumerate(exposure) if not same_exposure(value, exposure[at % size])), None)
+
+
+def _jumped(by_clock: Sequence[Source]) -> bool:
+    times = [datetime.fromisoformat(source.probe.exif.taken) for source in by_clock]
+    return any((after - before).total_seconds() > _JUMP_S for before, after in pairwise(times))
 
 
 def same_exposure(value: float | None, reference: float | None) -> bool:
@@ -269,10 +311,14 @@ def _list_photographs(folder: Path, remedy: str = "") -> tuple[list[Source], lis
     probes, unread = photograph_files.read_all(folder)
     found = [Source(path, one) for path, one in probes.items()]
     raws = [source for source in found if source.probe.kind == "raw"]
+    converted = [dng for dng, _ in conversions(raws)]
+    raws = [source for source in raws if source not in converted]
     extra = [source for source in found if source.probe.kind == "photo"]
     if remedy and not raws and not extra:
         raise CaptureError(f"{folder}: holds no photograph that polcap reads; {_lossy_or_packed(folder) or remedy}")
     notes = [f"not used: {few_names(unread)}, of other programs"] if unread else []
+    if converted:
+        notes.append(f"{len(converted)} DNGs are converted from a RAW in the folder: the RAW is used")
     if raws and extra:
         stems = {photograph_files.stem(source.path) for source in raws}
         paired = sum(photograph_files.stem(source.path) in stems for source in extra)
@@ -281,3 +327,17 @@ def _list_photographs(folder: Path, remedy: str = "") -> tuple[list[Source], lis
         if paired < len(extra):
             notes.append(f"not used: {len(extra) - paired} finished pictures among RAW files")
     return sorted(raws or extra, key=lambda source: natural(source.path.name)), notes
+
+
+def conversions(raws: Sequence[Source]) -> list[tuple[Source, Source]]:
+    """DNGs that were converted from another RAW of the list, each with that RAW: the same shot, by name and time."""
+    pairs = []
+    for dng in (source for source in raws if source.path.suffix.lower() == ".dng"):
+        original, stem, second = dng.probe.original.lower(), photograph_files.stem(dng.path), dng.probe.exif.taken[:19]
+        for raw in raws:
+            named = raw.path.name.lower() == original
+            named |= raw.path.suffix.lower() != ".dng" and photograph_files.stem(raw.path) == stem
+            if named and raw is not dng and raw.probe.exif.taken[:19] == second:
+                pairs.append((dng, raw))
+                break
+    return pairs

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
+import msgspec
+
 from polcap.calibration_values import Calibration
 from polcap.errors import CaptureError
 from polcap.formats import atomic, calibrations
@@ -15,9 +17,12 @@ from polcap.formats.capture.capture_toml import CaptureFile
 from polcap.formats.capture.focal_length import FocalLength
 from polcap.formats.capture.layouts import Source
 from polcap.formats.raw import photo
+from polcap.formats.raw.color_encoding import ColorEncoding
+from polcap.formats.raw.probe import Probe
 from polcap.images import Capture, Exif, Frame, FrameReading, Shot
 
 _ZOOM = 0.01  # relative change of the focal length above rounding
+_HEADROOM = 1.05  # white of radiance over its greatest value: above `hdr.clip`, so that nothing is over-exposed
 LOSS = ": normals and albedo lose accuracy against RAW"
 _SHOOT_RAW = "; set the camera to RAW or DNG"
 
@@ -47,7 +52,12 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
 
     every = _photographs(folder, plan)
     _check_one_camera({path: source.probe.exif for path, source in every.items()})
-    _check_no_duplicate({path: source.probe.digest for path, source in every.items()})
+    _check_no_duplicate(every)
+    if plan.layout != "sensor":
+        _check_encodings(every, stated)
+    radiance = max((source.probe.top for source in every.values()), default=0.0)
+    if radiance > 1 and not stated.white:  # a sensor's white is not known; one for all frames
+        stated = msgspec.structs.replace(stated, white=float(f"{_HEADROOM * radiance:.4g}"))
     shots = tuple(_shot(plan, stated, angle, bracket) for angle, bracket in plan.shots)
     _check_brackets(shots)
     crossed = None if plan.layout == "sensor" else _crossed(folder, plan, stated)
@@ -69,7 +79,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
         principal_px=principal,
         size_px=size,
         chart_frames=tuple(_frame(plan, stated, source, 0.0) for source in plan.others if source.role == "chart"),
-        notes=(*plan.notes, *_notes(plan, shots, stated), *calibration_notes, f"focal length {lens.note}"),
+        notes=(*plan.notes, *_notes(plan, shots, stated, radiance), *calibration_notes, f"focal length {lens.note}"),
         calibration=calibration,
         crossed=crossed,
         catalog=stated.catalog,
@@ -83,6 +93,19 @@ def _check_folder(folder: Path) -> None:
         raise CaptureError(f"{folder} is a file; give the folder that holds all photographs of the object")
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder; give the folder that holds the photographs")
+
+
+def _check_encodings(every: dict[Path, Source], stated: CaptureFile) -> None:
+    """Raise CaptureError for a finished picture of a contradictory encoding, unless the user states the encoding."""
+    for path, source in every.items():
+        found = source.probe.encoding
+        if stated.encoding is None and found.fault:
+            raise CaptureError(f"{path}: {found.fault}")
+        if stated.encoding is None and stated.white and found.curve not in ("", "linear"):
+            raise CaptureError(
+                f"{path}: its {found.source} states {found.curve}, but capture.toml states white, a level of linear "
+                'pictures; state encoding = "linear" too, or remove white'
+            )
 
 
 def _calibration(
@@ -190,7 +213,7 @@ def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: f
     if mosaic_deg is not None:
         settings = [f"sensor {mosaic_deg:g}", *levels]
     else:
-        settings = [] if kind == "raw" else [stated.encoding or "default", *levels]
+        settings = [] if kind == "raw" else [*_encoding(source.probe, stated), *levels]
     return Frame(
         path=str(source.path),
         exif=source.probe.exif,
@@ -199,6 +222,13 @@ def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: f
         exposure=_stated_exposure(source),
         reading=FrameReading(kind, stated.encoding, stated.white, stated.black, mosaic_deg),
     )
+
+
+def _encoding(probe: Probe, stated: CaptureFile) -> list[str]:
+    """Encoding of a finished picture as part of its digest: "default" if its bits alone decide."""
+    found = probe.encoding
+    usual = photo.encoding_of(probe.bits, found) == photo.encoding_of(probe.bits, ColorEncoding())
+    return [stated.encoding or ("default" if usual else found.curve), *["primaries"] * bool(found.to_rec709)]
 
 
 def _stated_exposure(source: Source) -> float | None:
@@ -251,14 +281,13 @@ def _check_one_camera(facts: dict[Path, Exif]) -> None:
             raise CaptureError(f"{path}: {fault} as {first_path.name}; use one set-up per capture, or remove the file")
 
 
-def _check_no_duplicate(digests: dict[Path, str]) -> None:
-    seen: dict[str, Path] = {}
-    for path, digest in digests.items():
-        if digest in seen:
-            raise CaptureError(
-                f"{path}: is the same photograph as {seen[digest]}; remove one, and shoot the missing one"
-            )
-        seen[digest] = path
+def _check_no_duplicate(every: dict[Path, Source]) -> None:
+    first: dict[str, Path] = {}
+    same = [(source.path, first.setdefault(source.probe.digest, path)) for path, source in every.items()]
+    same += [(dng.path, raw.path) for dng, raw in layouts.conversions(list(every.values()))]
+    for path, other in same:
+        if path != other:
+            raise CaptureError(f"{path}: is the same photograph as {other}; remove one, and shoot the missing one")
 
 
 def _check_brackets(shots: Sequence[Shot]) -> None:
@@ -288,15 +317,18 @@ def _settings(frame: Frame) -> str:
     return " ".join(parts) if fact.exposure_time else "no exposure in EXIF"
 
 
-def _notes(plan: layouts.Plan, shots: Sequence[Shot], stated: CaptureFile) -> list[str]:
-    notes, first = [], plan.shots[0][1][0].probe
+def _notes(plan: layouts.Plan, shots: Sequence[Shot], stated: CaptureFile, radiance: float) -> list[str]:
+    sources = [source for _, bracket in plan.shots for source in bracket]
+    notes, first = [], sources[0].probe
     cross = sum(source.role == "cross" for source in plan.others)
     if cross and plan.layout == "sensor":
         notes.append(f"not used: {cross} cross-polarized frames, which a polarization sensor cannot take")
-    if plan.layout != "sensor" and first.kind == "photo":
-        encoding = photo.encoding_of(first.bits, stated.encoding)
-        loss = (LOSS + _SHOOT_RAW) * (first.bits == 8)
-        notes.append(f"finished pictures of {first.bits} bits, taken as {encoding}{loss}")
+    if first.kind == "photo":
+        notes += _encoding_notes(first, stated, plan.layout == "sensor")
+    if radiance > 1:
+        notes.append(f"radiance up to {radiance:.4g}: over-exposed from white = {stated.white:g} on, see capture.toml")
+    if count := len({source.path for source in sources if source.probe.gain_map}):
+        notes.append(f"not applied: the gain maps of {count} files")
     if first.lossy:
         notes.append("lossy DNG" + LOSS)
     if stated.rotator:
@@ -304,4 +336,18 @@ def _notes(plan: layouts.Plan, shots: Sequence[Shot], stated: CaptureFile) -> li
     exposures = [exposure for frame in shots[0].frames if (exposure := _exposure(frame))]
     if len(exposures) == len(shots[0].frames) > 1 and layouts.same_exposure(max(exposures), min(exposures)):
         notes.append("all frames of a bracket state the same exposure; their ratios are measured from the pixels")
+    return notes
+
+
+def _encoding_notes(first: Probe, stated: CaptureFile, sensor: bool) -> list[str]:
+    """Notes on the encoding of finished pictures, and on a statement of their files that is not used."""
+    found, notes = first.encoding, []
+    name = "linear" if sensor else stated.encoding or photo.encoding_of(first.bits, found)
+    by = f", as their {found.source} states" * (name == found.curve)
+    loss = (LOSS + _SHOOT_RAW) * (first.bits == 8)
+    if not sensor:
+        notes.append(f"finished pictures of {first.bits} bits, taken as {name}{by}{loss}")
+    if found.curve and name != found.curve:
+        why = "a sensor's frames are linear" if sensor else "capture.toml decides"
+        notes.append(f"not used: their {found.source} states {found.curve}, but {why}")
     return notes

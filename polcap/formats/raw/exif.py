@@ -139,8 +139,10 @@ def sized(stated: Exif, width: int, height: int) -> Exif:
 
 
 def _taken(found: _Tags) -> str:
-    date, _, clock = (found.text("DateTimeOriginal") or found.text("DateTime")).partition(" ")
-    fraction = found.text("SubSecTimeOriginal")
+    """Time of the exposure; DateTime is not it, but the time at which a program wrote the file."""
+    which = "Original" if found.text("DateTimeOriginal") else "Digitized"
+    date, _, clock = found.text(f"DateTime{which}").partition(" ")
+    fraction = found.text(f"SubSecTime{which}")
     stamp = f"{date.replace(':', '-')}T{clock}" + (f".{fraction}" if fraction.isdecimal() else "")
     try:
         datetime.fromisoformat(stamp)

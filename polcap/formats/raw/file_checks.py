@@ -30,6 +30,10 @@ _MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # of a JPEG, after a scan
 _PNG_SAMPLES = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # per pixel, by color type
 _DEFLATE = 1032  # greatest compression of zlib (zlib.net, Technical Details: Maximum Compression Factor)
 _CLIPPED_SHARE = 0.5  # of a picture; no useful exposure has more at the white level
+_PERIOD = 12  # px; mosaics repeat after 2 (Bayer, polarization), 4 (both) or 6 (X-Trans)
+_BLOCK = 48  # px
+_MOST_BLOCKS = 64
+_REPEATED, _CONTRAST = 5.0, 0.01  # of a mosaic's blocks. Measured: 7 to 25 and 0.015 to 0.8; other pictures: 0.7 to 3.1
 _BEYOND = 2.0  # white levels; counts that reach so far prove the level wrong
 
 
@@ -147,3 +151,33 @@ def check_levels(path: str, value: NDArray[Any], black: float, white: float, los
     rows = max(1, len(value) // 50)
     if black > 0 and top > black and not value[-rows:].any():
         raise DecodeError(f"{path}: its last rows are empty, below the sensor's black level; it is cut, {COPY_AGAIN}")
+
+
+def check_no_mosaic(path: str, pixels: NDArray[Any]) -> None:
+    """Refuse a gray picture (H, W) that is a sensor's mosaic: neighboring pixels differ alike all over. DecodeError.
+
+    In the brightest blocks, second differences along rows and columns are averaged over pixels of equal place in the
+    mosaic. The power of these means over that expected of unrelated pixels is about 1 in a picture of one channel.
+    """
+    rows, columns = (side // _BLOCK for side in pixels.shape)
+    tiled = pixels[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK)
+    blocks = tiled.swapaxes(1, 2).reshape(-1, _BLOCK, _BLOCK)
+    light = blocks.mean(axis=(1, 2), dtype=np.float64)
+    uneven = np.flatnonzero((np.ptp(blocks, axis=(1, 2)) > 0) & (light > 0))
+    brightest = uneven[np.argsort(-light[uneven])][: max(1, min(_MOST_BLOCKS, len(uneven) // 4))]
+    value, count = blocks[brightest].astype(np.float32), (_BLOCK // _PERIOD) ** 2
+    if not len(value):
+        return
+    repeated, contrast = [], []
+    for axis in (1, 2):
+        moved = np.moveaxis(value, axis, 1)
+        second = (moved[:, 1:-1] - (moved[:, :-2] + moved[:, 2:]) / 2)[:, : _BLOCK - _PERIOD]
+        means = second.reshape(len(value), -1, _PERIOD, _BLOCK // _PERIOD, _PERIOD).mean(axis=(1, 3))
+        power, per_place = np.mean(means**2, axis=(1, 2)), count - _BLOCK // _PERIOD
+        repeated.append(per_place * power / np.maximum(np.mean(second**2, axis=(1, 2)), 1e-12))
+        contrast.append(np.sqrt(power) / light[brightest])
+    if np.median(repeated) > _REPEATED and np.median(contrast) > _CONTRAST:
+        raise DecodeError(
+            f"{path}: is a sensor's mosaic in a gray file; give the camera's RAW or a DNG, or develop it to a linear "
+            'color picture; a polarization sensor\'s frame is read with sensor = "polarization" in capture.toml'
+        )

@@ -13,7 +13,9 @@ Kind = Literal["raw", "photo", "other", "unknown"]
 
 SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE = 254, 256, 257, 258, 259, 262, 271
 STRIP_OFFSETS, SAMPLES, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS = 273, 277, 279, 324, 325, 330
-DNG_VERSION, CFA_LAYOUT = 50706, 50711
+TRANSFER_FUNCTION = 301
+DNG_VERSION, CFA_LAYOUT, ORIGINAL_RAW_NAME = 50706, 50711, 50827
+OPCODE_LISTS, GAIN_TABLES = (51008, 51009, 51022), (52525, 52544)  # DNG; ProfileGainTableMap, its second form
 CFA, LINEAR_RAW = 32803, 34892  # values of PHOTOMETRIC
 
 JPEG, PNG, EXR = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"  # first bytes
@@ -27,10 +29,11 @@ _RAW_SIGNATURES = (  # offset, bytes, suffix
 _RAW_COMPRESSION = {32767, 32769, 32770, 32867, 34316, 34713, 65000, 65535}
 _TAGS_READ = {
     SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE, DNG_VERSION, CFA_LAYOUT, SAMPLES,
-    STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS,
+    STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS, TRANSFER_FUNCTION, ORIGINAL_RAW_NAME,
+    *OPCODE_LISTS,
 }  # fmt: skip
-_INTEGERS = {1: "B", 3: "H", 4: "I", 13: "I"}
-_MAX_DIRECTORIES, _MAX_VALUES = 64, 1 << 18  # per file: stops at a loop or a forged count
+_INTEGERS = {1: "B", 2: "B", 3: "H", 4: "I", 7: "B", 13: "I"}  # texts and bytes as the numbers of their bytes
+MAX_DIRECTORIES, _MAX_VALUES = 64, 1 << 18  # per file: stops at a loop or a forged count
 _SIDECARS = {".pdf", ".zip", ".txt"}  # binary, or text in UTF-16; `foreign_files` has those of photographs
 _TEXT_BYTES = 1 << 16  # some makers put lines of text in front of their pixels
 
@@ -61,6 +64,12 @@ def strips(directory: Directory) -> list[tuple[int, int]]:
         for starts, counts in ((STRIP_OFFSETS, STRIP_BYTES), (TILE_OFFSETS, TILE_BYTES))
         for pair in zip(directory.get(starts, ()), directory.get(counts, ()))
     ]
+
+
+def original_name(structure: TiffStructure) -> str:
+    """Name of the RAW from which a DNG was converted; empty if it states none."""
+    names = (bytes(one[ORIGINAL_RAW_NAME]) for one in structure.directories if ORIGINAL_RAW_NAME in one)
+    return next(names, b"").rstrip(b"\0").decode(errors="replace")
 
 
 def first(directory: Directory, tag: int, default: int = 0) -> int:
@@ -117,6 +126,17 @@ def _is_raw(tiff: TiffStructure) -> bool:
     return MAKE in main and SUB_IFDS in main and main.get(SUBTYPE) == (1,)  # a preview in front of sensor data
 
 
+def png_chunks(data: bytes) -> dict[bytes, bytes]:
+    """Chunks of a PNG in front of its pixels, by type; none if the bytes are not a PNG."""
+    chunks: dict[bytes, bytes] = {}
+    at = len(PNG) if data.startswith(PNG) else len(data)
+    while at + 8 <= len(data) and data[at + 4 : at + 8] != b"IDAT":
+        (length,) = struct.unpack_from(">I", data, at)
+        chunks.setdefault(data[at + 4 : at + 8], data[at + 8 : at + 8 + length])
+        at += 12 + length
+    return chunks
+
+
 def structure(data: bytes | mmap) -> TiffStructure:
     """Parse the image directories of a TIFF, as far as they are readable; none if the bytes are not a TIFF."""
     directories: list[Directory] = []
@@ -125,7 +145,7 @@ def structure(data: bytes | mmap) -> TiffStructure:
         pending = deque(struct.unpack_from(order + "I", data, 4))
         seen: set[int] = set()
         left = _MAX_VALUES
-        while pending and len(directories) < _MAX_DIRECTORIES and left > 0:
+        while pending and len(directories) < MAX_DIRECTORIES and left > 0:
             offset = pending.popleft()
             if offset in seen or not 8 <= offset <= len(data) - 2:
                 continue
@@ -147,6 +167,8 @@ def _entries(data: bytes | mmap, order: str, places: range, most: int) -> Iterat
     """
     for at in places:
         tag, form, count = struct.unpack_from(order + "HHI", data, at)
+        if tag in GAIN_TABLES:  # only its presence counts
+            yield tag, ()
         if tag not in _TAGS_READ or count > most:
             continue
         code = f"{order}{count}{_INTEGERS.get(form, 'x')}"  # other forms have no whole numbers

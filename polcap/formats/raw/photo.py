@@ -1,7 +1,7 @@
 """Decodes a finished picture (TIFF, PNG, EXR, JPEG) to linear values, by OpenImageIO in the child process.
 
-16-bit and floating-point files are taken as linear, 8-bit files as sRGB-encoded, unless the caller states the encoding.
-RAW files go to `libraw`: OpenImageIO opens a DNG as its thumbnail.
+The encoding is that of the caller, or that of the file (`color_encoding`); without both, files of 16 bits and of
+floating point are linear, files of 8 bits sRGB. RAW files go to `libraw`: OpenImageIO opens a DNG as its thumbnail.
 """
 
 from collections.abc import Iterator
@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
-from polcap.formats.raw import file_bytes, file_checks, file_kind, libraw, worker
+from polcap.formats.raw import color_encoding, file_bytes, file_checks, file_kind, libraw, picture_count, worker
+from polcap.formats.raw.color_encoding import ColorEncoding
 from polcap.images import FrameReading, SensorImage
 from polcap.optics import color
 
 Encoding = Literal["linear", "srgb"]
 SENSOR_CELLS = {0.0: (1, 1), 45.0: (0, 1), 90.0: (0, 0), 135.0: (1, 0)}  # row, column of each angle [°] in a 2×2 cell
+_OTHER_COLORS = {5: "CMYK", 8: "CIELAB", 9: "ICCLAB", 10: "ITULAB", 32844: "LogL", 32845: "LogLuv"}  # of a TIFF
 _MOST_CHANNELS = 64  # of a layered EXR
 _DEFAULT = FrameReading("photo")
 _COLOR_LEVELS = 0.05  # averages of neighboring 2×2 cells differ less than this on a monochrome sensor
@@ -27,25 +29,23 @@ _COLOR_LEVELS = 0.05  # averages of neighboring 2×2 cells differ less than this
 def read(path: str | Path, reading: FrameReading = _DEFAULT, digest: str | None = None) -> SensorImage:
     """Decode a finished picture as linear values (H, W, 3); a gray picture is repeated in all three channels.
 
-    Linear integers stay counts; for floating point, white is 1. An sRGB-encoded picture becomes linear 0…1. It and
-    every 8-bit picture are marked `lossy`. With the `digest` of `probe.read`, the file must still have the bytes that
-    were probed.
+    Linear integers stay counts; for floating point, white is 1. An encoded picture becomes linear 0…1. It and every
+    8-bit picture are marked `lossy`. Primaries that the file states give the `camera_matrix`. With the `digest` of
+    `probe.read`, the file must still have the bytes that were probed.
 
-    Raises DecodeError: not a picture, damaged, or changed since it was probed.
+    Raises DecodeError: not a picture, damaged, changed since it was probed, of a contradictory encoding, or a mosaic.
     """
-    pixels, full = _pixels(path, digest)
-    lossy = pixels.dtype == np.uint8
-    encoding = encoding_of(8 * pixels.itemsize, reading.encoding)
+    meta, arrays = worker.call(decode, path, digest=digest, stated=reading.encoding)
+    pixels, matrix = arrays["pixels"], meta["to_rec709"]
+    lossy, black, white = meta["lossy"], reading.black, reading.white or meta["full"]
+    if "light" in arrays:
+        pixels, black, white = arrays["light"][pixels], 0.0, 1.0
+    elif meta["decoded"]:
+        black, white = 0.0, 1.0
     if pixels.shape[2] == 1:
         pixels = np.repeat(pixels, 3, axis=2)
-    if encoding == "linear":
-        white = reading.white or full
-        return SensorImage(_counts(pixels), np.full((1, 1), reading.black), white, None, lossy=lossy)
-    if pixels.dtype.kind == "f":
-        value = color.decode_srgb(pixels).astype(np.float32)
-    else:
-        value = color.decode_srgb(np.arange(full + 1) / full).astype(np.float32)[pixels]
-    return SensorImage(value, np.zeros((1, 1)), 1.0, None, lossy=True)
+    camera_matrix = np.reshape(matrix, (3, 3)) if matrix else None
+    return SensorImage(_counts(pixels), np.full((1, 1), black), white, None, camera_matrix, lossy=lossy)
 
 
 def read_mosaic(
@@ -59,7 +59,8 @@ def read_mosaic(
     """
     y, x = SENSOR_CELLS[angle_deg]
     if reading.kind == "photo":
-        pixels, full = _pixels(path, digest)
+        meta, arrays = worker.call(decode, path, digest=digest, stated="linear", mosaic=True)
+        pixels, full = arrays["pixels"], meta["full"]
         if pixels.shape[2] != 1:
             raise DecodeError(
                 f"{path}: has {pixels.shape[2]} channels, but the frame of a polarization sensor has one; "
@@ -84,36 +85,97 @@ def place_px(angle_deg: float) -> tuple[float, float]:
     return x / 2, y / 2
 
 
-def encoding_of(bits: int, stated: Encoding | None) -> Encoding:
-    """The encoding (linear or sRGB) of a picture with this number of bits per channel, unless the caller states one."""
-    return stated or ("srgb" if bits == 8 else "linear")
+def encoding_of(bits: int, found: ColorEncoding) -> str:
+    """Name of the encoding of a picture that states `found`: linear, srgb or another; by its bits if it states none."""
+    return found.curve or ("srgb" if bits == 8 else "linear")
 
 
-def size(path: str, data: bytes) -> dict[str, int]:
-    """In the child process: size, number of channels and bits of a picture, without decoding its pixels."""
+def describe(path: str, data: bytes) -> dict[str, Any]:
+    """In the child process: size, channels, bits and encoding of a picture, and the greatest value of floating point.
+
+    Raises DecodeError.
+    """
     with opened(path, data) as file:
+        picture_count.check_single(path, data, file)
         spec = file.spec()
-        count, bits = len(_channels(path, spec)), 8 * spec.format.size()
-    return {"width": spec.width, "height": spec.height, "channels": count, "bits": bits}
+        channels, bits = len(_channels(path, spec)), 8 * spec.format.size()
+        encoding, _ = color_encoding.read(data, spec)
+        top = float(_values(path, file).max()) if _is_float(spec) else 0.0
+        left, upper, right, lower = _display(spec)
+    facts = {"channels": channels, "bits": bits, "encoding": encoding, "top": top}
+    return {"width": right - left, "height": lower - upper, **facts}
 
 
-def decode(path: str, digest: str | None = None) -> worker.Answer:
-    """In the child process: the stored values of a picture (H, W, 1 or 3) in their stored type. Raises DecodeError."""
-    with opened(path, file_bytes.load(path, digest)) as file:
-        channels = _channels(path, file.spec())
-        pixels = every_channel(path, file)[..., channels]
+def decode(path: str, digest: str | None = None, stated: Encoding | None = None, mosaic: bool = False) -> worker.Answer:
+    """In the child process: the stored values of a picture (H, W, 1 or 3) in their stored type.
+
+    `stated` replaces the encoding that the file states. `light` is the linear light 0…1 of each stored integer, if the
+    picture is not linear; floating point is `decoded` already. `mosaic`: a gray picture is expected to be one.
+
+    Raises DecodeError.
+    """
+    data = file_bytes.load(path, digest)
+    with opened(path, data) as file:
+        picture_count.check_single(path, data, file)
+        pixels = _values(path, file)
+        found, curve = color_encoding.read(data, file.spec())
+    if stated is None and found.fault:
+        raise DecodeError(f"{path}: {found.fault}")
+    if pixels.shape[2] == 1 and not mosaic:
+        file_checks.check_no_mosaic(path, pixels[..., 0])
+    name = stated or encoding_of(8 * pixels.itemsize, found)
+    curve = color.decode_srgb if name == "srgb" else curve
+    floats, arrays = pixels.dtype.kind == "f", {"pixels": pixels}
+    full = 1 if floats else int(np.iinfo(pixels.dtype).max)
+    if name != "linear" and floats:
+        arrays["pixels"] = curve(pixels).astype(np.float32)
+    elif name != "linear":
+        arrays["light"] = curve(np.arange(full + 1) / full).astype(np.float32)
+    lossy = name != "linear" or pixels.dtype == np.uint8
+    return {"full": full, "lossy": lossy, "decoded": name != "linear", "to_rec709": found.to_rec709}, arrays
+
+
+def _is_float(spec: Any) -> bool:
+    import OpenImageIO as oiio
+
+    return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+
+
+def _display(spec: Any) -> tuple[int, int, int, int]:
+    """The picture's window: left, upper, right, lower [px], of an EXR its display window."""
+    if spec.getattribute("openexr:lineOrder") is None:
+        return spec.x, spec.y, spec.x + spec.width, spec.y + spec.height
+    return spec.full_x, spec.full_y, spec.full_x + spec.full_width, spec.full_y + spec.full_height
+
+
+def _values(path: str, file: Any) -> NDArray[Any]:
+    """The picture's channels (H, W, 1 or 3); 0 where an EXR's data window holds no pixels. Raises DecodeError."""
+    pixels = _display_window(path, file)[..., _channels(path, file.spec())]
     if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
         bad = int((~np.isfinite(pixels)).sum())
         raise DecodeError(f"{path}: {bad} values are not finite numbers; write the file without NaN and infinity")
-    return {}, {"pixels": pixels}
+    return pixels
+
+
+def _display_window(path: str, file: Any) -> NDArray[Any]:
+    spec, pixels = file.spec(), every_channel(path, file)
+    left, upper, right, lower = _display(spec)
+    if (left, upper, right, lower) == (spec.x, spec.y, spec.x + spec.width, spec.y + spec.height):
+        return pixels
+    file_checks.check_size(path, right - left, lower - upper)
+    x, y = spec.x - left, spec.y - upper  # of the first stored pixel in the picture
+    inner = pixels[max(-y, 0) : max(lower - spec.y, 0), max(-x, 0) : max(right - spec.x, 0)]
+    if not inner.size:
+        raise DecodeError(f"{path}: its data window lies outside its display window; write both alike")
+    picture = np.zeros((lower - upper, right - left, pixels.shape[2]), pixels.dtype)
+    picture[max(y, 0) :, max(x, 0) :][: inner.shape[0], : inner.shape[1]] = inner
+    return picture
 
 
 def every_channel(path: str, file: Any) -> NDArray[Any]:
     """All channels (H, W, C) of an open file of OpenImageIO: float32, or integers of their stored type. DecodeError."""
-    import OpenImageIO as oiio
-
     spec = file.spec()
-    kind = "float" if spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) else str(spec.format)
+    kind = "float" if _is_float(spec) else str(spec.format)
     pixels = file.read_image(0, 0, 0, spec.nchannels, kind)
     if pixels is None:
         raise DecodeError(f"{path}: truncated or damaged ({reason(file)}); {file_checks.COPY_AGAIN}, or write it again")
@@ -129,12 +191,6 @@ def reason(source: Any) -> str:
         return " ".join(source.geterror().split()) or "no reason stated"
     except UnicodeDecodeError:
         return "the reason is not readable text"
-
-
-def _pixels(path: str | Path, digest: str | None) -> tuple[NDArray[Any], float]:
-    """Stored values of a picture, and the greatest value of their type (1 for floating point)."""
-    pixels = worker.call(decode, path, digest=digest)[1]["pixels"]
-    return pixels, 1.0 if pixels.dtype.kind == "f" else float(np.iinfo(pixels.dtype).max)
 
 
 @contextmanager
@@ -166,7 +222,9 @@ def opened(path: str, data: bytes) -> Iterator[Any]:
 
 
 def _channels(path: str, spec: Any) -> list[int]:
-    """Indices of the picture's channels R, G and B, or of its single gray channel."""
+    """Indices of the picture's channels R, G and B, or of its single gray channel. Raises DecodeError."""
+    if other := _OTHER_COLORS.get(spec.getattribute("tiff:PhotometricInterpretation")):
+        raise DecodeError(f"{path}: its colors are {other}; save it as RGB")
     names = [name.rpartition(".")[2].upper() for name in spec.channelnames]
     if sum(name in ("R", "G", "B") for name in names) == 3:
         return [names.index(name) for name in "RGB"]

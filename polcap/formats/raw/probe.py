@@ -9,7 +9,8 @@ from pathlib import Path
 import msgspec
 
 from polcap.errors import DecodeError
-from polcap.formats.raw import exif, file_bytes, file_checks, file_kind, libraw, photo, worker
+from polcap.formats.raw import exif, file_bytes, file_checks, file_kind, libraw, photo, picture_count, worker
+from polcap.formats.raw.color_encoding import ColorEncoding
 from polcap.images import Exif
 
 _LIMIT_S = 30.0  # a sound file takes milliseconds
@@ -17,7 +18,7 @@ _LIMIT_S = 30.0  # a sound file takes milliseconds
 
 @dataclass(frozen=True)
 class Probe:
-    """Facts of one photograph's file: kind, digest, EXIF, channels, bits, and whether it is lossily compressed."""
+    """Facts of one photograph's file: kind, digest, EXIF, channels, bits, encoding, and how it was compressed."""
 
     kind: file_kind.Kind
     digest: str = ""  # of the bytes of a photograph
@@ -25,6 +26,10 @@ class Probe:
     channels: int = 0  # of a finished picture: 1 grey, 3 in color
     bits: int = 0  # of a finished picture, per channel
     lossy: bool = False  # a RAW of 8 bits under a tone curve
+    encoding: ColorEncoding = ColorEncoding()  # noqa: RUF009 — frozen; as a finished picture states it
+    top: float = 0.0  # greatest value of a picture in floating point
+    gain_map: bool = False  # holds one that polcap does not apply
+    original: str = ""  # name of the RAW from which a DNG was converted
 
 
 def read(path: str | Path) -> Probe:
@@ -77,20 +82,30 @@ def examine(path: str) -> worker.Answer:
 
 
 def _photo(path: str, data: bytes) -> tuple[Probe, bool]:
-    size = photo.size(path, data)
-    stated = exif.sized(exif.tags(data), size["width"], size["height"])
-    probe = Probe("photo", file_bytes.digest(data), stated, size["channels"], size["bits"])
-    return probe, file_kind.structure(data).truncated
+    facts, structure = photo.describe(path, data), file_kind.structure(data)
+    stated = exif.sized(exif.tags(data), facts.pop("width"), facts.pop("height"))
+    gain_map = picture_count.has_gain_map(data, structure)
+    return Probe("photo", file_bytes.digest(data), stated, gain_map=gain_map, **facts), structure.truncated
 
 
 def _raw(path: str, data: bytes) -> tuple[Probe, bool]:
     structure = file_kind.structure(data)
     file_checks.check_structure(path, structure, data)
+    picture_count.check_single_raw(path, structure)
     known = exif.tags(data)
     no_settings = known.exposure_time is None and not known.make  # CRW: LibRaw knows them, but has to unpack
     no_iso = known.iso is None and not structure.dng  # old bodies state it in their maker's tags only
     size = libraw.size(path, data, unpack=no_settings or no_iso)
-    decoded = {k: value for k, value in size.get("exif", {}).items() if no_settings or not getattr(known, k)}
+    # LibRaw's time may be that of writing
+    decoded = {k: v for k, v in size.get("exif", {}).items() if no_settings or not (getattr(known, k) or k == "taken")}
     stated = replace(exif.sized(known, size["width"], size["height"]), **decoded)
     lossy = file_checks.is_lossy(structure)
-    return Probe("raw", file_bytes.digest(data), stated, lossy=lossy), structure.truncated or lossy
+    probe = Probe(
+        kind="raw",
+        digest=file_bytes.digest(data),
+        exif=stated,
+        lossy=lossy,
+        gain_map=picture_count.has_gain_map(data, structure),
+        original=file_kind.original_name(structure),
+    )
+    return probe, structure.truncated or lossy

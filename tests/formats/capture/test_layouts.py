@@ -9,6 +9,7 @@ from polcap.errors import CaptureError
 from polcap.formats.capture import folder_names
 from polcap.formats.capture import reader as capture
 from polcap.formats.raw import frame_decoder
+from tests.formats import headers
 from tests.formats.capture.capture_folders import degrees, flat, folders, names, pictures, shoot
 from tests.formats.raw.test_photo import mosaic, save
 
@@ -81,6 +82,111 @@ def test_flat_folder_is_cut_into_equal_brackets_by_time(tmp_path):
         ["IMG_0000.dng", "IMG_0001.dng"],
         ["IMG_0002.dng", "IMG_0003.dng"],
     ]
+
+
+def renumbered(root, *numbers):
+    """Give the frames of a flat folder other numbers in their names, in the order of their times."""
+    frames = sorted(root.iterdir(), key=lambda path: path.name.replace("IMG_99", "A"))
+    for frame, number in zip(frames, numbers, strict=True):
+        frame.rename(root / f"DSC_{number:04d}.dng")
+
+
+def retimed(root, *clocks, time=(1 / 200, 1 / 50)):
+    """Frames 1, 2, … of a flat folder at these times of day."""
+    for number, clock in enumerate(clocks):
+        shoot(root / f"DSC_{number + 1:04d}.dng", time[number % len(time)], clock)
+
+
+def test_numbers_decide_where_the_clock_makes_no_equal_brackets(tmp_path):
+    """The clock was set back after the third frame."""
+    retimed(tmp_path, *(f"10:0{k}:00" for k in range(3)), *(f"09:0{k}:00" for k in range(3, 6)))
+    understood = capture.read(tmp_path)
+    assert [names(shot)[0] for shot in understood.shots] == ["DSC_0001.dng", "DSC_0003.dng", "DSC_0005.dng"]
+    assert any("by the numbers in their names (their EXIF times contradict" in note for note in understood.notes)
+
+
+def test_numbers_decide_where_the_clock_jumped(tmp_path):
+    """Set back by an hour between two brackets, so that both orders make equal brackets."""
+    retimed(tmp_path, *(f"10:0{k}:00" for k in range(4)), *(f"09:0{k}:00" for k in range(4, 6)))
+    understood = capture.read(tmp_path)
+    assert [names(shot)[0] for shot in understood.shots] == ["DSC_0001.dng", "DSC_0003.dng", "DSC_0005.dng"]
+    assert any("their EXIF times contradict: was the clock set?" in note for note in understood.notes)
+
+
+def test_the_clock_decides_where_files_were_renamed(tmp_path):
+    flat(tmp_path)
+    renumbered(tmp_path, 3, 4, 1, 2, 5, 6)
+    understood = capture.read(tmp_path)
+    assert [names(shot)[0] for shot in understood.shots] == ["DSC_0003.dng", "DSC_0001.dng", "DSC_0005.dng"]
+    assert any("the numbers in their names contradict: were they renamed?" in note for note in understood.notes)
+
+
+def test_frames_of_one_time_are_ordered_by_number(tmp_path):
+    retimed(tmp_path, *["10:00:00"] * 6)
+    understood = capture.read(tmp_path)
+    assert [names(shot)[0] for shot in understood.shots] == ["DSC_0001.dng", "DSC_0003.dng", "DSC_0005.dng"]
+    assert any("6 frames by name taken as 3 brackets" in note for note in understood.notes)
+
+
+def test_the_time_of_writing_orders_nothing(tmp_path):
+    """DateTime is when a converter wrote the file, here in the opposite order."""
+    for number in range(6):
+        clock = {306: (2, f"2026:01:02 00:{59 - number}:00".encode())}
+        photo = {
+            tag: value for tag, value in headers.settings(time=(1 / 200, 1 / 50)[number % 2]).items() if tag != 36867
+        }
+        pixels = np.random.default_rng(number).integers(500, 4000, (32, 48))
+        path = tmp_path / f"DSC_{number}.dng"
+        path.write_bytes(headers.dng(pixels, photo=photo, maker=headers.camera() | clock))
+    with pytest.raises(CaptureError, match="6 frames without EXIF times cannot be assigned to angles"):
+        capture.read(tmp_path)
+
+
+def converted(path, **states):
+    """A DNG of other bytes than the RAW next to it, as a converter writes it."""
+    shoot(path, **states)
+    path.write_bytes(path.read_bytes() + b"converted")
+
+
+@pytest.mark.parametrize(("raw", "dng"), [("IMG_7.NEF", "IMG_7.dng"), ("IMG_7.nef", "img_7.DNG")])
+def test_a_raw_and_its_converted_dng_are_one_photograph(tmp_path, raw, dng):
+    for minute, angle in enumerate(("000", "045", "090")):
+        for name in (raw, dng):
+            converted(tmp_path / f"pol{angle}" / name, clock=f"00:0{minute}:00")
+    understood = capture.read(tmp_path)
+    assert [names(shot) for shot in understood.shots] == [[raw]] * 3
+    assert (
+        sum("1 DNGs are converted from a RAW in the folder: the RAW is used" in note for note in understood.notes) == 3
+    )
+
+
+def test_a_dng_that_names_its_raw_is_that_photograph(tmp_path):
+    """OriginalRawFileName of DNG 1.2."""
+    for minute, angle in enumerate(("000", "045", "090")):
+        folder = tmp_path / f"pol{angle}"
+        shoot(folder / "a.dng", clock=f"00:0{minute}:00")
+        photo = headers.settings() | {36867: (2, f"2026:01:02 00:0{minute}:00".encode()), 42036: (2, b"Macro 60")}
+        maker = headers.camera() | {50827: (2, b"A.dng")}
+        pixels = np.random.default_rng(minute).integers(500, 4000, (32, 48))
+        (folder / "b.dng").write_bytes(headers.dng(pixels, photo=photo, maker=maker))
+    assert [names(shot) for shot in capture.read(tmp_path).shots] == [["a.dng"]] * 3
+
+
+def test_frames_of_one_name_and_another_time_are_two_photographs(tmp_path):
+    for angle in ("000", "045", "090"):
+        shoot(tmp_path / f"pol{angle}" / "a.nef", 1 / 200, "00:00:00")
+        shoot(tmp_path / f"pol{angle}" / "a.dng", 1 / 50, "00:00:05")
+    assert [names(shot) for shot in capture.read(tmp_path).shots] == [["a.nef", "a.dng"]] * 3
+
+
+def test_a_shot_listed_as_raw_and_as_dng_is_named(tmp_path):
+    listed = []
+    for name, angle in (("a.nef", 0), ("a.dng", 45), ("b.nef", 90)):
+        shoot(tmp_path / name, clock=f"00:0{angle // 90}:00")
+        listed.append(f'[[frame]]\nfile = "{name}"\nangle = {angle}\n')
+    (tmp_path / "capture.toml").write_text("\n".join(listed))
+    with pytest.raises(CaptureError, match=r"a\.dng: is the same photograph as .*a\.nef"):
+        capture.read(tmp_path)
 
 
 def test_flat_folder_follows_the_stated_order(tmp_path):

@@ -1,6 +1,7 @@
 """Capture folders are read and listed, and every fault is one clear line."""
 
 import shutil
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,11 @@ import pytest
 from polcap.errors import CaptureError, DecodeError, InputError
 from polcap.formats.capture import reader as capture
 from polcap.formats.raw import frame_decoder
+from polcap.optics import sensor
+from tests.formats import headers
 from tests.formats.capture.capture_folders import degrees, folders, shoot
 from tests.formats.headers import DATA, needs_data
+from tests.formats.raw.test_photo import save
 
 
 @pytest.mark.parametrize(
@@ -37,6 +41,71 @@ def test_table_shows_every_frame_and_assumption(tmp_path):
     assert text.count("1/200 s") == 3 and text.count("1/50 s") == 3
     for part in ("pol045/IMG_1.dng", "45°", "Acme Z1, 48×32 px", "Macro 60", "80 px (assumed)", "3 shots, 2 + 2 + 2"):
         assert part in text, part
+
+
+def finished(root, suffix, pixels, **attributes):
+    """A capture of finished pictures, one for each angle."""
+    for number, angle in enumerate(("000", "045", "090")):
+        (root / f"pol{angle}").mkdir(parents=True, exist_ok=True)
+        one = pixels.copy()
+        one[0, 0] = one[0, 0] * (1 + 0.01 * number)  # other bytes
+        save(root / f"pol{angle}" / f"a.{suffix}", one, **attributes)
+    return root
+
+
+SIXTEEN = np.full((24, 32, 3), 3000, np.uint16)
+
+
+def test_a_stated_encoding_is_noted_and_enters_the_digest(tmp_path):
+    linear = capture.read(finished(tmp_path / "linear", "tif", SIXTEEN))
+    srgb = capture.read(finished(tmp_path / "srgb", "tif", SIXTEEN, oiio__ColorSpace="sRGB"))
+    assert "finished pictures of 16 bits, taken as linear" in linear.notes
+    assert "finished pictures of 16 bits, taken as srgb, as their EXIF ColorSpace states" in srgb.notes
+    assert linear.shots[0].frames[0].digest.endswith(" default")
+    assert srgb.shots[0].frames[0].digest.endswith(" srgb")
+
+
+def test_a_contradictory_encoding_is_refused_unless_the_user_decides(tmp_path):
+    folder = finished(tmp_path, "png", SIXTEEN, oiio__ColorSpace="sRGB")
+    with pytest.raises(CaptureError, match=r"a\.png: its sRGB chunk states srgb, but .*state encoding = "):
+        capture.read(folder)
+    (folder / "capture.toml").write_text('encoding = "linear"\n')
+    assert "not used: their sRGB chunk states srgb, but capture.toml decides" in capture.read(folder).notes
+
+
+def test_white_of_linear_pictures_contradicts_another_encoding(tmp_path):
+    folder = finished(tmp_path, "tif", SIXTEEN, oiio__ColorSpace="sRGB")
+    (folder / "capture.toml").write_text("white = 4095\n")
+    with pytest.raises(CaptureError, match=r"states srgb, but capture\.toml states white.*encoding = \"linear\" too"):
+        capture.read(folder)
+
+
+def test_radiance_above_one_is_not_over_exposed(tmp_path):
+    """One white for all frames: they stay on one scale."""
+    radiance = np.linspace(0.1, 700, 24 * 32 * 3, dtype=np.float32).reshape(24, 32, 3)
+    understood = capture.read(finished(tmp_path / "radiance", "exr", radiance))
+    images = [frame_decoder.decode(shot.frames[0]) for shot in understood.shots]
+    assert len({image.white for image in images}) == 1
+    assert not any(sensor.clipped_share(image, 0.98) for image in images)
+    assert any("radiance up to 700" in note for note in understood.notes)
+    below = capture.read(finished(tmp_path / "below", "exr", radiance / 1000))
+    assert frame_decoder.decode(below.shots[0].frames[0]).white == 1
+    (tmp_path / "radiance" / "capture.toml").write_text("white = 500\n")
+    stated = capture.read(tmp_path / "radiance")
+    assert frame_decoder.decode(stated.shots[0].frames[0]).white == 500
+    assert sensor.clipped_share(frame_decoder.decode(stated.shots[0].frames[0]), 0.98) > 0.2
+
+
+def test_a_gain_map_that_is_not_applied_is_noted(tmp_path):
+    """OpcodeList2 of a phone's DNG: against the lens's shading."""
+    gain_map = struct.pack(">5I", 1, 9, 0x01030000, 0, 8) + bytes(8)
+    for minute, angle in enumerate(("000", "045", "090")):
+        pixels = np.random.default_rng(minute).integers(500, 4000, (32, 48))
+        path = tmp_path / f"pol{angle}" / "a.dng"
+        path.parent.mkdir()
+        path.write_bytes(headers.dng(pixels, maker=headers.camera() | {51009: (7, gain_map)}))
+    assert "not applied: the gain maps of 3 files" in capture.read(tmp_path).notes
+    assert not any("gain map" in note for note in capture.read(folders(tmp_path / "plain")).notes)
 
 
 def test_digest_follows_the_bytes(tmp_path):

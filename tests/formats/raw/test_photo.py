@@ -6,7 +6,7 @@ import OpenImageIO as oiio
 import pytest
 
 from polcap.errors import DecodeError
-from polcap.formats.raw import photo
+from polcap.formats.raw import photo, probe
 from polcap.images import FrameReading
 from polcap.optics import color
 from tests.formats import headers
@@ -16,12 +16,17 @@ SIXTEEN = np.arange(24 * 32 * 3, dtype=np.uint16).reshape(24, 32, 3) * 20
 EIGHT = (np.arange(24 * 32 * 3).reshape(24, 32, 3) % 256).astype(np.uint8)
 
 
-def save(path, pixels, names=None):
+def save(path, pixels, names=None, **attributes):
+    """Write a picture; OpenImageIO would mark a PNG of 16 bits as sRGB by itself."""
     pixels = np.atleast_3d(pixels)
     stored = {"float32": "float", "float16": "half"}.get(str(pixels.dtype), str(pixels.dtype))
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.TypeDesc(stored))
     if names:
         spec.channelnames = names
+    if path.suffix == ".png" and pixels.dtype == np.uint16:
+        spec["oiio:ColorSpace"] = "lin_rec709_scene"
+    for name, value in attributes.items():  # a value, or its type and value
+        spec.attribute(name.replace("__", ":"), *(value if isinstance(value, tuple) else (value,)))
     out = oiio.ImageOutput.create(str(path))
     assert out.open(str(path), spec) and out.write_image(np.ascontiguousarray(pixels)) and out.close()
     return path
@@ -151,3 +156,67 @@ def test_real_sensor_frame_balances():
     usable = np.max(list(planes.values()), axis=0) < 250
     blurred = [cv2.GaussianBlur(sum_, (0, 0), 2)[usable] for sum_ in (across, between)]
     assert np.median(abs(blurred[0] - blurred[1]) / blurred[0]) < 0.03
+
+
+def windows(path, data, display):
+    """An EXR whose windows (left, upper, right, lower) differ; each value states its place."""
+    left, upper, right, lower = data
+    spec = oiio.ImageSpec(right - left, lower - upper, 3, "float")
+    spec.x, spec.y, spec.full_x, spec.full_y = left, upper, display[0], display[1]
+    spec.full_width, spec.full_height = display[2] - display[0], display[3] - display[1]
+    y, x = np.mgrid[upper:lower, left:right].astype(np.float32)
+    out = oiio.ImageOutput.create(str(path))
+    assert out.open(str(path), spec) and out.write_image(np.stack([1000 + x, 1000 + y, 1 + 0 * x], -1)) and out.close()
+    return path
+
+
+@pytest.mark.parametrize("data", [(10, 4, 30, 20), (-10, -4, 50, 40), (-10, 4, 20, 40), (10, -4, 60, 20)])
+@pytest.mark.parametrize("display", [(0, 0, 40, 24), (5, 2, 35, 30)])
+def test_an_exr_is_read_in_its_display_window(tmp_path, data, display):
+    path = windows(tmp_path / "a.exr", data, display)
+    image, exif = photo.read(path).value, probe.read(path).exif
+    y, x = np.mgrid[display[1] : display[3], display[0] : display[2]]
+    held = (x >= data[0]) & (x < data[2]) & (y >= data[1]) & (y < data[3])
+    np.testing.assert_array_equal(image, np.stack([1000 + x, 1000 + y, 1 + 0 * x], -1) * held[..., None])
+    assert (exif.width, exif.height) == (display[2] - display[0], display[3] - display[1])
+
+
+def test_an_exr_without_pixels_in_its_window_is_refused(tmp_path):
+    path = windows(tmp_path / "a.exr", (100, 100, 120, 120), (0, 0, 40, 24))
+    with pytest.raises(DecodeError, match=r"a\.exr: its data window lies outside its display window"):
+        photo.read(path)
+
+
+def test_colors_other_than_rgb_are_refused(tmp_path):
+    tags = {256: (4, (32,)), 257: (4, (24,)), 258: (3, (16,) * 3), 259: (3, (1,)), 262: (3, (8,)), 277: (3, (3,))}
+    tags |= {278: (4, (24,)), 279: (4, (SIXTEEN.nbytes,)), 284: (3, (1,))}
+    (tmp_path / "lab.tif").write_bytes(headers.tiff(tags, image=SIXTEEN.tobytes()))
+    with pytest.raises(DecodeError, match=r"lab\.tif: its colors are CIELAB; save it as RGB"):
+        photo.read(tmp_path / "lab.tif")
+
+
+def scene(rng, height=192, width=240):
+    """A smooth colored picture (H, W, 3) with noise, 16 bits."""
+    smooth = cv2.resize(rng.uniform(0.1, 0.6, (6, 8, 3)), (width, height), interpolation=cv2.INTER_CUBIC)
+    return np.clip(smooth * [40000, 60000, 30000] * rng.normal(1, 0.02, smooth.shape), 0, 65535).astype(np.uint16)
+
+
+@pytest.mark.parametrize("period", [2, 4, 6])
+def test_a_mosaic_in_a_gray_file_is_named(tmp_path, rng, period):
+    """Bayer, quad Bayer and X-Trans."""
+    bayer = np.array([[0, 1], [1, 2]])
+    x_trans = np.array([[int(c) for c in row] for row in ("101121", "212110", "101112", "121101", "010112", "121110")])
+    cfa = {2: bayer, 4: np.kron(bayer, np.ones((2, 2), int)), 6: x_trans}[period]
+    color_at = np.tile(cfa, (192 // period, 240 // period))
+    pixels = np.take_along_axis(scene(rng), color_at[..., None], axis=2)
+    path = save(tmp_path / "mosaic.tif", pixels)
+    with pytest.raises(DecodeError, match=r"mosaic\.tif: is a sensor's mosaic in a gray file; give the camera's RAW"):
+        photo.read(path)
+    photo.read(save(tmp_path / "gray.tif", scene(rng)[..., 1]))
+
+
+def test_a_polarization_mosaic_in_a_gray_file_is_named(tmp_path):
+    with pytest.raises(DecodeError, match=r'is a sensor\'s mosaic.*sensor = "polarization" in capture\.toml'):
+        photo.read(
+            save(tmp_path / "mosaic.tif", mosaic(96, 96) + (np.arange(96 * 96).reshape(96, 96) % 7).astype(np.uint16))
+        )
