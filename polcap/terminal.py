@@ -2,6 +2,7 @@
 
 import errno
 import functools
+import io
 import json
 import os
 import platform
@@ -30,7 +31,62 @@ _LONGEST = 600  # characters of a message
 _FRAMES_S = 5.0  # between two lines about frames, where there is no terminal to write over
 _verbosity = 0  # -1 with --quiet, 1 with --verbose
 _log_file: TextIO | None = None  # with --log
+_outputs: dict[str, "_Output"] = {}  # stdout and --log: the exit code states whether they are complete
 _Level = Literal["INFO", "WARNING", "ERROR"]
+
+
+class _Output(io.FileIO):
+    """An output file. If it cannot be written, because the disk is full or a reader has ended, the work goes on."""
+
+    fault = ""
+
+    def write(self, data: Any, /) -> int:
+        """Write bytes; after the first failure, everything is discarded."""
+        try:
+            return super().write(data)
+        except OSError as error:
+            if error.errno != errno.EPIPE:  # the reader wanted no more
+                self.fault = error.strerror or str(error)
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, self.fileno())
+            os.close(null)
+            return len(data)
+
+
+def _text(output: _Output, encoding: str = "utf-8") -> TextIO:
+    """Text stream of an output; names of files may hold bytes that are no text."""
+    return io.TextIOWrapper(io.BufferedWriter(output), encoding, errors="backslashreplace", line_buffering=True)
+
+
+def open_streams() -> None:
+    """Prepare stdin, stdout and stderr for the whole run: a closed or full stream stops no work.
+
+    A closed stream becomes the null device: otherwise the next opened file would get its number, and all that is
+    printed.
+    """
+    while (null := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(null)
+    if sys.stdin is None:
+        sys.stdin = os.fdopen(0, encoding="utf-8", closefd=False)
+    for handle, name in ((1, "stdout"), (2, "stderr")):
+        stream = getattr(sys, name)
+        if sys.platform == "win32" and stream is not None and stream.isatty():  # a console is no file
+            stream.reconfigure(errors="backslashreplace")
+            continue
+        output = _Output(handle, "w", closefd=False)
+        setattr(sys, name, _text(output, "utf-8" if stream is None else stream.encoding))
+        if name == "stdout":
+            _outputs["standard output"] = output
+
+
+def final_code(code: int) -> int:
+    """Exit code of a command that ended with `code`; prints an error and returns 2 where its output is incomplete."""
+    for name, output in _outputs.items():
+        if output.fault:
+            print_message(f"polcap: error: {name} is incomplete: {output.fault}; write it elsewhere", "ERROR")
+            code = code or SettingError.exit_code
+    return code
 
 
 def set_verbosity(quiet: bool, verbose: bool) -> None:
@@ -43,12 +99,14 @@ def open_log(file: "Path | None") -> None:
     """Open the file of --log: write command line and versions; messages are appended from now on. Raises OSError."""
     global _log_file
     _log_file = None
+    _outputs.pop("--log", None)
     if file is not None:
         from polcap.formats.export import provenance
 
         if file.is_file() and not _is_log(file):
             raise FileExistsError(errno.EEXIST, "is there, and is no log of polcap")
-        _log_file = file.open("a", encoding="utf-8", errors="backslashreplace")
+        _outputs["--log"] = output = _Output(file, "a")
+        _log_file = _text(output)
         log(f"polcap {shlex.join(sys.argv[1:])}")
         versions = {"Python": platform.python_version(), **provenance.versions()}
         log(f"{', '.join(map(' '.join, versions.items()))}; {platform.platform()}")
@@ -78,9 +136,6 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
             return
         except (typer.Exit, typer.Abort):
             raise
-        except BrokenPipeError:  # the reader of stdout has ended
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            raise typer.Exit(0) from None
         except (Exception, KeyboardInterrupt) as error:
             if context.obj and isinstance(error, Exception):  # --debug
                 print_message("".join(traceback.format_exception(error)).rstrip())

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -16,7 +17,7 @@ from polcap import __version__, cli, config, terminal
 from polcap.cli import options
 from polcap.fusion.fusion_path import SessionConfig
 from polcap.pipeline import run as pipeline
-from tests.conftest import Command
+from tests.conftest import Command, environment
 
 
 def test_short_help_and_completion_are_there(polcap: Command) -> None:
@@ -146,3 +147,60 @@ def test_the_shell_completes_values(words: str, values: list[str]) -> None:
     command = [sys.executable, "-c", "import sys; sys.argv[0] = 'polcap'; from polcap.cli import main; main()"]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **line}, timeout=60)
     assert done.stdout.split() == values, done.stderr
+
+
+def redirected(words: str, streams: str) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of `polcap …` in a shell that redirects its streams."""
+    command = f"{shlex.quote(sys.executable)} -m polcap {words} {streams}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, env=environment(), timeout=300)
+    return done.returncode, done.stdout, done.stderr
+
+
+SHELL = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full and a shell")
+
+
+@SHELL
+@pytest.mark.parametrize(
+    ("words", "streams", "code"),
+    [
+        ("--version", ">&-", 0), ("--version", ">&- 2>&- <&-", 0), ("--version", "2>/dev/full", 0),
+        ("--version", ">/dev/full", 2), ("--version", ">/dev/full 2>/dev/full", 2),
+        ("settings hdr --json", ">/dev/full 2>&-", 2), ("status none", ">&- 2>/dev/full", 2),
+        ("status none", "2>&-", 2),
+    ],
+)  # fmt: skip
+def test_a_closed_or_full_stream_ends_by_an_honest_exit_code(words: str, streams: str, code: int) -> None:
+    ended, _, errors = redirected(words, streams)
+    lost = "polcap: error: standard output is incomplete: No space left on device; write it elsewhere\n"
+    assert (ended, errors) == (code, lost if streams == ">/dev/full" else "")
+
+
+@SHELL
+def test_every_command_prints_its_help_to_a_full_stream_without_a_traceback() -> None:
+    calls = "; ".join(f"main('{command.__name__}')" for command in cli.COMMANDS)
+    program = (
+        "import sys; from polcap import cli, terminal; terminal.open_streams(); codes = set()\n"
+        "def main(name):\n    try: cli.app([name, '--help'])\n    except SystemExit as end: codes.add(end.code)\n"
+        f"{calls}\nsys.exit(0 if codes == {{2}} else 1)"
+    )
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-c", program], stdout=full, stderr=subprocess.PIPE, env=environment())
+    assert done.returncode == 0 and b"Traceback" not in done.stderr
+
+
+@SHELL
+def test_work_goes_on_where_no_stream_can_be_written(tmp_path: Path) -> None:
+    made = redirected(f"synth {tmp_path}/c --set width=96 --log {tmp_path}/log", ">&- 2>&- <&-")
+    assert made == (0, "", "") and "polcap synth" in (tmp_path / "log").read_text(encoding="utf-8")
+    options = "--no-chart --estimator analytic --log /dev/full"
+    code, _, errors = redirected(f"process {tmp_path}/c {options}", ">/dev/full")
+    assert code in (2, 3) and (tmp_path / "c/polcap/asset/c.glb").exists()
+    assert "standard output is incomplete" in errors and "--log is incomplete" in errors
+    assert redirected(f"process {tmp_path}/c {options}", ">&- 2>/dev/full") == (code, "", "")
+
+
+@SHELL
+def test_a_reader_that_ends_early_is_no_error() -> None:
+    code, _, errors = redirected("settings --json", "| true; exit ${PIPESTATUS[0]}")
+    assert (code, errors) == (0, "")
+    assert redirected("status none", "2> >(true)")[0] == 2

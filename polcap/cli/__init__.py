@@ -55,9 +55,9 @@ class OneLine(TyperGroup):
             terminal.print_error_document(asked, SettingError(), text.removeprefix("polcap: error: "), code)
         except typer.Abort:  # a question without an answer
             terminal.print_message("polcap: aborted")
-            code = 1
+            code = 130
         if standalone_mode:
-            sys.exit(code or 0)
+            sys.exit(terminal.final_code(code or 0))
         return code
 
 
@@ -108,8 +108,7 @@ for command in COMMANDS:
 def main() -> None:
     """The `polcap` command."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # results must not depend on the number of threads
-    for stream in (sys.stdout, sys.stderr):
-        stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]  # names of files are bytes
+    terminal.open_streams()
     app()
 
 
