@@ -22,7 +22,7 @@ for seed, split in enumerate(("train", "test")):  # training looks at pictures o
     np.savez(folder / "shape.npz", vq=corners, vmin=low, vscale=np.float32(size), faces=mesh.faces)
 
 tiny = main_network.NetworkShape((8, 16, 16, 16, 16), (8, 8, 16, 16), (8, 8, 8, 8), (8, 8, 8, 8), (1, 1, 1, 1, 1))
-train.PRESETS["cpu"] = train.TrainingPreset(tiny, 4, 1, 64, (32, 64), (0.5, 0.5), (0.2, 0.8), 4 * 64**2)
+train.PRESETS["cpu"] = train.TrainingPreset(tiny, 4, 1, 1, 64, (32, 64), (0.5, 0.5), (0.2, 0.8), 4 * 64**2)
 own = train.main(train.TrainingOptions(data=out / "data", out=out / "mine", minutes=10 / 60, threads=1))
 
 polcap = [sys.executable, "-m", "polcap", "process", str(source), "--model", str(own), "--out", str(out / "result")]

@@ -33,6 +33,7 @@ def train(
     rate: Annotated[float, Option(min=0, help="Learning rate of Muon; lower for trained weights.")] = 1e-3,
     views: Annotated[int | None, Option(min=1, help="Views of each mesh.")] = None,
     procedural: Annotated[int | None, Option(min=0, help="Random shapes, six views each.")] = None,
+    flat: Annotated[int | None, Option(min=0, help="Flat and sharp-edged shapes, six views each.")] = None,
     threads: Annotated[int, Option("--threads", "-j", min=1, help="Batches computed at a time.")] = 2,
     seed: Annotated[int, Option(min=0, help="Of views, batches and first weights.")] = 1,
 ) -> None:
@@ -42,7 +43,7 @@ def train(
     run = options.training("ablation_study").main if ablation else trainer.main
     stated = {"preset": preset, "data": data, "out": out, "minutes": minutes, "samples": samples, "variant": variant}
     stated |= {"resume": resume, "start": start, "done": done, "rate": rate, "views": views}
-    stated |= {"procedural": procedural, "threads": threads, "seed": seed}
+    stated |= {"procedural": procedural, "flat": flat, "threads": threads, "seed": seed}
     terminal.print_data(str(run(trainer.TrainingOptions(**stated), terminal.print_progress)))
 
 

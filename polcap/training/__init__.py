@@ -2,7 +2,7 @@
 
 Training of the main network, in the order in which a picture passes:
 
-    random_shapes     random closed meshes
+    random_shapes     random closed meshes; `flat_shapes`: flat and sharp-edged ones
     traced_views      meshes -> cache of views: normal, depth, position
     bounced_light     light that one part of an object throws on another
     materials         a view -> diffuse, specular, roughness, refractive index, bumped normal; `gloss` draws their gloss

@@ -52,6 +52,7 @@ class ObjectPixels:
     lit: Tensor  # (M,) 1 where the flash reaches, else 0
     met: Tensor  # (M, RAYS) number, among the M, of the pixel that each ray meets; −1 for none
     open: Tensor  # (M,) share of the rays near the mirror direction that leave the object
+    hidden: Tensor  # (M,) share of all rays that do not
 
 
 def trace_visibility(

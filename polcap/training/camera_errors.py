@@ -1,7 +1,8 @@
 """Camera noise and errors in training: true Stokes parameters -> those of three imperfect photographs.
 
 Drawn per object: shot and read noise of a merged bracket, residual errors of flash energy and polarizer angle,
-misregistration, blur, stray light, depolarization, saturation.
+misregistration, blur, stray light, depolarization, saturation. And the noise of a sensor: fewer electrons of red and
+blue light, a black level that is not quite zero, rows with an offset.
 """
 
 from dataclasses import dataclass, replace
@@ -19,9 +20,11 @@ ANGLES = (0.0, pi / 4, pi / 2)  # rad
 class CameraErrors:
     """Errors of the simulated photographs of B objects; all fields (B,) unless noted."""
 
-    full_well: Tensor  # electrons at radiance 1 in the middle exposure, which saturates there
+    full_well: Tensor  # (3, B) electrons of each color at radiance 1 in the middle exposure, which saturates there
     bracket: Tensor  # ratio between neighboring exposures
     read_noise: Tensor  # electrons
+    black: Tensor  # (3, 3, B) radiance added to each shot and color
+    rows: Tensor  # radiance added to each row of each shot, 1σ
     gain: Tensor  # (3, B) factor on each shot
     angle: Tensor  # (3, B) rad
     shift: Tensor  # (3, B, 2) px
@@ -45,9 +48,11 @@ class CameraErrors:
         moved = u(0, 0.1) * sometimes(0.7) * torch.randn(2, 3, count, device=device)
         moved[:, 0] = 0.0
         return CameraErrors(
-            full_well=torch.exp(u(9.2, 11.0)),
+            full_well=torch.exp(u(9.2, 11.0)) * torch.stack([u(0.35, 1), torch.ones(count, device=device), u(0.35, 1)]),
             bracket=u(1, 5),
             read_noise=u(2, 8),
+            black=u(0, 3e-4) * sometimes(0.5) * torch.randn(3, 3, count, device=device),
+            rows=u(0, 3e-4) * sometimes(0.3),
             gain=1 + gain,
             angle=turn * pi / 180,
             shift=moved.permute(1, 2, 0),
@@ -63,7 +68,8 @@ class CameraErrors:
         one, zero = torch.ones(count, device=device), torch.zeros(count, device=device)
         three = torch.zeros(3, count, device=device)
         return CameraErrors(
-            1e9 * one, 1e3 * one, zero, three + 1, three, torch.zeros(3, count, 2, device=device),
+            1e9 * (three + 1), 1e3 * one, zero, torch.zeros(3, 3, count, device=device), zero,
+            three + 1, three, torch.zeros(3, count, 2, device=device),
             zero, one, zero, one,
         )  # fmt: skip
 
@@ -72,7 +78,7 @@ class CameraErrors:
         """The camera errors of the evaluation: 20 ke⁻, 5 e⁻, three exposures at ratios of 4, gain 0.3 %, angle 0.5°."""
         return replace(
             CameraErrors.none(count, device),
-            full_well=2e4 * torch.ones(count, device=device),
+            full_well=2e4 * torch.ones(3, count, device=device),
             bracket=4 * torch.ones(count, device=device),
             read_noise=5 * torch.ones(count, device=device),
             gain=1 + 0.003 * torch.randn(3, count, device=device),
@@ -103,6 +109,9 @@ def photograph(
         cos, sin = _double_axis((angle + errors.angle[k]).view(count, 1, 1), rays)
         light = (s0 + s1 * cos[..., None] + s2 * sin[..., None]) / 2
         light = _shift_and_blur(light, errors.shift[k], errors.blur).reshape(-1, 3)[at] * errors.gain[k][owner, None]
+        light = light + errors.black[k].T[owner]
+        if errors.rows.any():  # the evaluation has none, and its other noise is not to depend on them
+            light = light + errors.rows[owner, None] * torch.randn(count * height, 1, device=at.device)[at // width]
         clipped = clipped | (light > brightest).any(dim=-1)
         light = torch.minimum(light, brightest)
         noise = _merged_variance(light.clamp(min=0), errors, owner)
@@ -125,7 +134,8 @@ def _double_axis(angle: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
 
 def _merged_variance(light: Tensor, errors: CameraErrors, owner: Tensor) -> Tensor:
     """Variance of radiance (M, C) merged from the unsaturated of three exposures, weighted by exposure time."""
-    ratio, well, read = (x[owner, None] for x in (errors.bracket, errors.full_well, errors.read_noise))
+    ratio, read = (x[owner, None] for x in (errors.bracket, errors.read_noise))
+    well = errors.full_well.T[owner]
     long, middle = (light * ratio < 1).to(light.dtype), (light < 1).to(light.dtype)
     time = 1 / ratio + middle + ratio * long
     return light / (well * time) + (read / (well * time)) ** 2 * (1 + middle + long)

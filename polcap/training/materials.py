@@ -2,9 +2,11 @@
 
 Functions take flat lists of the object's pixels (M, ·), because two thirds of a view are background. An object has one
 to three materials in regions of solid noise. The pattern of a material comes from a texture set, projected along the
-nearest axis, or from solid noise. F0 and roughness follow the pattern of the albedo, as in real materials, about levels
-drawn per material. Many patterns mix two surfaces, as print, glaze, inlay and wear do: two glosses a few pixels from
-each other, often in relief. `gloss.py` draws gloss and diffuse polarization.
+nearest axis, or from solid noise. Every second object's patterns lie along its own axes. Some regions and patterns
+belong to the shape: dirt in hollows, bands along an axis, sides in other colors. F0 and roughness follow the pattern of
+the albedo, as in real materials, about levels drawn per material. Many patterns mix two surfaces, as print, glaze,
+inlay and wear do: two glosses a few pixels from each other, often in relief. `gloss.py` draws gloss and diffuse
+polarization.
 """
 
 import math
@@ -24,6 +26,8 @@ from polcap.training import gloss
 _MATERIALS = 3  # slots per object
 _SIDE = 48  # of the noise volume, cells
 _TEXELS = 256  # side of a texture
+_ALIGNED = 0.5  # share of objects whose patterns lie along the object's axes, as prints and weave do
+_OF_SHAPE = 0.25  # share of objects whose regions follow their shape, and of those whose patterns do
 
 
 @dataclass(frozen=True)
@@ -84,21 +88,29 @@ class MaterialLibrary:
 
 def draw_surface(
     library: MaterialLibrary, normal: Tensor, position: Tensor, turn: Tensor, owner: Tensor,
-    smooth_share: float = gloss.SMOOTH_SHARE,
+    smooth_share: float = gloss.SMOOTH_SHARE, hidden: Tensor | None = None,
 ) -> Surface:  # fmt: skip
     """Draw a material for each of B objects and evaluate it at their M pixels.
 
     normal (M, 3) camera frame, position (M, 3) object frame, turn (B, 3, 3) from object to camera, owner (M,) the
-    object of each pixel; smooth_share: of objects with a smooth interface (`optics/body.py`).
+    object of each pixel; smooth_share: of objects with a smooth interface (`optics/body.py`); hidden (M,): how far the
+    object itself surrounds each pixel, 0…1.
     """
     count, device = len(turn), normal.device
     frame, _ = torch.linalg.qr(torch.randn(count, 3, 3, device=device))  # from object to pattern
+    aligned = (_u((count, 1, 1), device) < _ALIGNED).to(frame.dtype)
+    frame = aligned * torch.eye(3, device=device) + (1 - aligned) * frame
     inner = _rotate(frame, position, owner)
     facing = _rotate(frame @ turn.transpose(1, 2), normal, owner)
     regions, fine, printed = (
         library.sample_noise(inner * _log_uniform((count, 1), low, high, device)[owner] + _u((count, 3), device)[owner])
         for low, high in ((0.5, 2.5), (2.0, 9.0), (4.0, 28.0))
     )
+    outward = _rotate(turn.transpose(1, 2), normal, owner)
+    form = _draw_form(position, outward, torch.zeros_like(owner) if hidden is None else hidden, owner, count)
+    of_shape = (_u((2, count), device) < _OF_SHAPE) * (0.5 + 2 * _u((2, count), device))  # of regions, of patterns
+    regions[:, 0] += of_shape[0, owner] * form
+    printed[:, 0] += of_shape[1, owner] * form
     used = 1 + torch.bucketize(_u((count,), device), torch.tensor([0.5, 0.85], device=device))  # mostly one or two
     active = torch.arange(_MATERIALS, device=device)[None] < used[:, None]
     slot = torch.where(active[owner], regions[:, :_MATERIALS], -9.0).argmax(dim=1)
@@ -129,6 +141,20 @@ def draw_surface(
     bumped = F.normalize(normal + own["bump"][:, None] * (slope - along * normal), dim=1)
     law = Law(law.rough, law.local, law.dolp_factor * fibers)
     return Surface(bumped, diffuse, specular, rough, own["ior"], law)
+
+
+def _draw_form(position: Tensor, outward: Tensor, hidden: Tensor, owner: Tensor, count: int) -> Tensor:
+    """Values (M,) of about −1…1 that follow the shape of each object: hollows, bands along an axis, or its sides.
+
+    Position and outward normal (M, 3) are in the object's frame; hidden (M,) as in `draw_surface`.
+    """
+    device = position.device
+    kind, axis = torch.randint(3, (count,), device=device), torch.randint(3, (count, 1), device=device)
+    frequency, phase = _log_uniform((count,), 2.0, 25.0, device), 2 * math.pi * _u((count,), device)
+    along, side = (vector.gather(1, axis[owner])[:, 0] for vector in (position, outward))
+    bands = torch.cos(frequency[owner] * along + phase[owner])
+    choices = torch.stack([(3 * hidden).clamp(max=2) - 1, bands, side])
+    return choices.gather(0, kind[owner][None])[0]
 
 
 def _albedo(

@@ -53,14 +53,19 @@ def orthogonal(matrix: Tensor) -> Tensor:
     """Approximate U Vᵀ of the singular value decompositions U S Vᵀ of matrices (N, rows, columns).
 
     Five Newton–Schulz steps bring the singular values to 0.7…1.2. More would bring them to 1, which training does not
-    need.
+    need. Each step is a polynomial of X Xᵀ times X. The polynomials commute, so they are multiplied first, as small
+    square matrices: filter banks are up to nine times as wide as high.
     """
     wide = matrix if matrix.shape[-2] <= matrix.shape[-1] else matrix.mT
-    x = (wide / (torch.linalg.matrix_norm(wide, keepdim=True) + 1e-7)).to(compute_type(matrix.device))
+    x = wide / (torch.linalg.matrix_norm(wide, keepdim=True) + 1e-7)
+    square = x @ x.mT
+    product = torch.eye(x.shape[-2], dtype=x.dtype, device=x.device)
     for _ in range(5):
-        square = x @ x.mT
-        x = torch.baddbmm(x, torch.baddbmm(square, square, square, beta=-4.7750, alpha=2.0315), x, beta=3.4445)
-    return (x if matrix.shape[-2] <= matrix.shape[-1] else x.mT).to(matrix.dtype)
+        factor = torch.baddbmm(square, square, square, beta=-4.7750, alpha=2.0315)
+        factor.diagonal(dim1=1, dim2=2).add_(3.4445)
+        product, square = factor @ product, factor @ square @ factor
+    x = product @ x
+    return x if matrix.shape[-2] <= matrix.shape[-1] else x.mT
 
 
 def _matrix(weight: Tensor) -> Tensor:

@@ -95,9 +95,9 @@ class Simulator:
         inside = np.flatnonzero(mask)
         owner, at = np.divmod(inside, area)
         view = pick[owner]  # of each pixel
-        met, escaped = np.full((len(at), bounced_light.RAYS), -1), np.zeros(len(at), np.float32)
+        met, (escaped, hidden) = np.full((len(at), bounced_light.RAYS), -1), np.zeros((2, len(at)), np.float32)
         if self.bounces:
-            met, escaped = self._seen_pixels(view, y[at], x[at], order, mask, owner)
+            met, escaped, hidden = self._seen_pixels(view, y[at], x[at], order, mask, owner)
         rows = (view * full + y[at]) * full + x[at]
 
         def tensor(array: NDArray[Any]) -> Tensor:
@@ -115,7 +115,7 @@ class Simulator:
         pixels = ObjectPixels(
             index=tensor(inside), owner=owners, v=v, normal=read("normal") @ mirror.T, position=read("position"),
             place=-v * (far / v[:, 2])[:, None], depth=depth, lit=read("lit")[:, 0], met=tensor(met),
-            open=tensor(escaped),
+            open=tensor(escaped), hidden=tensor(hidden),
         )  # fmt: skip
         return ViewBatch(
             mask=tensor(mask).reshape(-1, size, size),
@@ -127,8 +127,8 @@ class Simulator:
 
     def _seen_pixels(
         self, view: Indices, y: Indices, x: Indices, order: Indices, mask: Bools, owner: Indices
-    ) -> tuple[Indices, NDArray[np.float32]]:
-        """The fields `met` and `open` of `ObjectPixels` for pixels (y, x) of the cached views `view`.
+    ) -> tuple[Indices, NDArray[np.float32], NDArray[np.float32]]:
+        """The fields `met`, `open` and `hidden` of `ObjectPixels` for pixels (y, x) of the cached views `view`.
 
         `order` are the pixels that remain after subsampling, `mask` (B, H·W) their masks, `owner` the object of each.
         """
@@ -141,8 +141,10 @@ class Simulator:
         row = np.where(mask.reshape(-1), np.cumsum(mask) - 1, -1)
         cell = (view * coarse + y // bounced_light.COARSE) * coarse + x // bounced_light.COARSE
         found = self.views["met"].take(cell, axis=0)  # (M, RAYS)
-        to, escaped = new_place[found], found[:, -bounced_light.SHARP :] == bounced_light.ESCAPED
-        return np.where(to >= 0, row[to + owner[:, None] * area], -1), escaped.mean(axis=1, dtype=np.float32)
+        to, escaped = new_place[found], found == bounced_light.ESCAPED
+        met = np.where(to >= 0, row[to + owner[:, None] * area], -1)
+        share = escaped[:, -bounced_light.SHARP :].mean(axis=1, dtype=np.float32)
+        return met, share, 1 - escaped.mean(axis=1, dtype=np.float32)
 
     def photograph(
         self, views: ViewBatch, strength: Tensor, errors: CameraErrors, jitter: Tensor | None = None
@@ -155,7 +157,9 @@ class Simulator:
         count, height, width = views.mask.shape
         pixels = views.pixels
         own = pixels.owner
-        surface = materials.draw_surface(self.library, pixels.normal, pixels.position, views.turn, own)
+        surface = materials.draw_surface(
+            self.library, pixels.normal, pixels.position, views.turn, own, hidden=pixels.hidden
+        )
         to_flash = views.flash[own] - pixels.place
         normal, body, specular = materials.reflect(surface, pixels.v, to_flash, pixels.lit * strength[own])
         stokes = body + specular

@@ -7,7 +7,7 @@ import json
 import shutil
 import time
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -20,7 +20,7 @@ from polcap.formats import atomic, scene_files, text_file
 from polcap.images import Bools, Floats, GBuffer, View
 from polcap.optics.mesh_tracer import Tracer, Triangles, scatter, smooth
 from polcap.optics.outline import disc_radius
-from polcap.training import bounced_light, light_transport, random_shapes
+from polcap.training import bounced_light, flat_shapes, light_transport, random_shapes
 from polcap.training.progress import Report, silent
 
 ARRAYS = {  # step in pixels, channels, type
@@ -35,6 +35,7 @@ WITHHELD = frozenset((  # meshes that training must not use: new objects for eva
     "gz_trash_can", "poly_sugar_cup", "statue_maria", "ycb_dice", "ycb_fork", "ycb_nine_hole_peg_test", "ycb_orange",
     "ycb_tomato_soup_can",
 ))  # fmt: skip
+Rotate = Callable[[np.random.Generator], Floats]  # draws a rotation (3, 3) from object to camera
 _PROGRESS = "tracing.json"  # of an interrupted cache
 _REPORT_S, _SAVE_S = 10.0, 30.0  # between two lines of progress, between two records of it
 _TRIES = 200  # random sides before a mesh is rejected
@@ -49,7 +50,8 @@ class ViewsRecipe:
     procedural: int  # random shapes
     size: int  # px
     seed: int
-    per_shape: int = 6  # views of each random shape
+    per_shape: int = 6  # views of each random or flat shape
+    flat: int = 0  # flat and sharp-edged shapes, as many views each
     flash: tuple[float, float] | None = None  # right of the lens and above it, in object distances; None: at random
 
 
@@ -92,7 +94,7 @@ def _build_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe, inputs: 
     Raises StorageError: the disk has too little space.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    shapes, size = len(meshes) + recipe.procedural, recipe.size
+    shapes, size = len(meshes) + recipe.procedural + recipe.flat, recipe.size
     total = _first_view(shapes, meshes, recipe)
     begun = _traced_meshes(folder, inputs)
     first = _first_view(begun, meshes, recipe)
@@ -101,10 +103,10 @@ def _build_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe, inputs: 
     if not begun and gigabytes > free:
         raise StorageError(
             f"{folder}: {total} traced views need {gigabytes:.1f} GB, {free:.1f} GB are free; "
-            "take fewer with --views and --procedural, or another --out"
+            "take fewer with --views, --procedural and --flat, or another --out"
         )
     there = f"; {first} of them are there" if first else ""
-    of_shapes = f"{len(meshes)} meshes and {recipe.procedural} random shapes"
+    of_shapes = f"{len(meshes)} meshes, {recipe.procedural} random shapes and {recipe.flat} flat ones"
     report(f"tracing {total} views of {of_shapes}, {gigabytes:.2g} GB in {folder}{there}")
     made = {**ARRAYS, "camera": (size, 16, np.float32)}  # a row per view
     arrays: dict[str, NDArray[Any]] = {}
@@ -194,14 +196,15 @@ def _trace_shape(
     if number < len(meshes):
         path = meshes[number]
         rng = np.random.default_rng([recipe.seed, zlib.crc32(path.stem.encode())])
-        name, mesh, count = str(path), read_mesh(path), recipe.views
+        name, mesh, count, rotate = str(path), read_mesh(path), recipe.views, random_shapes.rotation
     else:
-        shape = number - len(meshes)
+        shape, count = number - len(meshes), recipe.per_shape
+        kind = random_shapes if shape < recipe.procedural else flat_shapes
         rng = np.random.default_rng([recipe.seed, 7, shape])
-        name, mesh, count = f"random shape {shape}", random_shapes.compose(rng), recipe.per_shape
+        name, mesh, rotate = f"random shape {shape}", kind.compose(rng), kind.rotation
     tracer = Tracer(mesh)
     for _ in range(count):
-        buffer, rotation, translation = trace_random_view(name, tracer, recipe.size, rng)
+        buffer, rotation, translation = trace_random_view(name, tracer, recipe.size, rng, rotate)
         offset = random_flash(rng)
         offset = offset if recipe.flash is None else recipe.flash
         middle = float(buffer.depth[buffer.mask].mean(dtype=np.float64))
@@ -215,13 +218,15 @@ def random_flash(rng: np.random.Generator) -> tuple[float, float]:
     return offset * np.cos(azimuth), offset * np.sin(azimuth)
 
 
-def trace_random_view(name: str, tracer: Tracer, size: int, rng: np.random.Generator) -> tuple[GBuffer, Floats, Floats]:
-    """Trace the mesh from a random side: G-buffer, rotation (3, 3) and translation (3,).
+def trace_random_view(
+    name: str, tracer: Tracer, size: int, rng: np.random.Generator, rotate: Rotate = random_shapes.rotation
+) -> tuple[GBuffer, Floats, Floats]:
+    """Trace the mesh from a random side, drawn by `rotate`: G-buffer, rotation (3, 3) and translation (3,).
 
     Raises InputError: the mesh is too thin: it covers too little of the picture from all sides.
     """
     for _ in range(_TRIES):
-        rotation, translation, view = random_pose(tracer.mesh, size, rng)
+        rotation, translation, view = random_pose(tracer.mesh, size, rng, rotate)
         buffer = tracer.trace(rotation, translation, view, size, size)
         if buffer.mask.mean() >= LEAST_SHARE:
             return buffer, rotation, translation
@@ -230,10 +235,12 @@ def trace_random_view(name: str, tracer: Tracer, size: int, rng: np.random.Gener
     )
 
 
-def random_pose(mesh: Triangles, size: int, rng: np.random.Generator) -> tuple[Floats, Floats, View]:
+def random_pose(
+    mesh: Triangles, size: int, rng: np.random.Generator, rotate: Rotate = random_shapes.rotation
+) -> tuple[Floats, Floats, View]:
     """Random pose of a mesh and crop of the picture: field of view 5–35°, up to 12° off axis, 60–95 % filled."""
     while True:
-        rotation = random_shapes.rotation(rng)
+        rotation = rotate(rng)
         turned = mesh.vertices @ rotation.T
         low, high = turned.min(axis=0), turned.max(axis=0)
         fill = rng.uniform(0.6, 0.95)

@@ -39,6 +39,7 @@ class TrainingOptions:
     done: int = 0  # pictures of `samples` with which `start` was trained; the schedule continues from there
     views: int | None = None  # of each mesh, instead of the preset's
     procedural: int | None = None  # random shapes, instead of the preset's
+    flat: int | None = None  # flat and sharp-edged shapes, instead of the preset's
     threads: int = 2  # on a CPU, each with a batch of its own; one more thread makes the batches
     seed: int = 1
     rate: float = 1e-3  # of Muon; at twice this rate weights grew until training diverged
@@ -53,6 +54,7 @@ class TrainingPreset:
     shape: main_network.NetworkShape
     views: int  # per training mesh
     procedural: int  # random shapes, 6 views each
+    flat: int  # flat and sharp-edged shapes, 6 views each
     size: int  # of traced views, px
     sizes: tuple[int, ...]  # of the pictures of a batch, px
     early: tuple[float, ...]  # probabilities of the sizes in the first half of the budget: many objects
@@ -62,11 +64,11 @@ class TrainingPreset:
 
 PRESETS = {
     "cpu": TrainingPreset(
-        main_network.SMALL, views=80, procedural=1200, size=192, sizes=(96, 128, 160, 192),
+        main_network.SMALL, views=80, procedural=1200, flat=600, size=192, sizes=(96, 128, 160, 192),
         early=(0.4, 0.35, 0.15, 0.1), late=(0.1, 0.25, 0.3, 0.35), pixels=10 * 128**2,
     ),
     "gpu": TrainingPreset(
-        main_network.LARGE, views=400, procedural=3000, size=256, sizes=(128, 192, 256),
+        main_network.LARGE, views=400, procedural=3000, flat=1500, size=256, sizes=(128, 192, 256),
         early=(0.5, 0.3, 0.2), late=(0.1, 0.4, 0.5), pixels=64 * 256**2,
     ),
 }  # fmt: skip
@@ -93,7 +95,8 @@ def main(options: TrainingOptions, report: Report = silent) -> Path:
         network.begin(options.start, options.done)
     views = preset.views if options.views is None else options.views
     procedural = preset.procedural if options.procedural is None else options.procedural
-    recipe = traced_views.ViewsRecipe(views=views, procedural=procedural, size=preset.size, seed=13)
+    flat = preset.flat if options.flat is None else options.flat
+    recipe = traced_views.ViewsRecipe(views=views, procedural=procedural, size=preset.size, seed=13, flat=flat)
     traced = options.traced or options.out
     cache = traced_views.open_cache(traced / "views", traced_views.training_meshes(options.data), recipe, report)
     library = materials.MaterialLibrary(options.data / "materials" / "train", device)
@@ -167,7 +170,7 @@ class NetworkTraining(loop.Trainee):
     other once per step use a busy machine better than threads that share each operation.
     """
 
-    hold, warm_up, averaging, burst = 0.2, 100, 0.999, 200.0
+    hold, warm_up, averaging, burst = 0.2, 100, 0.9998, 200.0
     network: main_network.MainNetwork
 
     def __init__(

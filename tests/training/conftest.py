@@ -16,7 +16,7 @@ from polcap.images import Floats
 from polcap.training import evaluation_materials, materials, random_shapes, traced_views
 from polcap.training.simulator import Simulator
 
-RECIPE = traced_views.ViewsRecipe(views=6, procedural=2, size=64, seed=5, per_shape=3)
+RECIPE = traced_views.ViewsRecipe(views=6, procedural=2, size=64, seed=5, per_shape=3, flat=2)
 
 
 @pytest.fixture(autouse=True)

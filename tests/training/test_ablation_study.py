@@ -19,7 +19,7 @@ pytestmark = pytest.mark.filterwarnings(
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    preset = train.TrainingPreset(TINY, 2, 1, 64, (32,), (1.0,), (1.0,), 4 * 32**2)
+    preset = train.TrainingPreset(TINY, 2, 1, 0, 64, (32,), (1.0,), (1.0,), 4 * 32**2)
     monkeypatch.setitem(train.PRESETS, "cpu", preset)
     monkeypatch.setattr(validation, "_RECIPE", replace(validation._RECIPE, views=2))
     monkeypatch.setattr(validation, "_COUNT", 8)

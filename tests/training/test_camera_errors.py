@@ -50,7 +50,7 @@ def test_polarizer_angles_are_projected_on_oblique_rays() -> None:
 def test_noise_has_the_variance_it_states() -> None:
     torch.manual_seed(0)
     images = scene()
-    errors = replace(CameraErrors.none(B, CPU), full_well=torch.full((B,), 2e4), read_noise=torch.full((B,), 5.0))
+    errors = replace(CameraErrors.none(B, CPU), full_well=torch.full((3, B), 2e4), read_noise=torch.full((B,), 5.0))
     errors = replace(errors, bracket=torch.full((B,), 3.0))
     measured, covariance, _ = shoot(errors, *images)
     difference = measured - images[0].reshape(3, -1, 3)
@@ -80,3 +80,30 @@ def test_saturation_is_flagged_and_stays_finite() -> None:
     errors = replace(CameraErrors.none(B, CPU), bracket=torch.full((B,), 4.0))
     measured, _, clipped = shoot(errors, stokes, *rest)
     assert clipped[: S * S].all() and not clipped[S * S :].any() and measured.isfinite().all()
+
+
+def test_noise_is_that_of_each_color() -> None:
+    """A channel with a quarter of the electrons has twice the shot noise, and says so in its variance."""
+    torch.manual_seed(0)
+    images = scene()
+    well = torch.tensor([5e3, 2e4, 2e4])[:, None].expand(3, B)
+    measured, covariance, _ = shoot(replace(CameraErrors.none(B, CPU), full_well=well), *images)
+    spread = (measured[0] - images[0].reshape(3, -1, 3)[0]).std(dim=0)
+    assert float(spread[0] / spread[1]) == pytest.approx(2, abs=0.06)
+    assert float(spread[1] / spread[2]) == pytest.approx(1, abs=0.03)
+    torch.testing.assert_close(covariance[0].mean(dim=0).sqrt(), spread, rtol=0.03, atol=0)
+
+
+def test_black_level_moves_whole_shots_and_row_noise_whole_rows() -> None:
+    torch.manual_seed(0)
+    images, none = scene(), CameraErrors.none(B, CPU)
+    black = torch.zeros(3, 3, B)
+    black[2, 0] = 0.01  # red of the shot at 90°
+    measured, _, _ = shoot(replace(none, black=black), *images)
+    moved = (measured - images[0].reshape(3, -1, 3)).mean(dim=1)
+    expected = torch.zeros(3, 3)
+    expected[:, 0] = torch.tensor([0.01, -0.01, -0.01])
+    torch.testing.assert_close(moved, expected, atol=1e-5, rtol=0)
+    measured, _, _ = shoot(replace(none, rows=torch.full((B,), 0.01)), *images)
+    error = (measured[0] - images[0].reshape(3, -1, 3)[0]).reshape(B, S, S, 3)
+    assert float(error.std(dim=2).max()) < 3e-4 and float(error.mean(dim=(2, 3)).std()) == pytest.approx(0.014, rel=0.3)

@@ -53,3 +53,36 @@ def test_an_eighth_of_all_objects_is_dark_gloss_everywhere_or_for_the_most_part(
     assert ((share > 0.1) & (share < 0.9)).float().mean() > 0.02
     whole = (share > 0.9)[:, None] & dark
     assert 0.035 < surface.specular.mean(dim=1).view(OBJECTS, PLACES)[whole].median() < 0.05
+
+
+def test_some_patterns_follow_hollows_and_bands_and_sides() -> None:
+    """Each kind of shape pattern is a function of the shape alone."""
+    torch.manual_seed(0)
+    place = torch.nn.functional.normalize(torch.randn(OBJECTS * PLACES, 3), dim=1)
+    owner = torch.arange(OBJECTS).repeat_interleave(PLACES)
+    hidden = (place[:, 2] < 0).float()
+    form = materials._draw_form(place / 2, place, hidden, owner, OBJECTS).view(OBJECTS, PLACES)
+    assert form.min() >= -1 and form.max() <= 1
+    levels = torch.tensor([len(one.unique()) for one in form])
+    hollows = levels == 2
+    assert 0.2 < hollows.float().mean() < 0.5  # a third
+    sides = torch.stack([(form[:, None] - place.view(OBJECTS, PLACES, 3).transpose(1, 2)).abs().amax(dim=2)])
+    assert 0.2 < (sides.amin(dim=(0, 2)) < 1e-6).float().mean() < 0.5
+
+
+def test_gloss_and_albedo_follow_the_hollows_of_some_objects() -> None:
+    torch.manual_seed(0)
+    normal = torch.nn.functional.normalize(torch.randn(OBJECTS * PLACES, 3), dim=1)
+    owner = torch.arange(OBJECTS).repeat_interleave(PLACES)
+    library = materials.MaterialLibrary(None, torch.device("cpu"))
+    hidden = (torch.rand(len(owner)) < 0.5).float()  # unrelated to the noise in space
+    turn = torch.eye(3).expand(OBJECTS, 3, 3)
+    correlation = []
+    for seen in (hidden, None):
+        torch.manual_seed(1)
+        surface = materials.draw_surface(library, normal, normal / 2, turn, owner, hidden=seen)
+        albedo = surface.diffuse.mean(dim=1).view(OBJECTS, PLACES)
+        pairs = zip(albedo, hidden.view(OBJECTS, PLACES))
+        correlation.append(torch.stack([torch.corrcoef(torch.stack(pair))[0, 1] for pair in pairs]).abs())
+    assert 0.04 < (correlation[0] > 0.3).float().mean() < 0.3
+    assert (correlation[1] > 0.15).float().mean() < 0.01

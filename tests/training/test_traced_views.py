@@ -47,11 +47,11 @@ def test_interrupted_tracing_continues_after_its_last_mesh(
     monkeypatch.setattr(traced_views, "_REPORT_S", 0.0)
     with pytest.raises(KeyboardInterrupt):
         traced_views.open_cache(tmp_path, meshes, RECIPE, stop_after_first)
-    assert lines[0].startswith("tracing 12 views of 1 meshes and 2 random shapes") and "GB in" in lines[0]
-    assert lines[1].startswith("1 of 12 views") and lines[1].endswith("min left")
+    assert lines[0].startswith("tracing 18 views of 1 meshes, 2 random shapes and 2 flat ones") and "GB in" in lines[0]
+    assert lines[1].startswith("1 of 18 views") and lines[1].endswith("min left")
     lines.clear()
     again = traced_views.open_cache(tmp_path, meshes, RECIPE, lines.append)
-    assert lines[0].endswith("; 6 of them are there") and lines[1].startswith("7 of 12")
+    assert lines[0].endswith("; 6 of them are there") and lines[1].startswith("7 of 18")
     for name in cache:
         np.testing.assert_array_equal(cache[name], again[name])
 
@@ -61,7 +61,7 @@ def test_a_cache_larger_than_the_disk_is_refused_before_tracing(
 ) -> None:
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr("shutil.disk_usage", lambda _: usage(10**9, 10**9 - 1000, 1000))
-    with pytest.raises(StorageError, match=r"12 traced views need .* GB are free; take fewer with --views"):
+    with pytest.raises(StorageError, match=r"18 traced views need .* GB are free; take fewer with --views"):
         traced_views.open_cache(tmp_path / "views", meshes, RECIPE)
 
 

@@ -23,7 +23,7 @@ CPU = torch.device("cpu")
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     """The preset "cpu" with a tiny network and few views."""
-    preset = train.TrainingPreset(TINY, 4, 1, 64, (32, 64), (0.5, 0.5), (0.2, 0.8), 4 * 64**2)
+    preset = train.TrainingPreset(TINY, 4, 1, 1, 64, (32, 64), (0.5, 0.5), (0.2, 0.8), 4 * 64**2)
     monkeypatch.setitem(train.PRESETS, "cpu", preset)
 
 
