@@ -18,7 +18,7 @@ from polcap.formats import atomic, own_files, own_folders, text_file
 from polcap.formats.export import provenance
 
 _FILE = "unchanged.json"
-_OF_A_RUN = {os.path.join("work", name) for name in ("lock", "owner", _FILE)}  # they differ from run to run
+_OF_A_RUN = {own_files.RECORD, *(os.path.join("work", name) for name in ("lock", "owner", _FILE))}  # differ by run
 _PACKAGE = Path(__file__).parents[1]
 _SETTLED_NS = 3_000_000_000  # some file systems have clocks of 2 s steps; within one a file may change unseen
 Stat = list[int]  # size, time of the content, time of the last change of any kind, inode
