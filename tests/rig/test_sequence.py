@@ -192,7 +192,7 @@ def test_resume_rejects_changed_and_unchecked_files_and_takes_them_again(rig: Ri
     (rig.folder / "pol000/frame_3.dng").unlink()
     (rig.folder / "pol090").mkdir(exist_ok=True)
     (rig.folder / "pol090/frame_3.dng").write_bytes(b"saved, not judged")
-    (rig.folder / "pol090/.frame_1.7.part.dng").write_bytes(b"half")
+    (rig.folder / "pol090/.frame_1.7-0123abcd.part.dng").write_bytes(b"half")
     rig.again()
     assert {("shot", 0.0, 1), ("shot", 0.0, 2), ("shot", 90.0, 2)} <= set(rig.taken)
     assert (rig.folder / "rejected/pol000_frame_2.try1.dng").read_bytes() == b"overwritten"
