@@ -6,12 +6,11 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import msgspec
 
 from polcap.batch.unit import FINISHED, FOLDER, WORDS, Unit, UnitRecord
-from polcap.formats import atomic
+from polcap.formats import addresses, atomic
 
 _COLUMNS = ("name", "state", "verdict", "expected_error_deg", "seconds", "attempts", "asset", "report", "says")
 _FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # first characters of cells that spreadsheets compute
@@ -88,4 +87,4 @@ def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[UnitR
 
 def _link(path: str) -> str:
     """Address of a file on the page; it never leads to another server."""
-    return "./" + quote(path.encode("utf-8", "backslashreplace"))
+    return "./" + addresses.of_file(path)

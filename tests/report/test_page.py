@@ -55,3 +55,10 @@ def test_a_name_from_a_file_is_text_and_no_markup(result: Path, tmp_path: Path) 
     page.write(tmp_path, about, pipeline.reopen(result)[0])
     text = (tmp_path / "report.html").read_text()
     assert "<i>jug" not in text and "&lt;i&gt;jug" in text
+
+
+def test_the_link_to_the_asset_leads_to_it_whatever_its_name(result: Path, tmp_path: Path) -> None:
+    about = report.read(result)
+    about["capture"]["name"] = "pot #3 50% Öl"
+    page.write(tmp_path, about, pipeline.reopen(result)[0])
+    assert 'href="asset/pot%20%233%2050%25%20%C3%96l.glb"' in (tmp_path / "report.html").read_text()

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import __version__
+from polcap.formats import addresses
 from polcap.formats.export import encoders, glb_geometry, texture_set
 from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.glb_geometry import Blob, Geometry
@@ -178,7 +179,7 @@ def _packet(name: str, provenance: Mapping[str, str]) -> dict[str, Any]:
 def _license(text: str) -> dict[str, Any]:
     """The license in XMP: WebStatement takes an address only, UsageTerms any text."""
     if text.startswith(("http://", "https://")):
-        return {"xmpRights:WebStatement": text}
+        return {"xmpRights:WebStatement": addresses.of_web(text)}
     return {"xmpRights:UsageTerms": _alternatives(text)}
 
 

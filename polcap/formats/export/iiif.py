@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from polcap.errors import SettingError
-from polcap.formats import atomic
+from polcap.formats import addresses, atomic
 from polcap.formats.export import encoders
 from polcap.formats.export.texture_set import Texture
 from polcap.images import TexturePixels
@@ -36,7 +36,7 @@ def write(folder: Path, pictures: Mapping[str, Texture], facts: Mapping[str, str
     `facts` are fields of `CatalogEntry` and the capture's `name`. Returns the manifest, the descriptions and the whole
     pictures; tiles are parts of these.
     """
-    address = address.rstrip("/")
+    address = addresses.of_web(address).rstrip("/")
     written = [folder / "manifest.json"]
     for name, picture in pictures.items():
         for place, part in _images(picture.pixels):
@@ -77,7 +77,7 @@ def manifest(pictures: Mapping[str, Texture], facts: Mapping[str, str], address:
         "type": "Manifest",
         "label": _text(facts.get("title") or facts["name"]),
         "metadata": [{"label": _text(_LABELS[key], "en"), "value": _text(value)} for key, value in stated.items()],
-        **({"rights": f"http://{named}"} if named.startswith(_RIGHTS) else {}),
+        **({"rights": addresses.of_web(f"http://{named}")} if named.startswith(_RIGHTS) else {}),
         **(
             {"requiredStatement": {"label": _text("Rights", "en"), "value": _text(facts["rights"])}}
             if facts.get("rights")

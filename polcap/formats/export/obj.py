@@ -23,8 +23,11 @@ _ROWS = 10_000  # of a table, formatted at a time
 
 
 def stem(name: str) -> str:
-    """File name without spaces, because OBJ and MTL cannot quote names."""
-    return re.sub(r"\s+", "_", name)
+    """File name without spaces, because OBJ and MTL cannot quote names, nor what web viewers and USD read as more.
+
+    Web viewers take the names of textures for addresses, USD takes brackets and @ for packages.
+    """
+    return re.sub(r"[\s#%@\[\]]+", "_", name)
 
 
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], comment: str = "") -> list[Path]:

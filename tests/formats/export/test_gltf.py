@@ -110,6 +110,7 @@ def test_only_the_address_of_a_license_is_a_web_statement(asset: Asset) -> None:
 
     address = "https://creativecommons.org/licenses/by/4.0/"
     assert packet(address)["xmpRights:WebStatement"] == address
+    assert packet("https://museum.example/our terms")["xmpRights:WebStatement"] == "https://museum.example/our%20terms"
     named = packet("CC BY 4.0")
     assert named["xmpRights:UsageTerms"]["rdf:_1"]["@value"] == "CC BY 4.0" and "xmpRights:WebStatement" not in named
 

@@ -1,6 +1,7 @@
 """The IIIF folder has every picture of its manifest, and Ward's law shades it as polcap shades the maps."""
 
 import json
+import re
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -155,3 +156,12 @@ def ward(folder: Path, to_light: Floats) -> tuple[Floats, np.ndarray]:
     lobe /= np.sqrt(np.maximum(cos_i * cos_o, 1e-3))
     diffuse, specular = (color.decode_srgb(one[..., ::-1]) for one in (albedo, f0))
     return np.pi * (diffuse / np.pi + specular * lobe[..., None]) * np.maximum(cos_i, 0)[..., None], length > 0.5
+
+
+def test_every_address_of_a_manifest_is_percent_encoded(tmp_path: Path) -> None:
+    facts = FACTS | {"license": "https://creativecommons.org/licenses/by nc/4.0/"}
+    iiif.write(tmp_path, {"one": waves(20, 30)}, facts, "https://example.org/my files/pot #3")
+    texts = [(tmp_path / file).read_text() for file in ("manifest.json", "one/info.json")]
+    found = [address for text in texts for address in re.findall(r'"(?:id|rights|target)": "([^"]*)"', text)]
+    assert "https://example.org/my%20files/pot%20%233/one" in found
+    assert len(found) > 8 and not [address for address in found if re.search(r"[ #]", address)]

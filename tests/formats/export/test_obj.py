@@ -1,6 +1,7 @@
 """OBJ and MTL, checked by a second reader and by their keywords."""
 
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -49,6 +50,14 @@ def test_material_names_files_that_are_there(asset: Asset, tmp_path: Path) -> No
         "ball_normal.png",
     )
     assert float(lines["Ni"]) == 1.5 and float(lines["Ns"]) == pytest.approx(30, rel=0.05)  # α = ¼
+
+
+def test_names_of_linked_files_mean_themselves_in_an_address(asset: Asset, tmp_path: Path) -> None:
+    written = obj.write(tmp_path / "pot #3 [a] 50%.obj", asset, "pot", FILES)
+    names = [path.name for path in written[1:]]
+    assert names == ["pot_3_a_50_.mtl", "pot_3_a_50__roughness.exr", "pot_3_a_50__normal.exr"]
+    assert all(quote(name) == name for name in names)
+    assert "mtllib pot_3_a_50_.mtl\n" in written[0].read_text()
 
 
 def test_data_are_in_files_that_no_reader_takes_for_srgb(asset: Asset, tmp_path: Path) -> None:
