@@ -10,7 +10,10 @@ _STRAY = re.compile(r"%(?![0-9A-Fa-f]{2})")
 
 def of_file(relative: str) -> str:
     """Address of a file, relative to the page that links to it; the names in its path may hold any bytes."""
-    return quote(os.fsencode(relative))
+    try:
+        return quote(os.fsencode(relative))
+    except UnicodeEncodeError:  # of a damaged record: no file has this name
+        return quote(relative.encode("utf-8", "backslashreplace"))
 
 
 def of_web(address: str) -> str:
