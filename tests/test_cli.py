@@ -240,8 +240,27 @@ def test_user_mask_replaces_the_search(copy: Path, example: Path, polcap: Comman
     cv2.imwrite(str(tmp_path / "mask.png"), drawn)
     done = polcap("process", example, "--out", copy, "--mask", tmp_path / "mask.png", "--until", "mask", "--json")
     assert done.returncode == 0, done.stderr
-    results, _ = pipeline.reopen(copy)
+    results, _ = pipeline.reopen(copy, "mask")
     assert results.object_.source == "user" and np.array_equal(results.object_.mask, drawn > 0)
+
+
+def test_a_run_that_ended_early_joins_no_old_result(copy: Path, example: Path, polcap: Command) -> None:
+    report = (copy / "report.json").read_bytes()
+    stopped = ("process", example, "--out", copy, "--estimator", "analytic", "--until", "mask")
+    assert polcap(*stopped, "--set", "mask.margin=0.2").returncode == 0
+    for words in (("report", copy), ("show", copy, "selfcal"), ("show", copy, "--animate", "light")):
+        done = polcap(*words)
+        assert done.returncode == 2 and "of another run" in done.stderr, words
+    assert polcap("show", copy, "mask").returncode == 0
+    assert (copy / "report.json").read_bytes() == report
+
+
+def test_maps_and_report_of_two_runs_are_not_exported(copy: Path, polcap: Command) -> None:
+    maps = json.loads((copy / "maps" / "maps.json").read_text())
+    (copy / "maps" / "maps.json").write_text(json.dumps({**maps, "keys": {**maps["keys"], "mask": "other"}}))
+    for words in (("export", copy, "--obj"), ("report", copy), ("report", copy, "--compare", copy)):
+        done = polcap(*words)
+        assert done.returncode == 2 and "of two runs" in done.stderr, words
 
 
 def test_watch_processes_new_photographs_and_settings(example: Path, tmp_path: Path) -> None:

@@ -104,7 +104,7 @@ def test_both_parts_of_the_light_are_written(
     keep: Callable[..., None] = lambda file, channels, **_: written.update({file.name: set(channels)})  # noqa: E731
     monkeypatch.setattr("polcap.formats.maps.maps_folder.exr.write", keep)
     found = results[1]
-    maps_folder.write(tmp_path, found.maps, found.mesh, found.stokes, found.cues)
+    maps_folder.write(tmp_path, found)
     assert {"scattered.R", "mirrored.B"} <= written["cues.exr"]
 
 

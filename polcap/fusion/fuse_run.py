@@ -175,7 +175,7 @@ def _gates(
 
 def write(out: Path, about: dict[str, Any], results: FusionResults, config: SessionConfig) -> None:
     """Write maps/, asset/, the turntable and the report of a fused result; StorageError."""
-    fused_maps.write(out / "maps", results.atlas, results.maps)
+    fused_maps.write(out / "maps", results.atlas, results.maps, about["keys"])
     source = fused_maps.read(out / "maps", config.asset)  # as stored, so that `polcap export` makes the same bytes
     request = ExportRequest(lod=_LODS if source.triangles > 16 * 4**_LODS else 0)
     asset_export.write(out, about, request, asset_export.levels(source, request))

@@ -38,22 +38,11 @@ _MEANINGS = {
 _NEIGHBORS = 4  # texels of which a coarser level's texel is the mean
 
 
-def write(folder: Path, atlas: Atlas, maps: AtlasMaps) -> None:
+def write(folder: Path, atlas: Atlas, maps: AtlasMaps, keys: Mapping[str, str]) -> None:
     """Write the maps as EXR and PNG, seen.png, mask.png, mesh.npz and maps.json; StorageError."""
-    for name, letters in _CHANNELS.items():
-        value = getattr(maps, name).reshape(*maps.mask.shape, -1)
-        channels = {letter: np.ascontiguousarray(value[..., k]) for k, letter in enumerate(letters)}
-        exr.write(folder / f"{name}.exr", channels, half=name != "normal")
-    png.write(folder / "normal.png", png.sixteen_bits(maps.normal / 2 + 0.5))
-    png.write(folder / "diffuse.png", color.srgb_eight_bits(maps.diffuse))
-    png.write(folder / "specular.png", color.srgb_eight_bits(maps.specular))
-    png.write(folder / "roughness.png", png.sixteen_bits(maps.roughness))
-    for name, mask in (("seen", maps.seen & maps.mask), ("mask", maps.mask)):
-        png.write(folder / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))
-    with atomic.path(folder / "mesh.npz") as temporary, temporary.open("wb") as file:
-        np.savez(file, **{name: getattr(atlas.mesh, name) for name in _ARRAYS})
     about = {
         "format": FORMAT,
+        "keys": dict(keys),
         "size": list(maps.mask.shape[::-1]),
         "margin": atlas.margin,
         "albedo": maps_folder.albedo_scale(maps.albedo_sigma),
@@ -66,7 +55,20 @@ def write(folder: Path, atlas: Atlas, maps: AtlasMaps) -> None:
             "mesh.npz": "vertices, normals, uv (v down), tangents, faces",
         },
     }
-    atomic.write_json(folder / "maps.json", about)
+    with atomic.folder_of_files(folder, "maps.json") as place:
+        for name, letters in _CHANNELS.items():
+            value = getattr(maps, name).reshape(*maps.mask.shape, -1)
+            channels = {letter: np.ascontiguousarray(value[..., k]) for k, letter in enumerate(letters)}
+            exr.write(place / f"{name}.exr", channels, half=name != "normal")
+        png.write(place / "normal.png", png.sixteen_bits(maps.normal / 2 + 0.5))
+        png.write(place / "diffuse.png", color.srgb_eight_bits(maps.diffuse))
+        png.write(place / "specular.png", color.srgb_eight_bits(maps.specular))
+        png.write(place / "roughness.png", png.sixteen_bits(maps.roughness))
+        for name, mask in (("seen", maps.seen & maps.mask), ("mask", maps.mask)):
+            png.write(place / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))
+        with (place / "mesh.npz").open("wb") as file:
+            np.savez(file, **{name: getattr(atlas.mesh, name) for name in _ARRAYS})
+        atomic.write_json(place / "maps.json", about)
 
 
 def is_fused(out: Path) -> bool:

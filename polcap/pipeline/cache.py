@@ -180,20 +180,35 @@ class DryRunCache(StageCache):
 
 
 class ArchiveCache(StageCache):
-    """Cache of an earlier run whose photographs are missing: stored results are used whatever their keys."""
+    """Cache of an earlier run whose photographs are missing, so that the keys of the first stages cannot be computed.
+
+    A stored result is used if it was made from the results of the stages before it, with these settings and versions.
+    """
 
     def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
         """The stored result of a stage; a result that is never stored is computed.
 
-        Raises StorageError: the result is missing or damaged.
+        Raises StorageError: the result is missing, damaged, or not made from the results of the stages before it.
         """
         if not stage.keep:
             return super().run(stage, *inputs, config=config)
         place = self.place(stage)
-        self.results[stage.name] = StageResult(manifest(place).get("key", ""), read(place, stage))
+        about, value = manifest(place), read(place, stage)
+        expected = [one.key if isinstance(one, StageResult) else "" for one in inputs if not callable(one)]
+        same_inputs = all(key in ("", stored) for key, stored in zip(expected, about["inputs"], strict=True))
+        if not same_inputs or (about["version"], about["settings"]) != (stage.version, msgspec.to_builtins(config)):
+            raise StorageError(
+                f"{place} is of another run than the stages before it, or of another polcap; run `polcap process` again"
+            )
+        self.results[stage.name] = StageResult(about["key"], value)
         if stage.name == self.until:
             raise StageReached(stage.name)
         return self.results[stage.name]
+
+    def derive(self, function: Callable[..., T], *inputs: Any) -> StageResult[T]:
+        """As in other caches; without a key if an input is missing, such as the user's mask."""
+        found = super().derive(function, *inputs)
+        return StageResult("", found.value) if None in inputs else found
 
 
 def _about(stage: Stage[..., Any], inputs: tuple[Any, ...], config: msgspec.Struct | None) -> dict[str, Any]:

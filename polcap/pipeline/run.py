@@ -13,7 +13,7 @@ import msgspec
 
 from polcap import parallel, report
 from polcap.config import Config, restore
-from polcap.errors import SettingError
+from polcap.errors import SettingError, StorageError
 from polcap.formats import color_profile, own_files
 from polcap.formats.export import encoders, provenance
 from polcap.formats.maps import maps_folder, png
@@ -69,7 +69,7 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
     """
     about, _ = parallel.both(
         partial(report.document, facts, results, config, timings(out)),
-        partial(maps_folder.write, out / "maps", results.maps, results.mesh, results.stokes, results.cues),
+        partial(maps_folder.write, out / "maps", results),
     )
     parallel.both(
         partial(report.write, out, about, results),
@@ -151,12 +151,17 @@ def animate(out: Path, motion: animation.Motion) -> list[Path]:
 
 
 def judge_again(out: Path) -> dict[str, Any]:
-    """Judge a finished result again from the stage cache: writes report.json and report.html."""
+    """Judge a finished result again from the stage cache: writes report.json and report.html.
+
+    Raises StorageError: a stage's result is missing, or work/, maps/ and report.json are not of one run.
+    """
     results, facts = reopen(out)
     with result_folder.locked(out):
+        keys = report.read(out)["keys"]
+        if keys != {**keys, **results.keys}:
+            raise StorageError(f"{out}: work/ and maps/ are of two runs; run `polcap process` again")
         about = report.document(facts, results, restore(Config, facts, out / "work" / "run.json"), timings(out))
-        if (out / "report.json").exists():
-            about["keys"] = report.read(out).get("keys", {})
+        about["keys"] = keys
         report.write(out, about, results)
     return about
 

@@ -130,7 +130,7 @@ def write(folder: Path, about: dict[str, Any], results: Results) -> None:
 def read(folder: Path) -> dict[str, Any]:
     """Read the report.json of a result folder.
 
-    Raises StorageError: the file is missing, or it is not a report of this version.
+    Raises StorageError: the file is missing, it is not a report of this version, or maps/ is of another run.
     """
     try:
         about: dict[str, Any] = text_file.read_json(folder / "report.json")
@@ -146,4 +146,14 @@ def read(folder: Path) -> dict[str, Any]:
     except ValueError as error:
         text = f"{folder / 'report.json'} is no report of this polcap ({error}); run `polcap process` again"
         raise StorageError(text) from error
+    if _keys_of_maps(folder) not in (None, about["keys"]):
+        raise StorageError(f"{folder}: maps/ and report.json are of two runs; run `polcap process` again")
     return about
+
+
+def _keys_of_maps(folder: Path) -> Any:
+    """The cache keys with which maps/ was written; None if there is no maps.json."""
+    try:
+        return text_file.read_json(folder / "maps" / "maps.json")["keys"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

@@ -28,6 +28,7 @@ from polcap.formats.raw import worker
 from polcap.images import Asset, Cues, Floats, ReliefMesh, StokesImage, SurfaceMaps, View
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.asset_export import ExportRequest
+from polcap.results import Results
 from polcap.stages import asset, surface
 from tests import surfaces
 
@@ -131,7 +132,7 @@ def write(folder: Path, maps: SurfaceMaps, mesh: ReliefMesh, noise: Floats) -> N
         quality=np.zeros(size, np.uint8),
         view=maps.view,
     )
-    maps_folder.write(folder / "maps", maps, mesh, stokes, cues)
+    maps_folder.write(folder / "maps", Results.partial(maps=maps, mesh=mesh, stokes=stokes, cues=cues, keys={}))
 
 
 if __name__ == "__main__":

@@ -106,7 +106,7 @@ def commands(root: Path, random: np.random.Generator) -> Iterator[tuple[object, 
     quick = ("--no-chart", "--estimator", "analytic")
     profile = result / "color.toml"
     choices: list[tuple[object, ...]] = [
-        ("process", capture, *quick), ("process", capture, *quick, "--set", "stokes.margin_px=3"),
+        ("process", capture, *quick), ("process", capture, *quick, "--set", "mask.margin=0.1"),
         ("process", capture, *quick, "--until", "mask"), ("process", capture, *quick, "-o", root),
         ("process", capture, *quick, "-o", out), ("process", capture, *quick, "-o", capture / "pol000" / "x"),
         ("process", result / "maps", "-o", result, *quick), ("process", capture, "--chart", profile),

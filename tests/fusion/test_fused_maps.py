@@ -30,7 +30,7 @@ def source() -> FusedSource:
 
 
 def test_maps_and_mesh_come_back_as_written(source: FusedSource, tmp_path: Path) -> None:
-    fused_maps.write(tmp_path / "maps", source.atlas, source.maps)
+    fused_maps.write(tmp_path / "maps", source.atlas, source.maps, {})
     back = fused_maps.read(tmp_path / "maps", AssetSettings())
     assert fused_maps.is_fused(tmp_path) and not fused_maps.is_fused(tmp_path / "maps")
     assert np.array_equal(back.atlas.mesh.vertices, source.atlas.mesh.vertices)
@@ -40,7 +40,7 @@ def test_maps_and_mesh_come_back_as_written(source: FusedSource, tmp_path: Path)
 
 def test_coarser_levels_have_the_unit_and_the_margin_of_the_full_mesh(source: FusedSource, tmp_path: Path) -> None:
     atlas = atlases.charted(ellipsoid.mesh(), 256, 16, metric=False)
-    fused_maps.write(tmp_path, atlas, fused_maps.transferred(source.atlas, source.maps, atlas))
+    fused_maps.write(tmp_path, atlas, fused_maps.transferred(source.atlas, source.maps, atlas), {})
     level = asset_export.levels(fused_maps.read(tmp_path, AssetSettings()), ExportRequest(lod=1))[1].asset.mesh
     coarse = fused_maps.closed(atlas.mesh)
     again = atlases.charted(closed_mesh.decimate(coarse, round(len(coarse.faces) / 4)), 256, 16)
@@ -78,7 +78,7 @@ def test_extra_textures_are_of_the_mesh(source: FusedSource, monkeypatch: pytest
 def test_a_reader_of_one_view_and_an_export_refuse_what_a_fused_object_lacks(
     source: FusedSource, tmp_path: Path
 ) -> None:
-    fused_maps.write(tmp_path / "fused" / "maps", source.atlas, source.maps)
+    fused_maps.write(tmp_path / "fused" / "maps", source.atlas, source.maps, {})
     for place in (tmp_path, tmp_path / "fused"):
         with pytest.raises(DecodeError, match=r"textures of a fused object.*give one of its views"):
             result_maps.read(place)

@@ -230,6 +230,25 @@ def test_keys_are_the_same_with_every_cache(tmp_path: Path) -> None:
     assert made[0] == made[1] == made[2] == made[3]
 
 
+@pytest.mark.parametrize("gain", [2.0, 3.0])
+def test_stages_of_two_runs_are_never_joined(tmp_path: Path, gain: float) -> None:
+    """Neither with the settings of the first run, nor with those of the second, which ended early."""
+    path(StageCache(tmp_path))
+    with pytest.raises(StageReached):
+        path(StageCache(tmp_path, until="double"), gain=3.0)
+    with pytest.raises(StorageError, match="of another run"):
+        path(ArchiveCache(tmp_path), gain=gain)
+    path(StageCache(tmp_path), gain=3.0)
+    path(ArchiveCache(tmp_path), gain=3.0)
+
+
+def test_a_stage_of_another_version_is_not_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path(StageCache(tmp_path))
+    monkeypatch.setitem(globals(), "TOTAL", Stage(TOTAL.function, 2, True))
+    with pytest.raises(StorageError, match="of another polcap"):
+        path(ArchiveCache(tmp_path))
+
+
 def test_a_version_changes_the_key(tmp_path: Path) -> None:
     raised = Stage(DOUBLE.function, 2, True)
     one, two = (DryRunCache(tmp_path).run(s, 3.0, config=Settings()) for s in (DOUBLE, raised))

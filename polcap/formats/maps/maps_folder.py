@@ -14,7 +14,8 @@ from polcap import parallel
 from polcap.errors import DecodeError
 from polcap.formats import atomic, text_file
 from polcap.formats.maps import exr, map_files, png
-from polcap.images import Bools, Cues, Floats, ReliefMesh, StokesImage, SurfaceMaps, View
+from polcap.images import Bools, Floats, ReliefMesh, SurfaceMaps, View
+from polcap.results import Results
 
 CONVENTIONS = {
     "frame": "camera: x right, y up, z toward the camera; a normal facing the camera is (0, 0, 1)",
@@ -72,13 +73,14 @@ class ResultMaps(SurfaceMaps):
     metric: bool  # depth is in metres; otherwise in a unit of its own
 
 
-def write(folder: Path, maps: SurfaceMaps, mesh: ReliefMesh, stokes: StokesImage, cues: Cues) -> None:
+def write(folder: Path, results: Results) -> None:
     """Write the folder maps/ of a result: every map as EXR, the main ones as PNG too, and maps.json.
 
-    Of the mesh its depth (H, W) is written. All images are on the crop (H, W) of `maps`. Files are encoded on
+    Of the mesh its depth (H, W) is written. All images are on the crop (H, W) of the maps. Files are encoded on
     threads. If one cannot be written, all files of an earlier run stay.
     """
-    made = {"maps": maps, "mesh": mesh, "stokes": stokes, "cues": cues}
+    maps, mesh = results.maps, results.mesh
+    made = {"maps": maps, "mesh": mesh, "stokes": results.stokes, "cues": results.cues}
     near, median, far = map_files.depth_range(maps, mesh)
     depth = {"unit": "m" if mesh.metric else "relative", "near": near, "median": median, "far": far}
     with atomic.folder_of_files(folder, "maps.json") as temporary:
@@ -87,7 +89,7 @@ def write(folder: Path, maps: SurfaceMaps, mesh: ReliefMesh, stokes: StokesImage
             for name, (sources, encode) in map_files.FILES.items()
             if name != map_files.DETAIL or maps.detail is not None
         )
-        atomic.write_json(temporary / "maps.json", _description(maps, depth))
+        atomic.write_json(temporary / "maps.json", {**_description(maps, depth), "keys": dict(results.keys)})
 
 
 def _write(file: Path, content: Callable[[], Any]) -> None:
