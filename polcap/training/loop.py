@@ -28,7 +28,7 @@ _OUTER_LAYERS = ("stem", "raw", "out", "hint.0")  # next to the pixels: AdamW tr
 _OUTER_RATE = 0.5  # AdamW's rate relative to Muon's
 _MAX_GRADIENT_NORM = 1.0  # longer gradients are scaled down to it
 _METRICS_STEPS = 50  # from one row of metrics.csv to the next
-_VALIDATION_S, _CHECKPOINT_S = 240, 60  # s between two validations, two checkpoints
+_VALIDATION_S, _CHECKPOINT_S = 600, 60  # s between two validations, two checkpoints
 _REPORT_S = 10  # s of training between two lines of progress
 
 
