@@ -49,6 +49,7 @@ class Quality(IntFlag):
     ILL_POSED = 8  # DoLP above the physical maximum, or S0 ≤ 0
     METAL = 16  # channels differ in AoLP or DoLP as on metals
     GHOST = 32  # exposures of one bracket differ by more than their noise
+    ERASED = 64  # showed the board's print, which was made as dark as its ink
 
 
 @dataclass(frozen=True)

@@ -43,11 +43,11 @@ def fuse(
         terminal.print_result(finished.report, target, json, open_)
         return
     from polcap import config as settings
-    from polcap.batch.processes import Limits
     from polcap.fusion import fuse_run
     from polcap.fusion.fusion_path import SessionConfig
     from polcap.fusion.session import SessionInput
     from polcap.pipeline import models
+    from polcap.process_pool import Limits
 
     resource_limits.set_limits(threads, memory)
     if missing := [name for name in _NEEDED if find_spec(name) is None]:

@@ -4,20 +4,22 @@ In the order of use:
 
     fuse_run          `polcap fuse`: processes the views, runs the path, writes maps, asset, report and verdict
     session           processes the views: one color calibration, one camera, poses, masks, maps
-    fusion_path       the stages from the views' maps to the textures: read it first
+    view_path         the stages of one view: read it first
+    each_view         runs a step on all views; a view may fail alone
+    fusion_path       the stages from the views' maps to the textures: read it second
     values            views, poses, closed meshes
 
   Poses
     board_corners     corners of the board in a view
     poses             camera and poses from the corners in all views
-    feature_poses     the same without a board, from features of the object
+    object_features   features of the object in a view
+    feature_poses     camera and poses without a board, from these features
     view_maps         maps of a view for the session's camera, with the pose
     joining           one frame for sets of views between which the object was laid on another side
 
   Masks
-    board_eraser      a picture without the board, in which the object is searched
-    bright_parts      parts that a mask lacks
-    mask_border       pixels on the outline of a mask
+    board_eraser      a picture without the board
+    mask_without_board  the object's mask, found in this picture
     silhouettes       which points of a grid lie inside a mask, and which of its pixels they cover
     mask_agreement    removes from a mask what no other view confirms, and finds views whose masks are wrong
 

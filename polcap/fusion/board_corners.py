@@ -17,6 +17,7 @@ from polcap.images import AngleStack, ColorCalibration, Floats
 from polcap.optics import board as boards
 from polcap.optics.board import BOARDS, Board
 from polcap.optics.projection import from_grid, transform_points
+from polcap.stages import stage
 
 _DETECTOR_PX = 2400  # longer side of the picture in which markers are searched
 _LEAST_MARKERS = 3  # of a board; fewer may be false
@@ -30,10 +31,6 @@ _LEAST_CORRELATION = 0.85  # of picture and print around a corner
 _MOST_TWINS = 2  # markers seen twice: more are a second board
 
 
-class NoBoardError(CaptureError):
-    """Error: a view does not show a board."""
-
-
 @dataclass(frozen=True)
 class BoardCorners:
     """Corners of one board in one view."""
@@ -42,6 +39,22 @@ class BoardCorners:
     number: NDArray[np.int64]  # (N,) OpenCV's
     world: Floats  # (N, 3) m
     measured_px: Floats  # (N, 2) x, y in visible RAW px of the reference shot
+
+
+@dataclass(frozen=True)
+class BoardSearch:
+    """Result of the search for a board in one view."""
+
+    corners: BoardCorners | None  # None: there is no board
+    markers: int  # that were found of one board
+
+    @property
+    def missing(self) -> str:
+        """The reason why there is no board, with its remedy."""
+        return (
+            f"no board is visible ({self.markers} of its markers, {_LEAST_MARKERS} are needed); "
+            "shoot with the object on the board of `polcap board`, sharp and lit"
+        )
 
 
 def gray_picture(radiance: AngleStack, color: ColorCalibration) -> tuple[Floats, float]:
@@ -58,30 +71,33 @@ def gray_picture(radiance: AngleStack, color: ColorCalibration) -> tuple[Floats,
     return sites * np.tile(gain, (sites.shape[0] // 2, sites.shape[1] // 2)), radiance.view.scale / 2
 
 
-def detect(radiance: AngleStack, color: ColorCalibration, name: str) -> BoardCorners:
-    """Detect the board in a view called `name`.
+@stage(version=1)
+def detect(radiance: AngleStack, color: ColorCalibration) -> BoardSearch:
+    """Search the board in a view.
 
-    Raises NoBoardError: no board is visible. CaptureError: too little of the board is visible, or two boards are.
+    Raises CaptureError: too little of the board is visible, or two boards are.
     """
     picture, scale = gray_picture(radiance, color)
     markers = _markers(picture)
-    board = _one_board(markers, name)
+    board, count = _one_board(markers)
+    if board is None:
+        return BoardSearch(None, count)
     known = np.asarray(boards.charuco(board).getIds()).ravel().tolist()
     plan = np.asarray(boards.charuco(board).getObjPoints())[..., :2]  # (M, 4, 2) m, from the top left
     pairs = [(plan[known.index(number)], quad) for number, quad in markers if number in known]
     flat, seen = (np.concatenate(side).astype(np.float64) for side in zip(*pairs, strict=True))
     place, _ = cv2.findHomography(flat, seen, cv2.RANSAC, 0.02 * float(np.ptp(seen, axis=0).max()))
     if place is None:
-        raise CaptureError(f"{name}: the board's markers contradict each other; show a flat board")
+        raise CaptureError("the board's markers contradict each other; show a flat board")
     number, world = boards.corners(board)
     moved = _located(picture, place, board)
     good = np.isfinite(moved).all(axis=1)
     if good.sum() < _LEAST_CORNERS:
         raise CaptureError(
-            f"{name}: {good.sum()} of {len(number)} corners of the board are visible, {_LEAST_CORNERS} are needed; "
+            f"{good.sum()} of {len(number)} corners of the board are visible, {_LEAST_CORNERS} are needed; "
             "let object and chart hide less of the board, and show it sharp"
         )
-    return BoardCorners(board, number[good], world[good], from_grid(moved[good], scale))
+    return BoardSearch(BoardCorners(board, number[good], world[good], from_grid(moved[good], scale)), count)
 
 
 def _markers(picture: Floats) -> list[tuple[int, Floats]]:
@@ -99,8 +115,8 @@ def _markers(picture: Floats) -> list[tuple[int, Floats]]:
     return list(zip(np.ravel(numbers).tolist(), (found + 0.5) / zoom - 0.5, strict=True))
 
 
-def _one_board(markers: list[tuple[int, Floats]], name: str) -> Board:
-    """The board that the markers belong to. Raises NoBoardError for none, CaptureError for several."""
+def _one_board(markers: list[tuple[int, Floats]]) -> tuple[Board | None, int]:
+    """The board that the markers belong to, or None; and how many belong to it. Raises CaptureError for several."""
     numbers = [number for number, _ in markers]
     twins = len(numbers) - len(set(numbers))
     seen = {
@@ -108,15 +124,10 @@ def _one_board(markers: list[tuple[int, Floats]], name: str) -> Board:
         for board in BOARDS.values()
     }
     there = [size for size, count in seen.items() if count >= _LEAST_MARKERS]
-    if not there:
-        raise NoBoardError(
-            f"{name}: no board is visible ({max(seen.values())} of its markers, {_LEAST_MARKERS} are needed); "
-            "shoot with the object on the board of `polcap board`, sharp and lit"
-        )
     if len(there) > 1 or twins > _MOST_TWINS:
         which = " and ".join(there) if len(there) > 1 else f"{twins} markers twice"
-        raise CaptureError(f"{name}: two boards are visible ({which}); leave one in the picture")
-    return BOARDS[there[0]]
+        raise CaptureError(f"two boards are visible ({which}); leave one in the picture")
+    return (BOARDS[there[0]] if there else None), max(seen.values())
 
 
 def _located(picture: Floats, place: Floats, board: Board) -> Floats:

@@ -14,7 +14,7 @@ from scipy.ndimage import maximum_filter
 
 from polcap.fusion.poses import SessionCamera
 from polcap.fusion.values import Pose
-from polcap.images import Alignment, AngleStack, Bools, ColorCalibration, Floats
+from polcap.images import Alignment, AngleStack, Bools, ColorCalibration, Floats, Quality
 from polcap.optics import board as boards
 from polcap.optics import distortion
 from polcap.optics.board import Board
@@ -33,6 +33,15 @@ _STRIP = 1 / boards.CELLS  # width of the strips of paper, in squares
 
 
 @dataclass(frozen=True)
+class PosedBoard:
+    """A board before the camera of a session."""
+
+    board: Board
+    camera: SessionCamera
+    pose: Pose
+
+
+@dataclass(frozen=True)
 class _Print:
     """The board in the merged picture of a view."""
 
@@ -45,14 +54,13 @@ def erase(
     radiance: AngleStack,
     alignment: Alignment,
     color: ColorCalibration,
-    board: Board,
-    posed: tuple[SessionCamera, Pose],
+    posed: PosedBoard,
 ) -> AngleStack:
-    """A copy of the merged shots in which the visible print of the board is as dark as its ink.
+    """A copy of the merged shots in which the visible print of the board is as dark as its ink, and flagged ERASED.
 
     Where the board is not in the picture, or hidden, nothing changes.
     """
-    print_ = _project(radiance, board, *posed)
+    board, print_ = posed.board, _project(radiance, posed)
     picture = mean_picture(radiance, alignment, color)
     covered = np.abs(print_.place).max(axis=-1) <= _BEYOND * board.page_m[0] / board.side_m
     if not covered.any():
@@ -62,14 +70,16 @@ def erase(
     white = np.linalg.inv(np.asarray(color.matrix, np.float64)) @ tint
     ink = (0.5 * light[1][..., None] * white).astype(np.float32)
     value = np.where(erased[..., None], ink, radiance.value)
-    return replace(radiance, value=value, mosaic=None)
+    quality = radiance.quality | np.where(erased, np.uint8(Quality.ERASED), np.uint8(0))
+    return replace(radiance, value=value, quality=quality, mosaic=None)
 
 
-def _project(radiance: AngleStack, board: Board, camera: SessionCamera, pose: Pose) -> _Print:
+def _project(radiance: AngleStack, posed: PosedBoard) -> _Print:
+    board = posed.board
     height, width = radiance.value.shape[1:3]
     scale = radiance.view.scale
     y, x = (from_grid(axis, scale) for axis in np.mgrid[:height, :width].astype(np.float64))
-    place = _on_board(camera, pose, x, y)
+    place = _on_board(posed.camera, posed.pose, x, y)
     near = np.abs(place).max(axis=-1) <= board.page_m[0] / 2
     down, across = (np.gradient(place, axis=axis)[near] for axis in (0, 1))  # m on the board per pixel
     steps = _SITE_PX * ((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5)

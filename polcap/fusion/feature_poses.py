@@ -1,22 +1,21 @@
 """Camera and poses of a session without a board, from features of the object (bundle adjustment of planar motion).
 
 The camera is fixed and the object turns on a flat table, so features outside the masks do not count, and all views turn
-about one axis. Features are found in the diffuse maps, which have no highlights. The measured normals of matching
-features give a first turn between two views; from features alone it is nearly ambiguous through a long lens.
+about one axis. The measured normals of matching features give a first turn between two views; from features alone it
+is nearly ambiguous through a long lens.
 
 World frame: y is the axis, upwards as the camera sees it; the origin is on it, below the lowest features.
 
 References
 ----------
-Lowe, Distinctive image features from scale-invariant keypoints, IJCV 2004. Horn, Closed-form solution of absolute
-orientation, JOSA A 1987. Golub & Pereyra, Separable nonlinear least squares, Inverse Problems 2003 (points eliminated).
+Horn, Closed-form solution of absolute orientation, JOSA A 1987. Golub & Pereyra, Separable nonlinear least squares,
+Inverse Problems 2003 (points eliminated).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -24,14 +23,13 @@ from scipy.sparse import coo_matrix, csgraph
 from scipy.spatial.transform import Rotation
 
 from polcap.errors import CaptureError
+from polcap.fusion.object_features import ObjectFeatures
 from polcap.fusion.poses import LEAST_VIEWS, PosedView, SessionCamera, SessionPoses
 from polcap.fusion.values import Pose
-from polcap.images import Bools, Capture, Floats, SurfaceMaps
-from polcap.optics import projection
+from polcap.images import Bools, Capture, Floats
 from polcap.optics.frames import dot, unit
-from polcap.results import Results
+from polcap.stages import stage
 
-_CONTRAST = 0.004  # least, of a feature; OpenCV's 0.04 is for photographs of high contrast
 _RATIO = 0.85  # of the distances of the nearest and the second descriptor
 _SAMPLES = 200  # pairs of matches that are tried as the turn between two views
 _AGREES = np.radians(15.0)  # between matching normals after the right turn; normals of single views err by 3 to 8°
@@ -52,15 +50,6 @@ _FOCAL = 4  # ln of the change of the focal length
 _TURNS = 5  # first of the N turns [rad]; then N shifts along x of the table, and N along z
 _Pair = tuple[int, int]  # numbers of two views
 _Matches = NDArray[np.intp]  # (M, 2) numbers of features
-
-
-@dataclass(frozen=True)
-class _Features:
-    """Features of a view."""
-
-    ray: Floats  # (N, 2) slopes X/−Z, Y/−Z in the camera frame
-    normal: Floats  # (N, 3) unit, camera frame
-    descriptor: NDArray[np.float32]  # (N, 128) unit; square roots, so that distances are Hellinger's
 
 
 @dataclass(frozen=True)
@@ -105,28 +94,26 @@ class _AdjustedMotion:
     near: Bools  # (M,) features that are no wrong matches
 
 
-def solve(results: Mapping[str, Results], capture: Capture) -> SessionPoses:
-    """Camera and poses of views from their maps; `capture` is one of them and states the camera's geometry.
+@stage(version=1)
+def solve(features: Mapping[str, ObjectFeatures], capture: Capture) -> SessionPoses:
+    """Camera and poses of views from their features; `capture` is one of them and states the camera's geometry.
 
     Views without enough features in common with the others are left out. Lengths are in metres if the chart's size is
     known; otherwise the lens is 1 from the axis.
 
     Raises CaptureError: fewer than three views have enough features in common.
     """
-    names, first = list(results), next(iter(results.values()))
-    features = [_find(one.maps) for one in results.values()]
-    pairs = {(i, j): _match(features[i], features[j]) for i, j in combinations(range(len(names)), 2)}
-    views, start = _first_motion(features, pairs)
-    posed: dict[str, PosedView] = {}
-    camera, metric = SessionCamera(capture.focal_px, 0.0, capture.principal_px, 0.0, 0.0), False
+    names, seen = list(features), list(features.values())
+    pairs = {(i, j): _match(seen[i], seen[j]) for i, j in combinations(range(len(names)), 2)}
+    views, start = _first_motion(seen, pairs)
+    posed: list[PosedView] = []
+    camera, distance = SessionCamera(capture.focal_px, 0.0, capture.principal_px, 0.0, 0.0), seen[0].distance_m
     if len(views) >= LEAST_VIEWS:
-        tracks = _tracks(features, pairs, start, views)
+        tracks = _tracks(seen, pairs, start, views)
         doubt = max(*np.abs(capture.focal_doubt), 0.002 if capture.focal_known else 0.5)
-        found = _adjusted(tracks, start, first.maps.view.focal, float(doubt))
-        chart = first.color.metres_per_px
-        distance, metric = (1.0, False) if chart is None else (chart * first.radiance.view.focal, True)
-        posed = {names[views[k]]: one for k, one in _posed(found, distance, capture.focal_px).items()}
-        camera = _camera(capture, first, found)
+        found = _adjusted(tracks, start, seen[0].focal, float(doubt))
+        posed = _posed(found, [names[k] for k in views], distance or 1.0, capture.focal_px)
+        camera = _camera(capture, seen[0].bend, found)
     if len(posed) < LEAST_VIEWS:
         raise CaptureError(
             f"no view shows a board, and {len(posed)} of {len(names)} views have {_LEAST_MATCHES} features of the "
@@ -134,50 +121,35 @@ def solve(results: Mapping[str, Results], capture: Capture) -> SessionPoses:
             "`polcap board`, or turn it by 15° or less between the views and let it fill the picture"
         )
     reason = f"fewer than {_LEAST_MATCHES} features of the object match those of other views; turn it by 15° or less"
-    return SessionPoses(camera, posed, {name: reason for name in names if name not in posed}, metric, board=False)
+    left_out = {name: reason for name in names if name not in {one.name for one in posed}}
+    return SessionPoses(camera, tuple(posed), left_out, distance is not None)
 
 
-def _camera(capture: Capture, view: Results, found: _AdjustedMotion) -> SessionCamera:
-    """Camera with the adjusted focal length and the stated distortion, which an object in the middle does not tell."""
-    lens = view.radiance.equipment.distortion
-    k1, k2 = (0.0, 0.0) if lens is None else (lens.k1, lens.k2)
+def _camera(capture: Capture, bend: tuple[float, float], found: _AdjustedMotion) -> SessionCamera:
+    """Camera with the adjusted focal length, and with the stated distortion: an object in the middle shows none."""
     focal = capture.focal_px * found.motion.focal_change
-    return SessionCamera(focal, focal * float(found.sigma[_FOCAL]), capture.principal_px, k1, k2)
+    return SessionCamera(focal, focal * float(found.sigma[_FOCAL]), capture.principal_px, *bend)
 
 
-def _posed(found: _AdjustedMotion, distance: float, focal_px: float) -> dict[int, PosedView]:
-    """Poses of the views with enough features, by number; the lens is `distance` from the axis."""
+def _posed(found: _AdjustedMotion, names: Sequence[str], distance: float, focal_px: float) -> list[PosedView]:
+    """Poses of the views with enough features; the lens is `distance` from the axis."""
     tracks, motion = found.tracks, found.motion
     point = _points(tracks, motion, found.near.astype(float))[0]
     height = point[tracks.point[found.near], 1]
     foot = float(np.quantile(height, _WRONG) - _BELOW * np.ptp(np.quantile(height, [_WRONG, 1 - _WRONG])))
     turns, shifts = motion.poses()
-    out = {}
-    for k, (turn, shift) in enumerate(zip(turns, shifts, strict=True)):
+    out = []
+    for k, (name, turn, shift) in enumerate(zip(names, turns, shifts, strict=True)):
         own = found.near & (tracks.view == k)
         if own.sum() >= _LEAST_MATCHES:
             residual = float(np.sqrt(2 * np.mean(found.error[own] ** 2))) * focal_px
             sigma = float(np.degrees(np.hypot(found.sigma[_TURNS + k], found.sigma[_TILT].max())))
-            out[k] = PosedView(Pose(turn, distance * (shift + foot * turn[:, 1])), int(own.sum()), residual, sigma)
+            pose = Pose(turn, distance * (shift + foot * turn[:, 1]))
+            out.append(PosedView(name, pose, int(own.sum()), residual, sigma))
     return out
 
 
-def _find(maps: SurfaceMaps) -> _Features:
-    """Features of the object in its diffuse map."""
-    gray, mask = np.asarray(maps.diffuse, np.float32).mean(axis=-1), np.asarray(maps.mask)
-    picture = 255 * np.clip(gray / max(float(np.quantile(gray[mask], 0.99)), 1e-6), 0, 1) ** (1 / 2.2)
-    finder = cv2.SIFT.create(contrastThreshold=_CONTRAST)
-    points, descriptor = finder.detectAndCompute(picture.astype(np.uint8), mask.astype(np.uint8))
-    if not points:
-        return _Features(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 128), np.float32))
-    place, index = np.unique(np.array([point.pt for point in points]), axis=0, return_index=True)
-    column, row = np.rint(place).astype(int).T
-    ray = np.stack(projection.ray_slopes(maps.view, *place.T), axis=-1)
-    roots = np.sqrt(descriptor[index] / descriptor[index].sum(axis=1, keepdims=True))
-    return _Features(ray, np.asarray(maps.normal, np.float64)[row, column], roots)
-
-
-def _match(one: _Features, other: _Features) -> _Matches:
+def _match(one: ObjectFeatures, other: ObjectFeatures) -> _Matches:
     """Numbers (M, 2) of features that are each other's nearest, and nearer than the second nearest."""
     if min(len(one.ray), len(other.ray)) < _LEAST_MATCHES:
         return np.zeros((0, 2), np.intp)
@@ -188,7 +160,9 @@ def _match(one: _Features, other: _Features) -> _Matches:
     return np.stack([i[good], j[good]], axis=-1)
 
 
-def _first_motion(features: Sequence[_Features], pairs: Mapping[_Pair, _Matches]) -> tuple[NDArray[np.intp], _Motion]:
+def _first_motion(
+    features: Sequence[ObjectFeatures], pairs: Mapping[_Pair, _Matches]
+) -> tuple[NDArray[np.intp], _Motion]:
     """The largest group of views that matches connect, and their motion, from normals alone."""
     found = {
         pair: _turn(features[pair[0]].normal[match[:, 0]], features[pair[1]].normal[match[:, 1]])
@@ -242,7 +216,7 @@ def _frames(pair: Floats) -> Floats:
 
 
 def _tracks(
-    features: Sequence[_Features], pairs: Mapping[_Pair, _Matches], first: _Motion, views: NDArray[np.intp]
+    features: Sequence[ObjectFeatures], pairs: Mapping[_Pair, _Matches], first: _Motion, views: NDArray[np.intp]
 ) -> _FeatureTracks:
     """Tracks of features of some views whose normals match after the first turns, one feature in each view."""
     start = np.cumsum([0, *(len(one.ray) for one in features)])

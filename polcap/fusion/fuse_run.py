@@ -22,7 +22,7 @@ from polcap.fusion.fusion_path import FusionResults, SessionConfig, path
 from polcap.fusion.session import Notify, ProcessedSession, SessionInput
 from polcap.pipeline import asset_export, result_folder
 from polcap.pipeline.asset_export import ExportRequest
-from polcap.pipeline.cache import Progress, StageCache
+from polcap.pipeline.cache import LazyCache, Progress
 from polcap.pipeline.run import timings
 from polcap.quality import fused_object, gates
 from polcap.quality.gate import Gate
@@ -44,9 +44,10 @@ def fuse(session_input: SessionInput, out: Path, notify: Notify, progress: Progr
     for view in folder_names.session_views(session_input.folder):
         result_folder.check(out, session_input.folder / view)
     with result_folder.locked(out):
-        processed = sessions.process(session, session_input, notify)
-        cache = StageCache(out, progress)
-        with cache.memory_explained(processed.views[0].mask.size):
+        cache = LazyCache(out, progress)
+        processed = sessions.process(session, session_input, cache, notify)
+        width, height = session.capture.size_px
+        with cache.memory_explained(width * height):
             results = path(processed.views, config.fusion, cache)
         results = replace(results, maps=_with_albedo_scale(results.maps, processed))
         cache.begin("write")
@@ -164,12 +165,13 @@ def _gates(
     processed: ProcessedSession, results: FusionResults, rows: Sequence[Mapping[str, Any]], limits: FusedGateLimits
 ) -> Iterator[Gate]:
     """All gates of a fused object."""
-    yield fused_object.views([view.name for view in processed.views], processed.left_out, limits)
-    yield fused_object.poses({row["name"]: row["reprojection_px"] for row in rows}, processed.poses.board, limits)
+    yield fused_object.views(list(processed.reports), processed.left_out, limits)
+    by_board = processed.poses.board is not None
+    yield fused_object.poses({row["name"]: row["reprojection_px"] for row in rows}, by_board, limits)
     yield fused_object.agreement({row["name"]: row["normal_deg"] for row in rows}, limits)
     for one in results.joined:
         yield fused_object.join(one.folder, one.shared, limits)
-    yield fused_object.seen(_seen(results), len(processed.views), limits)
+    yield fused_object.seen(_seen(results), len(processed.reports), limits)
     yield fused_object.closed(_closed(results))
 
 

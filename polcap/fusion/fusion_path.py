@@ -1,8 +1,8 @@
 """READ FIRST. The path of a session, one line per stage: from the maps of its views to the textures of a closed mesh.
 
-`session.py` makes the maps and poses of the views. Each stage is in the module of its name in this folder; `shape` uses
-five more. The docstring of the package lists all modules.
-`cache.run` finds a stored result, or computes it, as for a single capture (`pipeline/path.py`).
+`view_path.py` makes the maps of each view, `session.py` the poses. Each stage is in the module of its name in this
+folder; `shape` uses five more. The docstring of the package lists all modules. `cache.run` finds a stored
+result, or computes it, as for a single capture (`pipeline/path.py`).
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from polcap.fusion.joining import JoinedSet
 from polcap.fusion.material_fit import MaterialSettings
 from polcap.fusion.shape import ShapeSettings
 from polcap.fusion.values import ClosedMesh, FusionView
-from polcap.pipeline.cache import MemoryCache, StageResult, digest, fingerprint
+from polcap.pipeline.cache import MemoryCache, StageResult
 from polcap.quality.limits import FusedGateLimits
 
 # settings of `polcap process` that would not change a fused object, by the beginning of their keys
@@ -78,15 +78,14 @@ class FusionResults:
     keys: dict[str, str]
 
 
-def path(views: tuple[FusionView, ...], settings: FusionSettings, cache: MemoryCache) -> FusionResults:
+def path(views: StageResult[tuple[FusionView, ...]], settings: FusionSettings, cache: MemoryCache) -> FusionResults:
     """Run the stages in order.
 
     Raises CaptureError: a set of views does not show the object of the first one.
     """
-    given = StageResult(digest(fingerprint(views)), views)  # hashed once
-    joined = cache.run(joining.join, given)
+    joined = cache.run(joining.join, views)
     joining.require_shared(joined.value, settings.gates.min_shared)
-    placed = cache.derive(joining.place, given, joined)
+    placed = cache.derive(joining.place, views, joined)
     mesh = cache.run(shape.fuse_shape, placed, config=settings.shape)
     atlas_ = cache.run(atlas.unwrap, mesh, placed, config=settings.atlas)
     baked = cache.run(baking.bake, placed, atlas_, config=settings.baking)

@@ -92,7 +92,7 @@ class JoinedSet:
     shared: float  # share of the set's surface that the first one confirms
 
 
-@stage(version=4)
+@stage(version=4, uses=(fuse_shape,))
 def join(views: tuple[FusionView, ...]) -> tuple[JoinedSet, ...]:
     """Find the motions of all further sets of views, each in a folder of its own, onto the first one."""
     sets: dict[str, list[FusionView]] = {}

@@ -13,8 +13,8 @@ References
 Laurentini, The visual hull concept for silhouette-based image understanding, IEEE TPAMI 1994.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -24,9 +24,11 @@ from polcap.fusion.poses import LEAST_VIEWS
 from polcap.fusion.silhouettes import Silhouette, grid_around, halved
 from polcap.images import Bools, Floats
 from polcap.optics.outline import disc_radius
+from polcap.stages import stage
+from polcap.stages.mask import regions
 from polcap.stages.mask.regions import fill_holes
 
-COMPARED = "work/compared_mask.png"  # in the result of a view: its mask, as it was compared
+COMPARED = "work/compared_masks"  # folder in the result of a session: the masks, as they were compared
 _SLIT = 0.05  # of the object's diameter in a view; wider gaps in a mask are gaps between the object's parts
 _HOLE = 0.01  # of a mask's area; larger holes may be holes of the object
 _MOST_UNCOVERED = 0.01  # of a mask's area; masks whose outlines err by one cell of the grid leave 0.000
@@ -35,6 +37,30 @@ _MOST_UNCOVERED = 0.01  # of a mask's area; masks whose outlines err by one cell
 _SLIDE = 0.002
 _MOST_LEFT_OUT = 1 / 3  # of the views; where more contradict, nobody knows which are right
 _MOST_TRIMMED = 1 / 2  # of the views may be left out, or hold more than the object
+
+
+@dataclass(frozen=True)
+class AgreedMasks:
+    """Masks of the views that agree, without what the others do not confirm."""
+
+    names: tuple[str, ...]  # of these views
+    masks: tuple[Bools, ...]  # (H, W) on their merged pictures
+    left_out: Mapping[str, str]  # reason, by view whose mask contradicts the others
+
+
+@stage(version=1)
+def agree(views: tuple[Silhouette, ...]) -> AgreedMasks:
+    """Compare the masks of each set of views. The largest part of each stays; remains of the board are smaller.
+
+    Raises CaptureError: more than a third of the views of a set contradict the others, fewer than three are left, or
+    the masks have too little in common.
+    """
+    used, left_out = list[Silhouette](), dict[str, str]()
+    for folder in dict.fromkeys(view.folder for view in views):
+        agreed, contradicting = agreeing([view for view in views if view.folder == folder])
+        used, left_out = used + agreed, left_out | contradicting
+    masks = tuple(regions.nth_part(view.mask, 1) for view in used)
+    return AgreedMasks(tuple(view.name for view in used), masks, left_out)
 
 
 def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, str]]:
@@ -56,8 +82,8 @@ def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, s
         inside = np.delete(inside, worst, axis=0)
         left_out[view.name] = (
             f"its mask and those of the other views differ by {100 * share:.1f} % of their area, the limit is "
-            f"{100 * _MOST_UNCOVERED:g} %: the mask is wrong, or the object moved on the board; look at "
-            f"{COMPARED} in its polcap folder, and shoot the view again"
+            f"{100 * _MOST_UNCOVERED:g} %: the mask is wrong, or the object moved on the board; compare the pictures "
+            f"in {COMPARED}, and shoot the view again"
         )
         if len(left_out) > _MOST_LEFT_OUT * len(views) or len(used) < LEAST_VIEWS:
             raise _contradiction(list(left_out), len(views))
@@ -85,8 +111,8 @@ def _without_gaps(views: Sequence[Silhouette], points: Floats, step: float) -> l
 def _contradiction(names: Sequence[str], count: int) -> CaptureError:
     return CaptureError(
         f"the masks of {len(names)} of {count} views contradict the others ({', '.join(names)}): the object moved on "
-        f"the board between the views, or masks are wrong; look at {COMPARED} in their polcap folders, "
-        "fix the object to the board, and shoot again"
+        f"the board between the views, or masks are wrong; compare the pictures in {COMPARED}, fix the object to the "
+        "board, and shoot again"
     )
 
 

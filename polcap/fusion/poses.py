@@ -23,6 +23,8 @@ from polcap.fusion.board_corners import BoardCorners
 from polcap.fusion.values import Pose
 from polcap.images import Capture, Distortion, Floats, View
 from polcap.optics import distortion, projection
+from polcap.optics.board import Board
+from polcap.stages import stage
 
 LEAST_VIEWS = 3
 _MOST_RESIDUAL = 1.0  # px rms of a view's corners; a flat, sharp board leaves 0.02 to 0.1
@@ -74,6 +76,7 @@ class SessionCamera:
 class PosedView:
     """Pose of one view with its errors."""
 
+    name: str
     pose: Pose
     corners: int  # or features, used
     residual_px: float  # their rms, RAW px
@@ -85,12 +88,18 @@ class SessionPoses:
     """Camera and poses of a session, and why views were left out."""
 
     camera: SessionCamera
-    views: Mapping[str, PosedView]
+    posed: tuple[PosedView, ...]
     left_out: Mapping[str, str]
     metric: bool = True  # lengths are in metres
-    board: bool = True  # from the board; else from features of the object
+    board: Board | None = None  # from which the poses are; None: from features of the object
+
+    @property
+    def views(self) -> Mapping[str, PosedView]:
+        """Posed views by name."""
+        return {one.name: one for one in self.posed}
 
 
+@stage(version=1)
 def solve(boards: Mapping[str, BoardCorners], capture: Capture) -> SessionPoses:
     """Camera and poses of all views of a session; `capture` is one of them and states the camera's geometry.
 
@@ -105,21 +114,21 @@ def solve(boards: Mapping[str, BoardCorners], capture: Capture) -> SessionPoses:
     left_out: dict[str, str] = {}
     while True:
         if len(names) < LEAST_VIEWS:
-            reasons = "; ".join(left_out.values())
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
             raise CaptureError(
                 f"{len(names)} views can be posed, {LEAST_VIEWS} are needed; show the board in more views"
                 + (f" ({reasons})" if reasons else "")
             )
-        solved = _adjust([boards[name] for name in names], capture)
+        solved = _adjust({name: boards[name] for name in names}, capture)
         worst = max(range(len(names)), key=lambda k: solved.residual[k])
         if solved.residual[worst] <= _MOST_RESIDUAL:
             break
         name = names.pop(worst)
         left_out[name] = (
-            f"{name}: its corners are {solved.residual[worst]:.1f} px (rms) from those of the board, the limit is "
+            f"its corners are {solved.residual[worst]:.1f} px (rms) from those of the board, the limit is "
             f"{_MOST_RESIDUAL:g} px; keep the board flat, focus and zoom unchanged"
         )
-    return SessionPoses(solved.camera, dict(zip(names, solved.posed, strict=True)), left_out)
+    return SessionPoses(solved.camera, tuple(solved.posed), left_out, board=boards[names[0]].board)
 
 
 @dataclass(frozen=True)
@@ -132,8 +141,9 @@ class _Adjusted:
         return [one.residual_px for one in self.posed]
 
 
-def _adjust(boards: Sequence[BoardCorners], capture: Capture) -> _Adjusted:
+def _adjust(seen: Mapping[str, BoardCorners], capture: Capture) -> _Adjusted:
     """Bundle adjustment, twice: the second time without corners far from the first solution."""
+    boards = list(seen.values())
     stated = View(capture.focal_px, capture.principal_px, 1.0)
     start = np.concatenate([np.zeros(_CAMERA), *(_first_pose(one, stated) for one in boards)])
     found = _minimize(boards, capture, start)
@@ -141,7 +151,7 @@ def _adjust(boards: Sequence[BoardCorners], capture: Capture) -> _Adjusted:
     far = max(_OUTLIER * 1.48 * float(np.median(np.abs(np.concatenate(error)))), _LEAST_OUTLIER)
     used = [_without(one, np.linalg.norm(e, axis=1) > far) for one, e in zip(boards, error, strict=True)]
     found = _minimize(used, capture, found.x)
-    return _with_errors(used, capture, found)
+    return _with_errors(dict(zip(seen, used)), capture, found)
 
 
 def _without(corners: BoardCorners, bad: Floats) -> BoardCorners:
@@ -217,20 +227,21 @@ def _minimize(boards: Sequence[BoardCorners], capture: Capture, start: Floats) -
     )
 
 
-def _with_errors(boards: Sequence[BoardCorners], capture: Capture, found: OptimizeResult) -> _Adjusted:
+def _with_errors(boards: Mapping[str, BoardCorners], capture: Capture, found: OptimizeResult) -> _Adjusted:
     """Camera and poses with their errors, from the curvature at the solution and the actual residuals."""
     camera = _camera(capture, found.x)
-    error = [_residual(one, camera, found.x[_place(k)]) for k, one in enumerate(boards)]
+    error = [_residual(one, camera, found.x[_place(k)]) for k, one in enumerate(boards.values())]
     scale = float(np.sqrt(np.mean(np.concatenate(error) ** 2))) / _CORNER_SIGMA
     jacobian = found.jac
     sigma = max(scale, 0.1) * np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)))
     posed = [
         PosedView(
+            name=name,
             pose=_pose(found.x[_place(k)]),
             corners=len(one.number),
             residual_px=float(np.sqrt(2 * np.mean(e**2))),
             sigma_deg=float(np.degrees(sigma[_place(k)][:3].max())),
         )
-        for k, (one, e) in enumerate(zip(boards, error, strict=True))
+        for k, ((name, one), e) in enumerate(zip(boards.items(), error, strict=True))
     ]
     return _Adjusted(_camera(capture, found.x, float(sigma[0])), posed)

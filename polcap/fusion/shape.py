@@ -24,7 +24,7 @@ class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     grid: Annotated[int, Meta(ge=40, le=300, description="steps along the object's longest side")] = 140
 
 
-@stage(version=11)  # `joining.join` uses it: raise its version, too
+@stage(version=11)
 def fuse_shape(views: Sequence[FusionView], settings: ShapeSettings) -> ClosedMesh:
     """Join views of one object into a closed, manifold, outward mesh in the world frame.
 

@@ -52,6 +52,14 @@ class FusionView:
 
 
 @dataclass(frozen=True)
+class ViewMask:
+    """The object's mask on the merged picture of a view."""
+
+    mask: Bools  # (H, W)
+    scale: float  # RAW px per px
+
+
+@dataclass(frozen=True)
 class ClosedMesh:
     """A closed, manifold triangle mesh, outward orientation, in the world frame."""
 

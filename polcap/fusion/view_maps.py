@@ -15,11 +15,14 @@ from polcap.stages.cues import scale
 _LEAST_SHIFT_PX = 0.02  # of the map: below, a lens counts as free of distortion and nothing is resampled
 
 
-def fusion_view(name: str, results: Results, camera: SessionCamera, pose: Pose, undistorted: bool) -> FusionView:
+def fusion_view(
+    name: str, results: Results, camera: SessionCamera, pose: Pose, metric: bool, undistort: bool
+) -> FusionView:
     """The maps of a view's results, with its pose.
 
-    `undistorted`: the capture's own calibration has corrected the lens already.
+    `undistort` is the setting with which the capture's own calibration has corrected the lens, if there is one.
     """
+    undistorted = undistort and results.radiance.equipment.distortion is not None
     maps, height, width = results.maps, *results.maps.mask.shape
     view = on_grid(camera, maps.view)
     y, x = np.mgrid[:height, :width].astype(np.float64)
@@ -39,6 +42,7 @@ def fusion_view(name: str, results: Results, camera: SessionCamera, pose: Pose, 
         roughness=np.asarray(maps.roughness, np.float32),
         s0=np.asarray(results.cues.radiance, np.float32),
         white_distance=scale.surface_distance(maps.mask, maps.view) if scale.is_known(results.color) else None,
+        metric=metric,
     )
     if max(np.abs(source_x - x).max(), np.abs(source_y - y).max()) < _LEAST_SHIFT_PX:
         return found

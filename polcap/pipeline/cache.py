@@ -4,7 +4,8 @@ A key is a digest of the stage's name and version, its settings and the keys of 
 bytes of the RAW files and of the model file, not their paths, so a capture may be moved. A folder contains one `.npy`
 file per array, and `manifest.json`. It is written under a temporary name and renamed, so a killed run leaves a complete
 result or none. When a result is read, sizes and SHA-256 digests are compared; a damaged result is computed again. `run`
-returns arrays as read-only memory maps, whether the result was computed or read.
+returns arrays as read-only memory maps, whether the result was computed or read. A process compares a file's digest
+once, as long as the file's size and times stay the same.
 """
 
 import json
@@ -13,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
-from functools import partial
+from functools import cached_property, partial
 from hashlib import blake2b, sha256
 from pathlib import Path
 from typing import Any, Generic, TypeVar, get_type_hints
@@ -29,6 +30,7 @@ from polcap.stages import Stage
 T = TypeVar("T")
 FORMAT = 3  # of work/; raised when older folders can no longer be read
 _READERS = 2  # threads that compute digests: more do not read faster
+_verified: set[tuple[Any, ...]] = set()  # path, times, size and digest of the files that this process has compared
 _NOT_SEALED = ("seconds", "digest")  # fields of a manifest that its digest leaves out: no two runs take the same time
 Progress = Callable[[str, float | None, bool], None]  # stage, seconds (None: it begins), found in the cache
 
@@ -47,6 +49,19 @@ class StageResult(Generic[T]):
 
     key: str
     value: T
+
+
+class DeferredResult(StageResult[T]):
+    """Result whose value is made when it is first needed."""
+
+    def __init__(self, key: str, make: Callable[[], T]) -> None:
+        vars(self).update(key=key, make=make)
+
+    @cached_property
+    def value(self) -> T:
+        """The result."""
+        made: T = vars(self)["make"]()
+        return made
 
 
 class MemoryCache:
@@ -129,11 +144,13 @@ class StageCache(MemoryCache):
         self, folder: Path, progress: Progress = silent, force: str | None = None, until: str | None = None
     ) -> None:
         super().__init__(progress, force, until)
-        self.work = folder / "work"
+        self.folder, self.work = folder, folder / "work"
 
     def place(self, stage: Stage[..., Any]) -> Path:
-        """Folder in which the result of the next stage of the path is stored."""
-        return self.work / f"{len(self.results) + 1:02d}-{stage.name}"
+        """Folder in which the result of a stage is stored: of a stage of the path so far, or of the next one."""
+        names = list(self.results)
+        number = names.index(stage.name) if stage.name in names else len(names)
+        return self.work / f"{number + 1:02d}-{stage.name}"
 
     def _find(self, stage: Stage[..., T], key: str) -> T | None:
         place = self.place(stage)
@@ -159,6 +176,20 @@ class StageCache(MemoryCache):
             text = json.dumps({**about, "digest": seal(about)}, indent=1, allow_nan=False)
             (temporary / "manifest.json").write_text(text, encoding="utf-8")
         return read(place, stage, check=False)
+
+
+class LazyCache(StageCache):
+    """Stage cache that reads or computes a result when its value is first needed: not before a stored result."""
+
+    def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
+        """The result of a stage, not yet read or computed."""
+        about = _about(stage, inputs, config)
+        self.results[stage.name] = DeferredResult(about["key"], partial(self._value, stage, inputs, config, about))
+        return self.results[stage.name]
+
+    def derive(self, function: Callable[..., T], *inputs: Any) -> StageResult[T]:
+        """A value derived from stage results, not yet computed; its key has the function's name."""
+        return DeferredResult(_derived_key(function, inputs), lambda: function(*map(value_of, inputs)))
 
 
 class DryRunCache(StageCache):
@@ -216,7 +247,7 @@ def _about(stage: Stage[..., Any], inputs: tuple[Any, ...], config: msgspec.Stru
     about = {
         "format": FORMAT,
         "stage": stage.name,
-        "version": stage.version,
+        "version": stage.versions,
         "settings": msgspec.to_builtins(config),
         "inputs": [key_of(one) for one in inputs if not callable(one)],  # a function does not change a result
     }
@@ -253,19 +284,25 @@ def read(place: Path, stage: Stage[..., T], check: bool = True) -> T:
     if check:
         files = [place / name for name in about["files"]]
         with ThreadPoolExecutor(_READERS) as pool:
-            for file, expected, found in zip(files, about["files"].values(), pool.map(_checksum, files)):
-                if found != expected:
-                    raise StorageError(f"{file} is damaged; delete {place} and run again")
+            list(pool.map(_verify, files, about["files"].values()))
     value: T = npy_folder.decode(about["value"], get_type_hints(stage.function)["return"], place)
     return value
 
 
-def _checksum(file: Path) -> list[Any] | None:
-    """Size and digest of a file as of `npy_folder.checksum`; None if the file cannot be read."""
+def _verify(file: Path, expected: list[Any]) -> None:
+    """Compare a file with its size and digest as of `npy_folder.checksum`; once in this process, until it changes.
+
+    Raises StorageError: the file is missing, or it was changed.
+    """
     try:
-        return npy_folder.checksum(file)
+        stat = file.stat()
+        identity = str(file), stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size, *expected
+        if identity not in _verified and npy_folder.checksum(file) == expected:
+            _verified.add(identity)
     except OSError:
-        return None
+        identity = ()
+    if identity not in _verified:
+        raise StorageError(f"{file} is damaged; delete {file.parent} and run again")
 
 
 def digest(value: Any) -> str:

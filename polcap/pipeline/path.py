@@ -57,7 +57,17 @@ class UserInput:
 
 def path(capture: Capture | None, supplied: UserInput, config: Config, cache: MemoryCache) -> Results:
     """Run the stages in order; returns the results of all stages, or of those before the cache stops the path."""
-    with suppress(StageReached), ThreadPoolExecutor(1) as background:
+    with suppress(StageReached):
+        run_stages(capture, supplied, config, cache)
+    return results_of(cache.results)
+
+
+def run_stages(capture: Capture | None, supplied: UserInput, config: Config, cache: MemoryCache) -> None:
+    """Run the stages in order; their results are in `cache`.
+
+    Raises StageReached: the cache stops the path.
+    """
+    with ThreadPoolExecutor(1) as background:
         colors = background.submit(shipped_data.colorchecker, config.whitebalance.chart)  # imports a large library
         radiance = cache.run(hdr.merge, capture, supplied.decode, config=config.hdr)
         color = cache.run(whitebalance.measure, radiance, colors.result(), supplied.chart, config=config.whitebalance)
@@ -75,7 +85,6 @@ def path(capture: Capture | None, supplied: UserInput, config: Config, cache: Me
         stored = cache.derive(maps_folder.as_stored, maps)
         stored_mesh = cache.derive(remeshed, stored, mesh, config.surface)
         cache.run(asset.build, stored, stored_mesh, config=config.asset)
-    return results_of(cache.results)
 
 
 def results_of(made: Mapping[str, StageResult[Any]]) -> Results:

@@ -139,7 +139,13 @@ def clean(out: Path, dry_run: bool = False) -> int:
 
 
 def write_run(out: Path, about: Mapping[str, Any]) -> None:
-    """Write work/run.json: facts of a run that `show` and `report` need when the photographs are missing."""
+    """Write work/run.json: facts of a run that `show` and `report` need when the photographs are missing.
+
+    A file of the same facts stays as it is, so that a finished result is recognized.
+    """
+    with suppress(StorageError):
+        if read_run(out)["digest"] == seal(about):
+            return
     atomic.write_json(out / "work" / "run.json", {**about, "digest": seal(about)}, synced=False)
 
 

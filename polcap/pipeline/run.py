@@ -3,7 +3,8 @@
 The order of the stages is in `path.py`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -19,7 +20,7 @@ from polcap.formats.export import encoders, provenance
 from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
 from polcap.images import Capture, Decode, Frame, SensorImage
-from polcap.pipeline import asset_export, result_folder
+from polcap.pipeline import asset_export, result_folder, unchanged
 from polcap.pipeline.asset_export import DetailLevel, ExportRequest
 from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, contents, silent
 from polcap.pipeline.path import STAGES, UserInput, path
@@ -43,16 +44,8 @@ def process(
 
     Raises InputError: the user's input is wrong; the stage that found it raises the error.
     """
-    result_folder.check(out, Path(capture.folder))
     cache = StageCache(out, progress, force, until)
-    facts = {  # of the run, as report.json has them; they do not come from its pixels
-        "capture": report.capture_facts(capture),
-        "settings": msgspec.to_builtins(config),
-        "model": report.model_facts(supplied.network),
-        "versions": provenance.versions(),
-    }
-    with cache.memory_explained(capture.size_px[0] * capture.size_px[1]), result_folder.locked(out):
-        result_folder.write_run(out, facts)
+    with opened(capture, supplied, config, cache) as facts:
         results = path(capture, supplied, config, cache)
         if until is not None:
             return None
@@ -60,6 +53,44 @@ def process(
         about = _write(out, results, facts, config)
         cache.end()
         return about
+
+
+def process_once(capture: Capture, supplied: UserInput, config: Config, out: Path) -> dict[str, Any]:
+    """As `process`, unless `out` already holds the finished result of the same inputs, and no file of it has changed.
+
+    Raises InputError: as `process`.
+    """
+    keys = path(capture, supplied, config, DryRunCache(out)).keys
+    request = unchanged.request_of_run([_facts(capture, supplied, config), keys])
+    if (finished := unchanged.find(out, request)) is not None:
+        return finished.report
+    about = process(capture, supplied, config, out)
+    assert about is not None  # only `until` leaves it out
+    unchanged.remember(out, request)
+    return about
+
+
+@contextmanager
+def opened(capture: Capture, supplied: UserInput, config: Config, cache: StageCache) -> Iterator[dict[str, Any]]:
+    """Context manager that locks the result folder of a cache and writes its work/run.json; returns its facts.
+
+    Raises SettingError: the folder is not allowed, or memory is too small. StorageError: it is locked.
+    """
+    result_folder.check(cache.folder, Path(capture.folder))
+    with cache.memory_explained(capture.size_px[0] * capture.size_px[1]), result_folder.locked(cache.folder):
+        facts = _facts(capture, supplied, config)
+        result_folder.write_run(cache.folder, facts)
+        yield facts
+
+
+def _facts(capture: Capture, supplied: UserInput, config: Config) -> dict[str, Any]:
+    """Facts of a run as report.json has them, which do not come from pixels."""
+    return {
+        "capture": report.capture_facts(capture),
+        "settings": msgspec.to_builtins(config),
+        "model": report.model_facts(supplied.network),
+        "versions": provenance.versions(),
+    }
 
 
 def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -> dict[str, Any]:

@@ -47,6 +47,11 @@ def request(options: Mapping[str, Any], capture: Path, out: Path, files: Iterabl
     return _digest([options, os.path.realpath(capture), os.path.realpath(out), photographs, others, _program()])
 
 
+def request_of_run(stated: Any) -> str:
+    """Digest of a run's request from plain data that determine its inputs and settings, and of the program."""
+    return _digest([stated, _program()])
+
+
 def find(out: Path, asked: str | None) -> Finished | None:
     """The earlier run with this request digest, if nothing in its result folder has changed since; else None."""
     try:

@@ -6,7 +6,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from polcap.images import Bools, Floats, Quality
+from polcap.images import AngleStack, Bools, Floats, Quality
 from polcap.results import Results
 
 State = Literal["pass", "warn", "fail", "not measured"]
@@ -59,11 +59,16 @@ def full_size(results: Results, focal_doubt: tuple[float, float]) -> Evidence:
     radiance = results.radiance
     return Evidence.partial(
         **vars(results),
-        names=[f"{degrees:g}°" for degrees in np.round(np.degrees(radiance.angle), 6)],
+        names=shot_names(radiance),
         focal_doubt=focal_doubt,
         clipped=((radiance.quality & int(Quality.CLIPPED)) > 0)[:, None],
         blur_px=radiance.bracket.blur_px,
     )
+
+
+def shot_names(radiance: AngleStack) -> list[str]:
+    """Names of the shots by their angles, such as 45°."""
+    return [f"{degrees:g}°" for degrees in np.round(np.degrees(radiance.angle), 6)]
 
 
 def at_most(

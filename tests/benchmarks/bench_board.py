@@ -19,6 +19,8 @@ from polcap.config import Config
 from polcap.formats import onnx
 from polcap.formats.capture import reader
 from polcap.fusion import board_corners, board_eraser, poses
+from polcap.fusion.board_corners import BoardCorners
+from polcap.fusion.board_eraser import PosedBoard
 from polcap.images import AngleStack, Bools, ChartRequest, Floats, View
 from polcap.optics import projection
 from polcap.pipeline import models, run
@@ -45,6 +47,12 @@ def overlap(radiance: AngleStack, results: Results, true: Bools) -> float:
     return float((found & true).sum() / (found | true).sum())
 
 
+def corners_of(results: Results) -> BoardCorners:
+    found = board_corners.detect(results.radiance, results.color).corners
+    assert found is not None
+    return found
+
+
 def rms(error: Floats) -> float:
     return float(np.sqrt(2 * np.mean(error**2)))
 
@@ -57,7 +65,7 @@ def main(session: Path) -> None:
         name = one["name"]
         results[name] = aligned(session / name)
         start = time.process_time()
-        seen[name] = board_corners.detect(results[name].radiance, results[name].color, name)
+        seen[name] = corners_of(results[name])
         seconds[name] = time.process_time() - start
     solved = poses.solve(seen, reader.read(session / truth["views"][0]["name"]))
     print(f"focal length {solved.camera.focal_px:.1f} ± {solved.camera.focal_sigma_px:.1f} px, true {camera.focal:.1f}")
@@ -71,7 +79,7 @@ def main(session: Path) -> None:
         cosine = (np.trace(view.pose.rotation @ turn.T) - 1) / 2
         start = time.process_time()
         erased = board_eraser.erase(
-            result.radiance, result.alignment, result.color, corners.board, (solved.camera, view.pose)
+            result.radiance, result.alignment, result.color, PosedBoard(corners.board, solved.camera, view.pose)
         )
         spent = time.process_time() - start
         with np.load(session / name / "truth.npz") as maps:

@@ -35,7 +35,7 @@ from polcap.images import Floats
 from polcap.optics import color
 from polcap.optics.mesh_tracer import Tracer, Triangles, smooth
 from polcap.pipeline import models
-from polcap.pipeline.cache import MemoryCache
+from polcap.pipeline.cache import LazyCache, MemoryCache, StageResult
 from polcap.stages.asset import AssetSettings
 
 LEAST_SEEN = 0.02  # weight of a texel
@@ -93,9 +93,10 @@ def joined(folder: Path) -> str:
     """Table row on the join of two sets."""
     network, mask_network = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
     session_input = SessionInput(folder, SessionConfig(), network=network, mask_network=mask_network)
-    views = session.process(session.read(session_input), session_input, lambda _: None).views
+    cache = LazyCache(folder / "fused")
+    views = session.process(session.read(session_input), session_input, cache, lambda _: None).views
     both = path(views, FusionSettings(), MemoryCache())
-    placed = joining.place(views, both.joined)
+    placed = joining.place(views.value, both.joined)
     truth, about = dict(np.load(folder / "truth.npz")), json.loads((folder / "truth.json").read_text())
     surface = Trimesh(truth["vertices"], truth["faces"], process=False)
     point, size = sample_surface(surface, 30_000, seed=0)[0], float(np.ptp(truth["vertices"], axis=0).max())
@@ -107,7 +108,7 @@ def joined(folder: Path) -> str:
     turns = [Rotation.from_matrix(one.rotation @ other.rotation.T).magnitude() for one, other in pairs]
     middle = (point.min(axis=0) + point.max(axis=0)) / 2
     places = [np.linalg.norm(move(one, middle) - move(other, middle)) for one, other in pairs]
-    results = [path(tuple(first), FusionSettings(), MemoryCache()), both]
+    results = [path(StageResult("", tuple(first)), FusionSettings(), MemoryCache()), both]
     seen = [one.maps.seen[one.atlas.covered].mean() for one in results]
     right = first + [replace(view, pose=pose) for view, pose in zip(second, true)]
     meshes = [*(one.mesh for one in results), fuse_shape(right, ShapeSettings())]

@@ -30,7 +30,7 @@ from polcap.fusion.session import SessionInput
 from polcap.fusion.values import FusionView, Pose
 from polcap.images import Floats
 from polcap.pipeline import models
-from polcap.pipeline.cache import MemoryCache
+from polcap.pipeline.cache import LazyCache, MemoryCache
 from polcap.synth import all_around, scenes
 
 PATTERN_M = 0.006  # size of the pattern
@@ -46,15 +46,15 @@ def main(out: Path, mesh: str, views: int, step: int) -> None:
         networks = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
         session_input = SessionInput(folder, SessionConfig(), network=networks[0], mask_network=networks[1])
         found = session.read(session_input)
-        found.captures = dict(list(found.captures.items())[::step])
-        processed = session.process(found, session_input, print)
+        found = session.Session(dict(list(found.views.items())[::step]), {})
+        processed = session.process(found, session_input, LazyCache(folder / "fused"), print)
         results = path(processed.views, FusionSettings(), MemoryCache())
-        pairs = true_poses(folder, processed.views)
+        pairs = true_poses(folder, processed.views.value)
         turns = rotation_errors(pairs)
         residual = np.mean([one.residual_px for one in processed.poses.views.values()])
         away = 100 * distance(folder, results, processed.poses.metric, pairs)
         print(
-            f"| {mesh}, {len(turns)} of {len(found.captures)} views | {'board' if board != 'none' else 'features'} | "
+            f"| {mesh}, {len(turns)} of {len(found.views)} views | {'board' if board != 'none' else 'features'} | "
             f"{turns.mean():.2f}, {turns.max():.2f} | {residual:.2f} | {away:.2f} |"
         )
 

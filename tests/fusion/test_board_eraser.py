@@ -6,6 +6,7 @@ from msgspec import UNSET
 from msgspec.structs import replace
 
 from polcap.fusion import board_eraser
+from polcap.fusion.board_eraser import PosedBoard
 from polcap.fusion.poses import SessionCamera
 from polcap.images import Alignment, Bools, Floats
 from polcap.optics.morphology import dilate
@@ -24,7 +25,7 @@ def erased(albedo: tuple[float, float, float]) -> tuple[Floats, Floats, Bools]:
     coat = Coat((Material(albedo, albedo, "plain", roughness=(0.5, 0.5)),))
     scene = replace(board_views.scene(at, shift=np.array([0.03, 0.0, -0.02])), coat=coat)
     before = board_views.picture(scene)
-    after = board_eraser.erase(board_views.stack(before), STILL, COLOR, BOARD, (CAMERA, at))
+    after = board_eraser.erase(board_views.stack(before), STILL, COLOR, PosedBoard(BOARD, CAMERA, at))
     return before, 2 * np.asarray(after.value[0]), render.gbuffer(scene, VIEW, HEIGHT, WIDTH).mask
 
 
@@ -47,7 +48,7 @@ def test_the_print_becomes_dark_under_warm_light_and_a_quarter_of_a_pixel_aside(
     scene = board_views.scene(at)
     before = board_views.picture(scene) * [1.3, 1.0, 0.6]
     shifted = SessionCamera(FOCAL, 1.0, (VIEW.center[0] + 0.25, VIEW.center[1] - 0.25), 0.0, 0.0)
-    after = board_eraser.erase(board_views.stack(before), STILL, COLOR, BOARD, (shifted, at))
+    after = board_eraser.erase(board_views.stack(before), STILL, COLOR, PosedBoard(BOARD, shifted, at))
     bright = ~render.gbuffer(scene, VIEW, HEIGHT, WIDTH).mask & (before.mean(axis=-1) > 0.2)
     assert (2 * np.asarray(after.value[0])[bright].mean(axis=-1) < 0.1).mean() > 0.97
 
@@ -56,5 +57,5 @@ def test_a_picture_that_shows_no_board_does_not_change() -> None:
     at = board_views.pose(0)
     stack = board_views.stack(board_views.picture(replace(board_views.scene(at), board=UNSET)))
     away = board_views.pose(0, shift=(5.0, 0.0))
-    same = board_eraser.erase(stack, STILL, COLOR, BOARD, (CAMERA, away))
+    same = board_eraser.erase(stack, STILL, COLOR, PosedBoard(BOARD, CAMERA, away))
     assert np.array_equal(same.value, stack.value)

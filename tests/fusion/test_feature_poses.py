@@ -1,5 +1,6 @@
 """Poses without a board: a patterned object gives them, up to scale; one without pattern is refused."""
 
+from dataclasses import replace as replace_field
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,9 +10,10 @@ from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
 from polcap.errors import CaptureError
-from polcap.fusion import feature_poses
+from polcap.fusion import feature_poses, object_features
+from polcap.fusion.object_features import ObjectFeatures
 from polcap.fusion.poses import SessionPoses
-from polcap.images import View
+from polcap.images import ShotOrder, View
 from polcap.synth import render, scene_materials
 from polcap.synth.distance_fields import Cluster
 from polcap.synth.scene_materials import Coat, Material
@@ -21,6 +23,7 @@ SHAPE = Cluster(((0, 0, 0, 0.03), (0.022, 0.01, 0.01, 0.02), (-0.02, -0.005, 0.0
 PATTERN = Coat((Material((0.7, 0.6, 0.5), (0.2, 0.3, 0.25), "noise", size=0.004, roughness=(0.5, 0.5), seed=3),))
 VIEW = View(2600.0, board_views.VIEW.center, 1.0)
 DISTANCE = 0.7  # m
+SWAPPED = ShotOrder((1, 0))
 TURNS = {f"view{k + 1:02d}": board_views.pose(15 * k) for k in range(24)}
 
 
@@ -34,17 +37,20 @@ def maps(name: str, coat: Coat, seed: int = 0) -> Any:
     diffuse += 0.003 * random.normal(size=diffuse.shape)
     normal = seen.normal + np.radians(6.0) / np.sqrt(2) * random.normal(size=diffuse.shape)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    return SimpleNamespace(mask=seen.mask, diffuse=diffuse, normal=normal, view=VIEW)
+    return SimpleNamespace(mask=seen.mask, diffuse=diffuse, normal=normal, view=VIEW, order=None)
 
 
-def results(one: Any, metres_per_px: float | None = None) -> Any:
-    """Results of a view's stages with these maps."""
-    radiance = SimpleNamespace(view=VIEW, equipment=SimpleNamespace(distortion=None))
-    return SimpleNamespace(maps=one, radiance=radiance, color=SimpleNamespace(metres_per_px=metres_per_px))
+def features(one: Any, metres_per_px: float | None = None, as_stated: bool = True) -> ObjectFeatures:
+    """Features in these maps, of a view whose outline fits the stated order of its angles, or another one."""
+    radiance = board_views.stack(np.zeros((4, 4, 3)))
+    color = replace_field(board_views.COLOR, metres_per_px=metres_per_px)
+    outline = SimpleNamespace(as_stated=as_stated, best=SWAPPED, rival=None, concentration=0.9)
+    calibration: Any = SimpleNamespace(outline=outline)
+    return object_features.find(replace_field(radiance, view=VIEW), color, one, calibration, one)
 
 
 def solve(seen: dict[str, Any], metres_per_px: float | None = None) -> SessionPoses:
-    named = {name: results(one, metres_per_px) for name, one in seen.items()}
+    named = {name: features(one, metres_per_px) for name, one in seen.items()}
     return feature_poses.solve(named, board_views.capture(VIEW.focal))
 
 
@@ -77,6 +83,11 @@ def test_a_view_of_something_else_is_left_out(patterned: dict[str, Any]) -> None
     found = solve({**{name: patterned[name] for name in list(TURNS)[:6]}, "view07": maps("view07", other)})
     assert list(found.left_out) == ["view07"]
     assert "turn it by 15° or less" in found.left_out["view07"]
+
+
+def test_a_view_with_swapped_angles_is_refused_with_the_remedy(patterned: dict[str, Any]) -> None:
+    with pytest.raises(CaptureError, match=r"The outline fits the order 90°, 0° .*Rename the folders 0° to 90°"):
+        features(patterned["view01"], as_stated=False)
 
 
 def test_an_object_without_pattern_is_refused() -> None:

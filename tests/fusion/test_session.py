@@ -1,6 +1,7 @@
 """A session goes on without the views that cannot be used, and says why each is left out."""
 
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -8,21 +9,29 @@ import cv2
 import numpy as np
 import pytest
 
+from polcap.config import Config
 from polcap.errors import CaptureError
 from polcap.formats.capture import reader
-from polcap.fusion import fuse_run
+from polcap.formats.maps import png
+from polcap.fusion import fuse_run, mask_agreement, poses, view_path
 from polcap.fusion import session as sessions
-from polcap.fusion.board_corners import BoardCorners
+from polcap.fusion.board_corners import BoardCorners, BoardSearch
 from polcap.fusion.fusion_path import SessionConfig
-from polcap.fusion.session import Session, SessionInput
-from polcap.pipeline import run as pipeline
-from polcap.pipeline.cache import silent
+from polcap.fusion.mask_agreement import AgreedMasks
+from polcap.fusion.poses import PosedView, SessionCamera, SessionPoses
+from polcap.fusion.session import Session, SessionInput, StepRunner
+from polcap.fusion.values import ViewMask
+from polcap.fusion.view_path import SessionView
+from polcap.pipeline import run
+from polcap.pipeline.cache import LazyCache, silent
 from polcap.pipeline.path import UserInput
 from polcap.quality import fused_object
 from polcap.quality.limits import FusedGateLimits
+from polcap.stages import Stage
 from tests.fusion import board_views
 
 SWAPPED = {"name": "order", "state": "fail", "says": "90°, 45°, 0° fit better", "remedy": "rename the folders"}
+SILENT = StepRunner(None, lambda _: None)
 
 
 def session_of(folder: Path, *names: str) -> SessionInput:
@@ -39,7 +48,7 @@ def test_a_view_that_lacks_a_shot_is_left_out_with_the_reason(tmp_path: Path, mo
 
     monkeypatch.setattr(reader, "read", read)
     found = sessions.read(session_of(tmp_path, "view01", "view02", "view03", "view05"))  # view04 was never shot
-    assert found.used == ["view01", "view02", "view05"]
+    assert list(found.views) == ["view01", "view02", "view05"]
     assert found.left_out == {"view03": "2 different polarizer angles where 3 are needed; add the missing shot"}
 
 
@@ -51,7 +60,7 @@ def test_a_copy_of_a_view_is_left_out(tmp_path: Path) -> None:
             photo.write_bytes(cv2.imencode(".png", np.full((8, 8, 3), view + angle, np.uint16))[1].tobytes())
     shutil.copytree(tmp_path / "view02", tmp_path / "view05")
     found = sessions.read(SessionInput(tmp_path, SessionConfig()))
-    assert found.used == ["view01", "view02", "view03", "view04"]
+    assert list(found.views) == ["view01", "view02", "view03", "view04"]
     assert found.left_out == {"view05": "holds photographs of view02"}
 
 
@@ -73,36 +82,59 @@ def test_a_folder_without_views_stays_as_it_is(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["pol000"]
 
 
-def test_a_view_with_swapped_angles_is_left_out_with_the_remedy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    names = ("view01", "view02", "view03", "view04")
-    found = Session({name: board_views.capture() for name in names}, supplied={name: UserInput() for name in names})
+def session(names: Iterable[str], out: Path = Path("object")) -> Session:
+    """A session of views without photographs."""
+    made = {name: SessionView(name, board_views.capture(), UserInput(), Config(), out / name) for name in names}
+    return Session(made, {})
 
+
+def test_a_view_with_swapped_angles_is_left_out_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     def process(_: Any, __: Any, ___: Any, out: Path) -> dict[str, Any]:
-        return {"gates": [SWAPPED] if out.parent.name == "view02" else []}
+        return {"gates": [SWAPPED] if out.name == "view02" else []}
 
-    monkeypatch.setattr(pipeline, "process", process)
-    made = found.each(sessions._make_maps, sessions._tasks(found, session_of(tmp_path)), None, lambda _: None)
+    monkeypatch.setattr(run, "process_once", process)
+    found, made = SILENT("maps", view_path.make_maps, session(("view01", "view02", "view03", "view04")))
     assert found.left_out == {"view02": "90°, 45°, 0° fit better. rename the folders"}
-    assert list(made) == found.used == ["view01", "view03", "view04"]
+    assert list(made) == list(found.views) == ["view01", "view03", "view04"]
 
 
-def test_several_sets_need_the_board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_several_sets_need_the_board(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(view_path, "find_board", lambda view: BoardSearch(None, 0))
     names = [f"set{letter}/view0{k}" for letter in "AB" for k in (1, 2, 3)]
-    found = Session({name: board_views.capture() for name in names}, supplied={name: UserInput() for name in names})
-    monkeypatch.setattr(sessions, "_find_board", lambda task: "no board is visible")
     with pytest.raises(CaptureError, match="several sets of views need"):
-        sessions._find_boards(found, session_of(tmp_path), None, lambda _: None)
+        sessions._find_poses_and_masks(session(names), LazyCache(tmp_path), SILENT)
 
 
-def test_a_view_without_the_board_that_others_show_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = [f"view0{k}" for k in (1, 2, 3, 4)]
-    found = Session({name: board_views.capture() for name in names}, supplied={name: UserInput() for name in names})
+def test_a_view_without_the_board_that_others_show_is_left_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     corners = BoardCorners(board_views.BOARD, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)))
+    asked: dict[str, Any] = {}
+
+    def solve(boards: dict[str, Any], capture: Any) -> SessionPoses:
+        asked.update(boards)
+        raise CaptureError("asked")
+
     monkeypatch.setattr(
-        sessions, "_find_board", lambda task: "no board is visible" if task.name == "view03" else corners
+        view_path, "find_board", lambda view: BoardSearch(None if view.name == "view03" else corners, 0)
     )
-    boards = sessions._find_boards(found, session_of(tmp_path), None, lambda _: None)
-    assert list(boards) == found.used == ["view01", "view02", "view04"]
-    assert found.left_out == {"view03": "no board is visible"}
+    monkeypatch.setattr(poses, "solve", Stage(solve, 1, True))
+    with pytest.raises(CaptureError, match="asked"):
+        sessions._find_poses_and_masks(session(f"view0{k}" for k in (1, 2, 3, 4)), LazyCache(tmp_path), SILENT)
+    assert list(asked) == ["view01", "view02", "view04"]
+
+
+def test_views_whose_masks_contradict_each_other_are_written_for_comparison(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def agree(views: Any) -> AgreedMasks:
+        raise CaptureError("the masks of 3 of 3 views contradict the others")
+
+    monkeypatch.setattr(mask_agreement, "agree", Stage(agree, 1, True))
+    names = [f"setA/view0{k}" for k in (1, 2, 3)]
+    camera = SessionCamera(board_views.FOCAL, 1.0, board_views.VIEW.center, 0.0, 0.0)
+    posed = tuple(PosedView(name, board_views.pose(0), 20, 0.1, 0.1) for name in names)
+    masks = {name: ViewMask(np.eye(4, dtype=bool), 2.0) for name in names}
+    with pytest.raises(CaptureError, match="contradict"):
+        sessions._with_agreed_masks(session(names), masks, SessionPoses(camera, posed, {}), LazyCache(tmp_path))
+    pictures = sorted((tmp_path / mask_agreement.COMPARED).iterdir())
+    assert [file.name for file in pictures] == [f"setA-view0{k}.png" for k in (1, 2, 3)]
+    assert np.array_equal(png.read(pictures[0]) > 127, np.eye(4, dtype=bool))

@@ -1,7 +1,6 @@
 """Every setting of `polcap fuse` changes the fused object or its report, or is refused."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,14 +9,12 @@ from polcap import config as configs
 from polcap.config import Config, Setting
 from polcap.errors import SettingError
 from polcap.fusion import atlas as atlases
-from polcap.fusion import baking, filling, fusion_path
-from polcap.fusion import session as sessions
+from polcap.fusion import baking, filling, fusion_path, view_path
 from polcap.fusion.baking import BakingSettings
 from polcap.fusion.fused_maps import FusedSource
 from polcap.fusion.fusion_path import SessionConfig
-from polcap.fusion.session import Session, SessionInput
-from polcap.pipeline import path as pipeline
-from polcap.pipeline.cache import DryRunCache, MemoryCache
+from polcap.fusion.view_path import SessionView
+from polcap.pipeline.cache import LazyCache, MemoryCache, StageResult
 from polcap.pipeline.path import UserInput
 from polcap.quality import fused_object
 from tests.fusion import board_views, ellipsoid
@@ -68,10 +65,9 @@ def outcome(tmp_path_factory: pytest.TempPathFactory) -> Callable[[SessionConfig
 
     def make(config: SessionConfig) -> list[Any]:
         config.check()
-        session = Session({"view01": board_views.capture()}, supplied={"view01": UserInput()})
-        (task,) = sessions._tasks(session, SessionInput(Path("object"), config)).values()
-        view = pipeline.path(task.capture, task.supplied, task.config, DryRunCache(work))
-        fused = fusion_path.path((), config.fusion, KeyCache())
+        view = SessionView("view01", board_views.capture(), UserInput(), config.of_views, work)
+        of_view = view_path.path(view, LazyCache(work))
+        fused = fusion_path.path(StageResult("", ()), config.fusion, KeyCache())
         limits = config.fusion.gates
         gates = [
             fused_object.views(["view01"], {}, limits),
@@ -83,10 +79,11 @@ def outcome(tmp_path_factory: pytest.TempPathFactory) -> Callable[[SessionConfig
         ]
         built = FusedSource(atlas, maps, config.asset).whole(8, ())
         return [
-            view.keys["infer"],
+            of_view.features.key,
+            of_view.mask.key,
             fused.keys["comparison"],
             gates,
-            task.config.gates,
+            view.config.gates,
             built.ior,
             built.specular_factor,
         ]

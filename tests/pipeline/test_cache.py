@@ -1,6 +1,7 @@
 """The promises of the stage cache, on toy stages."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,12 +18,13 @@ import pytest
 
 from polcap import images
 from polcap.errors import SettingError, StorageError
-from polcap.formats import own_files
+from polcap.formats import npy_folder, own_files
 from polcap.formats.npy_folder import checksum, decode, encode, save
 from polcap.pipeline import result_folder
 from polcap.pipeline.cache import (
     ArchiveCache,
     DryRunCache,
+    LazyCache,
     MemoryCache,
     StageCache,
     StageReached,
@@ -435,3 +437,41 @@ def test_a_result_folder_is_refused_inside_every_kind_of_angle_folder(tmp_path: 
     result_folder.check(
         tmp_path / "new" / "out", tmp_path / "new"
     )  # a capture that does not exist is refused elsewhere
+
+
+def test_a_digest_is_compared_once_per_process_until_its_file_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path(StageCache(tmp_path))
+    compared: list[str] = []
+    monkeypatch.setattr(npy_folder, "checksum", lambda file: compared.append(file.name) or checksum(file))
+    path(StageCache(tmp_path))
+    once = list(compared)
+    path(StageCache(tmp_path))
+    assert len(once) == 2 and compared == once
+    (array,) = (tmp_path / "work" / "01-double").glob("*.npy")
+    os.utime(array, ns=(0, 0))
+    path(StageCache(tmp_path))
+    assert compared[2:] == [array.name]
+
+
+def test_a_lazy_cache_reads_and_computes_nothing_before_a_stored_result(tmp_path: Path) -> None:
+    expected = path(StageCache(tmp_path)).total.value
+    calls.clear()
+    made = path(LazyCache(tmp_path))
+    assert calls == [] and keys(made) == keys(path(DryRunCache(tmp_path)))
+    shutil.rmtree(tmp_path / "work" / "01-double")
+    np.testing.assert_array_equal(made.total.value.array, expected.array)
+    assert calls == [] and not (tmp_path / "work" / "01-double").exists()
+    shutil.rmtree(tmp_path / "work" / "03-total")
+    np.testing.assert_array_equal(path(LazyCache(tmp_path)).total.value.array, expected.array)
+    assert calls == ["double", "passing", "total"]
+    assert sorted(folder.name for folder in (tmp_path / "work").iterdir()) == ["01-double", "03-total"]
+
+
+def test_a_stage_is_computed_again_after_a_change_of_a_stage_that_it_uses(tmp_path: Path) -> None:
+    def key(version: int) -> str:
+        used = Stage(DOUBLE.function, version, True)
+        return MemoryCache().run(Stage(TOTAL.function, 1, True, uses=(used,)), everything().inner, None).key
+
+    assert key(1) == key(1) != key(2)

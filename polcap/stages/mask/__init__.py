@@ -3,6 +3,8 @@
 1. A network gives each pixel a probability of being the object (`network`, with the input of `mask_channels`).
 2. Pixels of high probability become a mask without specks (`regions`).
 3. The outline is moved to edges of color, where the probabilities allow it (`graph_cut`).
+4. For silhouettes, bright parts that the mask lacks are added (`bright_parts`), and the pixels on its outline are
+   decided by their coverage (`mask_border`).
 
 Without a network, or if it finds nothing, the object is found by its difference from the `backdrop`. Of a mask drawn by
 the user only the part is chosen (`mask.part`).
@@ -17,10 +19,21 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import ObjectError
-from polcap.images import Alignment, AngleStack, Bits, Bools, ColorCalibration, Floats, Network, ObjectMask, RunNetwork
+from polcap.images import (
+    Alignment,
+    AngleStack,
+    Bits,
+    Bools,
+    ColorCalibration,
+    Floats,
+    Network,
+    ObjectMask,
+    Quality,
+    RunNetwork,
+)
 from polcap.optics.warp import warp
 from polcap.stages import stage
-from polcap.stages.mask import backdrop, graph_cut, regions
+from polcap.stages.mask import backdrop, bright_parts, graph_cut, mask_border, regions
 from polcap.stages.mask.network import object_probability
 
 
@@ -36,6 +49,13 @@ class MaskSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float,
         Meta(ge=0, le=2, description="border around the chart without object, if there is no network [patch widths]"),
     ] = 0.7
+    silhouette: Annotated[
+        Literal["board", "always", "never"],
+        Meta(
+            description="add thin bright parts, and decide pixels on the outline by their coverage. It needs a dark "
+            "backdrop; board: where polcap fuse has erased the board. Maps of one view are better without"
+        ),
+    ] = "board"
 
 
 @stage(version=9)
@@ -66,22 +86,38 @@ def segment(
         return _object(user_mask, "user", None, settings)
     picture, zone = mean_picture(radiance, alignment, color), _chart_zone(radiance, color, settings.chart_margin)
     if network is None:
-        return _object(backdrop.find_object(picture, zone, settings.min_area), "automatic", None, settings)
-    patches = _chart_zone(radiance, color, 0.0)
-    probability = object_probability(radiance, alignment, color, patches, network, run)
+        mask, doubt = backdrop.find_object(picture, zone, settings.min_area), None
+    else:
+        patches = _chart_zone(radiance, color, 0.0)
+        probability = object_probability(radiance, alignment, color, patches, network, run)
+        mask = _by_probability(picture, probability, zone, patches, settings.min_area)
+        doubt = regions.expected_error(mask, probability)
+    erased = np.any((radiance.quality & int(Quality.ERASED)) > 0, axis=0)
+    if settings.silhouette == "always" or (settings.silhouette == "board" and erased.any()):
+        mask = mask_border.refine(picture, bright_parts.add(picture, mask, erased))
+    return _object(mask, "automatic", doubt, settings)
+
+
+def _by_probability(picture: Floats, probability: Floats, zone: Bits, patches: Bits, min_area: float) -> Bools:
+    """Mask (H, W) from the network's probability (H, W), or from the backdrop where the network finds nothing.
+
+    `zone` and `patches` (H, W) are 1 on the chart with and without a margin.
+
+    Raises ObjectError: the mask covers a smaller share of the picture than `min_area`.
+    """
     mask = regions.likely_regions(probability)
     if mask.any():
         colored = regions.clean(graph_cut.sharpen(picture, mask, patches, probability), probability)
         mask = regions.choose(colored, mask, probability)
     else:
         with contextlib.suppress(ObjectError):
-            mask = backdrop.find_object(picture, zone, settings.min_area)
-    if mask.mean() < settings.min_area:
+            mask = backdrop.find_object(picture, zone, min_area)
+    if mask.mean() < min_area:
         raise ObjectError(
             f"no object found: the mask covers {100 * mask.mean():.2f} % of the picture, less than "
-            f"mask.min_area = {100 * settings.min_area:g} %; show the object larger, or draw a mask (--mask PNG)"
+            f"mask.min_area = {100 * min_area:g} %; show the object larger, or draw a mask (--mask PNG)"
         )
-    return _object(mask, "automatic", regions.expected_error(mask, probability), settings)
+    return mask
 
 
 def _object(

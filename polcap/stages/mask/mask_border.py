@@ -1,6 +1,6 @@
 """Pixels on the outline of a mask: each belongs to the object if the object covers enough of it.
 
-Silhouettes need it. The maps of a single capture do not: their roughness is better without mixed pixels.
+Silhouettes of several views need it. Maps of one view do not: their roughness is better without mixed pixels.
 """
 
 import cv2

@@ -1,6 +1,6 @@
-"""Parts of the object that a view's mask lacks, such as thin legs: bright before the dark backdrop, joined to the mask.
+"""Parts of the object that a mask lacks, such as thin legs: bright before a dark backdrop, and joined to the mask.
 
-Only sessions with a board know that their backdrop is dark: its print is erased.
+Only where the board's print was erased, the backdrop is known to be dark.
 """
 
 import cv2

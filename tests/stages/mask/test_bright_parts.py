@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from polcap.fusion import bright_parts
 from polcap.images import Bools, Floats
+from polcap.stages.mask import bright_parts
 
 NOWHERE = np.zeros((120, 130), bool)
 BODY, LEG, APART = np.s_[30:60, 40:90], np.s_[60:75, 50:54], np.s_[85:95, 20:30]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.fusion import mask_border
+from polcap.stages.mask import mask_border
 
 
 @pytest.mark.parametrize("off", [-0.5, 0, 0.5])
