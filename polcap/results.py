@@ -1,21 +1,25 @@
-"""Results of all stages for one capture."""
+"""Results of all stages for one capture; their fields are the list of stages, in the order of the path."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Self
 
-from polcap.images import (
-    Alignment,
-    AngleStack,
-    Asset,
-    ColorCalibration,
-    Cues,
-    ObjectMask,
-    ReliefMesh,
-    SelfCalibration,
-    StokesImage,
-    SurfaceMaps,
-)
+if TYPE_CHECKING:  # the command line needs the names of the stages before the values are imported
+    from collections.abc import Mapping
+
+    from polcap.images import (
+        Alignment,
+        AngleStack,
+        Asset,
+        ColorCalibration,
+        Cues,
+        ObjectMask,
+        ReliefMesh,
+        SelfCalibration,
+        StokesImage,
+        SurfaceMaps,
+    )
 
 
 class NotReached(AttributeError):
@@ -26,16 +30,16 @@ class NotReached(AttributeError):
 class Results:
     """One value per stage, and the cache keys; after an early stop only the first stages have values."""
 
-    radiance: AngleStack
-    color: ColorCalibration
-    alignment: Alignment
-    object_: ObjectMask
-    selfcal: SelfCalibration
-    stokes: StokesImage
-    cues: Cues
-    maps: SurfaceMaps
-    mesh: ReliefMesh
-    asset: Asset
+    radiance: AngleStack = field(metadata={"stage": "hdr"})  # RAW brackets -> radiance, variance, quality
+    color: ColorCalibration = field(metadata={"stage": "whitebalance"})  # ColorChecker -> color matrix
+    alignment: Alignment = field(metadata={"stage": "align"})  # radiance -> one transform per shot
+    object_: ObjectMask = field(metadata={"stage": "mask"})  # radiance -> the object's pixels
+    selfcal: SelfCalibration = field(metadata={"stage": "selfcal"})  # gains of the shots, order of the angles
+    stokes: StokesImage = field(metadata={"stage": "stokes"})  # gains and transforms applied -> S0, S1, S2 of the crop
+    cues: Cues = field(metadata={"stage": "cues"})  # Stokes, color matrix -> DoLP, diffuse color, network channels
+    maps: SurfaceMaps = field(metadata={"stage": "infer"})  # cues -> normal, diffuse, specular, roughness, error
+    mesh: ReliefMesh = field(metadata={"stage": "surface"})  # normals -> depth and mesh
+    asset: Asset = field(metadata={"stage": "asset"})  # maps and mesh -> glTF textures and factors
     keys: Mapping[str, str]  # cache key of each stage that ran, by stage
 
     @classmethod
@@ -49,3 +53,7 @@ class Results:
 
         def __getattr__(self, name: str) -> Any:
             raise NotReached(f"the path stopped before {name}")
+
+
+FIELDS = {one.metadata["stage"]: one.name for one in fields(Results) if "stage" in one.metadata}  # by stage
+STAGES = tuple(FIELDS)

@@ -11,10 +11,14 @@ from typer import Argument, Option
 from polcap import terminal
 from polcap.errors import SettingError, package_for
 from polcap.formats import own_folders
+from polcap.results import STAGES
 
 if TYPE_CHECKING:
     from polcap.images import ChartRequest
 
+    Stage = str
+else:
+    Stage = Literal[STAGES]
 
 _NAMED = 5  # outdated exports that a warning lists
 # options without effect on the bytes of a result
@@ -61,9 +65,6 @@ Estimator = Annotated[Literal["network", "analytic"] | None, choice(_ESTIMATOR)]
 Model = Annotated[Path | None, Option(metavar="ONNX", help="A model of your own instead of the shipped one.")]
 _DEVICE = "Where the network runs; cuda fails where CUDA does not start."
 Device = Annotated[Literal["cpu", "cuda", "auto"], choice(_DEVICE)]
-Stage = Literal[  # those of pipeline.path, not imported at start
-    "hdr", "whitebalance", "align", "mask", "selfcal", "stokes", "cues", "infer", "surface", "asset"
-]  # fmt: skip
 Until = Annotated[Stage | None, choice("Stop after this stage.", "STAGE")]
 Force = Annotated[Stage | None, choice("Compute this stage and all after it again.", "STAGE")]
 Threads = Annotated[int, Option("--threads", "-j", min=0, help="Threads to use; 0 is all.")]

@@ -11,6 +11,7 @@ from polcap.cli import options
 from polcap.cli.watch import at_every_change
 from polcap.errors import SettingError
 from polcap.formats import own_files, own_folders
+from polcap.results import STAGES
 
 
 def process(
@@ -98,7 +99,6 @@ def _process(stated: dict[str, Any], target: Path, request: str | None) -> None:
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import asset_export, unchanged
     from polcap.pipeline import run as pipeline
-    from polcap.pipeline.path import STAGES
 
     capture, supplied, config = _inputs(stated)
     table = captures.table(capture)

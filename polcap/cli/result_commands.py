@@ -11,12 +11,13 @@ from polcap.cli import options
 from polcap.cli.options import Json, Result
 from polcap.errors import SettingError
 from polcap.formats import own_files, own_folders
+from polcap.results import STAGES
 
 
 def show(
     context: Context,
     result: Result,
-    stage: Annotated[str | None, Argument(help="hdr, whitebalance, align, mask, selfcal, stokes, cues, …")] = None,
+    stage: Annotated[str | None, Argument(help=f"One of {', '.join(STAGES)}.")] = None,
     all_: Annotated[bool, Option("--all", help="Every stage.")] = False,
     animate: Annotated[
         Literal["light", "turntable"] | None,
@@ -29,7 +30,6 @@ def show(
 ) -> None:
     """Draw a stage's result and print the picture's path."""
     from polcap.pipeline import run as pipeline
-    from polcap.pipeline.path import STAGES
 
     _check_single(result, "show")
     if (stage is None) + (not all_) + (animate is None) != 2:

@@ -33,15 +33,10 @@ from polcap.images import (
     SurfaceMaps,
 )
 from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
-from polcap.results import Results
+from polcap.results import FIELDS, Results
 from polcap.stages import align, asset, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
 
 AUTO = ChartRequest("auto")
-_FIELD = {  # of `Results`, by stage
-    "hdr": "radiance", "whitebalance": "color", "align": "alignment", "mask": "object_", "selfcal": "selfcal",
-    "stokes": "stokes", "cues": "cues", "infer": "maps", "surface": "mesh", "asset": "asset",
-}  # fmt: skip
-STAGES = tuple(_FIELD)
 
 
 @dataclass(frozen=True)
@@ -90,7 +85,7 @@ def run_stages(capture: Capture | None, supplied: UserInput, config: Config, cac
 def results_of(made: Mapping[str, StageResult[Any]]) -> Results:
     """Collect the results of the stages that have run as `Results`."""
     keys = {stage: result.key for stage, result in made.items()}
-    return Results.partial(keys=keys, **{_FIELD[stage]: result.value for stage, result in made.items()})
+    return Results.partial(keys=keys, **{FIELDS[stage]: result.value for stage, result in made.items()})
 
 
 def on_grid(drawn: Bools | None, radiance: AngleStack) -> Bools | None:

@@ -23,10 +23,10 @@ from polcap.images import Capture, Decode, Frame, SensorImage
 from polcap.pipeline import asset_export, result_folder, unchanged
 from polcap.pipeline.asset_export import DetailLevel, ExportRequest
 from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, contents, silent
-from polcap.pipeline.path import STAGES, UserInput, path
+from polcap.pipeline.path import UserInput, path
 from polcap.report import animation
 from polcap.report import stage_pictures as pictures
-from polcap.results import Results
+from polcap.results import STAGES, Results
 
 PROFILE = "color.toml"  # in the result folder, with the report
 

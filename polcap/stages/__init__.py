@@ -1,17 +1,4 @@
-"""The ten stages of the path. Each is a pure function: it takes and returns values of `images.py`.
-
-In the order of the path:
-
-    hdr            RAW brackets -> radiance, variance and quality of each shot
-    whitebalance   ColorChecker -> color matrix
-    align          radiance -> one transform per shot
-    mask           radiance -> the object's pixels
-    selfcal        gains of the shots, order and sense of the angles
-    stokes         radiance, gains, transforms -> S0, S1, S2 of the crop
-    cues           Stokes parameters, matrix -> DoLP, normalized Stokes map, diffuse color, network channels
-    infer          cues -> normal, diffuse, specular, roughness, expected error
-    surface        normals -> depth and mesh
-    asset          maps and mesh -> glTF textures and factors
+"""The stages of the path: pure functions that take and return values of `images.py`. `results.py` lists them.
 
 A stage opens no file and logs nothing: it returns a new value or raises.
 Stages do not import each other. Code that two of them use is in `optics/`.

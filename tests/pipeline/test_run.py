@@ -23,7 +23,8 @@ from polcap.formats.maps.result_maps import read_cues
 from polcap.images import AngleStack, ColorCalibration, View, single_frames
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
-from polcap.pipeline.path import STAGES, UserInput, distance_m, on_grid
+from polcap.pipeline.path import UserInput, distance_m, on_grid
+from polcap.results import STAGES
 from polcap.synth.scenes import random_scene
 from polcap.synth.shooting import Shoot, write
 from tests.conftest import ROOT, Command, environment, python
