@@ -105,6 +105,11 @@ def saturation(image: SensorImage) -> float:
     return top if crowded and 0.6 * image.white < top < image.white else image.white
 
 
+def is_radiance(image: SensorImage) -> bool:
+    """Whether an image is floating-point radiance on a scale of its own, so that its white is no sensor's full well."""
+    return image.value.dtype.kind == "f" and not image.lossy and image.white > 1
+
+
 def rounding_variance(image: SensorImage) -> float:
     """Noise variance from rounding to integer counts, in units of `signal`; nearly 0 for floating-point images."""
     step = 1.0 if np.issubdtype(image.value.dtype, np.integer) else 1e-3

@@ -21,6 +21,7 @@ from polcap.optics import color
 Encoding = Literal["linear", "srgb"]
 SENSOR_CELLS = {0.0: (1, 1), 45.0: (0, 1), 90.0: (0, 0), 135.0: (1, 0)}  # row, column of each angle [°] in a 2×2 cell
 _OTHER_COLORS = {5: "CMYK", 8: "CIELAB", 9: "ICCLAB", 10: "ITULAB", 32844: "LogL", 32845: "LogLuv"}  # of a TIFF
+_FIREFLIES, _FAR_ABOVE = 1e-4, 16.0  # most of them, share of a picture; how far glints reach above all else
 _MOST_CHANNELS = 64  # of a layered EXR
 _DEFAULT = FrameReading("photo")
 _COLOR_LEVELS = 0.05  # averages of neighboring 2×2 cells differ less than this on a monochrome sensor
@@ -100,7 +101,7 @@ def describe(path: str, data: bytes) -> dict[str, Any]:
         spec = file.spec()
         channels, bits = len(_channels(path, spec)), 8 * spec.format.size()
         encoding, _ = color_encoding.read(data, spec)
-        top = float(_values(path, file).max()) if _is_float(spec) else 0.0
+        top = _top(_values(path, file)) if _is_float(spec) else 0.0
         left, upper, right, lower = _display(spec)
     facts = {"channels": channels, "bits": bits, "encoding": encoding, "top": top}
     return {"width": right - left, "height": lower - upper, **facts}
@@ -139,6 +140,13 @@ def _is_float(spec: Any) -> bool:
     import OpenImageIO as oiio
 
     return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+
+
+def _top(pixels: NDArray[Any]) -> float:
+    """Greatest value of a picture (H, W, C), without a few pixels far above all others: a renderer's fireflies."""
+    brightest = pixels.max(axis=2).ravel()
+    beyond = min(max(20, round(_FIREFLIES * brightest.size)), brightest.size - 1)
+    return float(min(brightest.max(), _FAR_ABOVE * np.partition(brightest, -1 - beyond)[-1 - beyond]))
 
 
 def _display(spec: Any) -> tuple[int, int, int, int]:

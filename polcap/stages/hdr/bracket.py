@@ -98,6 +98,7 @@ class _BracketSignals:
         self._iso = [frame.exif.iso or f"frame {e}" for e, frame in enumerate(self.frames)]
         still = read(self.frames[self.reference])
         self.raw_px = still.superpixel  # RAW px per px
+        self._radiance = sensor.is_radiance(still)
         self._rounding = sensor.rounding_variance(still) / 2  # variance of binned green, the mean of two photosites
         self.ambient = ambient_light(bracket, lines, read)
 
@@ -118,7 +119,7 @@ class _BracketSignals:
         return self.sensor_line(e).with_ambient(self._ambient_exposure(e) * self.ambient.value.mean(axis=(1, 2)))
 
     def sensor_line(self, e: int) -> noise.Noise:
-        return self._lines.line(self._iso[e], self._rounding)
+        return self._lines.line(self._iso[e], self._rounding, self._radiance)
 
     def settled(self, *frames: int) -> bool:
         """Whether the noise lines for the ISO of these frames are final."""
@@ -212,7 +213,7 @@ def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool
         iso = frame.exif.iso or "ambient"
         if not lines.knows(iso):
             lines.learn(iso, noise.sample_frame(read.signals(frame)))
-        line = lines.line(iso, sensor.rounding_variance(image) / 2)
+        line = lines.line(iso, sensor.rounding_variance(image) / 2, sensor.is_radiance(image))
         level = np.stack([cv2.blur(plane, (5, 5)) for plane in value]) * np.float32(one)
         variance += noise.of_pixels(level, line, image.cfa if full else None) / np.float32(sum(share) ** 2)
     return AmbientLight(value, variance)

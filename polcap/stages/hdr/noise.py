@@ -146,15 +146,17 @@ def squared_differences(picture: Floats) -> Floats:
     return inner(np.stack([squared_gradient(plane) for plane in picture]))
 
 
-def fit(samples: list[Samples], iso: float | None, least_floor: float) -> Noise:
+def fit(samples: list[Samples], iso: float | None, least_floor: float, radiance: bool = False) -> Noise:
     """Fit the noise line of each channel to the tiles of all frames of one ISO.
 
     Tiles are binned by signal. Each bin is represented by the median of its variances; for `flat` samples by the 15 %
     quantile, converted to the mean by the χ² law. A typical sensor is assumed if there are too few usable tiles or the
-    line is implausible. `least_floor` is the variance from rounding to whole counts.
+    line is implausible. `least_floor` is the variance from rounding to whole counts. `radiance`: its scale is
+    arbitrary, so the brightest tile takes the place of the sensor's white.
     """
     channels = samples[0].signal.shape[1]
-    line = np.array([_line(samples, c, iso, least_floor) for c in range(channels)], np.float32)
+    white = [_brightest(samples, c) if radiance else 1.0 for c in range(channels)]
+    line = np.array([_line(samples, c, iso, least_floor, white[c]) for c in range(channels)], np.float32)
     return Noise(line[:, 0], line[:, 1])
 
 
@@ -210,11 +212,11 @@ class Lines:
             self._samples.setdefault(iso, []).append(samples)
             self._known.pop(iso, None)
 
-    def line(self, iso: object, least_floor: float) -> Noise:
-        """Noise line at an ISO; a key that is not a number means an unknown ISO."""
+    def line(self, iso: object, least_floor: float, radiance: bool = False) -> Noise:
+        """Noise line at an ISO; a key that is not a number means an unknown ISO. Other arguments are those of `fit`."""
         if iso not in self._known:
             number = float(iso) if isinstance(iso, int | float) else None
-            self._known[iso] = fit(self._samples[iso], number, least_floor)
+            self._known[iso] = fit(self._samples[iso], number, least_floor, radiance)
         return self._known[iso]
 
     def knows(self, iso: object) -> bool:
@@ -230,9 +232,9 @@ class Lines:
         self._samples.clear()
 
 
-def _line(samples: list[Samples], channel: int, iso: float | None, least: float) -> tuple[float, float]:
+def _line(samples: list[Samples], channel: int, iso: float | None, least: float, white: float) -> tuple[float, float]:
     """Fit slope and floor of one channel's noise line to samples of all frames of one ISO."""
-    electrons = _TYPICAL_ELECTRONS * 100 / max(iso or 100.0, 1.0)
+    electrons = _TYPICAL_ELECTRONS * 100 / max(iso or 100.0, 1.0) / white
     typical = 1 / electrons, max(least, (_TYPICAL_READ / electrons) ** 2)
     bins: list[tuple[Floats, Floats, bool]] = []  # signal and variance (n,) of tiles of like signal
     for sample in samples:
@@ -251,10 +253,15 @@ def _line(samples: list[Samples], channel: int, iso: float | None, least: float)
         quotient = np.array([_quotient(v / (slope * np.maximum(s, 0) + floor), flat) for s, v, flat in bins])
         seen = np.maximum(quotient * (slope * np.maximum(level, 0) + floor), least)
         fit = fit_noise_line(level, seen, FREEDOM * number, least=least, least_floor=least, outliers=True)
-        if not 1 / _SANE_ELECTRONS[1] < fit.slope < 1 / _SANE_ELECTRONS[0]:  # NaN if all signals are equal
+        if not white / _SANE_ELECTRONS[1] < fit.slope < white / _SANE_ELECTRONS[0]:  # NaN if all signals are equal
             return typical
         slope, floor = fit.slope, fit.floor
     return slope, floor
+
+
+def _brightest(samples: list[Samples], channel: int) -> float:
+    """Signal of the brightest tile; 1 without any."""
+    return max(float(np.nanmax(one.signal[:, channel], initial=0.0)) for one in samples) or 1.0
 
 
 def _quotient(relative: Floats, flat: bool) -> float:

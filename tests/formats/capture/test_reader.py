@@ -82,18 +82,25 @@ def test_white_of_linear_pictures_contradicts_another_encoding(tmp_path):
 
 def test_radiance_above_one_is_not_over_exposed(tmp_path):
     """One white for all frames: they stay on one scale."""
-    radiance = np.linspace(0.1, 700, 24 * 32 * 3, dtype=np.float32).reshape(24, 32, 3)
+    radiance = np.linspace(0.1, 700, 96 * 128 * 3, dtype=np.float32).reshape(96, 128, 3)
     understood = capture.read(finished(tmp_path / "radiance", "exr", radiance))
     images = [frame_decoder.decode(shot.frames[0]) for shot in understood.shots]
     assert len({image.white for image in images}) == 1
     assert not any(sensor.clipped_share(image, 0.98) for image in images)
-    assert any("radiance up to 700" in note for note in understood.notes)
+    assert any("radiance up to 700: over-exposed from white = 735 on" in note for note in understood.notes)
     below = capture.read(finished(tmp_path / "below", "exr", radiance / 1000))
     assert frame_decoder.decode(below.shots[0].frames[0]).white == 1
     (tmp_path / "radiance" / "capture.toml").write_text("white = 500\n")
     stated = capture.read(tmp_path / "radiance")
     assert frame_decoder.decode(stated.shots[0].frames[0]).white == 500
     assert sensor.clipped_share(frame_decoder.decode(stated.shots[0].frames[0]), 0.98) > 0.2
+
+
+def test_a_few_wrong_pixels_do_not_set_the_scale_of_radiance(tmp_path):
+    radiance = np.linspace(0.1, 700, 96 * 128 * 3, dtype=np.float32).reshape(96, 128, 3)
+    radiance[5, 6] = 1e9
+    understood = capture.read(finished(tmp_path, "exr", radiance))
+    assert 700 < frame_decoder.decode(understood.shots[0].frames[0]).white < 20 * 700
 
 
 def test_a_gain_map_that_is_not_applied_is_noted(tmp_path):

@@ -64,6 +64,17 @@ def test_too_few_tiles_mean_a_typical_sensor(iso):
     np.testing.assert_allclose(1 / line.slope, 20000 * 100 / (iso or 100), rtol=1e-5)
 
 
+@pytest.mark.parametrize("scale", [1e-2, 1e-4])
+def test_the_noise_of_radiance_does_not_depend_on_its_scale(scale):
+    """Without an ISO, nothing states the sensor's white; without noise, a typical sensor is assumed."""
+    noisy, exact = picture(np.random.default_rng(5), texture=0), np.full((200, 200, 3), 0.8, np.float32)
+    exact *= np.linspace(0.5, 1, 200, dtype=np.float32)[:, None, None]
+    for light in (noisy, exact):
+        usual, scaled = (noise.fit([noise.sample_frame(planes(k * light))], None, 1e-20, True) for k in (1.0, scale))
+        np.testing.assert_allclose(scaled.slope, scale * usual.slope, rtol=0.02)
+        np.testing.assert_allclose(scaled.floor, scale**2 * usual.floor, rtol=0.1)
+
+
 def test_a_noiseless_picture_keeps_a_variance():
     flat = np.broadcast_to(np.linspace(0.1, 0.9, 400, dtype=np.float32)[:, None, None], (400, 400, 3))
     line = noise.fit([noise.sample_frame(planes(flat))], 100.0, 1e-9)
