@@ -11,6 +11,7 @@ import math
 import os
 import re
 import stat
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, TypeVar
@@ -69,7 +70,7 @@ def parse_toml(text: str, finite: bool = True) -> dict[str, Any]:
 def parse_json(text: str) -> Any:
     """Parse JSON text; ValueError if it is not JSON, or if a number in it is not finite."""
     try:
-        return json.loads(text, parse_constant=_refuse, parse_float=_finite)
+        return json.loads(text, parse_constant=_refuse, parse_float=_finite, parse_int=_whole)
     except RecursionError:
         raise ValueError("nested too deeply") from None
 
@@ -106,6 +107,11 @@ def check_finite(value: Any, name: str = "") -> None:
 def _finite(text: str) -> float:
     value = float(text)
     return value if math.isfinite(value) else _refuse(text)
+
+
+def _whole(text: str) -> int:
+    value = int(text)
+    return value if abs(value) <= sys.float_info.max else _refuse(text[:20] + "…")
 
 
 def _refuse(text: str) -> NoReturn:

@@ -1,11 +1,15 @@
 """The folder maps/ of a fused result: atlas textures, seen texels, and the mesh; and the exports made from it."""
 
+import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -26,7 +30,7 @@ from polcap.stages.asset import AssetSettings
 from polcap.stages.surface import DecimatedMesh
 
 FORMAT = "polcap fused maps 1"
-_ARRAYS = ("vertices", "normals", "uv", "tangents", "faces")
+_ARRAYS = {"vertices": 3, "normals": 3, "uv": 2, "tangents": 4, "faces": 3}  # columns
 _CHANNELS = {"normal": "RGB", "diffuse": "RGB", "specular": "RGB", "roughness": "Y", "weight": "Y"}
 _MEANINGS = {
     "normal": "unit vectors in the board's frame; float",
@@ -35,7 +39,16 @@ _MEANINGS = {
     "roughness": "perceptual roughness, alpha = roughness squared; half",
     "weight": "total weight of the views, 1: one view along the normal; half",
 }
+_Side = Annotated[int, Meta(ge=1, le=8192)]
 _NEIGHBORS = 4  # texels of which a coarser level's texel is the mean
+
+
+class _Description(maps_folder.MapsFile, frozen=True, kw_only=True):
+    """The keys of a fused object's maps.json that `read` needs."""
+
+    size: tuple[_Side, _Side]
+    unit: Literal["m", "relative"]
+    margin: Annotated[int, Meta(ge=0, le=64)] = atlases.AtlasSettings().margin
 
 
 def write(folder: Path, atlas: Atlas, maps: AtlasMaps, keys: Mapping[str, str]) -> None:
@@ -118,30 +131,38 @@ def read(folder: Path, settings: AssetSettings) -> FusedSource:
     Raises DecodeError: a file is missing or damaged.
     """
     try:
-        about: Mapping[str, Any] = text_file.read_json(folder / "maps.json")
-        with np.load(folder / "mesh.npz") as stored:
-            arrays = {name: stored[name] for name in _ARRAYS}
-        side, margin, percent = (
-            int(about["size"][0]),
-            int(about.get("margin", atlases.AtlasSettings().margin)),
-            about["albedo"]["uncertainty_percent"],
-        )
-        metric = about["unit"] == "m"
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        about = msgspec.convert(text_file.read_json(folder / "maps.json"), _Description)
+    except (OSError, ValueError) as error:
         raise DecodeError(f"{folder} holds no fused maps of this polcap ({error}); run `polcap fuse` again") from error
+    percent, side = about.albedo.uncertainty_percent, about.size[0]
+    mask = png.read(folder / "mask.png")
+    if mask.shape != about.size[::-1]:
+        raise DecodeError(f"{folder / 'mask.png'} is not {side} × {side}; run `polcap fuse` again")
     maps = AtlasMaps(
-        **{name: _map(folder, name) for name in _CHANNELS},
-        mask=png.read(folder / "mask.png") > 127,
+        **{name: maps_folder.read_map(folder, name, letters, about.size) for name, letters in _CHANNELS.items()},
+        mask=mask > 127,
         albedo_sigma=None if percent is None else percent / 100,
     )
-    mesh = Mesh(**arrays, metric=metric, frame="board")
-    return FusedSource(atlases.of_mesh(mesh, side, margin), maps, settings)
+    mesh = Mesh(**_mesh_arrays(folder / "mesh.npz"), metric=about.unit == "m", frame="board")
+    return FusedSource(atlases.of_mesh(mesh, side, about.margin), maps, settings)
 
 
-def _map(folder: Path, name: str) -> Floats:
-    channels, _ = exr.read(folder / f"{name}.exr")
-    planes = [channels[letter] for letter in _CHANNELS[name]]
-    return np.stack(planes, axis=-1) if len(planes) > 1 else planes[0]
+def _mesh_arrays(file: Path) -> dict[str, Any]:
+    """The arrays of a stored mesh by name. Raises DecodeError: missing, damaged, or of another shape or type."""
+    try:
+        with zipfile.ZipFile(file) as stored:
+            arrays = {name: np.lib.format.read_array(stored.open(f"{name}.npy")) for name in _ARRAYS}
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        raise DecodeError(f"{file} cannot be read ({error}); run `polcap fuse` again") from error
+    faces, count = arrays["faces"], len(np.atleast_1d(arrays["vertices"]))
+    for name, columns in _ARRAYS.items():
+        rows, kind = (len(np.atleast_1d(faces)), "i") if name == "faces" else (count, "f")
+        array = arrays[name]
+        if array.shape != (rows, columns) or array.dtype.kind != kind or not np.isfinite(array).all():
+            raise DecodeError(f"{file}: {name} is not {rows} × {columns} finite numbers; run `polcap fuse` again")
+    if not len(faces) or faces.min() < 0 or faces.max() >= count:
+        raise DecodeError(f"{file}: faces name vertices that it does not have; run `polcap fuse` again")
+    return arrays
 
 
 def closed(mesh: Mesh) -> ClosedMesh:

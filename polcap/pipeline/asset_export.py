@@ -15,7 +15,7 @@ import msgspec
 from polcap import parallel
 from polcap.config import Config
 from polcap.errors import SettingError
-from polcap.formats import atomic, text_file
+from polcap.formats import atomic
 from polcap.formats.export import (
     exr_layers,
     glb_geometry,
@@ -267,7 +267,7 @@ def find_outdated(records: Sequence[Path], keys: Mapping[str, str]) -> list[Path
     """
     folders, files = [], []
     for sidecar in records:
-        about, folder = text_file.read_json(sidecar), sidecar.parent
+        about, folder = provenance.read(sidecar), sidecar.parent
         if about.get("stages") != keys:
             folders.append(folder)
         else:

@@ -17,14 +17,15 @@ from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property, partial
 from hashlib import blake2b, sha256
 from pathlib import Path
-from typing import Any, Generic, TypeVar, get_type_hints
+from typing import Annotated, Any, Generic, TypeVar, get_type_hints
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 
 from polcap import parallel, resource_limits
 from polcap.errors import StorageError
-from polcap.formats import atomic, npy_folder
+from polcap.formats import atomic, npy_folder, text_file
 from polcap.stages import Stage
 
 T = TypeVar("T")
@@ -37,6 +38,21 @@ Progress = Callable[[str, float | None, bool], None]  # stage, seconds (None: it
 
 def silent(stage: str, seconds: float | None, cached: bool) -> None:
     """Progress callback that shows nothing."""
+
+
+class _Manifest(msgspec.Struct, frozen=True):
+    """Fields of a manifest.json; `manifest` checks them, because another program may have changed the file."""
+
+    format: int
+    stage: str
+    version: int
+    settings: dict[str, Any] | None
+    inputs: list[str]
+    key: str
+    seconds: Annotated[float, Meta(ge=0, le=1e9)]
+    files: dict[str, tuple[int, str]]
+    value: Any
+    digest: str
 
 
 class StageReached(Exception):
@@ -261,11 +277,11 @@ def _derived_key(function: Callable[..., Any], inputs: tuple[Any, ...]) -> str:
 def manifest(place: Path) -> dict[str, Any]:
     """Read the manifest of a stored stage result; empty if there is none or it is damaged."""
     try:
-        about = json.loads((place / "manifest.json").read_text(encoding="utf-8"))
-        whole = isinstance(about, dict) and about.get("format") == FORMAT and about.get("digest") == seal(about)
-    except (OSError, ValueError, RecursionError):
+        about: dict[str, Any] = text_file.read_json(place / "manifest.json")
+        msgspec.convert(about, _Manifest)
+    except (OSError, ValueError):
         return {}
-    return about if whole else {}
+    return about if about["format"] == FORMAT and about["digest"] == seal(about) else {}
 
 
 def seal(about: Mapping[str, Any]) -> str:
@@ -347,6 +363,6 @@ def contents(folder: Path) -> list[dict[str, Any]]:
     found = []
     for place in sorted((folder / "work").glob("[0-9][0-9]-*")):
         if about := manifest(place):
-            size = sum(entry.stat().st_size for entry in place.iterdir())
+            size = sum(entry.lstat().st_size for entry in place.iterdir())
             found.append({**about, "folder": place.name, "bytes": size})
     return found

@@ -9,8 +9,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from filelock import FileLock, Timeout
 
+from polcap import report
 from polcap.errors import CaptureError, SettingError, StorageError
 from polcap.formats import atomic, folder_lock, own_files, own_folders, text_file
 from polcap.formats.capture import capture_toml, folder_names
@@ -156,9 +158,12 @@ def read_run(out: Path) -> dict[str, Any]:
     """
     file = out / "work" / "run.json"
     try:
-        about = text_file.read_json(file)
-    except (OSError, ValueError) as error:
+        about: dict[str, Any] = text_file.read_json(file)
+        msgspec.convert(about, report.RunFacts)
+    except OSError as error:
         raise StorageError(f"{out} holds no stage cache of this polcap; run `polcap process` again") from error
-    if not isinstance(about, dict) or about.get("digest") != seal(about):
+    except ValueError as error:
+        raise StorageError(f"{file} is no run of this polcap ({error}); run `polcap process` again") from error
+    if about.get("digest") != seal(about):
         raise StorageError(f"{file} is damaged, or of another polcap; run `polcap process` again")
     return about

@@ -25,6 +25,7 @@ from polcap.results import Results
 class _PhotographFacts(msgspec.Struct, frozen=True):
     file: str
     digest: str
+    exposure_time: float | None = None
 
 
 class _ShotFacts(msgspec.Struct, frozen=True):
@@ -37,19 +38,27 @@ class _CaptureFacts(msgspec.Struct, frozen=True):
     camera: str
     shots: list[_ShotFacts]
     catalog: dict[str, str] = {}
+    focal_doubt: tuple[float, float] = (0.0, 0.0)
 
 
-class _ReportFile(msgspec.Struct, frozen=True):
+class RunFacts(msgspec.Struct, frozen=True):
+    """Facts of a run that do not come from its pixels, with the fields that commands rely on."""
+
+    capture: _CaptureFacts
+    settings: dict[str, dict[str, Any]]
+    model: dict[str, str] | None
+    versions: dict[str, str]
+
+
+class _ReportFile(RunFacts, frozen=True, kw_only=True):
     """Fields of report.json that commands rely on; `read` checks them, because another version may have written it."""
 
     polcap: str
     verdict: Literal["pass", "warn", "fail"]
+    expected_error_deg: float | None = None
     gates: list[Gate]
-    capture: _CaptureFacts
     figures: dict[str, dict[str, Any]]
-    settings: dict[str, dict[str, Any]]
     keys: dict[str, str]
-    model: dict[str, str] | None
 
 
 def capture_facts(capture: Capture) -> dict[str, Any]:

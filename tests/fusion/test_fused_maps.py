@@ -1,6 +1,7 @@
 """The stored maps of a fused object, and exports made from them."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -107,3 +108,48 @@ def test_coarser_levels_are_closed_and_keep_their_textures(source: FusedSource) 
         color = textured.base_color[textured.normal[..., 2] > 128].reshape(-1, 3).mean(axis=0)
         assert color == pytest.approx(full.asset.base_color.reshape(-1, 3).mean(axis=0), rel=0.1)
     assert coarse.decimated is not None and 0 < coarse.decimated.error < 0.003
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("vertices", lambda array: array.T),
+        ("vertices", lambda array: array[:0]),
+        ("normals", lambda array: np.full_like(array, np.nan)),
+        ("uv", lambda array: array[:, :1]),
+        ("tangents", lambda array: array.astype(str)),
+        ("faces", lambda array: array + 10**6),
+        ("faces", lambda array: -array - 1),
+        ("faces", lambda array: array.astype(float)),
+        ("faces", lambda array: array[:0]),
+        ("faces", lambda array: np.int32(1)),
+        ("faces", None),
+    ],
+)
+def test_a_stored_mesh_of_another_shape_is_one_line(
+    source: FusedSource, tmp_path: Path, name: str, change: Callable[[np.ndarray], np.ndarray] | None
+) -> None:
+    fused_maps.write(tmp_path, source.atlas, source.maps, {})
+    with np.load(tmp_path / "mesh.npz") as stored:
+        arrays = dict(stored)
+    arrays |= {name: change(arrays[name])} if change else {}
+    np.savez(tmp_path / "mesh.npz", **arrays if change else {"other": arrays["faces"]})
+    with pytest.raises(DecodeError, match=r"mesh\.npz"):
+        fused_maps.read(tmp_path, AssetSettings())
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("maps.json", b"[]"), ("maps.json", b'{"size": [256], "unit": "m", "margin": 6}'), ("mesh.npz", b""),
+        ("maps.json", b'{"size": [512, 512], "unit": "m"}'), ("mesh.npz", b"PK\x05\x06" + b"\0" * 18),
+        ("mask.png", b""), ("normal.exr", b""),
+    ],
+)  # fmt: skip
+def test_a_damaged_file_of_fused_maps_is_one_line(
+    source: FusedSource, tmp_path: Path, file: str, content: bytes
+) -> None:
+    fused_maps.write(tmp_path, source.atlas, source.maps, {})
+    (tmp_path / file).write_bytes(content)
+    with pytest.raises(DecodeError):
+        fused_maps.read(tmp_path, AssetSettings())

@@ -1,11 +1,14 @@
 """The origin of an export (photographs, versions, settings), as a sidecar file and as texts for other formats."""
 
 import json
+import os
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from polcap import __version__
 from polcap.formats import atomic, text_file
@@ -15,6 +18,13 @@ _PARTS = (
     "numpy", "scipy", "opencv-contrib-python-headless", "onnxruntime", "rawpy", "OpenImageIO", "trimesh",
     "colour-science",
 )  # fmt: skip
+
+
+class _Sidecar(msgspec.Struct, frozen=True):
+    """Fields of a sidecar file that polcap reads."""
+
+    stages: dict[str, str]
+    files: dict[str, str]
 
 
 def versions() -> dict[str, str]:
@@ -64,14 +74,22 @@ def write(path: Path, facts: Mapping[str, Any], digests: Mapping[str, str]) -> N
 
     The sidecar of an earlier export with the same record also listed its files; those that exist stay in the list.
     """
-    earlier: dict[str, Any] = {}
-    with suppress(OSError, ValueError):
-        earlier = text_file.read_json(path)
+    earlier = read(path)
     files = earlier.pop("files", {})
     if earlier != json.loads(json.dumps(facts)):
         files = {}
-    files = {name: known for name, known in files.items() if (path.parent / name).exists()} | dict(digests)
+    files = {name: known for name, known in files.items() if os.path.exists(path.parent / name)} | dict(digests)
     atomic.write_json(path, {**facts, "files": dict(sorted(files.items()))})
+
+
+def read(path: Path) -> dict[str, Any]:
+    """The content of a sidecar file; empty if it is not one of polcap, or cannot be read."""
+    try:
+        about: dict[str, Any] = text_file.read_json(path)
+        msgspec.convert(about, _Sidecar)
+    except (OSError, ValueError):
+        return {}
+    return about
 
 
 def digest(file: Path) -> str:

@@ -34,7 +34,7 @@ _DETAIL_MEANING = (
 )
 
 _Side = Annotated[int, Meta(ge=1, le=1 << 16)]
-_Positive = Annotated[float, Meta(gt=0, le=1e9)]
+_Positive = Annotated[float, Meta(ge=1e-6, le=1e9)]
 _Place = Annotated[float, Meta(ge=-1e9, le=1e9)]
 
 
@@ -52,7 +52,22 @@ class _Albedo(Struct, frozen=True):
     uncertainty_percent: Annotated[float, Meta(ge=0)] | None = None
 
 
-class _Description(Struct, frozen=True):
+class _Export(Struct, frozen=True):
+    """What maps.json notes about an export, as far as later exports add to it."""
+
+    glb: dict[str, str] = {}
+    lods: dict[str, dict[str, Any]] = {}
+    textures: dict[str, str] = {}
+
+
+class MapsFile(Struct, frozen=True):
+    """Keys that the maps.json of every result has."""
+
+    albedo: _Albedo = _Albedo()
+    exports: dict[str, _Export] = {}
+
+
+class _Description(MapsFile, frozen=True, kw_only=True):
     """The keys of maps.json (crop, size, camera, depth unit…) that `read` needs."""
 
     crop: tuple[_Place, _Place, _Place, _Place]
@@ -61,7 +76,6 @@ class _Description(Struct, frozen=True):
     camera: _Camera
     depth: _Depth
     estimator: str
-    albedo: _Albedo = _Albedo()
     sizes: dict[str, tuple[_Side, _Side]] = {}
 
 
@@ -149,9 +163,9 @@ def read(folder: Path) -> ResultMaps:
         raise DecodeError(f"{folder / 'mask.png'} is not {about.size[0]} × {about.size[1]}; process again")
     inside = mask > 127
     normal, diffuse, specular = (
-        _read_map(folder, name, "RGB", about.size) for name in ("normal", "diffuse", "specular")
+        read_map(folder, name, "RGB", about.size) for name in ("normal", "diffuse", "specular")
     )
-    roughness, confidence = (_read_map(folder, name, "Y", about.size) for name in ("roughness", "confidence"))
+    roughness, confidence = (read_map(folder, name, "Y", about.size) for name in ("roughness", "confidence"))
     return ResultMaps(
         normal=normal,
         diffuse=diffuse,
@@ -164,7 +178,7 @@ def read(folder: Path) -> ResultMaps:
         estimator=about.estimator,
         albedo_sigma=None if percent is None else round(percent / 100, 3),
         detail=_read_detail(folder, about.size) if map_files.DETAIL in about.sizes else None,
-        depth=np.where(inside, _read_map(folder, "depth", "Z", about.size), np.nan).astype(np.float32),
+        depth=np.where(inside, read_map(folder, "depth", "Z", about.size), np.nan).astype(np.float32),
         metric=about.depth.unit == "m",
     )
 
@@ -180,7 +194,7 @@ def _read_detail(folder: Path, size: tuple[int, int]) -> Floats:
 def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
     """Add a record `about` an export to maps.json, merged with earlier records of the folder `where`."""
     file = folder / "maps.json"
-    known = text_file.read_json(file)
+    known = text_file.read_json(file)  # as `read` has checked it
     exports = known.get("exports", {})
     earlier = exports.get(where, {})
     note = {
@@ -191,8 +205,11 @@ def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
     atomic.write_json(file, known)
 
 
-def _read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Floats:
-    """Read the channels `letters` of one map's EXR as an array (H, W, C), or (H, W) for one channel."""
+def read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Floats:
+    """Read the channels `letters` of one map's EXR as an array (H, W, C), or (H, W) for one channel.
+
+    Raises DecodeError: the file is missing, damaged, not of this size (W, H), or a value is not finite.
+    """
     file = folder / f"{name}.exr"
     found, _ = exr.read(file)
     planes = [found[letter] for letter in letters if letter in found]

@@ -1,0 +1,103 @@
+"""A changed file of a result ends in one line or is made again; no command ends with a bug."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from polcap.pipeline import cache
+from tests.campaigns.changed_results import QUICK, make_template, tried
+from tests.conftest import Command
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small capture C with its finished result C/polcap, of a batch; read only."""
+    folder = tmp_path_factory.mktemp("template")
+    make_template(folder)
+    return folder
+
+
+@pytest.fixture
+def root(template: Path, tmp_path: Path) -> Path:
+    """A copy of that batch, to be changed."""
+    return Path(shutil.copytree(template, tmp_path / "batch"))
+
+
+def change(file: Path, edit: Callable[[Any], Any], sealed: bool = False) -> None:
+    about = edit(json.loads(file.read_text(encoding="utf-8")))
+    if sealed:
+        about["digest"] = cache.seal(about)
+    file.write_text(json.dumps(about), encoding="utf-8")
+
+
+@pytest.mark.parametrize("seconds", ["long", None, -1, {"a": 1}])
+def test_a_stage_whose_seconds_are_no_number_is_computed_again(root: Path, polcap: Command, seconds: Any) -> None:
+    result = root / "C" / "polcap"
+    change(result / "work" / "03-align" / "manifest.json", lambda about: {**about, "seconds": seconds})
+    assert polcap("status", result).returncode == 0 and "align" not in polcap("status", result).stdout
+    done = polcap("report", result)
+    assert done.returncode == 2 and "03-align" in done.stderr and "run `polcap process`" in done.stderr
+    assert polcap("process", root / "C", *QUICK).returncode in (0, 3) and polcap("report", result).returncode in (0, 3)
+
+
+@pytest.mark.parametrize("content", ["[]", "7", '{"files": [], "stages": {}}', '{"stages": 3}', "[" * 9999])
+def test_a_provenance_of_another_shape_counts_as_that_of_another_export(
+    root: Path, polcap: Command, content: str
+) -> None:
+    asset = root / "C" / "polcap" / "asset"
+    (asset / "C.provenance.json").write_text(content)
+    assert polcap("export", asset.parent, "--obj").returncode == 0
+    assert "C.glb" not in json.loads((asset / "C.provenance.json").read_text())["files"]
+    (asset / "web").mkdir()
+    (asset / "web" / "C.provenance.json").write_text(content)
+    done = polcap("process", root / "C", *QUICK)
+    assert done.returncode in (0, 3) and "asset/web in" in done.stderr
+    assert (asset / "web" / "C.provenance.json").read_text() == content
+
+
+@pytest.mark.parametrize(
+    ("name", "edit"),
+    [
+        ("maps/maps.json", lambda about: {**about, "exports": []}),
+        ("maps/maps.json", lambda about: {**about, "exports": {"asset": {"glb": 3}}}),
+        ("maps/maps.json", lambda about: {**about, "scale": 1e-300}),
+        ("maps/maps.json", lambda about: []),
+        ("report.json", lambda about: {**about, "versions": 3}),
+        ("report.json", lambda about: {**about, "expected_error_deg": "small"}),
+        ("report.json", lambda about: {**about, "keys": None}),
+        ("report.json", lambda about: {**about, "figures": {"mesh": {"metric": 10**400}}}),
+    ],
+)
+def test_a_record_of_another_shape_is_one_line(
+    root: Path, polcap: Command, name: str, edit: Callable[[Any], Any]
+) -> None:
+    result = root / "C" / "polcap"
+    change(result / name, edit)
+    done = polcap("export", result)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and Path(name).name in done.stderr
+    assert polcap("process", root / "C", *QUICK).returncode in (0, 3) and polcap("export", result).returncode == 0
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda about: {**about, "versions": None},
+        lambda about: {**about, "capture": {**about["capture"], "shots": {}}},
+        lambda about: {key: value for key, value in about.items() if key != "model"},
+    ],
+)
+def test_a_run_of_another_polcap_is_one_line(root: Path, polcap: Command, edit: Callable[[Any], Any]) -> None:
+    result = root / "C" / "polcap"
+    change(result / "work" / "run.json", edit, sealed=True)
+    for words in (("report", result), ("show", result, "mask")):
+        done = polcap(*words)
+        assert done.returncode == 2 and done.stderr.count("\n") == 1 and "run.json" in done.stderr
+
+
+@pytest.mark.parametrize("number", range(12))
+def test_no_command_ends_with_a_bug_after_a_random_change(template: Path, number: int) -> None:
+    assert tried(template, number, seed=45)["faults"] == []
