@@ -5,7 +5,6 @@ or `cluster` several at a time, and `contact_sheet` writes the summary. A captur
 its stage cache.
 """
 
-import json
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +19,7 @@ from polcap.batch.capture_search import Candidate
 from polcap.batch.shards import WHOLE, Shard
 from polcap.batch.unit import FINISHED, FOLDER, ProcessOptions, Unit, UnitRecord
 from polcap.errors import CaptureError
-from polcap.formats import atomic, own_files, own_folders
+from polcap.formats import atomic, own_files, own_folders, text_file
 from polcap.formats.capture import folder_names
 
 
@@ -63,7 +62,7 @@ def _units(root: Path, out: Path | None, found: Sequence[Candidate]) -> list[Uni
 def reopen(place: Path) -> list[Unit]:
     """The captures of an earlier batch. `place` was its root folder or its --out folder."""
     try:
-        about = json.loads((place / FOLDER / "batch.json").read_text(encoding="utf-8"))
+        about = text_file.read_json(place / FOLDER / "batch.json")
         return find(Path(about["root"]), None if about["out"] is None else Path(about["out"]))
     except (OSError, ValueError, KeyError, TypeError):
         return find(place)

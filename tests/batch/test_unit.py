@@ -140,3 +140,11 @@ def test_a_capture_that_was_finished_before_its_process_died_stays_finished(tmp_
     one.write_record(unit, done := one.UnitRecord("obj", "done", seconds=3.0))
     assert one.record_crash(unit, before, "its process died", 3) == one.read_record(unit) == done
     assert one.record_crash(unit, done, "its process died", 3).state == "crashed"  # of an earlier batch
+
+
+@pytest.mark.parametrize("text", ["", "[]", "7", '{"root": 7, "out": null}', '{"root": "/", "out": NaN}', "[" * 30_000])
+def test_a_batch_whose_note_has_another_shape_is_searched_for_captures(tmp_path: Path, text: str) -> None:
+    unit = only_unit(tmp_path, "obj")
+    (tmp_path / "polcap-batch").mkdir()
+    (tmp_path / "polcap-batch" / "batch.json").write_text(text)
+    assert batch.reopen(tmp_path) == [unit]
