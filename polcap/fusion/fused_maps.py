@@ -43,7 +43,7 @@ _Side = Annotated[int, Meta(ge=1, le=8192)]
 _NEIGHBORS = 4  # texels of which a coarser level's texel is the mean
 
 
-class _Description(maps_folder.MapsFile, frozen=True, kw_only=True):
+class _FusedMapsFile(maps_folder.MapsFile, frozen=True, kw_only=True):
     """The keys of a fused object's maps.json that `read` needs."""
 
     size: tuple[_Side, _Side]
@@ -131,7 +131,7 @@ def read(folder: Path, settings: AssetSettings) -> FusedSource:
     Raises DecodeError: a file is missing or damaged.
     """
     try:
-        about = msgspec.convert(text_file.read_json(folder / "maps.json"), _Description)
+        about = msgspec.convert(text_file.read_json(folder / "maps.json"), _FusedMapsFile)
     except (OSError, ValueError) as error:
         raise DecodeError(f"{folder} holds no fused maps of this polcap ({error}); run `polcap fuse` again") from error
     percent, side = about.albedo.uncertainty_percent, about.size[0]
