@@ -106,7 +106,10 @@ def mrw(exif_tiff):
 
 
 def dng(pixels, photometric=32803, cfa=((0, 1), (1, 2)), black=None, area=None, photo=None, maker=None, **levels):
-    """An uncompressed DNG of uint16 (H, W[, C]); `area` = top, left, bottom, right of the visible pixels."""
+    """An uncompressed DNG of uint16 (H, W[, C]); `area` = top, left, bottom, right of the visible pixels.
+
+    `black` is a repeating pattern (h, w[, C]), `columns` and `rows` of `levels` are added to it.
+    """
     pixels = np.ascontiguousarray(pixels, "<u2")
     height, width = pixels.shape[:2]
     samples = pixels.shape[2] if pixels.ndim == 3 else 1
@@ -120,7 +123,9 @@ def dng(pixels, photometric=32803, cfa=((0, 1), (1, 2)), black=None, area=None, 
         main |= {33421: (3, (len(cfa), len(cfa[0]))), 33422: (1, [c for row in cfa for c in row])}
         main |= {50710: (1, (0, 1, 2)), 50711: (3, (1,))}
     if black is not None:
-        main |= {50713: (3, np.shape(black)), 50714: (5, np.ravel(black).tolist())}
+        main |= {50713: (3, np.shape(black)[:2]), 50714: (5, np.ravel(black).tolist())}
+    for tag, name in ((50715, "columns"), (50716, "rows")):
+        main |= {tag: (10, levels[name])} if name in levels else {}
     if area is not None:
         main[50829] = (4, area)
     if samples == 3 or photometric == 32803:

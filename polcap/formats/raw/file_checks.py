@@ -70,7 +70,7 @@ def check_png(path: str, data: bytes) -> None:
 
 def check_structure(path: str, structure: TiffStructure, data: bytes) -> None:
     """Refuse a RAW of a kind that LibRaw decodes wrongly, and a DNG without its image data. Raises DecodeError."""
-    images = [one for one in structure.directories if _is_sensor(one)]
+    images = [one for one in structure.directories if file_kind.is_sensor(one)]
     for directory in images:
         refused = _REFUSED_COMPRESSION.get(first(directory, file_kind.COMPRESSION), "")
         if refused and structure.dng:
@@ -88,11 +88,9 @@ def check_structure(path: str, structure: TiffStructure, data: bytes) -> None:
 
 def is_lossy(structure: TiffStructure) -> bool:
     """Whether the sensor image in this TIFF structure is lossily compressed (a lossy DNG)."""
-    return any(_is_sensor(one) and first(one, file_kind.COMPRESSION) == _LOSSY for one in structure.directories)
-
-
-def _is_sensor(directory: Directory) -> bool:
-    return first(directory, file_kind.PHOTOMETRIC) in (file_kind.CFA, file_kind.LINEAR_RAW)
+    return any(
+        file_kind.is_sensor(one) and first(one, file_kind.COMPRESSION) == _LOSSY for one in structure.directories
+    )
 
 
 def _check_strips(path: str, directory: Directory, dng: bool) -> None:

@@ -13,8 +13,9 @@ Kind = Literal["raw", "photo", "other", "unknown"]
 
 SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE = 254, 256, 257, 258, 259, 262, 271
 STRIP_OFFSETS, SAMPLES, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS = 273, 277, 279, 324, 325, 330
-TRANSFER_FUNCTION = 301
-DNG_VERSION, CFA_LAYOUT, ORIGINAL_RAW_NAME = 50706, 50711, 50827
+TRANSFER_FUNCTION, SAMPLE_FORMAT, CFA_REPEAT = 301, 339, 33421
+DNG_VERSION, CFA_LAYOUT, ORIGINAL_RAW_NAME, ACTIVE_AREA = 50706, 50711, 50827, 50829
+BLACK_REPEAT, BLACK, BLACK_BY_COLUMN, BLACK_BY_ROW = 50713, 50714, 50715, 50716
 OPCODE_LISTS, GAIN_TABLES = (51008, 51009, 51022), (52525, 52544)  # DNG; ProfileGainTableMap, its second form
 CFA, LINEAR_RAW = 32803, 34892  # values of PHOTOMETRIC
 
@@ -30,14 +31,15 @@ _RAW_COMPRESSION = {32767, 32769, 32770, 32867, 34316, 34713, 65000, 65535}
 _TAGS_READ = {
     SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE, DNG_VERSION, CFA_LAYOUT, SAMPLES,
     STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS, TRANSFER_FUNCTION, ORIGINAL_RAW_NAME,
-    *OPCODE_LISTS,
+    SAMPLE_FORMAT, CFA_REPEAT, ACTIVE_AREA, BLACK_REPEAT, BLACK, BLACK_BY_COLUMN, BLACK_BY_ROW, *OPCODE_LISTS,
 }  # fmt: skip
 _INTEGERS = {1: "B", 2: "B", 3: "H", 4: "I", 7: "B", 13: "I"}  # texts and bytes as the numbers of their bytes
+_QUOTIENTS = {5: "I", 10: "i"}  # numerator, denominator
 MAX_DIRECTORIES, _MAX_VALUES = 64, 1 << 18  # per file: stops at a loop or a forged count
 _SIDECARS = {".pdf", ".zip", ".txt"}  # binary, or text in UTF-16; `foreign_files` has those of photographs
 _TEXT_BYTES = 1 << 16  # some makers put lines of text in front of their pixels
 
-Directory = dict[int, tuple[int, ...]]
+Directory = dict[int, tuple[float, ...]]
 
 
 class TiffStructure(NamedTuple):
@@ -60,21 +62,31 @@ class TiffStructure(NamedTuple):
 def strips(directory: Directory) -> list[tuple[int, int]]:
     """Byte offset and length of each image strip or tile of a TIFF directory."""
     return [
-        pair
+        (int(start), int(count))
         for starts, counts in ((STRIP_OFFSETS, STRIP_BYTES), (TILE_OFFSETS, TILE_BYTES))
-        for pair in zip(directory.get(starts, ()), directory.get(counts, ()))
+        for start, count in zip(directory.get(starts, ()), directory.get(counts, ()))
     ]
 
 
 def original_name(structure: TiffStructure) -> str:
     """Name of the RAW from which a DNG was converted; empty if it states none."""
-    names = (bytes(one[ORIGINAL_RAW_NAME]) for one in structure.directories if ORIGINAL_RAW_NAME in one)
+    names = (stored_bytes(one, ORIGINAL_RAW_NAME) for one in structure.directories if ORIGINAL_RAW_NAME in one)
     return next(names, b"").rstrip(b"\0").decode(errors="replace")
 
 
+def stored_bytes(directory: Directory, tag: int) -> bytes:
+    """The bytes of a tag in a TIFF directory; none if the tag is absent."""
+    return bytes(int(value) & 0xFF for value in directory.get(tag, ()))
+
+
 def first(directory: Directory, tag: int, default: int = 0) -> int:
-    """First value of a tag in a TIFF directory; `default` if the tag is absent, empty or not an integer."""
-    return next(iter(directory.get(tag, ())), default)
+    """First value of a tag in a TIFF directory; `default` if the tag is absent, empty or not a number."""
+    return int(next(iter(directory.get(tag, ())), default))
+
+
+def is_sensor(directory: Directory) -> bool:
+    """Whether a TIFF directory holds a sensor's counts: a mosaic, or linear channels."""
+    return first(directory, PHOTOMETRIC) in (CFA, LINEAR_RAW)
 
 
 def kind(file: BinaryIO, suffix: str) -> Kind:
@@ -118,8 +130,7 @@ def raw_suffix(head: bytes) -> str | None:
 
 def _is_raw(tiff: TiffStructure) -> bool:
     if tiff.dng or any(
-        first(directory, PHOTOMETRIC) in (CFA, LINEAR_RAW) or first(directory, COMPRESSION) in _RAW_COMPRESSION
-        for directory in tiff.directories
+        is_sensor(directory) or first(directory, COMPRESSION) in _RAW_COMPRESSION for directory in tiff.directories
     ):
         return True
     main = tiff.directories[0] if tiff.directories else {}
@@ -156,12 +167,12 @@ def structure(data: bytes | mmap) -> TiffStructure:
             left -= sum(map(len, directory.values()))
             directories.append(directory)
             following = struct.unpack_from(order + "I", data, end) if end + 4 <= len(data) else ()
-            pending.extend((*directory.get(SUB_IFDS, ()), *following))
+            pending.extend((*map(int, directory.get(SUB_IFDS, ())), *following))
     return TiffStructure(tuple(directories), len(data))
 
 
-def _entries(data: bytes | mmap, order: str, places: range, most: int) -> Iterator[tuple[int, tuple[int, ...]]]:
-    """Tag and whole-number values of the known TIFF directory entries at the byte offsets `places`.
+def _entries(data: bytes | mmap, order: str, places: range, most: int) -> Iterator[tuple[int, tuple[float, ...]]]:
+    """Tag and numbers of the known TIFF directory entries at the byte offsets `places`.
 
     At most `most` values are read in all; an entry with more values is skipped. Values of other types become ().
     """
@@ -171,11 +182,18 @@ def _entries(data: bytes | mmap, order: str, places: range, most: int) -> Iterat
             yield tag, ()
         if tag not in _TAGS_READ or count > most:
             continue
-        code = f"{order}{count}{_INTEGERS.get(form, 'x')}"  # other forms have no whole numbers
+        if form in _QUOTIENTS:
+            code = f"{order}{2 * count}{_QUOTIENTS[form]}"
+        else:
+            code = f"{order}{count}{_INTEGERS.get(form, 'x')}"  # other forms have no numbers
         length = struct.calcsize(code)
         start = at + 8 if length <= 4 else struct.unpack_from(order + "I", data, at + 8)[0]
-        if form not in _INTEGERS:
+        if form not in _INTEGERS and form not in _QUOTIENTS:
             yield tag, ()
         elif start + length <= len(data):
             most -= count
-            yield tag, struct.unpack_from(code, data, start)
+            values = struct.unpack_from(code, data, start)
+            if form in _QUOTIENTS:
+                pairs = tuple(zip(values[::2], values[1::2], strict=True))
+                values = tuple(a / b for a, b in pairs) if all(b for _, b in pairs) else ()
+            yield tag, values

@@ -4,6 +4,7 @@ The only module that imports rawpy.
 """
 
 import io
+import math
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
-from polcap.formats.raw import exif, file_bytes, file_checks, file_kind, worker
+from polcap.formats.raw import dng_black, exif, file_bytes, file_checks, file_kind, worker
 from polcap.images import Bits, Exif, Floats, SensorImage
 from polcap.optics import demosaic
 from polcap.optics.color import REC709_TO_XYZ
@@ -140,7 +141,7 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
     if structure.dng and structure.truncated:  # LibRaw would return whatever was in memory
         raise DecodeError(f"{path}: its image data run past the end of the file; {file_checks.COPY_AGAIN}")
     with _opened(path, data) as raw:
-        meta, arrays = _counts(path, raw)
+        meta, arrays = _counts(path, raw, structure)
     lossy = file_checks.is_lossy(structure)
     file_checks.check_levels(path, arrays["value"], float(np.max(meta["black"])), meta["white"], lossy)
     stated = exif.tags(data).color_matrix
@@ -148,19 +149,24 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
     return meta | ({} if stated is None else {"xyz_to_camera": stated}), arrays
 
 
-def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
-    """Visible sensor counts as stored in the RAW file, with their levels and colors."""
+def _counts(path: str, raw: Any, structure: file_kind.TiffStructure) -> tuple[dict[str, Any], worker.Arrays]:
+    """Visible sensor counts as stored in the RAW file, with their levels and colors; uneven blacks are evened out."""
     value: NDArray[Any] = raw.raw_image_visible
+    value = value[..., :3] if value.ndim == 3 else value
+    uneven, level = dng_black.uneven(structure, raw.sizes, math.prod(value.shape[2:])), None
+    if uneven is None and value.ndim == 3:
+        uneven = np.array(raw.black_level_per_channel[: value.shape[2]], np.float64)
+    if uneven is not None:
+        value, level = dng_black.even_out(value, uneven)
     balance, matrix = raw.camera_whitebalance[:3], raw.rgb_xyz_matrix[:3]
     meta: dict[str, Any] = {
         "balance": [gain / balance[1] for gain in balance] if min(balance) > 0 else None,
         "xyz_to_camera": matrix.tolist() if matrix.any() else None,
     }
-    if value.ndim == 3 and value.shape[2] >= 3:
+    if value.ndim == 3 and value.shape[2] == 3:
         if raw.num_colors != 3:
             raise DecodeError(f"{path}: has {raw.num_colors} color channels where 3 are supported")
-        arrays = {"value": value[..., :3]}
-        black = [[float(np.mean(raw.black_level_per_channel[:3]))]]
+        arrays, black = {"value": value}, [[0.0]]
     elif value.ndim == 2 and raw.num_colors == 1:
         arrays = {"value": np.repeat(value[..., None], 3, axis=2)}
         black = [[float(raw.black_level_per_channel[0])]]
@@ -174,6 +180,7 @@ def _counts(path: str, raw: Any) -> tuple[dict[str, Any], worker.Arrays]:
             cfa, levels = (np.roll(part, (-down, -right), (0, 1)) for part in (cfa, np.array(black)))
             value, black = np.ascontiguousarray(value[down:, right:]), levels.tolist()
         arrays = {"value": value, "cfa": cfa}
+    black = black if level is None else [[level]]
     return meta | {"black": black, "white": _white(raw, float(np.max(black)))}, arrays
 
 

@@ -100,7 +100,7 @@ def has_gain_map(data: bytes, structure: TiffStructure) -> bool:
     """Whether a JPEG holds a gain map for bright displays, or a DNG one against the lens's shading."""
     if data.startswith(file_kind.JPEG):
         return _GAIN_MAP_MARKS.search(data) is not None
-    lists = [bytes(one.get(tag, ())) for one in structure.directories for tag in file_kind.OPCODE_LISTS]
+    lists = [file_kind.stored_bytes(one, tag) for one in structure.directories for tag in file_kind.OPCODE_LISTS]
     profile = any(one.keys() & set(file_kind.GAIN_TABLES) for one in structure.directories)
     return structure.dng and (profile or any(_OPCODE_GAIN_MAP in _opcodes(one) for one in lists))
 

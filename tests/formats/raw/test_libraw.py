@@ -60,6 +60,52 @@ def test_monochrome_sensor_fills_all_channels(tmp_path):
     assert image.cfa is None and image.black.tolist() == [[7]]
 
 
+FOUR = np.kron([[500, 524, 512, 512], [512, 512, 500, 524]], np.ones((2, 1), int))
+AREA = {"area": (2, 4, 58, 80)}  # of 60×84 px
+
+
+@pytest.mark.parametrize(
+    ("black", "options"),
+    [
+        (FOUR, {}),
+        (FOUR, AREA),
+        ([[500], [520], [530.4]], {}),
+        ([[500, 520], [510, 530]], {"area": (3, 5, 59, 81)}),
+        ([[512]], {"rows": [i % 9 for i in range(60)], "columns": [-(i % 5) for i in range(84)]}),
+        ([[512]], AREA | {"rows": [i / 2 for i in range(56)], "columns": list(range(76))}),
+        ([[500, 520], [510, 530]], {"cfa": "x-trans"}),
+        (np.arange(36).reshape(6, 6) + 500, {"cfa": "x-trans"}),
+        ([[500, 520]], {"photometric": 34892}),
+        ([[[480, 512, 560]]], {"photometric": 34892, "channels": 3}),
+        ([[[480, 512, 560]], [[500, 500, 500]]], {"photometric": 34892, "channels": 3}),
+    ],
+)
+def test_light_is_counted_from_the_black_of_each_photosite(tmp_path, black, options):
+    """A black level that repeats over more than 2×2, by row or column, or by channel, is taken off everywhere."""
+    top, left, bottom, right = options.get("area", (0, 0, 60, 84))
+    cfa = X_TRANS if options.get("cfa") == "x-trans" else ((0, 1), (1, 2))
+    channels = options.get("channels", 1)
+    light = np.arange(60 * 84 * channels).reshape(60, 84, channels) % 1000
+    pattern = np.reshape(black, (*np.shape(black)[:2], -1))
+    y, x = np.arange(60) - top, np.arange(84) - left
+    level = pattern[y[:, None] % len(pattern), x % pattern.shape[1]]
+    rows, columns = (np.array(options.get(name, [0])) for name in ("rows", "columns"))
+    level = level + rows.take(y, mode="clip")[:, None, None] + columns.take(x, mode="clip")[:, None]
+    counts = np.rint(light + level).astype(np.uint16)
+    stated = {name: options[name] for name in ("area", "rows", "columns", "photometric") if name in options}
+    image = raw.read(written(tmp_path, counts if channels > 1 else counts[..., 0], cfa=cfa, black=black, **stated))
+    seen = np.reshape(image.value - float(image.black.item()), (*image.value.shape[:2], -1))
+    down, over = (side - got for side, got in zip((bottom - top, right - left), seen.shape))
+    expected = light[top + down : bottom, left + over : right]
+    np.testing.assert_allclose(seen, np.broadcast_to(expected, seen.shape), atol=1.0)  # both counts are rounded
+
+
+def test_a_saturated_count_stays_saturated(tmp_path):
+    full = np.full((60, 84), 65535, np.uint16)
+    image = raw.read(written(tmp_path, full, black=FOUR, white=65535))
+    assert image.value.min() == 65535 == image.white
+
+
 G, R, B = 1, 0, 2
 X_TRANS = [[G, G, R, G, G, B], [G, G, B, G, G, R], [B, R, G, R, B, G],
            [G, G, B, G, G, R], [G, G, R, G, G, B], [R, B, G, B, R, G]]  # fmt: skip
