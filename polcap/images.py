@@ -89,7 +89,7 @@ class SensorImage(ArrayValue):
     """One decoded frame, linear, black level not subtracted."""
 
     value: Floats | NDArray[np.uint16]  # (H, W) mosaic, or (H, W, 3) without a mosaic; counts
-    black: Floats  # per phase of the mosaic, same shape as `cfa`, or (1, 1); counts
+    black: Floats  # per phase of the mosaic, same shape as `cfa`; without one (1, C); or (1, 1); counts
     white: float  # counts at which the sensor saturates
     cfa: Bits | None  # (2, 2), X-Trans (6, 6), of 0 R, 1 G, 2 B; None without a mosaic
     camera_matrix: Floats | None = None  # (3, 3) camera RGB → linear Rec.709 at the camera's white balance
@@ -254,6 +254,14 @@ class CrossedShot:
 
 
 @dataclass(frozen=True)
+class BlackError:
+    """By how much the black level that the files state is too low."""
+
+    error: Floats  # (C,) or (1,) of the sensor's range; 0: none was found
+    corrected: bool = False  # the frames were read with the measured level
+
+
+@dataclass(frozen=True)
 class BracketMeasurement:
     """Comparison of the E frames within each of K brackets: exposure, linearity, motion, blur; NaN: unknown."""
 
@@ -263,6 +271,7 @@ class BracketMeasurement:
     ghost_fraction: Floats  # (K,) share of pixels with exposures that differ by more than noise
     ambient_share: Floats  # (K,) share of the light that is present without the flash
     blur_px: Floats  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]
+    black: BlackError = BlackError(np.zeros(1))
     ambient_shared: bool = False  # one ambient frame was subtracted from shots of several angles
 
 

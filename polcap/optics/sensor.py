@@ -1,6 +1,7 @@
 """Conversion of sensor counts to linear signals, and detection of clipped pixels."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ def signal(image: SensorImage, full: bool = False) -> Floats:
     span = np.float32(image.white - float(image.black.mean()))
     if image.cfa is None:
         value = image.value[..., :1] if monochrome(image) else image.value
-        return np.asarray((value - np.float32(image.black.mean())) / span, np.float32)
+        return np.asarray((value - image.black.astype(np.float32)) / span, np.float32)
     black = np.broadcast_to(image.black, image.cfa.shape)  # of each phase
     if full:
         h, w = (2 * (n // 2) for n in image.value.shape)
@@ -29,6 +30,14 @@ def signal(image: SensorImage, full: bool = False) -> Floats:
         mosaic /= span
         return demosaic.interpolate(mosaic, image.cfa)
     return np.ascontiguousarray(np.moveaxis(binned_planes(image), 0, -1))
+
+
+def with_black_error(image: SensorImage, error: Floats) -> SensorImage:
+    """A frame whose black levels are raised by `error` (C,) of the sensor's range, one per channel or for all."""
+    counts = error * (image.white - float(image.black.mean()))
+    if image.cfa is not None:
+        counts = np.broadcast_to(counts, 3)[image.cfa]
+    return replace(image, black=image.black + counts)
 
 
 def binned_planes(image: SensorImage, rows: slice = slice(None)) -> Floats:

@@ -42,6 +42,7 @@ def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iter
     yield shot_exposure.exposures(found)
     yield shot_exposure.tone(found, limits)
     yield shot_exposure.source(found)
+    yield shot_exposure.black_level(found, limits)
     yield light.chart(found, limits)
     yield geometry.alignment(found, limits, align)
     yield geometry.mask(found, limits)

@@ -19,6 +19,9 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_tone_curvature: Annotated[
         float, Meta(gt=0, le=1, description="allowed slope of ln exposure ratio over ln brightness; 0 is linear [1]")
     ] = 0.1
+    max_black_error: Annotated[
+        float, Meta(gt=0, le=1, description="allowed error of the stated black level, which is corrected [white level]")
+    ] = 0.001
     max_gain_disagreement: Annotated[
         float,
         Meta(

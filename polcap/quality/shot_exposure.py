@@ -13,6 +13,7 @@ _EVEN_STEPS = (1.3, 20.0)  # from one exposure to the next: less is no bracket, 
 _ALIKE, _PROMISED = 1.15, 1.4
 _MISFIRE = 0.2  # change of one frame's light that fails; smaller ones are measured and corrected
 _CLIPPED_HIGHLIGHTS = 0.001  # of the object: from .002 on roughness errs by .06 more (docs/benchmarks/gates.md)
+_WHOLE = 0.5  # share of the object that moving parts do not reach in every shot
 _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light patches
 
 
@@ -87,6 +88,27 @@ def source(found: Evidence) -> Gate:
     return Gate("source", "warn", "lossy", "linear counts", message, remedy, 5.0, unit="")
 
 
+def black_level(found: Evidence, limits: GateLimits) -> Gate:
+    """Gate on the black level that the files state, by the exposures of the first bracket."""
+    bracket, limit = found.radiance.bracket, limits.max_black_error
+    if bracket.exposure_ratio.shape[1] == 1:
+        return Gate("black level", "not measured", None, limit, "One exposure per shot does not show it")
+    error = float(max(bracket.black.error, key=abs))
+    message = "The exposures fit the stated black level"
+    if error:
+        message = f"Black is {100 * abs(error):.2g} % of the white level {'above' if error > 0 else 'below'} the stated"
+        message += ", which is corrected" if bracket.black.corrected else ", or a room's light adds to the flash's"
+    return at_most("black level", abs(error), limit, message, _levels_remedy(found), beyond="warn")
+
+
+def _levels_remedy(found: Evidence) -> str:
+    """Advice about wrong levels: only finished pictures take theirs from capture.toml."""
+    sensor = found.radiance.sensor
+    if sensor.camera_matrix is None and sensor.white_balance is None:
+        return "State `black`, `white` and `encoding` of these pictures in capture.toml, or shoot RAW"
+    return "Use the camera's own RAW files: converted ones state wrong levels"
+
+
 def noise(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on noise: false polarization that noise causes in the object's median pixel."""
     figure, limit = _noise(found.stokes), limits.max_dolp_noise
@@ -109,11 +131,22 @@ def stillness(found: Evidence, limits: GateLimits) -> Gate:
     message = f"{100 * fraction[k]:.2f} % of the object differs between the exposures of the {found.names[k]} shot"
     remedy = "Take the bracket again: something moved, or the light changed"
     bad = bad_shots(found.names, fraction > limits.max_ghost)
+    if _has_wrong_levels(found.radiance, fraction, limits):
+        message += ": their black level, white level or encoding is not as stated"
+        remedy, bad = _levels_remedy(found), ()
     blurred = np.nan_to_num(found.blur_px).max() > limits.max_blur_px  # `sharpness` judges this
     state: State = "warn" if blurred else "fail"
     return at_most(
         "stillness", float(fraction[k]), limits.max_ghost, message, remedy, bad, 1 if blurred else 5, beyond=state
     )
+
+
+def _has_wrong_levels(radiance: AngleStack, ghost: Floats, limits: GateLimits) -> bool:
+    """Whether wrong levels or an encoding explain the share of ghosts of each shot (K,), rather than motion."""
+    bracket = radiance.bracket
+    black = bool(bracket.black.error.any()) and not bracket.black.corrected
+    curved = np.nanmax(np.abs(np.nan_to_num(bracket.curvature)), axis=1) > limits.max_tone_curvature
+    return black or bool((ghost > _WHOLE).all() or ((ghost > _WHOLE) & curved).any())
 
 
 def clipping(found: Evidence, limits: GateLimits) -> Gate:

@@ -17,6 +17,7 @@ import pytest
 from polcap.config import Config
 from polcap.images import (
     AngleStack,
+    BlackError,
     OrderTest,
     OutlineCheck,
     PatchColors,
@@ -119,6 +120,11 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("tone curve", "fail", {"bracket": {"curvature": np.array([[0.0, -0.2]] * 3)}}),
     ("source", "pass", {}),
     ("source", "warn", {"sensor": {"lossy": True}}),
+    ("black level", "pass", {}),
+    ("black level", "pass", {"bracket": {"black": BlackError(np.full(3, 5e-4), True)}}),
+    ("black level", "warn", {"bracket": {"black": BlackError(np.full(3, -5e-3), True)}}),
+    ("black level", "warn", {"bracket": {"black": BlackError(np.full(3, 5e-3))}}),
+    ("black level", "not measured", {"bracket": exposures(1.0)}),
     ("stillness", "pass", {}),
     ("stillness", "fail", {"radiance": {"quality": ghosts()}}),
     ("chart", "pass", {"color": {"patches": PatchColors(np.full(24, 1.0))}}),

@@ -11,6 +11,8 @@ import pytest
 from polcap.config import Config
 from polcap.images import (
     AngleStack,
+    BlackError,
+    ColorSensor,
     Equipment,
     OutlineCheck,
     Quality,
@@ -110,6 +112,37 @@ def test_each_gate_fails_alone(good: Evidence) -> None:
         gate = judged(changed(good, **fields))[name]
         assert gate.state == "fail" and gate.remedy, name
         assert failed(changed(good, **fields)) in ([name], [name, "normal error"]), name
+
+
+@pytest.mark.parametrize(
+    ("shots", "measured", "levels"),
+    [
+        ((0, 1, 2), {}, True),
+        ((1,), {}, False),
+        ((1,), {"curvature": np.array([[0.0, 0.0], [0.0, -0.3], [0.0, 0.0]])}, True),
+        ((1,), {"black": BlackError(np.full(3, 0.004))}, True),
+        ((1,), {"black": BlackError(np.full(3, 0.004), True)}, False),
+    ],
+)
+def test_an_object_that_differs_as_a_whole_has_wrong_levels(
+    good: Evidence, shots: tuple[int, ...], measured: dict[str, Any], levels: bool
+) -> None:
+    quality = good.radiance.quality.copy()
+    quality[list(shots)] |= int(Quality.GHOST)
+    radiance = bracket(replace(good.radiance, quality=quality), **measured)
+    gate = judged(changed(good, radiance=radiance))["stillness"]
+    assert gate.state == "fail"
+    assert ("moved" in gate.remedy, "black level" in gate.message, bool(gate.shots)) == (not levels, levels, not levels)
+
+
+def test_wrong_levels_of_finished_pictures_are_stated_in_capture_toml(good: Evidence) -> None:
+    quality = np.full_like(good.radiance.quality, Quality.GHOST)
+    for sensor, remedy in (
+        (ColorSensor(), "capture.toml"),
+        (ColorSensor(white_balance=np.ones(3)), "own RAW files"),
+    ):
+        radiance = replace(good.radiance, quality=quality, sensor=sensor)
+        assert remedy in judged(changed(good, radiance=radiance))["stillness"].remedy
 
 
 @pytest.mark.parametrize(("grid_px", "state"), [(1.0, "warn"), (2.0, "fail")])

@@ -45,7 +45,7 @@ from polcap.optics import sharpness
 from polcap.optics.projection import to_grid
 from polcap.stages import stage
 from polcap.stages.hdr import exposure, noise, photosites, planes, weights
-from polcap.stages.hdr.bracket import Bracket, compare
+from polcap.stages.hdr.bracket import Bracket, black_error, compare
 from polcap.stages.hdr.planes import Reader, same_size
 
 _LEAST_PX = 48  # least side of a merged picture: noise and motion are measured in tiles
@@ -75,7 +75,7 @@ class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=17)
+@stage(version=18)
 def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack:
     """Merge every bracket: radiance (K, H, W, 3) of all shots, on the scale of each shot's reference frame.
 
@@ -106,11 +106,12 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     image = read(first.frames[_middle(order)])
     _check_grid(first.frames[_middle(order)], image, settings)
     sensor, view, side = _sensor(capture, image, settings), _view(capture, image, settings), image.superpixel
-    # in the middle frame by the metadata, as in `check`, which reads each frame only once
-    places = sharpness.places(read(first.frames[(len(first.frames) - 1) // 2]), settings.clip)
     full = settings.demosaic == "full" and image.cfa is not None
     bayer = image.cfa if sensor.site_px is not None and side == 2 else None  # binned
     del image  # so that the reader can free the frame
+    read.black = black_error(Bracket(first, order, _middle(order)), read)
+    # in the middle frame by the metadata, as in `check`, which reads each frame only once
+    places = sharpness.places(read(first.frames[(len(first.frames) - 1) // 2]), settings.clip)
     lines = noise.Lines(() if capture.calibration is None else capture.calibration.noise)
     shape, stack, mosaic = (0, 0, 0), _empty(0, (0, 0, 0)), None
     ratio, curvature, ambient_share, tiles = [], [], [], []
@@ -133,11 +134,9 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         del weighted, compared
         read.forget((*shot.frames, *shot.ambient))
         lines.settle()
-    falloff = None if capture.calibration is None else capture.calibration.falloff
     pictures = [MaskedImage(*shot) for shot in zip(stack.value, stack.variance, stack.quality, strict=True)]
-    if falloff is not None and settings.falloff:
-        for picture in pictures:
-            weights.divide_by_falloff(picture, view, capture.size_px, falloff)
+    if settings.falloff:
+        _correct_falloff(pictures, capture, view)
     return AngleStack(
         value=stack.value[:count],
         variance=stack.variance[:count],
@@ -151,6 +150,7 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
             ghost_fraction=np.array([np.mean((quality & Quality.GHOST) > 0) for quality in stack.quality[:count]]),
             ambient_share=np.array(ambient_share),
             blur_px=sharpness.frames_blur(tiles, side),
+            black=read.black,
             ambient_shared=_ambient_shared(capture.shots),
         ),
         sensor=replace(sensor, lossy=read.lossy),
@@ -159,6 +159,14 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         crossed=None if capture.crossed is None else CrossedShot(pictures[-1], capture.crossed_angle),
         mosaic=mosaic,
     )
+
+
+def _correct_falloff(pictures: list[MaskedImage], capture: Capture, view: View) -> None:
+    """Divide the merged pictures by the lens's calibrated falloff, in place."""
+    falloff = None if capture.calibration is None else capture.calibration.falloff
+    if falloff is not None:
+        for picture in pictures:
+            weights.divide_by_falloff(picture, view, capture.size_px, falloff)
 
 
 def _ambient_shared(shots: tuple[Shot, ...]) -> bool:

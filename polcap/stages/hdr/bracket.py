@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from polcap.errors import CaptureError
-from polcap.images import Bools, Floats, Shot
+from polcap.images import BlackError, Bools, Floats, Shot
 from polcap.optics import sensor
 from polcap.optics.registration import Pyramid, register
 from polcap.stages.hdr import exposure, noise
@@ -18,6 +18,7 @@ from polcap.stages.hdr.planes import Reader, Signals, blocks, in_memory, planar,
 
 _SMOOTH = cv2.getGaussianKernel(7, 0.8, cv2.CV_32F)
 _STILL_PX = 0.05  # frames that moved less are not resampled
+_ANY_CAUSE = 1e-3  # of the sensor's range: so little light may be taken off, too, if it is not an error of black
 _MOTION_SIGMAS = 3.0  # nor are frames that moved by less than this many of its standard deviations
 
 
@@ -86,6 +87,27 @@ def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float)
         estimate=estimate,
         ambient_share=float("nan") if source.ambient is None else _ambient_share(source.ambient, estimate),
     )
+
+
+def black_error(bracket: Bracket, read: Reader) -> BlackError:
+    """Measure the error of the stated black level in the frames of a bracket, and decide whether to correct it.
+
+    Light that does not scale with the exposure, such as a room's under a flash, looks the same. So an error above .1 %
+    of the range is corrected only where the exposures follow the camera settings.
+    """
+    frames = bracket.shot.frames
+    if bracket.shot.ambient:  # subtracting them corrects such an error for frames of their exposure
+        return BlackError(np.zeros(1))
+    reference, others = frames[bracket.reference], [frames[e] for e in bracket.others]
+    still, tiles = exposure.tiles(read.signals(reference)), []
+    for frame in others:
+        found = exposure.tiles(read.signals(frame))
+        if found[0].shape != still[0].shape:
+            return BlackError(np.zeros(1))  # `compare` refuses the frame
+        tiles.append(exposure.in_common(still, found))
+    error, ratio = exposure.black_error(tiles)
+    steady = all(exposure.scales_as_stated(one, frame, reference) for one, frame in zip(ratio.tolist(), others))
+    return BlackError(error, bool(error.any()) and (steady or bool(np.abs(error).max() < _ANY_CAUSE)))
 
 
 class _BracketSignals:

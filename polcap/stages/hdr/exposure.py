@@ -1,13 +1,14 @@
 """Exposure ratio of two frames: measured in their pixels, or from metadata."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from polcap.errors import CaptureError
-from polcap.images import Floats, Frame
+from polcap.images import Bools, Floats, Frame
 from polcap.optics.resize import block_means
-from polcap.optics.robust import MAD_TO_SIGMA
+from polcap.optics.robust import MAD_TO_SIGMA, biweight, spread
 from polcap.stages.hdr.planes import Signals, tile_means
 
 # For the tone curve: brightness in the sensor's range, bins of brightness, and their least span in ln (one stop).
@@ -17,6 +18,11 @@ _LEAST_TILES = 30
 _SURE, _LEAST_SURE = 0.01, 0.03  # largest relative 1σ of a ratio: of one channel, of all channels together
 _LEAST_VIGNETTING = 0.01  # smaller changes of the ratio over the picture are left to the limit of ghosts
 _DIM, _DIMMEST = 4e-3, 4e-4  # of the sensor's range: darker tiles suffer from errors of the black level
+# The black level: least step of the exposure; error of the sensor's range that matters; share and range by which
+# frames may differ. Good captures reach 2e-5 (docs/benchmarks/gates.md)
+_BLACK_STEP, _LEAST_BLACK, _BLACK_AGREES = 1.3, 1e-4, (0.1, 5e-5)
+_AS_STATED = 1.3  # factor between measured and stated exposure below which steady light follows too
+_TILE_NOISE = (1e-7, 0.005, 3e-6)  # of a tile's mean: variance per signal, relative error, error of a black tile
 
 
 @dataclass(frozen=True)
@@ -46,9 +52,61 @@ def of_tiles(a: Floats, b: Floats) -> Ratio | None:
 
 def common_tiles(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
     """Means (T, C) of tiles in both frames, for the tiles that are fully usable in both."""
-    inside = block_means(reference.usable & other.usable, TILE) == 1
-    a, b = (tile_means(picture, TILE)[inside].astype(np.float64) for picture in (reference, other))
-    return a, b
+    return in_common(tiles(reference), tiles(other))
+
+
+def tiles(picture: Signals) -> tuple[Floats, Bools]:
+    """Means (rows, columns, C) of all tiles of a frame, and which tiles (rows, columns) are fully usable."""
+    return tile_means(picture, TILE).astype(np.float64), block_means(picture.usable, TILE) == 1
+
+
+def in_common(first: tuple[Floats, Bools], second: tuple[Floats, Bools]) -> tuple[Floats, Floats]:
+    """Means (T, C) of the tiles that are fully usable in both of two frames, by their `tiles`."""
+    inside = first[1] & second[1]
+    return first[0][inside], second[0][inside]
+
+
+def black_error(tiles: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+    """Measure by how much the stated black level is too low, (C,) of the sensor's range, from `common_tiles` of frames.
+
+    A level that is too low by δ adds δ to every frame, so that b = r a + (1 − r) δ: δ follows from the intercept of a
+    line, and its slope r (N,) is the exposure ratio, NaN for too few tiles. The error is 0 where it is below 1e-4, or
+    where the frames disagree.
+    """
+    lines = [_lines(a, b) if len(a) >= _LEAST_TILES else np.full((2, a.shape[1]), np.nan) for a, b in tiles]
+    ratio = np.array([slope.mean() for slope, _ in lines])
+    known = [offset / (1 - slope) for slope, offset in lines if (np.abs(np.log(slope)) > np.log(_BLACK_STEP)).all()]
+    if not known:
+        return np.zeros(1), ratio
+    error = np.mean(known, axis=0)
+    share, least = _BLACK_AGREES
+    agree = np.ptp(known, axis=0) <= share * np.abs(error) + least
+    return np.where((np.abs(error) > _LEAST_BLACK) & agree, error, 0.0), ratio
+
+
+def _lines(a: Floats, b: Floats) -> Floats:
+    """Slopes and intercepts (2, C) of b over a, (T, C) each, by iterated least squares.
+
+    Tiles where something moved count less.
+    """
+    shot, relative, dark = _TILE_NOISE
+    found = np.empty((2, a.shape[1]))
+    for c in range(a.shape[1]):
+        sure = 1 / np.sqrt(shot * np.maximum(b[:, c], 0) + (relative * b[:, c]) ** 2 + dark**2)
+        weight = sure
+        for _ in range(10):
+            matrix = np.stack([a[:, c] * weight, weight], axis=1)
+            found[:, c] = np.linalg.lstsq(matrix, b[:, c] * weight, rcond=None)[0]
+            rest = (b[:, c] - found[0, c] * a[:, c] - found[1, c]) * sure
+            weight = sure * np.sqrt(biweight(rest, spread(rest)))
+    found[0] = np.maximum(found[0], 1e-9)
+    return found
+
+
+def scales_as_stated(ratio: float, frame: Frame, reference: Frame) -> bool:
+    """Whether a measured exposure ratio is that of the camera settings, so that steady light has the same ratio."""
+    known = frame.exif.relative_exposure and reference.exif.relative_exposure
+    return bool(known) and abs(np.log(ratio / of_ambient(frame, reference))) < np.log(_AS_STATED)
 
 
 def vignetting(reference: Signals, other: Signals, ratio: Floats) -> Floats | None:

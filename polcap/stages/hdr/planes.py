@@ -16,7 +16,7 @@ import numpy as np
 
 from polcap import parallel
 from polcap.errors import CaptureError, SettingError
-from polcap.images import Bools, Decode, Floats, Frame, SensorImage
+from polcap.images import BlackError, Bools, Decode, Floats, Frame, SensorImage
 from polcap.optics import sensor
 from polcap.optics.projection import coordinates
 from polcap.optics.resize import block_means
@@ -179,6 +179,7 @@ class Reader:
         self._clip = clip
         self._decode = decode
         self.lossy = False
+        self.black = BlackError(np.zeros(1))
         self.plan = MemoryPlan()
         self._channels = 0  # of the first frame
         self._coming = deque(coming)
@@ -199,7 +200,7 @@ class Reader:
         self._held.move_to_end(id(frame))
         image = self._held[id(frame)]
         self.lossy |= image.lossy
-        return image
+        return sensor.with_black_error(image, self.black.error) if self.black.corrected else image
 
     def signals(self, frame: Frame, full: bool = False) -> Signals:
         """Linear signals of a frame, with the same channels as the first frame read."""

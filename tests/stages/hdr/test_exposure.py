@@ -67,3 +67,31 @@ def test_vignetting_is_a_smooth_factor_and_none_without_it():
     found = exposure.vignetting(planes(flat), planes(darker.astype(np.float32)), np.ones(3, np.float32))
     assert found is not None and np.abs(found - shade[..., 0]).max() < 0.02
     assert exposure.vignetting(planes(flat), planes(picture(rng, 1.0, low=0.05)), np.ones(3, np.float32)) is None
+
+
+def black_error(*frames):
+    """Error of the black level by frames of `picture`, the first of which is the reference."""
+    first, *others = map(planes, frames)
+    return exposure.black_error([exposure.common_tiles(first, other) for other in others])
+
+
+@pytest.mark.parametrize("error", [-3e-3, -2e-4, 0.0, 2e-4, [1e-3, 0.0, -1e-3]])
+def test_a_wrong_black_level_comes_out_of_the_exposures(error):
+    """Light grows with the exposure, black does not; also where the darker half is nearly black."""
+    rng = np.random.default_rng(5)
+    frames = [picture(rng, factor, low=1e-4) + np.float32(error) for factor in (1, 0.25, 1.9)]
+    found, ratio = black_error(*frames)
+    np.testing.assert_allclose(found, np.broadcast_to(error, 3), atol=2e-5)
+    np.testing.assert_allclose(ratio, [0.25, 1.9], rtol=2e-3)
+
+
+def test_other_changes_are_no_error_of_the_black_level():
+    """Vignetting of a wider aperture, a tone curve, and something that moved."""
+    rng = np.random.default_rng(6)
+    frames = [picture(rng, factor, low=1e-3) for factor in (1, 0.25, 1.9)]
+    y, x = np.mgrid[-1:1:320j, -1:1:400j]
+    shaded = [frames[0], frames[1], frames[2] * (1 - 0.2 * (x * x + y * y))[..., None]]
+    moved = [frames[0], frames[1], frames[2].copy()]
+    moved[2][40:120, 100:300] *= 1.6
+    for case in (shaded, [np.maximum(frame, 0) ** 0.45 for frame in frames], moved):
+        assert not black_error(*case)[0].any()

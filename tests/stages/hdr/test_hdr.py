@@ -233,3 +233,35 @@ def test_rendered_captures_give_their_exposure_ratios(name):
     np.testing.assert_allclose(stack.bracket.exposure_ratio, expected, rtol=1e-3)
     assert np.all(stack.bracket.ghost_fraction == 0)
     assert not (stack.quality & Quality.CLIPPED).any()
+
+
+def with_black(frame, error):
+    """A frame that states a black level `error` counts above the true one."""
+    image = frame.load()
+    return replace(frame, load=lambda: replace(image, black=image.black + error))
+
+
+@pytest.mark.parametrize("error", [-40.0, 4.0, 40.0])
+def test_a_wrong_black_level_leaves_no_trace(error):
+    """Merged as with the true level: no ghosts, and values within 1e-5 of the range and .1 %."""
+    frames, *_ = bracket(ramp(192, 256), BRACKETS["time"], seed=3)
+    timed = [replace(one, exif=replace(one.exif, exposure_time=time)) for one, time in zip(frames, (0.01, 0.04, 0.16))]
+    right = merge(capture(timed), hdr.HdrSettings())
+    wrong = merge(capture([with_black(one, error) for one in timed]), hdr.HdrSettings())
+    assert wrong.bracket.black.corrected and not right.bracket.black.error.any()
+    np.testing.assert_allclose(wrong.bracket.black.error, -error / (WHITE - BLACK), rtol=0.1, atol=2e-5)
+    assert wrong.bracket.ghost_fraction[0] == right.bracket.ghost_fraction[0] == 0
+    clear = (right.quality[0] & Quality.CLIPPED) == 0
+    np.testing.assert_allclose(wrong.value[0][clear], right.value[0][clear], rtol=5e-3, atol=2e-5)
+
+
+def test_a_room_s_light_is_not_taken_for_black():
+    """Under a flash of varied power, the room adds the same light to all frames."""
+    quads = ramp(384, 512, ripple=0)
+    rng = np.random.default_rng(4)
+    room = 100.0  # e⁻, .3 % of the range
+    frames = [
+        frame(expose(quads + room / e, e, rng), iso=100.0, exposure_time=0.01, flash_fired=True) for e in (0.25, 1, 4)
+    ]
+    stack = merge(capture(frames), hdr.HdrSettings())
+    assert stack.bracket.black.error.min() > 0.002 and not stack.bracket.black.corrected
