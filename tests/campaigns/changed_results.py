@@ -26,7 +26,7 @@ import numpy as np
 from polcap.formats import npy_folder
 from polcap.formats.maps import exr
 from polcap.pipeline import cache
-from polcap.pipeline.path import STAGES
+from polcap.results import STAGES
 from tests.campaigns.mutations import mutated
 from tests.campaigns.rows import arguments, table
 from tests.campaigns.users_files import make_template as make_capture
