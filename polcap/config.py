@@ -85,7 +85,7 @@ def fill(kind: type[S], stated: Mapping[str, Any], assignments: Sequence[str]) -
         if not equals:
             raise SettingError(f"--set {assignment}: give a value, as in {next(iter(known))}=VALUE")
         values |= _by_key({key.strip(): _parse(text.strip())})
-    _check_finite(values)
+    _check_plain(values)
     table: dict[str, Any] = {}
     for key, value in values.items():
         _check_known(key, value, known)
@@ -151,12 +151,12 @@ def _parse(text: str) -> Any:
     return text
 
 
-def _check_finite(stated: dict[str, Any]) -> None:
-    """Refuse NaN and infinity, which pass every range check."""
+def _check_plain(stated: dict[str, Any]) -> None:
+    """Refuse NaN and infinity, which pass every range check, and NUL characters."""
     try:
-        text_file.check_finite(stated)
+        text_file.check_plain(stated)
     except ValueError as error:
-        raise SettingError(f"{error}; give a number") from error
+        raise SettingError(f"{error}; correct it") from error
 
 
 def _check_known(key: str, value: Any, known: dict[str, Setting]) -> None:

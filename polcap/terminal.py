@@ -105,11 +105,19 @@ def open_log(file: "Path | None") -> None:
 
         if file.is_file() and not _is_log(file):
             raise FileExistsError(errno.EEXIST, "is there, and is no log of polcap")
-        _outputs["--log"] = output = _Output(file, "a")
+        _outputs["--log"] = output = _Output(file, "a", opener=_open_at_once)
         _log_file = _text(output)
         log(f"polcap {shlex.join(sys.argv[1:])}")
         versions = {"Python": platform.python_version(), **provenance.versions()}
         log(f"{', '.join(map(' '.join, versions.items()))}; {platform.platform()}")
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    """Open a file for --log; a named pipe without a reader is an OSError, not a wait."""
+    handle = os.open(path, flags | getattr(os, "O_NONBLOCK", 0), 0o666)
+    if hasattr(os, "O_NONBLOCK"):
+        os.set_blocking(handle, True)
+    return handle
 
 
 def _is_log(file: "Path") -> bool:

@@ -110,6 +110,20 @@ def test_a_faulty_command_line_is_one_line_and_exit_2(polcap: Command, arguments
     assert all(word in done.stderr for word in words), done.stderr
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["export", "x", "--about", "title=Caf\udce9"],
+        ["export", "x", "--iiif", "http://x/caf\udce9"],
+        ["calibrate", "x", "--filter", "K\udce4semann"],
+    ],
+)
+def test_an_option_that_is_not_utf8_is_one_line(arguments: list[str]) -> None:
+    done = shell(*arguments)
+    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
+    assert arguments[2] in done.stderr and "is not UTF-8 text" in done.stderr
+
+
 def test_bug_is_exit_1_with_a_traceback_only_under_debug(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,5 +1,6 @@
 """`polcap board`: the board to print and lay under an object that is shot from all sides."""
 
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -26,7 +27,7 @@ def board(
     files = {".svg": board_print.svg(chosen).encode(), ".pdf": board_print.pdf(chosen)}
     written = [folder / f"board-{size}{suffix}" for suffix in files]
     for file, content in zip(written, files.values(), strict=True):
-        if file.exists() and file.read_bytes() != content:
+        if os.path.lexists(file) and not (file.is_file() and file.read_bytes() == content):
             raise SettingError(f"{file} exists and is another file; move it away, or name another folder")
     for file, content in zip(written, files.values(), strict=True):
         atomic.write(file, content)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Context, Option
 
 from polcap import terminal
+from polcap.cli import options
 from polcap.cli.options import Json
 from polcap.errors import SettingError
 
@@ -36,7 +37,7 @@ def calibrate(
     from polcap.formats import calibrations, own_folders
 
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    found = calibration.measure(folder, made, lens_filter, axis, parse_board(board))
+    found = calibration.measure(folder, made, options.utf8("--filter", lens_filter), axis, parse_board(board))
     path = calibrations.write(out or own_folders.calibrations(), found)
     terminal.print_progress("\n".join(lines(found)))
     terminal.print_data({"file": str(path), "calibration": msgspec.to_builtins(found)} if json else str(path))

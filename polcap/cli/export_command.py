@@ -80,7 +80,7 @@ def export(
         bits=None if bits is None else 8 if bits == "8" else 16,
         extras=_extra_textures(extra or []),
         page=page,
-        iiif=iiif,
+        iiif=None if iiif is None else options.utf8("--iiif", iiif),
         catalog=_catalog_fields(about or []),
         lod=lod,
     )
@@ -108,7 +108,7 @@ def _catalog_fields(stated: Sequence[str]) -> dict[str, str]:
     known = CatalogEntry.__struct_fields__
     found = {}
     for text in stated:
-        key, equals, found[key] = text.partition("=")
+        key, equals, found[key] = options.utf8("--about", text).partition("=")
         if not equals:
             raise SettingError(f'--about {text}: write FACT=TEXT, for example title="Vase with handles"')
         if key not in known:

@@ -35,6 +35,15 @@ def result_folder(named: Path | None) -> Path | None:
     return named
 
 
+def utf8(option: str, text: str) -> str:
+    """The text of an option that is written into files. Raises SettingError: it is not UTF-8."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise SettingError(f"{option} {text}: is not UTF-8 text; set the terminal to UTF-8, or write ASCII") from None
+    return text
+
+
 def choice(meaning: str, metavar: str | None = None) -> Any:
     """A command-line option with a fixed list of values; `metavar` replaces them in the help."""
     return Option(case_sensitive=False, help=meaning, metavar=metavar)

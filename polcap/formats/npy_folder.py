@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import StorageError
+from polcap.formats import text_file
 
 Arrays = dict[str, NDArray[Any]]
 _MAPPED = 1 << 16  # bytes; smaller files are read at once, as a map costs a page table and a handle
@@ -137,7 +138,8 @@ def load(file: Path) -> NDArray[Any]:
         if file.stat().st_size > _MAPPED:
             with suppress(OSError):
                 return np.asarray(np.load(file, mmap_mode="r", allow_pickle=False))
-        array: NDArray[Any] = np.load(file, allow_pickle=False)
+        with text_file.opened(file) as stream:
+            array: NDArray[Any] = np.load(stream, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise StorageError(f"{file} cannot be read; delete {file.parent} and run again") from error
     array.flags.writeable = False
@@ -146,7 +148,7 @@ def load(file: Path) -> NDArray[Any]:
 
 def checksum(file: Path) -> list[Any]:
     """Size in bytes and SHA-256 digest of a file, to detect damage."""
-    with file.open("rb") as stream:
+    with text_file.opened(file) as stream:
         return [file.stat().st_size, file_digest(stream, "sha256").hexdigest()]
 
 

@@ -1,20 +1,21 @@
-"""Reads TOML and JSON files from untrusted sources, explains errors in their keys, and makes TOML text.
+"""Opens all files that polcap did not just write; reads TOML and JSON, explains errors in keys, makes TOML text.
 
 Files are UTF-8, with or without a byte order mark. The functions return plain data, or raise an `OSError` or a
-`ValueError` with a message of one line. A pipe, a huge file, deep nesting and infinite numbers are refused.
+`ValueError` with a message of one line. A pipe, a huge file, deep nesting, infinite numbers and NUL characters are
+refused.
 """
 
 import difflib
 import errno
 import json
-import math
 import os
 import re
 import stat
 import sys
 import tomllib
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 from msgspec import inspect
@@ -25,7 +26,7 @@ _UNKNOWN = re.compile(r"Object contains unknown field `(.*)`")
 _Type = TypeVar("_Type", bound=inspect.Type)
 
 
-def opened(path: str | Path) -> BinaryIO:
+def opened(path: str | Path) -> BufferedReader:
     """Open a regular file for reading; a pipe or a device is refused. Raises OSError."""
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     if not stat.S_ISREG(os.fstat(handle).st_mode):
@@ -43,36 +44,42 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
         return file.read(size)
 
 
+def read_text(path: str | Path, limit: int = TEXT_BYTES) -> str:
+    """The text of a regular file of at most `limit` bytes. Raises OSError, or ValueError: it is not UTF-8."""
+    return read_bytes(path, limit).decode("utf-8-sig")
+
+
 def read_toml(path: str | Path, finite: bool = True) -> dict[str, Any]:
     """Read a TOML file from an untrusted source as plain data; with `finite`, NaN and infinity are errors.
 
     Raises OSError or ValueError.
     """
-    return parse_toml(read_bytes(path, TEXT_BYTES).decode("utf-8-sig"), finite)
+    return parse_toml(read_text(path), finite)
 
 
 def read_json(path: str | Path) -> Any:
     """Read a JSON file from an untrusted source as plain data. Raises OSError or ValueError."""
-    return parse_json(read_bytes(path, TEXT_BYTES).decode("utf-8-sig"))
+    return parse_json(read_text(path))
 
 
 def parse_toml(text: str, finite: bool = True) -> dict[str, Any]:
-    """Parse TOML text; ValueError if it is not TOML, or if it contains NaN or infinity and `finite` is set."""
+    """Parse TOML text; ValueError if it is not TOML, or as `check_plain`."""
     try:
         found = tomllib.loads(text)
+        check_plain(found, finite)
     except RecursionError:
         raise ValueError("nested too deeply") from None
-    if finite:
-        check_finite(found)
     return found
 
 
 def parse_json(text: str) -> Any:
-    """Parse JSON text; ValueError if it is not JSON, or if a number in it is not finite."""
+    """Parse JSON text; ValueError if it is not JSON, or as `check_plain`."""
     try:
-        return json.loads(text, parse_constant=_refuse, parse_float=_finite, parse_int=_whole)
+        found = json.loads(text)
+        check_plain(found)
     except RecursionError:
         raise ValueError("nested too deeply") from None
+    return found
 
 
 def to_toml(tree: dict[str, Any]) -> str:
@@ -92,30 +99,19 @@ def _plain(tree: Any) -> Any:
     return float(f"{tree:.9g}") if isinstance(tree, float) else tree
 
 
-def check_finite(value: Any, name: str = "") -> None:
-    """Raise a ValueError that names the first infinite or NaN number in plain data."""
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"{name} = {value} is not a finite number")
+def check_plain(value: Any, finite: bool = True, name: str = "") -> None:
+    """Raise a ValueError that names a NUL character or, with `finite`, a number that is not finite, in plain data."""
+    if isinstance(value, str) and "\0" in value:
+        raise ValueError(f"{name or 'a text'} holds a NUL character")
+    if finite and isinstance(value, (int, float)) and not abs(value) <= sys.float_info.max:
+        raise ValueError(f"{f'{name} = ' * bool(name)}{str(value)[:20]} is not a finite number")
     if isinstance(value, dict):
         for key, item in value.items():
-            check_finite(item, f"{name}.{key}" if name else str(key))
+            check_plain(key)
+            check_plain(item, finite, f"{name}.{key}" if name else str(key))
     if isinstance(value, list):
         for at, item in enumerate(value):
-            check_finite(item, f"{name}[{at}]")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    return value if math.isfinite(value) else _refuse(text)
-
-
-def _whole(text: str) -> int:
-    value = int(text)
-    return value if abs(value) <= sys.float_info.max else _refuse(text[:20] + "…")
-
-
-def _refuse(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a finite number")
+            check_plain(item, finite, f"{name}[{at}]")
 
 
 def fault(error: msgspec.ValidationError, data: Any, kind: type[msgspec.Struct]) -> str:

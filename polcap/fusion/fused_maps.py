@@ -150,7 +150,7 @@ def read(folder: Path, settings: AssetSettings) -> FusedSource:
 def _mesh_arrays(file: Path) -> dict[str, Any]:
     """The arrays of a stored mesh by name. Raises DecodeError: missing, damaged, or of another shape or type."""
     try:
-        with zipfile.ZipFile(file) as stored:
+        with text_file.opened(file) as stream, zipfile.ZipFile(stream) as stored:
             arrays = {name: np.lib.format.read_array(stored.open(f"{name}.npy")) for name in _ARRAYS}
     except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise DecodeError(f"{file} cannot be read ({error}); run `polcap fuse` again") from error

@@ -88,9 +88,8 @@ def locked(out: Path) -> Iterator[None]:
             own.record([work / "lock"])
             folder_lock.acquire(lock)
         except Timeout as error:
-            other = owner.read_text(encoding="utf-8", errors="replace")[:20].strip() if owner.exists() else "unknown"
             raise StorageError(
-                f"{out}: process {other} is working here; wait for it or choose another --out"
+                f"{out}: process {_owner(owner)} is working here; wait for it or choose another --out"
             ) from error
         except OSError as error:
             raise atomic.failure(work / "lock", error) from error
@@ -100,6 +99,14 @@ def locked(out: Path) -> Iterator[None]:
             yield
         finally:
             lock.release()
+
+
+def _owner(file: Path) -> str:
+    """Process id in the file `owner`."""
+    try:
+        return text_file.read_text(file, limit=20).strip()
+    except (OSError, ValueError):
+        return "unknown"
 
 
 def _remove_temporary(out: Path) -> None:

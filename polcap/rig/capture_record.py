@@ -172,8 +172,8 @@ def load(folder: Path) -> RigFile | None:
 def read(file: Path, kind: type[T]) -> T:
     """Read a file of this package, rig.json or views.json. Raises CaptureError."""
     try:
-        return msgspec.json.decode(file.read_bytes(), type=kind)
-    except (OSError, msgspec.MsgspecError) as error:
+        return msgspec.convert(text_file.read_json(file), kind)
+    except (OSError, ValueError) as error:
         raise CaptureError(f"{file}: cannot be read ({error}); shoot into another folder") from None
 
 

@@ -1,5 +1,7 @@
 """The log of a capture's devices, rig.log: every command sent and every answer, one line each."""
 
+import errno
+import os
 import threading
 from datetime import datetime
 from pathlib import Path
@@ -24,6 +26,8 @@ class Log:
             if self._path is None:
                 return
             try:
+                if os.path.lexists(self._path) and (self._path.is_symlink() or not self._path.is_file()):
+                    raise OSError(errno.EINVAL, "is no regular file; remove it")
                 with self._path.open("a", encoding="utf-8", newline="\n") as file:
                     file.write(f"{stamp} {device} {mark} {text}\n")
             except OSError as error:

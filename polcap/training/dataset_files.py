@@ -17,7 +17,6 @@ References
 Deschaintre, Lin, Ghosh, Deep Polarization Imaging for 3D Shape and SVBRDF Acquisition, CVPR 2021, §4.
 """
 
-import json
 from math import log1p
 from pathlib import Path
 from typing import Annotated, Literal
@@ -28,7 +27,7 @@ import torch
 from msgspec import Meta
 
 from polcap.errors import InputError
-from polcap.formats import atomic
+from polcap.formats import atomic, text_file
 from polcap.formats.maps import png
 from polcap.images import Floats
 from polcap.optics import frames, mueller
@@ -154,7 +153,7 @@ def _describe(out: Path, recipe: DatasetRecipe) -> None:
     """Write dataset.json. Raises InputError if the folder already holds samples of other settings, or other files."""
     asked, file = msgspec.to_builtins(recipe), out / "dataset.json"
     if file.exists():
-        there = json.loads(file.read_text(encoding="utf-8"))["recipe"]
+        there = text_file.read_json(file)["recipe"]
         if there != asked:
             raise InputError(f"{out} was started with the settings {there}, not {asked}; choose another folder")
         return

@@ -1,12 +1,27 @@
-"""The message about a wrong setting names its key, its value and its limit."""
+"""Files of others are opened by one function; the message about a wrong setting names key, value and limit."""
 
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
+from polcap import batch, config, report
+from polcap.batch import unit
+from polcap.errors import InputError
+from polcap.formats import calibrations, chart_file, color_profile, npy_folder, text_file
+from polcap.formats.capture import capture_toml
 from polcap.formats.capture.capture_toml import CaptureFile
+from polcap.formats.export import web_page
+from polcap.formats.maps import maps_folder
 from polcap.formats.text_file import fault
+from polcap.fusion import fused_maps
+from polcap.pipeline import cache, result_folder, unchanged
+from polcap.rig import capture_record
+from polcap.rig.device_log import Log
 from polcap.synth.shooting import Shoot
 
 
@@ -40,3 +55,77 @@ def test_fault_names_key_value_and_limit(data: dict[str, Any], kind: type[msgspe
     with pytest.raises(msgspec.ValidationError) as caught:
         msgspec.convert(data, kind)
     assert fault(caught.value, data, kind).startswith(words)
+
+
+def _checked(file: Path) -> object:
+    with suppress(OSError):  # its caller computes the stage again
+        return npy_folder.checksum(file)
+    return None
+
+
+def _unit(folder: Path) -> unit.Unit:
+    return type("Named", (unit.Unit,), {"slug": "a"})("a", "a", "a", str(folder))
+
+
+READERS: dict[str, tuple[str, Callable[[Path], object]]] = {  # place of the file below a folder, and its reader
+    "settings": ("a.toml", lambda folder: config.read(folder / "a.toml")),
+    "color profile": ("a.toml", lambda folder: color_profile.read(folder / "a.toml")),
+    "calibration": ("a.toml", lambda folder: calibrations.read(folder / "a.toml")),
+    "chart": ("a.txt", lambda folder: chart_file.read(folder / "a.txt")),
+    "capture.toml": ("capture.toml", capture_toml.load),
+    "rig.json": ("rig.json", capture_record.load),
+    "rig.log": ("rig.log", lambda folder: Log(folder / "rig.log").write("rotator", ">", "go")),
+    "report.json": ("report.json", report.read),
+    "maps.json": ("maps.json", maps_folder.read),
+    "run.json": ("work/run.json", result_folder.read_run),
+    "unchanged.json": ("work/unchanged.json", lambda folder: unchanged.find(folder, "digest")),
+    "owner": ("work/owner", lambda folder: result_folder._owner(folder / "work" / "owner")),
+    "manifest": ("manifest.json", cache.manifest),
+    "array": ("a.npy", lambda folder: npy_folder.load(folder / "a.npy")),
+    "checksum": ("a.npy", lambda folder: _checked(folder / "a.npy")),
+    "mesh of a fusion": ("mesh.npz", lambda folder: fused_maps._mesh_arrays(folder / "mesh.npz")),
+    "batch.json": ("polcap-batch/batch.json", batch.reopen),
+    "record of a batch": ("records/a.json", lambda folder: unit.read_record(_unit(folder))),
+    "model-viewer": ("viewer.js", lambda folder: web_page.read_script(folder / "viewer.js")),
+}
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("special", ["pipe", "device", "endless device"])
+@pytest.mark.parametrize("name", READERS)
+def test_a_pipe_or_device_in_place_of_a_file_hangs_no_reader(tmp_path: Path, name: str, special: str) -> None:
+    if not hasattr(os, "mkfifo"):
+        pytest.skip("no named pipes here")
+    place, read = READERS[name]
+    file = tmp_path / place
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if special == "pipe":
+        os.mkfifo(file)
+    else:
+        file.symlink_to("/dev/tty" if special == "device" else "/dev/zero")
+    try:
+        assert read(tmp_path) in (None, {}, "unknown", unit.UnitRecord("a"))  # as if there were none
+    except InputError as error:
+        assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize("text", ['a = "x\\u0000y"', '"a\\u0000" = 1', '[[b]]\na = ["x", "\\U00000000"]'])
+def test_a_nul_character_is_refused_where_it_is_read(text: str) -> None:
+    with pytest.raises(ValueError, match="holds a NUL character"):
+        text_file.parse_toml(text)
+    with pytest.raises(ValueError, match="holds a NUL character"):
+        text_file.parse_json('{"a": [{"b": "x\\u0000"}]}')
+
+
+@pytest.mark.parametrize("text", ["NaN", "[1e999]", '{"a": -Infinity}'])
+def test_a_number_that_is_not_finite_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="is not a finite number"):
+        text_file.parse_json(text)
+
+
+@pytest.mark.parametrize("depth", [900, 5000, 200_000])
+def test_deep_nesting_is_refused_or_read(depth: int) -> None:
+    try:
+        text_file.parse_json("[" * depth + "]" * depth)
+    except ValueError as error:
+        assert "nested too deeply" in str(error)

@@ -6,7 +6,7 @@ from pathlib import Path
 from string import Template
 
 from polcap.errors import SettingError
-from polcap.formats import atomic
+from polcap.formats import atomic, text_file
 
 # the page may load nothing but its own parts
 _PAGE = Template(
@@ -35,8 +35,8 @@ def read_script(file: Path) -> str:
     Raises SettingError: the file cannot be read, or is not model-viewer.
     """
     try:
-        script = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        script = text_file.read_text(file)
+    except (OSError, ValueError) as error:
         raise SettingError(f"--page {file} cannot be read ({error}); give model-viewer.min.js") from error
     if "model-viewer" not in script:
         raise SettingError(f"--page {file} is not model-viewer; give model-viewer.min.js of @google/model-viewer")
