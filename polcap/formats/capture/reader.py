@@ -96,15 +96,24 @@ def _check_folder(folder: Path) -> None:
 
 
 def _check_encodings(every: dict[Path, Source], stated: CaptureFile) -> None:
-    """Raise CaptureError for a finished picture of a contradictory encoding, unless the user states the encoding."""
+    """Raise CaptureError for finished pictures of contradictory encodings, unless the user states the encoding."""
+    if stated.encoding is not None:
+        return
+    first: dict[int, tuple[Path, str]] = {}  # of each number of bits
     for path, source in every.items():
-        found = source.probe.encoding
-        if stated.encoding is None and found.fault:
+        found, bits = source.probe.encoding, source.probe.bits
+        name = photo.encoding_of(bits, found)
+        if found.fault:
             raise CaptureError(f"{path}: {found.fault}")
-        if stated.encoding is None and stated.white and found.curve not in ("", "linear"):
+        if stated.white and found.curve not in ("", "linear"):
             raise CaptureError(
                 f"{path}: its {found.source} states {found.curve}, but capture.toml states white, a level of linear "
                 'pictures; state encoding = "linear" too, or remove white'
+            )
+        other, usual = first.setdefault(bits, (path, name))
+        if name != usual:
+            raise CaptureError(
+                f"{path}: is {name}, but {other} is {usual}; save all pictures alike, or state encoding in capture.toml"
             )
 
 

@@ -24,6 +24,7 @@ _OTHER_COLORS = {5: "CMYK", 8: "CIELAB", 9: "ICCLAB", 10: "ITULAB", 32844: "LogL
 _FIREFLIES, _FAR_ABOVE = 1e-4, 16.0  # most of them, share of a picture; how far glints reach above all else
 _MOST_CHANNELS = 64  # of a layered EXR
 _DEFAULT = FrameReading("photo")
+_DIAGONALS = 0.1  # relative difference of the sums along both diagonals of a polarization sensor's cell; measured: 0.02
 _COLOR_LEVELS = 0.05  # averages of neighboring 2×2 cells differ less than this on a monochrome sensor
 
 
@@ -247,7 +248,10 @@ def _counts(pixels: NDArray[Any]) -> Any:
 
 
 def _check_monochrome(path: str | Path, mosaic: NDArray[Any]) -> None:
-    """Refuse the frame of a color polarization sensor: neighboring 2×2 cells with different color filters."""
+    """Refuse mosaics of colors: a color polarization sensor's, with unlike 2×2 cells, and one without polarizers.
+
+    In a cell of polarizers, the diagonals have the same sum: I0 + I90 = I45 + I135.
+    """
     height, width = (size // 4 * 4 for size in mosaic.shape)
     cells = mosaic[:height, :width].reshape(height // 4, 2, 2, width // 4, 2, 2)
     levels = cells.mean(axis=(0, 2, 3, 5), dtype=np.float64)  # (2, 2)
@@ -255,4 +259,11 @@ def _check_monochrome(path: str | Path, mosaic: NDArray[Any]) -> None:
         raise DecodeError(
             f"{path}: neighboring 2×2 cells differ by {levels.max() / levels.min() - 1:.0%}, as on a color "
             "polarization sensor, which is not supported; give one demosaiced picture per angle"
+        )
+    (a, b), (c, d) = cells.mean(axis=(0, 1, 3, 4), dtype=np.float64)
+    difference = abs(a + d - b - c) / max(b + c, 1e-9)
+    if difference > _DIAGONALS:
+        raise DecodeError(
+            f"{path}: the diagonals of its 2×2 cells differ by {difference:.0%}, as in a mosaic of colors, not of "
+            "polarizers; give the camera's RAW, or one developed picture per angle"
         )

@@ -73,6 +73,14 @@ def test_a_contradictory_encoding_is_refused_unless_the_user_decides(tmp_path):
     assert "not used: their sRGB chunk states srgb, but capture.toml decides" in capture.read(folder).notes
 
 
+def test_pictures_of_several_encodings_are_refused(tmp_path):
+    """One of them lost its profile."""
+    folder = finished(tmp_path, "tif", SIXTEEN, oiio__ColorSpace="sRGB")
+    save(folder / "pol045" / "a.tif", SIXTEEN + 1)
+    with pytest.raises(CaptureError, match=r"pol045.a\.tif: is linear, but .*pol000.a\.tif is srgb; save all pictures"):
+        capture.read(folder)
+
+
 def test_white_of_linear_pictures_contradicts_another_encoding(tmp_path):
     folder = finished(tmp_path, "tif", SIXTEEN, oiio__ColorSpace="sRGB")
     (folder / "capture.toml").write_text("white = 4095\n")

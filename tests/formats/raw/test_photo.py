@@ -148,6 +148,13 @@ def test_colour_sensors_are_refused(tmp_path):
         photo.read_mosaic(bayer, 0)
 
 
+def test_a_color_mosaic_is_not_taken_for_polarizers(tmp_path, rng):
+    bayer = np.tile(np.array([[0, 1], [1, 2]]), (96, 120))
+    path = save(tmp_path / "bayer.tif", np.take_along_axis(scene(rng), bayer[..., None], axis=2))
+    with pytest.raises(DecodeError, match=r"bayer\.tif: the diagonals of its 2×2 cells differ by .*mosaic of colors"):
+        photo.read_mosaic(path, 0)
+
+
 @needs_data
 def test_real_sensor_frame_balances():
     path = DATA / "real/polarization_mosaic/fruits_IMX250MZR.png"
