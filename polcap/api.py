@@ -10,12 +10,12 @@ from polcap import resource_limits
 from polcap.config import Config
 from polcap.errors import SettingError
 from polcap.formats import own_folders
-from polcap.formats.capture import reader as captures
 from polcap.images import Bools, ChartRequest, Device
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.cache import Progress, silent
-from polcap.pipeline.path import AUTO, UserInput
+from polcap.pipeline.path import AUTO
+from polcap.pipeline.request import Request
 
 
 @dataclass(frozen=True)
@@ -102,11 +102,13 @@ def process(
     folder = Path(capture)
     target = folder / own_folders.OUTPUT if out is None else Path(out)
     resource_limits.set_limits(threads, memory)
-    network = models.load_network(estimator, None if model is None else Path(model), device, threads)
-    mask_network = models.load_mask_network(threads)
-    supplied = UserInput(chart=chart, mask=mask, network=network, mask_network=mask_network)
-    found = captures.read(folder, angles_deg, clockwise)
-    about = pipeline.process(found, supplied, config or Config(), target, progress=progress)
+    request = Request(
+        config=config or Config(), chart=chart, mask=mask, estimator=estimator,
+        model=None if model is None else Path(model), device=device, angles_deg=angles_deg, clockwise=clockwise,
+        threads=threads,
+    )  # fmt: skip
+    found, supplied = request.open(folder)
+    about = pipeline.process(found, supplied, request.config, target, progress=progress)
     assert about is not None  # only `until` leaves it out
     return Result(target, about)
 

@@ -17,10 +17,11 @@ from polcap.batch import capture_search, contact_sheet, processes
 from polcap.batch import unit as units
 from polcap.batch.capture_search import Candidate
 from polcap.batch.shards import WHOLE, Shard
-from polcap.batch.unit import FINISHED, FOLDER, ProcessOptions, Unit, UnitRecord
+from polcap.batch.unit import FINISHED, FOLDER, Unit, UnitRecord
 from polcap.errors import CaptureError
 from polcap.formats import atomic, own_files, own_folders, text_file
 from polcap.formats.capture import folder_names
+from polcap.pipeline.request import Request
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def _unit(root: Path, folder: Path, out: Path | None) -> Unit:
 
 
 def run(
-    root: Path, out: Path | None, options: ProcessOptions, plan: BatchPlan, print_line: Callable[[str], None]
+    root: Path, out: Path | None, request: Request, plan: BatchPlan, print_line: Callable[[str], None]
 ) -> dict[str, Any]:
     """Process the unfinished captures of this shard; returns the summary of the shard.
 
@@ -102,20 +103,20 @@ def run(
     own_files.claim(batch_folder, names)
     with own_files.opened(batch_folder):
         atomic.write_json(batch_folder / "batch.json", places)  # for `reopen`
-        return _run(root, candidates, found, options, plan, print_line)
+        return _run(root, candidates, found, request, plan, print_line)
 
 
 def _run(
     root: Path,
     candidates: Sequence[Candidate],
     found: list[Unit],
-    options: ProcessOptions,
+    request: Request,
     plan: BatchPlan,
     print_line: Callable[[str], None],
 ) -> dict[str, Any]:
     """Process the unfinished captures of this shard and write the summary files."""
     mine, batch_folder = plan.shard.of(found), Path(found[0].batch_folder)
-    records = {unit: record for unit in mine if (record := units.find_finished(unit, options)) is not None}
+    records = {unit: record for unit in mine if (record := units.find_finished(unit, request)) is not None}
     wanted = [unit for unit in mine if unit not in records]
     print_line(f"{len(found)} captures, shard {plan.shard}: {len(mine)}, finished before: {len(records)}")
     for candidate in candidates:
@@ -128,7 +129,7 @@ def _run(
             print_line(f"{folder}: {views[0]} to {views[-1]} are views of one object; `polcap fuse` joins them")
     by_name = {unit.name: unit for unit in wanted}
     start = time.monotonic()
-    for done, record in enumerate(_process(wanted, options, plan, print_line) if wanted else (), 1):
+    for done, record in enumerate(_process(wanted, request, plan, print_line) if wanted else (), 1):
         records[by_name[record.name]] = record
         left = timedelta(seconds=round((time.monotonic() - start) / done * (len(wanted) - done)))
         message = f": {record.message}" if record.message else ""
@@ -142,13 +143,13 @@ def _run(
 
 
 def _process(
-    wanted: Sequence[Unit], options: ProcessOptions, plan: BatchPlan, print_line: Callable[[str], None]
+    wanted: Sequence[Unit], request: Request, plan: BatchPlan, print_line: Callable[[str], None]
 ) -> Iterator[UnitRecord]:
     if plan.scheduler is not None:
         from polcap.batch import cluster
 
-        return cluster.run(wanted, options, plan.scheduler, plan.workers, plan.retries, print_line)
-    return processes.run(wanted, options, plan.workers, plan.retries)
+        return cluster.run(wanted, request, plan.scheduler, plan.workers, plan.retries, print_line)
+    return processes.run(wanted, request, plan.workers, plan.retries)
 
 
 def status(found: Sequence[Unit]) -> dict[str, Any]:

@@ -8,8 +8,9 @@ from typing import Any
 
 from polcap import resource_limits
 from polcap.batch import unit as units
-from polcap.batch.unit import ProcessOptions, Unit, UnitRecord
+from polcap.batch.unit import Unit, UnitRecord
 from polcap.errors import SettingError, package_for
+from polcap.pipeline.request import Request
 
 _SETTINGS = {
     "distributed.worker.profile.enabled": False,  # costs 6 % of a small capture's time
@@ -21,7 +22,7 @@ _SETTINGS = {
 
 def run(
     wanted: Sequence[Unit],
-    options: ProcessOptions,
+    request: Request,
     address: str,
     workers: int,
     retries: int,
@@ -37,7 +38,7 @@ def run(
     with package_for("--scheduler", "Dask", "batch"):
         import dask
         import distributed
-    resources = {"GPU": 1.0} if options.device == "cuda" else None
+    resources = {"GPU": 1.0} if request.device == "cuda" else None
     with dask.config.set({"distributed.scheduler.allowed-failures": retries, **_SETTINGS}):
         target: Any = address
         try:
@@ -54,7 +55,7 @@ def run(
             raise SettingError(f"--scheduler {address}: no scheduler answers there ({error}); start one") from error
         try:
             print_line(f"dashboard {client.dashboard_link}")
-            yield from _gather(client, wanted, options, resources, retries)
+            yield from _gather(client, wanted, request, resources, retries)
         finally:
             client.close()
             if target is not address:
@@ -62,17 +63,17 @@ def run(
 
 
 def _gather(
-    client: Any, wanted: Sequence[Unit], options: ProcessOptions, resources: dict[str, float] | None, retries: int
+    client: Any, wanted: Sequence[Unit], request: Request, resources: dict[str, float] | None, retries: int
 ) -> Iterator[UnitRecord]:
     import distributed
 
     def submit(unit: Unit, attempt: int) -> Any:
-        future = client.submit(units.run, unit, options, attempt, pure=False, resources=resources)
+        future = client.submit(units.run, unit, request, attempt, pure=False, resources=resources)
         running[future] = unit, attempt
         return future
 
     # workers that join later use the settings they were started with
-    client.run(resource_limits.set_limits, options.threads, options.memory_gb)
+    client.run(resource_limits.set_limits, request.threads, request.memory_gb)
     running: dict[Any, tuple[Unit, int]] = {}
     before = {unit: units.read_record(unit) for unit in wanted}
     ended = distributed.as_completed([submit(unit, 1) for unit in wanted])

@@ -4,7 +4,8 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 
 from polcap.batch import unit as units
-from polcap.batch.unit import ProcessOptions, Unit, UnitRecord
+from polcap.batch.unit import Unit, UnitRecord
+from polcap.pipeline.request import Request
 from polcap.process_pool import Died, Limits, ProcessPool
 
 _DIED = (
@@ -13,12 +14,12 @@ _DIED = (
 )
 
 
-def run(wanted: Sequence[Unit], options: ProcessOptions, workers: int, retries: int) -> Iterator[UnitRecord]:
+def run(wanted: Sequence[Unit], request: Request, workers: int, retries: int) -> Iterator[UnitRecord]:
     """Process captures in several child processes; yields records in the order in which captures end."""
-    limits = Limits(options.threads, options.memory_gb)
+    limits = Limits(request.threads, request.memory_gb)
     before = {unit: units.read_record(unit) for unit in wanted}
     with ProcessPool(workers, retries, limits) as pool:
-        for unit, outcome in pool.run(partial(_process, options), wanted):
+        for unit, outcome in pool.run(partial(_process, request), wanted):
             if isinstance(outcome, Died):
                 message = _DIED.format(attempts=outcome.attempts)
                 yield units.record_crash(unit, before[unit], message, outcome.attempts)
@@ -26,5 +27,5 @@ def run(wanted: Sequence[Unit], options: ProcessOptions, workers: int, retries: 
                 yield outcome
 
 
-def _process(options: ProcessOptions, unit: Unit, attempt: int) -> UnitRecord:
-    return units.run(unit, options, attempt)
+def _process(request: Request, unit: Unit, attempt: int) -> UnitRecord:
+    return units.run(unit, request, attempt)

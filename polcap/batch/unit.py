@@ -1,9 +1,8 @@
-"""One capture of a batch: its options, its processing, and the record of its state.
+"""One capture of a batch: its processing, and the record of its state.
 
 An interrupted unit continues from its stage cache; a finished one is recognized without reading its photographs.
 """
 
-import dataclasses
 import hashlib
 import os
 import socket
@@ -11,8 +10,7 @@ import subprocess
 import sys
 import time
 import traceback
-from dataclasses import dataclass, field
-from functools import lru_cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -21,15 +19,11 @@ from msgspec.structs import replace
 
 from polcap import resource_limits
 from polcap.batch import thumbnail
-from polcap.config import Config
 from polcap.errors import InputError, PolcapError, StorageError, one_line
 from polcap.formats import atomic, own_files, own_folders, text_file
-from polcap.formats.capture import reader
-from polcap.images import ChartRequest, Device, Network
-from polcap.pipeline import models, unchanged
 from polcap.pipeline import run as pipeline
-from polcap.pipeline.cache import fingerprint
-from polcap.pipeline.path import UserInput
+from polcap.pipeline import unchanged
+from polcap.pipeline.request import Request
 
 State = Literal["todo", "running", "interrupted", "done", "gates", "failed", "bug", "crashed"]
 WORDS: dict[State, str] = {**{state: state for state in get_args(State)}, "gates": "gate failed"}  # for people
@@ -61,20 +55,6 @@ class Unit:
         return Path(self.batch_folder) / "thumbnails" / f"{self.slug}.jpg"
 
 
-@dataclass(frozen=True)
-class ProcessOptions:
-    """Options of `polcap process`, the same for all captures of a batch."""
-
-    settings: dict[str, Any]  # of polcap.config.Config, as plain data
-    chart: ChartRequest = field(default_factory=lambda: ChartRequest("auto"))
-    estimator: models.Estimator | None = None
-    model: str | None = None
-    device: Device = "cpu"
-    threads: int = 0
-    memory_gb: float = 0.0
-    angles_deg: tuple[float, ...] | None = None
-
-
 class UnitRecord(msgspec.Struct, frozen=True):
     """State and result of one capture of a batch, as stored in its JSON file."""
 
@@ -91,23 +71,23 @@ class UnitRecord(msgspec.Struct, frozen=True):
     report: str = ""
 
 
-def run(unit: Unit, options: ProcessOptions, attempt: int = 1) -> UnitRecord:
+def run(unit: Unit, request: Request, attempt: int = 1) -> UnitRecord:
     """Process one capture of a batch. Errors are not raised, but written into the record.
 
     Dask calls it again if the worker died after the capture was finished: the record of that stays.
     """
-    if (finished := find_finished(unit, options)) is not None:
+    if (finished := find_finished(unit, request)) is not None:
         return finished
     start = time.perf_counter()
     record = UnitRecord(unit.name, "running", "", 0.0, socket.gethostname(), os.getpid(), attempt)
     with own_files.opened(Path(unit.batch_folder)):
-        return _run(unit, options, record, start)
+        return _run(unit, request, record, start)
 
 
-def _run(unit: Unit, options: ProcessOptions, record: UnitRecord, start: float) -> UnitRecord:
+def _run(unit: Unit, request: Request, record: UnitRecord, start: float) -> UnitRecord:
     try:
         write_record(unit, record)
-        about = _process(unit, options)
+        about = _process(unit, request)
         failed = [gate for gate in about["gates"] if gate["state"] == "fail"]
         message = " ".join(f"{gate['name']}: {gate['says']}. {gate['remedy']}." for gate in failed)
         record = replace(record, state="gates" if failed else "done", message=message, **_outcome(unit, about))
@@ -127,13 +107,10 @@ def _run(unit: Unit, options: ProcessOptions, record: UnitRecord, start: float) 
     return record
 
 
-def _process(unit: Unit, options: ProcessOptions) -> dict[str, Any]:
-    config = msgspec.convert(options.settings, Config)
-    network, mask_network = _networks(options.estimator, options.model, options.device, options.threads)
-    asked = request(unit, options)
-    capture = reader.read(unit.capture, options.angles_deg)
-    supplied = UserInput(chart=options.chart, network=network, mask_network=mask_network)
-    about = pipeline.process(capture, supplied, config, Path(unit.out))
+def _process(unit: Unit, request: Request) -> dict[str, Any]:
+    asked = request.digest(Path(unit.capture), Path(unit.out))
+    capture, supplied = request.open(Path(unit.capture))
+    about = pipeline.process(capture, supplied, request.config, Path(unit.out))
     assert about is not None  # only `until` leaves it out
     unchanged.remember(Path(unit.out), asked)
     thumbnail.write(unit.thumbnail_file, Path(unit.out))
@@ -148,29 +125,10 @@ def _outcome(unit: Unit, about: dict[str, Any]) -> dict[str, Any]:
     return {"verdict": about["verdict"], "expected_error_deg": about["expected_error_deg"], **places}
 
 
-@lru_cache(maxsize=1)
-def _networks(
-    estimator: models.Estimator | None, model: str | None, device: Device, threads: int
-) -> tuple[Network | None, Network | None]:
-    """The networks of the estimator and of the mask, loaded once per process."""
-    file = None if model is None else Path(model)
-    return models.load_network(estimator, file, device, threads), models.load_mask_network(threads)
-
-
-def request(unit: Unit, options: ProcessOptions) -> str | None:
-    """Digest of the options and files that decide a capture's result, for `pipeline/unchanged.py`; None: unknown."""
-    stated = {
-        **dataclasses.asdict(dataclasses.replace(options, threads=0, memory_gb=0.0)),
-        "chart": fingerprint(options.chart),
-    }
-    files = [] if options.model is None else [Path(options.model)]
-    return unchanged.request(stated, Path(unit.capture), Path(unit.out), files)
-
-
-def find_finished(unit: Unit, options: ProcessOptions) -> UnitRecord | None:
+def find_finished(unit: Unit, request: Request) -> UnitRecord | None:
     """The record of a capture's earlier run, if its result still exists and nothing has changed; otherwise None."""
-    record = read_record(unit)
-    if record.state not in FINISHED or unchanged.find(Path(unit.out), request(unit, options)) is None:
+    record, out = read_record(unit), Path(unit.out)
+    if record.state not in FINISHED or unchanged.find(out, request.digest(Path(unit.capture), out)) is None:
         return None
     return record
 

@@ -42,21 +42,20 @@ def batch(
     model: Model = None,
 ) -> None:
     """Process every capture below a folder. Finished ones are skipped; a failure does not stop the others."""
-    import msgspec
-
     from polcap import batch as batches
     from polcap import config as settings
     from polcap.batch import shards, unit
     from polcap.pipeline import models
+    from polcap.pipeline.request import Request
 
     resource_limits.check_memory(memory)
     if model is not None or estimator == "network":  # refuse an unusable model before any capture is processed
         models.load_network(estimator, model, "cpu", 1)  # the GPU may be in other machines
-    process_options = unit.ProcessOptions(
-        settings=msgspec.to_builtins(settings.load(config, assignments or ())),
+    request = Request(
+        config=settings.load(config, assignments or ()),
         chart=options.chart_request(None if chart is None else str(chart), no_chart),
         estimator=estimator,
-        model=None if model is None else str(model.resolve()),
+        model=None if model is None else model.resolve(),
         device=device,
         threads=threads,
         memory_gb=memory,
@@ -64,7 +63,7 @@ def batch(
     )
     part = shards.from_environment(os.environ) if shard is None else shards.parse(shard)
     plan = batches.BatchPlan(part, scheduler, workers, retries, keep_going)
-    summary = batches.run(root, out, process_options, plan, terminal.print_progress)
+    summary = batches.run(root, out, request, plan, terminal.print_progress)
     terminal.print_data(summary if json else str((out or root) / unit.FOLDER / "summary.html"))
     if code := batches.exit_code(summary):
         raise Exit(code)

@@ -37,8 +37,8 @@ def fuse(
     from polcap.pipeline import unchanged
 
     target = out or folder / own_folders.FUSED
-    request = options.request_digest({**context.params, "config": config, "model": model}, folder, target)
-    if (finished := unchanged.find(target, request)) is not None:
+    asked = options.request_digest({**context.params, "config": config, "model": model}, folder, target)
+    if (finished := unchanged.find(target, asked)) is not None:
         terminal.print_progress("Nothing has changed since the last run.")
         terminal.print_result(finished.report, target, json, open_)
         return
@@ -46,26 +46,27 @@ def fuse(
     from polcap.fusion import fuse_run
     from polcap.fusion.fusion_path import SessionConfig
     from polcap.fusion.session import SessionInput
-    from polcap.pipeline import models
-    from polcap.process_pool import Limits
+    from polcap.pipeline.request import Request
 
     resource_limits.set_limits(threads, memory)
     if missing := [name for name in _NEEDED if find_spec(name) is None]:
         raise SettingError(f"polcap fuse needs {', '.join(missing)}: pip install 'polcap[fusion]'")
     if not folder.is_dir():
         raise SettingError(f"{folder}: no such folder; give the folder that holds view01, view02, …")
-    session_input = SessionInput(
-        folder=folder,
-        config=settings.fill(SessionConfig, settings.read(config), assignments or []),
+    stated = settings.fill(SessionConfig, settings.read(config), assignments or [])
+    request = Request(
+        config=stated.of_views,
         chart=options.chart_request(chart, no_chart),
-        network=models.load_network(estimator, model, device, threads),
-        mask_network=models.load_mask_network(threads),
+        estimator=estimator,
+        model=model,
+        device=device,
         angles_deg=options.angles_deg(angles),
         clockwise=clockwise,
-        workers=workers,
-        limits=Limits(threads, memory),
+        threads=threads,
+        memory_gb=memory,
     )
     steps = terminal.Steps()
+    session_input = SessionInput(folder, stated, request, workers)
     about = fuse_run.fuse(session_input, target, terminal.print_progress, steps.stage)
-    unchanged.remember(target, request)
+    unchanged.remember(target, asked, files=request.files())
     terminal.print_result(about, target, json, open_)

@@ -135,22 +135,8 @@ def request_digest(stated: Mapping[str, Any], folder: Path, out: Path) -> str | 
 
     asked = {name: value for name, value in stated.items() if name not in _NO_EFFECT}
     named = [stated.get(name) for name in ("config", "mask", "model", "chart")]
-    named.append(measured_chart(stated["config"], stated["assignments"]))
     files = [Path(name) for name in named if name is not None and Path(name).is_file()]
     return unchanged.request(asked, folder, out, files)
-
-
-def measured_chart(config: Path | None, assignments: list[str] | None) -> str | None:
-    """The setting whitebalance.chart, which may name a file; None if it is not stated or --config is no TOML."""
-    from polcap.formats import text_file
-
-    stated = [text.partition("=")[2].strip() for text in assignments or () if text.startswith("whitebalance.chart=")]
-    if not stated and config is not None:
-        try:
-            stated = [str(text_file.read_toml(config)["whitebalance"]["chart"])]
-        except (OSError, ValueError, KeyError, TypeError):
-            return None
-    return stated[-1] if stated else None
 
 
 def user_mask(file: Path) -> Any:

@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Context, Option
 
@@ -12,6 +12,9 @@ from polcap.cli.watch import at_every_change
 from polcap.errors import SettingError
 from polcap.formats import own_files, own_folders
 from polcap.results import STAGES
+
+if TYPE_CHECKING:
+    from polcap.pipeline.request import Request
 
 
 def process(
@@ -46,37 +49,35 @@ def process(
     target = out or capture / own_folders.OUTPUT
     if mask is not None and own_files.wrote(target, mask):
         raise SettingError(f"--mask {mask} is part of the result that this run replaces; copy it elsewhere first")
-    request = None if until or force or dry_run or watch else options.request_digest(stated, capture, target)
-    if (finished := unchanged.find(target, request)) is not None:
+    asked = None if until or force or dry_run or watch else options.request_digest(stated, capture, target)
+    if (finished := unchanged.find(target, asked)) is not None:
         terminal.print_progress(f"{finished.table}\nNothing has changed since the last run.")
         terminal.print_result(finished.report, target, json, open_)
         return
     resource_limits.set_limits(threads, memory)  # before the libraries start threads
-    once = partial(_plan, stated, target) if dry_run else partial(_process, stated, target, request)
+    once = partial(_plan, stated, target) if dry_run else partial(_process, stated, target, asked)
     if watch:
         at_every_change(capture, target, config, once)
     else:
         once()
 
 
-def _inputs(stated: dict[str, Any]) -> tuple[Any, Any, Any]:
-    """Read the capture, the user's other inputs and the settings. Models are opened while photographs are read."""
-    from concurrent.futures import ThreadPoolExecutor
-
+def _request(stated: dict[str, Any]) -> "Request":
+    """The request that the options state. Raises SettingError: an option, or a file that it names, is wrong."""
     from polcap import config as settings
-    from polcap.formats.capture import reader as captures
-    from polcap.pipeline import models
-    from polcap.pipeline.path import UserInput
+    from polcap.pipeline.request import Request
 
-    config = settings.load(stated["config"], stated["assignments"] or ())
-    chart = options.chart_request(stated["chart"], stated["no_chart"])
-    mask = None if stated["mask"] is None else options.user_mask(stated["mask"])
-    with ThreadPoolExecutor(1) as pool:
-        angles_deg = options.angles_deg(stated["angles"])
-        reading = pool.submit(captures.read, stated["capture"], angles_deg, stated["clockwise"])
-        network = models.load_network(stated["estimator"], stated["model"], stated["device"], stated["threads"])
-        supplied = UserInput(chart, mask, network, models.load_mask_network(stated["threads"]))
-        return reading.result(), supplied, config
+    return Request(
+        config=settings.load(stated["config"], stated["assignments"] or ()),
+        chart=options.chart_request(stated["chart"], stated["no_chart"]),
+        mask=None if stated["mask"] is None else options.user_mask(stated["mask"]),
+        estimator=stated["estimator"],
+        model=stated["model"],
+        device=stated["device"],
+        angles_deg=options.angles_deg(stated["angles"]),
+        clockwise=stated["clockwise"],
+        threads=stated["threads"],
+    )
 
 
 def _plan(stated: dict[str, Any], target: Path) -> None:
@@ -85,14 +86,15 @@ def _plan(stated: dict[str, Any], target: Path) -> None:
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import run as pipeline
 
-    capture, supplied, config = _inputs(stated)
-    stages = pipeline.plan(capture, supplied, config, target, stated["force"])
+    request = _request(stated)
+    capture, supplied = request.open(stated["capture"])
+    stages = pipeline.plan(capture, supplied, request.config, target, stated["force"])
     rows = [f"{name:14}{state}" for name, state in stages.items()]
     table = "\n".join([captures.table(capture), "", *rows])
     terminal.print_data({"capture": report.capture_facts(capture), "stages": stages} if stated["json"] else table)
 
 
-def _process(stated: dict[str, Any], target: Path, request: str | None) -> None:
+def _process(stated: dict[str, Any], target: Path, asked: str | None) -> None:
     """Process the capture and write the result folder; print the path of the asset and the verdict."""
     from dataclasses import replace
 
@@ -100,16 +102,17 @@ def _process(stated: dict[str, Any], target: Path, request: str | None) -> None:
     from polcap.pipeline import asset_export, unchanged
     from polcap.pipeline import run as pipeline
 
-    capture, supplied, config = _inputs(stated)
+    request = _request(stated)
+    capture, supplied = request.open(stated["capture"])
     table = captures.table(capture)
     terminal.print_progress(table)
     with terminal.progress(len(STAGES) + 1) as bar:
         supplied = replace(supplied, decode=pipeline.decode_with_progress(capture, bar.frame))
-        about = pipeline.process(capture, supplied, config, target, stated["until"], stated["force"], bar.stage)
+        about = pipeline.process(capture, supplied, request.config, target, stated["until"], stated["force"], bar.stage)
     if about is None:
         work = str(target / "work")
         terminal.print_data({"until": stated["until"], "work": work} if stated["json"] else work)
         return
     options.warn_of_outdated_exports(target, asset_export.sidecars(target))
-    unchanged.remember(target, request, table)
+    unchanged.remember(target, asked, table, request.files())
     terminal.print_result(about, target, stated["json"], stated["open_"])

@@ -17,7 +17,7 @@ import numpy as np
 
 from polcap.errors import CaptureError, ChartError
 from polcap.formats import own_folders
-from polcap.formats.capture import folder_names, reader
+from polcap.formats.capture import folder_names
 from polcap.formats.maps import png
 from polcap.fusion import each_view, feature_poses, mask_agreement, poses, view_maps, view_path
 from polcap.fusion.board_eraser import PosedBoard
@@ -26,11 +26,11 @@ from polcap.fusion.poses import LEAST_VIEWS, SessionPoses
 from polcap.fusion.silhouettes import Silhouette
 from polcap.fusion.values import FusionView, ViewMask
 from polcap.fusion.view_path import SessionView
-from polcap.images import Capture, ChartRequest, ColorCalibration, Network
+from polcap.images import Capture, ChartRequest, ColorCalibration
 from polcap.pipeline import run
 from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult, digest
-from polcap.pipeline.path import AUTO, UserInput
-from polcap.process_pool import UNLIMITED, Limits, ProcessPool
+from polcap.pipeline.request import Request
+from polcap.process_pool import Limits, ProcessPool
 
 Notify = Callable[[str], None]  # is called with a line on the step that is done
 R = TypeVar("R")
@@ -38,17 +38,12 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class SessionInput:
-    """A session's folder, and options for all its views."""
+    """A session's folder and settings, and the request that is the same for all its views."""
 
     folder: Path
     config: SessionConfig
-    chart: ChartRequest = AUTO
-    network: Network | None = None
-    mask_network: Network | None = None
-    angles_deg: tuple[float, ...] | None = None
-    clockwise: bool = False
+    request: Request  # of each view; threads and memory are limits of each process
     workers: int = 1  # views at a time, each in a process
-    limits: Limits = UNLIMITED  # of each of these processes
 
 
 @dataclass(frozen=True)
@@ -126,16 +121,16 @@ def read(session_input: SessionInput) -> Session:
 
     Raises CaptureError: there are too few views.
     """
-    folder, config = session_input.folder, session_input.config.of_views
+    folder, request = session_input.folder, session_input.request
     names = folder_names.session_views(folder)
     if not names:
         raise CaptureError(f"{folder} holds no views; put each capture into a folder view01, view02, …")
-    supplied = UserInput(session_input.chart, None, session_input.network, session_input.mask_network)
+    supplied = request.supplied()
     views, left_out = dict[str, SessionView](), dict[str, str]()
     seen: dict[str, str] = {}  # name of the view, by digest of a photograph
     for name in names:
         try:
-            capture = reader.read(folder / name, session_input.angles_deg, session_input.clockwise)
+            capture = request.read(folder / name)
         except each_view.FAULTS as error:
             left_out[name] = each_view.reason(error, str(folder / name))
             continue
@@ -143,7 +138,7 @@ def read(session_input: SessionInput) -> Session:
         if earlier := next((seen[digest] for digest in photographs if digest in seen), None):
             left_out[name] = f"holds photographs of {earlier}"
             continue
-        views[name] = SessionView(name, capture, supplied, config, folder / name / own_folders.OUTPUT)
+        views[name] = SessionView(name, capture, supplied, request.config, folder / name / own_folders.OUTPUT)
         seen |= dict.fromkeys(photographs, name)
     return Session(views, {}).without(left_out)
 
@@ -170,7 +165,8 @@ def _process_pool(session_input: SessionInput) -> Iterator[ProcessPool | None]:
     if session_input.workers == 1:
         yield None
         return
-    with ProcessPool(session_input.workers, each_view.RETRIES, session_input.limits) as pool:
+    limits = Limits(session_input.request.threads, session_input.request.memory_gb)
+    with ProcessPool(session_input.workers, each_view.RETRIES, limits) as pool:
         yield pool
 
 

@@ -8,7 +8,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import cache
 from hashlib import blake2b
 from pathlib import Path
@@ -31,7 +31,7 @@ class Finished(NamedTuple):
     report: dict[str, Any]
 
 
-def request(options: Mapping[str, Any], capture: Path, out: Path, files: Iterable[Path] = ()) -> str | None:
+def request(options: Any, capture: Path, out: Path, files: Iterable[Path] = ()) -> str | None:
     """Digest of a run's request: options, program, and size and time of photographs and other input files.
 
     `options` is plain data. The user's calibrations count as input files. None if these do not determine the result.
@@ -58,15 +58,21 @@ def find(out: Path, asked: str | None) -> Finished | None:
         known = text_file.read_json(out / "work" / _FILE)
         if asked is None or known["request"] != asked or known["result"] != _result(out):
             return None
+        if any(_stat(file) != stat for file, stat in known["files"].items()):
+            return None
         return Finished(str(known["table"]), text_file.read_json(out / "report.json"))
     except (OSError, ValueError, TypeError, KeyError):
         return None
 
 
-def remember(out: Path, asked: str | None, table: str = "") -> None:
-    """Record the request digest that the result folder now answers; does nothing if it is None."""
+def remember(out: Path, asked: str | None, table: str = "", files: Iterable[Path] = ()) -> None:
+    """Record the request digest that the result folder now answers; does nothing if it is None.
+
+    `files` are further inputs, which were not known when the request was made.
+    """
     if asked is not None:
-        content = {"request": asked, "table": table, "result": _result(out)}
+        stats = {os.path.abspath(file): _stat(file) for file in files}
+        content = {"request": asked, "table": table, "files": stats, "result": _result(out)}
         with own_files.opened(out):
             atomic.write_json(out / "work" / _FILE, content, synced=False)
 

@@ -17,12 +17,13 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 
-from polcap import batch
+from polcap import batch, config
 from polcap.batch import cluster
 from polcap.batch import unit as one
 from polcap.errors import CaptureError
 from polcap.formats.maps import png
 from polcap.images import ChartRequest
+from polcap.pipeline.request import Request
 from tests.batch.conftest import OPTIONS
 from tests.conftest import ROOT, Command, shell
 
@@ -131,9 +132,10 @@ def test_second_run_opens_no_finished_capture(captures: Path, finished: Path, po
 
 def test_a_changed_setting_is_processed_again(captures: Path, finished: Path) -> None:
     units = [unit for unit in batch.find(captures, finished) if unit.name == "obj0"]
-    options = one.ProcessOptions({"hdr": {}})
-    assert one.find_finished(units[0], options) is None
-    assert one.request(units[0], options) != one.request(units[0], one.ProcessOptions({"hdr": {"clip": 0.9}}))
+    folders = Path(units[0].capture), Path(units[0].out)
+    other = Request(config=config.load(assignments=["hdr.clip=0.9"]))
+    assert one.find_finished(units[0], Request()) is None
+    assert Request().digest(*folders) != other.digest(*folders)
 
 
 def test_status_lists_every_capture(finished: Path, polcap: Command) -> None:
@@ -196,9 +198,9 @@ def test_scheduler_that_does_not_answer_is_named(captures: Path, tmp_path: Path,
     assert done.returncode == 2 and "tcp://127.0.0.1:9: no scheduler answers there" in done.stderr
 
 
-def finish_and_die(unit: one.Unit, options: one.ProcessOptions, attempt: int) -> None:
+def finish_and_die(unit: one.Unit, request: Request, attempt: int) -> None:
     """Process a capture, and kill the worker before it reports."""
-    one.run(unit, options, attempt)
+    one.run(unit, request, attempt)
     os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -207,13 +209,13 @@ def test_a_capture_stays_done_if_its_dask_worker_dies_afterwards(
 ) -> None:
     pytest.importorskip("distributed")
     (unit,) = [unit for unit in batch.find(captures, tmp_path) if unit.name == "obj0"]
-    options = one.ProcessOptions({}, ChartRequest("none"), "analytic")
+    request = Request(chart=ChartRequest("none"), estimator="analytic")
     monkeypatch.setattr("polcap.batch.cluster.units.run", finish_and_die)
-    (record,) = cluster.run([unit], options, "local", 1, 0, lambda line: None)
+    (record,) = cluster.run([unit], request, "local", 1, 0, lambda line: None)
     assert record.state in one.FINISHED and one.read_record(unit) == record
     written = unit.record_file.stat().st_mtime_ns
     monkeypatch.undo()
-    assert one.run(unit, options) == record  # as Dask repeats a task that a dead worker had ended
+    assert one.run(unit, request) == record  # as Dask repeats a task that a dead worker had ended
     assert unit.record_file.stat().st_mtime_ns == written
 
 
@@ -229,5 +231,5 @@ def test_a_local_cluster_listens_on_this_machine_only(monkeypatch: pytest.Monkey
         return iter(())
 
     monkeypatch.setattr(cluster, "_gather", note)
-    assert list(cluster.run([], one.ProcessOptions({}), "local", 1, 0, lambda line: None)) == []
+    assert list(cluster.run([], Request(), "local", 1, 0, lambda line: None)) == []
     assert len(hosts) >= 3 and set(hosts) == {"127.0.0.1"}  # scheduler, dashboard, worker

@@ -16,8 +16,9 @@ import pytest
 from polcap import batch
 from polcap.batch import contact_sheet
 from polcap.batch import unit as one
+from polcap.pipeline.request import Request
 
-ANALYTIC = one.ProcessOptions({}, estimator="analytic")
+ANALYTIC = Request(estimator="analytic")
 
 
 def only_unit(root: Path, name: str) -> one.Unit:

@@ -34,8 +34,8 @@ from polcap.fusion.values import Pose
 from polcap.images import Floats
 from polcap.optics import color
 from polcap.optics.mesh_tracer import Tracer, Triangles, smooth
-from polcap.pipeline import models
 from polcap.pipeline.cache import LazyCache, MemoryCache, StageResult
+from polcap.pipeline.request import Request
 from polcap.stages.asset import AssetSettings
 
 LEAST_SEEN = 0.02  # weight of a texel
@@ -91,8 +91,7 @@ def pose_of(stated: dict[str, Any]) -> Pose:
 
 def joined(folder: Path) -> str:
     """Table row on the join of two sets."""
-    network, mask_network = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
-    session_input = SessionInput(folder, SessionConfig(), network=network, mask_network=mask_network)
+    session_input = SessionInput(folder, SessionConfig(), Request(threads=1))
     cache = LazyCache(folder / "fused")
     views = session.process(session.read(session_input), session_input, cache, lambda _: None).views
     both = path(views, FusionSettings(), MemoryCache())

@@ -26,8 +26,8 @@ from polcap.fusion.session import SessionInput
 from polcap.images import Bools, Floats
 from polcap.optics import projection
 from polcap.optics.board import BOARDS
-from polcap.pipeline import models
 from polcap.pipeline.cache import silent
+from polcap.pipeline.request import Request
 from polcap.synth import all_around, shooting
 from polcap.synth.all_around import AroundShoot, ObjectPose
 from polcap.synth.laid_board import LaidBoard
@@ -64,8 +64,7 @@ def main(folder: Path) -> None:
 
 def outcome(folder: Path) -> str:
     """Cells of a session's row."""
-    network, mask_network = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
-    session_input = SessionInput(folder, SessionConfig(), network=network, mask_network=mask_network)
+    session_input = SessionInput(folder, SessionConfig(), Request(threads=1))
     try:
         about = fuse_run.fuse(session_input, folder / "fused", lambda _: None, silent)
     except InputError as error:

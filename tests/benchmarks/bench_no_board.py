@@ -29,8 +29,8 @@ from polcap.fusion.fusion_path import FusionResults, FusionSettings, SessionConf
 from polcap.fusion.session import SessionInput
 from polcap.fusion.values import FusionView, Pose
 from polcap.images import Floats
-from polcap.pipeline import models
 from polcap.pipeline.cache import LazyCache, MemoryCache
+from polcap.pipeline.request import Request
 from polcap.synth import all_around, scenes
 
 PATTERN_M = 0.006  # size of the pattern
@@ -43,8 +43,7 @@ def main(out: Path, mesh: str, views: int, step: int) -> None:
         folder = out / board
         if not folder.exists():
             render(folder, mesh, board, views)
-        networks = models.load_network(None, None, "cpu", 1), models.load_mask_network(1)
-        session_input = SessionInput(folder, SessionConfig(), network=networks[0], mask_network=networks[1])
+        session_input = SessionInput(folder, SessionConfig(), Request(threads=1))
         found = session.read(session_input)
         found = session.Session(dict(list(found.views.items())[::step]), {})
         processed = session.process(found, session_input, LazyCache(folder / "fused"), print)

@@ -25,19 +25,21 @@ from polcap.fusion.view_path import SessionView
 from polcap.pipeline import run
 from polcap.pipeline.cache import LazyCache, silent
 from polcap.pipeline.path import UserInput
+from polcap.pipeline.request import Request
 from polcap.quality import fused_object
 from polcap.quality.limits import FusedGateLimits
 from polcap.stages import Stage
 from tests.fusion import board_views
 
 SWAPPED = {"name": "order", "state": "fail", "says": "90°, 45°, 0° fit better", "remedy": "rename the folders"}
+ANALYTIC = Request(estimator="analytic")
 SILENT = StepRunner(None, lambda _: None)
 
 
 def session_of(folder: Path, *names: str) -> SessionInput:
     for name in names:
         (folder / name).mkdir()
-    return SessionInput(folder, SessionConfig())
+    return SessionInput(folder, SessionConfig(), ANALYTIC)
 
 
 def test_a_view_that_lacks_a_shot_is_left_out_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,7 +61,7 @@ def test_a_copy_of_a_view_is_left_out(tmp_path: Path) -> None:
             photo.parent.mkdir(parents=True)
             photo.write_bytes(cv2.imencode(".png", np.full((8, 8, 3), view + angle, np.uint16))[1].tobytes())
     shutil.copytree(tmp_path / "view02", tmp_path / "view05")
-    found = sessions.read(SessionInput(tmp_path, SessionConfig()))
+    found = sessions.read(SessionInput(tmp_path, SessionConfig(), ANALYTIC))
     assert list(found.views) == ["view01", "view02", "view03", "view04"]
     assert found.left_out == {"view05": "holds photographs of view02"}
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from polcap.formats import own_files
 from polcap.pipeline import unchanged
 from tests.conftest import Command, python
 
@@ -51,6 +52,19 @@ def test_content_that_changed_under_its_old_time_is_seen(capture: Path) -> None:
     _settled(capture / "new", "b")
     os.replace(capture / "new", capture / "a.dng")
     assert before != unchanged.request(ASKED, capture, capture / "polcap", ())
+
+
+def test_a_file_that_only_the_settings_name_is_watched(capture: Path) -> None:
+    """Such as the measured colors of the chart, which are known once the settings are read."""
+    out, colors = capture / "polcap", capture.parent / "chart.ti3"
+    (out / "work").mkdir(parents=True)
+    (out / "report.json").write_text("{}")
+    own_files.claim(out, [])
+    _settled(colors, "a")
+    unchanged.remember(out, "asked", files=[colors])
+    assert unchanged.find(out, "asked") is not None
+    _settled(colors, "b", 1)
+    assert unchanged.find(out, "asked") is None
 
 
 def test_what_has_just_changed_is_in_doubt(capture: Path) -> None:
