@@ -89,10 +89,11 @@ def draw(number: int, kind: str, folder: Path) -> Scene:
     turn = tilt * Rotation.from_rotvec([0, 0, random.uniform(-0.2, 0.2)])
     scene = random_scene(7000 + number, "bumps")  # its material, light and chart
     model = Model(str(file), RADIUS)
+    x, y, z = turn.as_rotvec(degrees=True).tolist()
     law: Any = ("smooth", "rough")[(number + round_) % 2]
     return Scene(
         shape=model, coat=scene.coat, position=scene.position, light=scene.light, chart=scene.chart, law=law,
-        turn_deg=tuple(float(x) for x in turn.as_rotvec(degrees=True)), interreflection=True,
+        turn_deg=(x, y, z), interreflection=True,
     )  # fmt: skip
 
 
