@@ -10,6 +10,7 @@ mesh and texture folder, the first included, is for tests; a single one is for b
 import argparse
 import re
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,7 @@ import numpy as np
 
 from polcap.errors import DecodeError, InputError, PolcapError, StorageError
 from polcap.formats import atomic, scene_files
+from polcap.formats.capture import folder_names, foreign_files
 from polcap.training.progress import Report, silent
 
 _MESHES = {".obj", ".glb", ".gltf", ".ply", ".stl", ".off"}
@@ -39,8 +41,9 @@ def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
     """
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; give the one that holds your meshes and textures")
-    meshes = sorted(path for path in source.rglob("*") if path.suffix.lower() in _MESHES and path.is_file())
-    textures = _texture_folders(source, report)
+    files = list(foreign_files.files_below(source))
+    meshes = sorted(path for path in files if path.suffix.lower() in _MESHES and path.is_file())
+    textures = _texture_folders(files, report)
     counts = [0, 0]
     jobs = (meshes, write_mesh, "meshes", ".npz"), (textures, write_textures, "materials", "")
     for kind, (found, convert, place, suffix) in enumerate(jobs):
@@ -61,10 +64,10 @@ def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
     return counts[0], counts[1]
 
 
-def _texture_folders(source: Path, report: Report) -> list[Path]:
+def _texture_folders(files: Iterable[Path], report: Report) -> list[Path]:
     """The folders with a picture of albedo and one of roughness; a folder with only one of them is reported."""
     complete = []
-    for folder in sorted({path.parent for path in source.rglob("*") if path.suffix.lower() in _PICTURES}):
+    for folder in sorted({path.parent for path in files if path.suffix.lower() in _PICTURES}):
         missing = sorted({"albedo", "roughness"} - _pictures(folder).keys())
         if not missing:
             complete.append(folder)
@@ -122,7 +125,7 @@ def write_textures(folder: Path, target: Path) -> None:
 def _pictures(folder: Path) -> dict[str, Path]:
     """The pictures of a texture folder by role."""
     found: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
+    for path in folder_names.children(folder):
         if path.suffix.lower() in _PICTURES:
             role = next((role for role, words in _ROLES.items() if words.search(path.stem)), None)
             if role is not None:

@@ -1,11 +1,10 @@
 """Watches a folder that a camera is filling, or a file that somebody edits: waits until changes have ended."""
 
-import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from polcap.formats.capture.foreign_files import is_ignored_file, is_ignored_folder
+from polcap.formats.capture.foreign_files import files_below
 
 _POLL_S = 0.1
 
@@ -15,14 +14,14 @@ FileStates = dict[str, tuple[int, int]]  # size and time of change by path
 def settled(folder: Path, ignored: Path, still_s: float = 2.0, edited: Sequence[Path] = ()) -> Iterator[None]:
     """Watch a folder: yield at once, then each time files changed and nothing has changed for `still_s` seconds since.
 
-    The folder `ignored` (of results) and the names of `foreign_files` are not watched. An editor saves the files
+    The folder `ignored` (of results) and files of other programs are not watched. An editor saves the files
     `edited` in one step, so their changes count as ended at the next poll.
     """
     folder, ignored = folder.resolve(), ignored.resolve()
     done: tuple[FileStates, FileStates] | None = None
-    last, texts, since = _seen(folder, ignored), _stats(edited), time.monotonic()
+    last, texts, since = _stats(files_below(folder, ignored)), _stats(edited), time.monotonic()
     while True:
-        now, texts_now = _seen(folder, ignored), _stats(edited)
+        now, texts_now = _stats(files_below(folder, ignored)), _stats(edited)
         if now != last:
             since = time.monotonic()
         still = done is None or now == done[0] or time.monotonic() - since >= still_s
@@ -32,16 +31,6 @@ def settled(folder: Path, ignored: Path, still_s: float = 2.0, edited: Sequence[
         else:
             last, texts = now, texts_now
         time.sleep(_POLL_S)
-
-
-def _seen(folder: Path, ignored: Path) -> FileStates:
-    """Size and modification time of all files below a watched folder."""
-    found: FileStates = {}
-    for root, folders, files in os.walk(folder):
-        here = Path(root)
-        folders[:] = [name for name in folders if not is_ignored_folder(name) and (here / name) != ignored]
-        found |= _stats(here / name for name in files if not is_ignored_file(name))
-    return found
 
 
 def _stats(files: Iterable[Path]) -> FileStates:

@@ -4,7 +4,9 @@ They are hidden, or thumbnails and bins of drives and systems, catalogs and side
 files that are still being copied.
 """
 
-from pathlib import PurePath
+import os
+from collections.abc import Iterator
+from pathlib import Path, PurePath
 
 # in lower case
 _FOLDERS = {
@@ -44,6 +46,13 @@ def is_ignored_file(name: str) -> bool:
     """Whether a file of this name is hidden, a sidecar or backup of another program, or not copied yet."""
     low = name.lower()
     return low.startswith(".") or low in _FILES or low.endswith(_ENDS) or PurePath(low).suffix in _SIDECARS | _CATALOGS
+
+
+def files_below(folder: Path, result: Path | None = None) -> Iterator[Path]:
+    """All files below a folder, without those of other programs and those of a result folder."""
+    for place, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not is_ignored_folder(name) and Path(place, name) != result]
+        yield from (Path(place, name) for name in files if not is_ignored_file(name))
 
 
 def is_photograph(name: str, among_raw: bool) -> bool:

@@ -9,7 +9,7 @@ import pytest
 
 from polcap.calibrate import calibration_photographs
 from polcap.errors import InputError
-from polcap.formats.capture import arrivals, reader
+from polcap.formats.capture import foreign_files, reader
 from polcap.images import Capture
 from tests.formats.capture.capture_folders import flat, folders, names, pictures, shoot
 
@@ -147,7 +147,8 @@ def test_calibration_leaves_out_the_same_files(tmp_path: Path) -> None:
 
 def test_a_watched_folder_does_not_change_by_thumbnails(tmp_path: Path) -> None:
     flat(tmp_path)
-    before = arrivals._seen(tmp_path, tmp_path / "polcap")
+    before = set(foreign_files.files_below(tmp_path, tmp_path / "polcap"))
     pictures(tmp_path / "@eaDir" / "IMG_0000.dng", ["THUMB.png"])
+    pictures(tmp_path / "polcap", ["normal.png"])
     (tmp_path / "Thumbs.db").write_bytes(BINARY)
-    assert arrivals._seen(tmp_path, tmp_path / "polcap") == before
+    assert set(foreign_files.files_below(tmp_path, tmp_path / "polcap")) == before
