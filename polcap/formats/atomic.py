@@ -29,7 +29,7 @@ _FORBIDDEN = set('/\\:*?"<>|')  # path separators, and characters that Windows r
 _TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.part(\.\w+)?")  # process id and random number
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{n}" for port in ("COM", "LPT") for n in range(10))}  # of Windows
 _NAME_BYTES = 60  # Windows allows 260 characters for the whole path
-_MISSING = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.ENODEV)  # of network drives
+_MISSING = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENODEV)  # of network drives
 _UNSYNCED = {*_MISSING, errno.EINVAL, errno.EBADF, errno.EISDIR, errno.EACCES, errno.EPERM}  # likewise, of fsync
 REASONS = {
     errno.ENOSPC: "the disk is full; free some space",
@@ -42,6 +42,7 @@ REASONS = {
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
     errno.EFBIG: "the file is larger than the file system allows; choose another folder",
     errno.EIO: "the disk reports an input/output error; check the disk",
+    errno.ENOLCK: "its drive has no file locks; choose a folder on a local disk with -o",
     **dict.fromkeys(_MISSING, "its drive lacks a function that polcap needs; choose a folder on a local disk with -o"),
 }
 

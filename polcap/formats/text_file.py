@@ -28,6 +28,8 @@ _Type = TypeVar("_Type", bound=inspect.Type)
 
 def opened(path: str | Path) -> BufferedReader:
     """Open a regular file for reading; a pipe or a device is refused. Raises OSError."""
+    if "\0" in os.fspath(path):
+        raise OSError(errno.EINVAL, "its name holds a NUL character", str(path))
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)

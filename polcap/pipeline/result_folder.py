@@ -32,6 +32,8 @@ def check(out: Path, photographs: Path) -> None:
         os.fspath(out).encode()
     except UnicodeEncodeError:
         raise SettingError(f"--out {out} is no UTF-8 text, as OpenEXR wants it; name another with --out") from None
+    if "\0" in os.fspath(out):
+        raise SettingError(f"--out {out} holds a NUL character; name another folder")
     here, there = Path(os.path.realpath(out)), Path(os.path.realpath(photographs))
     if here == there:
         raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from polcap.formats import atomic, onnx
+from polcap.formats import atomic, onnx, text_file
 from polcap.formats.maps import png
 from polcap.images import Cues, Network, SurfaceMaps
 from polcap.pipeline import models
@@ -117,7 +117,7 @@ def _evaluate_pictures(options: EvaluationOptions, means: Means, head: dict[str,
 
 def _read_results(path: Path, head: dict[str, Any]) -> list[Row]:
     """Read results from pictures.jsonl of an earlier run with the same inputs; an unfinished last line is dropped."""
-    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    lines = text_file.read_text(path, limit=1 << 30).splitlines(keepends=True) if path.exists() else []
     if not lines or lines[0] != json.dumps(head) + "\n":
         return []
     return [json.loads(line) for line in lines[1:] if line.endswith("\n")]

@@ -126,7 +126,7 @@ def _pictures(folder: Path) -> dict[str, Path]:
     """The pictures of a texture folder by role."""
     found: dict[str, Path] = {}
     for path in folder_names.children(folder):
-        if path.suffix.lower() in _PICTURES:
+        if path.suffix.lower() in _PICTURES and path.is_file():
             role = next((role for role, words in _ROLES.items() if words.search(path.stem)), None)
             if role is not None:
                 found.setdefault(role, path)

@@ -11,7 +11,7 @@ import pytest
 
 from polcap import batch, config, report
 from polcap.batch import unit
-from polcap.errors import InputError
+from polcap.errors import InputError, SettingError
 from polcap.formats import calibrations, chart_file, color_profile, npy_folder, text_file
 from polcap.formats.capture import capture_toml
 from polcap.formats.capture.capture_toml import CaptureFile
@@ -115,6 +115,13 @@ def test_a_nul_character_is_refused_where_it_is_read(text: str) -> None:
         text_file.parse_toml(text)
     with pytest.raises(ValueError, match="holds a NUL character"):
         text_file.parse_json('{"a": [{"b": "x\\u0000"}]}')
+
+
+def test_a_nul_character_in_the_name_of_a_file_is_an_error_of_the_file(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="its name holds a NUL character"):
+        text_file.read_bytes(tmp_path / "a\0b", 10)
+    with pytest.raises(SettingError, match="holds a NUL character"):
+        result_folder.check(tmp_path / "a\0b", tmp_path)
 
 
 @pytest.mark.parametrize("text", ["NaN", "[1e999]", '{"a": -Infinity}'])
