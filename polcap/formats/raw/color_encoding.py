@@ -10,7 +10,7 @@ ASWF, Color Interop Forum: color space identifiers for OpenEXR.
 
 import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -233,7 +233,7 @@ def _icc_curve(tag: bytes) -> Curve:
 def _exr(spec: Any) -> Iterator[_Statement]:
     """Statements of an EXR's attributes; without any it is linear, of Rec.709 (OpenEXR, standard attributes)."""
     stated = spec.getattribute("chromaticities")
-    matrix = None if stated is None else _from_primaries(tuple(map(float, stated)))
+    matrix = None if stated is None else _from_primaries(stated)
     named = False
     for attribute in spec.extra_attribs:
         name = re.split("[:/.]", attribute.name)[-1].replace("_", "").lower()
@@ -272,11 +272,11 @@ def _plain(name: str) -> str:
     )
 
 
-def _from_primaries(xy: tuple[float, ...]) -> Floats | None:
+def _from_primaries(xy: Sequence[float]) -> Floats | None:
     """Color matrix (3, 3) to linear Rec.709 from primaries: x, y of red, green, blue, white; None for Rec.709's own."""
-    x, y = np.reshape(xy, (4, 2)).T
-    if (y == 0).any():
+    if np.shape(xy) != (8,) or not np.isfinite(xy).all() or not np.all(xy[1::2]):
         raise _UnusableError(f"its primaries are not colors; {_DEVELOP}")
+    x, y = np.reshape(xy, (4, 2)).astype(np.float64).T
     xyz = np.stack([x / y, np.ones(4), (1 - x - y) / y])  # (3, 4)
     return _matrix(xyz[:, :3], xyz[:, 3])
 

@@ -175,6 +175,8 @@ def test_contradictory_encodings_are_refused_unless_the_user_decides(
         ("narrow.png", png(sixteen(SRGB), (b"cICP", bytes((1, 13, 0, 0)))), "code points 1/13/0/0"),
         ("channels.png", png(sixteen(SRGB), iccp(profile(curv(), curv(563), curv()))), "differ between the channels"),
         ("falling.png", png(sixteen(SRGB), iccp(profile(curv(65535, 0)))), "does not grow from 0 to 1"),
+        ("no_color.exr", exr(LIGHT, chromaticities=(*ACES[:7], np.nan)), "its primaries are not colors"),
+        ("one_color.exr", exr(LIGHT, chromaticities=(0.3, 0.3) * 4), "not three different colors"),
         ("film.exr", exr(LIGHT, colorspace="ACEScct"), "states ACEScct; write linear values"),
     ],
 )

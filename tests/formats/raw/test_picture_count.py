@@ -143,6 +143,7 @@ def opcode_list(*numbers: int) -> bytes:
         ({}, False),
         ({51009: (7, opcode_list(4, 9))}, True),  # OpcodeList2: bad pixels, GainMap
         ({51008: (7, opcode_list(1, 4))}, False),
+        ({51009: (3, (9, 999)), 50827: (3, (400, 5))}, False),  # damaged
         ({52525: (7, bytes(300_000))}, True),  # ProfileGainTableMap
     ],
 )
