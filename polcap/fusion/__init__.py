@@ -21,7 +21,7 @@ In the order of use:
     board_eraser      a picture without the board
     mask_without_board  the object's mask, found in this picture
     silhouettes       which points of a grid lie inside a mask, and which of its pixels they cover
-    mask_agreement    removes from a mask what no other view confirms, and finds views whose masks are wrong
+    mask_agreement    removes parts of masks that no other view confirms, and finds wrong masks
 
   Shape
     shape             masks and normals -> closed mesh

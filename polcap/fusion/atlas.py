@@ -67,11 +67,11 @@ def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSetti
     """
     pixel = _pixel(mesh, views)
     count = max(min(int(_area(mesh) / (_TRIANGLE * pixel**2)), len(mesh.faces)), _FEWEST)
-    return reduced(mesh, count, lambda coarse: _sized(coarse, pixel, settings, views[0].metric))
+    return chart_reduced(mesh, count, lambda coarse: _chart_sized(coarse, pixel, settings, views[0].metric))
 
 
-def reduced(mesh: ClosedMesh, count: int, chart: Callable[[ClosedMesh], Atlas]) -> Atlas:
-    """The atlas that `chart` makes of a mesh with about `count` triangles, or with fewer if it fails on these.
+def chart_reduced(mesh: ClosedMesh, count: int, make: Callable[[ClosedMesh], Atlas]) -> Atlas:
+    """The atlas that `make` returns for a mesh with about `count` triangles, or with fewer if it fails on these.
 
     Raises ObjectError: it fails on all, or these are too few triangles to enclose a body.
     """
@@ -79,26 +79,26 @@ def reduced(mesh: ClosedMesh, count: int, chart: Callable[[ClosedMesh], Atlas]) 
     for share in _SHARES:
         coarse = decimate(mesh, int(share * count))
         try:
-            return chart(coarse)
+            return make(coarse)
         except ObjectError as error:
             failure = error
     assert failure is not None
     raise failure
 
 
-def _sized(mesh: ClosedMesh, pixel: float, settings: AtlasSettings, metric: bool) -> Atlas:
+def _chart_sized(mesh: ClosedMesh, pixel: float, settings: AtlasSettings, metric: bool) -> Atlas:
     """The atlas in the size of the settings, or in one whose texels are no larger than `pixel` [m]."""
     if settings.size:
-        return charted(mesh, settings.size, settings.margin, metric)
+        return chart(mesh, settings.size, settings.margin, metric)
     side = _side(mesh, pixel)
-    found = charted(mesh, side, settings.margin, metric)
+    found = chart(mesh, side, settings.margin, metric)
     while found.texel > pixel and side < _SIDES[1]:  # the margins of the charts need room, too
         side *= 2
-        found = charted(mesh, side, settings.margin, metric)
+        found = chart(mesh, side, settings.margin, metric)
     return found
 
 
-def charted(mesh: ClosedMesh, side: int, margin: int, metric: bool = True) -> Atlas:
+def chart(mesh: ClosedMesh, side: int, margin: int, metric: bool = True) -> Atlas:
     """Cut a closed mesh into charts, and pack them into a texture of `side` px, with `margin` px between them.
 
     `metric`: the mesh is in metres.

@@ -1,9 +1,9 @@
 """Textures of the atlas from all views: which view sees which texel, how much it counts, and robust means.
 
-A view counts more where it looks squarely at the surface, where its maps expect small errors, and far from the
+A view counts more where it sees the surface squarely, where its maps expect small errors, and far from the
 object's outline and from edges of parts that hide others. Weights fade to 0 there, so that no seam shows.
 
-Every picture is parted into a smooth and a fine band. The smooth band is a mean over all views. The fine band comes
+Every picture is split into a smooth and a fine band. The smooth band is a mean over all views. The fine band comes
 from the best views: a mean of views whose poses err by a pixel would blur it. Normals are baked as differences from
 the mesh's own normals, so the mesh counts as one more view.
 
@@ -104,7 +104,7 @@ def bake(views: tuple[FusionView, ...], atlas: Atlas, settings: BakingSettings) 
     diffuse = _bake_bands([view.diffuse for view in views], views, visible, count, settings.smooth)
     gloss = [np.concatenate([view.specular, view.roughness[..., None]], axis=-1) for view in views]
     samples, plain = [one.sample(image) for one, image in zip(visible, gloss)], [one.weight for one in visible]
-    specular_roughness, _ = _reweighted(samples, plain, visible, count, _OUTLIER * _typical(samples))
+    specular_roughness, _ = _robust_mean(samples, plain, visible, count, _OUTLIER * _typical(samples))
     total = np.zeros(count)
     for one in visible:
         total[one.texel] += one.weight
@@ -149,13 +149,13 @@ def _visible(view: FusionView, atlas: Atlas, tracer: Tracer) -> VisibleTexels:
     in_front = -point[texel, 2] <= surface.depth[row, column] * (1 + slack)  # false where the surface is missed
     fade = _distance_from_edges(view, surface.depth)[row, column]
     weight = np.where(in_front, cosine**2 * fade, 0)
-    kept = np.flatnonzero(weight > 0)
-    texel = texel[kept]
+    seen = np.flatnonzero(weight > 0)
+    texel = texel[seen]
     return VisibleTexels(
         texel,
         pixel[texel].astype(np.float32),
-        cosine[kept].astype(np.float32),
-        weight[kept].astype(np.float32),
+        cosine[seen].astype(np.float32),
+        weight[seen].astype(np.float32),
         surface.normal,
     )
 
@@ -195,10 +195,10 @@ def _bake_normals(
     weights = [
         one.weight / (one.sample(view.sigma_deg)[:, 0] ** 2 + _FLOOR_DEG**2) for one, view in zip(visible, views)
     ]
-    smooth, weights = _reweighted(
+    smooth, weights = _robust_mean(
         [one[:, :3] for one in differences], weights, visible, count, float(np.radians(_OUTLIER_DEG)), prior
     )
-    fine, _ = _mean([one[:, 3:] for one in differences], [w**_SHARPNESS for w in weights], visible, count)
+    fine, _ = _weighted_mean([one[:, 3:] for one in differences], [w**_SHARPNESS for w in weights], visible, count)
     return frames.unit(atlas.normal + smooth + fine)
 
 
@@ -222,8 +222,8 @@ def _bake_bands(
     channels = images[0].shape[-1]
     weights = [one.weight for one in visible]
     low = [one[:, :channels] for one in bands]
-    mean, weights = _reweighted(low, weights, visible, count, _OUTLIER * _typical(low))
-    fine, _ = _mean([one[:, channels:] for one in bands], [w**_SHARPNESS for w in weights], visible, count)
+    mean, weights = _robust_mean(low, weights, visible, count, _OUTLIER * _typical(low))
+    fine, _ = _weighted_mean([one[:, channels:] for one in bands], [w**_SHARPNESS for w in weights], visible, count)
     return np.maximum(mean + fine, 0)
 
 
@@ -238,7 +238,7 @@ def _bands(image: Floats, inside: Bools, sigma: float) -> Floats:
     return np.concatenate([smooth, np.where(inner, image.astype(np.float32) - smooth, 0)], axis=-1)
 
 
-def _reweighted(
+def _robust_mean(
     samples: Sequence[Floats],
     weights: Sequence[Floats],
     visible: Sequence[VisibleTexels],
@@ -252,15 +252,15 @@ def _reweighted(
     """
     robust = list(weights)
     for _ in range(_ROUNDS):
-        mean, _ = _mean(samples, robust, visible, count, prior)
+        mean, _ = _weighted_mean(samples, robust, visible, count, prior)
         robust = [
             w / (1 + np.sum((value - mean[one.texel]) ** 2, axis=-1) / scale**2)
             for value, w, one in zip(samples, weights, visible)
         ]
-    return _mean(samples, robust, visible, count, prior)[0], robust
+    return _weighted_mean(samples, robust, visible, count, prior)[0], robust
 
 
-def _mean(
+def _weighted_mean(
     samples: Sequence[Floats],
     weights: Sequence[Floats],
     visible: Sequence[VisibleTexels],

@@ -78,8 +78,8 @@ def detect(radiance: AngleStack, color: ColorCalibration) -> BoardSearch:
     Raises CaptureError: too little of the board is visible, or two boards are.
     """
     picture, scale = gray_picture(radiance, color)
-    markers = _markers(picture)
-    board, count = _one_board(markers)
+    markers = _find_markers(picture)
+    board, count = _choose_board(markers)
     if board is None:
         return BoardSearch(None, count)
     known = np.asarray(boards.charuco(board).getIds()).ravel().tolist()
@@ -90,7 +90,7 @@ def detect(radiance: AngleStack, color: ColorCalibration) -> BoardSearch:
     if place is None:
         raise CaptureError("the board's markers contradict each other; show a flat board")
     number, world = boards.corners(board)
-    moved = _located(picture, place, board)
+    moved = _locate(picture, place, board)
     good = np.isfinite(moved).all(axis=1)
     if good.sum() < _LEAST_CORNERS:
         raise CaptureError(
@@ -100,7 +100,7 @@ def detect(radiance: AngleStack, color: ColorCalibration) -> BoardSearch:
     return BoardSearch(BoardCorners(board, number[good], world[good], from_grid(moved[good], scale)), count)
 
 
-def _markers(picture: Floats) -> list[tuple[int, Floats]]:
+def _find_markers(picture: Floats) -> list[tuple[int, Floats]]:
     """Numbers of all markers in a linear picture, with their corners (4, 2) px."""
     bright = max(float(np.quantile(picture, 0.98)), 1e-6)
     gray = np.asarray(255 * np.clip(picture / bright, 0, 1) ** (1 / 2.2), np.uint8)
@@ -115,7 +115,7 @@ def _markers(picture: Floats) -> list[tuple[int, Floats]]:
     return list(zip(np.ravel(numbers).tolist(), (found + 0.5) / zoom - 0.5, strict=True))
 
 
-def _one_board(markers: list[tuple[int, Floats]]) -> tuple[Board | None, int]:
+def _choose_board(markers: list[tuple[int, Floats]]) -> tuple[Board | None, int]:
     """The board that the markers belong to, or None; and how many belong to it. Raises CaptureError for several."""
     numbers = [number for number, _ in markers]
     twins = len(numbers) - len(set(numbers))
@@ -130,7 +130,7 @@ def _one_board(markers: list[tuple[int, Floats]]) -> tuple[Board | None, int]:
     return (BOARDS[there[0]] if there else None), max(seen.values())
 
 
-def _located(picture: Floats, place: Floats, board: Board) -> Floats:
+def _locate(picture: Floats, place: Floats, board: Board) -> Floats:
     """Corners (N, 2) px of the board; NaN where the print around a corner is not visible.
 
     Around each corner the print is drawn through the homography `place`, and moved until it fits (Gauss-Newton).
@@ -139,17 +139,17 @@ def _located(picture: Floats, place: Floats, board: Board) -> Floats:
     out = np.full((len(world), 2), np.nan)
     for k, corner in enumerate(world[:, [0, 2]]):
         at = corner + board.side_m / 2
-        x, y, drawn = _drawn(place, at, board)
+        x, y, drawn = _draw(place, at, board)
         reach = np.array([np.ptp(x), np.ptp(y)]) / (2 * _WINDOW)  # px per square
         if min(x.min(), y.min()) < 0 or x.max() > picture.shape[1] - 1 or y.max() > picture.shape[0] - 1:
             continue
-        moved, correlation = _registered(picture, x, y, drawn)
+        moved, correlation = _register(picture, x, y, drawn)
         if correlation > _LEAST_CORRELATION and (np.abs(moved) < np.maximum(_MOST_MOVED * reach, 1.5)).all():
             out[k] = transform_points(place, at) + moved
     return out
 
 
-def _drawn(place: Floats, at: Floats, board: Board) -> tuple[Floats, Floats, Floats]:
+def _draw(place: Floats, at: Floats, board: Board) -> tuple[Floats, Floats, Floats]:
     """Pixels x, y (h, w) around the flat point `at` (2,) [m], and the share of paper that they should show."""
     half = _WINDOW * board.square_m * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
     around = transform_points(place, at + half)
@@ -164,7 +164,7 @@ def _drawn(place: Floats, at: Floats, board: Board) -> tuple[Floats, Floats, Flo
     return x, y, gaussian_filter(drawn, _BLUR_PX)
 
 
-def _registered(picture: Floats, x: Floats, y: Floats, drawn: Floats) -> tuple[Floats, float]:
+def _register(picture: Floats, x: Floats, y: Floats, drawn: Floats) -> tuple[Floats, float]:
     """Shift (2,) px from the pixels x, y to where the picture looks as `drawn` (h, w), and their correlation."""
     down, across = np.gradient(drawn)
     terms = np.stack([drawn, across, down, np.ones_like(drawn)], axis=-1).reshape(-1, 4)

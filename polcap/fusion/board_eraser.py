@@ -1,7 +1,7 @@
 """Erases the board's print from a view's picture, so that the object's mask is found as before a dark backdrop.
 
-The pose tells where paper and ink are. Their brightness is fitted as smooth functions over the board. Pixels that look
-as the print then get the brightness of ink. Paper is printed in strips only, and a closing over their width returns
+The pose gives the places of paper and ink. Their brightness is fitted by smooth functions over the board. Pixels like
+the print then get the brightness of ink. Paper is printed in strips only, and a closing over their width returns
 parts of the object that are as bright as the paper behind them.
 """
 

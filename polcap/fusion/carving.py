@@ -61,23 +61,23 @@ class HollowDepths:
 
 def carve(hull: DistanceGrid, surface: FittedSurface, views: Sequence[SmallView]) -> DistanceGrid:
     """Signed distances of the hull less its hollows; the hull itself where views agree on the surface."""
-    doubtful = _doubtful(surface)
+    doubtful = _find_doubtful(surface)
     if not doubtful.any():
         return hull
     tracer = surface.tracer()
     sweeps = [partial(_sweep, k, views, tracer, doubtful, hull) for k in range(len(views))]
-    depths = _confirmed(parallel.results(sweeps), hull.grid.step)
+    depths = _confirm(parallel.results(sweeps), hull.grid.step)
     free = _mean_distance(hull, depths)
-    wall = _is_wall(surface, depths, hull.grid.step)
+    wall = _find_walls(surface, depths, hull.grid.step)
     inner = iso_surface(hull).vertices[wall]  # where masks are too narrow, the fitted surface lies outside the hull
-    carved = np.maximum(hull.distance, _behind_walls(hull, np.concatenate([surface.vertices[wall], inner]), free))
+    carved = np.maximum(hull.distance, _limit_at_walls(hull, np.concatenate([surface.vertices[wall], inner]), free))
     height = hull.grid.origin[1] + hull.grid.step * np.arange(hull.grid.shape[1])
     floor = height < _WALL * hull.grid.step  # the board is behind it
     carved[:, floor] = hull.distance[:, floor]
     return replace(hull, distance=plain_body(carved, hull.grid.step))
 
 
-def _doubtful(surface: FittedSurface) -> Bools:
+def _find_doubtful(surface: FittedSurface) -> Bools:
     """Vertices (V,) of large parts of the surface on which views contradict each other."""
     doubtful = surface.spread(1 - surface.agreement, _SPREAD) > _DOUBT
     index = np.flatnonzero(doubtful)
@@ -92,7 +92,7 @@ def _sweep(
 ) -> HollowDepths:
     """Best depth of each pixel of one view behind doubtful surface."""
     step = hull.grid.step
-    view = _coarser(views[number], step)
+    view = _coarsen(views[number], step)
     height, width = view.outline.shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
     ray = back_project(view.view, x, y) @ view.pose.rotation  # (H, W, 3) world, at depth 1
@@ -130,7 +130,7 @@ def _agreement(point: Floats, pixel: NDArray[np.intp], view: SmallView, others: 
     return np.asarray(np.sort(found, axis=0)[-_AGREEING:].mean(axis=0))
 
 
-def _coarser(of: SmallView, step: float) -> SmallView:
+def _coarsen(of: SmallView, step: float) -> SmallView:
     """The view with about one pixel to a grid step."""
     far = float(np.linalg.norm(of.pose.translation))
     every = max(1, round(step * of.view.focal / far))
@@ -139,7 +139,7 @@ def _coarser(of: SmallView, step: float) -> SmallView:
     return replace(of, view=view, outline=of.outline[::every, ::every], normal=normal, diffuse=diffuse)
 
 
-def _confirmed(depths: Sequence[HollowDepths], step: float) -> list[HollowDepths]:
+def _confirm(depths: Sequence[HollowDepths], step: float) -> list[HollowDepths]:
     """Depths that at least one other view has at the same place."""
     confirmed = []
     for one in depths:
@@ -183,7 +183,7 @@ def _mean_distance(hull: DistanceGrid, depths: Sequence[HollowDepths]) -> Floats
     return np.asarray(sums / np.maximum(counts, 1e-6))
 
 
-def _is_wall(surface: FittedSurface, depths: Sequence[HollowDepths], step: float) -> Bools:
+def _find_walls(surface: FittedSurface, depths: Sequence[HollowDepths], step: float) -> Bools:
     """Vertices (V,) through which no view looks at a depth behind them."""
     outward = vertex_normals(surface.vertices, surface.faces)
     seen = visible(surface.vertices, surface.faces, outward, [one.view for one in depths], step)
@@ -191,7 +191,7 @@ def _is_wall(surface: FittedSurface, depths: Sequence[HollowDepths], step: float
     return np.asarray(surface.spread(np.any(seen & beyond, axis=0).astype(float), _SPREAD) < _OPEN)
 
 
-def _behind_walls(hull: DistanceGrid, walls: Floats, free: Floats) -> Floats:
+def _limit_at_walls(hull: DistanceGrid, walls: Floats, free: Floats) -> Floats:
     """Free distances, limited so that _WALL steps stay behind wall vertices (N, 3)."""
     index = np.argwhere(free > -hull.grid.step)
     point = hull.grid.origin + hull.grid.step * index

@@ -35,19 +35,19 @@ def solid(mesh: ClosedMesh, floor: float | None = None) -> ClosedMesh:
     """
     import manifold3d
 
-    given = manifold3d.Mesh64(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.uint64))
-    given.merge()
-    body = manifold3d.Manifold(given)
+    raw = manifold3d.Mesh64(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.uint64))
+    raw.merge()
+    body = manifold3d.Manifold(raw)
     if body.status() != manifold3d.Error.NoError or body.is_empty():
         raise ObjectError(f"the fused mesh is not closed ({body.status().name}); check poses and masks of the views")
     if floor is not None:
         body = body.trim_by_plane((0.0, 1.0, 0.0), floor)
     parts = body.decompose()
     written = max(parts, key=lambda part: part.volume()).to_mesh64()
-    return _separated(ClosedMesh(np.array(written.vert_properties[:, :3]), np.array(written.tri_verts, np.int32)))
+    return _separate(ClosedMesh(np.array(written.vert_properties[:, :3]), np.array(written.tri_verts, np.int32)))
 
 
-def _separated(mesh: ClosedMesh) -> ClosedMesh:
+def _separate(mesh: ClosedMesh) -> ClosedMesh:
     """The mesh with coincident vertices moved a little towards their neighbors, so that programs do not merge them."""
     _, place, count = np.unique(mesh.vertices.astype(np.float32), axis=0, return_inverse=True, return_counts=True)
     shared = count[place.reshape(-1)] > 1

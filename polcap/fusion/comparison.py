@@ -45,14 +45,14 @@ def _agreement(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: Atl
     angle_deg = float(np.median(np.degrees(np.arccos(cosine)))) if both.any() else 90.0
     if view.s0 is None or not len(visible.texel):
         return ViewAgreement(view.name, angle_deg, None)
-    photograph, drawn = visible.sample(view.s0), rendered(view, visible, atlas, maps)
+    photograph, drawn = visible.sample(view.s0), render(view, visible, atlas, maps)
     weight = visible.weight[:, None]
     drawn = drawn * float((weight * drawn * photograph).sum() / max((weight * drawn * drawn).sum(), 1e-12))
     error = (weight * (photograph - drawn) ** 2).sum() / max((weight * photograph**2).sum(), 1e-12)
     return ViewAgreement(view.name, angle_deg, float(np.sqrt(error)))
 
 
-def rendered(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: AtlasMaps) -> Floats:
+def render(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: AtlasMaps) -> Floats:
     """S0 (M, 3) of the texels that a view sees, under its light; 1 on a white plane at the object's distance."""
     rotation, translation = view.pose.rotation, view.pose.translation
     point = atlas.position[visible.texel] @ rotation.T + translation

@@ -111,8 +111,8 @@ def solve(features: Mapping[str, ObjectFeatures], capture: Capture) -> SessionPo
     if len(views) >= LEAST_VIEWS:
         tracks = _tracks(seen, pairs, start, views)
         doubt = max(*np.abs(capture.focal_doubt), 0.002 if capture.focal_known else 0.5)
-        found = _adjusted(tracks, start, seen[0].focal, float(doubt))
-        posed = _posed(found, [names[k] for k in views], distance or 1.0, capture.focal_px)
+        found = _adjust(tracks, start, seen[0].focal, float(doubt))
+        posed = _pose_views(found, [names[k] for k in views], distance or 1.0, capture.focal_px)
         camera = _camera(capture, seen[0].bend, found)
     if len(posed) < LEAST_VIEWS:
         raise CaptureError(
@@ -131,7 +131,7 @@ def _camera(capture: Capture, bend: tuple[float, float], found: _AdjustedMotion)
     return SessionCamera(focal, focal * float(found.sigma[_FOCAL]), capture.principal_px, *bend)
 
 
-def _posed(found: _AdjustedMotion, names: Sequence[str], distance: float, focal_px: float) -> list[PosedView]:
+def _pose_views(found: _AdjustedMotion, names: Sequence[str], distance: float, focal_px: float) -> list[PosedView]:
     """Poses of the views with enough features; the lens is `distance` from the axis."""
     tracks, motion = found.tracks, found.motion
     point = _points(tracks, motion, found.near.astype(float))[0]
@@ -236,7 +236,7 @@ def _tracks(
     return _FeatureTracks(np.searchsorted(views, view[use]), np.unique(track[use], return_inverse=True)[1], ray[use])
 
 
-def _adjusted(tracks: _FeatureTracks, first: _Motion, focal_px: float, doubt: float) -> _AdjustedMotion:
+def _adjust(tracks: _FeatureTracks, first: _Motion, focal_px: float, doubt: float) -> _AdjustedMotion:
     """The motion that fits the tracks best; `doubt` is the 1σ of the logarithm of the focal length."""
     count = (len(first.value) - _TURNS) // 3
     prior = np.full(len(first.value), np.inf)
@@ -263,7 +263,7 @@ def _adjusted(tracks: _FeatureTracks, first: _Motion, focal_px: float, doubt: fl
 def _points(tracks: _FeatureTracks, motion: _Motion, weight: Floats) -> tuple[Floats, Floats]:
     """World points (P, 3) nearest to their rays, by linear least squares, and their slopes (M, 2) in the views.
 
-    A ray (x, y) of the view with rotation R and translation t says (R X + t)_x + x (R X + t)_z = 0, and so for y.
+    A ray (x, y) of the view with rotation R and translation t fulfills (R X + t)_x + x (R X + t)_z = 0; so for y.
     """
     turn, shift = (part[tracks.view] for part in motion.poses())
     ray = tracks.ray / motion.focal_change

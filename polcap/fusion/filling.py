@@ -1,6 +1,6 @@
 """Fills texels that no view saw, smoothly over the surface, from those around them.
 
-Values at the vertices solve (W + λ L) x = W b: W is the weight of the views, b what they saw, L the Laplacian of the
+Values at the vertices solve (W + λ L) x = W b: W is the weight of the views, b their values, L the Laplacian of the
 mesh. Far from seen surface x is harmonic, without steps.
 """
 

@@ -93,36 +93,45 @@ def document(
     """The content of report.json: facts, figures by view, gates; `seconds` are those of the stages."""
     rows = _rows(processed, results)
     judged = list(_gates(processed, results, rows, config.fusion.gates))
-    reports, camera = processed.reports, processed.poses.camera
-    first = next(iter(reports.values()))
-    shots = [
-        {**shot, "frames": [{**frame, "file": f"{view}/{frame['file']}"} for frame in shot["frames"]]}
-        for view, report in reports.items()
-        for shot in report["capture"]["shots"]
-    ]
+    first = next(iter(processed.reports.values()))
+    of_views = {f"{view} infer": report["keys"]["infer"] for view, report in processed.reports.items()}
     return {
         "polcap": __version__,
         "versions": provenance.versions(),
         "verdict": gates.verdict(judged),
-        "capture": {**first["capture"], "name": name, "shots": shots},
+        "capture": {**first["capture"], "name": name, "shots": _shots(processed)},
         "gates": msgspec.to_builtins(judged),
-        "figures": {
-            "views": {row["name"]: row for row in rows},
-            "left_out": dict(processed.left_out),
-            "sets": {one.folder: one.shared for one in results.joined},
-            "camera": asdict(camera),
-            "mesh": {
-                "metric": processed.poses.metric,
-                "triangles": len(results.atlas.mesh.faces),
-                "extent": np.ptp(results.mesh.vertices, axis=0).tolist(),
-                "closed": _closed(results),
-                "seen": _seen(results),
-            },
-        },
+        "figures": _figures(processed, results, rows),
         "timings": dict(seconds),
         "model": first["model"],
-        "keys": {**results.keys, **{f"{view} infer": report["keys"]["infer"] for view, report in reports.items()}},
+        "keys": {**results.keys, **of_views},
         "settings": msgspec.to_builtins(config),
+    }
+
+
+def _shots(processed: ProcessedSession) -> list[dict[str, Any]]:
+    """Facts of the shots of all views, with files named from the session's folder."""
+    return [
+        {**shot, "frames": [{**frame, "file": f"{view}/{frame['file']}"} for frame in shot["frames"]]}
+        for view, report in processed.reports.items()
+        for shot in report["capture"]["shots"]
+    ]
+
+
+def _figures(processed: ProcessedSession, results: FusionResults, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Figures of the views, the sets of views, the camera and the mesh."""
+    return {
+        "views": {row["name"]: row for row in rows},
+        "left_out": dict(processed.left_out),
+        "sets": {one.folder: one.shared for one in results.joined},
+        "camera": asdict(processed.poses.camera),
+        "mesh": {
+            "metric": processed.poses.metric,
+            "triangles": len(results.atlas.mesh.faces),
+            "extent": np.ptp(results.mesh.vertices, axis=0).tolist(),
+            "closed": _closed(results),
+            "seen": _seen(results),
+        },
     }
 
 
@@ -158,7 +167,7 @@ def _seen(results: FusionResults) -> float:
 
 def _closed(results: FusionResults) -> bool:
     """Whether every edge of the mesh, as it is written, belongs to two triangles."""
-    return is_closed(fused_maps.closed(results.atlas.mesh))
+    return is_closed(fused_maps.weld(results.atlas.mesh))
 
 
 def _gates(

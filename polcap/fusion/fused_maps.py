@@ -112,10 +112,10 @@ class FusedSource:
     def decimated(self, whole: Asset, triangles: int) -> DetailLevel:
         """The asset with about so many triangles, an atlas of its own, and the textures of the full mesh."""
         side, margin, metric = self.maps.mask.shape[0], self.atlas.margin, self.atlas.mesh.metric
-        atlas = atlases.reduced(
-            closed(self.atlas.mesh), triangles, lambda coarse: atlases.charted(coarse, side, margin, metric)
+        atlas = atlases.chart_reduced(
+            weld(self.atlas.mesh), triangles, lambda coarse: atlases.chart(coarse, side, margin, metric)
         )
-        maps = transferred(self.atlas, self.maps, atlas)
+        maps = transfer(self.atlas, self.maps, atlas)
         bits: Literal[8, 16] = 8 if whole.normal.dtype == np.uint8 else 16
         extras: tuple[Extra, ...] = ("occlusion",) if whole.has_occlusion else ()
         extras += () if whole.object_normal is None else ("object-normal",)
@@ -165,14 +165,14 @@ def _mesh_arrays(file: Path) -> dict[str, Any]:
     return arrays
 
 
-def closed(mesh: Mesh) -> ClosedMesh:
+def weld(mesh: Mesh) -> ClosedMesh:
     """The mesh without the seams of its charts: vertices at one position are one."""
     vertices, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces: NDArray[np.int32] = place.reshape(-1)[mesh.faces].astype(np.int32)
     return ClosedMesh(vertices, faces)
 
 
-def transferred(source: Atlas, maps: AtlasMaps, target: Atlas) -> AtlasMaps:
+def transfer(source: Atlas, maps: AtlasMaps, target: Atlas) -> AtlasMaps:
     """The maps of one atlas on the texels of another of the same object: means of the nearest texels."""
     distance, nearest = cKDTree(source.position).query(target.position, k=_NEIGHBORS)
     share: Floats = 1 / (np.asarray(distance) + 0.1 * source.texel)

@@ -121,7 +121,7 @@ def plain_body(distance: Floats, step: float) -> Floats:
     body = ndimage.binary_fill_holes(body)
     body = _without_false_loops(body)
     body = ndimage.binary_fill_holes(_largest_part(body))
-    near = 0.05 * step  # where the body was changed, its surface lies beside the changed points
+    near = 0.05 * step  # where the body was changed, its surface is near the changed points
     changed = np.where(body, np.minimum(distance, -near), np.maximum(distance, near))
     # marching cubes would join two cubes that share an edge alone, which `_euler` counts as separate
     changed[_touches_by_an_edge(body)] = -_LOOSE * step

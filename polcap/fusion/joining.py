@@ -145,15 +145,17 @@ def register(moving: ObservedSurface, fixed: ObservedSurface) -> tuple[Motion, f
     """The motion of one surface onto another, and the share of its points that then have a partner there."""
     random = np.random.default_rng(0)
     few, coarse = moving.some(_FEW, random), fixed.some(10 * _FEW, random)
-    tried = [_refined(motion, few, coarse, _CLOSE[:2]) for motion in _likely_turns(few, coarse)]
-    best = min(tried, key=lambda motion: _difference(motion.apply(few), coarse, _CLOSE[1]))
+    tried = [_refine(motion, few, coarse, _CLOSE[:2]) for motion in _search_turns(few, coarse)]
+    best = min(tried, key=lambda motion: _misfit(motion.apply(few), coarse, _CLOSE[1]))
     many = moving.some(_MANY, random)
-    motion = _refined(best, many, fixed, _CLOSE[1:])
-    partner, _ = _partners(motion.apply(many), cKDTree(fixed.features(_CLOSE[2] * fixed.size)), _CLOSE[2] * fixed.size)
+    motion = _refine(best, many, fixed, _CLOSE[1:])
+    partner, _ = _find_partners(
+        motion.apply(many), cKDTree(fixed.features(_CLOSE[2] * fixed.size)), _CLOSE[2] * fixed.size
+    )
     return motion, float(np.isfinite(partner).mean())
 
 
-def _likely_turns(moving: ObservedSurface, fixed: ObservedSurface) -> list[Motion]:
+def _search_turns(moving: ObservedSurface, fixed: ObservedSurface) -> list[Motion]:
     """Motions by the best of many sampled turns, middle onto middle and then shifted, by points nearest in space."""
     tree, close = cKDTree(fixed.point), _CLOSE[0] * fixed.size
     features = fixed.features(close)
@@ -171,34 +173,36 @@ def _likely_turns(moving: ObservedSurface, fixed: ObservedSurface) -> list[Motio
     return [motion for _, motion in sorted(found, key=lambda one: one[0])[:_TRIED]]
 
 
-def _difference(moved: ObservedSurface, fixed: ObservedSurface, close: float) -> float:
+def _misfit(moved: ObservedSurface, fixed: ObservedSurface, close: float) -> float:
     """Mean squared difference of points from their partners, σ²."""
-    away, _ = _partners(moved, cKDTree(fixed.features(close * fixed.size)), close * fixed.size)
+    away, _ = _find_partners(moved, cKDTree(fixed.features(close * fixed.size)), close * fixed.size)
     return float(np.mean(np.minimum(away, _FAR) ** 2))
 
 
-def _partners(moved: ObservedSurface, tree: "cKDTree[None]", close: float) -> tuple[Floats, Floats]:
+def _find_partners(moved: ObservedSurface, tree: "cKDTree[None]", close: float) -> tuple[Floats, Floats]:
     """Differences (P,) σ of points from the most alike ones of a tree of features, infinite beyond _FAR; indices."""
     away, index = tree.query(moved.features(close), distance_upper_bound=_FAR)
     return np.asarray(away), np.asarray(index)
 
 
-def _refined(motion: Motion, moving: ObservedSurface, fixed: ObservedSurface, steps: Sequence[float]) -> Motion:
+def _refine(motion: Motion, moving: ObservedSurface, fixed: ObservedSurface, steps: Sequence[float]) -> Motion:
     """A motion improved by iterated closest points, closer at each of `steps` [sizes]."""
     for close in steps:
         tree = cKDTree(fixed.features(close * fixed.size))
         for _ in range(_ROUNDS):
             moved = motion.apply(moving)
-            away, index = _partners(moved, tree, close * fixed.size)
+            away, index = _find_partners(moved, tree, close * fixed.size)
             there = np.isfinite(away)
             if there.sum() < 6:  # a motion has six unknowns
                 return motion
             weight = 1 / (1 + away[there] ** 2)
-            motion = _nearer(motion, moved.point[there], fixed.point[index[there]], fixed.normal[index[there]], weight)
+            motion = _step_to_planes(
+                motion, moved.point[there], fixed.point[index[there]], fixed.normal[index[there]], weight
+            )
     return motion
 
 
-def _nearer(motion: Motion, point: Floats, target: Floats, normal: Floats, weight: Floats) -> Motion:
+def _step_to_planes(motion: Motion, point: Floats, target: Floats, normal: Floats, weight: Floats) -> Motion:
     """A motion followed by the small one that brings points nearest to the planes of their targets."""
     middle = point.mean(axis=0)
     axes = [normal, *(np.broadcast_to(_ALONG * axis, normal.shape) for axis in np.eye(3))]

@@ -28,7 +28,7 @@ _INDEX = 1.5  # refractive index of the diffuse law and of the Fresnel term
 
 @dataclass(frozen=True)
 class LobeSamples:
-    """Radiance of points of one material in all views, and what the maps say of its gloss."""
+    """Radiance of points of one material in all views, and its gloss in the maps."""
 
     radiance: Floats  # (P,) luminance of S0 over the light that the point receives
     albedo: Floats  # (P,) luminance of the baked albedo
@@ -117,7 +117,7 @@ def profile(samples: LobeSamples, flash: Floats) -> LobeProfile | None:
     """Means of a material's samples in bins of the half-angle; None for too few bins."""
     to_light = samples.to_light(flash)
     number = (samples.half_angle_deg(to_light) / _BIN_DEG).astype(int)
-    weight = samples.weight * _usual(samples, number)
+    weight = samples.weight * _select_usual(samples, number)
     total = np.bincount(number, weight)
     filled = total > 0
     if filled.sum() < _LEAST_BINS:
@@ -139,7 +139,7 @@ def profile(samples: LobeSamples, flash: Floats) -> LobeProfile | None:
     )
 
 
-def _usual(samples: LobeSamples, number: NDArray[np.intp]) -> Bools:
+def _select_usual(samples: LobeSamples, number: NDArray[np.intp]) -> Bools:
     """Samples (P,) in bins with enough of them, without the darkest and the brightest of each bin."""
     ratio = samples.radiance / np.maximum(samples.albedo, 1e-3)
     usual = np.zeros(len(ratio), bool)

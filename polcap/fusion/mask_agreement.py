@@ -1,4 +1,4 @@
-"""Compares the views' masks: removes what one view alone shows, and finds views whose masks contradict the others.
+"""Compares the masks of the views: removes parts that one view alone shows, and finds masks that contradict the others.
 
 The points that lie inside the masks of all views form the visual hull; every pixel of the object shows one of them.
 Where the hull leaves a part of one mask uncovered, this mask holds the board's edge, a shadow or a reflection, and
@@ -21,7 +21,7 @@ import numpy as np
 
 from polcap.errors import CaptureError
 from polcap.fusion.poses import LEAST_VIEWS
-from polcap.fusion.silhouettes import Silhouette, grid_around, halved
+from polcap.fusion.silhouettes import Silhouette, grid_around, halve
 from polcap.images import Bools, Floats
 from polcap.optics.outline import disc_radius
 from polcap.stages import stage
@@ -41,7 +41,7 @@ _MOST_TRIMMED = 1 / 2  # of the views may be left out, or hold more than the obj
 
 @dataclass(frozen=True)
 class AgreedMasks:
-    """Masks of the views that agree, without what the others do not confirm."""
+    """Masks of the views that agree, without parts that the others do not confirm."""
 
     names: tuple[str, ...]  # of these views
     masks: tuple[Bools, ...]  # (H, W) on their merged pictures
@@ -57,25 +57,25 @@ def agree(views: tuple[Silhouette, ...]) -> AgreedMasks:
     """
     used, left_out = list[Silhouette](), dict[str, str]()
     for folder in dict.fromkeys(view.folder for view in views):
-        agreed, contradicting = agreeing([view for view in views if view.folder == folder])
+        agreed, contradicting = compare_set([view for view in views if view.folder == folder])
         used, left_out = used + agreed, left_out | contradicting
     masks = tuple(regions.nth_part(view.mask, 1) for view in used)
     return AgreedMasks(tuple(view.name for view in used), masks, left_out)
 
 
-def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, str]]:
-    """The views whose masks agree, without what the others do not confirm, and why the others are left out, by name.
+def compare_set(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, str]]:
+    """The views whose masks agree, without parts that others do not confirm; and why others are left out, by name.
 
     Raises CaptureError: more than a third of the views contradict the others, fewer than three are left, or the masks
     have too little in common.
     """
     points, step = grid_around(views)
-    used = _without_gaps(views, points, step)
+    used = _close_gaps(views, points, step)
     left_out: dict[str, str] = {}
     inside = np.stack([view.inside(points, step) for view in used])  # (N, P)
     while True:
         shares = _uncovered(used, points[inside.all(axis=0)], step)
-        worst, share = _contradicting(used, inside, points, step, shares)
+        worst, share = _find_contradicting(used, inside, points, step, shares)
         if share <= _MOST_UNCOVERED:
             break
         view = used.pop(worst)
@@ -90,10 +90,10 @@ def agreeing(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, s
     larger = [view.name for view, share in zip(used, shares, strict=True) if share > _MOST_UNCOVERED]
     if len(left_out) + len(larger) > _MOST_TRIMMED * len(views):
         raise _contradiction([*left_out, *larger], len(views))
-    return _trimmed(used, points[inside.all(axis=0)], step), left_out
+    return _trim(used, points[inside.all(axis=0)], step), left_out
 
 
-def _without_gaps(views: Sequence[Silhouette], points: Floats, step: float) -> list[Silhouette]:
+def _close_gaps(views: Sequence[Silhouette], points: Floats, step: float) -> list[Silhouette]:
     """The views with slits and small holes of their masks closed where all other masks have a point in common."""
     inside = np.stack([view.inside(points, step) for view in views])
     votes = inside.sum(axis=0)
@@ -125,7 +125,7 @@ def _uncovered(views: Sequence[Silhouette], hull: Floats, step: float) -> Floats
     return np.array(shares)
 
 
-def _contradicting(
+def _find_contradicting(
     views: Sequence[Silhouette], inside: Bools, points: Floats, step: float, shares: Floats
 ) -> tuple[int, float]:
     """The view without which the others agree best, and the share of a mask's area by which it contradicts; 0: none."""
@@ -145,9 +145,9 @@ def _contradicting(
     return worst, float(contradiction[worst])
 
 
-def _trimmed(views: Sequence[Silhouette], hull: Floats, step: float) -> list[Silhouette]:
+def _trim(views: Sequence[Silhouette], hull: Floats, step: float) -> list[Silhouette]:
     """The views without the parts of their masks that the hull of all masks does not cover."""
-    fine, half = halved(hull, step)
+    fine, half = halve(hull, step)
     fine = fine[fine[:, 1] > -half]  # the board is y = 0
     for view in views:
         fine = fine[view.inside(fine, half)]

@@ -91,7 +91,7 @@ def fit(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps, settings: 
     profiles = [None if one is None else profile(one, flash) for one in samples]
     widening = 2 * _normal_sigma(lit, visible, atlas, maps) ** 2
     lobes = _lobes(profiles, widening, settings)
-    return _blended(atlas, maps, share, lobes, all(view.white_distance is not None for view in lit))
+    return _blend(atlas, maps, share, lobes, all(view.white_distance is not None for view in lit))
 
 
 def _materials(maps: AtlasMaps, atlas: Atlas, count: int) -> Floats:
@@ -225,7 +225,7 @@ def _amplitudes(terms: Floats, radiance: Floats, expected: Floats, sigma: Floats
     return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
 
 
-def _blended(atlas: Atlas, maps: AtlasMaps, share: Floats, lobes: Sequence[Lobe | None], scaled: bool) -> AtlasMaps:
+def _blend(atlas: Atlas, maps: AtlasMaps, share: Floats, lobes: Sequence[Lobe | None], scaled: bool) -> AtlasMaps:
     """Maps with F0 and roughness of the lobes and, if `scaled`, the albedo with which the radiance agrees.
 
     A material without a lobe has the means of its maps.

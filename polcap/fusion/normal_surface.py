@@ -109,7 +109,7 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
         carved = Anchors(hollow, np.ones(len(hollow)), sunk, np.full(len(hollow), _HOLLOW_WEIGHT))
         move = _displacements(vertices, faces, outward, target, [rims, carved])
         move = np.clip(move, -_MOST_MOVE * step, _MOST_MOVE * step)
-        vertices = _smoothed(vertices + outward * move[:, None], faces, neighbors, target)
+        vertices = _smooth(vertices + outward * move[:, None], faces, neighbors, target)
     return FittedSurface(vertices, faces, target.agreement, neighbors)
 
 
@@ -220,12 +220,10 @@ def _displacements(
     return np.asarray(move)
 
 
-def _smoothed(
-    vertices: Floats, faces: NDArray[np.int32], neighbors: sparse.csr_matrix, target: SurfaceNormals
-) -> Floats:
+def _smooth(vertices: Floats, faces: NDArray[np.int32], neighbors: sparse.csr_matrix, target: SurfaceNormals) -> Floats:
     """Vertices moved to the middle of their neighbors, but not off a surface that has the measured normals.
 
-    This removes folds, smooths what no view sees, and draws tight what only the hull fills, e.g. between fingers.
+    This removes folds, smooths surface that no view sees, and tightens surface of the hull alone, e.g. between fingers.
     """
     for _ in range(_PASSES):
         outward = vertex_normals(vertices, faces)

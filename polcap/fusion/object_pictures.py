@@ -44,7 +44,7 @@ def render(atlas: Atlas, maps: AtlasMaps, tracer: Tracer, pose: Pose, view: View
     v = frames.rays(view, side, side).reshape(-1, 3)
     origin = np.broadcast_to(pose.center, v.shape)
     met = tracer.meet(origin, -v @ pose.rotation)
-    normal, diffuse, specular, roughness = sampled(atlas, maps, met.face, met.weight)
+    normal, diffuse, specular, roughness = sample_textures(atlas, maps, met.face, met.weight)
     ray = v[met.index]
     light = frames.to_ray_frame(np.broadcast_to(_LIGHT / np.linalg.norm(_LIGHT), ray.shape), ray)
     local = frames.lifted(frames.to_ray_frame(normal @ pose.rotation.T, ray))
@@ -56,7 +56,7 @@ def render(atlas: Atlas, maps: AtlasMaps, tracer: Tracer, pose: Pose, view: View
     return out.reshape(side, side, 3)
 
 
-def sampled(
+def sample_textures(
     atlas: Atlas, maps: AtlasMaps, face: NDArray[np.integer], weight: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Normal (N, 3), diffuse (N, 3), specular (N, 3) and roughness (N,) at points (N, 3) of triangles (N,)."""

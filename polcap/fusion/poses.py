@@ -149,12 +149,12 @@ def _adjust(seen: Mapping[str, BoardCorners], capture: Capture) -> _Adjusted:
     found = _minimize(boards, capture, start)
     error = [_residual(one, _camera(capture, found.x), found.x[_place(k)]) for k, one in enumerate(boards)]
     far = max(_OUTLIER * 1.48 * float(np.median(np.abs(np.concatenate(error)))), _LEAST_OUTLIER)
-    used = [_without(one, np.linalg.norm(e, axis=1) > far) for one, e in zip(boards, error, strict=True)]
+    used = [_remove_corners(one, np.linalg.norm(e, axis=1) > far) for one, e in zip(boards, error, strict=True)]
     found = _minimize(used, capture, found.x)
     return _with_errors(dict(zip(seen, used)), capture, found)
 
 
-def _without(corners: BoardCorners, bad: Floats) -> BoardCorners:
+def _remove_corners(corners: BoardCorners, bad: Floats) -> BoardCorners:
     """Corners without the bad ones; all of them where the others are too few."""
     keep = ~np.asarray(bad, bool)
     if keep.sum() < _LEAST_KEPT * len(keep):

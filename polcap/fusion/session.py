@@ -234,7 +234,7 @@ def _with_boards(session: Session, solved: SessionPoses) -> Session:
 def _with_agreed_masks(
     session: Session, masks: Mapping[str, ViewMask], solved: SessionPoses, cache: LazyCache
 ) -> Session:
-    """Give every view its mask without what no other view confirms, and leave out views that contradict the others.
+    """Give every view its mask without parts that no other view confirms; leave out views that contradict the others.
 
     Where views contradict each other, the masks are written as pictures for the user to compare.
 

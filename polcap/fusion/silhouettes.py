@@ -94,7 +94,7 @@ def _extent(view: Silhouette) -> float:
     return float(pixels) * view.distance / view.camera.focal_px
 
 
-def halved(points: Floats, step: float) -> tuple[Floats, float]:
+def halve(points: Floats, step: float) -> tuple[Floats, float]:
     """The points (8 P, 3) in the corners of the cells about `points`, and their spacing [m]."""
     corners = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     return (points[:, None] + step * corners).reshape(-1, 3), step / 2

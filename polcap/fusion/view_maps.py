@@ -28,7 +28,7 @@ def fusion_view(
     y, x = np.mgrid[:height, :width].astype(np.float64)
     lens = Distortion(view.focal, view.center, camera.k1, camera.k2)
     source_x, source_y = (x, y) if undistorted else distortion.distort(lens, x, y)
-    normal = _turned(maps.normal, maps.view, view, (source_x, source_y))
+    normal = _turn_normals(maps.normal, maps.view, view, (source_x, source_y))
     found = FusionView(
         name=name,
         pose=pose,
@@ -46,7 +46,7 @@ def fusion_view(
     )
     if max(np.abs(source_x - x).max(), np.abs(source_y - y).max()) < _LEAST_SHIFT_PX:
         return found
-    return _resampled(found, source_x.astype(np.float32), source_y.astype(np.float32))
+    return _resample(found, source_x.astype(np.float32), source_y.astype(np.float32))
 
 
 def on_grid(camera: SessionCamera, grid: View) -> View:
@@ -55,7 +55,7 @@ def on_grid(camera: SessionCamera, grid: View) -> View:
     return View(camera.focal_px / grid.scale, (x, y), grid.scale, grid.origin)
 
 
-def _turned(normal: Floats, before: View, after: View, source: tuple[Floats, Floats]) -> Floats:
+def _turn_normals(normal: Floats, before: View, after: View, source: tuple[Floats, Floats]) -> Floats:
     """Normals (H, W, 3), which were estimated in the frame of each ray, for the rays of another camera.
 
     The normal of a pixel turns with the pixel's ray.
@@ -67,7 +67,7 @@ def _turned(normal: Floats, before: View, after: View, source: tuple[Floats, Flo
     return np.asarray(frames.from_ray_frame(local, frames.rays_at(after, *moved)), np.float32)
 
 
-def _resampled(view: FusionView, x: Floats, y: Floats) -> FusionView:
+def _resample(view: FusionView, x: Floats, y: Floats) -> FusionView:
     """The view with pixels from the places x, y (H, W)."""
 
     def linear(image: Floats) -> Floats:

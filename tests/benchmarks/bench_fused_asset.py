@@ -1,4 +1,4 @@
-"""Errors of a fused object against its truth, beside those of its single views.
+"""Errors of a fused object against its truth, and those of its single views at the same texels.
 
 polcap synth FOLDER --views 12 && polcap fuse FOLDER
 python tests/benchmarks/bench_fused_asset.py FOLDER
@@ -14,6 +14,7 @@ first set and from both; and this distance from a mesh of both with the true tur
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,18 +26,17 @@ from scipy.spatial.transform import Rotation
 from trimesh import Trimesh
 from trimesh.sample import sample_surface
 
-import polcap
-from polcap.fusion import fused_maps, joining, session
+from polcap.config import restore
+from polcap.fusion import baking, fused_maps, joining, session
 from polcap.fusion.fusion_path import FusionResults, FusionSettings, SessionConfig, path
 from polcap.fusion.session import SessionInput
 from polcap.fusion.shape import ShapeSettings, fuse_shape
-from polcap.fusion.values import Pose
+from polcap.fusion.values import FusionView, Pose
 from polcap.images import Floats
-from polcap.optics import color
+from polcap.optics import color, frames
 from polcap.optics.mesh_tracer import Tracer, Triangles, smooth
 from polcap.pipeline.cache import LazyCache, MemoryCache, StageResult
 from polcap.pipeline.request import Request
-from polcap.stages.asset import AssetSettings
 
 LEAST_SEEN = 0.02  # weight of a texel
 SAMPLES = 400_000  # of the true surface
@@ -45,35 +45,59 @@ SAMPLES = 400_000  # of the true surface
 class Errors(NamedTuple):
     """Mean errors: normal [°], luminance of albedo and of F0, roughness; and distances, shares of the object's size."""
 
-    single: Floats  # (4,) mean over the views
-    fused: Floats  # (4,) of the texels that a view saw
+    single: Floats  # (V, 4) of each view, at the texels that it sees
+    fused: Floats  # (V, 4) of the fused object, at the same texels
     distance: float  # of the seen truth from the mesh
     excess: float  # of the texels that a view saw from the truth
+
+    @property
+    def best(self) -> int:
+        """The view with the best normals."""
+        return int(np.argmin(self.single[:, 0]))
 
 
 def main(folder: Path) -> None:
     found = errors(folder)
-    print(f"{'':10}{'normal':>9}{'albedo':>9}{'F0':>9}{'roughness':>11}")
-    print_row("single", found.single)
-    print_row("fused", found.fused)
-    print("reduction " + "".join(f"{100 * one:8.0f}%" for one in 1 - found.fused / found.single))
+    print(f"{'':18}{'normal':>9}{'albedo':>9}{'F0':>9}{'roughness':>11}")
+    for name, part in (("best view", found.best), ("mean of views", slice(None))):
+        single, fused = (np.mean(np.atleast_2d(rows[part]), axis=0) for rows in (found.single, found.fused))
+        print_row(name, single)
+        print_row("  same texels, fused", fused)
+        print("  reduction       " + "".join(f"{100 * one:8.0f}%" for one in 1 - fused / single))
     print(f"seen truth to mesh {100 * found.distance:.2f} %, seen texels to truth {100 * found.excess:.2f} %")
     if (folder / "setB").exists():
         print(joined(folder))
 
 
 def errors(folder: Path) -> Errors:
-    """Errors of the object that was fused in a folder of `polcap synth --views`."""
+    """Errors of the object that was fused in a folder of `polcap synth --views`, from its stage caches."""
     truth = dict(np.load(folder / "truth.npz"))
     surface = smooth(truth["vertices"], truth["faces"])
-    source = fused_maps.read(folder / "fused" / "maps", AssetSettings())
+    views, results = fused(folder)
     size = float(np.ptp(surface.vertices, axis=0).max())
-    views = sorted([*folder.glob("view*/"), *folder.glob("set*/view*/")])
-    singles = [single(view) for view in views if (view / "polcap" / "report.json").exists()]
+    true = material(surface, truth, results.atlas.position)
+    single, baked = [], []
+    for view, visible in zip(views, baking.visible_texels(views, results.atlas)):
+        good = visible.weight > LEAST_SEEN
+        normal = frames.unit(visible.sample(view.normal)) @ view.pose.rotation
+        own = [normal, *(visible.sample(part) for part in (view.diffuse, view.specular, view.roughness))]
+        texel = visible.texel[good]
+        single.append(mean_errors([part[good] for part in own], [part[texel] for part in true]))
+        baked.append(mean_errors([part[texel] for part in textures(results)], [part[texel] for part in true]))
     point = seen_points(Tracer(surface), true_lenses(folder))
-    away = mean_distance(fused_maps.closed(source.atlas.mesh), point) / size
-    excess = texel_distance(surface, source) / size
-    return Errors(np.mean(singles, axis=0), against_truth(source, surface, truth), away, excess)
+    away = mean_distance(fused_maps.weld(results.atlas.mesh), point) / size
+    return Errors(np.array(single), np.array(baked), away, texel_distance(surface, results) / size)
+
+
+def fused(folder: Path) -> tuple[tuple[FusionView, ...], FusionResults]:
+    """The views of a fused folder in one frame, and its results, read from the stage caches."""
+    about = json.loads((folder / "fused" / "report.json").read_text())
+    config = restore(SessionConfig, about, folder / "fused" / "report.json")
+    session_input = SessionInput(folder, config, Request(threads=1))
+    cache = LazyCache(folder / "fused")
+    views = session.process(session.read(session_input), session_input, cache, lambda _: None).views
+    results = path(views, config.fusion, cache)
+    return joining.place(views.value, results.joined), results
 
 
 def true_lenses(folder: Path) -> list[Floats]:
@@ -91,11 +115,7 @@ def pose_of(stated: dict[str, Any]) -> Pose:
 
 def joined(folder: Path) -> str:
     """Table row on the join of two sets."""
-    session_input = SessionInput(folder, SessionConfig(), Request(threads=1))
-    cache = LazyCache(folder / "fused")
-    views = session.process(session.read(session_input), session_input, cache, lambda _: None).views
-    both = path(views, FusionSettings(), MemoryCache())
-    placed = joining.place(views.value, both.joined)
+    placed, both = fused(folder)
     truth, about = dict(np.load(folder / "truth.npz")), json.loads((folder / "truth.json").read_text())
     surface = Trimesh(truth["vertices"], truth["faces"], process=False)
     point, size = sample_surface(surface, 30_000, seed=0)[0], float(np.ptp(truth["vertices"], axis=0).max())
@@ -129,58 +149,38 @@ def move(pose: Pose, point: Floats) -> Floats:
 
 
 def print_row(name: str, row: Floats) -> None:
-    print(f"{name:10}{row[0]:8.2f}°{row[1]:9.4f}{row[2]:9.4f}{row[3]:11.4f}")
+    print(f"{name:18}{row[0]:8.2f}°{row[1]:9.4f}{row[2]:9.4f}{row[3]:11.4f}")
 
 
-def single(view: Path) -> Floats:
-    """Mean errors of a view's maps: normal [°], luminance of albedo and of F0, roughness."""
-    maps, truth = polcap.read_maps(view / "polcap"), dict(np.load(view / "truth.npz"))
-    step = round(maps.view.scale)
-    x0, y0 = (round(start * maps.view.scale) for start in maps.view.origin)
-    height, width = maps.mask.shape
-
-    def on_grid(name: str) -> Any:
-        part = truth[name].astype(np.float64)[y0 : y0 + step * height, x0 : x0 + step * width]
-        return part.reshape(height, step, width, step, *part.shape[2:]).mean(axis=(1, 3))
-
-    inside = maps.mask & (on_grid("mask") == 1)
-    return np.array(
-        [
-            mean_angle_deg(maps.normal[inside], on_grid("normal")[inside]),
-            np.abs(color.luminance(maps.diffuse[inside]) - color.luminance(on_grid("diffuse")[inside])).mean(),
-            np.abs(color.luminance(maps.specular[inside]) - color.luminance(on_grid("specular")[inside])).mean(),
-            np.abs(maps.roughness[inside] - on_grid("roughness")[inside]).mean(),
-        ]
-    )
+def textures(results: FusionResults) -> list[Floats]:
+    """Normal, albedo, F0 and roughness of all N texels, (N, 3) or (N, 1)."""
+    maps, covered = results.maps, results.atlas.covered
+    return [maps.normal[covered], maps.diffuse[covered], maps.specular[covered], maps.roughness[covered][:, None]]
 
 
-def against_truth(source: fused_maps.FusedSource | FusionResults, surface: Triangles, truth: dict[str, Any]) -> Floats:
-    """The same of the atlas, over the texels that a view saw."""
-    seen = source.maps.weight[source.atlas.covered] > LEAST_SEEN
-    point = source.atlas.position[seen]
-    corner = surface.vertices[surface.faces]
+def material(surface: Triangles, truth: dict[str, Any], point: Floats) -> list[Floats]:
+    """True normal, albedo, F0 and roughness at points (N, 3), from the nearest of four samples of each triangle."""
     normals = np.zeros_like(surface.vertices, np.float64)
     np.add.at(normals, surface.faces, surface.corner_normals)
     share = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4]]) / np.array([[3], [6], [6], [6]])
-    sample = np.einsum("sk,fkc->fsc", share, corner).reshape(-1, 3)
 
-    def at(values: Floats) -> Floats:
-        parts = np.einsum("sk,fkc->fsc", share, values.reshape(len(surface.vertices), -1)[surface.faces])
-        return np.asarray(parts.reshape(len(sample), -1)[cKDTree(sample).query(point)[1]])
+    def sampled(values: Floats) -> Floats:
+        parts = values.reshape(len(surface.vertices), -1)[surface.faces]
+        return np.einsum("sk,fkc->fsc", share, parts).reshape(len(share) * len(surface.faces), -1)
 
-    maps = {name: getattr(source.maps, name)[source.atlas.covered][seen] for name in ("normal", "diffuse", "specular")}
-    roughness = source.maps.roughness[source.atlas.covered][seen]
-    return np.array(
-        [
-            mean_angle_deg(maps["normal"], at(normals)),
-            np.abs(color.luminance(maps["diffuse"]) - color.luminance(at(truth["diffuse"]))).mean(),
-            np.abs(color.luminance(maps["specular"]) - color.luminance(at(truth["specular"]))).mean(),
-            np.abs(roughness - at(truth["roughness"])[:, 0]).mean(),
-        ]
-    )
+    nearest = cKDTree(sampled(surface.vertices)).query(point)[1]
+    return [
+        sampled(part)[nearest] for part in (normals, *(truth[name] for name in ("diffuse", "specular", "roughness")))
+    ]
 
 
-def texel_distance(surface: Triangles, source: fused_maps.FusedSource) -> float:
+def mean_errors(found: Sequence[Floats], true: Sequence[Floats]) -> Floats:
+    """Mean errors (4,) of normals [°], luminance of albedo and of F0, and roughness."""
+    albedo, f0 = (np.abs(color.luminance(found[k]) - color.luminance(true[k])).mean() for k in (1, 2))
+    return np.array([mean_angle_deg(found[0], true[0]), albedo, f0, np.abs(found[3] - true[3]).mean()])
+
+
+def texel_distance(surface: Triangles, source: FusionResults) -> float:
     """Mean distance [m] of the texels that a view saw from the true surface, by the planes of its nearest samples."""
     truth = Trimesh(surface.vertices, surface.faces, process=False)
     sample, face = sample_surface(truth, SAMPLES, seed=0)

@@ -72,7 +72,8 @@ def outcome(folder: Path) -> str:
     found = bench_fused_asset.errors(folder)
     shown = [gate for gate in about["gates"] if gate["name"] == "views" or gate["state"] != "pass"]
     named = "; ".join(f"{gate['name']}: {gate['says']}" for gate in shown)
-    return f"{100 * found.distance:.2f} | {found.fused[0]:.2f} | {found.fused[1]:.4f} | {named}"
+    normal, albedo = found.fused[:, :2].mean(axis=0)
+    return f"{100 * found.distance:.2f} | {normal:.2f} | {albedo:.4f} | {named}"
 
 
 def scene_of(view: Path) -> Scene:

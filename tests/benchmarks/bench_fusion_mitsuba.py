@@ -54,7 +54,7 @@ def main() -> None:
             write(folder, name, options.views, options.out / "scenes")
         subprocess.run([sys.executable, "-m", "polcap", "fuse", str(folder)], check=True, stdout=subprocess.DEVNULL)
         errors = bench_fused_asset.errors(folder)
-        cells = [f"{one:.3g} → {both:.3g}" for one, both in zip(errors.single, errors.fused)]
+        cells = [f"{one:.3g} → {both:.3g}" for one, both in zip(errors.single.mean(axis=0), errors.fused.mean(axis=0))]
         print(f"| {name} | {options.views} | {' | '.join(cells)} | {100 * errors.distance:.2f} |", flush=True)
 
 

@@ -15,7 +15,7 @@ SIDE = 256
 
 @pytest.fixture(scope="module")
 def atlas() -> Atlas:
-    return atlases.charted(ellipsoid.mesh(), SIDE, 6)
+    return atlases.chart(ellipsoid.mesh(), SIDE, 6)
 
 
 def test_charts_do_not_overlap(atlas: Atlas) -> None:

@@ -19,7 +19,7 @@ RING = ellipsoid.views(8)
 
 @pytest.fixture(scope="module")
 def atlas() -> Atlas:
-    return atlases.charted(ellipsoid.mesh(), 256, 6)
+    return atlases.chart(ellipsoid.mesh(), 256, 6)
 
 
 def degrees(one: Floats, two: Floats) -> Floats:
@@ -60,7 +60,7 @@ def test_a_part_behind_another_takes_nothing_from_the_view() -> None:
     both = ClosedMesh(
         np.concatenate([front.vertices, behind]), np.concatenate([front.faces, front.faces + len(behind)])
     )
-    atlas = atlases.charted(both, 256, 6)
+    atlas = atlases.chart(both, 256, 6)
     (view,) = ellipsoid.views(1, elevation_deg=0)
     (visible,) = baking.visible_texels([view], atlas)
     assert len(visible.texel) > 1000

@@ -24,7 +24,7 @@ from tests.fusion import ellipsoid
 
 @pytest.fixture(scope="module")
 def source() -> FusedSource:
-    atlas = atlases.charted(ellipsoid.mesh(), 256, 6)
+    atlas = atlases.chart(ellipsoid.mesh(), 256, 6)
     return FusedSource(
         atlas, filling.fill(baking.bake(ellipsoid.views(8), atlas, BakingSettings()), atlas), AssetSettings()
     )
@@ -40,11 +40,11 @@ def test_maps_and_mesh_come_back_as_written(source: FusedSource, tmp_path: Path)
 
 
 def test_coarser_levels_have_the_unit_and_the_margin_of_the_full_mesh(source: FusedSource, tmp_path: Path) -> None:
-    atlas = atlases.charted(ellipsoid.mesh(), 256, 16, metric=False)
-    fused_maps.write(tmp_path, atlas, fused_maps.transferred(source.atlas, source.maps, atlas), {})
+    atlas = atlases.chart(ellipsoid.mesh(), 256, 16, metric=False)
+    fused_maps.write(tmp_path, atlas, fused_maps.transfer(source.atlas, source.maps, atlas), {})
     level = asset_export.levels(fused_maps.read(tmp_path, AssetSettings()), ExportRequest(lod=1))[1].asset.mesh
-    coarse = fused_maps.closed(atlas.mesh)
-    again = atlases.charted(closed_mesh.decimate(coarse, round(len(coarse.faces) / 4)), 256, 16)
+    coarse = fused_maps.weld(atlas.mesh)
+    again = atlases.chart(closed_mesh.decimate(coarse, round(len(coarse.faces) / 4)), 256, 16)
     assert not level.metric and np.array_equal(level.uv, again.mesh.uv)
 
 
@@ -52,7 +52,7 @@ def test_a_coarser_level_that_cannot_be_charted_is_reduced_further(
     source: FusedSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, level = (one.asset.mesh for one in asset_export.levels(source, ExportRequest(lod=1)))
-    charted, calls = atlases.charted, list[int]()
+    charted, calls = atlases.chart, list[int]()
 
     def failing(mesh: ClosedMesh, side: int, margin: int, metric: bool) -> atlases.Atlas:
         calls.append(len(mesh.faces))
@@ -60,7 +60,7 @@ def test_a_coarser_level_that_cannot_be_charted_is_reduced_further(
             raise ObjectError("no texture atlas")
         return charted(mesh, side, margin, metric)
 
-    monkeypatch.setattr(atlases, "charted", failing)
+    monkeypatch.setattr(atlases, "chart", failing)
     again = asset_export.levels(source, ExportRequest(lod=1))[1].asset.mesh
     assert 0.85 < len(again.faces) / len(level.faces) < 0.95 and len(level.faces) < len(whole.faces)
 
@@ -103,7 +103,7 @@ def test_the_glb_is_closed_when_it_is_read_back(source: FusedSource, tmp_path: P
 def test_coarser_levels_are_closed_and_keep_their_textures(source: FusedSource) -> None:
     full, coarse = asset_export.levels(source, ExportRequest(lod=1))
     assert len(coarse.asset.mesh.faces) == pytest.approx(len(full.asset.mesh.faces) / 4, rel=0.1)
-    assert is_closed(fused_maps.closed(coarse.asset.mesh))
+    assert is_closed(fused_maps.weld(coarse.asset.mesh))
     for textured in (full.asset, coarse.asset):
         color = textured.base_color[textured.normal[..., 2] > 128].reshape(-1, 3).mean(axis=0)
         assert color == pytest.approx(full.asset.base_color.reshape(-1, 3).mean(axis=0), rel=0.1)

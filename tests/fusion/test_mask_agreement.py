@@ -39,7 +39,7 @@ def views() -> list[Silhouette]:
 
 
 def test_masks_of_one_object_agree(views: list[Silhouette]) -> None:
-    used, left_out = mask_agreement.agreeing(views)
+    used, left_out = mask_agreement.compare_set(views)
     assert len(used) == COUNT
     assert not left_out
 
@@ -50,7 +50,7 @@ def test_outlines_that_err_by_two_pixels_agree(views: list[Silhouette]) -> None:
         replace(one, mask=(cv2.erode if k % 2 else cv2.dilate)(one.mask.astype(np.uint8), disc) > 0)
         for k, one in enumerate(views)
     ]
-    assert not mask_agreement.agreeing(wrong)[1]
+    assert not mask_agreement.compare_set(wrong)[1]
 
 
 def test_pieces_of_the_board_are_removed_from_the_masks_that_hold_them(views: list[Silhouette]) -> None:
@@ -59,7 +59,7 @@ def test_pieces_of_the_board_are_removed_from_the_masks_that_hold_them(views: li
         mask = views[k].mask.copy()
         mask[box] = True
         wrong[k] = replace(views[k], mask=mask)
-    used, left_out = mask_agreement.agreeing(wrong)
+    used, left_out = mask_agreement.compare_set(wrong)
     assert not left_out
     for right, found in zip(views, used, strict=True):
         assert overlap(found.mask, right.mask) > 0.97, found.name
@@ -69,7 +69,7 @@ def test_a_slit_of_one_mask_is_closed(views: list[Silhouette]) -> None:
     mask = views[3].mask.copy()
     rows = np.flatnonzero(mask.any(axis=1))
     mask[rows[len(rows) // 2] : rows[len(rows) // 2] + 4] = False
-    used, left_out = mask_agreement.agreeing([*views[:3], replace(views[3], mask=mask), *views[4:]])
+    used, left_out = mask_agreement.compare_set([*views[:3], replace(views[3], mask=mask), *views[4:]])
     assert not left_out
     assert overlap(used[3].mask, views[3].mask) > 0.99
 
@@ -80,14 +80,14 @@ def test_a_small_hole_of_one_mask_is_filled(views: list[Silhouette]) -> None:
     side = round(np.sqrt(0.008 * mask.sum()))
     top, left = rows[len(rows) * 2 // 3], columns[len(columns) // 2]
     mask[top : top + side, left : left + side] = False
-    used, left_out = mask_agreement.agreeing([*views[:3], replace(views[3], mask=mask), *views[4:]])
+    used, left_out = mask_agreement.compare_set([*views[:3], replace(views[3], mask=mask), *views[4:]])
     assert not left_out
     assert used[3].mask[top : top + side, left : left + side].all()
     assert all(overlap(one.mask, whole.mask) > 0.99 for one, whole in zip(used, views))
 
 
 def test_masks_without_errors_stay_as_they_are(views: list[Silhouette]) -> None:
-    used, _ = mask_agreement.agreeing(views)
+    used, _ = mask_agreement.compare_set(views)
     assert all(overlap(found.mask, right.mask) > 0.99 for right, found in zip(views, used, strict=True))
 
 
@@ -95,7 +95,7 @@ def test_a_mask_that_lacks_a_part_of_the_object_is_left_out(views: list[Silhouet
     mask = views[5].mask.copy()
     rows = np.flatnonzero(mask.any(axis=1))
     mask[: rows[len(rows) // 3]] = False  # the head
-    _, left_out = mask_agreement.agreeing([*views[:5], replace(views[5], mask=mask), *views[6:]])
+    _, left_out = mask_agreement.compare_set([*views[:5], replace(views[5], mask=mask), *views[6:]])
     assert list(left_out) == ["view06"]
 
 
@@ -104,11 +104,11 @@ def test_two_masks_that_lack_the_same_part_do_not_outvote_whole_ones() -> None:
     for k in (2, 7):
         rows = np.flatnonzero(twelve[k].mask.any(axis=1))
         twelve[k].mask[: rows[len(rows) // 3]] = False
-    assert sorted(mask_agreement.agreeing(twelve)[1]) == ["view03", "view08"]
+    assert sorted(mask_agreement.compare_set(twelve)[1]) == ["view03", "view08"]
 
 
 def test_a_view_in_which_the_object_had_slid_is_left_out(views: list[Silhouette]) -> None:
-    _, left_out = mask_agreement.agreeing([*views[:-1], view(COUNT - 1, np.array([0.008, 0, 0.005]))])
+    _, left_out = mask_agreement.compare_set([*views[:-1], view(COUNT - 1, np.array([0.008, 0, 0.005]))])
     assert list(left_out) == ["view08"]
     assert "moved on the board" in left_out["view08"]
 
@@ -122,10 +122,10 @@ def test_pieces_of_the_board_at_the_object_in_two_masks_leave_no_view_out(views:
         edge = np.flatnonzero(mask[middle]).max()
         mask[middle - 9 : middle + 9, edge : edge + 28] = True
         wrong[k] = replace(views[k], mask=mask)
-    assert not mask_agreement.agreeing(wrong)[1]
+    assert not mask_agreement.compare_set(wrong)[1]
 
 
 def test_an_object_that_slid_halfway_is_refused(views: list[Silhouette]) -> None:
     slid = [view(k, np.array([0.012, 0, 0.0])) for k in range(4, COUNT)]
     with pytest.raises(CaptureError, match="moved on the board"):
-        mask_agreement.agreeing([*views[:4], *slid])
+        mask_agreement.compare_set([*views[:4], *slid])

@@ -17,7 +17,7 @@ RING = ellipsoid.views(8)
 
 @pytest.fixture(scope="module")
 def atlas() -> Atlas:
-    return atlases.charted(ellipsoid.mesh(), 256, 6)
+    return atlases.chart(ellipsoid.mesh(), 256, 6)
 
 
 @pytest.fixture(scope="module")

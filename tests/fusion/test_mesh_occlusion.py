@@ -22,7 +22,7 @@ PROFILE = [(0, 0), (2, 0), (2, 2), (1, 2), (1, 1), (0, 1)]  # of a pot with a pi
 def pot() -> Atlas:
     fine = np.concatenate([np.linspace(a, b, 20, endpoint=False) for a, b in itertools.pairwise(PROFILE)])
     body = trimesh.creation.revolve(np.vstack([fine, PROFILE[-1]]), sections=96)
-    return atlases.charted(ClosedMesh(body.vertices.astype(np.float32), body.faces.astype(np.int32)), 512, 6)
+    return atlases.chart(ClosedMesh(body.vertices.astype(np.float32), body.faces.astype(np.int32)), 512, 6)
 
 
 def test_the_middle_of_a_pit_sees_its_share_of_the_sky(pot: Atlas) -> None:
@@ -36,5 +36,5 @@ def test_the_middle_of_a_pit_sees_its_share_of_the_sky(pot: Atlas) -> None:
 def test_convex_surfaces_see_the_whole_sky(pot: Atlas) -> None:
     x, y, _ = pot.position.T
     assert ambient_occlusion(pot)[pot.covered][np.hypot(x, y) > 1.1].min() > 0.99
-    ball = atlases.charted(ellipsoid.mesh(), 256, 6)
+    ball = atlases.chart(ellipsoid.mesh(), 256, 6)
     assert ambient_occlusion(ball)[ball.covered].min() > 0.99

@@ -37,7 +37,7 @@ def test_views_without_a_board_become_a_closed_object_of_relative_size(tmp_path:
     assert len(about["figures"]["views"]) >= 15  # of 17
     assert not about["figures"]["mesh"]["metric"]
     assert json.loads((folder / "fused" / "maps" / "maps.json").read_text())["unit"] == "relative"
-    mesh = fused_maps.closed(fused_maps.read(folder / "fused" / "maps", AssetSettings()).atlas.mesh)
+    mesh = fused_maps.weld(fused_maps.read(folder / "fused" / "maps", AssetSettings()).atlas.mesh)
     assert is_closed(mesh)
     with np.load(folder / "truth.npz") as truth:
         true = width(truth["vertices"])

@@ -60,7 +60,7 @@ class KeyCache(MemoryCache):
 def outcome(tmp_path_factory: pytest.TempPathFactory) -> Callable[[SessionConfig], list[Any]]:
     """What a fusion makes with some settings: keys of its stages, gates, and the factors of its material."""
     work = tmp_path_factory.mktemp("work")
-    atlas = atlases.charted(ellipsoid.mesh(), 64, 2)
+    atlas = atlases.chart(ellipsoid.mesh(), 64, 2)
     maps = filling.fill(baking.bake(ellipsoid.views(3), atlas, BakingSettings()), atlas)
 
     def make(config: SessionConfig) -> list[Any]:

@@ -444,7 +444,12 @@ def test_a_digest_is_compared_once_per_process_until_its_file_changes(
 ) -> None:
     path(StageCache(tmp_path))
     compared: list[str] = []
-    monkeypatch.setattr(npy_folder, "checksum", lambda file: compared.append(file.name) or checksum(file))
+
+    def noted(file: Path) -> list[Any]:
+        compared.append(file.name)
+        return checksum(file)
+
+    monkeypatch.setattr(npy_folder, "checksum", noted)
     path(StageCache(tmp_path))
     once = list(compared)
     path(StageCache(tmp_path))
