@@ -45,7 +45,7 @@ class _Manifest(msgspec.Struct, frozen=True):
 
     format: int
     stage: str
-    version: int
+    version: int | list[Any]  # with those of used stages
     settings: dict[str, Any] | None
     inputs: list[str]
     key: str
