@@ -166,7 +166,7 @@ def material(surface: Triangles, truth: dict[str, Any], point: Floats) -> list[F
 
     def sampled(values: Floats) -> Floats:
         parts = values.reshape(len(surface.vertices), -1)[surface.faces]
-        return np.einsum("sk,fkc->fsc", share, parts).reshape(len(share) * len(surface.faces), -1)
+        return np.asarray(np.einsum("sk,fkc->fsc", share, parts).reshape(len(share) * len(surface.faces), -1))
 
     nearest = cKDTree(sampled(surface.vertices)).query(point)[1]
     return [
