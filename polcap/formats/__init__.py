@@ -14,4 +14,6 @@ npy_folder      a value as JSON and arrays in a folder
 atomic          files and folders, complete or not at all
 text_file       TOML and JSON of any origin
 own_folders     names of polcap's folders
+folder_lock     one process at a time in a folder
+addresses       percent-encoded links
 """
