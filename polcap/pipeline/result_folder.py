@@ -45,7 +45,7 @@ def check(out: Path, photographs: Path) -> None:
     names = folder_names.angle_folder_names(there)
     among = any(name in names or folder_names.is_angle_folder(name) for name in inside)
     if among or any(map(_holds_shots, (here, *here.parents))):
-        raise SettingError(f"--out {out} lies among a capture's shots; choose {photographs / own_folders.OUTPUT}")
+        raise SettingError(f"--out {out} lies among the capture's shots; choose {photographs / own_folders.OUTPUT}")
 
 
 def _holds_shots(folder: Path) -> bool:

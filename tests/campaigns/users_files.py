@@ -117,7 +117,9 @@ def commands(root: Path, random: np.random.Generator) -> Iterator[tuple[object, 
         ("show", result, "--animate", "light"), ("board", result), ("status", result), ("check", capture),
         ("synth", result, "--set", "width=64", "--set", "height=64"),
     ]  # fmt: skip
-    for number in random.integers(len(choices), size=int(random.integers(1, 5))):
+    slow = np.array([words[0] in ("batch", "fuse") for words in choices])  # they start processes
+    share = np.where(slow, 0.2, 1.0)
+    for number in random.choice(len(choices), int(random.integers(1, 5)), p=share / share.sum()):
         yield choices[number]
 
 

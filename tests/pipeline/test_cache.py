@@ -431,7 +431,7 @@ def test_an_alias_of_an_array_type_is_read_as_the_array(tmp_path: Path) -> None:
 def test_a_result_folder_is_refused_inside_every_kind_of_angle_folder(tmp_path: Path, listed: tuple[str, ...]) -> None:
     for name in listed:
         (tmp_path / name).mkdir()
-    with pytest.raises(SettingError, match="lies among a capture's shots"):
+    with pytest.raises(SettingError, match="lies among the capture's shots"):
         result_folder.check(tmp_path / listed[1] / "out", tmp_path)
     result_folder.check(tmp_path / "out", tmp_path)
     result_folder.check(

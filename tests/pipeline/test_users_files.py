@@ -53,7 +53,7 @@ def test_a_result_is_refused_among_the_shots_of_any_capture(
         file = next(place.iterdir())
         (other / "capture.toml").write_text(f'[[frame]]\nfile = "frames/{file.name}"\nangle = 45\n')
     done = polcap("process", capture, "--out", place / "result", *QUICK)
-    assert done.returncode == 2 and "lies among a capture's shots" in done.stderr
+    assert done.returncode == 2 and "lies among the capture's shots" in done.stderr
     assert not (place / "result").exists()
 
 
