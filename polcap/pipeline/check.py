@@ -68,7 +68,8 @@ def inspect(
         finally:
             pool.shutdown(cancel_futures=True)
     bad = [line for line in lines if line.state == "fail"]
-    blamed = {name for line in bad for name in line.shots}
+    one_exposure = capture.layout == "sensor"  # a frame holds all angles
+    blamed = set() if one_exposure else {name for line in bad for name in line.shots}
     shots = tuple(shot.name for shot in capture.shots if shot.name in blamed)
     missing = any(line.name == "chart" and line.state == "warn" for line in lines)
     seconds = round(perf_counter() - start, 2)

@@ -95,6 +95,11 @@ def at_most(
     )
 
 
+def sentence(text: str) -> str:
+    """A text with a capital letter at the beginning."""
+    return text[:1].upper() + text[1:]
+
+
 def bad_shots(names: list[str], bad: Bools) -> tuple[str, ...]:
     """Names of the shots to take again, those where `bad` (K,) is true."""
     return tuple(name for name, one in zip(names, bad) if one)

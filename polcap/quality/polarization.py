@@ -7,12 +7,12 @@ from typing import TypeGuard
 import msgspec
 import numpy as np
 
-from polcap.images import Bools, Floats, OrderTest, Quality, SelfCalibration, ShotOrder, StokesImage, SurfaceMaps
+from polcap.images import Bools, Floats, OrderTest, Quality, ShotOrder, StokesImage, SurfaceMaps
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
 from polcap.quality import rim
-from polcap.quality.gate import Evidence, Gate, State, at_most
+from polcap.quality.gate import Evidence, Gate, State, at_most, sentence
 from polcap.quality.limits import GateLimits
 
 _LEAST_RIM = 200  # pixels of outline, to estimate an angle
@@ -43,7 +43,7 @@ def order(found: Evidence) -> Gate:
 
     The polarization along the outline decides, or the error that the network expects for this order and for others.
     """
-    outline, names = found.selfcal.outline, found.names
+    outline, names, statement = found.selfcal.outline, found.names, found.radiance.equipment.angles
     test = _test(found)
     better = None
     if not outline.as_stated:
@@ -52,8 +52,8 @@ def order(found: Evidence) -> Gate:
         better, because = test.rival, f"The network expects {1 / test.ratio:.1f} times smaller errors for"
     if better is not None:
         message = f"{because} the order {_order_text(better, names)} rather than the stated one"
-        steps = better.remedy(names)
-        remedy = f"{steps[:1].upper()}{steps[1:]}; or take the shots again in order"
+        remedy = sentence(statement.correct(better, found.radiance.angle))
+        remedy += "; or take the shots again in order" if statement.place != "cells" else ""
         return Gate("order", "fail", _order_text(better, names), "as stated", message, remedy, 45.0, unit="")
     message = f"The outline supports the stated order (fit {outline.concentration:.2f} of 1)"
     if _is_confirmed(test):
@@ -62,7 +62,7 @@ def order(found: Evidence) -> Gate:
         other = _order_text(outline.rival, names)
         message = f"The outline fits the order {other} as well as the stated one (fit {outline.concentration:.2f} of 1)"
         surer = "a rounded object or a chart" + ("" if len(names) > 3 else " or four angles")
-        remedy = f"Check folders and ring yourself; {surer} would decide"
+        remedy = sentence(f"{statement.check}; {surer} would decide")
         return Gate("order", "warn", "cannot tell", "as stated", message, remedy, unit="")
     return Gate("order", "pass", "as stated", "as stated", message, unit="")
 
@@ -92,15 +92,20 @@ def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     if body.dolp_most < _LEAST_DOLP:
         message = f"No part of the outline is polarized by more than {100 * body.dolp_most:.1f} %"
         remedy = "Check that the polarizer was on and turned; metal and translucent objects (wax, milk) hardly polarize"
+        if found.radiance.equipment.angles.place == "cells":
+            remedy = "Use the sensor's frames as they are, without binning or scaling; metal and wax hardly polarize"
         yield Gate("polarized", "fail", round(body.dolp_most, 4), _LEAST_DOLP, message, remedy, _UNPOLARIZED_DEG)
         return
-    of_shots = _angles(seen.turn, body, angle, found.selfcal, found.names, limits)
+    of_shots = _angles(seen.turn, body, angle, found, limits)
     closed = found.object_.border <= limits.max_mask_border
     if of_shots.state == "fail" and not closed:  # a part of an outline can fit a turned shot by chance
         of_shots = msgspec.structs.replace(of_shots, state="warn")
-    yield _with_ring(of_shots, body, found.selfcal, limits)
+    yield _with_ring(of_shots, body, found, limits)
     yield _light_of_body(body, found, limits)
     side = seen.side
+    if found.radiance.equipment.light == "one exposure":
+        yield Gate("other light", "pass", 0.0, limits.max_side_light, "All angles come from one exposure")
+        return
     if body.concentration <= _CLEAR or not closed:
         message = "Polarization does not follow a closed outline in the picture"
         yield Gate("other light", "not measured", None, limits.max_side_light, message)
@@ -148,16 +153,10 @@ def _ill_posed(found: Evidence) -> float:
     return float(((inside & int(Quality.ILL_POSED)) > 0).mean()) if inside.size else 0.0
 
 
-def _angles(
-    found: rim.AngleError,
-    body: rim.RimFigures,
-    angle: Floats,
-    selfcal: SelfCalibration,
-    names: list[str],
-    limits: GateLimits,
-) -> Gate:
+def _angles(found: rim.AngleError, body: rim.RimFigures, angle: Floats, evidence: Evidence, limits: GateLimits) -> Gate:
     """Gate on polarizer angles: it fails if one shot or all shots have a wrong angle, beyond the estimate's error."""
-    limit = limits.max_turn_deg
+    limit, selfcal, names = limits.max_turn_deg, evidence.selfcal, evidence.names
+    statement = evidence.radiance.equipment.angles
     known = selfcal.gains.source in ("grey patches", "one exposure")
     common = -float(np.degrees(body.turned))  # an AoLP too small is an angle stated too small
     if (
@@ -165,11 +164,11 @@ def _angles(
         and body.concentration > _CLEAR
         and abs(abs(common) - 90) > 25  # reflections are polarized across the contour; see "body"
     ):
-        message = f"The ring looks turned by {common:+.0f}° ± {np.degrees(body.turned_sigma):.0f}° in all shots"
-        remedy = "Set the ring's zero to the horizontal, or state the true angles"
+        message = f"All angles look turned by {common:+.0f}° ± {np.degrees(body.turned_sigma):.0f}°"
+        remedy = sentence(statement.turn(angle, -body.turned))
         return Gate("angles", "fail", round(common, 1), limit, message, remedy, abs(common), unit="°")
     if selfcal.turned.shots and abs(np.degrees(selfcal.turned.angle)) > limit:
-        return _not_closing(selfcal, names, limit)
+        return _not_closing(evidence, limit)
     fit = limits.max_turn_fit * (1.0 if known else 0.75)  # guessed gains look like turns
     if found.misfit >= fit or found.sigmas < _SURE or found.shot is None:
         return Gate("angles", "pass", 0.0, limit, "No other angle fits the outline clearly better", unit="°")
@@ -180,42 +179,44 @@ def _angles(
     cost = abs(degrees) / 2
     if same.any():  # the pictures do not show which of the two is wrong
         shots = tuple(names[k] for k in sorted((found.shot, int(np.argmax(same)))))
-        message = f"{' and '.join(shots)} look equal: the polarizer was not turned between them"
-        remedy = "Turn the ring to its mark and take the shot again"
+        message = f"{' and '.join(shots)} look equal, as if the polarizer was not turned between them"
+        remedy = sentence(statement.retake)
         return Gate("angles", "fail", round(degrees, 1), limit, message, remedy, cost, shots, "°")
     times = 1 / found.misfit
     message = f"The {names[found.shot]} shot looks turned by {degrees:+.0f}°: the outline fits {times:.1f} times better"
-    remedy = "Set the ring to its mark and take the shot again, or state its true angle"
+    remedy = sentence(statement.retake)
     state: State = "fail" if found.misfit < _CERTAIN * fit else "warn"
     return Gate("angles", state, round(degrees, 1), limit, message, remedy, cost, (names[found.shot],), "°")
 
 
-def _not_closing(selfcal: SelfCalibration, names: list[str], limit: float) -> Gate:
+def _not_closing(found: Evidence, limit: float) -> Gate:
     """Gate on the polarizer angle of one shot that contradicts those of three or more other shots."""
-    turned = selfcal.turned
+    turned = found.selfcal.turned
     degrees, doubt = np.degrees([turned.angle, turned.sigma])
-    shots = tuple(names[k] for k in turned.shots)
+    shots = tuple(found.names[k] for k in turned.shots)
     which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])}, by as much or less)"
     message = f"{which} looks turned by {degrees:+.0f}° ± {doubt:.0f}°: the shots contradict each other"
-    remedy = "Set the ring to its mark and take the shot again, or state its true angle"
+    remedy = sentence(found.radiance.equipment.angles.retake)
     return Gate("angles", "fail", round(float(degrees), 1), limit, message, remedy, abs(float(degrees)) / 2, shots, "°")
 
 
-def _with_ring(gate: Gate, body: rim.RimFigures, selfcal: SelfCalibration, limits: GateLimits) -> Gate:
+def _with_ring(gate: Gate, body: rim.RimFigures, found: Evidence, limits: GateLimits) -> Gate:
     """Replace a passed gate of the angles by one on the zero error of the ring, common to all shots.
 
     The path corrects this error where it is certain. With three angles, one turned shot looks like a smaller turn of
     all, so the gate warns, if the polarization follows the outline.
     """
+    selfcal, statement = found.selfcal, found.radiance.equipment.angles
     if selfcal.found_sigma is not None and gate.state == "pass":
         doubt, ring = float(np.degrees(selfcal.found_sigma)), np.degrees(selfcal.angle) % 180
         message = f"The angles were estimated: {', '.join(f'{one:.1f}°' for one in ring)} (± {doubt:.1f}°)"
-        remedy = "Note the ring's mark of every shot"
+        remedy = sentence(statement.check) if statement.place == "cells" else "Note the ring's mark of every shot"
         return Gate("angles", "warn", "found", "noted", message, remedy, doubt, unit="")
     turn, doubt = np.degrees([selfcal.ring.offset, selfcal.ring.sigma])
     applied = selfcal.ring.correction != 0
     noted = len(selfcal.angle) == 3 and abs(turn) > max(limits.max_ring_turn_deg, _SURE * doubt)
     noted = noted and body.concentration > _CLEAR and abs(turn) < 45  # above: reflections, see "body"
+    noted = noted and found.radiance.equipment.light != "one exposure"  # a sensor's angles are exact
     if gate.state != "pass" or not (applied or noted):
         return gate
     message = f"The ring's zero was off by {turn:+.1f}° ± {doubt:.1f}°"
@@ -223,7 +224,7 @@ def _with_ring(gate: Gate, body: rim.RimFigures, selfcal: SelfCalibration, limit
     value, limit = round(float(turn), 2), limits.max_ring_turn_deg
     if not noted and abs(turn) <= limits.max_turn_deg:
         return Gate("angles", "pass", value, limits.max_turn_deg, message, cost_deg=float(doubt), unit="°")
-    remedy = "Set the ring's zero to the horizontal, or state the true angles"
+    remedy = sentence(statement.turn(selfcal.angle, selfcal.ring.offset))
     if noted:
         message += "; if a single shot is wrong, it is two to four times as much and not corrected"
         remedy += "; if one shot was off its mark, take it again"
@@ -242,7 +243,7 @@ def _light_of_body(body: rim.RimFigures, found: Evidence, limits: GateLimits) ->
     zenith, roughness, albedo = _medians(found.maps)
     confirmed = _is_confirmed(_test(found))
     if body.along < _ALONG and not (confirmed and albedo < _DARK):  # dark gloss reflects itself
-        return _along_contour(body.along, albedo, remedy)
+        return _along_contour(body.along, albedo, f"{remedy}; {_across(found)}")
     flat, dimmed = zenith < limits.min_zenith_deg, body.brightness < _DIMMED
     hint = "Trust the shape less: translucent objects polarize little"
     if flat and dimmed and body.dolp < max(limit, _WEAK_DOLP):
@@ -283,10 +284,17 @@ def _along_contour(along: float, albedo: float, remedy: str) -> Gate:
         f"The outline is polarized along the contour: the object reflects {reflects}, or all angles are off by 90°; "
         "the pictures cannot tell which"
     )
-    remedy += "; if the room was dark, the ring was upright at 0°: state the angles plus 90°"
     if dark:
         return Gate("body", "warn", round(along, 2), _ALONG, message, remedy, _LOOSE_FIT_DEG, unit="")
     return Gate("body", "fail", round(along, 2), _ALONG, message, remedy, _ALONG_DEG, unit="")
+
+
+def _across(found: Evidence) -> str:
+    """Advice for angles that are all off by 90°."""
+    statement = found.radiance.equipment.angles
+    if statement.place == "cells":
+        return f"if the room was dark, {statement.turn(found.radiance.angle, np.pi / 2)}"
+    return "if the room was dark, the ring was upright at 0°: state the angles plus 90°"
 
 
 def _lopsided(body: rim.RimFigures) -> float:

@@ -5,6 +5,7 @@ MEASURES, so that cases can state the figure.
 """
 
 import json
+import re
 from dataclasses import is_dataclass, replace
 from functools import partial
 from types import SimpleNamespace
@@ -17,7 +18,9 @@ import pytest
 from polcap.config import Config
 from polcap.images import (
     AngleStack,
+    AngleStatement,
     BlackError,
+    Equipment,
     OrderTest,
     OutlineCheck,
     PatchColors,
@@ -319,3 +322,15 @@ def test_every_state_of_every_gate_becomes_json(
 def test_every_gate_has_cases(good: dict[str, Any], config: Config) -> None:
     judged = {gate.name for _, _, fields in CASES for gate in judge(good, config, fields)}
     assert judged == {name for name, _, _ in CASES}
+
+
+def test_a_polarization_sensor_gets_no_advice_about_rings_or_folders(good: dict[str, Any], config: Config) -> None:
+    """Its angles come from one exposure: no shot can be taken again, and no other lamp was on in one of them."""
+    cells = AngleStatement("cells", cells=((1, 1), (0, 1), (0, 0)))
+    radiance = replace(good["radiance"], equipment=Equipment("one exposure", angles=cells))
+    for name, state, fields in CASES:
+        if name not in ("order", "angles", "polarized", "body", "other light") or "radiance" in fields:
+            continue
+        gate = {gate.name: gate for gate in judge(good, config, {"radiance": radiance, **fields})}[name]
+        assert not re.search(r"\bring|folder|again|clockwise|polarizer", gate.remedy.replace("the sensor", "")), gate
+        assert name != "other light" or gate.state == "pass", state

@@ -40,7 +40,8 @@ class CaptureFile(Struct, frozen=True, forbid_unknown_fields=True):
     focal_length_mm: Positive | None = None
     sensor_width_mm: Positive | None = None  # of the visible pixels
     clockwise: bool = False  # angles count clockwise in the picture
-    sensor: Literal["polarization"] | None = None  # every frame is a 2×2 mosaic of 90 45 / 135 0 degrees
+    sensor: Literal["polarization"] | None = None  # every frame is the mosaic of such a sensor
+    cells: tuple[tuple[float, float], tuple[float, float]] | None = None  # angles [°] of that mosaic's 2×2 cell
     encoding: Literal["linear", "srgb"] | None = None  # of finished pictures; by default 8 bits are sRGB
     white: Positive | None = None  # stored value at which linear pictures saturate; by default the type's largest
     black: Annotated[float, Meta(ge=0)] = 0.0  # stored value of darkness, linear pictures
@@ -48,6 +49,11 @@ class CaptureFile(Struct, frozen=True, forbid_unknown_fields=True):
     rotator: Rotator | None = None
     catalog: CatalogEntry = CatalogEntry()
     frame: tuple[FrameEntry, ...] = ()
+
+    @property
+    def of_sensor(self) -> bool:
+        """Whether the frames are stated to be those of a polarization sensor."""
+        return self.sensor is not None or self.cells is not None
 
 
 def load(folder: Path) -> CaptureFile:
@@ -66,8 +72,13 @@ def load(folder: Path) -> CaptureFile:
         raise CaptureError(f"{path}: {error}; see the reference page on captures") from None
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+    if stated.cells is not None and {angle % 180 for row in stated.cells for angle in row} != {0, 45, 90, 135}:
+        raise CaptureError(
+            f"{path}: cells = {list(map(list, stated.cells))}; give the angles of the sensor's 2×2 cell, row by row: "
+            "0, 45, 90 and 135 degrees, such as [[90, 45], [135, 0]]"
+        )
     for entry in stated.frame:
-        if entry.role in ("shot", "repeat") and entry.angle is None and stated.sensor is None:
+        if entry.role in ("shot", "repeat") and entry.angle is None and not stated.of_sensor:
             raise CaptureError(f"{path}: {entry.file} has role {entry.role} and no angle; give its angle in degrees")
         if entry.exposure and entry.flash_energy:
             raise CaptureError(f"{path}: {entry.file} states both exposure and flash_energy; give one of them")

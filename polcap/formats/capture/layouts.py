@@ -33,7 +33,7 @@ from polcap.formats.capture.folder_names import (
 from polcap.formats.own_folders import OURS
 from polcap.formats.raw import photo
 from polcap.formats.raw.probe import Probe
-from polcap.images import Role
+from polcap.images import AngleStatement, Role
 
 DEFAULT_DEG = (0.0, 45.0, 90.0)
 EQUAL_STOPS = 0.15  # EXIF rounds exposure times to a sixth of a stop at most
@@ -66,6 +66,7 @@ class Plan:
     shots: Shots
     others: tuple[Source, ...] = ()  # ambient, chart, cross
     notes: tuple[str, ...] = ()
+    angles: AngleStatement = AngleStatement()  # noqa: RUF009 — frozen
 
 
 def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
@@ -89,18 +90,19 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     pictures, notes = _list_photographs(folder)
     if not pictures:
         raise CaptureError(f"{folder}: holds no photograph that polcap reads; {_hint(folder)}")
-    if stated.sensor or _is_sensor(pictures, angles_deg):
-        notes.append("frames taken as a polarization sensor's, 90 45 / 135 0")
-        return Plan("sensor", _sensor_shots(pictures, angles_deg), notes=tuple(notes))
+    if stated.of_sensor or _is_sensor(pictures, angles_deg):
+        return _sensor(pictures, stated, angles_deg, notes=notes)
     whole = Path(os.path.abspath(folder))
     if is_one_angle(whole):
         raise CaptureError(f"{folder}: holds one angle of a capture; give the folder of all, {whole.parent}")
     groups = _by_name(pictures)
     if groups:
         notes.append("angles read from the file names")
-        return Plan("flat", _select(folder, groups, angles_deg), notes=tuple(notes))
+        shots = _select(folder, groups, angles_deg)
+        files = tuple(bracket[0].path.name for _, bracket in shots)
+        return Plan("flat", shots, notes=tuple(notes), angles=AngleStatement("file names", files))
     shots, note = _by_time(folder, pictures, angles_deg or DEFAULT_DEG)
-    return Plan("flat", shots, notes=(*notes, note))
+    return Plan("flat", shots, notes=(*notes, note), angles=AngleStatement("order", _texts(shots)))
 
 
 def _hint(folder: Path) -> str:
@@ -152,8 +154,8 @@ def _toml(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
         sources.append(Source(path, found, entry.role, entry.angle, entry.exposure, entry.flash_energy))
     shots = [source for source in sources if source.role == "shot"]
     others = tuple(source for source in sources if source.role not in ("shot", "repeat"))
-    if stated.sensor:
-        return Plan("sensor", _sensor_shots(shots, angles_deg), others)
+    if stated.of_sensor:
+        return _sensor(shots, stated, angles_deg, others)
     brackets = _select(folder, _group(shots), angles_deg)
     repeats = _group(source for source in sources if source.role == "repeat")
     repeated = [
@@ -161,7 +163,13 @@ def _toml(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
         for angle, bracket in repeats.items()  # a motor repeats an angle within its tolerance
         if any(abs((angle - known + 90) % 180 - 90) < SEPARATION_DEG for known, _ in brackets)
     ]
-    return Plan("toml", (*brackets, *repeated), others)
+    shots_by_angle = (*brackets, *repeated)
+    return Plan("toml", shots_by_angle, others, angles=AngleStatement("capture.toml", _texts(shots_by_angle)))
+
+
+def _texts(shots: Shots) -> tuple[str, ...]:
+    """Angles of shots as text, as `--angles` and capture.toml state them."""
+    return tuple(f"{angle:g}" for angle, _ in shots)
 
 
 def _group(sources: Iterable[Source]) -> dict[float, list[Source]]:
@@ -188,7 +196,9 @@ def _folders(folder: Path, sub_folders: dict[float, Path], crossed: Path | None,
     notes += [f"not used: the folders {', '.join(unused)}"] if unused else []
     loose = [path.name for path in inside if path.is_file() and path.name != capture_toml.NAME]
     notes += [f"not used: the files {few_names(loose)}"] if loose else []
-    return Plan("folders", _select(folder, groups, angles_deg), others, tuple(notes))
+    shots = _select(folder, groups, angles_deg)
+    names = tuple(sub_folders[angle].name for angle, _ in shots)
+    return Plan("folders", shots, others, tuple(notes), AngleStatement("folders", names))
 
 
 def _is_sensor(pictures: list[Source], angles_deg: _Order) -> bool:
@@ -197,9 +207,21 @@ def _is_sensor(pictures: list[Source], angles_deg: _Order) -> bool:
     return len(grey) <= 2 and not angles_deg and all(grey)
 
 
-def _sensor_shots(sources: Sequence[Source], angles_deg: _Order) -> Shots:
-    groups = {angle: list(sources) for angle in photo.SENSOR_CELLS}
-    return _select(sources[0].path.parent, groups, angles_deg) if sources else ()
+def _sensor(
+    sources: list[Source],
+    stated: CaptureFile,
+    angles_deg: _Order,
+    others: tuple[Source, ...] = (),
+    notes: Sequence[str] = (),
+) -> Plan:
+    """Plan of a polarization sensor's frames: each of them holds all angles."""
+    cells = stated.cells or photo.SENSOR_CELLS
+    place = {angle % 180: (y, x) for y, row in enumerate(cells) for x, angle in enumerate(row)}
+    shots = _select(sources[0].path.parent, dict.fromkeys(sorted(place), sources), angles_deg) if sources else ()
+    statement = AngleStatement("cells", _texts(shots), tuple(place[angle] for angle, _ in shots))
+    listed = " / ".join(" ".join(f"{angle:g}" for angle in row) for row in cells)
+    note = f"frames taken as a polarization sensor's, {listed}"
+    return Plan("sensor", shots, others, (*notes, note), statement)
 
 
 def _by_name(pictures: list[Source]) -> dict[float, list[Source]]:

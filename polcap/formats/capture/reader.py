@@ -4,6 +4,7 @@ import math
 import os
 import zipfile
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +20,7 @@ from polcap.formats.capture.layouts import Source
 from polcap.formats.raw import photo
 from polcap.formats.raw.color_encoding import ColorEncoding
 from polcap.formats.raw.probe import Probe
-from polcap.images import Capture, Exif, Frame, FrameReading, Shot
+from polcap.images import AngleStatement, Capture, Exif, Frame, FrameReading, Shot
 
 _ZOOM = 0.01  # relative change of the focal length above rounding
 _HEADROOM = 1.05  # white of radiance over its greatest value: above `hdr.clip`, so that nothing is over-exposed
@@ -47,7 +48,10 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
     _check_angles(folder, [angle for angle, _ in plan.shots], "the shots' angles are")
     if clockwise:
         if plan.layout == "sensor":
-            raise CaptureError(f"{folder}: clockwise is stated, but a polarization sensor has no ring; leave it out")
+            raise CaptureError(
+                f"{folder}: clockwise is stated, but a polarization sensor has no ring; leave it out, and state the "
+                "angles of its 2×2 cell as `cells` in capture.toml"
+            )
         plan = layouts.counted_clockwise(plan)
 
     every = _photographs(folder, plan)
@@ -78,11 +82,14 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
         focal_doubt=lens.doubt,
         principal_px=principal,
         size_px=size,
-        chart_frames=tuple(_frame(plan, stated, source, 0.0) for source in plan.others if source.role == "chart"),
+        chart_frames=tuple(
+            _frame(plan, stated, source, plan.shots[0][0]) for source in plan.others if source.role == "chart"
+        ),
         notes=(*plan.notes, *_notes(plan, shots, stated, radiance), *calibration_notes, f"focal length {lens.note}"),
         calibration=calibration,
         crossed=crossed,
         catalog=stated.catalog,
+        angles=_sense(plan.angles, clockwise, calibration),
     )
 
 
@@ -125,6 +132,14 @@ def _calibration(
     if clockwise and found is not None and found.polarizer is not None and found.polarizer.sense < 0:
         raise CaptureError(f"{folder}: clockwise is stated, but the ring's calibration turns it already; leave it out")
     return found, notes
+
+
+def _sense(angles: AngleStatement, clockwise: bool, calibration: Calibration | None) -> AngleStatement:
+    """The statement of the angles, with the reason why they are counted clockwise, if they are."""
+    ring = None if calibration is None else calibration.polarizer
+    if ring is not None and ring.sense < 0:
+        return replace(angles, clockwise="calibrated")
+    return replace(angles, clockwise="stated" if clockwise else "")
 
 
 def _lens(
@@ -192,12 +207,19 @@ def shutter(time: float | None) -> str:
 
 def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Sequence[Source]) -> Shot:
     ambient = [s for s in plan.others if s.role == "ambient" and s.angle_deg in (None, angle_deg)]
+    cell = _cell(plan, angle_deg)
     return Shot(
         angle=math.radians(angle_deg),
         frames=_darkest_first(_frame(plan, stated, source, angle_deg) for source in bracket),
         ambient=_darkest_first(_frame(plan, stated, source, angle_deg) for source in ambient),
-        place_px=photo.place_px(angle_deg) if plan.layout == "sensor" else (0.0, 0.0),
+        place_px=(0.0, 0.0) if cell is None else (cell[1] / 2, cell[0] / 2),
     )
+
+
+def _cell(plan: layouts.Plan, angle_deg: float) -> tuple[int, int] | None:
+    """Row and column of an angle in a polarization sensor's 2×2 cell; None for other captures and photographs."""
+    places = zip(plan.shots, plan.angles.cells)
+    return next((cell for (angle, _), cell in places if angle == angle_deg), None)
 
 
 def _crossed(folder: Path, plan: layouts.Plan, stated: CaptureFile) -> Shot | None:
@@ -214,13 +236,13 @@ def _crossed(folder: Path, plan: layouts.Plan, stated: CaptureFile) -> Shot | No
 
 
 def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: float) -> Frame:
-    mosaic_deg = angle_deg if plan.layout == "sensor" else None
+    cell = _cell(plan, angle_deg)
     kind: Literal["raw", "photo"] = "raw" if source.probe.kind == "raw" else "photo"
     # the digest names how the file is read, because it enters the keys of the stage cache
     levels = [f"{stated.white:g}"] if stated.white else []
     levels += [f"-{stated.black:g}"] if stated.black else []
-    if mosaic_deg is not None:
-        settings = [f"sensor {mosaic_deg:g}", *levels]
+    if cell is not None:
+        settings = [f"sensor {cell[0]},{cell[1]}", *levels]
     else:
         settings = [] if kind == "raw" else [*_encoding(source.probe, stated), *levels]
     return Frame(
@@ -229,7 +251,7 @@ def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: f
         role=source.role,
         digest=" ".join([source.probe.digest, *settings]),
         exposure=_stated_exposure(source),
-        reading=FrameReading(kind, stated.encoding, stated.white, stated.black, mosaic_deg),
+        reading=FrameReading(kind, stated.encoding, stated.white, stated.black, cell),
     )
 
 

@@ -15,8 +15,8 @@ def decode(frame: Frame) -> SensorImage:
     monochrome.
     """
     path, digest, reading = frame.path, _file_digest(frame), frame.reading
-    if reading.sensor_deg is not None:
-        return photo.read_mosaic(path, reading.sensor_deg, reading, digest)
+    if reading.cell is not None:
+        return photo.read_mosaic(path, reading.cell, reading, digest)
     if reading.kind == "raw":
         return libraw.read(path, digest)
     return photo.read(path, reading, digest)
@@ -28,7 +28,7 @@ def apply(frame: Frame, function: Callable[..., worker.Answer], **options: Any) 
     So only the result is sent back. The function must be at the top level of a module, the options plain JSON values.
     Raises DecodeError as `decode` does.
     """
-    if frame.reading.kind != "raw" or frame.reading.sensor_deg is not None:
+    if frame.reading.kind != "raw" or frame.reading.cell is not None:
         return function(decode(frame), **options)
     digest, module, name = _file_digest(frame), function.__module__, function.__name__
     return worker.call(apply_to_raw, frame.path, digest=digest, module=module, name=name, options=options)

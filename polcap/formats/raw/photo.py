@@ -19,7 +19,7 @@ from polcap.images import FrameReading, SensorImage
 from polcap.optics import color
 
 Encoding = Literal["linear", "srgb"]
-SENSOR_CELLS = {0.0: (1, 1), 45.0: (0, 1), 90.0: (0, 0), 135.0: (1, 0)}  # row, column of each angle [°] in a 2×2 cell
+SENSOR_CELLS = ((90.0, 45.0), (135.0, 0.0))  # angles [°] in the 2×2 cell of the usual polarization sensor
 _OTHER_COLORS = {5: "CMYK", 8: "CIELAB", 9: "ICCLAB", 10: "ITULAB", 32844: "LogL", 32845: "LogLuv"}  # of a TIFF
 _FIREFLIES, _FAR_ABOVE = 1e-4, 16.0  # most of them, share of a picture; how far glints reach above all else
 _MOST_CHANNELS = 64  # of a layered EXR
@@ -51,15 +51,15 @@ def read(path: str | Path, reading: FrameReading = _DEFAULT, digest: str | None 
 
 
 def read_mosaic(
-    path: str | Path, angle_deg: float, reading: FrameReading = _DEFAULT, digest: str | None = None
+    path: str | Path, cell: tuple[int, int], reading: FrameReading = _DEFAULT, digest: str | None = None
 ) -> SensorImage:
-    """One angle (0, 45, 90 or 135°) of a polarization sensor's raw frame, (H/2, W/2, 3), linear.
+    """One angle of a polarization sensor's raw frame, (H/2, W/2, 3), linear: the pixels at `cell`, row and column.
 
-    The frame's 2×2 cell is 90 45 / 135 0 degrees. `digest` is as in `read`.
+    `digest` is as in `read`.
 
     Raises DecodeError: the frame is in color, or cannot be read.
     """
-    y, x = SENSOR_CELLS[angle_deg]
+    y, x = cell
     if reading.kind == "photo":
         meta, arrays = worker.call(decode, path, digest=digest, stated="linear", mosaic=True)
         pixels, full = arrays["pixels"], meta["full"]
@@ -79,12 +79,6 @@ def read_mosaic(
     plane = mosaic[y : height // 2 * 2 : 2, x : width // 2 * 2 : 2]
     value = np.repeat(_counts(plane)[..., None], 3, axis=2)
     return SensorImage(value, np.full((1, 1), level), reading.white or full, None, lossy=lossy)
-
-
-def place_px(angle_deg: float) -> tuple[float, float]:
-    """Position (x, y) of an angle's pixels in the polarization sensor's 2×2 cell: 0 or ½ px of `read_mosaic`."""
-    y, x = SENSOR_CELLS[angle_deg]
-    return x / 2, y / 2
 
 
 def encoding_of(bits: int, found: ColorEncoding) -> str:

@@ -255,7 +255,7 @@ def _equipment(capture: Capture, view: View) -> Equipment:
     """Light, lens distortion (in pixels of `view`) and polarizer of a capture, from metadata and calibration."""
     light, known = _light(capture), capture.calibration
     if known is None:
-        return Equipment(light)
+        return Equipment(light, angles=capture.angles)
     ring, lens = known.polarizer, known.geometry
     return Equipment(
         light=light,
@@ -263,6 +263,7 @@ def _equipment(capture: Capture, view: View) -> Equipment:
         extinction=None if ring is None else np.array(ring.extinction),
         ring_sigma=None if ring is None else np.radians(ring.zero_sigma_deg),
         distortion=None if lens is None else Distortion(view.focal, view.center, lens.k1, lens.k2),
+        angles=capture.angles,
     )
 
 

@@ -19,7 +19,17 @@ from msgspec import Meta
 
 from polcap import parallel
 from polcap.errors import CaptureError
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Gains, ObjectMask, RingZero, SelfCalibration
+from polcap.images import (
+    Alignment,
+    AngleStack,
+    AngleStatement,
+    ColorCalibration,
+    Floats,
+    Gains,
+    ObjectMask,
+    RingZero,
+    SelfCalibration,
+)
 from polcap.optics import frames
 from polcap.optics.outline import OutlineBand
 from polcap.stages import stage
@@ -121,7 +131,7 @@ def solve(
     least_score = _SOLID_ORDER if well_known else _GUESSED_ORDER
     order = angles.check_order(rim, angle, settings.order_margin, least_score)
     if settings.check_order and not order.check.as_stated:
-        raise CaptureError(_wrong_order(order, angle))
+        raise CaptureError(_wrong_order(order, angle, radiance.equipment.angles))
 
     ring = _ring(even, angle, first, object_.border > 0)
     if found_sigma is not None or not one_exposure:  # the angles of a polarization mosaic are exact
@@ -215,14 +225,14 @@ def _find_angles(
     return found, sigma
 
 
-def _wrong_order(found: angles.OrderFit, angle: Floats) -> str:
+def _wrong_order(found: angles.OrderFit, angle: Floats, statement: AngleStatement) -> str:
     """Error message for shots with angles (K,) rad that contradict the polarization at the object's outline."""
     names = [f"{np.degrees(a):g}°" for a in angle]
     stated, best = ", ".join(names), ", ".join(names[i] for i in found.check.best.shots)
     mirrored = " counted clockwise" if found.check.best.mirrored else ""
     return (
         f"the angles {stated} contradict the polarization at the object's outline (fit {found.check.score:.2f}); "
-        f"{best}{mirrored} fit better ({found.best_score:.2f}): {found.check.best.remedy(names)}; "
+        f"{best}{mirrored} fit better ({found.best_score:.2f}): {statement.correct(found.check.best, angle)}; "
         "or shoot in a dark room (reflections turn polarization by 90°), or --set selfcal.check_order=false"
     )
 

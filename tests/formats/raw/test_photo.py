@@ -103,10 +103,13 @@ def test_unreadable_pictures_are_one_error_each(tmp_path):
         photo.read(layers)
 
 
+CELLS = {0: (1, 1), 45: (0, 1), 90: (0, 0), 135: (1, 0)}  # row, column of each angle in the usual cell
+
+
 def mosaic(height=32, width=40, tint=None):
     """I(θ) of S = (2000, 600, 300) under the sensor's four analyzers, each pixel its own."""
     cell = np.empty((2, 2))
-    for angle, at in photo.SENSOR_CELLS.items():
+    for angle, at in CELLS.items():
         twice = 2 * np.radians(angle)
         cell[at] = (2000 + 600 * np.cos(twice) + 300 * np.sin(twice)) / 2
     levels = np.tile(cell, (height // 2, width // 2))
@@ -117,7 +120,7 @@ def mosaic(height=32, width=40, tint=None):
 
 def test_sensor_planes_obey_malus_law(tmp_path):
     path = save(tmp_path / "a.png", mosaic())
-    planes = {angle: photo.read_mosaic(path, angle) for angle in photo.SENSOR_CELLS}
+    planes = {angle: photo.read_mosaic(path, cell) for angle, cell in CELLS.items()}
     level = {angle: float(plane.value.mean()) for angle, plane in planes.items()}
     assert level == {0: 1300, 45: 1150, 90: 700, 135: 850}
     assert planes[0].value.shape == (16, 20, 3) and planes[0].cfa is None
@@ -126,39 +129,39 @@ def test_sensor_planes_obey_malus_law(tmp_path):
 def test_sensor_pixel_is_the_one_of_its_angle(tmp_path):
     counts = np.arange(32 * 40, dtype=np.uint16).reshape(32, 40) + 20000
     path = save(tmp_path / "a.tif", counts)
-    np.testing.assert_array_equal(photo.read_mosaic(path, 90).value[..., 0], counts[::2, ::2])
-    np.testing.assert_array_equal(photo.read_mosaic(path, 45).value[..., 0], counts[::2, 1::2])
-    np.testing.assert_array_equal(photo.read_mosaic(path, 135).value[..., 0], counts[1::2, ::2])
-    np.testing.assert_array_equal(photo.read_mosaic(path, 0).value[..., 0], counts[1::2, 1::2])
+    np.testing.assert_array_equal(photo.read_mosaic(path, CELLS[90]).value[..., 0], counts[::2, ::2])
+    np.testing.assert_array_equal(photo.read_mosaic(path, CELLS[45]).value[..., 0], counts[::2, 1::2])
+    np.testing.assert_array_equal(photo.read_mosaic(path, CELLS[135]).value[..., 0], counts[1::2, ::2])
+    np.testing.assert_array_equal(photo.read_mosaic(path, CELLS[0]).value[..., 0], counts[1::2, 1::2])
 
 
 def test_sensor_frame_may_be_raw(tmp_path):
     path = tmp_path / "a.dng"
     path.write_bytes(headers.dng(mosaic() + 100, photometric=34892, black=[[100]], white=4000))
-    plane = photo.read_mosaic(path, 45, FrameReading("raw"))
+    plane = photo.read_mosaic(path, CELLS[45], FrameReading("raw"))
     assert (plane.value.mean(), plane.black.tolist(), plane.white) == (1250, [[100]], 4000)
 
 
 def test_colour_sensors_are_refused(tmp_path):
     three = save(tmp_path / "rgb.png", SIXTEEN)
     with pytest.raises(DecodeError, match=r"rgb\.png: has 3 channels"):
-        photo.read_mosaic(three, 0)
+        photo.read_mosaic(three, CELLS[0])
     bayer = save(tmp_path / "bayer.png", mosaic(tint=[[0.6, 1], [1, 0.7]]))
     with pytest.raises(DecodeError, match=r"bayer\.png.*color polarization sensor"):
-        photo.read_mosaic(bayer, 0)
+        photo.read_mosaic(bayer, CELLS[0])
 
 
 def test_a_color_mosaic_is_not_taken_for_polarizers(tmp_path, rng):
     bayer = np.tile(np.array([[0, 1], [1, 2]]), (96, 120))
     path = save(tmp_path / "bayer.tif", np.take_along_axis(scene(rng), bayer[..., None], axis=2))
     with pytest.raises(DecodeError, match=r"bayer\.tif: the diagonals of its 2×2 cells differ by .*mosaic of colors"):
-        photo.read_mosaic(path, 0)
+        photo.read_mosaic(path, CELLS[0])
 
 
 @needs_data
 def test_real_sensor_frame_balances():
     path = DATA / "real/polarization_mosaic/fruits_IMX250MZR.png"
-    planes = {angle: photo.read_mosaic(path, angle).value[..., 0] for angle in photo.SENSOR_CELLS}
+    planes = {angle: photo.read_mosaic(path, cell).value[..., 0] for angle, cell in CELLS.items()}
     across, between = planes[0] + planes[90], planes[45] + planes[135]  # both are S0
     usable = np.max(list(planes.values()), axis=0) < 250
     blurred = [cv2.GaussianBlur(sum_, (0, 0), 2)[usable] for sum_ in (across, between)]
