@@ -5,8 +5,8 @@ python -m tests.campaigns.changed_results [--changes 300] [--seed 0] [--rows FIL
 The result is one of a batch, with an export and the pictures of `show`. Each change concerns one of its files or
 folders, in turn: bytes flipped, cut, emptied, replaced by other bytes, by a folder, by a link or by another file,
 without permissions; a key of a JSON file with a value of another type, or without one; an array or picture of another
-shape, type or with NaN. In half of the cases the digests of the stage cache are corrected, as if polcap had written the
-change. Then the six commands that read a result run in this process.
+shape, type or with NaN. A changed manifest or run.json gets the digest of its new content in half of the cases. Then
+the six commands that read a result run in this process.
 """
 
 import json
@@ -23,7 +23,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from polcap.formats import npy_folder
 from polcap.formats.maps import exr
 from polcap.pipeline import cache
 from polcap.results import STAGES
@@ -64,34 +63,29 @@ def commands(root: Path, random: Random) -> list[tuple[object, ...]]:
     ]  # fmt: skip
 
 
-def changes(path: Path) -> dict[str, Change]:
-    """Changes that a file or folder can undergo, by name."""
+def changes(path: Path) -> list[dict[str, Change]]:
+    """Changes that a file or folder can undergo, by name: of any, of bytes, of the content."""
     found: dict[str, Change] = {
         "removed": _removed, "looping link": _looping, "dangling link": _dangling, "link elsewhere": _linked,
-        "no permissions": lambda place, _: place.chmod(0), "other kind": _other_kind,
+        "other kind": _other_kind, "no permissions": lambda place, _: place.chmod(0),
     }  # fmt: skip
     if path.is_dir():
-        return found
-    found |= {
+        return [found]
+    of_bytes: dict[str, Change] = {
         "emptied": lambda place, _: _write(place, b""),
         "flipped": lambda place, random: _write(place, mutated(place.read_bytes(), random, 4, in_place=True)),
         "cut": lambda place, random: _write(place, place.read_bytes()[: random.randrange(place.stat().st_size or 1)]),
         "mixed": lambda place, random: _write(place, mutated(place.read_bytes(), random)),
         "swapped": lambda place, _: _write(place, (_result(place) / _SWAPPED).read_bytes()),
     }
-    by_kind: dict[str, dict[str, Change]] = {
-        ".json": {
-            "value": _value,
-            "value again": _value,
-            "key": _key,
-            "document": _document,
-            "not finite": _not_finite,
-        },
+    of_content: dict[str, dict[str, Change]] = {
+        ".json": {"value": _value, "key": _key, "document": _document, "not finite": _not_finite},
         ".npy": {"array": _array},
         ".png": {"picture": _picture},
         ".exr": {"channels": _channels},
     }
-    return found | by_kind.get(path.suffix, {})
+    kinds = of_content.get(path.suffix)
+    return [found, of_bytes] if kinds is None else [found, of_bytes, kinds, kinds, kinds]
 
 
 def _result(place: Path) -> Path:
@@ -180,18 +174,13 @@ def _position(tree: Any, random: Random) -> tuple[Any, Any]:
 
 
 def _array(place: Path, random: Random) -> None:
-    """An array of another shape or type, or with NaN; its manifest knows it in half of the cases."""
+    """An array of another shape or type, or with NaN."""
     array = np.load(place)
     others: Sequence[Any] = (
         array[None], array.ravel(), array[:0], array.T, array.astype(np.float64), array.astype(np.int8),
         np.full(array.shape, np.nan), np.array("text"), np.float32(1),
     )  # fmt: skip
     np.save(place, random.choice(others))
-    manifest = place.with_name("manifest.json")
-    if random.random() < 0.5:
-        about = json.loads(manifest.read_text("utf-8"))
-        about["files"][place.name] = npy_folder.checksum(place)
-        manifest.write_text(json.dumps({**about, "digest": cache.seal(about)}))
 
 
 def _picture(place: Path, random: Random) -> None:
@@ -214,11 +203,12 @@ def tried(template: Path, number: int, seed: int) -> dict[str, Any]:
     """One change, and the faults of the commands after it."""
     random = Random(f"{seed} {number}")
     every = places(template)
+    every += [place for place in every if place.endswith(".json")] * 2  # with many keys each
     order = Random(seed).sample(every, len(every))
     with tempfile.TemporaryDirectory() as name:
         root, what = Path(name) / "tree", order[number % len(order)]
         shutil.copytree(template, root)
-        kind, change = random.choice(list(changes(root / what).items()))
+        kind, change = random.choice(list(random.choice(changes(root / what)).items()))
         change(root / what, random)
         codes, faults = [], []
         for words in commands(root, random):
