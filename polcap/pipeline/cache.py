@@ -242,7 +242,8 @@ class ArchiveCache(StageCache):
         place = self.place(stage)
         about, value = manifest(place), read(place, stage)
         expected = [one.key if isinstance(one, StageResult) else "" for one in inputs if not callable(one)]
-        same_inputs = all(key in ("", stored) for key, stored in zip(expected, about["inputs"], strict=True))
+        pairs = zip(expected, about["inputs"])
+        same_inputs = len(expected) == len(about["inputs"]) and all(key in ("", stored) for key, stored in pairs)
         if not same_inputs or (about["version"], about["settings"]) != (stage.version, msgspec.to_builtins(config)):
             raise StorageError(
                 f"{place} is of another run than the stages before it, or of another polcap; run `polcap process` again"

@@ -44,6 +44,15 @@ def test_a_stage_whose_seconds_are_no_number_is_computed_again(root: Path, polca
     assert polcap("process", root / "C", *QUICK).returncode in (0, 3) and polcap("report", result).returncode in (0, 3)
 
 
+def test_a_stage_with_another_number_of_inputs_is_of_another_polcap(root: Path, polcap: Command) -> None:
+    result = root / "C" / "polcap"
+    manifest = result / "work" / "05-selfcal" / "manifest.json"
+    change(manifest, lambda about: {**about, "inputs": [*about["inputs"], "0"]}, sealed=True)
+    for words in (("report", result), ("show", result, "surface")):
+        done = polcap(*words)
+        assert done.returncode == 2 and done.stderr.count("\n") == 1 and "05-selfcal" in done.stderr
+
+
 @pytest.mark.parametrize("content", ["[]", "7", '{"files": [], "stages": {}}', '{"stages": 3}', "[" * 9999])
 def test_a_provenance_of_another_shape_counts_as_that_of_another_export(
     root: Path, polcap: Command, content: str
