@@ -13,6 +13,7 @@ from polcap.errors import DecodeError, StorageError
 from polcap.formats.maps import exr, png, result_maps
 from polcap.formats.maps import maps_folder as maps
 from polcap.images import ColorCalibration, Cues, ReliefMesh, StokesImage, SurfaceMaps
+from polcap.results import Results
 from polcap.stages import cues
 from tests import surfaces
 
@@ -23,6 +24,10 @@ FILES = {
 }  # fmt: skip
 
 Result = tuple[SurfaceMaps, ReliefMesh, StokesImage, Cues]
+
+
+def write(folder: Path, of: SurfaceMaps, mesh: ReliefMesh, stokes: StokesImage, cue: Cues) -> None:
+    maps.write(folder, Results.partial(maps=of, mesh=mesh, stokes=stokes, cues=cue, keys={}))
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +51,7 @@ def result() -> Result:
 @pytest.fixture(scope="module")
 def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("result") / "maps"
-    maps.write(folder, *result)
+    write(folder, *result)
     return folder
 
 
@@ -56,7 +61,7 @@ def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
 ) -> None:
     """The error is raised, and no file of the new result exists."""
     monkeypatch.setenv("OMP_NUM_THREADS", threads)
-    maps.write(tmp_path / "maps", *result)
+    write(tmp_path / "maps", *result)
     before = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "maps").iterdir()}
     assert {name: (tmp_path / "maps" / name).read_bytes() for name in FILES} == {
         name: (folder / name).read_bytes() for name in FILES
@@ -70,7 +75,7 @@ def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
 
     monkeypatch.setattr(exr, "write", refuse)
     with pytest.raises(StorageError, match=r"cues\.exr: the disk is full"):
-        maps.write(tmp_path / "maps", *result)
+        write(tmp_path / "maps", *result)
     assert {file.name: file.stat().st_mtime_ns for file in (tmp_path / "maps").iterdir()} == before
 
 
@@ -78,7 +83,7 @@ def test_detail_of_raw_pixels_comes_back_and_maps_json_states_its_size(result: R
     of, mesh, image, seen = result
     size = (2 * surfaces.HEIGHT, 2 * surfaces.WIDTH)
     detailed = replace(of, detail=np.random.default_rng(2).normal(0, 0.5, size).astype(np.float16))
-    maps.write(tmp_path / "maps", detailed, mesh, image, seen)
+    write(tmp_path / "maps", detailed, mesh, image, seen)
     stated = json.loads((tmp_path / "maps" / "maps.json").read_text("utf-8"))
     assert stated["sizes"] == {"detail.png": [size[1], size[0]]} and "detail.png" in stated["maps"]
     read, stored = maps.read(tmp_path / "maps").detail, maps.as_stored(detailed).detail
@@ -155,7 +160,7 @@ def test_maps_as_stored_equal_the_maps_read(folder: Path, result: Result) -> Non
     rng = np.random.default_rng(5)
     of = replace(of, diffuse=np.exp(rng.normal(-8, 6, of.diffuse.shape)).astype(np.float32))  # denormals, and too much
     mesh = replace(mesh, depth=np.where(rng.uniform(size=mesh.depth.shape) < 0.1, np.nan, mesh.depth))
-    maps.write(folder.parent / "other", of, mesh, *result[2:])
+    write(folder.parent / "other", of, mesh, *result[2:])
     read, known = maps.read(folder.parent / "other"), maps.as_stored(of)
     assert np.array_equal(read.depth, maps.stored_depth(known, mesh), equal_nan=True) and read.metric == mesh.metric
     for name, other in vars(known).items():
@@ -165,7 +170,7 @@ def test_maps_as_stored_equal_the_maps_read(folder: Path, result: Result) -> Non
 
 def test_relative_depth_is_described_as_relative(result: Result, tmp_path: Path) -> None:
     of, mesh, stokes, cue = result
-    maps.write(tmp_path, of, replace(mesh, metric=False), stokes, cue)
+    write(tmp_path, of, replace(mesh, metric=False), stokes, cue)
     assert json.loads((tmp_path / "maps.json").read_text("utf-8"))["depth"]["unit"] == "relative"
 
 
