@@ -59,7 +59,8 @@ def rerendering(results: Results, ior: float) -> dict[str, Any]:
     """Figures of the re-rendering: photographs against the maps rendered under the same light and polarizer angle."""
     small = page_data.reduce(results.maps, results.mesh, results.cues, results.radiance.angle, _COMPARED_PX)
     rendered = page_data.rerender(small, ior)
-    return {"rms": [_plain(one) for one in rendered.rms(small.maps.mask)], "scale": _plain(rendered.scale)}
+    found = {name: [_plain(one) for one in values] for name, values in rendered.residuals(small.maps.mask).items()}
+    return {**found, "scale": _plain(rendered.scale)}
 
 
 def _colors(color: ColorCalibration, albedo_sigma: float | None) -> dict[str, Any]:

@@ -68,7 +68,8 @@ LABELS: dict[str, tuple[str, str]] = {
     "mesh.cuts": ("Cuts inside the outline, both sides, relative to the outline's length", "%"),
     "mesh.cut_px": ("Length of the cuts inside the outline", "px"),
     "mesh.raggedness": ("Raggedness: mesh border longer than its smoothed curve by", "%"),
-    "rerendering.rms": ("Difference of photograph and re-rendering at each angle, relative to white", "%"),
+    "rerendering.rms": ("Difference of photograph and re-rendering at each angle, without outliers, to white", "%"),
+    "rerendering.outliers": ("Pixels that differ by more than five standard deviations, at each angle", "%"),
     "rerendering.scale": ("Brightness of the photographs relative to the re-rendering", "×"),
 }
 PARTS = {

@@ -1,6 +1,6 @@
 """Map figures of report.html: picture, color scale and caption; the pointer shows the values."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,20 +58,31 @@ def of_result(small: PageMaps, metric: bool) -> list[MapFigure]:
     ]
 
 
-def differences(small: PageMaps, rendering: Rerendering, rms: Sequence[float | None]) -> list[MapFigure]:
-    """One figure per polarizer angle: photograph minus re-rendering. `rms` are the differences relative to white."""
-    shots = zip(small.angle, rendering.measured, rendering.predicted, rms)
+def differences(
+    small: PageMaps, rendering: Rerendering, figures: Mapping[str, Sequence[float | None]]
+) -> list[MapFigure]:
+    """One figure per polarizer angle: photograph minus re-rendering. `figures` are those of `Rerendering.residuals`."""
+    notes = map(_difference_note, figures["rms"], figures["outliers"])
+    shots = zip(small.angle, rendering.measured, rendering.predicted, notes)
     return [
         scalar(
             f"difference-{count}",  # not by angle: two shots may share one
             f"Polarizer at {np.degrees(angle):g}°",
-            "" if difference is None else f"rms {number(100 * difference, 2)} % of white",
+            note,
             100 * (measured - predicted),
             small.maps.mask,
             keys.DIFFERENCE,
         )
-        for count, (angle, measured, predicted, difference) in enumerate(shots, 1)
+        for count, (angle, measured, predicted, note) in enumerate(shots, 1)
     ]
+
+
+def _difference_note(rms: float | None, outliers: float | None) -> str:
+    if rms is None or outliers is None:
+        return ""
+    return (
+        f"rms {number(100 * rms, 2)} % of white without outliers, which are {number(100 * outliers, 2)} % of the pixels"
+    )
 
 
 def scalar(name: str, title: str, note: str, value: Floats, inside: Bools, key: ColorKey) -> MapFigure:

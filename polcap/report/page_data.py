@@ -11,6 +11,7 @@ from polcap.optics.resize import area_mean
 from polcap.report.reduction import ObjectReduction
 
 _WHITE_PATCH = 18  # of a ColorChecker Classic, row by row from dark skin
+_OUTLIER = 5  # standard deviations of the differences
 _WHITE_QUANTILE = 0.995  # of the object's light; it becomes white
 
 
@@ -55,9 +56,19 @@ class Rerendering:
     flashed: Floats  # (H, W, 3) S0 of the maps under that flash, linear Rec.709
     scale: float  # brightness of the photographs over that of the re-rendering, median of the pixels
 
-    def rms(self, inside: Bools) -> list[float]:
-        """Root mean square difference between photograph and re-rendering at each angle, relative to white."""
-        return [float(np.sqrt(np.mean((m - p)[inside] ** 2))) for m, p in zip(self.measured, self.predicted)]
+    def residuals(self, inside: Bools) -> dict[str, list[float]]:
+        """Difference of photograph and re-rendering at each angle: `rms` without outliers, and share of `outliers`.
+
+        The rms is relative to white. An outlier differs by more than five standard deviations, which the median of
+        the absolute differences gives: a few pixels of a highlight do not carry the figure.
+        """
+        found: dict[str, list[float]] = {"rms": [], "outliers": []}
+        for measured, predicted in zip(self.measured, self.predicted):
+            size = np.abs(measured - predicted)[inside]
+            far = size > _OUTLIER * max(1.4826 * float(np.median(size)), 1e-6) if size.size else size > 0
+            found["rms"].append(float(np.sqrt(np.mean(size[~far] ** 2))))
+            found["outliers"].append(float(far.mean()))
+        return found
 
 
 def rerender(small: PageMaps, ior: float) -> Rerendering:

@@ -4,10 +4,12 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from polcap import report
 from polcap.errors import StorageError
+from polcap.report.page_data import Rerendering
 
 
 def test_report_is_plain_json_with_figures_gates_and_settings(result: Path) -> None:
@@ -21,6 +23,16 @@ def test_report_is_plain_json_with_figures_gates_and_settings(result: Path) -> N
 def test_photographs_and_their_rerendering_agree(result: Path) -> None:
     found = report.read(result)["figures"]["rerendering"]
     assert len(found["rms"]) == 3 and max(found["rms"]) < 0.15 and 0.5 < found["scale"] < 2
+
+
+def test_a_few_pixels_do_not_carry_the_residual_of_the_rerendering(rng: np.random.Generator) -> None:
+    """23 of 53,000 pixels of a highlight once made an rms of 813 % of noise of 3 %."""
+    predicted = np.zeros((2, 53_000, 1))
+    measured = rng.normal(0, 0.03, predicted.shape)
+    measured[1, :23] = 390
+    found = Rerendering(measured, predicted, np.zeros((53_000, 1, 3)), 1.0).residuals(np.ones((53_000, 1), bool))
+    assert found["rms"] == pytest.approx([0.03, 0.03], rel=0.02)
+    assert found["outliers"] == pytest.approx([0, 23 / 53_000], abs=2e-5)
 
 
 @pytest.mark.parametrize("text", [None, "{", "[]", "{}"])
