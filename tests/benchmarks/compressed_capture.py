@@ -17,7 +17,7 @@ import numpy as np
 import rawpy
 from numpy.typing import NDArray
 
-from polcap.formats.atomic import folder
+from polcap.formats.atomic import new_folder
 
 _COMPRESSION, _STRIP_OFFSET, _STRIP_BYTES = 259, 273, 279  # TIFF tags
 _LOSSLESS_JPEG = 7
@@ -25,7 +25,7 @@ _LOSSLESS_JPEG = 7
 
 def make(capture: Path, out: Path) -> None:
     """Write the frames of `capture` in lossless JPEG below `out`."""
-    with folder(out) as temporary:
+    with new_folder(out) as temporary:
         for file in sorted(capture.rglob("*.DNG")):
             place = temporary / file.relative_to(capture)
             place.parent.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.formats.atomic import folder
+from polcap.formats.atomic import new_folder
 from polcap.formats.raw import dng, probe
 from polcap.formats.raw import libraw as raw
 
@@ -25,7 +25,7 @@ _SRGB_FROM_XYZ = np.array([[3.2405, -1.5371, -0.4985], [-0.9693, 1.876, 0.0416],
 
 def make(capture: Path, out: Path, megapixels: float) -> None:
     """Write the frames of `capture` with about so many pixels each below `out`."""
-    with folder(out) as temporary:
+    with new_folder(out) as temporary:
         for number, file in enumerate(sorted(capture.rglob("*.DNG"))):
             place = temporary / file.relative_to(capture)
             place.parent.mkdir(parents=True, exist_ok=True)

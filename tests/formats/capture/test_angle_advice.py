@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -54,7 +55,7 @@ def angle_of_photographs(understood):
 
 def follow(advice, root):
     """Do what the advice states; the options that it adds to the command."""
-    options = {"clockwise": "add --clockwise" in advice}
+    options: dict[str, Any] = {"clockwise": "add --clockwise" in advice}
     if moves := re.search(r"rename the (?:folder|file)s? (.*?)(?:$|, and )", advice):
         pairs = [pair.split(" to ") for pair in moves[1].split(" and ")]
         for old, new in pairs:
