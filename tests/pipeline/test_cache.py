@@ -271,9 +271,9 @@ def test_key_follows_the_bytes_of_the_photographs_not_their_place(tmp_path: Path
 
 
 def test_only_facts_that_change_pixels_enter_the_key() -> None:
-    """For a new field: mark it NOT_IN_KEY, or list it here, if the same photographs give other pixels with it."""
+    """For a new field: mark it NOT_IN_KEY, or list it here, if the same photographs give another result with it."""
     capture = {"shots", "layout", "focal_px", "focal_known", "principal_px", "size_px", "chart_frames", "crossed"}
-    capture |= {"calibration"}
+    capture |= {"calibration", "angles"}  # advice on the angles is stored with the merged pictures
     frame = {"exif", "role", "digest", "exposure"}
     for kind, expected in ((images.Capture, capture), (images.Frame, frame)):
         assert {one.name for one in fields(kind) if one.metadata.get("in_key", True)} == expected
