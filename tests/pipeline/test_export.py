@@ -234,6 +234,8 @@ def test_exports_of_earlier_maps_are_named(own: Path, polcap: Command) -> None:
     assert asset_export.find_outdated(asset_export.sidecars(own), about["keys"]) == []
     about["keys"]["surface"] = "of other maps"
     (own / "report.json").write_text(json.dumps(about))
+    maps = json.loads((own / "maps" / "maps.json").read_text())
+    (own / "maps" / "maps.json").write_text(json.dumps({**maps, "keys": about["keys"]}))
     assert asset_export.find_outdated(asset_export.sidecars(own), about["keys"]) == [asset, asset / "unreal"]
     again = polcap("export", own, "--preset", "unreal", "--lod", 1, "--texture-size", 64)
     assert again.returncode == 0 and "asset/unreal/SM_capture_lod2.glb in" in again.stderr
