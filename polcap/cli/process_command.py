@@ -10,7 +10,7 @@ from polcap import resource_limits, terminal
 from polcap.cli import options
 from polcap.cli.watch import at_every_change
 from polcap.errors import SettingError
-from polcap.formats import own_files, own_folders
+from polcap.formats import own_folders
 from polcap.results import STAGES
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ def process(
     model: options.Model = None,
 ) -> None:
     """Turn a capture into maps and a 3-D asset."""
+    from polcap.formats import own_files
     from polcap.pipeline import unchanged
 
     stated = {**context.params, "capture": capture, "config": config, "mask": mask, "model": model}  # paths, not text

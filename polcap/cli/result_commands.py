@@ -10,7 +10,7 @@ from polcap import terminal
 from polcap.cli import options
 from polcap.cli.options import Json, Result
 from polcap.errors import SettingError
-from polcap.formats import own_files, own_folders
+from polcap.formats import own_folders
 from polcap.results import STAGES
 
 
@@ -144,6 +144,7 @@ def _results(named: Path) -> Iterator[Path]:
         yield named
         return
     from polcap import batch as batches
+    from polcap.formats import own_files
 
     for unit in batches.reopen(named):
         if not Path(unit.out).resolve().is_relative_to(named.resolve()):
