@@ -138,8 +138,9 @@ class MemoryCache:
             if stage.keep:
                 self.progress(stage.name, 0.0, True)
             return value
+        values = [value_of(one) for one in inputs]  # in a lazy cache, this runs the stages before
         self.begin(stage.name)
-        value = stage(*map(value_of, inputs), *(() if config is None else (config,)))
+        value = stage(*values, *(() if config is None else (config,)))
         value = self._store(stage, value, about, time.perf_counter() - self._began)
         self.end()
         return value

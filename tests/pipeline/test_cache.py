@@ -460,6 +460,13 @@ def test_a_digest_is_compared_once_per_process_until_its_file_changes(
     assert compared[2:] == [array.name]
 
 
+def test_a_lazy_cache_reports_each_stage_once_in_the_order_of_the_path(tmp_path: Path) -> None:
+    seen: list[tuple[str, bool]] = []
+    cache = LazyCache(tmp_path, lambda stage, seconds, cached: seen.append((stage, seconds is None)))
+    assert path(cache).total.value is not None
+    assert seen == [(stage, begins) for stage in ("double", "passing", "total") for begins in (True, False)]
+
+
 def test_a_lazy_cache_reads_and_computes_nothing_before_a_stored_result(tmp_path: Path) -> None:
     expected = path(StageCache(tmp_path)).total.value
     calls.clear()
