@@ -26,7 +26,7 @@ _DEVELOP = "save it as linear 16-bit TIFF"
 _SAME = 2e-3  # of white: difference of two curves that are one; sRGB and gamma 2.2 differ by 8e-3
 _CONTRADICTION = 0.1  # ln of the ratio of light at half the code
 _UNEQUAL = 0.01  # of a color matrix to the identity, above which primaries are not those of Rec.709
-_SRGB_GAMMA = 2.1, 2.3  # of a gAMA chunk: 1/2.2 stands for sRGB (PNG, 13.13)
+_SRGB_GAMMA = 2.1, 2.3  # of a gAMA chunk: 1/2.2 means sRGB (PNG, 13.13)
 _ABSOLUTE = b"\3"  # rendering intent of an sRGB chunk; OpenImageIO writes it into linear pictures of 16 bits too
 _PRIMARIES = {  # x, y of red, green, blue and white
     "rec709": (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290),
