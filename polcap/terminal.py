@@ -43,7 +43,10 @@ class _Output(io.FileIO):
     def write(self, data: Any, /) -> int:
         """Write bytes; after the first failure, everything is discarded."""
         try:
-            return super().write(data)
+            begun = 0
+            while begun < len(data):  # a signal may end a write early
+                begun += super().write(data[begun:]) or 0
+            return len(data)
         except OSError as error:
             if error.errno != errno.EPIPE:  # the reader wanted no more
                 self.fault = error.strerror or str(error)
@@ -54,8 +57,11 @@ class _Output(io.FileIO):
 
 
 def _text(output: _Output, encoding: str = "utf-8") -> TextIO:
-    """Text stream of an output; names of files may hold bytes that are no text."""
-    return io.TextIOWrapper(io.BufferedWriter(output), encoding, errors="backslashreplace", line_buffering=True)
+    """Text stream of an output; names of files may hold bytes that are no text.
+
+    Without a buffer, which would write its text again after Ctrl-C in a write.
+    """
+    return io.TextIOWrapper(output, encoding, errors="backslashreplace", line_buffering=True)
 
 
 def open_streams() -> None:

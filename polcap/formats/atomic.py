@@ -22,35 +22,16 @@ from typing import Any
 import msgspec
 
 from polcap.errors import StorageError
-from polcap.formats import own_files
+from polcap.formats import own_files, system_errors
 
 _SYNCED_AT_ONCE = 8  # files; the system then writes its journal once for all of them
 _FORBIDDEN = set('/\\:*?"<>|')  # path separators, and characters that Windows refuses
 _TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.part(\.\w+)?")  # process id and random number
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{n}" for port in ("COM", "LPT") for n in range(10))}  # of Windows
 _NAME_BYTES = 60  # Windows allows 260 characters for the whole path
-_MISSING = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENODEV)  # of network drives
-_UNSYNCED = {*_MISSING, errno.EINVAL, errno.EBADF, errno.EISDIR, errno.EACCES, errno.EPERM}  # likewise, of fsync
-REASONS = {
-    errno.ENOSPC: "the disk is full; free some space",
-    errno.EDQUOT: "the disk quota is used up; free some space",
-    errno.EROFS: "the file system is read-only; choose another folder",
-    errno.EACCES: "permission denied; choose a folder that may be written",
-    errno.EPERM: "permission denied; choose a folder that may be written",
-    errno.EEXIST: "there is a file where a folder is needed; choose another path",
-    errno.ENOTDIR: "there is a file where a folder is needed; choose another path",
-    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
-    errno.EFBIG: "the file is larger than the file system allows; choose another folder",
-    errno.EIO: "the disk reports an input/output error; check the disk",
-    errno.ENOLCK: "its drive has no file locks; choose a folder on a local disk with -o",
-    **dict.fromkeys(_MISSING, "its drive lacks a function that polcap needs; choose a folder on a local disk with -o"),
-}
-
-
-def failure(target: Path, error: OSError) -> StorageError:
-    """The StorageError to raise for an OSError while writing the file `target`, with reason and remedy if known."""
-    reason = REASONS.get(error.errno or 0, error.strerror or str(error))
-    return StorageError(f"cannot write {target}: {reason}")
+_UNSYNCED = {  # errors of fsync on drives without it
+    *system_errors.MISSING, errno.EINVAL, errno.EBADF, errno.EISDIR, errno.EACCES, errno.EPERM,
+}  # fmt: skip
 
 
 def write(final: str | Path, content: str | bytes, synced: bool = True) -> None:
@@ -98,7 +79,7 @@ def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
             own.record([final])
         os.replace(temporary, final)
     except OSError as error:
-        raise failure(final, error) from error
+        raise system_errors.cannot_write(final, error) from error
     finally:
         discard(temporary)
 
@@ -155,7 +136,7 @@ def _temporary_folder(final: Path) -> Iterator[Path]:
         temporary.mkdir()
         yield temporary
     except OSError as error:
-        raise failure(final, error) from error
+        raise system_errors.cannot_write(final, error) from error
     except StorageError as error:  # of a file inside: named as in `final`
         raise StorageError(str(error).replace(str(temporary), str(final))) from error
     finally:

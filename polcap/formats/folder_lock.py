@@ -7,7 +7,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from polcap.formats import atomic
+from polcap.formats import system_errors
 
 
 def acquire(lock: FileLock) -> AbstractContextManager[Any]:
@@ -21,6 +21,6 @@ def acquire(lock: FileLock) -> AbstractContextManager[Any]:
     except Timeout:
         raise
     except OSError as error:
-        raise atomic.failure(Path(lock.lock_file), error) from error
+        raise system_errors.cannot_write(Path(lock.lock_file), error) from error
     except NotImplementedError as error:
-        raise atomic.failure(Path(lock.lock_file), OSError(errno.ENOLCK, "no locks")) from error
+        raise system_errors.cannot_write(Path(lock.lock_file), OSError(errno.ENOLCK, "no locks")) from error

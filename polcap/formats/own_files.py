@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from polcap.errors import StorageError
-from polcap.formats import text_file
+from polcap.formats import system_errors, text_file
 
 RECORD = "polcap-files.txt"
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
@@ -110,7 +110,7 @@ def claim(folder: Path, uses: Iterable[str]) -> None:
         with suppress(FileExistsError):  # another process was faster
             os.close(os.open(record, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
-        raise StorageError(f"cannot write {record}: {error.strerror}; choose another folder") from error
+        raise system_errors.cannot_write(record, error) from error
 
 
 @contextmanager

@@ -50,7 +50,8 @@ def find(
 
     Raises CaptureError: the outline contradicts the order of the polarizer angles, so the normals are wrong everywhere.
     """
-    order = polarization.order(Evidence.partial(selfcal=calibration, maps=maps, names=shot_names(radiance)))
+    seen = Evidence.partial(radiance=radiance, selfcal=calibration, maps=maps, names=shot_names(radiance))
+    order = polarization.order(seen)
     if order.state == "fail":
         raise CaptureError(f"{order.message}. {order.remedy}")
     lens = radiance.equipment.distortion

@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 
 from polcap import report
 from polcap.errors import CaptureError, SettingError, StorageError
-from polcap.formats import atomic, folder_lock, own_files, own_folders, text_file
+from polcap.formats import atomic, folder_lock, own_files, own_folders, system_errors, text_file
 from polcap.formats.capture import capture_toml, folder_names
 from polcap.formats.raw import probe
 from polcap.pipeline.cache import seal
@@ -94,7 +94,7 @@ def locked(out: Path) -> Iterator[None]:
                 f"{out}: process {_owner(owner)} is working here; wait for it or choose another --out"
             ) from error
         except OSError as error:
-            raise atomic.failure(work / "lock", error) from error
+            raise system_errors.cannot_write(work / "lock", error) from error
         try:
             atomic.write(owner, f"{os.getpid()}\n", synced=False)
             _remove_temporary(out)

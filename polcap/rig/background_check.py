@@ -5,7 +5,6 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
 from polcap.errors import CaptureError, DecodeError
-from polcap.formats import atomic
 from polcap.images import Floats
 from polcap.rig import retake_criteria
 from polcap.rig.camera import CameraFile
@@ -55,8 +54,7 @@ class BackgroundCheck:
 
     def _save_and_check(self, slot: Slot, read_deg: float | None, photograph: CameraFile) -> None:
         name = f"{slot.name}{photograph.suffix}"
-        file = self._record.folder / name
-        atomic.write(file, photograph.data)
+        file = self._record.save(name, photograph.data)
         try:
             facts, small = retake_criteria.inspect(file)
         except DecodeError as error:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from polcap.errors import DecodeError, HardwareError, SettingError
-from polcap.formats import atomic
+from polcap.formats import system_errors
 from polcap.formats.capture import foreign_files
 from polcap.formats.raw import file_bytes, libraw, probe, worker
 from polcap.images import Role
@@ -168,7 +168,7 @@ def _fault(name: str, data: bytes) -> str | None:
                 return f"{name}: its content is that of no RAW file" if foreign_files.is_photograph(name, True) else ""
             worker.call(require_whole, copy)
         except OSError as error:
-            raise atomic.failure(copy, error) from error
+            raise system_errors.cannot_write(copy, error) from error
         except DecodeError as error:
             return str(error).replace(f"{place}{os.sep}", "")
     return None

@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 import msgspec
 import tomli_w
 
-from polcap.errors import CaptureError
-from polcap.formats import atomic, text_file
+from polcap.errors import CaptureError, StorageError
+from polcap.formats import atomic, system_errors, text_file
 from polcap.formats.capture import capture_toml
 from polcap.formats.raw import file_bytes
 from polcap.images import Role
@@ -56,6 +56,7 @@ class RigFile(msgspec.Struct):
     rotator: str = ""  # model
     camera: str = ""
     frames: dict[str, AcceptedFrame] = {}  # by slot
+    unchecked: dict[str, str] = {}  # digests of photographs that are saved but not yet accepted, by file
     rejected: list[RejectedFrame] = []
 
 
@@ -76,8 +77,23 @@ class CaptureRecord:
         with self._lock:
             return dict(self.content.frames)
 
+    def save(self, name: str, photograph: bytes) -> Path:
+        """Write a photograph into the capture folder, recorded as unchecked, and return its path.
+
+        Raises StorageError: it cannot be written, or a file that polcap did not write has its name.
+        """
+        file = self.folder / name
+        with self._lock:
+            if os.path.lexists(file):
+                raise StorageError(f"cannot write {file}: polcap did not write the file that is there; move it away")
+            self.content.unchecked[name] = file_bytes.digest(photograph)
+            self.write()
+        atomic.write(file, photograph)
+        return file
+
     def accept(self, slot: Slot, frame: AcceptedFrame) -> None:
         with self._lock:
+            self.content.unchecked.pop(frame.file, None)
             self.content.frames[slot.name] = frame
             self.write()
 
@@ -88,11 +104,12 @@ class CaptureRecord:
             names = (f"{REJECTED}/{stem}.try{n}{file.suffix}" for n in range(1, 1 << 20))
             name = next(name for name in names if not (self.folder / name).exists())
             self.content.frames.pop(slot_name, None)
+            self.content.unchecked.pop(file.relative_to(self.folder).as_posix(), None)
             try:
                 (self.folder / REJECTED).mkdir(exist_ok=True)
                 os.replace(file, self.folder / name)
             except OSError as error:
-                raise atomic.failure(self.folder / name, error) from error
+                raise system_errors.cannot_write(self.folder / name, error) from error
             self.content.rejected.append(RejectedFrame(name, slot_name, read_deg, reason))
             self.write()
             return name
@@ -109,7 +126,7 @@ class CaptureRecord:
         return list(begun)
 
     def verify(self) -> list[str]:
-        """Reject photographs that have changed since, and files without a record; returns a message for each."""
+        """Reject photographs that have changed since, or were not checked; returns a message for each."""
         messages = []
         for name, frame in self.accepted().items():
             file = self.folder / frame.file
@@ -119,13 +136,12 @@ class CaptureRecord:
             elif file_bytes.digest(file.read_bytes()) != frame.facts.digest:
                 self.reject(name, file, frame.read_deg, "changed since it was taken")
                 messages.append(f"{frame.file}: changed since it was taken; the frame is taken again")
-        recorded = {self.folder / frame.file for frame in self.content.frames.values()}
-        for slot in self.slots:
-            for file in sorted(self.folder.glob(f"{slot.name}.*")):
-                if file not in recorded:
-                    self.reject(slot.name, file, None, "left by an interrupted run before it was checked")
-                    relative = file.relative_to(self.folder)
-                    messages.append(f"{relative}: was not checked before the interruption; the frame is taken again")
+        for name, digest in list(self.content.unchecked.items()):
+            file = self.folder / name
+            if file.is_file() and file_bytes.digest(file.read_bytes()) == digest:
+                self.reject(name.rpartition(".")[0], file, None, "not checked before the run was interrupted")
+                messages.append(f"{name}: was not checked before the interruption; the frame is taken again")
+            self.content.unchecked.pop(name, None)
         for temporary in self.folder.rglob(".*.part*"):
             if atomic.is_temporary(temporary.name):
                 atomic.discard(temporary)

@@ -6,7 +6,7 @@ import threading
 from datetime import datetime
 from pathlib import Path
 
-from polcap.formats import atomic
+from polcap.formats import system_errors
 
 
 class Log:
@@ -32,7 +32,7 @@ class Log:
                     file.write(f"{stamp} {device} {mark} {text}\n")
             except OSError as error:
                 path, self._path = self._path, None
-                raise atomic.failure(path, error) from error
+                raise system_errors.cannot_write(path, error) from error
 
     def close(self) -> None:
         """Write no further lines to the log."""

@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 
 from polcap.errors import CaptureError, SettingError
-from polcap.formats import atomic
+from polcap.formats import system_errors
 from polcap.formats.capture import folder_names, layouts
 from polcap.rig import capture_record
 from polcap.rig.capture_record import RigFile
@@ -51,7 +51,7 @@ def open_folder(folder: Path, resume: bool) -> RigFile | None:
         folder.mkdir(parents=True, exist_ok=True)
         names = [path.name for path in folder_names.children(folder)]
     except OSError as error:
-        raise atomic.failure(folder, error) from error
+        raise system_errors.cannot_write(folder, error) from error
     if capture_record.NAME in names:
         raise CaptureError(f"{folder} holds a capture that was begun; continue with --resume, or choose another folder")
     if set(names) - {capture_record.LOG}:  # the log of a run that failed before its first frame

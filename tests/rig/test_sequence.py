@@ -1,5 +1,6 @@
 """The sequence of a capture: order of the frames, retakes, and resuming."""
 
+import json
 import shutil
 import signal
 import tomllib
@@ -12,6 +13,7 @@ import pytest
 
 from polcap.errors import CaptureError, HardwareError, SettingError, StorageError
 from polcap.formats.capture import reader as captures
+from polcap.formats.raw import file_bytes
 from polcap.images import Role
 from polcap.rig import capture_record, sequence
 from polcap.rig.camera import CameraFile
@@ -190,15 +192,33 @@ def test_resume_rejects_changed_and_unchecked_files_and_takes_them_again(rig: Ri
     rig.stop_at()
     (rig.folder / "pol000/frame_2.dng").write_bytes(b"overwritten")
     (rig.folder / "pol000/frame_3.dng").unlink()
+    unchecked = b"saved, not checked"
     (rig.folder / "pol090").mkdir(exist_ok=True)
-    (rig.folder / "pol090/frame_3.dng").write_bytes(b"saved, not judged")
+    (rig.folder / "pol090/frame_3.dng").write_bytes(unchecked)
+    record = json.loads((rig.folder / "rig.json").read_text())
+    record["unchecked"] = {"pol090/frame_3.dng": file_bytes.digest(unchecked)}
+    (rig.folder / "rig.json").write_text(json.dumps(record))
     (rig.folder / "pol090/.frame_1.7-0123abcd.part.dng").write_bytes(b"half")
     rig.again()
     assert {("shot", 0.0, 1), ("shot", 0.0, 2), ("shot", 90.0, 2)} <= set(rig.taken)
     assert (rig.folder / "rejected/pol000_frame_2.try1.dng").read_bytes() == b"overwritten"
-    assert (rig.folder / "rejected/pol090_frame_3.try1.dng").exists()
+    assert (rig.folder / "rejected/pol090_frame_3.try1.dng").read_bytes() == unchecked
     assert any("frame_3.dng: the file is missing" in line for line in rig.messages)
     assert not list(rig.folder.rglob(".*.part*"))
+
+
+def test_files_of_others_beside_the_frames_stay(rig: Rig) -> None:
+    rig.stop_at()
+    sidecar, foreign = rig.folder / "pol000/frame_1.xmp", rig.folder / "pol090/frame_3.dng"
+    foreign.parent.mkdir(exist_ok=True)
+    for file in (sidecar, foreign):
+        file.write_bytes(b"of the photographer")
+    with pytest.raises(StorageError, match=r"frame_3.dng: polcap did not write the file that is there; move it away"):
+        rig.again()
+    assert sidecar.read_bytes() == foreign.read_bytes() == b"of the photographer"
+    foreign.unlink()
+    rig.again()
+    assert sidecar.exists() and len(json.loads((rig.folder / "rig.json").read_text())["frames"]) == 15
 
 
 def test_a_bracket_has_one_angle_even_if_the_ring_returns_to_another(rig: Rig) -> None:
