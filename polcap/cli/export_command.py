@@ -1,5 +1,6 @@
 """`polcap export`: the asset of a result again, in other formats or for one program."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,7 @@ _PAGE = "Web page that shows the GLB with this model-viewer.min.js, without a ne
 _COLOR = "Color space or OCIO role of the colors in the EXR, such as ACEScg."
 _SIZE = "Longer side of the textures, px; by default each keeps its own size."
 _GEOMETRY = "Mesh in the GLB: 32-bit floats, integers, or Draco (extra [draco])."
+_LEVEL = re.compile(r"_lod\d\.glb$")
 Images = Annotated[Literal["png", "jpeg", "webp", "ktx2"] | None, choice("Picture format in the GLB.")]
 Geometry = Annotated[Literal["float", "quantized", "draco"] | None, choice(_GEOMETRY)]
 Bits = Annotated[Literal["8", "16"] | None, choice("Bits of a channel in PNG textures.", "8|16")]
@@ -58,7 +60,7 @@ def export(
     about: Annotated[list[str] | None, Option(metavar="K=V", help=_ABOUT)] = None,
     extra: Annotated[list[str] | None, _names(_EXTRA, EXTRAS)] = None,
     bits: Bits = None,
-    lod: Annotated[int, Option(min=0, max=6, help="Further GLBs, each with a quarter of the triangles.")] = 0,
+    lod: Annotated[int, Option(min=0, max=6, help="Further GLBs, each with a quarter of triangles and texels.")] = 0,
     json: Json = False,
 ) -> None:
     """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
@@ -88,6 +90,8 @@ def export(
     write = fuse_run.export if fused_maps.is_fused(result) else pipeline.export
     files = write(result, *wanted)
     options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
+    if (missing := lod * len(wanted) - sum(bool(_LEVEL.search(file.name)) for file in files)) > 0:
+        terminal.print_message(f"polcap: {missing} levels of --lod would differ by over 1 % of the size: not written")
     terminal.print_written(files, json)
 
 

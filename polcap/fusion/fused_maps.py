@@ -121,7 +121,7 @@ class FusedSource:
         extras += () if whole.object_normal is None else ("object-normal",)
         error = _distance(self.atlas.mesh.vertices, atlas)
         return DetailLevel(
-            _asset(atlas, maps, self.settings, bits, extras), DecimatedMesh(atlas.mesh, error, error / atlas.texel)
+            _asset(atlas, maps, self.settings, bits, extras), DecimatedMesh(atlas.mesh, error, self.atlas.texel)
         )
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from polcap.formats import atomic, html
 from polcap.fusion import object_pictures
 from polcap.fusion.fusion_path import FusionResults
-from polcap.report import labels, page
+from polcap.report import labels, levels, page
 
 _SIDES = 8
 _SIDE = 360  # px of a picture
@@ -30,6 +30,7 @@ def write(folder: Path, about: Mapping[str, Any], results: FusionResults) -> Non
         "left_out": list(about["figures"]["left_out"].items()),
         "asset": f"asset/{name}.glb",
         "size": _size(about["figures"]["mesh"]),
+        "levels": (levels.HEAD, levels.rows(folder)),
     }
     page.render("fused.html", folder / "report.html", f"{name}: polcap report", content)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import msgspec
+import numpy as np
 
 from polcap import parallel
 from polcap.config import Config
@@ -36,13 +37,14 @@ from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.presets import PRESETS, ExportPreset, Format
 from polcap.formats.export.texture_set import Extra, Key, Texture
 from polcap.formats.maps import maps_folder
-from polcap.images import Asset, ReliefMesh
+from polcap.images import Asset, Mesh, ReliefMesh
 from polcap.stages import asset, surface
 
 _Writer = Callable[[], list[Path]]  # returns the files that it has written
 _NEEDED: tuple[Extra, ...] = ("object-normal",)  # by the format `iiif`
 # of exported files
 _SUFFIXES = {".glb", ".obj", ".mtl", ".ply", ".stl", ".usdc", ".usdz", ".mtlx", ".exr", ".png", ".html"}
+_LARGEST_DEVIATION = 0.01  # of a level of detail from the full mesh, over its size
 _SHARING = {"obj", "usd", "materialx"}  # formats that share texture files
 
 
@@ -62,7 +64,7 @@ class ExportRequest:
     page: Path | None = None  # file with model-viewer's script, for a web page that shows the GLB
     iiif: str | None = None  # address where the folder of the format `iiif` will be served
     catalog: Mapping[str, str] = field(default_factory=dict)  # fields of `CatalogEntry` in place of the capture's
-    lod: int = 0  # number of further GLBs, each with a quarter of the triangles of the previous one
+    lod: int = 0  # number of further GLBs, each with a quarter of the previous one's triangles and texels
 
 
 class ExportSource(Protocol):
@@ -119,6 +121,22 @@ class DetailLevel:
 
     asset: Asset
     decimated: surface.DecimatedMesh | None = None
+    texel: float = 1.0  # of the normal texture, in map pixels
+
+    @property
+    def error(self) -> float:
+        """Distance of the full mesh from this one, in the mesh's unit."""
+        return 0.0 if self.decimated is None else self.decimated.error
+
+    @property
+    def screen_px(self) -> int | None:
+        """Height on the screen up to which neither a texel nor the distance from the full mesh exceeds a pixel.
+
+        None: the full mesh.
+        """
+        if self.decimated is None:
+            return None
+        return int(_extent(self.asset.mesh) / max(self.error, self.texel * self.decimated.pixel))
 
 
 def check(wanted: ExportRequest) -> None:
@@ -169,17 +187,40 @@ def read(folder: Path, config: Config) -> ReliefSource:
 def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
     """Build an export's levels of detail: first the asset with at most the requested triangles and texture size.
 
+    Each further level has a quarter of the triangles and of the texels, for twice the distance. Levels that differ from
+    the full mesh by more than 1 % of its size are left out.
+
     Raises ObjectError: a level has too few triangles.
     """
     preset, full = effective(wanted), source.triangles
     whole = source.whole(preset.bits, preset.extras)
     most = min(preset.triangles or full, full)
     found = [DetailLevel(whole) if most == full else source.decimated(whole, most)]
-    found += [source.decimated(whole, round(most * 0.25**k)) for k in range(1, wanted.lod + 1)]
-    size = wanted.texture_size
+    for k in range(1, wanted.lod + 1):
+        level = source.decimated(whole, round(most * 0.25**k))
+        if _deviation(level.asset.mesh, whole.mesh, level.error) > _LARGEST_DEVIATION:
+            break
+        found.append(level)
+    return [_with_texels(level, wanted.texture_size, 2**k) for k, level in enumerate(found)]
+
+
+def _deviation(coarse: Mesh, full: Mesh, error: float) -> float:
+    """Distance of a decimated mesh from the full one, or the change of its bounding box if larger, over the size."""
+    moved = [np.abs(edge(coarse.vertices, axis=0) - edge(full.vertices, axis=0)).max() for edge in (np.min, np.max)]
+    return float(max(error, *moved) / _extent(full))
+
+
+def _extent(mesh: Mesh) -> float:
+    """Longest side of a mesh's bounding box, in its unit."""
+    return float(np.ptp(mesh.vertices, axis=0).max())
+
+
+def _with_texels(level: DetailLevel, size: int | None, factor: int) -> DetailLevel:
+    """The level with textures of `size` px, or of their own size, divided by `factor`."""
     if size is None:
-        return found
-    return [replace(level, asset=asset.resize_textures(level.asset, size)) for level in found]
+        return level if factor == 1 else replace(level, asset=asset.shrink_textures(level.asset, factor), texel=factor)
+    resized = asset.resize_textures(level.asset, max(size // factor, 1))
+    return replace(level, asset=resized, texel=max(level.asset.normal.shape) / max(resized.normal.shape))
 
 
 def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Sequence[DetailLevel]) -> list[Path]:
@@ -231,7 +272,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
         "unit": unit,
         "glb": {f"{stem}_{key}": text for key, text in _embedded(whole, preset).items()},
         "mesh": _size(found[0]),
-        "lods": {file.name: _size(level) for file, level in coarser.items()},
+        "lods": _level_notes({folder / f"{stem}.glb": found[0], **coarser}) if wanted.lod else {},
         "textures": {file: texture.meaning for file, texture in sorted(loose.items())},
     }
     maps_folder.note_export(out / "maps", folder.relative_to(out).as_posix(), description)
@@ -329,6 +370,15 @@ def _embedded(content: Asset, preset: ExportPreset) -> dict[str, str]:
     textures = gltf.textures(content) if "gltf" in preset.formats else {}
     sizes = {key: "{1} × {0}".format(*texture.pixels.shape) for key, texture in textures.items()}
     return {key: f"{texture.meaning}; {sizes[key]} px; {preset.images}" for key, texture in textures.items()}
+
+
+def _level_notes(files: Mapping[Path, DetailLevel]) -> dict[str, dict[str, Any]]:
+    """Triangles, distance, height on the screen and bytes of the levels of detail that were written, for maps.json."""
+    return {
+        file.name: {**_size(level), "screen_px": level.screen_px, "bytes": file.stat().st_size}
+        for file, level in files.items()
+        if file.exists()
+    }
 
 
 def _size(level: DetailLevel) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from polcap.formats import html, shipped_data
 from polcap.formats.capture import reader
 from polcap.formats.maps import png
 from polcap.optics.color import srgb_eight_bits
-from polcap.report import keys, labels, map_figures, page_data, plots
+from polcap.report import keys, labels, levels, map_figures, page_data, plots
 from polcap.report import stage_pictures as pictures
 from polcap.report.keys import Palette
 from polcap.results import Results
@@ -45,6 +45,7 @@ def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
         "metric": results.mesh.metric,
         "asset": f"asset/{about['capture']['name']}.glb",
         "pictures": list(_pictures(results)),
+        "levels": (levels.HEAD, levels.rows(folder)),
     }
     data = {"view": view, "mesh": _mesh_preview(results, about["settings"])}
     render("report.html", folder / "report.html", f"{about['capture']['name']}: polcap report", content, data)

@@ -69,7 +69,9 @@ def test_extra_textures_are_of_the_mesh(source: FusedSource, monkeypatch: pytest
     half = np.tile(np.linspace(0, 1, 256), (256, 1))
     monkeypatch.setattr(fused_maps, "ambient_occlusion", lambda atlas: half)
     for level in asset_export.levels(source, ExportRequest(extras=("occlusion",), lod=1)):
-        assert texture_set.occlusion(level.asset).pixels == pytest.approx(255 * half, abs=0.5)
+        pixels = texture_set.occlusion(level.asset).pixels
+        expected = half.reshape(len(pixels), -1, len(pixels), 256 // len(pixels)).mean(axis=(1, 3))
+        assert pixels == pytest.approx(255 * expected, abs=1)
     (turned,) = asset_export.levels(source, ExportRequest(extras=("object-normal",)))
     assert "camera" not in texture_set.object_normal(turned.asset).meaning  # the object has no side of its own
     plain = asset_export.levels(source, ExportRequest(lod=1))
@@ -96,7 +98,7 @@ def test_the_glb_is_closed_when_it_is_read_back(source: FusedSource, tmp_path: P
     assert np.ptp(read.vertices, axis=0) == pytest.approx(2 * ellipsoid.AXES, rel=0.01)
     length = int.from_bytes((tmp_path / "ball.glb").read_bytes()[12:16], "little")
     said = json.loads((tmp_path / "ball.glb").read_bytes()[20 : 20 + length])
-    assert said["materials"][0]["doubleSided"] is False or len(source.atlas.mesh.vertices) > 0
+    assert said["materials"][0]["doubleSided"] is False
     assert "origin_in_board" in said["asset"]["extras"]
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from polcap.formats.export import encoders, texture_set
 from polcap.formats.export.presets import PRESETS
@@ -17,6 +18,7 @@ from polcap.formats.maps import exr, png
 from polcap.pipeline import asset_export
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.asset_export import ExportRequest
+from polcap.report import levels
 from tests.conftest import ROOT, Command, python, shell
 from tests.formats.export.test_gltf import NODE, document
 
@@ -215,17 +217,40 @@ def test_number_of_threads_changes_no_byte(example: Path, tmp_path: Path) -> Non
     assert [name for name in found[0] if found[0][name] != found[1][name]] == [] and found[0].keys() == found[1].keys()
 
 
-def test_texture_size_and_levels_of_detail(own: Path) -> None:
-    pipeline.export(own, ExportRequest(formats=("gltf",), texture_size=128, lod=2))
-    levels = json.loads((own / "maps" / "maps.json").read_text())["exports"]["asset"]["lods"]
-    counts = []
-    for name, recorded in levels.items():
-        glb = document((own / "asset" / name).read_bytes())
-        counts.append(glb["accessors"][glb["meshes"][0]["primitives"][0]["indices"]]["count"] // 3)
-        assert counts[-1] == recorded["triangles"] and recorded["error"].split()[1] in ("mm", "px")
-    assert len(counts) == 2 and counts[0] == pytest.approx(4 * counts[1], rel=0.1)
-    origins = [document(file.read_bytes())["asset"]["extras"] for file in (own / "asset").glob("*.glb")]
-    assert len({tuple(one["origin_in_camera"]) for one in origins}) == 1 and len(origins) == 3
+def test_levels_have_a_quarter_of_triangles_and_texels_and_one_origin(own: Path) -> None:
+    pipeline.export(own, ExportRequest(formats=("gltf",), texture_size=256, lod=2))
+    notes = json.loads((own / "maps" / "maps.json").read_text())["exports"]["asset"]["lods"]
+    glbs = [document((own / "asset" / name).read_bytes()) for name in notes]
+    counts = [glb["accessors"][glb["meshes"][0]["primitives"][0]["indices"]]["count"] // 3 for glb in glbs]
+    assert counts == [one["triangles"] for one in notes.values()]
+    assert counts[1] == pytest.approx(counts[0] / 4, rel=0.1) and counts[2] == pytest.approx(counts[0] / 16, rel=0.1)
+    assert len({tuple(glb["asset"]["extras"]["origin_in_camera"]) for glb in glbs}) == 1
+    heights = [one["screen_px"] for one in notes.values()]
+    assert heights[0] is None and heights[1] > 1.5 * heights[2]
+    assert [one["bytes"] for one in notes.values()] == [(own / "asset" / name).stat().st_size for name in notes]
+
+
+def test_all_levels_together_are_at_most_half_again_as_large_as_the_first(own: Path) -> None:
+    files = pipeline.export(own, ExportRequest(formats=("gltf",), lod=3))
+    sizes = [file.stat().st_size for file in files if file.suffix == ".glb"]
+    assert len(sizes) == 4 and sum(sizes) <= 1.5 * sizes[0]
+
+
+def test_a_level_off_by_over_one_percent_of_the_size_is_not_written(own: Path, polcap: Command) -> None:
+    done = polcap("export", own, "--gltf", "--lod", 6, "--texture-size", 64)
+    assert done.returncode == 0 and "levels of --lod would differ by over 1 % of the size" in done.stderr
+    written = [trimesh.load(file, force="mesh", skip_materials=True) for file in sorted((own / "asset").glob("*.glb"))]
+    size = written[0].extents.max()
+    assert 2 < len(written) < 7
+    for level in written[1:]:
+        assert np.abs(level.bounds - written[0].bounds).max() <= 0.0101 * size
+
+
+def test_the_report_lists_the_levels(own: Path) -> None:
+    pipeline.export(own, ExportRequest(formats=("gltf",), lod=1))
+    rows = levels.rows(own)
+    assert [row[0] for row in rows] == ["asset/capture.glb", "asset/capture_lod1.glb"]
+    assert rows[1][4].endswith(" px") and rows[1][2].endswith(" MB")
 
 
 def test_exports_of_earlier_maps_are_named(own: Path, polcap: Command) -> None:

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap import __version__
 from polcap.formats import addresses
@@ -24,7 +23,7 @@ from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.glb_geometry import Blob, Geometry
 from polcap.formats.export.texture_set import Texture
 from polcap.formats.maps import maps_folder
-from polcap.images import Asset, Floats
+from polcap.images import Asset, Floats, Mesh
 
 _LINEAR, _LINEAR_MIPMAP, _CLAMP = 9729, 9987, 33071
 _IMAGE_EXTENSION: dict[Kind, str] = {"webp": "EXT_texture_webp", "ktx2": "KHR_texture_basisu"}
@@ -143,7 +142,7 @@ def _extras(asset: Asset, origin: Floats) -> dict[str, Any]:
 def _material(asset: Asset, name: str) -> dict[str, Any]:
     return {
         "name": name,
-        "doubleSided": is_open(asset.mesh.faces),
+        "doubleSided": is_open(asset.mesh),
         "pbrMetallicRoughness": {
             "baseColorTexture": {"index": 0},
             "metallicRoughnessTexture": {"index": 1},
@@ -191,8 +190,13 @@ def center(vertices: Floats) -> Floats:
     return np.asarray((vertices.min(axis=0).astype(np.float64) + vertices.max(axis=0)) / 2)
 
 
-def is_open(faces: NDArray[np.int32]) -> bool:
-    """Whether a mesh has a border: an edge of faces (F, 3) that only one triangle has, so that its back can be seen."""
-    start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1)
+def is_open(mesh: Mesh) -> bool:
+    """Whether a mesh has a border: an edge that only one triangle has, so that its back can be seen.
+
+    Vertices at one position count as one: a texture atlas repeats those on the borders of its charts.
+    """
+    _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    start = place.reshape(-1)[mesh.faces].astype(np.int64)
+    end = np.roll(start, -1, axis=1)
     _, triangles = np.unique(np.minimum(start, end) << 32 | np.maximum(start, end), return_counts=True)
     return bool((triangles == 1).any())

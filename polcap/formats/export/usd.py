@@ -110,7 +110,7 @@ def _mesh(stage: Any, path: Any, mesh: Mesh) -> Any:
     shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.normals, dtype=np.float32)))
     shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    shape.CreateDoubleSidedAttr(gltf.is_open(mesh.faces))
+    shape.CreateDoubleSidedAttr(gltf.is_open(mesh))
     uv = (mesh.uv * [1.0, -1.0] + [0.0, 1.0]).astype(np.float32)  # USD counts v upwards
     coordinates = UsdGeom.PrimvarsAPI(shape).CreatePrimvar(
         "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex

@@ -52,11 +52,20 @@ class _Albedo(Struct, frozen=True):
     uncertainty_percent: Annotated[float, Meta(ge=0)] | None = None
 
 
+class LevelNote(Struct, frozen=True):
+    """Record of a level of detail in maps.json."""
+
+    triangles: int
+    error: str = ""  # distance from the full mesh, with its unit
+    screen_px: int | None = None  # greatest height on the screen at which the level equals the full mesh
+    bytes: int = 0
+
+
 class _Export(Struct, frozen=True):
     """What maps.json notes about an export, as far as later exports add to it."""
 
     glb: dict[str, str] = {}
-    lods: dict[str, dict[str, Any]] = {}
+    lods: dict[str, LevelNote] = {}
     textures: dict[str, str] = {}
 
 
@@ -203,6 +212,14 @@ def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
     }
     known["exports"] = dict(sorted({**exports, where: note}.items()))
     atomic.write_json(file, known)
+
+
+def read_exports(folder: Path) -> dict[str, _Export]:
+    """Records of the exports of a result by folder, from maps.json. Raises DecodeError: it is no file of polcap."""
+    try:
+        return msgspec.convert(text_file.read_json(folder / "maps.json"), MapsFile).exports
+    except (OSError, ValueError) as error:
+        raise DecodeError(f"{folder / 'maps.json'} cannot be read ({error}); process again") from error
 
 
 def read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Floats:

@@ -5,6 +5,7 @@ References
 Khronos, glTF 2.0 §3.9 (materials) and KHR_materials_specular.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -115,11 +116,21 @@ def resize_textures(asset: Asset, size: int) -> Asset:
     shorter = max(size * min(height, width) / max(height, width), 1.0)
     other = min(size, 1 << int(np.ceil(np.log2(shorter))))
     shape = (other, size) if width >= height else (size, other)
+    return _with_sizes(asset, lambda texture: shape)
+
+
+def shrink_textures(asset: Asset, factor: int) -> Asset:
+    """A copy of the asset whose textures have 1/`factor` of their width and height."""
+    return _with_sizes(asset, lambda texture: (-(-texture.shape[0] // factor), -(-texture.shape[1] // factor)))
+
+
+def _with_sizes(asset: Asset, shape: Callable[[TexturePixels], tuple[int, int]]) -> Asset:
+    """A copy of the asset with each texture in the size (height, width) that `shape` returns for it."""
     textures: dict[str, Any] = {}
     for name in ("base_color", "occlusion_roughness_metallic", "normal", "specular_color", *_EXTRAS):
         before = getattr(asset, name)
         if before is not None:
-            value = _resize(before, shape) / np.iinfo(before.dtype).max
+            value = _resize(before, shape(before)) / np.iinfo(before.dtype).max
             value = frames.unit(2 * value - 1) / 2 + 0.5 if name.endswith("normal") else value
             textures[name] = _as(before, value)
     return replace(asset, **textures)

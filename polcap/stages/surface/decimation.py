@@ -29,7 +29,12 @@ class DecimatedMesh:
 
     mesh: Mesh
     error: float  # distance of the full mesh's vertices from this surface, 99th percentile, in the mesh's unit
-    error_px: float  # the same in px of the maps, at the object's median depth
+    pixel: float  # side of a map pixel at the object's median depth, in the mesh's unit
+
+    @property
+    def error_px(self) -> float:
+        """The distance in px of the maps."""
+        return self.error / self.pixel
 
 
 def decimate(front: ReliefMesh, view: View, count: int, back: Back) -> DecimatedMesh:
@@ -51,8 +56,7 @@ def decimate(front: ReliefMesh, view: View, count: int, back: Back) -> Decimated
         if len(reduced.faces) + around > count:
             reduced = _simplify(reduced, view, max(count - around, count // _LEAST_FRONT))
         reduced = _simplify(add_back(reduced, back), view, count)
-    error = _distance(front, reduced)
-    return DecimatedMesh(reduced, error, error * view.focal / float(np.nanmedian(front.depth)))
+    return DecimatedMesh(reduced, _distance(front, reduced), float(np.nanmedian(front.depth)) / view.focal)
 
 
 def _simplify(mesh: ReliefMesh, view: View, count: int) -> ReliefMesh:

@@ -5,6 +5,7 @@ import shutil
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from polcap.errors import SettingError
 from polcap.formats.export import glb_geometry, gltf
 from polcap.formats.export.encoders import Kind
 from polcap.formats.export.glb_geometry import Geometry
-from polcap.images import Asset
+from polcap.images import Asset, Mesh
 from tests import surfaces
 
 NODE = Path(__file__).parents[2] / "gltf"
@@ -26,6 +27,16 @@ NODE = Path(__file__).parents[2] / "gltf"
 def asset() -> Asset:
     maps = surfaces.maps(ripple=0.1, roughness=0.5, specular=0.05)
     return surfaces.built(maps, surfaces.mesh(maps))
+
+
+def closed_ball() -> Mesh:
+    """A closed mesh, the first of whose vertices no triangle has."""
+    ball = trimesh.creation.icosphere(4)  # 2,562 vertices
+    faces = np.asarray(ball.faces, np.int32)
+    faces = faces[np.argsort(faces.min(axis=1))] + 7
+    vertices = np.concatenate([np.zeros((7, 3)), ball.vertices]).astype(np.float32)
+    none = np.zeros_like(vertices)
+    return Mesh(vertices, none, none[:, :2], np.zeros((len(none), 4), np.float32), faces, metric=True, frame="board")
 
 
 def document(data: bytes) -> dict[str, Any]:
@@ -117,15 +128,23 @@ def test_only_the_address_of_a_license_is_a_web_statement(asset: Asset) -> None:
 
 def test_an_open_surface_is_double_sided(asset: Asset) -> None:
     assert document(gltf.encode(asset, "ball"))["materials"][0]["doubleSided"] is True
-    tetrahedron = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]], dtype=np.int32)
-    assert gltf.is_open(tetrahedron[:3]) and not gltf.is_open(tetrahedron)
+    ball = closed_ball()
+    assert not gltf.is_open(ball)
 
 
 @pytest.mark.parametrize("lost", [0, -1])
 def test_a_lost_triangle_opens_a_closed_surface_wherever_its_vertices_are_listed(lost: int) -> None:
-    ball = np.asarray(trimesh.creation.icosphere(4).faces, np.int32)  # 2,562 vertices
-    ball = ball[np.argsort(ball.min(axis=1))] + 7  # no triangle at the first vertices
-    assert not gltf.is_open(ball) and gltf.is_open(np.delete(ball, lost, axis=0))
+    ball = closed_ball()
+    assert gltf.is_open(replace(ball, faces=np.delete(ball.faces, lost, axis=0)))
+
+
+def test_seams_of_an_atlas_do_not_open_a_closed_surface() -> None:
+    """Each triangle is a chart of its own."""
+    ball = closed_ball()
+    corners = ball.vertices[ball.faces].reshape(-1, 3)
+    charts = replace(ball, vertices=corners, faces=np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
+    assert not gltf.is_open(charts)
+    assert gltf.is_open(replace(charts, faces=charts.faces[1:]))
 
 
 def test_draco_without_its_package_is_one_line(asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
