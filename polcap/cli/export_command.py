@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from polcap.formats.export.texture_set import Extra
 
 # names in formats.export, which is not imported at start
-PRESETS = ("blender", "unreal", "unity", "web", "substance", "maya", "houdini", "archive")
+PRESETS = ("blender", "unreal", "unity", "godot", "web", "substance", "maya", "houdini", "archive")
 EXTRAS = ("displacement", "occlusion", "object-normal")
 _PRESET = f"Files for one program in asset/NAME/: {', '.join(PRESETS)}; repeatable."
 _EXTRA = f"A further texture: {', '.join(EXTRAS)}; repeatable."
@@ -92,21 +92,40 @@ def export(
     options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
     if (missing := lod * len(wanted) - sum(bool(_LEVEL.search(file.name)) for file in files)) > 0:
         terminal.print_message(f"polcap: {missing} levels of --lod would differ by over 1 % of the size: not written")
+    if texture_size is not None:
+        _warn_of_upsampling(result, texture_size)
     terminal.print_written(files, json)
+
+
+def _warn_of_upsampling(result: Path, size: int) -> None:
+    """Print a warning if the textures are larger than the maps, with the setting that gives more detail."""
+    from polcap.formats import text_file
+    from polcap.fusion import fused_maps
+
+    held = max(text_file.read_json(result / "maps" / "maps.json")["size"])
+    if size > held:
+        setting = "fusion.atlas.size" if fused_maps.is_fused(result) else "hdr.demosaic=full"
+        terminal.print_message(
+            f"polcap: textures of {size} px are {size / held:.2g} x larger than the maps of {held} px hold; "
+            f"for more detail use --set {setting}, or photograph from nearer",
+            "WARNING",
+        )
 
 
 def _extra_textures(named: Sequence[str]) -> "tuple[Extra, ...]":
     """Parse --extra: names of further textures. Raises SettingError for an unknown name."""
+    from polcap.formats import text_file
     from polcap.formats.export.texture_set import EXTRAS
 
     for name in named:
         if name not in EXTRAS:
-            raise SettingError(f"--extra {name}: there is no such texture; there are {', '.join(EXTRAS)}")
+            raise SettingError(f"--extra {name}: there is no such texture; {text_file.suggestion(name, EXTRAS)}")
     return tuple(extra for extra in EXTRAS if extra in named)
 
 
 def _catalog_fields(stated: Sequence[str]) -> dict[str, str]:
     """Parse --about K=V: fields of `CatalogEntry` by name. Raises SettingError for an unknown field."""
+    from polcap.formats import text_file
     from polcap.images import CatalogEntry
 
     known = CatalogEntry.__struct_fields__
@@ -116,5 +135,5 @@ def _catalog_fields(stated: Sequence[str]) -> dict[str, str]:
         if not equals:
             raise SettingError(f'--about {text}: write FACT=TEXT, for example title="Vase with handles"')
         if key not in known:
-            raise SettingError(f"--about {key}: there is no such fact; there are {', '.join(known)}")
+            raise SettingError(f"--about {key}: there is no such fact; {text_file.suggestion(key, known)}")
     return found

@@ -20,12 +20,13 @@ def settings(
 ) -> None:
     """List the settings of all stages with default, range and meaning; --set and --config take them."""
     from polcap import config
+    from polcap.formats import text_file
     from polcap.fusion.fusion_path import SessionConfig
 
     rows = list(config.settings(SessionConfig))
     stages = dict.fromkeys(row.key.partition(".")[0] for row in rows)
-    if stage not in (None, *stages):
-        raise SettingError(f"settings {stage}: no such stage; choose one of {', '.join(stages)}")
+    if stage is not None and stage not in stages:
+        raise SettingError(f"settings {stage}: no such stage; {text_file.suggestion(stage, stages)}")
     found, lines = [], []
     for row in rows:
         if stage in (None, row.key.partition(".")[0]):

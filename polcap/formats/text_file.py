@@ -13,6 +13,7 @@ import re
 import stat
 import sys
 import tomllib
+from collections.abc import Iterable
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, TypeVar
@@ -116,6 +117,13 @@ def check_plain(value: Any, finite: bool = True, name: str = "") -> None:
             check_plain(item, finite, f"{name}[{at}]")
 
 
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """The most similar known name as a question, or all of them where none is similar."""
+    choices = list(known)
+    near = difflib.get_close_matches(name.lower(), choices, n=1, cutoff=0.5)
+    return f"did you mean {near[0]}?" if near else f"there are {', '.join(choices)}"
+
+
 def fault(error: msgspec.ValidationError, data: Any, kind: type[msgspec.Struct]) -> str:
     """Explain msgspec's validation error about `data`: key, value, and limit or the most similar valid key."""
     message, _, path = str(error).partition(" - at `$")
@@ -125,9 +133,7 @@ def fault(error: msgspec.ValidationError, data: Any, kind: type[msgspec.Struct])
     where = path.strip("`.")
     if unknown := _UNKNOWN.fullmatch(message):
         known = [field.encode_name for field in _of(form, inspect.StructType).fields]
-        near = difflib.get_close_matches(unknown[1], known, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
-        return f"{f'{where}.' if where else ''}{unknown[1]}: there is no such key; {hint}"
+        return f"{f'{where}.' if where else ''}{unknown[1]}: there is no such key; {suggestion(unknown[1], known)}"
     if message.startswith("Invalid enum value"):
         message = f"not one of {', '.join(map(str, _of(form, inspect.LiteralType).values))}"
     elif "matching regex" in message:

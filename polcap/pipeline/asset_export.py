@@ -16,7 +16,7 @@ import numpy as np
 from polcap import parallel
 from polcap.config import Config
 from polcap.errors import SettingError
-from polcap.formats import atomic
+from polcap.formats import atomic, text_file
 from polcap.formats.export import (
     exr_layers,
     glb_geometry,
@@ -201,7 +201,7 @@ def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
         if _deviation(level.asset.mesh, whole.mesh, level.error) > _LARGEST_DEVIATION:
             break
         found.append(level)
-    return [_with_texels(level, wanted.texture_size, 2**k) for k, level in enumerate(found)]
+    return [_with_texels(level, wanted.texture_size, preset.powers, 2**k) for k, level in enumerate(found)]
 
 
 def _deviation(coarse: Mesh, full: Mesh, error: float) -> float:
@@ -215,12 +215,16 @@ def _extent(mesh: Mesh) -> float:
     return float(np.ptp(mesh.vertices, axis=0).max())
 
 
-def _with_texels(level: DetailLevel, size: int | None, factor: int) -> DetailLevel:
-    """The level with textures of `size` px, or of their own size, divided by `factor`."""
-    if size is None:
-        return level if factor == 1 else replace(level, asset=asset.shrink_textures(level.asset, factor), texel=factor)
-    resized = asset.resize_textures(level.asset, max(size // factor, 1))
-    return replace(level, asset=resized, texel=max(level.asset.normal.shape) / max(resized.normal.shape))
+def _with_texels(level: DetailLevel, size: int | None, powers: bool, factor: int) -> DetailLevel:
+    """The level with textures of `size` px, powers of two near their own size, or their own size, over `factor`."""
+    built = level.asset
+    if size is not None:
+        resized = asset.resize_textures(built, max(size // factor, 1))
+    elif powers:
+        resized = asset.to_powers_of_two(built, factor)
+    else:
+        resized = built if factor == 1 else asset.shrink_textures(built, factor)
+    return replace(level, asset=resized, texel=max(built.normal.shape) / max(resized.normal.shape))
 
 
 def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Sequence[DetailLevel]) -> list[Path]:
@@ -324,7 +328,8 @@ def effective(wanted: ExportRequest) -> ExportPreset:
     elif wanted.preset in PRESETS:
         preset = PRESETS[wanted.preset]
     else:
-        raise SettingError(f"--preset {wanted.preset} is none of {', '.join(PRESETS)}")
+        hint = text_file.suggestion(wanted.preset, PRESETS)
+        raise SettingError(f"--preset {wanted.preset}: there is no such preset; {hint}")
     return replace(
         preset,
         images=wanted.images or preset.images,

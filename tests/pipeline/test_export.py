@@ -126,14 +126,17 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, own: P
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (["--preset", "max"], f"--preset max is none of {', '.join(PRESETS)}"),
+        (["--preset", "quixel"], f"--preset quixel: there is no such preset; there are {', '.join(PRESETS)}"),
+        (["--preset", "unrael"], "--preset unrael: there is no such preset; did you mean unreal?"),
+        (["--extra", "oclusion"], "--extra oclusion: there is no such texture; did you mean occlusion?"),
+        (["--about", "titel=Vase"], "--about titel: there is no such fact; did you mean title?"),
         (["--preset", "web", "--obj"], "write --obj by a second export"),
         (["--preset", "maya", "--color", "ACEScg"], "converts the colors of the layered EXR only"),
         (["--obj", "--geometry", "draco"], "change the GLB, which is not written"),
         (["--preset", "web", "--bits", "16"], "--bits 16 is for PNG textures, and none is written; add --images png"),
         (["--ply", "--bits", "16"], "--bits 16 is for PNG textures"),
         (["--about", "title"], "--about title: write FACT=TEXT"),
-        (["--about", "author=me"], "--about author: there is no such fact; there are title, creator"),
+        (["--about", "by=me"], "--about by: there is no such fact; there are title, creator"),
         (["--obj", "--page", ROOT / "README.md"], "README.md is not model-viewer"),
         (["--iiif", "museum.example/7"], "--iiif museum.example/7 is no web address"),
         (["--iiif", "http://museum.example/7", "--texture-size", "512"], "leave out --texture-size"),
@@ -215,6 +218,20 @@ def test_number_of_threads_changes_no_byte(example: Path, tmp_path: Path) -> Non
         found.append({file.name: file.read_bytes() for part in ("maps", "asset") for file in (out / part).iterdir()})
         found[-1] |= {str(file.relative_to(out)): file.read_bytes() for file in (out / "work").rglob("*.npy")}
     assert [name for name in found[0] if found[0][name] != found[1][name]] == [] and found[0].keys() == found[1].keys()
+
+
+@pytest.mark.parametrize("preset", ["unreal", "unity", "godot"])
+def test_textures_for_engines_have_powers_of_two(exported: Path, preset: str) -> None:
+    sizes = [png.read(file).shape[:2] for file in (exported / "asset" / preset).glob("*.png")]
+    assert sizes and all(side & (side - 1) == 0 for size in sizes for side in size)
+    stated = json.loads((exported / "maps" / "maps.json").read_text())["size"]
+    assert all(0.84 * stated[0] <= width for _, width in sizes)
+
+
+def test_larger_textures_than_the_maps_hold_are_reported(own: Path, polcap: Command) -> None:
+    size = max(json.loads((own / "maps" / "maps.json").read_text())["size"])
+    done = polcap("export", own, "--gltf", "--texture-size", 4 * size)
+    assert f"4 x larger than the maps of {size} px hold" in done.stderr and "hdr.demosaic=full" in done.stderr
 
 
 def test_levels_have_a_quarter_of_triangles_and_texels_and_one_origin(own: Path) -> None:

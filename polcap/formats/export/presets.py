@@ -24,6 +24,7 @@ class ExportPreset:
     name: str = "{}"  # of the asset itself
     images: Kind = "png"  # inside the GLB
     geometry: Geometry = "float"  # inside the GLB
+    powers: bool = False  # sides of the textures are powers of two, as engines compress and mipmap them
     triangles: int | None = None  # at most; by default those of the full mesh
     bits: Literal[8, 16] = 8  # of a texture's channel
     shared: Literal["png", "exr"] = "png"  # files of the textures of OBJ, USD and MaterialX
@@ -40,6 +41,7 @@ PRESETS: Mapping[str, ExportPreset] = {
         formats=("gltf",),
         description="Interchange imports the GLB (normals +Y); the loose T_*_N is -Y, as Unreal's materials need it",
         name="SM_{}",
+        powers=True,
         textures={
             "T_{}_BC": texture_set.base_color,
             "T_{}_N": partial(texture_set.normal, up=False),
@@ -50,11 +52,22 @@ PRESETS: Mapping[str, ExportPreset] = {
     "unity": ExportPreset(
         formats=("gltf",),
         description="glTFast imports the GLB; loose maps for HDRP and for the specular set-ups of URP; normals +Y",
+        powers=True,
         textures={
             "{}_BaseMap": texture_set.base_color,
             "{}_Normal": texture_set.normal,
             "{}_MaskMap": texture_set.unity_mask,
             "{}_SpecularMap": texture_set.unity_specular,
+        },
+    ),
+    "godot": ExportPreset(
+        formats=("gltf",),
+        description="import the GLB, then set Specular; loose maps for an ORMMaterial3D; normals +Y (OpenGL)",
+        powers=True,
+        textures={
+            "{}_albedo": texture_set.base_color,
+            "{}_orm": texture_set.occlusion_roughness_metallic,
+            "{}_normal": texture_set.normal,
         },
     ),
     "web": ExportPreset(

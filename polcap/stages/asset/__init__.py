@@ -124,6 +124,18 @@ def shrink_textures(asset: Asset, factor: int) -> Asset:
     return _with_sizes(asset, lambda texture: (-(-texture.shape[0] // factor), -(-texture.shape[1] // factor)))
 
 
+def to_powers_of_two(asset: Asset, factor: int = 1) -> Asset:
+    """A copy of the asset whose textures have powers of two as width and height, divided by `factor`.
+
+    A side becomes the next power of two, or the one below if that is at most 16 % smaller.
+    """
+
+    def power(side: int) -> int:
+        return max(int(2 ** np.round(np.log2(side) + 0.25)) // factor, 1)
+
+    return _with_sizes(asset, lambda texture: (power(texture.shape[0]), power(texture.shape[1])))
+
+
 def _with_sizes(asset: Asset, shape: Callable[[TexturePixels], tuple[int, int]]) -> Asset:
     """A copy of the asset with each texture in the size (height, width) that `shape` returns for it."""
     textures: dict[str, Any] = {}
