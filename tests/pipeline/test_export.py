@@ -126,7 +126,7 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, own: P
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (["--preset", "quixel"], f"--preset quixel: there is no such preset; there are {', '.join(PRESETS)}"),
+        (["--preset", "3ds"], f"--preset 3ds: there is no such preset; there are {', '.join(PRESETS)}"),
         (["--preset", "unrael"], "--preset unrael: there is no such preset; did you mean unreal?"),
         (["--extra", "oclusion"], "--extra oclusion: there is no such texture; did you mean occlusion?"),
         (["--about", "titel=Vase"], "--about titel: there is no such fact; did you mean title?"),
