@@ -98,8 +98,9 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
 
     Files are encoded while figures are measured and the page is drawn: encoders alone do not fill two cores.
     """
+    judged, results = report.judge(facts, results, config)
     about, _ = parallel.both(
-        partial(report.document, facts, results, config, timings(out)),
+        partial(report.document, facts, results, judged, config, timings(out)),
         partial(maps_folder.write, out / "maps", results),
     )
     parallel.both(
@@ -191,7 +192,9 @@ def judge_again(out: Path) -> dict[str, Any]:
         keys = report.read(out)["keys"]
         if keys != {**keys, **results.keys}:
             raise StorageError(f"{out}: work/ and maps/ are of two runs; run `polcap process` again")
-        about = report.document(facts, results, restore(Config, facts, out / "work" / "run.json"), timings(out))
+        config = restore(Config, facts, out / "work" / "run.json")
+        judged, results = report.judge(facts, results, config)
+        about = report.document(facts, results, judged, config, timings(out))
         about["keys"] = keys
         report.write(out, about, results)
     return about

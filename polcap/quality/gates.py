@@ -9,11 +9,12 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from polcap.images import SurfaceMaps
-from polcap.quality import geometry, light, polarization, shot_exposure
+from polcap.quality import error_maps, geometry, light, polarization, shot_exposure
 from polcap.quality.gate import MOST_DEG, Evidence, Gate, State
 from polcap.quality.limits import GateLimits
 from polcap.stages.align import AlignSettings
+
+_LARGE_PART = 0.45  # of the expected error: the message names the gates that cost more
 
 
 def judge(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iterator[Gate]:
@@ -64,15 +65,13 @@ def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iter
 
 
 def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Gate:
-    """Gate on the median expected error of the normals: root of the squares of own error and all gates' costs."""
-    own = _own_error(found.maps)
-    expected = min(float(np.sqrt(own**2 + sum(gate.cost_deg**2 for gate in judged))), MOST_DEG)
-    because = ", ".join(gate.name for gate in judged if gate.cost_deg > 0.5 * own)
+    """Gate on the median expected error of the normals, with all gates' costs."""
+    expected, limit = _median_error(found, judged), limits.max_normal_error_deg
+    because = ", ".join(gate.name for gate in judged if gate.cost_deg > _LARGE_PART * expected)
     message = f"Expected error of the normals: {expected:.1f}° (median)"
     if expected == MOST_DEG:
         message = "The normals are unknown"
     message += f", mostly due to: {because}" if because else ""
-    limit = limits.max_normal_error_deg
     if not np.isfinite(expected):
         return Gate("normal error", "not measured", None, limit, message, unit="°")
     if expected <= limit:
@@ -82,7 +81,7 @@ def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Ga
     return Gate("normal error", "fail", round(expected, 2), limit, message, remedy, unit="°")
 
 
-def _own_error(maps: SurfaceMaps) -> float:
-    """Median expected normal error [degrees] by the estimator alone."""
-    inside = maps.confidence[maps.mask]
+def _median_error(found: Evidence, judged: list[Gate]) -> float:
+    """Median expected normal error [degrees], with all gates' costs."""
+    inside = error_maps.expected_normal_error(found, judged)[found.maps.mask]
     return float(np.median(inside)) if inside.size else float("nan")

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from polcap.formats import shipped_data
-from polcap.images import Mesh, SurfaceMaps
+from polcap.images import Floats, Mesh, SurfaceMaps
 from polcap.optics import frames, outline
 from polcap.optics.morphology import dilate
 from polcap.optics.projection import picture_corners, transform_points
@@ -288,7 +288,12 @@ def _inward_share(maps: SurfaceMaps) -> float:
 
 def _lean(maps: SurfaceMaps, least: float, most: float) -> float:
     """Largest change of a view ray's tilt [degrees] within the doubt of the focal length; median over the object."""
-    y, x = np.nonzero(maps.mask)
+    return float(np.median(lean(maps, least, most)[maps.mask])) if maps.mask.any() else 0.0
+
+
+def lean(maps: SurfaceMaps, least: float, most: float) -> Floats:
+    """Largest change of each view ray's tilt (H, W) [degrees] within the doubt of the focal length."""
+    y, x = np.indices(maps.mask.shape)
     off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
-    lean, more, less = (np.arctan(off * factor) for factor in (1.0, np.exp(-least), np.exp(-most)))
-    return float(np.degrees(np.median(np.maximum(more - lean, lean - less)))) if len(off) else 0.0
+    tilt, more, less = (np.arctan(off * factor) for factor in (1.0, np.exp(-least), np.exp(-most)))
+    return np.asarray(np.degrees(np.maximum(more - tilt, tilt - less)))

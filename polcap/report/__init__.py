@@ -5,6 +5,7 @@ assumption. A gate that had nothing to measure is marked "not measured".
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +17,7 @@ from polcap.config import Config
 from polcap.errors import StorageError
 from polcap.formats import atomic, text_file
 from polcap.images import Capture, Frame, Network
-from polcap.quality import gates
+from polcap.quality import error_maps, gates
 from polcap.quality.gate import Gate, full_size
 from polcap.report import figures, labels, page
 from polcap.results import Results
@@ -93,13 +94,19 @@ def _frame_facts(frame: Frame, folder: Path) -> dict[str, Any]:
     }
 
 
+def judge(facts: Mapping[str, Any], results: Results, config: Config) -> tuple[list[Gate], Results]:
+    """Judge a result by the gates, and give its maps the expected errors with the costs of all gates."""
+    evidence = full_size(results, tuple(facts["capture"].get("focal_doubt", (0.0, 0.0))))
+    judged = list(gates.judge(evidence, config.gates, config.align))
+    maps = replace(results.maps, confidence=error_maps.expected_normal_error(evidence, judged))
+    return judged, Results.partial(**{**vars(results), "maps": maps})
+
+
 def document(
-    facts: Mapping[str, Any], results: Results, config: Config, timings: Mapping[str, float]
+    facts: Mapping[str, Any], results: Results, judged: Sequence[Gate], config: Config, timings: Mapping[str, float]
 ) -> dict[str, Any]:
     """Assemble the content of report.json: facts of the run, figures, gates, computing time of each stage [s]."""
     measured = {**figures.measured(results), "rerendering": figures.rerendering(results, config.infer.ior)}
-    focal_doubt = tuple(facts["capture"].get("focal_doubt", (0.0, 0.0)))
-    judged = list(gates.judge(full_size(results, focal_doubt), config.gates, config.align))
     return {
         "polcap": __version__,
         "versions": facts["versions"],

@@ -61,7 +61,7 @@ MEASURES = {  # the function that measures each figure
     "noise": (shot_exposure, "_noise"), "crossed": (light, "_compare_crossed"),
     "ill_posed": (polarization, "_ill_posed"), "medians": (polarization, "_medians"),
     "outline": (polarization, "_outline"),
-    "normal_error": (gates, "_own_error"), "inward_outline": (geometry, "_inward_share"),
+    "normal_error": (gates, "_median_error"), "inward_outline": (geometry, "_inward_share"),
 }  # fmt: skip
 MESH = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
 FAR = np.array([[[1.0, 0, 50 * k], [0, 1, 0], [0, 0, 1]] for k in range(3)])

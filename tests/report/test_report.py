@@ -9,6 +9,7 @@ import pytest
 
 from polcap import report
 from polcap.errors import StorageError
+from polcap.formats.maps import maps_folder
 from polcap.report.page_data import Rerendering
 
 
@@ -18,6 +19,13 @@ def test_report_is_plain_json_with_figures_gates_and_settings(result: Path) -> N
     assert about["verdict"] == "pass"
     assert {gate["state"] for gate in about["gates"]} <= {"pass", "not measured"}
     assert len(about["figures"]["chart"]["delta_e"]) == 24
+
+
+def test_the_stated_error_is_the_median_of_the_stored_map(result: Path) -> None:
+    maps, about = maps_folder.read(result / "maps"), report.read(result)
+    median = float(np.median(maps.confidence[maps.mask]))
+    assert about["expected_error_deg"] == pytest.approx(median, rel=2e-3)  # half floats
+    assert about["figures"]["maps"]["normal_error_deg_median"] == pytest.approx(median, rel=2e-3)
 
 
 def test_photographs_and_their_rerendering_agree(result: Path) -> None:

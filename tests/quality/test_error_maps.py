@@ -1,0 +1,88 @@
+"""Expected errors grow where the gates' findings are, and only there."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polcap.config import Config
+from polcap.images import Floats, Quality
+from polcap.optics.morphology import dilate
+from polcap.optics.outline import disc_radius
+from polcap.quality import error_maps, gates
+from polcap.quality.gate import Evidence, Gate
+from tests.quality.test_gates import changed, found
+
+OWN = 4.0  # degrees, expected error of the estimator
+
+
+@pytest.fixture(scope="module")
+def good() -> Evidence:
+    return found()
+
+
+def flagged(good: Evidence, bit: Quality, width: int) -> tuple[Evidence, Any]:
+    """The capture with a flagged square of this width in the middle of the object, and the square (H, W)."""
+    mask = good.maps.mask
+    row, column = (int(np.median(at)) for at in np.nonzero(mask))
+    square = np.zeros(mask.shape, bool)
+    square[row - width // 2 : row + width // 2, column - width // 2 : column + width // 2] = True
+    quality = good.stokes.quality | np.where(square, np.uint8(bit), np.uint8(0))
+    return changed(good, stokes=replace(good.stokes, quality=quality)), square
+
+
+def errors(of: Evidence, *judged: Gate) -> Floats:
+    return error_maps.expected_normal_error(of, judged)
+
+
+def test_without_findings_the_error_is_the_estimators_own(good: Evidence) -> None:
+    error = errors(good)
+    assert np.allclose(error[good.maps.mask], OWN) and not error[~good.maps.mask].any()
+
+
+def test_a_cost_without_a_place_counts_on_the_whole_object_and_costs_add_in_squares(good: Evidence) -> None:
+    error = errors(good, *(Gate(name, "warn", None, None, "", cost_deg=6.0) for name in ("gains", "source")))
+    assert np.allclose(error[good.maps.mask], np.sqrt(OWN**2 + 2 * 6**2))
+
+
+def test_clipped_light_costs_in_its_place_alone_and_once(good: Evidence) -> None:
+    mask = good.maps.mask
+    of, square = flagged(good, Quality.CLIPPED, round(0.6 * disc_radius(mask)))
+    gate = Gate("clipping", "fail", 0.3, 0.02, "", cost_deg=20.0)
+    error = errors(of, gate)
+    assert np.array_equal(error, errors(of))  # not of the gate again
+    away = mask & ~dilate(square, round(0.4 * disc_radius(mask)))
+    assert error[square].min() > OWN + 2 and np.allclose(error[away], OWN, atol=0.3)
+
+
+def test_a_small_clipped_highlight_costs_less_than_a_wide_one(good: Evidence) -> None:
+    radius = disc_radius(good.maps.mask)
+    squares = (flagged(good, Quality.CLIPPED, round(share * radius)) for share in (0.05, 0.2, 0.8))
+    cost = [errors(of)[square].max() for of, square in squares]
+    assert OWN <= cost[0] < OWN + 0.5 < cost[1] < cost[2]
+
+
+def test_exposures_that_differ_cost_in_these_pixels(good: Evidence) -> None:
+    of, square = flagged(good, Quality.GHOST, 10)
+    error = errors(of, Gate("stillness", "fail", 0.1, 0.02, "", cost_deg=5.0))
+    assert np.allclose(error[square], np.hypot(OWN, 5)) and np.allclose(error[good.maps.mask & ~square], OWN)
+
+
+def test_an_assumed_focal_length_costs_more_away_from_the_middle_of_the_picture(good: Evidence) -> None:
+    view, mask = good.maps.view, good.maps.mask
+    error = errors(changed(good, focal_doubt=(-0.7, 0.7)), Gate("focal length", "warn", None, None, "", cost_deg=9.0))
+    y, x = np.nonzero(mask)
+    off = np.hypot(x - view.center[0], y - view.center[1])
+    order = np.argsort(off)
+    assert np.all(np.diff(error[mask][order]) > -1e-3)
+    assert error[mask][order[-1]] > error[mask][order[0]]
+
+
+def test_the_headline_is_the_median_of_the_map(good: Evidence) -> None:
+    of, _ = flagged(good, Quality.CLIPPED, round(1.2 * disc_radius(good.maps.mask)))
+    judged = list(gates.judge(of, Config().gates, Config().align))
+    (headline,) = (gate.value for gate in judged if gate.name == "normal error")
+    error = error_maps.expected_normal_error(of, judged)
+    median = float(np.median(error[of.maps.mask]))
+    assert headline == pytest.approx(median, abs=0.006) and median > OWN
