@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from polcap.api import Result, process
+    from polcap.capture_values import Capture, Frame, Shot
+    from polcap.chart_values import ChartRequest
     from polcap.config import Config
     from polcap.config import load as load_config
     from polcap.errors import PolcapError
@@ -22,7 +24,9 @@ if TYPE_CHECKING:
     from polcap.formats.maps.maps_folder import ResultMaps
     from polcap.formats.maps.result_maps import read as read_maps
     from polcap.formats.maps.result_maps import read_cues, read_stokes
-    from polcap.images import Asset, Capture, ChartRequest, Cues, Frame, Mesh, Shot, StokesImage, SurfaceMaps, View
+    from polcap.images import View
+    from polcap.mesh_values import Asset, Mesh
+    from polcap.stage_values import Cues, StokesImage, SurfaceMaps
 
 __version__ = "0.1.0"
 __all__ = [
@@ -30,7 +34,7 @@ __all__ = [
     "Shot", "StokesImage", "SurfaceMaps", "View", "load_config", "process", "read_capture", "read_cues", "read_maps",
     "read_stokes",
 ]  # fmt: skip
-_HOME = {  # public name → module and its name there; the others are values of `polcap.images`
+_HOME = {  # public name → module and its name there
     "process": ("polcap.api", "process"),
     "Result": ("polcap.api", "Result"),
     "Config": ("polcap.config", "Config"),
@@ -41,6 +45,11 @@ _HOME = {  # public name → module and its name there; the others are values of
     "read_cues": ("polcap.formats.maps.result_maps", "read_cues"),
     "read_maps": ("polcap.formats.maps.result_maps", "read"),
     "read_stokes": ("polcap.formats.maps.result_maps", "read_stokes"),
+    **{name: ("polcap.capture_values", name) for name in ("Capture", "Frame", "Shot")},
+    "ChartRequest": ("polcap.chart_values", "ChartRequest"),
+    "View": ("polcap.images", "View"),
+    **{name: ("polcap.mesh_values", name) for name in ("Asset", "Mesh")},
+    **{name: ("polcap.stage_values", name) for name in ("Cues", "StokesImage", "SurfaceMaps")},
 }
 
 
@@ -48,7 +57,7 @@ def __getattr__(name: str) -> Any:
     """Import a public name from its module."""
     if name not in __all__:
         raise AttributeError(f"module 'polcap' has no attribute {name!r}")
-    module, there = _HOME.get(name, ("polcap.images", name))
+    module, there = _HOME[name]
     return getattr(import_module(module), there)
 
 

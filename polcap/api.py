@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from polcap import resource_limits
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.errors import SettingError
 from polcap.formats import own_folders
-from polcap.images import Bools, ChartRequest, Device
+from polcap.images import Bools, Device
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.cache import Progress, silent

@@ -8,18 +8,9 @@ from typing import TYPE_CHECKING, Any, Self
 if TYPE_CHECKING:  # the command line needs the names of the stages before the values are imported
     from collections.abc import Mapping
 
-    from polcap.images import (
-        Alignment,
-        AngleStack,
-        Asset,
-        ColorCalibration,
-        Cues,
-        ObjectMask,
-        ReliefMesh,
-        SelfCalibration,
-        StokesImage,
-        SurfaceMaps,
-    )
+    from polcap.chart_values import ColorCalibration
+    from polcap.mesh_values import Asset, ReliefMesh
+    from polcap.stage_values import Alignment, AngleStack, Cues, ObjectMask, SelfCalibration, StokesImage, SurfaceMaps
 
 
 class NotReached(AttributeError):

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import Config, images, read_capture
+from polcap import Config, chart_values, images, mesh_values, read_capture, stage_values
 from polcap.formats import onnx, shipped_data
 from polcap.formats.raw import frame_decoder
 from polcap.images import View
@@ -168,7 +168,7 @@ class Golden:
     run: Callable[[], Any]
 
 
-def radiance() -> images.AngleStack:
+def radiance() -> stage_values.AngleStack:
     """The longest exposure of each angle of the bundled capture; sums and quotients of integers, no stage."""
     capture = read_capture(CAPTURE)
     photographs = [frame_decoder.decode(shot.frames[-1]) for shot in capture.shots]
@@ -178,18 +178,17 @@ def radiance() -> images.AngleStack:
         red, green, green2, blue = (count[y::2, x::2] for y in (0, 1) for x in (0, 1))  # RGGB
         values.append((np.stack([red, (green + green2) / 2, blue], axis=-1) - 256) / np.float32(4095 - 256))
         clipped.append(np.maximum.reduce([red, green, green2, blue]) > 4000)
-    value = np.stack(values)
-    shots = len(values)
-    return images.AngleStack(
+    value, first = np.stack(values), photographs[0]
+    return stage_values.AngleStack(
         value=value,
         variance=np.float32(3e-5) * (np.maximum(value, 0) + np.float32(0.02)),
         quality=np.stack(clipped).astype(np.uint8) * np.uint8(images.Quality.CLIPPED),
         angle=capture.angle,
         view=VIEW,
-        bracket=images.single_frames(shots),
-        sensor=images.ColorSensor(photographs[0].camera_matrix, photographs[0].white_balance, photographs[0].site_px),
-        equipment=images.Equipment("flash"),
-        mosaic=images.Mosaic(((photographs[0].value - np.float32(256)) / (4095 - 256)).astype(np.float16), RGGB),
+        bracket=stage_values.single_frames(len(value)),
+        sensor=stage_values.ColorSensor(first.camera_matrix, first.white_balance, first.site_px),
+        equipment=stage_values.Equipment("flash"),
+        mosaic=images.Mosaic(((first.value - np.float32(256)) / (4095 - 256)).astype(np.float16), RGGB),
     )
 
 
@@ -204,15 +203,15 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
     color = replace(
         scenes.no_color(),
         matrix=inputs["matrix"],
-        place=images.ChartPlace(inputs["quads"], inputs["corners"]),
+        place=chart_values.ChartPlace(inputs["quads"], inputs["corners"]),
         source="chart",
-        light=images.ChartLight(
+        light=chart_values.ChartLight(
             inputs["light.white"], inputs["light.normal"], inputs["light.flash"], inputs["light.covariance"]
         ),
     )
     registered = replace(scenes.still(), transform=inputs["transform"])
     x0, y0, x1, y1 = (int(edge) for edge in inputs["crop"])
-    object_ = images.ObjectMask(inputs["mask"], (x0, y0, x1, y1), "automatic")
+    object_ = stage_values.ObjectMask(inputs["mask"], (x0, y0, x1, y1), "automatic")
     equal = scenes.equal(gain=inputs["gain"])
     calibration = replace(equal, gains=replace(equal.gains, sigma=inputs["sigma"]))
 
@@ -224,7 +223,7 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
         "hdr": Golden(hdr.merge, lambda: hdr.merge(read_capture(CAPTURE), frame_decoder.decode, config.hdr)),
         "whitebalance": Golden(
             whitebalance.measure,
-            lambda: whitebalance.measure(shots(), chart, images.ChartRequest("auto"), config.whitebalance),
+            lambda: whitebalance.measure(shots(), chart, chart_values.ChartRequest("auto"), config.whitebalance),
         ),
         "align": Golden(align.register, lambda: align.register(shots(), color, config.align)),
         "mask": Golden(
@@ -240,12 +239,12 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
     }
 
 
-def plain_stokes(shots: images.AngleStack, object_: images.ObjectMask) -> images.StokesImage:
+def plain_stokes(shots: stage_values.AngleStack, object_: stage_values.ObjectMask) -> stage_values.StokesImage:
     """Stokes parameters of the shots at 0°, 45° and 90° as they are, unregistered; with the variance of each."""
     x0, y0, x1, y1 = object_.crop
     (i0, i45, i90), (v0, v45, v90) = shots.value[:, y0:y1, x0:x1], shots.variance[:, y0:y1, x0:x1]
     sum_ = v0 + v90
-    return images.StokesImage(
+    return stage_values.StokesImage(
         stokes=np.stack([i0 + i90, i0 - i90, 2 * i45 - i0 - i90]),
         covariance=np.stack([sum_, v0 - v90, -sum_, sum_, v90 - v0, 4 * v45 + sum_]),
         quality=np.bitwise_or.reduce(shots.quality[:, y0:y1, x0:x1]),
@@ -266,13 +265,13 @@ STEP = 4  # stored cues and maps hold every fourth pixel
 MESH_STEP = 8  # the stored mesh is made of every eighth
 
 
-def stored_cues(inputs: Arrays) -> images.Cues:
+def stored_cues(inputs: Arrays) -> stage_values.Cues:
     """The cues that `infer` runs on."""
     ratio, sigma, color = inputs["cues.ratio"], inputs["cues.ratio_sigma"], inputs["cues.radiance"]
     square = ratio[0] ** 2 + ratio[1] ** 2
     length = np.sqrt((color**2).sum(axis=-1, keepdims=True))
     view = crop_view((int(inputs["crop"][0]), int(inputs["crop"][1])), STEP)
-    return images.Cues(
+    return stage_values.Cues(
         radiance=color,
         ratio=ratio,
         ratio_sigma=sigma,
@@ -293,10 +292,10 @@ def stored_detail(shape: tuple[int, ...]) -> NDArray[np.float16]:
     return np.asarray(np.sin(2.1 * x + 0.7 * y) * (0.05 + 0.4 * (x // 40 % 2)), np.float16)
 
 
-def stored_maps(inputs: Arrays) -> images.SurfaceMaps:
+def stored_maps(inputs: Arrays) -> stage_values.SurfaceMaps:
     """The maps that `surface` and `asset` run on."""
     x, y = inputs["maps.normal"]
-    return images.SurfaceMaps(
+    return stage_values.SurfaceMaps(
         normal=np.stack([x, y, np.sqrt(np.maximum(1 - x**2 - y**2, np.float32(1e-4)))], axis=-1),
         diffuse=inputs["maps.diffuse"],
         specular=np.repeat(inputs["maps.specular"][..., None], 3, axis=-1),
@@ -310,11 +309,11 @@ def stored_maps(inputs: Arrays) -> images.SurfaceMaps:
     )
 
 
-def stored_mesh(inputs: Arrays) -> images.ReliefMesh:
+def stored_mesh(inputs: Arrays) -> mesh_values.ReliefMesh:
     """The mesh that `asset` runs on."""
     part: Any = {name.removeprefix("mesh."): array for name, array in inputs.items() if name.startswith("mesh.")}
     depth = np.full(inputs["cues.mask"].shape, 0.7, np.float32)
-    return images.ReliefMesh(**part, depth=depth, metric=True, pieces=1, cuts=0.0, cut_px=0.0, raggedness=0.0)
+    return mesh_values.ReliefMesh(**part, depth=depth, metric=True, pieces=1, cuts=0.0, cut_px=0.0, raggedness=0.0)
 
 
 # Store.
@@ -322,7 +321,7 @@ def stored_mesh(inputs: Arrays) -> images.ReliefMesh:
 
 def outputs(value: Any, name: str = "") -> Arrays:
     """Every array, number and text of a stage's output by dotted name; without the mesh that an asset repeats."""
-    if value is None or (name and isinstance(value, images.Mesh)):
+    if value is None or (name and isinstance(value, mesh_values.Mesh)):
         return {}
     if is_dataclass(value):
         parts: Iterator[tuple[str, Any]] = ((field.name, getattr(value, field.name)) for field in fields(value))
@@ -367,7 +366,7 @@ def make_inputs() -> Arrays:
     """Inputs of the later stages, by the stages before them."""
     config, shots = Config(), radiance()
     chart = shipped_data.colorchecker(config.whitebalance.chart)
-    color = whitebalance.measure(shots, chart, images.ChartRequest("auto"), config.whitebalance)
+    color = whitebalance.measure(shots, chart, chart_values.ChartRequest("auto"), config.whitebalance)
     registered = align.register(shots, color, config.align)
     object_ = mask.segment(shots, registered, color, None, models.load_mask_network(1), onnx.run, config.mask)
     calibration = selfcal.solve(shots, registered, object_, color, config.selfcal)

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.formats.raw import dng
-from polcap.images import Exif
+from polcap.capture_values import Exif
+from polcap.formats import dng_writer
 
 RGGB = np.array([[0, 1], [1, 2]], np.uint8)
 
 
 def write_raw(path: Path, mosaic: NDArray[np.uint16], exif: Exif, black: float = 512, white: int = 15871) -> bytes:
     """Write an uncompressed Bayer DNG; returns its bytes."""
-    dng.write(
+    dng_writer.write(
         path,
         mosaic,
         cfa=RGGB,

@@ -7,22 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from polcap.images import (
+from polcap.capture_values import ShotOrder
+from polcap.chart_values import ColorCalibration
+from polcap.images import Floats, View
+from polcap.optics import frames, mueller, shade
+from polcap.optics.warp import warp
+from polcap.stage_values import (
     Alignment,
     AngleStack,
-    ColorCalibration,
-    Floats,
     Gains,
     ObjectMask,
     OutlineCheck,
     RingZero,
     SelfCalibration,
-    ShotOrder,
-    View,
     single_frames,
 )
-from polcap.optics import frames, mueller, shade
-from polcap.optics.warp import warp
 
 HEIGHT, WIDTH, FOCAL = 240, 320, 900.0
 CENTER, RADIUS = (120.0, 118.0), 84.0  # px; x, y of the ball's outline

@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from polcap.images import Asset, Floats, Mesh, ReliefMesh, SurfaceMaps, View
+from polcap.images import Floats, View
+from polcap.mesh_values import Asset, Mesh, ReliefMesh
+from polcap.stage_values import SurfaceMaps
 from polcap.stages import asset, surface
 
 VIEW = View(focal=400.0, center=(70.0, 50.0), scale=2.0, origin=(300.0, 200.0))

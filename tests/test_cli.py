@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from polcap import cli
+from polcap.capture_values import CatalogEntry
 from polcap.cli import export_command
 from polcap.formats.export import presets, texture_set
 from polcap.fusion import fused_maps
-from polcap.images import CatalogEntry
 from polcap.pipeline import run as pipeline
 from polcap.results import STAGES
 from tests.conftest import Command, shell

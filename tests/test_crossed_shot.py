@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from msgspec import structs
 
+from polcap.capture_values import Capture
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.errors import CaptureError
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import maps_folder
-from polcap.images import Capture, ChartRequest, Quality
+from polcap.images import Quality
 from polcap.pipeline import check
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from polcap.capture_values import Exif
 from polcap.doctor import Finding
 from polcap.doctor.photograph import examine_file
 from polcap.formats.maps import png
 from polcap.formats.raw import libraw as raw
-from polcap.images import Exif
 from tests.conftest import Command
 from tests.raw_files import write_raw
 

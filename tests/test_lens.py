@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from polcap.calibration_values import Calibration, LensGeometry
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.formats import calibrations
 from polcap.formats.capture import reader as captures
-from polcap.images import ChartRequest
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
 from polcap.synth import forward_camera, scenes, shooting

@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 
 from polcap.calibrate.calibration_photographs import Photograph
 from polcap.calibration_values import LensGeometry
+from polcap.chart_values import ChartRequest
 from polcap.errors import CaptureError, ChartError
 from polcap.formats import shipped_data
-from polcap.images import AngleStack, ChartRequest, ColorSensor, Distortion, Floats, SensorImage, View, single_frames
+from polcap.images import Distortion, Floats, SensorImage, View
 from polcap.optics import distortion, sensor
 from polcap.optics.projection import from_grid, transform_points
+from polcap.stage_values import AngleStack, ColorSensor, single_frames
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import WhitebalanceSettings, chart
 

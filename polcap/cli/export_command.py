@@ -125,8 +125,8 @@ def _extra_textures(named: Sequence[str]) -> "tuple[Extra, ...]":
 
 def _catalog_fields(stated: Sequence[str]) -> dict[str, str]:
     """Parse --about K=V: fields of `CatalogEntry` by name. Raises SettingError for an unknown field."""
+    from polcap.capture_values import CatalogEntry
     from polcap.formats import text_file
-    from polcap.images import CatalogEntry
 
     known = CatalogEntry.__struct_fields__
     found = {}

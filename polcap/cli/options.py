@@ -14,7 +14,7 @@ from polcap.formats import own_folders
 from polcap.results import STAGES
 
 if TYPE_CHECKING:
-    from polcap.images import ChartRequest
+    from polcap.chart_values import ChartRequest
 
     Stage = str
 else:
@@ -114,8 +114,8 @@ def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
     """Parse --chart and --no-chart: corners, a profile or no chart; by default the chart is searched for."""
     import numpy as np
 
+    from polcap.chart_values import ChartRequest
     from polcap.formats import color_profile
-    from polcap.images import ChartRequest
 
     if text is None:
         return ChartRequest("none" if no_chart else "auto")

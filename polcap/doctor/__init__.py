@@ -16,10 +16,10 @@ import msgspec
 import numpy as np
 
 from polcap import __version__
+from polcap.capture_values import Exif
 from polcap.errors import PolcapError
-from polcap.formats import onnx, shipped_data
-from polcap.formats.raw import dng, libraw
-from polcap.images import Exif
+from polcap.formats import dng_writer, onnx, shipped_data
+from polcap.formats.raw import libraw
 from polcap.pipeline import models
 
 _ENOUGH_GB, _LEAST_GB = 10.0, 1.0  # free disk: a capture of 24 MP with its result takes about 2
@@ -88,7 +88,7 @@ def _decoder() -> Finding:
         name = libraw.version()
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "trial.dng"
-            dng.write(file, counts, cfa=cfa, black=0, white=16383, exif=exif, **colors)
+            dng_writer.write(file, counts, cfa=cfa, black=0, white=16383, exif=exif, **colors)
             if not np.array_equal(libraw.read(file).value, counts):
                 message = f"{name} decodes a RAW wrongly"
     except (PolcapError, OSError) as error:

@@ -6,11 +6,12 @@ Reports kind, metadata, mosaic pattern and levels.
 from collections.abc import Iterator
 from pathlib import Path
 
+from polcap.capture_values import Exif
 from polcap.doctor import Finding
 from polcap.errors import DecodeError
 from polcap.formats.capture import focal_length
 from polcap.formats.raw import libraw, photo, probe
-from polcap.images import Exif, SensorImage
+from polcap.images import SensorImage
 from polcap.optics import sensor
 from polcap.stages import hdr
 

@@ -1,10 +1,12 @@
-"""Reads and writes files; values of `images.py` go in and out.
+"""Reads and writes files; frozen dataclasses go in and out.
 
-raw/            photographs, decoded in a child process
+raw/            photographs, decoded in the sandbox
 capture/        folders of photographs
 maps/           the folder maps/ of a result
 export/         assets for other programs
 html/           the report's page
+sandbox         child processes that read untrusted files, with limits on time and memory
+dng_writer      a mosaic as a DNG
 onnx            opens and runs networks
 calibrations    measurements of the user
 color_profile   color matrix of a chart, for captures without one

@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from polcap.chart_values import ColorCalibration, PatchColors
 from polcap.errors import ChartError
 from polcap.formats import atomic, text_file
-from polcap.images import ColorCalibration, PatchColors
 
 _OfPatches = Meta(min_length=24, max_length=24)
 _Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]

@@ -1,4 +1,4 @@
-"""Stores a dataclass of images.py as JSON and one .npy file per array in a folder, and reads it back.
+"""Stores a frozen dataclass as JSON and one .npy file per array in a folder, and reads it back.
 
 The JSON holds the scalars and the names of the array files. A value that does not fit the expected type is a
 `StorageError`.

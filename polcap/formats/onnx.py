@@ -25,9 +25,9 @@ import numpy as np
 
 from polcap import parallel
 from polcap.errors import DecodeError, ModelError, one_line
-from polcap.formats import shipped_data, text_file
-from polcap.formats.raw import worker
-from polcap.images import Device, Floats, Network
+from polcap.formats import sandbox, shipped_data, text_file
+from polcap.images import Device, Floats
+from polcap.stage_values import Network
 
 ENCODING = "1"
 NUMBERS = ("native_size", "size_multiple")
@@ -55,7 +55,7 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: s
     known = digest(_bytes(path))
     if known not in {digest(file.read_bytes()) for file in shipped_data.model_files()}:
         try:
-            worker.call(trial, path, limit_s=_TRIAL_S, expected=known, encoding=encoding)
+            sandbox.call(trial, path, limit_s=_TRIAL_S, expected=known, encoding=encoding)
         except DecodeError as error:
             raise ModelError(f"a trial run of the model failed: {error}") from error
     session = _session(str(path), known, device, threads)
@@ -126,7 +126,7 @@ def _session(path: str, expected: str, device: Device, threads: int) -> Any:
     return session
 
 
-def trial(path: str, expected: str, encoding: str) -> worker.Answer:
+def trial(path: str, expected: str, encoding: str) -> sandbox.Answer:
     """Load a model and run it on a small picture of noise, in the child process; raises ModelError as `load` does."""
     session = _session(path, expected, "cpu", 1)
     channels, metadata = _check(Path(path), session, encoding)

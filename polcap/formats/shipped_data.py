@@ -5,9 +5,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from polcap.chart_values import ChartReference
 from polcap.errors import StorageError
 from polcap.formats import chart_file, text_file
-from polcap.images import ChartReference, Floats
+from polcap.images import Floats
 from polcap.optics.color import decode_srgb
 
 _NAMES = {

@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from polcap.chart_values import ColorCalibration
 from polcap.errors import CaptureError
-from polcap.images import AngleStack, ColorCalibration, Floats
+from polcap.images import Floats
 from polcap.optics import board as boards
 from polcap.optics.board import BOARDS, Board
 from polcap.optics.projection import from_grid, transform_points
+from polcap.stage_values import AngleStack
 from polcap.stages import stage
 
 _DETECTOR_PX = 2400  # longer side of the picture in which markers are searched

@@ -12,13 +12,15 @@ import cv2
 import numpy as np
 from scipy.ndimage import maximum_filter
 
+from polcap.chart_values import ColorCalibration
 from polcap.fusion.poses import SessionCamera
 from polcap.fusion.values import Pose
-from polcap.images import Alignment, AngleStack, Bools, ColorCalibration, Floats, Quality
+from polcap.images import Bools, Floats, Quality
 from polcap.optics import board as boards
 from polcap.optics import distortion
 from polcap.optics.board import Board
 from polcap.optics.projection import back_project, from_grid
+from polcap.stage_values import Alignment, AngleStack
 from polcap.stages.mask import mean_picture
 
 _SAMPLES = 4  # per pixel side, for the share of paper

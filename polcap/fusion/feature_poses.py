@@ -22,11 +22,12 @@ from scipy.optimize import least_squares
 from scipy.sparse import coo_matrix, csgraph
 from scipy.spatial.transform import Rotation
 
+from polcap.capture_values import Capture
 from polcap.errors import CaptureError
 from polcap.fusion.object_features import ObjectFeatures
 from polcap.fusion.poses import LEAST_VIEWS, PosedView, SessionCamera, SessionPoses
 from polcap.fusion.values import Pose
-from polcap.images import Bools, Capture, Floats
+from polcap.images import Bools, Floats
 from polcap.optics.frames import dot, unit
 from polcap.stages import stage
 

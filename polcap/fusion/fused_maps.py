@@ -22,7 +22,8 @@ from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, on_atlas
 from polcap.fusion.mesh_occlusion import ambient_occlusion
 from polcap.fusion.values import ClosedMesh
-from polcap.images import Asset, Floats, Mesh
+from polcap.images import Floats
+from polcap.mesh_values import Asset, Mesh
 from polcap.optics import color
 from polcap.pipeline.asset_export import DetailLevel
 from polcap.stages import asset

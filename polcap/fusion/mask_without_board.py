@@ -1,8 +1,9 @@
 """The object's mask in a view that shows the board: found as before a dark backdrop, after the print is erased."""
 
+from polcap.chart_values import ColorCalibration
 from polcap.fusion.board_eraser import PosedBoard, erase
 from polcap.fusion.values import ViewMask
-from polcap.images import Alignment, AngleStack, ColorCalibration, Network, RunNetwork
+from polcap.stage_values import Alignment, AngleStack, Network, RunNetwork
 from polcap.stages import mask, stage
 from polcap.stages.mask import MaskSettings
 

@@ -14,12 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap.chart_values import ColorCalibration
 from polcap.errors import CaptureError
 from polcap.fusion.values import ViewMask
-from polcap.images import AngleStack, ColorCalibration, Floats, ObjectMask, SelfCalibration, SurfaceMaps
+from polcap.images import Floats
 from polcap.optics import projection
 from polcap.quality import polarization
 from polcap.quality.gate import Evidence, shot_names
+from polcap.stage_values import AngleStack, ObjectMask, SelfCalibration, SurfaceMaps
 from polcap.stages import stage
 
 _CONTRAST = 0.004  # least, of a feature; OpenCV's 0.04 is for photographs of high contrast

@@ -18,10 +18,11 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 
+from polcap.capture_values import Capture
 from polcap.errors import CaptureError
 from polcap.fusion.board_corners import BoardCorners
 from polcap.fusion.values import Pose
-from polcap.images import Capture, Distortion, Floats, View
+from polcap.images import Distortion, Floats, View
 from polcap.optics import distortion, projection
 from polcap.optics.board import Board
 from polcap.stages import stage

@@ -15,6 +15,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from polcap.capture_values import Capture
+from polcap.chart_values import ChartRequest, ColorCalibration
 from polcap.errors import CaptureError, ChartError
 from polcap.formats import own_folders
 from polcap.formats.capture import folder_names
@@ -26,7 +28,6 @@ from polcap.fusion.poses import LEAST_VIEWS, SessionPoses
 from polcap.fusion.silhouettes import Silhouette
 from polcap.fusion.values import FusionView, ViewMask
 from polcap.fusion.view_path import SessionView
-from polcap.images import Capture, ChartRequest, ColorCalibration
 from polcap.pipeline import run
 from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult, digest
 from polcap.pipeline.request import Request

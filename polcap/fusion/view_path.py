@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from polcap.capture_values import Capture
+from polcap.chart_values import ColorCalibration
 from polcap.config import Config
 from polcap.errors import CaptureError
 from polcap.formats import onnx
@@ -18,7 +20,6 @@ from polcap.fusion.board_corners import BoardSearch
 from polcap.fusion.board_eraser import PosedBoard
 from polcap.fusion.object_features import ObjectFeatures
 from polcap.fusion.values import ViewMask
-from polcap.images import Capture, ColorCalibration
 from polcap.pipeline import path as single
 from polcap.pipeline import run
 from polcap.pipeline.cache import LazyCache, StageResult

@@ -11,11 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import InputError, package_for
-from polcap.images import Bools, Floats, GBuffer, View
+from polcap.images import ArrayValue, Bools, Floats, View
 from polcap.optics import frames
 from polcap.optics.vertex_frames import area_vectors
 
 _LEAST_FACING = 0.01  # least cosine between normal and view; smoothing may turn normals away from the camera
+
+
+@dataclass(frozen=True, repr=False)
+class GBuffer(ArrayValue):
+    """Geometry buffer: the surface point at each pixel."""
+
+    normal: Floats  # (H, W, 3) unit, camera frame; 0 outside
+    depth: Floats  # (H, W) along the optical axis, growing away from the camera, m; NaN outside
+    mask: Bools  # (H, W)
+    position: Floats  # (H, W, 3) in the object's own frame, for solid textures; 0 outside
+    view: View
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.presets import PRESETS, ExportPreset, Format
 from polcap.formats.export.texture_set import Extra, Key, Texture
 from polcap.formats.maps import maps_folder
-from polcap.images import Asset, Mesh, ReliefMesh
+from polcap.mesh_values import Asset, Mesh, ReliefMesh
 from polcap.stages import asset, surface
 
 _Writer = Callable[[], list[Path]]  # returns the files that it has written

@@ -12,10 +12,11 @@ from time import perf_counter
 
 import msgspec
 
+from polcap.capture_values import Capture
+from polcap.chart_values import ChartRequest, ColorCalibration
 from polcap.config import Config
 from polcap.errors import ChartError, DecodeError, InputError
 from polcap.formats.capture import folder_names
-from polcap.images import Capture, ChartRequest, ColorCalibration, Network
 from polcap.optics.projection import to_grid
 from polcap.pipeline import models, small_capture
 from polcap.pipeline.cache import MemoryCache
@@ -24,6 +25,7 @@ from polcap.pipeline.small_capture import SmallCapture
 from polcap.quality import gates
 from polcap.quality.gate import Evidence, Gate
 from polcap.results import NotReached
+from polcap.stage_values import Network
 
 _THREADS = 2  # frames that are decoded at a time
 _SYMMETRIES = 2  # positions of the network, one for each size: gates read medians of its maps only

@@ -14,26 +14,18 @@ from typing import Any
 
 import numpy as np
 
+from polcap.capture_values import Capture, Decode
+from polcap.chart_values import ChartRequest, ColorCalibration
 from polcap.config import Config
 from polcap.errors import ObjectError
 from polcap.formats import onnx, shipped_data
 from polcap.formats.maps import maps_folder
 from polcap.formats.raw import frame_decoder
-from polcap.images import (
-    AngleStack,
-    Bools,
-    Capture,
-    ChartRequest,
-    ColorCalibration,
-    Decode,
-    Network,
-    OtherOrder,
-    ReliefMesh,
-    SelfCalibration,
-    SurfaceMaps,
-)
+from polcap.images import Bools
+from polcap.mesh_values import ReliefMesh
 from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
 from polcap.results import FIELDS, Results
+from polcap.stage_values import AngleStack, Network, OtherOrder, SelfCalibration, SurfaceMaps
 from polcap.stages import align, asset, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
 
 AUTO = ChartRequest("auto")

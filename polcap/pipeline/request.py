@@ -5,12 +5,15 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
+from polcap.capture_values import Capture
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.formats.capture import reader
-from polcap.images import Bools, Capture, ChartRequest, Device, Network
+from polcap.images import Bools, Device
 from polcap.pipeline import models, unchanged
 from polcap.pipeline.cache import fingerprint
 from polcap.pipeline.path import AUTO, UserInput
+from polcap.stage_values import Network
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,14 @@ from typing import Any
 import msgspec
 
 from polcap import parallel, report
+from polcap.capture_values import Capture, Decode, Frame
 from polcap.config import Config, restore
 from polcap.errors import SettingError, StorageError
 from polcap.formats import color_profile, own_files
 from polcap.formats.export import encoders, provenance
 from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
-from polcap.images import Capture, Decode, Frame, SensorImage
+from polcap.images import SensorImage
 from polcap.pipeline import asset_export, result_folder, unchanged
 from polcap.pipeline.asset_export import DetailLevel, ExportRequest
 from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, contents, silent

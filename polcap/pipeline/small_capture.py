@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap.capture_values import Capture, Frame
 from polcap.formats.raw import frame_decoder
-from polcap.images import Capture, Floats, Frame, SensorImage
+from polcap.images import Floats, SensorImage
 from polcap.optics import sensor, sharpness
 from polcap.optics.projection import to_grid
 from polcap.optics.resize import block_means

@@ -6,8 +6,9 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from polcap.images import AngleStack, Bools, Floats, Quality
+from polcap.images import Bools, Floats, Quality
 from polcap.results import Results
+from polcap.stage_values import AngleStack
 
 State = Literal["pass", "warn", "fail", "not measured"]
 Unit = Literal["1", "px", "°", "×", "ΔE2000", ""]

@@ -7,7 +7,8 @@ import msgspec
 import numpy as np
 
 from polcap.formats import shipped_data
-from polcap.images import Floats, Mesh, SurfaceMaps
+from polcap.images import Floats
+from polcap.mesh_values import Mesh
 from polcap.optics import frames, outline
 from polcap.optics.morphology import dilate
 from polcap.optics.projection import picture_corners, transform_points
@@ -17,6 +18,7 @@ from polcap.optics.sharpness import TILE
 from polcap.quality import object_turn, rim
 from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, bad_shots
 from polcap.quality.limits import GateLimits
+from polcap.stage_values import SurfaceMaps
 from polcap.stages.align import AlignSettings, object_motion
 from polcap.stages.whitebalance import chart_in_mask
 

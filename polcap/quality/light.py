@@ -7,13 +7,14 @@ import cv2
 import msgspec
 import numpy as np
 
-from polcap.images import Quality, StokesImage
+from polcap.images import Quality
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays
 from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
 from polcap.quality.gate import Evidence, Gate, at_most, grade
 from polcap.quality.limits import GateLimits
+from polcap.stage_values import StokesImage
 from polcap.stages.whitebalance import patches
 
 _TURNED = 0.35  # rad: the message states larger turns of a chart, which cost a sixteenth of its light

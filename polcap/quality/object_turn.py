@@ -15,12 +15,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from polcap.images import Alignment, AngleStack, Bools, Floats, MaskedImage, ObjectMask, Quality, SurfaceMaps
+from polcap.images import Bools, Floats, MaskedImage, Quality
 from polcap.optics import outline, registration
 from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.optics.warp import warp
+from polcap.stage_values import Alignment, AngleStack, ObjectMask, SurfaceMaps
 from polcap.stages.align.detail import averaging_step, detail
 
 _MOST_PIXELS = 0.8e6  # a larger picture is averaged down first

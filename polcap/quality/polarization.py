@@ -7,13 +7,15 @@ from typing import TypeGuard
 import msgspec
 import numpy as np
 
-from polcap.images import Bools, Floats, OrderTest, Quality, ShotOrder, StokesImage, SurfaceMaps
+from polcap.capture_values import ShotOrder
+from polcap.images import Bools, Floats, Quality
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
 from polcap.quality import rim
 from polcap.quality.gate import Evidence, Gate, State, at_most, sentence
 from polcap.quality.limits import GateLimits
+from polcap.stage_values import OrderTest, StokesImage, SurfaceMaps
 
 _LEAST_RIM = 200  # pixels of outline, to estimate an angle
 _LEAST_DOLP = 0.01  # of the most polarized tenth of the outline; there the least index has ten times that

@@ -4,9 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from polcap.images import AngleStack, Floats, Quality, StokesImage
+from polcap.images import Floats, Quality
 from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots, grade
 from polcap.quality.limits import GateLimits
+from polcap.stage_values import AngleStack, StokesImage
 
 _EVEN_STEPS = (1.3, 20.0)  # from one exposure to the next: less is no bracket, more leaves a gap
 # frames of a bracket count as equal if the step in pixels is below the first and in metadata above the second

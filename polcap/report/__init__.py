@@ -13,14 +13,15 @@ import msgspec
 import numpy as np
 
 from polcap import __version__
+from polcap.capture_values import Capture, Frame
 from polcap.config import Config
 from polcap.errors import StorageError
 from polcap.formats import atomic, text_file
-from polcap.images import Capture, Frame, Network
 from polcap.quality import error_maps, gates
 from polcap.quality.gate import Gate, full_size
 from polcap.report import figures, labels, page
 from polcap.results import Results
+from polcap.stage_values import Network
 
 
 class _PhotographFacts(msgspec.Struct, frozen=True):

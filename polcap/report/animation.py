@@ -5,10 +5,12 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from polcap.images import Floats, ReliefMesh, SurfaceMaps, View
+from polcap.images import Floats, View
+from polcap.mesh_values import ReliefMesh
 from polcap.optics import color, frames, projection, shade
 from polcap.report.reduction import ObjectReduction
 from polcap.report.sheets import Picture
+from polcap.stage_values import SurfaceMaps
 
 Motion = Literal["light", "turntable"]
 FRAMES = 48

@@ -5,10 +5,13 @@ from typing import Any
 
 import numpy as np
 
+from polcap.chart_values import ColorCalibration, PatchColors
 from polcap.formats.maps import maps_folder
-from polcap.images import ColorCalibration, Floats, Mesh, PatchColors, Quality, StokesImage
+from polcap.images import Floats, Quality
+from polcap.mesh_values import Mesh
 from polcap.report import page_data
 from polcap.results import Results
+from polcap.stage_values import StokesImage
 from polcap.stages.whitebalance import patches
 
 _COMPARED_PX = 512  # longest side on which photographs and their re-rendering are compared

@@ -5,10 +5,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from polcap.images import AngleStack, Bools, ColorCalibration, Cues, Floats, ReliefMesh, SurfaceMaps, View
+from polcap.chart_values import ColorCalibration
+from polcap.images import Bools, Floats, View
+from polcap.mesh_values import ReliefMesh
 from polcap.optics import frames, shade
 from polcap.optics.resize import area_mean
 from polcap.report.reduction import ObjectReduction
+from polcap.stage_values import AngleStack, Cues, SurfaceMaps
 
 _WHITE_PATCH = 18  # of a ColorChecker Classic, row by row from dark skin
 _OUTLIER = 5  # standard deviations of the differences

@@ -6,10 +6,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from polcap.images import Alignment, ChartReference, Floats, Gains, PatchColors
+from polcap.chart_values import ChartReference, PatchColors
+from polcap.images import Floats
 from polcap.optics.color import srgb_eight_bits
 from polcap.report.labels import number
 from polcap.report.map_figures import css_colors
+from polcap.stage_values import Alignment, Gains
 
 _CHANNELS = {"red": "#e0434c", "green": "#2f9e4d", "blue": "#3f78e0"}  # on light and dark
 _BLUE = _CHANNELS["blue"]

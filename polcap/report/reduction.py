@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from polcap.images import Bools, Floats, SurfaceMaps
+from polcap.images import Bools, Floats
 from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
+from polcap.stage_values import SurfaceMaps
 
 
 class ObjectReduction:

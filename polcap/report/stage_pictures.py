@@ -11,21 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import (
-    Alignment,
-    AngleStack,
-    Asset,
-    Bools,
-    ColorCalibration,
-    Cues,
-    Floats,
-    Gains,
-    ObjectMask,
-    Quality,
-    ReliefMesh,
-    StokesImage,
-    SurfaceMaps,
-)
+from polcap.chart_values import ColorCalibration
+from polcap.images import Bools, Floats, Quality
+from polcap.mesh_values import Asset, ReliefMesh
 from polcap.optics import color, frames
 from polcap.optics.resize import area_mean
 from polcap.optics.warp import warp
@@ -33,6 +21,7 @@ from polcap.report import keys
 from polcap.report.sheets import WIDTH, Tile, sheet, write
 from polcap.report.sheets import Picture as Picture
 from polcap.results import Results
+from polcap.stage_values import Alignment, AngleStack, Cues, Gains, ObjectMask, StokesImage, SurfaceMaps
 
 
 def of_stage(results: Results, stage: str) -> Picture:

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from polcap.capture_values import Role
 from polcap.formats.raw import file_kind
-from polcap.images import Role
 from polcap.rig.exposure_bracket import Exposure
 
 _MAKERS = {"nikon": ".nef", "sony": ".arw", "pentax": ".pef", "ricoh": ".pef", "samsung": ".srw", "canon": ".cr2"}

@@ -12,9 +12,9 @@ from contextlib import suppress
 from functools import partial
 from typing import Any, TypeVar
 
+from polcap.capture_values import Role
 from polcap.errors import HardwareError, SettingError, package_for
 from polcap.formats.raw import file_kind
-from polcap.images import Role
 from polcap.rig.camera import CameraFile
 from polcap.rig.device_log import Log
 from polcap.rig.exposure_bracket import Exposure, bracket_by_iso, bracket_by_shutter, nearest

@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from polcap.capture_values import Role
 from polcap.errors import DecodeError, HardwareError, SettingError
-from polcap.formats import system_errors
+from polcap.formats import sandbox, system_errors
 from polcap.formats.capture import foreign_files
-from polcap.formats.raw import file_bytes, libraw, probe, worker
-from polcap.images import Role
+from polcap.formats.raw import file_bytes, libraw, probe
 from polcap.optics.resize import block_means
 from polcap.rig.camera import CameraFile
 from polcap.rig.device_log import Log
@@ -166,7 +166,7 @@ def _fault(name: str, data: bytes) -> str | None:
             copy.write_bytes(data)
             if probe.read(copy).kind != "raw":
                 return f"{name}: its content is that of no RAW file" if foreign_files.is_photograph(name, True) else ""
-            worker.call(require_whole, copy)
+            sandbox.call(require_whole, copy)
         except OSError as error:
             raise system_errors.cannot_write(copy, error) from error
         except DecodeError as error:
@@ -174,7 +174,7 @@ def _fault(name: str, data: bytes) -> str | None:
     return None
 
 
-def require_whole(path: str) -> worker.Answer:
+def require_whole(path: str) -> sandbox.Answer:
     """In the child process: decode a RAW; DecodeError if a part of it holds zeros only, because it is being copied."""
     data = file_bytes.load(path)
     value = libraw.decode(path)[1]["value"]

@@ -12,11 +12,11 @@ from typing import Any, TypeVar
 import msgspec
 import tomli_w
 
+from polcap.capture_values import Role
 from polcap.errors import CaptureError, StorageError
 from polcap.formats import atomic, system_errors, text_file
 from polcap.formats.capture import capture_toml
 from polcap.formats.raw import file_bytes
-from polcap.images import Role
 from polcap.rig.exposure_bracket import Exposure
 from polcap.rig.retake_criteria import FrameFacts
 from polcap.rig.shooting_plan import CaptureOrder, Slot

@@ -10,11 +10,13 @@ import cv2
 import msgspec
 import numpy as np
 
+from polcap.capture_values import Exif
 from polcap.errors import DecodeError
+from polcap.formats import sandbox
 from polcap.formats.capture import reader
 from polcap.formats.raw import libraw as raw
-from polcap.formats.raw import probe, worker
-from polcap.images import Exif, Floats
+from polcap.formats.raw import probe
+from polcap.images import Floats
 from polcap.optics import sensor
 from polcap.optics.resize import area_mean, block_means
 from polcap.rig.exposure_bracket import Exposure
@@ -44,11 +46,11 @@ def inspect(path: Path) -> tuple[FrameFacts, Floats]:
     file = probe.read(path)
     if file.kind != "raw":
         raise DecodeError(f"{path}: is not a RAW file; set the camera to RAW")
-    numbers, arrays = worker.call(measure, path)
+    numbers, arrays = sandbox.call(measure, path)
     return FrameFacts(file.exif, file.digest, numbers["clipped"], numbers["sharpness"]), arrays["small"]
 
 
-def measure(path: str) -> worker.Answer:
+def measure(path: str) -> sandbox.Answer:
     """In the child process: clipped share, sharpness and small picture of one RAW file."""
     image = raw.image(*raw.decode(path))
     value, black = image.value, float(image.black.mean())

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import msgspec
 
+from polcap.capture_values import Role
 from polcap.errors import SettingError
 from polcap.formats.capture import folder_names
-from polcap.images import Role
 from polcap.rig.exposure_bracket import Exposure
 
 

@@ -1,4 +1,4 @@
-"""The stages of the path: pure functions that take and return values of `images.py`. `results.py` lists them.
+"""The stages of the path: pure functions that take and return frozen dataclasses. `results.py` lists them.
 
 A stage opens no file and logs nothing: it returns a new value or raises.
 Stages do not import each other. Code that two of them use is in `optics/`.

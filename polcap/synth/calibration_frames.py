@@ -12,9 +12,10 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from polcap.capture_values import Exif
 from polcap.formats import atomic
 from polcap.formats.capture import folder_names
-from polcap.images import Exif, Floats, View
+from polcap.images import Floats, View
 from polcap.optics import frames
 from polcap.synth import color_checker, forward_camera
 from polcap.synth.color_checker import Chart

@@ -15,9 +15,10 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from polcap.capture_values import Exif
 from polcap.errors import CaptureError
-from polcap.formats.raw import dng
-from polcap.images import Bits, Exif, Floats, View
+from polcap.formats import dng_writer
+from polcap.images import Bits, Floats, View
 from polcap.optics.color import REC709_TO_XYZ
 
 SENSOR_WIDTH_MM = 36.0
@@ -100,7 +101,7 @@ def write_dng(
     path: Path, counts: NDArray[np.uint16], sensor: Sensor, cfa: Bits, color_matrix: Sequence[float], exif: Exif
 ) -> None:
     """Write the counts of one simulated photograph as a DNG."""
-    dng.write(
+    dng_writer.write(
         path,
         counts,
         cfa=cfa,

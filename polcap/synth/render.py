@@ -16,8 +16,9 @@ from scipy.ndimage import minimum_filter
 from scipy.spatial.transform import Rotation
 
 from polcap.errors import SettingError
-from polcap.images import Floats, GBuffer, Indices, View
+from polcap.images import Floats, Indices, View
 from polcap.optics import body, frames, fresnel, mesh_tracer, shade
+from polcap.optics.mesh_tracer import GBuffer
 from polcap.synth import color_checker as charts
 from polcap.synth import interreflection, laid_board, scene_materials, trace
 from polcap.synth.color_checker import Chart

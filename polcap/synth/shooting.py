@@ -20,11 +20,13 @@ import numpy as np
 from msgspec import Meta
 from scipy.ndimage import gaussian_filter
 
+from polcap.capture_values import Exif
 from polcap.errors import CaptureError
 from polcap.formats import atomic
 from polcap.formats.capture import folder_names
-from polcap.images import Exif, Floats, GBuffer, View
+from polcap.images import Floats, View
 from polcap.optics import frames, mueller, projection
+from polcap.optics.mesh_tracer import GBuffer
 from polcap.synth import color_checker as charts
 from polcap.synth import forward_camera, render, scene_materials
 from polcap.synth.forward_camera import COLOR_MATRIX, SENSOR_WIDTH_MM, Bend, Sensor

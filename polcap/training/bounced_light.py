@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from polcap.images import Bools, Floats, GBuffer, Indices
+from polcap.images import Bools, Floats, Indices
 from polcap.optics import brdf, frames, mesh_tracer, shade
-from polcap.optics.mesh_tracer import Tracer
+from polcap.optics.mesh_tracer import GBuffer, Tracer
 from polcap.optics.projection import project
 from polcap.synth.interreflection import LIFT
 from polcap.training import light_transport

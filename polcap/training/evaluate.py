@@ -21,8 +21,8 @@ import torch
 
 from polcap.formats import atomic, onnx, text_file
 from polcap.formats.maps import png
-from polcap.images import Cues, Network, SurfaceMaps
 from polcap.pipeline import models
+from polcap.stage_values import Cues, Network, SurfaceMaps
 from polcap.stages import cues, infer
 from polcap.training import evaluation_baselines, evaluation_page, evaluation_protocol
 from polcap.training.evaluation_baselines import Estimator, Means

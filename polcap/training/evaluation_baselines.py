@@ -10,9 +10,9 @@ import torch
 from torch.nn import functional as F
 
 from polcap.errors import InputError
-from polcap.images import Cues, SurfaceMaps
 from polcap.optics import frames
 from polcap.optics.outline import disc_radius
+from polcap.stage_values import Cues, SurfaceMaps
 from polcap.stages.cues import channels
 from polcap.training import main_network, train
 from polcap.training.evaluation_protocol import Case, Protocol

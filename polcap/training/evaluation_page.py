@@ -6,9 +6,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from polcap.images import Bools, Floats, SurfaceMaps
+from polcap.images import Bools, Floats
 from polcap.report import stage_pictures as pictures
 from polcap.report.stage_pictures import Picture
+from polcap.stage_values import SurfaceMaps
 from polcap.training import traced_views
 from polcap.training.evaluation_protocol import Case
 from polcap.training.map_errors import LIMITS_DEG, angle, render_intensity

@@ -15,16 +15,18 @@ from pathlib import Path
 
 import numpy as np
 
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats import atomic
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import png
-from polcap.images import ChartRequest, Cues, Floats, Network
+from polcap.images import Floats
 from polcap.optics import frames
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
+from polcap.stage_values import Cues, Network
 from polcap.training.evaluation_page import grid
 from polcap.training.map_errors import LIMITS_DEG, Score
 from polcap.training.progress import Report, silent

@@ -12,11 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from polcap.chart_values import ColorCalibration
 from polcap.errors import InputError
-from polcap.images import Bits, Bools, ColorCalibration, Cues, Floats, Indices, Quality, StokesImage, SurfaceMaps, View
+from polcap.images import Bits, Bools, Floats, Indices, Quality, View
 from polcap.optics import frames, resize
 from polcap.optics.body import SMOOTH, Law
 from polcap.optics.mesh_tracer import Tracer, Triangles, centred
+from polcap.stage_values import Cues, StokesImage, SurfaceMaps
 from polcap.stages import cues
 from polcap.training import evaluation_materials, light_transport, random_shapes, traced_views
 from polcap.training.camera_errors import CameraErrors, photograph

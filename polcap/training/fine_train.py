@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from polcap.formats import atomic, onnx
-from polcap.images import Floats, Network, View
+from polcap.images import Floats, View
 from polcap.optics import frames
+from polcap.stage_values import Network
 from polcap.stages import cues
 from polcap.stages.infer import fine, learned
 from polcap.training import evaluation_protocol, loop, materials, relief, traced_views, unet

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from polcap.images import Bools, Floats, Quality, SurfaceMaps
+from polcap.images import Bools, Floats, Quality
 from polcap.optics import frames, shade
 from polcap.optics.morphology import erode
 from polcap.optics.outline import disc_radius
+from polcap.stage_values import SurfaceMaps
 from polcap.stages import surface
 from polcap.training.evaluation_protocol import Case, render_lights
 

@@ -20,9 +20,9 @@ import pytest
 from polcap import batch, config
 from polcap.batch import cluster
 from polcap.batch import unit as one
+from polcap.chart_values import ChartRequest
 from polcap.errors import CaptureError
 from polcap.formats.maps import png
-from polcap.images import ChartRequest
 from polcap.pipeline.request import Request
 from tests.batch.conftest import OPTIONS
 from tests.conftest import ROOT, Command, shell

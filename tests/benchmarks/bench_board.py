@@ -15,17 +15,19 @@ from pathlib import Path
 
 import numpy as np
 
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.formats import onnx
 from polcap.formats.capture import reader
 from polcap.fusion import board_corners, board_eraser, poses
 from polcap.fusion.board_corners import BoardCorners
 from polcap.fusion.board_eraser import PosedBoard
-from polcap.images import AngleStack, Bools, ChartRequest, Floats, View
+from polcap.images import Bools, Floats, View
 from polcap.optics import projection
 from polcap.pipeline import models, run
 from polcap.pipeline.path import UserInput
 from polcap.results import Results
+from polcap.stage_values import AngleStack
 from polcap.stages import mask
 from polcap.stages.mask import MaskSettings
 

@@ -14,15 +14,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from polcap.capture_values import Capture
 from polcap.config import Config
 from polcap.formats import onnx
 from polcap.formats.capture import reader as captures
-from polcap.images import Capture, Floats, Network
+from polcap.images import Floats
 from polcap.optics import body, frames
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, distance_m, path
 from polcap.results import Results
+from polcap.stage_values import Network
 from polcap.stages import cues, infer, surface
 
 COLUMNS = (

@@ -20,10 +20,12 @@ import cv2
 import numpy as np
 
 from polcap.errors import ChartError
-from polcap.images import AngleStack, Floats
-from polcap.optics.color import decode_srgb, encode_srgb, fit_matrix
+from polcap.images import Floats
+from polcap.optics.color import decode_srgb, encode_srgb
+from polcap.stage_values import AngleStack
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import WhitebalanceSettings, patches
+from polcap.stages.whitebalance.color_matrix import fit_matrix
 from tests.stages.whitebalance.chart_pictures import AUTO, CLASSIC, stack
 from tests.stages.whitebalance.test_real_charts import DATA, MARKED, PHOTOS, REAL, corners_off, photo, superpixels
 

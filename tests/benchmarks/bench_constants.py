@@ -20,11 +20,12 @@ import numpy as np
 
 from polcap.config import Config
 from polcap.formats import onnx
-from polcap.images import Floats, Network
+from polcap.images import Floats
 from polcap.optics import registration
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.results import Results
+from polcap.stage_values import Network
 from polcap.stages import align, infer, selfcal
 from polcap.stages.infer import analytic, fine, half_turns, learned, zenith
 from polcap.stages.selfcal import object_gains

@@ -18,13 +18,16 @@ import cv2
 import numpy as np
 from msgspec import structs
 
+from polcap.capture_values import Capture
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.formats.capture import reader as captures
-from polcap.images import Capture, ChartRequest, Floats, Network, Quality
+from polcap.images import Floats, Quality
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
 from polcap.results import Results
+from polcap.stage_values import Network
 from polcap.synth import scenes, shooting
 
 NAMES = ("clipped", "without", "with", "gloss without", "gloss with", "elsewhere without", "elsewhere with")

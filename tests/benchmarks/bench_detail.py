@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.formats import onnx
-from polcap.images import Floats, Network
+from polcap.images import Floats
 from polcap.pipeline import models
+from polcap.stage_values import Network
 from polcap.stages import infer
 from polcap.training.evaluation_protocol import Case, Protocol
 

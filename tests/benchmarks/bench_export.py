@@ -20,15 +20,17 @@ import msgspec
 import numpy as np
 
 from polcap.config import Config
+from polcap.formats import sandbox
 from polcap.formats.export import exr_layers, gltf, texture_set
 from polcap.formats.export.encoders import TextureEncoder
 from polcap.formats.export.presets import PRESETS, ExportPreset
 from polcap.formats.maps import maps_folder
-from polcap.formats.raw import worker
-from polcap.images import Asset, Cues, Floats, ReliefMesh, StokesImage, SurfaceMaps, View
+from polcap.images import Floats, View
+from polcap.mesh_values import Asset, ReliefMesh
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.asset_export import ExportRequest
 from polcap.results import Results
+from polcap.stage_values import Cues, StokesImage, SurfaceMaps
 from polcap.stages import asset, surface
 from tests import surfaces
 
@@ -54,10 +56,10 @@ def both(folder: Path, built: Asset, name: str) -> tuple[float, float]:
 
 def seconds(work: Callable[[], object]) -> float:
     """CPU seconds of this process and of the children that it starts to read files."""
-    worker.end_idle()
+    sandbox.end_idle()
     start = spent()
     work()
-    worker.end_idle()
+    sandbox.end_idle()
     return spent() - start
 
 

@@ -21,8 +21,9 @@ from unittest.mock import MagicMock
 import numpy as np
 import rawpy
 
-from polcap.formats.raw import dng
-from polcap.images import Capture, Exif, Floats, Frame, SensorImage, Shot
+from polcap.capture_values import Capture, Exif, Frame, Shot
+from polcap.formats import dng_writer
+from polcap.images import Floats, SensorImage
 from polcap.optics import demosaic
 from polcap.stages import hdr
 
@@ -74,7 +75,7 @@ def compare(title: str, theirs: Any, quads: Floats, exposures: tuple[float, ...]
         counts = (rng.poisson(light) + rng.normal(0, READ, SIZE)) / GAIN + BLACK
         exif = Exif(exposure_time=exposure / 100, f_number=8.0, iso=100.0, focal_length_mm=50.0)
         paths.append(place / f"{k}.dng")
-        dng.write(
+        dng_writer.write(
             paths[-1], np.clip(np.round(counts), 0, WHITE).astype(np.uint16), cfa=RGGB, black=BLACK, white=WHITE,
             exif=exif, color_matrix=np.eye(3), as_shot_neutral=np.ones(3),
         )  # fmt: skip

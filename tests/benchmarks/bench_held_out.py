@@ -26,10 +26,12 @@ from polcap.formats.maps import png
 from polcap.fusion import fused_maps
 from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.values import Pose
-from polcap.images import Bools, Floats, Mesh, SurfaceMaps, View
+from polcap.images import Bools, Floats, View
+from polcap.mesh_values import Mesh
 from polcap.optics import color, frames, shade
 from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.pipeline import run
+from polcap.stage_values import SurfaceMaps
 from polcap.stages.asset import AssetSettings
 from polcap.synth import render, trace
 from polcap.synth.render import Scene

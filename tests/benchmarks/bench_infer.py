@@ -19,12 +19,13 @@ import cv2
 import numpy as np
 
 from polcap.formats import onnx
-from polcap.images import Cues
 from polcap.optics import frames
 from polcap.pipeline import models
+from polcap.stage_values import Cues
 from polcap.stages import infer
 from polcap.stages.cues import CHANNELS, channels
-from polcap.stages.infer import augmentation, learned
+from polcap.stages.infer import learned
+from polcap.stages.infer.sizes_and_positions import OUTPUTS, run_network
 from polcap.training.evaluation_protocol import Protocol
 
 
@@ -48,7 +49,7 @@ def _measured(seen: Cues, model: Path | None, symmetries: Literal[1, 2, 4, 8]) -
     assert network is not None
     small = learned._reduce(seen, int(network.metadata["native_size"]) / max(seen.mask.shape))
     settings = infer.InferSettings(symmetries=symmetries)
-    floor = _best(lambda: augmentation.run_network(channels(small), network, onnx.run, CHANNELS, augmentation.OUTPUTS))
+    floor = _best(lambda: run_network(channels(small), network, onnx.run, CHANNELS, OUTPUTS))
     stage = _best(lambda: infer.estimate(seen, network, onnx.run, settings))
     return stage, floor, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 

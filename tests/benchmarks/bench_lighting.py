@@ -24,12 +24,13 @@ from numpy.typing import NDArray
 
 from polcap.formats import onnx
 from polcap.formats.maps import png
-from polcap.images import AngleStack, Floats, Network, ObjectMask, single_frames
+from polcap.images import Floats
 from polcap.optics import fresnel, mueller
 from polcap.pipeline import models
 from polcap.quality import polarization
 from polcap.quality.gate import Evidence
 from polcap.quality.limits import GateLimits
+from polcap.stage_values import AngleStack, Network, ObjectMask, single_frames
 from polcap.stages import cues, infer, stokes
 from polcap.synth import scene_materials
 from polcap.synth.render import ObjectBuffer

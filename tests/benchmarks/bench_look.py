@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.formats.export import encoders, gltf, texture_set, usd
-from polcap.images import Asset, Floats, SurfaceMaps
+from polcap.images import Floats
+from polcap.mesh_values import Asset
 from polcap.optics import frames, shade
+from polcap.stage_values import SurfaceMaps
 from tests import surfaces
 from tests.blender import session
 from tests.render import browser

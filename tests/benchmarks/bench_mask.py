@@ -17,21 +17,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from polcap.chart_values import ChartPlace, ColorCalibration
 from polcap.errors import ObjectError
 from polcap.formats import onnx
-from polcap.images import (
-    Alignment,
-    AngleStack,
-    ChartPlace,
-    ColorCalibration,
-    Floats,
-    Network,
-    ObjectMask,
-    View,
-    single_frames,
-)
+from polcap.images import Floats, View
 from polcap.optics import mueller
 from polcap.optics.mesh_tracer import Tracer, Triangles, centred
+from polcap.stage_values import Alignment, AngleStack, Network, ObjectMask, single_frames
 from polcap.stages import mask
 from polcap.stages.mask.mask_channels import ENCODING
 from polcap.training import mask_scenes, mask_views, materials, traced_views

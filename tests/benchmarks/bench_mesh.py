@@ -22,8 +22,10 @@ import cv2
 import msgspec
 import numpy as np
 
-from polcap.images import Bools, Floats, ReliefMesh, SurfaceMaps, View
+from polcap.images import Bools, Floats, View
+from polcap.mesh_values import ReliefMesh
 from polcap.optics import frames
+from polcap.stage_values import SurfaceMaps
 from polcap.stages import surface
 from polcap.stages.surface.occlusion import least_step
 from polcap.stages.surface.triangles import boundary_edges, measure_boundary

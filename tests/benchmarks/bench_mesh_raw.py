@@ -25,11 +25,11 @@ from bench_mesh import Case, cut_share, error, slits, true_links, true_pieces
 
 from polcap.config import Config
 from polcap.formats.capture import reader as captures
-from polcap.images import SurfaceMaps
 from polcap.optics.frames import dot
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, distance_m, path
+from polcap.stage_values import SurfaceMaps
 from polcap.stages import surface
 from polcap.synth import render, scenes, shooting
 

@@ -19,10 +19,12 @@ import torch
 from bench_captures import kept
 from scipy import ndimage
 
+from polcap.chart_values import ColorCalibration
 from polcap.formats import onnx
-from polcap.images import ColorCalibration, Floats, SurfaceMaps, View
+from polcap.images import Floats, View
 from polcap.optics import frames
 from polcap.pipeline import models
+from polcap.stage_values import SurfaceMaps
 from polcap.stages import cues, infer
 from polcap.training.camera_errors import CameraErrors, photograph
 from polcap.training.evaluation_protocol import Case, stokes_image

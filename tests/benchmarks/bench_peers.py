@@ -26,20 +26,13 @@ import bench_speed
 import cv2
 import numpy as np
 
+from polcap.capture_values import Capture
+from polcap.chart_values import ChartRequest
 from polcap.formats import shipped_data
 from polcap.formats.capture import reader as captures
 from polcap.formats.raw import frame_decoder
-from polcap.images import (
-    Alignment,
-    AngleStack,
-    Capture,
-    ChartRequest,
-    Floats,
-    ObjectMask,
-    SelfCalibration,
-    SurfaceMaps,
-    View,
-)
+from polcap.images import Floats, View
+from polcap.stage_values import Alignment, AngleStack, ObjectMask, SelfCalibration, SurfaceMaps
 from polcap.stages import align, hdr, stokes, surface, whitebalance
 from polcap.stages.whitebalance import WhitebalanceSettings
 from tests import scenes

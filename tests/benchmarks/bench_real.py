@@ -15,15 +15,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import png
 from polcap.formats.raw import frame_decoder
-from polcap.images import AngleStack, ChartRequest, Floats
+from polcap.images import Floats
 from polcap.optics import mueller
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
+from polcap.stage_values import AngleStack
 from polcap.stages import hdr
 
 

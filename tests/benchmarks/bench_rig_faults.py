@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.errors import PolcapError
 from polcap.formats.capture import reader as captures
-from polcap.images import ChartRequest
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput
 from tests.rig import faults

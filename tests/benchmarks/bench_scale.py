@@ -18,10 +18,13 @@ import cv2
 import msgspec
 import numpy as np
 
+from polcap.chart_values import ChartRequest
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
-from polcap.images import AngleStack, ChartRequest, GBuffer, StokesImage, View, single_frames
+from polcap.images import View
 from polcap.optics import frames, point_light, projection
+from polcap.optics.mesh_tracer import GBuffer
+from polcap.stage_values import AngleStack, StokesImage, single_frames
 from polcap.stages import whitebalance
 from polcap.stages.cues import scale
 from polcap.stages.whitebalance import WhitebalanceSettings

@@ -22,7 +22,9 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from polcap.images import Floats, ReliefMesh, SurfaceMaps, View
+from polcap.images import Floats, View
+from polcap.mesh_values import ReliefMesh
+from polcap.stage_values import SurfaceMaps
 from polcap.stages import surface
 from polcap.stages.surface.slope_equations import normal_field, slope_terms
 

@@ -28,14 +28,16 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from plant_captures import FAULTS, shoot
 
+from polcap.capture_values import Capture
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats.capture import reader as captures
-from polcap.images import Capture, ChartRequest, Network, SurfaceMaps
 from polcap.pipeline import check, models, path
 from polcap.pipeline.cache import MemoryCache
 from polcap.quality import gates
 from polcap.quality.gate import full_size
+from polcap.stage_values import Network, SurfaceMaps
 
 Row = dict[str, Any]
 

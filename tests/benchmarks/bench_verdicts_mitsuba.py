@@ -24,10 +24,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 from bench_mitsuba import scene_light
 from bench_weaknesses import networks
 
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats.capture import reader as captures
-from polcap.images import Bools, ChartRequest, Floats
+from polcap.images import Bools, Floats
 from polcap.pipeline import path
 from polcap.pipeline.cache import MemoryCache
 from polcap.quality import gates

@@ -29,14 +29,15 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import plant_weaknesses
 
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats.capture import reader as captures
-from polcap.images import ChartRequest, Network, SurfaceMaps
 from polcap.pipeline import models, path
 from polcap.pipeline.cache import MemoryCache
 from polcap.quality import gates
 from polcap.quality.gate import full_size
+from polcap.stage_values import Network, SurfaceMaps
 
 Row = dict[str, Any]
 WORSE_DEG, WORSE_ROUGHNESS, WORSE_SCALE = 1.0, 0.04, 0.10  # beyond the capture without the weakness

@@ -16,8 +16,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 from polcap.formats import atomic, onnx
-from polcap.images import Floats, Network
+from polcap.images import Floats
 from polcap.pipeline import models
+from polcap.stage_values import Network
 from polcap.stages import infer
 from polcap.stages.infer import learned
 from polcap.training import evaluation_materials, evaluation_protocol, traced_views

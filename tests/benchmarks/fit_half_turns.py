@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from polcap.formats import onnx
-from polcap.images import Cues, Floats, Network
+from polcap.images import Floats
 from polcap.optics import frames
 from polcap.optics.resize import area_mean
 from polcap.pipeline import models
-from polcap.stages.infer import analytic, augmentation, half_turns, learned
+from polcap.stage_values import Cues, Network
+from polcap.stages.infer import analytic, half_turns, learned, sizes_and_positions
 from polcap.training import evaluation_materials, evaluation_protocol, traced_views
 from polcap.training.evaluation_protocol import Case, Protocol
 
@@ -92,7 +93,7 @@ def predicted(case: Case, network: Network) -> tuple[half_turns.Grid, Floats, Fl
     """The network's normals on the coarse grid, terms (h, w, 4) of `_WRONG`, and what turning a cell gains, degrees."""
     shrink = max(1.0, max(case.cues.mask.shape) / int(network.metadata["native_size"]))
     seen = learned._reduce(learned._limit_radiance(case.cues), 1 / shrink)
-    maps = augmentation.predict([seen], network, onnx.run, 4)
+    maps = sizes_and_positions.predict([seen], network, onnx.run, 4)
     grid = half_turns.coarse(frames.to_ray_frame(frames.unit(maps["normal"]), seen.rays), seen.mask)
     overview = learned._overview(seen, 1.0, network, onnx.run)
     doubt = half_turns.NetworkDoubt(maps["sigma"], maps["opposed"], overview)

@@ -14,9 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap.formats import dng_writer
 from polcap.formats.atomic import new_folder
-from polcap.formats.raw import dng, probe
 from polcap.formats.raw import libraw as raw
+from polcap.formats.raw import probe
 
 _ELECTRONS = 0.25  # counts per electron of the synthetic camera, about: the noise that is put back
 _DAYLIGHT = np.array([0.5, 1.0, 0.6])
@@ -46,7 +47,7 @@ def _frame(source: Path, target: Path, megapixels: float, rng: np.random.Generat
     for y in (0, 1):
         for x in (0, 1):
             out[y::2, x::2] = _plane(counts[y::2, x::2], size, float(image.black[y, x]), image.white, grown, rng)
-    dng.write(
+    dng_writer.write(
         target,
         out,
         cfa=image.cfa,

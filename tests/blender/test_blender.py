@@ -9,7 +9,9 @@ import pytest
 
 from polcap.formats.export import encoders, gltf, obj, texture_set, usd
 from polcap.formats.export.glb_geometry import Geometry
-from polcap.images import Floats, ReliefMesh, SurfaceMaps
+from polcap.images import Floats
+from polcap.mesh_values import ReliefMesh
+from polcap.stage_values import SurfaceMaps
 from tests import surfaces
 from tests.blender import session
 from tests.conftest import ROOT

@@ -11,10 +11,10 @@ import pytest
 from polcap import calibrate
 from polcap.calibrate import calibration_photographs
 from polcap.calibration_values import Calibration
+from polcap.capture_values import Exif
 from polcap.cli import calibrate_command
 from polcap.errors import CaptureError, InputError
 from polcap.formats import calibrations
-from polcap.images import Exif
 from polcap.synth import calibration_frames, forward_camera
 from polcap.synth.calibration_frames import CalibrationShoot
 from tests.raw_files import write_raw

@@ -8,10 +8,11 @@ import pytest
 
 from polcap import calibrate
 from polcap.calibration_values import Calibration, LensGeometry
+from polcap.capture_values import Exif
 from polcap.cli import calibrate_command
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import calibrations
-from polcap.images import Distortion, Exif
+from polcap.images import Distortion
 from polcap.optics import distortion
 from polcap.synth import calibration_frames
 from polcap.synth.calibration_frames import CalibrationShoot

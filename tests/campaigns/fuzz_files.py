@@ -24,8 +24,9 @@ from onnx import TensorProto, helper
 
 from polcap.errors import InputError
 from polcap.formats import onnx as models
+from polcap.formats import sandbox
 from polcap.formats.maps import exr, png
-from polcap.formats.raw import file_checks, photo, probe, worker
+from polcap.formats.raw import file_checks, photo, probe
 from polcap.formats.raw import libraw as raw
 from tests.campaigns.mutations import Target, campaign
 from tests.campaigns.rows import arguments
@@ -142,7 +143,7 @@ if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as place:
         kinds = targets(Path(place))
     failures = campaign(kinds, stated.files, stated.seed, stated.rows, _BATCH, time.perf_counter)
-    worker.end_idle()  # the memory of children is known once they have ended
+    sandbox.end_idle()  # the memory of children is known once they have ended
     children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     print(f"This process grew by {grown:.0f} MB, a child had {children:.0f} MB.")

@@ -28,17 +28,20 @@ from polcap.calibration_values import (
     NoiseLine,
     Polarizer,
 )
+from polcap.capture_values import Exif
+from polcap.chart_values import ColorCalibration, PatchColors
 from polcap.errors import PolcapError
 from polcap.formats import atomic, calibrations, color_profile, npy_folder, text_file
 from polcap.formats.capture import capture_toml
 from polcap.formats.maps import maps_folder as maps
 from polcap.formats.raw import exif, file_checks, file_kind
-from polcap.images import ColorCalibration, Exif, PatchColors, StokesImage, View
+from polcap.images import View
 from polcap.rig import exposure_bracket, serial_port
 from polcap.rig.device_log import Log
 from polcap.rig.motor_elliptec_ell14 import ElliptecMotor, ElliptecSettings
 from polcap.rig.motor_grbl import GrblMotor, GrblSettings
 from polcap.rig.motor_line_protocol import LineMotor, LineSettings
+from polcap.stage_values import StokesImage
 from tests.campaigns.mutations import Target, campaign
 from tests.campaigns.rows import arguments
 from tests.formats import headers

@@ -9,13 +9,14 @@ worst shot's of each capture, and the promised figures; with --parts also error 
 
 import numpy as np
 
+from polcap.chart_values import ColorCalibration
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
-from polcap.images import AngleStack, ColorCalibration
 from polcap.pipeline.path import AUTO
 from polcap.quality import shot_exposure
 from polcap.quality.gate import Evidence
 from polcap.quality.limits import GateLimits
+from polcap.stage_values import AngleStack
 from polcap.stages import selfcal, whitebalance
 from polcap.stages.selfcal import angles, integrability, object_gains
 from tests import scenes

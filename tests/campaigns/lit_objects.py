@@ -10,8 +10,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import AngleStack, Equipment, Floats, ObjectMask, Quality, single_frames
+from polcap.images import Floats, Quality
 from polcap.optics import frames, mueller
+from polcap.stage_values import AngleStack, Equipment, ObjectMask, single_frames
 from polcap.synth.scenes import random_scene
 from polcap.synth.shooting import Shoot, Studio
 from tests import scenes

@@ -17,11 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.errors import GateError, InputError
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import maps_folder as maps
-from polcap.images import ChartRequest, Floats
+from polcap.images import Floats
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput
 from tests.campaigns.rows import arguments, table

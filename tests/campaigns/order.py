@@ -14,13 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
+from polcap.chart_values import ColorCalibration
 from polcap.config import Config
 from polcap.errors import CaptureError, InputError
 from polcap.formats.capture import reader as captures
-from polcap.images import Alignment, AngleStack, ColorCalibration, Equipment, Floats, ObjectMask
+from polcap.images import Floats
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
+from polcap.stage_values import Alignment, AngleStack, Equipment, ObjectMask
 from polcap.stages import selfcal
 from polcap.stages.selfcal import angles as polarizer_angles
 from polcap.synth import scenes as random_scenes

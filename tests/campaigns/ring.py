@@ -19,10 +19,10 @@ import numpy as np
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats.capture import reader as captures
-from polcap.images import RingZero
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
+from polcap.stage_values import RingZero
 from polcap.stages import selfcal
 from polcap.synth import scenes as random_scenes
 from polcap.synth import shooting

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from polcap.errors import CaptureError
-from polcap.images import Equipment, Floats
+from polcap.images import Floats
 from polcap.optics import mueller
+from polcap.stage_values import Equipment
 from polcap.stages import selfcal
 from tests import scenes
 from tests.campaigns import lit_objects

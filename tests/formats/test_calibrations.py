@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from polcap.calibration_values import Calibration, Falloff, FlashEnergy, LensGeometry, Levels, NoiseLine, Polarizer
+from polcap.capture_values import Exif
 from polcap.errors import CaptureError
 from polcap.formats import calibrations
 from polcap.formats.capture import reader as capture
-from polcap.images import Exif
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "capture"
 EXIF = Exif(make="Polcap", model="Synthetic", lens="Synthetic 60mm", f_number=11.0, focal_length_mm=60.0)

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from polcap.chart_values import ColorCalibration, PatchColors
 from polcap.errors import ChartError
 from polcap.formats import color_profile
-from polcap.images import ColorCalibration, PatchColors
 
 PROFILE = ColorCalibration(
     matrix=np.array([[2.1, -0.4, 0.1], [-0.2, 1.5, -0.3], [0.05, -0.6, 1.9]]),

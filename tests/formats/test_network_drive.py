@@ -10,10 +10,10 @@ from typing import NoReturn
 import numpy as np
 import pytest
 
+from polcap.capture_values import Exif
 from polcap.errors import StorageError
 from polcap.formats import atomic, npy_folder
 from polcap.formats.raw import file_kind
-from polcap.images import Exif
 from polcap.pipeline import result_folder
 from polcap.rig import sequence
 from tests.raw_files import write_raw

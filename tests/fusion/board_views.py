@@ -5,9 +5,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from polcap.capture_values import Capture
+from polcap.chart_values import ColorCalibration
 from polcap.fusion.values import Pose
-from polcap.images import AngleStack, Capture, ColorCalibration, Floats, View, single_frames
+from polcap.images import Floats, View
 from polcap.optics import board as boards
+from polcap.stage_values import AngleStack, single_frames
 from polcap.synth import forward_camera, render
 from polcap.synth.distance_fields import Cluster
 from polcap.synth.laid_board import LaidBoard

@@ -9,11 +9,12 @@ import pytest
 from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
+from polcap.capture_values import ShotOrder
 from polcap.errors import CaptureError
 from polcap.fusion import feature_poses, object_features
 from polcap.fusion.object_features import ObjectFeatures
 from polcap.fusion.poses import SessionPoses
-from polcap.images import ShotOrder, View
+from polcap.images import View
 from polcap.synth import render, scene_materials
 from polcap.synth.distance_fields import Cluster
 from polcap.synth.scene_materials import Coat, Material

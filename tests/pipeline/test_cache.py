@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from polcap import images
+from polcap import capture_values, images
 from polcap.errors import SettingError, StorageError
 from polcap.formats import npy_folder, own_files
 from polcap.formats.npy_folder import checksum, decode, encode, save
@@ -258,14 +258,14 @@ def test_a_version_changes_the_key(tmp_path: Path) -> None:
 
 
 def test_key_follows_the_bytes_of_the_photographs_not_their_place(tmp_path: Path) -> None:
-    frame = images.Frame("/a/x.dng", images.Exif(), "shot", "digest")
-    capture = images.Capture(
-        "a", "/a", (images.Shot(0.0, (frame,)),), "folders", 1.0, True, (0.0, 0.0), (2, 2), notes=("n",)
+    frame = capture_values.Frame("/a/x.dng", capture_values.Exif(), "shot", "digest")
+    capture = capture_values.Capture(
+        "a", "/a", (capture_values.Shot(0.0, (frame,)),), "folders", 1.0, True, (0.0, 0.0), (2, 2), notes=("n",)
     )
-    elsewhere = images.Shot(0.0, (replace(frame, path="/b/x.dng"),))
+    elsewhere = capture_values.Shot(0.0, (replace(frame, path="/b/x.dng"),))
     moved = replace(capture, folder="/b", name="b", shots=(elsewhere,))
-    other = replace(capture, shots=(images.Shot(0.0, (replace(frame, digest="other"),)),))
-    turned = replace(capture, shots=(images.Shot(0.1, (frame,)),))
+    other = replace(capture, shots=(capture_values.Shot(0.0, (replace(frame, digest="other"),)),))
+    turned = replace(capture, shots=(capture_values.Shot(0.1, (frame,)),))
     key = [DryRunCache(tmp_path).run(DOUBLE, c, config=Settings()).key for c in (capture, moved, other, turned)]
     assert key[0] == key[1] and len(set(key)) == 3
 
@@ -275,7 +275,7 @@ def test_only_facts_that_change_pixels_enter_the_key() -> None:
     capture = {"shots", "layout", "focal_px", "focal_known", "principal_px", "size_px", "chart_frames", "crossed"}
     capture |= {"calibration", "angles"}  # advice on the angles is stored with the merged pictures
     frame = {"exif", "role", "digest", "exposure"}
-    for kind, expected in ((images.Capture, capture), (images.Frame, frame)):
+    for kind, expected in ((capture_values.Capture, capture), (capture_values.Frame, frame)):
         assert {one.name for one in fields(kind) if one.metadata.get("in_key", True)} == expected
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.errors import CaptureError, ChartError
-from polcap.formats import shipped_data
+from polcap.formats import dng_writer, shipped_data
 from polcap.formats.capture import reader as captures
-from polcap.formats.raw import dng, frame_decoder, probe
+from polcap.formats.raw import frame_decoder, probe
 from polcap.formats.raw import libraw as raw
-from polcap.images import ChartRequest
 from polcap.pipeline import check
 from polcap.pipeline.check import Verdict
 from polcap.pipeline.path import AUTO
@@ -168,7 +168,7 @@ def test_ambient_light_is_measured(example: Path, tmp_path: Path) -> None:
             frames.append(f'[[frame]]\nfile = "{file.name}"\nangle = {angle}\n')
         middle = raw.read(files[1])
         dark = middle.value.astype(float) - middle.black.mean()
-        dng.write(
+        dng_writer.write(
             tmp_path / f"dark{angle}.dng",
             (middle.black.mean() + dark / 5).astype(np.uint16),
             cfa=middle.cfa,

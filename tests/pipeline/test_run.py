@@ -16,16 +16,18 @@ import msgspec
 import numpy as np
 import pytest
 
+from polcap.chart_values import ColorCalibration
 from polcap.config import Config
 from polcap.errors import ObjectError, StorageError
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import maps_folder as maps
 from polcap.formats.maps.result_maps import read_cues
-from polcap.images import AngleStack, ColorCalibration, View, single_frames
+from polcap.images import View
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput, distance_m, on_grid
 from polcap.results import STAGES
+from polcap.stage_values import AngleStack, single_frames
 from polcap.synth.scenes import random_scene
 from polcap.synth.shooting import Shoot, write
 from tests.conftest import ROOT, Command, environment, python

@@ -15,23 +15,14 @@ import msgspec
 import numpy as np
 import pytest
 
+from polcap.capture_values import AngleStatement, ShotOrder
+from polcap.chart_values import PatchColors
 from polcap.config import Config
-from polcap.images import (
-    AngleStack,
-    AngleStatement,
-    BlackError,
-    Equipment,
-    OrderTest,
-    OutlineCheck,
-    PatchColors,
-    Quality,
-    RingZero,
-    ShotOrder,
-    TurnedShot,
-)
+from polcap.images import Quality
 from polcap.quality import gates, geometry, light, polarization, rim, shot_exposure
 from polcap.quality.gate import Evidence, Gate
 from polcap.quality.object_turn import ObjectTurn
+from polcap.stage_values import AngleStack, BlackError, Equipment, OrderTest, OutlineCheck, RingZero, TurnedShot
 from polcap.stages.align.object_motion import ObjectShift
 from tests import scenes
 

@@ -8,22 +8,22 @@ import cv2
 import numpy as np
 import pytest
 
+from polcap.capture_values import ShotOrder
 from polcap.config import Config
-from polcap.images import (
+from polcap.images import Quality
+from polcap.optics import frames
+from polcap.quality import gates
+from polcap.quality.gate import Evidence, Gate
+from polcap.stage_values import (
     AngleStack,
     BlackError,
     ColorSensor,
     Equipment,
     OutlineCheck,
-    Quality,
     RingZero,
-    ShotOrder,
     SurfaceMaps,
     TurnedShot,
 )
-from polcap.optics import frames
-from polcap.quality import gates
-from polcap.quality.gate import Evidence, Gate
 from polcap.stages import cues, selfcal, stokes
 from tests import scenes
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from polcap.images import AngleStack, SurfaceMaps
 from polcap.optics import mueller, shade
 from polcap.quality import object_turn
+from polcap.stage_values import AngleStack, SurfaceMaps
 from tests import scenes
 
 

@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from polcap.formats.export import gltf
-from polcap.images import Floats, ReliefMesh, View
+from polcap.images import Floats, View
+from polcap.mesh_values import ReliefMesh
 
 HERE = Path(__file__).parent
 MODULES = HERE.parent / "gltf" / "node_modules"

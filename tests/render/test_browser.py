@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from polcap.formats.export import encoders, gltf, obj, texture_set
 from polcap.formats.export.glb_geometry import Geometry
-from polcap.images import Floats, SurfaceMaps
+from polcap.images import Floats
+from polcap.stage_values import SurfaceMaps
 from tests import surfaces
 from tests.render import browser
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from polcap.capture_values import Exif, Role
 from polcap.errors import HardwareError
 from polcap.formats.raw.file_bytes import digest
-from polcap.images import Exif, Role
 from polcap.rig.camera import CameraFile
 from polcap.rig.camera_gphoto2 import call_within
 from polcap.rig.exposure_bracket import Exposure

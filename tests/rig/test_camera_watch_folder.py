@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from polcap.capture_values import Exif
 from polcap.errors import HardwareError, SettingError
-from polcap.images import Exif
 from polcap.rig import camera_watch_folder
 from polcap.rig.camera_watch_folder import WatchFolderCamera
 from polcap.rig.device_log import Log

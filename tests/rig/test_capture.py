@@ -9,9 +9,9 @@ from typing import get_args
 import msgspec
 import pytest
 
+from polcap.capture_values import Role
 from polcap.formats.capture import capture_toml
 from polcap.formats.capture import reader as captures
-from polcap.images import Role
 from polcap.rig import camera_gphoto2
 from tests.conftest import ROOT, Command
 from tests.rig import virtual

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
+from polcap.capture_values import Exif
 from polcap.errors import DecodeError
 from polcap.formats.raw import libraw as raw
-from polcap.images import Exif
 from polcap.rig import retake_criteria
 from polcap.rig.camera import CameraFile
 from polcap.rig.exposure_bracket import Exposure

@@ -11,10 +11,10 @@ from typing import Any
 import msgspec
 import pytest
 
+from polcap.capture_values import Role
 from polcap.errors import CaptureError, HardwareError, SettingError, StorageError
 from polcap.formats.capture import reader as captures
 from polcap.formats.raw import file_bytes
-from polcap.images import Role
 from polcap.rig import capture_record, sequence
 from polcap.rig.camera import CameraFile
 from polcap.rig.exposure_bracket import Exposure

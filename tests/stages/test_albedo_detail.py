@@ -8,9 +8,10 @@ import pytest
 from scipy import ndimage
 
 from polcap.formats import onnx
-from polcap.images import Distortion, Floats, Mosaic, ObjectMask, StokesImage, SurfaceMaps
+from polcap.images import Distortion, Floats, Mosaic
 from polcap.optics import color, demosaic, distortion, mueller, shade
 from polcap.optics.resize import block_means
+from polcap.stage_values import ObjectMask, StokesImage, SurfaceMaps
 from polcap.stages import asset, cues, infer, stokes, surface
 from polcap.stages.stokes.reference_detail import reference_detail
 from tests import scenes

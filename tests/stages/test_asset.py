@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from polcap.images import Asset, Floats, SurfaceMaps
+from polcap.images import Floats
+from polcap.mesh_values import Asset
 from polcap.optics import color
 from polcap.optics.texture_rasterizer import rasterize_frames
+from polcap.stage_values import SurfaceMaps
 from polcap.stages import asset, surface
 from tests import surfaces
 

@@ -7,7 +7,8 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from polcap.images import ChartLight, Quality
+from polcap.chart_values import ChartLight
+from polcap.images import Quality
 from polcap.optics import body, fresnel
 from polcap.stages import cues, stokes
 from tests import scenes

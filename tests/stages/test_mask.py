@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from polcap.chart_values import ChartPlace
 from polcap.errors import ObjectError
-from polcap.images import ChartPlace
 from polcap.stages import mask
 from polcap.stages.mask import graph_cut, mask_channels, regions
 from polcap.stages.mask import network as mask_network

@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
-from polcap.images import (
+from polcap.images import MaskedImage, Quality, SensorImage
+from polcap.stage_values import (
     AngleStack,
     ColorSensor,
     CrossedShot,
     Equipment,
-    MaskedImage,
     ObjectMask,
-    Quality,
     SelfCalibration,
-    SensorImage,
     single_frames,
 )
 from polcap.stages import stokes

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from polcap.images import ColorCalibration, View
+from polcap.chart_values import ColorCalibration
+from polcap.images import View
 from polcap.stages import cues
 from polcap.training import evaluation_protocol
 from polcap.training.camera_errors import CameraErrors

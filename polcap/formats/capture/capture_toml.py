@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
+from polcap.capture_values import CatalogEntry, Role
 from polcap.errors import CaptureError
 from polcap.formats import text_file
-from polcap.images import CatalogEntry, Role
 
 NAME = "capture.toml"
 Positive = Annotated[float, Meta(gt=0)]

@@ -6,8 +6,8 @@ from functools import cache
 from typing import NamedTuple
 
 from polcap.calibration_values import LensGeometry
+from polcap.capture_values import Exif
 from polcap.formats import shipped_data
-from polcap.images import Exif
 
 FULL_FRAME_MM = (36.0, 24.0)
 _FULL_DIAGONAL_MM = math.hypot(*FULL_FRAME_MM)

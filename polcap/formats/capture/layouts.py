@@ -13,6 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
+from polcap.capture_values import AngleStatement, Role
 from polcap.errors import CaptureError
 from polcap.formats.capture import capture_toml, photograph_files
 from polcap.formats.capture.capture_toml import CaptureFile
@@ -33,7 +34,6 @@ from polcap.formats.capture.folder_names import (
 from polcap.formats.own_folders import OURS
 from polcap.formats.raw import photo
 from polcap.formats.raw.probe import Probe
-from polcap.images import AngleStatement, Role
 
 DEFAULT_DEG = (0.0, 45.0, 90.0)
 EQUAL_STOPS = 0.15  # EXIF rounds exposure times to a sixth of a stop at most

@@ -11,6 +11,7 @@ from typing import Literal
 import msgspec
 
 from polcap.calibration_values import Calibration
+from polcap.capture_values import AngleStatement, Capture, Exif, Frame, FrameReading, Shot
 from polcap.errors import CaptureError
 from polcap.formats import atomic, calibrations
 from polcap.formats.capture import capture_toml, focal_length, folder_names, layouts
@@ -20,7 +21,6 @@ from polcap.formats.capture.layouts import Source
 from polcap.formats.raw import photo
 from polcap.formats.raw.color_encoding import ColorEncoding
 from polcap.formats.raw.probe import Probe
-from polcap.images import AngleStatement, Capture, Exif, Frame, FrameReading, Shot
 
 _ZOOM = 0.01  # relative change of the focal length above rounding
 _HEADROOM = 1.05  # white of radiance over its greatest value: above `hdr.clip`, so that nothing is over-exposed

@@ -23,7 +23,8 @@ from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.glb_geometry import Blob, Geometry
 from polcap.formats.export.texture_set import Texture
 from polcap.formats.maps import maps_folder
-from polcap.images import Asset, Floats, Mesh
+from polcap.images import Floats
+from polcap.mesh_values import Asset, Mesh
 
 _LINEAR, _LINEAR_MIPMAP, _CLAMP = 9729, 9987, 33071
 _IMAGE_EXTENSION: dict[Kind, str] = {"webp": "EXT_texture_webp", "ktx2": "KHR_texture_basisu"}

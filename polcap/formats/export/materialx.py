@@ -17,7 +17,7 @@ from string import Template
 from xml.sax.saxutils import quoteattr
 
 from polcap.formats.export.texture_set import SPECULAR_RANGE, Key
-from polcap.images import Asset
+from polcap.mesh_values import Asset
 from polcap.optics import color, fresnel
 
 VERSION = "1.39"

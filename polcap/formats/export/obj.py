@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from polcap.formats import atomic
 from polcap.formats.export import gltf, texture_set
 from polcap.formats.export.texture_set import SPECULAR_RANGE, Key
-from polcap.images import Asset
+from polcap.mesh_values import Asset
 
 _ROWS = 10_000  # of a table, formatted at a time
 

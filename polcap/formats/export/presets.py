@@ -9,7 +9,7 @@ from polcap.formats.export import texture_set
 from polcap.formats.export.encoders import Kind
 from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.texture_set import Extra, Texture
-from polcap.images import Asset
+from polcap.mesh_values import Asset
 
 Format = Literal["gltf", "obj", "ply", "stl", "usd", "usdz", "materialx", "exr", "iiif"]
 FORMATS: tuple[Format, ...] = ("gltf", "obj", "ply", "stl", "usd", "usdz", "materialx", "exr", "iiif")

@@ -12,7 +12,8 @@ import numpy as np
 
 from polcap.formats.export import encoders, texture_set
 from polcap.formats.export.texture_set import Texture
-from polcap.images import Asset, ReliefMesh, TexturePixels
+from polcap.images import TexturePixels
+from polcap.mesh_values import Asset, ReliefMesh
 from polcap.optics import color
 
 NO_NORMAL = 128  # a normal of length 0, by which viewers leave a pixel out

@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 
 from polcap.formats.maps import exr
-from polcap.images import Asset, Floats, TexturePixels
+from polcap.images import Floats, TexturePixels
+from polcap.mesh_values import Asset
 from polcap.optics import color, fresnel
 
 SPECULAR_RANGE = 0.08  # F0 of white in the loose specular textures: Disney's, Blender's and Unreal's "specular"

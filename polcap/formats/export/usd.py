@@ -23,7 +23,7 @@ from polcap.errors import package_for
 from polcap.formats import atomic
 from polcap.formats.export import gltf, materialx
 from polcap.formats.export.texture_set import SPECULAR_RANGE, Key
-from polcap.images import Asset, Mesh
+from polcap.mesh_values import Asset, Mesh
 from polcap.optics import fresnel
 
 _FIXED_TIME = 473_385_600  # s, 1985: times of the files in a USDZ, so that the same asset gives the same bytes

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from polcap.errors import DecodeError, StorageError
-from polcap.formats import atomic
-from polcap.formats.raw import file_bytes, file_kind, photo, worker
+from polcap.formats import atomic, sandbox
+from polcap.formats.raw import file_bytes, file_kind, photo
 from polcap.images import Floats
 
 Attribute = str | int | float | tuple[float, ...]
@@ -61,11 +61,11 @@ def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
 
     Raises DecodeError: the file is missing, cut short, not an OpenEXR file, or larger than any picture.
     """
-    meta, channels = worker.call(decode, path)
+    meta, channels = sandbox.call(decode, path)
     return {name: channels[name] for name in meta["names"]}, meta["attributes"]
 
 
-def decode(path: str) -> worker.Answer:
+def decode(path: str) -> sandbox.Answer:
     """Read an EXR in the child process; result and DecodeError as for `read`."""
     data = file_bytes.load(path)
     if not data.startswith(file_kind.EXR):

@@ -14,8 +14,10 @@ from polcap import parallel
 from polcap.errors import DecodeError
 from polcap.formats import atomic, text_file
 from polcap.formats.maps import exr, map_files, png
-from polcap.images import Bools, Floats, ReliefMesh, SurfaceMaps, View
+from polcap.images import Bools, Floats, View
+from polcap.mesh_values import ReliefMesh
 from polcap.results import Results
+from polcap.stage_values import SurfaceMaps
 
 CONVENTIONS = {
     "frame": "camera: x right, y up, z toward the camera; a normal facing the camera is (0, 0, 1)",

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError, StorageError
-from polcap.formats import atomic
-from polcap.formats.raw import file_bytes, file_kind, photo, worker
+from polcap.formats import atomic, sandbox
+from polcap.formats.raw import file_bytes, file_kind, photo
 from polcap.images import Floats
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
@@ -79,10 +79,10 @@ def read(path: Path) -> Pixels:
 
     Raises DecodeError: the file is missing, cut short, not a PNG, or larger than any picture.
     """
-    return worker.call(decode, path)[1]["pixels"]
+    return sandbox.call(decode, path)[1]["pixels"]
 
 
-def decode(path: str) -> worker.Answer:
+def decode(path: str) -> sandbox.Answer:
     """Read a PNG in the child process; result and DecodeError as for `read`."""
     data = file_bytes.load(path)
     if not data.startswith(file_kind.PNG):

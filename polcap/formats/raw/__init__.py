@@ -1,6 +1,5 @@
-"""Photographs: RAW files and finished pictures, decoded in a child process.
+"""Photographs: RAW files and finished pictures, decoded in the sandbox.
 
-worker        the child process with limits on time and memory
 probe         kind, digest, EXIF and size of a file, without its pixels
 libraw        sensor counts of a RAW file
 photo         linear values of a TIFF, PNG, EXR or JPEG
@@ -8,5 +7,4 @@ exif          camera settings from the metadata of every maker
 file_kind     RAW, picture or other, by the first bytes; the directories of a TIFF
 file_checks   refuses files that are cut, stripped or wrongly decoded
 file_bytes    the bytes of a file, read once, and their digest
-dng           writes a mosaic as a DNG
 """

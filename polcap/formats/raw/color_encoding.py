@@ -1,6 +1,6 @@
 """Color encoding that a finished picture states: by PNG chunks, an ICC profile, TIFF tags or EXR attributes.
 
-All of it runs in the child process of `worker`.
+All of it runs in the child process of `sandbox`.
 
 References
 ----------

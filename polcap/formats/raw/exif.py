@@ -14,8 +14,8 @@ from functools import cache
 from itertools import islice
 from typing import Any
 
+from polcap.capture_values import Exif
 from polcap.errors import SettingError
-from polcap.images import Exif
 
 _D65_FIRST = (21, 20, 22, 23, 1, 4, 9, 10, 11, 12, 13, 14, 15)  # EXIF LightSource, the daylights
 _UNIT_MM = {1: 25.4, 2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # FocalPlaneResolutionUnit; 1 "none" is inch in practice

@@ -1,6 +1,6 @@
 """The bytes of a photograph: read once, with their digest, and handed to libraries that open files by name.
 
-All of it runs in the child process of `worker`.
+All of it runs in the child process of `sandbox`.
 """
 
 import os

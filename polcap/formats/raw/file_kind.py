@@ -1,6 +1,6 @@
 """Detects the kind of a file (RAW, picture, other) from its content, not its name; parses the directories of a TIFF.
 
-All of it runs in the child process of `worker`.
+All of it runs in the child process of `sandbox`.
 """
 
 import struct

@@ -4,8 +4,10 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
-from polcap.formats.raw import libraw, photo, worker
-from polcap.images import Frame, SensorImage
+from polcap.capture_values import Frame
+from polcap.formats import sandbox
+from polcap.formats.raw import libraw, photo
+from polcap.images import SensorImage
 
 
 def decode(frame: Frame) -> SensorImage:
@@ -22,7 +24,7 @@ def decode(frame: Frame) -> SensorImage:
     return photo.read(path, reading, digest)
 
 
-def apply(frame: Frame, function: Callable[..., worker.Answer], **options: Any) -> worker.Answer:
+def apply(frame: Frame, function: Callable[..., sandbox.Answer], **options: Any) -> sandbox.Answer:
     """Decode a photograph and return `function(image, **options)`; for a RAW all of it runs in the child process.
 
     So only the result is sent back. The function must be at the top level of a module, the options plain JSON values.
@@ -31,12 +33,12 @@ def apply(frame: Frame, function: Callable[..., worker.Answer], **options: Any) 
     if frame.reading.kind != "raw" or frame.reading.cell is not None:
         return function(decode(frame), **options)
     digest, module, name = _file_digest(frame), function.__module__, function.__name__
-    return worker.call(apply_to_raw, frame.path, digest=digest, module=module, name=name, options=options)
+    return sandbox.call(apply_to_raw, frame.path, digest=digest, module=module, name=name, options=options)
 
 
-def apply_to_raw(path: str, digest: str | None, module: str, name: str, options: dict[str, Any]) -> worker.Answer:
+def apply_to_raw(path: str, digest: str | None, module: str, name: str, options: dict[str, Any]) -> sandbox.Answer:
     """In the child process: decode a RAW and evaluate the function `name` of `module` on it."""
-    function: Callable[..., worker.Answer] = getattr(importlib.import_module(module), name)
+    function: Callable[..., sandbox.Answer] = getattr(importlib.import_module(module), name)
     return function(libraw.image(*libraw.decode(path, digest)), **options)
 
 

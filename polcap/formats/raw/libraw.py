@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap.capture_values import Exif
 from polcap.errors import DecodeError
-from polcap.formats.raw import dng_black, exif, file_bytes, file_checks, file_kind, worker
-from polcap.images import Bits, Exif, Floats, SensorImage
+from polcap.formats import sandbox
+from polcap.formats.raw import dng_black, exif, file_bytes, file_checks, file_kind
+from polcap.images import Bits, Floats, SensorImage
 from polcap.optics import demosaic
 from polcap.optics.color import REC709_TO_XYZ
 
@@ -37,10 +39,10 @@ def read(path: str | Path, digest: str | None = None) -> SensorImage:
     Raises DecodeError: not a RAW, damaged, changed since, of another mosaic or Foveon; or the decoder crashed, hung or
     ran out of memory.
     """
-    return image(*worker.call(decode, path, digest=digest))
+    return image(*sandbox.call(decode, path, digest=digest))
 
 
-def image(meta: dict[str, Any], arrays: worker.Arrays) -> SensorImage:
+def image(meta: dict[str, Any], arrays: sandbox.Arrays) -> SensorImage:
     """Build a SensorImage from the answer of `decode`."""
     balance = None if meta["balance"] is None else np.array(meta["balance"])
     xyz_to_camera = meta["xyz_to_camera"]
@@ -131,7 +133,7 @@ def version() -> str:
     return ".".join(map(str, rawpy.libraw_version))
 
 
-def decode(path: str, digest: str | None = None) -> worker.Answer:
+def decode(path: str, digest: str | None = None) -> sandbox.Answer:
     """In the child process: decode a RAW file to counts (H, W) or (H, W, 3), levels and colors. Raises DecodeError."""
     data = file_bytes.load(path, digest)
     if data[:4] == b"FOVb":  # Sigma's X3F
@@ -149,7 +151,7 @@ def decode(path: str, digest: str | None = None) -> worker.Answer:
     return meta | ({} if stated is None else {"xyz_to_camera": stated}), arrays
 
 
-def _counts(path: str, raw: Any, structure: file_kind.TiffStructure) -> tuple[dict[str, Any], worker.Arrays]:
+def _counts(path: str, raw: Any, structure: file_kind.TiffStructure) -> tuple[dict[str, Any], sandbox.Arrays]:
     """Visible sensor counts as stored in the RAW file, with their levels and colors; uneven blacks are evened out."""
     value: NDArray[Any] = raw.raw_image_visible
     value = value[..., :3] if value.ndim == 3 else value

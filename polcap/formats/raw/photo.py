@@ -12,10 +12,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap.capture_values import FrameReading
 from polcap.errors import DecodeError
-from polcap.formats.raw import color_encoding, file_bytes, file_checks, file_kind, libraw, picture_count, worker
+from polcap.formats import sandbox
+from polcap.formats.raw import color_encoding, file_bytes, file_checks, file_kind, libraw, picture_count
 from polcap.formats.raw.color_encoding import ColorEncoding
-from polcap.images import FrameReading, SensorImage
+from polcap.images import SensorImage
 from polcap.optics import color
 
 Encoding = Literal["linear", "srgb"]
@@ -37,7 +39,7 @@ def read(path: str | Path, reading: FrameReading = _DEFAULT, digest: str | None 
 
     Raises DecodeError: not a picture, damaged, changed since it was probed, of a contradictory encoding, or a mosaic.
     """
-    meta, arrays = worker.call(decode, path, digest=digest, stated=reading.encoding)
+    meta, arrays = sandbox.call(decode, path, digest=digest, stated=reading.encoding)
     pixels, matrix = arrays["pixels"], meta["to_rec709"]
     lossy, black, white = meta["lossy"], reading.black, reading.white or meta["full"]
     if "light" in arrays:
@@ -61,7 +63,7 @@ def read_mosaic(
     """
     y, x = cell
     if reading.kind == "photo":
-        meta, arrays = worker.call(decode, path, digest=digest, stated="linear", mosaic=True)
+        meta, arrays = sandbox.call(decode, path, digest=digest, stated="linear", mosaic=True)
         pixels, full = arrays["pixels"], meta["full"]
         if pixels.shape[2] != 1:
             raise DecodeError(
@@ -102,7 +104,9 @@ def describe(path: str, data: bytes) -> dict[str, Any]:
     return {"width": right - left, "height": lower - upper, **facts}
 
 
-def decode(path: str, digest: str | None = None, stated: Encoding | None = None, mosaic: bool = False) -> worker.Answer:
+def decode(
+    path: str, digest: str | None = None, stated: Encoding | None = None, mosaic: bool = False
+) -> sandbox.Answer:
     """In the child process: the stored values of a picture (H, W, 1 or 3) in their stored type.
 
     `stated` replaces the encoding that the file states. `light` is the linear light 0…1 of each stored integer, if the

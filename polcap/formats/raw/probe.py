@@ -8,10 +8,11 @@ from pathlib import Path
 
 import msgspec
 
+from polcap.capture_values import Exif
 from polcap.errors import DecodeError
-from polcap.formats.raw import exif, file_bytes, file_checks, file_kind, libraw, photo, picture_count, worker
+from polcap.formats import sandbox
+from polcap.formats.raw import exif, file_bytes, file_checks, file_kind, libraw, photo, picture_count
 from polcap.formats.raw.color_encoding import ColorEncoding
-from polcap.images import Exif
 
 _LIMIT_S = 30.0  # a sound file takes milliseconds
 
@@ -40,7 +41,7 @@ def read(path: str | Path) -> Probe:
     Raises DecodeError: the file cannot be read, no decoder recognises it, it is cut short or of a form that polcap
     refuses.
     """
-    answer, _ = worker.call(examine, path, limit_s=_LIMIT_S)
+    answer, _ = sandbox.call(examine, path, limit_s=_LIMIT_S)
     found = msgspec.convert(answer["probe"], Probe)
     if answer["doubtful"]:  # some cameras store odd offsets for previews: only decoding shows whether it is cut
         libraw.read(path) if found.kind == "raw" else photo.read(path)
@@ -49,17 +50,17 @@ def read(path: str | Path) -> Probe:
 
 def kind(path: str | Path) -> file_kind.Kind:
     """Kind of a file by its first bytes. Raises DecodeError if the file cannot be read."""
-    found: file_kind.Kind = worker.call(examine_kind, path, limit_s=_LIMIT_S)[0]["kind"]
+    found: file_kind.Kind = sandbox.call(examine_kind, path, limit_s=_LIMIT_S)[0]["kind"]
     return found
 
 
-def examine_kind(path: str) -> worker.Answer:
+def examine_kind(path: str) -> sandbox.Answer:
     """In the child process: detect the kind of a file, as `kind` does."""
     with file_bytes.opened(path) as file:
         return {"kind": file_kind.kind(file, Path(path).suffix)}, {}
 
 
-def examine(path: str) -> worker.Answer:
+def examine(path: str) -> sandbox.Answer:
     """In the child process: probe a file as `read` does, and report whether only decoding can show that it is complete.
 
     Raises DecodeError.

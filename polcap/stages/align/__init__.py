@@ -11,11 +11,13 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from polcap.chart_values import ColorCalibration
 from polcap.errors import AlignmentError
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats
+from polcap.images import Floats
 from polcap.optics import registration
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import Pyramid
+from polcap.stage_values import Alignment, AngleStack
 from polcap.stages import stage
 from polcap.stages.align.detail import averaging_step, detail, edge_strength, shows_detail
 

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polcap.images import Alignment, AngleStack, Floats, ObjectMask
+from polcap.images import Floats
 from polcap.optics import registration
 from polcap.optics.morphology import dilate
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import Pyramid, Registration
 from polcap.optics.resize import area_mean
+from polcap.stage_values import Alignment, AngleStack, ObjectMask
 from polcap.stages.align.detail import averaging_step, detail
 
 _DETAIL_PX = 4.0  # as `align.detail_px`

@@ -7,25 +7,46 @@ Khronos, glTF 2.0 §3.9 (materials) and KHR_materials_specular.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polcap.images import Asset, Bools, Floats, Mesh, SurfaceMaps, TextureMaps, TexturePixels
+from polcap.images import Bools, Floats, TexturePixels
+from polcap.mesh_values import Asset, Mesh
 from polcap.optics import color, frames, fresnel
 from polcap.optics.morphology import dilate, erode
 from polcap.optics.outline import fill_outward
 from polcap.optics.resize import area_mean
 from polcap.optics.texture_rasterizer import rasterize_frames
+from polcap.stage_values import SurfaceMaps
 from polcap.stages import stage
 from polcap.stages.asset.ambient_occlusion import ambient_occlusion
 
 Bits = Literal[8, 16]  # of a texture's channel
 _EXTRAS = ("displacement", "object_normal")
 _LEAST_Z = 0.05  # of a tangent-space normal, which must leave the surface (glTF: blue above one half)
+
+
+class TextureMaps(Protocol):
+    """Appearance of a surface on a pixel grid, as an asset's textures need it: `SurfaceMaps` or an atlas."""
+
+    @property
+    def normal(self) -> Floats: ...  # (H, W, 3) unit, in the mesh's frame
+    @property
+    def diffuse(self) -> Floats: ...  # (H, W, 3) albedo ρ_d, linear Rec.709
+    @property
+    def specular(self) -> Floats: ...  # (H, W, 3) F0, linear Rec.709
+    @property
+    def roughness(self) -> Floats: ...  # (H, W) perceptual, α = roughness²
+    @property
+    def mask(self) -> Bools: ...  # (H, W)
+    @property
+    def albedo_sigma(self) -> float | None: ...  # relative 1σ of the scale of all albedos; None: unknown
+    @property
+    def detail(self) -> Floats | None: ...  # (2H, 2W) float16, ln of the albedo of RAW pixels over `diffuse`
 
 
 class AssetSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

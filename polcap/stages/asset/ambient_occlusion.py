@@ -8,9 +8,10 @@ Jimenez et al., Practical real-time strategies for accurate indirect occlusion, 
 import cv2
 import numpy as np
 
-from polcap.images import Floats, SurfaceMaps
+from polcap.images import Floats
 from polcap.optics import frames
 from polcap.optics.projection import back_project
+from polcap.stage_values import SurfaceMaps
 
 _SIDE = 512  # px, at most, of the longer side at which it is computed: it varies slowly
 _DIRECTIONS = 16

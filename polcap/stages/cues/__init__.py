@@ -6,9 +6,11 @@ no cv2, no torch. Pixel axes are (..., H, W).
 
 from typing import Any
 
-from polcap.images import ColorCalibration, Cues, OtherOrder, Quality, StokesImage
+from polcap.chart_values import ColorCalibration
+from polcap.images import Quality
 from polcap.optics import frames, fresnel
 from polcap.optics.namespace import array_namespace
+from polcap.stage_values import Cues, OtherOrder, StokesImage
 from polcap.stages import stage
 from polcap.stages.cues import scale
 

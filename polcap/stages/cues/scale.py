@@ -10,9 +10,11 @@ from math import exp, hypot, log, pi, sqrt
 
 import numpy as np
 
-from polcap.images import Bools, ChartLight, ColorCalibration, Floats, StokesImage, View
+from polcap.chart_values import ChartLight, ColorCalibration
+from polcap.images import Bools, Floats, View
 from polcap.optics import point_light
 from polcap.optics.projection import back_project
+from polcap.stage_values import StokesImage
 
 _BULGE = 0.5  # radii; mean distance of the visible surface in front of the center: 1/3 for a cone, 2/3 for a ball
 _BULGE_SPREAD = 0.4  # radii; its 1σ over 204 views of training meshes and random shapes (decision 8)

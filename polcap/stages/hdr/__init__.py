@@ -23,26 +23,12 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from polcap.capture_values import Capture, Decode, Frame, Shot
 from polcap.errors import CaptureError
-from polcap.images import (
-    AngleStack,
-    BracketMeasurement,
-    Capture,
-    ColorSensor,
-    CrossedShot,
-    Decode,
-    Distortion,
-    Equipment,
-    Floats,
-    Frame,
-    MaskedImage,
-    Quality,
-    SensorImage,
-    Shot,
-    View,
-)
+from polcap.images import Distortion, Floats, MaskedImage, Quality, SensorImage, View
 from polcap.optics import sharpness
 from polcap.optics.projection import to_grid
+from polcap.stage_values import AngleStack, BracketMeasurement, ColorSensor, CrossedShot, Equipment
 from polcap.stages import stage
 from polcap.stages.hdr import exposure, noise, photosites, planes, weights
 from polcap.stages.hdr.bracket import Bracket, black_error, compare

@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from polcap.capture_values import Shot
 from polcap.errors import CaptureError
-from polcap.images import BlackError, Bools, Floats, Shot
+from polcap.images import Bools, Floats
 from polcap.optics import sensor
 from polcap.optics.registration import Pyramid, register
+from polcap.stage_values import BlackError
 from polcap.stages.hdr import exposure, noise
 from polcap.stages.hdr.ghosts import Anchor, RegisteredFrame, first_estimate
 from polcap.stages.hdr.planes import Reader, Signals, blocks, in_memory, planar, resample, same_size

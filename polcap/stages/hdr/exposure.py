@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from polcap.capture_values import Frame
 from polcap.errors import CaptureError
-from polcap.images import Bools, Floats, Frame
+from polcap.images import Bools, Floats
 from polcap.optics.resize import block_means
 from polcap.optics.robust import MAD_TO_SIGMA, biweight, spread
 from polcap.stages.hdr.planes import Signals, tile_means

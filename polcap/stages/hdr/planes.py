@@ -15,11 +15,13 @@ import cv2
 import numpy as np
 
 from polcap import parallel
+from polcap.capture_values import Decode, Frame
 from polcap.errors import CaptureError, SettingError
-from polcap.images import BlackError, Bools, Decode, Floats, Frame, SensorImage
+from polcap.images import Bools, Floats, SensorImage
 from polcap.optics import sensor
 from polcap.optics.projection import coordinates
 from polcap.optics.resize import block_means
+from polcap.stage_values import BlackError
 
 _ROWS = 64  # of a block: one channel of a 24 MP picture then fits a core's cache
 _AHEAD = 2  # frames decoded ahead of the merge; each thread waits for a decoding process

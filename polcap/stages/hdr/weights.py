@@ -16,7 +16,8 @@ import numpy as np
 
 from polcap import parallel
 from polcap.calibration_values import Falloff
-from polcap.images import Bits, Bools, Floats, Frame, MaskedImage, Quality, View
+from polcap.capture_values import Frame
+from polcap.images import Bits, Bools, Floats, MaskedImage, Quality, View
 from polcap.optics.registration import scaled, squared_gradient
 from polcap.stages.hdr import exposure, noise
 from polcap.stages.hdr.bracket import AmbientLight, Bracket, ComparedBracket, ambient_light

@@ -4,10 +4,10 @@ Both estimators work in the frame of each view ray, where polarization depends o
 the camera frame.
 
     learned        the network, joined with the inversion
-        augmentation   its predictions in turned and mirrored positions, averaged
-        fine           relief finer than its pixels, by a second network
+        sizes_and_positions   its predictions at several sizes, in turned and mirrored positions, averaged
+        fine                  relief finer than its pixels, by a second network
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
-        zenith         by the object's law of diffuse polarization
+        zenith                by the object's law of diffuse polarization
     half_turns     the side of the ray to which a normal leans, for both estimators
     highlights     the albedo in highlights, for both estimators
 
@@ -27,10 +27,11 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polcap.images import Cues, Floats, Network, Quality, RunNetwork, SurfaceMaps
+from polcap.images import Floats, Quality
 from polcap.optics import brdf, frames
 from polcap.optics.morphology import erode, masked_mean
 from polcap.optics.resize import area_mean
+from polcap.stage_values import Cues, Network, RunNetwork, SurfaceMaps
 from polcap.stages import stage
 from polcap.stages.infer import analytic, highlights, learned
 

@@ -13,11 +13,12 @@ import cv2
 import numpy as np
 
 from polcap import parallel
-from polcap.images import Bools, Cues, Floats, Network, RunNetwork
+from polcap.images import Bools, Floats
 from polcap.optics import frames
 from polcap.optics.resize import area_mean
+from polcap.stage_values import Cues, Network, RunNetwork
 from polcap.stages import cues as cue_channels
-from polcap.stages.infer.augmentation import run_network
+from polcap.stages.infer.sizes_and_positions import run_network
 
 ENCODING = "fine 1"
 Window = tuple[slice, slice]

@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Cues, Floats, Quality, SurfaceMaps
+from polcap.images import Floats, Quality
 from polcap.optics import frames, fresnel
 from polcap.optics.morphology import dilate
 from polcap.optics.outline import disc_radius
+from polcap.stage_values import Cues, SurfaceMaps
 
 REACHED = 0.05  # least share of known pixels under a Gaussian for a mean
 # specular share of S0: below the first the estimator's albedo is used, above the second that of the crossed shot

@@ -12,11 +12,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from polcap.images import Bools, Cues, Floats, Network, OrderTest, Quality, RunNetwork, SurfaceMaps
+from polcap.images import Bools, Floats, Quality
 from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
+from polcap.stage_values import Cues, Network, OrderTest, RunNetwork, SurfaceMaps
 from polcap.stages.cues import FLOOR
-from polcap.stages.infer import analytic, augmentation, fine, half_turns, highlights
+from polcap.stages.infer import analytic, fine, half_turns, highlights, sizes_and_positions
 from polcap.stages.infer.highlights import REACHED
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join, for the network's input holds the inversion
@@ -75,7 +76,7 @@ def estimate_coarse(
     largest, *others = sorted({min(1.0, factor * scale) for factor in _SIZES}, reverse=True)
     seen = _reduce(_limit_radiance(cues), largest)
     pictures = [seen, *(_reduce(seen, other / largest) for other in others)]
-    small = augmentation.predict(pictures, network, run, symmetries)
+    small = sizes_and_positions.predict(pictures, network, run, symmetries)
     overview = _overview(seen, min(scale, 1.0) / largest, network, run)
     doubt = half_turns.NetworkDoubt(small["sigma"], small.pop("opposed"), overview)
     small["normal"], small["doubt"] = _correct_half_turns(small["normal"], seen, doubt)
@@ -106,7 +107,7 @@ def _compare_orders(cues: Cues, network: Network, run: RunNetwork) -> OrderTest 
         return None
 
     def error(matrix: Floats) -> float:
-        predicted = augmentation.predict([_transformed(low, matrix)], network, run, 1)
+        predicted = sizes_and_positions.predict([_transformed(low, matrix)], network, run, 1)
         return float(predicted["sigma"][low.mask].mean())
 
     errors = [error(other.matrix) for other in cues.other_orders]
@@ -178,7 +179,7 @@ def _overview(seen: Cues, scale: float, network: Network, run: RunNetwork) -> Fl
     lean = np.zeros((2, *seen.mask.shape), np.float32)
     for size in _OVERVIEWS:
         low = _reduce(seen, size * scale)
-        normal = augmentation.predict([low], network, run, _OVERVIEW_POSITIONS)["normal"]
+        normal = sizes_and_positions.predict([low], network, run, _OVERVIEW_POSITIONS)["normal"]
         local = frames.to_ray_frame(frames.unit(normal), low.rays)[..., :2] * low.mask[..., None]
         lean += np.moveaxis(cv2.resize(local.astype(np.float32), seen.mask.shape[::-1]), -1, 0) / len(_OVERVIEWS)
     return lean
@@ -203,14 +204,14 @@ def _log_factor(light: Floats, seen: Cues) -> Floats:
     factor = np.log((light + FLOOR) / (np.maximum(seen.radiance, 0) + FLOOR))
     near, far = (
         _masked_filter(factor, known, kernel, 1e-3, cv2.BORDER_CONSTANT)
-        for kernel in (augmentation.BINOMIAL, cv2.getGaussianKernel(9, 2).astype(np.float32))
+        for kernel in (sizes_and_positions.BINOMIAL, cv2.getGaussianKernel(9, 2).astype(np.float32))
     )
     return np.where(known[..., None], near, far)
 
 
 def _smooth_gloss(image: Floats, mask: Bools) -> Floats:
     """Remove the network's grid artifact of one or two pixels from a map (H, W[, 3]) inside the mask."""
-    smooth = _masked_filter(image, mask, augmentation.BINOMIAL, REACHED)
+    smooth = _masked_filter(image, mask, sizes_and_positions.BINOMIAL, REACHED)
     return np.where(mask if image.ndim == 2 else mask[..., None], smooth, image)
 
 

@@ -18,9 +18,10 @@ from itertools import pairwise, product
 import cv2
 import numpy as np
 
-from polcap.images import Cues, Floats, Quality
+from polcap.images import Floats, Quality
 from polcap.optics import body, frames
 from polcap.optics.outline import disc_radius
+from polcap.stage_values import Cues
 
 _ALPHAS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 _FACTORS = (1.0, 0.9, 0.8, 0.7, 0.5)  # on the polarization, everywhere

@@ -18,20 +18,11 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from polcap.chart_values import ColorCalibration
 from polcap.errors import ObjectError
-from polcap.images import (
-    Alignment,
-    AngleStack,
-    Bits,
-    Bools,
-    ColorCalibration,
-    Floats,
-    Network,
-    ObjectMask,
-    Quality,
-    RunNetwork,
-)
+from polcap.images import Bits, Bools, Floats, Quality
 from polcap.optics.warp import warp
+from polcap.stage_values import Alignment, AngleStack, Network, ObjectMask, RunNetwork
 from polcap.stages import stage
 from polcap.stages.mask import backdrop, bright_parts, graph_cut, mask_border, regions
 from polcap.stages.mask.network import object_probability

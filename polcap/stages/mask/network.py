@@ -9,10 +9,12 @@ import cv2
 import numpy as np
 
 from polcap import parallel
-from polcap.images import Alignment, AngleStack, Bits, ColorCalibration, Floats, Network, RunNetwork
+from polcap.chart_values import ColorCalibration
+from polcap.images import Bits, Floats
 from polcap.optics import mueller
 from polcap.optics.resize import area_mean
 from polcap.optics.warp import warp
+from polcap.stage_values import Alignment, AngleStack, Network, RunNetwork
 from polcap.stages.mask.mask_channels import SIZE_MULTIPLE, ReducedPicture, brightness, encode, mirror
 from polcap.stages.mask.regions import Box, box_around
 

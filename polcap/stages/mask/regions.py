@@ -1,4 +1,4 @@
-"""Connected regions of the object's mask: removes specks, fills holes, and measures the result."""
+"""From probabilities to a mask: their threshold, and connected regions without specks and holes."""
 
 import cv2
 import numpy as np

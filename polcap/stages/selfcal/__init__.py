@@ -18,20 +18,13 @@ import numpy as np
 from msgspec import Meta
 
 from polcap import parallel
+from polcap.capture_values import AngleStatement
+from polcap.chart_values import ColorCalibration
 from polcap.errors import CaptureError
-from polcap.images import (
-    Alignment,
-    AngleStack,
-    AngleStatement,
-    ColorCalibration,
-    Floats,
-    Gains,
-    ObjectMask,
-    RingZero,
-    SelfCalibration,
-)
+from polcap.images import Floats
 from polcap.optics import frames
 from polcap.optics.outline import OutlineBand
+from polcap.stage_values import Alignment, AngleStack, Gains, ObjectMask, RingZero, SelfCalibration
 from polcap.stages import stage
 from polcap.stages.selfcal import (
     angles,

@@ -16,10 +16,12 @@ from itertools import combinations, permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats, OtherOrder, OutlineCheck, ShotOrder, TurnedShot
+from polcap.capture_values import ShotOrder
+from polcap.images import Floats
 from polcap.optics import mueller, outline
 from polcap.optics.outline import OutlineBand
 from polcap.optics.robust import biweight, jackknife, spread
+from polcap.stage_values import OtherOrder, OutlineCheck, TurnedShot
 from polcap.stages.selfcal.object_gains import ObjectShots
 
 # Order and sense.

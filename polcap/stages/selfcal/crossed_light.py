@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, Quality
+from polcap.chart_values import ColorCalibration
+from polcap.images import Floats, Quality
 from polcap.optics import crossing, mueller
 from polcap.optics.warp import warp
+from polcap.stage_values import Alignment, AngleStack
 from polcap.stages.selfcal import grey_patches
 from polcap.stages.selfcal.object_gains import ObjectShots
 

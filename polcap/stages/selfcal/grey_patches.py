@@ -10,8 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polcap.images import Alignment, AngleStack, ColorCalibration, Floats, MaskedImage, Quality
+from polcap.chart_values import ColorCalibration
+from polcap.images import Floats, MaskedImage, Quality
 from polcap.optics.projection import pixels_inside, transform_points
+from polcap.stage_values import Alignment, AngleStack
 
 _GREYS = (18, 19, 20, 21, 22, 23)  # white to black
 _LIGHT = 4  # number of light patches, used for the gains; the two dark ones reflect 9 and 3 % and are mostly noise

@@ -25,12 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import parallel
-from polcap.images import Alignment, AngleStack, Bits, Bools, Floats, ObjectMask, Quality
+from polcap.images import Bits, Bools, Floats, Quality
 from polcap.optics import frames, mueller
 from polcap.optics.morphology import erode
 from polcap.optics.outline import OutlineBand
 from polcap.optics.robust import biweight, jackknife, spread
 from polcap.optics.warp import warp
+from polcap.stage_values import Alignment, AngleStack, ObjectMask
 
 # widths of the mean shift, in S1/S0; with 0.01 as the last, a vase errs 12 × (decision 6)
 _KERNELS = (0.04, 0.02, 0.01, 0.007, 0.005)

@@ -15,11 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats, RingZero
+from polcap.images import Bools, Floats
 from polcap.optics import mueller, outline
 from polcap.optics.morphology import masked_mean
 from polcap.optics.resize import area_mean
 from polcap.optics.robust import jackknife
+from polcap.stage_values import RingZero
 from polcap.stages.selfcal import integrability
 from polcap.stages.selfcal.object_gains import weighted_mean
 

@@ -13,22 +13,10 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import CaptureError
-from polcap.images import (
-    Alignment,
-    AngleStack,
-    Bits,
-    Bools,
-    Distortion,
-    Floats,
-    MaskedImage,
-    ObjectMask,
-    Quality,
-    SelfCalibration,
-    StokesImage,
-    View,
-)
+from polcap.images import Bits, Bools, Distortion, Floats, MaskedImage, Quality, View
 from polcap.optics import crossing, distortion, frames, fresnel, mueller
 from polcap.optics.warp import covered, warp
+from polcap.stage_values import Alignment, AngleStack, ObjectMask, SelfCalibration, StokesImage
 from polcap.stages import stage
 from polcap.stages.stokes.reference_detail import reference_detail
 

@@ -22,9 +22,11 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import ObjectError
-from polcap.images import Floats, ReliefMesh, SurfaceMaps
+from polcap.images import Floats
+from polcap.mesh_values import ReliefMesh
 from polcap.optics.projection import back_project
 from polcap.optics.vertex_frames import vertex_frames
+from polcap.stage_values import SurfaceMaps
 from polcap.stages import stage
 from polcap.stages.surface import triangles
 from polcap.stages.surface.decimation import DecimatedMesh, decimate

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats, SurfaceMaps, View
+from polcap.images import Bools, Floats, View
 from polcap.optics.frames import dot
 from polcap.optics.outline import disc_radius
 from polcap.optics.projection import ray_slopes
+from polcap.stage_values import SurfaceMaps
 
 _LEAST_SIGMA_DEG = 1.0  # expected errors below count as this
 _SIGMA_RANGE_DEG = (1.0, 20.0)  # of the median error that scales all residuals

@@ -2,8 +2,8 @@
 
 The chart is searched in 8-bit gamma pictures of the merged radiance (`chart_search`), and located to a fraction of a
 pixel in the radiance itself (`chart`). Its patches are sampled in the linear radiance (`patches`). A candidate is
-accepted only if detector, drawn model and colors all agree with a ColorChecker Classic. `optics/color.fit_matrix`
-solves for the color matrix.
+accepted only if detector, drawn model and colors all agree with a ColorChecker Classic. `color_matrix` solves for the
+color matrix.
 
 References
 ----------
@@ -18,18 +18,11 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from polcap.chart_values import ChartPlace, ChartReference, ChartRequest, ColorCalibration, PatchColors
 from polcap.errors import ChartError
-from polcap.images import (
-    AngleStack,
-    ChartPlace,
-    ChartReference,
-    ChartRequest,
-    ColorCalibration,
-    Floats,
-    PatchColors,
-    View,
-)
+from polcap.images import Floats, View
 from polcap.optics.projection import to_grid
+from polcap.stage_values import AngleStack
 from polcap.stages import stage
 from polcap.stages.whitebalance import chart, chart_light, chart_search, patches
 from polcap.stages.whitebalance.chart import Placement

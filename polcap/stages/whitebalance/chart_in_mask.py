@@ -3,8 +3,10 @@
 import cv2
 import numpy as np
 
+from polcap.chart_values import ChartReference
 from polcap.errors import ChartError
-from polcap.images import AngleStack, Bools, ChartReference
+from polcap.images import Bools
+from polcap.stage_values import AngleStack
 from polcap.stages.whitebalance import chart, patches
 
 _LEAST_SHARE = 0.05  # of the mask; smaller parts do little harm

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polcap.images import ChartLight, Floats, View
+from polcap.chart_values import ChartLight
+from polcap.images import Floats, View
 from polcap.optics import point_light
 from polcap.stages.whitebalance import chart, patches
 from polcap.stages.whitebalance.chart import Placement

@@ -9,11 +9,11 @@ from enum import IntEnum
 
 import numpy as np
 
+from polcap.chart_values import ChartReference
 from polcap.errors import ChartError
-from polcap.images import Bits, Bools, ChartReference, Floats, Quality
-from polcap.optics import color
+from polcap.images import Bits, Bools, Floats, Quality
 from polcap.optics.projection import pixels_inside
-from polcap.stages.whitebalance import chart
+from polcap.stages.whitebalance import chart, color_matrix
 from polcap.stages.whitebalance.chart import Placement
 
 WHITE = 18  # index of the white patch, the first of six greys
@@ -39,7 +39,7 @@ class PatchUse(IntEnum):
 class ChartFit:
     """Color matrix that was fitted to the patches of a chart in one shot."""
 
-    fit: color.MatrixFit
+    fit: color_matrix.MatrixFit
     use: Bits  # (24,) PatchUse
     mean: float  # mean ΔE2000 of all unclipped patches, excluded ones too: decides whether it is a chart
     color: Floats  # (24, 3) S0 of the patches, camera channels
@@ -75,12 +75,12 @@ def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
             f"{uneven} partly hidden or in shade), more than the {24 - _LEAST} allowed"
         )
         raise ChartError(f"{why}; add a shorter exposure to the bracket, or show the whole chart", why)
-    error = color.trimmed_residuals(seen, reference.rec709, position(), use == PatchUse.USED)
+    error = color_matrix.trimmed_residuals(seen, reference.rec709, position(), use == PatchUse.USED)
     odd = error > max(_LEAST_ODD, _ODD * float(np.median(error[use == PatchUse.USED])))
     use = np.where((use == PatchUse.USED) & odd, PatchUse.ODD, use).astype(np.uint8)
     if (use == PatchUse.USED).sum() < _LEAST:  # no matrix fits most patches: use all
         use = np.where(use == PatchUse.ODD, PatchUse.USED, use).astype(np.uint8)
-    found = color.fit_matrix(seen, reference.rec709, position(), use == PatchUse.USED)
+    found = color_matrix.fit_matrix(seen, reference.rec709, position(), use == PatchUse.USED)
     every = np.where(use == PatchUse.ODD, np.minimum(error, _MOST_COUNTED), found.delta_e)
     return ChartFit(found, use, float(np.nanmean(every)), seen)
 
@@ -88,7 +88,7 @@ def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
 def cross_validate(found: ChartFit, reference: ChartReference) -> Floats | None:
     """Color error ΔE2000 (24,) of each patch under the matrix fitted to all others; None for too few patches."""
     used = found.use == PatchUse.USED
-    return color.cross_validate(found.color, reference.rec709, position(), used) if used.sum() > _LEAST else None
+    return color_matrix.cross_validate(found.color, reference.rec709, position(), used) if used.sum() > _LEAST else None
 
 
 def residual(found: ChartFit, reference: ChartReference) -> float:
@@ -97,7 +97,7 @@ def residual(found: ChartFit, reference: ChartReference) -> float:
     It compares editions of the chart.
     """
     used = found.use == PatchUse.USED
-    return float(np.nanmean(color.fit_matrix(found.color, reference.rec709, position(), used).delta_e))
+    return float(np.nanmean(color_matrix.fit_matrix(found.color, reference.rec709, position(), used).delta_e))
 
 
 def position() -> Floats:
@@ -107,7 +107,7 @@ def position() -> Floats:
 
 def fit_with_surroundings(
     found: ChartFit, around: PatchSamples, reference: ChartReference
-) -> tuple[color.MatrixFit, Floats]:
+) -> tuple[color_matrix.MatrixFit, Floats]:
     """Fit the color matrix to all patches of a large chart: the 24 of its block `found` and the M `around` it.
 
     A surrounding patch is used if it agrees with the matrix of the block, because a chart may be partly hidden. If less
@@ -117,13 +117,13 @@ def fit_with_surroundings(
     others = reference.surroundings
     assert others is not None
     at = others.center - chart.centers()[WHITE]
-    error = color.residuals(found.fit, around.color, others.rec709, at)
+    error = color_matrix.residuals(found.fit, around.color, others.rec709, at)
     most = max(_LEAST_ODD, _ODD * float(np.nanmedian(found.fit.delta_e)))
     agree = (around.use == PatchUse.USED) & (error < most)
     agree &= agree.mean() >= _LEAST_SURROUNDINGS
     seen, known = np.vstack([found.color, around.color]), np.vstack([reference.rec709, others.rec709])
     arguments = (seen, known, np.vstack([position(), at]), np.concatenate([found.use == PatchUse.USED, agree]))
-    return color.fit_matrix(*arguments), color.cross_validate(*arguments)[:24]
+    return color_matrix.fit_matrix(*arguments), color_matrix.cross_validate(*arguments)[:24]
 
 
 def sample(value: Floats, quality: Bits, place: Placement, share: float, at: Floats | None = None) -> PatchSamples:

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from polcap.capture_values import AngleStatement, ShotOrder
 from polcap.errors import CaptureError
 from polcap.formats.capture import reader as capture
 from polcap.formats.raw import frame_decoder
-from polcap.images import AngleStatement, ShotOrder
 from tests.formats.capture.capture_folders import flat, folders, pictures, shoot
 from tests.formats.raw.test_photo import mosaic, save
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
+from polcap.capture_values import Exif
 from polcap.formats.capture import focal_length
-from polcap.images import Exif
 
 
 def test_sensor_table_makes_a_stated_focal_length_known() -> None:

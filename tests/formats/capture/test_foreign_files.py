@@ -8,9 +8,9 @@ from typing import Literal
 import pytest
 
 from polcap.calibrate import calibration_photographs
+from polcap.capture_values import Capture
 from polcap.errors import InputError
 from polcap.formats.capture import foreign_files, reader
-from polcap.images import Capture
 from tests.formats.capture.capture_folders import flat, folders, names, pictures, shoot
 
 Form = Literal["NFC", "NFD"]

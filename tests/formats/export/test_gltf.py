@@ -17,7 +17,7 @@ from polcap.errors import SettingError
 from polcap.formats.export import glb_geometry, gltf
 from polcap.formats.export.encoders import Kind
 from polcap.formats.export.glb_geometry import Geometry
-from polcap.images import Asset, Mesh
+from polcap.mesh_values import Asset, Mesh
 from tests import surfaces
 
 NODE = Path(__file__).parents[2] / "gltf"

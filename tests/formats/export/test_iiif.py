@@ -13,7 +13,8 @@ import pytest
 from polcap.errors import SettingError
 from polcap.formats.export import iiif, relightable_layer
 from polcap.formats.export.texture_set import Texture
-from polcap.images import Asset, Floats, ReliefMesh
+from polcap.images import Floats
+from polcap.mesh_values import Asset, ReliefMesh
 from polcap.optics import color, shade
 from polcap.stages import asset
 from tests import surfaces

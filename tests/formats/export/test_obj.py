@@ -10,7 +10,7 @@ import trimesh
 from polcap.formats.export import gltf, obj
 from polcap.formats.export.texture_set import LOOSE, Key
 from polcap.formats.maps import exr
-from polcap.images import Asset
+from polcap.mesh_values import Asset
 from tests import surfaces
 
 

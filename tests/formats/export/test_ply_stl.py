@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from polcap.formats.export import gltf, ply_stl
-from polcap.images import Asset
+from polcap.mesh_values import Asset
 from tests import surfaces
 
 

@@ -12,7 +12,7 @@ from polcap.errors import SettingError
 from polcap.formats.export import encoders, gltf, materialx, texture_set, usd
 from polcap.formats.export.texture_set import LOOSE, Key
 from polcap.formats.maps import exr
-from polcap.images import Asset
+from polcap.mesh_values import Asset
 from polcap.optics import color
 from tests import surfaces
 

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from polcap.chart_values import ColorCalibration
 from polcap.errors import DecodeError, StorageError
 from polcap.formats.maps import exr, png, result_maps
 from polcap.formats.maps import maps_folder as maps
-from polcap.images import ColorCalibration, Cues, ReliefMesh, StokesImage, SurfaceMaps
+from polcap.mesh_values import ReliefMesh
 from polcap.results import Results
+from polcap.stage_values import Cues, StokesImage, SurfaceMaps
 from polcap.stages import cues
 from tests import surfaces
 

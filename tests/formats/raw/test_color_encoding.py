@@ -12,9 +12,9 @@ import OpenImageIO as oiio
 import pytest
 from numpy.typing import NDArray
 
+from polcap.capture_values import FrameReading
 from polcap.errors import DecodeError
 from polcap.formats.raw import photo, probe
-from polcap.images import FrameReading
 from polcap.optics.color import encode_srgb
 from tests.formats import headers
 from tests.formats.raw.test_photo import save

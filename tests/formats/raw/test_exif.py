@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from polcap.capture_values import Exif
 from polcap.errors import DecodeError, SettingError
 from polcap.formats.raw import exif, file_checks, file_kind, probe
 from polcap.formats.raw import libraw as raw
-from polcap.images import Exif
 from tests.formats import headers
 from tests.formats.headers import DATA, EXIF_IFD, SUB_IFDS, needs_data
 

@@ -5,9 +5,9 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from polcap.capture_values import FrameReading
 from polcap.errors import DecodeError
 from polcap.formats.raw import photo, probe
-from polcap.images import FrameReading
 from polcap.optics import color
 from tests.formats import headers
 from tests.formats.headers import DATA, needs_data

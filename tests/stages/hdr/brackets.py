@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from polcap.images import Capture, Exif, Frame, Quality, SensorImage, Shot
+from polcap.capture_values import Capture, Exif, Frame, Shot
+from polcap.images import Quality, SensorImage
 from polcap.stages import hdr
 from polcap.stages.hdr.planes import in_memory, planar
 

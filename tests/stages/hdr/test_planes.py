@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from polcap.capture_values import Exif
 from polcap.errors import SettingError
-from polcap.images import Exif, SensorImage
+from polcap.images import SensorImage
 from polcap.stages import hdr
 from polcap.stages.hdr import planes
 from tests.stages.hdr.brackets import (

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from polcap.errors import ModelError
-from polcap.images import Cues, Floats, View
+from polcap.images import Floats, View
 from polcap.optics import frames
 from polcap.pipeline import models
+from polcap.stage_values import Cues
 from polcap.stages.infer import fine
 from tests.fake_network import FakeNetwork, run
 

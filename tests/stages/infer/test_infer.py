@@ -6,12 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
+from polcap.capture_values import ShotOrder
 from polcap.errors import ModelError
-from polcap.images import OutlineCheck, Quality, ShotOrder
+from polcap.images import Quality
 from polcap.optics import frames
 from polcap.pipeline import models
+from polcap.stage_values import OutlineCheck
 from polcap.stages import cues, infer, stokes
-from polcap.stages.infer import analytic, augmentation, fine, learned
+from polcap.stages.infer import analytic, fine, learned
+from polcap.stages.infer.sizes_and_positions import _turn, _turn_vectors, _without_grid, predict
 from polcap.stages.selfcal.angles import other_orders
 from tests import scenes
 from tests.fake_network import FakeNetwork, run
@@ -193,14 +196,14 @@ def test_a_grid_of_the_network_does_not_reach_the_normals_and_relief_does():
     relief = 0.15 * np.sin(2 * np.pi * x / 7) + 0.05 * np.sin(2 * np.pi * y / 3)
     grid = 0.05 * np.where((x % 2 == 0) & (y % 2 == 1), 1.0, -0.3) * (x / 160)
     clean, seen_ = (np.stack([relief + part, 0 * x, 1 + 0 * x], axis=-1) * mask[..., None] for part in (0 * x, grid))
-    found = augmentation._without_grid(seen_, mask)
+    found = _without_grid(seen_, mask)
     core = cv2.erode(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     before, after = (np.sqrt(np.mean((n - clean)[core] ** 2)) for n in (seen_, found))
     pattern = (np.bincount(((x % 2) + 2 * (y % 2))[core], (n - clean)[..., 0][core]) for n in (seen_, found))
     uneven, even = (np.ptp(sums) for sums in pattern)
     assert even < 0.1 * uneven and after < before
-    assert np.array_equal(augmentation._without_grid(seen_ + 1, mask)[~mask], (seen_ + 1)[~mask].astype(np.float32))
-    bare = augmentation._without_grid(clean, mask)
+    assert np.array_equal(_without_grid(seen_ + 1, mask)[~mask], (seen_ + 1)[~mask].astype(np.float32))
+    bare = _without_grid(clean, mask)
     assert np.sqrt(np.mean((bare - clean)[core] ** 2)) < 0.02 * np.std(relief)
 
 
@@ -277,22 +280,22 @@ def test_averaged_over_turns_a_turned_object_gets_the_turned_maps(quarters: int,
     moved = dataclasses.replace(
         found,
         **{
-            name: np.ascontiguousarray(augmentation._turn(getattr(found, name), quarters, mirror))
+            name: np.ascontiguousarray(_turn(getattr(found, name), quarters, mirror))
             for name in ("radiance", "ratio_sigma", "dolp", "mask", "quality", "rays")
         },
         **{
             name: (-1.0) ** quarters * np.stack([
-                augmentation._turn(getattr(found, name)[0], quarters, mirror),
-                (-1 if mirror else 1) * augmentation._turn(getattr(found, name)[1], quarters, mirror),
+                _turn(getattr(found, name)[0], quarters, mirror),
+                (-1 if mirror else 1) * _turn(getattr(found, name)[1], quarters, mirror),
             ])
             for name in ("ratio", "normalized_stokes")
         },
     )  # fmt: skip
-    moved.rays[..., :2] = augmentation._turn_vectors(moved.rays[..., :2], quarters, mirror)
-    whole, turned = (augmentation.predict([c], lopsided(), run, 8) for c in (found, moved))
-    np.testing.assert_allclose(turned["depth"], augmentation._turn(whole["depth"], quarters, mirror), atol=1e-4)
-    expected = np.array(augmentation._turn(whole["normal"], quarters, mirror))
-    expected[..., :2] = augmentation._turn_vectors(expected[..., :2], quarters, mirror)
+    moved.rays[..., :2] = _turn_vectors(moved.rays[..., :2], quarters, mirror)
+    whole, turned = (predict([c], lopsided(), run, 8) for c in (found, moved))
+    np.testing.assert_allclose(turned["depth"], _turn(whole["depth"], quarters, mirror), atol=1e-4)
+    expected = np.array(_turn(whole["normal"], quarters, mirror))
+    expected[..., :2] = _turn_vectors(expected[..., :2], quarters, mirror)
     np.testing.assert_allclose(turned["normal"], expected, atol=1e-4)
 
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from polcap.images import Cues, Floats, View
+from polcap.images import Floats, View
 from polcap.optics import body, frames, fresnel
+from polcap.stage_values import Cues
 from polcap.stages.infer.zenith import estimate_zenith
 
 RADIUS, SIZE = 70, 160

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as with_setting
 
-from polcap.images import AngleStack, Bools, Quality
+from polcap.images import Bools, Quality
+from polcap.stage_values import AngleStack
 from polcap.stages import mask
 from polcap.stages.mask import MaskSettings, backdrop
 from tests.fusion import board_views

@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from polcap.images import AngleStack, Bools, ColorCalibration, Floats, ObjectMask, SelfCalibration
+from polcap.chart_values import ColorCalibration
+from polcap.images import Bools, Floats
 from polcap.optics import body, mueller
+from polcap.stage_values import AngleStack, ObjectMask, SelfCalibration
 from polcap.stages import selfcal
 from tests import scenes
 

@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from polcap.capture_values import ShotOrder
 from polcap.errors import CaptureError
-from polcap.images import Equipment, OutlineCheck, ShotOrder
 from polcap.optics import mueller
 from polcap.optics.outline import OutlineBand
+from polcap.stage_values import Equipment, OutlineCheck
 from polcap.stages import stokes
 from polcap.stages.selfcal import angles as angles_
 from polcap.stages.selfcal import unknown_angles

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polcap.images import Bits, ChartPlace, ColorCalibration, PatchColors
+from polcap.chart_values import ChartPlace, ColorCalibration, PatchColors
+from polcap.images import Bits
 from polcap.quality import shot_exposure
 from polcap.quality.gate import Evidence
 from polcap.quality.limits import GateLimits

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from polcap.images import Equipment
+from polcap.stage_values import Equipment
 from polcap.stages.selfcal.object_gains import GainEstimate, with_prior
 from tests import scenes
 from tests.stages.selfcal.shapes import solve

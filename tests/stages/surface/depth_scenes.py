@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from polcap.images import Floats, ReliefMesh, SurfaceMaps, View
+from polcap.images import Floats, View
+from polcap.mesh_values import ReliefMesh
+from polcap.stage_values import SurfaceMaps
 
 VIEW = View(focal=400.0, center=(63.5, 55.5), scale=2.0)
 SHAPE = (112, 128)

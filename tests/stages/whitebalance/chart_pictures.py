@@ -5,9 +5,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from polcap.chart_values import ChartRequest
 from polcap.formats import shipped_data
-from polcap.images import AngleStack, ChartRequest, ColorSensor, Floats, Quality, View, single_frames
+from polcap.images import Floats, Quality, View
 from polcap.optics.projection import transform_points
+from polcap.stage_values import AngleStack, ColorSensor, single_frames
 
 CLASSIC = shipped_data.colorchecker()
 CAMERA = np.array([[0.28, 0.10, 0.07], [0.08, 0.71, 0.22], [0.02, 0.18, 0.66]])  # linear Rec.709 → S0 in camera

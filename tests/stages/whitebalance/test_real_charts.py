@@ -9,9 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+from polcap.chart_values import ChartReference, ColorCalibration
 from polcap.errors import ChartError
-from polcap.images import AngleStack, ChartReference, ColorCalibration, Floats, View
+from polcap.images import Floats, View
 from polcap.optics.color import decode_srgb
+from polcap.stage_values import AngleStack
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import WhitebalanceSettings
 from tests.stages.whitebalance.chart_pictures import AUTO, CLASSIC, stack

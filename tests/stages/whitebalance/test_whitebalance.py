@@ -8,10 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from polcap.chart_values import ChartReference, ChartRequest, ColorCalibration
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
-from polcap.images import AngleStack, ChartReference, ChartRequest, ColorCalibration, ColorSensor, Floats, View
+from polcap.images import Floats, View
 from polcap.optics.projection import transform_points
+from polcap.stage_values import AngleStack, ColorSensor
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import WhitebalanceSettings, chart, chart_in_mask, patches
 from tests.stages.whitebalance.chart_pictures import AUTO, CAMERA, CLASSIC, HEIGHT, WIDTH, draw, photograph, pose, stack

@@ -39,9 +39,7 @@ Arrays = dict[str, NDArray[Any]]
 Answer = tuple[dict[str, Any], Arrays]
 _LENGTH = struct.Struct("<Q")
 _READY = b"ready"  # the child has imported the function's module: its time starts to count
-_CHILD = (
-    "import sys; sys.path[:] = sys.argv[2:]; from polcap.formats.raw import worker; worker.serve(float(sys.argv[1]))"
-)
+_CHILD = "import sys; sys.path[:] = sys.argv[2:]; from polcap.formats import sandbox; sandbox.serve(float(sys.argv[1]))"
 
 
 class _Head(msgspec.Struct):
@@ -68,7 +66,7 @@ class ChildBug(RuntimeError):
     """
 
 
-class Worker:
+class Sandbox:
     """A child process that runs one function on one file at a time; it is started again after it died."""
 
     def __init__(self, timeout_s: float = TIMEOUT_S, memory_gib: float = MEMORY_GIB) -> None:
@@ -89,7 +87,7 @@ class Worker:
         """Run `function(path, **options)` in the child process and return its answer.
 
         The function must be at the top level of a module, the options plain JSON values. `limit_s` is a time limit
-        shorter than the worker's.
+        shorter than the sandbox's.
 
         Raises DecodeError: the function refused the file, crashed, or exceeded its time or memory.
         Raises ChildBug: the function has a defect.
@@ -212,7 +210,7 @@ class Worker:
         return f"the decoder {cause.strip()}; the file is damaged, copy it from the card again"
 
 
-_idle: list[Worker] = []
+_idle: list[Sandbox] = []
 _hold = threading.Lock()
 if hasattr(os, "register_at_fork"):  # a fork must not share the pipes
     os.register_at_fork(after_in_child=_idle.clear)
@@ -223,19 +221,19 @@ def call(
 ) -> Answer:
     """Run a function on an untrusted file in a child process: an idle one, or a new one for each thread."""
     with _hold:
-        worker = _idle.pop() if _idle else Worker()
+        sandbox = _idle.pop() if _idle else Sandbox()
     try:
-        return worker.call(function, path, limit_s=limit_s, **options)
+        return sandbox.call(function, path, limit_s=limit_s, **options)
     finally:
         with _hold:
-            _idle.append(worker)
+            _idle.append(sandbox)
 
 
 @atexit.register
 def end_idle() -> None:
     """End all idle child processes; the next call starts another one."""
-    for worker in _idle:
-        worker.close()
+    for sandbox in _idle:
+        sandbox.close()
 
 
 def serve(memory_gib: float) -> None:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import rawpy
 
+from polcap.capture_values import Exif
 from polcap.errors import StorageError
-from polcap.formats.raw import dng
-from polcap.images import Exif
+from polcap.formats import dng_writer
 
 EXIF = Exif(
     make="Polcap",
@@ -34,7 +34,7 @@ MATRIX = np.array([[0.9, -0.29, -0.07], [-0.45, 1.24, 0.23], [-0.09, 0.19, 0.71]
 
 
 def write(path: Path, mosaic: np.ndarray, phase: str = "RGGB", **exif: object) -> Path:
-    dng.write(
+    dng_writer.write(
         path,
         mosaic,
         cfa=np.array(PHASES[phase], np.uint8),

@@ -1,4 +1,4 @@
-"""The decode worker: a failure of the child is one error in the parent, and the next file is read."""
+"""The sandbox: a failure of the child is one error in the parent, and the next file is read."""
 
 import importlib
 import os
@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from polcap.errors import ChartError, DecodeError
-from polcap.formats.raw.worker import ChildBug, Worker
+from polcap.formats.sandbox import ChildBug, Sandbox
 
 FUNCTIONS = """
     import os, time
     import numpy as np
     from polcap.errors import ChartError
-    from polcap.formats.raw import worker
+    from polcap.formats import sandbox
 
     def ramp(path, count=12):
         print("a library chatters on stdout")
@@ -56,8 +56,8 @@ FUNCTIONS = """
         raise RuntimeError("a defect")
 
     def answer(path, text):
-        send = worker._send
-        worker._send = lambda pipe, message: send(pipe, text.encode())
+        send = sandbox._send
+        sandbox._send = lambda pipe, message: send(pipe, text.encode())
         return {}, {}
 
     def stopped(path):
@@ -65,29 +65,29 @@ FUNCTIONS = """
 """
 
 
-class Misled(Worker):
-    """A worker with a module of misbehaving functions."""
+class Misled(Sandbox):
+    """A sandbox with a module of misbehaving functions."""
 
     module: ModuleType
 
 
 @pytest.fixture
-def worker(tmp_path, monkeypatch):
+def sandbox(tmp_path, monkeypatch):
     (tmp_path / "misbehaving.py").write_text(textwrap.dedent(FUNCTIONS))
     monkeypatch.syspath_prepend(tmp_path)
-    worker = Misled(timeout_s=300, memory_gib=1.5)
-    worker.module = importlib.import_module("misbehaving")
-    yield worker
+    sandbox = Misled(timeout_s=300, memory_gib=1.5)
+    sandbox.module = importlib.import_module("misbehaving")
+    yield sandbox
     sys.modules.pop("misbehaving")
-    worker.close()
+    sandbox.close()
 
 
-def pid(worker):
-    return worker.call(worker.module.ramp, "next.raw")[0]["pid"]
+def pid(sandbox):
+    return sandbox.call(sandbox.module.ramp, "next.raw")[0]["pid"]
 
 
-def test_arrays_come_back_as_they_were(worker):
-    meta, arrays = worker.call(worker.module.ramp, "a.raw", count=8)
+def test_arrays_come_back_as_they_were(sandbox):
+    meta, arrays = sandbox.call(sandbox.module.ramp, "a.raw", count=8)
     assert meta["path"] == "a.raw" and meta["pid"] != os.getpid()
     np.testing.assert_array_equal(arrays["ramp"], [[0, 2], [4, 6]])
     assert arrays["ramp"].dtype == np.uint16 and arrays["ramp"].flags.writeable
@@ -95,17 +95,17 @@ def test_arrays_come_back_as_they_were(worker):
     assert arrays["bits"].tolist() == [[True, False]]
 
 
-def test_one_child_serves_several_files(worker):
-    assert pid(worker) == pid(worker)
+def test_one_child_serves_several_files(sandbox):
+    assert pid(sandbox) == pid(sandbox)
 
 
-def test_a_child_imports_no_modules_from_inside_a_package(worker, tmp_path, monkeypatch):
+def test_a_child_imports_no_modules_from_inside_a_package(sandbox, tmp_path, monkeypatch):
     package = tmp_path / "package"
     package.mkdir()
     (package / "__init__.py").touch()
     (package / "typing.py").write_text("raise ImportError('not the typing of Python')")  # as OpenCV has one
     monkeypatch.setattr(sys, "path", [str(package), *sys.path])
-    assert worker.call(worker.module.ramp, "next.raw")[0]["path"] == "next.raw"
+    assert sandbox.call(sandbox.module.ramp, "next.raw")[0]["path"] == "next.raw"
 
 
 @pytest.mark.parametrize(
@@ -120,10 +120,10 @@ def test_a_child_imports_no_modules_from_inside_a_package(worker, tmp_path, monk
         ("stopped", None, "the system ended the decoder, most often for lack of memory"),
     ],
 )
-def test_a_failure_names_the_file_and_the_next_file_is_read(worker, function, limit_s, message):
+def test_a_failure_names_the_file_and_the_next_file_is_read(sandbox, function, limit_s, message):
     with pytest.raises(DecodeError, match=rf"broken\.raw: .*{message}"):
-        worker.call(getattr(worker.module, function), "broken.raw", limit_s=limit_s)
-    assert pid(worker)
+        sandbox.call(getattr(sandbox.module, function), "broken.raw", limit_s=limit_s)
+    assert pid(sandbox)
 
 
 @pytest.mark.parametrize(
@@ -142,37 +142,37 @@ def test_a_failure_names_the_file_and_the_next_file_is_read(worker, function, li
         '{"meta": {}, "arrays": [["a", "f4,(", [1]]]}',
     ],
 )
-def test_a_malformed_answer_is_an_error_of_the_file(worker, text):
+def test_a_malformed_answer_is_an_error_of_the_file(sandbox, text):
     with pytest.raises(DecodeError, match=r"broken\.raw: the decoder's answer is damaged"):
-        worker.call(worker.module.answer, "broken.raw", text=text)
-    assert pid(worker)
+        sandbox.call(sandbox.module.answer, "broken.raw", text=text)
+    assert pid(sandbox)
 
 
-def test_an_error_without_a_class_is_an_error_of_the_file(worker):
+def test_an_error_without_a_class_is_an_error_of_the_file(sandbox):
     with pytest.raises(DecodeError, match=r"broken\.raw: no picture"):
-        worker.call(worker.module.answer, "broken.raw", text='{"error": "no picture"}')
+        sandbox.call(sandbox.module.answer, "broken.raw", text='{"error": "no picture"}')
 
 
-def test_an_error_of_the_function_keeps_its_class_and_its_child(worker):
-    before = pid(worker)
+def test_an_error_of_the_function_keeps_its_class_and_its_child(sandbox):
+    before = pid(sandbox)
     with pytest.raises(ChartError, match=r"^a\.raw: no chart$"):
-        worker.call(worker.module.refuse, "a.raw")
-    assert pid(worker) == before
+        sandbox.call(sandbox.module.refuse, "a.raw")
+    assert pid(sandbox) == before
 
 
-def test_a_defect_of_our_own_is_a_bug_with_the_childs_traceback(worker):
+def test_a_defect_of_our_own_is_a_bug_with_the_childs_traceback(sandbox):
     with pytest.raises(ChildBug, match=r"odd\.raw: RuntimeError: a defect") as caught:
-        worker.call(worker.module.mistake, "odd.raw")
+        sandbox.call(sandbox.module.mistake, "odd.raw")
     assert 'raise RuntimeError("a defect")' in caught.value.__notes__[0]
-    assert pid(worker)
+    assert pid(sandbox)
 
 
 @pytest.mark.parametrize("loop", ["spin", "hang"])
-def test_a_child_in_a_loop_ends_when_its_parent_was_killed(worker, tmp_path, loop):
+def test_a_child_in_a_loop_ends_when_its_parent_was_killed(sandbox, tmp_path, loop):
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); import misbehaving\n"
-        "from polcap.formats.raw.worker import Worker\n"
-        "w = Worker(); print(w.call(misbehaving.ramp, 'a')[0]['pid'], flush=True)\n"
+        "from polcap.formats.sandbox import Sandbox\n"
+        "w = Sandbox(); print(w.call(misbehaving.ramp, 'a')[0]['pid'], flush=True)\n"
         f"w.call(misbehaving.{loop}, 'b', limit_s=2)"
     )
     parent = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)

@@ -12,9 +12,10 @@ import numpy as np
 
 from polcap import parallel
 from polcap.errors import ModelError
-from polcap.images import Bools, Cues, Floats, Network, RunNetwork
+from polcap.images import Bools, Floats
 from polcap.optics import frames
 from polcap.optics.morphology import erode
+from polcap.stage_values import Cues, Network, RunNetwork
 from polcap.stages.cues import CHANNELS, channels
 from polcap.stages.infer.highlights import REACHED
 

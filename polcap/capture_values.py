@@ -1,0 +1,206 @@
+"""A capture as its folder describes it: photographs, shots, stated angles and the camera's geometry."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from msgspec import Struct
+
+from polcap.calibration_values import Calibration
+from polcap.images import NOT_IN_KEY, Floats, SensorImage
+
+Role = Literal["shot", "ambient", "repeat", "chart", "cross"]
+
+
+@dataclass(frozen=True)
+class Exif:
+    """Camera settings of one photograph from its EXIF tags; None or "" where the file has no value."""
+
+    make: str = ""
+    model: str = ""
+    lens: str = ""
+    exposure_time: float | None = None  # s
+    f_number: float | None = None
+    iso: float | None = None
+    focal_length_mm: float | None = None
+    focal_length_35mm: float | None = None  # mm, full-frame equivalent
+    pixel_pitch_um: float | None = None  # from FocalPlaneResolution, visible RAW pixels
+    taken: str = ""  # ISO 8601 with sub-seconds where known
+    flash_fired: bool | None = None
+    width: int | None = None  # visible RAW pixels
+    height: int | None = None
+    color_matrix: tuple[float, ...] | None = None  # 9, XYZ (D65 or the nearest stated illuminant) → camera
+
+    @property
+    def camera(self) -> str:
+        return f"{self.make} {self.model}".strip()
+
+    @property
+    def relative_exposure(self) -> float | None:
+        """Exposure by the camera settings [s · ISO/100 / f-number²]; not valid under flash."""
+        if self.exposure_time is None:
+            return None
+        aperture = self.f_number if self.f_number else 1.0  # a lens without electronics reports 0
+        return self.exposure_time * (self.iso or 100.0) / 100.0 / aperture**2
+
+
+@dataclass(frozen=True)
+class FrameReading:
+    """Options for reading the pixels of a frame's file."""
+
+    kind: Literal["raw", "photo"] = "raw"
+    encoding: Literal["linear", "srgb"] | None = None  # of a developed picture; None: sRGB for 8 bits, otherwise linear
+    white: float | None = None  # counts; None: from the file, or the largest value of its type
+    black: float = 0.0  # counts
+    cell: tuple[int, int] | None = None  # row, column to extract from the 2×2 cell of a polarization sensor's mosaic
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One photograph of a capture; a `Decode` function reads its pixels."""
+
+    path: str = field(metadata=NOT_IN_KEY)
+    exif: Exif
+    role: Role
+    digest: str  # of the file's bytes, then the reading options that change its pixels
+    exposure: float | None = None  # relative, from capture.toml; replaces EXIF
+    reading: FrameReading = field(default=FrameReading(), metadata=NOT_IN_KEY)
+
+
+Decode = Callable[[Frame], SensorImage]  # as `formats.raw.frame_decoder.decode`
+
+
+@dataclass(frozen=True)
+class Shot:
+    """All photographs of one polarizer angle: a bracket of exposures, and ambient frames."""
+
+    angle: float  # rad, from image x towards image up
+    frames: tuple[Frame, ...]  # (E,), darkest first by their metadata
+    ambient: tuple[Frame, ...] = ()  # flash off, same settings
+    place_px: tuple[float, float] = (0.0, 0.0)  # x, y of its pixel (0, 0) in a polarization sensor's mosaic
+
+    @property
+    def name(self) -> str:
+        return f"{np.degrees(self.angle):g}°"
+
+
+class CatalogEntry(Struct, frozen=True, forbid_unknown_fields=True):
+    """Facts for the catalog of a collection: the table `[catalog]` of capture.toml; an empty text is not stated."""
+
+    title: str = ""  # of the object
+    creator: str = ""  # person or institution that made the photographs
+    rights: str = ""  # copyright notice
+    license: str = ""  # address or name of the license
+    object_number: str = ""  # inventory number of the object
+
+
+@dataclass(frozen=True)
+class ShotOrder:
+    """A possible assignment of the stated polarizer angles to the shots: their order, and the sense of rotation."""
+
+    shots: tuple[int, ...]  # (K,) index of the stated angle of each shot
+    mirrored: bool = False  # angles count clockwise
+
+
+@dataclass(frozen=True)
+class AngleStatement:
+    """The place where a capture states the polarizer angles of its shots, to advise how to correct them."""
+
+    place: Literal["folders", "capture.toml", "file names", "order", "cells"] = "folders"
+    texts: tuple[str, ...] = ()  # (K,) folder or file that names the angle of each shot, or the angle as stated
+    cells: tuple[tuple[int, int], ...] = ()  # (K,) row, column of each shot in a polarization sensor's 2×2 cell
+    clockwise: Literal["", "stated", "calibrated"] = ""  # by the user, or by the ring's calibration
+
+    def correct(self, order: ShotOrder, angle: Floats) -> str:
+        """Advice how to correct the stated angles (K,) rad to another order and sense."""
+        if self.place == "cells":
+            return self._cells((-1 if order.mirrored else 1) * np.degrees(angle)[list(order.shots)])
+        texts = self.texts or tuple(f"{degrees:g}°" for degrees in np.degrees(angle))
+        moved = [(texts[k], texts[at]) for k, at in enumerate(order.shots) if k != at]
+        changes, many = " and ".join(f"{old} to {new}" for old, new in moved), "s" * (len(moved) > 1)
+        how = {
+            "folders": f"rename the folder{many} {changes}",
+            "file names": f"rename the file{many} {changes}",
+            "capture.toml": f"change the angle{many} in capture.toml: {changes}",
+            "order": f"give the order --angles {','.join(texts[at] for at in order.shots)}",
+        }[self.place]
+        sense = {
+            "": "add --clockwise, or clockwise = true in capture.toml",
+            "stated": "leave out --clockwise, and clockwise in capture.toml",
+            "calibrated": "repeat `polcap calibrate`: its ring counts the other way",
+        }[self.clockwise]
+        return ", and ".join([how] * bool(moved) + [sense] * order.mirrored)
+
+    def turn(self, angle: Floats, turn: float) -> str:
+        """Advice for stated angles (K,) rad that are too small by `turn` rad in all shots."""
+        if self.place != "cells":
+            return "set the ring's zero to the horizontal, or state the true angles"
+        steps = round(float(turn) / (np.pi / 4))
+        return self._cells(np.degrees(angle) + 45 * steps) if steps else "use the frame as the sensor delivers it"
+
+    @property
+    def retake(self) -> str:
+        """Advice for one shot of another angle than stated."""
+        ring = "set the ring to its mark and take the shot again, or state its true angle"
+        return self.check if self.place == "cells" else ring
+
+    @property
+    def check(self) -> str:
+        """Advice for angles that the pictures contradict, or do not confirm, without showing others."""
+        return {
+            "folders": "check the names of the folders and the ring's marks",
+            "file names": "check the names of the files and the ring's marks",
+            "capture.toml": "check the angles in capture.toml and the ring's marks",
+            "order": "check the order of the shots (--angles) and the ring's marks",
+            "cells": "check the sensor's data sheet, and state its `cells` in capture.toml",
+        }[self.place]
+
+    def _cells(self, degrees: Floats) -> str:
+        """Advice to state these angles (K,) in the cells of a polarization sensor."""
+        grid = {cell: round(float(one)) % 180 for cell, one in zip(self.cells, degrees)}
+        left = iter({0, 45, 90, 135} - set(grid.values()))
+        rows = [[grid[y, x] if (y, x) in grid else next(left) for x in (0, 1)] for y in (0, 1)]
+        return f"state the angles of the sensor's cells in capture.toml: cells = {rows}"
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture: all photographs of one object, and the camera's geometry. The input of a run."""
+
+    name: str = field(metadata=NOT_IN_KEY)
+    folder: str = field(metadata=NOT_IN_KEY)
+    shots: tuple[Shot, ...]  # (K,), the first is the reference
+    layout: Literal["folders", "toml", "flat", "sensor"]
+    focal_px: float  # in visible RAW pixels
+    focal_known: bool
+    principal_px: tuple[float, float]  # in visible RAW pixels
+    size_px: tuple[int, int]  # width, height, visible RAW pixels
+    chart_frames: tuple[Frame, ...] = ()
+    notes: tuple[str, ...] = field(default=(), metadata=NOT_IN_KEY)  # on how the folder was read, one line each
+    focal_doubt: tuple[float, float] = field(
+        default=(0.0, 0.0), metadata=NOT_IN_KEY
+    )  # ln of least, largest focal length / focal_px
+    calibration: Calibration | None = None  # of this camera, lens and filter, if measured
+    crossed: Shot | None = None  # under a polarized flash; its angle is that of the lens's polarizer
+    catalog: CatalogEntry = field(default=CatalogEntry(), metadata=NOT_IN_KEY)
+    angles: AngleStatement = AngleStatement()
+
+    @property
+    def all_shots(self) -> tuple[Shot, ...]:
+        """The capture's shots, and the cross-polarized shot if there is one."""
+        return self.shots if self.crossed is None else (*self.shots, self.crossed)
+
+    @property
+    def angle(self) -> Floats:
+        """Polarizer axes (K,) rad of the shots: as stated, or corrected by the ring's calibration."""
+        return self._turned(np.array([shot.angle for shot in self.shots]))
+
+    @property
+    def crossed_angle(self) -> float:
+        """Polarizer axis [rad] of the cross-polarized shot; NaN without one."""
+        return float("nan") if self.crossed is None else float(self._turned(np.array(self.crossed.angle)))
+
+    def _turned(self, stated: Floats) -> Floats:
+        ring = self.calibration.polarizer if self.calibration is not None else None
+        return stated if ring is None else ring.sense * stated + np.radians(ring.zero_deg)
