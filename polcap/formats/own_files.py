@@ -1,7 +1,8 @@
 """Files that polcap wrote into a folder, such as a result: it replaces and removes only these.
 
-`polcap-files.txt` in the folder lists them, one path per line, relative to the folder. A path is recorded before the
-file gets its name, so a killed run leaves no file without a record. Links inside the folder are never followed.
+`polcap-files.txt` in the folder lists them after its first line, one path per line, relative to the folder. A path is
+recorded before the file gets its name, so a killed run leaves no file without a record. Links inside the folder are
+never followed.
 """
 
 import os
@@ -13,6 +14,7 @@ from polcap.errors import StorageError
 from polcap.formats import system_errors, text_file
 
 RECORD = "polcap-files.txt"
+_FIRST_LINE = b"# polcap wrote these files; it replaces and removes only these.\n"
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 _opened: dict[str, "OwnFiles"] = {}  # by absolute path of the folder; polcap writes into these now
 
@@ -48,6 +50,8 @@ class OwnFiles:
         if fresh:
             handle = os.open(self.folder / RECORD, os.O_APPEND | os.O_CREAT | os.O_WRONLY | _NO_LINK, 0o666)
             with os.fdopen(handle, "wb") as record:
+                if os.fstat(handle).st_size == 0:  # somebody removed the record
+                    record.write(_FIRST_LINE)
                 record.write("".join(f"{name}\n" for name in fresh).encode(errors="surrogateescape"))
             self.names.update(fresh)
 
@@ -72,13 +76,17 @@ class OwnFiles:
     def _read(self) -> None:
         with suppress(OSError, ValueError):  # there is none yet
             content = text_file.read_bytes(self.folder / RECORD, text_file.TEXT_BYTES)
-            self.names.update(content.decode(errors="surrogateescape").splitlines())
+            self.names.update(content.decode(errors="surrogateescape").splitlines()[1:])
 
 
 def is_claimed(folder: Path) -> bool:
     """Whether a folder has a record of polcap's files."""
     record = folder / RECORD
-    return record.is_file() and not record.is_symlink()
+    if record.is_symlink():
+        return False
+    with suppress(OSError, ValueError):
+        return text_file.read_bytes(record, text_file.TEXT_BYTES).startswith(_FIRST_LINE)
+    return False
 
 
 def wrote(folder: Path, file: Path) -> bool:
@@ -99,6 +107,8 @@ def claim(folder: Path, uses: Iterable[str]) -> None:
     record = folder / RECORD
     if record.is_symlink():
         raise StorageError(f"{record} is a link; remove it, or choose another --out")
+    if record.exists():
+        raise StorageError(f"{record} is no record of polcap; move it away, or choose another --out")
     for name in uses:
         if os.path.lexists(folder / name):
             raise StorageError(
@@ -107,8 +117,8 @@ def claim(folder: Path, uses: Iterable[str]) -> None:
             )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with suppress(FileExistsError):  # another process was faster
-            os.close(os.open(record, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        with suppress(FileExistsError), record.open("xb") as file:  # another process may be faster
+            file.write(_FIRST_LINE)
     except OSError as error:
         raise system_errors.cannot_write(record, error) from error
 

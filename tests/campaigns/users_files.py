@@ -133,7 +133,7 @@ def sequence(template: Path, seed: int) -> list[str]:
         if random.random() < 0.4:
             shutil.rmtree(result)
         else:
-            names = [*(result / own_files.RECORD).read_text().splitlines(), own_files.RECORD]
+            names = [*(result / own_files.RECORD).read_text().splitlines()[1:], own_files.RECORD]
             recorded = {f"C/polcap/{name}" for name in names}
         plant(root, random)
         before, done, faults = foreign(root, recorded), [], []

@@ -32,7 +32,15 @@ def test_only_recorded_files_are_replaced(folder: Path) -> None:
             atomic.write(folder / "foreign.txt", "lost")
     assert (folder / "foreign.txt").read_text() == "stays"
     assert (folder / "maps" / "own.txt").read_text() == "two"
-    assert (folder / own_files.RECORD).read_text() == "maps/own.txt\n"
+    assert (folder / own_files.RECORD).read_text().splitlines()[1:] == ["maps/own.txt"]
+
+
+def test_a_foreign_file_with_the_record_s_name_stays(tmp_path: Path) -> None:
+    (tmp_path / own_files.RECORD).write_text("maps/mine.txt\n")
+    with pytest.raises(StorageError, match=r"polcap-files\.txt is no record of polcap; move it away"):
+        own_files.claim(tmp_path, ["maps"])
+    assert not own_files.is_claimed(tmp_path)
+    assert (tmp_path / own_files.RECORD).read_text() == "maps/mine.txt\n"
 
 
 @pytest.mark.parametrize("name", ["maps", "maps/own.txt", own_files.RECORD])
@@ -59,7 +67,7 @@ def test_a_file_is_recorded_before_it_gets_its_name(folder: Path, monkeypatch: p
     monkeypatch.setattr(os, "replace", killed)
     with pytest.raises(KeyboardInterrupt), own_files.opened(folder):
         atomic.write(folder / "own.txt", "text")
-    assert (folder / own_files.RECORD).read_text() == "own.txt\n"
+    assert (folder / own_files.RECORD).read_text().splitlines()[1:] == ["own.txt"]
 
 
 def test_another_process_may_record_files_meanwhile(folder: Path) -> None:
