@@ -101,6 +101,11 @@ def set_verbosity(quiet: bool, verbose: bool) -> None:
     _verbosity = -1 if quiet else int(verbose)
 
 
+def is_verbose() -> bool:
+    """Whether --verbose asks for everything."""
+    return _verbosity > 0
+
+
 def open_log(file: "Path | None") -> None:
     """Open the file of --log: write command line and versions; messages are appended from now on. Raises OSError."""
     global _log_file
@@ -245,13 +250,14 @@ def open_page(file: "Path") -> None:
 
 
 def print_gates(about: dict[str, Any]) -> None:
-    """Print failed gates and warnings. Raises GateError where a gate failed."""
+    """Print failed gates and warnings, those with a remedy first. Raises GateError where a gate failed."""
     words: dict[str, tuple[str, _Level]] = {"fail": ("gate failed", "ERROR"), "warn": ("warning", "WARNING")}
-    for gate in about["gates"]:
+    for gate in sorted(about["gates"], key=lambda gate: (gate["state"] != "fail", not gate["remedy"])):
         if gate["state"] in words:
             word, level = words[gate["state"]]
             cost = f", costs about {gate['cost_deg']:.0f}°" if gate["cost_deg"] >= 1 else ""
-            print_message(f"polcap: {word}: {gate['name']}: {gate['says']}{cost}. {gate['remedy']}.", level)
+            remedy = f" {gate['remedy']}." if gate["remedy"] else ""
+            print_message(f"polcap: {word}: {gate['name']}: {gate['says']}{cost}.{remedy}", level)
     if failed := sum(gate["state"] == "fail" for gate in about["gates"]):
         raise GateError(f"{failed} of {len(about['gates'])} gates failed; the asset was written, see report.html")
 

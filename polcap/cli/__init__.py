@@ -124,7 +124,9 @@ def front(
     context: typer.Context,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of a failure.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress, only data and errors.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line per frame and stage.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Print a line per frame and stage, and all gates.")
+    ] = False,
     log: Annotated[
         Path | None,
         typer.Option("--log", metavar="FILE", help="Append all messages to a file, with times and versions."),

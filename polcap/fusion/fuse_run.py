@@ -25,6 +25,7 @@ from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import LazyCache, Progress
 from polcap.pipeline.run import timings
 from polcap.quality import fused_object, gates
+from polcap.quality.advice import advise
 from polcap.quality.gate import Gate
 from polcap.quality.limits import FusedGateLimits
 from polcap.report import animation
@@ -92,7 +93,7 @@ def document(
 ) -> dict[str, Any]:
     """The content of report.json: facts, figures by view, gates; `seconds` are those of the stages."""
     rows = _rows(processed, results)
-    judged = list(_gates(processed, results, rows, config.fusion.gates))
+    judged = advise(list(_gates(processed, results, rows, config.fusion.gates)))
     first = next(iter(processed.reports.values()))
     of_views = {f"{view} infer": report["keys"]["infer"] for view, report in processed.reports.items()}
     return {

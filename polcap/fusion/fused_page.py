@@ -22,7 +22,7 @@ def write(folder: Path, about: Mapping[str, Any], results: FusionResults) -> Non
     content = {
         "about": about,
         "headline": headline,
-        "advice": [page.gate_row(gate) for gate in about["gates"] if gate["state"] in ("fail", "warn")],
+        "advice": page.advice_rows(about["gates"]),
         "gates": page.gate_rows(about["gates"]),
         "sides": [(f"{k * 360 // _SIDES}°", html.jpeg(picture)) for k, picture in enumerate(drawn)],
         "seen": html.jpeg(object_pictures.seen_picture(results.maps)),

@@ -12,7 +12,7 @@ from time import perf_counter
 
 import msgspec
 
-from polcap.capture_values import Capture
+from polcap.capture_values import Capture, Frame
 from polcap.chart_values import ChartRequest, ColorCalibration
 from polcap.config import Config
 from polcap.errors import ChartError, DecodeError, InputError
@@ -23,8 +23,8 @@ from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import AUTO, UserInput, path, results_of
 from polcap.pipeline.small_capture import SmallCapture
 from polcap.quality import gates
+from polcap.quality.advice import advise
 from polcap.quality.gate import Evidence, Gate
-from polcap.results import NotReached
 from polcap.stage_values import Network
 
 _THREADS = 2  # frames that are decoded at a time
@@ -80,7 +80,8 @@ def inspect(
 
 def _judge(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config) -> list[Gate]:
     """Judge the reduced capture by the gates, in the order of the path; an error of a stage is the last gate."""
-    cache, failure, chart_missing = MemoryCache(until="infer"), None, ""
+    cache, chart_missing = MemoryCache(until="infer"), ""
+    failure: InputError | None = None
     try:
         chart_missing = _run_path(capture, small, supplied, config, cache)
     except DecodeError:
@@ -93,20 +94,26 @@ def _judge(capture: Capture, small: SmallCapture, supplied: UserInput, config: C
         focal_doubt=small.capture.focal_doubt,
         clipped=small.clipped,
         blur_px=small.blur_px,
+        align=config.align,
+        files=tuple(tuple(_name(frame, capture) for frame in shot.frames) for shot in capture.shots),
         grid_px=small.step / (small.merged_px if config.hdr.demosaic == "superpixel" else 1),
         chart_missing=chart_missing,
         later_view=folder_names.is_later_view(Path(capture.folder)),
     )
-    lines = []
-    try:
-        for gate in gates.judge(evidence, config.gates, config.align):
-            lines.append(gate)
-    except NotReached:
-        assert failure is not None  # only an error ends the path before its gates
-        reason, _, remedy = str(failure).partition("; ")
-        name = type(failure).__name__.removesuffix("Error").lower()
-        lines.append(Gate(name, "fail", None, None, reason, remedy, _ERROR_COST_DEG))
-    return lines
+    return advise(gates.judge(evidence, config.gates, None if failure is None else _gate_of(failure)))
+
+
+def _name(frame: Frame, capture: Capture) -> str:
+    """A photograph as the user finds it in the capture's folder."""
+    path = Path(frame.path)
+    return (path.relative_to(capture.folder) if path.is_relative_to(capture.folder) else path).as_posix()
+
+
+def _gate_of(error: InputError) -> Gate:
+    """Gate of an error that ended the path."""
+    reason, _, remedy = str(error).partition("; ")
+    name = type(error).__name__.removesuffix("Error").lower()
+    return Gate(name, "fail", None, None, reason, remedy, _ERROR_COST_DEG)
 
 
 def _run_path(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config, cache: MemoryCache) -> str:
@@ -153,16 +160,19 @@ def _scale_chart(chart: ChartRequest, step: int) -> ChartRequest:
     return chart if chart.corners is None else replace(chart, corners=to_grid(chart.corners, step))
 
 
-def table(verdict: Verdict) -> str:
-    """The verdict as text for the terminal, on one screen."""
+def table(verdict: Verdict, everything: bool = False) -> str:
+    """The verdict as text for the terminal: what did not pass, or all gates."""
     head = "keep" if verdict.keep else f"reshoot {', '.join(verdict.shots)}".rstrip()
     if not verdict.keep and not verdict.shots:  # the fault is of the whole capture
         head += f": {', '.join(line.name for line in verdict.lines if line.state == 'fail')}"
     if verdict.keep and verdict.needs:
         head += f", and process it with {verdict.needs}"
-    width = max((len(line.name) for line in verdict.lines), default=0) + 2
     rows = [f"{head}   ({verdict.capture}, {verdict.seconds:.1f} s)"]
-    for line in verdict.lines:
+    shown = [line for line in verdict.lines if everything or line.state in ("fail", "warn")]
+    if not everything:
+        shown = sorted(shown, key=lambda line: (line.state != "fail", not line.remedy))
+    width = max((len(line.name) for line in shown), default=0) + 2
+    for line in shown:
         limit = ""
         if isinstance(line.limit, float | int):
             number, unit = (100 * line.limit, "%") if line.unit == "1" else (line.limit, line.unit)
@@ -171,6 +181,10 @@ def table(verdict: Verdict) -> str:
         rows.append(f"{line.state:13}{line.name:{width}}{line.message}{limit}{cost}")
         if line.remedy:
             rows.append(f"{'':{13 + width}}→ {line.remedy}")
+    count = {state: sum(line.state == state for line in verdict.lines) for state in ("pass", "not judged")}
+    if not everything:
+        after = f", {count['not judged']} are not judged, because these explain them" * (count["not judged"] > 0)
+        rows.append(f"{count['pass']} of {len(verdict.lines)} gates passed{after}; -v prints all")
     return "\n".join(rows)
 
 

@@ -7,13 +7,15 @@ import msgspec
 import numpy as np
 
 from polcap.images import Bools, Floats, Quality
-from polcap.results import Results
+from polcap.results import FIELDS, Results
 from polcap.stage_values import AngleStack
+from polcap.stages.align import AlignSettings
 
-State = Literal["pass", "warn", "fail", "not measured"]
+State = Literal["pass", "warn", "fail", "not measured", "not judged"]  # not judged: another gate is the cause
 Unit = Literal["1", "px", "°", "×", "ΔE2000", ""]
 
 MOST_DEG = 90.0  # of an error: normals face the camera
+_ALIGN = AlignSettings()
 DEGREES_PER_GAIN = 600.0  # 1 % of a shot's light tilts facing pixels by about 6° (error budget)
 
 
@@ -50,12 +52,23 @@ class Evidence(Results):
     focal_doubt: tuple[float, float]  # ln of the least and of the greatest possible focal length over the assumed one
     clipped: Floats  # (K, E, H, W) share of each pixel that is clipped
     blur_px: Floats  # (K, E) beyond the sharpest frame of the same exposure, 1σ [visible RAW px]
+    align: AlignSettings = _ALIGN  # the gate of the alignment has the limits of the stage
+    files: tuple[tuple[str, ...], ...] = ()  # (K, E) photographs, as the user finds them in the capture's folder
     grid_px: float = 1.0  # px of the picture that `process` works on per px of these
     chart_missing: str = ""  # the reason, where a chart was expected and none was found
     later_view: bool = False  # of a session whose first view shows the chart
 
+    def has(self, stage: str) -> bool:
+        """Whether the path reached this stage."""
+        return FIELDS[stage] in vars(self)
 
-def full_size(results: Results, focal_doubt: tuple[float, float]) -> Evidence:
+
+def full_size(
+    results: Results,
+    focal_doubt: tuple[float, float],
+    align: AlignSettings = _ALIGN,
+    files: tuple[tuple[str, ...], ...] = (),
+) -> Evidence:
     """Evidence of a run of `process`; clipping is that of the merged picture of each shot, not of every exposure."""
     radiance = results.radiance
     return Evidence.partial(
@@ -64,6 +77,8 @@ def full_size(results: Results, focal_doubt: tuple[float, float]) -> Evidence:
         focal_doubt=focal_doubt,
         clipped=((radiance.quality & int(Quality.CLIPPED)) > 0)[:, None],
         blur_px=radiance.bracket.blur_px,
+        align=align,
+        files=files,
     )
 
 
@@ -94,6 +109,21 @@ def at_most(
     return Gate(
         name, beyond, round(float(value), 5), limit, message, remedy, round(min(cost_deg, MOST_DEG), 1), shots, unit
     )
+
+
+def compared(change: float, other: str) -> str:
+    """Relative change of light in words, such as 3.0 % brighter than the others."""
+    text = f"{100 * abs(change):.1f}"
+    return (
+        f"as bright as {other}" if text == "0.0" else f"{text} % {'darker' if change < 0 else 'brighter'} than {other}"
+    )
+
+
+def worded(figure: float, text: str, zero: str) -> str:
+    """`text` with the figure in its place {:.1f}, or `zero` where it rounds to zero."""
+    if not np.isfinite(figure):
+        return "There is too little to measure"
+    return zero if text.format(figure) == text.format(0.0) else text.format(figure)
 
 
 def sentence(text: str) -> str:

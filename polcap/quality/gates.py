@@ -1,67 +1,115 @@
-"""Judges a capture by all quality gates, in the order of the path; `process` and `check` both use it.
+"""Judges a capture by all quality gates, causes before consequences; `process` and `check` both use it.
 
 A gate that fails means that the result needs a look before use: `process` ends with exit code 3, `check` asks to
 reshoot. A gate that warns states an assumption or a loss. Each gate has a finding, a cost in degrees and a remedy. A
 difference counts only beyond its measurement error.
+
+The table `_STEPS` is the picture of causes. A gate that depends on a failed one is "not judged": it has no cost and no
+remedy, because its figure shows the same cause again.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from polcap.quality import error_maps, geometry, light, polarization, shot_exposure
 from polcap.quality.gate import MOST_DEG, Evidence, Gate, State
 from polcap.quality.limits import GateLimits
-from polcap.stages.align import AlignSettings
 
 _LARGE_PART = 0.45  # of the expected error: the message names the gates that cost more
 
 
-def judge(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iterator[Gate]:
-    """Judge a capture: yield all quality gates, in the order of the path.
+@dataclass(frozen=True)
+class Step:
+    """Gates that one function judges, with their place in the picture of causes."""
 
-    Raises NotReached: the path ended before a stage that the next gate judges.
+    gates: tuple[str, ...]
+    judge: Callable[[Evidence, GateLimits], Gate | Iterable[Gate]]
+    stage: str  # the last stage whose result is judged
+    after: tuple[str, ...] = ()  # gates whose failure leaves nothing to judge here
+    explained_by: tuple[str, ...] = ()  # gates whose warning explains what would be found here, too
+
+
+def _without_limits(judge: Callable[[Evidence], Gate]) -> Callable[[Evidence, GateLimits], Gate]:
+    return lambda found, _limits: judge(found)
+
+
+_FILES = ("tone curve", "exposures")
+_LIT = ("clipping", "noise")  # no shot is measured
+_PAIRED = (*_LIT, "sharpness", "alignment")  # the shots cannot be compared
+_EVEN = (*_PAIRED, "stillness", "gains", "energy")  # the light of the shots is not known
+_POLARIZED = (*_EVEN, "order", "angles", "polarized")  # the Stokes parameters are wrong
+_SHAPED = (*_POLARIZED, "mask", "body", "other light", "lighting")  # the normals are wrong
+
+_STEPS = (
+    Step(("source",), _without_limits(shot_exposure.source), "hdr"),
+    Step(("exposures",), _without_limits(shot_exposure.exposures), "hdr"),
+    Step(("clipping",), shot_exposure.clipping, "hdr"),
+    Step(("tone curve",), shot_exposure.tone, "selfcal", ("clipping",)),
+    Step(("black level",), shot_exposure.black_level, "hdr", ("clipping",)),
+    Step(("noise",), shot_exposure.noise, "stokes", ("clipping",)),
+    Step(("sharpness",), geometry.sharpness, "hdr", _LIT),
+    Step(("alignment",), geometry.alignment, "mask", (*_LIT, "sharpness")),
+    Step(("chart",), light.chart, "whitebalance", ("clipping",)),
+    Step(("mask",), geometry.mask, "mask", ("clipping", "alignment")),
+    Step(("stillness",), shot_exposure.stillness, "mask", (*_FILES, *_PAIRED), ("black level", "sharpness")),
+    Step(("focus",), geometry.focus, "mask", _PAIRED),
+    Step(("gains", "gain doubt", "energy"), shot_exposure.gains, "selfcal", (*_PAIRED, "stillness")),
+    Step(("order",), _without_limits(polarization.order), "selfcal", _EVEN),
+    Step(("angles", "body", "other light"), polarization.of_outline, "infer", (*_EVEN, "order")),
+    Step(("ambient",), light.ambient, "hdr"),
+    Step(("room light", "lighting"), light.polarized_light, "infer", (*_POLARIZED, "other light")),
+    Step(("crossed",), light.crossed, "stokes", _PAIRED),
+    Step(("ill-posed",), polarization.ill_posed, "stokes", (*_POLARIZED, "other light", "lighting")),
+    Step(("outline",), geometry.inward_outline, "infer", _SHAPED),
+    Step(("albedo scale",), light.albedo_scale, "infer", ("clipping", "chart")),
+    Step(("focal length",), _without_limits(geometry.focal_length), "infer"),
+)
+
+
+def judge(found: Evidence, limits: GateLimits, failure: Gate | None = None) -> list[Gate]:
+    """Judge a capture by all quality gates, in the order of the path.
+
+    `failure` is the gate of the error that ended the path before a stage that gates judge.
     """
     judged: list[Gate] = []
-    for gate in _in_order(found, limits, align):
-        judged.append(gate)
-        yield gate
-        if gate.name == "order" and gate.state == "fail":
-            return  # with a wrong order nothing after it means anything
-    yield _normal_error(found, judged, limits)
-    if hasattr(found, "mesh"):
-        yield geometry.mesh(found.mesh, limits)
+    for step in _STEPS:
+        cause = _cause(step, judged)
+        if cause is None and not found.has(step.stage):
+            assert failure is not None  # only an error ends the path before its gates
+            cause = next((gate.name for gate in judged if gate.state == "fail"), None)
+            if cause is None:
+                judged.append(failure)
+                cause = failure.name
+        if cause is not None:
+            judged += [_not_judged(name, cause) for name in step.gates if name != cause]
+        else:
+            gates = step.judge(found, limits)
+            judged += [gates] if isinstance(gates, Gate) else gates
+    if not any(gate.name == "order" and gate.state == "fail" for gate in judged) and found.has("infer"):
+        judged.append(_normal_error(found, judged, limits))
+        if found.has("surface"):
+            judged.append(geometry.mesh(found.mesh, limits))
+    return judged
+
+
+def _cause(step: Step, judged: Sequence[Gate]) -> str | None:
+    """Name of the first judged gate that explains what this step would find, if any."""
+    for gate in judged:
+        if gate.name in {"fail": step.after, "warn": step.explained_by}.get(gate.state, ()):
+            return gate.name
+    return None
+
+
+def _not_judged(name: str, cause: str) -> Gate:
+    return Gate(name, "not judged", None, None, f"The gate {cause!r} explains what this one would find", unit="")
 
 
 def verdict(gates: Iterable[Gate]) -> State:
     """Verdict of a capture: the worst state of its gates."""
     states = {gate.state for gate in gates}
     return "fail" if "fail" in states else "warn" if "warn" in states else "pass"
-
-
-def _in_order(found: Evidence, limits: GateLimits, align: AlignSettings) -> Iterator[Gate]:
-    yield shot_exposure.exposures(found)
-    yield shot_exposure.tone(found, limits)
-    yield shot_exposure.source(found)
-    yield shot_exposure.black_level(found, limits)
-    yield light.chart(found, limits)
-    yield geometry.alignment(found, limits, align)
-    yield geometry.mask(found, limits)
-    yield shot_exposure.stillness(found, limits)
-    yield shot_exposure.clipping(found, limits)
-    yield geometry.sharpness(found, limits)
-    yield geometry.focus(found, limits)
-    yield from shot_exposure.gains(found, limits)
-    yield polarization.order(found)
-    yield from polarization.of_outline(found, limits)
-    yield shot_exposure.noise(found, limits)
-    yield light.ambient(found, limits)
-    yield from light.polarized_light(found, limits)
-    yield from light.crossed(found, limits)
-    yield polarization.ill_posed(found, limits)
-    yield geometry.inward_outline(found, limits)
-    yield light.albedo_scale(found, limits)
-    yield geometry.focal_length(found)
 
 
 def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Gate:
@@ -77,7 +125,8 @@ def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Ga
     if expected <= limit:
         return Gate("normal error", "pass", round(expected, 2), limit, message, unit="°")
     more = "" if len(found.names) > 3 else " four angles,"
-    remedy = "See these gates" if because else f"Use more light or frames,{more} or a darker room"
+    known = because or any(gate.state == "fail" for gate in judged)  # these gates have the remedy
+    remedy = "" if known else f"Use more light or frames,{more} or a darker room"
     return Gate("normal error", "fail", round(expected, 2), limit, message, remedy, unit="°")
 
 

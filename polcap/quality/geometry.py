@@ -1,13 +1,14 @@
 """Gates of geometry: alignment, mask, mesh, outline, sharpness, focal length."""
 
 from functools import partial
+from pathlib import PurePath
 
 import cv2
 import msgspec
 import numpy as np
 
 from polcap.formats import shipped_data
-from polcap.images import Floats
+from polcap.images import Bools, Floats
 from polcap.mesh_values import Mesh
 from polcap.optics import frames, outline
 from polcap.optics.morphology import dilate
@@ -16,10 +17,10 @@ from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean
 from polcap.optics.sharpness import TILE
 from polcap.quality import object_turn, rim
-from polcap.quality.gate import Evidence, Gate, State, Unit, at_most, bad_shots
+from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, Unit, at_most, bad_shots, worded
 from polcap.quality.limits import GateLimits
 from polcap.stage_values import SurfaceMaps
-from polcap.stages.align import AlignSettings, object_motion
+from polcap.stages.align import object_motion
 from polcap.stages.whitebalance import chart_in_mask
 
 _LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ
@@ -35,12 +36,12 @@ _INWARD = 0.2  # sine of the zenith from which a normal leans inward
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
 
 
-def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate:
+def alignment(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on movement between shots: of the camera, of the object against its surroundings, and turns of the object.
 
     The object is judged only if the camera passes. The first of the three that does not pass is the gate.
     """
-    camera = _judge_camera(found, limits, align)
+    camera = _judge_camera(found, limits)
     if camera.state != "pass":
         return camera
     shift, turn = _judge_shift(found, limits), _judge_turn(found, limits)
@@ -48,9 +49,9 @@ def alignment(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate
     return msgspec.structs.replace(worst, cost_deg=float(np.hypot(shift.cost_deg, turn.cost_deg)))
 
 
-def _judge_camera(found: Evidence, limits: GateLimits, align: AlignSettings) -> Gate:
+def _judge_camera(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on the movement of each shot, on its 1σ error and on the correlation of its detail with the first shot's."""
-    measured, names, correlation = found.alignment, found.names, found.alignment.correlation
+    measured, names, correlation, align = found.alignment, found.names, found.alignment.correlation, found.align
     height, width = found.radiance.value.shape[1:3]
     corners = picture_corners(width, height)
     moved = np.stack([transform_points(matrix, corners) for matrix in measured.transform])  # (K, 4, 2)
@@ -61,15 +62,26 @@ def _judge_camera(found: Evidence, limits: GateLimits, align: AlignSettings) -> 
     k = int(np.argmax(np.where(bad, 1e9, 0) + np.nan_to_num(shift)))
     message, value = f"The {names[k]} shot moved by {shift[k]:.1f} ± {doubt[k]:.2f} px", round(float(shift[k]), 3)
     if not bad.any():
+        message = message if shift[k] >= 0.05 else "No shot moved"
         return Gate("alignment", "pass", value, most, message, unit="px")
-    failed = partial(Gate, "alignment", "fail", remedy=_LOCK, cost_deg=10.0, shots=bad_shots(names, bad))
-    if unlike[k] or not np.isfinite(shift[k]):
-        message = f"The {names[k]} shot shows another scene, or it moved too far to be registered"
+    if (odd := unlike | ~np.isfinite(shift)).any():
+        return _another_scene(found, odd)
+    failed = partial(Gate, "alignment", "fail", remedy=_LOCK, cost_deg=10.0, shots=bad_shots(names, bad), unit="px")
     if far[k]:
-        return failed(value if np.isfinite(shift[k]) else None, most, message, unit="px")
-    if unlike[k]:
-        return failed(round(float(correlation[k]), 3), align.min_correlation, message, unit="")
-    return failed(round(float(doubt[k]), 3), most_doubt, f"{message}: too little texture", unit="px")
+        return failed(value, most, message)
+    return failed(round(float(doubt[k]), 3), most_doubt, f"{message}: too little texture")
+
+
+def _another_scene(found: Evidence, unlike: Bools) -> Gate:
+    """Gate on shots (K,) that share no detail with the first one; if no shot does, the first is the odd one."""
+    odd = ~unlike if unlike[1:].all() else unlike
+    names, least = bad_shots(found.names, odd), found.align.min_correlation
+    folders = sorted({str(PurePath(files[0]).parent) for files, one in zip(found.files, odd) if one} - {"."})
+    where = f" in {', '.join(folders)}" if folders else ""
+    message = f"The {' and '.join(names)} shot shows another scene than the others, or the camera moved far"
+    remedy = f"Check the files of that shot{where}: are they of this object? Otherwise take the shot again"
+    value = round(float(found.alignment.correlation[unlike].min()), 3)
+    return Gate("alignment", "fail", value, least, message, remedy, MOST_DEG, names, unit="")
 
 
 def _judge_shift(found: Evidence, limits: GateLimits) -> Gate:
@@ -118,7 +130,7 @@ def _measure_shift(found: Evidence) -> object_motion.ObjectShift:
 
 
 def _measure_turn(found: Evidence) -> object_turn.ObjectTurn:
-    maps = found.maps if hasattr(found, "maps") else None
+    maps = found.maps if found.has("infer") else None
     return object_turn.measure(found.radiance, found.alignment, found.object_, maps)
 
 
@@ -203,7 +215,8 @@ def sharpness(found: Evidence, limits: GateLimits) -> Gate:
     if not moved <= TILE / 2:  # tiles would compare unlike detail
         return Gate("sharpness", "not measured", None, limit, "The shots show different places", unit="px")
     k, e = (int(i) for i in np.unravel_index(int(np.nanargmax(blur)), blur.shape))
-    message = f"Frame {e + 1} of the {found.names[k]} shot is blurred by {blur[k, e]:.1f} px more than the sharpest"
+    text = f"Frame {e + 1} of the {found.names[k]} shot is blurred by {{:.1f}} px more than the sharpest"
+    message = worded(float(blur[k, e]), text, "All frames are equally sharp")
     bad = bad_shots(found.names, np.nanmax(np.nan_to_num(blur), axis=1) > limit)
     remedy = "Focus by hand and tape the ring, use a remote release, and take it again"
     of_shot = float(np.nan_to_num(blur).mean(axis=1).max())  # a single frame is only a part of its shot
@@ -216,7 +229,7 @@ def focus(found: Evidence, limits: GateLimits) -> Gate:
     blur, limit = _edge_blur(found), limits.max_edge_blur_px
     if found.grid_px > 1:
         return Gate("focus", "not measured", None, limit, "Only `process` measures this", unit="px")
-    message = f"The sharpest edges of the object are blurred by {blur:.1f} px (1σ)"
+    message = worded(blur, "The sharpest edges of the object are blurred by {:.1f} px (1σ)", "Edges are sharp")
     if blur > limit:
         message += ": all shots are out of focus, which costs about 0.04 of roughness"
     remedy = "Focus by hand on the front of the object, with f/8 to f/11"
@@ -265,7 +278,8 @@ def inward_outline(found: Evidence, limits: GateLimits) -> Gate:
     On a closed surface all of them point outwards.
     """
     share = _inward_share(found.maps)
-    message = f"{100 * share:.0f} % of the normals at the outline point into the object"
+    text = "{:.0f} % of the normals at the outline point into the object"
+    message = worded(100 * share, text, "All normals at the outline point outwards")
     if share > limits.max_inward_outline:
         message += ": parts of the shape are inside out, most often on black gloss that mirrors its surroundings"
     remedy = (

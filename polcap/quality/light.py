@@ -12,7 +12,7 @@ from polcap.optics import mueller
 from polcap.optics.frames import dot, rays
 from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
-from polcap.quality.gate import Evidence, Gate, at_most, grade
+from polcap.quality.gate import Evidence, Gate, at_most, grade, worded
 from polcap.quality.limits import GateLimits
 from polcap.stage_values import StokesImage
 from polcap.stages.whitebalance import patches
@@ -99,7 +99,8 @@ def crossed(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
         return
     seen = _compare_crossed(found.stokes)
     share = 100 * seen.mirrored
-    message = f"{share:.1f} % of the object's light is mirrored at its surface; it is removed from the albedo"
+    text = "{:.1f} % of the object's light is mirrored at its surface; it is removed from the albedo"
+    message = worded(share, text, "No light is mirrored at the object's surface")
     if seen.left > _STILL_CLIPPED and seen.clipped > _FEW:
         message = f"{100 * seen.left:.0f} % of the clipped highlights are also clipped in the cross-polarized shot"
         yield Gate("crossed", "warn", round(seen.left, 3), _STILL_CLIPPED, message, remedy)
@@ -144,7 +145,8 @@ def ambient(found: Evidence, limits: GateLimits) -> Gate:
     if not np.isfinite(bracket.ambient_share).any():
         return Gate("ambient", "not measured", None, limit, "No frame was taken without the flash")
     worst = float(np.nanmax(bracket.ambient_share))
-    message = f"{100 * worst:.1f} % of the light does not come from the flash; the ambient frames are subtracted"
+    text = "{:.1f} % of the light does not come from the flash; the ambient frames are subtracted"
+    message = worded(100 * worst, text, "All light comes from the flash")
     cost = round(_DEGREES_PER_AMBIENT * worst, 1) if bracket.ambient_shared else 0.0
     if bracket.ambient_shared and limits.max_ambient_shared < worst <= limit:
         limit = limits.max_ambient_shared
@@ -164,13 +166,14 @@ def polarized_light(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     direction.
     """
     share, limit = _surroundings_dolp(found), limits.max_room_dolp
-    message = f"The surroundings are polarized by {100 * share:.1f} %"
+    message = worded(100 * share, "The surroundings are polarized by {:.1f} %", "The surroundings are not polarized")
     if share > limit:
         message += ": polarized light from the room, or glossy surroundings"
     remedy = "Darken the room, or take one ambient frame per angle: subtracting them is exact"
     yield at_most("room light", share, limit, message, remedy, cost_deg=_DEGREES_PER_ROOM_DOLP * share, beyond="warn")
     share, limit = _highlight_dolp(found), limits.max_highlight_dolp
-    message = f"The brightest parts that face the camera share a polarization of {100 * share:.1f} %"
+    text = "The brightest parts that face the camera share a polarization of {:.1f} %"
+    message = worded(100 * share, text, "The brightest parts that face the camera share no polarization")
     if share > limit:
         message += (
             ": light from the sides (two flashes, softboxes, a window), or light that changed across the picture "
@@ -193,7 +196,8 @@ def _highlight_dolp(found: Evidence) -> float:
         return float("nan")
     light = found.cues.radiance[towards].sum(-1) / np.maximum(maps.diffuse[towards].sum(-1), _LEAST_ALBEDO)
     bright = light >= np.percentile(light, 90)
-    return float(np.hypot(*np.median(found.cues.ratio[:, towards][:, bright], axis=1)))
+    dolp = float(np.hypot(*np.median(found.cues.ratio[:, towards][:, bright], axis=1)))
+    return dolp if dolp <= 1 else float("nan")  # the shots contradict each other
 
 
 def _surroundings_dolp(found: Evidence) -> float:
@@ -210,4 +214,5 @@ def _surroundings_dolp(found: Evidence) -> float:
     shots = zip(radiance.value, found.selfcal.gains.gain)
     light = [block_means(shot, _ROOM_TILE)[clear] @ (1 / gain) for shot, gain in shots]
     s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(found.selfcal.angle), np.stack(light), rcond=None)[0]
-    return float(np.hypot(np.median(s1 / np.maximum(s0, 1e-9)), np.median(s2 / np.maximum(s0, 1e-9))))
+    dolp = float(np.hypot(np.median(s1 / np.maximum(s0, 1e-9)), np.median(s2 / np.maximum(s0, 1e-9))))
+    return dolp if dolp <= 1 else float("nan")  # the shots contradict each other

@@ -13,7 +13,7 @@ from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
 from polcap.quality import rim
-from polcap.quality.gate import Evidence, Gate, State, at_most, sentence
+from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, at_most, sentence, worded
 from polcap.quality.limits import GateLimits
 from polcap.stage_values import OrderTest, StokesImage, SurfaceMaps
 
@@ -71,7 +71,7 @@ def order(found: Evidence) -> Gate:
 
 def _test(found: Evidence) -> OrderTest | None:
     """Test of the order by the network; None without one."""
-    return found.maps.order if hasattr(found, "maps") else None
+    return found.maps.order if found.has("infer") else None
 
 
 def _is_confirmed(test: OrderTest | None) -> TypeGuard[OrderTest]:
@@ -91,6 +91,10 @@ def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
         yield Gate("angles", "not measured", None, limit, "The outline is too short", unit="°")
         return
     body = seen.body
+    if body.dolp > 1:
+        message = "The shots contradict each other: they are not of one object under one light"
+        yield Gate("body", "fail", None, None, message, sentence(found.radiance.equipment.angles.check), MOST_DEG)
+        return
     if body.dolp_most < _LEAST_DOLP:
         message = f"No part of the outline is polarized by more than {100 * body.dolp_most:.1f} %"
         remedy = "Check that the polarizer was on and turned; metal and translucent objects (wax, milk) hardly polarize"
@@ -113,7 +117,8 @@ def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
         yield Gate("other light", "not measured", None, limits.max_side_light, message)
         return
     k = int(np.argmax(side))
-    message = f"The {found.names[k]} shot is {100 * side[k]:.1f} % brighter on one side than the others"
+    text = f"The {found.names[k]} shot is {{:.1f}} % brighter on one side than the others"
+    message = worded(100 * float(side[k]), text, "No shot is brighter on one side than the others")
     remedy = "Darken the room and take that shot again: another light was on"
     yield at_most("other light", float(side[k]), limits.max_side_light, message, remedy, (found.names[k],), 10)
 

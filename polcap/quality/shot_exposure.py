@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from polcap.images import Floats, Quality
-from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots, grade
+from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots, compared, grade, worded
 from polcap.quality.limits import GateLimits
 from polcap.stage_values import AngleStack, StokesImage
 
@@ -14,6 +14,8 @@ _EVEN_STEPS = (1.3, 20.0)  # from one exposure to the next: less is no bracket, 
 _ALIKE, _PROMISED = 1.15, 1.4
 _MISFIRE = 0.2  # change of one frame's light that fails; smaller ones are measured and corrected
 _CLIPPED_HIGHLIGHTS = 0.001  # of the object: from .002 on roughness errs by .06 more (docs/benchmarks/gates.md)
+_MOST_CLIPPED = 0.97  # from here on the pictures do not show how bright the object is
+_CLIPPED_PICTURE = 0.1  # of a picture in which no object was found; a bright backdrop may clip
 _WHOLE = 0.5  # share of the object that moving parts do not reach in every shot
 _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light patches
 
@@ -113,7 +115,7 @@ def _levels_remedy(found: Evidence) -> str:
 def noise(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on noise: false polarization that noise causes in the object's median pixel."""
     figure, limit = _noise(found.stokes), limits.max_dolp_noise
-    message = f"Noise adds about {100 * figure:.1f} % false polarization"
+    message = worded(100 * figure, "Noise adds about {:.1f} % false polarization", "Noise adds no false polarization")
     remedy = "Use more light, a wider aperture, a longer exposure or more frames"
     return at_most("noise", figure, limit, message, remedy, cost_deg=300 * figure)
 
@@ -129,17 +131,14 @@ def stillness(found: Evidence, limits: GateLimits) -> Gate:
     ghost = (found.radiance.quality & int(Quality.GHOST)) > 0
     fraction = ghost[:, found.object_.mask].mean(1) if found.object_.mask.any() else np.zeros(len(ghost))
     k = int(np.argmax(fraction))
-    message = f"{100 * fraction[k]:.2f} % of the object differs between the exposures of the {found.names[k]} shot"
+    text = f"{{:.2f}} % of the object differs between the exposures of the {found.names[k]} shot"
+    message = worded(100 * float(fraction[k]), text, "The exposures of every shot show the same")
     remedy = "Take the bracket again: something moved, or the light changed"
     bad = bad_shots(found.names, fraction > limits.max_ghost)
     if _has_wrong_levels(found.radiance, fraction, limits):
         message += ": their black level, white level or encoding is not as stated"
         remedy, bad = _levels_remedy(found), ()
-    blurred = np.nan_to_num(found.blur_px).max() > limits.max_blur_px  # `sharpness` judges this
-    state: State = "warn" if blurred else "fail"
-    return at_most(
-        "stillness", float(fraction[k]), limits.max_ghost, message, remedy, bad, 1 if blurred else 5, beyond=state
-    )
+    return at_most("stillness", float(fraction[k]), limits.max_ghost, message, remedy, bad, 5)
 
 
 def _has_wrong_levels(radiance: AngleStack, ghost: Floats, limits: GateLimits) -> bool:
@@ -151,16 +150,34 @@ def _has_wrong_levels(radiance: AngleStack, ghost: Floats, limits: GateLimits) -
 
 
 def clipping(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on the share of the object that is clipped in the shortest exposure."""
-    clipped, limit = found.clipped[:, :, found.object_.mask].mean(2).min(1), limits.max_clipped
-    share, few = float(clipped.max()), min(_CLIPPED_HIGHLIGHTS, limits.max_clipped)
-    name = found.names[int(np.argmax(clipped))]
-    message = f"{100 * share:.1f} % of the object is clipped in the shortest exposure of the {name} shot"
-    remedy = "Add a darker exposure or use less light"
-    if few < share <= limit:
+    """Gate on the share of the object that is clipped in the shortest exposure; of the picture without an object."""
+    known = found.has("mask")
+    where, limit = ("object", limits.max_clipped) if known else ("picture", _CLIPPED_PICTURE)
+    clipped = found.clipped[:, :, found.object_.mask] if known else found.clipped.reshape(*found.clipped.shape[:2], -1)
+    shares = clipped.mean(2).min(1)  # (K,)
+    share, few = float(shares.max()), min(_CLIPPED_HIGHLIGHTS, limits.max_clipped)
+    name, stops = found.names[int(np.argmax(shares))], _stops_too_bright(share)
+    text = f"{{:.1f}} % of the {where} is clipped in the shortest exposure of the {name} shot"
+    message = worded(100 * share, text, f"No part of the {where} is clipped in the shortest exposures")
+    remedy = (
+        f"Shoot again with {stops} stop{'s' * (stops > 1)} less light (1/{2**stops} of it), or add an exposure that is "
+        "darker by as much to every bracket"
+    )
+    if (shares <= few).sum() > 1:  # the others are exposed well
+        remedy = "Take that shot again with as much light as the others had"
+    if known and few < share <= limit:
         message += ": highlights, without which roughness and specular are uncertain"
-        return at_most("clipping", share, few, message, remedy, bad_shots(found.names, clipped > few), beyond="warn")
-    return at_most("clipping", share, limit, message, remedy, bad_shots(found.names, clipped > limit), 20 * share)
+        return at_most("clipping", share, few, message, remedy, bad_shots(found.names, shares > few), beyond="warn")
+    return at_most("clipping", share, limit, message, remedy, bad_shots(found.names, shares > limit), 20 * share)
+
+
+def _stops_too_bright(share: float) -> int:
+    """Whole stops of light to take away, so that of a clipped `share` only highlights stay clipped.
+
+    The share that is brighter than a level falls exponentially with the level, as over a rounded object.
+    """
+    share = float(np.clip(share, 2 * _CLIPPED_HIGHLIGHTS, _MOST_CLIPPED))
+    return int(np.ceil(np.log2(np.log(_CLIPPED_HIGHLIGHTS) / np.log(share))))
 
 
 def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
@@ -176,7 +193,7 @@ def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     remedy = "Wait longer between flashes: this one misfired or had not recycled"
     if radiance.equipment.light == "steady":
         remedy = "Shoot again under constant light: the lamp or daylight changed between shots"
-    message = f"The {names[k]} shot was {abs(100 * each[k]):.1f} % {_comparative(each[k])} than the others"
+    message = f"The {names[k]} shot was {compared(each[k], 'the others')}"
     message += ", which is corrected" if -each[k] > limit else ""
     bad = bad_shots(names, brighter if brighter.any() else -each > limit)
     state: State = "fail" if brighter.any() else "warn"
@@ -186,16 +203,12 @@ def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     k, e = (int(i) for i in np.unravel_index(int(np.argmax(np.abs(drift))), drift.shape))
     limit = limits.max_energy_drift
     change = float(drift[k, e])
-    message = f"Frame {e + 1} of {names[k]} was {abs(100 * change):.1f} % {_comparative(change)} than its bracket"
+    message = f"Frame {e + 1} of {names[k]} was {compared(change, 'its bracket')}"
     bad = bad_shots(names, np.abs(drift).max(1) > limit)
     remedy = remedy.replace("between shots", "within a bracket")
     yield at_most(
         "energy", abs(change), limit, message, remedy, bad, beyond="fail" if abs(change) > _MISFIRE else "warn"
     )
-
-
-def _comparative(change: float) -> str:
-    return "darker" if change < 0 else "brighter"
 
 
 def gain_doubt(found: Evidence, limits: GateLimits) -> Gate:

@@ -18,6 +18,7 @@ from polcap.config import Config
 from polcap.errors import StorageError
 from polcap.formats import atomic, text_file
 from polcap.quality import error_maps, gates
+from polcap.quality.advice import advise
 from polcap.quality.gate import Gate, full_size
 from polcap.report import figures, labels, page
 from polcap.results import Results
@@ -97,8 +98,10 @@ def _frame_facts(frame: Frame, folder: Path) -> dict[str, Any]:
 
 def judge(facts: Mapping[str, Any], results: Results, config: Config) -> tuple[list[Gate], Results]:
     """Judge a result by the gates, and give its maps the expected errors with the costs of all gates."""
-    evidence = full_size(results, tuple(facts["capture"].get("focal_doubt", (0.0, 0.0))))
-    judged = list(gates.judge(evidence, config.gates, config.align))
+    files = tuple(tuple(frame["file"] for frame in shot["frames"]) for shot in facts["capture"]["shots"])
+    focal_doubt = tuple(facts["capture"].get("focal_doubt", (0.0, 0.0)))
+    evidence = full_size(results, focal_doubt, config.align, files)
+    judged = advise(gates.judge(evidence, config.gates))
     maps = replace(results.maps, confidence=error_maps.expected_normal_error(evidence, judged))
     return judged, Results.partial(**{**vars(results), "maps": maps})
 

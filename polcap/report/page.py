@@ -26,7 +26,7 @@ _HEADLINE = {
     "warn": "Good to use, but check an assumption",
     "fail": "Check the result before you use it",
 }
-_ORDER = ("fail", "warn", "pass", "not measured")  # of the gates in their table
+_ORDER = ("fail", "warn", "pass", "not measured", "not judged")  # of the gates in their table
 
 
 def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
@@ -40,7 +40,7 @@ def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
         "about": about,
         "headline": headline,
         "expected_error": expected_error,
-        "advice": [gate_row(gate) for gate in about["gates"] if gate["state"] in ("fail", "warn")],
+        "advice": advice_rows(about["gates"]),
         "gates": gate_rows(about["gates"]),
         "metric": results.mesh.metric,
         "asset": f"asset/{about['capture']['name']}.glb",
@@ -84,6 +84,12 @@ def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
 def gate_rows(gates: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """The quality gates as texts for a table, failed ones first."""
     return [gate_row(gate) for gate in sorted(gates, key=lambda gate: _ORDER.index(gate["state"]))]
+
+
+def advice_rows(gates: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """The failed gates and warnings as texts, those with a remedy first."""
+    found = [gate for gate in gates if gate["state"] in ("fail", "warn")]
+    return [gate_row(gate) for gate in sorted(found, key=lambda gate: (gate["state"] != "fail", not gate["remedy"]))]
 
 
 def gate_row(gate: Mapping[str, Any]) -> dict[str, str]:

@@ -64,7 +64,7 @@ def main() -> None:
             )
         capture = captures.read(folder)
         found = path(capture, supplied, Config(), MemoryCache(until="surface"))
-        lines = list(gates.judge(full_size(found, capture.focal_doubt), Config().gates, Config().align))
+        lines = gates.judge(full_size(found, capture.focal_doubt), Config().gates)
         warned = ", ".join(f"{line.name} {line.state}" for line in lines if line.state in ("warn", "fail"))
         row = errors(found, folder)
         for name in (kind, str(scene.law), "all"):

@@ -108,7 +108,7 @@ def judge_process(capture: Capture, place: Path, no_chart: bool = False) -> Row:
     chart = ChartRequest("none" if no_chart else "auto")
     try:
         found = path.path(capture, path.UserInput(chart, None, *networks()), Config(), MemoryCache(until="surface"))
-        lines = list(gates.judge(full_size(found, capture.focal_doubt), Config().gates, Config().align))
+        lines = gates.judge(full_size(found, capture.focal_doubt), Config().gates)
         actual = error_deg(found.maps, place)
     except InputError as error:
         return {

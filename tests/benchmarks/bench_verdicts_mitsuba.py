@@ -147,7 +147,7 @@ def judged(place: Path, scene: dict[str, Any], corner: tuple[int, int]) -> tuple
     capture = captures.read(place)
     user = path.UserInput(ChartRequest("auto"), None, *networks())
     found = path.path(capture, user, Config(), MemoryCache(until="surface"))
-    lines = list(gates.judge(full_size(found, capture.focal_doubt), Config().gates, Config().align))
+    lines = gates.judge(full_size(found, capture.focal_doubt), Config().gates)
     maps = found.maps
     rows, columns = np.nonzero(maps.mask)
     x = np.round((columns + maps.view.origin[0]) - corner[0] / TIMES).astype(int)

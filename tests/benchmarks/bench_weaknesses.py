@@ -87,7 +87,7 @@ def judge(folder: Path, seed: int, kind: str) -> Row:
 def _processed(place: Path, chart: ChartRequest) -> Row:
     capture = captures.read(place)
     found = path.path(capture, path.UserInput(chart, None, *networks()), Config(), MemoryCache(until="surface"))
-    lines = list(gates.judge(full_size(found, capture.focal_doubt), Config().gates, Config().align))
+    lines = gates.judge(full_size(found, capture.focal_doubt), Config().gates)
     spoke = {line.name: [line.state, line.value, line.cost_deg, line.message] for line in lines if line.state != "pass"}
     expected = next((line.value for line in lines if line.name == "normal error"), None)
     own = float(np.median(found.maps.confidence[found.maps.mask]))

@@ -211,7 +211,8 @@ def test_corners_of_the_chart_are_moved_to_the_reduced_picture() -> None:
 
 def test_shares_are_per_cent_on_the_terminal_and_shares_in_json() -> None:
     verdict = Verdict(True, (), (Gate("mask", "pass", 0.03, 0.25, "About 3 % of the outline may be wrong"),), "bowl", 1)
-    assert "(limit 25 %)" in check.table(verdict)
+    assert "(limit 25 %)" in check.table(verdict, everything=True)
+    assert check.table(verdict).splitlines()[1:] == ["1 of 1 gates passed; -v prints all"]
     (line,) = json.loads(json.dumps(check.to_json(verdict)))["lines"]
     assert (line["value"], line["limit"], line["unit"]) == (0.03, 0.25, "1")
     assert page.gate_row(line)["limit"] == "25 %"

@@ -81,7 +81,7 @@ def test_an_assumed_focal_length_costs_more_away_from_the_middle_of_the_picture(
 
 def test_the_headline_is_the_median_of_the_map(good: Evidence) -> None:
     of, _ = flagged(good, Quality.CLIPPED, round(1.2 * disc_radius(good.maps.mask)))
-    judged = list(gates.judge(of, Config().gates, Config().align))
+    judged = gates.judge(of, Config().gates)
     (headline,) = (gate.value for gate in judged if gate.name == "normal error")
     error = error_maps.expected_normal_error(of, judged)
     median = float(np.median(error[of.maps.mask]))

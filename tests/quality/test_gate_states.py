@@ -292,7 +292,7 @@ def judge(good: dict[str, Any], config: Config, fields: dict[str, Any]) -> list[
     with pytest.MonkeyPatch.context() as patch:
         for figure, (module, function) in MEASURES.items():
             patch.setattr(module, function, partial(stated, in_numpy(figures[figure])))
-        return list(gates.judge(Evidence.partial(**parts), config.gates, config.align))
+        return gates.judge(Evidence.partial(**parts, align=config.align), config.gates)
 
 
 def stated(figure: Any, *_: Any) -> Any:

@@ -1,5 +1,6 @@
 """Each gate speaks of its own fault, in words, beyond its own error; nothing speaks on a good capture."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +14,8 @@ from polcap.config import Config
 from polcap.images import Quality
 from polcap.optics import frames
 from polcap.quality import gates
-from polcap.quality.gate import Evidence, Gate
+from polcap.quality.advice import advice, advise
+from polcap.quality.gate import Evidence, Gate, State
 from polcap.stage_values import (
     AngleStack,
     BlackError,
@@ -26,6 +28,8 @@ from polcap.stage_values import (
 )
 from polcap.stages import cues, selfcal, stokes
 from tests import scenes
+
+STOPPED = ("object_", "selfcal", "stokes", "cues", "maps")  # results after an error of the registration
 
 
 def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> Evidence:
@@ -64,7 +68,7 @@ def good() -> Evidence:
 
 
 def judged(of: Evidence) -> dict[str, Gate]:
-    return {gate.name: gate for gate in gates.judge(of, Config().gates, Config().align)}
+    return {gate.name: gate for gate in gates.judge(of, Config().gates)}
 
 
 def failed(of: Evidence) -> list[str]:
@@ -154,10 +158,84 @@ def test_a_push_counts_in_pixels_of_the_processed_picture(good: Evidence, grid_p
     assert gate.state == state and gate.shots == ("45°",)
 
 
-def test_what_follows_a_wrong_order_is_not_judged(good: Evidence) -> None:
-    by_name = judged(changed(good, selfcal=replace(good.selfcal, outline=OutlineCheck(ShotOrder((2, 1, 0)), 0.9))))
-    assert list(by_name)[-1] == "focal length" or by_name["order"].state == "fail"
-    assert "angles" not in by_name
+@pytest.mark.parametrize(
+    ("cause", "silent", "judged_still"),
+    [
+        ("order", {"angles", "body", "room light", "outline"}, {"gains", "ambient", "normal error"}),
+        ("clipping", {"alignment", "stillness", "gains", "order", "angles", "lighting"}, {"ambient", "focal length"}),
+        ("alignment", {"stillness", "gains", "order", "body", "lighting", "ill-posed"}, {"noise", "chart"}),
+        ("sharpness", {"alignment", "stillness", "order"}, {"noise", "chart"}),
+    ],
+)
+def test_what_a_failed_gate_explains_is_not_judged(
+    good: Evidence, cause: str, silent: set[str], judged_still: set[str]
+) -> None:
+    unlike = replace(good.alignment, correlation=np.array([1.0, 0.9, 0.1]))
+    quality = np.full_like(good.radiance.quality, Quality.GHOST)  # one of the consequences
+    faults: dict[str, dict[str, Any]] = {
+        "order": {"selfcal": replace(good.selfcal, outline=OutlineCheck(ShotOrder((2, 1, 0)), 0.9))},
+        "clipping": {"clipped": clipped(0.3), "alignment": unlike},
+        "alignment": {"alignment": unlike, "radiance": replace(good.radiance, quality=quality)},
+        "sharpness": {"blur_px": np.array([[0.0], [3.0], [0.0]]), "alignment": unlike},
+    }
+    found = judged(changed(good, **faults[cause]))
+    assert found[cause].state == "fail"
+    for name in silent:
+        assert found[name].state == "not judged" and cause in found[name].message and not found[name].cost_deg, name
+    assert all(found[name].state != "not judged" for name in judged_still if name in found)
+    assert ("normal error" in found) is (cause != "order")
+
+
+def test_a_blurred_frame_alone_explains_ghosts(good: Evidence) -> None:
+    """One of three exposures is blurred: that warns, and says why the exposures differ."""
+    quality = np.full_like(good.radiance.quality, Quality.GHOST)
+    ratio = np.tile([[[0.25], [1.0], [4.0]]], (3, 1, 3))
+    radiance = bracket(replace(good.radiance, quality=quality), exposure_ratio=ratio, exif_ratio=ratio[..., 0])
+    blur = np.array([[0.0, 0, 0], [0, 0, 3.0], [0, 0, 0]])
+    found = judged(changed(good, radiance=radiance, blur_px=blur))
+    assert (found["sharpness"].state, found["stillness"].state) == ("warn", "not judged")
+
+
+def test_an_error_is_a_gate_unless_an_earlier_cause_explains_it(good: Evidence) -> None:
+    error = Gate("alignment", "fail", None, None, "shot 45° has no detail", "shoot again")
+    reached = {name: value for name, value in vars(good).items() if name not in STOPPED}
+    for share, names in ((0.0, ["alignment"]), (0.5, ["clipping"])):
+        found = gates.judge(Evidence.partial(**{**reached, "clipped": clipped(share)}), Config().gates, error)
+        assert [gate.name for gate in found if gate.state == "fail"] == names
+        assert len({gate.name for gate in found}) == len(found)
+
+
+def test_at_most_two_remedies_are_given_causes_first() -> None:
+    def gate(name: str, state: State, cost: float = 0.0, remedy: str = "") -> Gate:
+        return Gate(name, state, None, None, name, remedy or f"mend {name}", cost)
+
+    warned = [gate("chart", "warn"), gate("gains", "warn", 2.0), gate("body", "warn", 9.0), gate("mask", "pass")]
+    assert [one.name for one in advice(warned)] == ["gains", "body"]
+    failed = [gate("clipping", "fail"), gate("angles", "fail", remedy="mend clipping"), *warned, gate("mesh", "fail")]
+    assert [one.name for one in advice(failed)] == ["clipping", "mesh"]
+    assert [one.name for one in advise(failed) if one.remedy] == ["clipping", "mesh"]
+    assert [one.name for one in advise(failed)] == [one.name for one in failed]
+
+
+def test_shots_of_another_scene_are_named_with_their_folder(good: Evidence) -> None:
+    files = tuple((f"pol{angle}/IMG.DNG",) for angle in ("000", "045", "090"))
+    for correlation, name, folder in (([1, 0.9, 0.1], "90°", "pol090"), ([1, 0.1, 0.2], "0°", "pol000")):
+        unlike = replace(good.alignment, correlation=np.array(correlation, float))
+        gate = judged(changed(good, alignment=unlike, files=files))["alignment"]
+        assert gate.shots == (name,) and folder in gate.remedy and name in gate.message
+
+
+def test_equal_light_is_called_equal(good: Evidence) -> None:
+    assert "as bright as the others" in judged(good)["gains"].message
+    assert not re.search(r"\b0\.0+ (%|px) (brighter|darker|more)", " ".join(g.message for g in judged(good).values()))
+
+
+def test_a_clipped_capture_is_told_how_many_stops(good: Evidence) -> None:
+    every = np.zeros_like(good.clipped)
+    for share, stops in ((0.05, 2), (0.4, 3), (0.9, 7)):
+        every[:] = share
+        assert f"{stops} stops less light" in judged(changed(good, clipped=every))["clipping"].remedy
+    assert "as much light as the others" in judged(changed(good, clipped=clipped(0.4)))["clipping"].remedy
 
 
 def test_flash_bracketed_by_the_shutter_is_named(good: Evidence) -> None:

@@ -96,7 +96,7 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
         "radiance": radiance, "color": color, "alignment": alignment, "object_": object_, "selfcal": calibration,
         "stokes": image, "cues": seen, "maps": maps, "mesh": mesh,
     }  # fmt: skip
-    judged = list(gates.judge(Evidence.partial(**found), config.gates, config.align))
+    judged = gates.judge(Evidence.partial(**found), config.gates)
     assert all(gate.message and gate.state in ("pass", "warn", "fail", "not measured") for gate in judged)
     assert built.base_color.dtype == np.uint8
 
