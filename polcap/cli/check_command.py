@@ -30,6 +30,9 @@ def check(
         opening = pool.submit(checks.shipped_networks)
         found = captures.read(capture, options.angles_deg(angles), clockwise)
         verdict = checks.inspect(found, chosen, request, opening.result)
+    for note in found.notes:
+        if "--resume" in note:
+            terminal.print_message(f"polcap: {note}")
     terminal.print_data(checks.to_json(verdict) if json else checks.table(verdict, terminal.is_verbose()))
     if not verdict.keep:
         raise typer.Exit(GateError.exit_code)

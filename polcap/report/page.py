@@ -9,7 +9,7 @@ import numpy as np
 
 from polcap.config import Config
 from polcap.formats import html, shipped_data
-from polcap.formats.capture import reader
+from polcap.formats.capture import layouts
 from polcap.formats.maps import png
 from polcap.optics.color import srgb_eight_bits
 from polcap.report import keys, labels, levels, map_figures, page_data, plots
@@ -204,7 +204,7 @@ def _tables(about: Mapping[str, Any]) -> dict[str, Any]:
             (
                 f"{labels.number(shot['angle_deg'])}°",
                 frame["file"],
-                reader.shutter(frame["exposure_time"]),
+                layouts.shutter(frame["exposure_time"]),
                 frame["digest"][:12],
             )
             for shot in about["capture"]["shots"]

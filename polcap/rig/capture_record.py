@@ -15,14 +15,14 @@ import tomli_w
 from polcap.capture_values import Role
 from polcap.errors import CaptureError, StorageError
 from polcap.formats import atomic, system_errors, text_file
-from polcap.formats.capture import capture_toml
+from polcap.formats.capture import capture_toml, unfinished
 from polcap.formats.raw import file_bytes
 from polcap.rig.exposure_bracket import Exposure
 from polcap.rig.retake_criteria import FrameFacts
 from polcap.rig.shooting_plan import CaptureOrder, Slot
 
 T = TypeVar("T")
-NAME, LOG, REJECTED = "rig.json", "rig.log", "rejected"
+NAME, LOG, REJECTED = unfinished.RECORD, "rig.log", "rejected"
 _SAME_DEG = 0.1  # the frames of a bracket are at one angle up to this
 
 

@@ -14,12 +14,12 @@ from msgspec import Meta
 
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import atomic
-from polcap.formats.capture import folder_names
+from polcap.formats.capture import folder_names, unfinished
 from polcap.rig import capture_record, device_urls, sequence
 from polcap.rig.device_log import Log
 from polcap.rig.shooting_plan import CaptureOrder
 
-NAME, LOG = "views.json", "turntable.log"
+NAME, LOG = unfinished.SESSION, "turntable.log"
 
 
 class SessionFile(msgspec.Struct):

@@ -1,6 +1,7 @@
 """The sequence of a capture: order of the frames, retakes, and resuming."""
 
 import json
+import re
 import shutil
 import signal
 import tomllib
@@ -176,6 +177,20 @@ def test_resume_takes_only_missing_frames(rig: Rig) -> None:
     assert len(rig.taken) == 7
     rig.again()
     assert rig.taken == [] and rig.turner.moves == []
+
+
+@pytest.mark.parametrize("frame", [2, 7, 12])
+def test_an_interrupted_capture_names_resume(rig: Rig, frame: int) -> None:
+    """Within the first bracket, within another, and after three complete angles of four."""
+    rig.stop_at(frame)
+    words = rf"polcap capture {re.escape(str(rig.folder))} --resume. takes the \d+ missing frames"
+    try:
+        notes = "; ".join(captures.read(rig.folder).notes)
+    except CaptureError as error:
+        notes = str(error)
+    assert re.search(words, notes), notes
+    rig.again()
+    assert "--resume" not in "; ".join(captures.read(rig.folder).notes)
 
 
 def test_resume_keeps_what_a_person_added_to_capture_toml(rig: Rig) -> None:

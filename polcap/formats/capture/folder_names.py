@@ -19,6 +19,7 @@ SEPARATION_DEG = 5.0  # closer angles count as one
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _FOLDER_NUMBER = re.compile(r"\d+(?:[.,]\d+)?")
 _FOLDER = re.compile(r"pol[ _-]?(?P<pol>\d+(?:\.\d+)?)|cross(?:[ _-]?(?P<cross>\d+(?:\.\d+)?))?", re.IGNORECASE)
+_DEGREES = re.compile(r"(\d+(?:[.,]\d+)?)[ _-]*(?:[°º˚]|(?:deg|degrees?|grad)(?![^\W\d_]))", re.IGNORECASE)
 _VIEW = re.compile(r"view[ _-]?\d+", re.IGNORECASE)
 
 
@@ -139,15 +140,17 @@ def numbered(folder: Path) -> list[str]:
 
 
 def _degrees_by_name(names: Iterable[str]) -> dict[str, float]:
-    """Angle [degrees] by folder name: of pol000, pol045, …, otherwise of names that differ in one number only.
+    """Angle [degrees] by folder name: of pol000, pol045, …, else of numbers with °, deg or Grad, else of plain numbers.
 
-    0, 45, 90; "0 Grad", "45 Grad", "90 Grad"; 角度0, 角度45, 角度90: at least three different axes below 180°, one of
-    them 0°.
+    Numbers with a unit may stand beside others: "01 Foto 0°", "02 Foto 45°". Plain numbers are the only difference of
+    the names: 0, 45, 90; 角度0, 角度45, 角度90. There are at least three different axes below 180°, one of them 0°.
     """
     names = [name for name in names if name not in OURS and not foreign_files.is_ignored_folder(name)]
     found = {name: float(match["pol"]) for name in names if (match := _FOLDER.fullmatch(name)) and match["pol"]}
     if found:
         return found
+    if marked := degrees_with_unit(names):
+        return marked
     patterns: dict[str, dict[str, float]] = defaultdict(dict)
     for name in names:
         numbers = _FOLDER_NUMBER.findall(name)
@@ -160,6 +163,27 @@ def _degrees_by_name(names: Iterable[str]) -> dict[str, float]:
         if angles[0] == 0 and angles[-1] < 180 and count_axes(angles) == len(angles) >= 3:
             return group
     return {}
+
+
+def degrees_with_unit(names: Iterable[str]) -> dict[str, float]:
+    """Angle [degrees] by name, of names with one number that °, deg or Grad follows; at least three different axes."""
+    found = {name: _DEGREES.findall(unicodedata.normalize("NFC", name)) for name in names}
+    angles = {name: float(texts[0].replace(",", ".")) for name, texts in found.items() if len(texts) == 1}
+    return angles if count_axes(angles.values()) >= 3 and max(angles.values()) <= 180 else {}
+
+
+def suggested_names(names: Sequence[str]) -> list[tuple[str, str]]:
+    """New names such as pol045 for three or four folders: by a number that can be an angle, else by their order."""
+    listed = sorted(names, key=natural)
+    if not 3 <= len(listed) <= 4:
+        return []
+    found = [[float(text.replace(",", ".")) for text in _FOLDER_NUMBER.findall(name)] for name in listed]
+    columns = list(zip(*found)) if len({len(one) for one in found}) == 1 else []
+    angles = next(
+        (one for one in columns if min(one) == 0 and max(one) < 180 and count_axes(one) == len(listed)),
+        tuple(45.0 * k for k in range(len(listed))),
+    )
+    return [(name, f"pol{degrees(angle)}") for name, angle in zip(listed, angles)]
 
 
 def angle_folders(folder: Path) -> tuple[dict[float, Path], Path | None]:

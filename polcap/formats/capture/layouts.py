@@ -13,9 +13,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
-from polcap.capture_values import AngleStatement, Role
+from polcap.capture_values import AngleStatement, Exif, Role
 from polcap.errors import CaptureError
-from polcap.formats.capture import capture_toml, photograph_files
+from polcap.formats.capture import capture_toml, photograph_files, unequal_brackets
 from polcap.formats.capture.capture_toml import CaptureFile
 from polcap.formats.capture.folder_names import (
     NUMBER,
@@ -25,18 +25,20 @@ from polcap.formats.capture.folder_names import (
     children,
     count_axes,
     degrees_of_cross,
+    degrees_with_unit,
     few_names,
     is_one_angle,
     is_result,
     natural,
+    suggested_names,
     views,
 )
+from polcap.formats.capture.unequal_brackets import ExposedFile, same_exposure
 from polcap.formats.own_folders import OURS
 from polcap.formats.raw import photo
 from polcap.formats.raw.probe import Probe
 
 DEFAULT_DEG = (0.0, 45.0, 90.0)
-EQUAL_STOPS = 0.15  # EXIF rounds exposure times to a sixth of a stop at most
 _COUNTER = 9999  # greatest file number of a camera
 _JUMP_S = 600.0  # between two frames: the clock was set, or the photographer had a long break
 _LOSSY_SUFFIXES = {".heic", ".heif", ".hif", ".avif", ".webp"}  # of phones and small cameras; not decoded
@@ -99,7 +101,7 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     if groups:
         notes.append("angles read from the file names")
         shots = _select(folder, groups, angles_deg)
-        files = tuple(bracket[0].path.name for _, bracket in shots)
+        files = tuple(bracket[0].path.name for _, bracket in shots)  # of brackets, the first frames
         return Plan("flat", shots, notes=tuple(notes), angles=AngleStatement("file names", files))
     shots, note = _by_time(folder, pictures, angles_deg or DEFAULT_DEG)
     return Plan("flat", shots, notes=(*notes, note), angles=AngleStatement("order", _texts(shots)))
@@ -119,7 +121,9 @@ def _hint(folder: Path) -> str:
     if is_result(folder):
         return "it is a result of polcap: give the folder of the photographs"
     if inside:
-        return f"its sub-folders are {named}, but polcap looks for pol000, pol045, …"
+        new = ", ".join(f"{old} to {name}" for old, name in suggested_names([path.name for path in inside]))
+        rename = f": if these are the angles, rename {new}" if new else ""
+        return f"its sub-folders are {named}, but polcap looks for pol000, pol045, …{rename}"
     return "give the folder that holds the photographs"
 
 
@@ -225,10 +229,13 @@ def _sensor(
 
 
 def _by_name(pictures: list[Source]) -> dict[float, list[Source]]:
-    """Pictures other than RAW, grouped by the polarizer angle in their names.
+    """Pictures grouped by the polarizer angle in their names: a number with °, deg or Grad.
 
-    Empty unless exactly one number in the names differs and can be an angle.
+    For pictures other than RAW, a plain number counts, if exactly one number differs and can be an angle.
     """
+    marked = degrees_with_unit([source.path.stem for source in pictures])
+    if len(marked) == len(pictures):
+        return dict(sorted(_group(replace(one, angle_deg=marked[one.path.stem]) for one in pictures).items()))
     stems = [source.path.stem for source in pictures]
     raw = any(source.probe.kind == "raw" for source in pictures)  # numbers of a camera's counter
     if raw or len({NUMBER.sub("#", stem) for stem in stems}) != 1:
@@ -250,22 +257,35 @@ def _by_time(folder: Path, pictures: list[Source], angles_deg: Sequence[float]) 
     count, shots = len(pictures), len(angles_deg)
     listed = ", ".join(f"{angle:g}" for angle in angles_deg)
     sort = "sort the frames into pol000, pol045, …, or list them in capture.toml"
-    remedy = f"give the order with --angles, or {sort}"
-    if count % shots:
-        raise CaptureError(f"{folder}: {count} frames do not make {shots} equal brackets (angles {listed}); {remedy}")
-    size = count // shots
-    if size > 1 and not all(source.probe.exif.taken for source in pictures):
+    if not count % shots and count > shots and not all(source.probe.exif.taken for source in pictures):
         raise CaptureError(f"{folder}: {count} frames without EXIF times cannot be assigned to angles; {sort}")
-    order, by = _in_order(pictures, size)
-    if (at := _first_unequal(order, size)) is not None:
+    order, by = _in_order(pictures, max(count // shots, 1))
+    size, at = count // shots, _first_unequal(order, max(count // shots, 1))
+    if count % shots or at is not None:
+        found = [exposed_file(one.path.name, one.probe.exif) for one in order]
+        odd = unequal_brackets.advise_sequence(found, angles_deg) or f"give the order with --angles, or {sort}"
+        if at is None or count % shots:
+            raise CaptureError(f"{folder}: {count} frames do not make {shots} equal brackets (angles {listed}); {odd}")
         value, reference = (one.probe.exif.relative_exposure for one in (order[at], order[at % size]))
         times = f"{value / reference:.3g} times" if value and reference else "not stated like"
         raise CaptureError(
             f"{order[at].path}: its exposure is {times} that of the same frame of the first bracket; these {count} "
-            f"frames {by} are not {shots} equal brackets ({angles_deg[at // size]:g}°); {remedy}"
+            f"frames {by} are not {shots} equal brackets ({angles_deg[at // size]:g}°); {odd}"
         )
     note = f"{count} frames {by} taken as {shots} brackets of {size}, in the order {listed}°"
     return tuple((angle, tuple(order[k * size : (k + 1) * size])) for k, angle in enumerate(angles_deg)), note
+
+
+def exposed_file(name: str, fact: Exif, stated: float | None = None) -> ExposedFile:
+    """A photograph for `unequal_brackets`; `stated` is its exposure by capture.toml."""
+    return ExposedFile(name, stated or fact.relative_exposure, shutter(fact.exposure_time))
+
+
+def shutter(time: float | None) -> str:
+    """A shutter time [s] as text, such as 1/200 s."""
+    if not time:
+        return "?"
+    return f"1/{1 / time:.0f} s" if time < 0.3 else f"{time:.3g} s"
 
 
 def _in_order(pictures: list[Source], size: int) -> tuple[list[Source], str]:
@@ -307,13 +327,6 @@ def _first_unequal(order: Sequence[Source], size: int) -> int | None:
 def _jumped(by_clock: Sequence[Source]) -> bool:
     times = [datetime.fromisoformat(source.probe.exif.taken) for source in by_clock]
     return any((after - before).total_seconds() > _JUMP_S for before, after in pairwise(times))
-
-
-def same_exposure(value: float | None, reference: float | None) -> bool:
-    """Whether two relative exposures (time, aperture and ISO) are the same within the rounding of cameras."""
-    if not value or not reference:
-        return value == reference
-    return max(value / reference, reference / value) < 2**EQUAL_STOPS
 
 
 def _select(folder: Path, groups: dict[float, list[Source]], angles_deg: _Order) -> Shots:

@@ -14,10 +14,11 @@ from polcap.calibration_values import Calibration
 from polcap.capture_values import AngleStatement, Capture, Exif, Frame, FrameReading, Shot
 from polcap.errors import CaptureError
 from polcap.formats import atomic, calibrations
-from polcap.formats.capture import capture_toml, focal_length, folder_names, layouts
+from polcap.formats.capture import capture_toml, focal_length, folder_names, layouts, unequal_brackets, unfinished
 from polcap.formats.capture.capture_toml import CaptureFile
 from polcap.formats.capture.focal_length import FocalLength
 from polcap.formats.capture.layouts import Source
+from polcap.formats.capture.unequal_brackets import same_exposure
 from polcap.formats.raw import photo
 from polcap.formats.raw.color_encoding import ColorEncoding
 from polcap.formats.raw.probe import Probe
@@ -39,6 +40,18 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
     Raises DecodeError: a file is cut short, or no decoder recognises it.
     """
     folder = Path(folder)
+    missing = unfinished.missing_frames(folder)
+    try:
+        found = _read(folder, angles_deg, clockwise)
+    except CaptureError as error:
+        if not missing:
+            raise
+        reason = str(error).partition("; ")[0]
+        raise CaptureError(f"{reason}; {unfinished.advice(folder, missing)}") from None
+    return found if not missing else replace(found, notes=(*found.notes, unfinished.advice(folder, missing)))
+
+
+def _read(folder: Path, angles_deg: tuple[float, ...] | None, clockwise: bool) -> Capture:
     _check_folder(folder)
     stated = capture_toml.load(folder)
     clockwise = clockwise or stated.clockwise
@@ -193,16 +206,9 @@ def _row(frame: Frame, folder: str) -> list[str]:
     path = Path(frame.path)
     name = str(path.relative_to(folder)) if path.is_relative_to(folder) else frame.path
     flash = {True: "fired", False: "off", None: "?"}[fact.flash_fired]
-    stated = f"{frame.exposure:.4g} (stated)" if frame.exposure else shutter(fact.exposure_time)
+    stated = f"{frame.exposure:.4g} (stated)" if frame.exposure else layouts.shutter(fact.exposure_time)
     numbers = [f"{value:g}" if value else "?" for value in (fact.iso, fact.f_number)]
     return [name, frame.role, stated, *numbers, flash, fact.taken.replace("T", " ") or "?"]
-
-
-def shutter(time: float | None) -> str:
-    """A shutter time [s] as text, such as 1/200 s."""
-    if not time:
-        return "?"
-    return f"1/{1 / time:.0f} s" if time < 0.3 else f"{time:.3g} s"
 
 
 def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Sequence[Source]) -> Shot:
@@ -325,26 +331,32 @@ def _check_brackets(shots: Sequence[Shot]) -> None:
     counts = [len(shot.frames) for shot in shots]
     usual = max(set(counts), key=counts.count)
     model = next(shot for shot in shots if len(shot.frames) == usual)
+    files = {shot.name: [_exposed(frame) for frame in shot.frames] for shot in shots}
+    remedy = unequal_brackets.advise_shots(files) or "shoot equal brackets, or remove the surplus"
     for shot in shots:
         where = Path(shot.frames[0].path).parent
         if len(shot.frames) != usual:
             raise CaptureError(
-                f"{where}: {shot.name} has {len(shot.frames)} frames where {model.name} has {usual}; "
-                "shoot equal brackets, or remove the surplus"
+                f"{where}: {shot.name} has {len(shot.frames)} frames where {model.name} has {usual}; {remedy}"
             )
         for frame, other in zip(shot.frames, model.frames):
-            if not layouts.same_exposure(_exposure(frame), _exposure(other)):
+            if not same_exposure(_exposure(frame), _exposure(other)):
                 raise CaptureError(
                     f"{frame.path}: {_settings(frame)} where {model.name} has {_settings(other)} "
                     f"({Path(other.path).name}); shoot equal brackets at every angle"
                 )
 
 
+def _exposed(frame: Frame) -> unequal_brackets.ExposedFile:
+    path = Path(frame.path)
+    return layouts.exposed_file(f"{path.parent.name}/{path.name}", frame.exif, frame.exposure)
+
+
 def _settings(frame: Frame) -> str:
     if frame.exposure:
         return f"exposure {frame.exposure:.4g} stated"
     fact = frame.exif
-    parts = [shutter(fact.exposure_time), f"f/{fact.f_number or '?'}", f"ISO {fact.iso or '?'}"]
+    parts = [layouts.shutter(fact.exposure_time), f"f/{fact.f_number or '?'}", f"ISO {fact.iso or '?'}"]
     return " ".join(parts) if fact.exposure_time else "no exposure in EXIF"
 
 
@@ -365,7 +377,7 @@ def _notes(plan: layouts.Plan, shots: Sequence[Shot], stated: CaptureFile, radia
     if stated.rotator:
         notes.append(f"rotator {stated.rotator.model or 'of unknown model'}, log {stated.rotator.log or 'none'}")
     exposures = [exposure for frame in shots[0].frames if (exposure := _exposure(frame))]
-    if len(exposures) == len(shots[0].frames) > 1 and layouts.same_exposure(max(exposures), min(exposures)):
+    if len(exposures) == len(shots[0].frames) > 1 and same_exposure(max(exposures), min(exposures)):
         notes.append("all frames of a bracket state the same exposure; their ratios are measured from the pixels")
     return notes
 

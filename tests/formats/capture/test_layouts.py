@@ -47,6 +47,44 @@ def test_angles_are_read_from_folder_names_that_differ_in_one_number(tmp_path, l
 
 
 @pytest.mark.parametrize(
+    ("listed", "expected"),
+    [
+        (("01 Foto 0°", "02 Foto 45°", "03 Foto 90°"), [0, 45, 90]),
+        (("IMG 3 - 90 Grad", "IMG 1 - 0 Grad", "IMG 2 - 45 Grad"), [0, 45, 90]),
+        (("1_30deg", "2_90deg", "3_150 degrees"), [30, 90, 150]),
+        (("take1 22,5º", "take2 67.5°", "take3 112,5 GRAD"), [22.5, 67.5, 112.5]),
+    ],
+)
+def test_a_number_with_a_unit_is_the_angle_whatever_else_counts(tmp_path, listed, expected):
+    for name in listed:
+        shoot(tmp_path / name / "a.dng")
+    assert degrees(capture.read(tmp_path)) == expected
+
+
+def test_file_names_with_a_unit_state_the_angles_of_brackets(tmp_path):
+    for number, angle in enumerate((0, 0, 45, 45, 90, 90)):
+        shoot(tmp_path / f"DSC{number:04d} {angle}°.dng", (1 / 200, 1 / 50)[number % 2])
+    understood = capture.read(tmp_path)
+    assert degrees(understood) == [0, 45, 90] and [len(shot.frames) for shot in understood.shots] == [2, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("listed", "advice"),
+    [
+        (("1-0", "2-45", "3-90"), "rename 1-0 to pol000, 2-45 to pol045, 3-90 to pol090"),
+        (("left", "middle", "right"), "rename left to pol000, middle to pol045, right to pol090"),
+        (("a1", "a2", "a3", "a4"), "a3 to pol090, a4 to pol135"),
+    ],
+)
+def test_other_names_get_a_suggestion_for_each_folder(tmp_path, listed, advice):
+    for name in listed:
+        shoot(tmp_path / name / "a.dng")
+    with pytest.raises(CaptureError, match="but polcap looks for pol000") as error:
+        capture.read(tmp_path)
+    assert advice in str(error.value)
+
+
+@pytest.mark.parametrize(
     "listed", [("1", "2", "3"), ("10", "20", "30"), ("0", "100", "200"), ("vase 0", "cup 45", "90")]
 )
 def test_numbered_folders_of_objects_are_not_angles(tmp_path, listed):
@@ -264,7 +302,7 @@ def test_missing_numbers_of_views_are_named(names, missing):
 
 def test_untimed_brackets_in_one_folder_are_to_be_sorted(tmp_path):
     """No order of the angles can separate the brackets, so the message does not mention --angles."""
-    folder = pictures(tmp_path, [f"krug_{angle}_grad_{number}.png" for angle in (0, 45, 90) for number in range(3)])
+    folder = pictures(tmp_path, [f"krug_{angle}_shot_{number}.png" for angle in (0, 45, 90) for number in range(3)])
     for angles in (None, (0.0, 45.0, 90.0)):
         with pytest.raises(CaptureError, match="cannot be assigned to angles; sort the frames into pol000") as caught:
             capture.read(folder, angles)
