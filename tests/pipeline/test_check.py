@@ -99,7 +99,7 @@ def test_missing_chart_keeps_and_says_what_process_asks_for(tmp_path: Path, monk
     capture = captures.read(tmp_path / "small")
     found = verdict(tmp_path / "small")
     line = next(line for line in found.lines if line.name == "chart")
-    assert line.state == "warn" and found.needs == "--no-chart" and "--no-chart" in check.table(found).splitlines()[0]
+    assert line.state == "warn" and found.needs == "--no-chart" and "--no-chart" in line.message
     with pytest.raises(ChartError):
         merged = hdr.merge(capture, frame_decoder.decode, Config().hdr)
         whitebalance.measure(merged, shipped_data.colorchecker(), AUTO, Config().whitebalance)
