@@ -1,4 +1,4 @@
-"""Results of all stages for one capture; their fields are the list of stages, in the order of the path."""
+"""Results of the path for one capture; their fields list its stages, in order. The last stage is the asset."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:  # the command line needs the names of the stages before the v
     from collections.abc import Mapping
 
     from polcap.chart_values import ColorCalibration
-    from polcap.mesh_values import Asset, ReliefMesh
+    from polcap.mesh_values import ReliefMesh
     from polcap.stage_values import Alignment, AngleStack, Cues, ObjectMask, SelfCalibration, StokesImage, SurfaceMaps
 
 
@@ -30,7 +30,6 @@ class Results:
     cues: Cues = field(metadata={"stage": "cues"})  # Stokes, color matrix -> DoLP, diffuse color, network channels
     maps: SurfaceMaps = field(metadata={"stage": "infer"})  # cues -> normal, diffuse, specular, roughness, error
     mesh: ReliefMesh = field(metadata={"stage": "surface"})  # normals -> depth and mesh
-    asset: Asset = field(metadata={"stage": "asset"})  # maps and mesh -> glTF textures and factors
     keys: Mapping[str, str]  # cache key of each stage that ran, by stage
 
     @classmethod
@@ -47,4 +46,4 @@ class Results:
 
 
 FIELDS = {one.metadata["stage"]: one.name for one in fields(Results) if "stage" in one.metadata}  # by stage
-STAGES = tuple(FIELDS)
+STAGES = (*FIELDS, "asset")  # maps/ and mesh -> glTF textures and factors: `pipeline/asset_export.py`

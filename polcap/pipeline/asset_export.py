@@ -1,6 +1,6 @@
 """Exports the asset of a result in the formats of a preset, with a record of its provenance.
 
-Both `process` and `polcap export` build the asset from the maps as stored in their files. So the same result gives the
+`process` and `polcap export` build the asset from the files in maps/. So the same result gives the
 same bytes, with any number of threads.
 """
 
@@ -38,7 +38,9 @@ from polcap.formats.export.presets import PRESETS, ExportPreset, Format
 from polcap.formats.export.texture_set import Extra, Key, Texture
 from polcap.formats.maps import maps_folder
 from polcap.mesh_values import Asset, Mesh, ReliefMesh
+from polcap.pipeline.cache import digest
 from polcap.stages import asset, surface
+from polcap.stages.asset import AssetSettings
 
 _Writer = Callable[[], list[Path]]  # returns the files that it has written
 _NEEDED: tuple[Extra, ...] = ("object-normal",)  # by the format `iiif`
@@ -82,11 +84,10 @@ class ExportSource(Protocol):
 
 @dataclass(frozen=True)
 class ReliefSource:
-    """The maps of a result, with the full mesh and asset made from them."""
+    """The maps of a result as stored, and their full mesh."""
 
     maps: maps_folder.ResultMaps
     mesh: ReliefMesh
-    asset: Asset
     config: Config
 
     @property
@@ -97,7 +98,7 @@ class ReliefSource:
     def whole(self, bits: Literal[8, 16], extras: tuple[Extra, ...]) -> Asset:
         """The asset with the full mesh, textures of 8 or 16 bits, and extra textures."""
         maps = self.maps
-        built = self.asset if bits == 8 else asset.build(maps, self.mesh, self.config.asset, bits)
+        built = asset.build(maps, self.mesh, self.config.asset, bits)
         return asset.with_extras(built, maps, maps.depth, "occlusion" in extras) if extras else built
 
     def decimated(self, whole: Asset, triangles: int) -> "DetailLevel":
@@ -174,14 +175,18 @@ def _has_png(preset: ExportPreset) -> bool:
     return inside or separate or bool(preset.textures or preset.extras)
 
 
-def read(folder: Path, config: Config) -> ReliefSource:
-    """Read the maps of a result and build the full mesh and asset from them.
+def read(folder: Path, config: Config, mesh: ReliefMesh | None = None) -> ReliefSource:
+    """Read the maps of a result. `mesh` is the mesh from which they were written; None: it is made again.
 
     Raises DecodeError: a map is missing or damaged. ObjectError: no triangle fits into the mask.
     """
     maps = maps_folder.read(folder)
-    mesh = surface.triangulate(maps.depth, maps, maps.metric, config.surface)
-    return ReliefSource(maps, mesh, asset.build(maps, mesh, config.asset), config)
+    return ReliefSource(maps, mesh or surface.triangulate(maps.depth, maps, maps.metric, config.surface), config)
+
+
+def key(keys: Mapping[str, str], settings: AssetSettings) -> str:
+    """Key of the asset of a result with these cache keys, to recognize exports of other maps or settings."""
+    return digest([asset.build.versions, msgspec.to_builtins(settings), keys["infer"], keys["surface"]])
 
 
 def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:

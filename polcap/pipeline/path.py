@@ -1,9 +1,9 @@
-"""READ FIRST. The path of a capture, one line per stage: from RAW brackets to the asset.
+"""READ FIRST. The path of a capture, one line per stage: from RAW brackets to depth and mesh.
 
 The code of a stage is in the folder of the same name in `stages/`. White balance, alignment and self-calibration only
 measure: they return small values. `stokes` applies gains and transforms, `cues` the color matrix, so images are
 resampled once. `cache.run` reads a stored result, or computes it. `process`, `check`, `show` and a dry run all follow
-this path, with different caches.
+this path, with different caches. `run.py` then writes maps/, and `asset_export.py` builds the asset from these files.
 """
 
 from collections.abc import Mapping
@@ -19,14 +19,12 @@ from polcap.chart_values import ChartRequest, ColorCalibration
 from polcap.config import Config
 from polcap.errors import ObjectError
 from polcap.formats import onnx, shipped_data
-from polcap.formats.maps import maps_folder
 from polcap.formats.raw import frame_decoder
 from polcap.images import Bools
-from polcap.mesh_values import ReliefMesh
 from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
 from polcap.results import FIELDS, Results
-from polcap.stage_values import AngleStack, Network, OtherOrder, SelfCalibration, SurfaceMaps
-from polcap.stages import align, asset, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
+from polcap.stage_values import AngleStack, Network, OtherOrder, SelfCalibration
+from polcap.stages import align, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
 
 AUTO = ChartRequest("auto")
 
@@ -67,11 +65,7 @@ def run_stages(capture: Capture | None, supplied: UserInput, config: Config, cac
         cues_ = cache.run(cues.compute, stokes_, color, cache.derive(other_orders, calibration))
         maps = cache.run(infer.estimate, cues_, supplied.network, onnx.run, config=config.infer)
         distance = cache.derive(distance_m, color, radiance)
-        mesh = cache.run(surface.integrate, maps, distance, config=config.surface)
-        # from the maps as their files hold them: `polcap export` then makes the same bytes
-        stored = cache.derive(maps_folder.as_stored, maps)
-        stored_mesh = cache.derive(remeshed, stored, mesh, config.surface)
-        cache.run(asset.build, stored, stored_mesh, config=config.asset)
+        cache.run(surface.integrate, maps, distance, config=config.surface)
 
 
 def results_of(made: Mapping[str, StageResult[Any]]) -> Results:
@@ -108,8 +102,3 @@ def other_orders(calibration: SelfCalibration) -> tuple[OtherOrder, ...]:
 def distance_m(color: ColorCalibration, radiance: AngleStack) -> float | None:
     """Distance of the object [m], assumed equal to the chart's; None without a chart of known size."""
     return None if color.metres_per_px is None else color.metres_per_px * radiance.view.focal
-
-
-def remeshed(stored: SurfaceMaps, mesh: ReliefMesh, settings: surface.SurfaceSettings) -> ReliefMesh:
-    """Rebuild the mesh from the maps and depth as stored in maps/."""
-    return surface.triangulate(maps_folder.stored_depth(stored, mesh), stored, mesh.metric, settings)

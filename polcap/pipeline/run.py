@@ -5,6 +5,7 @@ The order of the stages is in `path.py`.
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -21,8 +22,9 @@ from polcap.formats.export import encoders, provenance
 from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
 from polcap.images import SensorImage
+from polcap.mesh_values import ReliefMesh
 from polcap.pipeline import asset_export, result_folder, unchanged
-from polcap.pipeline.asset_export import DetailLevel, ExportRequest
+from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, contents, silent
 from polcap.pipeline.path import UserInput, path
 from polcap.report import animation
@@ -30,6 +32,7 @@ from polcap.report import stage_pictures as pictures
 from polcap.results import STAGES, Results
 
 PROFILE = "color.toml"  # in the result folder, with the report
+ASSET = STAGES[-1]  # made after the path, from the files in maps/
 
 
 def process(
@@ -41,16 +44,18 @@ def process(
     force: str | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any] | None:
-    """Process a capture into the result folder `out`; returns the content of report.json, or None with `until`.
+    """Process a capture into the result folder `out`; returns the content of report.json.
+
+    None if it ended after the stage `until` of the path, without an asset.
 
     Raises InputError: the user's input is wrong; the stage that found it raises the error.
     """
     cache = StageCache(out, progress, force, until)
     with opened(capture, supplied, config, cache) as facts:
         results = path(capture, supplied, config, cache)
-        if until is not None:
+        if until not in (None, ASSET):
             return None
-        cache.begin("write")
+        cache.begin(ASSET)
         about = _write(out, results, facts, config)
         cache.end()
         return about
@@ -100,13 +105,14 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
     Files are encoded while figures are measured and the page is drawn: encoders alone do not fill two cores.
     """
     judged, results = report.judge(facts, results, config)
+    results = replace(results, keys={**results.keys, ASSET: asset_export.key(results.keys, config.asset)})
     about, _ = parallel.both(
         partial(report.document, facts, results, judged, config, timings(out)),
         partial(maps_folder.write, out / "maps", results),
     )
     parallel.both(
         partial(report.write, out, about, results),
-        partial(asset_export.write, out, about, ExportRequest(), [DetailLevel(results.asset)]),
+        partial(_write_assets, out, about, config, [ExportRequest()], results.mesh),
     )
     if results.color.source in ("chart", "corners"):
         color_profile.write(out / PROFILE, results.color)
@@ -132,7 +138,7 @@ def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force
     """Dry run of `process`: whether each stage is cached, to compute, or on demand. Nothing is computed."""
     cache = DryRunCache(out, force)
     path(capture, supplied, config, cache)
-    return cache.states
+    return {**cache.states, ASSET: "on demand"}
 
 
 def export(out: Path, *wanted: ExportRequest) -> list[Path]:
@@ -144,9 +150,16 @@ def export(out: Path, *wanted: ExportRequest) -> list[Path]:
         asset_export.check(one)
     about = report.read(out)
     with result_folder.locked(out):
-        source = asset_export.read(out / "maps", restore(Config, about, out / "report.json"))
-        exports = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in wanted)
-        return [file for files in exports for file in files]
+        return _write_assets(out, about, restore(Config, about, out / "report.json"), wanted)
+
+
+def _write_assets(
+    out: Path, about: dict[str, Any], config: Config, wanted: Sequence[ExportRequest], mesh: ReliefMesh | None = None
+) -> list[Path]:
+    """Write an asset for each request, from the files in maps/ and their mesh; returns the files."""
+    source = asset_export.read(out / "maps", config, mesh)
+    exports = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in wanted)
+    return [file for files in exports for file in files]
 
 
 def reopen(out: Path, until: str = "surface") -> tuple[Results, dict[str, Any]]:
@@ -169,8 +182,14 @@ def show(out: Path, stages: Sequence[str]) -> list[Path]:
     with result_folder.opened(out):
         for stage in stages:
             drawn.append(out / "work" / f"{stage}.png")
-            png.write(drawn[-1], pictures.of_stage(results, stage))
+            png.write(drawn[-1], _textures(out) if stage == ASSET else pictures.of_stage(results, stage))
     return drawn
+
+
+def _textures(out: Path) -> pictures.Picture:
+    """Picture of the textures of a finished result's asset. Raises StorageError: it is not finished."""
+    config = restore(Config, report.read(out), out / "report.json")
+    return pictures.textures(asset_export.read(out / "maps", config).whole(8, ()))
 
 
 def animate(out: Path, motion: animation.Motion) -> list[Path]:

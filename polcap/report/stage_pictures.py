@@ -25,7 +25,7 @@ from polcap.stage_values import Alignment, AngleStack, Cues, Gains, ObjectMask, 
 
 
 def of_stage(results: Results, stage: str) -> Picture:
-    """Picture of one stage's result, for people to check."""
+    """Picture of the result of a stage of the path, for people to check."""
     paint: dict[str, Callable[[], Picture | list[Tile]]] = {
         "hdr": lambda: _merged(results.radiance),
         "whitebalance": lambda: chart(results.radiance, results.color),
@@ -36,7 +36,6 @@ def of_stage(results: Results, stage: str) -> Picture:
         "cues": lambda: _cues(results.cues),
         "infer": lambda: _maps(results.maps),
         "surface": lambda: _surface(results.mesh, results.maps),
-        "asset": lambda: _textures(results.asset),
     }
     drawn = paint[stage]()
     return sheet(drawn) if isinstance(drawn, list) else drawn
@@ -216,15 +215,17 @@ def _surface(mesh: ReliefMesh, found: SurfaceMaps) -> list[Tile]:
     return [Tile(key.picture(depth, inside), "Depth", key), Tile(shaded(mesh, found), "Shape", note=note)]
 
 
-def _textures(built: Asset) -> list[Tile]:
-    """Pictures of the textures as stored in the glTF file."""
+def textures(built: Asset) -> Picture:
+    """Picture of the textures as stored in the glTF file."""
     specular_note = f"white is {max(built.specular_factor):.3g} × F0 of the index"
-    return [
-        Tile(built.base_color, "Base color", note="sRGB"),
-        Tile(built.normal, "Normal", note="tangent space, +Y"),
-        Tile(built.occlusion_roughness_metallic, "Occlusion, roughness, metallic", note="red, green, blue"),
-        Tile(built.specular_color, "Specular color", note=specular_note),
-    ]
+    return sheet(
+        [
+            Tile(built.base_color, "Base color", note="sRGB"),
+            Tile(built.normal, "Normal", note="tangent space, +Y"),
+            Tile(built.occlusion_roughness_metallic, "Occlusion, roughness, metallic", note="red, green, blue"),
+            Tile(built.specular_color, "Specular color", note=specular_note),
+        ]
+    )
 
 
 def _top(linear: Floats) -> float:

@@ -1,7 +1,7 @@
 """Writes and reads the folder maps/ of a result (docs/reference/result.md)."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,8 +14,7 @@ from polcap import parallel
 from polcap.errors import DecodeError
 from polcap.formats import atomic, text_file
 from polcap.formats.maps import exr, map_files, png
-from polcap.images import Bools, Floats, View
-from polcap.mesh_values import ReliefMesh
+from polcap.images import Floats, View
 from polcap.results import Results
 from polcap.stage_values import SurfaceMaps
 
@@ -123,33 +122,6 @@ def _write(file: Path, content: Callable[[], Any]) -> None:
         exr.write(file, content(), half=file.stem not in map_files.FLOAT_FILES)
     else:
         png.write(file, content())
-
-
-def as_stored(maps: SurfaceMaps) -> SurfaceMaps:
-    """The maps (H, W) as `read` returns them after `write`: rounded to half where the files are half."""
-    return replace(
-        maps,
-        normal=map_files.masked(maps.normal, maps.mask),
-        diffuse=_masked_half(maps.diffuse, maps.mask),
-        specular=_masked_half(maps.specular, maps.mask),
-        roughness=_masked_half(maps.roughness, maps.mask),
-        depth_prior=None,
-        confidence=_masked_half(maps.confidence, maps.mask),
-        order=None,
-        albedo_sigma=None if maps.albedo_sigma is None else round(maps.albedo_sigma, 3),
-        detail=None if maps.detail is None else map_files.detail_of(map_files.detail_levels(maps.detail)),
-    )
-
-
-def stored_depth(maps: SurfaceMaps, mesh: ReliefMesh) -> Floats:
-    """The mesh's depth (H, W) as `read` returns it after `write`; NaN outside the mask."""
-    return np.where(maps.mask, map_files.object_depth(maps, mesh), np.nan).astype(np.float32)
-
-
-def _masked_half(values: Floats, inside: Bools) -> Floats:
-    """A map with 0 outside the object, clipped to the range of half floats and rounded to half."""
-    limit = np.finfo(np.float16).max
-    return np.clip(map_files.masked(values, inside), -limit, limit).astype(np.float16).astype(np.float32)
 
 
 def read(folder: Path) -> ResultMaps:

@@ -71,7 +71,7 @@ class SurfaceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = "open"
 
 
-@stage(version=14)
+@stage(version=15)
 def integrate(maps: SurfaceMaps, distance_m: float | None, settings: SurfaceSettings) -> ReliefMesh:
     """Integrate normals to the visible surface of the object: depth and mesh.
 
@@ -87,11 +87,14 @@ def integrate(maps: SurfaceMaps, distance_m: float | None, settings: SurfaceSett
     depth = np.full(maps.mask.shape, np.nan)
     depth[maps.mask] = np.exp((z - np.median(z)) / maps.view.focal)
     depth *= 1.0 if distance_m is None else distance_m
-    return triangulate(depth, maps, distance_m is not None, settings)
+    return triangulate(depth.astype(np.float32), maps, distance_m is not None, settings)
 
 
 def triangulate(depth: Floats, maps: SurfaceMaps, metric: bool, settings: SurfaceSettings) -> ReliefMesh:
-    """Make the mesh of a depth map (H, W), NaN outside the object; `metric` tells that depths are in metres.
+    """Make the mesh of a depth map (H, W) in float32, NaN outside the object; `metric`: depths are in metres.
+
+    Of the maps only mask, normals and camera are used. maps/ stores them and the depth exactly, so the mesh can be made
+    again from there.
 
     Raises ObjectError: no triangle fits into the mask.
     """

@@ -16,7 +16,7 @@ from polcap.formats.maps import maps_folder as maps
 from polcap.mesh_values import ReliefMesh
 from polcap.results import Results
 from polcap.stage_values import Cues, StokesImage, SurfaceMaps
-from polcap.stages import cues
+from polcap.stages import cues, surface
 from tests import surfaces
 
 FILES = {
@@ -88,9 +88,8 @@ def test_detail_of_raw_pixels_comes_back_and_maps_json_states_its_size(result: R
     write(tmp_path / "maps", detailed, mesh, image, seen)
     stated = json.loads((tmp_path / "maps" / "maps.json").read_text("utf-8"))
     assert stated["sizes"] == {"detail.png": [size[1], size[0]]} and "detail.png" in stated["maps"]
-    read, stored = maps.read(tmp_path / "maps").detail, maps.as_stored(detailed).detail
-    assert detailed.detail is not None and read is not None and stored is not None
-    assert np.array_equal(read, stored)
+    read = maps.read(tmp_path / "maps").detail
+    assert detailed.detail is not None and read is not None
     assert np.abs(read.astype(float) - detailed.detail).max() < 0.011  # half a level of 1/50, and the half floats
     png.write(tmp_path / "maps" / "detail.png", np.zeros((4, 4), np.uint8))
     with pytest.raises(DecodeError, match=r"detail\.png is not 320 × 240"):
@@ -157,17 +156,22 @@ def test_stored_maps_come_back(folder: Path, result: Result) -> None:
     assert np.allclose(stored.diffuse[of.mask], of.diffuse[of.mask], rtol=1e-3)
 
 
-def test_maps_as_stored_equal_the_maps_read(folder: Path, result: Result) -> None:
+def test_values_outside_the_range_of_half_floats_are_rounded_or_clipped(folder: Path, result: Result) -> None:
     of, mesh, *_ = result
-    rng = np.random.default_rng(5)
-    of = replace(of, diffuse=np.exp(rng.normal(-8, 6, of.diffuse.shape)).astype(np.float32))  # denormals, and too much
-    mesh = replace(mesh, depth=np.where(rng.uniform(size=mesh.depth.shape) < 0.1, np.nan, mesh.depth))
-    write(folder.parent / "other", of, mesh, *result[2:])
-    read, known = maps.read(folder.parent / "other"), maps.as_stored(of)
-    assert np.array_equal(read.depth, maps.stored_depth(known, mesh), equal_nan=True) and read.metric == mesh.metric
-    for name, other in vars(known).items():
-        value = getattr(read, name)
-        assert np.array_equal(value, other) if isinstance(value, np.ndarray) else value == other, name
+    values = np.exp(np.random.default_rng(5).normal(-8, 6, of.diffuse.shape)).astype(np.float32)
+    write(folder.parent / "other", replace(of, diffuse=values), mesh, *result[2:])
+    half = np.clip(values, 0, np.finfo(np.float16).max).astype(np.float16)
+    assert np.array_equal(maps.read(folder.parent / "other").diffuse, half * of.mask[..., None])
+
+
+def test_the_mesh_of_the_stored_maps_is_that_of_the_stage(folder: Path, result: Result) -> None:
+    of, settings = result[0], surface.SurfaceSettings()
+    mesh = surface.integrate(of, 0.7, settings)
+    write(folder.parent / "integrated", of, mesh, *result[2:])
+    read = maps.read(folder.parent / "integrated")
+    again = surface.triangulate(read.depth, read, read.metric, settings)
+    for name, value in vars(mesh).items():
+        assert np.array_equal(value, getattr(again, name), equal_nan=isinstance(value, np.ndarray)), name
 
 
 def test_relative_depth_is_described_as_relative(result: Result, tmp_path: Path) -> None:
