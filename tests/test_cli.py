@@ -226,7 +226,11 @@ def test_status_and_report_print_json(result: Path, copy: Path, polcap: Command)
     again = json.loads(polcap("report", copy, "--json").stdout)
     assert again == json.loads((result / "report.json").read_text())
     same = polcap("report", copy, "--compare", result)
-    assert same.stdout == "" and "no figure and no setting differs" in same.stderr
+    assert same.stdout.startswith("Nothing changed beyond the doubt: colors agree to ΔE2000 0,")
+    assert "no figures and settings differ" in same.stderr
+    document = json.loads(polcap("report", copy, "--compare", result, "--json").stdout)
+    assert [row["quantity"] for row in document["changes"]] == ["Color, ΔE2000", "Normal", "Roughness"]
+    assert document["differences"] == []
 
 
 def test_a_folder_of_another_kind_is_exit_2(tmp_path: Path, polcap: Command, result: Path, example: Path) -> None:

@@ -87,7 +87,7 @@ def report(
 
 
 def _compare(result: Path, other: Path, json: bool, open_: bool) -> None:
-    """Write the page compare.html into a result folder, and print the figures and settings that differ."""
+    """Write the page compare.html into a result folder, and print what changed on the object."""
     from polcap import report as reports
     from polcap.pipeline import result_folder
     from polcap.report import compare as pairs
@@ -95,16 +95,16 @@ def _compare(result: Path, other: Path, json: bool, open_: bool) -> None:
     abouts = reports.read(result), reports.read(other)
     file = result / "compare.html"
     with result_folder.opened(result):
-        pairs.write(file, (result, other), abouts)
+        sentence, table = pairs.write(file, (result, other), abouts)
     rows = pairs.rows(*abouts)
     if json:
-        terminal.print_data([{"name": name, "here": here, "there": there} for name, here, there in rows])
-    elif rows:
-        labelled = map(pairs.label_row, rows)
-        terminal.print_data("\n".join(f"{title}: {here}  |  {there}" for title, here, there in labelled))
-    if not rows:
-        terminal.print_message("polcap: no figure and no setting differs")
-    terminal.print_message(f"polcap: comparison: {file}")
+        named = [dict(zip(("quantity", *pairs.HEAD[1:]), row)) for row in table]
+        differing = [{"name": name, "here": here, "there": there} for name, here, there in rows]
+        terminal.print_data({"sentence": sentence, "changes": named, "differences": differing})
+    else:
+        lines = ["".join(cell.ljust(18) for cell in row).rstrip() for row in (pairs.HEAD, *table) if table]
+        terminal.print_data("\n".join([sentence, *lines]))
+    terminal.print_message(f"polcap: {len(rows) or 'no'} figures and settings differ; comparison: {file}")
     if open_:
         terminal.open_page(file)
 

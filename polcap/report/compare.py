@@ -1,19 +1,33 @@
-"""Comparison of two results: differing figures and settings, and a page that shows both."""
+"""Comparison of two results: what changed on the object, the figures and settings that differ, and a page of both."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
+from polcap.formats import html
 from polcap.formats.maps import maps_folder
-from polcap.report import keys, labels, map_figures, page
+from polcap.images import Bools
+from polcap.optics.color import luminance, srgb_eight_bits
+from polcap.report import changes, keys, labels, map_figures, page
+from polcap.report.changes import Changes
+from polcap.report.keys import ColorKey
 from polcap.report.map_figures import MapFigure
 from polcap.report.reduction import ObjectReduction
+from polcap.stage_values import SurfaceMaps
 
 _LONGEST = 640  # px, longest side of a map
-_DIFFERENCE = keys.ColorKey(-0.2, 0.2, "", (-0.2, -0.1, 0, 0.1, 0.2), "balance", digits=3)
+_KEYS = {
+    "color": ColorKey(0, 20, "", (0, 2, 5, 10, 20), "inferno", power=2, digits=1),
+    "normal": keys.ERROR,
+    "roughness": ColorKey(-0.2, 0.2, "", (-0.2, -0.1, 0, 0.1, 0.2), "balance", digits=3),
+}
+_OVER_DOUBT = ColorKey(0, 10, "", (0, 2.5, 5, 7.5, 10), "inferno", digits=1)
+_NAMES = {"color": ("Color, ΔE2000", ""), "normal": ("Normal", "°"), "roughness": ("Roughness", "")}
+HEAD = ("", "Median difference", "99th percentile", "Doubt, median", "Changed share of the object")
 Row = tuple[str, Any, Any]  # name, value in the first result, value in the second
 
 
@@ -31,8 +45,10 @@ def label_row(row: Row) -> tuple[str, str, str]:
     return title, labels.text(name, row[1]), labels.text(name, row[2])
 
 
-def write(file: Path, folders: tuple[Path, Path], abouts: tuple[Mapping[str, Any], Mapping[str, Any]]) -> None:
-    """Write a page that shows two results next to each other."""
+def write(
+    file: Path, folders: tuple[Path, Path], abouts: tuple[Mapping[str, Any], Mapping[str, Any]]
+) -> tuple[str, list[tuple[str, ...]]]:
+    """Write a page that shows two results and what changed; returns its sentence, and the rows of its table `HEAD`."""
     names = _names(folders)
     results = []
     for name, about in zip(names, abouts):
@@ -40,15 +56,18 @@ def write(file: Path, folders: tuple[Path, Path], abouts: tuple[Mapping[str, Any
         heading = {"name": name, "verdict": about["verdict"], "headline": headline, "expected_error": expected_error}
         results.append({**heading, "gates": page.gate_rows(about["gates"])})
     found = rows(*abouts)
+    maps = _maps(folders, names)
     content = {
         "results": results,
-        **_maps(folders, names),
+        **maps,
+        "head": HEAD,
         "differences": [
             (f"{kind} that differ", [label_row(row) for row in found if row[0].startswith(kind.lower())])
             for kind in ("Figures", "Settings")
         ],
     }
     page.render("compare.html", file, f"{names[0]} and {names[1]}: polcap", content)
+    return maps["sentence"], maps["rows"]
 
 
 def _names(folders: tuple[Path, Path]) -> tuple[str, str]:
@@ -61,41 +80,95 @@ def _names(folders: tuple[Path, Path]) -> tuple[str, str]:
     return "first", "second"
 
 
-def _maps(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
-    """Figures of the maps of two results by title, with difference maps where the crops have the same size."""
+def _maps(folders: tuple[Path, Path], names: tuple[str, str]) -> dict[str, Any]:
+    """What changed between the maps of two results: sentences, table, and figures by title."""
     try:
-        stored = [maps_folder.read(folder / "maps") for folder in folders]
+        one, other = (maps_folder.read(folder / "maps") for folder in folders)
     except DecodeError as error:
-        return {"fault": str(error)}
-    small = [ObjectReduction(maps.mask, _LONGEST).maps(maps) for maps in stored]
-    same = stored[0].mask.shape == stored[1].mask.shape
-    both = small[0].mask & small[1].mask if same else np.zeros((1, 1), bool)
-    normals = [
-        map_figures.normal(f"normal-{place}", name, maps.normal, maps.mask)
-        for place, (maps, name) in enumerate(zip(small, names))
-    ]
-    if same:
-        cosine = np.sum(small[0].normal * small[1].normal, axis=-1)
-        angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-        note = f"median {labels.number(float(np.median(angle[both])), 2)}°" if both.any() else ""
-        normals.append(
-            map_figures.scalar("normal-difference", "Angle between the normals", note, angle, both, keys.ERROR)
-        )
-    sections: list[tuple[str, list[MapFigure]]] = [("Normal", normals)]
-    for kind, title, key, values in (
-        ("roughness", "Roughness", keys.ROUGHNESS, [maps.roughness for maps in small]),
-        ("error", "Expected error of the normal", keys.ERROR, [maps.confidence for maps in small]),
-        ("diffuse", "Diffuse albedo, mean of the channels", keys.ALBEDO, [maps.diffuse.mean(-1) for maps in small]),
-    ):
+        return {"sentence": f"No maps to compare: {error}", "notes": [], "rows": [], "slider": (), "maps": []}
+    first, second = (ObjectReduction(maps.mask, _LONGEST).maps(maps) for maps in (one, other))
+    found = changes.measure(first, second)
+    if not found.usable:
+        text = "The two results show different objects or sides: their pictures cannot be laid on each other"
+        return {"sentence": f"{text}.", "notes": [], "rows": [], "slider": (), "maps": []}
+    return {
+        "sentence": sentence(found),
+        "notes": _notes(found),
+        "rows": _table(found),
+        "slider": tuple(html.jpeg(_picture(maps, found.both)) for maps in (first, found.other)),
+        "maps": _figures(names, first, found),
+    }
+
+
+def sentence(found: Changes) -> str:
+    """One sentence on what changed beyond the doubt."""
+    changed = [_change(name, one) for name, one in found.differences.items() if one.changed.any()]
+    if changed:
+        return f"Changed beyond the doubt: {', '.join(changed)} of the object."
+    color, normal, rough = (labels.number(one.median, 2) for one in found.differences.values())
+    agree = f"colors agree to ΔE2000 {color}, normals to {normal}°, roughness to {rough} (medians)"
+    return f"Nothing changed beyond the doubt: {agree}."
+
+
+def _change(name: str, difference: changes.Difference) -> str:
+    """A changed quantity with its size and share."""
+    size = float(np.median(difference.value[difference.changed]))
+    share = f"on {labels.number(100 * difference.share, 2)} %"
+    if name == "roughness":
+        return f"roughness by {size:+.2f} {share}"
+    return f"color by ΔE2000 {size:.1f} {share}" if name == "color" else f"normals by {size:.1f}° {share}"
+
+
+def _notes(found: Changes) -> list[str]:
+    """Sentences on how the second result was laid on the first."""
+    notes = [f"{100 * found.share:.0f} % of the object is compared; the pictures correlate by {found.correlation:.2f}."]
+    if found.turn_deg > 1:
+        notes.append(f"The camera turned by {found.turn_deg:.1f}° about the object; the normals are turned back.")
+    if abs(found.gain - 1) > 0.02:
+        notes.append(f"Albedo of the second result × {found.gain:.2f}: the scales of both are known no better.")
+    return notes
+
+
+def _table(found: Changes) -> list[tuple[str, ...]]:
+    rows = []
+    for name, one in found.differences.items():
+        title, unit = _NAMES[name]
+        size, middle = (float(np.quantile(np.abs(one.value[found.both]), q)) for q in (0.99, 0.5))
+        doubt = float(np.median(one.doubt[found.both]))
+        numbers = (f"{labels.number(value, 2)}{unit}" for value in (middle, size, doubt))
+        rows.append((title, *numbers, f"{labels.number(100 * one.share, 2)} %"))
+    return rows
+
+
+def _picture(maps: SurfaceMaps, both: Bools) -> NDArray[np.uint8]:
+    """The object under a lamp at the upper right, as 8-bit sRGB."""
+    return srgb_eight_bits(np.clip(maps.diffuse * (changes.shading(maps) * both)[..., None], 0, 1))
+
+
+def _figures(names: tuple[str, str], first: SurfaceMaps, found: Changes) -> list[tuple[str, list[MapFigure]]]:
+    """Figures of each quantity: both results, their difference, and the difference over the doubt."""
+    draw: dict[str, Callable[[str, str, SurfaceMaps], MapFigure]] = {
+        "color": lambda at, name, maps: map_figures.scalar(
+            at, name, "luminance of the diffuse albedo", luminance(maps.diffuse), found.both, keys.ALBEDO
+        ),
+        "normal": lambda at, name, maps: map_figures.normal(at, name, maps.normal, found.both),
+        "roughness": lambda at, name, maps: map_figures.scalar(
+            at, name, "", maps.roughness, found.both, keys.ROUGHNESS
+        ),
+    }
+    sections = []
+    for kind, one in found.differences.items():
+        title, unit = _NAMES[kind]
+        note = f"{names[1]} minus {names[0]}" if kind == "roughness" else f"median {labels.number(one.median, 2)}{unit}"
+        over, limit = np.abs(one.value) / one.doubt, f"over {changes.LIMIT:g} in a region: changed"
         figures = [
-            map_figures.scalar(f"{kind}-{place}", name, "", values[place], small[place].mask, key)
-            for place, name in enumerate(names)
+            draw[kind](f"{kind}-0", names[0], first),
+            draw[kind](f"{kind}-1", names[1], found.other),
+            map_figures.scalar(f"{kind}-difference", "Change", note, one.value, found.both, _KEYS[kind]),
+            map_figures.scalar(f"{kind}-doubt", "Change over doubt", limit, over, found.both, _OVER_DOUBT),
         ]
-        if same and kind != "error":
-            note, change = f"{names[1]} minus {names[0]}", values[1] - values[0]
-            figures.append(map_figures.scalar(f"{kind}-difference", "Difference", note, change, both, _DIFFERENCE))
         sections.append((title, figures))
-    return {"fault": "", "same_size": same, "maps": sections}
+    return sections
 
 
 def _flat(about: Mapping[str, Any]) -> dict[str, Any]:
