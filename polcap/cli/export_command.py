@@ -70,8 +70,8 @@ def export(
     from polcap.pipeline.asset_export import ExportRequest
 
     formats = tuple(name for name in presets.FORMATS if context.params[name] not in (None, False))
-    if preset and formats:
-        raise SettingError(f"--preset {preset[0]} brings its formats; write --{formats[0]} by a second export")
+    if preset and (others := [name for name in formats if name != "iiif"]):
+        raise SettingError(f"--preset {preset[0]} brings its formats; write --{others[0]} by a second export")
     plain = ExportRequest(
         formats=formats or ("gltf", "obj"),
         images=images,
@@ -87,8 +87,10 @@ def export(
         lod=lod,
     )
     wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
-    write = fuse_run.export if fused_maps.is_fused(result) else pipeline.export
-    files = write(result, *wanted)
+    fused = fused_maps.is_fused(result)
+    if fused and "displacement" in plain.extras:
+        terminal.print_message("polcap: --extra displacement is left out: a closed mesh has none", "WARNING")
+    files = (fuse_run.export if fused else pipeline.export)(result, *wanted)
     options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
     if (missing := lod * len(wanted) - sum(bool(_LEVEL.search(file.name)) for file in files)) > 0:
         terminal.print_message(f"polcap: {missing} levels of --lod would differ by over 1 % of the size: not written")

@@ -14,6 +14,7 @@ from polcap.chart_values import ColorCalibration, PatchColors
 from polcap.errors import ChartError
 from polcap.formats import atomic, text_file
 
+NAME = "color.toml"  # in a result folder
 _OfPatches = Meta(min_length=24, max_length=24)
 _Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
 

@@ -14,6 +14,7 @@ from polcap.config import restore
 from polcap.errors import SettingError
 from polcap.formats.capture import folder_names
 from polcap.formats.export import encoders, provenance
+from polcap.formats.export.presets import Format
 from polcap.fusion import fused_maps, fused_page, object_pictures
 from polcap.fusion import session as sessions
 from polcap.fusion.baking import AtlasMaps
@@ -61,20 +62,24 @@ def fuse(session_input: SessionInput, out: Path, notify: Notify, progress: Progr
 
 def export(out: Path, *requests: ExportRequest) -> list[Path]:
     """Write the asset of a fused result again for each request, from maps/ and report.json; returns the files."""
+    requests = tuple(_of_closed_mesh(request) for request in requests)
     for request in requests:
         asset_export.check(request)
         for flag in {"exr", "iiif"} & set(asset_export.effective(request).formats):
             raise SettingError(
-                f"--{flag} is for results of one view, not for a fused object; "
-                "leave it out (and --preset archive), and use maps/"
+                f"--{flag} is for results of one view, not for a fused object; leave it out, and use maps/"
             )
-        if "displacement" in request.extras:
-            raise SettingError("--extra displacement is for results of one view: a closed mesh has none; leave it out")
     about = reports.read(out)
     with result_folder.locked(out):
         source = fused_maps.read(out / "maps", restore(SessionConfig, about, out / "report.json").asset)
         exports = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in requests)
         return [file for files in exports for file in files]
+
+
+def _of_closed_mesh(request: ExportRequest) -> ExportRequest:
+    """The request without what a closed mesh does not have: displacement, and the layered EXR of a preset."""
+    without: tuple[Format, ...] = () if request.preset is None else ("exr",)
+    return replace(request, without=without, extras=tuple(one for one in request.extras if one != "displacement"))
 
 
 def _with_albedo_scale(maps: AtlasMaps, processed: ProcessedSession) -> AtlasMaps:

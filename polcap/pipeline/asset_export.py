@@ -18,6 +18,7 @@ from polcap.config import Config
 from polcap.errors import SettingError
 from polcap.formats import atomic, text_file
 from polcap.formats.export import (
+    archive,
     exr_layers,
     glb_geometry,
     gltf,
@@ -64,7 +65,8 @@ class ExportRequest:
     extras: tuple[Extra, ...] = ()  # channels to compute, and to write as a file each
     texture_size: int | None = None  # px of the longer side; by default each texture's own
     page: Path | None = None  # file with model-viewer's script, for a web page that shows the GLB
-    iiif: str | None = None  # address where the folder of the format `iiif` will be served
+    iiif: str | None = None  # address where the folder of the format `iiif`, which it adds, will be served
+    without: tuple[Format, ...] = ()  # formats of a preset that this kind of result does not have
     catalog: Mapping[str, str] = field(default_factory=dict)  # fields of `CatalogEntry` in place of the capture's
     lod: int = 0  # number of further GLBs, each with a quarter of the previous one's triangles and texels
 
@@ -158,8 +160,10 @@ def check(wanted: ExportRequest) -> None:
     glb_geometry.require(preset.geometry)
     if "iiif" in preset.formats:
         iiif.check(wanted.iiif or "")
-        if wanted.texture_size is not None:
-            raise SettingError("--iiif keeps the proportions of the photographs; leave out --texture-size")
+        if wanted.texture_size is not None or preset.powers:
+            raise SettingError(
+                "--iiif keeps the proportions of the photographs; leave out --texture-size and presets for engines"
+            )
     if wanted.page is not None:
         web_page.read_script(wanted.page)
         if "gltf" not in preset.formats:
@@ -273,9 +277,6 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
         page, glb = folder / f"{stem}.html", folder / f"{stem}.glb"
         web_page.write(page, glb, web_page.read_script(wanted.page), facts.get("title", stem))
         written.append(page)
-    sidecar = folder / f"{stem}.provenance.json"
-    digests = {file.relative_to(folder).as_posix(): provenance.digest(file) for file in written}
-    provenance.write(sidecar, record, digests)
     description = {
         "for": preset.description,
         "unit": unit,
@@ -285,6 +286,13 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
         "textures": {file: texture.meaning for file, texture in sorted(loose.items())},
     }
     maps_folder.note_export(out / "maps", folder.relative_to(out).as_posix(), description)
+    if preset.gathers:
+        written += archive.gather(out, folder)
+    sidecar = folder / f"{stem}.provenance.json"
+    digests = {file.relative_to(folder).as_posix(): provenance.digest(file) for file in written}
+    provenance.write(sidecar, record, digests)
+    if preset.gathers:
+        written.append(archive.write_manifest(folder))
     return [*written, sidecar]
 
 
@@ -335,13 +343,16 @@ def effective(wanted: ExportRequest) -> ExportPreset:
     else:
         hint = text_file.suggestion(wanted.preset, PRESETS)
         raise SettingError(f"--preset {wanted.preset}: there is no such preset; {hint}")
+    added: tuple[Format, ...] = () if wanted.iiif is None else ("iiif",)
+    formats = tuple(one for one in dict.fromkeys((*preset.formats, *added)) if one not in wanted.without)
     return replace(
         preset,
         images=wanted.images or preset.images,
         geometry=wanted.geometry or preset.geometry,
         triangles=wanted.triangles or preset.triangles,
         bits=wanted.bits or preset.bits,
-        extras=(*preset.extras, *wanted.extras, *(_NEEDED if "iiif" in preset.formats else ())),
+        formats=formats,
+        extras=(*preset.extras, *wanted.extras, *(_NEEDED if "iiif" in formats else ())),
     )
 
 

@@ -31,7 +31,6 @@ from polcap.report import animation
 from polcap.report import stage_pictures as pictures
 from polcap.results import STAGES, Results
 
-PROFILE = "color.toml"  # in the result folder, with the report
 ASSET = STAGES[-1]  # made after the path, from the files in maps/
 
 
@@ -115,9 +114,11 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
         partial(_write_assets, out, about, config, [ExportRequest()], results.mesh),
     )
     if results.color.source in ("chart", "corners"):
-        color_profile.write(out / PROFILE, results.color)
-    elif results.color.source != "profile" and (own := own_files.owner(out / PROFILE)):  # a profile may be this file
-        own.remove(out / PROFILE)
+        color_profile.write(out / color_profile.NAME, results.color)
+    elif results.color.source != "profile" and (
+        own := own_files.owner(out / color_profile.NAME)
+    ):  # a profile may be this file
+        own.remove(out / color_profile.NAME)
     return about
 
 

@@ -1,5 +1,6 @@
 """`polcap export`: every preset whole and valid, the same bytes whenever, one line where it cannot."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -104,7 +105,7 @@ def test_sidecar_knows_photographs_settings_and_files(exported: Path) -> None:
     assert recorded["settings"] == about["settings"] and recorded["stages"] == about["keys"]
     assert recorded["versions"]["polcap"] == about["polcap"] and "numpy" in recorded["versions"]
     files = {file.name for file in (exported / "asset" / "archive").iterdir()}
-    assert set(recorded["files"]) == files - {"capture.provenance.json"}
+    assert files - {"capture.provenance.json", "manifest-sha256.txt", "maps"} <= set(recorded["files"])
     packet = document((exported / "asset/archive/capture.glb").read_bytes())["extensions"]["KHR_xmp_json_ld"][
         "packets"
     ][0]
@@ -140,6 +141,10 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, own: P
         (["--obj", "--page", ROOT / "README.md"], "README.md is not model-viewer"),
         (["--iiif", "museum.example/7"], "--iiif museum.example/7 is no web address"),
         (["--iiif", "http://museum.example/7", "--texture-size", "512"], "leave out --texture-size"),
+        (
+            ["--iiif", "http://museum.example/7", "--preset", "unity"],
+            "and presets for engines",
+        ),
         (["--exr", "--color", "ACEScq"], "--color ACEScq is not a color space or role"),
     ],
 )
@@ -289,6 +294,35 @@ def test_presets_of_one_command_each_get_their_folder(own: Path, polcap: Command
     for preset in ("web", "unreal"):
         assert stated[f"asset/{preset}"]["mesh"]["triangles"] == pytest.approx(3000, rel=0.01)
     assert "KHR_mesh_quantization" in document((own / "asset/web/capture.glb").read_bytes())["extensionsRequired"]
+
+
+def check_sums(archive: Path) -> list[str]:
+    """The files that the manifest of an archive lists; it must be right for each, and list all others."""
+    listed = {}
+    for line in (archive / "manifest-sha256.txt").read_text().splitlines():
+        digest, name = line.split("  ")
+        assert hashlib.sha256((archive / name).read_bytes()).hexdigest() == digest
+        listed[name] = digest
+    files = {file.relative_to(archive).as_posix() for file in archive.rglob("*") if file.is_file()}
+    assert set(listed) == files - {"manifest-sha256.txt"}
+    return list(listed)
+
+
+def test_an_archive_checks_itself_after_two_exports_and_a_copy(own: Path, polcap: Command, tmp_path: Path) -> None:
+    pytest.importorskip("pxr", reason="needs usd-core")
+    first = polcap("export", own, "--preset", "archive", "--about", "title=Vase", "--iiif", "https://museum.example/7")
+    assert first.returncode == 0, first.stderr
+    names = check_sums(own / "asset/archive")
+    assert {"maps/normal.exr", "maps/maps.json", "report.html", "report.json", "capture.glb"} <= set(names)
+    assert "capture_iiif/manifest.json" in names and len([name for name in names if name.endswith("default.jpg")]) > 8
+    assert ("color.toml" in names) == (own / "color.toml").exists()
+    second = polcap("export", own, "--preset", "archive", "--extra", "occlusion", "--about", "title=Vase")
+    assert second.returncode == 0 and second.stderr == ""
+    shutil.copytree(own / "asset/archive", tmp_path / "elsewhere")
+    assert set(check_sums(tmp_path / "elsewhere")) == {*names, "capture_occlusion.png"}
+    if program := shutil.which("sha256sum"):
+        command = [program, "-c", "--quiet", "manifest-sha256.txt"]
+        assert subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True).returncode == 0
 
 
 def test_extra_textures_and_sixteen_bits(own: Path, polcap: Command) -> None:

@@ -25,6 +25,7 @@ class ExportPreset:
     images: Kind = "png"  # inside the GLB
     geometry: Geometry = "float"  # inside the GLB
     powers: bool = False  # sides of the textures are powers of two, as engines compress and mipmap them
+    gathers: bool = False  # maps, report and color profile too, with a list of digests
     triangles: int | None = None  # at most; by default those of the full mesh
     bits: Literal[8, 16] = 8  # of a texture's channel
     shared: Literal["png", "exr"] = "png"  # files of the textures of OBJ, USD and MaterialX
@@ -109,7 +110,8 @@ PRESETS: Mapping[str, ExportPreset] = {
     ),
     "archive": ExportPreset(
         formats=("gltf", "obj", "usd", "materialx", "exr"),
-        description="every format; textures of 16 bits, values in full precision in the layered EXR; normals +Y",
+        description="every format, maps and report, with digests; textures of 16 bits; normals +Y",
+        gathers=True,
         bits=16,
     ),
 }

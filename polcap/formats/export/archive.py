@@ -1,0 +1,35 @@
+"""Gathers a result's records next to an export, and lists digests of all its files for `sha256sum -c`."""
+
+import shutil
+from pathlib import Path
+
+from polcap.formats import atomic, color_profile, own_files
+from polcap.formats.raw import file_bytes
+
+MANIFEST = "manifest-sha256.txt"
+_RECORDS = ("report.html", "report.json", color_profile.NAME)
+
+
+def gather(out: Path, folder: Path) -> list[Path]:
+    """Copy maps/, report and color profile of the result `out` into the folder of an export; returns the copies."""
+    own = own_files.owner(out / "report.json")
+    maps = [] if own is None else own.below(out / "maps")
+    found = [*maps, *(file for name in _RECORDS if (file := out / name).is_file())]
+    copies = [folder / file.relative_to(out) for file in found]
+    for file, copy in zip(found, copies):
+        with atomic.path(copy) as temporary:
+            shutil.copyfile(file, temporary)
+    return copies
+
+
+def write_manifest(folder: Path) -> Path:
+    """Write the digests of all files that polcap has written into a folder, those of earlier exports included.
+
+    The lines are those of sha256sum, with paths relative to the folder.
+    """
+    manifest = folder / MANIFEST
+    own = own_files.owner(manifest)
+    files = [] if own is None else [file for file in own.below(folder) if file != manifest]
+    lines = [f"{file_bytes.digest(file.read_bytes())}  {file.relative_to(folder).as_posix()}\n" for file in files]
+    atomic.write(manifest, "".join(lines))
+    return manifest
