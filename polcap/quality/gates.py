@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polcap.quality import error_maps, geometry, light, polarization, shot_exposure
+from polcap.quality import error_maps, geometry, light, polarization, rerendering, shot_exposure
 from polcap.quality.gate import MOST_DEG, Evidence, Gate, State
 from polcap.quality.limits import GateLimits
 
@@ -62,7 +62,8 @@ _STEPS = (
     Step(("room light", "lighting"), light.polarized_light, "infer", (*_POLARIZED, "other light")),
     Step(("crossed",), light.crossed, "stokes", _PAIRED),
     Step(("ill-posed",), polarization.ill_posed, "stokes", (*_POLARIZED, "other light", "lighting")),
-    Step(("outline",), geometry.inward_outline, "infer", _SHAPED),
+    Step(("re-rendering",), rerendering.rerendering, "infer", _SHAPED),
+    Step(("outline",), geometry.inward_outline, "infer", (*_SHAPED, "re-rendering")),
     Step(("albedo scale",), light.albedo_scale, "infer", ("clipping", "chart")),
     Step(("focal length",), _without_limits(geometry.focal_length), "infer"),
 )

@@ -16,7 +16,7 @@ from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean
 from polcap.optics.sharpness import TILE
-from polcap.quality import object_turn, rim
+from polcap.quality import object_turn, rerendering, rim
 from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, Unit, at_most, bad_shots, worded
 from polcap.quality.limits import GateLimits
 from polcap.stage_values import SurfaceMaps
@@ -112,7 +112,7 @@ def _judge_shift(found: Evidence, limits: GateLimits) -> Gate:
 
 def _judge_turn(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on a turn of the object between shots, beyond twice its error."""
-    measured, names, limit = _measure_turn(found), found.names, limits.max_object_turn_deg
+    measured, names, limit = _measure_turn(found, limits), found.names, limits.max_object_turn_deg
     least = measured.degrees - 2 * measured.sigma
     k = int(np.argmax(least))
     true = np.sqrt(np.maximum(measured.degrees**2 - measured.sigma**2 - _FALSE_TURN_DEG**2, 0))
@@ -129,8 +129,11 @@ def _measure_shift(found: Evidence) -> object_motion.ObjectShift:
     return object_motion.measure(found.radiance, found.alignment, found.object_)
 
 
-def _measure_turn(found: Evidence) -> object_turn.ObjectTurn:
+def _measure_turn(found: Evidence, limits: GateLimits) -> object_turn.ObjectTurn:
+    """Turn of the object, by the depth of the maps only if these explain the photographs."""
     maps = found.maps if found.has("infer") else None
+    if maps is not None and not rerendering.explains(rerendering.measure(found), limits):
+        maps = None
     return object_turn.measure(found.radiance, found.alignment, found.object_, maps)
 
 

@@ -149,6 +149,18 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_ill_posed: Annotated[
         float, Meta(ge=0, le=1, description="allowed share of the object with a DoLP above that of any dielectric [1]")
     ] = 0.05
+    min_rerendering_agreement: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=1,
+            description="least agreement of the photographs' polarization with that of the maps; 1 is perfect [1]",
+        ),
+    ] = 0.2
+    max_rerendering_scale: Annotated[
+        float,
+        Meta(ge=1, description="largest factor between the brightness of the photographs and that of the maps [1]"),
+    ] = 1.7
     max_ghost: Annotated[
         float,
         Meta(ge=0, le=1, description="allowed share of the object where exposures of a shot disagree beyond noise [1]"),

@@ -8,7 +8,7 @@ import numpy as np
 from polcap.images import Floats, View
 from polcap.mesh_values import ReliefMesh
 from polcap.optics import color, frames, projection, shade
-from polcap.report.reduction import ObjectReduction
+from polcap.optics.reduction import ObjectReduction
 from polcap.report.sheets import Picture
 from polcap.stage_values import SurfaceMaps
 

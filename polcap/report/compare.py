@@ -12,11 +12,11 @@ from polcap.formats import html
 from polcap.formats.maps import maps_folder
 from polcap.images import Bools
 from polcap.optics.color import luminance, srgb_eight_bits
+from polcap.optics.reduction import ObjectReduction
 from polcap.report import changes, keys, labels, map_figures, page
 from polcap.report.changes import Changes
 from polcap.report.keys import ColorKey
 from polcap.report.map_figures import MapFigure
-from polcap.report.reduction import ObjectReduction
 from polcap.stage_values import SurfaceMaps
 
 _LONGEST = 640  # px, longest side of a map

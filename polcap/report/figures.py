@@ -9,7 +9,7 @@ from polcap.chart_values import ColorCalibration, PatchColors
 from polcap.formats.maps import maps_folder
 from polcap.images import Floats, Quality
 from polcap.mesh_values import Mesh
-from polcap.report import page_data
+from polcap.quality.rerendering import reduce, rerender
 from polcap.results import Results
 from polcap.stage_values import StokesImage
 from polcap.stages.whitebalance import patches
@@ -60,10 +60,10 @@ def measured(results: Results) -> dict[str, dict[str, Any]]:
 
 def rerendering(results: Results, ior: float) -> dict[str, Any]:
     """Figures of the re-rendering: photographs against the maps rendered under the same light and polarizer angle."""
-    small = page_data.reduce(results.maps, results.mesh, results.cues, results.radiance.angle, _COMPARED_PX)
-    rendered = page_data.rerender(small, ior)
+    small = reduce(results.maps, results.cues, results.radiance.angle, _COMPARED_PX)
+    rendered = rerender(small, ior)
     found = {name: [_plain(one) for one in values] for name, values in rendered.residuals(small.maps.mask).items()}
-    return {**found, "scale": _plain(rendered.scale)}
+    return {**found, "scale": _plain(rendered.scale), "agreement": _plain(rendered.agreement)}
 
 
 def _colors(color: ColorCalibration, albedo_sigma: float | None) -> dict[str, Any]:

@@ -70,6 +70,7 @@ LABELS: dict[str, tuple[str, str]] = {
     "mesh.raggedness": ("Raggedness: mesh border longer than its smoothed curve by", "%"),
     "rerendering.rms": ("Difference of photograph and re-rendering at each angle, without outliers, to white", "%"),
     "rerendering.outliers": ("Pixels that differ by more than five standard deviations, at each angle", "%"),
+    "rerendering.agreement": ("Agreement of their polarizations: 1 if equal, −1 if across", "1"),
     "rerendering.scale": ("Brightness of the photographs relative to the re-rendering", "×"),
 }
 PARTS = {

@@ -12,10 +12,11 @@ from polcap.images import Bools, Floats
 from polcap.optics.color import srgb_eight_bits
 from polcap.optics.morphology import dilate
 from polcap.optics.outline import fill_outward
+from polcap.quality.rerendering import Rerendering
 from polcap.report import keys
 from polcap.report.keys import ColorKey
 from polcap.report.labels import number
-from polcap.report.page_data import PageMaps, Rerendering
+from polcap.report.page_data import PageMaps
 
 _BORDER_PX = 4  # colors continue beyond the outline, because textures are interpolated
 _WHEEL_STEPS = 72

@@ -12,6 +12,7 @@ from polcap.formats import html, shipped_data
 from polcap.formats.capture import layouts
 from polcap.formats.maps import png
 from polcap.optics.color import srgb_eight_bits
+from polcap.quality.rerendering import rerender
 from polcap.report import keys, labels, levels, map_figures, page_data, plots
 from polcap.report import stage_pictures as pictures
 from polcap.report.keys import Palette
@@ -125,7 +126,7 @@ def _maps(about: Mapping[str, Any], results: Results) -> tuple[dict[str, Any], d
     """Map figures of the report, and the camera data of its interactive pictures."""
     maps, ior = results.maps, float(about["settings"]["infer"]["ior"])
     small = page_data.reduce(maps, results.mesh, results.cues, results.radiance.angle, _LONGEST)
-    rendered = page_data.rerender(small, ior)
+    rendered = rerender(small, ior)
     bright = page_data.exposure(small)
     view, size = small.maps.view, small.maps.mask.shape[1::-1]
     photograph = page_data.photograph(results.radiance, results.color, view, size)

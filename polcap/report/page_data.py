@@ -6,102 +6,44 @@ import cv2
 import numpy as np
 
 from polcap.chart_values import ColorCalibration
-from polcap.images import Bools, Floats, View
+from polcap.images import Floats, View
 from polcap.mesh_values import ReliefMesh
-from polcap.optics import frames, shade
+from polcap.optics.reduction import ObjectReduction
 from polcap.optics.resize import area_mean
-from polcap.report.reduction import ObjectReduction
+from polcap.quality import rerendering
+from polcap.quality.rerendering import WHITE_QUANTILE, ReducedResult
 from polcap.stage_values import AngleStack, Cues, SurfaceMaps
 
 _WHITE_PATCH = 18  # of a ColorChecker Classic, row by row from dark skin
-_OUTLIER = 5  # standard deviations of the differences
-_WHITE_QUANTILE = 0.995  # of the object's light; it becomes white
 
 
 @dataclass(frozen=True)
-class PageMaps:
+class PageMaps(ReducedResult):
     """Maps and cues of the object on one reduced grid, for report.html."""
 
-    maps: SurfaceMaps
     depth: Floats  # (H, W) of the mesh; NaN outside
-    radiance: Floats  # (H, W, 3) S0, linear Rec.709
     dolp: Floats  # (H, W)
     aolp: Floats  # (H, W) degrees, 0…180
-    ratio: Floats  # (2, H, W) S1/S0, S2/S0
-    angle: Floats  # (K,) rad
 
 
 def reduce(maps: SurfaceMaps, mesh: ReliefMesh, cues: Cues, angle: Floats, longest: int) -> PageMaps:
     """Reduce the maps of a result to at most `longest` pixels a side; means are taken over the object only."""
+    small = rerendering.reduce(maps, cues, angle, longest)
     reduction = ObjectReduction(np.asarray(maps.mask & cues.mask, bool), longest)
-    light = np.maximum(frames.total(cues.radiance), 1e-6)
-    weight = np.maximum(reduction.mean(light), 1e-9)
     axis = [reduction.mean(part) for part in cues.normalized_stokes]
-    small = reduction.maps(maps)
     where_depth = ObjectReduction(reduction.inside & np.isfinite(mesh.depth), longest)
     return PageMaps(
-        maps=small,
-        depth=np.where((where_depth.share > 0.5) & small.mask, where_depth.mean(mesh.depth), np.nan),
-        radiance=reduction.mean(cues.radiance),
+        **vars(small),
+        depth=np.where((where_depth.share > 0.5) & small.maps.mask, where_depth.mean(mesh.depth), np.nan),
         dolp=reduction.mean(cues.dolp),
         aolp=np.degrees(np.arctan2(axis[1], axis[0]) / 2) % 180,
-        ratio=np.stack([reduction.mean(part * light) / weight for part in cues.ratio]),
-        angle=angle,
     )
-
-
-@dataclass(frozen=True)
-class Rerendering:
-    """Gray photographs of each polarizer angle, and the maps rendered under the same light and angle."""
-
-    measured: Floats  # (K, H, W) S0 + S1 cos 2θ + S2 sin 2θ; 1 is white, brighter values are clipped
-    predicted: Floats  # (K, H, W) the same, rendered from the maps under a flash at the lens
-    flashed: Floats  # (H, W, 3) S0 of the maps under that flash, linear Rec.709
-    scale: float  # brightness of the photographs over that of the re-rendering, median of the pixels
-
-    def residuals(self, inside: Bools) -> dict[str, list[float]]:
-        """Difference of photograph and re-rendering at each angle: `rms` without outliers, and share of `outliers`.
-
-        The rms is relative to white. An outlier differs by more than five standard deviations, which the median of
-        the absolute differences gives: a few pixels of a highlight do not carry the figure.
-        """
-        found: dict[str, list[float]] = {"rms": [], "outliers": []}
-        for measured, predicted in zip(self.measured, self.predicted):
-            size = np.abs(measured - predicted)[inside]
-            far = size > _OUTLIER * max(1.4826 * float(np.median(size)), 1e-6) if size.size else size > 0
-            found["rms"].append(float(np.sqrt(np.mean(size[~far] ** 2))))
-            found["outliers"].append(float(far.mean()))
-        return found
-
-
-def rerender(small: PageMaps, ior: float) -> Rerendering:
-    """Render the maps under the flash for each polarizer angle, for comparison with the photographs."""
-    maps = small.maps
-    ray = frames.rays(maps.view, *maps.mask.shape)
-    normal = frames.to_ray_frame(maps.normal, ray)
-    ahead = np.zeros_like(ray)
-    ahead[..., 2] = 1.0
-    one = np.ones(maps.mask.shape, np.float32)
-    rough = np.maximum(maps.roughness, 0.02)
-    stokes = np.asarray(shade.stokes(normal, maps.diffuse, maps.specular, rough, ior * one, ahead, one))
-    s0, s1, s2 = frames.total(stokes) / 3 * maps.mask
-    seen = frames.total(small.radiance) / 3 * maps.mask
-    light, lit = seen[maps.mask], s0[maps.mask]
-    scale = float(np.median(light[lit > 0] / lit[lit > 0])) if (lit > 0).any() else 1.0
-    white = max(float(np.quantile(light, _WHITE_QUANTILE)), 1e-6) if light.size else 1.0
-    measured, predicted = [], []
-    for angle in small.angle:
-        on_ray = frames.axis_on_ray(np.float32(angle), ray)
-        measured.append(seen * (1 + small.ratio[0] * np.cos(2 * angle) + small.ratio[1] * np.sin(2 * angle)) / white)
-        predicted.append(scale * (s0 + s1 * np.cos(2 * on_ray) + s2 * np.sin(2 * on_ray)) / white)
-    flashed = stokes[0] * maps.mask[..., None]
-    return Rerendering(np.minimum(measured, 1.0), np.minimum(predicted, 1.0), flashed, scale)
 
 
 def exposure(small: PageMaps) -> float:
     """Factor on S0 for display: the brightest parts of the object become just below white."""
     inside = small.radiance[small.maps.mask]
-    return 0.9 / max(float(np.quantile(inside.max(axis=-1), _WHITE_QUANTILE)), 1e-6) if inside.size else 1.0
+    return 0.9 / max(float(np.quantile(inside.max(axis=-1), WHITE_QUANTILE)), 1e-6) if inside.size else 1.0
 
 
 def photograph(radiance: AngleStack, calibration: ColorCalibration, view: View, size: tuple[int, int]) -> Floats:

@@ -19,9 +19,10 @@ from polcap.capture_values import AngleStatement, ShotOrder
 from polcap.chart_values import PatchColors
 from polcap.config import Config
 from polcap.images import Quality
-from polcap.quality import gates, geometry, light, polarization, rim, shot_exposure
+from polcap.quality import gates, geometry, light, polarization, rerendering, rim, shot_exposure
 from polcap.quality.gate import Evidence, Gate
 from polcap.quality.object_turn import ObjectTurn
+from polcap.quality.rerendering import Rerendering
 from polcap.stage_values import AngleStack, BlackError, Equipment, OrderTest, OutlineCheck, RingZero, TurnedShot
 from polcap.stages.align.object_motion import ObjectShift
 from tests import scenes
@@ -33,6 +34,10 @@ def pushed(second: float, third: float = 0.0, sigma: float = 0.1) -> ObjectShift
     return ObjectShift(np.array([0.0, second, third]), np.array([0.0, sigma, sigma]))
 
 
+def rendered(agreement: float = 0.7, scale: float = 1.0) -> Rerendering:
+    return Rerendering(np.zeros(0), np.zeros(0), np.zeros(0), scale, agreement)
+
+
 BODY = {
     "dolp": 0.1, "dolp_lit": 0.1, "dolp_most": 0.1, "along": 0.9, "concentration": 0.95, "turned": 0.0,
     "turned_sigma": 0.01, "brightness": 0.5, "one_sided": 0.1,
@@ -42,12 +47,13 @@ FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
     "pushed": pushed(0.1, 0.1), "turn": ObjectTurn(np.array([0.0, 0.2, 0.1]), np.full(3, 0.1)),
     "edge_blur": 0.8,
-    "charted": 0.0, "noise": 0.001, "ill_posed": 0.0, "medians": [45.0, 0.2, 0.3],
+    "charted": 0.0, "rendered": rendered(), "noise": 0.001, "ill_posed": 0.0, "medians": [45.0, 0.2, 0.3],
     "normal_error": 4.0, "lean": 2.0, "crossed": light.CrossedFigures(0.0, 0, 0.0, 0.1),
 }  # fmt: skip
 MEASURES = {  # the function that measures each figure
     "surroundings": (light, "_surroundings_dolp"), "highlight": (light, "_highlight_dolp"),
     "pushed": (geometry, "_measure_shift"), "turn": (geometry, "_measure_turn"), "edge_blur": (geometry, "_edge_blur"),
+    "rendered": (rerendering, "measure"),
     "charted": (geometry, "_chart_share"), "lean": (geometry, "_lean"),
     "noise": (shot_exposure, "_noise"), "crossed": (light, "_compare_crossed"),
     "ill_posed": (polarization, "_ill_posed"), "medians": (polarization, "_medians"),
@@ -220,6 +226,11 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("ill-posed", "fail", {"figures": {"ill_posed": 0.5}}),
     ("outline", "pass", {}),
     ("outline", "fail", {"figures": {"inward_outline": 0.3}}),
+    ("re-rendering", "pass", {}),
+    ("re-rendering", "fail", {"figures": {"rendered": rendered(agreement=-0.5)}}),
+    ("re-rendering", "fail", {"figures": {"rendered": rendered(scale=0.4)}}),
+    ("re-rendering", "fail", {"figures": {"rendered": rendered(scale=2.5)}}),
+    ("re-rendering", "not measured", {"figures": {"rendered": rendered(agreement=NAN)}}),
     ("albedo scale", "pass", {}),
     ("albedo scale", "warn", {"maps": SimpleNamespace(albedo_sigma=0.5, order=None)}),
     ("albedo scale", "warn", {"maps": SimpleNamespace(albedo_sigma=None, order=None)}),

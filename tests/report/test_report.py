@@ -10,7 +10,7 @@ import pytest
 from polcap import report
 from polcap.errors import StorageError
 from polcap.formats.maps import maps_folder
-from polcap.report.page_data import Rerendering
+from polcap.quality.rerendering import Rerendering
 
 
 def test_report_is_plain_json_with_figures_gates_and_settings(result: Path) -> None:

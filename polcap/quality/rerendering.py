@@ -1,0 +1,150 @@
+"""Renders the maps under the flash again, and judges whether they explain the photographs.
+
+The maps come from an estimator, which may be wrong. Their rendering does not depend on it: on the normals, the flash
+makes a shading and a polarization, and both are in the photographs.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from polcap.images import Bools, Floats, Quality
+from polcap.optics import frames, shade
+from polcap.optics.reduction import ObjectReduction
+from polcap.quality.gate import Evidence, Gate
+from polcap.quality.limits import GateLimits
+from polcap.stage_values import Cues, SurfaceMaps
+from polcap.stages.cues import NOMINAL_IOR
+
+WHITE_QUANTILE = 0.995  # of the object's light; it becomes white
+_JUDGED_PX = 256  # longest side on which the gate compares
+_OUTLIER = 5  # standard deviations of the differences
+_MOST_DOLP = 0.1  # more has no more weight: that of noise and of reflections
+_WRONG_DEG = 40.0  # error of normals that were turned, exchanged or flattened (docs/benchmarks/gates.md)
+
+
+@dataclass(frozen=True)
+class ReducedResult:
+    """Maps and light of the object on one reduced grid."""
+
+    maps: SurfaceMaps
+    radiance: Floats  # (H, W, 3) S0, linear Rec.709
+    ratio: Floats  # (2, H, W) S1/S0, S2/S0
+    angle: Floats  # (K,) rad
+    sound: Bools  # (H, W) on the object, without clipped light
+
+
+def reduce(maps: SurfaceMaps, cues: Cues, angle: Floats, longest: int) -> ReducedResult:
+    """Reduce maps and light to at most `longest` pixels a side; means are taken over the object only."""
+    reduction = ObjectReduction(np.asarray(maps.mask & cues.mask, bool), longest)
+    light = np.maximum(frames.total(cues.radiance), 1e-6)
+    weight = np.maximum(reduction.mean(light), 1e-9)
+    small = reduction.maps(maps)
+    clipped = ((cues.quality & np.uint8(Quality.CLIPPED)) > 0).astype(np.float32)
+    return ReducedResult(
+        maps=small,
+        radiance=reduction.mean(cues.radiance),
+        ratio=np.stack([reduction.mean(part * light) / weight for part in cues.ratio]),
+        angle=angle,
+        sound=small.mask & (reduction.mean(clipped) == 0),
+    )
+
+
+@dataclass(frozen=True)
+class Rerendering:
+    """Gray photographs of each polarizer angle, and the maps rendered under the same light and angle."""
+
+    measured: Floats  # (K, H, W) S0 + S1 cos 2θ + S2 sin 2θ; 1 is white, brighter values are clipped
+    predicted: Floats  # (K, H, W) the same, rendered from the maps under a flash at the lens
+    flashed: Floats  # (H, W, 3) S0 of the maps under that flash, linear Rec.709
+    scale: float  # brightness of the photographs over that of the re-rendering, median of the pixels
+    agreement: float = float("nan")  # of the polarizations, see `_agreement`
+
+    def residuals(self, inside: Bools) -> dict[str, list[float]]:
+        """Difference of photograph and re-rendering at each angle: `rms` without outliers, and share of `outliers`.
+
+        The rms is relative to white. An outlier differs by more than five standard deviations, which the median of
+        the absolute differences gives: a few pixels of a highlight do not carry the figure.
+        """
+        found: dict[str, list[float]] = {"rms": [], "outliers": []}
+        for measured, predicted in zip(self.measured, self.predicted):
+            size = np.abs(measured - predicted)[inside]
+            far = size > _OUTLIER * max(1.4826 * float(np.median(size)), 1e-6) if size.size else size > 0
+            found["rms"].append(float(np.sqrt(np.mean(size[~far] ** 2))))
+            found["outliers"].append(float(far.mean()))
+        return found
+
+
+def rerender(small: ReducedResult, ior: float) -> Rerendering:
+    """Render the maps under the flash for each polarizer angle, for comparison with the photographs."""
+    maps = small.maps
+    ray = frames.rays(maps.view, *maps.mask.shape)
+    normal = frames.to_ray_frame(maps.normal, ray)
+    ahead = np.zeros_like(ray)
+    ahead[..., 2] = 1.0
+    one = np.ones(maps.mask.shape, np.float32)
+    rough = np.maximum(maps.roughness, 0.02)
+    stokes = np.asarray(shade.stokes(normal, maps.diffuse, maps.specular, rough, ior * one, ahead, one))
+    s0, s1, s2 = frames.total(stokes) / 3 * maps.mask
+    seen = frames.total(small.radiance) / 3 * maps.mask
+    light, lit = seen[maps.mask], s0[maps.mask]
+    scale = float(np.median(light[lit > 0] / lit[lit > 0])) if (lit > 0).any() else 1.0
+    white = max(float(np.quantile(light, WHITE_QUANTILE)), 1e-6) if light.size else 1.0
+
+    def modulation(angle: float) -> Floats:
+        """S1 cos 2θ + S2 sin 2θ of the maps (H, W), for an angle θ in the picture."""
+        on_ray = frames.axis_on_ray(np.float32(angle), ray)
+        return np.asarray(s1 * np.cos(2 * on_ray) + s2 * np.sin(2 * on_ray))
+
+    measured, predicted = [], []
+    for angle in small.angle:
+        measured.append(seen * (1 + small.ratio[0] * np.cos(2 * angle) + small.ratio[1] * np.sin(2 * angle)) / white)
+        predicted.append(scale * (s0 + modulation(angle)) / white)
+    rendered = np.stack([modulation(0.0), modulation(np.pi / 4)]) / np.maximum(s0, 1e-6)
+    return Rerendering(
+        measured=np.minimum(measured, 1.0),
+        predicted=np.minimum(predicted, 1.0),
+        flashed=stokes[0] * maps.mask[..., None],
+        scale=scale,
+        agreement=_agreement(small.ratio[:, small.sound], rendered[:, small.sound]),
+    )
+
+
+def _agreement(measured: Floats, rendered: Floats) -> float:
+    """Agreement of two polarizations S1/S0, S2/S0 (2, N), −1…1; NaN without pixels.
+
+    For each pixel the smaller DoLP times the cosine between both, relative to the larger DoLP: 1 if both are equal, 0
+    for other directions or if one of them is unpolarized, −1 across.
+    """
+    one, other = (np.linalg.norm(ratio, axis=0) for ratio in (measured, rendered))
+    cosine = (measured * rendered).sum(axis=0) / np.maximum(one * other, 1e-9)
+    least, most = (np.minimum(bound(one, other), _MOST_DOLP) for bound in (np.minimum, np.maximum))
+    return float((least * cosine).sum() / most.sum()) if most.sum() > 0 else float("nan")
+
+
+def measure(found: Evidence) -> Rerendering:
+    """Render the maps again on few pixels, for the gate."""
+    return rerender(reduce(found.maps, found.cues, found.selfcal.angle, _JUDGED_PX), NOMINAL_IOR)
+
+
+def explains(found: Rerendering, limits: GateLimits) -> bool:
+    """Whether maps explain the photographs: polarization and brightness are about those of their re-rendering."""
+    alike = not found.agreement < limits.min_rerendering_agreement
+    return alike and abs(np.log(found.scale)) <= np.log(limits.max_rerendering_scale)
+
+
+def rerendering(found: Evidence, limits: GateLimits) -> Gate:
+    """Gate on the maps: whether they explain the polarization and the brightness of the photographs."""
+    seen = measure(found)
+    if not np.isfinite(seen.agreement):
+        return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, "All light is clipped")
+    value, limit = round(seen.agreement, 3), limits.min_rerendering_agreement
+    message = f"Rendered again, the maps show {100 * max(seen.agreement, 0):.0f} % of the photographs' polarization"
+    if explains(seen, limits):
+        return Gate("re-rendering", "pass", value, limit, message)
+    if seen.agreement >= limit:
+        value, limit = round(seen.scale, 2), limits.max_rerendering_scale
+        times, kind = max(value, 1 / value), "dark" if value > 1 else "bright"
+        message = f"Rendered again, the maps are {times:.1f} times as {kind} as the photographs"
+    remedy = "Compare with --estimator analytic; a model of your own may be wrong: leave out --model"
+    return Gate("re-rendering", "fail", value, limit, f"{message}: the normals are wrong", remedy, _WRONG_DEG)
