@@ -35,7 +35,10 @@ class ReducedResult:
 
 
 def reduce(maps: SurfaceMaps, cues: Cues, angle: Floats, longest: int) -> ReducedResult:
-    """Reduce maps and light to at most `longest` pixels a side; means are taken over the object only."""
+    """Reduce maps (H, W) and light to at most `longest` pixels a side; means are taken over the object only.
+
+    `angle` (K,) are the polarizer angles of the shots, rad.
+    """
     reduction = ObjectReduction(np.asarray(maps.mask & cues.mask, bool), longest)
     light = np.maximum(frames.total(cues.radiance), 1e-6)
     weight = np.maximum(reduction.mean(light), 1e-9)
@@ -63,8 +66,9 @@ class Rerendering:
     def residuals(self, inside: Bools) -> dict[str, list[float]]:
         """Difference of photograph and re-rendering at each angle: `rms` without outliers, and share of `outliers`.
 
-        The rms is relative to white. An outlier differs by more than five standard deviations, which the median of
-        the absolute differences gives: a few pixels of a highlight do not carry the figure.
+        Pixels `inside` (H, W) count. The rms is relative to white. An outlier differs by more than five standard
+        deviations, which the median of the absolute differences gives: a few pixels of a highlight do not carry the
+        figure.
         """
         found: dict[str, list[float]] = {"rms": [], "outliers": []}
         for measured, predicted in zip(self.measured, self.predicted):
