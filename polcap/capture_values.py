@@ -30,6 +30,7 @@ class Exif:
     flash_fired: bool | None = None
     width: int | None = None  # visible RAW pixels
     height: int | None = None
+    serial: str = field(default="", metadata=NOT_IN_KEY)  # of the camera
     color_matrix: tuple[float, ...] | None = None  # 9, XYZ (D65 or the nearest stated illuminant) → camera
 
     @property
@@ -93,6 +94,9 @@ class CatalogEntry(Struct, frozen=True, forbid_unknown_fields=True):
     rights: str = ""  # copyright notice
     license: str = ""  # address or name of the license
     object_number: str = ""  # inventory number of the object
+    date: str = ""  # when the object was made
+    institution: str = ""  # that keeps the object
+    description: str = ""  # of the object
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,21 @@ import msgspec
 from polcap.batch.unit import FINISHED, FOLDER, WORDS, Unit, UnitRecord
 from polcap.formats import addresses, atomic
 
-_COLUMNS = ("name", "state", "verdict", "expected_error_deg", "seconds", "attempts", "asset", "report", "says")
+_COLUMNS = (
+    "name",
+    "title",
+    "object_number",
+    "creator",
+    "rights",
+    "state",
+    "verdict",
+    "expected_error_deg",
+    "seconds",
+    "attempts",
+    "asset",
+    "report",
+    "says",
+)
 _FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # first characters of cells that spreadsheets compute
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{{ folder }}</title><style>
@@ -33,6 +47,8 @@ table { border-collapse: collapse } td, th { text-align: left; padding: .2em .8e
 {% for slug, one in drawn %}
 <figure><a href="{{ link(one.report) }}"><img loading="lazy" width="256" height="128" alt=""
  src="{{ link('thumbnails/' ~ slug ~ '.jpg') }}"></a><figcaption><span class="{{ one.state }}">{{ one.name }}</span>
+{{ one.title }}{% if one.object_number %} ({{ one.object_number }}){% endif %}
+
 {{ one.verdict }}{% if one.expected_error_deg is not none %}, normals {{ "%.1f" % one.expected_error_deg }}°{% endif %},
 {{ "%.1f" % one.seconds }} s, <a href="{{ link(one.asset) }}">GLB</a></figcaption></figure>
 {% endfor %}

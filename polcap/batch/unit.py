@@ -69,6 +69,10 @@ class UnitRecord(msgspec.Struct, frozen=True):
     expected_error_deg: float | None = None  # median of the normals
     asset: str = ""  # GLB, and page below; relative to the batch's folder
     report: str = ""
+    title: str = ""  # facts of the capture's catalog entry
+    object_number: str = ""
+    creator: str = ""
+    rights: str = ""
 
 
 def run(unit: Unit, request: Request, attempt: int = 1) -> UnitRecord:
@@ -122,7 +126,9 @@ def _outcome(unit: Unit, about: dict[str, Any]) -> dict[str, Any]:
     asset = Path(unit.out, "asset", f"{about['capture']['name']}.glb")
     outputs = {"asset": asset, "report": Path(unit.out, "report.html")}
     places = {name: Path(os.path.relpath(path, unit.batch_folder)).as_posix() for name, path in outputs.items()}
-    return {"verdict": about["verdict"], "expected_error_deg": about["expected_error_deg"], **places}
+    stated = about["capture"].get("catalog", {})
+    facts = {key: stated.get(key, "") for key in ("title", "object_number", "creator", "rights")}
+    return {"verdict": about["verdict"], "expected_error_deg": about["expected_error_deg"], **places, **facts}
 
 
 def find_finished(unit: Unit, request: Request) -> UnitRecord | None:

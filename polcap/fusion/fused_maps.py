@@ -75,8 +75,8 @@ def write(folder: Path, atlas: Atlas, maps: AtlasMaps, keys: Mapping[str, str]) 
             channels = {letter: np.ascontiguousarray(value[..., k]) for k, letter in enumerate(letters)}
             exr.write(place / f"{name}.exr", channels, half=name != "normal")
         png.write(place / "normal.png", png.sixteen_bits(maps.normal / 2 + 0.5))
-        png.write(place / "diffuse.png", color.srgb_eight_bits(maps.diffuse))
-        png.write(place / "specular.png", color.srgb_eight_bits(maps.specular))
+        png.write(place / "diffuse.png", color.srgb_eight_bits(maps.diffuse), srgb=True)
+        png.write(place / "specular.png", color.srgb_eight_bits(maps.specular), srgb=True)
         png.write(place / "roughness.png", png.sixteen_bits(maps.roughness))
         for name, mask in (("seen", maps.seen & maps.mask), ("mask", maps.mask)):
             png.write(place / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))

@@ -30,6 +30,7 @@ def write(folder: Path, about: Mapping[str, Any], results: FusionResults) -> Non
         "left_out": list(about["figures"]["left_out"].items()),
         "asset": f"asset/{name}.glb",
         "size": _size(about["figures"]["mesh"]),
+        "catalog": page.catalog(about),
         "levels": (levels.HEAD, levels.rows(folder)),
     }
     page.render("fused.html", folder / "report.html", f"{name}: polcap report", content)

@@ -275,7 +275,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
     written = [file for files in parallel.results(tasks) for file in files]  # pictures are encoded on threads
     if wanted.page is not None:
         page, glb = folder / f"{stem}.html", folder / f"{stem}.glb"
-        web_page.write(page, glb, web_page.read_script(wanted.page), facts.get("title", stem))
+        web_page.write(page, glb, web_page.read_script(wanted.page), facts)
         written.append(page)
     description = {
         "for": preset.description,

@@ -20,7 +20,7 @@ from polcap.formats import atomic, text_file
 from polcap.quality import error_maps, gates
 from polcap.quality.advice import advise
 from polcap.quality.gate import Gate, full_size
-from polcap.report import figures, labels, page
+from polcap.report import chart_colors, figures, labels, page
 from polcap.results import Results
 from polcap.stage_values import Network
 
@@ -66,7 +66,7 @@ class _ReportFile(RunFacts, frozen=True, kw_only=True):
 
 def capture_facts(capture: Capture) -> dict[str, Any]:
     """Camera, angles and photographs of a capture, as report.json has them."""
-    shots = []
+    shots, first = [], capture.shots[0].frames[0].exif
     for shot in capture.shots:
         frames = [_frame_facts(frame, Path(capture.folder)) for frame in shot.frames]
         shots.append({"angle_deg": round(float(np.degrees(shot.angle)), 6), "frames": frames})
@@ -74,7 +74,10 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
         "name": capture.name,
         "folder": capture.folder,
         "layout": capture.layout,
-        "camera": capture.shots[0].frames[0].exif.camera,
+        "camera": first.camera,
+        "serial": first.serial,
+        "lens": first.lens,
+        "taken": first.taken,
         "size_px": list(capture.size_px),
         "focal_px": capture.focal_px,
         "focal_known": capture.focal_known,
@@ -111,6 +114,8 @@ def document(
 ) -> dict[str, Any]:
     """Assemble the content of report.json: facts of the run, figures, gates, computing time of each stage [s]."""
     measured = {**figures.measured(results), "rerendering": figures.rerendering(results, config.infer.ior)}
+    chart = config.whitebalance.chart
+    measured["chart"]["reference_sha256"] = chart_colors.digest(chart)
     return {
         "polcap": __version__,
         "versions": facts["versions"],
@@ -119,6 +124,7 @@ def document(
         "capture": facts["capture"],
         "gates": msgspec.to_builtins(judged),
         "figures": measured,
+        "patches": chart_colors.patches(results.radiance, results.color, chart),
         "units": labels.units(bool(measured["mesh"]["metric"])),
         "timings": dict(timings),
         "model": facts["model"],

@@ -75,6 +75,7 @@ def _colors(color: ColorCalibration, albedo_sigma: float | None) -> dict[str, An
         "tilt_deg": None if light is None else _plain(np.degrees(light.tilt)),
         "flash": None if light is None else _plain(light.flash[:2], 3),
         "delta_e_mean": None if delta_e is None else _plain(np.nanmean(delta_e)),
+        "delta_e_90": None if delta_e is None else _plain(np.nanquantile(delta_e, 0.9)),
         "delta_e_max": None if delta_e is None else _plain(np.nanmax(delta_e)),
         "delta_e": _plain(delta_e, 2),
         "predicted_mean": None if predicted is None else _plain(np.nanmean(predicted)),

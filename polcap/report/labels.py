@@ -13,6 +13,8 @@ LABELS: dict[str, tuple[str, str]] = {
     "chart.tilt_deg": ("Tilt of the chart away from the lens", "°"),
     "chart.flash": ("Estimated flash position right of and above the lens, relative to the chart's distance", ""),
     "chart.delta_e_mean": ("Mean color error of the patches", "ΔE2000"),
+    "chart.reference_sha256": ("Digest of the file of measured reference colors", ""),
+    "chart.delta_e_90": ("90th percentile of the color errors of the patches", "ΔE2000"),
     "chart.delta_e_max": ("Largest color error of a patch", "ΔE2000"),
     "chart.delta_e": ("Color error of each patch, dark skin first", "ΔE2000"),
     "chart.predicted_mean": ("Mean color error, each patch left out of the fit in turn", "ΔE2000"),

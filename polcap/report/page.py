@@ -7,13 +7,14 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 
+from polcap.capture_values import CatalogEntry
 from polcap.config import Config
-from polcap.formats import html, shipped_data
+from polcap.formats import html
 from polcap.formats.capture import layouts
 from polcap.formats.maps import png
 from polcap.optics.color import srgb_eight_bits
 from polcap.quality.rerendering import rerender
-from polcap.report import keys, labels, levels, map_figures, page_data, plots
+from polcap.report import chart_colors, keys, labels, levels, map_figures, page_data, plots
 from polcap.report import stage_pictures as pictures
 from polcap.report.keys import Palette
 from polcap.results import Results
@@ -47,9 +48,16 @@ def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
         "asset": f"asset/{about['capture']['name']}.glb",
         "pictures": list(_pictures(results)),
         "levels": (levels.HEAD, levels.rows(folder)),
+        "catalog": catalog(about),
     }
     data = {"view": view, "mesh": _mesh_preview(results, about["settings"])}
     render("report.html", folder / "report.html", f"{about['capture']['name']}: polcap report", content, data)
+
+
+def catalog(about: Mapping[str, Any]) -> dict[str, str]:
+    """The facts of a result's `CatalogEntry`, "" where not stated; empty without any."""
+    stated = about["capture"].get("catalog", {})
+    return {key: stated.get(key, "") for key in CatalogEntry.__struct_fields__} if stated else {}
 
 
 def render(
@@ -172,9 +180,8 @@ def _plots(about: Mapping[str, Any], results: Results) -> dict[str, Any]:
     merge, fit = about["figures"]["merge"], results.color.patches
     chart, measured = None, page_data.patches(results.radiance, results.color)
     if measured is not None and fit is not None:
-        known = shipped_data.colorchecker(about["settings"]["whitebalance"]["chart"])
-        edition = next((one for one in known.editions if one.name == fit.edition), known)
-        chart = plots.chart(edition, measured, fit, about["figures"]["chart"])
+        known = chart_colors.reference(results.color, about["settings"]["whitebalance"]["chart"])
+        chart = plots.chart(known, measured, fit, about["figures"]["chart"])
     return {
         "chart": chart,
         "exposures": plots.exposures(merge["exposure_ratio"], merge["exif_ratio"], names),
@@ -211,8 +218,17 @@ def _tables(about: Mapping[str, Any]) -> dict[str, Any]:
             for shot in about["capture"]["shots"]
             for frame in shot["frames"]
         ],
+        "patches": [_patch_row(patch) for patch in about["patches"]],
         "settings": _rows(about["settings"]),
     }
+
+
+def _patch_row(patch: Mapping[str, Any]) -> tuple[str, ...]:
+    """A patch of the chart as texts: Lab measured and reference, and their differences."""
+    labs = ["" if None in patch[key] else "  ".join(f"{x:.1f}" for x in patch[key]) for key in ("lab", "lab_reference")]
+    names = ("delta_l", "delta_c", "delta_h", "delta_e")
+    differences = ["" if patch[name] is None else f"{patch[name]:.2f}" for name in names]
+    return patch["name"], *labs, *differences
 
 
 def _rows(sections: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:

@@ -112,9 +112,10 @@ def shifts(found: Alignment, names: Sequence[str]) -> dict[str, Any]:
 
 
 def chart(reference: ChartReference, measured: Floats, fit: PatchColors, figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Plot of the 24 chart patches: the maker's color, the photographed one (24, 3), linear Rec.709, and ΔE."""
-    note = "outside: the maker's color; inside: the photographed color; below: ΔE2000, mean "
-    note += number(figures["delta_e_mean"], 2)
+    """Plot of the 24 chart patches: the reference color, the photographed one (24, 3), linear Rec.709, and ΔE."""
+    whose = "your measured" if figures["reference_sha256"] else "the maker's"
+    note = f"outside: {whose} color; inside: the photographed color; below: ΔE2000, mean "
+    note += f"{number(figures['delta_e_mean'], 2)}, 90th percentile {number(figures['delta_e_90'], 2)}"
     if figures["predicted_mean"] is not None:
         note += f" ({number(figures['predicted_mean'], 2)} when each patch is left out of the fit)"
     colors = (css_colors(srgb_eight_bits(linear)) for linear in (reference.rec709, measured))

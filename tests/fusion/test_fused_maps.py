@@ -85,8 +85,14 @@ def test_a_reader_of_one_view_and_an_export_refuse_what_a_fused_object_lacks(
     for place in (tmp_path, tmp_path / "fused"):
         with pytest.raises(DecodeError, match=r"textures of a fused object.*give one of its views"):
             result_maps.read(place)
-    with pytest.raises(SettingError, match="a closed mesh has none"):
-        fuse_run.export(tmp_path / "fused", ExportRequest(extras=("displacement",)))
+    with pytest.raises(SettingError, match="--exr is for results of one view"):
+        fuse_run.export(tmp_path / "fused", ExportRequest(formats=("exr",)))
+
+
+def test_an_export_leaves_out_what_a_closed_mesh_lacks_and_writes_the_rest() -> None:
+    request = fuse_run._of_closed_mesh(ExportRequest(preset="archive", extras=("displacement", "occlusion")))
+    found = asset_export.effective(request)
+    assert found.extras == ("occlusion",) and found.formats == ("gltf", "obj", "usd", "materialx")
 
 
 def test_the_glb_is_closed_when_it_is_read_back(source: FusedSource, tmp_path: Path) -> None:

@@ -169,6 +169,15 @@ def test_relightable_layer_has_the_facts_of_the_catalog_and_is_in_the_sidecar(ow
     assert len(sizes) == 1 and {f"capture_iiif/{name}/full/max/0/default.jpg" for name in names} <= written
 
 
+def test_a_page_for_visitors_states_number_maker_and_rights(own: Path, polcap: Command, tmp_path: Path) -> None:
+    (tmp_path / "viewer.js").write_text("// model-viewer")
+    facts = {"title": "Vase", "object_number": "18<97", "creator": "A. B.", "rights": "© House"}
+    stated = [part for key, text in facts.items() for part in ("--about", f"{key}={text}")]
+    done = polcap("export", own, "--preset", "web", "--page", tmp_path / "viewer.js", *stated)
+    assert done.returncode == 0, done.stderr
+    assert "<p>Vase · 18&lt;97 · A. B. · © House</p>" in (own / "asset/web/capture.html").read_text()
+
+
 def test_ktx2_needs_an_encoder_and_says_so(own: Path, polcap: Command) -> None:
     if encoders.ktx2_encoder() is not None:
         pytest.skip("an encoder is here")

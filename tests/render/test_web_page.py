@@ -21,7 +21,7 @@ def test_page_shows_the_object_without_network_or_complaint(tmp_path: Path) -> N
     maps = surfaces.maps()
     options = gltf.GlbOptions("webp", "quantized")
     (tmp_path / "ball.glb").write_bytes(gltf.encode(surfaces.built(maps, surfaces.mesh(maps)), "ball", options))
-    web_page.write(tmp_path / "ball.html", tmp_path / "ball.glb", web_page.read_script(SCRIPT), "a <ball>")
+    web_page.write(tmp_path / "ball.html", tmp_path / "ball.glb", web_page.read_script(SCRIPT), {"title": "a <ball>"})
     with devtools.opened() as page:
         page.call("Page.navigate", url=(tmp_path / "ball.html").as_uri())
         page.wait("document.readyState === 'complete' && innerWidth > 0")

@@ -74,7 +74,7 @@ def encode(texture: Texture, kind: Kind) -> bytes:
     Raises StorageError: OpenCV cannot encode the picture as JPEG or WebP.
     """
     if kind == "png":
-        return png.encode(texture.pixels)
+        return png.encode(texture.pixels, texture.color)
     if kind == "ktx2":
         return _ktx2(texture)
     quality = _QUALITY[kind][texture.color]

@@ -47,6 +47,9 @@ _CATALOG: Mapping[str, tuple[str, Callable[[str], Any]]] = {  # fields of `Catal
     "creator": ("dc:creator", lambda text: {"@list": [text]}),
     "rights": ("dc:rights", _alternatives),
     "object_number": ("dc:identifier", str),
+    "date": ("dc:date", lambda text: {"@list": [text]}),
+    "institution": ("dc:publisher", lambda text: {"@set": [text]}),
+    "description": ("dc:description", _alternatives),
 }  # the license follows, see `_license`
 
 

@@ -19,7 +19,10 @@ from polcap.optics.resize import area_mean
 TILE = 512  # px of a tile's sides
 FULL = "full/max/0/default.jpg"  # the whole picture, below the address of its service
 _RIGHTS = ("creativecommons.org/", "rightsstatements.org/")  # the addresses that a manifest's `rights` may hold
-_LABELS = {"creator": "Creator", "license": "License", "object_number": "Identifier"}  # Dublin Core
+_LABELS = {  # Dublin Core
+    "creator": "Creator", "license": "License", "object_number": "Identifier", "date": "Date",
+    "institution": "Institution",
+}  # fmt: skip
 
 
 def check(address: str) -> None:
@@ -76,6 +79,7 @@ def manifest(pictures: Mapping[str, Texture], facts: Mapping[str, str], address:
         "id": f"{address}/manifest.json",
         "type": "Manifest",
         "label": _text(facts.get("title") or facts["name"]),
+        **({"summary": _text(facts["description"])} if facts.get("description") else {}),
         "metadata": [{"label": _text(_LABELS[key], "en"), "value": _text(value)} for key, value in stated.items()],
         **({"rights": addresses.of_web(f"http://{named}")} if named.startswith(_RIGHTS) else {}),
         **(

@@ -42,6 +42,7 @@ def record(about: Mapping[str, Any], catalog: Mapping[str, str] | None = None) -
     Fields of the capture's `CatalogEntry` follow, where stated; those of `catalog` replace them.
     """
     capture, model, error = about["capture"], about["model"], about.get("expected_error_deg")
+    chart = about.get("figures", {}).get("chart", {}).get("reference_sha256")  # of a file of measurements
     return {
         "format": "polcap provenance 1",
         "name": capture["name"],
@@ -50,6 +51,8 @@ def record(about: Mapping[str, Any], catalog: Mapping[str, str] | None = None) -
         "verdict": about["verdict"],
         **({} if error is None else {"expected_error_deg": error}),  # median of the normals
         "camera": capture["camera"],
+        **{key: text for key in ("serial", "lens", "taken") if (text := capture.get(key))},
+        **({"chart_sha256": chart} if chart else {}),
         "photographs": [  # after a space the digest names how the file was read
             {"file": frame["file"], "angle_deg": shot["angle_deg"], "sha256": frame["digest"].partition(" ")[0]}
             for shot in capture["shots"]

@@ -1,6 +1,7 @@
 """Writes a web page that shows a GLB with model-viewer; both are in the page, so it works without a network."""
 
 import base64
+from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 from string import Template
@@ -8,6 +9,7 @@ from string import Template
 from polcap.errors import SettingError
 from polcap.formats import atomic, text_file
 
+_SHOWN = ("object_number", "date", "institution", "creator", "rights")
 # the page may load nothing but its own parts
 _PAGE = Template(
     """<!doctype html>
@@ -20,9 +22,11 @@ _PAGE = Template(
 <style>
 html, body { margin: 0; height: 100%; font: 14px sans-serif; background: #eee; }
 model-viewer { width: 100%; height: 100%; }
+p { position: absolute; left: 12px; bottom: 4px; margin: 0; color: #333; pointer-events: none; }
 </style>
 <model-viewer src="data:model/gltf-binary;base64,$glb" alt="$title" camera-controls touch-action="pan-y"
  tone-mapping="neutral" shadow-intensity="1"></model-viewer>
+<p>$caption</p>
 <script type="module">$script</script>
 </html>
 """
@@ -43,10 +47,15 @@ def read_script(file: Path) -> str:
     return script
 
 
-def write(path: Path, glb: Path, script: str, title: str) -> None:
-    """Write the page of a GLB without Draco, with the text of model-viewer's script."""
+def write(path: Path, glb: Path, script: str, facts: Mapping[str, str]) -> None:
+    """Write the page of a GLB without Draco, with the text of model-viewer's script.
+
+    `facts` are fields of `CatalogEntry`; the page shows title, number, date, institution, creator and rights.
+    """
+    title = facts.get("title", path.stem)
     page = _PAGE.substitute(
         title=escape(title),
+        caption=escape(" · ".join([title, *(facts[name] for name in _SHOWN if facts.get(name))])),
         glb=base64.b64encode(glb.read_bytes()).decode(),
         script=script.replace("</script", "<\\/script"),
     )

@@ -74,6 +74,7 @@ def _separated(cues: Cues) -> dict[str, Floats]:
     return {f"{name}.{c}": part[..., k] for name, part in parts.items() for k, c in enumerate("RGB")}
 
 
+SRGB = ("photograph.png", "diffuse.png", "specular.png")  # pictures of colors
 DETAIL = "detail.png"  # of twice the size of the other files; only of Bayer cameras
 _DETAIL_STEPS = 50  # per unit of the logarithm
 

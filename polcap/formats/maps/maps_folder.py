@@ -121,7 +121,7 @@ def _write(file: Path, content: Callable[[], Any]) -> None:
     if file.suffix == ".exr":
         exr.write(file, content(), half=file.stem not in map_files.FLOAT_FILES)
     else:
-        png.write(file, content())
+        png.write(file, content(), srgb=file.name in map_files.SRGB)
 
 
 def read(folder: Path) -> ResultMaps:
@@ -189,11 +189,11 @@ def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
 
 
 def read_exports(folder: Path) -> dict[str, _Export]:
-    """Records of the exports of a result by folder, from maps.json. Raises DecodeError: it is no file of polcap."""
+    """Records of the exports of a result by folder, from maps.json; empty where it cannot be read."""
     try:
         return msgspec.convert(text_file.read_json(folder / "maps.json"), MapsFile).exports
-    except (OSError, ValueError) as error:
-        raise DecodeError(f"{folder / 'maps.json'} cannot be read ({error}); process again") from error
+    except (OSError, ValueError):
+        return {}
 
 
 def read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Floats:

@@ -1,7 +1,7 @@
 """Reads and writes PNG files of 8 or 16 bits.
 
-No gamma or color chunk is written: glTF ignores them, and viewers disagree on them. maps.json or the material states
-the meaning of the numbers.
+Colors have the chunk sRGB. Data have no chunk of color, so that no program converts them; maps.json or the material
+states the meaning of the numbers.
 """
 
 import struct
@@ -25,13 +25,13 @@ _SWAPS = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}  # seven times faster th
 _HEADER = 33  # bytes of the signature and IHDR, which comes first
 
 
-def write(path: Path, array: Pixels) -> None:
+def write(path: Path, array: Pixels, srgb: bool = False) -> None:
     """Write a uint8 or uint16 image (H, W), (H, W, 3) RGB or (H, W, 4) RGBA as PNG; same array, same bytes."""
-    atomic.write(path, encode(array))
+    atomic.write(path, encode(array, srgb))
 
 
-def encode(array: Pixels) -> bytes:
-    """Encode an image (H, W[, C]), uint8 or uint16, as the bytes of a PNG.
+def encode(array: Pixels, srgb: bool = False) -> bytes:
+    """Encode an image (H, W[, C]), uint8 or uint16, as the bytes of a PNG; `srgb` states that it is sRGB color.
 
     Raises TypeError: the values are neither uint8 nor uint16.
     Raises StorageError: OpenCV cannot encode them.
@@ -41,7 +41,8 @@ def encode(array: Pixels) -> bytes:
     done, data = cv2.imencode(".png", swapped(array), [cv2.IMWRITE_PNG_COMPRESSION, _LEVEL])
     if not done:
         raise StorageError(f"cannot encode a picture of {array.shape} as PNG; report this as a bug")
-    return bytes(data)
+    coded = bytes(data)
+    return b"".join([coded[:_HEADER], _SRGB, coded[_HEADER:]]) if srgb else coded
 
 
 def described(data: bytes, text: Mapping[str, str]) -> bytes:
@@ -52,6 +53,9 @@ def described(data: bytes, text: Mapping[str, str]) -> bytes:
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+_SRGB = _chunk(b"sRGB", b"\1")  # relative colorimetric
 
 
 def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> bytes:

@@ -112,6 +112,7 @@ def tags(data: bytes) -> Exif:
         make=found.text("Make"),
         model=found.text("Model"),
         lens=found.text("LensModel"),
+        serial=found.text("BodySerialNumber") or found.text("Tag 0xC62F"),  # the second is that of DNG
         exposure_time=time or None,
         f_number=found.number("FNumber") or None,
         # 65535 means a value above 16 bits, which is in another tag; of a pair (0, 200) the second counts

@@ -106,11 +106,13 @@ def test_provenance_is_in_the_packet(asset: Asset) -> None:
 
 def test_catalog_entry_is_in_dublin_core_and_in_the_copyright(asset: Asset) -> None:
     stated = {"title": "Krug", "creator": "Haus", "rights": "© Haus", "license": "CC0", "object_number": "7"}
+    stated |= {"date": "1897", "institution": "Haus", "description": "Blau"}
     parsed = document(gltf.encode(asset, "ball", provenance=stated))
     packet = parsed["extensions"]["KHR_xmp_json_ld"]["packets"][0]
     assert packet["dc:title"]["rdf:_1"]["@value"] == "Krug" and packet["dc:creator"] == {"@list": ["Haus"]}
     assert packet["dc:rights"]["rdf:_1"]["@value"] == parsed["asset"]["copyright"] == "© Haus"
-    assert packet["dc:identifier"] == "7"
+    assert packet["dc:identifier"] == "7" and packet["dc:date"] == {"@list": ["1897"]}
+    assert packet["dc:publisher"] == {"@set": ["Haus"]} and packet["dc:description"]["rdf:_1"]["@value"] == "Blau"
 
 
 def test_only_the_address_of_a_license_is_a_web_statement(asset: Asset) -> None:

@@ -69,3 +69,12 @@ def test_folder_that_is_a_file_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "maps").write_text("")
     with pytest.raises(StorageError, match="file where a folder is needed"):
         png.write(tmp_path / "maps" / "a.png", np.zeros((2, 2), dtype=np.uint8))
+
+
+def test_colors_state_srgb_and_data_state_nothing(tmp_path: Path) -> None:
+    pixels = np.full((2, 2, 3), 128, np.uint8)
+    png.write(tmp_path / "color.png", pixels, srgb=True)
+    png.write(tmp_path / "data.png", pixels)
+    assert (tmp_path / "color.png").read_bytes()[33:46] == bytes.fromhex("00000001 73524742 01 d9c92c7f")
+    assert b"sRGB" not in (tmp_path / "data.png").read_bytes()
+    assert np.array_equal(png.read(tmp_path / "color.png"), pixels)
