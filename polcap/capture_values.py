@@ -109,63 +109,12 @@ class ShotOrder:
 
 @dataclass(frozen=True)
 class AngleStatement:
-    """The place where a capture states the polarizer angles of its shots, to advise how to correct them."""
+    """The place where a capture states the polarizer angles of its shots."""
 
     place: Literal["folders", "capture.toml", "file names", "order", "cells"] = "folders"
     texts: tuple[str, ...] = ()  # (K,) folder or file that names the angle of each shot, or the angle as stated
     cells: tuple[tuple[int, int], ...] = ()  # (K,) row, column of each shot in a polarization sensor's 2×2 cell
     clockwise: Literal["", "stated", "calibrated"] = ""  # by the user, or by the ring's calibration
-
-    def correct(self, order: ShotOrder, angle: Floats) -> str:
-        """Advice how to correct the stated angles (K,) rad to another order and sense."""
-        if self.place == "cells":
-            return self._cells((-1 if order.mirrored else 1) * np.degrees(angle)[list(order.shots)])
-        texts = self.texts or tuple(f"{degrees:g}°" for degrees in np.degrees(angle))
-        moved = [(texts[k], texts[at]) for k, at in enumerate(order.shots) if k != at]
-        changes, many = " and ".join(f"{old} to {new}" for old, new in moved), "s" * (len(moved) > 1)
-        how = {
-            "folders": f"rename the folder{many} {changes}",
-            "file names": f"rename the file{many} {changes}",
-            "capture.toml": f"change the angle{many} in capture.toml: {changes}",
-            "order": f"give the order --angles {','.join(texts[at] for at in order.shots)}",
-        }[self.place]
-        sense = {
-            "": "add --clockwise, or clockwise = true in capture.toml",
-            "stated": "leave out --clockwise, and clockwise in capture.toml",
-            "calibrated": "repeat `polcap calibrate`: its ring counts the other way",
-        }[self.clockwise]
-        return ", and ".join([how] * bool(moved) + [sense] * order.mirrored)
-
-    def turn(self, angle: Floats, turn: float) -> str:
-        """Advice for stated angles (K,) rad that are too small by `turn` rad in all shots."""
-        if self.place != "cells":
-            return "set the ring's zero to the horizontal, or state the true angles"
-        steps = round(float(turn) / (np.pi / 4))
-        return self._cells(np.degrees(angle) + 45 * steps) if steps else "use the frame as the sensor delivers it"
-
-    @property
-    def retake(self) -> str:
-        """Advice for one shot of another angle than stated."""
-        ring = "set the ring to its mark and take the shot again, or state its true angle"
-        return self.check if self.place == "cells" else ring
-
-    @property
-    def check(self) -> str:
-        """Advice for angles that the pictures contradict, or do not confirm, without showing others."""
-        return {
-            "folders": "check the names of the folders and the ring's marks",
-            "file names": "check the names of the files and the ring's marks",
-            "capture.toml": "check the angles in capture.toml and the ring's marks",
-            "order": "check the order of the shots (--angles) and the ring's marks",
-            "cells": "check the sensor's data sheet, and state its `cells` in capture.toml",
-        }[self.place]
-
-    def _cells(self, degrees: Floats) -> str:
-        """Advice to state these angles (K,) in the cells of a polarization sensor."""
-        grid = {cell: round(float(one)) % 180 for cell, one in zip(self.cells, degrees)}
-        left = iter({0, 45, 90, 135} - set(grid.values()))
-        rows = [[grid[y, x] if (y, x) in grid else next(left) for x in (0, 1)] for y in (0, 1)]
-        return f"state the angles of the sensor's cells in capture.toml: cells = {rows}"
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 
 from polcap.capture_values import ShotOrder
+from polcap.formats.capture import angle_advice
 from polcap.images import Bools, Floats, Quality
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
@@ -54,7 +55,7 @@ def order(found: Evidence) -> Gate:
         better, because = test.rival, f"The network expects {1 / test.ratio:.1f} times smaller errors for"
     if better is not None:
         message = f"{because} the order {_order_text(better, names)} rather than the stated one"
-        remedy = sentence(statement.correct(better, found.radiance.angle))
+        remedy = sentence(angle_advice.correct(statement, better, found.radiance.angle))
         remedy += "; or take the shots again in order" if statement.place != "cells" else ""
         return Gate("order", "fail", _order_text(better, names), "as stated", message, remedy, 45.0, unit="")
     message = f"The outline supports the stated order (fit {outline.concentration:.2f} of 1)"
@@ -64,7 +65,7 @@ def order(found: Evidence) -> Gate:
         other = _order_text(outline.rival, names)
         message = f"The outline fits the order {other} as well as the stated one (fit {outline.concentration:.2f} of 1)"
         surer = "a rounded object or a chart" + ("" if len(names) > 3 else " or four angles")
-        remedy = sentence(f"{statement.check}; {surer} would decide")
+        remedy = sentence(f"{angle_advice.check(statement)}; {surer} would decide")
         return Gate("order", "warn", "cannot tell", "as stated", message, remedy, unit="")
     return Gate("order", "pass", "as stated", "as stated", message, unit="")
 
@@ -93,7 +94,8 @@ def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     body = seen.body
     if body.dolp > 1:
         message = "The shots contradict each other: they are not of one object under one light"
-        yield Gate("body", "fail", None, None, message, sentence(found.radiance.equipment.angles.check), MOST_DEG)
+        remedy = sentence(angle_advice.check(found.radiance.equipment.angles))
+        yield Gate("body", "fail", None, None, message, remedy, MOST_DEG)
         return
     if body.dolp_most < _LEAST_DOLP:
         message = f"No part of the outline is polarized by more than {100 * body.dolp_most:.1f} %"
@@ -172,7 +174,7 @@ def _angles(found: rim.AngleError, body: rim.RimFigures, angle: Floats, evidence
         and abs(abs(common) - 90) > 25  # reflections are polarized across the contour; see "body"
     ):
         message = f"All angles look turned by {common:+.0f}° ± {np.degrees(body.turned_sigma):.0f}°"
-        remedy = sentence(statement.turn(angle, -body.turned))
+        remedy = sentence(angle_advice.turn(statement, angle, -body.turned))
         return Gate("angles", "fail", round(common, 1), limit, message, remedy, abs(common), unit="°")
     if selfcal.turned.shots and abs(np.degrees(selfcal.turned.angle)) > limit:
         return _not_closing(evidence, limit)
@@ -187,11 +189,11 @@ def _angles(found: rim.AngleError, body: rim.RimFigures, angle: Floats, evidence
     if same.any():  # the pictures do not show which of the two is wrong
         shots = tuple(names[k] for k in sorted((found.shot, int(np.argmax(same)))))
         message = f"{' and '.join(shots)} look equal, as if the polarizer was not turned between them"
-        remedy = sentence(statement.retake)
+        remedy = sentence(angle_advice.retake(statement))
         return Gate("angles", "fail", round(degrees, 1), limit, message, remedy, cost, shots, "°")
     times = 1 / found.misfit
     message = f"The {names[found.shot]} shot looks turned by {degrees:+.0f}°: the outline fits {times:.1f} times better"
-    remedy = sentence(statement.retake)
+    remedy = sentence(angle_advice.retake(statement))
     state: State = "fail" if found.misfit < _CERTAIN * fit else "warn"
     return Gate("angles", state, round(degrees, 1), limit, message, remedy, cost, (names[found.shot],), "°")
 
@@ -203,7 +205,7 @@ def _not_closing(found: Evidence, limit: float) -> Gate:
     shots = tuple(found.names[k] for k in turned.shots)
     which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])}, by as much or less)"
     message = f"{which} looks turned by {degrees:+.0f}° ± {doubt:.0f}°: the shots contradict each other"
-    remedy = sentence(found.radiance.equipment.angles.retake)
+    remedy = sentence(angle_advice.retake(found.radiance.equipment.angles))
     return Gate("angles", "fail", round(float(degrees), 1), limit, message, remedy, abs(float(degrees)) / 2, shots, "°")
 
 
@@ -217,7 +219,11 @@ def _with_ring(gate: Gate, body: rim.RimFigures, found: Evidence, limits: GateLi
     if selfcal.found_sigma is not None and gate.state == "pass":
         doubt, ring = float(np.degrees(selfcal.found_sigma)), np.degrees(selfcal.angle) % 180
         message = f"The angles were estimated: {', '.join(f'{one:.1f}°' for one in ring)} (± {doubt:.1f}°)"
-        remedy = sentence(statement.check) if statement.place == "cells" else "Note the ring's mark of every shot"
+        remedy = (
+            sentence(angle_advice.check(statement))
+            if statement.place == "cells"
+            else "Note the ring's mark of every shot"
+        )
         return Gate("angles", "warn", "found", "noted", message, remedy, doubt, unit="")
     turn, doubt = np.degrees([selfcal.ring.offset, selfcal.ring.sigma])
     applied = selfcal.ring.correction != 0
@@ -231,7 +237,7 @@ def _with_ring(gate: Gate, body: rim.RimFigures, found: Evidence, limits: GateLi
     value, limit = round(float(turn), 2), limits.max_ring_turn_deg
     if not noted and abs(turn) <= limits.max_turn_deg:
         return Gate("angles", "pass", value, limits.max_turn_deg, message, cost_deg=float(doubt), unit="°")
-    remedy = sentence(statement.turn(selfcal.angle, selfcal.ring.offset))
+    remedy = sentence(angle_advice.turn(statement, selfcal.angle, selfcal.ring.offset))
     if noted:
         message += "; if a single shot is wrong, it is two to four times as much and not corrected"
         remedy += "; if one shot was off its mark, take it again"
@@ -300,7 +306,7 @@ def _across(found: Evidence) -> str:
     """Advice for angles that are all off by 90°."""
     statement = found.radiance.equipment.angles
     if statement.place == "cells":
-        return f"if the room was dark, {statement.turn(found.radiance.angle, np.pi / 2)}"
+        return f"if the room was dark, {angle_advice.turn(statement, found.radiance.angle, np.pi / 2)}"
     return "if the room was dark, the ring was upright at 0°: state the angles plus 90°"
 
 

@@ -21,6 +21,7 @@ from polcap import parallel
 from polcap.capture_values import AngleStatement
 from polcap.chart_values import ColorCalibration
 from polcap.errors import CaptureError
+from polcap.formats.capture import angle_advice
 from polcap.images import Floats
 from polcap.optics import frames
 from polcap.optics.outline import OutlineBand
@@ -223,9 +224,10 @@ def _wrong_order(found: angles.OrderFit, angle: Floats, statement: AngleStatemen
     names = [f"{np.degrees(a):g}°" for a in angle]
     stated, best = ", ".join(names), ", ".join(names[i] for i in found.check.best.shots)
     mirrored = " counted clockwise" if found.check.best.mirrored else ""
+    remedy = angle_advice.correct(statement, found.check.best, angle)
     return (
         f"the angles {stated} contradict the polarization at the object's outline (fit {found.check.score:.2f}); "
-        f"{best}{mirrored} fit better ({found.best_score:.2f}): {statement.correct(found.check.best, angle)}; "
+        f"{best}{mirrored} fit better ({found.best_score:.2f}): {remedy}; "
         "or shoot in a dark room (reflections turn polarization by 90°), or --set selfcal.check_order=false"
     )
 

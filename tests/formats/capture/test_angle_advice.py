@@ -9,6 +9,7 @@ import pytest
 
 from polcap.capture_values import AngleStatement, ShotOrder
 from polcap.errors import CaptureError
+from polcap.formats.capture import angle_advice
 from polcap.formats.capture import reader as capture
 from polcap.formats.raw import frame_decoder
 from tests.formats.capture.capture_folders import flat, folders, pictures, shoot
@@ -84,7 +85,7 @@ def test_advice_on_the_order_of_the_angles_is_followed_literally(tmp_path, layou
     expected = angle_of_photographs(replace(before, shots=tuple(
         replace(shot, angle=np.radians(degrees)) for shot, degrees in zip(before.shots, right)
     )))  # fmt: skip
-    options = follow(before.angles.correct(order, stated), root)
+    options = follow(angle_advice.correct(before.angles, order, stated), root)
     assert angle_of_photographs(capture.read(root, **options)) == expected
 
 
@@ -113,7 +114,7 @@ def test_a_turned_picture_of_a_polarization_sensor_is_read_by_its_cells(tmp_path
 def test_advice_for_a_polarization_sensor_are_cells(tmp_path, order):
     save(tmp_path / "frame.png", mosaic())
     before = capture.read(tmp_path)
-    advice = before.angles.correct(order, before.angle)
+    advice = angle_advice.correct(before.angles, order, before.angle)
     assert "folder" not in advice and "clockwise" not in advice
     cells = re.search(r"cells = .*", advice)
     (tmp_path / "capture.toml").write_text(f"{cells[0]}\n")
@@ -124,9 +125,10 @@ def test_advice_for_a_polarization_sensor_are_cells(tmp_path, order):
 
 def test_three_of_a_sensor_s_angles_give_all_cells():
     statement = AngleStatement("cells", cells=((1, 1), (0, 1), (0, 0)))
-    advice = statement.correct(ShotOrder((0, 1, 2), True), np.radians([0, 45, 90]))
+    advice = angle_advice.correct(statement, ShotOrder((0, 1, 2), True), np.radians([0, 45, 90]))
     assert advice.endswith("cells = [[90, 135], [45, 0]]")
-    assert statement.turn(np.radians([0, 45, 90]), np.pi / 2).endswith("cells = [[0, 135], [45, 90]]")
+    turned = angle_advice.turn(statement, np.radians([0, 45, 90]), np.pi / 2)
+    assert turned.endswith("cells = [[0, 135], [45, 90]]")
 
 
 @pytest.mark.parametrize("cells", ["[[0, 45], [90, 90]]", "[[0, 30], [60, 90]]"])
@@ -139,5 +141,6 @@ def test_cells_that_no_sensor_has_are_refused(tmp_path, cells):
 
 def test_a_ring_calibrated_as_clockwise_is_calibrated_again():
     """--clockwise would be refused."""
-    advice = AngleStatement(clockwise="calibrated").correct(ShotOrder((0, 1, 2), True), np.radians([0, 45, 90]))
+    calibrated = AngleStatement(clockwise="calibrated")
+    advice = angle_advice.correct(calibrated, ShotOrder((0, 1, 2), True), np.radians([0, 45, 90]))
     assert "polcap calibrate" in advice and "--clockwise" not in advice
