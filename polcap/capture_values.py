@@ -1,8 +1,8 @@
 """A capture as its folder describes it: photographs, shots, stated angles and the camera's geometry."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -10,6 +10,7 @@ from msgspec import Struct
 from polcap.calibration_values import Calibration
 from polcap.images import NOT_IN_KEY, Floats, SensorImage
 
+T = TypeVar("T")
 Role = Literal["shot", "ambient", "repeat", "chart", "cross"]
 
 
@@ -69,6 +70,11 @@ class Frame:
     reading: FrameReading = field(default=FrameReading(), metadata=NOT_IN_KEY)
 
 
+def middle(bracket: Sequence[T]) -> T:
+    """The middle one of a bracket that is sorted, darkest first; of an even number the darker of the two."""
+    return bracket[(len(bracket) - 1) // 2]
+
+
 Decode = Callable[[Frame], SensorImage]  # as `formats.raw.frame_decoder.decode`
 
 
@@ -123,7 +129,7 @@ class Capture:
 
     name: str = field(metadata=NOT_IN_KEY)
     folder: str = field(metadata=NOT_IN_KEY)
-    shots: tuple[Shot, ...]  # (K,), the first is the reference
+    shots: tuple[Shot, ...]  # (K,) with brackets of equal length; the first is the reference
     layout: Literal["folders", "toml", "flat", "sensor"]
     focal_px: float  # in visible RAW pixels
     focal_known: bool

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.capture_values import Capture, Frame
+from polcap.capture_values import Capture, Frame, middle
 from polcap.formats.raw import frame_decoder
 from polcap.images import Floats, SensorImage
 from polcap.optics import sensor, sharpness
@@ -68,7 +68,7 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
 
     Raises DecodeError: of the reference frame immediately, of another frame when it is used.
     """
-    first = capture.shots[0].frames[(len(capture.shots[0].frames) - 1) // 2]
+    first = middle(capture.shots[0].frames)
     meta, arrays = frame_decoder.apply(first, reduce_first, clip=clip, most_pixels=_MOST_PIXELS)
     times, half, corners = int(meta["times"]), int(meta["superpixel"]), arrays["corners"].tolist()
     reduced = {first: pool.submit(_build_frame, meta, arrays)}

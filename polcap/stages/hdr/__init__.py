@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polcap.capture_values import Capture, Decode, Frame, Shot
+from polcap.capture_values import Capture, Decode, Frame, Shot, middle
 from polcap.errors import CaptureError
 from polcap.images import Distortion, Floats, MaskedImage, Quality, SensorImage, View
 from polcap.optics import sharpness
@@ -72,10 +72,8 @@ def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack
     are used only where pixels do not suffice and no flash fired. Ambient frames are subtracted in proportion to the
     exposure by their settings; they are not registered.
 
-    Raises CaptureError: brackets of unequal length, frames of different size, unknown exposure ratios or too much
-    motion.
+    Raises CaptureError: frames of different size, unknown exposure ratios, or too much motion.
     """
-    _check_counts(capture.shots)
     read = Reader(
         (frame for shot in capture.all_shots for frame in (*shot.frames, *shot.ambient)), decode, settings.clip
     )
@@ -89,22 +87,22 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     shots, count, first = capture.all_shots, len(capture.shots), capture.shots[0]
     read.plan = _memory_plan(capture, read(first.frames[0]), settings)
     order = _by_brightness(first, read)
-    image = read(first.frames[_middle(order)])
-    _check_grid(first.frames[_middle(order)], image, settings)
+    reference = first.frames[middle(order)]
+    image = read(reference)
+    _check_grid(reference, image, settings)
     sensor, view, side = _sensor(capture, image, settings), _view(capture, image, settings), image.superpixel
     full = settings.demosaic == "full" and image.cfa is not None
     bayer = image.cfa if sensor.site_px is not None and side == 2 else None  # binned
     del image  # so that the reader can free the frame
-    read.black = black_error(Bracket(first, order, _middle(order)), read)
+    read.black = black_error(Bracket(first, order), read)
     # in the middle frame by the metadata, as in `check`, which reads each frame only once
-    places = sharpness.places(read(first.frames[(len(first.frames) - 1) // 2]), settings.clip)
+    places = sharpness.places(read(middle(first.frames)), settings.clip)
     lines = noise.Lines(() if capture.calibration is None else capture.calibration.noise)
     shape, stack, mosaic = (0, 0, 0), _empty(0, (0, 0, 0)), None
     ratio, curvature, ambient_share, tiles = [], [], [], []
     for k, shot in enumerate(shots):
         # the crossed shot is merged on the scale of its own middle frame: its flash has another energy
-        bracket_order = _by_brightness(shot, read) if k == count else order
-        bracket = Bracket(shot, bracket_order, _middle(bracket_order))
+        bracket = Bracket(shot, _by_brightness(shot, read) if k == count else order)
         compared = compare(bracket, lines, read, settings.max_motion_px)
         weighted = weights.prepare(bracket, compared, lines, read, full)
         if k == 0:
@@ -131,7 +129,7 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         view=view,
         bracket=BracketMeasurement(
             exposure_ratio=np.repeat(ratio, 3 // shape[0], axis=2),
-            exif_ratio=_stated_ratios(capture.shots, _middle(order)),
+            exif_ratio=_stated_ratios(capture.shots, middle(order)),
             curvature=np.array(curvature),
             ghost_fraction=np.array([np.mean((quality & Quality.GHOST) > 0) for quality in stack.quality[:count]]),
             ambient_share=np.array(ambient_share),
@@ -161,19 +159,9 @@ def _ambient_shared(shots: tuple[Shot, ...]) -> bool:
     return len(set(digests)) < len(digests)
 
 
-def _stated_ratios(shots: tuple[Shot, ...], middle: int) -> Floats:
-    """Exposures (K, E) of all frames by their metadata, relative to frame `middle` of their shot."""
-    return np.array([[exposure.stated(frame, shot.frames[middle]) for frame in shot.frames] for shot in shots])
-
-
-def _check_counts(shots: tuple[Shot, ...]) -> None:
-    """Raise CaptureError for brackets with different numbers of frames."""
-    for shot in shots:
-        if len(shot.frames) != len(shots[0].frames):
-            raise CaptureError(
-                f"shot {shot.name} has {len(shot.frames)} frames, shot {shots[0].name} has "
-                f"{len(shots[0].frames)}: give every angle the same bracket"
-            )
+def _stated_ratios(shots: tuple[Shot, ...], reference: int) -> Floats:
+    """Exposures (K, E) of all frames by their metadata, relative to frame `reference` of their shot."""
+    return np.array([[exposure.stated(frame, shot.frames[reference]) for frame in shot.frames] for shot in shots])
 
 
 def _memory_plan(capture: Capture, image: SensorImage, settings: HdrSettings) -> planes.MemoryPlan:
@@ -196,11 +184,6 @@ def _by_brightness(shot: Shot, read: Reader) -> tuple[int, ...]:
     if len(shot.frames) == 1:
         return (0,)
     return tuple(int(e) for e in np.argsort([level(frame) for frame in shot.frames], kind="stable"))
-
-
-def _middle(order: tuple[int, ...]) -> int:
-    """Index of the frame of middle brightness, which is the bracket's reference frame."""
-    return order[(len(order) - 1) // 2]
 
 
 def _check_grid(frame: Frame, image: SensorImage, settings: HdrSettings) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from polcap.capture_values import Shot
+from polcap.capture_values import Shot, middle
 from polcap.errors import CaptureError
 from polcap.images import Bools, Floats
 from polcap.optics import sensor
@@ -26,11 +26,15 @@ _MOTION_SIGMAS = 3.0  # nor are frames that moved by less than this many of its 
 
 @dataclass(frozen=True)
 class Bracket:
-    """One shot of E frames, with their order and the index of the reference frame."""
+    """One shot of E frames, with their order by the brightness of their pixels."""
 
     shot: Shot
     order: tuple[int, ...]  # of the frames, darkest first
-    reference: int
+
+    @property
+    def reference(self) -> int:
+        """Index of the reference frame."""
+        return middle(self.order)
 
     @property
     def others(self) -> list[int]:

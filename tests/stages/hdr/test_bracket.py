@@ -127,7 +127,7 @@ def test_hand_held_nikon_bracket():
     assert ghost[:1150].mean() < 0.001
     # frame against frame, registered and on one scale, where nothing moved
     shot = Shot(0.0, tuple(frames))
-    found = compare(Bracket(shot, (0, 1, 2), 1), noise.Lines(), Reader((), decode, 0.98), 60.0)
+    found = compare(Bracket(shot, (0, 1, 2)), noise.Lines(), Reader((), decode, 0.98), 60.0)
     own, first = signals(frames[1].load(), 0.98).rows(slice(None)), found.estimate
     for e in (0, 2):
         link, other, gain = found.frames[e], found.frames[e].signals, found.frames[e].gain

@@ -200,11 +200,9 @@ def test_shots_share_the_reference_index_and_keep_their_own_flash_energy():
     assert gain == pytest.approx(b[1] / a[1], rel=1e-3)
 
 
-def test_unequal_brackets_and_sizes_are_refused_by_name():
+def test_unequal_sizes_are_refused_by_name():
     rng = np.random.default_rng(0)
     small, large = expose(ramp(192, 192), 1, rng), expose(ramp(192, 256), 1, rng)
-    with pytest.raises(CaptureError, match=r"shot 45° has 1 frames, shot 0° has 2"):
-        merge(capture([frame(small)] * 2, [frame(small)]), hdr.HdrSettings())
     with pytest.raises(CaptureError, match=r"^shot 45° is 128×96"):
         merge(capture([frame(small)], [frame(large)]), hdr.HdrSettings())
 
