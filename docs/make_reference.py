@@ -13,8 +13,7 @@ from typer.main import get_command
 
 import polcap
 from polcap.cli import app
-from polcap.config import settings
-from polcap.fusion.fusion_path import SessionConfig
+from polcap.material.material_path import all_settings
 
 REFERENCE = Path(__file__).parent / "reference"
 _OPTIONS = re.compile(r"(<!-- options of (\w+) -->\n).*?(<!-- end -->)", re.S)
@@ -49,10 +48,11 @@ def settings_page() -> str:
         "# Settings", "", _MADE, "",
         "`--config FILE.toml` (sections as below) overrides the defaults; `--set stage.name=value` overrides both.",
         "An unknown name or a value outside its range is an error that names it.",
-        "In a file, `fusion.shape.grid` is `grid` below `[fusion.shape]`. Only `polcap fuse` takes `fusion.…`;",
+        "In a file, `fusion.shape.grid` is `grid` below `[fusion.shape]`. Only `polcap material` takes `material.…`,",
+        "only `polcap fuse` takes `fusion.…`;",
         "it refuses `surface.…`, `mask.part` and `asset.raw_pixels`, which would not change a fused object.", "",
     ]  # fmt: skip
-    for name, rows in groupby(settings(SessionConfig), lambda setting: setting.key.partition(".")[0]):
+    for name, rows in groupby(all_settings(), lambda setting: setting.key.partition(".")[0]):
         lines += ["", f"## {name}", "", "| setting | type | default | range | meaning [unit] |"]
         lines += ["| --- | --- | --- | --- | --- |"]
         for row in rows:

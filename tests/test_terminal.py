@@ -13,9 +13,9 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from polcap import __version__, cli, config, terminal
+from polcap import __version__, cli, terminal
 from polcap.cli import options
-from polcap.fusion.fusion_path import SessionConfig
+from polcap.material.material_path import all_settings
 from polcap.pipeline import run as pipeline
 from tests.conftest import Command, environment
 
@@ -36,7 +36,7 @@ def test_help_has_complete_summaries_and_explains_a_command(polcap: Command) -> 
 
 def test_settings_are_listed_with_default_range_and_meaning(polcap: Command) -> None:
     every = json.loads(polcap("settings", "--json").stdout)
-    assert [row["name"] for row in every] == [setting.key for setting in config.settings(SessionConfig)]
+    assert [row["name"] for row in every] == [setting.key for setting in all_settings()]
     of_stage = json.loads(polcap("settings", "hdr", "--json").stdout)
     assert of_stage == [row for row in every if row["name"].startswith("hdr.")]
     assert "fusion.atlas.size = 0  (≥ 0, ≤ 8192)" in polcap("settings", "fusion").stdout

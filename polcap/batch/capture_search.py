@@ -64,4 +64,5 @@ def _chosen(here: Candidate, below: list[Candidate], fused: bool) -> list[Candid
 
 
 def _is_fused(folder: Path) -> bool:
-    return folder_names.is_result(folder / own_folders.FUSED)
+    """Whether a folder holds the joined result of its views."""
+    return any(folder_names.is_result(folder / name) for name in (own_folders.FUSED, own_folders.MATERIAL))

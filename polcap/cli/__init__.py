@@ -25,6 +25,7 @@ from polcap.cli.check_command import check
 from polcap.cli.doctor_command import doctor
 from polcap.cli.export_command import export
 from polcap.cli.fuse_command import fuse
+from polcap.cli.material_command import material
 from polcap.cli.process_command import process
 from polcap.cli.result_commands import clean, report, show, status
 from polcap.cli.settings_command import settings
@@ -87,8 +88,8 @@ def _one_line(error: TyperException) -> str:
 
 
 COMMANDS = (
-    process, batch, fuse, export, show, status, report, clean, check, settings, calibrate, doctor, synth, board,
-    capture, train, evaluate,
+    process, batch, fuse, material, export, show, status, report, clean, check, settings, calibrate, doctor, synth,
+    board, capture, train, evaluate,
 )  # fmt: skip
 app = typer.Typer(
     cls=OneLine,

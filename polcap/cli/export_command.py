@@ -67,6 +67,7 @@ def export(
     """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
     from polcap.formats.export import presets
     from polcap.fusion import fuse_run, fused_maps
+    from polcap.material import material_maps, material_run
     from polcap.pipeline import run as pipeline
     from polcap.pipeline.asset_export import ExportRequest
 
@@ -91,7 +92,9 @@ def export(
     fused = fused_maps.is_fused(result)
     if fused and "displacement" in plain.extras:
         terminal.print_message("polcap: --extra displacement is left out: a closed mesh has none", "WARNING")
-    files = (fuse_run.export if fused else pipeline.export)(result, *wanted)
+    write = fuse_run.export if fused else pipeline.export
+    write = material_run.export if material_maps.is_material(result) else write
+    files = write(result, *wanted)
     options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
     if (missing := lod * len(wanted) - sum(bool(_LEVEL.search(file.name)) for file in files)) > 0:
         terminal.print_message(f"polcap: {missing} levels of --lod would differ by over 1 % of the size: not written")

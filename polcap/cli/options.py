@@ -29,7 +29,7 @@ def result_folder(named: Path | None) -> Path | None:
     """The result folder that an argument names: itself, or the result in the folder of a capture or of views."""
     if named is None or any((named / name).exists() for name in ("work", "report.json", "maps")):
         return named
-    for inside in (named / own_folders.OUTPUT, named / own_folders.FUSED):
+    for inside in (named / name for name in (own_folders.OUTPUT, own_folders.FUSED, own_folders.MATERIAL)):
         if (inside / "report.json").exists() or (inside / "work").is_dir():
             return inside
     return named

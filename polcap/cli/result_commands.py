@@ -128,13 +128,19 @@ def clean(
 
 
 def _check_single(result: Path, command: str) -> None:
-    """Raise a SettingError for the result of `polcap fuse`, which has other stages."""
+    """Raise a SettingError for the result of `polcap fuse` or `polcap material`, which have other stages."""
     from polcap.fusion import fused_maps
+    from polcap.material import material_maps
 
     if fused_maps.is_fused(result):
         raise SettingError(
             f"`polcap {command}` is for results of one view, and {result} is a fused object: see its report.html and "
             "asset/turntable.webp, or give one of its views"
+        )
+    if material_maps.is_material(result):
+        raise SettingError(
+            f"`polcap {command}` is for results of one view, and {result} is a material: see its report.html, or give "
+            "one of its views"
         )
 
 

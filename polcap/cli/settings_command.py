@@ -19,11 +19,10 @@ def settings(
     json: Json = False,
 ) -> None:
     """List the settings of all stages with default, range and meaning; --set and --config take them."""
-    from polcap import config
     from polcap.formats import text_file
-    from polcap.fusion.fusion_path import SessionConfig
+    from polcap.material.material_path import all_settings
 
-    rows = list(config.settings(SessionConfig))
+    rows = all_settings()
     stages = dict.fromkeys(row.key.partition(".")[0] for row in rows)
     if stage is not None and stage not in stages:
         raise SettingError(f"settings {stage}: no such stage; {text_file.suggestion(stage, stages)}")

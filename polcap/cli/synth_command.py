@@ -39,6 +39,9 @@ def synth(
         int | None,
         Option(min=3, max=99, metavar="N", help="N captures from all sides, on a board; a mesh stands upright, y up."),
     ] = None,
+    flat: Annotated[
+        bool, Option("--flat", help="With --views: a flat sample with relief, for `polcap material`, instead.")
+    ] = False,
     calibration: Annotated[bool, Option("--calibration", help="Photographs for `polcap calibrate` instead.")] = False,
     dataset: Annotated[
         int | None,
@@ -60,6 +63,10 @@ def synth(
 
         set_up = settings.fill(calibration_frames.CalibrationShoot, {"seed": seed}, assignments or ())
         calibration_frames.write(folder, set_up)
+    elif flat and (views is None or mesh is not None or interreflection):
+        raise SettingError(
+            "--flat needs --views, and takes neither --mesh nor --interreflection; write --flat --views 9"
+        )
     elif interreflection and mesh is None:
         raise SettingError("--interreflection needs a mesh; name one with --mesh")
     else:
@@ -73,19 +80,26 @@ def synth(
         changes: dict[str, Any] = {"law": law} if law == "rough" else {}
         changes |= {"cast_shadows": True} if cast_shadow else {}
         changes |= {"interreflection": True} if interreflection else {}
-        _render(folder, replace(chosen, **changes), seed, assignments or (), views)
+        _render(folder, replace(chosen, **changes), seed, assignments or (), views, flat)
     terminal.print_written([made], json)
 
 
-def _render(folder: Path, scene: "Scene", seed: int, assignments: Sequence[str], views: int | None) -> None:
-    """Render one capture of a scene, or `views` captures from all sides; `assignments` set camera and shooting."""
+def _render(folder: Path, scene: "Scene", seed: int, assignments: Sequence[str], views: int | None, flat: bool) -> None:
+    """Render one capture of a scene, or `views` captures, from all sides or of a flat sample with its material.
+
+    `assignments` set camera and shooting.
+    """
     from polcap import config as settings
-    from polcap.synth import all_around, shooting
+    from polcap.synth import all_around, flat_views, shooting
 
     if views is None:
         shoot = settings.fill(shooting.Shoot, {"seed": seed}, assignments)
         with terminal.progress(len(shoot.angles_deg) * shoot.exposures) as bar:
             shooting.write(folder, scene, shoot, bar.frame)
+    elif flat:
+        sample = settings.fill(flat_views.FlatShoot, {"seed": seed}, assignments)
+        with terminal.progress(views * len(sample.angles_deg) * sample.exposures) as bar:
+            flat_views.write(folder, scene, sample, views, bar.frame)
     else:
         around = settings.fill(all_around.AroundShoot, {"seed": seed}, assignments)
         with terminal.progress((views + around.laid) * len(around.angles_deg) * around.exposures) as bar:

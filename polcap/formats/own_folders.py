@@ -10,6 +10,7 @@ from pathlib import Path
 OUTPUT = "polcap"  # default folder of results
 FUSED = "fused"  # default folder of the result of `polcap fuse`, next to the views
 BATCH = "polcap-batch"  # folder of a batch's records, in ROOT or in --out; safe to delete
+MATERIAL = "material"  # default folder of the result of `polcap material`, next to the views
 OURS = (OUTPUT, BATCH)  # these folders hold no photographs
 
 

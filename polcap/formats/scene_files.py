@@ -67,6 +67,19 @@ def read_textures(folder: Path, side: int = 256) -> Floats:
     return np.ascontiguousarray(maps.transpose(2, 0, 1), dtype=np.float32)
 
 
+def read_height(path: Path, side: int) -> Floats:
+    """Read a height map, (side, side), 0…1: the gray of a picture of 8 or 16 bits.
+
+    Raises DecodeError: the file is missing or cannot be read.
+    """
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if path.is_file() else None
+    if image is None:
+        raise DecodeError(f"{path} is missing or not a picture; give a height map as PNG, white is high")
+    gray = image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
+    how = cv2.INTER_AREA if min(image.shape) >= side else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(gray, (side, side), interpolation=how))
+
+
 def _picture(path: Path, side: int) -> Floats:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None  # OpenCV would print a warning
     if image is None:

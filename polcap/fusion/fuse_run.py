@@ -35,7 +35,7 @@ _LODS = 2  # coarser levels, each with a quarter of the triangles
 _SIDE = 480  # px of an animation's frame
 
 
-def fuse(session_input: SessionInput, out: Path, notify: Notify, progress: Progress) -> dict[str, Any]:
+def fuse(session_input: SessionInput[SessionConfig], out: Path, notify: Notify, progress: Progress) -> dict[str, Any]:
     """Fuse the views below a folder into the result folder `out`; returns the content of report.json.
 
     Raises InputError: anything at fault with the user's input.

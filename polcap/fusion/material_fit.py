@@ -27,7 +27,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
-import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
@@ -39,7 +38,7 @@ from polcap.fusion.baking import AtlasMaps, VisibleTexels, on_atlas, visible_tex
 from polcap.fusion.lobe_profiles import ALPHAS, LobeProfile, LobeSamples, flash_place, profile
 from polcap.fusion.values import FusionView
 from polcap.images import Floats
-from polcap.optics import color, frames
+from polcap.optics import clusters, color, frames
 from polcap.optics.point_light import irradiance
 from polcap.stages import stage
 
@@ -98,15 +97,8 @@ def _materials(maps: AtlasMaps, atlas: Atlas, count: int) -> Floats:
     """Soft share (N, K) of each texel in each material, by clusters of the encoded albedo."""
     encoded = color.encode_srgb(np.clip(maps.diffuse[atlas.covered], 0, 1)).astype(np.float32)
     seen = maps.seen[atlas.covered]
-    some = encoded[seen][:: max(1, int(seen.sum()) // 40_000)]
-    count = min(count, len(some))
-    stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-4)
-    cv2.setRNGSeed(0)
-    compactness, _, center = cv2.kmeans(some, count, np.empty(0, np.int32), stop, 3, cv2.KMEANS_PP_CENTERS)
-    spread = max(float(np.sqrt(compactness / len(some))), 0.02)
-    distance = np.linalg.norm(encoded[:, None] - center[None], axis=-1)
-    likeness = np.exp(-((distance / spread) ** 2) + (distance.min(axis=1, keepdims=True) / spread) ** 2)
-    return np.asarray(likeness / likeness.sum(axis=1, keepdims=True))
+    center, spread = clusters.color_clusters(encoded[seen], count)
+    return clusters.soft_share(encoded, center, spread)
 
 
 def _samples(

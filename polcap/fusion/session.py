@@ -11,12 +11,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from polcap.capture_values import Capture
 from polcap.chart_values import ChartRequest, ColorCalibration
+from polcap.config import Config
 from polcap.errors import CaptureError, ChartError
 from polcap.formats import own_folders
 from polcap.formats.capture import folder_names
@@ -35,14 +36,15 @@ from polcap.process_pool import Limits, ProcessPool
 
 Notify = Callable[[str], None]  # is called with a line on the step that is done
 R = TypeVar("R")
+C = TypeVar("C", bound=Config)
 
 
 @dataclass(frozen=True)
-class SessionInput:
+class SessionInput(Generic[C]):
     """A session's folder and settings, and the request that is the same for all its views."""
 
     folder: Path
-    config: SessionConfig
+    config: C
     request: Request  # of each view; threads and memory are limits of each process
     workers: int = 1  # views at a time, each in a process
 
@@ -78,7 +80,7 @@ class Session:
                 raise CaptureError(
                     f"{count} views {f'of {folder} ' * bool(folder)}can be used, {LEAST_VIEWS} are needed"
                     + (f" ({listed})" if listed else "")
-                    + "; shoot more, 12 for a simple shape"
+                    + "; shoot more, 12 for a simple shape, 9 for a flat sample"
                 )
         return left
 
@@ -117,7 +119,7 @@ class StepRunner:
         self.notify(f"{name}: {step}")
 
 
-def read(session_input: SessionInput) -> Session:
+def read(session_input: SessionInput[Any]) -> Session:
     """Read the captures of all folders view…/ and set…/view…/; nothing is written.
 
     Raises CaptureError: there are too few views.
@@ -144,13 +146,15 @@ def read(session_input: SessionInput) -> Session:
     return Session(views, {}).without(left_out)
 
 
-def process(session: Session, session_input: SessionInput, cache: LazyCache, notify: Notify) -> ProcessedSession:
+def process(
+    session: Session, session_input: SessionInput[SessionConfig], cache: LazyCache, notify: Notify
+) -> ProcessedSession:
     """Process all views of a session; `cache` stores the stages that need all views.
 
     Raises CaptureError: too few views can be used. ChartError: no view shows the chart.
     """
-    session = _with_colors(session, notify)
-    with _process_pool(session_input) as pool:
+    session = with_colors(session, notify)
+    with process_pool(session_input) as pool:
         run_step = StepRunner(pool, notify)
         session, solved, masks = _find_poses_and_masks(session, cache, run_step)
         session = _with_agreed_masks(session, masks, solved, cache)
@@ -161,7 +165,7 @@ def process(session: Session, session_input: SessionInput, cache: LazyCache, not
 
 
 @contextmanager
-def _process_pool(session_input: SessionInput) -> Iterator[ProcessPool | None]:
+def process_pool(session_input: SessionInput[Any]) -> Iterator[ProcessPool | None]:
     """Context manager: the child processes of `workers`; None if there is one worker."""
     if session_input.workers == 1:
         yield None
@@ -171,7 +175,7 @@ def _process_pool(session_input: SessionInput) -> Iterator[ProcessPool | None]:
         yield pool
 
 
-def _with_colors(session: Session, notify: Notify) -> Session:
+def with_colors(session: Session, notify: Notify) -> Session:
     """Give all other views the color calibration of the first view that shows the chart, as a profile.
 
     Raises ChartError: no view shows the chart.

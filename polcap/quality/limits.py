@@ -209,3 +209,23 @@ class FusedGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ),
     ] = 0.7
     min_seen: Annotated[float, Meta(ge=0, le=1, description="least share of the surface that a view saw [1]")] = 0.85
+
+
+class MaterialGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Limits of the gates of a flat sample, the section `material.gates`."""
+
+    min_views: Annotated[int, Meta(ge=3, le=999, description="least number of views without a warning")] = 5
+    max_corner_px: Annotated[
+        float,
+        Meta(gt=0, description="allowed rms distance of board corners from the pose; usually 0.1 to 0.2 [RAW px]"),
+    ] = 0.5
+    max_residual: Annotated[
+        float,
+        Meta(gt=0, description="allowed median of a view's radiance minus that of the fit, relative; usually 0.01 [1]"),
+    ] = 0.05
+    min_seen: Annotated[
+        float, Meta(ge=0, le=1, description="least share of the texels that three views or more have measured [1]")
+    ] = 0.95
+    min_tilt_deg: Annotated[
+        float, Meta(ge=0, le=90, description="least tilt of the most oblique view against the steepest [°]")
+    ] = 15.0

@@ -45,8 +45,8 @@ def of_result(small: PageMaps, metric: bool) -> list[MapFigure]:
     error_note = "smaller is better; 3° is very good"
     return [
         normal("normal", "Normal", found.normal, inside),
-        _albedo("diffuse", "Diffuse albedo", "ρ_d, linear: red, green, blue", found.diffuse, inside, 1.0),
-        _albedo("specular", "Specular albedo F0", "linear: red, green, blue", found.specular, inside, keys.F0.high),
+        albedo("diffuse", "Diffuse albedo", "ρ_d, linear: red, green, blue", found.diffuse, inside, 1.0),
+        albedo("specular", "Specular albedo F0", "linear: red, green, blue", found.specular, inside, keys.F0.high),
         scalar(
             "roughness", "Roughness", "perceptual: 0 is a mirror, 1 is matt", found.roughness, inside, keys.ROUGHNESS
         ),
@@ -120,7 +120,7 @@ def css_colors(rgb: NDArray[np.uint8]) -> tuple[str, ...]:
     return tuple(f"#{bytes(color).hex()}" for color in rgb)
 
 
-def _albedo(name: str, title: str, note: str, linear: Floats, inside: Bools, top: float) -> MapFigure:
+def albedo(name: str, title: str, note: str, linear: Floats, inside: Bools, top: float) -> MapFigure:
     """Figure of a color map with values from 0 to `top`."""
     image = html.jpeg(_extend(srgb_eight_bits(linear / top), inside), whole_color=True)
     bar = srgb_eight_bits(np.linspace(0, 1, 17))[:, None].repeat(3, axis=1)

@@ -2,6 +2,7 @@
 
 shooting            a capture: brackets of DNGs, and the true maps
 all_around          captures of one object from all sides, on a board
+flat_views          captures of a flat sample on the board, by a camera that is moved about it
 calibration_frames  calibration photographs of a known camera, lens, polarizer and flash
 scenes              random scenes
 render              Stokes parameters of a scene at any pixel position

@@ -33,7 +33,7 @@ from polcap.synth.render import Scene
 from polcap.synth.shooting import Shoot, Studio
 
 Poses = list[tuple[Rotation, Floats]]  # turn and position [m] of the board in the camera frame
-_CONVENTIONS = (
+CONVENTIONS = (
     "world: origin in the board's middle, x right and z down the printed page, y up, metres; "
     "camera: x right, y up, z towards the camera; camera point = rotation @ world point + translation; "
     "pixels are those of a pinhole with focal_px and principal_px, before the lens"
@@ -177,7 +177,7 @@ def _write_poses(
         for name, (turn, position) in poses.items()
     ]
     document: dict[str, Any] = {
-        "conventions": _CONVENTIONS, "board": shoot.board, "focal_px": shoot.view.focal,
+        "conventions": CONVENTIONS, "board": shoot.board, "focal_px": shoot.view.focal,
         "principal_px": shoot.view.center, "size_px": (shoot.width, shoot.height), "distortion": shoot.distortion,
         "light": scene.light, "views": views,
     }  # fmt: skip

@@ -10,13 +10,16 @@ Hart, Sphere tracing, The Visual Computer 1996.
 
 from functools import lru_cache
 from math import hypot
+from pathlib import Path
 
 import msgspec
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from polcap.formats import scene_files
 from polcap.images import Floats
 
+_GRID = 1024  # points along a side of a slab's relief
 Wave = tuple[float, float, float, float, float]  # amplitude, wave vector x y z [rad/unit], phase [rad]
 
 
@@ -87,7 +90,58 @@ class Model(msgspec.Struct, frozen=True, tag="model", forbid_unknown_fields=True
     radius: float  # m, of the smallest sphere about the origin that contains it
 
 
-Shape = Cluster | Bumps | Vase
+class Slab(msgspec.Struct, frozen=True, tag="slab", forbid_unknown_fields=True):
+    """Shape of a flat square sample with relief on its upper side, y up, as a distance field.
+
+    It lies on the plane y = 0; its upper side is at y = thickness + height, with a height of mean 0.
+    """
+
+    side: float  # m
+    thickness: float  # m, mean
+    relief: float  # m, from the lowest to the highest point
+    feature: float = 0.006  # m, size of the features of random relief
+    seed: int = 0
+    height_map: str = ""  # picture file in place of random relief, white is high
+
+    @property
+    def radius(self) -> float:
+        return hypot(self.side / np.sqrt(2), self.thickness + self.relief)
+
+    def distance(self, p: Floats) -> Floats:
+        _, steepest = _heights(self)
+        over = (p[..., 1] - self.thickness - self.height(p[..., 0], p[..., 2])) / hypot(1, steepest)
+        beside = np.maximum(np.abs(p[..., 0]), np.abs(p[..., 2])) - self.side / 2
+        return np.asarray(np.maximum(np.maximum(over, beside), -p[..., 1]))
+
+    def height(self, x: Floats, z: Floats) -> Floats:
+        """Height (...,) [m] of the relief at x and z (...,), bilinear between the points of a fine grid."""
+        grid, _ = _heights(self)
+        last = len(grid) - 1
+        column, row = (np.clip((a / self.side + 0.5) * last, 0, last - 1e-6) for a in (x, z))
+        i, j = row.astype(np.intp), column.astype(np.intp)
+        down, across = row - i, column - j
+        flat, at = grid.ravel(), i * len(grid) + j
+        upper = flat[at] * (1 - across) + flat[at + 1] * across
+        lower = flat[at + len(grid)] * (1 - across) + flat[at + len(grid) + 1] * across
+        return np.asarray(upper * (1 - down) + lower * down)
+
+
+Shape = Cluster | Bumps | Vase | Slab
+
+
+@lru_cache(maxsize=4)
+def _heights(slab: Slab) -> tuple[Floats, float]:
+    """Heights (N, N) [m] of a slab's relief, rows along z, and its steepest slope."""
+    if slab.height_map:
+        grid = scene_files.read_height(Path(slab.height_map), _GRID).astype(float)
+    else:
+        white = np.random.default_rng([slab.seed, 0x51AB]).normal(size=(_GRID, _GRID))
+        spatial = np.fft.fftfreq(_GRID, slab.side / (_GRID - 1))
+        band = np.hypot(spatial[:, None], spatial[None]) * slab.feature
+        grid = np.fft.ifft2(np.fft.fft2(white) * band * np.exp(-2 * band**2)).real
+    grid = (grid - grid.mean()) * (slab.relief / max(float(np.ptp(grid)), 1e-12))
+    slope = np.gradient(grid, slab.side / (_GRID - 1))
+    return grid, float(np.hypot(*slope).max())
 
 
 @lru_cache

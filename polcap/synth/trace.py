@@ -75,7 +75,7 @@ def trace(shape: Shape | Model, position: Vector, turn: Rotation, v: Floats, sta
     index, distance = _march(shape, np.broadcast_to(origin, direction.shape), direction, first)
     local = origin + direction[index] * distance[:, None]
     at = candidates[index]
-    point, normal = -v[at] * distance[:, None], turn.apply(_gradient(shape, local))
+    point, normal = -v[at] * distance[:, None], turn.apply(gradient(shape, local))
     return Hits(at, distance, point, local, normal, np.full(len(at), -1), np.zeros((len(at), 3)))
 
 
@@ -115,7 +115,7 @@ def _march(shape: Shape, origin: Floats, direction: Floats, start: Floats | floa
     return index[order], np.concatenate(arrived_at)[order]
 
 
-def _gradient(shape: Shape, p: Floats) -> Floats:
+def gradient(shape: Shape, p: Floats) -> Floats:
     """Unit normals (N, 3) of a distance field by central differences."""
     steps = 1e-4 * np.eye(3)  # m
     slope = np.stack([shape.distance(p + step) - shape.distance(p - step) for step in steps], axis=-1)

@@ -23,11 +23,14 @@ def pictures(asset: Asset) -> dict[str, Texture]:
     """Albedo, F0, gloss and normals of an asset as 8-bit pictures of the size of its base color.
 
     Gloss is 1 − √roughness, so that Ward's slope parameter is (1 − gloss)⁴ = roughness². Outside the object the normal
-    is the zero vector and all other pictures are 0. The asset must be of one view, with its object-space normals.
+    is the zero vector and all other pictures are 0. The asset must be of one view or a plane, with its object-space
+    normals; a plane has no outside.
     """
-    assert asset.object_normal is not None and isinstance(asset.mesh, ReliefMesh)
+    assert asset.object_normal is not None
     height, width = asset.base_color.shape[:2]
-    inside = cv2.resize(np.isfinite(asset.mesh.depth).astype(np.uint8), (width, height)) > 0
+    inside = np.ones((height, width), bool)
+    if isinstance(asset.mesh, ReliefMesh):
+        inside = cv2.resize(np.isfinite(asset.mesh.depth).astype(np.uint8), (width, height)) > 0
     rough = encoders.eight_bits(texture_set.roughness(asset))
     gloss = np.rint(255 - np.sqrt(255.0 * np.arange(256))).astype(np.uint8)[rough]
     made = {

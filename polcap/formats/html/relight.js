@@ -310,7 +310,7 @@ async function begin() {
   const sources = textures(images);
   window.relight = new Relight(document.getElementById('relight'), sources);
   document.getElementById('relit').classList.add('live');
-  window.solid = new Solid(document.getElementById('solid'), sources, await meshed(DATA.mesh));
+  if (DATA.mesh) window.solid = new Solid(document.getElementById('solid'), sources, await meshed(DATA.mesh));
   document.documentElement.dataset.ready = 'yes';
 }
 

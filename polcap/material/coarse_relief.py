@@ -1,0 +1,199 @@
+"""Height of the sample over the board, and the light of each view, on coarse texels, from parallax and normals.
+
+1. The plane on which the textures of all views agree best gives the sample's thickness.
+2. Fits of coarse texels give normals, and the radiance that each view should show.
+3. Where a view shows the texture of a neighbor instead, the height is wrong: least squares over a window give it.
+4. Heights from normals and from parallax are joined, by the errors of both. Steps 2 to 4 are repeated.
+
+The radiance in excess of the fits, which is common to a view, corrects its gain; only what a tilt of the whole sample
+cannot explain.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import cv2
+import msgspec
+import numpy as np
+from msgspec import Meta
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+
+from polcap.images import ArrayValue, Floats
+from polcap.material import flash_light, texel_grid
+from polcap.material.stokes_view import PosedStokes
+from polcap.material.texel_fit import FitSettings, Measurements, TexelEstimate, TexelPrior, fit, start
+from polcap.material.texel_grid import FlashLight, TexelGrid
+from polcap.material.texel_stokes import TexelStokes, resample
+from polcap.optics import body
+from polcap.stages import stage
+
+_COARSE = 160  # texels along the longer side, about
+_ROUNDS = 3
+_WINDOW = 2.5  # coarse texels, 1σ, over which parallax is summed
+_THICKEST_M, _LOWEST_M = 0.02, -0.002  # range of the plane
+_SLOPE_ERROR = 0.03  # 1σ of the coarse slopes
+# Parallax errs by 0.08 texels over long ranges, slopes by 0.001; slopes are better up to 500 texels = 2π · 80
+CROSSOVER = 80.0  # texels
+_MOST_STEP = 1.5  # coarse texels of height, in a round
+_FIRST = TexelPrior(np.array([[0.45, 0.042]], np.float32), np.array([[0.2, 0.012]], np.float32))
+
+
+@dataclass(frozen=True, repr=False)
+class CoarseRelief(ArrayValue):
+    """Height of the sample, and the light corrected with it."""
+
+    height: Floats  # (H, W) m over the board, on the fine grid
+    sigma: Floats  # (H, W) m, of the heights from parallax alone
+    light: FlashLight
+
+
+class ReliefSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Settings of the stage `coarse_relief`."""
+
+    parallax_error: Annotated[
+        float, Meta(gt=0, le=1, description="error of a view's radiance in the search for parallax [1]")
+    ] = 0.03
+    refine_gains: Annotated[bool, Meta(description="correct the light of each view by the sample itself")] = True
+
+
+@stage(version=1)
+def solve(views: tuple[PosedStokes, ...], light: FlashLight, grid: TexelGrid, settings: ReliefSettings) -> CoarseRelief:
+    """Height on the fine grid, interpolated from coarse texels, and corrected light."""
+    step = max(1, round(max(grid.size) / _COARSE))
+    coarse = grid.coarser(step)
+    middle = _plane(views, light, grid, step)
+    height = np.full(coarse.size[::-1], middle)
+    for number in range(_ROUNDS):
+        fine = _enlarge(height, grid, step)
+        seen = resample(views, light, grid, fine, step)
+        estimate = _fit(seen, views, light, coarse, height)
+        if settings.refine_gains:
+            light = texel_grid.with_gain(light, _gain_errors(seen, estimate, views, light, coarse, height))
+        delta = coarse.texel
+        raised = resample(views, light, grid, fine + delta, step)
+        update, weight = _parallax(seen, raised, estimate, delta, settings)
+        stereo = height + np.clip(update, -_MOST_STEP * delta, _MOST_STEP * delta)
+        slope = estimate.value[:, :2].reshape(*height.shape, 2)
+        reach = np.inf if number == 0 else CROSSOVER / step  # slopes of misplaced views are wrong
+        height = _join(stereo, weight, slope, coarse.texel, reach)
+    sigma = 1 / np.sqrt(np.maximum(weight, 1e-30))
+    return CoarseRelief(_enlarge(height, grid, step), _enlarge(np.minimum(sigma, 1.0), grid, step), light)
+
+
+def _enlarge(image: Floats, grid: TexelGrid, step: int) -> Floats:
+    """An image of coarse texels, interpolated on the fine grid (H, W), float32."""
+    width, height = grid.size
+    x = ((np.arange(width) + 0.5) / step - 0.5).astype(np.float32)
+    y = ((np.arange(height) + 0.5) / step - 0.5).astype(np.float32)
+    across, down = (np.ascontiguousarray(a) for a in np.broadcast_arrays(x[None], y[:, None]))
+    smooth = image.astype(np.float32)
+    return np.asarray(cv2.remap(smooth, across, down, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _detail(seen: TexelStokes) -> Floats:
+    """Texture (K, H, W) of each view: ln S0 without its coarse shading; 0 where not measured."""
+    gray = np.maximum(seen.radiance.mean(axis=-1), 1e-3)
+    log = np.where(np.isfinite(seen.noise[..., 0]), np.log(gray), 0)
+    return np.stack([one - cv2.GaussianBlur(one, (0, 0), 6.0) for one in log])
+
+
+def _plane(views: tuple[PosedStokes, ...], light: FlashLight, grid: TexelGrid, step: int) -> float:
+    """Mean height [m] over the board on which the textures of all views agree best."""
+    shape = grid.size[::-1]
+
+    def disagreement(height: float) -> float:
+        detail = _detail(resample(views, light, grid, np.full(shape, np.float32(height)), step))
+        return float(np.median((detail - np.median(detail, axis=0)) ** 2, axis=0).mean() + 1e-12)
+
+    spacing = 1.5 * step * grid.texel
+    trial = np.arange(_LOWEST_M, _THICKEST_M + spacing, spacing)
+    cost = np.array([disagreement(height) for height in trial])
+    best = int(np.clip(cost.argmin(), 1, len(trial) - 2))
+    low, mid, high = cost[best - 1 : best + 2]
+    bend = low - 2 * mid + high
+    return float(trial[best] + spacing * (np.clip((low - high) / (2 * bend), -1, 1) if bend > 0 else 0.0))
+
+
+def _fit(
+    seen: TexelStokes, views: Sequence[PosedStokes], light: FlashLight, grid: TexelGrid, height: Floats
+) -> TexelEstimate:
+    """Fits of all coarse texels with a wide prior of their gloss."""
+    data = measurements(seen, views)
+    geometry = texel_grid.geometry(grid.points(height).reshape(-1, 3), [view.pose for view in views], light)
+    count = data.radiance.shape[1]
+    prior = TexelPrior(np.repeat(_FIRST.mean, count, axis=0), np.repeat(_FIRST.sigma, count, axis=0))
+    first = start(data, geometry, prior, body.SMOOTH)
+    return fit(data, geometry, prior, first, body.SMOOTH, FitSettings())
+
+
+def measurements(seen: TexelStokes, views: Sequence[PosedStokes]) -> Measurements:
+    """The data of all texels, in one row."""
+    parts = (seen.radiance, seen.polarized, seen.noise)
+    radiance, polarized, noise = (one.reshape(len(one), -1, one.shape[-1]) for one in parts)
+    return Measurements(radiance, polarized, noise, flash_light.gray_of_colors(views[0].matrix))
+
+
+def _gain_errors(
+    seen: TexelStokes,
+    estimate: TexelEstimate,
+    views: Sequence[PosedStokes],
+    light: FlashLight,
+    grid: TexelGrid,
+    height: Floats,
+) -> Floats:
+    """Factors (K,) on the gains: medians of measured over modelled radiance, less what a tilt would explain."""
+    gray = (seen.radiance @ flash_light.gray_of_colors(views[0].matrix)).reshape(len(views), -1)
+    known = np.isfinite(seen.noise[..., 0]).reshape(gray.shape) & (gray > 0)
+    ratio = np.log(np.where(known, gray, 1) / np.maximum(estimate.model, 1e-4))
+    excess = np.array([np.median(r[k]) if k.any() else 0.0 for r, k in zip(ratio, known, strict=True)])
+    middle = grid.points(height).reshape(-1, 3).mean(axis=0)
+    towards = np.stack([view.pose.center + view.pose.rotation.T @ light.place - middle for view in views])
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    terms = np.stack([np.ones(len(views)), *(towards / towards[:, 1:2])[:, [0, 2]].T], axis=-1)
+    return np.asarray(np.exp(excess - terms @ np.linalg.lstsq(terms, excess, rcond=None)[0]))
+
+
+def _parallax(
+    seen: TexelStokes, raised: TexelStokes, estimate: TexelEstimate, delta: float, settings: ReliefSettings
+) -> tuple[Floats, Floats]:
+    """Change (H, W) [m] of the height that makes all views agree, and its inverse variance."""
+    shape = seen.noise.shape[1:3]
+    known = np.isfinite(seen.noise[..., 0]) & np.isfinite(raised.noise[..., 0])
+    here, above = (one.radiance.mean(axis=-1) for one in (seen, raised))
+    model = estimate.model.reshape(-1, *shape)
+    level = np.maximum(model, 1e-3)
+    slope = np.where(known, (above - here) / level / delta, 0)
+    count = np.maximum(known.sum(axis=0), 1)
+    slope = np.where(known, slope - slope.sum(axis=0) / count, 0)  # albedo absorbs what is common to the views
+    error = np.where(known, np.clip((model - here) / level, -0.5, 0.5), 0)
+    sums = [cv2.GaussianBlur((slope * part).sum(axis=0), (0, 0), _WINDOW) for part in (error, slope)]
+    area = 4 * np.pi * _WINDOW**2
+    weight = sums[1] * area / settings.parallax_error**2
+    return np.asarray(sums[0] / np.maximum(sums[1], 1e-12)), np.asarray(weight)
+
+
+def _join(stereo: Floats, weight: Floats, slope: Floats, texel: float, reach: float) -> Floats:
+    """Height (H, W) [m] by least squares: near `stereo` by its inverse variance, with slopes (H, W, 2).
+
+    Over less than about `reach` texels the slopes alone give the height.
+    """
+    height, width = stereo.shape
+    number = np.arange(height * width).reshape(height, width)
+    across = number[:, :-1].ravel(), number[:, 1:].ravel()
+    up = number[1:].ravel(), number[:-1].ravel()  # rows run down
+    rise = np.concatenate(
+        [(slope[:, :-1, 0] + slope[:, 1:, 0]).ravel(), (slope[1:, :, 1] + slope[:-1, :, 1]).ravel()]
+    ) * (texel / 2)
+    first, second = (np.concatenate(ends) for ends in zip(across, up, strict=True))
+    count = len(first)
+    rows = np.repeat(np.arange(count), 2)
+    columns = np.stack([first, second], axis=-1).ravel()
+    links: Any = sparse.csr_matrix((np.tile([-1.0, 1.0], count), (rows, columns)), (count, number.size))
+    tie = 1 / (_SLOPE_ERROR * texel) ** 2
+    own = weight.ravel() / (2 * np.pi * _WINDOW**2) + tie * 1e-8  # windows overlap
+    own = np.minimum(own, tie / reach**2) if np.isfinite(reach) else own
+    system = tie * (links.T @ links) + sparse.diags(own)
+    right = tie * (links.T @ rise) + own * stereo.ravel()
+    return np.asarray(spsolve(system.tocsc(), right)).reshape(height, width)

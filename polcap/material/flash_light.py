@@ -1,0 +1,164 @@
+"""Place of the flash, its energy in each view and each shot, from the board's paper; its scale from the chart.
+
+The paper around the sample is flat, evenly white, matt and unpolarized. Its radiance in view k is
+
+    S0 = c_k cos θ / d²
+
+with the distance d to the flash and the angle θ between the page's normal and the flash. The flash's place beside the
+lens is the one that leaves the least scatter; c_k are then means. Where S1 and S2 of the paper are not 0, the shots of
+a view had different energies, and a matrix corrects them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from polcap.chart_values import ColorCalibration
+from polcap.errors import CaptureError
+from polcap.images import Floats, Quality
+from polcap.material.stokes_view import PosedStokes
+from polcap.material.texel_grid import FlashLight
+from polcap.optics import board as boards
+from polcap.optics import distortion, frames, mueller
+from polcap.optics.board import Board
+from polcap.optics.projection import back_project, from_grid
+from polcap.stages import stage
+
+_STEP_M = 0.001  # between the points of the paper that are sampled
+_MARGIN_PX = 1.5  # between such a point and the print
+_LEAST_POINTS = 60  # of the paper, in a view
+_FLASH_SIGMA_M = 0.08  # distance of a flash from the lens
+_ROUNDS, _OUTLIER = 3, 4.0  # of the fit; robust standard deviations
+_SCATTER = 0.02  # of paper about Lambert's law
+_USABLE = ~np.uint8(Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST | Quality.DARK)
+PAPER = 0.8  # albedo of matt paper, for sessions without a chart
+
+
+@dataclass(frozen=True)
+class ChartInView:
+    """The chart of the session: color calibration of the view that shows it, and the view's place in the session."""
+
+    view: int
+    color: ColorCalibration
+
+
+@stage(version=1)
+def measure(views: tuple[PosedStokes, ...], chart: ChartInView | None, board: Board) -> FlashLight:
+    """Flash and light of all views; without a chart the paper's albedo gives the scale.
+
+    Raises CaptureError: too little of the paper is visible.
+    """
+    samples = [_paper(view, board) for view in views]
+    keep = [np.ones(len(one.radiance), bool) for one in samples]
+    place: Floats = np.zeros(3)
+    for _ in range(_ROUNDS):
+        place = _flash(samples, keep, place)
+        error = [_log_error(one, place) for one in samples]
+        middle = [float(np.median(e[k])) for e, k in zip(error, keep, strict=True)]
+        spread = 1.48 * np.median(np.abs(np.concatenate([e - m for e, m in zip(error, middle, strict=True)])))
+        keep = [np.abs(e - m) < _OUTLIER * spread for e, m in zip(error, middle, strict=True)]
+    level = np.exp([float(e[k].mean()) for e, k in zip(error, keep, strict=True)])  # c_k
+    rest = np.concatenate([(e - np.log(c))[k] for e, c, k in zip(error, level, keep, strict=True)])
+    paper = PAPER if chart is None else float(level[chart.view] * _chart_irradiance(views[chart.view], chart, place))
+    matrix = np.stack([_shot_matrix(view, one, k) for view, one, k in zip(views, samples, keep, strict=True)])
+    return FlashLight(place, level / paper, matrix, float(rest.std()), paper, len(rest))
+
+
+@dataclass(frozen=True)
+class PaperSamples:
+    """Points of the paper in one view."""
+
+    point: Floats  # (M, 3) m, camera frame
+    normal: Floats  # (3,) of the page, camera frame
+    radiance: Floats  # (M,) S0, gray
+    ratio: Floats  # (M, 2, 3) S1/S0 and S2/S0 of each channel
+
+
+def _paper(view: PosedStokes, board: Board) -> PaperSamples:
+    """Samples of the paper in a view. Raises CaptureError: there are too few."""
+    distance = float(np.linalg.norm(view.pose.translation))
+    margin = _MARGIN_PX * distance * view.stokes.view.scale / view.camera.focal_px
+    world = _paper_points(board, margin)
+    x, y = view.pixels(world)
+    height, width = view.stokes.mask.shape
+    inside = (x >= 1) & (y >= 1) & (x <= width - 2) & (y <= height - 2)
+    column, row = (np.rint(a[inside]).astype(int) for a in (x, y))
+    stokes = np.asarray(view.stokes.stokes[:, row, column])  # (3, M, 3)
+    good = ((view.stokes.quality[row, column] & ~_USABLE) == 0) & (stokes[0].min(axis=-1) > 0)
+    if good.sum() < _LEAST_POINTS:
+        raise CaptureError(
+            f"{view.name}: {good.sum()} points of the board's paper are usable, {_LEAST_POINTS} are needed; "
+            "show the whole board, and expose so that its paper does not clip"
+        )
+    stokes, world = stokes[:, good], world[inside][good]
+    radiance = gray(view.matrix) @ stokes[0].T
+    point = world @ view.pose.rotation.T + view.pose.translation
+    return PaperSamples(point, view.pose.rotation[:, 1], radiance, np.moveaxis(stokes[1:] / stokes[0], 0, 1))
+
+
+def gray(matrix: Floats) -> Floats:
+    """Weights (3,) of camera channels: their sum, scaled so that white is 1."""
+    return np.full(3, 1 / np.linalg.inv(np.asarray(matrix, np.float64)).sum())
+
+
+def gray_of_colors(matrix: Floats) -> Floats:
+    """The same weights (3,) for colors in linear Rec.709."""
+    total = np.linalg.inv(np.asarray(matrix, np.float64)).sum(axis=0)
+    return np.asarray(total / total.sum())
+
+
+def _paper_points(board: Board, margin: float) -> Floats:
+    """World points (M, 3) [m] of the page that are white up to `margin` [m] around."""
+    half = board.page_m[0] / 2 - margin
+    axis = np.arange(-half, half, _STEP_M)
+    x, z = (a.ravel() for a in np.meshgrid(axis, axis))
+    clear = np.ones(len(x), bool)
+    for turn in np.arange(8) * np.pi / 4:
+        clear &= ~boards.is_ink(board, x + margin * np.cos(turn), z + margin * np.sin(turn))
+    return np.stack([x, 0 * x, z], axis=-1)[clear]
+
+
+def _log_error(samples: PaperSamples, place: Floats) -> Floats:
+    """ln (M,) of the radiance over its law, without c_k."""
+    return np.asarray(np.log(samples.radiance / _irradiance(samples.point, samples.normal, place)))
+
+
+def _irradiance(point: Floats, normal: Floats, place: Floats) -> Floats:
+    """cos θ / d² (...,) at points (..., 3) of the camera frame."""
+    towards = place - point
+    squared = frames.dot(towards, towards)
+    return np.asarray(np.maximum(towards @ normal, 1e-6) / squared**1.5)
+
+
+def _flash(samples: Sequence[PaperSamples], keep: Sequence[Floats], start: Floats) -> Floats:
+    """Place (3,) [m] of the flash with the least scatter."""
+
+    def residuals(place: Floats) -> Floats:
+        parts = [_log_error(one, place)[k] for one, k in zip(samples, keep, strict=True)]
+        even = [(part - np.median(part)) / _SCATTER / np.sqrt(len(part) / _LEAST_POINTS) for part in parts]
+        return np.concatenate([*even, place / _FLASH_SIGMA_M])
+
+    return np.asarray(least_squares(residuals, start, loss="soft_l1", x_scale=0.01).x)
+
+
+def _chart_irradiance(view: PosedStokes, chart: ChartInView, place: Floats) -> float:
+    """cos θ / d² at the chart's white patch, which lies on the board's plane."""
+    assert chart.color.place is not None
+    patch = chart.color.place.quads[18].mean(axis=0)
+    raw = from_grid(patch, view.stokes.view.scale)
+    x, y = distortion.undistort(view.camera.lens, *(np.array(a) for a in raw))
+    ray, normal = back_project(view.camera.view, x, y), view.pose.rotation[:, 1]
+    point = ray * (view.pose.translation @ normal) / (ray @ normal)
+    return float(_irradiance(point, normal, place))
+
+
+def _shot_matrix(view: PosedStokes, samples: PaperSamples, keep: Floats) -> Floats:
+    """Matrices (3, 3, 3), by channel, that make the paper's S1 and S2 zero."""
+    analyzers = mueller.analyzer(np.asarray(view.angle, np.float64))
+    back, out = np.linalg.pinv(analyzers), []
+    for q, u in np.median(samples.ratio[np.asarray(keep, bool)], axis=0).T:
+        gain = analyzers @ [1, q, u] * 2
+        out.append(back @ (analyzers / gain[:, None]))
+    return np.stack(out)

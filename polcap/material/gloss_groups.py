@@ -1,0 +1,165 @@
+"""Materials of the sample: groups of texels of like albedo, with the roughness and F0 that all of a group share.
+
+A narrow highlight is met by few texels in few views. So every group gets the gloss that fits many of its texels best:
+first the best of a few values of roughness, then Newton steps on sums of the texels' normal equations. The law of
+diffuse reflection, of a smooth or a rough interface, is the one that fits better.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from polcap.errors import CaptureError
+from polcap.images import ArrayValue, Floats
+from polcap.material import texel_fit, texel_grid
+from polcap.material.coarse_relief import CoarseRelief, measurements
+from polcap.material.stokes_view import PosedStokes
+from polcap.material.texel_fit import LEAST_VIEWS, FitSettings, Measurements, TexelEstimate, TexelPrior
+from polcap.material.texel_grid import TexelGrid, TexelViews
+from polcap.material.texel_stokes import TexelStokes
+from polcap.optics import body, clusters, color
+from polcap.stages import stage
+
+_ROUGHNESS = (0.1, 0.16, 0.25, 0.38, 0.55, 0.8)  # tried first
+_SIDE = 70  # texels along the longer side of the sampled grid
+_SAMPLES, _TRIED = 400, 120  # texels of a group; with each of the roughnesses tried first
+_LEAST_SAMPLES = 40
+_ROUNDS = 4
+_TIGHT = np.array([1e-3, 1e-4], np.float32)  # of roughness and F0, while their group's are varied
+_F0, _F0_SIGMA = 0.042, 0.01
+LAWS = {"smooth": body.SMOOTH, "rough": body.Law(rough=1.0)}
+
+
+class GlossSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Settings of the stage `gloss_groups`."""
+
+    materials: Annotated[int, Meta(ge=1, le=32, description="greatest number of materials, grouped by albedo [1]")] = 6
+    roughness_sigma: Annotated[float, Meta(gt=0, le=1, description="spread of roughness within a material [1]")] = 0.06
+    f0_sigma: Annotated[float, Meta(gt=0, le=1, description="spread of F0 within a material [1]")] = 0.004
+    fitting: FitSettings = FitSettings()
+
+
+@dataclass(frozen=True, repr=False)
+class GlossGroups(ArrayValue):
+    """Materials of a sample."""
+
+    center: Floats  # (G, 3) sRGB-encoded albedo
+    spread: float
+    roughness: Floats  # (G,)
+    f0: Floats  # (G,)
+    law: Literal["smooth", "rough"]
+
+    def prior(self, albedo: Floats, settings: GlossSettings) -> TexelPrior:
+        """Expected gloss of texels of an albedo (N, 3)."""
+        share = clusters.soft_share(_encoded(albedo), self.center, self.spread)
+        mean = share @ np.stack([self.roughness, self.f0], axis=-1)
+        sigma = np.tile(np.array([settings.roughness_sigma, settings.f0_sigma], np.float32), (len(mean), 1))
+        return TexelPrior(mean.astype(np.float32), sigma)
+
+
+def _encoded(albedo: Floats) -> Floats:
+    return np.asarray(color.encode_srgb(np.clip(albedo, 0, 1)), np.float32)
+
+
+@stage(version=1)
+def find(
+    views: tuple[PosedStokes, ...], relief: CoarseRelief, grid: TexelGrid, seen: TexelStokes, settings: GlossSettings
+) -> GlossGroups:
+    """Group texels on an even grid by their first albedo, and fit the gloss of each group.
+
+    Raises CaptureError: fewer than `LEAST_VIEWS` views show the sample.
+    """
+    step = max(1, round(max(grid.size) / _SIDE))
+    at = (slice(step // 2, None, step),) * 2
+    some = TexelStokes(*(part[:, *at] for part in (seen.radiance, seen.polarized, seen.noise)))
+    data = measurements(some, views)
+    known = np.flatnonzero(np.isfinite(data.noise[..., 0]).sum(axis=0) >= LEAST_VIEWS)
+    if len(known) < _LEAST_SAMPLES:
+        raise CaptureError(
+            f"{len(known)} of {data.radiance.shape[1]} sampled texels are seen by {LEAST_VIEWS} views or more, "
+            f"{_LEAST_SAMPLES} are needed; expose darker, or name the sample's part with --region"
+        )
+    point = grid.points(relief.height)[at].reshape(-1, 3)[known]
+    geometry = texel_grid.geometry(point, [view.pose for view in views], relief.light)
+    data = data.take(known)
+    first = TexelPrior(*(np.repeat(np.array([a], np.float32), len(known), axis=0) for a in ((0.45, _F0), (0.2, 0.01))))
+    begin = texel_fit.start(data, geometry, first, body.SMOOTH)
+    albedo = texel_fit.fit(data, geometry, first, begin, body.SMOOTH, settings.fitting, rounds=4).value[:, 4:]
+    return group(data, geometry, albedo, settings)
+
+
+def group(data: Measurements, views: TexelViews, albedo: Floats, settings: GlossSettings) -> GlossGroups:
+    """Group sampled texels by their albedo (N, 3), and fit the gloss of each group."""
+    encoded, fitting = _encoded(albedo), settings.fitting
+    center, spread = clusters.color_clusters(encoded, settings.materials)
+    member = clusters.soft_share(encoded, center, spread).argmax(axis=1)
+    found: dict[str, tuple[float, Floats]] = {}
+    for name, law in LAWS.items():
+        gloss = np.tile([0.45, _F0], (len(center), 1))
+        cost = 0.0
+        for k in range(len(center)):
+            mine = np.flatnonzero(member == k)
+            mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), _SAMPLES)).astype(int)] if len(mine) else mine
+            if len(mine) >= _LEAST_SAMPLES:
+                gloss[k], misfit = _shared(data.take(mine), views.take(mine), law, fitting)
+                cost += misfit * (member == k).sum()
+        found[name] = cost, gloss
+    law_name: Literal["smooth", "rough"] = "smooth" if found["smooth"][0] <= found["rough"][0] else "rough"
+    roughness, f0 = found[law_name][1].T
+    return GlossGroups(center, spread, roughness, f0, law_name)
+
+
+def _shared(data: Measurements, views: TexelViews, law: body.Law, fitting: FitSettings) -> tuple[Floats, float]:
+    """Roughness and F0 (2,) that all texels share, and the mean cost of a texel."""
+    few = slice(None, None, max(1, data.radiance.shape[1] // _TRIED))
+    some, seen = data.take(few), views.take(few)
+    gloss = min((np.array([rough, _F0]) for rough in _ROUGHNESS), key=lambda one: _at(some, seen, one, law, fitting)[0])
+    cost, estimate = _at(data, views, gloss, law, fitting)
+    for _ in range(_ROUNDS):
+        step = _newton(estimate, gloss)
+        for share in (1.0, 0.3):
+            trial = np.clip(gloss + share * step, [0.06, 0.01], [1.0, 0.15])
+            found, there = _at(data, views, trial, law, fitting, estimate.value)
+            if found < cost:
+                gloss, cost, estimate = trial, found, there
+                break
+        else:
+            break
+    return gloss, cost
+
+
+def _at(
+    data: Measurements,
+    views: TexelViews,
+    gloss: Floats,
+    law: body.Law,
+    fitting: FitSettings,
+    first: Floats | None = None,
+) -> tuple[float, TexelEstimate]:
+    """Mean cost of texels that all have one gloss (2,), with its prior, and their estimates."""  # fmt: skip
+    count = data.radiance.shape[1]
+    prior = TexelPrior(np.tile(gloss.astype(np.float32), (count, 1)), np.tile(_TIGHT, (count, 1)))
+    begin = texel_fit.start(data, views, prior, law)
+    if first is not None:
+        begin = np.concatenate([first[:, :2], prior.mean, first[:, 4:]], axis=-1)
+    estimate = texel_fit.fit(data, views, prior, begin, law, fitting, rounds=5)
+    away = (gloss[1] - _F0) / _F0_SIGMA
+    return float(estimate.cost.mean()) + away**2 / count, estimate
+
+
+def _newton(estimate: TexelEstimate, gloss: Floats) -> Floats:
+    """Step (2,) of the shared gloss: Schur complements of the texels' normal equations, without their priors."""
+    data = estimate.information.astype(np.float64)
+    data[:, (2, 3), (2, 3)] -= _TIGHT.astype(float) ** -2
+    own, others = np.array([2, 3]), np.array([0, 1, 4, 5, 6])
+    cross = data[:, own[:, None], others]
+    inner = np.linalg.inv(data[:, others[:, None], others] + 1e-6 * np.eye(5))
+    schur = data[:, own[:, None], own] - cross @ inner @ np.swapaxes(cross, 1, 2)
+    # at the texels' optimum the prior's pull equals the data's gradient
+    pull = (estimate.value[:, 2:4] - gloss) / _TIGHT.astype(float) ** 2
+    total = schur.sum(axis=0) + np.diag([1e-6, _F0_SIGMA**-2])
+    right = pull.sum(axis=0) + np.array([0, (_F0 - gloss[1]) / _F0_SIGMA**2])
+    return np.asarray(np.linalg.solve(total, right))

@@ -1,0 +1,181 @@
+"""Measures a flat sample: processes its views, runs the path, writes maps, asset, report and verdict."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from polcap import __version__
+from polcap import report as reports
+from polcap.config import restore
+from polcap.errors import SettingError
+from polcap.formats.capture import folder_names
+from polcap.formats.export import provenance
+from polcap.fusion import session as sessions
+from polcap.fusion.session import Notify, Session, SessionInput
+from polcap.material import material_maps, material_page, material_path, material_session
+from polcap.material.material_path import MaterialConfig, MaterialResults
+from polcap.material.material_session import FlatSession, Region
+from polcap.pipeline import asset_export, result_folder
+from polcap.pipeline.asset_export import ExportRequest
+from polcap.pipeline.cache import LazyCache, Progress
+from polcap.pipeline.run import timings
+from polcap.quality import flat_sample, gates
+from polcap.quality.advice import advise
+from polcap.quality.gate import Gate
+
+_SINGLE_VIEW = {"exr"}  # formats that need the maps of one picture
+
+
+def measure(
+    session_input: SessionInput[MaterialConfig],
+    out: Path,
+    region: Region | None,
+    texel: float | None,
+    tile: bool,
+    notify: Notify,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Make a material of the views below a folder, in the result folder `out`; returns the content of report.json.
+
+    `region` and `texel` as for `material_session.process`; `tile` makes the maps seamless.
+
+    Raises InputError: anything at fault with the user's input.
+    """  # fmt: skip
+    session = sessions.read(session_input)  # first: a folder without views stays as it is
+    for view in folder_names.session_views(session_input.folder):
+        result_folder.check(out, session_input.folder / view)
+    with result_folder.locked(out):
+        cache = LazyCache(out, progress)
+        flat = material_session.process(session, session_input, region, texel, cache, notify)
+        width, height = session.capture.size_px
+        settings = session_input.config.material
+        with cache.memory_explained(width * height):
+            results = material_path.path(flat.views, flat.chart, flat.board, flat.grid, settings, tile, cache)
+        cache.begin("write")
+        name = session_input.folder.resolve().name
+        about = document(name, session, flat, session_input.config, results, timings(out))
+        material_maps.write(out / "maps", flat.grid, results.maps, about["keys"], tile)
+        source = material_maps.read(out / "maps", session_input.config.asset)  # as stored, as `polcap export` reads it
+        request = ExportRequest(formats=("gltf", "obj"))
+        asset_export.write(out, about, request, asset_export.levels(source, request))
+        material_page.write(out, about, source)
+        cache.end()
+        return about
+
+
+def export(out: Path, *requests: ExportRequest) -> list[Path]:
+    """Write the asset of a material again for each request, from maps/ and report.json; returns the files."""
+    requests = tuple(_of_plane(request) for request in requests)
+    for request in requests:
+        asset_export.check(request)
+        for flag in _SINGLE_VIEW & set(asset_export.effective(request).formats):
+            raise SettingError(f"--{flag} is for results of one view; leave it out, and use the EXRs in maps/")
+        if request.lod or request.triangles:
+            raise SettingError("--lod and --triangles reduce a mesh, and a material is a plane; leave them out")
+    about = reports.read(out)
+    with result_folder.locked(out):
+        source = material_maps.read(out / "maps", restore(MaterialConfig, about, out / "report.json").asset)
+        exports = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in requests)
+        return [file for files in exports for file in files]
+
+
+def _of_plane(request: ExportRequest) -> ExportRequest:
+    """The request without the layered EXR of a preset, which is of one picture."""
+    return request if request.preset is None else replace(request, without=("exr",))
+
+
+def document(
+    name: str,
+    session: Session,
+    flat: FlatSession,
+    config: MaterialConfig,
+    results: MaterialResults,
+    seconds: Mapping[str, float],
+) -> dict[str, Any]:
+    """The content of report.json: facts, figures by view, gates; `seconds` are those of the stages."""  # fmt: skip
+    rows = list(_rows(flat, results))
+    judged = advise(list(_gates(flat, results, rows, config)))
+    first = reports.capture_facts(session.views[flat.names[0]].capture)
+    return {
+        "polcap": __version__,
+        "versions": provenance.versions(),
+        "verdict": gates.verdict(judged),
+        "capture": {**first, "name": name, "shots": _shots(session, flat)},
+        "gates": msgspec.to_builtins(judged),
+        "figures": _figures(flat, results, rows),
+        "timings": dict(seconds),
+        "model": None,
+        "keys": results.keys,
+        "settings": msgspec.to_builtins(config),
+    }
+
+
+def _shots(session: Session, flat: FlatSession) -> list[dict[str, Any]]:
+    """Facts of the shots of all views, with files named from the session's folder."""
+    return [
+        {**shot, "frames": [{**frame, "file": f"{view}/{frame['file']}"} for frame in shot["frames"]]}
+        for view in flat.names
+        for shot in reports.capture_facts(session.views[view].capture)["shots"]
+    ]
+
+
+def _rows(flat: FlatSession, results: MaterialResults) -> Iterator[dict[str, Any]]:
+    """Figures of each view."""
+    gain = results.relief.light.gain
+    for k, name in enumerate(flat.names):
+        posed = flat.poses.views[name]
+        yield {
+            "name": name,
+            "tilt_deg": flat.tilt_deg[name],
+            "corners": posed.corners,
+            "reprojection_px": posed.residual_px,
+            "pose_sigma_deg": posed.sigma_deg,
+            "light": float(gain[k] / gain[0]),
+            "residual": float(results.fitted.residual[k]),
+            "misfit": float(results.fitted.misfit[k]),
+        }
+
+
+def _figures(flat: FlatSession, results: MaterialResults, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Figures of the views, the light, the materials and the maps."""
+    maps, light, gloss = results.maps, results.relief.light, results.gloss
+    height, width = maps.seen.shape
+    seen = maps.seen if maps.seen.any() else np.ones_like(maps.seen)
+    doubts = ("normal_sigma", "diffuse_sigma", "specular_sigma", "roughness_sigma")
+    return {
+        "views": {row["name"]: row for row in rows},
+        "left_out": dict(flat.left_out),
+        "camera": asdict(flat.poses.camera),
+        "flash": {"place_m": light.place.tolist(), "paper_albedo": light.paper, "paper_scatter": light.sigma},
+        "chart": {"view": None if flat.chart is None else flat.names[flat.chart.view]},
+        "materials": {
+            "law": gloss.law,
+            "roughness": [float(one) for one in gloss.roughness],
+            "f0": [float(one) for one in gloss.f0],
+        },
+        "maps": {
+            "size": [width, height],
+            "texel_mm": 1000 * flat.grid.texel,
+            "extent_mm": [1000 * flat.grid.texel * side for side in (width, height)],
+            "height_mm": [1000 * float(maps.height.min()), 1000 * float(maps.height.max())],
+            "thickness_mm": 1000 * maps.thickness,
+            "seen": float(maps.seen.mean()),
+            **{f"{name}_median": float(np.median(getattr(maps, name)[seen])) for name in doubts},
+        },
+    }
+
+
+def _gates(
+    flat: FlatSession, results: MaterialResults, rows: list[dict[str, Any]], config: MaterialConfig
+) -> Iterator[Gate]:
+    """All gates of a flat sample."""
+    limits = config.material.gates
+    yield flat_sample.views(len(flat.names), flat.left_out, limits)
+    yield flat_sample.tilts(flat.tilt_deg, limits)
+    yield flat_sample.poses({row["name"]: row["reprojection_px"] for row in rows}, limits)
+    yield flat_sample.agreement({row["name"]: row["residual"] for row in rows}, limits)
+    yield flat_sample.seen(float(results.maps.seen.mean()), limits)

@@ -1,0 +1,148 @@
+"""Processes the views of a flat sample up to their Stokes parameters: color calibration, board, poses, texel grid.
+
+Views and steps are those of `polcap fuse` (`fusion/session.py`); a view that cannot be used is left out, with the
+reason.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from polcap.chart_values import ColorCalibration
+from polcap.errors import SettingError
+from polcap.fusion import poses, session, view_path
+from polcap.fusion.poses import SessionPoses
+from polcap.fusion.session import Notify, Session, SessionInput, StepRunner
+from polcap.fusion.values import Pose
+from polcap.fusion.view_path import SessionView
+from polcap.material import stokes_view
+from polcap.material.flash_light import ChartInView
+from polcap.material.material_path import MaterialConfig
+from polcap.material.stokes_view import PosedStokes
+from polcap.material.texel_grid import TexelGrid
+from polcap.optics.board import RING, SQUARES, Board
+from polcap.pipeline import run
+from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult, digest
+from polcap.results import Results
+
+Region = tuple[float, float, float, float]  # m, left, lower, right, upper side, from the board's middle; y up the page
+_MARGIN_M = 0.0015  # inside the board's black middle
+_MOST_TEXELS = 8192  # along a side
+
+
+@dataclass(frozen=True)
+class FlatSession:
+    """Stokes parameters of the used views of a flat sample, and what they share."""
+
+    views: StageResult[tuple[PosedStokes, ...]]
+    names: tuple[str, ...]
+    poses: SessionPoses
+    chart: ChartInView | None
+    board: Board
+    grid: TexelGrid
+    left_out: Mapping[str, str]  # reason, by view
+    tilt_deg: Mapping[str, float]  # between the page's normal and the direction to the lens, by view
+
+
+def process(
+    found: Session,
+    session_input: SessionInput[MaterialConfig],
+    region: Region | None,
+    texel: float | None,
+    cache: LazyCache,
+    notify: Notify,
+) -> FlatSession:
+    """Process all views; `texel` [m] is the texel's size, by default that of the camera's pixels.
+
+    Raises CaptureError: too few views can be used. ChartError: no view shows the chart. SettingError: the region or
+    the texel does not fit the board.
+    """  # fmt: skip
+    found = found.with_inputs(lambda view: replace(view, config=stokes_view.of_flat_views(view.config)))
+    charted = session.with_colors(found, notify)
+    with session.process_pool(session_input) as pool:
+        run_step = StepRunner(pool, notify)
+        charted, boards = run_step("exposures and board", view_path.find_board, charted)
+        charted = charted.without({name: one.missing for name, one in boards.items() if one.corners is None})
+        corners = {name: boards[name].corners for name in charted.views}
+        solved = cache.run(poses.solve, corners, charted.capture).value
+        charted = charted.without(solved.left_out)
+        board = solved.board
+        assert board is not None
+        masked = charted.with_inputs(lambda view: _with_mask(view, solved, board))
+        masked, keys = run_step("Stokes parameters", stokes_view.solve, masked)
+    posed = [_posed(view, solved, keys[name], cache) for name, view in masked.views.items()]
+    together = DeferredResult(digest([one.key for one in posed]), lambda: tuple(one.value for one in posed))
+    names = tuple(masked.views)
+    tilts = {name: _tilt_deg(solved, name) for name in names}
+    return FlatSession(
+        together, names, solved, _chart(masked, charted), board, texel_grid(solved, names, board, posed, region, texel),
+        masked.left_out, tilts,
+    )  # fmt: skip
+
+
+def _with_mask(view: SessionView, solved: SessionPoses, board: Board) -> SessionView:
+    pose = solved.views[view.name].pose
+    mask = stokes_view.board_mask(view.capture.size_px, solved.camera, pose, board)
+    return replace(view, supplied=replace(view.supplied, mask=mask))
+
+
+def _posed(view: SessionView, solved: SessionPoses, key: str, cache: LazyCache) -> StageResult[PosedStokes]:
+    """Stokes parameters of a view with its pose, which are read when they are needed."""
+    results = DeferredResult(key, lambda: run.reopen(view.out, "stokes")[0])
+    return cache.derive(posed_stokes, view.name, results, solved, solved.views[view.name].pose)
+
+
+def posed_stokes(name: str, results: Results, solved: SessionPoses, pose: Pose) -> PosedStokes:
+    """The Stokes parameters of a view's results, with its pose and the session's camera."""
+    return PosedStokes(
+        name, results.stokes, np.asarray(results.selfcal.angle), np.asarray(results.color.matrix), pose, solved.camera
+    )
+
+
+def _chart(found: Session, charted: Session) -> ChartInView | None:
+    """The view that shows the chart, if there is one."""
+    for number, view in enumerate(found.views.values()):
+        if view.supplied.chart.mode in ("auto", "corners"):
+            color: ColorCalibration = view_path.find_chart(charted.views[view.name])
+            if color.place is not None:
+                return ChartInView(number, color)
+    return None
+
+
+def _tilt_deg(solved: SessionPoses, name: str) -> float:
+    towards = solved.views[name].pose.center
+    return float(np.degrees(np.arccos(towards[1] / np.linalg.norm(towards))))
+
+
+def texel_grid(
+    solved: SessionPoses,
+    names: tuple[str, ...],
+    board: Board,
+    views: list[StageResult[PosedStokes]],
+    region: Region | None,
+    texel: float | None,
+) -> TexelGrid:
+    """Grid of the sample: by default over the board's middle, with texels as large as the nearest view's pixels.
+
+    Raises SettingError: the region reaches beyond the board, or has too many texels.
+    """  # fmt: skip
+    half = (SQUARES / 2 - RING) * board.square_m - _MARGIN_M
+    left, lower, right, upper = region or (-half, -half, half, half)
+    most = board.page_m[0] / 2
+    if not (-most <= left < right <= most and -most <= lower < upper <= most):
+        raise SettingError(
+            f"--region {', '.join(f'{1000 * a:g}' for a in (left, lower, right, upper))} mm: x0 < x1 and y0 < y1 must "
+            f"lie within ±{1000 * most:g} mm, the board's page"
+        )
+    if texel is None:
+        nearest = min(float(np.linalg.norm(solved.views[name].pose.translation)) for name in names)
+        texel = float(f"{nearest * views[0].value.stokes.view.scale / solved.camera.focal_px:.3g}")
+    size = tuple(int(side / texel) for side in (right - left, upper - lower))
+    if not 8 <= min(size) <= max(size) <= _MOST_TEXELS:
+        raise SettingError(
+            f"{size[0]} × {size[1]} texels of {1000 * texel:g} mm: 8 to {_MOST_TEXELS} along a side are possible; "
+            "change --texel or --region"
+        )
+    origin = ((left + right) / 2 - (size[0] - 1) / 2 * texel, -(lower + upper) / 2 - (size[1] - 1) / 2 * texel)
+    return TexelGrid(origin, texel, (size[0], size[1]))

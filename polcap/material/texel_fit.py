@@ -1,0 +1,221 @@
+"""Normal, albedo, roughness and F0 of each texel from its Stokes parameters in all views, by least squares.
+
+The light at the camera is E (ρ_d D(n) + F0 S(n, roughness)), with the diffuse and the specular law of `optics/shade.py`
+and the irradiance E. Unknown are two slopes, roughness, F0 and three albedos. Data are S0 of three colors, S1 and S2 in
+every view. Roughness and F0 have priors: those of the texel's material. Levenberg-Marquardt steps are taken for many
+texels at once; a view that contradicts the others, as in a shadow, gets less weight (Cauchy).
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from polcap.images import ArrayValue, Bools, Floats, Indices
+from polcap.material.texel_grid import TexelViews
+from polcap.optics import body, frames, shade
+
+IOR = 1.5  # of the diffuse law and of Fresnel's terms; F0 is free
+UNKNOWNS = 7  # slopes to the right and up, roughness, F0, albedo of three colors
+LEAST_VIEWS = 3
+_ROUNDS = 9
+_STEP = np.array([2e-3, 2e-3, 4e-3], np.float32)  # of the derivatives: slopes, roughness
+_LOW = np.array([-1.5, -1.5, 0.06, 0.004, 0.002, 0.002, 0.002], np.float32)
+_HIGH = np.array([1.5, 1.5, 1.0, 0.25, 1.3, 1.3, 1.3], np.float32)
+_MOST_STEP = np.array([0.2, 0.2, 0.15, 0.02, 0.3, 0.3, 0.3], np.float32)
+_SLOPE_SIGMA = 0.5  # prior
+_CAUCHY = 2.0  # rms error of a view, in standard deviations, from which its weight falls
+_DAMPING = 1e-3  # at the start, relative to the diagonal
+
+
+class FitSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Settings of the stage `texel_fit`."""
+
+    radiance_error: Annotated[
+        float, Meta(gt=0, le=0.5, description="error of a view's radiance against the law, besides noise [1]")
+    ] = 0.012
+    polarization_error: Annotated[
+        float,
+        Meta(gt=0, le=1, description="error of S1 and S2 over S0, besides noise; 1: polarization is not used [1]"),
+    ] = 0.003
+
+
+@dataclass(frozen=True, repr=False)
+class Measurements(ArrayValue):
+    """Stokes parameters of N texels in K views."""
+
+    radiance: Floats  # (K, N, 3) S0, linear Rec.709
+    polarized: Floats  # (K, N, 2)
+    noise: Floats  # (K, N, 2) as in `TexelStokes`
+    gray: Floats  # (3,) weights of the colors in `polarized`
+
+    def take(self, index: Indices | slice) -> "Measurements":
+        """The data of some of the texels."""
+        return Measurements(self.radiance[:, index], self.polarized[:, index], self.noise[:, index], self.gray)
+
+
+@dataclass(frozen=True, repr=False)
+class TexelPrior(ArrayValue):
+    """Expected roughness and F0 of N texels, with their 1σ."""
+
+    mean: Floats  # (N, 2)
+    sigma: Floats  # (N, 2)
+
+
+@dataclass(frozen=True, repr=False)
+class TexelEstimate(ArrayValue):
+    """Estimates at N texels."""
+
+    value: Floats  # (N, 7)
+    information: Floats  # (N, 7, 7) of data and priors
+    cost: Floats  # (N,) of the data, robust
+    error: Floats  # (K, N, 5) measured minus modelled, in standard deviations; 0 where not measured
+    model: Floats  # (K, N) modelled S0, gray
+
+    @property
+    def normal(self) -> Floats:
+        """Unit normals (N, 3) in the plane's frame."""
+        return normals(self.value)
+
+
+def normals(value: Floats) -> Floats:
+    """Unit normals (N, 3) in the plane's frame, from slopes in the first two columns."""
+    ones = np.ones_like(value[:, :1])
+    return np.asarray(frames.unit(np.concatenate([-value[:, :2], ones], axis=-1)))
+
+
+def responses(slope: Floats, roughness: Floats, views: TexelViews, law: body.Law) -> Floats:
+    """Stokes parameters (3, K, N, 2) of a texel of albedo 1 and F0 0, and of albedo 0 and F0 1."""
+    normal = (views.normal_to_ray @ normals(slope)[:, :, None])[..., 0]
+    count = normal.shape[:2]
+    unit_diffuse, unit_specular = (np.array(v, np.float32) for v in ((1, 0), (0, 1)))
+    rough = np.broadcast_to(roughness, count)
+    ior = np.full((1, 1), IOR, np.float32)
+    return np.asarray(
+        shade.stokes(normal, unit_diffuse, unit_specular, rough, ior, views.to_light, views.irradiance, law)
+    )
+
+
+def start(data: Measurements, views: TexelViews, prior: TexelPrior, law: body.Law) -> Floats:
+    """First values (N, 7): flat texels with the prior's gloss, and the albedo of the median view."""
+    count = data.radiance.shape[1]
+    flat = np.zeros((count, 2), np.float32)
+    one = responses(flat, prior.mean[:, 0], views, law)[0]
+    rest = (data.radiance - (one[..., 1] * prior.mean[:, 1])[..., None]) / np.maximum(one[..., :1], 1e-6)
+    known = np.isfinite(data.noise[..., :1])
+    albedo = np.nan_to_num(np.nanmedian(np.where(known, rest, np.nan), axis=0), nan=0.2)
+    value = np.concatenate([flat, prior.mean, albedo], axis=-1).astype(np.float32)
+    return np.clip(value, _LOW, _HIGH)
+
+
+def fit(
+    data: Measurements,
+    views: TexelViews,
+    prior: TexelPrior,
+    value: Floats,
+    law: body.Law,
+    settings: FitSettings,
+    rounds: int = _ROUNDS,
+) -> TexelEstimate:
+    """Estimate all unknowns of N texels from first values (N, 7)."""  # fmt: skip
+    sigma = _sigma(data, settings)
+    best = _linearize(data, views, prior, value, law, sigma)
+    damping = np.full(len(value), _DAMPING, np.float32)
+    eye = np.eye(UNKNOWNS, dtype=np.float32)
+    for _ in range(rounds):
+        diagonal = np.einsum("nii->ni", best.information)
+        system = best.information + (damping[:, None] * diagonal + 1e-6)[:, :, None] * eye
+        step = np.clip(np.linalg.solve(system, best.gradient[..., None])[..., 0], -_MOST_STEP, _MOST_STEP)
+        trial = _linearize(data, views, prior, np.clip(best.value + step, _LOW, _HIGH), law, sigma)
+        better = trial.total < best.total
+        damping = np.clip(np.where(better, damping / 4, damping * 8), 1e-6, 1e4)
+        best = best.replaced(trial, better)
+    return TexelEstimate(best.value, best.information, best.cost, best.error, best.model)
+
+
+@dataclass(frozen=True)
+class _Linearized:
+    value: Floats  # (N, 7)
+    information: Floats  # (N, 7, 7)
+    gradient: Floats  # (N, 7) descent
+    cost: Floats  # (N,) data
+    total: Floats  # (N,) with priors
+    error: Floats  # (K, N, 5)
+    model: Floats  # (K, N)
+
+    def replaced(self, other: "_Linearized", where: Bools) -> "_Linearized":
+        """The values of another linearization where it is better."""
+        mine, theirs = vars(self), vars(other)
+        out = {}
+        for name, old in mine.items():
+            along = where[None, :] if name in ("error", "model") else where
+            out[name] = np.where(along.reshape(along.shape + (1,) * (old.ndim - along.ndim)), theirs[name], old)
+        return _Linearized(**out)
+
+
+def _sigma(data: Measurements, settings: FitSettings) -> Floats:
+    """1σ (K, N, 5) of the data: noise, and errors in proportion to S0."""
+    level = np.maximum(data.radiance, 0) @ data.gray
+    # three colors share the errors of light and geometry, so each counts by a third
+    colors = np.sqrt(3) * np.hypot(
+        data.noise[..., :1], settings.radiance_error * np.maximum(data.radiance, 0.3 * level[..., None])
+    )
+    polarized = np.hypot(data.noise[..., 1], settings.polarization_error * level)
+    both = np.concatenate([colors, np.repeat(polarized[..., None], 2, axis=-1)], axis=-1)
+    return np.where(np.isfinite(both), np.maximum(both, 1e-6), np.inf).astype(np.float32)
+
+
+def _linearize(
+    data: Measurements, views: TexelViews, prior: TexelPrior, value: Floats, law: body.Law, sigma: Floats
+) -> _Linearized:
+    """Errors and normal equations at values (N, 7)."""
+    slope, rough = value[:, :2], value[:, 2]
+    base = responses(slope, rough, views, law)
+    across, up = _STEP[0] * np.array([[1, 0], [0, 1]], np.float32)
+    moved = [
+        responses(slope + across, rough, views, law),
+        responses(slope + up, rough, views, law),
+        responses(slope, rough + _STEP[2], views, law),
+    ]
+    f0, albedo = value[:, 3], value[:, 4:]
+    level = albedo @ data.gray.astype(np.float32)
+
+    def light(one: Floats) -> Floats:  # (K, N, 5)
+        colors = one[0, ..., :1] * albedo + (one[0, ..., 1] * f0)[..., None]
+        return np.concatenate([colors, np.moveaxis(one[1:, ..., 0] * level + one[1:, ..., 1] * f0, 0, -1)], axis=-1)
+
+    model, measured = light(base), np.concatenate([data.radiance, data.polarized], axis=-1)
+    jacobian = np.empty((*model.shape, UNKNOWNS), np.float32)
+    for k, (one, step) in enumerate(zip(moved, _STEP, strict=True)):
+        jacobian[..., k] = (light(one) - model) / step
+    jacobian[..., :3, 3] = base[0, ..., 1:]
+    jacobian[..., 3:, 3] = np.moveaxis(base[1:, ..., 1], 0, -1)
+    jacobian[..., :3, 4:] = base[0, ..., 0, None, None] * np.eye(3, dtype=np.float32)
+    jacobian[..., 3:, 4:] = np.moveaxis(base[1:, ..., 0], 0, -1)[..., None] * data.gray.astype(np.float32)
+    known = np.isfinite(sigma)
+    weight = np.where(known, 1 / sigma, 0).astype(np.float32)
+    error = np.where(known, measured - model, 0) * weight
+    rms2 = (error**2).sum(axis=-1) / 5
+    robust = 1 / (1 + rms2 / _CAUCHY**2)  # (K, N)
+    root = np.sqrt(robust)[..., None]
+    jacobian *= (weight * root)[..., None]
+    rows = np.moveaxis(jacobian, 0, 1).reshape(len(value), -1, UNKNOWNS)  # (N, 5K, 7)
+    left = np.moveaxis(error * root, 0, 1).reshape(len(value), -1)
+    transposed = np.swapaxes(rows, 1, 2)
+    information = transposed @ rows
+    gradient = (transposed @ left[..., None])[..., 0]
+    cost = 5 * _CAUCHY**2 * np.log1p(rms2 / _CAUCHY**2).sum(axis=0)
+    pull, tie = _priors(prior, value)
+    information[:, range(4), range(4)] += tie
+    gradient[:, :4] += pull * tie
+    total = cost + (pull**2 * tie).sum(axis=-1)
+    return _Linearized(value, information, gradient, cost, total, error, model[..., :3] @ data.gray.astype(np.float32))
+
+
+def _priors(prior: TexelPrior, value: Floats) -> tuple[Floats, Floats]:
+    """Distance (N, 4) from the priors of slopes, roughness and F0, and their inverse variances."""
+    mean = np.concatenate([np.zeros_like(prior.mean), prior.mean], axis=-1)
+    sigma = np.concatenate([np.full_like(prior.mean, _SLOPE_SIGMA), prior.sigma], axis=-1)
+    return (mean - value[:, :4]).astype(np.float32), (sigma**-2).astype(np.float32)

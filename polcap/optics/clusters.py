@@ -1,0 +1,27 @@
+"""Groups of like colors, as a sign of one material."""
+
+import cv2
+import numpy as np
+
+from polcap.images import Floats
+
+_LEAST_SPREAD = 0.02
+_SOME = 40_000  # colors that are grouped, at most
+
+
+def color_clusters(encoded: Floats, count: int) -> tuple[Floats, float]:
+    """Centers (G, 3) of at most `count` groups of sRGB-encoded colors (N, 3), and the spread within a group."""
+    some = np.ascontiguousarray(encoded[:: max(1, len(encoded) // _SOME)], np.float32)
+    stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-4)
+    cv2.setRNGSeed(0)
+    compactness, _, center = cv2.kmeans(
+        some, min(count, len(some)), np.empty(0, np.int32), stop, 3, cv2.KMEANS_PP_CENTERS
+    )
+    return np.asarray(center), max(float(np.sqrt(compactness / len(some))), _LEAST_SPREAD)
+
+
+def soft_share(encoded: Floats, center: Floats, spread: float) -> Floats:
+    """Share (N, G) of each color (N, 3) in each group; the shares of a color sum to 1."""
+    distance = np.linalg.norm(encoded[:, None] - center[None], axis=-1)
+    likeness = np.exp(-((distance / spread) ** 2) + (distance.min(axis=1, keepdims=True) / spread) ** 2)
+    return np.asarray(likeness / likeness.sum(axis=1, keepdims=True))

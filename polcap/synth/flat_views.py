@@ -1,0 +1,150 @@
+"""Simulated captures of a flat sample on the board: camera and flash are moved about it, nine views by default.
+
+::
+
+    FOLDER/view01/ …   one capture per view, as `shooting.py` writes it; the chart lies on the board in the first
+    FOLDER/truth.json  poses of the board, camera, light of each view, and the grid of the maps
+    FOLDER/truth.npz   true maps of the sample's upper side on a grid of the board's plane
+
+Rows of the maps run down the printed page (z), columns to the right (x).
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from scipy.spatial.transform import Rotation
+
+from polcap.formats import atomic
+from polcap.formats.capture import folder_names
+from polcap.images import Floats
+from polcap.synth import forward_camera, scene_materials, shooting, trace
+from polcap.synth.all_around import CONVENTIONS, Poses
+from polcap.synth.color_checker import Chart
+from polcap.synth.distance_fields import Slab
+from polcap.synth.laid_board import LaidBoard
+from polcap.synth.render import Scene
+from polcap.synth.shooting import Shoot, Studio
+
+_BOARD: Literal["A4"] = "A4"
+_CHART = (0.084, 0.003, 0.0)  # m, world, middle of the chart: on the right of the ring, over the page's edge
+_CHART_TURN = Rotation.from_matrix([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # its columns run to the left, it faces up
+_FEW = 5  # views, up to which all oblique ones have one tilt
+_TEXELS = 1024  # along a side of the true maps
+
+
+class FlatShoot(Shoot, frozen=True, forbid_unknown_fields=True):
+    """Camera, sample and positions of captures of a flat sample. One flat list, because users set fields by name."""
+
+    width: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 1500
+    height: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 1000
+    focal_mm: Annotated[float, Meta(ge=1, le=10000)] = 80.0
+    distance_m: Annotated[float, Meta(gt=0.1, le=100)] = 0.6  # from the lens to the board's middle
+    tilts_deg: tuple[float, float] = (20.0, 40.0)  # of the oblique views; their mean for up to five views
+    by_hand_m: Annotated[float, Meta(ge=0, le=0.1)] = 0.004  # 1σ of the camera's aim and distance
+    by_hand_deg: Annotated[float, Meta(ge=0, le=20)] = 2.0  # 1σ of the camera's direction
+    flash_jitter: Annotated[float, Meta(ge=0, le=0.5)] = 0.02  # 1σ of the flash's energy from view to view, relative
+    side_m: Annotated[float, Meta(gt=0, le=0.2)] = 0.094  # of the sample
+    thickness_m: Annotated[float, Meta(ge=0, le=0.05)] = 0.001
+    relief_m: Annotated[float, Meta(ge=0, le=0.02)] = 0.0006  # from the lowest to the highest point
+    feature_m: Annotated[float, Meta(gt=0, le=0.1)] = 0.008  # size of the features of random relief
+    height_map: str = ""  # picture file in place of random relief, white is high
+
+
+def write(
+    folder: Path, scene: Scene, shoot: FlatShoot, views: int, frame_written: Callable[[int, int], None] | None = None
+) -> None:
+    """Write captures of a flat sample with the coat of `scene` into a new folder; same arguments give the same bytes.
+
+    Shape, position and turn of `scene` are not used. `frame_written` is called with the number of photographs written
+    so far and in all.
+
+    Raises CaptureError: the folder holds something already. StorageError: the folder cannot be written; then it is
+    removed.
+    """
+    forward_camera.require_empty(folder)
+    slab = Slab(shoot.side_m, shoot.thickness_m, shoot.relief_m, shoot.feature_m, shoot.seed, shoot.height_map)
+    frames = shoot.exposures * (len(shoot.angles_deg) + shoot.cross)
+    power = np.random.default_rng([shoot.seed, 0xF1A5]).normal(1.0, shoot.flash_jitter, views)
+    exposure, poses = None, _poses(shoot, views)
+    with atomic.new_folder(folder) as place:
+        for k, pose in enumerate(poses):
+
+            def report(written: int, _: int, before: int = k * frames) -> None:
+                if frame_written is not None:
+                    frame_written(before + written, views * frames)
+
+            one = msgspec.structs.replace(shoot, seed=shoot.seed + 1000 * k)
+            studio = Studio(_view(scene, slab, *pose, with_chart=k == 0), one, exposure)
+            exposure = studio.middle
+            studio.middle *= float(power[k] * _closer(scene, poses[0], pose))
+            shooting.write_capture(place / folder_names.view_name(k), studio, report)
+        _write_maps(place / "truth.npz", scene, slab)
+        _write_poses(place / "truth.json", scene, shoot, poses, power)
+
+
+def _closer(scene: Scene, first: tuple[Rotation, Floats], pose: tuple[Rotation, Floats]) -> float:
+    """Factor by which a scene is too bright in a pose: its unit is the light at the board's middle, not the flash."""
+    light = np.array(scene.light)
+    return float(np.sum((light - first[1]) ** 2) / np.sum((light - pose[1]) ** 2))
+
+
+def _poses(shoot: FlatShoot, views: int) -> Poses:
+    """Turn and position [m] of the board in the camera frame of each view; the first looks straight down."""
+    random = np.random.default_rng([shoot.seed, 0xF1A7])
+    near, far = shoot.tilts_deg
+    count = views - 1
+    inner = 0 if views <= _FEW else (count + 1) // 2
+    tilts = [near] * inner + [far if inner else (near + far) / 2] * (count - inner)
+    turns = [360 * k / max(inner, 1) for k in range(inner)]
+    turns += [360 * (k + 0.5) / (count - inner) for k in range(count - inner)]
+    out: Poses = []
+    for tilt, azimuth in zip([0.0, *tilts], [0.0, *turns], strict=True):
+        tilt, azimuth = (a + shoot.by_hand_deg * random.normal() for a in (tilt, azimuth))
+        turn = Rotation.from_euler("x", 90 - tilt, degrees=True) * Rotation.from_euler("y", azimuth, degrees=True)
+        out.append((turn, shoot.by_hand_m * random.normal(size=3) - [0.0, 0.0, shoot.distance_m]))
+    return out
+
+
+def _view(scene: Scene, slab: Slab, turn: Rotation, position: Floats, with_chart: bool) -> Scene:
+    vector, at = tuple(turn.as_rotvec(degrees=True).tolist()), tuple(position.tolist())
+    middle = turn.apply(_CHART) + position
+    chart = Chart(tuple(middle.tolist()), tuple((turn * _CHART_TURN).as_rotvec(degrees=True).tolist()))
+    return msgspec.structs.replace(
+        scene, shape=slab, turn_deg=vector, position=at, chart=chart if with_chart else None,
+        board=LaidBoard(at, vector, _BOARD), cast_shadows=True, shadows=True,
+    )  # fmt: skip
+
+
+def _write_maps(file: Path, scene: Scene, slab: Slab) -> None:
+    """True maps at the middles of _TEXELS² texels: normals in the frame x right, y up the page, z out of it."""
+    axis = ((np.arange(_TEXELS) + 0.5) / _TEXELS - 0.5) * slab.side
+    x, z = np.meshgrid(axis, axis)
+    point = np.stack([x, slab.thickness + slab.height(x, z), z], axis=-1)
+    facing = trace.gradient(slab, point)
+    bent = scene_materials.add_relief(scene.coat, point, facing)
+    diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, point, facing)
+    values = {
+        "normal": np.stack([bent[..., 0], -bent[..., 2], bent[..., 1]], axis=-1), "diffuse": diffuse,
+        "specular": specular, "roughness": roughness, "ior": ior, "height": slab.height(x, z),
+    }  # fmt: skip
+    single: dict[str, Any] = {name: value.astype(np.float32) for name, value in values.items()}
+    with atomic.path(file) as temporary:
+        np.savez_compressed(temporary, **single)
+
+
+def _write_poses(file: Path, scene: Scene, shoot: FlatShoot, poses: Poses, power: Floats) -> None:
+    views = [
+        {"name": folder_names.view_name(k), "rotation": turn.as_matrix().tolist(), "translation": at.tolist(),
+         "light": float(power[k])}
+        for k, (turn, at) in enumerate(poses)
+    ]  # fmt: skip
+    document = {
+        "conventions": CONVENTIONS, "board": _BOARD, "focal_px": shoot.view.focal, "principal_px": shoot.view.center,
+        "size_px": (shoot.width, shoot.height), "distortion": shoot.distortion, "light": scene.light,
+        "side_m": shoot.side_m, "thickness_m": shoot.thickness_m, "texels": _TEXELS, "views": views,
+    }  # fmt: skip
+    atomic.write_json(file, document)

@@ -1,0 +1,59 @@
+"""Heights from slopes, ambient occlusion of a groove, seamless maps."""
+
+import numpy as np
+
+from polcap.images import Floats
+from polcap.material import height_map, tiling
+from polcap.material.height_map import MaterialMaps
+
+TEXEL = 1e-4
+
+
+def waves(size: int) -> tuple[Floats, Floats]:
+    """Heights (S, S) [m] of a relief, and its slopes to the right and up."""
+    x = TEXEL * np.arange(size)
+    a, b = 2 * np.pi / (0.2 * size * TEXEL), 2 * np.pi / (0.13 * size * TEXEL)
+    height = 1e-4 * (np.sin(a * x)[None] + np.cos(b * x)[:, None])
+    right = np.broadcast_to(1e-4 * a * np.cos(a * x)[None], height.shape)
+    up = np.broadcast_to(1e-4 * b * np.sin(b * x)[:, None], height.shape)
+    return height, np.stack([right, up], axis=-1)
+
+
+def test_heights_have_the_slopes_and_the_coarse_shape() -> None:
+    height, slope = waves(200)
+    bowl = 2e-4 * np.linspace(-1, 1, 200)[None] ** 2 + np.zeros((200, 1))
+    bowl_slope = np.stack([np.broadcast_to(np.gradient(bowl[0], TEXEL), bowl.shape), 0 * bowl], axis=-1)
+    found = height_map.integrate(slope + bowl_slope + 0.001, bowl, TEXEL)  # slopes with an error common to all
+    error = found - height - bowl
+    assert (error - error.mean()).std() < 0.05 * np.ptp(height)
+
+
+def test_a_groove_is_darker_than_the_plane() -> None:
+    height = np.zeros((64, 64), np.float32)
+    height[:, 30:34] = -4 * TEXEL
+    normal = np.broadcast_to(np.array([0, 0, 1], np.float32), (64, 64, 3))
+    occlusion = height_map.ambient_occlusion(height, normal, TEXEL)
+    assert occlusion[32, 5] > 0.99 and occlusion[32, 31] < 0.7
+
+
+def maps(size: int = 120) -> MaterialMaps:
+    random = np.random.default_rng(0)
+    height, slope = waves(size)
+    normal = np.concatenate([-slope, np.ones((size, size, 1))], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    flat = random.uniform(0.2, 0.8, (size, size)).astype(np.float32)
+    color = np.repeat(flat[..., None], 3, axis=-1)
+    return MaterialMaps(
+        normal.astype(np.float32), color, 0.04 + 0 * color, flat, height.astype(np.float32), np.ones_like(flat),
+        flat, flat, flat, flat, seen=np.ones(flat.shape, bool), thickness=0.001,
+    )  # fmt: skip
+
+
+def test_tiled_maps_continue_across_their_edges_and_keep_their_contrast() -> None:
+    whole = maps()
+    tiled = tiling.tile(whole)
+    assert tiled.roughness.shape == (100, 100)
+    for value in (tiled.height, tiled.normal[..., 0]):
+        inner = np.abs(np.diff(value, axis=1)).max()
+        assert np.abs(value[:, 0] - value[:, -1]).max() < 1.5 * inner
+    assert abs(tiled.roughness[:, :15].std() / whole.roughness.std() - 1) < 0.1

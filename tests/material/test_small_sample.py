@@ -1,0 +1,74 @@
+"""The whole chain on small views, `polcap synth --flat --views` and `polcap material`, against the truth."""
+
+import json
+import shutil
+from pathlib import Path
+
+import bench_material
+import pytest
+
+from tests.conftest import shell
+
+SMALL = ("width=600", "height=400", "samples=1", "exposures=1", "relief_m=0.001", "feature_m=0.016")
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five small views of a flat sample, and its material."""
+    folder = tmp_path_factory.mktemp("flat") / "sample"
+    made = shell("synth", folder, "--flat", "--views", 5, *(word for one in SMALL for word in ("--set", one)))
+    assert made.returncode == 0, made.stderr
+    done = shell("material", folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_five_raw_views_become_a_material_that_is_like_the_true_one(sample: Path) -> None:
+    errors = bench_material.errors(sample)
+    assert errors["normal"] < 1.5 and errors["flat"] > 2.5  # degrees; of the maps, and of a flat guess
+    assert errors["albedo"] < 0.04 and errors["roughness"] < 0.12 and errors["f0"] < 0.01  # five views
+    assert errors["height"] < 0.15
+
+
+def test_maps_state_their_scale_and_light_is_found(sample: Path) -> None:
+    about = json.loads((sample / "material" / "report.json").read_text())
+    stored = json.loads((sample / "material" / "maps" / "maps.json").read_text())
+    truth = json.loads((sample / "truth.json").read_text())
+    assert stored["texel_m"] == pytest.approx(0.6 * 2 / truth["focal_px"], rel=0.05)
+    assert stored["thickness_m"] == pytest.approx(truth["thickness_m"], abs=0.0004)
+    true = [view["light"] / truth["views"][0]["light"] for view in truth["views"]]
+    assert [view["light"] for view in about["figures"]["views"].values()] == pytest.approx(true, rel=0.025)
+    assert about["figures"]["flash"]["place_m"] == pytest.approx(truth["light"], abs=0.02)
+
+
+def test_a_run_again_computes_nothing_and_exports_work(sample: Path) -> None:
+    again = shell("material", sample)
+    assert again.returncode == 0
+    assert "Nothing has changed" in again.stderr or "texel_maps    cached" in again.stderr
+    exported = shell("export", sample / "material", "--preset", "unreal")
+    assert exported.returncode == 0 and "T_sample_N.png" in exported.stdout
+    assert shell("export", sample / "material", "--lod", 2).returncode == 2
+    assert shell("show", sample / "material", "stokes").returncode == 2
+
+
+def test_a_view_without_the_board_is_left_out_and_named(sample: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "fewer"
+    shutil.copytree(sample, folder, ignore=shutil.ignore_patterns("material"))
+    for file in (folder / "view03").glob("pol*/*.DNG"):
+        shutil.copy(next((Path(__file__).parents[2] / "examples/capture/pol000").glob("*.DNG")), file)
+    done = shell("material", folder)
+    assert done.returncode in (0, 2) and "view03" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("option", "part"),
+    [
+        (("--region", "1,2,3"), "4 are needed"),
+        (("--region", "0,0,500,500"), "must lie within"),
+        (("--texel", "50"), "change --texel or --region"),
+        (("--no-chart", "--chart", "a"), "exclude"),
+    ],
+)
+def test_a_wrong_option_is_one_line_with_a_remedy(sample: Path, option: tuple[str, ...], part: str) -> None:
+    refused = shell("material", sample, "--out", sample.parent / "other", *option)
+    assert refused.returncode == 2 and part in refused.stderr and len(refused.stderr.strip().splitlines()[-1]) > 20
