@@ -24,7 +24,7 @@ from polcap.pipeline.cache import MemoryCache, StageResult
 from polcap.quality.limits import MaterialGateLimits
 
 
-class MaterialSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SampleSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of a material: a section for each stage with settings, and one for the gates."""
 
     relief: ReliefSettings = ReliefSettings()
@@ -35,7 +35,7 @@ class MaterialSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class MaterialConfig(Config, frozen=True, forbid_unknown_fields=True):
     """Settings of `polcap material`: those of its views, and in the section `material` those of the sample."""
 
-    material: MaterialSettings = MaterialSettings()
+    material: SampleSettings = SampleSettings()
 
     @property
     def of_views(self) -> Config:
@@ -66,7 +66,7 @@ def path(
     chart: ChartInView | None,
     board: Board,
     grid: TexelGrid,
-    settings: MaterialSettings,
+    settings: SampleSettings,
     tile: bool,
     cache: MemoryCache,
 ) -> MaterialResults:
