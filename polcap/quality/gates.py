@@ -13,11 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polcap.quality import error_maps, geometry, light, polarization, rerendering, shot_exposure
+from polcap.quality import error_maps, flatness, geometry, light, polarization, rerendering, shot_exposure
 from polcap.quality.gate import MOST_DEG, Evidence, Gate, State
 from polcap.quality.limits import GateLimits
 
 _LARGE_PART = 0.45  # of the expected error: the message names the gates that cost more
+
+_Judged = Gate | Iterable[Gate]
 
 
 @dataclass(frozen=True)
@@ -25,13 +27,14 @@ class Step:
     """Gates that one function judges, with their place in the picture of causes."""
 
     gates: tuple[str, ...]
-    judge: Callable[[Evidence, GateLimits], Gate | Iterable[Gate]]
+    judge: Callable[[Evidence, GateLimits], _Judged]
     stage: str  # the last stage whose result is judged
     after: tuple[str, ...] = ()  # gates whose failure leaves nothing to judge here
     explained_by: tuple[str, ...] = ()  # gates whose warning explains what would be found here, too
+    needs: tuple[str, ...] = ()  # gates without whose measurement there is nothing to judge here
 
 
-def _without_limits(judge: Callable[[Evidence], Gate]) -> Callable[[Evidence, GateLimits], Gate]:
+def _without_limits(judge: Callable[[Evidence], _Judged]) -> Callable[[Evidence, GateLimits], _Judged]:
     return lambda found, _limits: judge(found)
 
 
@@ -41,6 +44,7 @@ _PAIRED = (*_LIT, "sharpness", "alignment")  # the shots cannot be compared
 _EVEN = (*_PAIRED, "stillness", "gains", "energy")  # the light of the shots is not known
 _POLARIZED = (*_EVEN, "order", "angles", "polarized")  # the Stokes parameters are wrong
 _SHAPED = (*_POLARIZED, "mask", "body", "other light", "lighting")  # the normals are wrong
+_ROUND: dict[str, tuple[str, ...]] = {"explained_by": ("flat",), "needs": ("contour",)}  # of a rounded object
 
 _STEPS = (
     Step(("source",), _without_limits(shot_exposure.source), "hdr"),
@@ -56,13 +60,16 @@ _STEPS = (
     Step(("stillness",), shot_exposure.stillness, "mask", (*_FILES, *_PAIRED), ("black level", "sharpness")),
     Step(("focus",), geometry.focus, "mask", _PAIRED),
     Step(("gains", "gain doubt", "energy"), shot_exposure.gains, "selfcal", (*_PAIRED, "stillness")),
-    Step(("order",), _without_limits(polarization.order), "selfcal", _EVEN),
-    Step(("angles", "body", "other light"), polarization.of_outline, "infer", (*_EVEN, "order")),
+    Step(("angles",), polarization.turned_shot, "selfcal", _EVEN),
+    Step(("flat", "contour"), _without_limits(flatness.judge), "infer", _EVEN),
+    Step(("order",), _without_limits(polarization.order), "selfcal", _EVEN, **_ROUND),
+    Step(("angles", "body", "other light"), polarization.of_outline, "infer", (*_EVEN, "angles", "order"), **_ROUND),
     Step(("ambient",), light.ambient, "hdr"),
-    Step(("room light", "lighting"), light.polarized_light, "infer", (*_POLARIZED, "other light")),
+    Step(("room light",), light.room_light, "infer", (*_POLARIZED, "other light")),
+    Step(("lighting",), light.side_light, "infer", (*_POLARIZED, "other light"), **_ROUND),
     Step(("crossed",), light.crossed, "stokes", _PAIRED),
     Step(("ill-posed",), polarization.ill_posed, "stokes", (*_POLARIZED, "other light", "lighting")),
-    Step(("re-rendering",), rerendering.rerendering, "infer", _SHAPED),
+    Step(("re-rendering",), rerendering.rerendering, "infer", _SHAPED, ("flat",)),
     Step(("outline",), geometry.inward_outline, "infer", (*_SHAPED, "re-rendering")),
     Step(("albedo scale",), light.albedo_scale, "infer", ("clipping", "chart")),
     Step(("focal length",), _without_limits(geometry.focal_length), "infer"),
@@ -84,7 +91,8 @@ def judge(found: Evidence, limits: GateLimits, failure: Gate | None = None) -> l
                 judged.append(failure)
                 cause = failure.name
         if cause is not None:
-            judged += [_not_judged(name, cause) for name in step.gates if name != cause]
+            known = {gate.name for gate in judged}
+            judged += [_not_judged(name, cause) for name in step.gates if name not in known]
         else:
             gates = step.judge(found, limits)
             judged += [gates] if isinstance(gates, Gate) else gates
@@ -98,7 +106,7 @@ def judge(found: Evidence, limits: GateLimits, failure: Gate | None = None) -> l
 def _cause(step: Step, judged: Sequence[Gate]) -> str | None:
     """Name of the first judged gate that explains what this step would find, if any."""
     for gate in judged:
-        if gate.name in {"fail": step.after, "warn": step.explained_by}.get(gate.state, ()):
+        if gate.name in {"fail": step.after, "warn": step.explained_by, "not measured": step.needs}.get(gate.state, ()):
             return gate.name
     return None
 
@@ -126,9 +134,10 @@ def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Ga
     if expected <= limit:
         return Gate("normal error", "pass", round(expected, 2), limit, message, unit="°")
     more = "" if len(found.names) > 3 else " four angles,"
-    known = because or any(gate.state == "fail" for gate in judged)  # these gates have the remedy
+    flat = any(gate.name == "flat" and gate.state == "warn" for gate in judged)
+    known = because or flat or any(gate.state == "fail" for gate in judged)  # these gates have the remedy
     remedy = "" if known else f"Use more light or frames,{more} or a darker room"
-    return Gate("normal error", "fail", round(expected, 2), limit, message, remedy, unit="°")
+    return Gate("normal error", "warn" if flat else "fail", round(expected, 2), limit, message, remedy, unit="°")
 
 
 def _median_error(found: Evidence, judged: list[Gate]) -> float:

@@ -25,7 +25,8 @@ _FEW = 20  # px
 _DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame for all angles: 1 to 2° at 15 %
 _LEAST_ALBEDO = 0.02  # sum of the channels
 _TOWARDS_CAMERA = float(np.cos(np.radians(30)))  # cosine; lamps 45° to the side are mirrored at 22°
-_LEAST_TOWARDS = 0.02  # of the object
+_LEAST_TOWARDS = 0.12  # of the object: five bodies from .18, boxes and cans mostly below
+_ONE_WAY = 0.6  # 0…1, of the facing normals: five bodies up to .46, cans up to .9 (tests/benchmarks/bench_flat.py)
 _DEGREES_PER_ROOT_OF_HIGHLIGHT_DOLP = 30.0  # of the normals: 2 to 4° at 1 %, 4 to 8° at 2 %, 2 to 11° at 3 to 15 %
 _FALSE_HIGHLIGHT_DOLP = 0.002  # under one flash: up to .0025 (24 captures)
 _ROOM_TILE, _LEAST_ROOM_TILES = 16, 20  # px; tiles
@@ -157,20 +158,25 @@ def ambient(found: Evidence, limits: GateLimits) -> Gate:
     return msgspec.structs.replace(at_most("ambient", worst, limit, message, remedy), cost_deg=cost)
 
 
-def polarized_light(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
-    """Gates on light from elsewhere than a flash at the lens: polarization that many pixels share.
+def room_light(found: Evidence, limits: GateLimits) -> Gate:
+    """Gate on the common polarization of the object's surroundings.
 
-    "room light" judges the surroundings of the object. A flash leaves them unpolarized, a window or a glossy lamp does
-    not. "lighting" judges the brightest of the parts that face the camera, relative to albedo. Under a flash at the
-    lens their polarization points in all directions. Two flashes or softboxes at the sides polarize them in the same
-    direction.
+    A flash at the lens leaves them unpolarized, a window or a glossy lamp does not.
     """
     share, limit = _surroundings_dolp(found), limits.max_room_dolp
     message = worded(100 * share, "The surroundings are polarized by {:.1f} %", "The surroundings are not polarized")
     if share > limit:
         message += ": polarized light from the room, or glossy surroundings"
     remedy = "Darken the room, or take one ambient frame per angle: subtracting them is exact"
-    yield at_most("room light", share, limit, message, remedy, cost_deg=_DEGREES_PER_ROOM_DOLP * share, beyond="warn")
+    return at_most("room light", share, limit, message, remedy, cost_deg=_DEGREES_PER_ROOM_DOLP * share, beyond="warn")
+
+
+def side_light(found: Evidence, limits: GateLimits) -> Gate:
+    """Gate "lighting" on the common polarization of the brightest parts that face the camera, relative to albedo.
+
+    Under a flash at the lens their polarization points in all directions, as their normals do. Two flashes or softboxes
+    at the sides polarize them in the same direction.
+    """
     share, limit = _highlight_dolp(found), limits.max_highlight_dolp
     text = "The brightest parts that face the camera share a polarization of {:.1f} %"
     message = worded(100 * share, text, "The brightest parts that face the camera share no polarization")
@@ -182,17 +188,22 @@ def polarized_light(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     remedy = "Use one flash next to the lens, leave it where it is, and darken the room"
     cost = float(_DEGREES_PER_ROOT_OF_HIGHLIGHT_DOLP * np.sqrt(max(np.nan_to_num(share) - _FALSE_HIGHLIGHT_DOLP, 0.0)))
     gate = at_most("lighting", share, limit, message, remedy, beyond=grade(cost))
-    yield msgspec.structs.replace(gate, cost_deg=round(cost, 1))
+    return msgspec.structs.replace(gate, cost_deg=round(cost, 1))
 
 
 def _highlight_dolp(found: Evidence) -> float:
     """Common DoLP of the tenth of the surfaces that face the camera with most light over albedo.
 
-    Highlights of lamps at the sides are there, too. NaN if too little of the object faces the camera.
+    Highlights of lamps at the sides are there, too. NaN if too little of the object faces the camera, or if most of it
+    leans the same way, as a cylinder: it shares a polarization under any light.
     """
     maps, both = found.maps, found.maps.mask & found.cues.mask
     towards = both & (dot(maps.normal, rays(maps.view, *maps.mask.shape)) > _TOWARDS_CAMERA)
     if not towards.any() or towards.sum() < _LEAST_TOWARDS * both.sum():
+        return float("nan")
+    azimuth = np.arctan2(maps.normal[towards, 1], maps.normal[towards, 0])
+    polarized = 1 - maps.normal[towards, 2] ** 2  # DoLP of small tilts, but for a factor
+    if np.abs((polarized * np.exp(2j * azimuth)).mean()) > _ONE_WAY * polarized.mean():
         return float("nan")
     light = found.cues.radiance[towards].sum(-1) / np.maximum(maps.diffuse[towards].sum(-1), _LEAST_ALBEDO)
     bright = light >= np.percentile(light, 90)

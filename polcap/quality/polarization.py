@@ -84,6 +84,19 @@ def _order_text(order: ShotOrder, names: list[str]) -> str:
     return ", ".join(names[i] for i in order.shots) + (", counted clockwise" if order.mirrored else "")
 
 
+def turned_shot(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
+    """Gate "angles", only if the polarizer angle of one shot contradicts those of three or more other shots."""
+    turned, limit = found.selfcal.turned, limits.max_turn_deg
+    if not turned.shots or abs(np.degrees(turned.angle)) <= limit:
+        return
+    degrees, doubt = np.degrees([turned.angle, turned.sigma])
+    shots = tuple(found.names[k] for k in turned.shots)
+    which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])}, by as much or less)"
+    message = f"{which} looks turned by {degrees:+.0f}° ± {doubt:.0f}°: the shots contradict each other"
+    remedy = sentence(angle_advice.retake(found.radiance.equipment.angles))
+    yield Gate("angles", "fail", round(float(degrees), 1), limit, message, remedy, abs(float(degrees)) / 2, shots, "°")
+
+
 def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     """Gates on angles, material and other light, judged by the polarization along the object's outline."""
     angle, limit = found.selfcal.angle - found.selfcal.ring.correction, limits.max_turn_deg
@@ -176,8 +189,6 @@ def _angles(found: rim.AngleError, body: rim.RimFigures, angle: Floats, evidence
         message = f"All angles look turned by {common:+.0f}° ± {np.degrees(body.turned_sigma):.0f}°"
         remedy = sentence(angle_advice.turn(statement, angle, -body.turned))
         return Gate("angles", "fail", round(common, 1), limit, message, remedy, abs(common), unit="°")
-    if selfcal.turned.shots and abs(np.degrees(selfcal.turned.angle)) > limit:
-        return _not_closing(evidence, limit)
     fit = limits.max_turn_fit * (1.0 if known else 0.75)  # guessed gains look like turns
     if found.misfit >= fit or found.sigmas < _SURE or found.shot is None:
         return Gate("angles", "pass", 0.0, limit, "No other angle fits the outline clearly better", unit="°")
@@ -196,17 +207,6 @@ def _angles(found: rim.AngleError, body: rim.RimFigures, angle: Floats, evidence
     remedy = sentence(angle_advice.retake(statement))
     state: State = "fail" if found.misfit < _CERTAIN * fit else "warn"
     return Gate("angles", state, round(degrees, 1), limit, message, remedy, cost, (names[found.shot],), "°")
-
-
-def _not_closing(found: Evidence, limit: float) -> Gate:
-    """Gate on the polarizer angle of one shot that contradicts those of three or more other shots."""
-    turned = found.selfcal.turned
-    degrees, doubt = np.degrees([turned.angle, turned.sigma])
-    shots = tuple(found.names[k] for k in turned.shots)
-    which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])}, by as much or less)"
-    message = f"{which} looks turned by {degrees:+.0f}° ± {doubt:.0f}°: the shots contradict each other"
-    remedy = sentence(angle_advice.retake(found.radiance.equipment.angles))
-    return Gate("angles", "fail", round(float(degrees), 1), limit, message, remedy, abs(float(degrees)) / 2, shots, "°")
 
 
 def _with_ring(gate: Gate, body: rim.RimFigures, found: Evidence, limits: GateLimits) -> Gate:

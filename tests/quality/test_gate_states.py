@@ -19,7 +19,8 @@ from polcap.capture_values import AngleStatement, ShotOrder
 from polcap.chart_values import PatchColors
 from polcap.config import Config
 from polcap.images import Quality
-from polcap.quality import gates, geometry, light, polarization, rerendering, rim, shot_exposure
+from polcap.quality import flatness, gates, geometry, light, polarization, rerendering, rim, shot_exposure
+from polcap.quality.flatness import Flatness
 from polcap.quality.gate import Evidence, Gate
 from polcap.quality.object_turn import ObjectTurn
 from polcap.quality.rerendering import Rerendering
@@ -43,11 +44,13 @@ BODY = {
     "turned_sigma": 0.01, "brightness": 0.5, "one_sided": 0.1,
 }  # fmt: skip
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
+ROUNDED = Flatness(contour=0.8, common=0.1, rim_dolp=0.2, rim_light=0.7, aligned=0.7)
 FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
     "pushed": pushed(0.1, 0.1), "turn": ObjectTurn(np.array([0.0, 0.2, 0.1]), np.full(3, 0.1)),
     "edge_blur": 0.8,
-    "charted": 0.0, "rendered": rendered(), "noise": 0.001, "ill_posed": 0.0, "medians": [45.0, 0.2, 0.3],
+    "flatness": ROUNDED, "charted": 0.0, "rendered": rendered(), "noise": 0.001, "ill_posed": 0.0,
+    "medians": [45.0, 0.2, 0.3],
     "normal_error": 4.0, "lean": 2.0, "crossed": light.CrossedFigures(0.0, 0, 0.0, 0.1),
 }  # fmt: skip
 MEASURES = {  # the function that measures each figure
@@ -57,7 +60,7 @@ MEASURES = {  # the function that measures each figure
     "charted": (geometry, "_chart_share"), "lean": (geometry, "_lean"),
     "noise": (shot_exposure, "_noise"), "crossed": (light, "_compare_crossed"),
     "ill_posed": (polarization, "_ill_posed"), "medians": (polarization, "_medians"),
-    "outline": (polarization, "_outline"),
+    "outline": (polarization, "_outline"), "flatness": (flatness, "measure"),
     "normal_error": (gates, "_median_error"), "inward_outline": (geometry, "_inward_share"),
 }  # fmt: skip
 MESH = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
@@ -198,6 +201,12 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("body", "fail", {"figures": outline(along=-0.9)}),
     ("body", "warn", {"figures": {**outline(along=-0.9), "medians": [45.0, 0.2, 0.04]}}),
     ("body", "warn", {"figures": outline(concentration=0.3)}),
+    ("body", "not judged", {"figures": {"flatness": replace(ROUNDED, common=0.9)}}),
+    ("flat", "pass", {}),
+    ("flat", "warn", {"figures": {"flatness": replace(ROUNDED, common=0.9, aligned=0.95)}}),
+    ("flat", "not measured", {"figures": {"flatness": None}}),
+    ("contour", "pass", {}),
+    ("contour", "not measured", {"figures": {"flatness": replace(ROUNDED, common=0.9)}}),
     ("body", "warn", {"figures": {**outline(dolp=0.02), "medians": [10.0, 0.6, 0.3]}}),
     ("body", "warn", {"figures": outline(dolp=0.02)}),
     ("body", "warn", {"figures": outline(one_sided=0.9, dolp_lit=0.03)}),
@@ -332,6 +341,8 @@ def test_a_polarization_sensor_gets_no_advice_about_rings_or_folders(good: dict[
     radiance = replace(good["radiance"], equipment=Equipment("one exposure", angles=cells))
     for name, state, fields in CASES:
         if name not in ("order", "angles", "polarized", "body", "other light") or "radiance" in fields:
+            continue
+        if state == "not judged":
             continue
         gate = {gate.name: gate for gate in judge(good, config, {"radiance": radiance, **fields})}[name]
         assert not re.search(r"\bring|folder|again|clockwise|polarizer", gate.remedy.replace("the sensor", "")), gate

@@ -287,7 +287,6 @@ def shaped(good: Evidence, polarized: float, flattened: float, roughness: float,
         (0.25, 0.4, 0.6, True, "the shape is flat"),  # wax that is not quite as bad
         (0.13, 1.0, 0.2, True, "gloss and shading"),  # no rough body shines
         (0.13, 1.0, 0.7, True, ""),  # a rough body, which the estimator has allowed for
-        (0.13, 0.3, 0.2, False, ""),  # a coin
         (0.9, 0.4, 0.2, True, ""),  # the wall of a vessel
     ],
 )
@@ -297,6 +296,13 @@ def test_body_that_polarizes_too_little_for_its_shape_is_reported(
     gate = judged(shaped(good, polarized, flattened, roughness, dimmed))["body"]
     assert gate.state == ("warn" if words else "pass"), gate
     assert words in gate.message and (gate.cost_deg > 5) == bool(words)
+
+
+def test_a_flat_object_is_one_finding_with_one_remedy(good: Evidence) -> None:
+    """A coin, whose polarization is too weak to judge the order of the angles, its material or the light."""
+    found = judged(shaped(good, 0.13, 0.3, 0.2, dimmed=False))
+    assert found["flat"].state == "warn" and "polcap material" in found["flat"].remedy
+    assert {found[name].state for name in ("order", "angles", "body", "other light", "lighting")} == {"not judged"}
 
 
 def test_room_light_costs_what_one_ambient_frame_cannot_remove(good: Evidence) -> None:

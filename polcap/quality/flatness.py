@@ -1,0 +1,116 @@
+"""Flat and sharp-edged objects: their outline is no occluding contour, and says nothing of polarization.
+
+At an occluding contour the surface turns away from the camera, so its polarization grows towards the outline. At the
+edge of a plate or a box it does not. The facing plane of a coin or a painting is hardly polarized at all, a tilted
+plane is polarized alike everywhere. Measured on thirty flat and sharp-edged objects and five rounded ones
+(tests/benchmarks/bench_flat.py).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from polcap.images import Bools, Floats
+from polcap.optics import outline
+from polcap.optics.frames import total
+from polcap.optics.resize import block_means
+from polcap.quality.gate import Evidence, Gate
+from polcap.stage_values import StokesImage, SurfaceMaps
+
+_MOST_PIXELS = 1e4  # of the object; a larger picture is averaged down
+_RIM, _INNER = 0.08, (0.2, 0.4)  # bands along the outline, by depth over the object's radius
+_LEAST_RIM_PX = 3.0
+_FEW = 5  # px of a sector's band
+_GROWTH, _LEAST_DOLP = 1.5, 0.04  # of the DoLP in a sector with an occluding contour
+_ROUNDED = 0.2  # share of such sectors: plates, coins and sheets up to .17, unless tilted; bodies from .25
+_ONE_PLANE = 0.6  # common part of the polarization: rounded objects up to .45
+_LIT = 0.9  # light of an outline that is not dimmed: wax too is hardly polarized, but dimmed
+_FACING_DOLP = 0.045  # most of the outline of a plane that faces the camera
+_ALIGNED = 0.84  # length of the mean normal: boxes up to .83, except one whose normals are wrong; bodies up to .77
+
+
+@dataclass(frozen=True)
+class Flatness:
+    """How flat an object is, and how much of its outline is an occluding contour."""
+
+    contour: float  # share of the outline's sectors in which the polarization grows towards the outline
+    common: float  # 0…1, length of the mean polarization over its mean length: 1 for one plane, 0 for a sphere
+    rim_dolp: float  # 90th percentile along the outline
+    rim_light: float  # median along the outline over that of the object
+    aligned: float  # 0…1, length of the mean normal
+
+    @property
+    def sharp_edged(self) -> bool:
+        """Whether the outline is the edge of faces, at least in most parts."""
+        return (self.contour < _ROUNDED and self.rim_light > _LIT) or self.common > _ONE_PLANE
+
+    @property
+    def flat(self) -> bool:
+        """Whether the object is one plane, apart from its relief."""
+        return (
+            self.sharp_edged and self.aligned > _ALIGNED and (self.rim_dolp < _FACING_DOLP or self.common > _ONE_PLANE)
+        )
+
+
+def judge(found: Evidence) -> Iterator[Gate]:
+    """Gates "flat" and "contour": whether the object is one plane, and whether its outline is an occluding contour."""
+    seen = measure(found.stokes, found.maps)
+    if seen is None:
+        yield Gate("flat", "not measured", None, _ONE_PLANE, "The object is too small")
+        return
+    if seen.flat:
+        message = (
+            "The object is flat: a surface that faces camera and flash is hardly polarized, so one picture shows "
+            "neither its relief nor its gloss"
+        )
+        if found.radiance.crossed is not None:
+            message += "; the cross-polarized shot shows its color without highlights"
+        remedy = (
+            "Photograph it from five to nine sides for `polcap material`, which measures both; a single picture "
+            "shows more of it where it is tilted by 30°"
+        )
+        yield Gate("flat", "warn", round(seen.common, 3), _ONE_PLANE, message, remedy)
+    else:
+        yield Gate("flat", "pass", round(seen.common, 3), _ONE_PLANE, "The object is not flat")
+    value = round(seen.contour, 3)
+    if seen.sharp_edged:
+        message = (
+            "The outline is the edge of flat faces: its polarization shows neither the angles' order nor the light"
+        )
+        yield Gate("contour", "not measured", value, _ROUNDED, message)
+    else:
+        message = f"Polarization grows towards {100 * value:.0f} % of the outline, as where a surface turns away"
+        yield Gate("contour", "pass", value, _ROUNDED, message)
+
+
+def measure(image: StokesImage, maps: SurfaceMaps) -> Flatness | None:
+    """Measure how flat an object is; None for one that is too small."""
+    step = int(np.ceil(np.sqrt(max(image.mask.sum() / _MOST_PIXELS, 1))))
+    inside = block_means(image.mask.astype(np.float32), step) > 0.99
+    s0, s1, s2 = (block_means(part, step) for part in total(image.stokes))
+    polarized = (s1 + 1j * s2) / np.maximum(s0, 1e-9)
+    dolp = np.minimum(np.abs(polarized), outline.DOLP_CAP)
+    depth, radius = outline.depth(inside), outline.disc_radius(inside)
+    body = inside & (depth > 1)
+    rim = body & (depth <= max(_RIM * radius, _LEAST_RIM_PX))
+    inner = (depth > _INNER[0] * radius) & (depth < _INNER[1] * radius)
+    of_rim, of_inner = (_by_sector(dolp, band) for band in (rim, inner))
+    both = np.isfinite(of_rim) & np.isfinite(of_inner)
+    if not both.any():
+        return None
+    mean = (dolp * np.exp(1j * np.angle(polarized)))[body].mean()
+    return Flatness(
+        contour=float((of_rim > np.maximum(_GROWTH * of_inner, _LEAST_DOLP))[both].mean()),
+        common=float(np.abs(mean) / max(float(dolp[body].mean()), 1e-9)),
+        rim_dolp=float(np.quantile(dolp[rim], 0.9)),
+        rim_light=float(np.median(s0[rim]) / max(float(np.median(s0[body])), 1e-9)),
+        aligned=float(np.linalg.norm(maps.normal[maps.mask].mean(axis=0))) if maps.mask.any() else 0.0,
+    )
+
+
+def _by_sector(value: Floats, band: Bools) -> Floats:
+    """Medians (24,) of a map (H, W) over the sectors of a band (H, W); NaN for sectors with few pixels."""
+    sector, inside = outline.sectors(band), value[band]
+    parts = (inside[sector == k] for k in range(outline.SECTORS))
+    return np.array([np.median(part) if len(part) >= _FEW else np.nan for part in parts])

@@ -1,0 +1,71 @@
+"""What is flat, what has sharp edges, and what is rounded, by polarization, light and normals of ideal objects."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polcap.quality import flatness
+from polcap.quality.flatness import Flatness
+
+SIDE = 160  # px
+Y, X = (np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2) / (0.4 * SIDE)
+
+
+def measure(normal: Any, mask: Any, dolp: Any, light: Any) -> Flatness:
+    """Flatness of a surface with normals (H, W, 3), polarized by `dolp` (H, W) along their azimuth."""
+    azimuth = np.arctan2(normal[..., 1], normal[..., 0])
+    stokes = light * np.stack([np.ones_like(dolp), dolp * np.cos(2 * azimuth), dolp * np.sin(2 * azimuth)])
+    image: Any = SimpleNamespace(mask=mask, stokes=np.repeat((stokes * mask)[..., None] / 3, 3, axis=-1))
+    maps: Any = SimpleNamespace(mask=mask, normal=normal)
+    found = flatness.measure(image, maps)
+    assert found is not None
+    return found
+
+
+def ball(polarizing: float = 0.35) -> Flatness:
+    mask = np.hypot(X, Y) < 1
+    z = np.sqrt(np.maximum(1 - X**2 - Y**2, 0))
+    return measure(np.stack([X, -Y, z], axis=-1), mask, polarizing * (1 - z**2), 0.2 + 0.8 * z)
+
+
+def faces(*tilts_deg: float, relief_deg: float = 0.0) -> Flatness:
+    """Upright strips of equal width in a square, turned about the upright axis, with a random relief."""
+    random = np.random.default_rng(1)
+    strip = np.clip(((X + 1) / 2 * len(tilts_deg)).astype(int), 0, len(tilts_deg) - 1)
+    slope = np.tan(np.radians(np.array(tilts_deg)))[strip]
+    relief = np.tan(np.radians(relief_deg)) * random.normal(size=(2, SIDE, SIDE))
+    normal = np.stack([slope + relief[0], relief[1], np.ones_like(X)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    mask = np.maximum(np.abs(X), np.abs(Y)) < 1
+    return measure(normal, mask, 0.35 * (1 - normal[..., 2] ** 2), normal[..., 2])
+
+
+def test_a_ball_is_rounded() -> None:
+    seen = ball()
+    assert not seen.sharp_edged and not seen.flat
+    assert seen.contour > 0.9 and seen.common < 0.05 and seen.aligned == pytest.approx(2 / 3, abs=0.02)
+
+
+def test_a_ball_that_hardly_polarizes_is_not_taken_for_a_plane() -> None:
+    """Wax, or a polarizer that was off: the outline is dimmed as that of a rounded surface."""
+    seen = ball(polarizing=0.01)
+    assert seen.contour == 0 and not seen.sharp_edged and not seen.flat
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 20.0, 45.0])
+def test_a_plane_with_relief_is_flat(tilt_deg: float) -> None:
+    assert faces(tilt_deg, relief_deg=4.0).flat
+
+
+def test_a_box_has_sharp_edges_and_is_not_flat() -> None:
+    seen = faces(-50.0, 40.0)
+    assert seen.sharp_edged and not seen.flat
+
+
+def test_a_small_object_is_not_measured() -> None:
+    mask = np.zeros((20, 20), bool)
+    mask[10, 10] = True
+    image: Any = SimpleNamespace(mask=mask, stokes=np.ones((3, 20, 20, 3)))
+    assert flatness.measure(image, SimpleNamespace(mask=mask, normal=np.ones((20, 20, 3)))) is None  # type: ignore[arg-type]
