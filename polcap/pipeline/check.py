@@ -183,7 +183,7 @@ def table(verdict: Verdict, everything: bool = False) -> str:
             rows.append(f"{'':{13 + width}}→ {line.remedy}")
     count = {state: sum(line.state == state for line in verdict.lines) for state in ("pass", "not judged")}
     if not everything:
-        after = f", {count['not judged']} are not judged, because these explain them" * (count["not judged"] > 0)
+        after = f", {count['not judged']} are not judged" * (count["not judged"] > 0)
         rows.append(f"{count['pass']} of {len(verdict.lines)} gates passed{after}; -v prints all")
     return "\n".join(rows)
 

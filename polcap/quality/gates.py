@@ -112,7 +112,7 @@ def _cause(step: Step, judged: Sequence[Gate]) -> str | None:
 
 
 def _not_judged(name: str, cause: str) -> Gate:
-    return Gate(name, "not judged", None, None, f"The gate {cause!r} explains what this one would find", unit="")
+    return Gate(name, "not judged", None, None, f"The gate {cause!r} leaves nothing to judge here", unit="")
 
 
 def verdict(gates: Iterable[Gate]) -> State:
