@@ -76,7 +76,7 @@ def api_page() -> str:
         "arrays, and `polcap clean` removes them. The values and the calls of stages may change between versions.",
     ]  # fmt: skip
     for name in sorted(polcap.__all__, key=lambda name: (name[0].isupper(), name)):
-        source = inspect.getsource(getattr(polcap, name))
+        source = inspect.getsource(getattr(polcap, name)).removeprefix("@_in_python\n")
         definition = ast.parse(source).body[0]
         if isinstance(definition, ast.FunctionDef):  # its signature and docstring, without the body
             source = "\n".join(source.splitlines()[: definition.body[0].end_lineno])

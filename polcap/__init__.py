@@ -14,7 +14,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from polcap.api import Result, process
+    from polcap.api import Result, check, export, fuse, process
     from polcap.capture_values import Capture, Frame, Shot
     from polcap.chart_values import ChartRequest
     from polcap.config import Config
@@ -31,12 +31,11 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "Asset", "Capture", "ChartRequest", "Config", "Cues", "Frame", "Mesh", "PolcapError", "Result", "ResultMaps",
-    "Shot", "StokesImage", "SurfaceMaps", "View", "load_config", "process", "read_capture", "read_cues", "read_maps",
-    "read_stokes",
+    "Shot", "StokesImage", "SurfaceMaps", "View", "check", "export", "fuse", "load_config", "process", "read_capture",
+    "read_cues", "read_maps", "read_stokes",
 ]  # fmt: skip
 _HOME = {  # public name → module and its name there
-    "process": ("polcap.api", "process"),
-    "Result": ("polcap.api", "Result"),
+    **{name: ("polcap.api", name) for name in ("process", "check", "export", "fuse", "Result")},
     "Config": ("polcap.config", "Config"),
     "load_config": ("polcap.config", "load"),
     "PolcapError": ("polcap.errors", "PolcapError"),

@@ -1,27 +1,64 @@
-"""Python interface: `polcap.process` does the same as the command `polcap process`."""
+"""Python interface: `process`, `check`, `export` and `fuse` do the same as the commands of these names."""
 
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar
 
 import numpy as np
 
 from polcap import resource_limits
 from polcap.chart_values import ChartRequest
 from polcap.config import Config
-from polcap.errors import SettingError
+from polcap.errors import PolcapError, SettingError
 from polcap.formats import own_folders
+from polcap.formats.export.encoders import Kind
+from polcap.formats.export.glb_geometry import Geometry
+from polcap.formats.export.presets import Format
+from polcap.formats.export.texture_set import Extra
 from polcap.images import Bools, Device
+from polcap.pipeline import check as checks
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
+from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import Progress, silent
 from polcap.pipeline.path import AUTO
 from polcap.pipeline.request import Request
 
+if TYPE_CHECKING:
+    from polcap.fusion.fusion_path import SessionConfig
+
+_FLAG = re.compile(r"--([a-z]+(?:-[a-z]+)*)")
+_ARGUMENTS = {"angles": "angles_deg", "set": "config", "about": "catalog", "extra": "extras", "no-chart": "chart"}
+_Arguments = ParamSpec("_Arguments")
+_Returned = TypeVar("_Returned")
+
+
+def _in_python(function: Callable[_Arguments, _Returned]) -> Callable[_Arguments, _Returned]:
+    """A function whose errors name its arguments, not the flags of the command line."""
+    names = inspect.signature(function).parameters
+
+    def argument(flag: re.Match[str]) -> str:
+        name = _ARGUMENTS.get(flag[1], flag[1].replace("-", "_"))
+        return name if name in names else flag[0]
+
+    @wraps(function)
+    def called(*arguments: _Arguments.args, **options: _Arguments.kwargs) -> _Returned:
+        try:
+            return function(*arguments, **options)
+        except PolcapError as error:
+            error.args = tuple(_FLAG.sub(argument, part) if isinstance(part, str) else part for part in error.args)
+            raise
+
+    return called
+
 
 @dataclass(frozen=True)
 class Result:
-    """Result of `polcap.process`: the result folder, and the content of its report.json."""
+    """Result of `polcap.process` or `polcap.fuse`: the result folder, and the content of its report.json."""
 
     folder: Path  # maps/, asset/, report.html
     report: dict[str, Any]  # report.json's content
@@ -37,7 +74,8 @@ class Result:
     @property
     def expected_error_deg(self) -> float | None:
         """Median expected error of the normals with the costs of all checks, degrees; None: it was not measured."""
-        return None if self.report["expected_error_deg"] is None else float(self.report["expected_error_deg"])
+        error = self.report.get("expected_error_deg")
+        return None if error is None else float(error)
 
     @property
     def asset(self) -> Path:
@@ -45,6 +83,7 @@ class Result:
         return self.folder / "asset" / f"{self.report['capture']['name']}.glb"
 
 
+@_in_python
 def process(
     capture: str | Path,
     out: str | Path | None = None,
@@ -111,6 +150,142 @@ def process(
     found, supplied = request.open(folder)
     about = pipeline.process(found, supplied, request.config, target, progress=progress)
     assert about is not None  # only `until` leaves it out
+    return Result(target, about)
+
+
+@_in_python
+def check(
+    capture: str | Path,
+    *,
+    config: Config | None = None,
+    angles_deg: tuple[float, ...] | None = None,
+    clockwise: bool = False,
+    chart: ChartRequest = AUTO,
+) -> checks.Verdict:
+    """Judge a capture in seconds: keep or reshoot, and why. Arguments as for `process`; writes nothing.
+
+    `Verdict.keep` tells whether to keep it, `lines` has the gates, `shots` the shots to repeat.
+
+    Raises
+    ------
+    PolcapError
+        Its message is one line: the thing, its value, the limit and the remedy.
+    """
+    from polcap.formats.capture import reader
+
+    _check_types(config, chart, None)
+    return checks.inspect(reader.read(Path(capture), angles_deg, clockwise), config or Config(), chart)
+
+
+@_in_python
+def export(
+    result: str | Path | Result,
+    preset: str | None = None,
+    *,
+    formats: Sequence[Format] = ("gltf", "obj"),
+    images: Kind | None = None,
+    geometry: Geometry | None = None,
+    triangles: int | None = None,
+    color: str = "lin_rec709",
+    bits: Literal[8, 16] | None = None,
+    extras: Sequence[Extra] = (),
+    texture_size: int | None = None,
+    page: str | Path | None = None,
+    iiif: str | None = None,
+    catalog: Mapping[str, str] | None = None,
+    lod: int = 0,
+) -> list[Path]:
+    """Write the asset of a result again, in other formats or for one program; returns the files.
+
+    Parameters
+    ----------
+    result
+        Result folder of `process` or `fuse`, or its `Result`.
+    preset
+        Program, such as "unreal"; it brings its formats. All are in `docs/how-to/export.md`.
+    formats
+        Without a preset: of gltf, obj, ply, stl, usd, usdz, materialx, exr, iiif.
+    images, geometry
+        Inside the GLB: "png", "jpeg", "webp" or "ktx2"; "float", "quantized" or "draco".
+    triangles, texture_size
+        Most triangles; px of the longer side of the textures.
+    color
+        Color space or OCIO role of the colors in the layered EXR.
+    bits
+        Of a texture's channel in PNG.
+    extras
+        Further textures: "displacement", "occlusion", "object-normal", …
+    page
+        File model-viewer.min.js, for a web page that shows the GLB.
+    iiif
+        Address where the relightable layer will be served.
+    catalog
+        Facts such as title and rights, in place of those of the capture.
+    lod
+        Number of further levels of detail.
+
+    Raises
+    ------
+    PolcapError
+        Its message is one line: the thing, its value, the limit and the remedy.
+    """
+    from polcap.fusion import fuse_run, fused_maps
+
+    folder = result.folder if isinstance(result, Result) else Path(result)
+    request = ExportRequest(
+        formats=tuple(formats), preset=preset, images=images, geometry=geometry, triangles=triangles, color=color,
+        bits=bits, extras=tuple(extras), texture_size=texture_size, page=None if page is None else Path(page),
+        iiif=iiif, catalog=catalog or {}, lod=lod,
+    )  # fmt: skip
+    return (fuse_run.export if fused_maps.is_fused(folder) else pipeline.export)(folder, request)
+
+
+@_in_python
+def fuse(
+    folder: str | Path,
+    out: str | Path | None = None,
+    *,
+    config: "SessionConfig | None" = None,
+    angles_deg: tuple[float, ...] | None = None,
+    clockwise: bool = False,
+    chart: ChartRequest = AUTO,
+    estimator: models.Estimator | None = None,
+    model: str | Path | None = None,
+    device: Device = "cpu",
+    workers: int = 1,
+    threads: int = 0,
+    memory: float = 0.0,
+    notify: Callable[[str], None] = lambda text: None,
+    progress: Progress = silent,
+) -> Result:
+    """Join several captures of one object, in `folder`/view01, view02, …, into a closed asset; extra [fusion].
+
+    `out` is by default `folder`/fused; `workers` views are processed at a time. `config` is a
+    `polcap.fusion.fusion_path.SessionConfig`, the settings of the views and of the fusion. `notify` is called with
+    lines of text. The other arguments are those of `process`. Run again, it goes on where it was stopped.
+
+    Raises
+    ------
+    PolcapError
+        Its message is one line: the thing, its value, the limit and the remedy.
+    """
+    from polcap.fusion import fuse_run
+    from polcap.fusion.fusion_path import SessionConfig
+    from polcap.fusion.session import SessionInput
+
+    chosen = config or SessionConfig()
+    if not isinstance(chosen, SessionConfig):
+        raise SettingError(f"config = {config!r:.60}: cannot be used; give a polcap.fusion.fusion_path.SessionConfig")
+    place = Path(folder)
+    if not place.is_dir():
+        raise SettingError(f"{place}: no such folder; give the folder that holds view01, view02, …")
+    resource_limits.set_limits(threads, memory)
+    request = Request(
+        config=chosen.of_views, chart=chart, estimator=estimator, model=None if model is None else Path(model),
+        device=device, angles_deg=angles_deg, clockwise=clockwise, threads=threads, memory_gb=memory,
+    )  # fmt: skip
+    target = place / own_folders.FUSED if out is None else Path(out)
+    about = fuse_run.fuse(SessionInput(place, chosen, request, workers), target, notify, progress)
     return Result(target, about)
 
 

@@ -1,5 +1,6 @@
 """The public surface: what it names, what it costs, and that it does what the command line does."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ from polcap.errors import SettingError
 from polcap.formats.maps import result_maps as maps
 from polcap.images import MaskedImage
 from polcap.pipeline import models
+from polcap.pipeline import run as pipeline
 
 
 @pytest.mark.parametrize(
@@ -85,3 +87,34 @@ def test_results_and_values_have_a_short_repr(tmp_path: Path) -> None:
         repr(picture)
         == "MaskedImage(value=float64 (400, 300, 3), variance=float64 (400, 300, 3), quality=uint8 (400, 300))"
     )
+
+
+def test_check_export_and_reopen_take_strings(result: Path, example: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(result, copy)
+    assert polcap.check(str(example)).keep
+    files = polcap.export(str(copy), "godot", texture_size=64, catalog={"title": "Vase"})
+    assert {"capture.glb", "capture_orm.png"} <= {file.name for file in files}
+    assert pipeline.reopen(str(copy), "mask")[0].object_.mask.any()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"preset": "maya", "color": "ACEScg"}, "^color ACEScg converts"),
+        ({"formats": ("obj",), "geometry": "draco"}, "^images and geometry change the GLB"),
+        ({"iiif": "http://museum.example", "texture_size": 64}, "leave out texture_size"),
+        ({"preset": "unrael"}, "^preset unrael: there is no such preset; did you mean unreal"),
+    ],
+)
+def test_errors_name_the_argument_and_not_the_flag(result: Path, options: dict[str, Any], words: str) -> None:
+    with pytest.raises(SettingError, match=words) as caught:
+        polcap.export(result, **options)
+    assert "--texture" not in str(caught.value) and "--color" not in str(caught.value)
+
+
+def test_fuse_refuses_what_the_command_refuses(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="no such folder; give the folder that holds view01"):
+        polcap.fuse(tmp_path / "none")
+    with pytest.raises(SettingError, match=r"config = .*SessionConfig"):
+        polcap.fuse(tmp_path, config=polcap.Config())  # type: ignore[arg-type]

@@ -30,8 +30,16 @@ def test_conda_recipe_has_the_dependencies_of_the_package():
 def test_version_is_written_once():
     import polcap
 
-    for name in ("pyproject.toml", "CITATION.cff", ".ci/conda/recipe.yaml"):
+    for name in ("pyproject.toml", ".ci/conda/recipe.yaml"):
         assert f'"{polcap.__version__}"' not in (ROOT / name).read_text(encoding="utf-8"), name
+
+
+def test_the_citation_names_version_and_date() -> None:
+    import polcap
+
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {polcap.__version__}\n" in citation
+    assert re.search(r'^date-released: "\d{4}-\d\d-\d\d"$', citation, re.MULTILINE)
 
 
 @pytest.mark.parametrize(

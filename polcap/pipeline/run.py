@@ -163,11 +163,12 @@ def _write_assets(
     return [file for files in exports for file in files]
 
 
-def reopen(out: Path, until: str = "surface") -> tuple[Results, dict[str, Any]]:
+def reopen(out: str | Path, until: str = "surface") -> tuple[Results, dict[str, Any]]:
     """Read the results of an earlier run up to a stage, without its photographs, and the facts in work/run.json.
 
     Raises StorageError: `out` has no stage cache, or the result of a stage is missing.
     """
+    out = Path(out)
     about = result_folder.read_run(out)
     config = restore(Config, about, out / "work" / "run.json")
     return path(None, UserInput(), config, ArchiveCache(out, until=until)), about
