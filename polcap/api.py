@@ -266,6 +266,8 @@ def fuse(
 
     Raises
     ------
+    SettingError
+        `folder` is none, or `config` is that of one view.
     PolcapError
         Its message is one line: the thing, its value, the limit and the remedy.
     """
