@@ -1,4 +1,4 @@
-"""Measurements of `polcap calibrate`: camera, lens, polarizer and flash, each value with its 1σ."""
+"""Measurements of `polcap calibrate`, each value with its 1σ, and of `polcap validate`."""
 
 from dataclasses import dataclass
 
@@ -118,3 +118,18 @@ class Calibration:
     geometry: LensGeometry | None = None
     polarizer: Polarizer | None = None
     flash: FlashEnergy | None = None
+
+
+@dataclass(frozen=True)
+class BallAccuracy:
+    """Errors of the normals of a ball, as `polcap validate` measured them with one camera, lens and filter."""
+
+    made: str  # ISO 8601
+    camera: str  # make and model
+    lens: str
+    filter: str  # the polarizer's name, from capture.toml
+    capture: str  # name of the capture of the ball
+    mean_deg: float
+    median_deg: float
+    expected_deg: float  # mean of the expected errors of the same pixels
+    pixels: int

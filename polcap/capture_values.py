@@ -7,7 +7,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from msgspec import Struct
 
-from polcap.calibration_values import Calibration
+from polcap.calibration_values import BallAccuracy, Calibration
 from polcap.images import NOT_IN_KEY, Floats, SensorImage
 
 T = TypeVar("T")
@@ -144,6 +144,8 @@ class Capture:
     crossed: Shot | None = None  # under a polarized flash; its angle is that of the lens's polarizer
     catalog: CatalogEntry = field(default=CatalogEntry(), metadata=NOT_IN_KEY)
     angles: AngleStatement = AngleStatement()
+    lens_filter: str = field(default="", metadata=NOT_IN_KEY)  # the polarizer's name, from capture.toml
+    accuracy: BallAccuracy | None = field(default=None, metadata=NOT_IN_KEY)  # of these, on a ball; None: not validated
 
     @property
     def all_shots(self) -> tuple[Shot, ...]:

@@ -235,7 +235,9 @@ def print_result(about: dict[str, Any], out: "Path", json: bool, open_: bool) ->
     print_data({**about, "outputs": outputs} if json else asset)
     error = about.get("expected_error_deg")
     expected = "" if error is None else f", expected error of the normals {error:.1f}°"
-    print_progress(f"verdict {about['verdict']}{expected}; {outputs['report']}")
+    ball = about["capture"].get("ball")
+    measured = "" if ball is None else f", on your ball {ball['mean_deg']:.1f}°"
+    print_progress(f"verdict {about['verdict']}{expected}{measured}; {outputs['report']}")
     if open_:
         open_page(out / "report.html")
     print_gates(about)

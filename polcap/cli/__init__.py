@@ -31,6 +31,7 @@ from polcap.cli.result_commands import clean, report, show, status
 from polcap.cli.settings_command import settings
 from polcap.cli.synth_command import synth
 from polcap.cli.training_commands import evaluate, train
+from polcap.cli.validate_command import validate
 from polcap.errors import SettingError
 
 _ANYWHERE = ("--debug", "-q", "--quiet", "-v", "--verbose", "--log")  # options that may follow the command
@@ -88,8 +89,8 @@ def _one_line(error: TyperException) -> str:
 
 
 COMMANDS = (
-    process, batch, fuse, material, export, show, status, report, clean, check, settings, calibrate, doctor, synth,
-    board, capture, train, evaluate,
+    process, batch, fuse, material, export, show, status, report, clean, check, settings, calibrate, validate, doctor,
+    synth, board, capture, train, evaluate,
 )  # fmt: skip
 app = typer.Typer(
     cls=OneLine,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def synth(
     context: Context,
     folder: Annotated[Path, Argument(help="Folder to make; must be new or empty.")],
-    scene: Annotated[Literal["bumps", "clusters", "vase"], choice("Kind of object.")] = "bumps",
+    scene: Annotated[Literal["bumps", "clusters", "vase", "ball"], choice("Kind of object.")] = "bumps",
     seed: Annotated[int, Option(min=0, help="Of shape, material, light and noise.")] = 0,
     assignments: Annotated[
         list[str] | None,

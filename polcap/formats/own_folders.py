@@ -26,6 +26,11 @@ def calibrations() -> Path:
     return Path(os.environ.get("XDG_CONFIG_HOME") or home / ".config") / "polcap" / "calib"
 
 
+def ball_accuracies() -> Path:
+    """Path of the folder with the measurements of `polcap validate`; it may not exist."""
+    return calibrations() / "balls"
+
+
 def calibration_files() -> list[Path]:
     """All calibration files of the user, by name."""
     try:

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from polcap import __version__
+from polcap.calibration_values import BallAccuracy
 from polcap.capture_values import Capture, Frame
 from polcap.config import Config
 from polcap.errors import StorageError
@@ -40,6 +41,9 @@ class _CaptureFacts(msgspec.Struct, frozen=True):
     name: str
     camera: str
     shots: list[_ShotFacts]
+    lens: str = ""
+    filter: str = ""
+    ball: BallAccuracy | None = None
     catalog: dict[str, str] = {}
     focal_doubt: tuple[float, float] = (0.0, 0.0)
 
@@ -77,6 +81,8 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
         "camera": first.camera,
         "serial": first.serial,
         "lens": first.lens,
+        "filter": capture.lens_filter,
+        "ball": None if capture.accuracy is None else msgspec.to_builtins(capture.accuracy),
         "taken": first.taken,
         "size_px": list(capture.size_px),
         "focal_px": capture.focal_px,

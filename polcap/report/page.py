@@ -85,9 +85,11 @@ def verdict(about: Mapping[str, Any]) -> tuple[str, str]:
     judged = [gate for gate in gates if gate["name"] == "normal error" and gate["value"] is not None]
     if not judged:  # the shots are out of order, or there is no object
         return headline, ""
+    ball = about["capture"].get("ball")
+    measured = "" if ball is None else f" On your ball it was {ball['mean_deg']:.1f}° ({ball['made'][:10]})."
     within = f"For half of the normals, the expected error is below {_gate_number(judged[0], 'value')}"
     because = judged[0]["says"].partition(", mostly due to: ")[2]
-    return headline, f"{within}; mostly due to these gates: {because}." if because else f"{within}."
+    return headline, (f"{within}; mostly due to these gates: {because}." if because else f"{within}.") + measured
 
 
 def gate_rows(gates: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:

@@ -1,4 +1,4 @@
-"""Random synthetic scenes from a seed: bumps, clusters of balls, vases, or a mesh from a file."""
+"""Random synthetic scenes from a seed: bumps, clusters of balls, vases, one ball, or a mesh from a file."""
 
 import colorsys
 from pathlib import Path
@@ -14,22 +14,24 @@ from polcap.synth.distance_fields import Bumps, Cluster, Model, Shape, Vase, Wav
 from polcap.synth.render import Scene
 from polcap.synth.scene_materials import Coat, Color, Material
 
-Kind = Literal["bumps", "clusters", "vase"]
+Kind = Literal["bumps", "clusters", "vase", "ball"]
 
 
 def random_scene(seed: int, kind: Kind) -> Scene:
     """A random scene: object 0.1 to 0.17 m wide at 0.7 m, next to a chart, under a flash 4 to 7 cm above the lens.
 
-    Its one or two materials are dielectrics of roughness 0.3–0.6 and refractive index 1.4–1.6.
+    A ball has one color. The one or two materials are dielectrics of roughness 0.3–0.6 and refractive index 1.4–1.6.
 
     Raises SettingError for an unknown kind.
     """
     if kind not in get_args(Kind):
         raise SettingError(f'there is no scene "{kind}"; choose one of {", ".join(get_args(Kind))}')
     random = np.random.default_rng([seed, get_args(Kind).index(kind)])
-    shape = {"bumps": _bumps, "clusters": _cluster, "vase": _vase}[kind](random)
+    shape = {"bumps": _bumps, "clusters": _cluster, "vase": _vase, "ball": _ball}[kind](random)
     ior = random.uniform(1.4, 1.6)
     materials = tuple(_material(random, ior) for _ in range(random.integers(1, 3)))
+    if kind == "ball":
+        materials = (msgspec.structs.replace(materials[0], second=materials[0].first),)
     turn = random.uniform(-1, 1, 3) * ((15, 180, 8) if kind == "vase" else (180, 180, 180))
     return Scene(
         shape=shape,
@@ -77,6 +79,10 @@ def _cluster(random: np.random.Generator) -> Shape:
         if np.linalg.norm(center) + radius < 0.085:
             balls.append(np.array([*center, radius]))
     return Cluster(tuple((_rounded(x), _rounded(y), _rounded(z), _rounded(r)) for x, y, z, r in balls))
+
+
+def _ball(random: np.random.Generator) -> Shape:
+    return Cluster(((0.0, 0.0, 0.0, _rounded(random.uniform(0.045, 0.06))),))
 
 
 def _vase(random: np.random.Generator) -> Shape:

@@ -13,7 +13,7 @@ import msgspec
 from polcap.calibration_values import Calibration
 from polcap.capture_values import AngleStatement, Capture, Exif, Frame, FrameReading, Shot
 from polcap.errors import CaptureError
-from polcap.formats import atomic, calibrations
+from polcap.formats import atomic, ball_accuracies, calibrations
 from polcap.formats.capture import capture_toml, focal_length, folder_names, layouts, unequal_brackets, unfinished
 from polcap.formats.capture.capture_toml import CaptureFile
 from polcap.formats.capture.focal_length import FocalLength
@@ -103,6 +103,8 @@ def _read(folder: Path, angles_deg: tuple[float, ...] | None, clockwise: bool) -
         crossed=crossed,
         catalog=stated.catalog,
         angles=_sense(plan.angles, clockwise, calibration),
+        lens_filter=stated.filter or "",
+        accuracy=ball_accuracies.choose(reference, stated.filter),
     )
 
 
