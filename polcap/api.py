@@ -230,6 +230,7 @@ def export(
         Its message is one line: the thing, its value, the limit and the remedy.
     """
     from polcap.fusion import fuse_run, fused_maps
+    from polcap.material import material_maps, material_run
 
     folder = result.folder if isinstance(result, Result) else Path(result)
     request = ExportRequest(
@@ -237,7 +238,8 @@ def export(
         bits=bits, extras=tuple(extras), texture_size=texture_size, page=None if page is None else Path(page),
         iiif=iiif, catalog=catalog or {}, lod=lod,
     )  # fmt: skip
-    return (fuse_run.export if fused_maps.is_fused(folder) else pipeline.export)(folder, request)
+    write = fuse_run.export if fused_maps.is_fused(folder) else pipeline.export
+    return (material_run.export if material_maps.is_material(folder) else write)(folder, request)
 
 
 @_in_python

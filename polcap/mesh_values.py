@@ -44,6 +44,7 @@ class Asset(ArrayValue):
     specular_factor: tuple[float, float, float]  # KHR_materials_specular specularColorFactor
     ior: float
     displacement: TexturePixels | None = None  # (H, W) 0 at the farthest point, 1 at the nearest
+    curvature: TexturePixels | None = None  # (H, W) ½ flat, above convex, below concave
     object_normal: TexturePixels | None = None  # (H, W, 3) camera frame, n * 0.5 + 0.5
     albedo_sigma: float | None = None  # as in `SurfaceMaps`
 

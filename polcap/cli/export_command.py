@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # names in formats.export, which is not imported at start
 PRESETS = ("blender", "unreal", "unity", "godot", "web", "substance", "maya", "houdini", "archive")
-EXTRAS = ("displacement", "occlusion", "object-normal")
+EXTRAS = ("displacement", "occlusion", "object-normal", "curvature", "cavity")
 _PRESET = f"Files for one program in asset/NAME/: {', '.join(PRESETS)}; repeatable."
 _EXTRA = f"A further texture: {', '.join(EXTRAS)}; repeatable."
 _FACTS = ("title", "creator", "rights", "license", "object_number", "date", "institution", "description")
@@ -89,15 +89,15 @@ def export(
         lod=lod,
     )
     wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
-    fused = fused_maps.is_fused(result)
-    if fused and "displacement" in plain.extras:
-        terminal.print_message("polcap: --extra displacement is left out: a closed mesh has none", "WARNING")
-    write = fuse_run.export if fused else pipeline.export
+    write = fuse_run.export if fused_maps.is_fused(result) else pipeline.export
     write = material_run.export if material_maps.is_material(result) else write
     files = write(result, *wanted)
     options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
     if (missing := lod * len(wanted) - sum(bool(_LEVEL.search(file.name)) for file in files)) > 0:
         terminal.print_message(f"polcap: {missing} levels of --lod would differ by over 1 % of the size: not written")
+    for name in plain.extras:
+        if not any(file.name.endswith(f"_{name.replace('-', '')}.png") for file in files):
+            terminal.print_message(f"polcap: --extra {name} is left out: this kind of result has none", "WARNING")
     if texture_size is not None:
         _warn_of_upsampling(result, texture_size)
     terminal.print_written(files, json)
@@ -108,7 +108,7 @@ def _warn_of_upsampling(result: Path, size: int) -> None:
     from polcap.formats import text_file
     from polcap.fusion import fused_maps
 
-    held = max(text_file.read_json(result / "maps" / "maps.json")["size"])
+    held = max(text_file.read_json(result / "maps" / "maps.json").get("size", [size]))
     if size > held:
         setting = "fusion.atlas.size" if fused_maps.is_fused(result) else "hdr.demosaic=full"
         terminal.print_message(

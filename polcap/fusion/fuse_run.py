@@ -31,6 +31,7 @@ from polcap.quality.gate import Gate
 from polcap.quality.limits import FusedGateLimits
 from polcap.report import animation
 
+OF_ONE_VIEW = frozenset(("displacement", "curvature", "cavity"))  # extra textures
 _LODS = 2  # coarser levels, each with a quarter of the triangles
 _SIDE = 480  # px of an animation's frame
 
@@ -77,9 +78,9 @@ def export(out: Path, *requests: ExportRequest) -> list[Path]:
 
 
 def _of_closed_mesh(request: ExportRequest) -> ExportRequest:
-    """The request without what a closed mesh does not have: displacement, and the layered EXR of a preset."""
+    """The request without the textures of one view only, and without the layered EXR of a preset."""
     without: tuple[Format, ...] = () if request.preset is None else ("exr",)
-    return replace(request, without=without, extras=tuple(one for one in request.extras if one != "displacement"))
+    return replace(request, without=without, extras=tuple(one for one in request.extras if one not in OF_ONE_VIEW))
 
 
 def _with_albedo_scale(maps: AtlasMaps, processed: ProcessedSession) -> AtlasMaps:
@@ -134,6 +135,8 @@ def _figures(processed: ProcessedSession, results: FusionResults, rows: Sequence
         "mesh": {
             "metric": processed.poses.metric,
             "triangles": len(results.atlas.mesh.faces),
+            "texture_px": results.maps.mask.shape[0],
+            "texels_per_mm": 0.001 / results.atlas.texel if processed.poses.metric else None,
             "extent": np.ptp(results.mesh.vertices, axis=0).tolist(),
             "closed": _closed(results),
             "seen": _seen(results),

@@ -301,12 +301,13 @@ def _loose_textures(
 ) -> dict[str, Texture]:
     """Texture files of a preset, of --extra, and those that OBJ, USD and MaterialX share, by file name.
 
-    A closed mesh has no displacement.
+    Textures whose values the asset lacks are left out: displacement and curvature of a closed mesh.
     """
     makers = {f"{pattern.format(stem)}.png": make for pattern, make in preset.textures.items()}
     makers |= {f"{stem}_{key.replace('-', '')}.png": texture_set.EXTRAS[key] for key in extras}
-    known = whole.displacement is not None
-    found = {file: make(whole) for file, make in makers.items() if known or make is not texture_set.displacement}
+    of_relief: dict[Any, Any] = {texture_set.displacement: whole.displacement}
+    of_relief |= dict.fromkeys((texture_set.curvature, texture_set.cavity), whole.curvature)
+    found = {file: make(whole) for file, make in makers.items() if of_relief.get(make, whole) is not None}
     if _SHARING.intersection(preset.formats):
         made = {file: texture_set.LOOSE[key](whole) for key, file in shared.items()}
         found |= {file: texture_set.linear(one) for file, one in made.items()} if preset.shared == "exr" else made

@@ -352,6 +352,14 @@ def test_extra_textures_and_sixteen_bits(own: Path, polcap: Command) -> None:
     assert stated["capture_orm"].startswith("R ambient occlusion, G")
 
 
+def test_cavities_are_the_concave_part_of_the_curvature(own: Path) -> None:
+    pipeline.export(own, ExportRequest(formats=("gltf",), extras=("curvature", "cavity")))
+    curvature, cavity = (png.read(own / f"asset/capture_{name}.png").astype(int) for name in ("curvature", "cavity"))
+    mask = png.read(own / "maps" / "mask.png") > 127
+    assert np.array_equal(cavity, np.minimum(2 * curvature, 65535))
+    assert 0.45 < np.median(curvature[mask]) / 65535 < 0.6 and (curvature[~mask] == 32768).all()
+
+
 def test_a_second_export_adds_to_the_records_of_the_first(own: Path) -> None:
     """`process` wrote GLB and OBJ; the sidecar and maps.json list them after an export of the EXR too."""
     sidecar = own / "asset" / "capture.provenance.json"

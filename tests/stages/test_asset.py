@@ -9,6 +9,7 @@ from scipy import ndimage
 from polcap.images import Floats
 from polcap.mesh_values import Asset
 from polcap.optics import color
+from polcap.optics.morphology import erode
 from polcap.optics.texture_rasterizer import rasterize_frames
 from polcap.stage_values import SurfaceMaps
 from polcap.stages import asset, surface
@@ -147,3 +148,14 @@ def test_frames_are_interpolated_as_by_a_renderer() -> None:
                 assert there[number[y, x]] == pytest.approx(share @ value[face], abs=2e-4)
                 found += 1
     assert found > 60
+
+
+def test_the_curvature_of_a_ball_is_that_of_its_radius() -> None:
+    """A twentieth above one half, if its outline were of its radius; nearer parts are larger. Its hollow is below."""
+    ball = surfaces.maps()
+    found = asset.curvature(ball)
+    inner = erode(ball.mask, 6, from_border=True) & (ball.normal[..., 2] > 0.5)
+    outline, radius = np.ptp(np.flatnonzero(ball.mask.any(axis=0))) / 2, 400 * surfaces.RADIUS / surfaces.DISTANCE
+    assert np.median(found[inner]) - 0.5 == pytest.approx(outline / radius / 20, rel=0.05)
+    hollow = replace(ball, normal=ball.normal * np.array([-1, -1, 1], np.float32))
+    assert np.median(asset.curvature(hollow)[inner]) - 0.5 == pytest.approx(-outline / radius / 20, rel=0.05)

@@ -18,7 +18,9 @@ from polcap.optics import color, fresnel
 SPECULAR_RANGE = 0.08  # F0 of white in the loose specular textures: Disney's, Blender's and Unreal's "specular"
 
 Key = Literal["basecolor", "roughness", "normal", "specular"]  # the texture files of OBJ, USD and MaterialX
-Extra = Literal["displacement", "occlusion", "object-normal"]  # channels that are computed on request
+Extra = Literal[
+    "displacement", "occlusion", "object-normal", "curvature", "cavity"
+]  # channels that are computed on request
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,23 @@ def displacement(asset: Asset) -> Texture:
     """Height of the surface towards the camera."""
     assert asset.displacement is not None
     return Texture(asset.displacement, False, "height, linear: 0 at depth.far of maps.json, 1 at depth.near")
+
+
+def curvature(asset: Asset) -> Texture:
+    """Mean curvature of the surface, for masks of edges and pits."""
+    assert asset.curvature is not None
+    meaning = "mean curvature, linear: 0.5 flat, 1 convex and 0 concave with a tenth of the object's radius or less"
+    return Texture(asset.curvature, False, meaning)
+
+
+def cavity(asset: Asset) -> Texture:
+    """The concave part of the curvature, for dirt and shade in pits."""
+    assert asset.curvature is not None
+    top = np.iinfo(asset.curvature.dtype).max
+    dark = np.minimum(2 * asset.curvature.astype(np.uint32), top).astype(asset.curvature.dtype)
+    return Texture(
+        dark, False, "cavities, linear: 1 flat or convex, 0 concave with a tenth of the object's radius or less"
+    )
 
 
 def occlusion(asset: Asset) -> Texture:
@@ -126,6 +145,8 @@ LOOSE: Mapping[Key, Callable[[Asset], Texture]] = {
 
 EXTRAS: Mapping[Extra, Callable[[Asset], Texture]] = {
     "displacement": displacement,
+    "curvature": curvature,
+    "cavity": cavity,
     "occlusion": occlusion,
     "object-normal": object_normal,
 }

@@ -26,7 +26,8 @@ from polcap.stages import stage
 from polcap.stages.asset.ambient_occlusion import ambient_occlusion
 
 Bits = Literal[8, 16]  # of a texture's channel
-_EXTRAS = ("displacement", "object_normal")
+_EXTRAS = ("displacement", "curvature", "object_normal")
+_CURVATURE_SIGMA_PX, _CURVATURE_RANGE = 1.0, 10.0  # 1σ of the smoothing; curvature of white, over the object's
 _LEAST_Z = 0.05  # of a tangent-space normal, which must leave the surface (glTF: blue above one half)
 
 
@@ -110,7 +111,7 @@ def with_mesh(asset: Asset, maps: TextureMaps, mesh: Mesh) -> Asset:
 
 
 def with_extras(asset: Asset, maps: SurfaceMaps, depth: Floats, occlusion: bool) -> Asset:
-    """The asset with displacement and object-space normals and, if asked for, ambient occlusion in its channel.
+    """The asset with displacement, curvature and object-space normals and, if asked for, ambient occlusion.
 
     `depth` (H, W) is along the optical axis, NaN outside the mask.
     """
@@ -124,8 +125,26 @@ def with_extras(asset: Asset, maps: SurfaceMaps, depth: Floats, occlusion: bool)
         asset,
         occlusion_roughness_metallic=packed,
         displacement=_integers(np.ascontiguousarray(filled[..., 0]), 16),
+        curvature=_integers(curvature(maps), 16),
         object_normal=_as(asset.normal, filled[..., 1:]),
     )
+
+
+def curvature(maps: SurfaceMaps) -> Floats:
+    """Mean curvature (H, W) from the normals: ½ where flat, 1 convex and 0 concave with a tenth of the object's radius.
+
+    The surface is a graph over the picture, so its mean curvature is half the divergence of the normals' x and y. The
+    object's radius is half the longer side of its outline.
+
+    References
+    ----------
+    do Carmo, Differential Geometry of Curves and Surfaces, §3.3 (mean curvature of a graph).
+    """
+    normal = cv2.GaussianBlur(fill_outward(maps.normal, maps.mask), (0, 0), _CURVATURE_SIGMA_PX)
+    across = np.gradient(normal[..., 0], axis=1) - np.gradient(normal[..., 1], axis=0)  # rows count downwards
+    radius = max(np.ptp(np.flatnonzero(maps.mask.any(axis=axis))) + 1 for axis in (0, 1)) / 2
+    scaled = np.where(_without_outline(maps.mask), across / 2 * radius / _CURVATURE_RANGE, 0)
+    return np.asarray(np.clip(0.5 + scaled / 2, 0, 1))
 
 
 def resize_textures(asset: Asset, size: int) -> Asset:
