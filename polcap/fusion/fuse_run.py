@@ -27,6 +27,7 @@ from polcap.pipeline.cache import LazyCache, Progress
 from polcap.pipeline.run import timings
 from polcap.quality import fused_object, gates
 from polcap.quality.advice import advise
+from polcap.quality.fused_object import SeenSurface
 from polcap.quality.gate import Gate
 from polcap.quality.limits import FusedGateLimits
 from polcap.report import animation
@@ -139,7 +140,7 @@ def _figures(processed: ProcessedSession, results: FusionResults, rows: Sequence
             "texels_per_mm": 0.001 / results.atlas.texel if processed.poses.metric else None,
             "extent": np.ptp(results.mesh.vertices, axis=0).tolist(),
             "closed": _closed(results),
-            "seen": _seen(results),
+            "seen": _seen(results).seen,
         },
     }
 
@@ -169,9 +170,9 @@ def _verdict(about: Mapping[str, Any]) -> str:
     return next((state for state in ("fail", "warn") if state in states), "pass")
 
 
-def _seen(results: FusionResults) -> float:
-    """Share of the surface that a view saw."""
-    return float(results.maps.seen[results.atlas.covered].mean())
+def _seen(results: FusionResults) -> SeenSurface:
+    """Share of the surface that a view saw, and where the rest faces."""
+    return SeenSurface.measure(results.maps.seen[results.atlas.covered], results.atlas.normal[:, 1])
 
 
 def _closed(results: FusionResults) -> bool:

@@ -1,10 +1,15 @@
 """Gates of a fused object: its views, their poses and normals, joined sets, the seen share, the closed mesh."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
 
 from polcap.formats.capture import folder_names
+from polcap.images import Bools, Floats
 from polcap.quality.gate import Gate
 from polcap.quality.limits import FusedGateLimits
+
+_STEEP = 0.5  # upward component of a normal: faces up or down by more than 30°
 
 
 def views(used: Sequence[str], left_out: Mapping[str, str], limits: FusedGateLimits) -> Gate:
@@ -52,14 +57,39 @@ def join(folder: str, shared: float, limits: FusedGateLimits) -> Gate:
     return Gate(f"join {folder}", "pass", shared, limits.min_shared, message)
 
 
-def seen(share: float, view_count: int, limits: FusedGateLimits) -> Gate:
-    """Gate on the share of the surface that a view saw."""
-    message, limit = f"Views saw {share:.0%} of the surface; the rest is filled", limits.min_seen
-    if share >= limit:
+@dataclass(frozen=True)
+class SeenSurface:
+    """Share of the surface that a view saw, and where the rest faces; all shares are of the whole surface."""
+
+    seen: float
+    down: float  # unseen, faces down
+    side: float
+    up: float
+
+    @classmethod
+    def measure(cls, seen: Bools, height: Floats) -> Self:
+        """Of texels (N,) that a view saw, and the upward component (N,) of their normals."""
+        down, up = height < -_STEEP, height > _STEEP
+        parts = (float((~seen & part).mean()) for part in (down, ~down & ~up, up))
+        return cls(float(seen.mean()), *parts)
+
+
+def seen(surface: SeenSurface, view_count: int, limits: FusedGateLimits) -> Gate:
+    """Gate on the share of the surface that a view saw; an underside on which the object stands is left out."""
+    limit, share = limits.min_seen, surface.seen
+    above = share / max(1 - surface.down, 1e-9)
+    most = max(("down", "side", "up"), key=lambda side: float(getattr(surface, side)))
+    where = {"down": "faces down", "side": "faces sideways", "up": "faces up"}[most]
+    message = f"Views saw {share:.0%} of the surface; the rest, which mostly {where}, is filled"
+    if share >= limit or above >= limit:
         return Gate("seen", "pass", share, limit, message)
-    few = view_count < limits.min_views
-    remedy = "Shoot more views" if few else "Take a second ring of views from higher up"
-    return Gate("seen", "warn", share, limit, message, remedy)
+    remedies = {
+        "down": "Turn the object over and take a second set of views of its underside (setB)",
+        "side": "Shoot more views, from the sides that seen.png in maps/ shows black",
+        "up": "Take a second ring of views from higher up",
+    }
+    few = view_count < limits.min_views and most == "side"
+    return Gate("seen", "warn", share, limit, message, "Shoot more views" if few else remedies[most])
 
 
 def closed(every_edge: bool) -> Gate:

@@ -1,6 +1,6 @@
 """One cause, one remedy: plants causes in simulated captures and does what polcap advises.
 
-python -m tests.campaigns.planted_causes [--folder FOLDER] [--rows FILE] [--only NAME] [--width 400] [--report]
+python -m tests.campaigns.planted_causes [--folder FOLDER] [--rows FILE] [--only NAME] [--width 512] [--report]
 
 Each row plants one cause, or two, in a capture of three angles and three exposures, and runs `check` and `process`.
 It notes whether the first printed remedy is the right one, how many are printed, whether both commands agree on keep
@@ -310,7 +310,7 @@ class Cause:
 RETAKE = r"[Tt]ake (that|this|the) (shot|bracket)s? again"
 LESS, FILES = r"stops? less light|as much light", r"[Mm]ove .*IMG_"
 CAUSES = {
-    **{f"clipped {n:g} times": Cause(clipped(n), LESS) for n in (0.5, 0.8, 1.5, 4, 16, 60)},
+    **{f"clipped {n:g} times": Cause(clipped(n), LESS, n < 1) for n in (0.5, 0.8, 1.5, 4, 16, 60)},
     "clipped in 45°": Cause(clipped(3, 1), LESS),
     "clipped in 0°": Cause(clipped(8, 0), LESS),
     **{f"black {n:+d}": Cause(levels(black=n), r"black|own RAW", True) for n in (2, -2, 4, -4)},
@@ -508,7 +508,7 @@ def main(folder: Path, rows: Rows, only: str, width: int) -> None:
 
 
 if __name__ == "__main__":
-    stated = arguments(__doc__, "report", folder="/tmp/planted", only="", width=400)
+    stated = arguments(__doc__, "report", folder="/tmp/planted", only="", width=512)
     if not stated.report:
         main(Path(stated.folder), stated.rows, stated.only, stated.width)
     report(stated.rows)

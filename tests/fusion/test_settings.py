@@ -17,6 +17,7 @@ from polcap.fusion.view_path import SessionView
 from polcap.pipeline.cache import LazyCache, MemoryCache, StageResult
 from polcap.pipeline.path import UserInput
 from polcap.quality import fused_object
+from polcap.quality.fused_object import SeenSurface
 from tests.fusion import board_views, ellipsoid
 
 SETTINGS = list(configs.settings(SessionConfig))
@@ -75,7 +76,7 @@ def outcome(tmp_path_factory: pytest.TempPathFactory) -> Callable[[SessionConfig
             fused_object.poses({"view01": 0.1}, False, limits),
             fused_object.agreement({"view01": 6.0}, limits),
             fused_object.join("setB", 0.9, limits),
-            fused_object.seen(0.9, 1, limits),
+            fused_object.seen(SeenSurface(0.9, 0.0, 0.1, 0.0), 1, limits),
         ]
         built = FusedSource(atlas, maps, config.asset).whole(8, ())
         return [
