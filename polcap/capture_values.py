@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -146,6 +147,11 @@ class Capture:
     angles: AngleStatement = AngleStatement()
     lens_filter: str = field(default="", metadata=NOT_IN_KEY)  # the polarizer's name, from capture.toml
     accuracy: BallAccuracy | None = field(default=None, metadata=NOT_IN_KEY)  # of these, on a ball; None: not validated
+
+    def file_name(self, frame: Frame) -> str:
+        """A photograph's file as the user finds it in the capture's folder."""
+        path = Path(frame.path)
+        return (path.relative_to(self.folder) if path.is_relative_to(self.folder) else path).as_posix()
 
     @property
     def all_shots(self) -> tuple[Shot, ...]:

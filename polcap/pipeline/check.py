@@ -12,7 +12,7 @@ from time import perf_counter
 
 import msgspec
 
-from polcap.capture_values import Capture, Frame
+from polcap.capture_values import Capture
 from polcap.chart_values import ChartRequest, ColorCalibration
 from polcap.config import Config
 from polcap.errors import ChartError, DecodeError, InputError
@@ -24,12 +24,11 @@ from polcap.pipeline.path import AUTO, UserInput, path, results_of
 from polcap.pipeline.small_capture import SmallCapture
 from polcap.quality import gates
 from polcap.quality.advice import advise
-from polcap.quality.gate import Evidence, Gate
+from polcap.quality.gate import Evidence, Gate, of_error
 from polcap.stage_values import Network
 
 _THREADS = 2  # frames that are decoded at a time
 _SYMMETRIES = 2  # positions of the network, one for each size: gates read medians of its maps only
-_ERROR_COST_DEG = 45.0  # of a stage that gives up: nothing is known of the normals
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -95,25 +94,12 @@ def _judge(capture: Capture, small: SmallCapture, supplied: UserInput, config: C
         clipped=small.clipped,
         blur_px=small.blur_px,
         align=config.align,
-        files=tuple(tuple(_name(frame, capture) for frame in shot.frames) for shot in capture.shots),
+        files=tuple(tuple(capture.file_name(frame) for frame in shot.frames) for shot in capture.shots),
         grid_px=small.step / (small.merged_px if config.hdr.demosaic == "superpixel" else 1),
         chart_missing=chart_missing,
         later_view=folder_names.is_later_view(Path(capture.folder)),
     )
-    return advise(gates.judge(evidence, config.gates, None if failure is None else _gate_of(failure)))
-
-
-def _name(frame: Frame, capture: Capture) -> str:
-    """A photograph as the user finds it in the capture's folder."""
-    path = Path(frame.path)
-    return (path.relative_to(capture.folder) if path.is_relative_to(capture.folder) else path).as_posix()
-
-
-def _gate_of(error: InputError) -> Gate:
-    """Gate of an error that ended the path."""
-    reason, _, remedy = str(error).partition("; ")
-    name = type(error).__name__.removesuffix("Error").lower()
-    return Gate(name, "fail", None, None, reason, remedy, _ERROR_COST_DEG)
+    return advise(gates.judge(evidence, config.gates, None if failure is None else of_error(failure)))
 
 
 def _run_path(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config, cache: MemoryCache) -> str:

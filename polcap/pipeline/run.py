@@ -16,14 +16,14 @@ import msgspec
 from polcap import parallel, report
 from polcap.capture_values import Capture, Decode, Frame
 from polcap.config import Config, restore
-from polcap.errors import SettingError, StorageError
+from polcap.errors import InputError, SettingError, StorageError
 from polcap.formats import color_profile, own_files
 from polcap.formats.export import encoders, provenance
 from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
 from polcap.images import SensorImage
 from polcap.mesh_values import ReliefMesh
-from polcap.pipeline import asset_export, result_folder, unchanged
+from polcap.pipeline import asset_export, early_end, result_folder, unchanged
 from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, contents, silent
 from polcap.pipeline.path import UserInput, path
@@ -51,7 +51,10 @@ def process(
     """
     cache = StageCache(out, progress, force, until)
     with opened(capture, supplied, config, cache) as facts:
-        results = path(capture, supplied, config, cache)
+        try:
+            results = path(capture, supplied, config, cache)
+        except InputError as error:
+            raise early_end.explain(error, cache, capture, config) from error
         if until not in (None, ASSET):
             return None
         cache.begin(ASSET)

@@ -6,6 +6,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
+from polcap.errors import InputError
 from polcap.images import Bools, Floats, Quality
 from polcap.results import FIELDS, Results
 from polcap.stage_values import AngleStack
@@ -16,6 +17,7 @@ Unit = Literal["1", "px", "°", "×", "ΔE2000", ""]
 
 MOST_DEG = 90.0  # of an error: normals face the camera
 _ALIGN = AlignSettings()
+_ERROR_COST_DEG = 45.0  # of a stage that gives up: nothing is known of the normals
 DEGREES_PER_GAIN = 600.0  # 1 % of a shot's light tilts facing pixels by about 6° (error budget)
 
 
@@ -80,6 +82,13 @@ def full_size(
         align=align,
         files=files,
     )
+
+
+def of_error(error: InputError) -> Gate:
+    """Gate of an error that ended the path."""
+    reason, _, remedy = str(error).partition("; ")
+    name = type(error).__name__.removesuffix("Error").lower()
+    return Gate(name, "fail", None, None, reason, remedy, _ERROR_COST_DEG)
 
 
 def shot_names(radiance: AngleStack) -> list[str]:

@@ -54,7 +54,7 @@ _STEPS = (
     Step(("black level",), shot_exposure.black_level, "hdr", ("clipping",)),
     Step(("noise",), shot_exposure.noise, "stokes", ("clipping",)),
     Step(("sharpness",), geometry.sharpness, "hdr", _LIT),
-    Step(("alignment",), geometry.alignment, "mask", (*_LIT, "sharpness")),
+    Step(("alignment",), geometry.alignment, "align", (*_LIT, "sharpness")),
     Step(("chart",), light.chart, "whitebalance", ("clipping",)),
     Step(("mask",), geometry.mask, "mask", ("clipping", "alignment")),
     Step(("stillness",), shot_exposure.stillness, "mask", (*_FILES, *_PAIRED), ("black level", "sharpness")),
@@ -65,10 +65,10 @@ _STEPS = (
     Step(("order",), _without_limits(polarization.order), "selfcal", _EVEN, **_ROUND),
     Step(("angles", "body", "other light"), polarization.of_outline, "infer", (*_EVEN, "angles", "order"), **_ROUND),
     Step(("ambient",), light.ambient, "hdr"),
-    Step(("room light",), light.room_light, "infer", (*_POLARIZED, "other light")),
-    Step(("lighting",), light.side_light, "infer", (*_POLARIZED, "other light"), **_ROUND),
+    Step(("room light",), light.room_light, "infer", (*_POLARIZED, "other light"), ("sharpness",)),
+    Step(("lighting",), light.side_light, "infer", (*_POLARIZED, "other light"), ("flat", "sharpness"), ("contour",)),
     Step(("crossed",), light.crossed, "stokes", _PAIRED),
-    Step(("ill-posed",), polarization.ill_posed, "stokes", (*_POLARIZED, "other light", "lighting")),
+    Step(("ill-posed",), polarization.ill_posed, "stokes", (*_POLARIZED, "other light", "lighting"), ("sharpness",)),
     Step(("re-rendering",), rerendering.rerendering, "infer", _SHAPED, ("flat",)),
     Step(("outline",), geometry.inward_outline, "infer", (*_SHAPED, "re-rendering")),
     Step(("albedo scale",), light.albedo_scale, "infer", ("clipping", "chart")),
@@ -82,20 +82,22 @@ def judge(found: Evidence, limits: GateLimits, failure: Gate | None = None) -> l
     `failure` is the gate of the error that ended the path before a stage that gates judge.
     """
     judged: list[Gate] = []
+    unreached: list[str] = []
     for step in _STEPS:
-        cause = _cause(step, judged)
-        if cause is None and not found.has(step.stage):
-            assert failure is not None  # only an error ends the path before its gates
-            cause = next((gate.name for gate in judged if gate.state == "fail"), None)
-            if cause is None:
-                judged.append(failure)
-                cause = failure.name
-        if cause is not None:
+        if (cause := _cause(step, judged)) is not None:
             known = {gate.name for gate in judged}
             judged += [_not_judged(name, cause) for name in step.gates if name not in known]
-        else:
+        elif found.has(step.stage):
             gates = step.judge(found, limits)
             judged += [gates] if isinstance(gates, Gate) else gates
+        else:
+            unreached += step.gates
+    if unreached:
+        assert failure is not None  # only an error ends the path before its gates
+        cause = next((gate.name for gate in judged if gate.state == "fail"), "")
+        if not cause:
+            judged, cause = [*(gate for gate in judged if gate.name != failure.name), failure], failure.name
+        judged += [_not_judged(name, cause) for name in unreached if name != cause]
     if not any(gate.name == "order" and gate.state == "fail" for gate in judged) and found.has("infer"):
         judged.append(_normal_error(found, judged, limits))
         if found.has("surface"):

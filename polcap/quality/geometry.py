@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from polcap.formats import shipped_data
-from polcap.images import Bools, Floats
+from polcap.images import Bools, Floats, Quality
 from polcap.mesh_values import Mesh
 from polcap.optics import frames, outline
 from polcap.optics.morphology import dilate
@@ -16,7 +16,7 @@ from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean
 from polcap.optics.sharpness import TILE
-from polcap.quality import object_turn, rerendering, rim
+from polcap.quality import object_turn, rerendering, rim, shot_exposure
 from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, Unit, at_most, bad_shots, worded
 from polcap.quality.limits import GateLimits
 from polcap.stage_values import SurfaceMaps
@@ -29,8 +29,13 @@ _SIGMAS = 2.3  # of a push: one in two hundred still shots exceeds it
 _DEGREES_PER_TURN = 5.0  # error of the normals per degree by which the object turned (docs/benchmarks/gates.md)
 _FALSE_TURN_DEG = 0.2  # 1σ of a turn that polarization imitates
 _SHARP_PX, _DEGREES_PER_BLUR_PX = 1.2, 2.5  # greatest blur of sharp edges; error of the normals per px beyond it
+_DEGREES_PER_FRAME_BLUR_PX = 9.0  # of a reference frame beyond the limit: 12° at 2.2 and 2.7 px, 24° at 4.6
 _EDGE_FLOOR = 0.1  # of the object's median light: dark backdrops differ by less
 _LOCK = "Lock the camera, do not touch the object, and take that shot again"
+_MOST_CONTRADICTION = 0.1  # of the object; set by hand: noise, glare and swapped angles leave less than .01
+_TEXTURE = (
+    "Put something with texture next to the object, such as the chart; of a locked camera, --set align.model=none"
+)
 _HOLD_STILL = "Fix the object, do not touch it between shots, and take that shot again"
 _INWARD = 0.2  # sine of the zenith from which a normal leans inward
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
@@ -39,10 +44,14 @@ _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/ha
 def alignment(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on movement between shots: of the camera, of the object against its surroundings, and turns of the object.
 
-    The object is judged only if the camera passes. The first of the three that does not pass is the gate.
+    The object is judged only if the camera passes. The first that does not pass is the gate. Shots of two objects, or
+    of an object that something covers, contradict each other: more than all light would be polarized.
     """
     camera = _judge_camera(found, limits)
-    if camera.state != "pass":
+    if camera.remedy != _LOCK and found.has("stokes") and (share := _contradiction(found)) > _MOST_CONTRADICTION:
+        return _one_object(found, share)
+    blurred = np.nan_to_num(found.blur_px).max() > limits.max_blur_px  # looks like motion of the object
+    if camera.state != "pass" or not found.has("mask") or blurred:
         return camera
     shift, turn = _judge_shift(found, limits), _judge_turn(found, limits)
     worst = next((gate for gate in (shift, turn) if gate.state != "pass"), camera)
@@ -66,22 +75,52 @@ def _judge_camera(found: Evidence, limits: GateLimits) -> Gate:
         return Gate("alignment", "pass", value, most, message, unit="px")
     if (odd := unlike | ~np.isfinite(shift)).any():
         return _another_scene(found, odd)
-    failed = partial(Gate, "alignment", "fail", remedy=_LOCK, cost_deg=10.0, shots=bad_shots(names, bad), unit="px")
+    failed = partial(Gate, "alignment", "fail", cost_deg=10.0, shots=bad_shots(names, bad), unit="px")
     if far[k]:
-        return failed(value, most, message)
-    return failed(round(float(doubt[k]), 3), most_doubt, f"{message}: too little texture")
+        return failed(value, most, message, remedy=_LOCK)
+    message = f"{message}: it shares too little texture with the first one"
+    remedy = _TEXTURE if unsure[1:].all() else _check_files(found, unsure)
+    return failed(round(float(doubt[k]), 3), most_doubt, message, remedy=remedy)
 
 
 def _another_scene(found: Evidence, unlike: Bools) -> Gate:
     """Gate on shots (K,) that share no detail with the first one; if no shot does, the first is the odd one."""
-    odd = ~unlike if unlike[1:].all() else unlike
-    names, least = bad_shots(found.names, odd), found.align.min_correlation
+    odd, least = _odd(unlike), found.align.min_correlation
+    names = bad_shots(found.names, odd)
+    message = f"The {' and '.join(names)} shot shows another scene than the others, or the camera moved far"
+    value = round(float(found.alignment.correlation[unlike].min()), 3)
+    return Gate("alignment", "fail", value, least, message, _check_files(found, odd), MOST_DEG, names, unit="")
+
+
+def _contradiction(found: Evidence) -> float:
+    """Share of the object where the shots would need more polarized light than there is light."""
+    image = found.stokes
+    s0, s1, s2 = (cv2.blur(np.ascontiguousarray(part, np.float32), (5, 5)) for part in frames.total(image.stokes))
+    inside = image.mask & (image.quality & int(Quality.CLIPPED | Quality.OUTSIDE) == 0)
+    return float((np.hypot(s1, s2) > s0)[inside].mean()) if inside.any() else 0.0
+
+
+def _one_object(found: Evidence, share: float) -> Gate:
+    """Gate on shots that contradict each other: the odd one is that which resembles the others least."""
+    light = np.log(np.maximum(frames.total(found.radiance.value), 1e-6))[:, found.object_.mask]
+    alike = np.nan_to_num(np.corrcoef(light)).sum(0)
+    odd = np.arange(len(alike)) == int(np.argmin(alike))
+    names = bad_shots(found.names, odd)
+    message = f"The {names[0]} shot contradicts the others in {share:.0%} of the object: it shows another one, or moved"
+    remedy = _check_files(found, odd)
+    return Gate("alignment", "fail", share, _MOST_CONTRADICTION, message, remedy, MOST_DEG, names)
+
+
+def _odd(unlike: Bools) -> Bools:
+    """Which shots (K,) are the odd ones, from those that differ from the first shot."""
+    return ~unlike if unlike[1:].all() else unlike
+
+
+def _check_files(found: Evidence, odd: Bools) -> str:
+    """Advice for shots (K,) that may be of another object."""
     folders = sorted({str(PurePath(files[0]).parent) for files, one in zip(found.files, odd) if one} - {"."})
     where = f" in {', '.join(folders)}" if folders else ""
-    message = f"The {' and '.join(names)} shot shows another scene than the others, or the camera moved far"
-    remedy = f"Check the files of that shot{where}: are they of this object? Otherwise take the shot again"
-    value = round(float(found.alignment.correlation[unlike].min()), 3)
-    return Gate("alignment", "fail", value, least, message, remedy, MOST_DEG, names, unit="")
+    return f"Check the files of that shot{where}: are they of this object? Otherwise take the shot again"
 
 
 def _judge_shift(found: Evidence, limits: GateLimits) -> Gate:
@@ -100,9 +139,11 @@ def _judge_shift(found: Evidence, limits: GateLimits) -> Gate:
     figure = round(float(length[k]), 3)
     message = f"The object moved by {figure:.1f} ± {sigma[k]:.1f} px against its surroundings in {names[k]}"
     bad, moved = bad_shots(names, sure > limit), bad_shots(names, (sure > 0) & (length > least))
-    if np.isinf(length[k]):
-        message = f"The {names[k]} shot shows another object in the same surroundings"
-        return Gate("alignment", "fail", None, limit, message, _HOLD_STILL, 45.0, bad, "px")
+    if (unlike := np.isinf(length)).any():
+        odd = _odd(unlike)
+        other = bad_shots(names, odd)
+        message = f"The {' and '.join(other)} shot shows another object in the same surroundings"
+        return Gate("alignment", "fail", None, limit, message, _check_files(found, odd), MOST_DEG, other, "px")
     if bad:
         return Gate("alignment", "fail", figure, limit, message, _HOLD_STILL, max(cost, 5.0), bad, "px")
     if moved:
@@ -210,9 +251,12 @@ def mesh(surface: Mesh, limits: GateLimits) -> Gate:
 
 
 def sharpness(found: Evidence, limits: GateLimits) -> Gate:
-    """Gate on the blur of each frame relative to the sharpest frame of the same exposure."""
+    """Gate on the blur of each frame relative to the sharpest frame of the same exposure.
+
+    It fails if the reference frame of a shot is blurred, because ghosts take their light from it; others only warn.
+    """
     blur, limit = found.blur_px, limits.max_blur_px
-    moved = float(np.abs(found.alignment.transform[:, :2, 2]).max()) * found.grid_px
+    moved = float(np.abs(found.alignment.transform[:, :2, 2]).max()) * found.grid_px if found.has("align") else 0.0
     if np.isnan(blur).all():
         return Gate("sharpness", "not measured", None, limit, "There is too little bright detail", unit="px")
     if not moved <= TILE / 2:  # tiles would compare unlike detail
@@ -220,11 +264,17 @@ def sharpness(found: Evidence, limits: GateLimits) -> Gate:
     k, e = (int(i) for i in np.unravel_index(int(np.nanargmax(blur)), blur.shape))
     text = f"Frame {e + 1} of the {found.names[k]} shot is blurred by {{:.1f}} px more than the sharpest"
     message = worded(float(blur[k, e]), text, "All frames are equally sharp")
-    bad = bad_shots(found.names, np.nanmax(np.nan_to_num(blur), axis=1) > limit)
-    remedy = "Focus by hand and tape the ring, use a remote release, and take it again"
-    of_shot = float(np.nan_to_num(blur).mean(axis=1).max())  # a single frame is only a part of its shot
-    state: State = "fail" if of_shot > limit else "warn"
-    return at_most("sharpness", float(blur[k, e]), limit, message, remedy, bad, 2 * of_shot, "px", state)
+    unsharp = np.asarray(np.nan_to_num(blur) > limit)
+    bad = bad_shots(found.names, np.asarray(unsharp.any(axis=1)))
+    remedy = "Focus by hand and tape the ring, use a remote release, and take that shot again"
+    if rescue := shot_exposure.leave_out(found, unsharp, limits):
+        remedy = f"{rescue}; or take that shot again: focus by hand, tape the ring, use a remote release"
+    reference = np.abs(np.log(found.radiance.bracket.exposure_ratio.mean(2))).argmin(1)  # (K,)
+    worst = float(np.nan_to_num(blur)[np.arange(len(blur)), reference].max())
+    cost = _DEGREES_PER_FRAME_BLUR_PX * max(worst - limit, 0.0)
+    return at_most(
+        "sharpness", float(blur[k, e]), limit, message, remedy, bad, cost, "px", "fail" if worst > limit else "warn"
+    )
 
 
 def focus(found: Evidence, limits: GateLimits) -> Gate:

@@ -17,6 +17,7 @@ from polcap.stage_values import Cues, SurfaceMaps
 from polcap.stages.cues import NOMINAL_IOR
 
 WHITE_QUANTILE = 0.995  # of the object's light; it becomes white
+_BRIGHTEST = 0.99  # quantile of the light from which a pixel is a highlight
 _JUDGED_PX = 256  # longest side on which the gate compares
 _OUTLIER = 5  # standard deviations of the differences
 _MOST_DOLP = 0.1  # more has no more weight: that of noise and of reflections
@@ -62,6 +63,8 @@ class Rerendering:
     flashed: Floats  # (H, W, 3) S0 of the maps under that flash, linear Rec.709
     scale: float  # brightness of the photographs over that of the re-rendering, median of the pixels
     agreement: float = float("nan")  # of the polarizations, see `_agreement`
+    difference: float = 0.0  # of both lights S0, relative, median of the pixels
+    highlights: float = 1.0  # S0 of the photographs over that of the re-rendering, where either is brightest
 
     def residuals(self, inside: Bools) -> dict[str, list[float]]:
         """Difference of photograph and re-rendering at each angle: `rms` without outliers, and share of `outliers`.
@@ -100,6 +103,8 @@ def rerender(small: ReducedResult, ior: float) -> Rerendering:
         on_ray = frames.axis_on_ray(np.float32(angle), ray)
         return np.asarray(s1 * np.cos(2 * on_ray) + s2 * np.sin(2 * on_ray))
 
+    shown = scale * lit
+    bright = (either := np.maximum(light, shown)) >= (np.quantile(either, _BRIGHTEST) if either.size else 0.0)
     measured, predicted = [], []
     for angle in small.angle:
         measured.append(seen * (1 + small.ratio[0] * np.cos(2 * angle) + small.ratio[1] * np.sin(2 * angle)) / white)
@@ -111,6 +116,8 @@ def rerender(small: ReducedResult, ior: float) -> Rerendering:
         flashed=stokes[0] * maps.mask[..., None],
         scale=scale,
         agreement=_agreement(small.ratio[:, small.sound], rendered[:, small.sound]),
+        difference=float(np.median(np.abs(light - shown) / np.maximum(light, 1e-6))) if light.size else 0.0,
+        highlights=float(light[bright].sum() / max(float(shown[bright].sum()), 1e-9)) if light.size else 1.0,
     )
 
 

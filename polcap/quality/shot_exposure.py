@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from polcap.images import Floats, Quality
+from polcap.images import Bools, Floats, Quality
 from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots, compared, grade, worded
 from polcap.quality.limits import GateLimits
 from polcap.stage_values import AngleStack, StokesImage
@@ -14,6 +14,7 @@ _EVEN_STEPS = (1.3, 20.0)  # from one exposure to the next: less is no bracket, 
 _ALIKE, _PROMISED = 1.15, 1.4
 _MISFIRE = 0.2  # change of one frame's light that fails; smaller ones are measured and corrected
 _CLIPPED_HIGHLIGHTS = 0.001  # of the object: from .002 on roughness errs by .06 more (docs/benchmarks/gates.md)
+_FULL = 0.95  # of the white level
 _MOST_CLIPPED = 0.97  # from here on the pictures do not show how bright the object is
 _CLIPPED_PICTURE = 0.1  # of a picture in which no object was found; a bright backdrop may clip
 _WHOLE = 0.5  # share of the object that moving parts do not reach in every shot
@@ -149,6 +150,26 @@ def _has_wrong_levels(radiance: AngleStack, ghost: Floats, limits: GateLimits) -
     return black or bool((ghost > _WHOLE).all() or ((ghost > _WHOLE) & curved).any())
 
 
+def leave_out(found: Evidence, bad: Bools, limits: GateLimits) -> str:
+    """Advice to leave out the exposure of the bracket that has all bad frames (K, E); empty if there is none.
+
+    The darkest exposure that remains must hold the object's highlights.
+    """
+    columns = np.flatnonzero(bad.any(axis=0))
+    count = bad.shape[1]
+    if len(columns) != 1 or count < 2 or not found.files:
+        return ""
+    rest = [e for e in range(count) if e != columns[0]]
+    ratio = found.radiance.bracket.exposure_ratio  # (K, E, 3)
+    darkest = min(rest, key=lambda e: float(ratio[:, e].mean()))
+    inside = found.object_.mask if found.has("mask") else np.ones(found.radiance.value.shape[1:3], bool)
+    full = (found.radiance.value[:, inside] * ratio[:, darkest, None]).max(2) > _FULL  # (K, N)
+    if full.mean(1).max() > limits.max_clipped:
+        return ""
+    names = ", ".join(files[columns[0]] for files in found.files)
+    return f"Move {names} out of the folder: the same exposure of every shot, without which the others suffice"
+
+
 def clipping(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on the share of the object that is clipped in the shortest exposure; of the picture without an object."""
     known = found.has("mask")
@@ -206,6 +227,8 @@ def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     message = f"Frame {e + 1} of {names[k]} was {compared(change, 'its bracket')}"
     bad = bad_shots(names, np.abs(drift).max(1) > limit)
     remedy = remedy.replace("between shots", "within a bracket")
+    if rescue := leave_out(found, np.abs(drift) > limit, limits):
+        remedy = f"{rescue}. {remedy}"
     yield at_most(
         "energy", abs(change), limit, message, remedy, bad, beyond="fail" if abs(change) > _MISFIRE else "warn"
     )

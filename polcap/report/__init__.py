@@ -72,7 +72,7 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
     """Camera, angles and photographs of a capture, as report.json has them."""
     shots, first = [], capture.shots[0].frames[0].exif
     for shot in capture.shots:
-        frames = [_frame_facts(frame, Path(capture.folder)) for frame in shot.frames]
+        frames = [_frame_facts(frame, capture) for frame in shot.frames]
         shots.append({"angle_deg": round(float(np.degrees(shot.angle)), 6), "frames": frames})
     return {
         "name": capture.name,
@@ -94,10 +94,10 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
     }
 
 
-def _frame_facts(frame: Frame, folder: Path) -> dict[str, Any]:
-    path, exif = Path(frame.path), frame.exif
+def _frame_facts(frame: Frame, capture: Capture) -> dict[str, Any]:
+    exif = frame.exif
     return {
-        "file": (path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix(),
+        "file": capture.file_name(frame),
         "exposure_time": exif.exposure_time,
         "iso": exif.iso,
         "f_number": exif.f_number,

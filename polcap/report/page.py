@@ -28,6 +28,8 @@ _HEADLINE = {
     "warn": "Good to use, but check an assumption",
     "fail": "Check the result before you use it",
 }
+_SAME_LIGHT = (0.77, 1.3)  # ratio of highlights that agree, set by hand
+_SIMILAR = 0.15  # relative difference of pictures that agree, set by hand
 _ORDER = ("fail", "warn", "pass", "not measured", "not judged")  # of the gates in their table
 
 
@@ -144,6 +146,7 @@ def _maps(about: Mapping[str, Any], results: Results) -> tuple[dict[str, Any], d
     drawn = {
         "photograph": html.jpeg(srgb_eight_bits(bright * photograph)),
         "flashed": html.jpeg(srgb_eight_bits(bright * rendered.scale * rendered.flashed)),
+        "agreement": light_agreement(rendered),
         "maps": map_figures.of_result(small, results.mesh.metric),
         "differences": map_figures.differences(small, rendered, figures),
     }
@@ -155,6 +158,21 @@ def _maps(about: Mapping[str, Any], results: Results) -> tuple[dict[str, Any], d
         "exposure": bright * rendered.scale,
         "top": keys.F0.high,
     }
+
+
+def light_agreement(rendered: Rerendering) -> str:
+    """A sentence on whether the photograph and the maps under its flash agree, and on the gloss if they do not."""
+    percent, ratio = f"{100 * rendered.difference:.0f} %", rendered.highlights
+    if not _SAME_LIGHT[0] < ratio < _SAME_LIGHT[1]:
+        times = f"{max(ratio, 1 / max(ratio, 1e-3)):.1f} times {'brighter' if ratio > 1 else 'darker'}"
+        gloss = "glossier" if ratio > 1 else "duller"
+        return (
+            f"Both differ in the highlights: there the photograph is {times}, so the object is {gloss} than its maps of "
+            f"specular and roughness. Elsewhere they differ by {percent} (median)"
+        )
+    if rendered.difference > _SIMILAR:
+        return f"Both differ by {percent} (median); the pictures of the differences below show where"
+    return f"Both pictures agree, within {percent} (median), and in their highlights"
 
 
 def _mesh_preview(results: Results, settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.chart_values import ColorCalibration
+from polcap.chart_values import ChartReference, ColorCalibration
 from polcap.images import Bools, Floats, Quality
 from polcap.mesh_values import Asset, ReliefMesh
 from polcap.optics import color, frames
@@ -22,6 +22,9 @@ from polcap.report.sheets import WIDTH, Tile, sheet, write
 from polcap.report.sheets import Picture as Picture
 from polcap.results import Results
 from polcap.stage_values import Alignment, AngleStack, Cues, Gains, ObjectMask, StokesImage, SurfaceMaps
+from polcap.stages.whitebalance import chart_search
+
+_RED = (230, 40, 30)
 
 
 def of_stage(results: Results, stage: str) -> Picture:
@@ -39,6 +42,26 @@ def of_stage(results: Results, stage: str) -> Picture:
     }
     drawn = paint[stage]()
     return sheet(drawn) if isinstance(drawn, list) else drawn
+
+
+def stopped(results: Results, colors: ChartReference | None) -> Picture:
+    """Picture of the shots of a path that an error ended: red where all exposures are clipped.
+
+    With `colors`, of the chart that was not found, the first shot shows the patches of all that resembles it.
+    """
+    radiance, tiles = results.radiance, []
+    for k, degrees in enumerate(np.degrees(radiance.angle)):
+        shot = shrink(radiance.value[k], 2 * WIDTH)
+        clipped = (radiance.quality[k] & int(Quality.CLIPPED)) > 0
+        picture = display(shot)
+        picture[area_mean(clipped, picture.shape) > 0.5] = _RED
+        if k == 0 and colors is not None:
+            zoom = picture.shape[1] / radiance.value.shape[2]
+            for centers, _cost in chart_search.candidates(radiance.value[0], colors.is_block):
+                for x, y in np.round((centers + 0.5) * zoom - 0.5).astype(int).tolist():
+                    cv2.drawMarker(picture, (x, y), (255, 255, 0), cv2.MARKER_CROSS, 8)
+        tiles.append(Tile(picture, f"{degrees:g}° shot", note=f"red: {100 * clipped.mean():.1f} % are clipped"))
+    return sheet(tiles)
 
 
 def reference(radiance: AngleStack, color: ColorCalibration, widest: int | None = None) -> Picture:

@@ -142,7 +142,8 @@ def other_object(shot: int, frame: int | None = None) -> Plant:
     """The files are of another capture by the same camera."""
 
     def plant(to: Shooting) -> None:
-        other = studio(to.studio.shoot.seed + 7, to.studio.shoot.width)
+        without = {"chart": None} if to.studio.scene.chart is None else {}
+        other = studio(to.studio.shoot.seed + 7, to.studio.shoot.width, **without)
         light = other.through(ANGLES[shot])
         to.lights.append(lambda own, k, e: light if k == shot and frame in (None, e) else own)
 

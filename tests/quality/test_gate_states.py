@@ -48,13 +48,14 @@ ROUNDED = Flatness(contour=0.8, common=0.1, rim_dolp=0.2, rim_light=0.7, aligned
 FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
     "pushed": pushed(0.1, 0.1), "turn": ObjectTurn(np.array([0.0, 0.2, 0.1]), np.full(3, 0.1)),
-    "edge_blur": 0.8,
+    "edge_blur": 0.8, "contradiction": 0.0,
     "flatness": ROUNDED, "charted": 0.0, "rendered": rendered(), "noise": 0.001, "ill_posed": 0.0,
     "medians": [45.0, 0.2, 0.3],
     "normal_error": 4.0, "lean": 2.0, "crossed": light.CrossedFigures(0.0, 0, 0.0, 0.1),
 }  # fmt: skip
 MEASURES = {  # the function that measures each figure
     "surroundings": (light, "_surroundings_dolp"), "highlight": (light, "_highlight_dolp"),
+    "contradiction": (geometry, "_contradiction"),
     "pushed": (geometry, "_measure_shift"), "turn": (geometry, "_measure_turn"), "edge_blur": (geometry, "_edge_blur"),
     "rendered": (rerendering, "measure"),
     "charted": (geometry, "_chart_share"), "lean": (geometry, "_lean"),
@@ -135,6 +136,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("chart", "warn", {"chart_missing": "nothing like one"}),
     ("chart", "not measured", {}),
     ("chart", "not measured", {"chart_missing": "nothing like one", "later_view": True}),
+    ("alignment", "fail", {"figures": {"contradiction": 0.5}}),
     ("alignment", "pass", {}),
     ("alignment", "fail", {"alignment": {"transform": FAR}}),
     ("alignment", "fail", {"alignment": {"correlation": np.array([1.0, 0.1, 1.0])}}),

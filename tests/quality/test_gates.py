@@ -196,6 +196,32 @@ def test_a_blurred_frame_alone_explains_ghosts(good: Evidence) -> None:
     assert (found["sharpness"].state, found["stillness"].state) == ("warn", "not judged")
 
 
+@pytest.mark.parametrize(
+    ("frames", "brightness", "state", "rescued"),
+    [
+        ([(1, 2)], 0.1, "warn", True),  # the brightest frame: ghosts are taken from the reference
+        ([(1, 1)], 0.1, "fail", True),
+        ([(0, 0), (2, 0)], 0.1, "warn", True),
+        ([(0, 0), (2, 0)], 0.99, "warn", False),  # only the darkest exposure holds the highlights
+        ([(0, 0), (2, 1)], 0.1, "fail", False),  # two exposures
+    ],
+)
+def test_the_exposure_that_a_bracket_can_do_without_is_named(
+    good: Evidence, frames: list[tuple[int, int]], brightness: float, state: str, rescued: bool
+) -> None:
+    ratio = np.tile([[[0.25], [1.0], [4.0]]], (3, 1, 3))
+    value = np.full_like(good.radiance.value, brightness)
+    radiance = bracket(replace(good.radiance, value=value), exposure_ratio=ratio, exif_ratio=ratio[..., 0])
+    blur = np.zeros((3, 3))
+    for place in frames:
+        blur[place] = 2.5
+    files = tuple(tuple(f"pol{k}/{e}.DNG" for e in range(3)) for k in range(3))
+    gate = judged(changed(good, radiance=radiance, blur_px=blur, files=files))["sharpness"]
+    e = frames[0][1]
+    assert gate.state == state and (f"Move pol0/{e}.DNG, pol1/{e}.DNG, pol2/{e}.DNG out" in gate.remedy) is rescued
+    assert "take that shot again" in gate.remedy and (gate.cost_deg > 5) is (state == "fail")
+
+
 def test_an_error_is_a_gate_unless_an_earlier_cause_explains_it(good: Evidence) -> None:
     error = Gate("alignment", "fail", None, None, "shot 45° has no detail", "shoot again")
     reached = {name: value for name, value in vars(good).items() if name not in STOPPED}

@@ -11,6 +11,7 @@ from polcap import report
 from polcap.errors import StorageError
 from polcap.formats.maps import maps_folder
 from polcap.quality.rerendering import Rerendering
+from polcap.report import page
 
 
 def test_report_is_plain_json_with_figures_gates_and_settings(result: Path) -> None:
@@ -41,6 +42,24 @@ def test_a_few_pixels_do_not_carry_the_residual_of_the_rerendering(rng: np.rando
     found = Rerendering(measured, predicted, np.zeros((53_000, 1, 3)), 1.0).residuals(np.ones((53_000, 1), bool))
     assert found["rms"] == pytest.approx([0.03, 0.03], rel=0.02)
     assert found["outliers"] == pytest.approx([0, 23 / 53_000], abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("difference", "highlights", "words"),
+    [
+        (0.06, 1.1, "Both pictures agree, within 6 %"),
+        (0.06, 2.5, "2.5 times brighter, so the object is glossier"),
+        (0.06, 0.4, "2.5 times darker, so the object is duller"),
+        (0.4, 1.0, "Both differ by 40 %"),
+    ],
+)
+def test_photograph_and_rerendering_agree_only_where_the_page_says_so(
+    difference: float, highlights: float, words: str
+) -> None:
+    none = np.zeros((1, 1, 1))
+    rendered = Rerendering(none, none, np.zeros((1, 1, 3)), 1.0, 1.0, difference, highlights)
+    said = page.light_agreement(rendered)
+    assert words in said and ("agree" in said) is (words.startswith("Both pictures agree"))
 
 
 @pytest.mark.parametrize("text", [None, "{", "[]", "{}"])

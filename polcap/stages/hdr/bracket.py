@@ -4,6 +4,7 @@ Each frame is compared with the bracket's reference frame, after binning: one pi
 """
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -164,7 +165,8 @@ def _compare_frame(
     source: _BracketSignals, e: int, still: Signals, pyramid: Pyramid, limit_px: float
 ) -> RegisteredFrame:
     """Measure motion, exposure ratio, noise and misfit of frame e relative to the reference frame."""
-    reference, name = source.reference, f"frame {e + 1} of {source.name}"
+    reference, file = source.reference, Path(source.frames[e].path)
+    name = f"{file.name}, frame {e + 1} of {source.name},"
     found, gain = source.signals(e), None
     same_size(name, found.shape, still.shape)
     motion = measure_motion(name, pyramid, brightness_pyramid(found), limit_px / source.raw_px)
@@ -210,8 +212,9 @@ def measure_motion(name: str, still: Pyramid, other: Pyramid, limit_px: float) -
     found = register(still, other)
     if found.shift_px > limit_px:
         raise CaptureError(
-            f"{name} moved by {found.shift_px:.0f} px against the bracket's reference frame, more than "
-            f"{limit_px:.0f}: use a tripod, or raise hdr.max_motion_px"
+            f"{name} moved by {found.shift_px:.0f} px against the bracket's reference frame, more than {limit_px:.0f}, "
+            "or it shows another scene; check this file, and take it again with a tripod; or move it out of the folder, "
+            "with the same exposure of every other shot; or raise hdr.max_motion_px"
         )
     return found.matrix if found.shift_px > max(_STILL_PX, _MOTION_SIGMAS * found.sigma_px) else None
 

@@ -159,7 +159,7 @@ def measured_or_stated(name: str, measured: Ratio | None, channels: int, frame: 
             why = "the flash fired, so its shutter time does not set the exposure"
         raise CaptureError(
             f"{name} shares too few well exposed pixels with the reference frame to measure its exposure, "
-            f"and {why}: state `exposure` in capture.toml, or leave the frame out"
+            f"and {why}; state `exposure` in capture.toml, or leave the frame out, with the same exposure of every shot"
         )
     return np.full(channels, by_metadata, np.float32)
 

@@ -101,7 +101,7 @@ def test_tripod_bracket_is_not_resampled():
 def test_too_much_motion_is_refused():
     rng = np.random.default_rng(7)
     frames = [frame(photograph(1, rng), iso=100.0), frame(photograph(2, rng, turned(9, 9, 0)), iso=100.0)]
-    with pytest.raises(CaptureError, match=r"frame \d of shot 0° moved by .* hdr.max_motion_px"):
+    with pytest.raises(CaptureError, match=r"frame \d of shot 0°, moved by .*; check this file.* hdr.max_motion_px"):
         merge(capture(frames), hdr.HdrSettings(max_motion_px=4))
 
 
