@@ -213,7 +213,7 @@ def measure_motion(name: str, still: Pyramid, other: Pyramid, limit_px: float) -
     if found.shift_px > limit_px:
         raise CaptureError(
             f"{name} moved by {found.shift_px:.0f} px against the bracket's reference frame, more than {limit_px:.0f}, "
-            "or it shows another scene; check this file, and take it again with a tripod; or move it out of the folder, "
+            "or it shows another scene; check this file, take it again with a tripod, or move it out of the folder, "
             "with the same exposure of every other shot; or raise hdr.max_motion_px"
         )
     return found.matrix if found.shift_px > max(_STILL_PX, _MOTION_SIGMAS * found.sigma_px) else None
