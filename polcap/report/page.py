@@ -13,7 +13,7 @@ from polcap.formats import html
 from polcap.formats.capture import layouts
 from polcap.formats.maps import png
 from polcap.optics.color import srgb_eight_bits
-from polcap.quality.rerendering import rerender
+from polcap.quality.rerendering import Rerendering, rerender
 from polcap.report import chart_colors, keys, labels, levels, map_figures, page_data, plots
 from polcap.report import stage_pictures as pictures
 from polcap.report.keys import Palette
@@ -167,8 +167,8 @@ def light_agreement(rendered: Rerendering) -> str:
         times = f"{max(ratio, 1 / max(ratio, 1e-3)):.1f} times {'brighter' if ratio > 1 else 'darker'}"
         gloss = "glossier" if ratio > 1 else "duller"
         return (
-            f"Both differ in the highlights: there the photograph is {times}, so the object is {gloss} than its maps of "
-            f"specular and roughness. Elsewhere they differ by {percent} (median)"
+            f"Both differ in the highlights: there the photograph is {times}, so the object is {gloss} than its maps "
+            f"of specular and roughness. Elsewhere they differ by {percent} (median)"
         )
     if rendered.difference > _SIMILAR:
         return f"Both differ by {percent} (median); the pictures of the differences below show where"
