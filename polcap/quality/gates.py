@@ -97,7 +97,8 @@ def judge(found: Evidence, limits: GateLimits, failure: Gate | None = None) -> l
         cause = next((gate.name for gate in judged if gate.state == "fail"), "")
         if not cause:
             judged, cause = [*(gate for gate in judged if gate.name != failure.name), failure], failure.name
-        judged += [_not_judged(name, cause) for name in unreached if name != cause]
+        known = {gate.name for gate in judged}
+        judged += [_not_judged(name, cause) for name in dict.fromkeys(unreached) if name not in known]
     if not any(gate.name == "order" and gate.state == "fail" for gate in judged) and found.has("infer"):
         judged.append(_normal_error(found, judged, limits))
         if found.has("surface"):
