@@ -32,9 +32,6 @@ class Limits:
     memory_gb: float = 0.0  # 0: no limit
 
 
-UNLIMITED = Limits()
-
-
 @dataclass(frozen=True)
 class Died:
     """Outcome of a task whose process died at every attempt."""

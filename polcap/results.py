@@ -13,10 +13,6 @@ if TYPE_CHECKING:  # the command line needs the names of the stages before the v
     from polcap.stage_values import Alignment, AngleStack, Cues, ObjectMask, SelfCalibration, StokesImage, SurfaceMaps
 
 
-class NotReached(AttributeError):
-    """Error: the code asked for the result of a stage that did not run."""
-
-
 @dataclass(frozen=True)
 class Results:
     """One value per stage, and the cache keys; after an early stop only the first stages have values."""
@@ -34,15 +30,10 @@ class Results:
 
     @classmethod
     def partial(cls, **made: Any) -> Self:
-        """Results of some stages only; access to the result of any other stage raises NotReached."""
+        """Results of some stages only, without the attributes of the others."""
         found = object.__new__(cls)
         vars(found).update(made)
         return found
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            raise NotReached(f"the path stopped before {name}")
 
 
 FIELDS = {one.metadata["stage"]: one.name for one in fields(Results) if "stage" in one.metadata}  # by stage

@@ -271,6 +271,15 @@ def test_a_run_that_ended_early_joins_no_old_result(copy: Path, example: Path, p
     assert (copy / "report.json").read_bytes() == report
 
 
+def test_the_asset_is_the_last_stage_and_no_part_of_another_run(copy: Path, example: Path, polcap: Command) -> None:
+    command = ("process", example, "--out", copy, "--estimator", "analytic", "--until")
+    (copy / "asset" / "capture.glb").unlink()
+    assert polcap(*command, "asset").returncode == 0 and (copy / "asset" / "capture.glb").exists()
+    assert polcap(*command, "surface", "--set", "surface.back=closed").returncode == 0
+    shown = polcap("show", copy, "asset")
+    assert shown.returncode == 2 and "of two runs" in shown.stderr
+
+
 def test_maps_and_report_of_two_runs_are_not_exported(copy: Path, polcap: Command) -> None:
     maps = json.loads((copy / "maps" / "maps.json").read_text())
     (copy / "maps" / "maps.json").write_text(json.dumps({**maps, "keys": {**maps["keys"], "mask": "other"}}))

@@ -4,11 +4,10 @@ A stage runs when its result is first needed: the session first asks all views f
 object. These give the poses. Then it asks for masks, compares them, and processes each view like a single capture.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from polcap.capture_values import Capture
 from polcap.chart_values import ColorCalibration
@@ -25,6 +24,7 @@ from polcap.pipeline import run
 from polcap.pipeline.cache import LazyCache, StageResult
 from polcap.pipeline.path import UserInput
 
+T = TypeVar("T")
 _REFUSED = ("order",)  # gates of a view whose failure makes its normals wrong everywhere
 
 
@@ -62,36 +62,31 @@ def path(view: SessionView, cache: LazyCache) -> ViewStages:
     return ViewStages(color, board, features, found)
 
 
-@contextmanager
-def _stages(view: SessionView) -> Iterator[ViewStages]:
-    """Context manager: the stages of a view on its stage cache, whose folder is locked."""
+def _value(view: SessionView, choose: Callable[[ViewStages], StageResult[T]]) -> T:
+    """The value of a stage of a view, from its stage cache or computed; the folder is locked."""
     cache = LazyCache(view.out)
     with run.opened(view.capture, view.supplied, view.config, cache):
-        yield path(view, cache)
+        return choose(path(view, cache)).value
 
 
 def find_chart(view: SessionView) -> ColorCalibration:
     """Color calibration of a view. Raises ChartError: it shows no chart."""
-    with _stages(view) as stages:
-        return stages.color.value
+    return _value(view, lambda stages: stages.color)
 
 
 def find_board(view: SessionView) -> BoardSearch:
     """Search the board in a view. Raises CaptureError: as `board_corners.detect`."""
-    with _stages(view) as stages:
-        return stages.board.value
+    return _value(view, lambda stages: stages.board)
 
 
 def find_features(view: SessionView) -> ObjectFeatures:
     """Find features of the object, and a first mask. Raises CaptureError: as `object_features.find`."""
-    with _stages(view) as stages:
-        return stages.features.value
+    return _value(view, lambda stages: stages.features)
 
 
 def find_mask(view: SessionView) -> ViewMask:
     """Find the mask of the object before the board. Raises ObjectError: no object is found."""
-    with _stages(view) as stages:
-        return stages.mask.value
+    return _value(view, lambda stages: stages.mask)
 
 
 def make_maps(view: SessionView) -> dict[str, Any]:

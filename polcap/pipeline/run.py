@@ -187,14 +187,22 @@ def show(out: Path, stages: Sequence[str]) -> list[Path]:
     with result_folder.opened(out):
         for stage in stages:
             drawn.append(out / "work" / f"{stage}.png")
-            png.write(drawn[-1], _textures(out) if stage == ASSET else pictures.of_stage(results, stage))
+            png.write(drawn[-1], _textures(out, results) if stage == ASSET else pictures.of_stage(results, stage))
     return drawn
 
 
-def _textures(out: Path) -> pictures.Picture:
-    """Picture of the textures of a finished result's asset. Raises StorageError: it is not finished."""
-    config = restore(Config, report.read(out), out / "report.json")
-    return pictures.textures(asset_export.read(out / "maps", config).whole(8, ()))
+def _textures(out: Path, results: Results) -> pictures.Picture:
+    """Picture of the textures of a finished result's asset. Raises StorageError: as `_report_of`."""
+    config = restore(Config, _report_of(out, results), out / "report.json")
+    return pictures.textures(asset_export.read(out / "maps", config, results.mesh).whole(8, ()))
+
+
+def _report_of(out: Path, results: Results) -> dict[str, Any]:
+    """The report.json of a finished result. Raises StorageError: it is not finished, or work/ is of another run."""
+    about = report.read(out)
+    if about["keys"] != {**about["keys"], **results.keys}:
+        raise StorageError(f"{out}: work/ and maps/ are of two runs; run `polcap process` again")
+    return about
 
 
 def animate(out: Path, motion: animation.Motion) -> list[Path]:
@@ -214,9 +222,7 @@ def judge_again(out: Path) -> dict[str, Any]:
     """
     results, facts = reopen(out)
     with result_folder.locked(out):
-        keys = report.read(out)["keys"]
-        if keys != {**keys, **results.keys}:
-            raise StorageError(f"{out}: work/ and maps/ are of two runs; run `polcap process` again")
+        keys = _report_of(out, results)["keys"]
         config = restore(Config, facts, out / "work" / "run.json")
         judged, results = report.judge(facts, results, config)
         about = report.document(facts, results, judged, config, timings(out))
