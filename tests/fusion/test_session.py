@@ -36,7 +36,7 @@ ANALYTIC = Request(estimator="analytic")
 SILENT = StepRunner(None, lambda _: None)
 
 
-def session_of(folder: Path, *names: str) -> SessionInput:
+def session_of(folder: Path, *names: str) -> SessionInput[SessionConfig]:
     for name in names:
         (folder / name).mkdir()
     return SessionInput(folder, SessionConfig(), ANALYTIC)
