@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from polcap.chart_values import ColorCalibration
 from polcap.errors import AlignmentError
-from polcap.images import Floats
+from polcap.images import Floats, MaskedImage, Quality
 from polcap.optics import registration
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import Pyramid
@@ -23,6 +23,7 @@ from polcap.stages.align.detail import averaging_step, detail, edge_strength, sh
 
 _SURE_CORRELATION = 0.6  # of detail, from which edges need not be compared
 _MOST_PIXELS = 0.5e6  # a larger picture is averaged down first: it has detail to spare
+_OVEREXPOSED, _TOO_DARK = 0.2, 3.0  # share of a picture; signal over noise of its median pixel
 _FLOOR_PX = 0.02  # error that aliasing leaves whatever the noise: the bundled capture's is .026 and .025 (decision 19)
 
 
@@ -64,10 +65,15 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: AlignSetti
     for k in range(1, shots):
         shot = detail(radiance.shot(k), detail_px, step)
         name = f"shot {np.degrees(radiance.angle[k]):g}°"
+        if not (shows_detail(reference) and shows_detail(shot)):
+            raise _no_detail(name, radiance.shot(k))
         transform[k], residual[k], correlation[k] = _register_shot(name, reference, shot, step, settings)
     if radiance.crossed is not None:
         shot = detail(radiance.crossed.picture, detail_px, step)
-        crossed, _, _ = _register_shot("the cross-polarized shot", reference, shot, step, settings)
+        name = "the cross-polarized shot"
+        if not (shows_detail(reference) and shows_detail(shot)):
+            raise _no_detail(name, radiance.crossed.picture)
+        crossed, _, _ = _register_shot(name, reference, shot, step, settings)
     return Alignment(transform, residual, correlation, crossed)
 
 
@@ -78,6 +84,21 @@ def _of_mosaic(offset_px: Floats) -> Alignment:
     return Alignment(transform, np.zeros(len(offset_px)), np.ones(len(offset_px)))
 
 
+def _no_detail(name: str, picture: MaskedImage) -> AlignmentError:
+    """Error of a shot that shares no detail with the first one, with the likely cause."""
+    clipped = float(((picture.quality & int(Quality.CLIPPED)) > 0).mean())
+    signal = float(np.median(picture.value / np.sqrt(np.maximum(picture.variance, 1e-12))))
+    cause, remedy = "even all over", "put something with texture next to the object"
+    if clipped > _OVEREXPOSED:
+        cause, remedy = f"{clipped:.0%} of it is over-exposed", "shoot with less light, or add a darker exposure"
+    elif signal < _TOO_DARK:
+        cause, remedy = "it is too dark", "use more light or a longer exposure"
+    return AlignmentError(
+        f"{name} has no unclipped detail in common with the first shot: {cause}; "
+        f"{remedy}; with a locked camera, --set align.model=none"
+    )
+
+
 def _register_shot(
     name: str, reference: Pyramid, shot: Pyramid, step: int, settings: AlignSettings
 ) -> tuple[Floats, float, float]:
@@ -85,11 +106,6 @@ def _register_shot(
 
     Raises AlignmentError.
     """
-    if not (shows_detail(reference) and shows_detail(shot)):
-        raise AlignmentError(
-            f"{name} has no unclipped detail in common with the first shot: over-exposed, black, or even all over; "
-            "shoot a darker frame, or with a locked camera --set align.model=none"
-        )
     found, correlation = _best_match(reference, shot, settings)
     transform = registration.scaled(found.matrix, step)
     corners = picture_corners(step * reference.shape[1], step * reference.shape[0])

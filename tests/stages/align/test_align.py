@@ -124,9 +124,14 @@ def test_strong_polarization_is_no_other_scene() -> None:
 
 def test_shots_with_nothing_to_compare_are_named() -> None:
     radiance = scenes.stack()
-    clipped = dataclasses.replace(radiance, quality=np.full_like(radiance.quality, 1))
-    with pytest.raises(AlignmentError, match="no unclipped detail"):
-        align.register(clipped, scenes.no_color(), align.AlignSettings())
+    even = np.full_like(radiance.value, 0.2)
+    for fields, words in (
+        ({"quality": np.full_like(radiance.quality, 1)}, "100% of it is over-exposed; shoot with less light"),
+        ({"value": even, "variance": np.full_like(even, 1e-6)}, "even all over; put something with texture"),
+        ({"value": 0 * even, "variance": np.full_like(even, 1e-6)}, "it is too dark; use more light"),
+    ):
+        with pytest.raises(AlignmentError, match=f"no unclipped detail in common with the first shot: {words}"):
+            align.register(dataclasses.replace(radiance, **fields), scenes.no_color(), align.AlignSettings())
 
 
 def test_an_object_that_moved_before_a_still_backdrop_is_distinguished_from_a_moved_camera():
