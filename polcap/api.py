@@ -204,7 +204,7 @@ def export(
     preset
         Program, such as "unreal"; it brings its formats. All are in `docs/how-to/export.md`.
     formats
-        Without a preset: of gltf, obj, ply, stl, usd, usdz, materialx, exr, iiif.
+        Without a preset: of gltf, obj, ply, stl, usd, usdz, materialx, exr, iiif, sfp.
     images, geometry
         Inside the GLB: "png", "jpeg", "webp" or "ktx2"; "float", "quantized" or "draco".
     triangles, texture_size

@@ -50,6 +50,7 @@ def export(
     usdz: Annotated[bool, Option("--usdz", help="asset/NAME.usdz, one file for phones (extra [usd])")] = False,
     materialx: Annotated[bool, Option("--materialx", help="asset/NAME.mtlx and textures")] = False,
     exr: Annotated[bool, Option("--exr", help="asset/NAME_layers.exr, every map as a layer")] = False,
+    sfp: Annotated[bool, Option("--sfp", help="asset/NAME_sfp/, for codes of shape from polarization")] = False,
     preset: Annotated[list[str] | None, _names(_PRESET, PRESETS)] = None,
     images: Images = None,
     geometry: Geometry = None,

@@ -67,7 +67,7 @@ def export(out: Path, *requests: ExportRequest) -> list[Path]:
     requests = tuple(_of_closed_mesh(request) for request in requests)
     for request in requests:
         asset_export.check(request)
-        for flag in {"exr", "iiif"} & set(asset_export.effective(request).formats):
+        for flag in {"exr", "iiif", "sfp"} & set(asset_export.effective(request).formats):
             raise SettingError(
                 f"--{flag} is for results of one view, not for a fused object; leave it out, and use maps/"
             )

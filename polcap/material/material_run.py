@@ -27,7 +27,7 @@ from polcap.quality import flat_sample, gates
 from polcap.quality.advice import advise
 from polcap.quality.gate import Gate
 
-_SINGLE_VIEW = {"exr"}  # formats that need the maps of one picture
+_SINGLE_VIEW = {"exr", "sfp"}  # formats that need the maps of one picture
 
 
 def measure(

@@ -29,6 +29,7 @@ from polcap.formats.export import (
     ply_stl,
     provenance,
     relightable_layer,
+    sfp,
     texture_set,
     usd,
     web_page,
@@ -265,6 +266,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Seq
         "usdz": partial(_write_usdz, folder / f"{stem}.usdz", whole, facts, encoder),
         "materialx": partial(_write_named, materialx.document, folder / f"{stem}.mtlx", whole, shared, comment),
         "exr": partial(_write_one, exr_layers.write, folder / f"{stem}_layers.exr", out / "maps", wanted.color, facts),
+        "sfp": partial(sfp.write, folder / f"{stem}_sfp", out / "maps"),
         "iiif": partial(_write_iiif, folder / f"{stem}_iiif", whole, facts, wanted.iiif or ""),
     }
     coarser = {folder / f"{stem}_lod{k}.glb": level for k, level in enumerate(found[1:], 1)}

@@ -11,8 +11,8 @@ from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.texture_set import Extra, Texture
 from polcap.mesh_values import Asset
 
-Format = Literal["gltf", "obj", "ply", "stl", "usd", "usdz", "materialx", "exr", "iiif"]
-FORMATS: tuple[Format, ...] = ("gltf", "obj", "ply", "stl", "usd", "usdz", "materialx", "exr", "iiif")
+Format = Literal["gltf", "obj", "ply", "stl", "usd", "usdz", "materialx", "exr", "iiif", "sfp"]
+FORMATS: tuple[Format, ...] = ("gltf", "obj", "ply", "stl", "usd", "usdz", "materialx", "exr", "iiif", "sfp")
 
 
 @dataclass(frozen=True)
