@@ -20,11 +20,11 @@ PICTURE = "stopped.png"  # in work/
 _OF_PIXELS = (CaptureError, ChartError, AlignmentError, ObjectError)  # the pictures show more about these
 
 
-def explain(error: InputError, cache: StageCache, capture: Capture, config: Config) -> InputError:
-    """The error, or one with the cause that gates find in the stages so far; it names a picture of these stages."""
+def explain(error: InputError, cache: StageCache, capture: Capture, config: Config) -> InputError | None:
+    """The error with the cause that gates find in the stages so far, and a picture of these; None without pixels."""
     reached = results_of(cache.results)
     if not isinstance(error, _OF_PIXELS) or "hdr" not in reached.keys:
-        return error
+        return None
     found = _registered(reached, config) if isinstance(error, AlignmentError) else reached
     files = tuple(tuple(capture.file_name(frame) for frame in shot.frames) for shot in capture.shots)
     evidence = full_size(found, capture.focal_doubt, config.align, files)

@@ -54,7 +54,9 @@ def process(
         try:
             results = path(capture, supplied, config, cache)
         except InputError as error:
-            raise early_end.explain(error, cache, capture, config) from error
+            if (explained := early_end.explain(error, cache, capture, config)) is None:
+                raise
+            raise explained from error
         if until not in (None, ASSET):
             return None
         cache.begin(ASSET)

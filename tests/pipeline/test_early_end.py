@@ -50,6 +50,13 @@ def told(folder: Path, request: ChartRequest, out: Path) -> str:
     return next(gate["remedy"] for gate in about["gates"] if gate["remedy"])
 
 
+def test_an_error_before_the_pictures_are_merged_stays_as_it_is(tmp_path: Path) -> None:
+    folder = shoot(tmp_path / "capture", causes.frame_moved(150, 1, 2))
+    with pytest.raises(InputError, match=r"IMG_0006\.DNG, frame 3 of shot 45°, moved by") as error:
+        run.process(captures.read(folder), UserInput(ChartRequest("none")), Config(), tmp_path / "out")
+    assert error.value.__cause__ is None and "stopped.png" not in str(error.value)
+
+
 def test_a_chart_that_is_not_found_leaves_the_picture_of_the_search(tmp_path: Path) -> None:
     folder = shoot(tmp_path / "capture", lambda to: None)
     with pytest.raises(InputError, match=r"--no-chart; see .*stopped\.png"):
