@@ -48,7 +48,7 @@ def alignment(found: Evidence, limits: GateLimits) -> Gate:
     of an object that something covers, contradict each other: more than all light would be polarized.
     """
     camera = _judge_camera(found, limits)
-    if camera.remedy != _LOCK and found.has("stokes") and (share := _contradiction(found)) > _MOST_CONTRADICTION:
+    if found.has("stokes") and (share := _contradiction(found)) > _MOST_CONTRADICTION:
         return _one_object(found, share)
     blurred = np.nan_to_num(found.blur_px).max() > limits.max_blur_px  # looks like motion of the object
     if camera.state != "pass" or not found.has("mask") or blurred:
@@ -103,7 +103,8 @@ def _contradiction(found: Evidence) -> float:
 def _one_object(found: Evidence, share: float) -> Gate:
     """Gate on shots that contradict each other: the odd one is that which resembles the others least."""
     light = np.log(np.maximum(frames.total(found.radiance.value), 1e-6))[:, found.object_.mask]
-    alike = np.nan_to_num(np.corrcoef(light)).sum(0)
+    with np.errstate(divide="ignore", invalid="ignore"):  # an even shot
+        alike = np.nan_to_num(np.corrcoef(light)).sum(0)
     odd = np.arange(len(alike)) == int(np.argmin(alike))
     names = bad_shots(found.names, odd)
     message = f"The {names[0]} shot contradicts the others in {share:.0%} of the object: it shows another one, or moved"
