@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from polcap.formats.capture.reader import read as read_capture
     from polcap.formats.maps.maps_folder import ResultMaps
     from polcap.formats.maps.result_maps import read as read_maps
-    from polcap.formats.maps.result_maps import read_cues, read_stokes
+    from polcap.formats.maps.result_maps import read_cues, read_stokes, read_stokes_covariance
     from polcap.images import View
     from polcap.mesh_values import Asset, Mesh
     from polcap.stage_values import Cues, StokesImage, SurfaceMaps
@@ -32,7 +32,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Asset", "Capture", "ChartRequest", "Config", "Cues", "Frame", "Mesh", "PolcapError", "Result", "ResultMaps",
     "Shot", "StokesImage", "SurfaceMaps", "View", "check", "export", "fuse", "load_config", "process", "read_capture",
-    "read_cues", "read_maps", "read_stokes",
+    "read_cues", "read_maps", "read_stokes", "read_stokes_covariance",
 ]  # fmt: skip
 _HOME = {  # public name → module and its name there
     **{name: ("polcap.api", name) for name in ("process", "check", "export", "fuse", "Result")},
@@ -44,6 +44,7 @@ _HOME = {  # public name → module and its name there
     "read_cues": ("polcap.formats.maps.result_maps", "read_cues"),
     "read_maps": ("polcap.formats.maps.result_maps", "read"),
     "read_stokes": ("polcap.formats.maps.result_maps", "read_stokes"),
+    "read_stokes_covariance": ("polcap.formats.maps.result_maps", "read_stokes_covariance"),
     **{name: ("polcap.capture_values", name) for name in ("Capture", "Frame", "Shot")},
     "ChartRequest": ("polcap.chart_values", "ChartRequest"),
     "View": ("polcap.images", "View"),

@@ -259,3 +259,5 @@ class SurfaceMaps(ArrayValue):
     albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown, albedos are relative
     detail: Floats | None = None  # (2H, 2W) float16, ln of the albedo of RAW pixels over `diffuse`, enlarged
     order: OrderTest | None = None  # None without a network, or without other orders
+    diffuse_error: Floats | None = None  # (H, W) 1σ of the mean of its channels; None until the gates judged
+    roughness_error: Floats | None = None  # (H, W) 1σ of `roughness`

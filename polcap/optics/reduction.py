@@ -36,6 +36,8 @@ class ObjectReduction:
             specular=self.mean(maps.specular),
             roughness=self.mean(maps.roughness),
             confidence=self.mean(maps.confidence),
+            diffuse_error=None if maps.diffuse_error is None else self.mean(maps.diffuse_error),
+            roughness_error=None if maps.roughness_error is None else self.mean(maps.roughness_error),
             depth_prior=None,
             mask=self.share > 0.5,
             view=replace(

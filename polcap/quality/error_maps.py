@@ -1,10 +1,12 @@
-"""Expected errors of each pixel: those of the estimator, and the costs of all gates.
+"""Expected errors of each pixel: of the normals, of the albedo and of the roughness.
 
+That of a normal is the estimator's own error, and the costs of all gates.
 A finding of a gate costs the same on the whole object, unless it has a place in `_PLACES`: there its pixels have their
 own costs, also where they are too few for a finding.
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,6 +16,7 @@ from polcap.optics.outline import disc_radius
 from polcap.optics.resize import area_mean
 from polcap.quality import geometry
 from polcap.quality.gate import MOST_DEG, Evidence, Gate
+from polcap.stage_values import SurfaceMaps
 
 _AROUND = 0.12  # 1σ over the object's radius: how far clipped pixels mislead the estimator
 _FINEST_PX = 4.0  # this distance on the reduced grid on which it is computed
@@ -22,6 +25,23 @@ _CLIPPED_AROUND = (0.0, 0.15, 0.3, 0.45, 0.6, 0.8, 1.0)
 _CLIPPED_DEG = (0.0, 5.0, 9.5, 22.0, 28.0, 25.0, 18.0)
 _CLIPPED_PART = 0.3  # clipped part of the object with these costs; they grow with its root, as a highlight's width
 _GHOST_DEG = 5.0  # where the exposures of a shot differ
+# 1σ by 150 simulated captures and the 4 rendered ones (docs/benchmarks/albedo.md); (network, analytic)
+_ALBEDO_FLOOR = 0.011  # of the diffuse albedo
+_ALBEDO = (0.08, 0.12)  # of it, relative, times the root of the expected normal error [degrees]
+_MOST_DEG = 9.0  # normal error: a larger one does not change the albedo more
+_ALBEDO_CLIPPED = 3.0  # relative, times the clipped shares of the object and around: light that no shot shows
+_ROUGHNESS = ((0.065, 0.045), (0.25, 0.0))  # constant, and times the roughness
+_ROUGHNESS_CLIPPED = (0.29, 0.3)  # factor and power of the clipped share: without highlights it is a guess
+
+
+def with_errors(found: Evidence, judged: Iterable[Gate]) -> SurfaceMaps:
+    """The maps with the expected errors of normals, albedo and roughness, with the costs of all gates."""
+    return replace(
+        found.maps,
+        confidence=expected_normal_error(found, judged),
+        diffuse_error=_diffuse_error(found),
+        roughness_error=_roughness_error(found),
+    )
 
 
 def expected_normal_error(found: Evidence, judged: Iterable[Gate]) -> Floats:
@@ -56,6 +76,30 @@ def _of_focal_length(found: Evidence) -> Floats:
     if not any(found.focal_doubt):
         return np.zeros(1)
     return geometry.lean(found.maps, *found.focal_doubt)
+
+
+def _diffuse_error(found: Evidence) -> Floats:
+    """1σ of the diffuse albedo (H, W), mean of the channels, if chart and object had the same light."""
+    maps, clipped = found.maps, _flagged(found, Quality.CLIPPED)
+    relative = _ALBEDO[_is_analytic(maps)] * np.sqrt(np.minimum(maps.confidence, _MOST_DEG))
+    if clipped.any():
+        hidden = _ALBEDO_CLIPPED * clipped.sum() / maps.mask.sum()
+        relative = np.hypot(relative, hidden * _share_around(clipped, maps.mask))
+    error = np.hypot(_ALBEDO_FLOOR, relative * maps.diffuse.mean(axis=-1))
+    return np.where(maps.mask, np.minimum(error, 1), 0).astype(np.float32)
+
+
+def _roughness_error(found: Evidence) -> Floats:
+    """1σ of the roughness (H, W). Highlights that are clipped leave it unknown on the whole object."""
+    maps, clipped = found.maps, _flagged(found, Quality.CLIPPED)
+    constant, slope = _ROUGHNESS[_is_analytic(maps)]
+    factor, power = _ROUGHNESS_CLIPPED
+    hidden = factor * float(clipped.sum() / max(maps.mask.sum(), 1)) ** power
+    return np.where(maps.mask, np.hypot(constant + slope * maps.roughness, hidden), 0).astype(np.float32)
+
+
+def _is_analytic(maps: SurfaceMaps) -> bool:
+    return maps.estimator == "analytic"
 
 
 def _flagged(found: Evidence, bit: Quality) -> Bools:

@@ -5,7 +5,6 @@ assumption. A gate that had nothing to measure is marked "not measured".
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -111,7 +110,7 @@ def judge(facts: Mapping[str, Any], results: Results, config: Config) -> tuple[l
     focal_doubt = tuple(facts["capture"].get("focal_doubt", (0.0, 0.0)))
     evidence = full_size(results, focal_doubt, config.align, files)
     judged = advise(gates.judge(evidence, config.gates))
-    maps = replace(results.maps, confidence=error_maps.expected_normal_error(evidence, judged))
+    maps = error_maps.with_errors(evidence, judged)
     return judged, Results.partial(**{**vars(results), "maps": maps})
 
 

@@ -86,6 +86,7 @@ ALBEDO = ColorKey(0, 1, "", (0, 0.25, 0.5, 0.75, 1))
 ROUGHNESS = ColorKey(0, 1, "", (0, 0.25, 0.5, 0.75, 1))
 F0 = ColorKey(0, 0.16, "", (0, 0.04, 0.08, 0.12, 0.16), digits=3)
 ERROR = ColorKey(0, 30, "°", (0, 1, 3, 10, 20, 30), "inferno", power=2, digits=1)  # 3° at a third of the bar
+MATERIAL_ERROR = ColorKey(0, 0.4, "", (0, 0.01, 0.05, 0.1, 0.2, 0.4), "inferno", power=2, digits=3)
 DIFFERENCE = ColorKey(-20, 20, " %", (-20, -10, 0, 10, 20), "balance", digits=1)
 SIGMA = ColorKey(0, 0.01, "", (0, 0.0025, 0.005, 0.01), "inferno", digits=4)
 

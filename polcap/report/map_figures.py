@@ -43,6 +43,7 @@ def of_result(small: PageMaps, metric: bool) -> list[MapFigure]:
     depth = small.depth * (1000.0 if metric else 1.0)
     depth_key = keys.depth(depth[inside & np.isfinite(depth)], metric)
     error_note = "smaller is better; 3° is very good"
+    errors = [("diffuse", "diffuse albedo", found.diffuse_error), ("roughness", "roughness", found.roughness_error)]
     return [
         normal("normal", "Normal", found.normal, inside),
         albedo("diffuse", "Diffuse albedo", "ρ_d, linear: red, green, blue", found.diffuse, inside, 1.0),
@@ -52,6 +53,11 @@ def of_result(small: PageMaps, metric: bool) -> list[MapFigure]:
         ),
         scalar("depth", "Depth", "distance along the optical axis", depth, inside, depth_key),
         scalar("error", "Expected error of the normal", error_note, found.confidence, inside, keys.ERROR),
+        *(
+            scalar(f"{name}-error", f"Expected error of the {title}", "1σ", error, inside, keys.MATERIAL_ERROR)
+            for name, title, error in errors
+            if error is not None
+        ),
         scalar("dolp", "Degree of linear polarization", "share of the light", small.dolp, inside, keys.DOLP),
         scalar(
             "aolp", "Angle of linear polarization", "from image right, counter-clockwise", small.aolp, inside, keys.AOLP

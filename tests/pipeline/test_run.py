@@ -48,6 +48,8 @@ def partial(folder: Path) -> list[Path]:
 def test_result_holds_what_the_contract_names(result: Path) -> None:
     named = """maps/normal.exr maps/normal.png maps/depth.exr maps/depth.png maps/diffuse.exr maps/diffuse.png
         maps/specular.exr maps/specular.png maps/roughness.exr maps/roughness.png maps/mask.png maps/confidence.exr
+        maps/diffuse_error.exr maps/roughness_error.exr
+        maps/stokes_covariance.exr
         maps/stokes.exr maps/cues.exr maps/maps.json asset/capture.glb asset/capture.obj asset/capture.mtl
         report.html report.json color.toml work"""
     assert [name for name in named.split() if not (result / name).exists()] == []

@@ -86,3 +86,39 @@ def test_the_headline_is_the_median_of_the_map(good: Evidence) -> None:
     error = error_maps.expected_normal_error(of, judged)
     median = float(np.median(error[of.maps.mask]))
     assert headline == pytest.approx(median, abs=0.006) and median > OWN
+
+
+def material_errors(of: Evidence) -> tuple[Floats, Floats]:
+    maps = error_maps.with_errors(of, ())
+    assert maps.diffuse_error is not None and maps.roughness_error is not None
+    return maps.diffuse_error, maps.roughness_error
+
+
+def test_albedo_and_roughness_have_errors_on_the_object_only(good: Evidence) -> None:
+    mask = good.maps.mask
+    for error in material_errors(good):
+        assert error[mask].min() > 0 and error.max() < 1 and not error[~mask].any()
+
+
+def test_the_error_of_the_albedo_follows_its_brightness_and_the_error_of_the_normals(good: Evidence) -> None:
+    mask = good.maps.mask
+    dark = changed(good, maps=replace(good.maps, diffuse=good.maps.diffuse / 10))
+    sure = changed(good, maps=replace(good.maps, confidence=good.maps.confidence / 4))
+    usual, of_dark, of_sure = (material_errors(of)[0][mask].mean() for of in (good, dark, sure))
+    assert 0.005 < of_dark < usual / 4 and of_sure == pytest.approx(usual / 2, rel=0.05)
+
+
+def test_clipped_light_makes_albedo_uncertain_there_and_roughness_everywhere(good: Evidence) -> None:
+    mask = good.maps.mask
+    of, square = flagged(good, Quality.CLIPPED, round(0.6 * disc_radius(mask)))
+    away = mask & ~dilate(square, round(0.4 * disc_radius(mask)))
+    (albedo, rough), (usual_albedo, usual_rough) = material_errors(of), material_errors(good)
+    assert (albedo[square] > 1.05 * usual_albedo[square]).all()
+    assert np.allclose(albedo[away], usual_albedo[away], rtol=0.02)
+    assert (rough[mask] > 1.05 * usual_rough[mask]).all()
+
+
+def test_the_analytic_estimator_states_larger_errors_of_the_material(good: Evidence) -> None:
+    network = changed(good, maps=replace(good.maps, estimator="network"))
+    for error, of_network in zip(material_errors(good), material_errors(network)):
+        assert (error[good.maps.mask] > of_network[good.maps.mask]).all()

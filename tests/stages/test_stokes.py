@@ -111,6 +111,32 @@ def test_covariance_is_the_scatter_of_repeated_captures(angles):
     assert np.allclose(actual / expected, 1, atol=0.05)  # 8640 values: 1.6 % of a variance
 
 
+@pytest.mark.parametrize(("shift", "least"), [(0.0, 0.97), (0.25, 0.5), (0.5, 0.3)])
+def test_residuals_over_the_covariance_have_mean_0_and_variance_1_or_less_between_pixels(shift, least):
+    """Resampling averages the noise of neighbors, so between pixels the covariance is an upper bound."""
+    moved = [np.array([[1, 0, shift * k], [0, 1, -shift * k], [0, 0, 1.0]]) for k in range(3)]
+    alignment = dataclasses.replace(scenes.still(), transform=np.array(moved))
+    true, found = (
+        stokes.solve(
+            scenes.stack(moved, noise=noise, seed=3),
+            alignment,
+            scenes.equal(),
+            scenes.ball_object(),
+            stokes.StokesSettings(),
+        )
+        for noise in (0.0, 0.01)
+    )
+    residual = (found.stokes - true.stokes)[:, found.mask].astype(float)  # (3, N, C)
+    full = np.empty((*residual.shape[1:], 3, 3))
+    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    for (i, j), covariance in zip(pairs, found.covariance[:, found.mask]):
+        full[..., i, j] = full[..., j, i] = covariance
+    normalized = np.linalg.solve(np.linalg.cholesky(full), np.moveaxis(residual, 0, -1)[..., None])[..., 0]
+    assert np.abs(normalized.mean((0, 1))).max() < 0.02
+    variance = normalized.var((0, 1))
+    assert least < variance.min() and variance.max() < 1.03
+
+
 def test_gains_divide_each_shot():
     gain = np.array([[1.0] * 3, [1.1] * 3, [0.9] * 3])
     radiance = seen((0, 45, 90), 0.3, 25)

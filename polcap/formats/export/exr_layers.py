@@ -20,6 +20,7 @@ from polcap.images import Floats
 LINEAR_REC709 = "lin_rec709"  # its alias in OpenColorIO configurations
 _COLORS = ("diffuse", "specular")
 _PLAIN = {"depth": "Z", "roughness": "Y", "confidence": "Y"}
+_ERRORS = ("diffuse_error", "roughness_error")
 _FLOAT = ("normal", "depth")  # layers of 32 bits; all others are half
 MEANINGS = {
     "S0, S1, S2": "linear Stokes parameters in camera channels; sensor white at the reference exposure = 1",
@@ -29,6 +30,8 @@ MEANINGS = {
     "specular": "specular albedo F0",
     "roughness": "perceptual roughness, alpha = roughness squared",
     "confidence": "expected error of the normal, degrees",
+    "diffuse_error": "expected error of diffuse, 1 sigma, mean of the channels",
+    "roughness_error": "expected error of roughness, 1 sigma",
     "dolp": "degree of linear polarization",
     "aolp": "angle of linear polarization, degrees, 0 to 180 from image x toward image up",
     "mask": "1 on the object",
@@ -60,7 +63,8 @@ def write(path: Path, maps: Path, color: str, header: Mapping[str, str]) -> None
         layers |= {f"{name}.{c}": converted[..., k] for k, c in enumerate("RGB")}
     normal, _ = exr.read(maps / "normal.exr")
     layers |= {f"normal.{axis}": normal[c] for axis, c in zip("xyz", "RGB")}
-    for name, letter in _PLAIN.items():
+    errors = {name: "Y" for name in _ERRORS if (maps / f"{name}.exr").exists()}  # older results have none
+    for name, letter in {**_PLAIN, **errors}.items():
         layers[f"{name}.{letter}"] = exr.read(maps / f"{name}.exr")[0][letter]
     cues, _ = exr.read(maps / "cues.exr")
     layers |= {f"{name}.Y": cues[name] for name in ("dolp", "aolp")}

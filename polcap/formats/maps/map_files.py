@@ -52,6 +52,26 @@ def _stokes_channels(stokes: StokesImage) -> dict[str, Floats]:
     return {f"S{s}.{c}": stokes.stokes[s, ..., k] for s in range(3) for k, c in enumerate("RGB")}
 
 
+STOKES_PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+def _covariance_channels(stokes: StokesImage) -> dict[str, Floats]:
+    """1σ of S0, S1 and S2, and their correlations: half floats hold both, but no small variances."""
+    s00, s01, s02, s11, s12, s22 = stokes.covariance
+    sigma = np.sqrt(np.maximum([s00, s11, s22], 0))
+    channels = {f"sigma.S{s}.{c}": _rounded(sigma[s, ..., k]) for s in range(3) for k, c in enumerate("RGB")}
+    for (i, j), covariance in zip(STOKES_PAIRS, (s01, s02, s12)):
+        correlation = covariance / np.maximum(sigma[i] * sigma[j], 1e-20)
+        channels |= {f"correlation.S{i}S{j}.{c}": _rounded(correlation[..., k]) for k, c in enumerate("RGB")}
+    return channels
+
+
+def _rounded(values: Floats) -> Floats:
+    """Values (H, W) rounded to 5 bits of mantissa, 1.6 %: enough for an error, and small when compressed."""
+    bits = values.astype(np.float16).view(np.uint16)
+    return ((bits + np.uint16(0x10)) & np.uint16(0xFFE0)).view(np.float16)
+
+
 def _cue_channels(cues: Cues) -> dict[str, Floats]:
     aolp = np.degrees(np.arctan2(cues.normalized_stokes[1], cues.normalized_stokes[0]) / 2) % 180.0
     return {
@@ -98,6 +118,7 @@ FLOAT_FILES = ("depth", "normal")  # .exr files of 32 bits; the others are half
 FILES: Mapping[str, tuple[tuple[Source, ...], Callable[..., Any]]] = {
     "stokes.exr": (("stokes",), _stokes_channels),
     "cues.exr": (("cues",), _cue_channels),
+    "stokes_covariance.exr": (("stokes",), _covariance_channels),
     "normal.exr": (("maps",), lambda maps: _channels("RGB", masked(maps.normal, maps.mask))),
     "normal.png": (("maps",), _normal_picture),
     "photograph.png": (("cues",), lambda cues: color.srgb_eight_bits(cues.radiance)),
@@ -110,6 +131,8 @@ FILES: Mapping[str, tuple[tuple[Source, ...], Callable[..., Any]]] = {
     "roughness.exr": (("maps",), lambda maps: {"Y": masked(maps.roughness, maps.mask)}),
     "roughness.png": (("maps",), lambda maps: png.sixteen_bits(masked(maps.roughness, maps.mask))),
     "confidence.exr": (("maps",), lambda maps: {"Y": masked(maps.confidence, maps.mask)}),
+    "diffuse_error.exr": (("maps",), lambda maps: {"Y": masked(maps.diffuse_error, maps.mask)}),
+    "roughness_error.exr": (("maps",), lambda maps: {"Y": masked(maps.roughness_error, maps.mask)}),
     DETAIL: (("maps",), lambda maps: detail_levels(maps.detail)),
     "mask.png": (("maps",), lambda maps: np.where(maps.mask, 255, 0).astype(np.uint8)),
 }

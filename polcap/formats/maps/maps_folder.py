@@ -34,6 +34,12 @@ _DETAIL_MEANING = (
     "0 where shading or noise explains the photograph's detail"
 )
 
+_ERROR_MEANINGS = {
+    "diffuse_error.exr": "expected error of diffuse, 1 sigma, mean of the channels, if chart and object had the same "
+    "light; half",
+    "roughness_error.exr": "expected error of roughness, 1 sigma; half",
+}
+
 _Side = Annotated[int, Meta(ge=1, le=1 << 16)]
 _Positive = Annotated[float, Meta(ge=1e-6, le=1e9)]
 _Place = Annotated[float, Meta(ge=-1e9, le=1e9)]
@@ -87,6 +93,7 @@ class _Description(MapsFile, frozen=True, kw_only=True):
     depth: _Depth
     estimator: str
     sizes: dict[str, tuple[_Side, _Side]] = {}
+    maps: dict[str, str] = {}
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -107,13 +114,14 @@ def write(folder: Path, results: Results) -> None:
     made = {"maps": maps, "mesh": mesh, "stokes": results.stokes, "cues": results.cues}
     near, median, far = map_files.depth_range(maps, mesh)
     depth = {"unit": "m" if mesh.metric else "relative", "near": near, "median": median, "far": far}
+    stated = _description(maps, depth)
     with atomic.folder_of_files(folder, "maps.json") as temporary:
         parallel.results(
             partial(_write, temporary / name, partial(encode, *(made[source] for source in sources)))
             for name, (sources, encode) in map_files.FILES.items()
-            if name != map_files.DETAIL or maps.detail is not None
+            if name in stated["maps"]
         )
-        atomic.write_json(temporary / "maps.json", {**_description(maps, depth), "keys": dict(results.keys)})
+        atomic.write_json(temporary / "maps.json", {**stated, "keys": dict(results.keys)})
 
 
 def _write(file: Path, content: Callable[[], Any]) -> None:
@@ -149,6 +157,7 @@ def read(folder: Path) -> ResultMaps:
         read_map(folder, name, "RGB", about.size) for name in ("normal", "diffuse", "specular")
     )
     roughness, confidence = (read_map(folder, name, "Y", about.size) for name in ("roughness", "confidence"))
+    with_errors = "diffuse_error.exr" in about.maps
     return ResultMaps(
         normal=normal,
         diffuse=diffuse,
@@ -161,6 +170,8 @@ def read(folder: Path) -> ResultMaps:
         estimator=about.estimator,
         albedo_sigma=None if percent is None else round(percent / 100, 3),
         detail=_read_detail(folder, about.size) if map_files.DETAIL in about.sizes else None,
+        diffuse_error=read_map(folder, "diffuse_error", "Y", about.size) if with_errors else None,
+        roughness_error=read_map(folder, "roughness_error", "Y", about.size) if with_errors else None,
         depth=np.where(inside, read_map(folder, "depth", "Z", about.size), np.nan).astype(np.float32),
         metric=about.depth.unit == "m",
     )
@@ -249,7 +260,10 @@ def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[st
             "mask.png": "8 bit, 255 on the object",
             **({} if maps.detail is None else {map_files.DETAIL: _DETAIL_MEANING}),
             "confidence.exr": "expected error of the normal, degrees; half",
+            **({} if maps.diffuse_error is None else _ERROR_MEANINGS),
             "stokes.exr": "S0.R ... S2.B in camera channels, linear, sensor white at the reference exposure = 1; half",
+            "stokes_covariance.exr": "sigma.S0.R ... sigma.S2.B, 1 sigma of each channel of stokes.exr; their "
+            "correlations, correlation.S0S1.R ... correlation.S1S2.B; photon and read noise; half",
             "cues.exr": "dolp; aolp in degrees, 0 ... 180; normalized.S1, normalized.S2; diffuse_color.R, .G, .B; "
             "with a cross-polarized shot the two parts of S0 as photograph.png has it, linear: scattered.R, .G, .B and "
             "mirrored.R, .G, .B; half",

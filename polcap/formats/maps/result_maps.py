@@ -1,4 +1,4 @@
-"""Reads the maps of a result folder for Python users: `polcap.read_maps`, `read_stokes` and `read_cues`."""
+"""Reads the maps of a result folder for Python users: `polcap.read_maps`, `read_stokes`, `read_cues` and others."""
 
 from pathlib import Path
 
@@ -7,6 +7,7 @@ import numpy as np
 from polcap.errors import DecodeError
 from polcap.formats import own_folders
 from polcap.formats.maps import exr, maps_folder
+from polcap.formats.maps.map_files import STOKES_PAIRS
 from polcap.formats.maps.maps_folder import ResultMaps
 from polcap.images import Floats
 
@@ -26,6 +27,25 @@ def read_stokes(result: str | Path) -> Floats:
     """
     found = _channels(_folder(result) / "stokes.exr", [f"S{s}.{color}" for s in range(3) for color in "RGB"])
     return np.moveaxis(np.stack(found).reshape(3, 3, *found[0].shape), 1, -1)
+
+
+def read_stokes_covariance(result: str | Path) -> Floats:
+    """Covariance of S0, S1, S2 of a result by noise, (3, 3, H, W, 3), in the squared unit of `read_stokes`.
+
+    It holds the noise of each pixel, not errors that pixels share (gains, angles, registration). Resampling averages
+    noise, so it is an upper bound for shots that moved by parts of a pixel.
+
+    Raises DecodeError: the file is missing or damaged.
+    """
+    file = _folder(result) / "stokes_covariance.exr"
+    sigma = [_channels(file, [f"sigma.S{s}.{color}" for color in "RGB"]) for s in range(3)]
+    scale = np.moveaxis(np.array(sigma), 1, -1)  # (3, H, W, 3)
+    covariance = scale[:, None] * scale[None]
+    for i, j in STOKES_PAIRS:
+        correlation = np.stack(_channels(file, [f"correlation.S{i}S{j}.{color}" for color in "RGB"]), axis=-1)
+        covariance[i, j] *= correlation
+        covariance[j, i] *= correlation
+    return np.asarray(covariance)
 
 
 def read_cues(result: str | Path) -> dict[str, Floats]:

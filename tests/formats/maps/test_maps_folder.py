@@ -21,7 +21,8 @@ from tests import surfaces
 
 FILES = {
     "normal.exr", "normal.png", "depth.exr", "depth.png", "diffuse.exr", "diffuse.png", "specular.exr",
-    "specular.png", "roughness.exr", "roughness.png", "mask.png", "confidence.exr", "stokes.exr",
+    "specular.png", "roughness.exr", "roughness.png", "mask.png", "confidence.exr", "diffuse_error.exr",
+    "roughness_error.exr", "stokes.exr", "stokes_covariance.exr",
     "cues.exr", "photograph.png", "maps.json",
 }  # fmt: skip
 
@@ -35,6 +36,7 @@ def write(folder: Path, of: SurfaceMaps, mesh: ReliefMesh, stokes: StokesImage, 
 @pytest.fixture(scope="module")
 def result() -> Result:
     of = surfaces.maps(roughness=0.4, specular=0.05)
+    of = replace(of, diffuse_error=0.1 * of.roughness, roughness_error=0.2 * of.roughness)
     rng = np.random.default_rng(4)
     stokes = rng.normal(0, 0.1, (3, *of.mask.shape, 3)).astype(np.float32)
     stokes[0] = np.abs(stokes[0]) + 0.5
@@ -146,6 +148,18 @@ def test_stokes_and_cues_are_readable_by_name(folder: Path, result: Result) -> N
     assert read["aolp"].min() >= 0 and read["aolp"].max() <= 180
 
 
+def test_the_covariance_of_the_stokes_parameters_comes_back(folder: Path, result: Result, tmp_path: Path) -> None:
+    of, mesh, image, cue = result
+    root = np.random.default_rng(8).normal(0, 0.02, (3, 3, *of.mask.shape, 3))
+    true = np.einsum("ikhwc,jkhwc->ijhwc", root, root)
+    packed = np.stack([true[i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]).astype(np.float32)
+    write(tmp_path / "maps", of, mesh, replace(image, covariance=packed), cue)
+    found = result_maps.read_stokes_covariance(tmp_path)
+    scale = np.sqrt(np.einsum("iihwc->ihwc", true))
+    assert (np.abs(found - true) <= 0.06 * scale[:, None] * scale[None]).all()
+    assert np.array_equal(found, np.swapaxes(found, 0, 1))
+
+
 def test_stored_maps_come_back(folder: Path, result: Result) -> None:
     of, mesh, *_ = result
     stored = maps.read(folder)
@@ -172,6 +186,19 @@ def test_the_mesh_of_the_stored_maps_is_that_of_the_stage(folder: Path, result: 
     again = surface.triangulate(read.depth, read, read.metric, settings)
     for name, value in vars(mesh).items():
         assert np.array_equal(value, getattr(again, name), equal_nan=isinstance(value, np.ndarray)), name
+
+
+def test_expected_errors_of_the_material_come_back_and_a_result_without_them_is_read(
+    folder: Path, result: Result, tmp_path: Path
+) -> None:
+    of, mesh, stokes, cue = result
+    stored = maps.read(folder)
+    assert stored.diffuse_error is not None and stored.roughness_error is not None
+    assert np.allclose(stored.diffuse_error[of.mask], 0.04, rtol=1e-3)
+    assert np.allclose(stored.roughness_error[of.mask], 0.08, rtol=1e-3)
+    write(tmp_path / "maps", replace(of, diffuse_error=None, roughness_error=None), mesh, stokes, cue)
+    without = maps.read(tmp_path / "maps")
+    assert without.diffuse_error is None and without.roughness_error is None
 
 
 def test_relative_depth_is_described_as_relative(result: Result, tmp_path: Path) -> None:
@@ -217,6 +244,6 @@ def test_python_reads_the_maps_of_a_result_by_any_of_its_folders(
 
 
 def test_a_folder_without_maps_is_one_clear_line(tmp_path: Path) -> None:
-    for read in (result_maps.read, result_maps.read_stokes, result_maps.read_cues):
+    for read in (result_maps.read, result_maps.read_stokes, result_maps.read_stokes_covariance, result_maps.read_cues):
         with pytest.raises(DecodeError, match="give a result's folder"):
             read(tmp_path)
