@@ -187,6 +187,8 @@ def _resampled(one: SurfaceMaps, other: SurfaceMaps, at: Floats) -> tuple[Surfac
             view=one.view,
             depth_prior=None,
             detail=None,
+            diffuse_error=None,
+            roughness_error=None,
         ),
         both,
     )
