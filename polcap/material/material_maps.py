@@ -76,8 +76,8 @@ def write(folder: Path, grid: TexelGrid, maps: MaterialMaps, keys: Mapping[str, 
             channels = {letter: np.ascontiguousarray(value[..., k]) for k, letter in enumerate(letters)}
             exr.write(place / f"{name}.exr", channels, half=name not in _FLOAT)
         png.write(place / "normal.png", png.sixteen_bits(maps.normal / 2 + 0.5))
-        png.write(place / "diffuse.png", color.srgb_eight_bits(maps.diffuse))
-        png.write(place / "specular.png", color.srgb_eight_bits(maps.specular))
+        png.write(place / "diffuse.png", color.srgb_eight_bits(maps.diffuse), srgb=True)
+        png.write(place / "specular.png", color.srgb_eight_bits(maps.specular), srgb=True)
         png.write(place / "roughness.png", png.sixteen_bits(maps.roughness))
         png.write(place / "occlusion.png", png.sixteen_bits(maps.occlusion))
         png.write(place / "height.png", png.sixteen_bits((maps.height - low) / max(high - low, 1e-12)))
