@@ -57,7 +57,7 @@ _STEPS = (
     Step(("alignment",), geometry.alignment, "align", (*_LIT, "sharpness")),
     Step(("chart",), light.chart, "whitebalance", ("clipping",)),
     Step(("mask",), geometry.mask, "mask", ("clipping", "alignment")),
-    Step(("stillness",), shot_exposure.stillness, "mask", (*_FILES, *_PAIRED), ("black level", "sharpness")),
+    Step(("stillness",), shot_exposure.stillness, "mask", (*_FILES, *_PAIRED), ("black level",)),
     Step(("focus",), geometry.focus, "mask", _PAIRED),
     Step(("gains", "gain doubt", "energy"), shot_exposure.gains, "selfcal", (*_PAIRED, "stillness")),
     Step(("angles",), polarization.turned_shot, "selfcal", _EVEN),

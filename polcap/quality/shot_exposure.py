@@ -135,7 +135,14 @@ def stillness(found: Evidence, limits: GateLimits) -> Gate:
     text = f"{{:.2f}} % of the object differs between the exposures of the {found.names[k]} shot"
     message = worded(100 * float(fraction[k]), text, "The exposures of every shot show the same")
     remedy = "Take the bracket again: something moved, or the light changed"
-    bad = bad_shots(found.names, fraction > limits.max_ghost)
+    bad, blurred = (
+        bad_shots(found.names, fraction > limits.max_ghost),
+        np.nan_to_num(found.blur_px) > limits.max_blur_px,
+    )
+    if blurred.any() and limits.max_ghost < fraction[k] <= _WHOLE:
+        return Gate("stillness", "not judged", None, None, "The gate 'sharpness' leaves nothing to judge here", unit="")
+    if rescue := leave_out(found, np.asarray(blurred), limits):  # it shows something else, not less sharp
+        remedy = f"{rescue}; or take the bracket again: a frame shows something else"
     if _has_wrong_levels(found.radiance, fraction, limits):
         message += ": their black level, white level or encoding is not as stated"
         remedy, bad = _levels_remedy(found), ()

@@ -187,13 +187,19 @@ def test_what_a_failed_gate_explains_is_not_judged(
 
 
 def test_a_blurred_frame_alone_explains_ghosts(good: Evidence) -> None:
-    """One of three exposures is blurred: that warns, and says why the exposures differ."""
-    quality = np.full_like(good.radiance.quality, Quality.GHOST)
+    """One of three exposures is blurred: that warns, and says why a part differs; not why the whole object does."""
+    quality = np.zeros_like(good.radiance.quality)
+    quality[:, ::3] = int(Quality.GHOST)
     ratio = np.tile([[[0.25], [1.0], [4.0]]], (3, 1, 3))
     radiance = bracket(replace(good.radiance, quality=quality), exposure_ratio=ratio, exif_ratio=ratio[..., 0])
     blur = np.array([[0.0, 0, 0], [0, 0, 3.0], [0, 0, 0]])
     found = judged(changed(good, radiance=radiance, blur_px=blur))
     assert (found["sharpness"].state, found["stillness"].state) == ("warn", "not judged")
+    quality[1] = int(Quality.GHOST)
+    radiance = replace(radiance, quality=quality)
+    files = tuple(tuple(f"pol{k}/{e}.DNG" for e in range(3)) for k in range(3))
+    gate = judged(changed(good, radiance=radiance, blur_px=blur, files=files))["stillness"]
+    assert gate.state == "fail" and "Move pol0/2.DNG, pol1/2.DNG, pol2/2.DNG out" in gate.remedy
 
 
 @pytest.mark.parametrize(
