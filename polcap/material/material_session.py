@@ -16,7 +16,7 @@ from polcap.fusion.poses import SessionPoses
 from polcap.fusion.session import Notify, Session, SessionInput, StepRunner
 from polcap.fusion.values import Pose
 from polcap.fusion.view_path import SessionView
-from polcap.material import stokes_view
+from polcap.material import board_focus, stokes_view
 from polcap.material.flash_light import ChartInView
 from polcap.material.material_path import MaterialConfig
 from polcap.material.stokes_view import PosedStokes
@@ -71,14 +71,22 @@ def process(
         assert board is not None
         masked = charted.with_inputs(lambda view: _with_mask(view, solved, board))
         masked, keys = run_step("Stokes parameters", stokes_view.solve, masked)
-    posed = [_posed(view, solved, keys[name], cache) for name, view in masked.views.items()]
-    together = DeferredResult(digest([one.key for one in posed]), lambda: tuple(one.value for one in posed))
+    every = {name: _posed(view, solved, keys[name], cache) for name, view in masked.views.items()}
+    blur = cache.run(board_focus.measure, _together(list(every.values())), board).value
+    masked = masked.without(board_focus.left_out(tuple(every), blur))
+    posed = [every[name] for name in masked.views]
+    together = _together(posed)
     names = tuple(masked.views)
     tilts = {name: _tilt_deg(solved, name) for name in names}
     return FlatSession(
         together, names, solved, _chart(masked, charted), board, texel_grid(solved, names, board, posed, region, texel),
         masked.left_out, tilts,
     )  # fmt: skip
+
+
+def _together(posed: list[StageResult[PosedStokes]]) -> StageResult[tuple[PosedStokes, ...]]:
+    """Views as one input of a stage, read when they are needed."""
+    return DeferredResult(digest([one.key for one in posed]), lambda: tuple(one.value for one in posed))
 
 
 def _with_mask(view: SessionView, solved: SessionPoses, board: Board) -> SessionView:

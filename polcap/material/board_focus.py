@@ -1,0 +1,73 @@
+"""Blur of each view at the edges of the board's squares, to leave out views that are out of focus or shaken."""
+
+import cv2
+import numpy as np
+
+from polcap.images import Floats
+from polcap.material import flash_light
+from polcap.material.stokes_view import PosedStokes
+from polcap.optics import board as boards
+from polcap.optics.board import SQUARES, Board
+from polcap.stages import stage
+
+_REACH_PX, _STEPS = 4.0, 33  # of the profile across an edge
+_BESIDE = 0.11  # squares from an edge, up to which both sides are even
+_MOST_OVER, _MOST_RATIO = 0.5, 1.6  # px over that of the median view, and its factor; both
+
+
+@stage(version=1)
+def measure(views: tuple[PosedStokes, ...], board: Board) -> tuple[float, ...]:
+    """Blur of each view, 1σ in pixels of its Stokes image; NaN where no edge is visible."""
+    return tuple(_blur(view, board) for view in views)
+
+
+def left_out(names: tuple[str, ...], blur: tuple[float, ...]) -> dict[str, str]:
+    """Reasons for the views that are much less sharp than the others, by name."""
+    middle = float(np.nanmedian(blur))
+    limit = max(middle + _MOST_OVER, _MOST_RATIO * middle)
+    return {
+        name: f"it is out of focus or shaken: edges of the board are blurred by {one:.1f} px, in other views by "
+        f"{middle:.1f} px"
+        for name, one in zip(names, blur, strict=True)
+        if one > limit
+    }
+
+
+def _blur(view: PosedStokes, board: Board) -> float:
+    """Standard deviation of the mean edge's derivative, px."""
+    edge, across = _edges(board)
+    step = 1e-4  # m
+    ends = [np.stack(view.pixels(edge + sign * step * across), axis=-1) for sign in (-1, 1)]
+    scale = np.linalg.norm(ends[1] - ends[0], axis=-1) / (2 * step)  # px per m
+    t = np.linspace(-_REACH_PX, _REACH_PX, _STEPS)
+    near = _REACH_PX / scale < _BESIDE * board.square_m
+    place = edge[near, None] + across[near, None] * (t / scale[near, None])[..., None]
+    x, y = (a.astype(np.float32) for a in view.pixels(place))
+    height, width = view.stokes.mask.shape
+    inside = ((x > 0) & (y > 0) & (x < width - 1) & (y < height - 1)).all(axis=1)
+    if inside.sum() == 0:
+        return float("nan")
+    gray = np.asarray(view.stokes.stokes[0] @ flash_light.gray(view.matrix), np.float32)
+    profile = cv2.remap(gray, x[inside], y[inside], cv2.INTER_LINEAR)
+    low, high = profile[:, :4].mean(axis=1), profile[:, -4:].mean(axis=1)
+    contrast = high - low
+    clear = contrast > 0.5 * np.median(contrast)  # the chart hides some
+    rise = np.diff(((profile - low[:, None]) / np.maximum(contrast, 1e-6)[:, None])[clear].mean(axis=0))
+    at, weight = (t[1:] + t[:-1]) / 2, np.maximum(rise, 0)
+    middle = float((weight * at).sum() / weight.sum())
+    return float(np.sqrt((weight * (at - middle) ** 2).sum() / weight.sum()))
+
+
+def _edges(board: Board) -> tuple[Floats, Floats]:
+    """World points (M, 3) [m] on edges of the squares, and unit vectors (M, 3) across them, from ink to paper."""
+    line = (np.arange(1, SQUARES) - SQUARES / 2) * board.square_m
+    along = (np.arange(8 * SQUARES) / 8 + 1 / 16 - SQUARES / 2) * board.square_m
+    a, b = (one.ravel() for one in np.meshgrid(line, along))
+    point = np.concatenate([np.stack([a, 0 * a, b], -1), np.stack([b, 0 * a, a], -1)])
+    across = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], len(a), axis=0)
+    sides = [
+        [boards.is_ink(board, *(point + share * board.square_m * across)[:, [0, 2]].T) for share in shares]
+        for shares in ((-0.1, -0.02), (0.02, 0.1))
+    ]
+    even = (sides[0][0] == sides[0][1]) & (sides[1][0] == sides[1][1]) & (sides[0][0] != sides[1][0])
+    return point[even], across[even] * np.where(sides[0][0], 1.0, -1.0)[even, None]
