@@ -10,7 +10,7 @@ from polcap.optics import board as boards
 from polcap.optics.board import SQUARES, Board
 from polcap.stages import stage
 
-_REACH_PX, _STEPS = 4.0, 33  # of the profile across an edge
+_REACH_PX, _STEPS = 4.0, 33  # of the profile across an edge, at most
 _BESIDE = 0.11  # squares from an edge, up to which both sides are even
 _MOST_OVER, _MOST_RATIO = 0.5, 1.6  # px over that of the median view, and its factor; both
 
@@ -23,7 +23,8 @@ def measure(views: tuple[PosedStokes, ...], board: Board) -> tuple[float, ...]:
 
 def left_out(names: tuple[str, ...], blur: tuple[float, ...]) -> dict[str, str]:
     """Reasons for the views that are much less sharp than the others, by name."""
-    middle = float(np.nanmedian(blur))
+    known = [one for one in blur if np.isfinite(one)]
+    middle = float(np.median(known)) if known else float("inf")
     limit = max(middle + _MOST_OVER, _MOST_RATIO * middle)
     return {
         name: f"it is out of focus or shaken: edges of the board are blurred by {one:.1f} px, in other views by "
@@ -39,9 +40,9 @@ def _blur(view: PosedStokes, board: Board) -> float:
     step = 1e-4  # m
     ends = [np.stack(view.pixels(edge + sign * step * across), axis=-1) for sign in (-1, 1)]
     scale = np.linalg.norm(ends[1] - ends[0], axis=-1) / (2 * step)  # px per m
-    t = np.linspace(-_REACH_PX, _REACH_PX, _STEPS)
-    near = _REACH_PX / scale < _BESIDE * board.square_m
-    place = edge[near, None] + across[near, None] * (t / scale[near, None])[..., None]
+    reach = min(_REACH_PX, _BESIDE * board.square_m * float(np.quantile(scale, 0.1)))
+    t = np.linspace(-reach, reach, _STEPS)
+    place = edge[:, None] + across[:, None] * (t / scale[:, None])[..., None]
     x, y = (a.astype(np.float32) for a in view.pixels(place))
     height, width = view.stokes.mask.shape
     inside = ((x > 0) & (y > 0) & (x < width - 1) & (y < height - 1)).all(axis=1)
