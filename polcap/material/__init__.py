@@ -9,7 +9,7 @@ In the order of use:
     texel_grid        texels on the board's plane, and directions and light of each view there
 
   Stages
-    board_focus       blur of each view
+    board_focus       blur of each view, and its usable paper
     flash_light       the flash's place and energy in each view, from the board's paper
     coarse_relief     height from parallax and normals, on coarse texels
     rectification     Stokes parameters of all views on the texels

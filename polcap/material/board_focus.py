@@ -1,4 +1,6 @@
-"""Blur of each view at the edges of the board's squares, to leave out views that are out of focus or shaken."""
+"""How well each view shows the board: blur at the edges of its squares, and usable paper; unfit views are left out."""
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -15,23 +17,40 @@ _BESIDE = 0.11  # squares from an edge, up to which both sides are even
 _MOST_OVER, _MOST_RATIO = 0.5, 1.6  # px over that of the median view, and its factor; both
 
 
-@stage(version=1)
-def measure(views: tuple[PosedStokes, ...], board: Board) -> tuple[float, ...]:
-    """Blur of each view, 1σ in pixels of its Stokes image; NaN where no edge is visible."""
-    return tuple(_blur(view, board) for view in views)
+@dataclass(frozen=True)
+class BoardSight:
+    """How the views show the board."""
+
+    blur: tuple[float, ...]  # (K,) 1σ in pixels of the Stokes image; NaN where no edge is visible
+    paper: tuple[int, ...]  # (K,) usable points of the paper
 
 
-def left_out(names: tuple[str, ...], blur: tuple[float, ...]) -> dict[str, str]:
-    """Reasons for the views that are much less sharp than the others, by name."""
+@stage(version=2)
+def measure(views: tuple[PosedStokes, ...], board: Board) -> BoardSight:
+    """Blur and usable points of the paper in each view."""
+    paper = tuple(len(flash_light.paper(view, board).radiance) for view in views)
+    return BoardSight(tuple(_blur(view, board) for view in views), paper)
+
+
+def left_out(names: tuple[str, ...], sight: BoardSight) -> dict[str, str]:
+    """Reasons for the views with too little paper, and for those much less sharp than the others, by name."""
+    blur = sight.blur
     known = [one for one in blur if np.isfinite(one)]
     middle = float(np.median(known)) if known else float("inf")
     limit = max(middle + _MOST_OVER, _MOST_RATIO * middle)
-    return {
+    few = {
+        name: f"{count} points of the board's paper are usable, {flash_light.LEAST_POINTS} are needed; show the whole "
+        "board, and expose so that its paper does not clip"
+        for name, count in zip(names, sight.paper, strict=True)
+        if count < flash_light.LEAST_POINTS
+    }
+    blurred = {
         name: f"it is out of focus or shaken: edges of the board are blurred by {one:.1f} px, in other views by "
         f"{middle:.1f} px"
         for name, one in zip(names, blur, strict=True)
         if one > limit
     }
+    return {**blurred, **few}
 
 
 def _blur(view: PosedStokes, board: Board) -> float:

@@ -16,7 +16,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from polcap.chart_values import ColorCalibration
-from polcap.errors import CaptureError
 from polcap.images import Floats, Quality
 from polcap.material.stokes_view import PosedStokes
 from polcap.material.texel_grid import FlashLight
@@ -28,7 +27,7 @@ from polcap.stages import stage
 
 _STEP_M = 0.001  # between the points of the paper that are sampled
 _MARGIN_PX = 1.5  # between such a point and the print
-_LEAST_POINTS = 60  # of the paper, in a view
+LEAST_POINTS = 60  # of the paper, in a view
 _FLASH_SIGMA_M = 0.08  # distance of a flash from the lens
 _ROUNDS, _OUTLIER = 3, 4.0  # of the fit; robust standard deviations
 _SCATTER = 0.02  # of paper about Lambert's law
@@ -48,9 +47,9 @@ class ChartInView:
 def measure(views: tuple[PosedStokes, ...], chart: ChartInView | None, board: Board) -> FlashLight:
     """Flash and light of all views; without a chart the paper's albedo gives the scale.
 
-    Raises CaptureError: too little of the paper is visible.
+    Each view must show `LEAST_POINTS` points of the paper or more.
     """
-    samples = [_paper(view, board) for view in views]
+    samples = [paper(view, board) for view in views]
     keep = [np.ones(len(one.radiance), bool) for one in samples]
     place: Floats = np.zeros(3)
     for _ in range(_ROUNDS):
@@ -61,9 +60,9 @@ def measure(views: tuple[PosedStokes, ...], chart: ChartInView | None, board: Bo
         keep = [np.abs(e - m) < _OUTLIER * spread for e, m in zip(error, middle, strict=True)]
     level = np.exp([float(e[k].mean()) for e, k in zip(error, keep, strict=True)])  # c_k
     rest = np.concatenate([(e - np.log(c))[k] for e, c, k in zip(error, level, keep, strict=True)])
-    paper = PAPER if chart is None else float(level[chart.view] * _chart_irradiance(views[chart.view], chart, place))
+    albedo = PAPER if chart is None else float(level[chart.view] * _chart_irradiance(views[chart.view], chart, place))
     matrix = np.stack([_shot_matrix(view, one, k) for view, one, k in zip(views, samples, keep, strict=True)])
-    return FlashLight(place, level / paper, matrix, float(rest.std()), paper, len(rest))
+    return FlashLight(place, level / albedo, matrix, float(rest.std()), albedo, len(rest))
 
 
 @dataclass(frozen=True)
@@ -76,8 +75,8 @@ class PaperSamples:
     ratio: Floats  # (M, 2, 3) S1/S0 and S2/S0 of each channel
 
 
-def _paper(view: PosedStokes, board: Board) -> PaperSamples:
-    """Samples of the paper in a view. Raises CaptureError: there are too few."""
+def paper(view: PosedStokes, board: Board) -> PaperSamples:
+    """Samples of the paper in a view."""
     distance = float(np.linalg.norm(view.pose.translation))
     margin = _MARGIN_PX * distance * view.stokes.view.scale / view.camera.focal_px
     world = _paper_points(board, margin)
@@ -87,11 +86,6 @@ def _paper(view: PosedStokes, board: Board) -> PaperSamples:
     column, row = (np.rint(a[inside]).astype(int) for a in (x, y))
     stokes = np.asarray(view.stokes.stokes[:, row, column])  # (3, M, 3)
     good = ((view.stokes.quality[row, column] & ~_USABLE) == 0) & (stokes[0].min(axis=-1) > 0)
-    if good.sum() < _LEAST_POINTS:
-        raise CaptureError(
-            f"{view.name}: {good.sum()} points of the board's paper are usable, {_LEAST_POINTS} are needed; "
-            "show the whole board, and expose so that its paper does not clip"
-        )
     stokes, world = stokes[:, good], world[inside][good]
     radiance = gray(view.matrix) @ stokes[0].T
     point = world @ view.pose.rotation.T + view.pose.translation
@@ -137,7 +131,7 @@ def _flash(samples: Sequence[PaperSamples], keep: Sequence[Floats], start: Float
 
     def residuals(place: Floats) -> Floats:
         parts = [_log_error(one, place)[k] for one, k in zip(samples, keep, strict=True)]
-        even = [(part - np.median(part)) / _SCATTER / np.sqrt(len(part) / _LEAST_POINTS) for part in parts]
+        even = [(part - np.median(part)) / _SCATTER / np.sqrt(len(part) / LEAST_POINTS) for part in parts]
         return np.concatenate([*even, place / _FLASH_SIGMA_M])
 
     return np.asarray(least_squares(residuals, start, loss="soft_l1", x_scale=0.01).x)

@@ -72,8 +72,8 @@ def process(
         masked = charted.with_inputs(lambda view: _with_mask(view, solved, board))
         masked, keys = run_step("Stokes parameters", stokes_view.solve, masked)
     every = {name: _posed(view, solved, keys[name], cache) for name, view in masked.views.items()}
-    blur = cache.run(board_focus.measure, _together(list(every.values())), board).value
-    masked = masked.without(board_focus.left_out(tuple(every), blur))
+    sight = cache.run(board_focus.measure, _together(list(every.values())), board).value
+    masked = masked.without(board_focus.left_out(tuple(every), sight))
     posed = [every[name] for name in masked.views]
     together = _together(posed)
     names = tuple(masked.views)

@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from polcap.fusion.poses import SessionCamera
 from polcap.images import Floats
 from polcap.material import board_focus
+from polcap.material.board_focus import BoardSight
 from polcap.material.stokes_view import PosedStokes
 from polcap.stage_values import StokesImage
 from tests.fusion.board_views import BOARD, COLOR, FOCAL, VIEW, picture, pose, scene
@@ -28,8 +29,9 @@ def seen(s0: Floats) -> PosedStokes:
 def test_blur_of_the_board_is_measured_and_a_blurred_view_is_named() -> None:
     sharp = seen(picture(scene(pose(10.0, 60.0))))
     blurred = replace(sharp, stokes=seen(gaussian_filter(np.asarray(sharp.stokes.stokes[0]), (1.5, 1.5, 0))).stokes)
-    first, second = board_focus.measure((sharp, blurred), BOARD)
+    first, second = board_focus.measure((sharp, blurred), BOARD).blur
     assert first < 0.6
     assert np.sqrt(second**2 - first**2) == pytest.approx(1.5, rel=0.15)
-    named = board_focus.left_out(("view01", "view02", "view03"), (first, second, first))
-    assert list(named) == ["view02"] and "out of focus" in named["view02"]
+    sight = BoardSight((first, second, first), (900, 900, 12))
+    named = board_focus.left_out(("view01", "view02", "view03"), sight)
+    assert "out of focus" in named["view02"] and "12 points" in named["view03"] and "view01" not in named
