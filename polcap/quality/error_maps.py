@@ -24,6 +24,8 @@ _FINEST_PX = 4.0  # this distance on the reduced grid on which it is computed
 _CLIPPED_AROUND = (0.0, 0.15, 0.3, 0.45, 0.6, 0.8, 1.0)
 _CLIPPED_DEG = (0.0, 5.0, 9.5, 22.0, 28.0, 25.0, 18.0)
 _CLIPPED_PART = 0.3  # clipped part of the object with these costs; they grow with its root, as a highlight's width
+# part of a cost that the estimators do not state themselves, where the polarization contradicts itself
+_UNSTATED = {"sharpness": 0.3, "ill-posed": 0.0}
 _GHOST_DEG = 5.0  # where the exposures of a shot differ
 # 1σ by 150 simulated captures and the 4 rendered ones (docs/benchmarks/albedo.md); (network, analytic)
 _ALBEDO_FLOOR = 0.011  # of the diffuse albedo
@@ -47,7 +49,8 @@ def with_errors(found: Evidence, judged: Iterable[Gate]) -> SurfaceMaps:
 def expected_normal_error(found: Evidence, judged: Iterable[Gate]) -> Floats:
     """Expected error of the normals (H, W), degrees: root of the squares of the estimator's own and all costs."""
     places = {name: cost(found) for name, cost in _PLACES.items()}
-    everywhere = sum(gate.cost_deg**2 for gate in judged if gate.name not in places)
+    costs = ((gate.name, gate.cost_deg) for gate in judged if gate.name not in places)
+    everywhere = sum((_UNSTATED.get(name, 1.0) * cost) ** 2 for name, cost in costs)
     squares = found.maps.confidence**2 + everywhere + sum(cost**2 for cost in places.values())
     return np.where(found.maps.mask, np.minimum(np.sqrt(squares), MOST_DEG), 0).astype(np.float32)
 
@@ -64,11 +67,6 @@ def _of_clipping(found: Evidence) -> Floats:
 def _of_ghosts(found: Evidence) -> Floats:
     """Cost (H, W) of pixels that differ between the exposures of a shot, in degrees."""
     return _GHOST_DEG * _flagged(found, Quality.GHOST)
-
-
-def _of_ill_posed(found: Evidence) -> Floats:
-    """No cost: the estimators state the error of these pixels themselves."""
-    return np.zeros(1)
 
 
 def _of_focal_length(found: Evidence) -> Floats:
@@ -118,6 +116,5 @@ def _share_around(chosen: Bools, inside: Bools) -> Floats:
 _PLACES: Mapping[str, Callable[[Evidence], Floats]] = {
     "clipping": _of_clipping,
     "stillness": _of_ghosts,
-    "ill-posed": _of_ill_posed,
     "focal length": _of_focal_length,
 }

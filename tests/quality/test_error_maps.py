@@ -46,6 +46,12 @@ def test_a_cost_without_a_place_counts_on_the_whole_object_and_costs_add_in_squa
     assert np.allclose(error[good.maps.mask], np.sqrt(OWN**2 + 2 * 6**2))
 
 
+def test_what_the_estimators_state_themselves_is_not_added_in_full(good: Evidence) -> None:
+    gates_ = [Gate(name, "fail", None, None, "", cost_deg=10.0) for name in ("sharpness", "ill-posed")]
+    blurred, ill_posed = (errors(good, gate)[good.maps.mask] for gate in gates_)
+    assert np.allclose(blurred, np.hypot(OWN, 3)) and np.allclose(ill_posed, OWN)
+
+
 def test_clipped_light_costs_in_its_place_alone_and_once(good: Evidence) -> None:
     mask = good.maps.mask
     of, square = flagged(good, Quality.CLIPPED, round(0.6 * disc_radius(mask)))
