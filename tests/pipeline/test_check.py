@@ -53,7 +53,7 @@ def test_planted_fault_is_named(tmp_path: Path, fault: str) -> None:
     states = ("fail", "warn") if fault in ("shaken", "drift", "misfire") else ("fail",)  # these are corrected
     failed = {line.name for line in found.lines if line.state in states}
     assert failed & set(faulty.FAULTS[fault]), check.table(found)
-    assert all(line.remedy for line in found.lines if line.state in ("warn", "fail"))
+    assert 1 <= sum(bool(line.remedy) for line in found.lines) <= 2, check.table(found)
 
 
 def test_one_turned_shot_of_three_is_reported_with_the_ring_that_it_looks_like(tmp_path: Path) -> None:
