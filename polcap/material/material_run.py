@@ -14,6 +14,7 @@ from polcap.config import restore
 from polcap.errors import SettingError
 from polcap.formats.capture import folder_names
 from polcap.formats.export import provenance
+from polcap.formats.export.presets import Format
 from polcap.fusion import session as sessions
 from polcap.fusion.session import Notify, Session, SessionInput
 from polcap.material import material_maps, material_page, material_path, material_session
@@ -84,8 +85,10 @@ def export(out: Path, *requests: ExportRequest) -> list[Path]:
 
 
 def _of_plane(request: ExportRequest) -> ExportRequest:
-    """The request without the layered EXR of a preset, which is of one picture."""
-    return request if request.preset is None else replace(request, without=("exr",))
+    """The request without what a plane does not have: the layered EXR of a preset, and curvature."""
+    without: tuple[Format, ...] = () if request.preset is None else ("exr",)
+    extras = tuple(one for one in request.extras if one not in ("curvature", "cavity"))
+    return replace(request, without=without, extras=extras)
 
 
 def document(
