@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # names in formats.export, which is not imported at start
 PRESETS = ("blender", "unreal", "unity", "godot", "web", "substance", "maya", "houdini", "archive")
-EXTRAS = ("displacement", "occlusion", "object-normal", "curvature", "cavity")
+EXTRAS = ("displacement", "curvature", "cavity", "occlusion", "object-normal")
 _PRESET = f"Files for one program in asset/NAME/: {', '.join(PRESETS)}; repeatable."
 _EXTRA = f"A further texture: {', '.join(EXTRAS)}; repeatable."
 _FACTS = ("title", "creator", "rights", "license", "object_number", "date", "institution", "description")
