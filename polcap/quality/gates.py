@@ -42,7 +42,7 @@ _FILES = ("tone curve", "exposures")
 _LIT = ("clipping", "noise")  # no shot is measured
 _PAIRED = (*_LIT, "sharpness", "alignment")  # the shots cannot be compared
 _EVEN = (*_PAIRED, "stillness", "gains", "energy")  # the light of the shots is not known
-_POLARIZED = (*_EVEN, "order", "angles", "polarized")  # the Stokes parameters are wrong
+_POLARIZED = (*_EVEN, "angles", "polarized", "order")  # the Stokes parameters are wrong
 _SHAPED = (*_POLARIZED, "mask", "body", "other light", "lighting")  # the normals are wrong
 _ROUND: dict[str, tuple[str, ...]] = {"explained_by": ("flat",), "needs": ("contour",)}  # of a rounded object
 
@@ -62,8 +62,9 @@ _STEPS = (
     Step(("gains", "gain doubt", "energy"), shot_exposure.gains, "selfcal", (*_PAIRED, "stillness")),
     Step(("angles",), polarization.turned_shot, "selfcal", _EVEN),
     Step(("flat", "contour"), _without_limits(flatness.judge), "infer", _EVEN),
-    Step(("order",), _without_limits(polarization.order), "selfcal", _EVEN, **_ROUND),
-    Step(("angles", "body", "other light"), polarization.of_outline, "infer", (*_EVEN, "angles", "order"), **_ROUND),
+    Step(("polarized",), _without_limits(polarization.polarized), "infer", _EVEN, ("flat",)),
+    Step(("order",), _without_limits(polarization.order), "selfcal", (*_EVEN, "polarized"), **_ROUND),
+    Step(("angles", "body", "other light"), polarization.of_outline, "infer", _POLARIZED, **_ROUND),
     Step(("ambient",), light.ambient, "hdr"),
     Step(("room light",), light.room_light, "infer", (*_POLARIZED, "other light"), ("sharpness",)),
     Step(("lighting",), light.side_light, "infer", (*_POLARIZED, "other light"), ("flat", "sharpness"), ("contour",)),

@@ -97,6 +97,25 @@ def turned_shot(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     yield Gate("angles", "fail", round(float(degrees), 1), limit, message, remedy, abs(float(degrees)) / 2, shots, "°")
 
 
+def polarized(found: Evidence) -> Iterator[Gate]:
+    """Gate "polarized", only if no part of the outline is polarized."""
+    most = _most_dolp(found)
+    if not most < _LEAST_DOLP:
+        return
+    message = f"No part of the outline is polarized by more than {100 * most:.1f} %"
+    remedy = "Check that the polarizer was on and turned; metal and translucent objects (wax, milk) hardly polarize"
+    if found.radiance.equipment.angles.place == "cells":
+        remedy = "Use the sensor's frames as they are, without binning or scaling; metal and wax hardly polarize"
+    yield Gate("polarized", "fail", round(most, 4), _LEAST_DOLP, message, remedy, _UNPOLARIZED_DEG)
+
+
+def _most_dolp(found: Evidence) -> float:
+    """DoLP of the most polarized tenth of the outline; NaN for a short outline."""
+    angle = found.selfcal.angle - found.selfcal.ring.correction
+    band = rim.sample(*_reduce(found.stokes, angle))
+    return rim.summarize(band, angle).dolp_most if len(band.azimuth) >= _LEAST_RIM else float("nan")
+
+
 def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     """Gates on angles, material and other light, judged by the polarization along the object's outline."""
     angle, limit = found.selfcal.angle - found.selfcal.ring.correction, limits.max_turn_deg
@@ -109,13 +128,6 @@ def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
         message = "The shots contradict each other: they are not of one object under one light"
         remedy = sentence(angle_advice.check(found.radiance.equipment.angles))
         yield Gate("body", "fail", None, None, message, remedy, MOST_DEG)
-        return
-    if body.dolp_most < _LEAST_DOLP:
-        message = f"No part of the outline is polarized by more than {100 * body.dolp_most:.1f} %"
-        remedy = "Check that the polarizer was on and turned; metal and translucent objects (wax, milk) hardly polarize"
-        if found.radiance.equipment.angles.place == "cells":
-            remedy = "Use the sensor's frames as they are, without binning or scaling; metal and wax hardly polarize"
-        yield Gate("polarized", "fail", round(body.dolp_most, 4), _LEAST_DOLP, message, remedy, _UNPOLARIZED_DEG)
         return
     of_shots = _angles(seen.turn, body, angle, found, limits)
     closed = found.object_.border <= limits.max_mask_border

@@ -177,7 +177,11 @@ def _spoken(image: Any) -> dict[str, str]:
     found = Evidence.partial(
         stokes=image, radiance=SimpleNamespace(angle=ANGLE), gains=scenes.equal(), names=["0°", "45°", "90°"], maps=maps
     )
-    lines = [*polarization.of_outline(found, GateLimits()), polarization.ill_posed(found, GateLimits())]
+    lines = [
+        *polarization.polarized(found),
+        *polarization.of_outline(found, GateLimits()),
+        polarization.ill_posed(found, GateLimits()),
+    ]
     return {line.name: line.message for line in lines if line.state in ("fail", "warn")}
 
 

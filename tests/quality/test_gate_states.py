@@ -49,7 +49,7 @@ FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
     "pushed": pushed(0.1, 0.1), "turn": ObjectTurn(np.array([0.0, 0.2, 0.1]), np.full(3, 0.1)),
     "edge_blur": 0.8, "contradiction": 0.0,
-    "flatness": ROUNDED, "charted": 0.0, "rendered": rendered(), "noise": 0.001, "ill_posed": 0.0,
+    "flatness": ROUNDED, "most_dolp": 0.1, "charted": 0.0, "rendered": rendered(), "noise": 0.001, "ill_posed": 0.0,
     "medians": [45.0, 0.2, 0.3],
     "normal_error": 4.0, "lean": 2.0, "crossed": light.CrossedFigures(0.0, 0, 0.0, 0.1),
 }  # fmt: skip
@@ -61,7 +61,7 @@ MEASURES = {  # the function that measures each figure
     "charted": (geometry, "_chart_share"), "lean": (geometry, "_lean"),
     "noise": (shot_exposure, "_noise"), "crossed": (light, "_compare_crossed"),
     "ill_posed": (polarization, "_ill_posed"), "medians": (polarization, "_medians"),
-    "outline": (polarization, "_outline"), "flatness": (flatness, "measure"),
+    "outline": (polarization, "_outline"), "flatness": (flatness, "measure"), "most_dolp": (polarization, "_most_dolp"),
     "normal_error": (gates, "_median_error"), "inward_outline": (geometry, "_inward_share"),
 }  # fmt: skip
 MESH = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
@@ -198,7 +198,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("angles", "warn", {"selfcal": {"found_sigma": 0.02}}),
     ("angles", "warn", {"selfcal": {"ring": RingZero(0.2, 0.01)}}),
     ("angles", "pass", {"selfcal": {"ring": RingZero(0.03, 0.01, 0.03)}}),
-    ("polarized", "fail", {"figures": outline(dolp_most=0.004)}),
+    ("polarized", "fail", {"figures": {"most_dolp": 0.004}}),
     ("body", "pass", {}),
     ("body", "fail", {"figures": outline(along=-0.9)}),
     ("body", "warn", {"figures": {**outline(along=-0.9), "medians": [45.0, 0.2, 0.04]}}),
