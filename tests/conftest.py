@@ -21,6 +21,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as in a shell's backgro
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "capture"
+slow = pytest.mark.skipif("POLCAP_SLOW" not in os.environ, reason="takes a minute or more: set POLCAP_SLOW")
 
 
 def pytest_configure(config: pytest.Config) -> None:

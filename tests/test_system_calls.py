@@ -18,12 +18,11 @@ from typing import NamedTuple
 
 import pytest
 
-from tests.conftest import EXAMPLE, ROOT
+from tests.conftest import EXAMPLE, ROOT, slow
 
 WATCH_S = 12.0  # onnxruntime 1.32 looks up its host's address 9 s after it is loaded
 MINUTE_S = 60.0  # of a process that has loaded it
 HOMES = ("writable", "unset", "unwritable")
-slow = pytest.mark.skipif("POLCAP_SLOW" not in os.environ, reason="a minute each: set POLCAP_SLOW")
 CALLS = "open,openat,openat2,creat,mkdir,mkdirat,mknod,mknodat,truncate,rename,renameat,renameat2"
 CALLS += ",link,linkat,symlink,symlinkat,unlink,unlinkat,rmdir"
 CALL = re.compile(r"^\d+ +(\w+)\((.*)")

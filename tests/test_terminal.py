@@ -42,7 +42,7 @@ def test_settings_are_listed_with_default_range_and_meaning(polcap: Command) -> 
     assert "fusion.atlas.size = 0  (≥ 0, ≤ 8192)" in polcap("settings", "fusion").stdout
     assert "hdr.clip = 0.98  (≥ 0.5, ≤ 1.0)\n    clipping threshold" in polcap("settings", "hdr").stdout
     assert "stokes.undistort = true\n" in polcap("settings", "stokes").stdout
-    assert "choose one of hdr, whitebalance" in polcap("settings", "polish").stderr
+    assert "there are hdr, whitebalance" in polcap("settings", "polish").stderr
 
 
 def test_quiet_prints_only_data_and_errors_wherever_it_is(polcap: Command, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from polcap.fusion.closed_mesh import is_closed
 from polcap.images import Floats
 from polcap.stages.asset import AssetSettings
 from polcap.synth import all_around, scenes
-from tests.conftest import shell
+from tests.conftest import shell, slow
 
 pytest.importorskip("embreex")
 
@@ -29,6 +29,7 @@ def session(folder: Path, pattern: str, views: int) -> Path:
     return folder
 
 
+@slow
 def test_views_without_a_board_become_a_closed_object_of_relative_size(tmp_path: Path) -> None:
     folder = session(tmp_path / "object", "noise", 18)
     done = shell("fuse", folder, "--no-chart", "--set", "fusion.shape.grid=60")

@@ -16,7 +16,7 @@ import polcap
 from polcap.fusion import fused_maps
 from polcap.fusion.closed_mesh import is_closed
 from polcap.stages.asset import AssetSettings
-from tests.conftest import ROOT, shell
+from tests.conftest import ROOT, shell, slow
 
 pytest.importorskip("embreex")
 
@@ -30,6 +30,7 @@ def synth(folder: Path, views: int) -> Path:
     return folder
 
 
+@slow
 def test_twelve_raw_views_become_a_closed_object_that_is_like_the_true_one(tmp_path: Path) -> None:
     folder = synth(tmp_path / "object", 12)
     done = shell("fuse", folder)
@@ -78,6 +79,7 @@ def finished(folder: Path) -> dict[Path, int]:
     return {file: file.stat().st_mtime_ns for file in folder.rglob("manifest.json")}
 
 
+@slow
 def test_a_fusion_that_was_killed_twice_ends_as_one_that_was_not(tmp_path: Path) -> None:
     """And so does one of two views at a time as one of a single one."""
     folder, coarse = synth(tmp_path / "object", 4), ("--set", "fusion.shape.grid=60")
