@@ -18,7 +18,7 @@ from polcap.report.keys import ColorKey
 
 _LONGEST = 640  # px of a map on the page
 _DISTANCE = 4.0  # of the camera on the page, in widths of the sample
-_LIGHT = np.array([-0.45, 0.35, 0.82], np.float32)  # of the first picture
+_LIGHT = np.array([-0.45, 0.35, 0.82], np.float32)  # first direction; from the front, gloss would be one highlight
 
 
 def write(folder: Path, about: Mapping[str, Any], source: MaterialSource) -> None:
@@ -45,7 +45,7 @@ def write(folder: Path, about: Mapping[str, Any], source: MaterialSource) -> Non
     }
     view = {
         "size": [width, height], "center": [(width - 1) / 2, (height - 1) / 2], "focal": _DISTANCE * width,
-        "ior": IOR, "exposure": bright, "top": keys.F0.high,
+        "ior": IOR, "exposure": bright, "top": keys.F0.high, "light": _LIGHT.tolist(),
     }  # fmt: skip
     page.render("material.html", folder / "report.html", f"{name}: polcap report", content, {"view": view})
 

@@ -107,7 +107,7 @@ const ARROWS = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], 
 class Relight {
   constructor(canvas, sources) {
     this.canvas = canvas;
-    this.light = [0, 0, 0];  // none: the flash, next to the lens
+    this.light = DATA.view.light || [0, 0, 0];  // none: the flash, next to the lens
     this.size = DATA.view.size;
     this.share = 1;  // of the picture's sides that is drawn while the light moves
     canvas.style.aspectRatio = this.size.join(' / ');
