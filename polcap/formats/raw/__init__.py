@@ -8,3 +8,7 @@ file_kind     RAW, picture or other, by the first bytes; the directories of a TI
 file_checks   refuses files that are cut, stripped or wrongly decoded
 file_bytes    the bytes of a file, read once, and their digest
 """
+
+from polcap.formats import dng_writer as dng  # users' scripts write DNG by this name
+
+__all__ = ["dng"]
