@@ -1,4 +1,4 @@
-"""Page ball.html and picture ball.png of a validation: error map beside the normal map, and tables."""
+"""Page ball.html and picture ball.png of a validation: error map next to the normal map, and tables."""
 
 from pathlib import Path
 from typing import Any

@@ -22,7 +22,7 @@ def views(count: int, left_out: Mapping[str, str], limits: MaterialGateLimits) -
 
 
 def tilts(tilt_deg: Mapping[str, float], limits: MaterialGateLimits) -> Gate:
-    """Gate on the difference of the views' tilts: without it, slopes, albedo and gloss cannot be told apart."""
+    """Gate on the difference of the views' tilts: without it, slopes, albedo and gloss cannot be separated."""
     value, limit = max(tilt_deg.values()), limits.min_tilt_deg
     message = f"The most oblique view is tilted by {value:.0f}°, the steepest by {min(tilt_deg.values()):.0f}°"
     if value - min(tilt_deg.values()) >= limit:

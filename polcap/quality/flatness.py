@@ -47,7 +47,7 @@ class Flatness:
 
     @property
     def flat(self) -> bool:
-        """Whether the object is one plane, apart from its relief."""
+        """Whether the object is one plane, except for its relief."""
         return (
             self.sharp_edged and self.aligned > _ALIGNED and (self.rim_dolp < _FACING_DOLP or self.common > _ONE_PLANE)
         )

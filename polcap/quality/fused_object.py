@@ -75,7 +75,7 @@ class SeenSurface:
 
 
 def seen(surface: SeenSurface, view_count: int, limits: FusedGateLimits) -> Gate:
-    """Gate on the share of the surface that a view saw; an underside on which the object stands is left out."""
+    """Gate on the share of the surface that a view saw; the underside is left out."""
     limit, share = limits.min_seen, surface.seen
     above = share / max(1 - surface.down, 1e-9)
     most = max(("down", "side", "up"), key=lambda side: float(getattr(surface, side)))

@@ -36,10 +36,13 @@ def test_process_and_check_name_the_same_cause(tmp_path: Path, plant: causes.Pla
     verdict = check.inspect(captures.read(folder), Config(), request, lambda: (None, None))
     advised = [line.remedy for line in verdict.lines if line.remedy]
     assert not verdict.keep and len(advised) == 1 and words in advised[0]
-    assert told(folder, request, tmp_path / "out") in (advised[0], f"{advised[0]}; see {tmp_path}/out/work/stopped.png")
+    assert message_of(folder, request, tmp_path / "out") in (
+        advised[0],
+        f"{advised[0]}; see {tmp_path}/out/work/stopped.png",
+    )
 
 
-def told(folder: Path, request: ChartRequest, out: Path) -> str:
+def message_of(folder: Path, request: ChartRequest, out: Path) -> str:
     """The remedy of `process`, in its error or of its first gate."""
     try:
         about = run.process(captures.read(folder), UserInput(request), Config(), out)
