@@ -7,8 +7,5 @@ exif          camera settings from the metadata of every maker
 file_kind     RAW, picture or other, by the first bytes; the directories of a TIFF
 file_checks   refuses files that are cut, stripped or wrongly decoded
 file_bytes    the bytes of a file, read once, and their digest
+dng           the writer of DNGs under the name that users' scripts know
 """
-
-from polcap.formats import dng_writer as dng  # users' scripts write DNG by this name
-
-__all__ = ["dng"]
