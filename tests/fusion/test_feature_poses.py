@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import UNSET
 from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
@@ -22,16 +23,17 @@ from tests.fusion import board_views
 
 SHAPE = Cluster(((0, 0, 0, 0.03), (0.022, 0.01, 0.01, 0.02), (-0.02, -0.005, 0.012, 0.018)))
 PATTERN = Coat((Material((0.7, 0.6, 0.5), (0.2, 0.3, 0.25), "noise", size=0.004, roughness=(0.5, 0.5), seed=3),))
-VIEW = View(2600.0, board_views.VIEW.center, 1.0)
+SIDE = 400  # px
+VIEW = View(2600.0, ((SIDE - 1) / 2, (SIDE - 1) / 2), 1.0)
 DISTANCE = 0.7  # m
 SWAPPED = ShotOrder((1, 0))
-TURNS = {f"view{k + 1:02d}": board_views.pose(15 * k) for k in range(24)}
+TURNS = {f"view{k + 1:02d}": board_views.pose(15 * k) for k in range(12)}
 
 
 def maps(name: str, coat: Coat, seed: int = 0) -> Any:
     """Traced maps of a view, with normals that err by 6°, as far as the poses need them."""
-    scene = replace(board_views.scene(TURNS[name], SHAPE), coat=coat)
-    seen = render.gbuffer(scene, VIEW, board_views.HEIGHT, board_views.WIDTH)
+    scene = replace(board_views.scene(TURNS[name], SHAPE), coat=coat, board=UNSET, cast_shadows=False)
+    seen = render.gbuffer(scene, VIEW, SIDE, SIDE)
     diffuse = np.zeros((*seen.mask.shape, 3))
     diffuse[seen.mask] = scene_materials.evaluate(coat, seen.position[seen.mask], seen.facing[seen.mask])[0]
     random = np.random.default_rng([seed, list(TURNS).index(name)])
@@ -52,7 +54,8 @@ def features(one: Any, metres_per_px: float | None = None, as_stated: bool = Tru
 
 def solve(seen: dict[str, Any], metres_per_px: float | None = None) -> SessionPoses:
     named = {name: features(one, metres_per_px) for name, one in seen.items()}
-    return feature_poses.solve(named, board_views.capture(VIEW.focal))
+    camera = replace_field(board_views.capture(VIEW.focal), principal_px=VIEW.center, size_px=(SIDE, SIDE))
+    return feature_poses.solve(named, camera)
 
 
 @pytest.fixture(scope="module")

@@ -53,7 +53,8 @@ def named(some: list[FusionView], folder: str) -> tuple[FusionView, ...]:
     return tuple(replace(view, name=f"{folder}/view{k:02d}".lstrip("/")) for k, view in enumerate(some, 1))
 
 
-def test_a_laid_object_is_turned_back(rng: np.random.Generator) -> None:
+def test_a_laid_object_is_turned_back(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(joining, "_GRID", 60)
     body = pear()
     other, shift = laid(body)
     first, second = views(body, None, rng), views(other, shift, rng)
@@ -70,7 +71,9 @@ def test_a_laid_object_is_turned_back(rng: np.random.Generator) -> None:
         assert np.linalg.norm(away) < 0.006 * body.size  # half a pixel and more
 
 
-def test_another_object_is_recognized(rng: np.random.Generator) -> None:
+def test_another_object_is_recognized(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(joining, "_GRID", 40)
+    monkeypatch.setattr(joining, "_TURNS", 500)
     torus = trimesh.creation.torus(1.0, 0.35, 48, 24)
     other = stand(torus.vertices, torus.faces)
     joined = joining.join(named(views(pear(), None, rng), "setA") + named(views(other, None, rng), "setB"))

@@ -381,7 +381,7 @@ def test_killed_stage_leaves_no_half_result_and_resumes_to_the_same_bytes(tmp_pa
     whole = tmp_path / "whole"
     path(StageCache(whole))
     random = np.random.default_rng(1)
-    for attempt in range(6):
+    for attempt in range(3):
         folder = tmp_path / f"killed{attempt}"
         here = str(Path(__file__).parent)
         run = subprocess.Popen([sys.executable, "-c", KILLED, str(folder), here], stdout=subprocess.PIPE)

@@ -328,13 +328,9 @@ def test_every_state_of_every_gate_becomes_json(
 ) -> None:
     judged = judge(good, config, fields)
     assert {gate.name: gate.state for gate in judged}[name] == state
+    assert {gate.name for gate in judged} <= {name for name, _, _ in CASES}  # every gate has cases
     text = json.dumps(msgspec.to_builtins(judged), allow_nan=False)
     assert msgspec.json.decode(text, type=list[Gate]) == judged
-
-
-def test_every_gate_has_cases(good: dict[str, Any], config: Config) -> None:
-    judged = {gate.name for _, _, fields in CASES for gate in judge(good, config, fields)}
-    assert judged == {name for name, _, _ in CASES}
 
 
 def test_a_polarization_sensor_gets_no_advice_about_rings_or_folders(good: dict[str, Any], config: Config) -> None:
