@@ -29,24 +29,28 @@ _COLUMNS = (
 )
 _FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # first characters of cells that spreadsheets compute
 _PAGE = """<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>{{ folder }}</title><style>
-body { font: 14px/1.4 system-ui, sans-serif; margin: 1.5em; color: #222 } img { background: #000; display: block }
+<html lang="en"><meta charset="utf-8"><meta name="color-scheme" content="light dark"><title>{{ folder }}</title><style>
+:root { --pass: #17692b; --warn: #8a5300; --fail: #b3121d }
+@media (prefers-color-scheme: dark) { :root { --pass: #6fd388; --warn: #f0b45a; --fail: #ff7b80 } }
+body { font: 14px/1.4 system-ui, sans-serif; margin: 1.5em } img { background: #000; display: block }
 table { border-collapse: collapse } td, th { text-align: left; padding: .2em .8em .2em 0; vertical-align: top }
 .sheet { display: grid; grid-template-columns: repeat(auto-fill, 256px); gap: 12px } figcaption { font-size: 12px }
-.done { color: #176617 } .gates { color: #9a5b00 } .failed, .bug, .crashed { color: #b00000; font-weight: bold }
+.done { color: var(--pass) } .done.warn { color: var(--warn) } .gates, .failed, .bug, .crashed { color: var(--fail) }
 </style>
 <h1>{{ finished }} of {{ captures }} captures finished ({{ states }})</h1>
 {% if wrong %}
 <table><tr><th>capture</th><th></th><th>reason and remedy</th></tr>
 {% for one in wrong %}
-<tr><td>{{ one.name }}</td><td class="{{ one.state }}">{{ words[one.state] }}</td><td>{{ one.message }}</td></tr>
+<tr><td>{{ one.name }}</td><td class="{{ one.state }} {{ one.verdict }}">
+{{ "warning" if one.state == "done" else words[one.state] }}</td><td>{{ one.message }}</td></tr>
 {% endfor %}
 </table>
 {% endif %}
 <div class="sheet">
 {% for slug, one in drawn %}
 <figure><a href="{{ link(one.report) }}"><img loading="lazy" width="256" height="128" alt=""
- src="{{ link('thumbnails/' ~ slug ~ '.jpg') }}"></a><figcaption><span class="{{ one.state }}">{{ one.name }}</span>
+ src="{{ link('thumbnails/' ~ slug ~ '.jpg') }}"></a><figcaption>
+<span class="{{ one.state }} {{ one.verdict }}">{{ one.name }}</span>
 {{ one.title }}{% if one.object_number %} ({{ one.object_number }}){% endif %}
 
 {{ one.verdict }}{% if one.expected_error_deg is not none %}, normals {{ "%.1f" % one.expected_error_deg }}°{% endif %},
@@ -86,7 +90,7 @@ def _cell(value: Any) -> Any:
 
 
 def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[UnitRecord]) -> str:
-    """The page summary.html: counts, captures that are not done, and a picture of each result."""
+    """The page summary.html: counts, captures with an error, a failed gate or a warning, a picture of each result."""
     import jinja2  # not needed by most commands
 
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(_PAGE)
@@ -94,7 +98,7 @@ def _page(totals: dict[str, Any], units: Sequence[Unit], records: Sequence[UnitR
     return page.render(
         **totals | {"states": ", ".join(f"{count} {WORDS[state]}" for state, count in totals["states"].items())},
         folder=FOLDER,
-        wrong=[record for record in records if record.state != "done"],
+        wrong=[record for record in records if record.state != "done" or record.verdict == "warn"],
         drawn=[(unit.slug, record) for unit, record in pairs if unit.thumbnail_file.exists()],
         words=WORDS,
         link=_link,

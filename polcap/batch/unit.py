@@ -60,7 +60,7 @@ class UnitRecord(msgspec.Struct, frozen=True):
 
     name: str
     state: State = "todo"
-    message: str = msgspec.field(default="", name="says")  # one line: error and remedy, or the failed gates
+    message: str = msgspec.field(default="", name="says")  # one line: error and remedy, or the gates that decided
     seconds: float = 0.0
     host: str = ""
     pid: int = 0
@@ -92,9 +92,8 @@ def _run(unit: Unit, request: Request, record: UnitRecord, start: float) -> Unit
     try:
         write_record(unit, record)
         about = _process(unit, request)
-        failed = [gate for gate in about["gates"] if gate["state"] == "fail"]
-        message = " ".join(f"{gate['name']}: {gate['says']}. {gate['remedy']}." for gate in failed)
-        record = replace(record, state="gates" if failed else "done", message=message, **_outcome(unit, about))
+        state: State = "gates" if about["verdict"] == "fail" else "done"
+        record = replace(record, state=state, message=_reason(about), **_outcome(unit, about))
     except (PolcapError, OSError) as error:
         record = replace(record, state="failed", message=one_line(error))
     except Exception as error:
@@ -119,6 +118,13 @@ def _process(unit: Unit, request: Request) -> dict[str, Any]:
     unchanged.remember(Path(unit.out), asked)
     thumbnail.write(unit.thumbnail_file, Path(unit.out))
     return about
+
+
+def _reason(about: dict[str, Any]) -> str:
+    """The gates that failed, or else those that warn, with their remedies; "" if all passed."""
+    decided = [gate for gate in about["gates"] if gate["state"] == about["verdict"] != "pass"]
+    sentences = ([f"{gate['name']}: {gate['says']}", gate["remedy"]] for gate in decided)
+    return " ".join(f"{sentence}." for pair in sentences for sentence in pair if sentence)
 
 
 def _outcome(unit: Unit, about: dict[str, Any]) -> dict[str, Any]:

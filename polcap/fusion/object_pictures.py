@@ -9,8 +9,10 @@ from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.values import Pose
 from polcap.images import Floats, View
-from polcap.optics import color, frames, shade
+from polcap.optics import color, frames
 from polcap.optics.mesh_tracer import Tracer, Triangles
+from polcap.report import animation
+from polcap.report.animation import TexturedPoints
 from polcap.report.sheets import Picture
 
 FRAMES = 48  # of the turntable
@@ -19,7 +21,6 @@ _FILLED = 0.85  # of the picture's side, by the sphere around the object
 _DISTANCE = 5.0  # from the object's middle, in its radii
 _ELEVATION_DEG = 20.0
 _LIGHT = np.array([-0.5, 0.7, 0.8])  # direction towards the light, camera frame
-_SKY = 0.25  # light from everywhere, relative to the lamp
 _BACKGROUND = 0.012  # linear
 
 
@@ -44,27 +45,21 @@ def render(atlas: Atlas, maps: AtlasMaps, tracer: Tracer, pose: Pose, view: View
     v = frames.rays(view, side, side).reshape(-1, 3)
     origin = np.broadcast_to(pose.center, v.shape)
     met = tracer.meet(origin, -v @ pose.rotation)
-    normal, diffuse, specular, roughness = sample_textures(atlas, maps, met.face, met.weight)
-    ray = v[met.index]
-    light = frames.to_ray_frame(np.broadcast_to(_LIGHT / np.linalg.norm(_LIGHT), ray.shape), ray)
-    local = frames.lifted(frames.to_ray_frame(normal @ pose.rotation.T, ray))
-    one = np.ones(len(ray))
-    lit = shade.stokes(local, diffuse, specular, np.maximum(roughness, 0.05), _INDEX * one, light, one)[0]
-    lit += _SKY * (diffuse * (0.6 + 0.4 * (normal[:, 1:2])) + specular)
+    points, ray = sample_textures(atlas, maps, met.face, met.weight), v[met.index]
+    turned = points._replace(normal=points.normal @ pose.rotation.T)
+    lit = animation.render(turned, ray, _LIGHT, pose.rotation[:, 1], _INDEX)
     out = np.full((side * side, 3), _BACKGROUND, np.float32)
     out[met.index] = lit
     return out.reshape(side, side, 3)
 
 
-def sample_textures(
-    atlas: Atlas, maps: AtlasMaps, face: NDArray[np.integer], weight: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Normal (N, 3), diffuse (N, 3), specular (N, 3) and roughness (N,) at points (N, 3) of triangles (N,)."""
+def sample_textures(atlas: Atlas, maps: AtlasMaps, face: NDArray[np.integer], weight: Floats) -> TexturedPoints:
+    """Normal, albedo, F0 and roughness at points of triangles `face` (N,) with barycentric weights (N, 3)."""
     side = maps.mask.shape[0]
     uv = (atlas.mesh.uv[atlas.mesh.faces[face]] * weight[..., None]).sum(axis=1) * side - 0.5
     at = np.clip(np.rint(uv).astype(int), 0, side - 1)
     row, column = at[:, 1], at[:, 0]
-    return maps.normal[row, column], maps.diffuse[row, column], maps.specular[row, column], maps.roughness[row, column]
+    return TexturedPoints(*(one[row, column] for one in (maps.normal, maps.diffuse, maps.specular, maps.roughness)))
 
 
 def seen_picture(maps: AtlasMaps) -> Picture:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from polcap.images import Bools, Floats
+from polcap.images import Bools, Floats, View
 from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stage_values import SurfaceMaps
@@ -27,8 +27,6 @@ class ObjectReduction:
 
     def maps(self, maps: SurfaceMaps) -> SurfaceMaps:
         """Reduce all maps of a result; the network's coarse depth is left out."""
-        x, y = ((edge + 0.5) * self.factor - 0.5 for edge in maps.view.center)
-        left, top = (edge * self.factor for edge in maps.view.origin)
         return replace(
             maps,
             normal=frames.unit(self.mean(maps.normal)),
@@ -40,11 +38,12 @@ class ObjectReduction:
             roughness_error=None if maps.roughness_error is None else self.mean(maps.roughness_error),
             depth_prior=None,
             mask=self.share > 0.5,
-            view=replace(
-                maps.view,
-                focal=maps.view.focal * self.factor,
-                center=(x, y),
-                scale=maps.view.scale / self.factor,
-                origin=(left, top),
-            ),
+            view=scaled_view(maps.view, self.factor),
         )
+
+
+def scaled_view(view: View, factor: float) -> View:
+    """The camera of a picture in `factor` times its size."""
+    x, y = ((edge + 0.5) * factor - 0.5 for edge in view.center)
+    left, top = (edge * factor for edge in view.origin)
+    return replace(view, focal=view.focal * factor, center=(x, y), scale=view.scale / factor, origin=(left, top))

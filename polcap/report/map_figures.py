@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from polcap.formats import html
 from polcap.images import Bools, Floats
+from polcap.optics import outline
 from polcap.optics.color import srgb_eight_bits
 from polcap.optics.morphology import dilate
 from polcap.optics.outline import fill_outward
@@ -34,7 +35,7 @@ class MapFigure:
     colors: tuple[str, ...] = ()  # CSS colors of bar or wheel
     ticks: tuple[tuple[float, str], ...] = ()  # place 0…1 and text; none: a wheel
     ball: str = ""  # data URL
-    outline: str = ""  # data URL, opaque on the object; "": the image is transparent outside
+    outline: str = ""  # data URL, opaque on the object; it hides colors beyond the outline
 
 
 def of_result(small: PageMaps, metric: bool) -> list[MapFigure]:
@@ -96,13 +97,15 @@ def scalar(name: str, title: str, note: str, value: Floats, inside: Bools, key: 
     """Figure of a map with one number per pixel."""
     probe = {name: getattr(key, name) for name in ("low", "high", "power", "palette", "unit", "digits")}
     palette = keys.colors(key.palette)
-    image = html.indexed(key.level(value, inside), palette)
+    near = dilate(inside, _BORDER_PX)
+    image = html.indexed(key.level(fill_outward(value[..., None], inside)[..., 0], near), palette)
     if key.palette == "wheel":  # once around in 180°
         steps = [round(2 * k / _WHEEL_STEPS % 1 * keys.LEVELS) % keys.LEVELS for k in range(_WHEEL_STEPS)]
-        return MapFigure(name, title, note, image, {"kind": "scalar", **probe}, css_colors(palette[steps]))
+        colors = css_colors(palette[steps])
+        return MapFigure(name, title, note, image, {"kind": "scalar", **probe}, colors, outline=matte(inside))
     ticks = tuple((key.place(tick), f"{number(tick, 3)}{key.unit}") for tick in key.ticks)
     bar = css_colors(palette[:: keys.LEVELS // 17])
-    return MapFigure(name, title, note, image, {"kind": "scalar", **probe}, bar, ticks)
+    return MapFigure(name, title, note, image, {"kind": "scalar", **probe}, bar, ticks, outline=matte(inside))
 
 
 def normal(name: str, title: str, vectors: Floats, inside: Bools) -> MapFigure:
@@ -117,7 +120,7 @@ def normal(name: str, title: str, vectors: Floats, inside: Bools) -> MapFigure:
         html.lossless(_extend(_normal_colors(vectors), inside)),
         {"kind": "normal", "unit": "", "digits": 2},
         ball=html.lossless(ball),
-        outline=_outline(inside),
+        outline=matte(inside),
     )
 
 
@@ -132,12 +135,13 @@ def albedo(name: str, title: str, note: str, linear: Floats, inside: Bools, top:
     bar = srgb_eight_bits(np.linspace(0, 1, 17))[:, None].repeat(3, axis=1)
     ticks = tuple((share, number(top * share)) for share in (0, 0.25, 0.5, 0.75, 1))
     probe = {"kind": "color", "top": top, "unit": "", "digits": 2 if top == 1 else 3}
-    return MapFigure(name, title, note, image, probe, css_colors(bar), ticks, outline=_outline(inside))
+    return MapFigure(name, title, note, image, probe, css_colors(bar), ticks, outline=matte(inside))
 
 
-def _outline(inside: Bools) -> str:
-    """The object's mask as a picture; it hides the border of an extended picture on the page."""
-    return html.indexed(inside.astype(np.uint8), np.zeros((keys.LEVELS, 3), np.uint8))
+def matte(inside: Bools) -> str:
+    """The object as an opaque black picture with a soft outline, a data URL."""
+    opaque = np.rint(255 * outline.matte(inside)).astype(np.uint8)
+    return html.lossless(np.dstack([np.zeros((*inside.shape, 3), np.uint8), opaque]))
 
 
 def _normal_colors(vectors: Floats) -> NDArray[np.uint8]:

@@ -157,6 +157,7 @@ def _maps(about: Mapping[str, Any], results: Results) -> tuple[dict[str, Any], d
         "ior": ior,
         "exposure": bright * rendered.scale,
         "top": keys.F0.high,
+        "matte": map_figures.matte(small.maps.mask),
     }
 
 

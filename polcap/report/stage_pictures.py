@@ -15,6 +15,7 @@ from polcap.chart_values import ChartReference, ColorCalibration
 from polcap.images import Bools, Floats, Quality
 from polcap.mesh_values import Asset, ReliefMesh
 from polcap.optics import color, frames
+from polcap.optics import outline as outlines
 from polcap.optics.resize import area_mean
 from polcap.optics.warp import warp
 from polcap.report import keys
@@ -113,7 +114,13 @@ def outline(radiance: AngleStack, color: ColorCalibration, object_: ObjectMask, 
 
 def normal(found: SurfaceMaps) -> Picture:
     """Picture of a normal map as colors, black outside the object."""
-    return _eight_bits((found.normal / 2 + 0.5) * found.mask[..., None])
+    return cut_out(_eight_bits(found.normal / 2 + 0.5), found.mask)
+
+
+def cut_out(picture: Picture, mask: Bools) -> Picture:
+    """A picture that blends into black at the object's outline."""
+    continued = outlines.fill_outward(picture, mask)
+    return np.asarray(np.rint(continued * outlines.matte(mask)[..., None]), np.uint8)
 
 
 def shaded(mesh: ReliefMesh, found: SurfaceMaps) -> Picture:
@@ -219,13 +226,15 @@ def polarization(dolp: Floats, aolp: Floats, inside: Bools) -> list[Tile]:
 
 
 def _maps(found: SurfaceMaps) -> list[Tile]:
-    inside = found.mask[..., None]
+    inside = found.mask
+    specular, rough = display(found.specular, keys.F0.high), keys.ROUGHNESS.picture(found.roughness, inside)
+    error = keys.ERROR.picture(found.confidence, inside)
     return [
         Tile(normal(found), "Normal", note="red right, green up, blue toward the camera"),
-        Tile(display(found.diffuse * inside, 1.0), "Diffuse albedo", note="white: 1"),
-        Tile(display(found.specular * inside, keys.F0.high), "Specular albedo F0", note=f"white: {keys.F0.high:g}"),
-        Tile(keys.ROUGHNESS.picture(found.roughness, found.mask), "Roughness", keys.ROUGHNESS),
-        Tile(keys.ERROR.picture(found.confidence, found.mask), "Expected error of the normal", keys.ERROR),
+        Tile(cut_out(display(found.diffuse, 1.0), inside), "Diffuse albedo", note="white: 1"),
+        Tile(cut_out(specular, inside), "Specular albedo F0", note=f"white: {keys.F0.high:g}"),
+        Tile(cut_out(rough, inside), "Roughness", keys.ROUGHNESS),
+        Tile(cut_out(error, inside), "Expected error of the normal", keys.ERROR),
     ]
 
 

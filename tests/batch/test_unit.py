@@ -97,6 +97,15 @@ def test_no_text_of_a_record_becomes_an_element_of_the_summary(tmp_path: Path, t
     assert pages[1].names == pages[0].names and pages[1].attributes == pages[0].attributes
 
 
+def test_a_warning_is_listed_with_its_reason(tmp_path: Path) -> None:
+    unit = only_unit(tmp_path, "obj")
+    for verdict in ("pass", "warn"):
+        record = one.UnitRecord("obj", "done", "focal length: in doubt.", verdict=verdict)
+        contact_sheet.write(Path(unit.batch_folder), [unit], [record])
+        page = (Path(unit.batch_folder) / "summary.html").read_text(encoding="utf-8")
+        assert ("in doubt" in page) == ("done warn" in page) == (verdict == "warn")
+
+
 @pytest.mark.parametrize(
     "address", ["//elsewhere.example/x", "https://elsewhere.example", "javascript:alert(1)", "\ud800"]
 )

@@ -64,3 +64,14 @@ def test_pixels_without_a_value_take_that_of_a_nearest_one() -> None:
     assert np.array_equal(out[known], value[known])
     away = np.linalg.norm(out - value, axis=-1)
     assert np.all(away <= 1.05 * ndimage.distance_transform_edt(~known) + 1e-3)
+
+
+@pytest.mark.parametrize("radius", [8.3, 30.2])
+def test_matte_of_a_mask_is_near_the_share_that_the_object_covers(radius: float) -> None:
+    fine = (np.arange(96 * 16) + 0.5) / 16 - 0.5
+    covered = np.hypot(fine[:, None] - 47.3, fine - 47.6) < radius
+    share = covered.reshape(96, 16, 96, 16).mean(axis=(1, 3))
+    mask = share > 0.5
+    edge = (share > 0) & (share < 1)
+    assert np.std(outline.matte(mask)[edge] - share[edge]) < 0.6 * np.std(mask[edge] - share[edge])
+    assert outline.matte(np.ones((9, 9), bool)).min() == 1  # the picture's border is no outline

@@ -11,13 +11,14 @@ from polcap.report import map_figures
 
 
 def test_colors_beyond_the_outline_are_hidden_by_a_mask() -> None:
-    inside = np.zeros((9, 9), bool)
-    inside[3:6, 3:6] = True
-    figure = map_figures.normal("normal", "Normal", np.dstack([np.zeros((9, 9, 2)), np.ones((9, 9))]), inside)
+    inside = np.zeros((15, 15), bool)
+    inside[3:12, 3:12] = True
+    figure = map_figures.normal("normal", "Normal", np.dstack([np.zeros((15, 15, 2)), np.ones((15, 15))]), inside)
     opaque = cv2.imdecode(
         np.frombuffer(b64decode(figure.outline.partition("base64,")[2]), np.uint8), cv2.IMREAD_UNCHANGED
-    )
-    assert np.array_equal(opaque[..., 3] > 0, inside)
+    )[..., 3]
+    assert (opaque[5:10, 5:10] == 255).all() and (opaque[0] == 0).all()
+    assert 0 < opaque[3, 3] < 255  # corners are round
 
 
 def test_a_difference_that_was_not_measured_has_no_number() -> None:

@@ -14,7 +14,7 @@ from polcap.formats.export import encoders, texture_set
 from polcap.formats.export.texture_set import Texture
 from polcap.images import TexturePixels
 from polcap.mesh_values import Asset, ReliefMesh
-from polcap.optics import color
+from polcap.optics import color, outline
 
 NO_NORMAL = 128  # a normal of length 0, by which viewers leave a pixel out
 
@@ -23,14 +23,14 @@ def pictures(asset: Asset) -> dict[str, Texture]:
     """Albedo, F0, gloss and normals of an asset as 8-bit pictures of the size of its base color.
 
     Gloss is 1 − √roughness, so that Ward's slope parameter is (1 − gloss)⁴ = roughness². Outside the object the normal
-    is the zero vector and all other pictures are 0. The asset must be of one view or a plane, with its object-space
-    normals; a plane has no outside.
+    is the zero vector and all other pictures are 0; along its outline the colors blend into black. The asset must be of
+    one view or a plane, with its object-space normals; a plane has no outside.
     """
     assert asset.object_normal is not None
     height, width = asset.base_color.shape[:2]
-    inside = np.ones((height, width), bool)
+    coverage = np.ones((height, width), np.float32)
     if isinstance(asset.mesh, ReliefMesh):
-        inside = cv2.resize(np.isfinite(asset.mesh.depth).astype(np.uint8), (width, height)) > 0
+        coverage = np.asarray(cv2.resize(outline.matte(np.isfinite(asset.mesh.depth)), (width, height)))
     rough = encoders.eight_bits(texture_set.roughness(asset))
     gloss = np.rint(255 - np.sqrt(255.0 * np.arange(256))).astype(np.uint8)[rough]
     made = {
@@ -42,6 +42,9 @@ def pictures(asset: Asset) -> dict[str, Texture]:
 
     def on_object(picture: Texture, outside: int) -> TexturePixels:
         whole: Any = cv2.resize(encoders.eight_bits(picture), (width, height))
+        if picture.color:  # the backdrop is black
+            return color.srgb_eight_bits(color.decode_srgb(whole / np.float32(255)) * coverage[..., None])
+        inside = coverage > 0
         return np.where(inside if whole.ndim == 2 else inside[..., None], whole, np.uint8(outside))
 
     return {

@@ -6,7 +6,7 @@ const SOLID = `attribute vec3 position; attribute vec2 uv; uniform mat4 view; un
 varying vec2 at; varying vec3 point;
 void main() { at = uv; point = low + extent * position; gl_Position = view * vec4(point, 1.0); }`;
 const PIXEL = `
-uniform sampler2D shape, body, gloss;  // normal and roughness; root of the diffuse albedo and mask; root of F0
+uniform sampler2D shape, body, gloss;  // normal and roughness; root of the diffuse albedo and matte; root of F0
 uniform vec3 light, eye; uniform vec2 size, center; uniform float focal, ior, exposure, top; uniform int mode;
 varying vec2 at;
 #ifdef SOLID
@@ -15,7 +15,7 @@ varying vec3 point;
 void main() {
   vec4 inner = texture2D(body, at);
 #ifndef SOLID
-  if (inner.a < 0.5) { gl_FragColor = vec4(0.0, 0.0, 0.0, 1.0); return; }
+  if (inner.a == 0.0) { gl_FragColor = vec4(0.0, 0.0, 0.0, 1.0); return; }
 #endif
   vec4 outer = texture2D(shape, at);
 #ifdef SOLID
@@ -33,6 +33,8 @@ void main() {
 #ifdef SOLID
   seen += 0.04 * diffuse;  // so that the dark side differs from the backdrop
   if (!gl_FrontFacing) seen = vec3(0.02);
+#else
+  seen *= inner.a;
 #endif
   gl_FragColor = vec4(encoded(seen * (clay ? 1.0 : exposure)), 1.0);
 }`;
@@ -286,8 +288,9 @@ async function meshed({ position, uv, faces, low, extent }) {
 }
 
 // textures of the shader; it squares the roots of linear light, which in 8 bits resolve dark colors
-function textures({ normal, diffuse, specular, roughness }) {
+function textures({ normal, diffuse, specular, roughness, matte }) {
   const [n, d, s, r] = [normal, diffuse, specular, roughness].map(pixels), { width, height } = n;
+  const opaque = matte && pixels(matte).data;
   const root = Uint8Array.from({ length: 256 }, (_, code) => Math.round(255 * Math.sqrt(linear(code))));
   const [shape, body, gloss] = [0, 1, 2].map(() => ({ data: new Uint8Array(4 * width * height), width, height }));
   for (let k = 0; k < n.data.length; k += 4) {
@@ -298,7 +301,7 @@ function textures({ normal, diffuse, specular, roughness }) {
       gloss.data[k + c] = root[s.data[k + c]];
     }
     shape.data[k + 3] = Math.round(level / 254 * 255);
-    body.data[k + 3] = r.data[k + 3];  // transparent outside
+    body.data[k + 3] = opaque ? opaque[k + 3] : 255;
   }
   return { shape, body, gloss };
 }
@@ -306,6 +309,7 @@ function textures({ normal, diffuse, specular, roughness }) {
 async function begin() {
   const images = Object.fromEntries(['normal', 'diffuse', 'specular', 'roughness'].map(
     (name) => [name, document.querySelector(`#map-${name} img`)]));
+  if (DATA.view.matte) images.matte = Object.assign(new Image(), { src: DATA.view.matte });
   await Promise.all(Object.values(images).map((image) => image.decode()));
   const sources = textures(images);
   window.relight = new Relight(document.getElementById('relight'), sources);

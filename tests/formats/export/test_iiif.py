@@ -135,7 +135,8 @@ def test_wards_law_shows_the_layer_as_polcap_shades_the_maps(
     seen, drawn = ward(tmp_path, to_light)
     half = (slice(None, None, 2), slice(None, None, 2))
     shown = drawn[half] & maps.mask
-    assert shown.sum() > 0.97 * maps.mask.sum() and (drawn[half] & ~maps.mask).sum() < 0.02 * maps.mask.sum()
+    around = cv2.dilate(maps.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0  # the outline is soft
+    assert shown.sum() > 0.97 * maps.mask.sum() and (drawn[half] & ~around).sum() < 0.02 * maps.mask.sum()
     inner = cv2.erode(maps.mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     near = inner & (maps.normal @ to_light > 0.5) & (maps.normal[..., 2] > 0.5)
     assert near.sum() > 1000
