@@ -229,17 +229,28 @@ def export(
     PolcapError
         Its message is one line: the thing, its value, the limit and the remedy.
     """
-    from polcap.fusion import fuse_run, fused_maps
-    from polcap.material import material_maps, material_run
-
     folder = result.folder if isinstance(result, Result) else Path(result)
     request = ExportRequest(
         formats=tuple(formats), preset=preset, images=images, geometry=geometry, triangles=triangles, color=color,
         bits=bits, extras=tuple(extras), texture_size=texture_size, page=None if page is None else Path(page),
         iiif=iiif, catalog=catalog or {}, lod=lod,
     )  # fmt: skip
-    write = fuse_run.export if fused_maps.is_fused(folder) else pipeline.export
-    return (material_run.export if material_maps.is_material(folder) else write)(folder, request)
+    return write_exports(folder, request)
+
+
+def write_exports(folder: Path, *requests: ExportRequest) -> list[Path]:
+    """Write the asset of a result for each request: of one view, of a fused object or of a material; returns the files.
+
+    Raises SettingError: a preset or color space does not exist, or a package or encoder is missing.
+    """
+    from polcap.fusion import fuse_run, fused_maps
+    from polcap.material import material_maps, material_run
+
+    if fused_maps.is_fused(folder):
+        return fuse_run.export(folder, *requests)
+    if material_maps.is_material(folder):
+        return material_run.export(folder, *requests)
+    return pipeline.export(folder, *requests)
 
 
 @_in_python
@@ -281,8 +292,6 @@ def fuse(
     if not isinstance(chosen, SessionConfig):
         raise SettingError(f"config = {config!r:.60}: cannot be used; give a polcap.fusion.fusion_path.SessionConfig")
     place = Path(folder)
-    if not place.is_dir():
-        raise SettingError(f"{place}: no such folder; give the folder that holds view01, view02, …")
     resource_limits.set_limits(threads, memory)
     request = Request(
         config=chosen.of_views, chart=chart, estimator=estimator, model=None if model is None else Path(model),

@@ -121,10 +121,11 @@ def settings(kind: type[msgspec.Struct] = Config, prefix: str = "") -> Iterator[
             yield from settings(type_, f"{key}.")
             continue
         arms = [hint] if get_origin(hint) is Annotated else [*get_args(hint)] or [hint]  # of a union with None
-        meta = next((extra for arm in arms for extra in get_args(arm)[1:] if isinstance(extra, Meta)), Meta())
+        metas = [extra for arm in arms for extra in get_args(arm)[1:] if isinstance(extra, Meta)]
         choices = get_origin(type_) is Literal
         word = str(type_).replace("typing.", "") if choices else (*get_args(type_), type_)[0].__name__
-        yield Setting(key, word, field.default, _limits(meta), meta.description or "")
+        description = "".join(meta.description or "" for meta in metas)
+        yield Setting(key, word, field.default, ", ".join(filter(None, map(_limits, metas))), description)
 
 
 def _limits(meta: Meta) -> str:

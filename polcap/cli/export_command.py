@@ -66,10 +66,8 @@ def export(
     json: Json = False,
 ) -> None:
     """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
+    from polcap import api
     from polcap.formats.export import presets
-    from polcap.fusion import fuse_run, fused_maps
-    from polcap.material import material_maps, material_run
-    from polcap.pipeline import run as pipeline
     from polcap.pipeline.asset_export import ExportRequest
 
     formats = tuple(name for name in presets.FORMATS if context.params[name] not in (None, False))
@@ -90,9 +88,7 @@ def export(
         lod=lod,
     )
     wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
-    write = fuse_run.export if fused_maps.is_fused(result) else pipeline.export
-    write = material_run.export if material_maps.is_material(result) else write
-    files = write(result, *wanted)
+    files = api.write_exports(result, *wanted)
     options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
     if (missing := lod * len(wanted) - sum(bool(_LEVEL.search(file.name)) for file in files)) > 0:
         terminal.print_message(f"polcap: {missing} levels of --lod would differ by over 1 % of the size: not written")

@@ -38,9 +38,7 @@ def fuse(
 
     target = out or folder / own_folders.FUSED
     asked = options.request_digest({**context.params, "config": config, "model": model}, folder, target)
-    if (finished := unchanged.find(target, asked)) is not None:
-        terminal.print_progress("Nothing has changed since the last run.")
-        terminal.print_result(finished.report, target, json, open_)
+    if options.print_finished(target, asked, json, open_):
         return
     from polcap import config as settings
     from polcap.fusion import fuse_run
@@ -51,8 +49,6 @@ def fuse(
     resource_limits.set_limits(threads, memory)
     if missing := [name for name in _NEEDED if find_spec(name) is None]:
         raise SettingError(f"polcap fuse needs {', '.join(missing)}: pip install 'polcap[fusion]'")
-    if not folder.is_dir():
-        raise SettingError(f"{folder}: no such folder; give the folder that holds view01, view02, …")
     stated = settings.fill(SessionConfig, settings.read(config), assignments or [])
     request = Request(
         config=stated.of_views,

@@ -43,9 +43,7 @@ def material(
 
     target = out or folder / own_folders.MATERIAL
     asked = options.request_digest({**context.params, "config": config}, folder, target)
-    if (finished := unchanged.find(target, asked)) is not None:
-        terminal.print_progress("Nothing has changed since the last run.")
-        terminal.print_result(finished.report, target, json, open_)
+    if options.print_finished(target, asked, json, open_):
         return
     from polcap import config as settings
     from polcap.fusion.session import SessionInput
@@ -54,8 +52,6 @@ def material(
     from polcap.pipeline.request import Request
 
     resource_limits.set_limits(threads, memory)
-    if not folder.is_dir():
-        raise SettingError(f"{folder}: no such folder; give the folder that holds view01, view02, …")
     stated = settings.fill(MaterialConfig, settings.read(config), assignments or [])
     request = Request(
         config=stated.of_views,

@@ -139,6 +139,20 @@ def request_digest(stated: Mapping[str, Any], folder: Path, out: Path) -> str | 
     return unchanged.request(asked, folder, out, files)
 
 
+def print_finished(out: Path, asked: str | None, json: bool, open_: bool) -> bool:
+    """Whether a result folder already answers this request digest; its result is then printed.
+
+    Raises GateError: one of its gates failed.
+    """
+    from polcap.pipeline import unchanged
+
+    finished = unchanged.find(out, asked)
+    if finished is not None:
+        terminal.print_progress(f"{finished.table}\nNothing has changed since the last run.".lstrip())
+        terminal.print_result(finished.report, out, json, open_)
+    return finished is not None
+
+
 def user_mask(file: Path) -> Any:
     """Read the picture of --mask as (H, W) bool: true where it is lighter than half of white."""
     from polcap.formats.maps import png

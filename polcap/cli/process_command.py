@@ -44,16 +44,13 @@ def process(
 ) -> None:
     """Turn a capture into maps and a 3-D asset."""
     from polcap.formats import own_files
-    from polcap.pipeline import unchanged
 
     stated = {**context.params, "capture": capture, "config": config, "mask": mask, "model": model}  # paths, not text
     target = out or capture / own_folders.OUTPUT
     if mask is not None and own_files.wrote(target, mask):
         raise SettingError(f"--mask {mask} is part of the result that this run replaces; copy it elsewhere first")
     asked = None if until or force or dry_run or watch else options.request_digest(stated, capture, target)
-    if (finished := unchanged.find(target, asked)) is not None:
-        terminal.print_progress(f"{finished.table}\nNothing has changed since the last run.")
-        terminal.print_result(finished.report, target, json, open_)
+    if options.print_finished(target, asked, json, open_):
         return
     resource_limits.set_limits(threads, memory)  # before the libraries start threads
     once = partial(_plan, stated, target) if dry_run else partial(_process, stated, target, asked)

@@ -1,5 +1,6 @@
 """Fuses a session: processes its views, runs the path, writes maps, asset, animation, report and verdict."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,7 +13,6 @@ from polcap import __version__
 from polcap import report as reports
 from polcap.config import restore
 from polcap.errors import SettingError
-from polcap.formats.capture import folder_names
 from polcap.formats.export import encoders, provenance
 from polcap.formats.export.presets import Format
 from polcap.fusion import fused_maps, fused_page, object_pictures
@@ -23,7 +23,7 @@ from polcap.fusion.fusion_path import FusionResults, SessionConfig, path
 from polcap.fusion.session import Notify, ProcessedSession, SessionInput
 from polcap.pipeline import asset_export, result_folder
 from polcap.pipeline.asset_export import ExportRequest
-from polcap.pipeline.cache import LazyCache, Progress
+from polcap.pipeline.cache import Progress
 from polcap.pipeline.run import timings
 from polcap.quality import fused_object, gates
 from polcap.quality.advice import advise
@@ -44,14 +44,9 @@ def fuse(session_input: SessionInput[SessionConfig], out: Path, notify: Notify, 
     """
     config = session_input.config
     config.check()
-    session = sessions.read(session_input)  # first: a folder without views stays as it is
-    for view in folder_names.session_views(session_input.folder):
-        result_folder.check(out, session_input.folder / view)
-    with result_folder.locked(out):
-        cache = LazyCache(out, progress)
+    with sessions.opened(session_input, out, progress) as (session, cache):
         processed = sessions.process(session, session_input, cache, notify)
-        width, height = session.capture.size_px
-        with cache.memory_explained(width * height):
+        with cache.memory_explained(math.prod(session.capture.size_px)):
             results = path(processed.views, config.fusion, cache)
         results = replace(results, maps=_with_albedo_scale(results.maps, processed))
         cache.begin("write")
@@ -74,8 +69,7 @@ def export(out: Path, *requests: ExportRequest) -> list[Path]:
     about = reports.read(out)
     with result_folder.locked(out):
         source = fused_maps.read(out / "maps", restore(SessionConfig, about, out / "report.json").asset)
-        exports = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in requests)
-        return [file for files in exports for file in files]
+        return [file for one in requests for file in asset_export.write(out, about, one, source)]
 
 
 def _of_closed_mesh(request: ExportRequest) -> ExportRequest:
@@ -102,12 +96,13 @@ def document(
     rows = _rows(processed, results)
     judged = advise(list(_gates(processed, results, rows, config.fusion.gates)))
     first = next(iter(processed.reports.values()))
+    shots = sessions.shots({view: report["capture"] for view, report in processed.reports.items()})
     of_views = {f"{view} infer": report["keys"]["infer"] for view, report in processed.reports.items()}
     return {
         "polcap": __version__,
         "versions": provenance.versions(),
         "verdict": gates.verdict(judged),
-        "capture": {**first["capture"], "name": name, "shots": _shots(processed)},
+        "capture": {**first["capture"], "name": name, "shots": shots},
         "gates": msgspec.to_builtins(judged),
         "figures": _figures(processed, results, rows),
         "timings": dict(seconds),
@@ -115,15 +110,6 @@ def document(
         "keys": {**results.keys, **of_views},
         "settings": msgspec.to_builtins(config),
     }
-
-
-def _shots(processed: ProcessedSession) -> list[dict[str, Any]]:
-    """Facts of the shots of all views, with files named from the session's folder."""
-    return [
-        {**shot, "frames": [{**frame, "file": f"{view}/{frame['file']}"} for frame in shot["frames"]]}
-        for view, report in processed.reports.items()
-        for shot in report["capture"]["shots"]
-    ]
 
 
 def _figures(processed: ProcessedSession, results: FusionResults, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -199,7 +185,7 @@ def write(out: Path, about: dict[str, Any], results: FusionResults, config: Sess
     fused_maps.write(out / "maps", results.atlas, results.maps, about["keys"])
     source = fused_maps.read(out / "maps", config.asset)  # as stored, so that `polcap export` makes the same bytes
     request = ExportRequest(lod=_LODS if source.triangles > 16 * 4**_LODS else 0)
-    asset_export.write(out, about, request, asset_export.levels(source, request))
+    asset_export.write(out, about, request, source)
     turning = object_pictures.around(results.atlas, results.maps, object_pictures.FRAMES, _SIDE)
     encoders.animate(out / "asset" / "turntable", turning, animation.SECONDS)
     fused_page.write(out, about, results)

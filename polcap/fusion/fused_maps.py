@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from polcap.errors import DecodeError
 from polcap.formats import atomic, text_file
 from polcap.formats.export.texture_set import Extra
-from polcap.formats.maps import exr, maps_folder, png
+from polcap.formats.maps import maps_folder, png
 from polcap.fusion import atlas as atlases
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, on_atlas
@@ -24,7 +24,6 @@ from polcap.fusion.mesh_occlusion import ambient_occlusion
 from polcap.fusion.values import ClosedMesh
 from polcap.images import Floats
 from polcap.mesh_values import Asset, Mesh
-from polcap.optics import color
 from polcap.pipeline.asset_export import DetailLevel
 from polcap.stages import asset
 from polcap.stages.asset import AssetSettings
@@ -70,14 +69,7 @@ def write(folder: Path, atlas: Atlas, maps: AtlasMaps, keys: Mapping[str, str]) 
         },
     }
     with atomic.folder_of_files(folder, "maps.json") as place:
-        for name, letters in _CHANNELS.items():
-            value = getattr(maps, name).reshape(*maps.mask.shape, -1)
-            channels = {letter: np.ascontiguousarray(value[..., k]) for k, letter in enumerate(letters)}
-            exr.write(place / f"{name}.exr", channels, half=name != "normal")
-        png.write(place / "normal.png", png.sixteen_bits(maps.normal / 2 + 0.5))
-        png.write(place / "diffuse.png", color.srgb_eight_bits(maps.diffuse), srgb=True)
-        png.write(place / "specular.png", color.srgb_eight_bits(maps.specular), srgb=True)
-        png.write(place / "roughness.png", png.sixteen_bits(maps.roughness))
+        maps_folder.write_textures(place, maps, _CHANNELS, ("normal",))
         for name, mask in (("seen", maps.seen & maps.mask), ("mask", maps.mask)):
             png.write(place / f"{name}.png", np.where(mask, 255, 0).astype(np.uint8))
         with (place / "mesh.npz").open("wb") as file:
@@ -87,10 +79,7 @@ def write(folder: Path, atlas: Atlas, maps: AtlasMaps, keys: Mapping[str, str]) 
 
 def is_fused(out: Path) -> bool:
     """Whether a result folder is that of `polcap fuse`."""
-    try:
-        return bool(text_file.read_json(out / "maps" / "maps.json")["format"] == FORMAT)
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
+    return maps_folder.read_format(out) == FORMAT
 
 
 @dataclass(frozen=True)
@@ -135,17 +124,13 @@ def read(folder: Path, settings: AssetSettings) -> FusedSource:
         about = msgspec.convert(text_file.read_json(folder / "maps.json"), _FusedMapsFile)
     except (OSError, ValueError) as error:
         raise DecodeError(f"{folder} holds no fused maps of this polcap ({error}); run `polcap fuse` again") from error
-    percent, side = about.albedo.uncertainty_percent, about.size[0]
-    mask = png.read(folder / "mask.png")
-    if mask.shape != about.size[::-1]:
-        raise DecodeError(f"{folder / 'mask.png'} is not {side} × {side}; run `polcap fuse` again")
     maps = AtlasMaps(
         **{name: maps_folder.read_map(folder, name, letters, about.size) for name, letters in _CHANNELS.items()},
-        mask=mask > 127,
-        albedo_sigma=None if percent is None else percent / 100,
+        mask=maps_folder.read_mask(folder / "mask.png", about.size),
+        albedo_sigma=about.albedo.sigma,
     )
     mesh = Mesh(**_mesh_arrays(folder / "mesh.npz"), metric=about.unit == "m", frame="board")
-    return FusedSource(atlases.of_mesh(mesh, side, about.margin), maps, settings)
+    return FusedSource(atlases.of_mesh(mesh, about.size[0], about.margin), maps, settings)
 
 
 def _mesh_arrays(file: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import numpy as np
 from polcap.capture_values import Capture
 from polcap.chart_values import ChartRequest, ColorCalibration
 from polcap.config import Config
-from polcap.errors import CaptureError, ChartError
+from polcap.errors import CaptureError, ChartError, SettingError
 from polcap.formats import own_folders
 from polcap.formats.capture import folder_names
 from polcap.formats.maps import png
@@ -29,8 +29,8 @@ from polcap.fusion.poses import LEAST_VIEWS, SessionPoses
 from polcap.fusion.silhouettes import Silhouette
 from polcap.fusion.values import FusionView, ViewMask
 from polcap.fusion.view_path import SessionView
-from polcap.pipeline import run
-from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult, digest
+from polcap.pipeline import result_folder, run
+from polcap.pipeline.cache import DeferredResult, LazyCache, Progress, StageResult, digest
 from polcap.pipeline.request import Request
 from polcap.process_pool import Limits, ProcessPool
 
@@ -89,6 +89,15 @@ class Session:
         return Session({name: change(view) for name, view in self.views.items()}, self.left_out)
 
 
+def shots(captures: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Facts of all shots, with files named from the session's folder; `captures` are the facts of each view."""
+    return [
+        {**shot, "frames": [{**frame, "file": f"{view}/{frame['file']}"} for frame in shot["frames"]]}
+        for view, capture in captures.items()
+        for shot in capture["shots"]
+    ]
+
+
 @dataclass(frozen=True)
 class ProcessedSession:
     """Maps and reports of the used views of a session, and their camera and poses."""
@@ -119,12 +128,28 @@ class StepRunner:
         self.notify(f"{name}: {step}")
 
 
+@contextmanager
+def opened(session_input: SessionInput[Any], out: Path, progress: Progress) -> Iterator[tuple[Session, LazyCache]]:
+    """Context manager: the views of a session, and the cache of its result folder `out`, which is locked.
+
+    Raises SettingError: there is no such folder, or `out` is not allowed. CaptureError: there are too few views.
+    StorageError: `out` is locked.
+    """
+    session = read(session_input)  # first: a folder without views stays as it is
+    for view in folder_names.session_views(session_input.folder):
+        result_folder.check(out, session_input.folder / view)
+    with result_folder.locked(out):
+        yield session, LazyCache(out, progress)
+
+
 def read(session_input: SessionInput[Any]) -> Session:
     """Read the captures of all folders view…/ and set…/view…/; nothing is written.
 
-    Raises CaptureError: there are too few views.
+    Raises SettingError: there is no such folder. CaptureError: there are too few views.
     """
     folder, request = session_input.folder, session_input.request
+    if not folder.is_dir():
+        raise SettingError(f"{folder}: no such folder; give the folder that holds view01, view02, …")
     names = folder_names.session_views(folder)
     if not names:
         raise CaptureError(f"{folder} holds no views; put each capture into a folder view01, view02, …")

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -12,12 +12,10 @@ from msgspec import Meta
 from polcap.errors import DecodeError, ObjectError
 from polcap.formats import atomic, text_file
 from polcap.formats.export.texture_set import Extra
-from polcap.formats.maps import exr, maps_folder, png
-from polcap.images import Floats
+from polcap.formats.maps import maps_folder, png
 from polcap.material.height_map import MaterialMaps
 from polcap.material.texel_grid import TexelGrid
 from polcap.mesh_values import Asset, Mesh
-from polcap.optics import color
 from polcap.pipeline.asset_export import DetailLevel
 from polcap.stages import asset
 from polcap.stages.asset import AssetSettings
@@ -71,14 +69,7 @@ def write(folder: Path, grid: TexelGrid, maps: MaterialMaps, keys: Mapping[str, 
         },
     }
     with atomic.folder_of_files(folder, "maps.json") as place:
-        for name, (letters, _) in _MEANINGS.items():
-            value = getattr(maps, name).reshape(height, width, -1)
-            channels = {letter: np.ascontiguousarray(value[..., k]) for k, letter in enumerate(letters)}
-            exr.write(place / f"{name}.exr", channels, half=name not in _FLOAT)
-        png.write(place / "normal.png", png.sixteen_bits(maps.normal / 2 + 0.5))
-        png.write(place / "diffuse.png", color.srgb_eight_bits(maps.diffuse), srgb=True)
-        png.write(place / "specular.png", color.srgb_eight_bits(maps.specular), srgb=True)
-        png.write(place / "roughness.png", png.sixteen_bits(maps.roughness))
+        maps_folder.write_textures(place, maps, {name: letters for name, (letters, _) in _MEANINGS.items()}, _FLOAT)
         png.write(place / "occlusion.png", png.sixteen_bits(maps.occlusion))
         png.write(place / "height.png", png.sixteen_bits((maps.height - low) / max(high - low, 1e-12)))
         png.write(place / "seen.png", np.where(maps.seen, 255, 0).astype(np.uint8))
@@ -87,10 +78,7 @@ def write(folder: Path, grid: TexelGrid, maps: MaterialMaps, keys: Mapping[str, 
 
 def is_material(out: Path) -> bool:
     """Whether a result folder is that of `polcap material`."""
-    try:
-        return bool(text_file.read_json(out / "maps" / "maps.json")["format"] == FORMAT)
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
+    return maps_folder.read_format(out) == FORMAT
 
 
 @dataclass(frozen=True)
@@ -132,14 +120,8 @@ def read(folder: Path, settings: AssetSettings) -> MaterialSource:
             f"{folder} holds no material of this polcap ({error}); run `polcap material` again"
         ) from error
     values = {name: maps_folder.read_map(folder, name, letters, about.size) for name, (letters, _) in _MEANINGS.items()}
-    seen = png.read(folder / "seen.png")
-    if seen.shape != about.size[::-1]:
-        raise DecodeError(
-            f"{folder / 'seen.png'} is not {about.size[0]} × {about.size[1]}; run `polcap material` again"
-        )
-    percent = about.albedo.uncertainty_percent
-    sigma = None if percent is None else percent / 100
-    maps = MaterialMaps(**values, seen=seen > 127, thickness=about.thickness_m, albedo_sigma=sigma)
+    seen = maps_folder.read_mask(folder / "seen.png", about.size)
+    maps = MaterialMaps(**values, seen=seen, thickness=about.thickness_m, albedo_sigma=about.albedo.sigma)
     return MaterialSource(maps, about.texel_m, settings)
 
 
@@ -155,13 +137,3 @@ def plane(height: int, width: int, texel: float) -> Mesh:
         metric=True,
         frame="board",
     )
-
-
-def finite(maps: MaterialMaps) -> MaterialMaps:
-    """The maps as their files hold them: sigmas that are not finite become the greatest of the map."""
-    changed: dict[str, Any] = {}
-    for name in ("normal_sigma", "diffuse_sigma", "specular_sigma", "roughness_sigma"):
-        value: Floats = getattr(maps, name)
-        known = np.isfinite(value)
-        changed[name] = np.where(known, value, value[known].max() if known.any() else 1.0)
-    return replace(maps, **changed)

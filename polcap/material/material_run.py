@@ -1,5 +1,6 @@
 """Measures a flat sample: processes its views, runs the path, writes maps, asset, report and verdict."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,7 +13,6 @@ from polcap import __version__
 from polcap import report as reports
 from polcap.config import restore
 from polcap.errors import SettingError
-from polcap.formats.capture import folder_names
 from polcap.formats.export import provenance
 from polcap.formats.export.presets import Format
 from polcap.fusion import session as sessions
@@ -22,7 +22,7 @@ from polcap.material.material_path import MaterialConfig, MaterialResults
 from polcap.material.material_session import FlatSession, Region
 from polcap.pipeline import asset_export, result_folder
 from polcap.pipeline.asset_export import ExportRequest
-from polcap.pipeline.cache import LazyCache, Progress
+from polcap.pipeline.cache import Progress
 from polcap.pipeline.run import timings
 from polcap.quality import flat_sample, gates
 from polcap.quality.advice import advise
@@ -46,23 +46,17 @@ def measure(
 
     Raises InputError: anything at fault with the user's input.
     """  # fmt: skip
-    session = sessions.read(session_input)  # first: a folder without views stays as it is
-    for view in folder_names.session_views(session_input.folder):
-        result_folder.check(out, session_input.folder / view)
-    with result_folder.locked(out):
-        cache = LazyCache(out, progress)
+    with sessions.opened(session_input, out, progress) as (session, cache):
         flat = material_session.process(session, session_input, region, texel, cache, notify)
-        width, height = session.capture.size_px
         settings = session_input.config.material
-        with cache.memory_explained(width * height):
+        with cache.memory_explained(math.prod(session.capture.size_px)):
             results = material_path.path(flat.views, flat.chart, flat.board, flat.grid, settings, tile, cache)
         cache.begin("write")
         name = session_input.folder.resolve().name
         about = document(name, session, flat, session_input.config, results, timings(out))
         material_maps.write(out / "maps", flat.grid, results.maps, about["keys"], tile)
         source = material_maps.read(out / "maps", session_input.config.asset)  # as stored, as `polcap export` reads it
-        request = ExportRequest(formats=("gltf", "obj"))
-        asset_export.write(out, about, request, asset_export.levels(source, request))
+        asset_export.write(out, about, ExportRequest(), source)
         material_page.write(out, about, source)
         cache.end()
         return about
@@ -80,8 +74,7 @@ def export(out: Path, *requests: ExportRequest) -> list[Path]:
     about = reports.read(out)
     with result_folder.locked(out):
         source = material_maps.read(out / "maps", restore(MaterialConfig, about, out / "report.json").asset)
-        exports = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in requests)
-        return [file for files in exports for file in files]
+        return [file for one in requests for file in asset_export.write(out, about, one, source)]
 
 
 def _of_plane(request: ExportRequest) -> ExportRequest:
@@ -102,12 +95,12 @@ def document(
     """The content of report.json: facts, figures by view, gates; `seconds` are those of the stages."""  # fmt: skip
     rows = list(_rows(flat, results))
     judged = advise(list(_gates(flat, results, rows, config)))
-    first = reports.capture_facts(session.views[flat.names[0]].capture)
+    captures = {name: reports.capture_facts(session.views[name].capture) for name in flat.names}
     return {
         "polcap": __version__,
         "versions": provenance.versions(),
         "verdict": gates.verdict(judged),
-        "capture": {**first, "name": name, "shots": _shots(session, flat)},
+        "capture": {**captures[flat.names[0]], "name": name, "shots": sessions.shots(captures)},
         "gates": msgspec.to_builtins(judged),
         "figures": _figures(flat, results, rows),
         "timings": dict(seconds),
@@ -115,15 +108,6 @@ def document(
         "keys": results.keys,
         "settings": msgspec.to_builtins(config),
     }
-
-
-def _shots(session: Session, flat: FlatSession) -> list[dict[str, Any]]:
-    """Facts of the shots of all views, with files named from the session's folder."""
-    return [
-        {**shot, "frames": [{**frame, "file": f"{view}/{frame['file']}"} for frame in shot["frames"]]}
-        for view in flat.names
-        for shot in reports.capture_facts(session.views[view].capture)["shots"]
-    ]
 
 
 def _rows(flat: FlatSession, results: MaterialResults) -> Iterator[dict[str, Any]]:

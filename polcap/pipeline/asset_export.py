@@ -237,14 +237,15 @@ def _with_texels(level: DetailLevel, size: int | None, powers: bool, factor: int
     return replace(level, asset=resized, texel=max(built.normal.shape) / max(resized.normal.shape))
 
 
-def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, found: Sequence[DetailLevel]) -> list[Path]:
-    """Write an asset and its levels of detail into a result folder; returns the files, the record of provenance last.
+def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: ExportSource) -> list[Path]:
+    """Write an object's asset and its levels of detail into a result folder; returns the files, the provenance last.
 
     Without a preset the files go to asset/, with one to asset/PRESET/. `about` is report.json's content. All GLBs have
     the origin of the first level. The records of an earlier export of the same maps into the same folder are merged.
 
-    Raises SettingError: no such preset or color space, or an encoder is missing.
+    Raises SettingError: no such preset or color space, or an encoder is missing. ObjectError: as `levels`.
     """
+    found = levels(source, wanted)
     whole = found[0].asset
     preset, mesh = effective(wanted), whole.mesh
     name = atomic.safe_name(str(about["capture"].get("name")))  # files stay in the folder, whatever name the report has

@@ -164,8 +164,7 @@ def _write_assets(
 ) -> list[Path]:
     """Write an asset for each request, from the files in maps/ and their mesh; returns the files."""
     source = asset_export.read(out / "maps", config, mesh)
-    exports = (asset_export.write(out, about, one, asset_export.levels(source, one)) for one in wanted)
-    return [file for files in exports for file in files]
+    return [file for one in wanted for file in asset_export.write(out, about, one, source)]
 
 
 def reopen(out: str | Path, until: str = "surface") -> tuple[Results, dict[str, Any]]:

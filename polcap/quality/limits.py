@@ -5,6 +5,10 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
+Positive = Annotated[float, Meta(gt=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+PositiveShare = Annotated[float, Meta(gt=0, le=1)]
+
 
 class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Limits of the quality gates.
@@ -13,82 +17,67 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     max_delta_e: Annotated[
-        float, Meta(gt=0, description="allowed mean color error of the chart's patches [CIEDE2000]")
+        Positive, Meta(description="allowed mean color error of the chart's patches [CIEDE2000]")
     ] = 5.0
-    max_scale_doubt: Annotated[float, Meta(gt=0, le=1, description="allowed 1σ of the scale of all albedos [1]")] = 0.2
+    max_scale_doubt: Annotated[PositiveShare, Meta(description="allowed 1σ of the scale of all albedos [1]")] = 0.2
     max_tone_curvature: Annotated[
-        float, Meta(gt=0, le=1, description="allowed slope of ln exposure ratio over ln brightness; 0 is linear [1]")
+        PositiveShare, Meta(description="allowed slope of ln exposure ratio over ln brightness; 0 is linear [1]")
     ] = 0.1
     max_black_error: Annotated[
-        float, Meta(gt=0, le=1, description="allowed error of the stated black level, which is corrected [white level]")
+        PositiveShare, Meta(description="allowed error of the stated black level, which is corrected [white level]")
     ] = 0.001
     max_gain_disagreement: Annotated[
-        float,
-        Meta(
-            gt=0,
-            le=1,
-            description="allowed difference of a shot's gain by chart and by object, beyond both errors [1]",
-        ),
+        PositiveShare,
+        Meta(description="allowed difference of a shot's gain by chart and by object, beyond both errors [1]"),
     ] = 0.03
     max_gain_doubt: Annotated[
-        float, Meta(gt=0, le=1, description="allowed 1σ of the gain of a shot; 1 % costs 6° of the normals [1]")
+        PositiveShare, Meta(description="allowed 1σ of the gain of a shot; 1 % costs 6° of the normals [1]")
     ] = 0.006
     max_gain_change: Annotated[
-        float,
+        PositiveShare,
         Meta(
-            gt=0,
-            le=1,
             description="allowed change of the light from shot to shot. A darker shot only warns: its gain is measured "
-            "and corrected. A brighter shot fails: another lamp may have been on [1]",
+            "and corrected. A brighter shot fails: another lamp may have been on [1]"
         ),
     ] = 0.1
     max_energy_drift: Annotated[
-        float, Meta(gt=0, le=1, description="allowed change of one frame's light against its bracket [1]")
+        PositiveShare, Meta(description="allowed change of one frame's light against its bracket [1]")
     ] = 0.06
     max_align_residual_px: Annotated[
-        float, Meta(gt=0, description="allowed 1σ error of a shot's registration [merged px]")
+        Positive, Meta(description="allowed 1σ error of a shot's registration [merged px]")
     ] = 0.15
     min_object_shift: Annotated[
-        float, Meta(gt=0, le=1, description="least movement of the object that is reported [radius of the object]")
+        PositiveShare, Meta(description="least movement of the object that is reported [radius of the object]")
     ] = 0.01
     max_object_shift_px: Annotated[
-        float,
-        Meta(gt=0, description="allowed movement of the object against its surroundings [merged px]"),
+        Positive, Meta(description="allowed movement of the object against its surroundings [merged px]")
     ] = 1.5
     max_object_turn_deg: Annotated[
         float,
         Meta(gt=0, le=45, description="allowed turn of the object between shots, beyond twice its error [degrees]"),
     ] = 0.45
     max_mask_doubt: Annotated[
-        float, Meta(ge=0, le=1, description="allowed expected error of the mask, 1 − overlap; half of it warns [1]")
+        Share, Meta(description="allowed expected error of the mask, 1 − overlap; half of it warns [1]")
     ] = 0.25
-    max_mask_islands: Annotated[
-        float, Meta(ge=0, le=1, description="allowed share of the mask outside its largest part [1]")
-    ] = 0.02
-    max_mask_holes: Annotated[float, Meta(ge=0, le=1, description="allowed area of holes relative to the mask [1]")] = (
-        0.05
-    )
-    max_mask_border: Annotated[
-        float, Meta(ge=0, le=1, description="allowed share of the picture's border that the object touches [1]")
-    ] = 0.0
-    max_clipped: Annotated[float, Meta(ge=0, le=1, description="allowed share of the object that is clipped [1]")] = (
+    max_mask_islands: Annotated[Share, Meta(description="allowed share of the mask outside its largest part [1]")] = (
         0.02
     )
+    max_mask_holes: Annotated[Share, Meta(description="allowed area of holes relative to the mask [1]")] = 0.05
+    max_mask_border: Annotated[
+        Share, Meta(description="allowed share of the picture's border that the object touches [1]")
+    ] = 0.0
+    max_clipped: Annotated[Share, Meta(description="allowed share of the object that is clipped [1]")] = 0.02
     max_blur_px: Annotated[
-        float,
-        Meta(gt=0, le=20, description="allowed 1σ of a frame's blur beyond the sharpest frame [RAW px]"),
+        float, Meta(gt=0, le=20, description="allowed 1σ of a frame's blur beyond the sharpest frame [RAW px]")
     ] = 1.2
     max_edge_blur_px: Annotated[
-        float,
-        Meta(gt=0, le=20, description="allowed 1σ blur of the object's sharpest edges [merged px]"),
+        float, Meta(gt=0, le=20, description="allowed 1σ blur of the object's sharpest edges [merged px]")
     ] = 1.4
     max_turn_deg: Annotated[
-        float,
-        Meta(ge=3, le=45, description="allowed error of an angle, measured from the outline [degrees]"),
+        float, Meta(ge=3, le=45, description="allowed error of an angle, measured from the outline [degrees]")
     ] = 8.0
     max_ring_turn_deg: Annotated[
-        float,
-        Meta(gt=0, le=45, description="allowed error of the ring's zero, with three angles [degrees]"),
+        float, Meta(gt=0, le=45, description="allowed error of the ring's zero, with three angles [degrees]")
     ] = 3.0
     max_turn_fit: Annotated[
         float,
@@ -98,72 +87,57 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             description="misfit of the outline with a turn over that without, from which no turn is reported [1]",
         ),
     ] = 0.68
-    min_outline_dolp: Annotated[
-        float, Meta(ge=0, le=1, description="least allowed median polarization of the outline [1]")
-    ] = 0.03
+    min_outline_dolp: Annotated[Share, Meta(description="least allowed median polarization of the outline [1]")] = 0.03
     min_zenith_deg: Annotated[
         float,
         Meta(
-            ge=0,
-            le=90,
-            description="least allowed median tilt of the normals, for a weakly polarized object [degrees]",
+            ge=0, le=90, description="least allowed median tilt of the normals, for a weakly polarized object [degrees]"
         ),
     ] = 33.0
     max_inward_outline: Annotated[
-        float, Meta(ge=0, le=1, description="allowed share of the outline's normals that point into the object [1]")
+        Share, Meta(description="allowed share of the outline's normals that point into the object [1]")
     ] = 0.12
     min_concentration: Annotated[
-        float, Meta(ge=0, le=1, description="least allowed agreement of polarization and outline; 1 is perfect [1]")
+        Share, Meta(description="least allowed agreement of polarization and outline; 1 is perfect [1]")
     ] = 0.5
     max_one_sided: Annotated[
-        float, Meta(gt=0, description="allowed uneven light round the outline, amplitude over mean [1]")
+        Positive, Meta(description="allowed uneven light round the outline, amplitude over mean [1]")
     ] = 0.5
-    max_side_light: Annotated[
-        float, Meta(gt=0, le=1, description="allowed excess light on one side in one shot [1]")
-    ] = 0.07
+    max_side_light: Annotated[PositiveShare, Meta(description="allowed excess light on one side in one shot [1]")] = (
+        0.07
+    )
     max_dolp_noise: Annotated[
-        float, Meta(gt=0, le=1, description="allowed false polarization from noise, median over the object [1]")
+        PositiveShare, Meta(description="allowed false polarization from noise, median over the object [1]")
     ] = 0.04
     max_ambient: Annotated[
-        float, Meta(gt=0, le=1, description="allowed share of ambient light, which is subtracted [1]")
+        PositiveShare, Meta(description="allowed share of ambient light, which is subtracted [1]")
     ] = 0.3
     max_ambient_shared: Annotated[
-        float,
-        Meta(gt=0, le=1, description="allowed share of ambient light if one ambient frame serves several angles [1]"),
+        PositiveShare, Meta(description="allowed share of ambient light if one ambient frame serves several angles [1]")
     ] = 0.08
     max_highlight_dolp: Annotated[
-        float,
-        Meta(gt=0, le=1, description="allowed polarization common to the brightest parts that face the camera [1]"),
+        PositiveShare, Meta(description="allowed polarization common to the brightest parts that face the camera [1]")
     ] = 0.004
     max_room_dolp: Annotated[
-        float, Meta(gt=0, le=1, description="allowed polarization of the surroundings, common to all of them [1]")
+        PositiveShare, Meta(description="allowed polarization of the surroundings, common to all of them [1]")
     ] = 0.015
     max_crossed_misfit: Annotated[
-        float,
-        Meta(
-            gt=0,
-            le=1,
-            description="allowed share of the object that is brighter in the cross-polarized shot than in S0 [1]",
-        ),
+        PositiveShare,
+        Meta(description="allowed share of the object that is brighter in the cross-polarized shot than in S0 [1]"),
     ] = 0.05
     max_ill_posed: Annotated[
-        float, Meta(ge=0, le=1, description="allowed share of the object with a DoLP above that of any dielectric [1]")
+        Share, Meta(description="allowed share of the object with a DoLP above that of any dielectric [1]")
     ] = 0.05
     min_rerendering_agreement: Annotated[
-        float,
-        Meta(
-            ge=0,
-            le=1,
-            description="least agreement of the photographs' polarization with that of the maps; 1 is perfect [1]",
-        ),
+        Share,
+        Meta(description="least agreement of the photographs' polarization with that of the maps; 1 is perfect [1]"),
     ] = 0.2
     max_rerendering_scale: Annotated[
         float,
         Meta(ge=1, description="largest factor between the brightness of the photographs and that of the maps [1]"),
     ] = 1.7
     max_ghost: Annotated[
-        float,
-        Meta(ge=0, le=1, description="allowed share of the object where exposures of a shot disagree beyond noise [1]"),
+        Share, Meta(description="allowed share of the object where exposures of a shot disagree beyond noise [1]")
     ] = 0.02
     max_normal_error_deg: Annotated[
         float, Meta(gt=0, le=90, description="allowed median expected error of the normals [degrees]")
@@ -182,33 +156,24 @@ class FusedGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     min_views: Annotated[int, Meta(ge=3, le=999, description="least number of views without a warning")] = 8
     max_corner_px: Annotated[
-        float,
-        Meta(
-            gt=0,
-            description="allowed rms distance of board corners from the pose; usually 0.1 to 0.2 [RAW px]",
-        ),
+        Positive, Meta(description="allowed rms distance of board corners from the pose; usually 0.1 to 0.2 [RAW px]")
     ] = 0.5
     max_feature_px: Annotated[
-        float,
-        Meta(
-            gt=0,
-            description="without a board: allowed rms distance of features from the pose; usually 0.6 to 1 [RAW px]",
-        ),
+        Positive,
+        Meta(description="without a board: allowed rms distance of features from the pose; usually 0.6 to 1 [RAW px]"),
     ] = 2.0
     max_normal_deg: Annotated[
         float,
         Meta(gt=0, le=90, description="allowed median angle between a view's normals and the mesh; usually 6 to 9 [°]"),
     ] = 20.0
     min_shared: Annotated[
-        float,
+        Share,
         Meta(
-            ge=0,
-            le=1,
             description="least share of a further set's surface that the first set confirms; less ends the run. "
-            "Sets of one object have .84 or more, of two objects mostly .5 or less [1]",
+            "Sets of one object have .84 or more, of two objects mostly .5 or less [1]"
         ),
     ] = 0.7
-    min_seen: Annotated[float, Meta(ge=0, le=1, description="least share of the surface that a view saw [1]")] = 0.85
+    min_seen: Annotated[Share, Meta(description="least share of the surface that a view saw [1]")] = 0.85
 
 
 class MaterialGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -216,15 +181,14 @@ class MaterialGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
     min_views: Annotated[int, Meta(ge=3, le=999, description="least number of views without a warning")] = 5
     max_corner_px: Annotated[
-        float,
-        Meta(gt=0, description="allowed rms distance of board corners from the pose; usually 0.1 to 0.2 [RAW px]"),
+        Positive, Meta(description="allowed rms distance of board corners from the pose; usually 0.1 to 0.2 [RAW px]")
     ] = 0.5
     max_residual: Annotated[
-        float,
-        Meta(gt=0, description="allowed median of a view's radiance minus that of the fit, relative; usually 0.01 [1]"),
+        Positive,
+        Meta(description="allowed median of a view's radiance minus that of the fit, relative; usually 0.01 [1]"),
     ] = 0.05
     min_seen: Annotated[
-        float, Meta(ge=0, le=1, description="least share of the texels that three views or more have measured [1]")
+        Share, Meta(description="least share of the texels that three views or more have measured [1]")
     ] = 0.95
     min_tilt_deg: Annotated[
         float, Meta(ge=0, le=90, description="least tilt of the most oblique view against the steepest [°]")

@@ -1,6 +1,6 @@
 """Writes and reads the folder maps/ of a result (docs/reference/result.md)."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,8 @@ from polcap import parallel
 from polcap.errors import DecodeError
 from polcap.formats import atomic, text_file
 from polcap.formats.maps import exr, map_files, png
-from polcap.images import Floats, View
+from polcap.images import Bools, Floats, View
+from polcap.optics import color
 from polcap.results import Results
 from polcap.stage_values import SurfaceMaps
 
@@ -57,6 +58,11 @@ class _Depth(Struct, frozen=True):
 
 class _Albedo(Struct, frozen=True):
     uncertainty_percent: Annotated[float, Meta(ge=0)] | None = None
+
+    @property
+    def sigma(self) -> float | None:
+        """Relative 1σ of the scale of all albedos; None: unknown."""
+        return None if self.uncertainty_percent is None else round(self.uncertainty_percent / 100, 3)
 
 
 class LevelNote(Struct, frozen=True):
@@ -146,13 +152,9 @@ def read(folder: Path) -> ResultMaps:
         ) from error
     except ValueError as error:
         raise DecodeError(f"{folder / 'maps.json'} is not a maps.json of polcap ({error}); process again") from error
-    percent = about.albedo.uncertainty_percent
     origin = (about.crop[0] / about.scale, about.crop[1] / about.scale)
     view = View(about.camera.focal_px, about.camera.center_px, about.scale, origin, about.camera.focal_known)
-    mask = png.read(folder / "mask.png")
-    if mask.shape != about.size[::-1]:
-        raise DecodeError(f"{folder / 'mask.png'} is not {about.size[0]} × {about.size[1]}; process again")
-    inside = mask > 127
+    inside = read_mask(folder / "mask.png", about.size)
     normal, diffuse, specular = (
         read_map(folder, name, "RGB", about.size) for name in ("normal", "diffuse", "specular")
     )
@@ -168,7 +170,7 @@ def read(folder: Path) -> ResultMaps:
         mask=inside,
         view=view,
         estimator=about.estimator,
-        albedo_sigma=None if percent is None else round(percent / 100, 3),
+        albedo_sigma=about.albedo.sigma,
         detail=_read_detail(folder, about.size) if map_files.DETAIL in about.sizes else None,
         diffuse_error=read_map(folder, "diffuse_error", "Y", about.size) if with_errors else None,
         roughness_error=read_map(folder, "roughness_error", "Y", about.size) if with_errors else None,
@@ -205,6 +207,37 @@ def read_exports(folder: Path) -> dict[str, _Export]:
         return msgspec.convert(text_file.read_json(folder / "maps.json"), MapsFile).exports
     except (OSError, ValueError):
         return {}
+
+
+def read_format(out: Path) -> str:
+    """The format of the maps of a result folder, which names the kind of result; empty without maps."""
+    try:
+        return str(text_file.read_json(out / "maps" / "maps.json")["format"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+
+
+def write_textures(folder: Path, maps: Any, letters: Mapping[str, str], full: Collection[str]) -> None:
+    """Write maps (H, W[, C]), attributes of `maps`, as EXRs with the channels `letters`; those not in `full` as half.
+
+    Normal, albedo, F0 and roughness are written as PNG too.
+    """
+    for name, channels in letters.items():
+        value = np.atleast_3d(getattr(maps, name))
+        planes = {letter: np.ascontiguousarray(value[..., k]) for k, letter in enumerate(channels)}
+        exr.write(folder / f"{name}.exr", planes, half=name not in full)
+    png.write(folder / "normal.png", png.sixteen_bits(maps.normal / 2 + 0.5))
+    png.write(folder / "diffuse.png", color.srgb_eight_bits(maps.diffuse), srgb=True)
+    png.write(folder / "specular.png", color.srgb_eight_bits(maps.specular), srgb=True)
+    png.write(folder / "roughness.png", png.sixteen_bits(maps.roughness))
+
+
+def read_mask(file: Path, size: tuple[int, int]) -> Bools:
+    """Read a mask (H, W) that has this size (W, H). Raises DecodeError: it is missing, damaged, or of another size."""
+    levels = png.read(file)
+    if levels.shape != size[::-1]:
+        raise DecodeError(f"{file} is not {size[0]} × {size[1]}; process again")
+    return np.asarray(levels > 127)
 
 
 def read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Floats:
