@@ -72,7 +72,7 @@ class Frame:
 
 
 def middle(bracket: Sequence[T]) -> T:
-    """The middle one of a bracket that is sorted, darkest first; of an even number the darker of the two."""
+    """The middle one of a sorted bracket; of an even number, the one before the middle."""
     return bracket[(len(bracket) - 1) // 2]
 
 
@@ -84,7 +84,7 @@ class Shot:
     """All photographs of one polarizer angle: a bracket of exposures, and ambient frames."""
 
     angle: float  # rad, from image x towards image up
-    frames: tuple[Frame, ...]  # (E,), darkest first by their metadata
+    frames: tuple[Frame, ...]  # (E,) by stated exposure, else by name; an index has one exposure in every shot
     ambient: tuple[Frame, ...] = ()  # flash off, same settings
     place_px: tuple[float, float] = (0.0, 0.0)  # x, y of its pixel (0, 0) in a polarization sensor's mosaic
 

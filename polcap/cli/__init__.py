@@ -122,7 +122,7 @@ def _version(asked: bool) -> None:
 
 
 @app.callback()
-def front(
+def common_options(
     context: typer.Context,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of a failure.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress, only data and errors.")] = False,

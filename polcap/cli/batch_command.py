@@ -46,21 +46,12 @@ def batch(
     from polcap import config as settings
     from polcap.batch import shards, unit
     from polcap.pipeline import models
-    from polcap.pipeline.request import Request
 
     resource_limits.check_memory(memory)
     if model is not None or estimator == "network":  # refuse an unusable model before any capture is processed
         models.load_network(estimator, model, "cpu", 1)  # the GPU may be in other machines
-    request = Request(
-        config=settings.load(config, assignments or ()),
-        chart=options.chart_request(None if chart is None else str(chart), no_chart),
-        estimator=estimator,
-        model=None if model is None else model.resolve(),
-        device=device,
-        threads=threads,
-        memory_gb=memory,
-        angles_deg=options.angles_deg(angles),
-    )
+    given = {**context.params, "model": None if model is None else model.resolve()}
+    request = options.request(given, settings.load(config, assignments or ()))
     part = shards.from_environment(os.environ) if shard is None else shards.parse(shard)
     plan = batches.BatchPlan(part, scheduler, workers, retries, keep_going)
     summary = batches.run(root, out, request, plan, terminal.print_progress)

@@ -36,31 +36,21 @@ def fuse(
     """Join several captures of one object into a closed asset. Run again, it goes on where it was stopped."""
     from polcap.pipeline import unchanged
 
+    given = {**context.params, "config": config, "model": model}  # paths, not text
     target = out or folder / own_folders.FUSED
-    asked = options.request_digest({**context.params, "config": config, "model": model}, folder, target)
+    asked = options.request_digest(given, folder, target)
     if options.print_finished(target, asked, json, open_):
         return
     from polcap import config as settings
     from polcap.fusion import fuse_run
     from polcap.fusion.fusion_path import SessionConfig
     from polcap.fusion.session import SessionInput
-    from polcap.pipeline.request import Request
 
     resource_limits.set_limits(threads, memory)
     if missing := [name for name in _NEEDED if find_spec(name) is None]:
         raise SettingError(f"polcap fuse needs {', '.join(missing)}: pip install 'polcap[fusion]'")
     stated = settings.fill(SessionConfig, settings.read(config), assignments or [])
-    request = Request(
-        config=stated.of_views,
-        chart=options.chart_request(chart, no_chart),
-        estimator=estimator,
-        model=model,
-        device=device,
-        angles_deg=options.angles_deg(angles),
-        clockwise=clockwise,
-        threads=threads,
-        memory_gb=memory,
-    )
+    request = options.request(given, stated.of_views)
     steps = terminal.Steps()
     session_input = SessionInput(folder, stated, request, workers)
     about = fuse_run.fuse(session_input, target, terminal.print_progress, steps.stage)

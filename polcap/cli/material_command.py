@@ -49,19 +49,11 @@ def material(
     from polcap.fusion.session import SessionInput
     from polcap.material import material_run
     from polcap.material.material_path import MaterialConfig
-    from polcap.pipeline.request import Request
 
     resource_limits.set_limits(threads, memory)
     stated = settings.fill(MaterialConfig, settings.read(config), assignments or [])
-    request = Request(
-        config=stated.of_views,
-        chart=options.chart_request(chart, no_chart),
-        estimator="analytic",  # no network is needed up to the Stokes parameters
-        angles_deg=options.angles_deg(angles),
-        clockwise=clockwise,
-        threads=threads,
-        memory_gb=memory,
-    )
+    given = {**context.params, "estimator": "analytic"}  # no network is needed up to the Stokes parameters
+    request = options.request(given, stated.of_views)
     steps = terminal.Steps()
     session_input = SessionInput(folder, stated, request, workers)
     about = material_run.measure(

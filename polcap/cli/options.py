@@ -15,6 +15,8 @@ from polcap.results import STAGES
 
 if TYPE_CHECKING:
     from polcap.chart_values import ChartRequest
+    from polcap.config import Config
+    from polcap.pipeline.request import Request
 
     Stage = str
 else:
@@ -137,6 +139,28 @@ def request_digest(stated: Mapping[str, Any], folder: Path, out: Path) -> str | 
     named = [stated.get(name) for name in ("config", "mask", "model", "chart")]
     files = [Path(name) for name in named if name is not None and Path(name).is_file()]
     return unchanged.request(asked, folder, out, files)
+
+
+def request(stated: Mapping[str, Any], config: "Config") -> "Request":
+    """The request that options state, by their names, with parsed paths; options that a command lacks are not stated.
+
+    Raises SettingError: an option, or a file that it names, is wrong.
+    """
+    from polcap.pipeline.request import Request
+
+    mask = stated.get("mask")
+    return Request(
+        config=config,
+        chart=chart_request(stated["chart"], stated["no_chart"]),
+        mask=None if mask is None else user_mask(mask),
+        estimator=stated.get("estimator"),
+        model=stated.get("model"),
+        device=stated.get("device", "cpu"),
+        angles_deg=angles_deg(stated["angles"]),
+        clockwise=stated.get("clockwise", False),
+        threads=stated.get("threads", 0),
+        memory_gb=stated.get("memory", 0.0),
+    )
 
 
 def print_finished(out: Path, asked: str | None, json: bool, open_: bool) -> bool:

@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from typer import Context, Option
 
@@ -12,9 +12,6 @@ from polcap.cli.watch import at_every_change
 from polcap.errors import SettingError
 from polcap.formats import own_folders
 from polcap.results import STAGES
-
-if TYPE_CHECKING:
-    from polcap.pipeline.request import Request
 
 
 def process(
@@ -60,31 +57,14 @@ def process(
         once()
 
 
-def _request(stated: dict[str, Any]) -> "Request":
-    """The request that the options state. Raises SettingError: an option, or a file that it names, is wrong."""
-    from polcap import config as settings
-    from polcap.pipeline.request import Request
-
-    return Request(
-        config=settings.load(stated["config"], stated["assignments"] or ()),
-        chart=options.chart_request(stated["chart"], stated["no_chart"]),
-        mask=None if stated["mask"] is None else options.user_mask(stated["mask"]),
-        estimator=stated["estimator"],
-        model=stated["model"],
-        device=stated["device"],
-        angles_deg=options.angles_deg(stated["angles"]),
-        clockwise=stated["clockwise"],
-        threads=stated["threads"],
-    )
-
-
 def _plan(stated: dict[str, Any], target: Path) -> None:
     """Option --dry-run: print how the capture is understood and which stages would run."""
+    from polcap import config as settings
     from polcap import report
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import run as pipeline
 
-    request = _request(stated)
+    request = options.request(stated, settings.load(stated["config"], stated["assignments"] or ()))
     capture, supplied = request.open(stated["capture"])
     stages = pipeline.plan(capture, supplied, request.config, target, stated["force"])
     rows = [f"{name:14}{state}" for name, state in stages.items()]
@@ -96,11 +76,12 @@ def _process(stated: dict[str, Any], target: Path, asked: str | None) -> None:
     """Process the capture and write the result folder; print the path of the asset and the verdict."""
     from dataclasses import replace
 
+    from polcap import config as settings
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import asset_export, unchanged
     from polcap.pipeline import run as pipeline
 
-    request = _request(stated)
+    request = options.request(stated, settings.load(stated["config"], stated["assignments"] or ()))
     capture, supplied = request.open(stated["capture"])
     table = captures.table(capture)
     terminal.print_progress(table)

@@ -33,9 +33,11 @@ def validate(
 
     import msgspec
 
+    from polcap import config as settings
     from polcap.calibrate import ball_page, ball_validation
     from polcap.formats import atomic, ball_accuracies
     from polcap.pipeline import result_folder
+    from polcap.pipeline import run as pipeline
     from polcap.report import read
 
     if not ball:
@@ -43,24 +45,27 @@ def validate(
     if (capture / "report.json").exists():
         result = capture
     else:
-        stated = {"config": config, "assignments": assignments, "angles": angles, "clockwise": clockwise}
-        result = _process(capture, out or capture / own_folders.OUTPUT, {**stated, "chart": (chart, no_chart)})
-    found, about = ball_validation.measure(result, diameter), read(result)
-    facts, unsure = about["capture"], _reason_against_record(about)
-    texts = ball_validation.lines(found.figures)
+        result = out or capture / own_folders.OUTPUT
+        request = options.request(context.params, settings.load(config, assignments or ()))
+        found, supplied = request.open(capture)
+        about = pipeline.process_once(found, supplied, request.config, result)
+        terminal.print_progress(f"verdict {about['verdict']}; {result / 'report.html'}")
+    measured, about = ball_validation.measure(result, diameter), read(result)
+    figures, facts, unsure = measured.figures, about["capture"], _reason_against_record(about)
+    texts = ball_validation.lines(figures)
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    record = None if unsure else ball_accuracies.write(ball_validation.accuracy(found.figures, facts, made))
+    record = None if unsure else ball_accuracies.write(ball_validation.accuracy(figures, facts, made))
     with result_folder.opened(result):
-        ball_page.write(result, facts["name"], found, texts)
-        atomic.write_json(result / "ball.json", found.figures)
+        ball_page.write(result, facts["name"], measured, texts)
+        atomic.write_json(result / "ball.json", figures)
     terminal.print_progress("\n".join(texts))
-    for text in found.figures.warnings:
+    for text in figures.warnings:
         terminal.print_message(f"polcap: warning: {text}", "WARNING")
     if unsure:
         terminal.print_message(f"polcap: warning: later reports will not state this accuracy: {unsure}", "WARNING")
     page = str(result / "ball.html")
     written = {"page": page, "record": None if record is None else str(record)}
-    terminal.print_data({**msgspec.to_builtins(found.figures), **written} if json else page)
+    terminal.print_data({**msgspec.to_builtins(figures), **written} if json else page)
     if open_:
         terminal.open_page(result / "ball.html")
 
@@ -71,21 +76,3 @@ def _reason_against_record(about: dict[str, Any]) -> str:
     if failed:
         return f"gates failed ({', '.join(failed)}); see report.html, and photograph the ball again"
     return "" if about["capture"]["camera"] else "the photographs name no camera"
-
-
-def _process(capture: Path, target: Path, stated: dict[str, Any]) -> Path:
-    """Process a capture into the result folder `target`, unless it is finished and unchanged."""
-    from polcap import config as settings
-    from polcap.pipeline import run as pipeline
-    from polcap.pipeline.request import Request
-
-    request = Request(
-        config=settings.load(stated["config"], stated["assignments"] or ()),
-        chart=options.chart_request(*stated["chart"]),
-        angles_deg=options.angles_deg(stated["angles"]),
-        clockwise=stated["clockwise"],
-    )
-    found, supplied = request.open(capture)
-    about = pipeline.process_once(found, supplied, request.config, target)
-    terminal.print_progress(f"verdict {about['verdict']}; {target / 'report.html'}")
-    return target

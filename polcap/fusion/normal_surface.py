@@ -194,9 +194,11 @@ def find_rims(
 def _displacements(
     vertices: Floats, faces: NDArray[np.int32], outward: Floats, target: SurfaceNormals, anchors: Sequence[Anchors]
 ) -> Floats:
-    """Displacements (V,) m along `outward` by least squares.
+    """Displacements d (V,) m of the vertices along `outward` (V, 3) by which triangles get their measured normals.
 
-    Every equation has the form w (a_j d_j − a_i d_i) = w b for the two ends i, j of an edge, or w a_i d_i = w b.
+    Weighted least squares of three kinds of equations, in normal form. An edge from i to j is to lie square to the
+    measured normal t of its triangle: t·(x_j + d_j n_j − x_i − d_i n_i) = 0, with the outward normals n. An anchored
+    vertex is to reach its place: slope · d_i = distance. Neighbors move alike, and little: d_i = d_j, d_i = 0.
     """
     count = len(vertices)
     tilt = unit(np.sum((target.normal * target.weight[:, None])[faces], axis=1))  # (F, 3) target of each triangle

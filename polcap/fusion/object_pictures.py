@@ -54,7 +54,10 @@ def render(atlas: Atlas, maps: AtlasMaps, tracer: Tracer, pose: Pose, view: View
 
 
 def sample_textures(atlas: Atlas, maps: AtlasMaps, face: NDArray[np.integer], weight: Floats) -> TexturedPoints:
-    """Normal, albedo, F0 and roughness at points of triangles `face` (N,) with barycentric weights (N, 3)."""
+    """The values of the texels nearest to N surface points.
+
+    A point lies in triangle `face` (N,), at the barycentric coordinates `weight` (N, 3).
+    """
     side = maps.mask.shape[0]
     uv = (atlas.mesh.uv[atlas.mesh.faces[face]] * weight[..., None]).sum(axis=1) * side - 0.5
     at = np.clip(np.rint(uv).astype(int), 0, side - 1)

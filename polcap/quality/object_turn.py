@@ -81,7 +81,11 @@ def _relief(maps: SurfaceMaps | None, object_: ObjectMask, step: int) -> Floats:
 
 
 def _displacements(relief: Floats, inside: Bools) -> tuple[Floats, Floats]:
-    """Displacement (N, 2, 6) of the pixels inside per shift, zoom, roll and two tilts, and the cell (N,) of each."""
+    """Motion field of a small motion of the object on the N pixels `inside`, and the cell (N,) of each pixel.
+
+    The field (N, 2, 6) is the derivative of a pixel's place x, y [px] by two shifts [px], zoom [1], roll and two tilts
+    [rad]; a tilt moves a pixel in proportion to its height in `relief` (h, w) [px]. Cells are squares of _CELL px.
+    """
     y, x = np.nonzero(inside)
     height = relief[inside] - relief[inside].mean()
     cell = y // _CELL * (inside.shape[1] // _CELL + 1) + x // _CELL

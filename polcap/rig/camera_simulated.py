@@ -52,7 +52,11 @@ class SimulatedCamera:
         return tuple(Exposure(time_s=MIDDLE_S * stop, f_number=11.0, iso=100.0) for stop in stops)
 
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
-        """Set the seed of noise and the time stamp of the next frame, as `synth.write` does."""
+        """Set up the next frame: number of its shot and of the frame in it, and the true angle of the polarizer.
+
+        The numbers give the seed of the noise and the time stamp, as in `synth.write`. Angles that the simulated shoot
+        does not have get numbers of their own.
+        """
         angles = self._shoot.angles_deg
         wanted = 0.0 if angle_deg is None else angle_deg
         shot = angles.index(wanted) if wanted in angles else len(angles) + round(10 * wanted) % 900

@@ -82,6 +82,7 @@ def dry_run(order: CaptureOrder) -> dict[str, Any]:
 
 
 def _by_kind(option: str, url: str, values: dict[str, float]) -> float:
+    """The value, by kind of device, for a device's URL such as grbl:PORT. Raises SettingError: an unknown kind."""
     kind = url.partition("?")[0].partition(":")[0]
     if kind not in values:
         raise SettingError(f"{option} {url}: no such {option[2:]}; choose one of {', '.join(values)}")

@@ -139,7 +139,11 @@ def _list_meshes(mesh: str) -> list[Path]:
 
 
 def _photograph(light: Floats, rays: Floats, noise: float, rng: np.random.Generator) -> Floats:
-    """Simulate photographs (4, M, 3) of Stokes parameters through a polarizer at 0, 45, 90 and 135°, with noise."""
+    """Simulate photographs (4, M, 3) through an ideal polarizer at 0, 45, 90 and 135°, with photon and read noise.
+
+    `light` (3, M, 3) are S0, S1 and S2 of three colors, in the frames of the view rays `rays` (M, 3). `noise` is the 1σ
+    of light 1; that of darkness is a tenth of it.
+    """
     photographs = []
     for angle in np.radians(ANGLES_DEG):
         weights = mueller.analyzer(frames.axis_on_ray(np.asarray(angle), rays), np.inf)

@@ -218,8 +218,8 @@ def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Se
     cell = _cell(plan, angle_deg)
     return Shot(
         angle=math.radians(angle_deg),
-        frames=_darkest_first(_frame(plan, stated, source, angle_deg) for source in bracket),
-        ambient=_darkest_first(_frame(plan, stated, source, angle_deg) for source in ambient),
+        frames=_sorted_alike(_frame(plan, stated, source, angle_deg) for source in bracket),
+        ambient=_sorted_alike(_frame(plan, stated, source, angle_deg) for source in ambient),
         place_px=(0.0, 0.0) if cell is None else (cell[1] / 2, cell[0] / 2),
     )
 
@@ -264,7 +264,10 @@ def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: f
 
 
 def _encoding(probe: Probe, stated: CaptureFile) -> list[str]:
-    """Encoding of a finished picture as part of its digest: "default" if its bits alone decide."""
+    """Words for a finished picture's digest that state how it is decoded: its tone curve, and whether colors change.
+
+    The curve is "default" where the number of bits alone decides. Colors in other primaries become Rec.709.
+    """
     found = probe.encoding
     usual = photo.encoding_of(probe.bits, found) == photo.encoding_of(probe.bits, ColorEncoding())
     return [stated.encoding or ("default" if usual else found.curve), *["primaries"] * bool(found.to_rec709)]
@@ -281,7 +284,11 @@ def _exposure(frame: Frame) -> float | None:
     return frame.exposure or frame.exif.relative_exposure
 
 
-def _darkest_first(frames: Iterable[Frame]) -> tuple[Frame, ...]:
+def _sorted_alike(frames: Iterable[Frame]) -> tuple[Frame, ...]:
+    """Frames so that the same exposure has the same index in every shot: by stated exposures, else by names.
+
+    Which of them is darkest, the stage `hdr` measures in the pixels: of a flash the camera states no power.
+    """
     listed = sorted(frames, key=lambda frame: folder_names.natural(Path(frame.path).name))
     exposures = [_exposure(frame) for frame in listed]
     if None in exposures:

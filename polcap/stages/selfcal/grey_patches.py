@@ -104,7 +104,10 @@ def _gloss(light: Floats, variance: Floats) -> float:
 
 
 def _one_for_all_channels(gain: Floats, sigma: Floats) -> tuple[Floats, Floats]:
-    """Replace a shot's gains of three channels by one where they agree within 3σ: most flashes do not change color."""
+    """Gains (K, 3) and their relative 1σ (K, 3), with one gain for all channels of a shot that agree within 3σ.
+
+    Most flashes do not change color. The first shot, to which the gains refer, has the gain 1 and 1σ of 0.
+    """
     weight = 1 / np.maximum(sigma, 1e-6) ** 2
     mean = (gain * weight).sum(1, keepdims=True) / weight.sum(1, keepdims=True)
     agree = (np.abs(gain - mean) <= 3 * np.maximum(sigma, 1e-6)).all(1, keepdims=True)

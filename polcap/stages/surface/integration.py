@@ -60,20 +60,23 @@ def log_depth(field: NormalField, stiffness: float, iterations: int, tolerance: 
 
 
 def decide(level: PyramidLevel, iterations: int, tolerance: float) -> None:
-    """Decide on the coarsest grid where the surface is cut, and solve its z (the six steps above)."""
+    """Decide on the coarsest grid where the surface is cut, and solve its z: steps 1 to 6 of this module's docstring.
+
+    `iterations` and `tolerance` end step 2, as for `log_depth`.
+    """
     if level.stiffness > 0:
-        cut_contours(level)
-    level.integrate_bilaterally(iterations, tolerance)
-    restore_contours(level)
-    found = level.occlusions()
+        cut_contours(level)  # 1
+    level.integrate_bilaterally(iterations, tolerance)  # 2
+    restore_contours(level)  # 3
+    found = level.occlusions()  # 4
     level.choosing = ~dilate(found.torn, REACH)[level.field.mask] & (level.stiffness > 0) & found.any()
     if not level.choosing.any():
         level.z = np.zeros_like(level.z)  # no cuts: plain least squares, to the last bit
     level.chords = level.precise
     level.solve()
     if not level.precise:
-        remove_useless_cuts(level)
-    join_contacts(level)
+        remove_useless_cuts(level)  # 5
+    join_contacts(level)  # 6
 
 
 def cut_contours(level: PyramidLevel) -> None:

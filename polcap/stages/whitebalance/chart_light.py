@@ -79,7 +79,11 @@ class _ChartPlane:
 
 
 def _slope(outlined: _ChartPlane, state: Floats) -> Floats:
-    """Relative change (2,) of the light per chart patch, for flash position, falloff, rotation… in `state` (7,)."""
+    """Relative change (2,) of the light per patch, to the chart's right and down, as `state` (7,) predicts it.
+
+    The light on the patches is fitted by a plane. `state` as in `measure`: flash (2,) [chart distances], power of the
+    falloff, turn (2,) [rad], and the slope (2,) that the flash does not cause [per patch].
+    """
     plane = outlined.turned(state[3:5])
     level, *slope = _STRAIGHT @ point_light.irradiance(plane.point, state[:2], state[2], plane.normal)
     return np.asarray(np.array(slope) / level + state[5:])
