@@ -14,7 +14,7 @@ from polcap.api import Result
 from polcap.errors import SettingError
 from polcap.formats.maps import result_maps as maps
 from polcap.images import MaskedImage
-from polcap.pipeline import models
+from polcap.pipeline import models, request
 from polcap.pipeline import run as pipeline
 
 
@@ -56,6 +56,7 @@ def test_python_takes_the_network_as_the_command_line_does(monkeypatch: pytest.M
         raise polcap.PolcapError("far enough")
 
     monkeypatch.setattr(models, "load_network", load)
+    request._networks.cache_clear()  # an earlier test of this process may have opened the networks
     with pytest.raises(polcap.PolcapError, match="far enough"):
         polcap.process("nowhere")
     assert asked == [(None, None, "cpu", 0)]  # what `polcap process` without flags asks for
