@@ -25,7 +25,13 @@ def material(
     texel: Annotated[
         float | None, Option(min=0.001, metavar="MM", help="Size of a texel; by default that of the camera's pixels.")
     ] = None,
-    tile: Annotated[bool, Option("--tile", help="Make the maps seamless; they lose a sixth of each side.")] = False,
+    tile: Annotated[
+        bool,
+        Option(
+            "--tile",
+            help="Make the maps seamless; they lose a sixth of each side, up to a third where patterns repeat.",
+        ),
+    ] = False,
     config: options.ConfigFile = None,
     assignments: options.Assignments = None,
     json: options.Json = False,

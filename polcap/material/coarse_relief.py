@@ -21,7 +21,7 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
 from polcap.images import ArrayValue, Floats
-from polcap.material import flash_light, texel_grid
+from polcap.material import flash_light, texel_grid, texel_stokes
 from polcap.material.stokes_view import PosedStokes
 from polcap.material.texel_fit import FitSettings, Measurements, TexelEstimate, TexelPrior, fit, start
 from polcap.material.texel_grid import FlashLight, TexelGrid
@@ -58,12 +58,12 @@ class ReliefSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     refine_gains: Annotated[bool, Meta(description="correct the light of each view by the sample itself")] = True
 
 
-@stage(version=1)
+@stage(version=2)
 def solve(views: tuple[PosedStokes, ...], light: FlashLight, grid: TexelGrid, settings: ReliefSettings) -> CoarseRelief:
     """Height on the fine grid, interpolated from coarse texels, and corrected light."""
     step = max(1, round(max(grid.size) / _COARSE))
     coarse = grid.coarser(step)
-    middle = _plane(views, light, grid, step)
+    middle = _plane(views, grid, step)
     height = np.full(coarse.size[::-1], middle)
     for number in range(_ROUNDS):
         fine = _enlarge(height, grid, step)
@@ -92,28 +92,38 @@ def _enlarge(image: Floats, grid: TexelGrid, step: int) -> Floats:
     return np.asarray(cv2.remap(smooth, across, down, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
 
 
-def _detail(seen: TexelStokes) -> Floats:
-    """Texture (K, H, W) of each view: ln S0 without its coarse shading; 0 where not measured."""
-    gray = np.maximum(seen.radiance.mean(axis=-1), 1e-3)
-    log = np.where(np.isfinite(seen.noise[..., 0]), np.log(gray), 0)
-    return np.stack([one - cv2.GaussianBlur(one, (0, 0), 6.0) for one in log])
-
-
-def _plane(views: tuple[PosedStokes, ...], light: FlashLight, grid: TexelGrid, step: int) -> float:
+def _plane(views: tuple[PosedStokes, ...], grid: TexelGrid, step: int) -> float:
     """Mean height [m] over the board on which the textures of all views agree best."""
-    shape = grid.size[::-1]
+    coarse = grid.coarser(step)
+    pictures = [_picture(view, step) for view in views]
 
     def disagreement(height: float) -> float:
-        detail = _detail(resample(views, light, grid, np.full(shape, np.float32(height)), step))
+        point = coarse.points(np.full(coarse.size[::-1], height))
+        detail = np.stack([_detail(view, one, point) for view, one in zip(views, pictures, strict=True)])
         return float(np.median((detail - np.median(detail, axis=0)) ** 2, axis=0).mean() + 1e-12)
 
-    spacing = 1.5 * step * grid.texel
+    spacing = coarse.texel
     trial = np.arange(_LOWEST_M, _THICKEST_M + spacing, spacing)
     cost = np.array([disagreement(height) for height in trial])
     best = int(np.clip(cost.argmin(), 1, len(trial) - 2))
     low, mid, high = cost[best - 1 : best + 2]
     bend = low - 2 * mid + high
     return float(trial[best] + spacing * (np.clip((low - high) / (2 * bend), -1, 1) if bend > 0 else 0.0))
+
+
+def _picture(view: PosedStokes, step: int) -> Floats:
+    """ln S0 (H, W), gray, of a view, in means of about a coarse texel; NaN where not measured."""
+    gray = np.asarray(view.stokes.stokes[0] @ flash_light.gray(view.matrix), np.float32)
+    log = np.log(cv2.blur(np.maximum(gray, 1e-3), (step, step)))
+    return np.where((view.stokes.quality & texel_stokes.UNKNOWN) > 0, np.nan, log)
+
+
+def _detail(view: PosedStokes, picture: Floats, point: Floats) -> Floats:
+    """Texture (H, W) of a view at world points (H, W, 3): its logarithm without coarse shading; 0: not measured."""
+    x, y = (a.astype(np.float32) for a in view.pixels(point))
+    log = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
+    log = np.nan_to_num(log, nan=0.0)
+    return np.asarray(log - cv2.GaussianBlur(log, (0, 0), 6.0))
 
 
 def _fit(

@@ -28,8 +28,9 @@ _SIDE = 70  # texels along the longer side of the sampled grid
 _SAMPLES, _TRIED = 400, 120  # texels of a group; with each of the roughnesses tried first
 _LEAST_SAMPLES = 40
 _ROUNDS = 4
+_INDEPENDENT = 6.0  # texels, as many as a group counts for: light, pose and law err alike in all of them
 _TIGHT = np.array([1e-3, 1e-4], np.float32)  # of roughness and F0, while their group's are varied
-_F0, _F0_SIGMA = 0.042, 0.01
+_F0, _F0_SIGMA = 0.042, 0.008
 LAWS = {"smooth": body.SMOOTH, "rough": body.Law(rough=1.0)}
 
 
@@ -50,21 +51,29 @@ class GlossGroups(ArrayValue):
     spread: float
     roughness: Floats  # (G,)
     f0: Floats  # (G,)
+    sigma: Floats  # (G, 2) 1σ of roughness and F0
     law: Literal["smooth", "rough"]
 
     def prior(self, albedo: Floats, settings: GlossSettings) -> TexelPrior:
         """Expected gloss of texels of an albedo (N, 3)."""
-        share = clusters.soft_share(_encoded(albedo), self.center, self.spread)
-        mean = share @ np.stack([self.roughness, self.f0], axis=-1)
+        mean = self._mix(albedo, np.stack([self.roughness, self.f0], axis=-1))
         sigma = np.tile(np.array([settings.roughness_sigma, settings.f0_sigma], np.float32), (len(mean), 1))
-        return TexelPrior(mean.astype(np.float32), sigma)
+        return TexelPrior(mean, sigma)
+
+    def sigma_of(self, albedo: Floats) -> Floats:
+        """1σ (N, 2) of the roughness and F0 that texels of an albedo (N, 3) share with their material."""
+        return self._mix(albedo, self.sigma)
+
+    def _mix(self, albedo: Floats, value: Floats) -> Floats:
+        share = clusters.soft_share(_encoded(albedo), self.center, self.spread)
+        return np.asarray(share @ value, np.float32)
 
 
 def _encoded(albedo: Floats) -> Floats:
     return np.asarray(color.encode_srgb(np.clip(albedo, 0, 1)), np.float32)
 
 
-@stage(version=1)
+@stage(version=3)
 def find(
     views: tuple[PosedStokes, ...], relief: CoarseRelief, grid: TexelGrid, seen: TexelStokes, settings: GlossSettings
 ) -> GlossGroups:
@@ -96,30 +105,31 @@ def group(data: Measurements, views: TexelViews, albedo: Floats, settings: Gloss
     encoded, fitting = _encoded(albedo), settings.fitting
     center, spread = clusters.color_clusters(encoded, settings.materials)
     member = clusters.soft_share(encoded, center, spread).argmax(axis=1)
-    found: dict[str, tuple[float, Floats]] = {}
+    found: dict[str, tuple[float, Floats, Floats]] = {}
     for name, law in LAWS.items():
         gloss = np.tile([0.45, _F0], (len(center), 1))
+        sigma = np.tile([0.2, _F0_SIGMA], (len(center), 1))
         cost = 0.0
         for k in range(len(center)):
             mine = np.flatnonzero(member == k)
             mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), _SAMPLES)).astype(int)] if len(mine) else mine
             if len(mine) >= _LEAST_SAMPLES:
-                gloss[k], misfit = _shared(data.take(mine), views.take(mine), law, fitting)
+                gloss[k], sigma[k], misfit = _shared(data.take(mine), views.take(mine), law, fitting)
                 cost += misfit * (member == k).sum()
-        found[name] = cost, gloss
+        found[name] = cost, gloss, sigma
     law_name: Literal["smooth", "rough"] = "smooth" if found["smooth"][0] <= found["rough"][0] else "rough"
-    roughness, f0 = found[law_name][1].T
-    return GlossGroups(center, spread, roughness, f0, law_name)
+    _, gloss, sigma = found[law_name]
+    return GlossGroups(center, spread, gloss[:, 0], gloss[:, 1], sigma, law_name)
 
 
-def _shared(data: Measurements, views: TexelViews, law: body.Law, fitting: FitSettings) -> tuple[Floats, float]:
-    """Roughness and F0 (2,) that all texels share, and the mean cost of a texel."""
+def _shared(data: Measurements, views: TexelViews, law: body.Law, fitting: FitSettings) -> tuple[Floats, Floats, float]:
+    """Roughness and F0 (2,) that all texels share, their 1σ (2,), and the mean cost of a texel."""
     few = slice(None, None, max(1, data.radiance.shape[1] // _TRIED))
     some, seen = data.take(few), views.take(few)
     gloss = min((np.array([rough, _F0]) for rough in _ROUGHNESS), key=lambda one: _at(some, seen, one, law, fitting)[0])
     cost, estimate = _at(data, views, gloss, law, fitting)
     for _ in range(_ROUNDS):
-        step = _newton(estimate, gloss)
+        step, _ = _newton(estimate, gloss)
         for share in (1.0, 0.3):
             trial = np.clip(gloss + share * step, [0.06, 0.01], [1.0, 0.15])
             found, there = _at(data, views, trial, law, fitting, estimate.value)
@@ -128,7 +138,7 @@ def _shared(data: Measurements, views: TexelViews, law: body.Law, fitting: FitSe
                 break
         else:
             break
-    return gloss, cost
+    return gloss, _newton(estimate, gloss)[1], cost
 
 
 def _at(
@@ -147,11 +157,11 @@ def _at(
         begin = np.concatenate([first[:, :2], prior.mean, first[:, 4:]], axis=-1)
     estimate = texel_fit.fit(data, views, prior, begin, law, fitting, rounds=5)
     away = (gloss[1] - _F0) / _F0_SIGMA
-    return float(estimate.cost.mean()) + away**2 / count, estimate
+    return float(estimate.cost.mean()) + away**2 / _INDEPENDENT, estimate
 
 
-def _newton(estimate: TexelEstimate, gloss: Floats) -> Floats:
-    """Step (2,) of the shared gloss: Schur complements of the texels' normal equations, without their priors."""
+def _newton(estimate: TexelEstimate, gloss: Floats) -> tuple[Floats, Floats]:
+    """Step (2,) of the shared gloss, and its 1σ (2,): Schur complements of the texels' equations, without priors."""
     data = estimate.information.astype(np.float64)
     data[:, (2, 3), (2, 3)] -= _TIGHT.astype(float) ** -2
     own, others = np.array([2, 3]), np.array([0, 1, 4, 5, 6])
@@ -160,6 +170,7 @@ def _newton(estimate: TexelEstimate, gloss: Floats) -> Floats:
     schur = data[:, own[:, None], own] - cross @ inner @ np.swapaxes(cross, 1, 2)
     # at the texels' optimum the prior's pull equals the data's gradient
     pull = (estimate.value[:, 2:4] - gloss) / _TIGHT.astype(float) ** 2
-    total = schur.sum(axis=0) + np.diag([1e-6, _F0_SIGMA**-2])
-    right = pull.sum(axis=0) + np.array([0, (_F0 - gloss[1]) / _F0_SIGMA**2])
-    return np.asarray(np.linalg.solve(total, right))
+    total = _INDEPENDENT * schur.mean(axis=0) + np.diag([1e-6, _F0_SIGMA**-2])
+    right = _INDEPENDENT * pull.mean(axis=0) + np.array([0, (_F0 - gloss[1]) / _F0_SIGMA**2])
+    inverse = np.linalg.inv(total)
+    return np.asarray(inverse @ right), np.sqrt(np.diag(inverse))

@@ -24,6 +24,7 @@ from polcap.stages import stage
 
 _DIRECTIONS, _GROWTH = 12, 1.25  # of the horizon's search; ratio of successive distances
 _FARTHEST = 0.1  # of the longer side
+_MISPLACED = 0.25  # texels, 1σ of a texel's place in a view
 
 
 @dataclass(frozen=True, repr=False)
@@ -55,7 +56,7 @@ class MaterialMaps(ArrayValue):
         return None
 
 
-@stage(version=1)
+@stage(version=2)
 def build(found: TexelMaps, relief: CoarseRelief, grid: TexelGrid, albedo_sigma: float | None) -> MaterialMaps:
     """Integrate heights, fill texels that were not measured, and compute ambient occlusion."""
     filled = fill_outward(np.concatenate([found.value, found.sigma], axis=-1), found.seen)
@@ -71,13 +72,20 @@ def build(found: TexelMaps, relief: CoarseRelief, grid: TexelGrid, albedo_sigma:
         height=np.asarray(height - middle, np.float32),
         occlusion=ambient_occlusion(height, normal, grid.texel),
         normal_sigma=np.degrees(np.hypot(sigma[..., 0], sigma[..., 1])) * normal[..., 2] ** 2,
-        diffuse_sigma=sigma[..., 4:].mean(axis=-1),
+        diffuse_sigma=_albedo_doubt(value[..., 4:], sigma[..., 4:].mean(axis=-1), albedo_sigma or 0.0),
         roughness_sigma=sigma[..., 2],
         specular_sigma=sigma[..., 3],
         seen=found.seen,
         thickness=middle,
         albedo_sigma=albedo_sigma,
     )
+
+
+def _albedo_doubt(albedo: Floats, sigma: Floats, scale: float) -> Floats:
+    """1σ (H, W) of the albedo (H, W, 3): of its texel (H, W), of its scale (relative), and of its place at edges."""
+    gray = albedo.mean(axis=-1)
+    down, across = np.gradient(gray)
+    return np.asarray(np.sqrt(sigma**2 + (scale * gray) ** 2 + _MISPLACED**2 * (down**2 + across**2)), np.float32)
 
 
 def integrate(slope: Floats, coarse: Floats, texel: float) -> Floats:

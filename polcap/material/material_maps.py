@@ -29,7 +29,7 @@ _MEANINGS = {
     "height": ("Y", "metres, mean 0"),
     "occlusion": ("Y", "share of a uniform sky that the relief leaves visible"),
     "normal_sigma": ("Y", "1 sigma of the normal, degrees"),
-    "diffuse_sigma": ("Y", "1 sigma of the diffuse albedo, without that of its scale"),
+    "diffuse_sigma": ("Y", "1 sigma of the diffuse albedo, with that of its scale"),
     "specular_sigma": ("Y", "1 sigma of F0"),
     "roughness_sigma": ("Y", "1 sigma of the roughness"),
 }

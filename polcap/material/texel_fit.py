@@ -27,6 +27,7 @@ _HIGH = np.array([1.5, 1.5, 1.0, 0.25, 1.3, 1.3, 1.3], np.float32)
 _MOST_STEP = np.array([0.2, 0.2, 0.15, 0.02, 0.3, 0.3, 0.3], np.float32)
 _SLOPE_SIGMA = 0.5  # prior
 _CAUCHY = 2.0  # rms error of a view, in standard deviations, from which its weight falls
+_LEAST_DESCENT = 0.01  # of the sum of squared errors, by the next step of a texel that is not finished
 _DAMPING = 1e-3  # at the start, relative to the diagonal
 
 
@@ -62,6 +63,10 @@ class TexelPrior(ArrayValue):
 
     mean: Floats  # (N, 2)
     sigma: Floats  # (N, 2)
+
+    def take(self, index: Indices | slice) -> "TexelPrior":
+        """The priors of some of the texels."""
+        return TexelPrior(self.mean[index], self.sigma[index])
 
 
 @dataclass(frozen=True, repr=False)
@@ -121,17 +126,26 @@ def fit(
 ) -> TexelEstimate:
     """Estimate all unknowns of N texels from first values (N, 7)."""  # fmt: skip
     sigma = _sigma(data, settings)
-    best = _linearize(data, views, prior, value, law, sigma)
+    best = _linearize(data, views, prior, value.copy(), law, sigma)
     damping = np.full(len(value), _DAMPING, np.float32)
     eye = np.eye(UNKNOWNS, dtype=np.float32)
+    active = np.arange(len(value))
     for _ in range(rounds):
-        diagonal = np.einsum("nii->ni", best.information)
-        system = best.information + (damping[:, None] * diagonal + 1e-6)[:, :, None] * eye
-        step = np.clip(np.linalg.solve(system, best.gradient[..., None])[..., 0], -_MOST_STEP, _MOST_STEP)
-        trial = _linearize(data, views, prior, np.clip(best.value + step, _LOW, _HIGH), law, sigma)
-        better = trial.total < best.total
-        damping = np.clip(np.where(better, damping / 4, damping * 8), 1e-6, 1e4)
-        best = best.replaced(trial, better)
+        information, gradient, first = best.information[active], best.gradient[active], best.value[active]
+        diagonal = np.einsum("nii->ni", information)
+        system = information + (damping[active, None] * diagonal + 1e-6)[:, :, None] * eye
+        step = np.clip(np.linalg.solve(system, gradient[..., None])[..., 0], -_MOST_STEP, _MOST_STEP)
+        second = np.clip(first + step, _LOW, _HIGH)
+        going = ((second - first) * gradient).sum(axis=-1) > _LEAST_DESCENT
+        active, second = active[going], second[going]
+        if len(active) == 0:
+            break
+        trial = _linearize(
+            data.take(active), views.take(active), prior.take(active), second, law, sigma[:, active]
+        )  # fmt: skip
+        better = trial.total < best.total[active]
+        damping[active] = np.clip(np.where(better, damping[active] / 4, damping[active] * 8), 1e-6, 1e4)
+        best.put(active[better], trial, better)
     return TexelEstimate(best.value, best.information, best.cost, best.error, best.model)
 
 
@@ -145,14 +159,11 @@ class _Linearized:
     error: Floats  # (K, N, 5)
     model: Floats  # (K, N)
 
-    def replaced(self, other: "_Linearized", where: Bools) -> "_Linearized":
-        """The values of another linearization where it is better."""
-        mine, theirs = vars(self), vars(other)
-        out = {}
-        for name, old in mine.items():
-            along = where[None, :] if name in ("error", "model") else where
-            out[name] = np.where(along.reshape(along.shape + (1,) * (old.ndim - along.ndim)), theirs[name], old)
-        return _Linearized(**out)
+    def put(self, index: Indices, other: "_Linearized", where: Bools) -> None:
+        """Replace the texels at `index` by the chosen ones of another linearization."""
+        for name, array in vars(self).items():
+            along = (slice(None),) if name in ("error", "model") else ()
+            array[*along, index] = getattr(other, name)[*along, where]
 
 
 def _sigma(data: Measurements, settings: FitSettings) -> Floats:

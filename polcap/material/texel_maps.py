@@ -10,7 +10,7 @@ from polcap.material import texel_fit, texel_grid
 from polcap.material.coarse_relief import CoarseRelief, measurements
 from polcap.material.gloss_groups import LAWS, GlossGroups, GlossSettings
 from polcap.material.stokes_view import PosedStokes
-from polcap.material.texel_fit import LEAST_VIEWS, UNKNOWNS
+from polcap.material.texel_fit import LEAST_VIEWS, UNKNOWNS, TexelEstimate, TexelPrior
 from polcap.material.texel_grid import TexelGrid
 from polcap.material.texel_stokes import TexelStokes
 from polcap.optics import body
@@ -32,7 +32,7 @@ class TexelMaps(ArrayValue):
     residual: Floats  # (K,) median of |measured − modelled| S0 over S0
 
 
-@stage(version=1)
+@stage(version=2)
 def estimate(
     views: tuple[PosedStokes, ...],
     relief: CoarseRelief,
@@ -44,7 +44,7 @@ def estimate(
     """Fit all texels of the sample."""  # fmt: skip
     width, height = grid.size
     value = np.zeros((height, width, UNKNOWNS), np.float32)
-    sigma = np.full_like(value, np.inf)
+    sigma, common = np.full_like(value, np.inf), np.zeros_like(value)
     cost, residual = np.zeros((height, width), np.float32), np.zeros((len(views), height, width), np.float16)
     square: Floats = np.zeros((len(views), 2))  # sum of squared errors, number
     point, poses = grid.points(relief.height), [view.pose for view in views]
@@ -61,8 +61,9 @@ def estimate(
         found = texel_fit.fit(data, geometry, prior, begin.value, law, settings.fitting)
         shape = value[strip].shape
         value[strip] = found.value.reshape(shape)
-        variance = np.einsum("nii->ni", np.linalg.inv(found.information.astype(np.float64)))
-        sigma[strip] = np.sqrt(np.maximum(variance, 0)).reshape(shape)
+        sigma[strip], common[strip] = (
+            one.reshape(shape) for one in _doubts(found, prior, gloss.sigma_of(begin.value[:, 4:]))
+        )
         known = np.isfinite(data.noise[..., 0])
         cost[strip] = (found.cost / np.maximum(5 * known.sum(axis=0) - UNKNOWNS + 2, 5)).reshape(shape[:2])
         square += np.stack([(found.error**2).sum(axis=(1, 2)), 5.0 * known.sum(axis=1)], axis=-1)
@@ -73,8 +74,17 @@ def estimate(
     with np.errstate(all="ignore"):
         middle = np.nanmedian(residual[:, measured].astype(np.float32), axis=1)
     return TexelMaps(
-        value, sigma * scale[..., None], measured, np.sqrt(square[:, 0] / np.maximum(square[:, 1], 1)), middle
-    )
+        value, np.hypot(sigma * scale[..., None], common), measured,
+        np.sqrt(square[:, 0] / np.maximum(square[:, 1], 1)), middle,
+    )  # fmt: skip
+
+
+def _doubts(found: TexelEstimate, prior: TexelPrior, shared: Floats) -> tuple[Floats, Floats]:
+    """1σ (N, 7) of texels from their own data, and from the 1σ `shared` (N, 2) of their material's gloss."""
+    covariance = np.linalg.inv(found.information.astype(np.float64))
+    response = covariance[:, :, 2:4] / prior.sigma[:, None, :] ** 2  # to a change of the prior's mean
+    own = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0))
+    return own, np.linalg.norm(response * shared[:, None, :], axis=-1)
 
 
 def _first_albedo(data: texel_fit.Measurements, gloss: GlossGroups) -> Floats:

@@ -14,7 +14,7 @@ from polcap.optics.warp import Spline, Taps
 
 _ROWS = 256  # of the grid at a time
 _BORDER = 12  # px around a strip's pixels, for the splines
-_UNKNOWN = np.uint8(Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST)
+UNKNOWN = np.uint8(Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST)
 _SPLINE_NOISE = 0.7  # standard deviation of a spline between pixels, over that of a pixel
 
 
@@ -74,7 +74,7 @@ def _sample(view: PosedStokes, shot_matrix: Floats, point: Floats) -> tuple[Floa
     covariance = [view.stokes.covariance[k][box] @ squares for k in (0, 3, 5)]
     s0, s1, s2 = (_SPLINE_NOISE**2 * linear(one) for one in covariance)
     noise = np.sqrt(np.maximum(np.stack([s0, (s1 + s2) / 2], axis=-1), 0))
-    bad = linear(np.asarray((view.stokes.quality[box] & _UNKNOWN) > 0, np.float32)) > 0.01
+    bad = linear(np.asarray((view.stokes.quality[box] & UNKNOWN) > 0, np.float32)) > 0.01
     bad |= (x < 0) | (y < 0) | (x > width - 1) | (y > height - 1)
     noise[bad] = np.inf
     return radiance.astype(np.float32), polarized.astype(np.float32), noise

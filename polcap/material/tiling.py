@@ -1,7 +1,8 @@
 """Makes the maps of a material seamless: their edges are blended over a strip, and keep their contrast.
 
-The strip at the right and lower edge fades into the opposite one. A mean of two textures has less contrast than either,
-so the difference from the mean of the map is divided by the root of the sum of the squared weights.
+The strip at the right and lower edge fades into the opposite one. A periodic pattern is first cut to a length at which
+both strips agree. A mean of two textures has less contrast than either, so their fine parts are divided by the standard
+deviation of the mean.
 
 References
 ----------
@@ -11,6 +12,7 @@ Heitz & Neyret, High-performance by-example noise using a histogram-preserving b
 from dataclasses import fields, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from polcap.images import Floats
@@ -19,21 +21,25 @@ from polcap.optics import frames
 from polcap.stages import stage
 
 _STRIP = 1 / 6  # of each side
+_PERIODIC = 0.5  # of the median difference of two strips, that of a periodic pattern at its best length
+_LINES = 64  # across the strips, that are compared
 _CONTRAST = ("normal", "diffuse", "roughness", "height")  # maps with texture; the others are plain means
 
 
-@stage(version=1)
+@stage(version=2)
 def tile(maps: MaterialMaps) -> MaterialMaps:
     """The maps, smaller by the strip, such that opposite edges continue each other."""
     changed: dict[str, Any] = {}
     level = replace(maps, height=_level(maps.height))
+    texture = np.concatenate([maps.diffuse, maps.normal[..., :2]], axis=-1)
+    strips = [max(1, round(_STRIP * side)) for side in maps.seen.shape]
+    rows, columns = (_length(np.moveaxis(texture, axis, 0), strips[axis]) for axis in (0, 1))
     for one in fields(maps):
         value = getattr(level, one.name)
         if isinstance(value, np.ndarray):
-            contrast = one.name in _CONTRAST
-            blended: Floats = value.astype(np.float64)
+            blended: Floats = value[:rows, :columns].astype(np.float64)
             for axis in (0, 1):
-                blended = _blend(blended, axis, contrast)
+                blended = _blend(blended, axis, strips[axis], one.name in _CONTRAST)
             changed[one.name] = (blended > 0.999) if value.dtype == bool else blended.astype(np.float32)
     changed["normal"] = frames.unit(changed["normal"]).astype(np.float32)
     for name in ("diffuse", "roughness", "specular"):
@@ -50,15 +56,26 @@ def _level(height: Floats) -> Floats:
     return np.asarray(height - (terms @ plane).reshape(rows, columns), np.float32)
 
 
-def _blend(value: Floats, axis: int, contrast: bool) -> Floats:
+def _length(texture: Floats, strip: int) -> int:
+    """Rows of a texture (H, W, C) at which the last strip is most like the first; all, if it is not periodic."""
+    total = len(texture)
+    some = texture[:, :: max(1, texture.shape[1] // _LINES)]
+    lengths = np.arange(total - strip, total + 1)
+    difference = [float(np.mean((some[:strip] - some[end - strip : end]) ** 2)) for end in lengths]
+    best = int(np.argmin(difference))
+    return int(lengths[best]) if difference[best] < _PERIODIC * np.median(difference) else total
+
+
+def _blend(value: Floats, axis: int, strip: int, contrast: bool) -> Floats:
     """An image whose last strip along `axis` has been blended into the first one, and removed."""
-    length = value.shape[axis]
-    strip = max(1, round(_STRIP * length))
     image = np.moveaxis(value, axis, 0)
+    length = len(image)
     share = ((np.arange(strip) + 0.5) / strip).reshape(-1, *(1,) * (image.ndim - 1))
-    mean = image.mean(axis=(0, 1))
-    start, end = image[:strip] - mean, image[length - strip :] - mean
+    start, end = image[:strip], image[length - strip :]
     mixed = share * start + (1 - share) * end
     if contrast:
-        mixed /= np.sqrt(share**2 + (1 - share) ** 2)
-    return np.moveaxis(np.concatenate([mean + mixed, image[strip : length - strip]]), 0, axis)
+        fine, other = (one - cv2.GaussianBlur(one, (0, 0), strip / 4) for one in (start, end))
+        likeness = np.clip((fine * other).sum() / max(np.sqrt((fine**2).sum() * (other**2).sum()), 1e-12), 0, 1)
+        spread = np.sqrt(share**2 + (1 - share) ** 2 + 2 * likeness * share * (1 - share))
+        mixed += (share * fine + (1 - share) * other) * (1 / spread - 1)
+    return np.moveaxis(np.concatenate([mixed, image[strip : length - strip]]), 0, axis)

@@ -1,5 +1,7 @@
 """Heights from slopes, ambient occlusion of a groove, seamless maps."""
 
+import dataclasses
+
 import numpy as np
 
 from polcap.images import Floats
@@ -57,3 +59,13 @@ def test_tiled_maps_continue_across_their_edges_and_keep_their_contrast() -> Non
         inner = np.abs(np.diff(value, axis=1)).max()
         assert np.abs(value[:, 0] - value[:, -1]).max() < 1.5 * inner
     assert abs(tiled.roughness[:, :15].std() / whole.roughness.std() - 1) < 0.1
+
+
+def test_a_periodic_pattern_is_tiled_in_whole_periods() -> None:
+    period = 14
+    stripes = np.where(np.arange(120) % period < period / 2, 0.7, 0.3).astype(np.float32)
+    color = np.broadcast_to(stripes[:, None, None], (120, 120, 3))
+    whole = dataclasses.replace(maps(), diffuse=color, normal=np.broadcast_to(np.float32([0, 0, 1]), (120, 120, 3)))
+    tiled = tiling.tile(whole).diffuse
+    assert tiled.shape[0] % period == 0 and tiled.shape[1] == 100
+    np.testing.assert_allclose(tiled, color[: len(tiled), :100], atol=0.02)

@@ -72,3 +72,14 @@ def test_a_material_gets_its_own_gloss_and_law(law: str, roughness: float) -> No
     assert found.law == law
     assert found.roughness[0] == pytest.approx(roughness, abs=0.02)
     assert found.f0[0] == pytest.approx(0.045, abs=0.004)
+
+
+def test_a_material_states_errors_that_all_its_texels_share() -> None:
+    truth, seen = materials(160), views(160)
+    truth[:, 2], truth[:, 3], truth[:, 4:] = 0.7, 0.036, [0.4, 0.3, 0.2]
+    data = measured(truth, seen, LAWS["rough"])
+    gains = 1 + 0.01 * np.random.default_rng(4).normal(size=len(data.radiance))
+    data.radiance[:] *= gains[:, None, None].astype(np.float32)
+    found = gloss_groups.group(data, seen, truth[:, 4:], GlossSettings(materials=1, fitting=SETTINGS))
+    score = (np.array([found.roughness[0], found.f0[0]]) - [0.7, 0.036]) / found.sigma[0]
+    assert np.abs(score).max() < 2 and (found.sigma[0] < [0.1, 0.009]).all()
