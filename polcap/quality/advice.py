@@ -19,9 +19,10 @@ def advise(judged: Sequence[Gate]) -> list[Gate]:
 def advice(judged: Sequence[Gate]) -> list[Gate]:
     """The gates of the remedies to follow first, at most two.
 
-    Where gates failed, theirs; otherwise those of warnings. `judged` has causes before consequences.
+    Where gates failed, theirs; otherwise, or where warnings are their cause, those of warnings. `judged` has causes
+    before consequences.
     """
-    failed = [gate for gate in judged if gate.state == "fail"]
+    failed = [gate for gate in judged if gate.state == "fail" and gate.remedy]
     warned = sorted((gate for gate in judged if gate.state == "warn"), key=lambda gate: gate.cost_deg < _NOTABLE_DEG)
     first = {gate.remedy: gate for gate in reversed(failed or warned) if gate.remedy}  # one gate for each remedy
     return list(reversed(first.values()))[:_MOST]

@@ -28,6 +28,7 @@ _ONE_PLANE = 0.6  # common part of the polarization: rounded objects up to .45
 _LIT = 0.9  # light of an outline that is not dimmed: wax too is hardly polarized, but dimmed
 _FACING_DOLP = 0.045  # most of the outline of a plane that faces the camera
 _ALIGNED = 0.84  # length of the mean normal: boxes up to .83, except one whose normals are wrong; bodies up to .77
+_ONE_NORMAL = 0.92  # of the mean normal: beyond, the outline decides nothing
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,8 @@ class Flatness:
     @property
     def flat(self) -> bool:
         """Whether the object is one plane, except for its relief."""
-        return (
-            self.sharp_edged and self.aligned > _ALIGNED and (self.rim_dolp < _FACING_DOLP or self.common > _ONE_PLANE)
-        )
+        one_plane = self.rim_dolp < _FACING_DOLP or self.common > _ONE_PLANE or self.aligned > _ONE_NORMAL
+        return self.sharp_edged and self.aligned > _ALIGNED and one_plane
 
 
 def judge(found: Evidence) -> Iterator[Gate]:

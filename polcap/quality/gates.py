@@ -71,7 +71,7 @@ _STEPS = (
     Step(("crossed",), light.crossed, "stokes", _PAIRED),
     Step(("ill-posed",), polarization.ill_posed, "stokes", (*_POLARIZED, "other light", "lighting"), ("sharpness",)),
     Step(("re-rendering",), rerendering.rerendering, "infer", _SHAPED, ("flat",)),
-    Step(("outline",), geometry.inward_outline, "infer", (*_SHAPED, "re-rendering")),
+    Step(("outline",), geometry.inward_outline, "infer", (*_SHAPED, "re-rendering"), ("flat",)),
     Step(("albedo scale",), light.albedo_scale, "infer", ("clipping", "chart")),
     Step(("focal length",), _without_limits(geometry.focal_length), "infer"),
 )

@@ -25,7 +25,7 @@ from polcap.stages.whitebalance import chart_in_mask
 
 _LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ
 _DEGREES_PER_PUSH = 200.0  # error of the normals per movement by the object's radius
-_SIGMAS = 2.3  # of a push: one in two hundred still shots exceeds it
+_SIGMAS, _FALSE_PUSH = 3.0, 0.003  # of a push; 1σ that polarization imitates, of the object's radius
 _DEGREES_PER_TURN = 5.0  # error of the normals per degree by which the object turned (docs/benchmarks/gates.md)
 _FALSE_TURN_DEG = 0.2  # 1σ of a turn that polarization imitates
 _SHARP_PX, _DEGREES_PER_BLUR_PX = 1.2, 2.5  # greatest blur of sharp edges; error of the normals per px beyond it
@@ -34,7 +34,8 @@ _EDGE_FLOOR = 0.1  # of the object's median light: dark backdrops differ by less
 _LOCK = "Lock the camera, do not touch the object, and take that shot again"
 _MOST_CONTRADICTION = 0.1  # of the object; set by hand: noise, glare and swapped angles leave less than .01
 _TEXTURE = (
-    "Put something with texture next to the object, such as the chart; of a locked camera, --set align.model=none"
+    "Put something with texture next to the object, such as the chart, or use more light; of a locked camera, "
+    "--set align.model=none"
 )
 _HOLD_STILL = "Fix the object, do not touch it between shots, and take that shot again"
 _INWARD = 0.2  # sine of the zenith from which a normal leans inward
@@ -130,16 +131,18 @@ def _judge_shift(found: Evidence, limits: GateLimits) -> Gate:
     It warns from a share of the object's radius on, and fails beyond a limit in px.
     """
     names, measured, limit = found.names, _measure_shift(found), limits.max_object_shift_px
-    length, sigma = np.nan_to_num(measured.length, posinf=np.inf) * found.grid_px, measured.sigma * found.grid_px
-    sure = length - _SIGMAS * sigma
     radius = max(outline.disc_radius(found.object_.mask) * found.grid_px, 1.0)
+    length = np.nan_to_num(measured.length, posinf=np.inf) * found.grid_px
+    sigma = measured.sigma * found.grid_px
+    sure = length - _SIGMAS * sigma
     least = limits.min_object_shift * radius
     true = np.sqrt(np.maximum(length**2 - sigma**2, 0))
     cost = _DEGREES_PER_PUSH * float(true.max()) / radius
     k = int(np.argmax(sure))
     figure = round(float(length[k]), 3)
     message = f"The object moved by {figure:.1f} ± {sigma[k]:.1f} px against its surroundings in {names[k]}"
-    bad, moved = bad_shots(names, sure > limit), bad_shots(names, (sure > 0) & (length > least))
+    bad = bad_shots(names, sure > limit)
+    moved = bad_shots(names, length > np.maximum(_SIGMAS * np.hypot(sigma, _FALSE_PUSH * radius), least))
     if (unlike := np.isinf(length)).any():
         odd = _odd(unlike)
         other = bad_shots(names, odd)
@@ -155,7 +158,7 @@ def _judge_shift(found: Evidence, limits: GateLimits) -> Gate:
 def _judge_turn(found: Evidence, limits: GateLimits) -> Gate:
     """Gate on a turn of the object between shots, beyond twice its error."""
     measured, names, limit = _measure_turn(found, limits), found.names, limits.max_object_turn_deg
-    least = measured.degrees - 2 * measured.sigma
+    least = measured.degrees - 2 * np.hypot(measured.sigma, _FALSE_TURN_DEG)
     k = int(np.argmax(least))
     true = np.sqrt(np.maximum(measured.degrees**2 - measured.sigma**2 - _FALSE_TURN_DEG**2, 0))
     figure, cost = round(float(measured.degrees[k]), 3), _DEGREES_PER_TURN * float(true.max())
@@ -257,10 +260,9 @@ def sharpness(found: Evidence, limits: GateLimits) -> Gate:
     It fails if the reference frame of a shot is blurred, because ghosts take their light from it; others only warn.
     """
     blur, limit = found.blur_px, limits.max_blur_px
-    moved = float(np.abs(found.alignment.transform[:, :2, 2]).max()) * found.grid_px if found.has("align") else 0.0
     if np.isnan(blur).all():
         return Gate("sharpness", "not measured", None, limit, "There is too little bright detail", unit="px")
-    if not moved <= TILE / 2:  # tiles would compare unlike detail
+    if found.has("align") and not _show_one_place(found):
         return Gate("sharpness", "not measured", None, limit, "The shots show different places", unit="px")
     k, e = (int(i) for i in np.unravel_index(int(np.nanargmax(blur)), blur.shape))
     text = f"Frame {e + 1} of the {found.names[k]} shot is blurred by {{:.1f}} px more than the sharpest"
@@ -276,6 +278,12 @@ def sharpness(found: Evidence, limits: GateLimits) -> Gate:
     return at_most(
         "sharpness", float(blur[k, e]), limit, message, remedy, bad, cost, "px", "fail" if worst > limit else "warn"
     )
+
+
+def _show_one_place(found: Evidence) -> bool:
+    """Whether the tiles of all shots show the same detail, sharp or not."""
+    moved = float(np.abs(found.alignment.transform[:, :2, 2]).max()) * found.grid_px
+    return moved <= TILE / 2 and bool((found.alignment.correlation >= found.align.min_correlation).all())
 
 
 def focus(found: Evidence, limits: GateLimits) -> Gate:

@@ -26,6 +26,7 @@ _DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame for all an
 _LEAST_ALBEDO = 0.02  # sum of the channels
 _TOWARDS_CAMERA = float(np.cos(np.radians(30)))  # cosine; lamps 45° to the side are mirrored at 22°
 _LEAST_TOWARDS = 0.12  # of the object: five bodies from .18, boxes and cans mostly below
+_LEAST_FACING = 500  # px, a tenth of which is judged
 _ONE_WAY = 0.6  # 0…1, of the facing normals: five bodies up to .46, cans up to .9 (tests/benchmarks/bench_flat.py)
 _DEGREES_PER_ROOT_OF_HIGHLIGHT_DOLP = 30.0  # of the normals: 2 to 4° at 1 %, 4 to 8° at 2 %, 2 to 11° at 3 to 15 %
 _FALSE_HIGHLIGHT_DOLP = 0.002  # under one flash: up to .0025 (24 captures)
@@ -200,8 +201,9 @@ def _highlight_dolp(found: Evidence) -> float:
     leans the same way, as a cylinder: it shares a polarization under any light.
     """
     maps, both = found.maps, found.maps.mask & found.cues.mask
+    both &= found.cues.quality & int(Quality.CLIPPED) == 0
     towards = both & (dot(maps.normal, rays(maps.view, *maps.mask.shape)) > _TOWARDS_CAMERA)
-    if not towards.any() or towards.sum() < _LEAST_TOWARDS * both.sum():
+    if towards.sum() < max(_LEAST_TOWARDS * both.sum(), _LEAST_FACING):
         return float("nan")
     azimuth = np.arctan2(maps.normal[towards, 1], maps.normal[towards, 0])
     polarized = 1 - maps.normal[towards, 2] ** 2  # DoLP of small tilts, but for a factor

@@ -25,12 +25,14 @@ _SURE = 2.5  # σ between sectors of the outline: least significance of a turn
 _CERTAIN = 0.8  # of the limit of the misfit: above, also good captures fit a turn (docs/benchmarks/gates.md)
 _CLEAR = 0.8  # least concentration of the AoLP about the outline, to estimate a common turn
 _LIKELIER = 1.1  # factor between expected errors that decides on an order (docs/benchmarks/gates.md)
+_LIKELIER_SMALL, _SMALL_PX = 1.5, 5000  # the same for objects of fewer pixels, of which good ones reach 1.2
 _ALONG = -0.3  # below: the AoLP is along the contour
 _DARK = 0.1  # albedo below which a glossy object shows mostly reflections of itself
 _WEAK_DOLP = 0.05  # of an outline: above, no shape counts as flattened; below, uneven light is light from the side
 _LIT_DOLP = 0.07  # of an outline's brighter half; above, the flash lights it (93 captures with a lamp: up to .049)
 _LOPSIDED = 1.4  # factor on the limit of uneven light for an object that is polarized all round: its shape is uneven
 _DIMMED = 0.9  # of the mean light: below, an outline turns away
+_MOST_ILL_POSED = 0.15  # of the object; gloss with shadows and thin parts reaches .12 (docs/benchmarks/gates.md)
 _ROUGH = 0.5  # roughness from which facets alone leave little polarization
 # What a finding adds to the expected error of the normals, by captures with known normals: docs/benchmarks/gates.md
 _UNPOLARIZED_DEG = 11.0
@@ -51,7 +53,7 @@ def order(found: Evidence) -> Gate:
     better = None
     if not outline.as_stated:
         better, because = outline.best, "The outline fits"
-    elif test is not None and test.ratio < 1 / _LIKELIER:
+    elif test is not None and test.ratio < 1 / (_LIKELIER if found.stokes.mask.sum() > _SMALL_PX else _LIKELIER_SMALL):
         better, because = test.rival, f"The network expects {1 / test.ratio:.1f} times smaller errors for"
     if better is not None:
         message = f"{because} the order {_order_text(better, names)} rather than the stated one"
@@ -178,12 +180,13 @@ def ill_posed(found: Evidence, limits: GateLimits) -> Gate:
     if share >= 0.0005:
         message = f"{100 * share:.1f} % of the object looks like metal or a mirror reflection"
     remedy = "Darken the room and check the angles; metal is outside the model"
-    return at_most("ill-posed", share, limits.max_ill_posed, message, remedy, cost_deg=30 * share)
+    state: State = "fail" if share > _MOST_ILL_POSED else "warn"
+    return at_most("ill-posed", share, limits.max_ill_posed, message, remedy, cost_deg=30 * share, beyond=state)
 
 
 def _ill_posed(found: Evidence) -> float:
     image = found.stokes
-    inside = image.quality[image.mask]
+    inside = image.quality[image.mask & (image.quality & int(Quality.CLIPPED) == 0)]
     return float(((inside & int(Quality.ILL_POSED)) > 0).mean()) if inside.size else 0.0
 
 

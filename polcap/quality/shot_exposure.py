@@ -5,7 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from polcap.images import Bools, Floats, Quality
-from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots, compared, grade, worded
+from polcap.quality import flatness
+from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots, compared, worded
 from polcap.quality.limits import GateLimits
 from polcap.stage_values import AngleStack, StokesImage
 
@@ -15,7 +16,8 @@ _ALIKE, _PROMISED = 1.15, 1.4
 _MISFIRE = 0.2  # change of one frame's light that fails; smaller ones are measured and corrected
 _CLIPPED_HIGHLIGHTS = 0.001  # of the object: from .002 on roughness errs by .06 more (docs/benchmarks/gates.md)
 _FULL = 0.95  # of the white level
-_MOST_CLIPPED = 0.97  # from here on the pictures do not show how bright the object is
+_MOST_CLIPPED = 0.9975  # from here on the pictures do not show how bright the object is
+_STOPS, _STOPS_PER_HALVING = 1.0, 0.75  # too bright; per halving of the unclipped share (docs/benchmarks/gates.md)
 _CLIPPED_PICTURE = 0.1  # of a picture in which no object was found; a bright backdrop may clip
 _WHOLE = 0.5  # share of the object that moving parts do not reach in every shot
 _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light patches
@@ -77,7 +79,7 @@ def _exposure_power(radiance: AngleStack) -> float:
     """Power law between measured and stated exposures: slope of their logarithms; 1 without metadata or steps."""
     ratio = radiance.bracket.exif_ratio[0]
     stated: Floats = np.log(ratio) if np.isfinite(ratio).all() else np.zeros(1)
-    seen = np.log(np.maximum(radiance.bracket.exposure_ratio.mean((0, 2)), 1e-6))
+    seen = np.log(np.maximum(np.median(radiance.bracket.exposure_ratio.mean(2), axis=0), 1e-6))  # of most shots
     if np.ptp(stated) < 0.5 or np.ptp(seen) < 0.3:
         return 1.0
     return float(np.polyfit(stated, seen, 1)[0])
@@ -191,7 +193,7 @@ def clipping(found: Evidence, limits: GateLimits) -> Gate:
         f"Shoot again with {stops} stop{'s' * (stops > 1)} less light (1/{2**stops} of it), or add an exposure that is "
         "darker by as much to every bracket"
     )
-    if (shares <= few).sum() > 1:  # the others are exposed well
+    if share > limit and (shares <= few).sum() > 1:  # the others are exposed well
         remedy = "Take that shot again with as much light as the others had"
     if known and few < share <= limit:
         message += ": highlights, without which roughness and specular are uncertain"
@@ -200,12 +202,8 @@ def clipping(found: Evidence, limits: GateLimits) -> Gate:
 
 
 def _stops_too_bright(share: float) -> int:
-    """Whole stops of light to take away, so that of a clipped `share` only highlights stay clipped.
-
-    The share that is brighter than a level falls exponentially with the level, as over a rounded object.
-    """
-    share = float(np.clip(share, 2 * _CLIPPED_HIGHLIGHTS, _MOST_CLIPPED))
-    return int(np.ceil(np.log2(np.log(_CLIPPED_HIGHLIGHTS) / np.log(share))))
+    """Whole stops of light to take away, so that of a clipped `share` only highlights stay clipped."""
+    return int(np.ceil(_STOPS - _STOPS_PER_HALVING * np.log2(1 - min(share, _MOST_CLIPPED))))
 
 
 def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
@@ -250,6 +248,9 @@ def gain_doubt(found: Evidence, limits: GateLimits) -> Gate:
     if measured.source == "grey patches" and max(doubt, gloss := _GLOSS_PART * measured.chart_gloss) <= limit:
         gap, limit = measured.disagreement, limits.max_gain_disagreement
         message = f"Gray patches and object agree on the light of each shot (1σ {100 * doubt:.2f} %)"
+        if gap > limit and _has_sharp_edges(found):
+            message = f"Gray patches give the light of each shot (1σ {100 * doubt:.2f} %); flat faces do not confirm it"
+            return Gate("gain doubt", "pass", doubt, limits.max_gain_doubt, message)
         if gap > limit:
             message = f"Gray patches and object disagree by {100 * gap:.1f} % on a shot's light, beyond their errors"
         remedy = "Turn the chart to the camera, and light it as the object"
@@ -268,4 +269,11 @@ def gain_doubt(found: Evidence, limits: GateLimits) -> Gate:
         remedy += "" if found.radiance.equipment.light == "steady" else ", or use a steady lamp"
         remedy += "" if len(found.names) > 3 else ", or shoot four angles"
     cost = DEGREES_PER_GAIN * doubt
-    return at_most("gain doubt", doubt, limit, message, remedy, cost_deg=cost, beyond=grade(cost))
+    state: State = "fail" if cost > limits.max_normal_error_deg else "warn"
+    return at_most("gain doubt", doubt, limit, message, remedy, cost_deg=cost, beyond=state)
+
+
+def _has_sharp_edges(found: Evidence) -> bool:
+    """Whether the object's outline is the edge of flat faces, whose polarization does not show the shots' light."""
+    seen = flatness.measure(found.stokes, found.maps) if found.has("infer") else None
+    return seen is not None and seen.sharp_edged

@@ -2,6 +2,7 @@
 
 python tests/benchmarks/bench_verdicts.py FOLDER [--captures 49] [--first-seed 300] [--only KIND] [--width PX]
 python tests/benchmarks/bench_verdicts.py FOLDER --seeds 301,307
+python tests/benchmarks/bench_verdicts.py FOLDER --only good --meshes $POLCAP_DATA/meshes/train --width 640
 python tests/benchmarks/bench_verdicts.py FOLDER --tally
 
 A seed says everything: good or which fault, angles, light, look, size (0.3 to 0.6 MP unless --width). Of 49 in a row 21
@@ -55,6 +56,7 @@ def main() -> None:
     parse.add_argument("--seeds", default="", help="instead of a row of them")
     parse.add_argument("--width", type=int, default=0)
     parse.add_argument("--only", help="a kind of fault, or good")
+    parse.add_argument("--meshes", type=Path, help="folder of objects, instead of bumps, clusters and vases")
     parse.add_argument("--keep", action="store_true")
     parse.add_argument("--tally", action="store_true")
     given = parse.parse_args()
@@ -67,7 +69,7 @@ def main() -> None:
         kind, width = PLAN[seed % len(PLAN)], given.width or WIDTHS[seed // 7 % len(WIDTHS)]
         if (given.only and (kind or "good") != given.only) or (seed, width) in done:
             continue
-        row = one(given.folder, seed, kind, width, given.keep)
+        row = one(given.folder, seed, kind, width, given.keep, given.meshes)
         rows.append(row)
         with log.open("a") as out:
             out.write(json.dumps(row) + "\n")
@@ -75,12 +77,12 @@ def main() -> None:
     tally(rows)
 
 
-def one(folder: Path, seed: int, kind: str, width: int, keep: bool) -> Row:
+def one(folder: Path, seed: int, kind: str, width: int, keep: bool, meshes: Path | None) -> Row:
     place = folder / f"{seed}-{kind.replace(' ', '-') or 'good'}-{width}"
     start = time.process_time()
     if place.exists():
         shutil.rmtree(place)
-    row: Row = {"seed": seed, "kind": kind, **shoot(place, seed, kind, width)}
+    row: Row = {"seed": seed, "kind": kind, **shoot(place, seed, kind, width, meshes)}
     try:
         capture = captures.read(place)
     except InputError as error:

@@ -3,6 +3,7 @@
 Kind "" is a good capture: ordinary jitter of light and angles, ordinary nudges. The truth (normals, mask) lies beside.
 """
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,13 +11,16 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
+from bench_flat import KINDS as FLAT
+from bench_flat import draw
 from scipy.ndimage import gaussian_filter
 
 from polcap.formats.maps import png
 from polcap.images import Floats
 from polcap.optics import mueller
 from polcap.synth.color_checker import Chart
-from polcap.synth.scenes import random_scene
+from polcap.synth.render import Scene
+from polcap.synth.scenes import random_scene, with_model
 from polcap.synth.shooting import Shoot, ShotPose, Studio, Take
 
 Random = np.random.Generator
@@ -71,14 +75,19 @@ class Planned:
             "chart": self.chart,
             "look": self.look,
             "law": law if isinstance(law, str) else "smooth",
+            "object": Path(getattr(self.studio.scene.shape, "file", "")).stem,
+            "focal": round(how.focal_mm),
             "width": how.width,
         }
 
 
-def shoot(folder: Path, seed: int, kind: str, width: int) -> dict[str, Any]:
-    """Write a capture of 3 exposures, width × ¾ width RAW px, and the fault `kind`; returns what was drawn."""
+def shoot(folder: Path, seed: int, kind: str, width: int, meshes: Path | None = None) -> dict[str, Any]:
+    """Write a capture of 3 exposures, width × ¾ width RAW px, and the fault `kind`; returns what was drawn.
+
+    With a folder of meshes the object is one of them or, every fourth time, a flat shape; lenses have 36 to 100 mm.
+    """
     random = np.random.default_rng([seed, 11])
-    planned = _good(seed, kind, width, random)
+    planned = _good(seed, kind, width, random, meshes)
     _plant(planned, kind, random)
     how = planned.studio.shoot
     for k, name in enumerate(planned.names):
@@ -104,7 +113,7 @@ def shoot(folder: Path, seed: int, kind: str, width: int) -> dict[str, Any]:
     return planned.about
 
 
-def _good(seed: int, kind: str, width: int, random: Random) -> Planned:
+def _good(seed: int, kind: str, width: int, random: Random, meshes: Path | None) -> Planned:
     angles = _angles(seed, random)
     bracket: Literal["time", "flash", "iso", "aperture"] = ("time", "flash", "iso", "time", "aperture")[seed // 3 % 5]
     how = Shoot(
@@ -131,11 +140,31 @@ def _good(seed: int, kind: str, width: int, random: Random) -> Planned:
         turn = tuple(random.uniform(-1, 1, 3) * (6, 6, 3))  # not along the rays' rows: one ray a pixel sees steps there
         scene = msgspec.structs.replace(scene, chart=Chart(center=(0.144, 0.106 * up, -0.7), turn_deg=turn))
     scene = msgspec.structs.replace(scene, law=("smooth", "rough")[int(random.integers(2))])
+    if meshes is not None:
+        scene, times = _other_object(scene, seed, meshes)
+        how = msgspec.structs.replace(how, focal_mm=how.focal_mm * times)
     shots = len(angles)
     actual = (np.array(angles) + how.angle_error_deg * random.normal(size=shots)).tolist()
     shifts = random.uniform(-1, 1, (shots, 2)) * how.nudge_px
     shifts[0] = 0
     return Planned(Studio(scene, how), look, chart, actual, list(angles), shifts)
+
+
+def _other_object(scene: Scene, seed: int, meshes: Path) -> tuple[Scene, float]:
+    """The scene with a mesh or a flat shape as its object, and the factor of focal length and distance."""
+    random = np.random.default_rng([seed, 12])
+    times = float(random.uniform(0.6, 1.67))
+    if seed % 4 == 0:
+        flat = draw(seed, list(FLAT)[seed // 4 % len(FLAT)], Path(tempfile.gettempdir()) / "polcap-flat")
+        scene = msgspec.structs.replace(scene, shape=flat.shape, turn_deg=flat.turn_deg, interreflection=True)
+    else:
+        files = sorted(meshes.glob("*.npz"))
+        scene = with_model(scene, files[int(random.integers(len(files)))], seed)
+    x, y, z = scene.position
+    chart = scene.chart
+    if chart is not None:
+        chart = msgspec.structs.replace(chart, center=(*chart.center[:2], times * chart.center[2]))
+    return msgspec.structs.replace(scene, position=(x, y, times * z), chart=chart), times
 
 
 def _angles(seed: int, random: Random) -> tuple[float, ...]:

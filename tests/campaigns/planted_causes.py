@@ -373,7 +373,7 @@ PAIRS = [
     ("clipped 4 times", "a lamp in 45°"), ("clipped 16 times", "clockwise"), ("clipped 1.5 times", "no chart"),
     ("black +60", "frame 2 of 90° shaken"), ("black -120", "0° and 45° swapped"),
     ("45° blurred", "90° moved by 110 px"),
-    ("all blurred", "a lamp in all shots"), ("all blurred", "no chart"), ("another object in 90°", "clipped 4 times"),
+    ("a lamp in all shots", "all blurred"), ("all blurred", "no chart"), ("another object in 90°", "clipped 4 times"),
     ("another object in 45°", "no chart"), ("0° and 45° swapped", "no chart"), ("clockwise", "a lamp in all shots"),
     ("90° not turned", "no chart"), ("45° with 40 % less light", "chart in the shade"),
     ("frame 2 of 45° with 40 % less light", "0° and 45° swapped"), ("a hand in frame 2 of 45°", "clockwise"),
@@ -387,9 +387,7 @@ def trial(
 ) -> dict[str, Any]:
     """Plant the causes of a row, judge, follow the first remedy until the capture is kept or the causes end."""
     planted = name.split(" + ")
-    to = Shooting(studio(seed, width))
-    for one in planted:
-        CAUSES[one].plant(to)
+    to = arranged(planted, seed, width)
     shutil.rmtree(folder, ignore_errors=True)
     to.write(folder)
     seen, processed = judge(folder, networks), process(folder, networks)
@@ -403,7 +401,7 @@ def trial(
            "process_first": processed["remedies"][0] if processed["remedies"] else ""}  # fmt: skip
     for _ in planted:  # two causes may need two rounds
         if not seen["keep"]:
-            follow(seen, folder, to)
+            planted = follow(seen, folder, to, planted)
             seen = judge(folder, networks)
     return {
         **row,
@@ -411,6 +409,14 @@ def trial(
         "after_finding": seen["finding"],
         "after_first": (seen["remedies"] or [""])[0],
     }
+
+
+def arranged(planted: list[str], seed: int, width: int) -> Shooting:
+    """A capture with these causes."""
+    to = Shooting(studio(seed, width))
+    for one in planted:
+        CAUSES[one].plant(to)
+    return to
 
 
 def judge(folder: Path, networks: tuple[Network | None, Network | None]) -> dict[str, Any]:
@@ -455,10 +461,16 @@ def judged(gates: list[Gate]) -> dict[str, Any]:
     }
 
 
-def follow(seen: dict[str, Any], folder: Path, to: Shooting) -> None:
-    """Do what the first remedy says; a shot is taken again without the cause."""
+def follow(seen: dict[str, Any], folder: Path, to: Shooting, planted: list[str]) -> list[str]:
+    """Do what the first remedy says and return the causes that remain.
+
+    A shot is taken again without the cause that the remedy is for, without any if it is for none of them, and with as
+    much light as the others now have.
+    """
     first = seen["remedies"][0] if seen["remedies"] else ""
-    clean = Shooting(studio(to.studio.shoot.seed, to.studio.shoot.width))
+    left = [one for one in planted if not re.search(CAUSES[one].remedy, first)]
+    left = [] if left == planted else left
+    clean = arranged(left, to.studio.shoot.seed, to.studio.shoot.width)
     files = re.findall(r"pol\d+/IMG_\w+\.DNG", first)
     pairs = re.findall(r"(pol\d+) to (pol\d+)", first)
     stops = re.search(r"(\d+) stops? less light", first)
@@ -471,16 +483,20 @@ def follow(seen: dict[str, Any], folder: Path, to: Shooting) -> None:
         (folder / "capture.toml").write_text("clockwise = true\n")
     elif stops:
         to.times /= 2 ** int(stops[1])
+        again = arranged(planted, to.studio.shoot.seed, to.studio.shoot.width)
+        again.times = to.times
         shutil.rmtree(folder)
-        to.write(folder)
+        again.write(folder)
     elif files:
         for file in files:
             (folder / file).unlink()
     elif seen["shots"]:
+        clean.times = to.times
         clean.write(folder, tuple(k for k, angle in enumerate(ANGLES) if f"{angle}°" in seen["shots"]))
     else:  # the cause concerns the whole capture
         shutil.rmtree(folder)
         clean.write(folder)
+    return left
 
 
 def report(rows: Rows) -> None:

@@ -177,8 +177,7 @@ def _compare_frame(
             source.learn(reference, noise.sample_frame(still))
         found, gain = resample(found, motion)
     tiles = exposure.common_tiles(still, found)
-    measured = exposure.of_tiles(*tiles)
-    ratio = exposure.measured_or_stated(name, measured, still.shape[0], source.frames[e], source.frames[reference])
+    ratio = _exposure_ratio(source, e, name, tiles)
     if motion is None and learn:
         for number, samples in zip((reference, e), noise.sample_pair(still, found, ratio)):
             source.learn(number, samples)
@@ -187,6 +186,15 @@ def _compare_frame(
     frame = RegisteredFrame(found, ratio, source.line(e), misfit, motion, gain, shaded, curvature)
     lines = source.line(reference), frame.noise
     return replace(frame, misfit=noise.misfit(still, found, ratio, lines, frame.mean_gain))
+
+
+def _exposure_ratio(source: _BracketSignals, e: int, name: str, tiles: tuple[Floats, Floats]) -> Floats:
+    """Exposure ratio (C,) of frame e, called `name` in errors, to the reference frame, from tiles (T, C) of both."""
+    frame, reference = source.frames[e], source.frames[source.reference]
+    measured = exposure.of_tiles(*tiles)
+    if measured is None and (unlit := exposure.of_unlit(*tiles, exposure.stated(frame, reference))) is not None:
+        return np.full(tiles[0].shape[1], unlit, np.float32)
+    return exposure.measured_or_stated(name, measured, tiles[0].shape[1], frame, reference)
 
 
 def brightness_pyramid(frame: Signals) -> Pyramid:

@@ -23,6 +23,7 @@ _DIM, _DIMMEST = 4e-3, 4e-4  # of the sensor's range: darker tiles suffer from e
 # frames may differ. Good captures reach 2e-5 (docs/benchmarks/gates.md)
 _BLACK_STEP, _LEAST_BLACK, _BLACK_AGREES = 1.3, 1e-4, (0.1, 5e-5)
 _AS_STATED = 1.3  # factor between measured and stated exposure below which steady light follows too
+_UNLIT, _LEAST_RATIO = 0.01, 1e-4  # of the stated exposure: less is none; for a frame without light
 _TILE_NOISE = (1e-7, 0.005, 3e-6)  # of a tile's mean: variance per signal, relative error, error of a black tile
 
 
@@ -140,6 +141,15 @@ def vignetting(reference: Signals, other: Signals, ratio: Floats) -> Floats | No
 def _quadratic(x: Floats, y: Floats) -> Floats:
     """Design matrix of a quadratic surface: columns 1, x, y, x², xy, y² of points (N,)."""
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+
+def of_unlit(a: Floats, b: Floats, stated: float) -> float | None:
+    """Exposure ratio of a frame that got no light, from tiles (T, C); None if it got some, or was to get little."""
+    a, b = a.sum(axis=1), b.sum(axis=1)
+    seen = stated * a > _DIM
+    if seen.sum() < _LEAST_TILES or b[seen].sum() > _UNLIT * stated * a[seen].sum():
+        return None
+    return max(float(b[seen].sum() / a[seen].sum()), _LEAST_RATIO)
 
 
 def measured_or_stated(name: str, measured: Ratio | None, channels: int, frame: Frame, reference: Frame) -> Floats:

@@ -59,6 +59,17 @@ def test_too_few_bright_tiles_give_no_answer():
     assert ratio(planes(bright), planes(bright, np.zeros((320, 400), bool))) is None
 
 
+def test_a_frame_without_light_has_next_to_no_exposure():
+    """Unless its settings promise little anyway."""
+    rng = np.random.default_rng(5)
+    tiles = exposure.common_tiles(planes(picture(rng, 1)), planes(np.zeros((320, 400, 3), np.float32)))
+    assert exposure.of_tiles(*tiles) is None
+    assert exposure.of_unlit(*tiles, 4.0) == pytest.approx(1e-4)
+    assert exposure.of_unlit(*tiles, 1e-3) is None and exposure.of_unlit(*tiles, float("nan")) is None
+    lit = exposure.common_tiles(planes(picture(rng, 1)), planes(picture(rng, 0.3)))
+    assert exposure.of_unlit(*lit, 1.0) is None
+
+
 def test_vignetting_is_a_smooth_factor_and_none_without_it():
     rng = np.random.default_rng(3)
     y, x = np.mgrid[-1:1:320j, -1:1:400j]
