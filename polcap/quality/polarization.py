@@ -53,7 +53,7 @@ def order(found: Evidence) -> Gate:
     better = None
     if not outline.as_stated:
         better, because = outline.best, "The outline fits"
-    elif test is not None and test.ratio < 1 / (_LIKELIER if found.stokes.mask.sum() > _SMALL_PX else _LIKELIER_SMALL):
+    elif test is not None and test.ratio < 1 / (_LIKELIER if found.object_.mask.sum() > _SMALL_PX else _LIKELIER_SMALL):
         better, because = test.rival, f"The network expects {1 / test.ratio:.1f} times smaller errors for"
     if better is not None:
         message = f"{because} the order {_order_text(better, names)} rather than the stated one"

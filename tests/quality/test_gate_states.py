@@ -65,6 +65,7 @@ MEASURES = {  # the function that measures each figure
     "normal_error": (gates, "_median_error"), "inward_outline": (geometry, "_inward_share"),
 }  # fmt: skip
 MESH = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
+SMALL = np.hypot(*np.mgrid[-scenes.HEIGHT // 2 : scenes.HEIGHT // 2, -scenes.WIDTH // 2 : scenes.WIDTH // 2]) < 30
 FAR = np.array([[[1.0, 0, 50 * k], [0, 1, 0], [0, 0, 1]] for k in range(3)])
 GAINS = replace(scenes.equal().gains, source="grey patches")
 STATED = ShotOrder((0, 1, 2))
@@ -188,6 +189,9 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("order", "fail", {"selfcal": {"outline": OutlineCheck(ShotOrder((2, 1, 0)), 0.9)}}),
     ("order", "fail", {"maps": SimpleNamespace(albedo_sigma=0.1, order=OrderTest(ShotOrder((2, 1, 0)), 0.5))}),
     ("order", "pass", {"maps": SimpleNamespace(albedo_sigma=0.1, order=OrderTest(ShotOrder((2, 1, 0)), 2.0))}),
+    ("order", "fail", {"maps": SimpleNamespace(albedo_sigma=0.1, order=OrderTest(ShotOrder((2, 1, 0)), 0.8))}),
+    ("order", "pass", {"maps": SimpleNamespace(albedo_sigma=0.1, order=OrderTest(ShotOrder((2, 1, 0)), 0.8)),
+                       "object_": {"mask": SMALL}}),
     ("angles", "pass", {}),
     ("angles", "not measured", {"figures": {"outline": None}}),
     ("angles", "fail", {"figures": outline(turned=0.3)}),
