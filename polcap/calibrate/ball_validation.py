@@ -107,8 +107,8 @@ def measure(result: Path, diameter_mm: float | None = None) -> MeasuredBall:
         light = replace(light, ball=seen.ball)
     truth, shown = light.ball.normals(maps.view, maps.mask.shape)
     inside = maps.mask & shown
-    error = _angle(maps.normal.astype(np.float64), truth)
-    zenith = _angle(truth, frames.rays(maps.view, *maps.mask.shape))
+    error = frames.angle_deg(maps.normal.astype(np.float64), truth)
+    zenith = frames.angle_deg(truth, frames.rays(maps.view, *maps.mask.shape))
     every = error[inside], maps.confidence[inside]
     limits = np.quantile(every[1], np.linspace(0, 1, _TENTHS + 1))
     found = BallReport(
@@ -162,11 +162,6 @@ def lines(found: BallReport) -> list[str]:
         f"flash      {where}",
         f"polarizer  zero {ring.zero_deg:+.1f}° ± {ring.sigma_deg:.1f}°, extinction {weakest}",
     ]
-
-
-def _angle(a: Floats, b: Floats) -> Floats:
-    """Angle [degrees] (H, W) between unit vectors (H, W, 3)."""
-    return np.asarray(np.degrees(np.arccos(np.clip(frames.dot(a, b), -1, 1))))
 
 
 def _classes(error: Floats, expected: Floats, by: Floats, limits: Any) -> tuple[ErrorClass, ...]:

@@ -41,8 +41,7 @@ def compare(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps) -> Com
 
 def _agreement(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: AtlasMaps) -> ViewAgreement:
     both = view.mask & (frames.dot(visible.mesh_normal, visible.mesh_normal) > 0.5)
-    cosine = np.clip(frames.dot(view.normal, visible.mesh_normal)[both], -1, 1)
-    angle_deg = float(np.median(np.degrees(np.arccos(cosine)))) if both.any() else 90.0
+    angle_deg = float(np.median(frames.angle_deg(view.normal, visible.mesh_normal)[both])) if both.any() else 90.0
     if view.s0 is None or not len(visible.texel):
         return ViewAgreement(view.name, angle_deg, None)
     photograph, drawn = visible.sample(view.s0), render(view, visible, atlas, maps)

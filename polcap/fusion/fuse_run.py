@@ -14,7 +14,7 @@ from polcap import report as reports
 from polcap.config import restore
 from polcap.errors import SettingError
 from polcap.formats.export import encoders, provenance
-from polcap.formats.export.presets import Format
+from polcap.formats.export.texture_set import Extra
 from polcap.fusion import fused_maps, fused_page, object_pictures
 from polcap.fusion import session as sessions
 from polcap.fusion.baking import AtlasMaps
@@ -32,7 +32,7 @@ from polcap.quality.gate import Gate
 from polcap.quality.limits import FusedGateLimits
 from polcap.report import animation
 
-OF_ONE_VIEW = frozenset(("displacement", "curvature", "cavity"))  # extra textures
+OF_ONE_VIEW: tuple[Extra, ...] = ("displacement", "curvature", "cavity")  # extra textures
 _LODS = 2  # coarser levels, each with a quarter of the triangles
 _SIDE = 480  # px of an animation's frame
 
@@ -59,7 +59,7 @@ def fuse(session_input: SessionInput[SessionConfig], out: Path, notify: Notify, 
 
 def export(out: Path, *requests: ExportRequest) -> list[Path]:
     """Write the asset of a fused result again for each request, from maps/ and report.json; returns the files."""
-    requests = tuple(_of_closed_mesh(request) for request in requests)
+    requests = tuple(asset_export.without(request, OF_ONE_VIEW) for request in requests)
     for request in requests:
         asset_export.check(request)
         for flag in {"exr", "iiif", "sfp"} & set(asset_export.effective(request).formats):
@@ -70,12 +70,6 @@ def export(out: Path, *requests: ExportRequest) -> list[Path]:
     with result_folder.locked(out):
         source = fused_maps.read(out / "maps", restore(SessionConfig, about, out / "report.json").asset)
         return [file for one in requests for file in asset_export.write(out, about, one, source)]
-
-
-def _of_closed_mesh(request: ExportRequest) -> ExportRequest:
-    """The request without the textures of one view only, and without the layered EXR of a preset."""
-    without: tuple[Format, ...] = () if request.preset is None else ("exr",)
-    return replace(request, without=without, extras=tuple(one for one in request.extras if one not in OF_ONE_VIEW))
 
 
 def _with_albedo_scale(maps: AtlasMaps, processed: ProcessedSession) -> AtlasMaps:

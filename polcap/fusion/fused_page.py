@@ -17,23 +17,15 @@ def write(folder: Path, about: Mapping[str, Any], results: FusionResults) -> Non
     """Write report.json and report.html into a result folder; StorageError."""
     atomic.write_json(folder / "report.json", about)
     drawn = object_pictures.around(results.atlas, results.maps, _SIDES, _SIDE)
-    headline, _ = page.verdict(about)
-    name = about["capture"]["name"]
     content = {
-        "about": about,
-        "headline": headline,
-        "advice": page.advice_rows(about["gates"]),
-        "gates": page.gate_rows(about["gates"]),
         "sides": [(f"{k * 360 // _SIDES}°", html.jpeg(picture)) for k, picture in enumerate(drawn)],
         "seen": html.jpeg(object_pictures.seen_picture(results.maps)),
         "rows": [_row(row) for row in about["figures"]["views"].values()],
         "left_out": list(about["figures"]["left_out"].items()),
-        "asset": f"asset/{name}.glb",
         "size": _size(about["figures"]["mesh"]),
-        "catalog": page.catalog(about),
         "levels": (levels.HEAD, levels.rows(folder)),
     }
-    page.render("fused.html", folder / "report.html", f"{name}: polcap report", content)
+    page.write_report("fused.html", folder, about, content, {})
 
 
 def _size(mesh: Mapping[str, Any]) -> str:

@@ -56,7 +56,7 @@ class LobeSamples:
     def half_angle_deg(self, to_light: Floats) -> Floats:
         """Angle (P,) between normal and half vector."""
         half = frames.unit(to_light + np.array([0.0, 0.0, 1.0]))
-        return np.asarray(np.degrees(np.arccos(np.clip(frames.dot(half, self.normal), -1, 1))))
+        return frames.angle_deg(half, self.normal)
 
     def diffuse(self, to_light: Floats) -> Floats:
         """Radiance (P,) of diffuse reflection."""

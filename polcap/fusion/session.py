@@ -23,6 +23,7 @@ from polcap.formats import own_folders
 from polcap.formats.capture import folder_names
 from polcap.formats.maps import png
 from polcap.fusion import each_view, feature_poses, mask_agreement, poses, view_maps, view_path
+from polcap.fusion.board_corners import BoardSearch
 from polcap.fusion.board_eraser import PosedBoard
 from polcap.fusion.fusion_path import SessionConfig
 from polcap.fusion.poses import LEAST_VIEWS, SessionPoses
@@ -238,9 +239,7 @@ def _find_poses_and_masks(
     """
     session, boards = run_step("exposures and board", view_path.find_board, session)
     if any(one.corners is not None for one in boards.values()):
-        session = session.without({name: one.missing for name, one in boards.items() if one.corners is None})
-        corners = {name: boards[name].corners for name in session.views}
-        solved = cache.run(poses.solve, corners, session.capture).value
+        session, solved = pose_by_board(session, boards, cache)
         session, masks = run_step("mask", view_path.find_mask, _with_boards(session, solved))
         return session, solved, masks
     if len(session.folders) > 1:
@@ -254,11 +253,24 @@ def _find_poses_and_masks(
     return session.without(solved.left_out), solved, {name: one.mask for name, one in features.items()}
 
 
+def pose_by_board(
+    session: Session, boards: Mapping[str, BoardSearch], cache: LazyCache
+) -> tuple[Session, SessionPoses]:
+    """Poses of the views from their boards, and the session without views that have no board or no pose.
+
+    Raises CaptureError: too few views are left.
+    """
+    session = session.without({name: one.missing for name, one in boards.items() if one.corners is None})
+    corners = {name: boards[name].corners for name in session.views}
+    solved = cache.run(poses.solve, corners, session.capture).value
+    return session.without(solved.left_out), solved
+
+
 def _with_boards(session: Session, solved: SessionPoses) -> Session:
-    """The session with the board before each view, without views that have no pose."""
+    """The session with the board before each view."""
     assert solved.board is not None
     boards = {name: PosedBoard(solved.board, solved.camera, one.pose) for name, one in solved.views.items()}
-    return session.without(solved.left_out).with_inputs(lambda view: replace(view, board=boards[view.name]))
+    return session.with_inputs(lambda view: replace(view, board=boards[view.name]))
 
 
 def _with_agreed_masks(

@@ -26,28 +26,22 @@ def write(folder: Path, about: Mapping[str, Any], source: MaterialSource) -> Non
     atomic.write_json(folder / "report.json", about)
     small = _reduced(source.maps)
     inside = np.ones(small["roughness"].shape[:2], bool)
-    headline, _ = page.verdict(about)
-    name, figures = about["capture"]["name"], about["figures"]
+    figures = about["figures"]
     lit = _lit(small)
     bright = 0.9 / max(float(np.quantile(lit, 0.995)), 1e-6)
     height, width = small["roughness"].shape[:2]
     content = {
-        "about": about,
-        "headline": headline,
-        "advice": [page.gate_row(gate) for gate in about["gates"] if gate["state"] in ("fail", "warn")],
-        "gates": page.gate_rows(about["gates"]),
         "lit": html.jpeg(color.srgb_eight_bits(bright * lit)),
         "maps": _figures(small, inside),
         "rows": [_row(row) for row in figures["views"].values()],
         "left_out": list(figures["left_out"].items()),
-        "asset": f"asset/{name}.glb",
         "size": _size(figures["maps"]),
     }
     view = {
         "size": [width, height], "center": [(width - 1) / 2, (height - 1) / 2], "focal": _DISTANCE * width,
         "ior": IOR, "exposure": bright, "top": keys.F0.high, "light": _LIGHT.tolist(),
     }  # fmt: skip
-    page.render("material.html", folder / "report.html", f"{name}: polcap report", content, {"view": view})
+    page.write_report("material.html", folder, about, content, {"view": view})
 
 
 def _reduced(maps: MaterialMaps) -> dict[str, Floats]:

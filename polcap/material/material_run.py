@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from polcap import report as reports
 from polcap.config import restore
 from polcap.errors import SettingError
 from polcap.formats.export import provenance
-from polcap.formats.export.presets import Format
+from polcap.formats.export.texture_set import Extra
 from polcap.fusion import session as sessions
 from polcap.fusion.session import Notify, Session, SessionInput
 from polcap.material import material_maps, material_page, material_path, material_session
@@ -28,6 +28,7 @@ from polcap.quality import flat_sample, gates
 from polcap.quality.advice import advise
 from polcap.quality.gate import Gate
 
+_OF_SHAPE: tuple[Extra, ...] = ("curvature", "cavity")  # extra textures that a plane does not have
 _SINGLE_VIEW = {"exr", "sfp"}  # formats that need the maps of one picture
 
 
@@ -64,7 +65,7 @@ def measure(
 
 def export(out: Path, *requests: ExportRequest) -> list[Path]:
     """Write the asset of a material again for each request, from maps/ and report.json; returns the files."""
-    requests = tuple(_of_plane(request) for request in requests)
+    requests = tuple(asset_export.without(request, _OF_SHAPE) for request in requests)
     for request in requests:
         asset_export.check(request)
         for flag in _SINGLE_VIEW & set(asset_export.effective(request).formats):
@@ -75,13 +76,6 @@ def export(out: Path, *requests: ExportRequest) -> list[Path]:
     with result_folder.locked(out):
         source = material_maps.read(out / "maps", restore(MaterialConfig, about, out / "report.json").asset)
         return [file for one in requests for file in asset_export.write(out, about, one, source)]
-
-
-def _of_plane(request: ExportRequest) -> ExportRequest:
-    """The request without what a plane does not have: the layered EXR of a preset, and curvature."""
-    without: tuple[Format, ...] = () if request.preset is None else ("exr",)
-    extras = tuple(one for one in request.extras if one not in ("curvature", "cavity"))
-    return replace(request, without=without, extras=extras)
 
 
 def document(

@@ -11,7 +11,7 @@ import numpy as np
 
 from polcap.chart_values import ColorCalibration
 from polcap.errors import SettingError
-from polcap.fusion import poses, session, view_path
+from polcap.fusion import session, view_path
 from polcap.fusion.poses import SessionPoses
 from polcap.fusion.session import Notify, Session, SessionInput, StepRunner
 from polcap.fusion.values import Pose
@@ -63,10 +63,7 @@ def process(
     with session.process_pool(session_input) as pool:
         run_step = StepRunner(pool, notify)
         charted, boards = run_step("exposures and board", view_path.find_board, charted)
-        charted = charted.without({name: one.missing for name, one in boards.items() if one.corners is None})
-        corners = {name: boards[name].corners for name in charted.views}
-        solved = cache.run(poses.solve, corners, charted.capture).value
-        charted = charted.without(solved.left_out)
+        charted, solved = session.pose_by_board(charted, boards, cache)
         board = solved.board
         assert board is not None
         masked = charted.with_inputs(lambda view: _with_mask(view, solved, board))

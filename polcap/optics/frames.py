@@ -51,6 +51,11 @@ def dot(a: Any, b: Any) -> Any:
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
+def angle_deg(a: Floats, b: Floats) -> Floats:
+    """Angles (...,) between unit vectors (..., 3), degrees."""
+    return np.asarray(np.degrees(np.arccos(np.clip(dot(a, b), -1, 1))))
+
+
 def total(a: Any) -> Any:
     """Sum of the three numbers on the last axis, four times as fast as the namespace's `sum`."""
     return a[..., 0] + a[..., 1] + a[..., 2]

@@ -4,7 +4,7 @@
 same bytes, with any number of threads.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -178,6 +178,12 @@ def _has_png(preset: ExportPreset) -> bool:
     inside = preset.images == "png" and "gltf" in preset.formats
     separate = preset.shared == "png" and not {"obj", "usd", "usdz", "materialx"}.isdisjoint(preset.formats)
     return inside or separate or bool(preset.textures or preset.extras)
+
+
+def without(request: ExportRequest, extras: Collection[Extra]) -> ExportRequest:
+    """The request for a result of several views: without the layered EXR of a preset, and without some textures."""
+    formats: tuple[Format, ...] = () if request.preset is None else ("exr",)
+    return replace(request, without=formats, extras=tuple(one for one in request.extras if one not in extras))
 
 
 def read(folder: Path, config: Config, mesh: ReliefMesh | None = None) -> ReliefSource:

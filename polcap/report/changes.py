@@ -234,7 +234,7 @@ def _differences(one: SurfaceMaps, other: SurfaceMaps, both: Bools) -> dict[str,
     first, second = (np.clip(maps.diffuse, 0, 1) for maps in (one, other))
     pairs: dict[str, tuple[Floats, Floats, Callable[[Floats, Floats], Floats]]] = {
         "color": (first, second, color.delta_e),
-        "normal": (one.normal, other.normal, _angle_deg),
+        "normal": (one.normal, other.normal, frames.angle_deg),
         "roughness": (one.roughness, other.roughness, lambda a, b: b - a),
     }
     found = {}
@@ -246,11 +246,6 @@ def _differences(one: SurfaceMaps, other: SurfaceMaps, both: Bools) -> dict[str,
         least = _OF_EXPECTED * expected if name == "normal" else _LEAST_DOUBT[name]
         found[name] = _difference(value, np.maximum(doubt, least), both)
     return found
-
-
-def _angle_deg(one: Floats, other: Floats) -> Floats:
-    """Angle (...,) between unit vectors (..., 3), degrees."""
-    return np.asarray(np.degrees(np.arccos(np.clip(frames.dot(one, other), -1, 1))))
 
 
 def _usual(name: str, value: Floats) -> float:

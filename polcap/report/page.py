@@ -36,24 +36,38 @@ _ORDER = ("fail", "warn", "pass", "not measured", "not judged")  # of the gates 
 def write(folder: Path, about: Mapping[str, Any], results: Results) -> None:
     """Write report.html, the page of a result for people, into a result folder."""
     drawn, view = _maps(about, results)
-    headline, expected_error = verdict(about)
     content = {
         **drawn,
         **_plots(about, results),
         **_tables(about),
+        "metric": results.mesh.metric,
+        "pictures": list(_pictures(results)),
+        "levels": (levels.HEAD, levels.rows(folder)),
+    }
+    write_report(
+        "report.html", folder, about, content, {"view": view, "mesh": _mesh_preview(results, about["settings"])}
+    )
+
+
+def write_report(
+    template: str, folder: Path, about: Mapping[str, Any], content: Mapping[str, Any], data: Mapping[str, Any]
+) -> None:
+    """Write report.html of any kind of result: `content`, and the verdict, gates, catalog and asset of report.json.
+
+    `about` is the content of report.json, `data` is for the scripts of the page.
+    """
+    headline, expected_error = verdict(about)
+    name = about["capture"]["name"]
+    common = {
         "about": about,
         "headline": headline,
         "expected_error": expected_error,
         "advice": advice_rows(about["gates"]),
         "gates": gate_rows(about["gates"]),
-        "metric": results.mesh.metric,
-        "asset": f"asset/{about['capture']['name']}.glb",
-        "pictures": list(_pictures(results)),
-        "levels": (levels.HEAD, levels.rows(folder)),
+        "asset": f"asset/{name}.glb",
         "catalog": catalog(about),
     }
-    data = {"view": view, "mesh": _mesh_preview(results, about["settings"])}
-    render("report.html", folder / "report.html", f"{about['capture']['name']}: polcap report", content, data)
+    render(template, folder / "report.html", f"{name}: polcap report", {**common, **content}, data)
 
 
 def catalog(about: Mapping[str, Any]) -> dict[str, str]:

@@ -90,7 +90,9 @@ def test_a_reader_of_one_view_and_an_export_refuse_what_a_fused_object_lacks(
 
 
 def test_an_export_leaves_out_what_a_closed_mesh_lacks_and_writes_the_rest() -> None:
-    request = fuse_run._of_closed_mesh(ExportRequest(preset="archive", extras=("displacement", "occlusion")))
+    request = asset_export.without(
+        ExportRequest(preset="archive", extras=("displacement", "occlusion")), fuse_run.OF_ONE_VIEW
+    )
     found = asset_export.effective(request)
     assert found.extras == ("occlusion",) and found.formats == ("gltf", "obj", "usd", "materialx")
 
