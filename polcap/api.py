@@ -286,7 +286,7 @@ def fuse(
     """
     from polcap.fusion import fuse_run
     from polcap.fusion.fusion_path import SessionConfig
-    from polcap.fusion.session import SessionInput
+    from polcap.fusion.session_views import SessionInput
 
     chosen = config or SessionConfig()
     if not isinstance(chosen, SessionConfig):

@@ -44,7 +44,7 @@ def fuse(
     from polcap import config as settings
     from polcap.fusion import fuse_run
     from polcap.fusion.fusion_path import SessionConfig
-    from polcap.fusion.session import SessionInput
+    from polcap.fusion.session_views import SessionInput
 
     resource_limits.set_limits(threads, memory)
     if missing := [name for name in _NEEDED if find_spec(name) is None]:

@@ -52,7 +52,7 @@ def material(
     if options.print_finished(target, asked, json, open_):
         return
     from polcap import config as settings
-    from polcap.fusion.session import SessionInput
+    from polcap.fusion.session_views import SessionInput
     from polcap.material import material_run
     from polcap.material.material_path import MaterialConfig
 

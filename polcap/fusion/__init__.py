@@ -3,7 +3,8 @@
 In the order of use:
 
     fuse_run          `polcap fuse`: processes the views, runs the path, writes maps, asset, report and verdict
-    session           processes the views: one color calibration, one camera, poses, masks, maps
+    session_views     the views of a session, read from their folders
+    session           processes them: one color calibration, one camera, poses, masks, maps
     view_path         the stages of one view: read it first
     each_view         runs a step on all views; a view may fail alone
     fusion_path       the stages from the views' maps to the textures: read it second

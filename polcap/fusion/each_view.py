@@ -2,62 +2,67 @@
 
 import traceback
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from polcap.errors import (
-    AlignmentError,
-    CaptureError,
-    ChartError,
-    DecodeError,
-    InputError,
-    ObjectError,
-    SettingError,
-)
-from polcap.process_pool import Died, ProcessPool
+from polcap.errors import SettingError
+from polcap.fusion.session_views import FAULTS, Session, SessionInput, reason
+from polcap.fusion.view_path import SessionView
+from polcap.process_pool import Died, Limits, ProcessPool
 
-RETRIES = 1  # of a view, if its process died
-# faults of a view, without which the others go on; settings, models and the disk are common to all
-FAULTS = (CaptureError, DecodeError, ChartError, AlignmentError, ObjectError)
-T = TypeVar("T")
+Notify = Callable[[str], None]  # is called with a line on the step that is done
+_RETRIES = 1  # of a view, if its process died
 R = TypeVar("R")
 
 
-def run(
-    work: Callable[[T], R], views: Mapping[str, T], pool: ProcessPool | None, done: Callable[[str], None]
-) -> tuple[dict[str, R], dict[str, str]]:
-    """Results of `work` by view, and for each view in which it failed the reason. `done` is called with each name.
+@dataclass(frozen=True)
+class StepRunner:
+    """Runs a step on all views of a session, and reports it."""
 
-    Raises SettingError: a process died at every attempt.
-    """
-    outcomes = {}
-    for name, outcome in _outcomes(work, views, pool):
-        outcomes[name] = outcome
-        done(name)
-    results, failed = dict[str, R](), dict[str, str]()
-    for name in views:  # in their order, not in that of their ends
-        outcome = outcomes[name]
-        if isinstance(outcome, FAULTS):
-            failed[name] = reason(outcome, name)
-        elif isinstance(outcome, Exception):
-            raise outcome
-        elif isinstance(outcome, Died):
-            raise SettingError(
-                f"{name}: its process died {outcome.attempts} times, most often from lack of memory; "
-                "run fewer --workers"
-            )
-        else:
-            results[name] = outcome
-    return results, failed
+    pool: ProcessPool | None  # None: in this process
+    notify: Notify
+
+    def __call__(self, step: str, work: Callable[[SessionView], R], session: Session) -> tuple[Session, dict[str, R]]:
+        """The session without the views in which the step failed, and the results by view.
+
+        Raises CaptureError: too few views are left. SettingError: a process died at every attempt.
+        """
+        outcomes = {}
+        for name, outcome in _outcomes(work, session.views, self.pool):
+            outcomes[name] = outcome
+            self.notify(f"{name}: {step}")
+        results, failed = dict[str, R](), dict[str, str]()
+        for name in session.views:  # in their order, not in that of their ends
+            outcome = outcomes[name]
+            if isinstance(outcome, FAULTS):
+                failed[name] = reason(outcome, name)
+            elif isinstance(outcome, Exception):
+                raise outcome
+            elif isinstance(outcome, Died):
+                raise SettingError(
+                    f"{name}: its process died {outcome.attempts} times, most often from lack of memory; "
+                    "run fewer --workers"
+                )
+            else:
+                results[name] = outcome
+        return session.without(failed), results
 
 
-def reason(error: InputError, name: str) -> str:
-    """Why a view is left out, without its name or folder at the beginning."""
-    return str(error).removeprefix(f"{name}: ")
+@contextmanager
+def step_runner(session_input: SessionInput[Any], notify: Notify) -> Iterator[StepRunner]:
+    """Context manager: a step runner with a child process for each of the `workers`, if there are several."""
+    if session_input.workers == 1:
+        yield StepRunner(None, notify)
+        return
+    limits = Limits(session_input.request.threads, session_input.request.memory_gb)
+    with ProcessPool(session_input.workers, _RETRIES, limits) as pool:
+        yield StepRunner(pool, notify)
 
 
 def _outcomes(
-    work: Callable[[T], R], views: Mapping[str, T], pool: ProcessPool | None
+    work: Callable[[SessionView], R], views: Mapping[str, SessionView], pool: ProcessPool | None
 ) -> Iterator[tuple[str, R | Exception | Died]]:
     """Name and outcome of each view, as they end."""
     if pool is not None:
@@ -71,7 +76,7 @@ def _outcomes(
             yield name, error
 
 
-def _outcome(work: Callable[[T], R], named: tuple[str, T], _: int) -> R | Exception:
+def _outcome(work: Callable[[SessionView], R], named: tuple[str, SessionView], _: int) -> R | Exception:
     """Result of a view, or its error with a traceback for the process that raises it again."""
     try:
         return work(named[1])

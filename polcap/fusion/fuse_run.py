@@ -15,12 +15,14 @@ from polcap.config import restore
 from polcap.errors import SettingError
 from polcap.formats.export import encoders, provenance
 from polcap.formats.export.texture_set import Extra
-from polcap.fusion import fused_maps, fused_page, object_pictures
+from polcap.fusion import fused_maps, fused_page, object_pictures, session_views
 from polcap.fusion import session as sessions
 from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.closed_mesh import is_closed
+from polcap.fusion.each_view import Notify
 from polcap.fusion.fusion_path import FusionResults, SessionConfig, path
-from polcap.fusion.session import Notify, ProcessedSession, SessionInput
+from polcap.fusion.session import ProcessedSession
+from polcap.fusion.session_views import SessionInput
 from polcap.pipeline import asset_export, result_folder
 from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import Progress
@@ -44,7 +46,7 @@ def fuse(session_input: SessionInput[SessionConfig], out: Path, notify: Notify, 
     """
     config = session_input.config
     config.check()
-    with sessions.opened(session_input, out, progress) as (session, cache):
+    with session_views.opened(session_input, out, progress) as (session, cache):
         processed = sessions.process(session, session_input, cache, notify)
         with cache.memory_explained(math.prod(session.capture.size_px)):
             results = path(processed.views, config.fusion, cache)
@@ -90,7 +92,7 @@ def document(
     rows = _rows(processed, results)
     judged = advise(list(_gates(processed, results, rows, config.fusion.gates)))
     first = next(iter(processed.reports.values()))
-    shots = sessions.shots({view: report["capture"] for view, report in processed.reports.items()})
+    shots = session_views.shots({view: report["capture"] for view, report in processed.reports.items()})
     of_views = {f"{view} infer": report["keys"]["infer"] for view, report in processed.reports.items()}
     return {
         "polcap": __version__,

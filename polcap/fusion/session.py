@@ -1,102 +1,32 @@
-"""Processes all views of a session: one color calibration, one camera, poses, masks, maps.
+"""Processes all views of a session: one color calibration, one camera, poses, masks, maps. `process` has the order.
 
-Each view is a capture that `polcap process` takes, with its result in viewNN/polcap; `view_path.py` has its stages. A
-view that cannot be used is left out, with the reason; the others go on. Between sets of views (setA/view01 …,
-setB/view01 …) the object was laid on another side; `joining.py` gives them one frame later. Without a board the poses
-come from features of the maps.
+The result of a view is in viewNN/polcap; `view_path.py` has its stages. A view that cannot be used is left out, with
+the reason; the others go on. Without a board the poses come from features of the maps. `joining.py` gives several sets
+of views one frame later.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 
-from polcap.capture_values import Capture
 from polcap.chart_values import ChartRequest, ColorCalibration
-from polcap.config import Config
-from polcap.errors import CaptureError, ChartError, SettingError
-from polcap.formats import own_folders
-from polcap.formats.capture import folder_names
+from polcap.errors import CaptureError, ChartError
 from polcap.formats.maps import png
 from polcap.fusion import each_view, feature_poses, mask_agreement, poses, view_maps, view_path
 from polcap.fusion.board_corners import BoardSearch
 from polcap.fusion.board_eraser import PosedBoard
+from polcap.fusion.each_view import Notify, StepRunner
 from polcap.fusion.fusion_path import SessionConfig
-from polcap.fusion.poses import LEAST_VIEWS, SessionPoses
+from polcap.fusion.poses import SessionPoses
+from polcap.fusion.session_views import Session, SessionInput
 from polcap.fusion.silhouettes import Silhouette
 from polcap.fusion.values import FusionView, ViewMask
 from polcap.fusion.view_path import SessionView
-from polcap.pipeline import result_folder, run
-from polcap.pipeline.cache import DeferredResult, LazyCache, Progress, StageResult, digest
-from polcap.pipeline.request import Request
-from polcap.process_pool import Limits, ProcessPool
-
-Notify = Callable[[str], None]  # is called with a line on the step that is done
-R = TypeVar("R")
-C = TypeVar("C", bound=Config)
-
-
-@dataclass(frozen=True)
-class SessionInput(Generic[C]):
-    """A session's folder and settings, and the request that is the same for all its views."""
-
-    folder: Path
-    config: C
-    request: Request  # of each view; threads and memory are limits of each process
-    workers: int = 1  # views at a time, each in a process
-
-
-@dataclass(frozen=True)
-class Session:
-    """The views that can be used, by name, and the reasons why others are left out."""
-
-    views: Mapping[str, SessionView]
-    left_out: Mapping[str, str]
-
-    @property
-    def folders(self) -> list[str]:
-        """Folders of the sets of views, such as setA; one empty name if there are no sets."""
-        return list(dict.fromkeys(name.rpartition("/")[0] for name in sorted([*self.views, *self.left_out])))
-
-    @property
-    def capture(self) -> Capture:
-        """Capture of the first view, for the geometry of the camera of all."""
-        return next(iter(self.views.values())).capture
-
-    def without(self, reasons: Mapping[str, str]) -> "Session":
-        """The session without some views.
-
-        Raises CaptureError: too few views of a set are left.
-        """
-        used = {name: view for name, view in self.views.items() if name not in reasons}
-        left = Session(used, {**self.left_out, **reasons})
-        for folder in left.folders:
-            count = sum(name.rpartition("/")[0] == folder for name in used)
-            if count < LEAST_VIEWS:
-                listed = "; ".join(f"{name}: {reason}" for name, reason in left.left_out.items())
-                raise CaptureError(
-                    f"{count} views {f'of {folder} ' * bool(folder)}can be used, {LEAST_VIEWS} are needed"
-                    + (f" ({listed})" if listed else "")
-                    + "; shoot more, 12 for a simple shape, 9 for a flat sample"
-                )
-        return left
-
-    def with_inputs(self, change: Callable[[SessionView], SessionView]) -> "Session":
-        """The session with other inputs of its views."""
-        return Session({name: change(view) for name, view in self.views.items()}, self.left_out)
-
-
-def shots(captures: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Facts of all shots, with files named from the session's folder; `captures` are the facts of each view."""
-    return [
-        {**shot, "frames": [{**frame, "file": f"{view}/{frame['file']}"} for frame in shot["frames"]]}
-        for view, capture in captures.items()
-        for shot in capture["shots"]
-    ]
+from polcap.pipeline import run
+from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult, digest
 
 
 @dataclass(frozen=True)
@@ -109,69 +39,6 @@ class ProcessedSession:
     left_out: Mapping[str, str]  # reason, by view
 
 
-@dataclass(frozen=True)
-class StepRunner:
-    """Runs a step on all views of a session, and reports it."""
-
-    pool: ProcessPool | None
-    notify: Notify
-
-    def __call__(self, step: str, work: Callable[[SessionView], R], session: Session) -> tuple[Session, dict[str, R]]:
-        """Results of the step by view, and the session without the views in which it failed.
-
-        Raises CaptureError: too few views are left.
-        """
-        done = partial(self._report, step)
-        results, failed = each_view.run(work, session.views, self.pool, done)
-        return session.without(failed), results
-
-    def _report(self, step: str, name: str) -> None:
-        self.notify(f"{name}: {step}")
-
-
-@contextmanager
-def opened(session_input: SessionInput[Any], out: Path, progress: Progress) -> Iterator[tuple[Session, LazyCache]]:
-    """Context manager: the views of a session, and the cache of its result folder `out`, which is locked.
-
-    Raises SettingError: there is no such folder, or `out` is not allowed. CaptureError: there are too few views.
-    StorageError: `out` is locked.
-    """
-    session = read(session_input)  # first: a folder without views stays as it is
-    for view in folder_names.session_views(session_input.folder):
-        result_folder.check(out, session_input.folder / view)
-    with result_folder.locked(out):
-        yield session, LazyCache(out, progress)
-
-
-def read(session_input: SessionInput[Any]) -> Session:
-    """Read the captures of all folders view…/ and set…/view…/; nothing is written.
-
-    Raises SettingError: there is no such folder. CaptureError: there are too few views.
-    """
-    folder, request = session_input.folder, session_input.request
-    if not folder.is_dir():
-        raise SettingError(f"{folder}: no such folder; give the folder that holds view01, view02, …")
-    names = folder_names.session_views(folder)
-    if not names:
-        raise CaptureError(f"{folder} holds no views; put each capture into a folder view01, view02, …")
-    supplied = request.supplied()
-    views, left_out = dict[str, SessionView](), dict[str, str]()
-    seen: dict[str, str] = {}  # name of the view, by digest of a photograph
-    for name in names:
-        try:
-            capture = request.read(folder / name)
-        except each_view.FAULTS as error:
-            left_out[name] = each_view.reason(error, str(folder / name))
-            continue
-        photographs = [frame.digest for shot in capture.shots for frame in shot.frames]
-        if earlier := next((seen[digest] for digest in photographs if digest in seen), None):
-            left_out[name] = f"holds photographs of {earlier}"
-            continue
-        views[name] = SessionView(name, capture, supplied, request.config, folder / name / own_folders.OUTPUT)
-        seen |= dict.fromkeys(photographs, name)
-    return Session(views, {}).without(left_out)
-
-
 def process(
     session: Session, session_input: SessionInput[SessionConfig], cache: LazyCache, notify: Notify
 ) -> ProcessedSession:
@@ -180,25 +47,13 @@ def process(
     Raises CaptureError: too few views can be used. ChartError: no view shows the chart.
     """
     session = with_colors(session, notify)
-    with process_pool(session_input) as pool:
-        run_step = StepRunner(pool, notify)
+    with each_view.step_runner(session_input, notify) as run_step:
         session, solved, masks = _find_poses_and_masks(session, cache, run_step)
         session = _with_agreed_masks(session, masks, solved, cache)
         session, reports = run_step("maps", view_path.make_maps, session)
     views = tuple(_fusion_view(view, solved, reports[name], cache) for name, view in session.views.items())
     together = DeferredResult(digest([view.key for view in views]), lambda: tuple(view.value for view in views))
     return ProcessedSession(together, solved, reports, session.left_out)
-
-
-@contextmanager
-def process_pool(session_input: SessionInput[Any]) -> Iterator[ProcessPool | None]:
-    """Context manager: the child processes of `workers`; None if there is one worker."""
-    if session_input.workers == 1:
-        yield None
-        return
-    limits = Limits(session_input.request.threads, session_input.request.memory_gb)
-    with ProcessPool(session_input.workers, each_view.RETRIES, limits) as pool:
-        yield pool
 
 
 def with_colors(session: Session, notify: Notify) -> Session:

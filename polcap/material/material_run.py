@@ -15,8 +15,9 @@ from polcap.config import restore
 from polcap.errors import SettingError
 from polcap.formats.export import provenance
 from polcap.formats.export.texture_set import Extra
-from polcap.fusion import session as sessions
-from polcap.fusion.session import Notify, Session, SessionInput
+from polcap.fusion import session_views
+from polcap.fusion.each_view import Notify
+from polcap.fusion.session_views import Session, SessionInput
 from polcap.material import material_maps, material_page, material_path, material_session
 from polcap.material.material_path import MaterialConfig, MaterialResults
 from polcap.material.material_session import FlatSession, Region
@@ -47,7 +48,7 @@ def measure(
 
     Raises InputError: anything at fault with the user's input.
     """  # fmt: skip
-    with sessions.opened(session_input, out, progress) as (session, cache):
+    with session_views.opened(session_input, out, progress) as (session, cache):
         flat = material_session.process(session, session_input, region, texel, cache, notify)
         settings = session_input.config.material
         with cache.memory_explained(math.prod(session.capture.size_px)):
@@ -94,7 +95,7 @@ def document(
         "polcap": __version__,
         "versions": provenance.versions(),
         "verdict": gates.verdict(judged),
-        "capture": {**captures[flat.names[0]], "name": name, "shots": sessions.shots(captures)},
+        "capture": {**captures[flat.names[0]], "name": name, "shots": session_views.shots(captures)},
         "gates": msgspec.to_builtins(judged),
         "figures": _figures(flat, results, rows),
         "timings": dict(seconds),

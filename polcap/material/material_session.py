@@ -1,7 +1,7 @@
 """Processes the views of a flat sample up to their Stokes parameters: color calibration, board, poses, texel grid.
 
-Views and steps are those of `polcap fuse` (`fusion/session.py`); a view that cannot be used is left out, with the
-reason.
+Views and steps are those of `polcap fuse` (`fusion/session_views.py`, `fusion/view_path.py`); a view that cannot be
+used is left out, with the reason.
 """
 
 from collections.abc import Mapping
@@ -11,9 +11,10 @@ import numpy as np
 
 from polcap.chart_values import ColorCalibration
 from polcap.errors import SettingError
-from polcap.fusion import session, view_path
+from polcap.fusion import each_view, session, view_path
+from polcap.fusion.each_view import Notify
 from polcap.fusion.poses import SessionPoses
-from polcap.fusion.session import Notify, Session, SessionInput, StepRunner
+from polcap.fusion.session_views import Session, SessionInput
 from polcap.fusion.values import Pose
 from polcap.fusion.view_path import SessionView
 from polcap.material import board_focus, stokes_view
@@ -60,8 +61,7 @@ def process(
     """  # fmt: skip
     found = found.with_inputs(lambda view: replace(view, config=stokes_view.of_flat_views(view.config)))
     charted = session.with_colors(found, notify)
-    with session.process_pool(session_input) as pool:
-        run_step = StepRunner(pool, notify)
+    with each_view.step_runner(session_input, notify) as run_step:
         charted, boards = run_step("exposures and board", view_path.find_board, charted)
         charted, solved = session.pose_by_board(charted, boards, cache)
         board = solved.board

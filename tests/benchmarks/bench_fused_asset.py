@@ -27,9 +27,9 @@ from trimesh import Trimesh
 from trimesh.sample import sample_surface
 
 from polcap.config import restore
-from polcap.fusion import baking, fused_maps, joining, session
+from polcap.fusion import baking, fused_maps, joining, session, session_views
 from polcap.fusion.fusion_path import FusionResults, FusionSettings, SessionConfig, path
-from polcap.fusion.session import SessionInput
+from polcap.fusion.session_views import SessionInput
 from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.values import FusionView, Pose
 from polcap.images import Floats
@@ -95,7 +95,7 @@ def fused(folder: Path) -> tuple[tuple[FusionView, ...], FusionResults]:
     config = restore(SessionConfig, about, folder / "fused" / "report.json")
     session_input = SessionInput(folder, config, Request(threads=1))
     cache = LazyCache(folder / "fused")
-    views = session.process(session.read(session_input), session_input, cache, lambda _: None).views
+    views = session.process(session_views.read(session_input), session_input, cache, lambda _: None).views
     results = path(views, config.fusion, cache)
     return joining.place(views.value, results.joined), results
 

@@ -22,7 +22,7 @@ import numpy as np
 from polcap.errors import InputError
 from polcap.fusion import fuse_run
 from polcap.fusion.fusion_path import SessionConfig
-from polcap.fusion.session import SessionInput
+from polcap.fusion.session_views import SessionInput
 from polcap.images import Bools, Floats
 from polcap.optics import projection
 from polcap.optics.board import BOARDS

@@ -24,9 +24,9 @@ from trimesh import Trimesh
 from trimesh.registration import procrustes
 from trimesh.sample import sample_surface
 
-from polcap.fusion import session
+from polcap.fusion import session, session_views
 from polcap.fusion.fusion_path import FusionResults, FusionSettings, SessionConfig, path
-from polcap.fusion.session import SessionInput
+from polcap.fusion.session_views import SessionInput
 from polcap.fusion.values import FusionView, Pose
 from polcap.images import Floats
 from polcap.pipeline.cache import LazyCache, MemoryCache
@@ -44,8 +44,8 @@ def main(out: Path, mesh: str, views: int, step: int) -> None:
         if not folder.exists():
             render(folder, mesh, board, views)
         session_input = SessionInput(folder, SessionConfig(), Request(threads=1))
-        found = session.read(session_input)
-        found = session.Session(dict(list(found.views.items())[::step]), {})
+        found = session_views.read(session_input)
+        found = session_views.Session(dict(list(found.views.items())[::step]), {})
         processed = session.process(found, session_input, LazyCache(folder / "fused"), print)
         results = path(processed.views, FusionSettings(), MemoryCache())
         pairs = true_poses(folder, processed.views.value)

@@ -13,13 +13,14 @@ from polcap.config import Config
 from polcap.errors import CaptureError
 from polcap.formats.capture import reader
 from polcap.formats.maps import png
-from polcap.fusion import fuse_run, mask_agreement, poses, view_path
+from polcap.fusion import fuse_run, mask_agreement, poses, session_views, view_path
 from polcap.fusion import session as sessions
 from polcap.fusion.board_corners import BoardCorners, BoardSearch
+from polcap.fusion.each_view import StepRunner
 from polcap.fusion.fusion_path import SessionConfig
 from polcap.fusion.mask_agreement import AgreedMasks
 from polcap.fusion.poses import PosedView, SessionCamera, SessionPoses
-from polcap.fusion.session import Session, SessionInput, StepRunner
+from polcap.fusion.session_views import Session, SessionInput
 from polcap.fusion.values import ViewMask
 from polcap.fusion.view_path import SessionView
 from polcap.pipeline import run
@@ -49,7 +50,7 @@ def test_a_view_that_lacks_a_shot_is_left_out_with_the_reason(tmp_path: Path, mo
         return board_views.capture()
 
     monkeypatch.setattr(reader, "read", read)
-    found = sessions.read(session_of(tmp_path, "view01", "view02", "view03", "view05"))  # view04 was never shot
+    found = session_views.read(session_of(tmp_path, "view01", "view02", "view03", "view05"))  # view04 was never shot
     assert list(found.views) == ["view01", "view02", "view05"]
     assert found.left_out == {"view03": "2 different polarizer angles where 3 are needed; add the missing shot"}
 
@@ -61,7 +62,7 @@ def test_a_copy_of_a_view_is_left_out(tmp_path: Path) -> None:
             photo.parent.mkdir(parents=True)
             photo.write_bytes(cv2.imencode(".png", np.full((8, 8, 3), view + angle, np.uint16))[1].tobytes())
     shutil.copytree(tmp_path / "view02", tmp_path / "view05")
-    found = sessions.read(SessionInput(tmp_path, SessionConfig(), ANALYTIC))
+    found = session_views.read(SessionInput(tmp_path, SessionConfig(), ANALYTIC))
     assert list(found.views) == ["view01", "view02", "view03", "view04"]
     assert found.left_out == {"view05": "holds photographs of view02"}
 
@@ -74,7 +75,7 @@ def test_a_missing_number_of_a_view_is_in_the_report() -> None:
 def test_three_views_are_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reader, "read", lambda *_: board_views.capture())
     with pytest.raises(CaptureError, match="2 views can be used, 3 are needed"):
-        sessions.read(session_of(tmp_path, "view01", "view02"))
+        session_views.read(session_of(tmp_path, "view01", "view02"))
 
 
 def test_a_folder_without_views_stays_as_it_is(tmp_path: Path) -> None:
