@@ -47,7 +47,7 @@ def measure(
     `region` and `texel` as for `material_session.process`; `tile` makes the maps seamless.
 
     Raises InputError: anything at fault with the user's input.
-    """  # fmt: skip
+    """
     with session_views.opened(session_input, out, progress) as (session, cache):
         flat = material_session.process(session, session_input, region, texel, cache, notify)
         settings = session_input.config.material
@@ -87,7 +87,7 @@ def document(
     results: MaterialResults,
     seconds: Mapping[str, float],
 ) -> dict[str, Any]:
-    """The content of report.json: facts, figures by view, gates; `seconds` are those of the stages."""  # fmt: skip
+    """The content of report.json: facts, figures by view, gates; `seconds` are those of the stages."""
     rows = list(_rows(flat, results))
     judged = advise(list(_gates(flat, results, rows, config)))
     captures = {name: reports.capture_facts(session.views[name].capture) for name in flat.names}
