@@ -28,6 +28,7 @@ _PAGE = "Web page that shows the GLB with this model-viewer.min.js, without a ne
 _COLOR = "Color space or OCIO role of the colors in the EXR, such as ACEScg."
 _SIZE = "Longer side of the textures, px; by default each keeps its own size."
 _GEOMETRY = "Mesh in the GLB: 32-bit floats, integers, or Draco (extra [draco])."
+_OUT = "New result folder for the files, with a copy of the maps; an archive stays as it is."
 _LEVEL = re.compile(r"_lod\d\.glb$")
 Images = Annotated[Literal["png", "jpeg", "webp", "ktx2"] | None, choice("Picture format in the GLB.")]
 Geometry = Annotated[Literal["float", "quantized", "draco"] | None, choice(_GEOMETRY)]
@@ -62,12 +63,14 @@ def export(
     about: Annotated[list[str] | None, Option(metavar="K=V", help=_ABOUT)] = None,
     extra: Annotated[list[str] | None, _names(_EXTRA, EXTRAS)] = None,
     bits: Bits = None,
+    out: Annotated[Path | None, Option(metavar="DIR", help=_OUT)] = None,
     lod: Annotated[int, Option(min=0, max=6, help="Further GLBs, each with a quarter of triangles and texels.")] = 0,
     json: Json = False,
 ) -> None:
     """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
     from polcap import api
     from polcap.formats.export import presets
+    from polcap.pipeline import result_folder
     from polcap.pipeline.asset_export import ExportRequest
 
     formats = tuple(name for name in presets.FORMATS if context.params[name] not in (None, False))
@@ -88,6 +91,9 @@ def export(
         lod=lod,
     )
     wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
+    if out is not None:
+        result_folder.copy(result, out)
+        result = out
     files = api.write_exports(result, *wanted)
     options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
     if (missing := lod * len(wanted) - sum(bool(_LEVEL.search(file.name)) for file in files)) > 0:

@@ -84,6 +84,12 @@ def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
         discard(temporary)
 
 
+def copy(source: Path, final: Path) -> None:
+    """Write a copy of the content of a file. Raises StorageError: it cannot be read or written."""
+    with path(final) as temporary:
+        shutil.copyfile(source, temporary)
+
+
 @contextmanager
 def new_folder(final: str | Path) -> Iterator[Path]:
     """Context manager: a temporary folder to fill, renamed to `final` at the end; `final` may be an empty folder.

@@ -73,6 +73,20 @@ def opened(out: Path) -> Iterator[None]:
         yield
 
 
+def copy(result: Path, out: Path) -> None:
+    """Make a result folder with the maps and the report of another one, such as an archive, which stays as it is.
+
+    Raises SettingError: `out` holds something already. StorageError: `result` is no result, or `out` is not writable.
+    """
+    if os.path.lexists(out) and (not out.is_dir() or any(out.iterdir())):
+        raise SettingError(f"--out {out} is not an empty folder; choose another folder")
+    report.read(result)
+    with opened(out):
+        for file in (result / "report.json", *sorted((result / "maps").iterdir())):
+            if file.is_file():
+                atomic.copy(file, out / file.relative_to(result))
+
+
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
     """Context manager that locks and opens a result folder for this process; removes temporary files of a killed run.

@@ -328,6 +328,8 @@ def test_an_archive_checks_itself_after_two_exports_and_a_copy(own: Path, polcap
     second = polcap("export", own, "--preset", "archive", "--extra", "occlusion", "--about", "title=Vase")
     assert second.returncode == 0 and second.stderr == ""
     shutil.copytree(own / "asset/archive", tmp_path / "elsewhere")
+    again = polcap("export", tmp_path / "elsewhere", "--out", tmp_path / "new", "--ply")
+    assert again.returncode == 0 and (tmp_path / "new/asset/capture.ply").exists()
     assert set(check_sums(tmp_path / "elsewhere")) == {*names, "capture_occlusion.png"}
     if program := shutil.which("sha256sum"):
         command = [program, "-c", "--quiet", "manifest-sha256.txt"]

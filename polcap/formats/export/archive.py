@@ -1,6 +1,5 @@
 """Gathers a result's records next to an export, and lists digests of all its files for `sha256sum -c`."""
 
-import shutil
 from pathlib import Path
 
 from polcap.formats import atomic, color_profile, own_files
@@ -17,8 +16,7 @@ def gather(out: Path, folder: Path) -> list[Path]:
     found = [*maps, *(file for name in _RECORDS if (file := out / name).is_file())]
     copies = [folder / file.relative_to(out) for file in found]
     for file, copy in zip(found, copies):
-        with atomic.path(copy) as temporary:
-            shutil.copyfile(file, temporary)
+        atomic.copy(file, copy)
     return copies
 
 
