@@ -19,7 +19,7 @@ def write(folder: Path, about: Mapping[str, Any], results: FusionResults) -> Non
     drawn = object_pictures.around(results.atlas, results.maps, _SIDES, _SIDE)
     content = {
         "sides": [(f"{k * 360 // _SIDES}°", html.jpeg(picture)) for k, picture in enumerate(drawn)],
-        "seen": html.jpeg(object_pictures.seen_picture(results.maps)),
+        "atlas": [(one.caption, one.note, html.jpeg(one.picture)) for one in object_pictures.of_atlas(results.maps)],
         "rows": [_row(row) for row in about["figures"]["views"].values()],
         "left_out": list(about["figures"]["left_out"].items()),
         "size": _size(about["figures"]["mesh"]),
