@@ -1,4 +1,4 @@
-"""Fixtures of several tests: the bundled capture, the `polcap` command, and one finished run of the two."""
+"""Fixtures of several tests: a small capture, the `polcap` command, and one finished run of the two."""
 
 import os
 import shutil
@@ -20,7 +20,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as in a shell's backgro
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).parents[1]
-EXAMPLE = ROOT / "examples" / "capture"
+EXAMPLE = ROOT / "tests" / "capture"
 slow = pytest.mark.skipif("POLCAP_SLOW" not in os.environ, reason="takes a minute or more: set POLCAP_SLOW")
 
 
@@ -67,7 +67,7 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture(scope="session")
 def example() -> Path:
-    """The capture bundled with polcap; never written to."""
+    """A small capture; never written to."""
     return EXAMPLE
 
 
@@ -104,7 +104,7 @@ def polcap(capsys: pytest.CaptureFixture[str]) -> Command:
 
 @pytest.fixture(scope="session")
 def result(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
-    """The result folder of the bundled capture with the analytic estimator, made once for all workers; read only."""
+    """The result folder of the small capture with the analytic estimator, made once for all workers; read only."""
     shared = tmp_path_factory.getbasetemp()
     shared = shared if worker_id == "master" else shared.parent
     folder = shared / "bundled"

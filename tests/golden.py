@@ -3,7 +3,7 @@
     python -m tests.golden        renew tests/goldens/ after a stage's `version` was raised
 
 No stage runs on the output of another, so a rounding difference is never passed on. The first stages run on the
-photographs of examples/capture (integers); the later ones on a sixteenth of their pixels, in tests/goldens/inputs.npz.
+photographs of tests/capture (integers); the later ones on a sixteenth of their pixels, in tests/goldens/inputs.npz.
 To make new inputs, delete that file and run the command.
 """
 
@@ -30,7 +30,7 @@ from tests import scenes
 Arrays = dict[str, NDArray[Any]]
 FOLDER = Path(__file__).with_name("goldens")
 INPUTS = FOLDER / "inputs.npz"
-CAPTURE = Path(__file__).parents[1] / "examples" / "capture"
+CAPTURE = Path(__file__).parent / "capture"
 SAMPLES = 3000  # pixels or vertices stored of one array, evenly spread
 REMEDY = "If the change is intended, raise the stage's `version`, then run `python -m tests.golden`."
 
@@ -169,7 +169,7 @@ class Golden:
 
 
 def radiance() -> stage_values.AngleStack:
-    """The longest exposure of each angle of the bundled capture; sums and quotients of integers, no stage."""
+    """The longest exposure of each angle of the small capture; sums and quotients of integers, no stage."""
     capture = read_capture(CAPTURE)
     photographs = [frame_decoder.decode(shot.frames[-1]) for shot in capture.shots]
     values, clipped = [], []
@@ -193,7 +193,7 @@ def radiance() -> stage_values.AngleStack:
 
 
 RGGB = np.array([[0, 1], [1, 2]], np.uint8)
-VIEW = View(focal=1344.0, center=(287.5, 215.5), scale=2.0)  # of the bundled capture
+VIEW = View(focal=1344.0, center=(287.5, 215.5), scale=2.0)  # of the small capture
 
 
 def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:

@@ -18,7 +18,7 @@ NESTED = "[" * 30_000
 
 @pytest.fixture
 def capture(example: Path, tmp_path: Path) -> Path:
-    """A copy of the bundled capture, to be spoilt."""
+    """A copy of the small capture, to be spoilt."""
     return Path(shutil.copytree(example, tmp_path / "capture", ignore=shutil.ignore_patterns("polcap")))
 
 

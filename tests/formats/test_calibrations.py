@@ -12,7 +12,7 @@ from polcap.errors import CaptureError
 from polcap.formats import calibrations
 from polcap.formats.capture import reader as capture
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "capture"
+EXAMPLE = Path(__file__).parents[1] / "capture"
 EXIF = Exif(make="Polcap", model="Synthetic", lens="Synthetic 60mm", f_number=11.0, focal_length_mm=60.0)
 LINE = NoiseLine(100.0, (3e-5,), (1e-7,), (1e-8,), (1e-9,), (33333.0,), (3.3,))
 RING = Polarizer(1.5, 0.05, -1, True, (300.0, 500.0, 200.0), (10.0, 10.0, 10.0), 24)

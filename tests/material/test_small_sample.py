@@ -56,7 +56,7 @@ def test_a_view_without_the_board_is_left_out_and_named(sample: Path, tmp_path: 
     folder = tmp_path / "fewer"
     shutil.copytree(sample, folder, ignore=shutil.ignore_patterns("material"))
     for file in (folder / "view03").glob("pol*/*.DNG"):
-        shutil.copy(next((Path(__file__).parents[2] / "examples/capture/pol000").glob("*.DNG")), file)
+        shutil.copy(next((Path(__file__).parents[1] / "capture/pol000").glob("*.DNG")), file)
     done = shell("material", folder)
     assert done.returncode in (0, 2) and "view03" in done.stderr
 

@@ -26,7 +26,7 @@ from tests.formats.export.test_gltf import NODE, document
 
 @pytest.fixture(scope="module")
 def exported(result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The bundled capture's result with every preset exported."""
+    """The small capture's result with every preset exported."""
     pytest.importorskip("pxr", reason="needs usd-core")
     copy = tmp_path_factory.mktemp("export") / "copy"
     shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))

@@ -1,4 +1,4 @@
-"""The whole path on the bundled capture: right, resumable, and clear where the input is at fault."""
+"""The whole path on a small capture: right, resumable, and clear where the input is at fault."""
 
 import json
 import os
@@ -147,7 +147,7 @@ def test_interrupted_run_ends_with_130_and_one_line(example: Path, tmp_path: Pat
 
 
 def broken(example: Path, folder: Path, fault: str) -> Path:
-    """The bundled capture with one thing wrong."""
+    """The small capture with one thing wrong."""
     if fault == "empty folder":
         folder.mkdir()
         return folder

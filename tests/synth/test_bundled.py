@@ -1,8 +1,10 @@
-"""The capture in examples/ is the one that its script writes."""
+"""The captures in examples/ and tests/ are those that their scripts write."""
 
 import importlib.util
 import json
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import msgspec
 import numpy as np
@@ -11,38 +13,49 @@ import rawpy
 
 from polcap.synth import render
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
-CAPTURE = EXAMPLES / "capture"
+ROOT = Path(__file__).parents[2]
+LIMITS = {"examples": 16e6, "tests": 8e6}  # bytes
 
 
 @pytest.fixture(scope="module")
-def script():
-    spec = importlib.util.spec_from_file_location("make_capture", EXAMPLES / "make_capture.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def scripts() -> dict[str, ModuleType]:
+    found = {}
+    for folder in LIMITS:
+        sys.path.insert(0, str(ROOT / folder))
+        spec = importlib.util.spec_from_file_location(f"make_{folder}", ROOT / folder / "make_capture.py")
+        assert spec and spec.loader
+        found[folder] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(found[folder])
+        sys.path.pop(0)
+    return found
 
 
-def test_bundled_capture_is_small_and_whole() -> None:
-    truth = json.loads((CAPTURE / "truth.json").read_text())
+@pytest.mark.parametrize("folder", LIMITS)
+def test_bundled_capture_is_small_and_whole(folder: str) -> None:
+    capture = ROOT / folder / "capture"
+    truth = json.loads((capture / "truth.json").read_text())
     assert len(truth["files"]) == 9
-    assert sum(p.stat().st_size for p in CAPTURE.rglob("*") if p.relative_to(CAPTURE).parts[0] != "polcap") < 8e6
+    files = [path for path in capture.rglob("*") if path.relative_to(capture).parts[0] != "polcap"]
+    assert sum(path.stat().st_size for path in files) < LIMITS[folder]
     patch = np.array(truth["chart"]["patch_corners_px"]) / 2  # binned px
     assert np.ptp(patch, axis=1).min() >= 10
     for file in truth["files"]:
-        with rawpy.imread(str(CAPTURE / file["file"])) as raw:
+        with rawpy.imread(str(capture / file["file"])) as raw:
             assert raw.raw_image_visible.shape == (truth["shoot"]["height"], truth["shoot"]["width"])
 
 
-def test_script_and_bundle_agree(script) -> None:
-    """Bytes agree on one machine only (the last bits of a sine differ on others), so surfaces are compared."""
-    truth = json.loads((CAPTURE / "truth.json").read_text())
+@pytest.mark.parametrize("folder", LIMITS)
+def test_script_and_bundle_state_the_same_scene(scripts: dict[str, ModuleType], folder: str) -> None:
+    truth, script = json.loads((ROOT / folder / "capture" / "truth.json").read_text()), scripts[folder]
     assert msgspec.convert(truth["scene"], type(script.SCENE)) == script.SCENE
     assert msgspec.convert(truth["shoot"], type(script.SHOOT)) == script.SHOOT
-    shoot = script.SHOOT
+
+
+def test_script_and_bundle_agree(scripts: dict[str, ModuleType]) -> None:
+    """Bytes agree on one machine only (the last bits of a sine differ on others), so surfaces are compared."""
+    script, shoot = scripts["tests"], scripts["tests"].SHOOT
     buffer = render.gbuffer(script.SCENE, shoot.view, shoot.height, shoot.width)
-    with np.load(CAPTURE / "truth.npz") as maps:
+    with np.load(ROOT / "tests" / "capture" / "truth.npz") as maps:
         assert (maps["mask"] != buffer.mask).sum() < 5
         both = maps["mask"] & buffer.mask
         off = np.abs(maps["normal"][both] - buffer.normal[both]).max(axis=-1)

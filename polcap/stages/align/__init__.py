@@ -24,7 +24,7 @@ from polcap.stages.align.detail import averaging_step, detail, edge_strength, sh
 _SURE_CORRELATION = 0.6  # of detail, from which edges need not be compared
 _MOST_PIXELS = 0.5e6  # a larger picture is averaged down first: it has detail to spare
 _OVEREXPOSED, _TOO_DARK = 0.2, 3.0  # share of a picture; signal over noise of its median pixel
-_FLOOR_PX = 0.02  # error that aliasing leaves whatever the noise: the bundled capture's is .026 and .025 (decision 19)
+_FLOOR_PX = 0.02  # error that aliasing leaves whatever the noise: that of tests/capture is .026 and .025 (decision 19)
 
 
 class AlignSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

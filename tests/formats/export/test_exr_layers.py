@@ -1,4 +1,4 @@
-"""The layered EXR of the bundled capture's result, read back and held against the maps."""
+"""The layered EXR of the small capture's result, read back and held against the maps."""
 
 from pathlib import Path
 
