@@ -10,7 +10,10 @@ _SOME = 40_000  # colors that are grouped, at most
 
 
 def color_clusters(encoded: Floats, count: int) -> tuple[Floats, float]:
-    """Centers (G, 3) of at most `count` groups of sRGB-encoded colors (N, 3), and the spread within a group."""
+    """Centers (G, C) of at most `count` groups of sRGB-encoded colors (N, C), and the spread within a group.
+
+    Other features than color count as much as their units make them.
+    """
     some = np.ascontiguousarray(encoded[:: max(1, len(encoded) // _SOME)], np.float32)
     stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-4)
     cv2.setRNGSeed(0)
@@ -21,7 +24,7 @@ def color_clusters(encoded: Floats, count: int) -> tuple[Floats, float]:
 
 
 def soft_share(encoded: Floats, center: Floats, spread: float) -> Floats:
-    """Share (N, G) of each color (N, 3) in each group; the shares of a color sum to 1."""
+    """Share (N, G) of each color (N, C) in each group; the shares of a color sum to 1."""
     distance = np.linalg.norm(encoded[:, None] - center[None], axis=-1)
     likeness = np.exp(-((distance / spread) ** 2) + (distance.min(axis=1, keepdims=True) / spread) ** 2)
     return np.asarray(likeness / likeness.sum(axis=1, keepdims=True))

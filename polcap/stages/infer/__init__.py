@@ -9,7 +9,7 @@ the camera frame.
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
         zenith                by the object's law of diffuse polarization
     half_turns     the side of the ray to which a normal leans, for both estimators
-    highlights     the albedo in highlights, for both estimators
+    highlights     the albedo in highlights, for both estimators; the gloss of materials, for the network
 
 Two properties of the albedo are estimated here. The error of its scale: a chart behind the object, or in a shadow, gets
 less light than the object. The picture of the chart does not show this, but then both albedos and F0 are higher
@@ -59,7 +59,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fine: Annotated[bool, Meta(description="a second network adds relief finer than the pixels of the first")] = True
 
 
-@stage(version=31)
+@stage(version=32)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Estimate normal, diffuse, specular, roughness and expected error from cues; without a network by inversion.
 

@@ -1,19 +1,31 @@
-"""Albedo in highlights: fills clipped ones, and corrects all of them by a cross-polarized shot, if any.
+"""Highlights: the albedo under them, and the gloss that they show.
 
-A cross-polarized shot shows the diffuse reflection under a highlight. Outside highlights, the ratio of the estimated
-albedo to this reflection gives the shading that the estimator assumed. It is divided by the shading of the normals,
-continued smoothly into the highlight, and used there to turn the diffuse reflection into an albedo.
+**Albedo.** Clipped highlights are filled. A cross-polarized shot shows the diffuse reflection under a highlight.
+Outside highlights, the ratio of the estimated albedo to this reflection gives the shading that the estimator assumed.
+It is divided by the shading of the normals, continued smoothly into the highlight, and used there to turn the diffuse
+reflection into an albedo.
+
+**Gloss.** The network's roughness follows prints and highlights, but few materials make most objects, and a print
+changes albedo, not gloss. Pixels of like roughness, and perhaps of like albedo, are taken for one material. Its
+roughness √α is the mean of the network's, unless one of its highlights is too bright for that. Under a flash at the
+lens, in units of a white plane that faces it, the mirrored light is
+
+    S ≤ F0 / (4 α²)
+
+and reaches this limit where the surface faces the lens. So the brightest highlight bounds the roughness from above.
+Mirrored light is what S0 has beyond the albedo, and therefore less certain on a bright material.
 """
 
 from dataclasses import replace
+from math import hypot
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats, Quality
-from polcap.optics import frames, fresnel
-from polcap.optics.morphology import dilate
+from polcap.images import Bools, Floats, Quality
+from polcap.optics import clusters, color, frames, fresnel
+from polcap.optics.morphology import dilate, masked_mean
 from polcap.optics.outline import disc_radius
 from polcap.stage_values import Cues, SurfaceMaps
 
@@ -25,6 +37,24 @@ _LEAST_PX = 2.0
 _LEAST_COSINE = 0.2  # of the shading that divides
 _LEAST_MATTE = 1e-3  # share of matte pixels in a neighborhood
 _FLOOR = 1e-3  # albedo
+
+_MOST_MATERIALS = 4
+_COLOR = 0.1  # weight of the encoded albedo beside the roughness
+_LIKE = 0.06  # rms distance from the mean of a material: a larger one asks for one more material
+_BLUR = 0.004  # 1σ over the object's radius, of S0 before the brightest pixel is taken
+_LEAST_BLUR_PX = 0.7
+_BRIGHTEST = 3  # this pixel counts as the highlight, not the brightest
+_FACING_DEG = 35.0  # greatest zenith angle of a highlight
+_BESIDE_DEG = (25.0, 60.0)  # zenith angles without highlight; what S0 has there beyond the albedo is its error
+_BESIDE_QUANTILE = 0.99
+_FEWEST_PX = 50
+# measured on path-traced pictures (docs/benchmarks/network.md)
+_ALBEDO_SIGMA = 0.2  # relative error of the albedo under a highlight
+_NETWORK_SIGMA = 0.08  # error of the network's roughness
+_BOUND_SIGMA = 0.06  # relative error of the bound without that of the mirrored light: F0, and highlights below a pixel
+# median F0 of training surfaces by the predicted F0, if a twentieth of them has more than .06
+_PREDICTED_F0 = (0.03, 0.04, 0.05, 0.06, 0.08, 0.105, 0.16, 1.0)
+_MEDIAN_F0 = (0.039, 0.0415, 0.0425, 0.0435, 0.046, 0.0556, 0.16, 1.0)
 
 
 def fill(image: Floats, cues: Cues) -> Floats:
@@ -84,3 +114,60 @@ def _specular_share(cues: Cues) -> Floats:
     assert cues.body is not None and cues.body_known is not None
     share = np.clip(1 - cues.body.sum(-1) / np.maximum(cues.radiance.sum(-1), 1e-6), 0, 1)
     return np.where(cues.body_known & cues.mask, share, 0).astype(np.float32)
+
+
+def pool_gloss(maps: SurfaceMaps, cues: Cues) -> SurfaceMaps:
+    """Replace roughness and F0 of a network's maps (H, W, …) by those of the materials, with soft borders."""
+    if not maps.mask.any():
+        return maps
+    mask = maps.mask
+    alike = np.column_stack([_COLOR * color.encode_srgb(maps.diffuse[mask]), maps.roughness[mask]])
+    center, spread = _fewest_groups(alike.astype(np.float32))
+    share = clusters.soft_share(alike, center, spread)  # (N, K)
+    member = np.full(mask.shape, -1)
+    member[mask] = share.argmax(axis=1)
+    mirrored = _mirrored_light(maps, cues)
+    zenith = np.degrees(np.arccos(np.clip(frames.dot(maps.normal, cues.rays), 0, 1)))
+    weight = share / np.maximum(share.sum(axis=0), 1e-9)
+    f0 = _calibrated(weight.T @ maps.specular[mask].mean(axis=-1))
+    roughness = weight.T @ maps.roughness[mask]
+    for k in range(len(center)):
+        roughness[k] = _bounded(float(roughness[k]), float(f0[k]), member == k, zenith, mirrored, maps.diffuse)
+    out_f0, out_roughness = np.zeros(mask.shape, np.float32), np.zeros(mask.shape, np.float32)
+    out_f0[mask], out_roughness[mask] = share @ f0, share @ roughness
+    return replace(maps, specular=np.repeat(out_f0[..., None], 3, axis=-1), roughness=out_roughness)
+
+
+def _fewest_groups(alike: Floats) -> tuple[Floats, float]:
+    """Centers (K, 4) of as few groups of pixels (N, 4) as are alike, and the spread within a group."""
+    for count in range(1, _MOST_MATERIALS + 1):
+        center, spread = clusters.color_clusters(alike, count)
+        if spread < _LIKE:
+            break
+    return center, spread
+
+
+def _calibrated(f0: Floats) -> Floats:
+    """F0 of common surfaces for a predicted F0: the network learned from more coatings and gems than people own."""
+    return np.interp(f0, _PREDICTED_F0, _MEDIAN_F0)
+
+
+def _mirrored_light(maps: SurfaceMaps, cues: Cues) -> Floats:
+    """S0 (H, W), mean of the channels, beyond that of the albedo in a surface that faces the lens."""
+    beyond = (cues.radiance - maps.diffuse).mean(axis=-1)
+    return masked_mean(beyond, maps.mask, max(_LEAST_BLUR_PX, _BLUR * disc_radius(maps.mask)))
+
+
+def _bounded(roughness: float, f0: float, member: Bools, zenith: Floats, mirrored: Floats, albedo: Floats) -> float:
+    """Roughness of a material of pixels `member` (H, W), at most what its highlights allow."""
+    facing, beside = member & (zenith < _FACING_DEG), member & (zenith > _BESIDE_DEG[0]) & (zenith < _BESIDE_DEG[1])
+    if facing.sum() < _FEWEST_PX or beside.sum() < _FEWEST_PX:
+        return roughness
+    highlight = float(np.partition(mirrored[facing], -_BRIGHTEST)[-_BRIGHTEST])
+    error = hypot(np.quantile(mirrored[beside], _BESIDE_QUANTILE), _ALBEDO_SIGMA * albedo[facing].mean())
+    if highlight <= error:
+        return roughness
+    bound: float = (f0 / (4 * highlight)) ** 0.25
+    sigma = bound * hypot(_BOUND_SIGMA, error / (4 * highlight))
+    weight = _NETWORK_SIGMA**2 / (_NETWORK_SIGMA**2 + sigma**2)
+    return roughness + weight * min(bound - roughness, 0.0)

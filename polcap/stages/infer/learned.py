@@ -5,6 +5,7 @@
 3. The analytic inversion gives normals of each pixel. Their detail replaces that of the network where noise is low.
 4. The refinement network adds relief.
 5. The picture over the shading of the normals, times a smooth factor of the network, is the albedo.
+6. Pixels of one material get one roughness and one F0.
 """
 
 from dataclasses import replace
@@ -48,7 +49,7 @@ def estimate(
     error = np.minimum(scale * stated**power * np.exp(rougher * np.clip(maps["roughness"], 0, 1)), most)
     error = half_turns.error_with_doubt(error, maps["doubt"], frames.dot(normal, cues.rays))
     inside = cues.mask[..., None]
-    return SurfaceMaps(
+    maps_by_pixel = SurfaceMaps(
         normal=(normal * inside).astype(np.float32),
         diffuse=(np.clip(diffuse, 0, 1) * inside).astype(np.float32),
         specular=(np.clip(maps["specular"], 0, 1) * inside).astype(np.float32),
@@ -60,6 +61,7 @@ def estimate(
         order=_compare_orders(cues, network, run),
         estimator=f"network {network.metadata.get('version', network.digest[:8])}",
     )
+    return highlights.pool_gloss(maps_by_pixel, cues)
 
 
 def estimate_coarse(

@@ -1,0 +1,90 @@
+"""Gloss of a ball of one or two materials: what a network got wrong is pooled, and bounded by highlights."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from polcap.images import Floats
+from polcap.optics import frames, shade
+from polcap.stage_values import Cues, SurfaceMaps
+from polcap.stages import cues, stokes
+from polcap.stages.infer import highlights
+from tests import scenes
+
+ROUGH, F0 = 0.4, 0.042
+
+
+@pytest.fixture(scope="module")
+def ball() -> Cues:
+    solved = stokes.solve(
+        scenes.stack(textured=False), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings()
+    )
+    return cues.compute(solved, scenes.no_color())
+
+
+def lit(ball: Cues, albedo: Floats, roughness: Floats, said: Floats) -> tuple[SurfaceMaps, Cues]:
+    """The ball's light for an albedo and a roughness (H, W), and the maps of a network that said `said` of it."""
+    normal, mask = scenes.truth()
+    light = np.zeros_like(normal)
+    light[..., 2] = 1
+    color, f0 = np.repeat(albedo[..., None], 3, -1), np.full_like(normal, F0)
+    radiance = shade.stokes(normal, color, f0, roughness, 1.5 * np.ones_like(albedo), light, np.ones_like(albedo))[0]
+    seen = replace(ball, radiance=(radiance * ball.mask[..., None]).astype(np.float32))
+    maps = SurfaceMaps(
+        normal=np.asarray(frames.from_ray_frame(normal, ball.rays), np.float32),
+        diffuse=color.astype(np.float32), specular=f0.astype(np.float32), roughness=said.astype(np.float32),
+        depth_prior=np.zeros_like(said), confidence=np.zeros_like(said), mask=mask & ball.mask, view=ball.view,
+        estimator="network",
+    )  # fmt: skip
+    return maps, seen
+
+
+def found(maps: SurfaceMaps, seen: Cues) -> Floats:
+    return highlights.pool_gloss(maps, seen).roughness[maps.mask]
+
+
+def test_a_bright_highlight_lowers_the_roughness_of_its_whole_material(ball: Cues) -> None:
+    one = np.ones(ball.mask.shape)
+    roughness = found(*lit(ball, 0.2 * one, ROUGH * one, 0.55 * one))
+    assert np.ptp(roughness) < 1e-4
+    assert roughness.mean() == pytest.approx(ROUGH, abs=0.04)
+
+
+def test_a_roughness_that_its_highlight_allows_stays(ball: Cues) -> None:
+    one = np.ones(ball.mask.shape)
+    assert found(*lit(ball, 0.2 * one, ROUGH * one, 0.3 * one)) == pytest.approx(0.3, abs=1e-3)
+
+
+def test_a_white_albedo_hides_a_weak_highlight(ball: Cues) -> None:
+    one = np.ones(ball.mask.shape)
+    assert found(*lit(ball, 0.8 * one, 0.65 * one, 0.8 * one)) == pytest.approx(0.8, abs=1e-3)
+
+
+def test_speckle_of_the_network_is_pooled(ball: Cues) -> None:
+    one = np.ones(ball.mask.shape)
+    speckle = 0.35 + 0.02 * np.random.default_rng(0).standard_normal(one.shape)
+    assert found(*lit(ball, 0.2 * one, ROUGH * one, speckle)).std() < 0.02 * 0.7
+
+
+def test_two_materials_keep_their_two_roughnesses(ball: Cues) -> None:
+    left = np.indices(ball.mask.shape)[1] < scenes.CENTER[0]
+    roughness = np.where(left, 0.35, 0.7)
+    maps, seen = lit(ball, np.where(left, 0.1, 0.5), roughness, roughness)
+    both = highlights.pool_gloss(maps, seen).roughness
+    assert np.abs(both - roughness)[maps.mask].max() < 0.03
+
+
+@pytest.mark.parametrize(("predicted", "common"), [(0.06, 0.0435), (0.16, 0.16)])
+def test_f0_is_that_of_common_surfaces_unless_it_is_far_above(ball: Cues, predicted: float, common: float) -> None:
+    one = np.ones(ball.mask.shape)
+    maps, seen = lit(ball, 0.2 * one, ROUGH * one, 0.3 * one)
+    bright = replace(maps, specular=np.full_like(maps.specular, predicted))
+    assert highlights.pool_gloss(bright, seen).specular[maps.mask] == pytest.approx(common, abs=1e-4)
+
+
+def test_an_empty_mask_has_no_materials(ball: Cues) -> None:
+    one = np.ones(ball.mask.shape)
+    maps, seen = lit(ball, 0.2 * one, ROUGH * one, 0.3 * one)
+    nothing = replace(maps, mask=np.zeros_like(maps.mask))
+    assert highlights.pool_gloss(nothing, seen) is nothing
