@@ -21,6 +21,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as in a shell's backgro
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "tests" / "capture"
+TINY = ("--no-chart", "--estimator", "analytic")  # how the tiny capture is processed
 slow = pytest.mark.skipif("POLCAP_SLOW" not in os.environ, reason="takes a minute or more: set POLCAP_SLOW")
 
 
@@ -102,20 +103,43 @@ def polcap(capsys: pytest.CaptureFixture[str]) -> Command:
     return run
 
 
+def made_once(factory: pytest.TempPathFactory, worker: str, name: str, make: Callable[[Path], None]) -> Path:
+    """The folder `name`, which the first worker that asks for it makes for all."""
+    base = factory.getbasetemp()
+    folder = (base if worker == "master" else base.parent) / name
+    with FileLock(folder.with_suffix(".lock")):
+        if not (made := folder.with_suffix(".made")).exists():
+            make(folder)
+            made.touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def result(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
-    """The result folder of the small capture with the analytic estimator, made once for all workers; read only."""
-    shared = tmp_path_factory.getbasetemp()
-    shared = shared if worker_id == "master" else shared.parent
-    folder = shared / "bundled"
-    with FileLock(shared / "bundled.lock"):
-        if not (folder / "report.json").exists():
-            done = shell("process", EXAMPLE, "--out", folder, "--estimator", "analytic")
-            assert done.returncode == 0, done.stderr
-    return folder
+    """The result folder of the small capture with the analytic estimator; read only."""
+
+    def make(folder: Path) -> None:
+        done = shell("process", EXAMPLE, "--out", folder, "--estimator", "analytic")
+        assert done.returncode == 0, done.stderr
+
+    return made_once(tmp_path_factory, worker_id, "small-result", make)
 
 
 @pytest.fixture
 def copy(result: Path, tmp_path: Path) -> Path:
     """A copy of that result folder, to be changed."""
     return Path(shutil.copytree(result, tmp_path / "copy"))
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
+    """A folder with a capture of 96 × 96 px, C, and its result C/polcap of the options TINY; read only."""
+    from tests.campaigns.users_files import make_template
+
+    return made_once(tmp_path_factory, worker_id, "tiny", make_template)
+
+
+@pytest.fixture
+def tiny_result(tiny: Path, tmp_path: Path) -> Path:
+    """A copy of that result folder, to be changed."""
+    return Path(shutil.copytree(tiny / "C" / "polcap", tmp_path / "tiny"))

@@ -1,6 +1,7 @@
 """The house stands as the architecture page draws it."""
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -40,10 +41,16 @@ MODULES = {  # dotted name → file
 }
 
 
+@functools.cache
+def tree(name: str) -> ast.Module:
+    """The syntax tree of a module."""
+    return ast.parse(MODULES[name].read_text(encoding="utf-8"))
+
+
 def imported(name: str) -> set[str]:
     """The house's modules that one of them names, wherever in the file."""
     found = set()
-    for node in ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8"))):
+    for node in ast.walk(tree(name)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -52,7 +59,10 @@ def imported(name: str) -> set[str]:
     return (found & MODULES.keys()) - {name}
 
 
-USES = {name: imported(name) for name in MODULES}
+@functools.cache
+def uses() -> dict[str, set[str]]:
+    """What each module imports."""
+    return {name: imported(name) for name in MODULES}
 
 
 UNIX_ONLY = {"fcntl", "resource", "termios", "tty", "pty", "pwd", "grp"}
@@ -61,7 +71,7 @@ UNIX_ONLY = {"fcntl", "resource", "termios", "tty", "pty", "pwd", "grp"}
 @pytest.mark.parametrize("name", MODULES)
 def test_a_module_loads_where_there_is_no_unix(name: str) -> None:
     """What Windows lacks is imported where it is used, and only there."""
-    top = ast.parse(MODULES[name].read_text(encoding="utf-8")).body
+    top = tree(name).body
     named = {alias.name for node in top if isinstance(node, ast.Import) for alias in node.names}
     named |= {node.module for node in top if isinstance(node, ast.ImportFrom) and node.module}
     assert not named & UNIX_ONLY
@@ -76,8 +86,8 @@ def test_the_path_is_imported_without_unix_modules() -> None:
 
 def test_imports_form_no_circle() -> None:
     """Also those inside functions; a package and its own modules count as one another's house, not as a circle."""
-    left = {name: {used for used in uses if not name.startswith(f"{used}.")} for name, uses in USES.items()}
-    while free := [name for name, uses in left.items() if not uses & left.keys()]:
+    left = {name: {used for used in named if not name.startswith(f"{used}.")} for name, named in uses().items()}
+    while free := [name for name, named in left.items() if not named & left.keys()]:
         for name in free:
             del left[name]
     assert left == {}
@@ -87,8 +97,8 @@ def test_what_one_room_uses_stands_in_that_room() -> None:
     """A module of optics is used by two rooms or more; rooms are stages, and the folders beside them."""
     single = {}
     for module in (name for name in MODULES if re.fullmatch(r"polcap\.optics\.\w+", name)):
-        rooms = {_room(name) for name, uses in USES.items() if module in uses and _room(name) != "polcap.optics"}
-        inside = any(module in uses for name, uses in USES.items() if _room(name) == "polcap.optics")
+        rooms = {_room(name) for name, named in uses().items() if module in named and _room(name) != "polcap.optics"}
+        inside = any(module in named for name, named in uses().items() if _room(name) == "polcap.optics")
         if len(rooms) < 2 and not inside:
             single[module] = rooms
     assert single == {}
@@ -106,8 +116,8 @@ def test_a_files_name_is_unique_in_the_house() -> None:
 
 def test_a_class_name_is_unique_in_the_house() -> None:
     homes: dict[str, list[str]] = {}
-    for name, file in MODULES.items():
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for name in MODULES:
+        for node in ast.walk(tree(name)):
             if isinstance(node, ast.ClassDef):
                 homes.setdefault(node.name, []).append(name)
     assert {name: found for name, found in homes.items() if len(found) > 1} == {}
@@ -133,8 +143,8 @@ LARGE = {  # functions beyond that, and why
 def test_functions_are_of_human_size() -> None:
     """Commands declare an option per parameter, so they are not counted."""
     large = {}
-    for name, file in MODULES.items():
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for name in MODULES:
+        for node in ast.walk(tree(name)):
             if not isinstance(node, ast.FunctionDef) or name.startswith("polcap.cli."):
                 continue
             doc = ast.get_docstring(node, clean=False)
@@ -223,7 +233,7 @@ def explained(doc: str) -> list[str]:
 def test_docstrings_name_shapes_and_errors(name: str) -> None:
     """Arrays have shapes, our errors are named, and no parameter is explained that does not exist."""
     faults = []
-    for function in public(ast.parse(MODULES[name].read_text(encoding="utf-8")).body):
+    for function in public(tree(name).body):
         doc = ast.get_docstring(function) or ""
         where = f"{function.name} (line {function.lineno})"
         names = [one.arg for one in parameters(function)]

@@ -37,7 +37,7 @@ def exported(result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def own(result: Path, tmp_path: Path) -> Path:
-    """A copy of the result, because an export locks its folder."""
+    """A copy of the small capture's result, because an export locks its folder."""
     copy = tmp_path / "own"
     shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
     return copy
@@ -83,11 +83,11 @@ def test_unreal_gets_green_down_and_unity_smoothness(exported: Path) -> None:
     assert np.array_equal(mask[..., 3], 255 - packed[..., 1]) and mask[..., 0].max() == 0
 
 
-def test_an_asset_and_the_textures_beside_it_are_spelled_alike(own: Path) -> None:
-    about = json.loads((own / "report.json").read_text())
+def test_an_asset_and_the_textures_beside_it_are_spelled_alike(tiny_result: Path) -> None:
+    about = json.loads((tiny_result / "report.json").read_text())
     about["capture"]["name"] = "blue jug 7"
-    (own / "report.json").write_text(json.dumps(about))
-    named = {file.name for file in pipeline.export(own, ExportRequest(preset="unreal", texture_size=64))}
+    (tiny_result / "report.json").write_text(json.dumps(about))
+    named = {file.name for file in pipeline.export(tiny_result, ExportRequest(preset="unreal", texture_size=64))}
     assert {"SM_blue_jug_7.glb", "T_blue_jug_7_N.png"} <= named and not any(" " in name for name in named)
 
 
@@ -112,16 +112,16 @@ def test_sidecar_knows_photographs_settings_and_files(exported: Path) -> None:
     assert json.loads(packet["polcap:settings"]) == about["settings"]
 
 
-def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, own: Path, polcap: Command) -> None:
-    before = {file.name: file.read_bytes() for file in (own / "asset").iterdir()}
-    shutil.rmtree(own / "asset")
+def test_exporting_again_gives_the_bytes_that_process_wrote(tiny: Path, tiny_result: Path, polcap: Command) -> None:
+    before = {file.name: file.read_bytes() for file in (tiny_result / "asset").iterdir()}
+    shutil.rmtree(tiny_result / "asset")
     cv2.setNumThreads(1)
     try:
-        assert polcap("export", own).returncode == 0
+        assert polcap("export", tiny_result).returncode == 0
     finally:
         cv2.setNumThreads(-1)
-    assert {file.name: file.read_bytes() for file in (own / "asset").iterdir()} == before
-    assert (own / "maps/maps.json").read_bytes() == (result / "maps/maps.json").read_bytes()
+    assert {file.name: file.read_bytes() for file in (tiny_result / "asset").iterdir()} == before
+    assert (tiny_result / "maps/maps.json").read_bytes() == (tiny / "C/polcap/maps/maps.json").read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -148,45 +148,47 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(result: Path, own: P
         (["--exr", "--color", "ACEScq"], "--color ACEScq is not a color space or role"),
     ],
 )
-def test_what_does_not_exist_is_one_line(own: Path, polcap: Command, flags: list[str], words: str) -> None:
-    done = polcap("export", own, *flags)
+def test_what_does_not_exist_is_one_line(tiny_result: Path, polcap: Command, flags: list[str], words: str) -> None:
+    done = polcap("export", tiny_result, *flags)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and words in done.stderr
 
 
-def test_relightable_layer_has_the_facts_of_the_catalog_and_is_in_the_sidecar(own: Path, polcap: Command) -> None:
+def test_relightable_layer_has_the_facts_of_the_catalog_and_is_in_the_sidecar(
+    tiny_result: Path, polcap: Command
+) -> None:
     done = polcap(
-        "export", own, "--iiif", "http://localhost:8000/", "--about", "title=Vase", "--about", "creator=A. B."
+        "export", tiny_result, "--iiif", "http://localhost:8000/", "--about", "title=Vase", "--about", "creator=A. B."
     )
     assert done.returncode == 0, done.stderr
-    manifest = json.loads((own / "asset/capture_iiif/manifest.json").read_text())
+    manifest = json.loads((tiny_result / "asset/C_iiif/manifest.json").read_text())
     assert manifest["id"] == "http://localhost:8000/manifest.json" and manifest["label"] == {"none": ["Vase"]}
     assert [one["value"] for one in manifest["metadata"]] == [{"none": ["A. B."]}]
-    files = json.loads((own / "asset/capture.provenance.json").read_text())["files"]
-    written = {Path(line).relative_to(own / "asset").as_posix() for line in done.stdout.splitlines()}
-    assert written - {"capture.provenance.json"} <= set(files)
+    files = json.loads((tiny_result / "asset/C.provenance.json").read_text())["files"]
+    written = {Path(line).relative_to(tiny_result / "asset").as_posix() for line in done.stdout.splitlines()}
+    assert written - {"C.provenance.json"} <= set(files)
     names = ("albedo", "specular", "normal", "gloss")
-    sizes = {cv2.imread(str(own / f"asset/capture_iiif/{name}/full/max/0/default.jpg")).shape[:2] for name in names}
-    assert len(sizes) == 1 and {f"capture_iiif/{name}/full/max/0/default.jpg" for name in names} <= written
+    sizes = {cv2.imread(str(tiny_result / f"asset/C_iiif/{name}/full/max/0/default.jpg")).shape[:2] for name in names}
+    assert len(sizes) == 1 and {f"C_iiif/{name}/full/max/0/default.jpg" for name in names} <= written
 
 
-def test_a_page_for_visitors_states_number_maker_and_rights(own: Path, polcap: Command, tmp_path: Path) -> None:
+def test_a_page_for_visitors_states_number_maker_and_rights(tiny_result: Path, polcap: Command, tmp_path: Path) -> None:
     (tmp_path / "viewer.js").write_text("// model-viewer")
     facts = {"title": "Vase", "object_number": "18<97", "creator": "A. B.", "rights": "© House"}
     stated = [part for key, text in facts.items() for part in ("--about", f"{key}={text}")]
-    done = polcap("export", own, "--preset", "web", "--page", tmp_path / "viewer.js", *stated)
+    done = polcap("export", tiny_result, "--preset", "web", "--page", tmp_path / "viewer.js", *stated)
     assert done.returncode == 0, done.stderr
-    assert "<p>Vase · 18&lt;97 · A. B. · © House</p>" in (own / "asset/web/capture.html").read_text()
+    assert "<p>Vase · 18&lt;97 · A. B. · © House</p>" in (tiny_result / "asset/web/C.html").read_text()
 
 
-def test_ktx2_needs_an_encoder_and_says_so(own: Path, polcap: Command) -> None:
+def test_ktx2_needs_an_encoder_and_says_so(tiny_result: Path, polcap: Command) -> None:
     if encoders.ktx2_encoder() is not None:
         pytest.skip("an encoder is here")
-    done = polcap("export", own, "--gltf", "--images", "ktx2")
+    done = polcap("export", tiny_result, "--gltf", "--images", "ktx2")
     assert done.returncode == 2 and "ktx" in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_encoder_on_the_path_makes_ktx2_textures(
-    own: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_result: Path, polcap: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A stand-in for `toktx` keeps its arguments and writes KTX2's identifier: the way there, not the compression."""
     encoder = tmp_path / "bin" / "toktx"
@@ -198,9 +200,9 @@ def test_encoder_on_the_path_makes_ktx2_textures(
     encoder.chmod(0o755)
     monkeypatch.setenv("PATH", f"{encoder.parent}:{os.environ['PATH']}")
     monkeypatch.delitem(encoders._KTX2, "ktx")
-    done = polcap("export", own, "--gltf", "--images", "ktx2")
+    done = polcap("export", tiny_result, "--gltf", "--images", "ktx2")
     assert done.returncode == 0, done.stderr
-    written = document((own / "asset" / "capture.glb").read_bytes())
+    written = document((tiny_result / "asset" / "C.glb").read_bytes())
     assert written["extensionsRequired"] == ["KHR_texture_basisu"]
     assert {image["mimeType"] for image in written["images"]} == {"image/ktx2"}
     assert all("KHR_texture_basisu" in texture["extensions"] for texture in written["textures"])
@@ -215,20 +217,19 @@ def test_the_example_of_presets_runs(own: Path) -> None:
 
 
 def test_usd_without_its_package_is_one_line_with_the_remedy(
-    own: Path, polcap: Command, monkeypatch: pytest.MonkeyPatch
+    tiny_result: Path, polcap: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
-    done = polcap("export", own, "--usd")
+    done = polcap("export", tiny_result, "--usd")
     assert done.returncode == 2 and "pip install 'polcap[usd]'" in done.stderr and done.stderr.count("\n") == 1
 
 
-def test_number_of_threads_changes_no_byte(example: Path, tmp_path: Path) -> None:
-    """Two whole runs; the network's own threads are tested in tests/stages/test_golden.py."""
+def test_number_of_threads_changes_no_byte(result: Path, example: Path, tmp_path: Path) -> None:
+    """The result was made on one thread; the network's own threads are tested in tests/stages/test_golden.py."""
+    done = shell("process", example, "--out", tmp_path, "--estimator", "analytic", "--threads", 2)
+    assert done.returncode == 0, done.stderr
     found = []
-    for threads in (1, 2):
-        out = tmp_path / str(threads)
-        done = shell("process", example, "--out", out, "--estimator", "analytic", "--threads", threads)
-        assert done.returncode == 0, done.stderr
+    for out in (result, tmp_path):
         found.append({file.name: file.read_bytes() for part in ("maps", "asset") for file in (out / part).iterdir()})
         found[-1] |= {str(file.relative_to(out)): file.read_bytes() for file in (out / "work").rglob("*.npy")}
     assert [name for name in found[0] if found[0][name] != found[1][name]] == [] and found[0].keys() == found[1].keys()
@@ -242,9 +243,9 @@ def test_textures_for_engines_have_powers_of_two(exported: Path, preset: str) ->
     assert all(0.84 * stated[0] <= width for _, width in sizes)
 
 
-def test_larger_textures_than_the_maps_hold_are_reported(own: Path, polcap: Command) -> None:
-    size = max(json.loads((own / "maps" / "maps.json").read_text())["size"])
-    done = polcap("export", own, "--gltf", "--texture-size", 4 * size)
+def test_larger_textures_than_the_maps_hold_are_reported(tiny_result: Path, polcap: Command) -> None:
+    size = max(json.loads((tiny_result / "maps" / "maps.json").read_text())["size"])
+    done = polcap("export", tiny_result, "--gltf", "--texture-size", 4 * size)
     assert f"4 x larger than the maps of {size} px hold" in done.stderr and "hdr.demosaic=full" in done.stderr
 
 
@@ -317,67 +318,69 @@ def check_sums(archive: Path) -> list[str]:
     return list(listed)
 
 
-def test_an_archive_checks_itself_after_two_exports_and_a_copy(own: Path, polcap: Command, tmp_path: Path) -> None:
+def test_an_archive_checks_itself_after_two_exports_and_a_copy(
+    tiny_result: Path, polcap: Command, tmp_path: Path
+) -> None:
     pytest.importorskip("pxr", reason="needs usd-core")
-    first = polcap("export", own, "--preset", "archive", "--about", "title=Vase", "--iiif", "https://museum.example/7")
+    first = polcap(
+        "export", tiny_result, "--preset", "archive", "--about", "title=Vase", "--iiif", "https://museum.example/7"
+    )
     assert first.returncode == 0, first.stderr
-    names = check_sums(own / "asset/archive")
-    assert {"maps/normal.exr", "maps/maps.json", "report.html", "report.json", "capture.glb"} <= set(names)
-    assert "capture_iiif/manifest.json" in names and len([name for name in names if name.endswith("default.jpg")]) > 8
-    assert ("color.toml" in names) == (own / "color.toml").exists()
-    second = polcap("export", own, "--preset", "archive", "--extra", "occlusion", "--about", "title=Vase")
+    names = check_sums(tiny_result / "asset/archive")
+    assert {"maps/normal.exr", "maps/maps.json", "report.html", "report.json", "C.glb"} <= set(names)
+    assert "C_iiif/manifest.json" in names and len([name for name in names if name.endswith("default.jpg")]) > 8
+    assert ("color.toml" in names) == (tiny_result / "color.toml").exists()
+    second = polcap("export", tiny_result, "--preset", "archive", "--extra", "occlusion", "--about", "title=Vase")
     assert second.returncode == 0 and second.stderr == ""
-    shutil.copytree(own / "asset/archive", tmp_path / "elsewhere")
+    shutil.copytree(tiny_result / "asset/archive", tmp_path / "elsewhere")
     again = polcap("export", tmp_path / "elsewhere", "--out", tmp_path / "new", "--ply")
-    assert again.returncode == 0 and (tmp_path / "new/asset/capture.ply").exists()
-    assert set(check_sums(tmp_path / "elsewhere")) == {*names, "capture_occlusion.png"}
+    assert again.returncode == 0 and (tmp_path / "new/asset/C.ply").exists()
+    assert set(check_sums(tmp_path / "elsewhere")) == {*names, "C_occlusion.png"}
     if program := shutil.which("sha256sum"):
         command = [program, "-c", "--quiet", "manifest-sha256.txt"]
         assert subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True).returncode == 0
 
 
-def test_extra_textures_and_sixteen_bits(own: Path, polcap: Command) -> None:
+def test_extra_textures_and_sixteen_bits(tiny_result: Path, polcap: Command) -> None:
     """Displacement is depth.png turned round; object-space normals are the maps'; the GLB holds the occlusion."""
     named = [part for name in texture_set.EXTRAS for part in ("--extra", name)]
-    assert polcap("export", own, "--obj", "--gltf", "--bits", 16, *named).returncode == 0
-    pictures = {name: png.read(own / "asset" / f"capture_{name}.png") for name in ("displacement", "objectnormal")}
-    mask = png.read(own / "maps" / "mask.png") > 127
-    depth, normal = (png.read(own / "maps" / f"{name}.png").astype(int) for name in ("depth", "normal"))
+    assert polcap("export", tiny_result, "--obj", "--gltf", "--bits", 16, *named).returncode == 0
+    pictures = {name: png.read(tiny_result / "asset" / f"C_{name}.png") for name in ("displacement", "objectnormal")}
+    mask = png.read(tiny_result / "maps" / "mask.png") > 127
+    depth, normal = (png.read(tiny_result / "maps" / f"{name}.png").astype(int) for name in ("depth", "normal"))
     assert np.abs(pictures["displacement"][mask] - (65535 - depth[mask])).max() <= 2
     assert np.abs(pictures["objectnormal"][mask] - normal[mask]).max() <= 2
-    assert png.read(own / "asset" / "capture_basecolor.png").dtype == np.uint16
-    occlusion = png.read(own / "asset" / "capture_occlusion.png")[mask] / 65535
+    assert png.read(tiny_result / "asset" / "C_basecolor.png").dtype == np.uint16
+    occlusion = png.read(tiny_result / "asset" / "C_occlusion.png")[mask] / 65535
     assert 0.5 < occlusion.mean() < 1 and occlusion.min() < 0.9
-    material = document((own / "asset/capture.glb").read_bytes())["materials"][0]
+    material = document((tiny_result / "asset/C.glb").read_bytes())["materials"][0]
     assert material["occlusionTexture"] == {"index": 1}
-    stated = json.loads((own / "maps" / "maps.json").read_text())["exports"]["asset"]["glb"]
-    assert stated["capture_orm"].startswith("R ambient occlusion, G")
+    stated = json.loads((tiny_result / "maps" / "maps.json").read_text())["exports"]["asset"]["glb"]
+    assert stated["C_orm"].startswith("R ambient occlusion, G")
 
 
-def test_cavities_are_the_concave_part_of_the_curvature(own: Path) -> None:
-    pipeline.export(own, ExportRequest(formats=("gltf",), extras=("curvature", "cavity")))
-    curvature, cavity = (png.read(own / f"asset/capture_{name}.png").astype(int) for name in ("curvature", "cavity"))
-    mask = png.read(own / "maps" / "mask.png") > 127
+def test_cavities_are_the_concave_part_of_the_curvature(tiny_result: Path) -> None:
+    pipeline.export(tiny_result, ExportRequest(formats=("gltf",), extras=("curvature", "cavity")))
+    curvature, cavity = (png.read(tiny_result / f"asset/C_{name}.png").astype(int) for name in ("curvature", "cavity"))
+    mask = png.read(tiny_result / "maps" / "mask.png") > 127
     assert np.array_equal(cavity, np.minimum(2 * curvature, 65535))
     assert 0.45 < np.median(curvature[mask]) / 65535 < 0.6 and (curvature[~mask] == 32768).all()
 
 
-def test_a_second_export_adds_to_the_records_of_the_first(own: Path) -> None:
+def test_a_second_export_adds_to_the_records_of_the_first(tiny_result: Path) -> None:
     """`process` wrote GLB and OBJ; the sidecar and maps.json list them after an export of the EXR too."""
-    sidecar = own / "asset" / "capture.provenance.json"
+    sidecar = tiny_result / "asset" / "C.provenance.json"
     before = json.loads(sidecar.read_text())["files"]
-    pipeline.export(own, ExportRequest(formats=("exr",)))
+    pipeline.export(tiny_result, ExportRequest(formats=("exr",)))
     after = json.loads(sidecar.read_text())["files"]
-    assert set(after) == {*before, "capture_layers.exr"} and after["capture.obj"] == before["capture.obj"]
-    stated = json.loads((own / "maps" / "maps.json").read_text())["exports"]["asset"]
-    assert {"capture_basecolor", "capture_normal"} <= set(stated["glb"]) and "capture_roughness.png" in stated[
-        "textures"
-    ]
+    assert set(after) == {*before, "C_layers.exr"} and after["C.obj"] == before["C.obj"]
+    stated = json.loads((tiny_result / "maps" / "maps.json").read_text())["exports"]["asset"]
+    assert {"C_basecolor", "C_normal"} <= set(stated["glb"]) and "C_roughness.png" in stated["textures"]
 
 
-def test_a_sidecar_of_other_maps_is_replaced(own: Path) -> None:
-    sidecar = own / "asset" / "capture.provenance.json"
+def test_a_sidecar_of_other_maps_is_replaced(tiny_result: Path) -> None:
+    sidecar = tiny_result / "asset" / "C.provenance.json"
     recorded = json.loads(sidecar.read_text())
     sidecar.write_text(json.dumps({**recorded, "stages": {}}))
-    pipeline.export(own, ExportRequest(formats=("exr",)))
-    assert set(json.loads(sidecar.read_text())["files"]) == {"capture_layers.exr"}
+    pipeline.export(tiny_result, ExportRequest(formats=("exr",)))
+    assert set(json.loads(sidecar.read_text())["files"]) == {"C_layers.exr"}

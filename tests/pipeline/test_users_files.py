@@ -5,24 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.campaigns.users_files import make_template, sequence
-from tests.conftest import Command
-
-QUICK = ("--no-chart", "--estimator", "analytic")
-
-
-@pytest.fixture(scope="module")
-def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small capture C with its finished result C/polcap; read only."""
-    folder = tmp_path_factory.mktemp("template")
-    make_template(folder)
-    return folder
+from tests.campaigns.users_files import sequence
+from tests.conftest import TINY, Command
 
 
 @pytest.fixture
-def capture(template: Path, tmp_path: Path) -> Path:
-    """A copy of that capture, to be changed."""
-    return Path(shutil.copytree(template / "C", tmp_path / "C"))
+def capture(tiny: Path, tmp_path: Path) -> Path:
+    """The tiny capture C with its finished result C/polcap, to be changed."""
+    return Path(shutil.copytree(tiny / "C", tmp_path / "C"))
 
 
 def photographs(folder: Path) -> dict[str, bytes]:
@@ -36,7 +26,7 @@ def test_a_capture_inside_the_result_folder_stays(capture: Path, polcap: Command
     inside = tmp_path / "out" / place
     inside.parent.mkdir(parents=True)
     capture.rename(inside)
-    done = polcap("process", inside, "--out", tmp_path / "out", *QUICK)
+    done = polcap("process", inside, "--out", tmp_path / "out", *TINY)
     assert done.returncode == 2 and "contains the capture" in done.stderr
     assert photographs(inside) == before
 
@@ -52,7 +42,7 @@ def test_a_result_is_refused_among_the_shots_of_any_capture(
         place = place.rename(other / "frames")
         file = next(place.iterdir())
         (other / "capture.toml").write_text(f'[[frame]]\nfile = "frames/{file.name}"\nangle = 45\n')
-    done = polcap("process", capture, "--out", place / "result", *QUICK)
+    done = polcap("process", capture, "--out", place / "result", *TINY)
     assert done.returncode == 2 and "lies among the capture's shots" in done.stderr
     assert not (place / "result").exists()
 
@@ -64,7 +54,7 @@ def test_a_folder_that_holds_parts_of_a_result_without_record_is_refused(
     out = tmp_path / "home"
     (out / name).mkdir(parents=True)
     (out / name / "photograph.dng").write_bytes(b"RAW")
-    done = polcap("process", capture, "--out", out, *QUICK)
+    done = polcap("process", capture, "--out", out, *TINY)
     assert done.returncode == 2 and f"holds {name}" in done.stderr
     assert [path.name for path in out.rglob("*") if path.is_file()] == ["photograph.dng"]
 
@@ -77,9 +67,9 @@ def test_foreign_files_in_a_result_survive_every_command(capture: Path, polcap: 
         (result / name).parent.mkdir(exist_ok=True)
         (result / name).write_bytes(name.encode())
     for words in (
-        ("process", capture, *QUICK, "--set", "asset.ior=1.4"), ("export", result, "--obj"), ("report", result),
+        ("process", capture, *TINY, "--set", "asset.ior=1.4"), ("export", result, "--obj"), ("report", result),
         ("report", result, "--compare", result), ("show", result, "--animate", "light"), ("clean", result),
-        ("process", capture, *QUICK, "--force", "hdr"),
+        ("process", capture, *TINY, "--force", "hdr"),
     ):  # fmt: skip
         assert polcap(*words).returncode != 1
     assert {name: (result / name).read_bytes() for name in places} == {name: name.encode() for name in places}
@@ -91,7 +81,7 @@ def test_links_in_a_result_are_not_written_through(capture: Path, polcap: Comman
     link.rename(target)
     link.symlink_to(target)
     before = {path: path.read_bytes() for path in [target, *target.rglob("*")] if path.is_file()}
-    done = polcap("process", capture, *QUICK, "--force", "hdr")
+    done = polcap("process", capture, *TINY, "--force", "hdr")
     assert done.returncode == 2 and "is a link" in done.stderr
     polcap("clean", capture)
     assert link.is_symlink() and {path: path.read_bytes() for path in before} == before
@@ -103,9 +93,9 @@ def test_a_linked_default_result_is_refused_and_a_named_one_is_used(
     target = tmp_path / "disk"
     (capture / "polcap").rename(target)
     (capture / "polcap").symlink_to(target)
-    assert "is a link" in polcap("process", capture, *QUICK, "--force", "asset").stderr
+    assert "is a link" in polcap("process", capture, *TINY, "--force", "asset").stderr
     (tmp_path / "named").symlink_to(target)
-    assert polcap("process", capture, "--out", tmp_path / "named", *QUICK, "--force", "asset").returncode in (0, 3)
+    assert polcap("process", capture, "--out", tmp_path / "named", *TINY, "--force", "asset").returncode in (0, 3)
 
 
 def test_a_chart_profile_in_the_result_is_used_and_stays(capture: Path, polcap: Command) -> None:
@@ -119,12 +109,12 @@ def test_a_chart_profile_in_the_result_is_used_and_stays(capture: Path, polcap: 
 def test_an_input_that_the_run_would_replace_is_refused(capture: Path, polcap: Command) -> None:
     mask = capture / "polcap" / "maps" / "mask.png"
     before = mask.read_bytes()
-    done = polcap("process", capture, "--mask", mask, *QUICK)
+    done = polcap("process", capture, "--mask", mask, *TINY)
     assert done.returncode == 2 and "part of the result" in done.stderr
     assert mask.read_bytes() == before
 
 
-def test_clean_stays_in_the_named_folder(template: Path, capture: Path, polcap: Command, tmp_path: Path) -> None:
+def test_clean_stays_in_the_named_folder(capture: Path, polcap: Command, tmp_path: Path) -> None:
     """Also if the batch.json of a stranger names another tree."""
     batch = tmp_path / "batch" / "polcap-batch"
     batch.mkdir(parents=True)
@@ -152,5 +142,5 @@ def test_a_board_replaces_no_file(polcap: Command, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_random_sequences_of_commands_leave_every_foreign_byte(template: Path, seed: int) -> None:
-    assert sequence(template, seed) == []
+def test_random_sequences_of_commands_leave_every_foreign_byte(tiny: Path, seed: int) -> None:
+    assert sequence(tiny, seed) == []

@@ -16,7 +16,7 @@ from polcap.synth.render import Scene
 from polcap.synth.scene_materials import Coat, Material
 from polcap.training import random_shapes
 
-SIDE, SAMPLES, FINE, FOV = 96, 256, 6, 36.0
+SIDE, SAMPLES, FINE, FOV = 96, 144, 4, 36.0
 ALBEDO, ALPHA, IOR, STRENGTH = 0.6, 0.16, 1.55, 0.8
 VIEW = View(SIDE / 2 / np.tan(np.radians(FOV / 2)), ((SIDE - 1) / 2,) * 2, 1)
 LIGHT = (0.04, 0.06, 0.0)
