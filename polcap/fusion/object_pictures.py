@@ -1,7 +1,6 @@
 """Pictures of the fused object from any side: rays meet the mesh, and its textures are shaded there."""
 
-from dataclasses import replace
-
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -12,19 +11,17 @@ from polcap.fusion.values import Pose
 from polcap.images import Floats, View
 from polcap.optics import color, frames
 from polcap.optics.mesh_tracer import Tracer, Triangles
-from polcap.optics.resize import area_mean
-from polcap.report import animation, keys
+from polcap.report import animation
 from polcap.report.animation import TexturedPoints
-from polcap.report.sheets import Picture, Tile
+from polcap.report.sheets import Picture
 
 FRAMES = 48  # of the turntable
-_INDEX = 1.5
+INDEX = 1.5
 _FILLED = 0.85  # of the picture's side, by the sphere around the object
 _DISTANCE = 5.0  # from the object's middle, in its radii
 _ELEVATION_DEG = 20.0
 _LIGHT = np.array([-0.5, 0.7, 0.8])  # direction towards the light, camera frame
 _BACKGROUND = 0.012  # linear
-_ATLAS_PX = 640  # side of its pictures
 
 
 def around(atlas: Atlas, maps: AtlasMaps, count: int, side: int) -> list[Picture]:
@@ -50,7 +47,7 @@ def render(atlas: Atlas, maps: AtlasMaps, tracer: Tracer, pose: Pose, view: View
     met = tracer.meet(origin, -v @ pose.rotation)
     points, ray = sample_textures(atlas, maps, met.face, met.weight), v[met.index]
     turned = points._replace(normal=points.normal @ pose.rotation.T)
-    lit = animation.render(turned, ray, _LIGHT, pose.rotation[:, 1], _INDEX)
+    lit = animation.render(turned, ray, _LIGHT, pose.rotation[:, 1], INDEX)
     out = np.full((side * side, 3), _BACKGROUND, np.float32)
     out[met.index] = lit
     return out.reshape(side, side, 3)
@@ -68,14 +65,7 @@ def sample_textures(atlas: Atlas, maps: AtlasMaps, face: NDArray[np.integer], we
     return TexturedPoints(*(one[row, column] for one in (maps.normal, maps.diffuse, maps.specular, maps.roughness)))
 
 
-def of_atlas(maps: AtlasMaps) -> list[Tile]:
-    """The base color of the atlas, darkened where no view saw the surface, its normals and its roughness."""
-    seen = np.where(maps.seen, 1.0, 0.3)[..., None]
-    normal = np.asarray(np.rint(255 * (maps.normal / 2 + 0.5) * maps.mask[..., None]), np.uint8)
-    rough = keys.ROUGHNESS.picture(maps.roughness, maps.mask)
-    tiles = (
-        Tile(color.srgb_eight_bits(maps.diffuse * seen), "Base color", note="dark where no view saw the surface"),
-        Tile(normal, "Normals", note="of the object: red x, green y (up), blue z"),
-        Tile(rough, "Roughness", note="from 0, dark blue, to 1, yellow"),
-    )
-    return [replace(tile, picture=area_mean(tile.picture, (_ATLAS_PX, _ATLAS_PX))) for tile in tiles]
+def seen_picture(maps: AtlasMaps) -> Picture:
+    """The base color of the atlas, darkened where no view saw the surface."""
+    shown = maps.diffuse * np.where(maps.seen, 1.0, 0.3)[..., None]
+    return np.asarray(cv2.resize(color.srgb_eight_bits(shown), (640, 640)))

@@ -12,6 +12,7 @@ from polcap.config import Config
 from polcap.formats import html
 from polcap.formats.capture import layouts
 from polcap.formats.maps import png
+from polcap.mesh_values import Mesh
 from polcap.optics.color import srgb_eight_bits
 from polcap.quality.rerendering import Rerendering, rerender
 from polcap.report import chart_colors, keys, labels, levels, map_figures, page_data, plots
@@ -191,13 +192,17 @@ def light_agreement(rendered: Rerendering) -> str:
 
 
 def _mesh_preview(results: Results, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Data of a reduced mesh for the page's interactive view: positions, texture coordinates and faces as base64 texts.
+    """`mesh_data` of a reduced mesh."""
+    chosen = msgspec.convert(settings, Config).surface
+    chosen = msgspec.structs.replace(chosen, max_vertices=min(chosen.max_vertices, _MOST_VERTICES))
+    return mesh_data(surface.triangulate(results.mesh.depth, results.maps, results.mesh.metric, chosen))
+
+
+def mesh_data(mesh: Mesh) -> dict[str, Any]:
+    """Data of a mesh for a page's interactive view: positions, texture coordinates and faces as base64 texts.
 
     Positions are 16-bit shares of the box `low`, `extent`: 65535 is 1. Face indices are stored as differences.
     """
-    chosen = msgspec.convert(settings, Config).surface
-    chosen = msgspec.structs.replace(chosen, max_vertices=min(chosen.max_vertices, _MOST_VERTICES))
-    mesh = surface.triangulate(results.mesh.depth, results.maps, results.mesh.metric, chosen)
     low = mesh.vertices.min(axis=0)
     extent = np.maximum(mesh.vertices.max(axis=0) - low, 1e-9)
     return {

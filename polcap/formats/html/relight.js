@@ -237,7 +237,8 @@ class Solid {
 
   rotate(right, up) {
     const within = (x, most) => Math.max(-most, Math.min(most, x));
-    this.turn = [within(this.turn[0] + right, 1.5), within(this.turn[1] + up, 1.4)];
+    const around = this.turn[0] + right;
+    this.turn = [DATA.mesh.closed ? around : within(around, 1.5), within(this.turn[1] + up, 1.4)];
     this.redraw.ask();
   }
 
@@ -312,8 +313,10 @@ async function begin() {
   if (DATA.view.matte) images.matte = Object.assign(new Image(), { src: DATA.view.matte });
   await Promise.all(Object.values(images).map((image) => image.decode()));
   const sources = textures(images);
-  window.relight = new Relight(document.getElementById('relight'), sources);
-  document.getElementById('relit').classList.add('live');
+  if (document.getElementById('relight')) {
+    window.relight = new Relight(document.getElementById('relight'), sources);
+    document.getElementById('relit').classList.add('live');
+  }
   if (DATA.mesh) window.solid = new Solid(document.getElementById('solid'), sources, await meshed(DATA.mesh));
   document.documentElement.dataset.ready = 'yes';
 }
