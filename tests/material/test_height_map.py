@@ -65,7 +65,8 @@ def test_a_periodic_pattern_is_tiled_in_whole_periods() -> None:
     period = 14
     stripes = np.where(np.arange(120) % period < period / 2, 0.7, 0.3).astype(np.float32)
     color = np.broadcast_to(stripes[:, None, None], (120, 120, 3))
-    whole = dataclasses.replace(maps(), diffuse=color, normal=np.broadcast_to(np.float32([0, 0, 1]), (120, 120, 3)))
+    normal = np.broadcast_to(np.array([0, 0, 1], np.float32), (120, 120, 3))
+    whole = dataclasses.replace(maps(), diffuse=color, normal=normal)
     tiled = tiling.tile(whole).diffuse
     assert tiled.shape[0] % period == 0 and tiled.shape[1] == 100
     np.testing.assert_allclose(tiled, color[: len(tiled), :100], atol=0.02)
