@@ -28,7 +28,7 @@ from polcap.images import TexturePixels
 Kind = Literal["png", "jpeg", "webp", "ktx2"]
 MIME: dict[Kind, str] = {"png": "image/png", "jpeg": "image/jpeg", "webp": "image/webp", "ktx2": "image/ktx2"}
 Frames = list[NDArray[np.uint8]]
-_ANIMATION_QUALITY = 80
+_ANIMATION_QUALITY = 95  # with 80, blocks that change slowly stay as they were for several frames
 _KTX2 = {  # options of each encoder: UASTC with mipmaps, which preserves normals
     "ktx": "create --format {pixel} --assign-tf {transfer} --encode uastc --threads 1 "
     "--generate-mipmap {source} {target}",

@@ -1,7 +1,9 @@
-"""A texture of several files of an export is encoded once, and is the same in all of them."""
+"""A texture of several files of an export is encoded once; animations show what their frames show."""
 
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -51,3 +53,13 @@ def test_a_texture_that_cannot_be_encoded_fails_each_time() -> None:
     for _ in range(2):
         with pytest.raises(SettingError, match="no fourth channel"):
             encoder(texture, "jpeg")
+
+
+def test_an_animation_follows_slow_changes(tmp_path: Path) -> None:
+    y, x = np.mgrid[:96, :96] / 96
+    light = [0.2 + 0.5 * x * y + 0.012 * k + 0.02 * np.sin(9 * x + k / 3) for k in range(24)]
+    frames = [np.repeat(np.rint(255 * one).astype(np.uint8)[..., None], 3, axis=-1) for one in light]
+    file = encoders.animate(tmp_path / "light", frames, 2.0)[0]
+    _, shown = cv2.imdecodeanimation(np.fromfile(file, np.uint8))
+    drawn = [np.asarray(one)[..., :3].astype(int) for one in shown.frames]
+    assert max(np.abs(one - frame).mean() for one, frame in zip(drawn, frames)) < 3  # of 255
