@@ -11,15 +11,21 @@ import numpy as np
 import pytest
 
 from polcap.formats.maps import exr
-from tests.conftest import Command, Done, shell
+from tests.conftest import TINY, Command, Done, shell
 
 NESTED = "[" * 30_000
 
 
 @pytest.fixture
-def capture(example: Path, tmp_path: Path) -> Path:
-    """A copy of the small capture, to be spoilt."""
-    return Path(shutil.copytree(example, tmp_path / "capture", ignore=shutil.ignore_patterns("polcap")))
+def capture(tiny: Path, tmp_path: Path) -> Path:
+    """A copy of the tiny capture, to be spoilt."""
+    return Path(shutil.copytree(tiny / "C", tmp_path / "capture", ignore=shutil.ignore_patterns("polcap")))
+
+
+@pytest.fixture
+def copy(tiny_result: Path) -> Path:
+    """A copy of its result, to be changed."""
+    return tiny_result
 
 
 def refused(done: Done, *words: str) -> None:
@@ -62,8 +68,8 @@ def test_a_result_folder_whose_name_is_no_text_is_refused_before_work(nameless: 
 
 
 def test_a_capture_whose_name_is_no_text_gets_its_result_elsewhere(polcap: Command, nameless: Path, copy: Path) -> None:
-    done = polcap("process", nameless, "--out", copy, "--estimator", "analytic")
-    assert done.returncode == 0, done.stderr
+    done = polcap("process", nameless, "--out", copy, *TINY)
+    assert done.returncode in (0, 3), done.stderr
     assert json.loads((copy / "report.json").read_text())["capture"]["folder"] == str(nameless)
 
 
@@ -104,10 +110,10 @@ def test_a_capture_that_no_path_leads_to_is_one_line(polcap: Command, tmp_path: 
 
 @pytest.mark.parametrize("name", ["a\\b\nmtllib evil", "é" * 120, "a" * 255, "\udcff\udcfe", "..."])
 def test_a_strange_name_of_the_folder_becomes_a_plain_one(
-    polcap: Command, example: Path, tmp_path: Path, name: str
+    polcap: Command, capture: Path, tmp_path: Path, name: str
 ) -> None:
     folder = tmp_path / name
-    folder.symlink_to(example) if name == "..." else shutil.copytree(example, folder)
+    folder.symlink_to(capture) if name == "..." else capture.rename(folder)
     done = (shell if "\udcff" in name else polcap)("process", folder, "--dry-run", "--json", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)["capture"]["name"]

@@ -11,7 +11,7 @@ from typing import Literal
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET, UnsetType, structs
 from scipy.ndimage import minimum_filter
 from scipy.spatial.transform import Rotation
 
@@ -85,7 +85,8 @@ class ObjectBuffer(GBuffer):
 def gbuffer(scene: Scene, view: View, height: int, width: int) -> ObjectBuffer:
     """G-buffer of a scene's object at the center of each pixel."""
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    hits, _ = _visible(scene, frames.rays_at(view, x, y).reshape(-1, 3))
+    unlit = structs.replace(scene, cast_shadows=False)  # their light is not needed
+    hits, _ = _visible(unlit, frames.rays_at(view, x, y).reshape(-1, 3))
     facing, bent = _normals(scene, hits)
     depth = mesh_tracer.scatter(-hits.point[:, 2], hits.index, x.shape, np.nan)
     normal, position, facing = (mesh_tracer.scatter(a, hits.index, x.shape) for a in (bent, hits.local, facing))

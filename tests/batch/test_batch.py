@@ -178,7 +178,7 @@ def kill_worker(out: Path) -> None:
     raise AssertionError("no worker began")
 
 
-@pytest.mark.parametrize("how", [(), ("--scheduler", "local", "--workers", "2")], ids=["processes", "dask"])
+@pytest.mark.parametrize("how", [(), ("--scheduler", "local", "--workers", "1")], ids=["processes", "dask"])
 def test_killed_worker_costs_nothing_but_time_under_a_temporary_folder_of_any_length(
     captures: Path, finished: Path, tmp_path: Path, how: tuple[str, ...]
 ) -> None:
