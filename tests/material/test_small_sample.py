@@ -10,7 +10,7 @@ from pathlib import Path
 import bench_material
 import pytest
 
-from tests.conftest import ROOT, shell
+from tests.conftest import ROOT, Command
 
 
 @pytest.fixture(scope="module")
@@ -43,21 +43,23 @@ def test_maps_state_their_scale_and_light_is_found(sample: Path) -> None:
     assert about["figures"]["flash"]["place_m"] == pytest.approx(truth["light"], abs=0.02)
 
 
-def test_a_run_again_computes_nothing_and_exports_work(sample: Path) -> None:
-    again = shell("material", sample)
+def test_a_run_again_computes_nothing_and_exports_work(sample: Path, polcap: Command) -> None:
+    again = polcap("material", sample)
     assert again.returncode == 0
     assert "Nothing has changed" in again.stderr or "texel_maps    cached" in again.stderr
     assert (sample / "material" / "asset" / "unreal" / "T_sample_N.png").is_file()
-    assert shell("export", sample / "material", "--lod", 2).returncode == 2
-    assert shell("show", sample / "material", "stokes").returncode == 2
+    assert polcap("export", sample / "material", "--lod", 2).returncode == 2
+    assert polcap("show", sample / "material", "stokes").returncode == 2
 
 
-def test_a_view_without_the_board_is_left_out_and_named(sample: Path, tmp_path: Path) -> None:
+def test_a_view_without_the_board_is_left_out_and_named(
+    sample: Path, example: Path, polcap: Command, tmp_path: Path
+) -> None:
     folder = tmp_path / "fewer"
-    shutil.copytree(sample, folder, ignore=shutil.ignore_patterns("material"))
+    shutil.copytree(sample, folder)  # with the stages of the other views
     for file in (folder / "view03").glob("pol*/*.DNG"):
-        shutil.copy(next((Path(__file__).parents[1] / "capture/pol000").glob("*.DNG")), file)
-    done = shell("material", folder)
+        shutil.copy(next((example / "pol000").glob("*.DNG")), file)
+    done = polcap("material", folder)
     assert done.returncode in (0, 2) and "view03" in done.stderr
 
 
@@ -70,6 +72,8 @@ def test_a_view_without_the_board_is_left_out_and_named(sample: Path, tmp_path: 
         (("--no-chart", "--chart", "a"), "exclude"),
     ],
 )
-def test_a_wrong_option_is_one_line_with_a_remedy(sample: Path, option: tuple[str, ...], part: str) -> None:
-    refused = shell("material", sample, "--out", sample.parent / "other", *option)
+def test_a_wrong_option_is_one_line_with_a_remedy(
+    sample: Path, polcap: Command, option: tuple[str, ...], part: str
+) -> None:
+    refused = polcap("material", sample, *option)
     assert refused.returncode == 2 and part in refused.stderr and len(refused.stderr.strip().splitlines()[-1]) > 20
