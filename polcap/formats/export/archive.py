@@ -1,5 +1,6 @@
 """Gathers a result's records next to an export, and lists digests of all its files for `sha256sum -c`."""
 
+import os
 from pathlib import Path
 
 from polcap.formats import atomic, color_profile, own_files
@@ -11,6 +12,7 @@ _RECORDS = ("report.html", "report.json", color_profile.NAME)
 
 def gather(out: Path, folder: Path) -> list[Path]:
     """Copy maps/, report and color profile of the result `out` into the folder of an export; returns the copies."""
+    out = Path(os.path.abspath(out))
     own = own_files.owner(out / "report.json")
     maps = [] if own is None else own.below(out / "maps")
     found = [*maps, *(file for name in _RECORDS if (file := out / name).is_file())]
@@ -25,9 +27,9 @@ def write_manifest(folder: Path) -> Path:
 
     The lines are those of sha256sum, with paths relative to the folder.
     """
-    manifest = folder / MANIFEST
+    manifest, here = folder / MANIFEST, Path(os.path.abspath(folder))
     own = own_files.owner(manifest)
-    files = [] if own is None else [file for file in own.below(folder) if file != manifest]
-    lines = [f"{file_bytes.digest(file.read_bytes())}  {file.relative_to(folder).as_posix()}\n" for file in files]
+    files = [] if own is None else [file for file in own.below(here) if file != here / MANIFEST]
+    lines = [f"{file_bytes.digest(file.read_bytes())}  {file.relative_to(here).as_posix()}\n" for file in files]
     atomic.write(manifest, "".join(lines))
     return manifest
