@@ -25,7 +25,7 @@ from polcap.pipeline import asset_export, result_folder
 from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import Progress
 from polcap.pipeline.run import timings
-from polcap.quality import flat_sample, gates
+from polcap.quality import flat_sample, gates, several_views
 from polcap.quality.advice import advise
 from polcap.quality.gate import Gate
 
@@ -156,8 +156,8 @@ def _gates(
 ) -> Iterator[Gate]:
     """All gates of a flat sample."""
     limits = config.material.gates
-    yield flat_sample.views(len(flat.names), flat.left_out, limits)
+    yield flat_sample.views(flat.names, flat.left_out, limits)
     yield flat_sample.tilts(flat.tilt_deg, limits)
-    yield flat_sample.poses({row["name"]: row["reprojection_px"] for row in rows}, limits)
+    yield several_views.poses({row["name"]: row["reprojection_px"] for row in rows}, limits.max_corner_px, board=True)
     yield flat_sample.agreement({row["name"]: row["residual"] for row in rows}, limits)
     yield flat_sample.seen(float(results.maps.seen.mean()), limits)

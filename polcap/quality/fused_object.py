@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
-from polcap.formats.capture import folder_names
 from polcap.images import Bools, Floats
+from polcap.quality import several_views
 from polcap.quality.gate import Gate
 from polcap.quality.limits import FusedGateLimits
 
@@ -13,30 +13,14 @@ _STEEP = 0.5  # upward component of a normal: faces up or down by more than 30°
 
 
 def views(used: Sequence[str], left_out: Mapping[str, str], limits: FusedGateLimits) -> Gate:
-    """Gate on the number of used views. It names views that are left out, and numbers that no folder has."""
-    count, limit = len(used), limits.min_views
-    missing = folder_names.missing_views([*used, *left_out])
-    absent = f"; no folder {folder_names.few_names(missing)}" if missing else ""
-    if left_out:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
-        message = f"{len(left_out)} of {count + len(left_out)} views are left out: {reasons}{absent}"
-        return Gate("views", "warn", count, limit, message, "Shoot these views again, or delete them", unit="")
-    if count < limit:
-        message = f"{count} views are few: parts between them are guessed from outlines{absent}"
-        return Gate("views", "warn", count, limit, message, "Shoot 12 views or more", unit="")
-    return Gate("views", "pass", count, limit, f"All {count} views are used{absent}", unit="")
+    """Gate on the number of used views."""
+    few = "parts between them are guessed from outlines"
+    return several_views.views(used, left_out, limits.min_views, few, "Shoot 12 views or more")
 
 
 def poses(residual_px: Mapping[str, float], board: bool, limits: FusedGateLimits) -> Gate:
     """Gate on the rms distance of a view's board corners, or features, from where its pose projects them."""
-    worst = max(residual_px, key=lambda name: residual_px[name])
-    value, limit = residual_px[worst], limits.max_corner_px if board else limits.max_feature_px
-    points = "The board's corners" if board else "Features of the object"
-    message = f"{points} are within {value:.2f} px (rms) in every view; the worst is {worst}"
-    if value <= limit:
-        return Gate("poses", "pass", value, limit, message, unit="px")
-    support = "Keep the board flat, and" if board else "Turn the object on a flat table,"
-    return Gate("poses", "fail", value, limit, message, f"{support} focus and zoom unchanged", unit="px")
+    return several_views.poses(residual_px, limits.max_corner_px if board else limits.max_feature_px, board)
 
 
 def agreement(normal_deg: Mapping[str, float], limits: FusedGateLimits) -> Gate:

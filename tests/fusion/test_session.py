@@ -27,8 +27,8 @@ from polcap.pipeline import run
 from polcap.pipeline.cache import LazyCache, silent
 from polcap.pipeline.path import UserInput
 from polcap.pipeline.request import Request
-from polcap.quality import fused_object
-from polcap.quality.limits import FusedGateLimits
+from polcap.quality import flat_sample, fused_object
+from polcap.quality.limits import FusedGateLimits, MaterialGateLimits
 from polcap.stages import Stage
 from tests.fusion import board_views
 
@@ -68,8 +68,9 @@ def test_a_copy_of_a_view_is_left_out(tmp_path: Path) -> None:
 
 
 def test_a_missing_number_of_a_view_is_in_the_report() -> None:
-    gate = fused_object.views([f"view{number:02d}" for number in range(1, 13) if number != 5], {}, FusedGateLimits())
-    assert gate.message == "All 11 views are used; no folder view05"
+    names = [f"view{number:02d}" for number in range(1, 13) if number != 5]
+    gates = fused_object.views(names, {}, FusedGateLimits()), flat_sample.views(names, {}, MaterialGateLimits())
+    assert [gate.message for gate in gates] == 2 * ["All 11 views are used; no folder view05"]
 
 
 def test_three_views_are_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
