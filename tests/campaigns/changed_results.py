@@ -28,8 +28,7 @@ from polcap.pipeline import cache
 from polcap.results import STAGES
 from tests.campaigns.mutations import mutated
 from tests.campaigns.rows import arguments, table
-from tests.campaigns.users_files import make_template as make_capture
-from tests.campaigns.users_files import run
+from tests.campaigns.users_files import make_template, run
 
 QUICK = ("--no-chart", "--estimator", "analytic")
 _OTHER: tuple[Any, ...] = (None, True, -1, 0, 1e300, "text", "\ud800", [], {}, [None], {"a": 1}, [[[]]], "9" * 5000)
@@ -38,9 +37,8 @@ _SWAPPED = "work/04-mask/value.mask.npy"
 Change = Callable[[Path, Random], None]
 
 
-def make_template(folder: Path) -> None:
-    """A batch of one capture, folder/C, with everything that can be in a result."""
-    make_capture(folder)
+def complete(folder: Path) -> None:
+    """Make of a capture with its result, folder/C, a batch of one capture with everything that can be in a result."""
     result = folder / "C" / "polcap"
     for words in (("batch", folder, *QUICK), ("export", result, "--obj"), ("show", result, "--all")):
         assert run(*words)[0] in (0, 3)
@@ -229,6 +227,7 @@ def main() -> None:
     stated = arguments(__doc__, changes=300, seed=0)
     with tempfile.TemporaryDirectory() as name:
         make_template(Path(name))
+        complete(Path(name))
         ended = stated.rows.done("seed", "number")
         for number in range(stated.changes):
             if (stated.seed, number) not in ended:

@@ -9,15 +9,15 @@ from typing import Any
 import pytest
 
 from polcap.pipeline import cache
-from tests.campaigns.changed_results import QUICK, make_template, tried
-from tests.conftest import Command
+from tests.campaigns.changed_results import complete, tried
+from tests.conftest import TINY, Command
 
 
 @pytest.fixture(scope="module")
-def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small capture C with its finished result C/polcap, of a batch; read only."""
-    folder = tmp_path_factory.mktemp("template")
-    make_template(folder)
+def template(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny capture C with its finished result C/polcap, of a batch; read only."""
+    folder = Path(shutil.copytree(tiny, tmp_path_factory.mktemp("template") / "batch"))
+    complete(folder)
     return folder
 
 
@@ -41,7 +41,7 @@ def test_a_stage_whose_seconds_are_no_number_is_computed_again(root: Path, polca
     assert polcap("status", result).returncode == 0 and "align" not in polcap("status", result).stdout
     done = polcap("report", result)
     assert done.returncode == 2 and "03-align" in done.stderr and "run `polcap process`" in done.stderr
-    assert polcap("process", root / "C", *QUICK).returncode in (0, 3) and polcap("report", result).returncode in (0, 3)
+    assert polcap("process", root / "C", *TINY).returncode in (0, 3) and polcap("report", result).returncode in (0, 3)
 
 
 def test_a_stage_with_another_number_of_inputs_is_of_another_polcap(root: Path, polcap: Command) -> None:
@@ -63,7 +63,7 @@ def test_a_provenance_of_another_shape_counts_as_that_of_another_export(
     assert "C.glb" not in json.loads((asset / "C.provenance.json").read_text())["files"]
     (asset / "web").mkdir()
     (asset / "web" / "C.provenance.json").write_text(content)
-    done = polcap("process", root / "C", *QUICK)
+    done = polcap("process", root / "C", *TINY)
     assert done.returncode in (0, 3) and "asset/web in" in done.stderr
     assert (asset / "web" / "C.provenance.json").read_text() == content
 
@@ -88,7 +88,7 @@ def test_a_record_of_another_shape_is_one_line(
     change(result / name, edit)
     done = polcap("export", result)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and Path(name).name in done.stderr
-    assert polcap("process", root / "C", *QUICK).returncode in (0, 3) and polcap("export", result).returncode == 0
+    assert polcap("process", root / "C", *TINY).returncode in (0, 3) and polcap("export", result).returncode == 0
 
 
 @pytest.mark.parametrize(
