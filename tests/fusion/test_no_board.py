@@ -19,11 +19,13 @@ from tests.conftest import shell, slow
 pytest.importorskip("embreex")
 
 
-def session(folder: Path, pattern: str, views: int) -> Path:
+def session(folder: Path, pattern: str, views: int, width: int = 540) -> Path:
     """Views all around, without the one with the chart."""
     scene = scenes.random_scene(1, "bumps")
     materials = tuple(replace(one, pattern=pattern, size=0.006) for one in scene.coat.materials[:1])
-    shoot = all_around.AroundShoot(width=540, height=360, samples=1, exposures=1, board="none", focal_mm=110.0)
+    shoot = all_around.AroundShoot(
+        width=width, height=width * 2 // 3, samples=1, exposures=1, board="none", focal_mm=110.0
+    )
     all_around.write(folder, replace(scene, coat=replace(scene.coat, materials=materials)), shoot, views)
     shutil.rmtree(folder / "view01")
     return folder
@@ -51,7 +53,7 @@ def width(vertices: Floats) -> float:
 
 
 def test_an_object_without_pattern_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    folder = session(tmp_path / "object", "plain", 4)
+    folder = session(tmp_path / "object", "plain", 4, width=300)
     done = shell("fuse", folder, "--no-chart", "--estimator", "analytic")
     assert done.returncode == 2
     assert "no view shows a board" in done.stderr and "polcap board" in done.stderr
