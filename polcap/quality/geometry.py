@@ -31,6 +31,7 @@ _FALSE_TURN_DEG = 0.2  # 1σ of a turn that polarization imitates
 _SHARP_PX, _DEGREES_PER_BLUR_PX = 1.2, 2.5  # greatest blur of sharp edges; error of the normals per px beyond it
 _DEGREES_PER_FRAME_BLUR_PX = 9.0  # of a reference frame beyond the limit: 12° at 2.2 and 2.7 px, 24° at 4.6
 _EDGE_FLOOR = 0.1  # of the object's median light: dark backdrops differ by less
+_SAME_SCENE = 0.8  # correlation of detail that no two objects have: they reach .4
 _LOCK = "Lock the camera, do not touch the object, and take that shot again"
 _MOST_CONTRADICTION = 0.1  # of the object; set by hand: noise, glare and swapped angles leave less than .01
 _TEXTURE = (
@@ -80,7 +81,8 @@ def _judge_camera(found: Evidence, limits: GateLimits) -> Gate:
     if far[k]:
         return failed(value, most, message, remedy=_LOCK)
     message = f"{message}: it shares too little texture with the first one"
-    remedy = _TEXTURE if unsure[1:].all() else _check_files(found, unsure)
+    plain = unsure[1:].all() or correlation[unsure].min() > _SAME_SCENE
+    remedy = _TEXTURE if plain else _check_files(found, unsure)
     return failed(round(float(doubt[k]), 3), most_doubt, message, remedy=remedy)
 
 

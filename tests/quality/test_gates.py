@@ -309,7 +309,7 @@ def test_equal_light_is_called_equal(good: Evidence) -> None:
 
 def test_a_clipped_capture_is_told_how_many_stops(good: Evidence) -> None:
     every = np.zeros_like(good.clipped)
-    for share, stops in ((0.05, 2), (0.4, 2), (0.9, 4)):
+    for share, stops in ((0.05, 2), (0.4, 3), (0.9, 4)):
         every[:] = share
         assert f"{stops} stops less light" in judged(changed(good, clipped=every))["clipping"].remedy
     assert "as much light as the others" in judged(changed(good, clipped=clipped(0.4)))["clipping"].remedy
