@@ -181,10 +181,10 @@ def light_agreement(rendered: Rerendering) -> str:
     percent, ratio = f"{100 * rendered.difference:.0f} %", rendered.highlights
     if not _SAME_LIGHT[0] < ratio < _SAME_LIGHT[1]:
         times = f"{max(ratio, 1 / max(ratio, 1e-3)):.1f} times {'brighter' if ratio > 1 else 'darker'}"
-        gloss = "glossier" if ratio > 1 else "duller"
+        gloss = "glossier than its maps" if ratio > 1 else "duller than its maps, or has finer relief"
         return (
-            f"Both differ in the highlights: there the photograph is {times}, so the object is {gloss} than its maps "
-            f"of specular and roughness. Elsewhere they differ by {percent} (median)"
+            f"Both differ in the highlights: there the photograph is {times}, so the object is {gloss}. "
+            f"Elsewhere they differ by {percent} (median)"
         )
     if rendered.difference > _SIMILAR:
         return f"Both differ by {percent} (median); the pictures of the differences below show where"
