@@ -76,8 +76,14 @@ def opened(out: Path) -> Iterator[None]:
 def copy(result: Path, out: Path) -> None:
     """Make a result folder with the maps and the report of another one, such as an archive, which stays as it is.
 
-    Raises SettingError: `out` holds something already. StorageError: `result` is no result, or `out` is not writable.
+    Raises SettingError: `out` holds something already, or lies in `result` or among the shots of a capture.
+    StorageError: `result` is no result, or `out` is not writable.
     """
+    here, there = (Path(os.path.realpath(folder)) for folder in (out, result))
+    if here.is_relative_to(there):
+        raise SettingError(f"--out {out} lies in {result}, which is to stay as it is; choose a folder outside")
+    if any(map(_holds_shots, (here, *here.parents))):
+        raise SettingError(f"--out {out} lies among the shots of a capture; choose another folder")
     if os.path.lexists(out) and (not out.is_dir() or any(out.iterdir())):
         raise SettingError(f"--out {out} is not an empty folder; choose another folder")
     report.read(result)

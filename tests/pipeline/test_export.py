@@ -341,6 +341,20 @@ def test_an_archive_checks_itself_after_two_exports_and_a_copy(
         assert subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True).returncode == 0
 
 
+@pytest.mark.parametrize("place", ["F/new", "link/new", "C/pol000/new"])
+def test_a_copied_result_lies_outside_the_result_and_the_shots(
+    tiny_result: Path, polcap: Command, tmp_path: Path, place: str
+) -> None:
+    shutil.copytree(tiny_result, tmp_path / "F")
+    (tmp_path / "link").symlink_to(tmp_path / "F" / "maps", target_is_directory=True)
+    (tmp_path / "C" / "pol000").mkdir(parents=True)
+    (tmp_path / "C" / "pol000" / "IMG_1.DNG").write_bytes(b"II*\0")
+    before = sorted(tmp_path.rglob("*"))
+    refused = polcap("export", tmp_path / "F", "--out", tmp_path / place)
+    assert refused.returncode == 2 and refused.stderr.count("\n") == 1 and " lies " in refused.stderr
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_extra_textures_and_sixteen_bits(tiny_result: Path, polcap: Command) -> None:
     """Displacement is depth.png turned round; object-space normals are the maps'; the GLB holds the occlusion."""
     named = [part for name in texture_set.EXTRAS for part in ("--extra", name)]
