@@ -25,6 +25,6 @@ def color_clusters(encoded: Floats, count: int) -> tuple[Floats, float]:
 
 def soft_share(encoded: Floats, center: Floats, spread: float) -> Floats:
     """Share (N, G) of each color (N, C) in each group; the shares of a color sum to 1."""
-    distance = np.linalg.norm(encoded[:, None] - center[None], axis=-1)
+    distance = np.stack([np.linalg.norm(encoded - one, axis=-1) for one in center], axis=-1)
     likeness = np.exp(-((distance / spread) ** 2) + (distance.min(axis=1, keepdims=True) / spread) ** 2)
     return np.asarray(likeness / likeness.sum(axis=1, keepdims=True))
