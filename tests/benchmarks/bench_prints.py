@@ -9,6 +9,7 @@ the estimated roughness inside the object, where the true one has none.
 
 import argparse
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -54,10 +55,10 @@ def printed(number: int) -> Scene:
     """Scene `number`: one gloss under a print."""
     random = np.random.default_rng([number, 0x9217])
     scene = random_scene(4000 + number, ("bumps", "clusters", "vase")[number % 3])
-    light, dark = random.uniform(0.4, 0.85, 3), random.uniform(0.03, 0.15, 3)
-    pattern = ("chequer", "veins", "noise")[number // 3 % 3]
+    (r, g, b), dark = random.uniform(0.4, 0.85, 3).tolist(), random.uniform(0.03, 0.15, 3).tolist()
+    pattern: Literal["chequer", "veins", "noise"] = ("chequer", "veins", "noise")[number // 3 % 3]
     material = Material(
-        first=tuple(light.tolist()), second=tuple(dark.tolist()), pattern=pattern,  # type: ignore[arg-type]
+        first=(r, g, b), second=(dark[0], dark[1], dark[2]), pattern=pattern,
         size=float(random.uniform(0.01, 0.03)), roughness=(float(random.uniform(0.2, 0.7)),) * 2,
         ior=float(random.uniform(1.45, 1.58)), seed=number,
     )  # fmt: skip

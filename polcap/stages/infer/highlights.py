@@ -39,14 +39,14 @@ _LEAST_MATTE = 1e-3  # share of matte pixels in a neighborhood
 _FLOOR = 1e-3  # albedo
 
 _MOST_MATERIALS = 4
-_COLOR = 0.1  # weight of the encoded albedo beside the roughness
+_COLOR = 0.1  # weight of the encoded albedo, relative to the roughness
 _LIKE = 0.06  # rms distance from the mean of a material: a larger one asks for one more material
 _BLUR = 0.004  # 1σ over the object's radius, of S0 before the brightest pixel is taken
 _LEAST_BLUR_PX = 0.7
 _BRIGHTEST = 3  # this pixel counts as the highlight, not the brightest
 _FACING_DEG = 35.0  # greatest zenith angle of a highlight
-_BESIDE_DEG = (25.0, 60.0)  # zenith angles without highlight; what S0 has there beyond the albedo is its error
-_BESIDE_QUANTILE = 0.99
+_AWAY_DEG = (25.0, 60.0)  # zenith angles without highlight; what S0 has there beyond the albedo is its error
+_AWAY_QUANTILE = 0.99
 _FEWEST_PX = 50
 # measured on path-traced pictures (docs/benchmarks/network.md)
 _ALBEDO_SIGMA = 0.2  # relative error of the albedo under a highlight
@@ -160,11 +160,11 @@ def _mirrored_light(maps: SurfaceMaps, cues: Cues) -> Floats:
 
 def _bounded(roughness: float, f0: float, member: Bools, zenith: Floats, mirrored: Floats, albedo: Floats) -> float:
     """Roughness of a material of pixels `member` (H, W), at most what its highlights allow."""
-    facing, beside = member & (zenith < _FACING_DEG), member & (zenith > _BESIDE_DEG[0]) & (zenith < _BESIDE_DEG[1])
-    if facing.sum() < _FEWEST_PX or beside.sum() < _FEWEST_PX:
+    facing, away = member & (zenith < _FACING_DEG), member & (zenith > _AWAY_DEG[0]) & (zenith < _AWAY_DEG[1])
+    if facing.sum() < _FEWEST_PX or away.sum() < _FEWEST_PX:
         return roughness
     highlight = float(np.partition(mirrored[facing], -_BRIGHTEST)[-_BRIGHTEST])
-    error = hypot(np.quantile(mirrored[beside], _BESIDE_QUANTILE), _ALBEDO_SIGMA * albedo[facing].mean())
+    error = hypot(np.quantile(mirrored[away], _AWAY_QUANTILE), _ALBEDO_SIGMA * albedo[facing].mean())
     if highlight <= error:
         return roughness
     bound: float = (f0 / (4 * highlight)) ** 0.25
