@@ -13,12 +13,13 @@ from polcap.formats import atomic
 from polcap.pipeline import run as pipeline
 from polcap.report import animation, keys, sheets
 from polcap.report import stage_pictures as pictures
+from polcap.results import Results
 
 WIDTH, HEAD, GAP, ROW = 300, 30, 8, 4  # px of a panel, its label and the gaps; panels in a row
 LIGHT = 6 / 48  # of the way round, from the left above
 
 result, file = map(Path, sys.argv[1:3])
-found, about = pipeline.reopen(result)
+found, about = pipeline.reopen(result, Results)
 maps, depth = found.maps, found.mesh.depth
 relit = animation.light(maps, about["settings"]["infer"]["ior"])
 key = keys.depth(depth[np.isfinite(depth)], metric=False)

@@ -11,6 +11,7 @@ from polcap.formats import html
 from polcap.pipeline import run as pipeline
 from polcap.report import stage_pictures as pictures
 from polcap.report.page import verdict
+from polcap.results import Results
 
 page, *folders = map(Path, sys.argv[1:])
 
@@ -21,7 +22,7 @@ def picture(address: str, words: str) -> str:
 
 body = ["<h1>Gallery</h1><p>From nine photographs each. A report lies beside every result.</p>"]
 for folder in folders:
-    results, _ = pipeline.reopen(folder)
+    results, _ = pipeline.reopen(folder, Results)
     maps, mesh, about = results.maps, results.mesh, report.read(folder)
     moving = pipeline.animate(folder, "light")[0].read_bytes()
     name, says = escape(about["capture"]["name"]), escape(" ".join(verdict(about)))

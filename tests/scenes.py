@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from polcap.chart_values import ColorCalibration
 from polcap.images import Floats, View
 from polcap.optics import frames, mueller, shade
 from polcap.optics.warp import warp
+from polcap.quality.gate import Evidence
+from polcap.results import FIELDS, collect
 from polcap.stage_values import (
     Alignment,
     AngleStack,
@@ -139,3 +142,9 @@ def truth() -> tuple[Floats, NDArray[np.bool_]]:
     x0, y0, x1, y1 = ball_object().crop
     y, x = np.mgrid[y0:y1, x0:x1].astype(float)
     return normals(x, y)
+
+
+def evidence(**parts: Any) -> Evidence[Any]:
+    """Evidence of the results of the first stages and of measurements, by their names."""
+    results = {stage: parts.pop(name) for stage, name in FIELDS.items() if name in parts}
+    return Evidence(collect(results, {}), **parts)

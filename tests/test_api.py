@@ -16,6 +16,7 @@ from polcap.formats.maps import result_maps as maps
 from polcap.images import MaskedImage
 from polcap.pipeline import models, request
 from polcap.pipeline import run as pipeline
+from polcap.results import ResultsUntilMask
 
 
 @pytest.mark.parametrize(
@@ -96,7 +97,7 @@ def test_check_export_and_reopen_take_strings(result: Path, example: Path, tmp_p
     assert polcap.check(str(example)).keep
     files = polcap.export(str(copy), "godot", texture_size=64, catalog={"title": "Vase"})
     assert {"capture.glb", "capture_orm.png"} <= {file.name for file in files}
-    assert pipeline.reopen(str(copy), "mask")[0].object_.mask.any()
+    assert pipeline.reopen(str(copy), ResultsUntilMask)[0].object_.mask.any()
 
 
 @pytest.mark.parametrize(

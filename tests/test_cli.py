@@ -19,7 +19,7 @@ from polcap.formats.export import presets, texture_set
 from polcap.fusion import fused_maps
 from polcap.pipeline import run as pipeline
 from polcap.report import animation
-from polcap.results import STAGES
+from polcap.results import STAGES, ResultsUntilMask
 from tests.conftest import TINY, Command, shell
 
 
@@ -263,7 +263,7 @@ def test_user_mask_replaces_the_search(copy: Path, example: Path, polcap: Comman
     cv2.imwrite(str(tmp_path / "mask.png"), drawn)
     done = polcap("process", example, "--out", copy, "--mask", tmp_path / "mask.png", "--until", "mask", "--json")
     assert done.returncode == 0, done.stderr
-    results, _ = pipeline.reopen(copy, "mask")
+    results, _ = pipeline.reopen(copy, ResultsUntilMask)
     assert results.object_.source == "user" and np.array_equal(results.object_.mask, drawn > 0)
 
 

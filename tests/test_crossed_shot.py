@@ -49,7 +49,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 def solved(capture: Capture) -> Results:
     with np.load(Path(capture.folder) / "truth.npz") as truth:
         mask = truth["mask"].astype(bool)
-    return path(capture, UserInput(chart=ChartRequest("none"), mask=mask), Config(), MemoryCache())
+    return path(capture, UserInput(chart=ChartRequest("none"), mask=mask), Config(), MemoryCache(), Results)
 
 
 @pytest.fixture(scope="module")

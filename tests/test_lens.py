@@ -14,6 +14,7 @@ from polcap.formats import calibrations
 from polcap.formats.capture import reader as captures
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
+from polcap.results import ResultsUntilStokes
 from polcap.synth import forward_camera, scenes, shooting
 
 SHOOT = shooting.Shoot(
@@ -54,7 +55,7 @@ def test_stokes_are_those_of_a_pinhole(shot, tmp_path, monkeypatch):
     supplied = UserInput(chart=ChartRequest("none"), mask=seen)
     error, overlap = {}, {}
     for name, what in (("pinhole", capture), ("as seen", replace(capture, calibration=None))):
-        image = path(what, supplied, Config(), MemoryCache(until="stokes")).stokes
+        image = path(what, supplied, Config(), MemoryCache(), ResultsUntilStokes).stokes
         (left, top), (height, width) = np.array(image.view.origin, int), image.mask.shape
         assert image.view.center == pytest.approx((95.5 - left, 71.5 - top), abs=0.01)
         s0 = truth["S"][0].astype(float).sum(-1).reshape(144, 2, 192, 2).mean((1, 3))

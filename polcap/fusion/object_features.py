@@ -20,7 +20,7 @@ from polcap.fusion.values import ViewMask
 from polcap.images import Floats
 from polcap.optics import projection
 from polcap.quality import polarization
-from polcap.quality.gate import Evidence, shot_names
+from polcap.quality.gate import shot_names
 from polcap.stage_values import AngleStack, ObjectMask, SelfCalibration, SurfaceMaps
 from polcap.stages import stage
 
@@ -52,8 +52,8 @@ def find(
 
     Raises CaptureError: the outline contradicts the order of the polarizer angles, so the normals are wrong everywhere.
     """
-    seen = Evidence.partial(radiance=radiance, selfcal=calibration, maps=maps, names=shot_names(radiance))
-    order = polarization.order(seen)
+    outline, names = calibration.outline, shot_names(radiance)
+    order = polarization.order_of_shots(radiance, object_, outline, maps.order, names)
     if order.state == "fail":
         raise CaptureError(f"{order.message}. {order.remedy}")
     lens = radiance.equipment.distortion

@@ -27,6 +27,7 @@ from polcap.fusion.values import FusionView, ViewMask
 from polcap.fusion.view_path import SessionView
 from polcap.pipeline import run
 from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult, digest
+from polcap.results import ResultsUntilInfer
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ def _fusion_view(
     view: SessionView, solved: SessionPoses, report: Mapping[str, Any], cache: LazyCache
 ) -> StageResult[FusionView]:
     """Maps of a processed view with its pose, which are read when they are needed."""
-    results = DeferredResult(digest(report["keys"]), lambda: run.reopen(view.out, "infer")[0])
+    results = DeferredResult(digest(report["keys"]), lambda: run.reopen(view.out, ResultsUntilInfer)[0])
     undistort = view.config.stokes.undistort
     pose = solved.views[view.name].pose
     return cache.derive(view_maps.fusion_view, view.name, results, solved.camera, pose, solved.metric, undistort)

@@ -9,14 +9,14 @@ from polcap.fusion.poses import SessionCamera
 from polcap.fusion.values import FusionView, Pose
 from polcap.images import Distortion, Floats, View
 from polcap.optics import distortion, frames, projection
-from polcap.results import Results
+from polcap.results import ResultsUntilInfer
 from polcap.stages.cues import scale
 
 _LEAST_SHIFT_PX = 0.02  # of the map: below, a lens counts as free of distortion and nothing is resampled
 
 
 def fusion_view(
-    name: str, results: Results, camera: SessionCamera, pose: Pose, metric: bool, undistort: bool
+    name: str, results: ResultsUntilInfer, camera: SessionCamera, pose: Pose, metric: bool, undistort: bool
 ) -> FusionView:
     """The maps of a view's results, with its pose.
 

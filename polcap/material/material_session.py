@@ -25,7 +25,7 @@ from polcap.material.texel_grid import TexelGrid
 from polcap.optics.board import RING, SQUARES, Board
 from polcap.pipeline import run
 from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult, digest
-from polcap.results import Results
+from polcap.results import ResultsUntilStokes
 
 Region = tuple[float, float, float, float]  # m, left, lower, right, upper side, from the board's middle; y up the page
 _MARGIN_M = 0.0015  # inside the board's black middle
@@ -94,11 +94,11 @@ def _with_mask(view: SessionView, solved: SessionPoses, board: Board) -> Session
 
 def _posed(view: SessionView, solved: SessionPoses, key: str, cache: LazyCache) -> StageResult[PosedStokes]:
     """Stokes parameters of a view with its pose, which are read when they are needed."""
-    results = DeferredResult(key, lambda: run.reopen(view.out, "stokes")[0])
+    results = DeferredResult(key, lambda: run.reopen(view.out, ResultsUntilStokes)[0])
     return cache.derive(posed_stokes, view.name, results, solved, solved.views[view.name].pose)
 
 
-def posed_stokes(name: str, results: Results, solved: SessionPoses, pose: Pose) -> PosedStokes:
+def posed_stokes(name: str, results: ResultsUntilStokes, solved: SessionPoses, pose: Pose) -> PosedStokes:
     """The Stokes parameters of a view's results, with its pose and the session's camera."""
     return PosedStokes(
         name, results.stokes, np.asarray(results.selfcal.angle), np.asarray(results.color.matrix), pose, solved.camera

@@ -83,12 +83,13 @@ class DeferredResult(StageResult[T]):
 class MemoryCache:
     """Runs the stages of one path, in order, and holds their results in memory; nothing is written.
 
-    `force` names a stage that is computed again even if its result is stored, as are all stages after it. `until` names
-    the stage after which StageReached ends the path.
+    `force` names a stage that is computed again even if its result is stored, as are all stages after it.
     """
 
-    def __init__(self, progress: Progress = silent, force: str | None = None, until: str | None = None) -> None:
-        self.progress, self.until = progress, until
+    until: str | None = None  # the stage after which StageReached ends the path
+
+    def __init__(self, progress: Progress = silent, force: str | None = None) -> None:
+        self.progress = progress
         self.results: dict[str, StageResult[Any]] = {}  # of the path so far, by stage
         self.stage, self._began = "start", 0.0  # the stage begun last, and when
         self._force, self._forced = force, False
@@ -157,10 +158,8 @@ class MemoryCache:
 class StageCache(MemoryCache):
     """The stage cache of one result folder: results in `folder/work`."""
 
-    def __init__(
-        self, folder: Path, progress: Progress = silent, force: str | None = None, until: str | None = None
-    ) -> None:
-        super().__init__(progress, force, until)
+    def __init__(self, folder: Path, progress: Progress = silent, force: str | None = None) -> None:
+        super().__init__(progress, force)
         self.folder, self.work = folder, folder / "work"
 
     def place(self, stage: Stage[..., Any]) -> Path:

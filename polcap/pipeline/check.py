@@ -20,11 +20,12 @@ from polcap.formats.capture import folder_names
 from polcap.optics.projection import to_grid
 from polcap.pipeline import models, small_capture
 from polcap.pipeline.cache import MemoryCache
-from polcap.pipeline.path import AUTO, UserInput, path, results_of
+from polcap.pipeline.path import AUTO, UserInput, path, results_so_far
 from polcap.pipeline.small_capture import SmallCapture
 from polcap.quality import gates
 from polcap.quality.advice import advise
 from polcap.quality.gate import Evidence, Gate, of_error
+from polcap.results import ResultsUntilInfer, ResultsUntilWhitebalance
 from polcap.stage_values import Network
 
 _THREADS = 2  # frames that are decoded at a time
@@ -79,7 +80,7 @@ def inspect(
 
 def _judge(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config) -> list[Gate]:
     """Judge the reduced capture by the gates, in the order of the path; an error of a stage is the last gate."""
-    cache, chart_missing = MemoryCache(until="infer"), ""
+    cache, chart_missing = MemoryCache(), ""
     failure: InputError | None = None
     try:
         chart_missing = _run_path(capture, small, supplied, config, cache)
@@ -87,8 +88,8 @@ def _judge(capture: Capture, small: SmallCapture, supplied: UserInput, config: C
         raise
     except InputError as error:
         failure = error
-    evidence = Evidence.partial(
-        **vars(results_of(cache.results)),
+    evidence = Evidence(
+        results_so_far(cache),
         names=[shot.name for shot in small.capture.shots],
         focal_doubt=small.capture.focal_doubt,
         clipped=small.clipped,
@@ -110,7 +111,7 @@ def _run_path(capture: Capture, small: SmallCapture, supplied: UserInput, config
     """
     missing, settings = "", _settings(config, small.step)
     try:
-        path(small.capture, supplied, settings, cache)
+        path(small.capture, supplied, settings, cache, ResultsUntilInfer)
     except ChartError:
         if supplied.chart.mode != "auto":
             raise
@@ -119,14 +120,14 @@ def _run_path(capture: Capture, small: SmallCapture, supplied: UserInput, config
             request = ChartRequest("profile", profile=_colors_at_full_size(capture, config))
         except ChartError as error:
             missing = error.reason
-        path(small.capture, replace(supplied, chart=request), settings, cache)
+        path(small.capture, replace(supplied, chart=request), settings, cache, ResultsUntilInfer)
     return missing
 
 
 def _colors_at_full_size(capture: Capture, config: Config) -> ColorCalibration:
     """The color calibration of the reference shot at full size, as `process` makes it. Raises ChartError."""
-    alone = MemoryCache(until="whitebalance")
-    return path(replace(capture, shots=capture.shots[:1], crossed=None), UserInput(), config, alone).color
+    first = replace(capture, shots=capture.shots[:1], crossed=None)
+    return path(first, UserInput(), config, MemoryCache(), ResultsUntilWhitebalance).color
 
 
 def _settings(config: Config, step: int) -> Config:

@@ -8,12 +8,12 @@ from polcap.errors import AlignmentError, CaptureError, ChartError, InputError, 
 from polcap.formats import shipped_data
 from polcap.formats.maps import png
 from polcap.pipeline.cache import StageCache
-from polcap.pipeline.path import results_of
+from polcap.pipeline.path import results_so_far
 from polcap.quality import gates
 from polcap.quality.advice import advice
 from polcap.quality.gate import full_size, of_error
 from polcap.report import stage_pictures
-from polcap.results import Results
+from polcap.results import ResultsUntilAlign, ResultsUntilHdr, ResultsUntilWhitebalance
 from polcap.stages import align
 
 PICTURE = "stopped.png"  # in work/
@@ -22,10 +22,12 @@ _OF_PIXELS = (CaptureError, ChartError, AlignmentError, ObjectError)  # the pict
 
 def explain(error: InputError, cache: StageCache, capture: Capture, config: Config) -> InputError | None:
     """The error with the cause that gates find in the stages so far, and a picture of these; None without pixels."""
-    reached = results_of(cache.results)
-    if not isinstance(error, _OF_PIXELS) or "hdr" not in reached.keys:
+    reached = results_so_far(cache)
+    if not isinstance(error, _OF_PIXELS) or not isinstance(reached, ResultsUntilHdr):
         return None
-    found = _registered(reached, config) if isinstance(error, AlignmentError) else reached
+    found = reached
+    if isinstance(error, AlignmentError) and isinstance(reached, ResultsUntilWhitebalance):
+        found = _registered(reached, config)
     files = tuple(tuple(capture.file_name(frame) for frame in shot.frames) for shot in capture.shots)
     evidence = full_size(found, capture.focal_doubt, config.align, files)
     first = next(iter(advice(gates.judge(evidence, config.gates, of_error(error)))), of_error(error))
@@ -36,11 +38,11 @@ def explain(error: InputError, cache: StageCache, capture: Capture, config: Conf
     return type(error)(f"{message}; see {picture}")
 
 
-def _registered(reached: Results, config: Config) -> Results:
+def _registered(reached: ResultsUntilWhitebalance, config: Config) -> ResultsUntilWhitebalance:
     """The results with the motion of all shots, also of those that moved too far or show another scene."""
     anything = msgspec.structs.replace(config.align, max_shift_px=500.0, min_correlation=0.0)
     try:
         alignment = align.register(reached.radiance, reached.color, anything)
     except AlignmentError:  # there is nothing to register
         return reached
-    return Results.partial(**{**vars(reached), "alignment": alignment})
+    return ResultsUntilAlign(**vars(reached), alignment=alignment)

@@ -6,11 +6,9 @@ resampled once. `cache.run` reads a stored result, or computes it. `process`, `c
 this path, with different caches. `run.py` then writes maps/, and `asset_export.py` builds the asset from these files.
 """
 
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -21,8 +19,8 @@ from polcap.errors import ObjectError
 from polcap.formats import onnx, shipped_data
 from polcap.formats.raw import frame_decoder
 from polcap.images import Bools
-from polcap.pipeline.cache import MemoryCache, StageReached, StageResult
-from polcap.results import FIELDS, Results
+from polcap.pipeline.cache import MemoryCache, StageReached
+from polcap.results import FirstResults, R, collect, last_stage
 from polcap.stage_values import AngleStack, Network, OtherOrder, SelfCalibration
 from polcap.stages import align, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
 
@@ -40,17 +38,20 @@ class UserInput:
     decode: Decode = frame_decoder.decode  # the pixels of a photograph
 
 
-def path(capture: Capture | None, supplied: UserInput, config: Config, cache: MemoryCache) -> Results:
-    """Run the stages in order; returns the results of all stages, or of those before the cache stops the path."""
+def path(capture: Capture | None, supplied: UserInput, config: Config, cache: MemoryCache, wanted: type[R]) -> R:
+    """Run the stages in order, up to the last one of the `wanted` results."""
+    cache.until = last_stage(wanted)
     with suppress(StageReached):
         run_stages(capture, supplied, config, cache)
-    return results_of(cache.results)
+    results = results_so_far(cache)
+    assert isinstance(results, wanted)
+    return results
 
 
 def run_stages(capture: Capture | None, supplied: UserInput, config: Config, cache: MemoryCache) -> None:
     """Run the stages in order; their results are in `cache`.
 
-    Raises StageReached: the cache stops the path.
+    Raises StageReached: this was the last stage that the path needs.
     """
     with ThreadPoolExecutor(1) as background:
         colors = background.submit(shipped_data.colorchecker, config.whitebalance.chart)  # imports a large library
@@ -68,10 +69,10 @@ def run_stages(capture: Capture | None, supplied: UserInput, config: Config, cac
         cache.run(surface.integrate, maps, distance, config=config.surface)
 
 
-def results_of(made: Mapping[str, StageResult[Any]]) -> Results:
-    """Collect the results of the stages that have run as `Results`."""
-    keys = {stage: result.key for stage, result in made.items()}
-    return Results.partial(keys=keys, **{FIELDS[stage]: result.value for stage, result in made.items()})
+def results_so_far(cache: MemoryCache) -> FirstResults:
+    """The results of the stages that have run; after an error, these are the first ones."""
+    keys = {stage: result.key for stage, result in cache.results.items()}
+    return collect({stage: result.value for stage, result in cache.results.items()}, keys)
 
 
 def on_grid(drawn: Bools | None, radiance: AngleStack) -> Bools | None:

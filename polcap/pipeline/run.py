@@ -29,7 +29,7 @@ from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCach
 from polcap.pipeline.path import UserInput, path
 from polcap.report import animation
 from polcap.report import stage_pictures as pictures
-from polcap.results import STAGES, Results
+from polcap.results import STAGES, FirstResults, R, Results, kind_until
 
 ASSET = STAGES[-1]  # made after the path, from the files in maps/
 
@@ -49,16 +49,17 @@ def process(
 
     Raises InputError: the user's input is wrong; the stage that found it raises the error.
     """
-    cache = StageCache(out, progress, force, until)
+    cache = StageCache(out, progress, force)
     with opened(capture, supplied, config, cache) as facts:
         try:
-            results = path(capture, supplied, config, cache)
+            results = path(capture, supplied, config, cache, kind_until(until or ASSET))
         except InputError as error:
             if (explained := early_end.explain(error, cache, capture, config)) is None:
                 raise
             raise explained from error
         if until not in (None, ASSET):
             return None
+        assert isinstance(results, Results)
         cache.begin(ASSET)
         about = _write(out, results, facts, config)
         cache.end()
@@ -70,7 +71,7 @@ def process_once(capture: Capture, supplied: UserInput, config: Config, out: Pat
 
     Raises InputError: as `process`.
     """
-    keys = path(capture, supplied, config, DryRunCache(out)).keys
+    keys = path(capture, supplied, config, DryRunCache(out), Results).keys
     request = unchanged.request_of_run([_facts(capture, supplied, config), keys])
     if (finished := unchanged.find(out, request)) is not None:
         return finished.report
@@ -143,7 +144,7 @@ def decode_with_progress(capture: Capture, frame_read: Callable[[int, int], None
 def plan(capture: Capture, supplied: UserInput, config: Config, out: Path, force: str | None = None) -> dict[str, str]:
     """Dry run of `process`: whether each stage is cached, to compute, or on demand. Nothing is computed."""
     cache = DryRunCache(out, force)
-    path(capture, supplied, config, cache)
+    path(capture, supplied, config, cache, Results)
     return {**cache.states, ASSET: "on demand"}
 
 
@@ -167,15 +168,15 @@ def _write_assets(
     return [file for one in wanted for file in asset_export.write(out, about, one, source)]
 
 
-def reopen(out: str | Path, until: str = "surface") -> tuple[Results, dict[str, Any]]:
-    """Read the results of an earlier run up to a stage, without its photographs, and the facts in work/run.json.
+def reopen(out: str | Path, wanted: type[R]) -> tuple[R, dict[str, Any]]:
+    """Read the `wanted` results of an earlier run, without its photographs, and the facts in work/run.json.
 
     Raises StorageError: `out` has no stage cache, or the result of a stage is missing.
     """
     out = Path(out)
     about = result_folder.read_run(out)
     config = restore(Config, about, out / "work" / "run.json")
-    return path(None, UserInput(), config, ArchiveCache(out, until=until)), about
+    return path(None, UserInput(), config, ArchiveCache(out), wanted), about
 
 
 def show(out: Path, stages: Sequence[str]) -> list[Path]:
@@ -183,7 +184,7 @@ def show(out: Path, stages: Sequence[str]) -> list[Path]:
     for stage in stages:
         if stage not in STAGES:
             raise SettingError(f"{stage!r} is no stage; choose one of {', '.join(STAGES)}")
-    results, _ = reopen(out, max(stages, key=STAGES.index))
+    results, _ = reopen(out, kind_until(max(stages, key=STAGES.index)))
     drawn = []
     with result_folder.opened(out):
         for stage in stages:
@@ -192,13 +193,14 @@ def show(out: Path, stages: Sequence[str]) -> list[Path]:
     return drawn
 
 
-def _textures(out: Path, results: Results) -> pictures.Picture:
+def _textures(out: Path, results: FirstResults) -> pictures.Picture:
     """Picture of the textures of a finished result's asset. Raises StorageError: as `_report_of`."""
+    assert isinstance(results, Results)
     config = restore(Config, _report_of(out, results), out / "report.json")
     return pictures.textures(asset_export.read(out / "maps", config, results.mesh).whole(8, ()))
 
 
-def _report_of(out: Path, results: Results) -> dict[str, Any]:
+def _report_of(out: Path, results: FirstResults) -> dict[str, Any]:
     """The report.json of a finished result. Raises StorageError: it is not finished, or work/ is of another run."""
     about = report.read(out)
     if about["keys"] != {**about["keys"], **results.keys}:
@@ -208,7 +210,7 @@ def _report_of(out: Path, results: Results) -> dict[str, Any]:
 
 def animate(out: Path, motion: animation.Motion) -> list[Path]:
     """Write an animation with a moving light or object; returns the paths of the WebP and, with FFmpeg, of the MP4."""
-    results, about = reopen(out)
+    results, about = reopen(out, Results)
     ior = float(about["settings"]["infer"]["ior"])
     turning = motion == "turntable"
     frames = animation.turntable(results.maps, results.mesh, ior) if turning else animation.light(results.maps, ior)
@@ -221,7 +223,7 @@ def judge_again(out: Path) -> dict[str, Any]:
 
     Raises StorageError: a stage's result is missing, or work/, maps/ and report.json are not of one run.
     """
-    results, facts = reopen(out)
+    results, facts = reopen(out, Results)
     with result_folder.locked(out):
         keys = _report_of(out, results)["keys"]
         config = restore(Config, facts, out / "work" / "run.json")

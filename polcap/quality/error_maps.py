@@ -16,6 +16,7 @@ from polcap.optics.outline import disc_radius
 from polcap.optics.resize import area_mean
 from polcap.quality import geometry
 from polcap.quality.gate import MOST_DEG, Evidence, Gate
+from polcap.results import ResultsUntilInfer
 from polcap.stage_values import SurfaceMaps
 
 _AROUND = 0.12  # 1σ over the object's radius: how far clipped pixels mislead the estimator
@@ -36,49 +37,49 @@ _ROUGHNESS = ((0.065, 0.045), (0.25, 0.0))  # constant, and times the roughness
 _ROUGHNESS_CLIPPED = (0.29, 0.3)  # factor and power of the clipped share: without highlights it is a guess
 
 
-def with_errors(found: Evidence, judged: Iterable[Gate]) -> SurfaceMaps:
+def with_errors(found: Evidence[ResultsUntilInfer], judged: Iterable[Gate]) -> SurfaceMaps:
     """The maps with the expected errors of normals, albedo and roughness, with the costs of all gates."""
     return replace(
-        found.maps,
+        found.results.maps,
         confidence=expected_normal_error(found, judged),
         diffuse_error=_diffuse_error(found),
         roughness_error=_roughness_error(found),
     )
 
 
-def expected_normal_error(found: Evidence, judged: Iterable[Gate]) -> Floats:
+def expected_normal_error(found: Evidence[ResultsUntilInfer], judged: Iterable[Gate]) -> Floats:
     """Expected error of the normals (H, W), degrees: root of the squares of the estimator's own and all costs."""
     places = {name: cost(found) for name, cost in _PLACES.items()}
     costs = ((gate.name, gate.cost_deg) for gate in judged if gate.name not in places)
     everywhere = sum((_UNSTATED.get(name, 1.0) * cost) ** 2 for name, cost in costs)
-    squares = found.maps.confidence**2 + everywhere + sum(cost**2 for cost in places.values())
-    return np.where(found.maps.mask, np.minimum(np.sqrt(squares), MOST_DEG), 0).astype(np.float32)
+    squares = found.results.maps.confidence**2 + everywhere + sum(cost**2 for cost in places.values())
+    return np.where(found.results.maps.mask, np.minimum(np.sqrt(squares), MOST_DEG), 0).astype(np.float32)
 
 
-def _of_clipping(found: Evidence) -> Floats:
+def _of_clipping(found: Evidence[ResultsUntilInfer]) -> Floats:
     """Cost (H, W) of clipped light, in degrees: normals look flat there, and bend towards it around."""
-    clipped, mask = _flagged(found, Quality.CLIPPED), found.maps.mask
+    clipped, mask = _flagged(found, Quality.CLIPPED), found.results.maps.mask
     if not clipped.any():
         return np.zeros(1)
     width = np.sqrt(clipped.sum() / mask.sum() / _CLIPPED_PART)
     return np.asarray(width * np.interp(_share_around(clipped, mask), _CLIPPED_AROUND, _CLIPPED_DEG))
 
 
-def _of_ghosts(found: Evidence) -> Floats:
+def _of_ghosts(found: Evidence[ResultsUntilInfer]) -> Floats:
     """Cost (H, W) of pixels that differ between the exposures of a shot, in degrees."""
     return _GHOST_DEG * _flagged(found, Quality.GHOST)
 
 
-def _of_focal_length(found: Evidence) -> Floats:
+def _of_focal_length(found: Evidence[ResultsUntilInfer]) -> Floats:
     """Cost (H, W) of an unknown focal length, in degrees: by how much it tilts the view ray."""
     if not any(found.focal_doubt):
         return np.zeros(1)
-    return geometry.lean(found.maps, *found.focal_doubt)
+    return geometry.lean(found.results.maps, *found.focal_doubt)
 
 
-def _diffuse_error(found: Evidence) -> Floats:
+def _diffuse_error(found: Evidence[ResultsUntilInfer]) -> Floats:
     """1σ of the diffuse albedo (H, W), mean of the channels, if chart and object had the same light."""
-    maps, clipped = found.maps, _flagged(found, Quality.CLIPPED)
+    maps, clipped = found.results.maps, _flagged(found, Quality.CLIPPED)
     relative = _ALBEDO[_is_analytic(maps)] * np.sqrt(np.minimum(maps.confidence, _MOST_DEG))
     if clipped.any():
         hidden = _ALBEDO_CLIPPED * clipped.sum() / maps.mask.sum()
@@ -87,9 +88,9 @@ def _diffuse_error(found: Evidence) -> Floats:
     return np.where(maps.mask, np.minimum(error, 1), 0).astype(np.float32)
 
 
-def _roughness_error(found: Evidence) -> Floats:
+def _roughness_error(found: Evidence[ResultsUntilInfer]) -> Floats:
     """1σ of the roughness (H, W). Highlights that are clipped leave it unknown on the whole object."""
-    maps, clipped = found.maps, _flagged(found, Quality.CLIPPED)
+    maps, clipped = found.results.maps, _flagged(found, Quality.CLIPPED)
     constant, slope = _ROUGHNESS[_is_analytic(maps)]
     factor, power = _ROUGHNESS_CLIPPED
     hidden = factor * float(clipped.sum() / max(maps.mask.sum(), 1)) ** power
@@ -100,8 +101,8 @@ def _is_analytic(maps: SurfaceMaps) -> bool:
     return maps.estimator == "analytic"
 
 
-def _flagged(found: Evidence, bit: Quality) -> Bools:
-    return found.maps.mask & ((found.stokes.quality & np.uint8(bit)) > 0)
+def _flagged(found: Evidence[ResultsUntilInfer], bit: Quality) -> Bools:
+    return found.results.maps.mask & ((found.results.stokes.quality & np.uint8(bit)) > 0)
 
 
 def _share_around(chosen: Bools, inside: Bools) -> Floats:
@@ -113,7 +114,7 @@ def _share_around(chosen: Bools, inside: Bools) -> Floats:
     return np.asarray(cv2.resize(part / np.maximum(whole, 1e-6), inside.shape[::-1]))
 
 
-_PLACES: Mapping[str, Callable[[Evidence], Floats]] = {
+_PLACES: Mapping[str, Callable[[Evidence[ResultsUntilInfer]], Floats]] = {
     "clipping": _of_clipping,
     "stillness": _of_ghosts,
     "focal length": _of_focal_length,

@@ -16,6 +16,7 @@ from polcap.optics import outline
 from polcap.optics.frames import total
 from polcap.optics.resize import block_means
 from polcap.quality.gate import Evidence, Gate
+from polcap.results import ResultsUntilInfer
 from polcap.stage_values import StokesImage, SurfaceMaps
 
 _MOST_PIXELS = 1e4  # of the object; a larger picture is averaged down
@@ -53,9 +54,9 @@ class Flatness:
         return self.sharp_edged and self.aligned > _ALIGNED and one_plane
 
 
-def judge(found: Evidence) -> Iterator[Gate]:
+def judge(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
     """Gates "flat" and "contour": whether the object is one plane, and whether its outline is an occluding contour."""
-    seen = measure(found.stokes, found.maps)
+    seen = measure(found.results.stokes, found.results.maps)
     if seen is None:
         yield Gate("flat", "not measured", None, _ONE_PLANE, "The object is too small")
         return
@@ -64,7 +65,7 @@ def judge(found: Evidence) -> Iterator[Gate]:
             "The object is flat: a surface that faces camera and flash is hardly polarized, so one picture shows "
             "neither its relief nor its gloss"
         )
-        if found.radiance.crossed is not None:
+        if found.results.radiance.crossed is not None:
             message += "; the cross-polarized shot shows its color without highlights"
         remedy = (
             "Photograph it from five to nine sides for `polcap material`, which measures both; a single picture "

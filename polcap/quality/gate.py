@@ -1,14 +1,14 @@
 """Defines a quality gate, and the evidence (results and measurements) that gates judge."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Generic, Literal, TypeGuard, TypeVar
 
 import msgspec
 import numpy as np
 
 from polcap.errors import InputError
 from polcap.images import Bools, Floats, Quality
-from polcap.results import FIELDS, Results
+from polcap.results import FirstResults, ResultsUntilHdr
 from polcap.stage_values import AngleStack
 from polcap.stages.align import AlignSettings
 
@@ -16,6 +16,8 @@ State = Literal["pass", "warn", "fail", "not measured", "not judged"]  # not jud
 Unit = Literal["1", "px", "°", "×", "ΔE2000", ""]
 
 MOST_DEG = 90.0  # of an error: normals face the camera
+R = TypeVar("R", bound=FirstResults, covariant=True)
+H = TypeVar("H", bound=ResultsUntilHdr)
 _ALIGN = AlignSettings()
 _ERROR_COST_DEG = 45.0  # of a stage that gives up: nothing is known of the normals
 DEGREES_PER_GAIN = 600.0  # 1 % of a shot's light tilts facing pixels by about 6° (error budget)
@@ -44,15 +46,16 @@ class Gate(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Evidence(Results):
+class Evidence(Generic[R]):
     """Everything that the gates judge: the stages' results, and measurements made before `check` reduces the pictures.
 
-    If the path stopped early, later results are missing, as in `Results`. Without a mesh there is no mesh gate.
+    A gate states in its type which results it needs. It does not run if the path ended before these.
     """
 
+    results: R
     names: list[str]  # (K,) of the shots
     focal_doubt: tuple[float, float]  # ln of the least and of the greatest possible focal length over the assumed one
-    clipped: Floats  # (K, E, H, W) share of each pixel that is clipped
+    clipped: Floats | Bools  # (K, E, H, W) share of each pixel that is clipped
     blur_px: Floats  # (K, E) beyond the sharpest frame of the same exposure, 1σ [visible RAW px]
     align: AlignSettings = _ALIGN  # the gate of the alignment has the limits of the stage
     files: tuple[tuple[str, ...], ...] = ()  # (K, E) photographs, as the user finds them in the capture's folder
@@ -60,21 +63,22 @@ class Evidence(Results):
     chart_missing: str = ""  # the reason, where a chart was expected and none was found
     later_view: bool = False  # of a session whose first view shows the chart
 
-    def has(self, stage: str) -> bool:
-        """Whether the path reached this stage."""
-        return FIELDS[stage] in vars(self)
+
+def reaches(found: Evidence[Any], results: type[R]) -> TypeGuard[Evidence[R]]:
+    """Whether the path has reached these results."""
+    return isinstance(found.results, results)
 
 
 def full_size(
-    results: Results,
+    results: H,
     focal_doubt: tuple[float, float],
     align: AlignSettings = _ALIGN,
     files: tuple[tuple[str, ...], ...] = (),
-) -> Evidence:
+) -> Evidence[H]:
     """Evidence of a run of `process`; clipping is that of the merged picture of each shot, not of every exposure."""
     radiance = results.radiance
-    return Evidence.partial(
-        **vars(results),
+    return Evidence(
+        results,
         names=shot_names(radiance),
         focal_doubt=focal_doubt,
         clipped=((radiance.quality & int(Quality.CLIPPED)) > 0)[:, None],

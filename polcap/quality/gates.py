@@ -10,31 +10,44 @@ remedy, because its figure shows the same cause again.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from polcap.quality import error_maps, flatness, geometry, light, polarization, rerendering, shot_exposure
-from polcap.quality.gate import MOST_DEG, Evidence, Gate, State
+from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, reaches
 from polcap.quality.limits import GateLimits
+from polcap.results import (
+    FirstResults,
+    Results,
+    ResultsUntilAlign,
+    ResultsUntilHdr,
+    ResultsUntilInfer,
+    ResultsUntilMask,
+    ResultsUntilSelfcal,
+    ResultsUntilStokes,
+    ResultsUntilWhitebalance,
+)
 
+R = TypeVar("R", bound=FirstResults)
 _LARGE_PART = 0.45  # of the expected error: the message names the gates that cost more
 
 _Judged = Gate | Iterable[Gate]
 
 
 @dataclass(frozen=True)
-class Step:
+class Step(Generic[R]):
     """Gates that one function judges, with their place in the picture of causes."""
 
     gates: tuple[str, ...]
-    judge: Callable[[Evidence, GateLimits], _Judged]
-    stage: str  # the last stage whose result is judged
+    judge: Callable[[Evidence[R], GateLimits], _Judged]
+    results: type[R]  # without these, there is nothing to judge yet
     after: tuple[str, ...] = ()  # gates whose failure leaves nothing to judge here
     explained_by: tuple[str, ...] = ()  # gates whose warning explains what would be found here, too
     needs: tuple[str, ...] = ()  # gates without whose measurement there is nothing to judge here
 
 
-def _without_limits(judge: Callable[[Evidence], _Judged]) -> Callable[[Evidence, GateLimits], _Judged]:
+def _without_limits(judge: Callable[[Evidence[R]], _Judged]) -> Callable[[Evidence[R], GateLimits], _Judged]:
     return lambda found, _limits: judge(found)
 
 
@@ -43,52 +56,54 @@ _LIT = ("clipping", "noise")  # no shot is measured
 _PAIRED = (*_LIT, "sharpness", "alignment")  # the shots cannot be compared
 _EVEN = (*_PAIRED, "stillness", "gains", "energy")  # the light of the shots is not known
 _POLARIZED = (*_EVEN, "angles", "polarized", "order")  # the Stokes parameters are wrong
+_ONE_LIGHT = (*_POLARIZED, "other light")  # the light is not the flash alone
 _SHAPED = (*_POLARIZED, "mask", "body", "other light", "lighting")  # the normals are wrong
 _ROUND: dict[str, tuple[str, ...]] = {"explained_by": ("flat",), "needs": ("contour",)}  # of a rounded object
 
 _STEPS = (
-    Step(("source",), _without_limits(shot_exposure.source), "hdr"),
-    Step(("exposures",), _without_limits(shot_exposure.exposures), "hdr"),
-    Step(("clipping",), shot_exposure.clipping, "hdr"),
-    Step(("tone curve",), shot_exposure.tone, "selfcal", ("clipping",)),
-    Step(("black level",), shot_exposure.black_level, "hdr", ("clipping",)),
-    Step(("noise",), shot_exposure.noise, "stokes", ("clipping",)),
-    Step(("sharpness",), geometry.sharpness, "hdr", _LIT),
-    Step(("alignment",), geometry.alignment, "align", (*_LIT, "sharpness")),
-    Step(("chart",), light.chart, "whitebalance", ("clipping",)),
-    Step(("mask",), geometry.mask, "mask", ("clipping", "alignment")),
-    Step(("stillness",), shot_exposure.stillness, "mask", (*_FILES, *_PAIRED), ("black level",)),
-    Step(("focus",), geometry.focus, "mask", _PAIRED),
-    Step(("gains", "gain doubt", "energy"), shot_exposure.gains, "selfcal", (*_PAIRED, "stillness")),
-    Step(("angles",), polarization.turned_shot, "selfcal", _EVEN),
-    Step(("flat", "contour"), _without_limits(flatness.judge), "infer", _EVEN),
-    Step(("polarized",), _without_limits(polarization.polarized), "infer", _EVEN, ("flat",)),
-    Step(("order",), _without_limits(polarization.order), "selfcal", (*_EVEN, "polarized"), **_ROUND),
-    Step(("angles", "body", "other light"), polarization.of_outline, "infer", _POLARIZED, **_ROUND),
-    Step(("ambient",), light.ambient, "hdr"),
-    Step(("room light",), light.room_light, "infer", (*_POLARIZED, "other light"), ("sharpness",)),
-    Step(("lighting",), light.side_light, "infer", (*_POLARIZED, "other light"), ("flat", "sharpness"), ("contour",)),
-    Step(("crossed",), light.crossed, "stokes", _PAIRED),
-    Step(("ill-posed",), polarization.ill_posed, "stokes", (*_POLARIZED, "other light", "lighting"), ("sharpness",)),
-    Step(("re-rendering",), rerendering.rerendering, "infer", _SHAPED, ("flat",)),
-    Step(("outline",), geometry.inward_outline, "infer", (*_SHAPED, "re-rendering"), ("flat",)),
-    Step(("albedo scale",), light.albedo_scale, "infer", ("clipping", "chart")),
-    Step(("focal length",), _without_limits(geometry.focal_length), "infer"),
+    Step(("source",), _without_limits(shot_exposure.source), ResultsUntilHdr),
+    Step(("exposures",), _without_limits(shot_exposure.exposures), ResultsUntilHdr),
+    Step(("clipping",), shot_exposure.clipping, ResultsUntilHdr),
+    Step(("tone curve",), shot_exposure.tone, ResultsUntilSelfcal, ("clipping",)),
+    Step(("black level",), shot_exposure.black_level, ResultsUntilHdr, ("clipping",)),
+    Step(("noise",), shot_exposure.noise, ResultsUntilStokes, ("clipping",)),
+    Step(("sharpness",), geometry.sharpness, ResultsUntilHdr, _LIT),
+    Step(("alignment",), geometry.alignment, ResultsUntilAlign, (*_LIT, "sharpness")),
+    Step(("chart",), light.chart, ResultsUntilWhitebalance, ("clipping",)),
+    Step(("mask",), geometry.mask, ResultsUntilMask, ("clipping", "alignment")),
+    Step(("stillness",), shot_exposure.stillness, ResultsUntilMask, (*_FILES, *_PAIRED), ("black level",)),
+    Step(("focus",), geometry.focus, ResultsUntilMask, _PAIRED),
+    Step(("gains", "gain doubt", "energy"), shot_exposure.gains, ResultsUntilSelfcal, (*_PAIRED, "stillness")),
+    Step(("angles",), polarization.turned_shot, ResultsUntilSelfcal, _EVEN),
+    Step(("flat", "contour"), _without_limits(flatness.judge), ResultsUntilInfer, _EVEN),
+    Step(("polarized",), _without_limits(polarization.polarized), ResultsUntilInfer, _EVEN, ("flat",)),
+    Step(("order",), _without_limits(polarization.order), ResultsUntilSelfcal, (*_EVEN, "polarized"), **_ROUND),
+    Step(("angles", "body", "other light"), polarization.of_outline, ResultsUntilInfer, _POLARIZED, **_ROUND),
+    Step(("ambient",), light.ambient, ResultsUntilHdr),
+    Step(("room light",), light.room_light, ResultsUntilInfer, _ONE_LIGHT, ("sharpness",)),
+    Step(("lighting",), light.side_light, ResultsUntilInfer, _ONE_LIGHT, ("flat", "sharpness"), ("contour",)),
+    Step(("crossed",), light.crossed, ResultsUntilStokes, _PAIRED),
+    Step(("ill-posed",), polarization.ill_posed, ResultsUntilStokes, (*_ONE_LIGHT, "lighting"), ("sharpness",)),
+    Step(("re-rendering",), rerendering.rerendering, ResultsUntilInfer, _SHAPED, ("flat",)),
+    Step(("outline",), geometry.inward_outline, ResultsUntilInfer, (*_SHAPED, "re-rendering"), ("flat",)),
+    Step(("albedo scale",), light.albedo_scale, ResultsUntilInfer, ("clipping", "chart")),
+    Step(("focal length",), _without_limits(geometry.focal_length), ResultsUntilInfer),
 )
 
 
-def judge(found: Evidence, limits: GateLimits, failure: Gate | None = None) -> list[Gate]:
+def judge(found: Evidence[FirstResults], limits: GateLimits, failure: Gate | None = None) -> list[Gate]:
     """Judge a capture by all quality gates, in the order of the path.
 
     `failure` is the gate of the error that ended the path before a stage that gates judge.
     """
     judged: list[Gate] = []
     unreached: list[str] = []
-    for step in _STEPS:
+    steps: Iterable[Step[Any]] = _STEPS
+    for step in steps:
         if (cause := _cause(step, judged)) is not None:
             known = {gate.name for gate in judged}
             judged += [_not_judged(name, cause) for name in step.gates if name not in known]
-        elif found.has(step.stage):
+        elif reaches(found, step.results):
             gates = step.judge(found, limits)
             judged += [gates] if isinstance(gates, Gate) else gates
         else:
@@ -100,14 +115,14 @@ def judge(found: Evidence, limits: GateLimits, failure: Gate | None = None) -> l
             judged, cause = [*(gate for gate in judged if gate.name != failure.name), failure], failure.name
         known = {gate.name for gate in judged}
         judged += [_not_judged(name, cause) for name in dict.fromkeys(unreached) if name not in known]
-    if not any(gate.name == "order" and gate.state == "fail" for gate in judged) and found.has("infer"):
+    if not any(gate.name == "order" and gate.state == "fail" for gate in judged) and reaches(found, ResultsUntilInfer):
         judged.append(_normal_error(found, judged, limits))
-        if found.has("surface"):
-            judged.append(geometry.mesh(found.mesh, limits))
+        if reaches(found, Results):
+            judged.append(geometry.mesh(found.results.mesh, limits))
     return judged
 
 
-def _cause(step: Step, judged: Sequence[Gate]) -> str | None:
+def _cause(step: Step[Any], judged: Sequence[Gate]) -> str | None:
     """Name of the first judged gate that explains what this step would find, if any."""
     for gate in judged:
         if gate.name in {"fail": step.after, "warn": step.explained_by, "not measured": step.needs}.get(gate.state, ()):
@@ -125,7 +140,7 @@ def verdict(gates: Iterable[Gate]) -> State:
     return "fail" if "fail" in states else "warn" if "warn" in states else "pass"
 
 
-def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Gate:
+def _normal_error(found: Evidence[ResultsUntilInfer], judged: list[Gate], limits: GateLimits) -> Gate:
     """Gate on the median expected error of the normals, with all gates' costs."""
     expected, limit = _median_error(found, judged), limits.max_normal_error_deg
     because = ", ".join(gate.name for gate in judged if gate.cost_deg > _LARGE_PART * expected)
@@ -144,7 +159,7 @@ def _normal_error(found: Evidence, judged: list[Gate], limits: GateLimits) -> Ga
     return Gate("normal error", "warn" if flat else "fail", round(expected, 2), limit, message, remedy, unit="°")
 
 
-def _median_error(found: Evidence, judged: list[Gate]) -> float:
+def _median_error(found: Evidence[ResultsUntilInfer], judged: list[Gate]) -> float:
     """Median expected normal error [degrees], with all gates' costs."""
-    inside = error_maps.expected_normal_error(found, judged)[found.maps.mask]
+    inside = error_maps.expected_normal_error(found, judged)[found.results.maps.mask]
     return float(np.median(inside)) if inside.size else float("nan")

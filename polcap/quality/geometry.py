@@ -17,9 +17,10 @@ from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean
 from polcap.optics.sharpness import TILE
 from polcap.quality import object_turn, rerendering, rim, shot_exposure
-from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, Unit, at_most, bad_shots, worded
+from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, Unit, at_most, bad_shots, reaches, worded
 from polcap.quality.limits import GateLimits
-from polcap.stage_values import SurfaceMaps
+from polcap.results import ResultsUntilAlign, ResultsUntilHdr, ResultsUntilInfer, ResultsUntilMask, ResultsUntilStokes
+from polcap.stage_values import StokesImage, SurfaceMaps
 from polcap.stages.align import object_motion
 from polcap.stages.whitebalance import chart_in_mask
 
@@ -43,30 +44,31 @@ _INWARD = 0.2  # sine of the zenith from which a normal leans inward
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
 
 
-def alignment(found: Evidence, limits: GateLimits) -> Gate:
+def alignment(found: Evidence[ResultsUntilAlign], limits: GateLimits) -> Gate:
     """Gate on movement between shots: of the camera, of the object against its surroundings, and turns of the object.
 
     The object is judged only if the camera passes. The first that does not pass is the gate. Shots of two objects, or
     of an object that something covers, contradict each other: more than all light would be polarized.
     """
     camera = _judge_camera(found, limits)
-    if found.has("stokes") and (share := _contradiction(found)) > _MOST_CONTRADICTION:
+    if reaches(found, ResultsUntilStokes) and (share := _contradiction(found.results.stokes)) > _MOST_CONTRADICTION:
         return _one_object(found, share)
     blurred = np.nan_to_num(found.blur_px).max() > limits.max_blur_px  # looks like motion of the object
-    if camera.state != "pass" or not found.has("mask") or blurred:
+    if camera.state != "pass" or not reaches(found, ResultsUntilMask) or blurred:
         return camera
     shift, turn = _judge_shift(found, limits), _judge_turn(found, limits)
     worst = next((gate for gate in (shift, turn) if gate.state != "pass"), camera)
     return msgspec.structs.replace(worst, cost_deg=float(np.hypot(shift.cost_deg, turn.cost_deg)))
 
 
-def _judge_camera(found: Evidence, limits: GateLimits) -> Gate:
+def _judge_camera(found: Evidence[ResultsUntilAlign], limits: GateLimits) -> Gate:
     """Gate on the movement of each shot, on its 1σ error and on the correlation of its detail with the first shot's."""
-    measured, names, correlation, align = found.alignment, found.names, found.alignment.correlation, found.align
-    height, width = found.radiance.value.shape[1:3]
+    measured, names, align = found.results.alignment, found.names, found.align
+    height, width = found.results.radiance.value.shape[1:3]
     corners = picture_corners(width, height)
     moved = np.stack([transform_points(matrix, corners) for matrix in measured.transform])  # (K, 4, 2)
     shift, doubt = np.abs(moved - corners).max((1, 2)) * found.grid_px, measured.residual_px * found.grid_px
+    correlation = measured.correlation
     most, most_doubt = align.max_shift_px, limits.max_align_residual_px * max(found.grid_px, 1)
     far, unlike, unsure = ~(shift <= most), correlation < align.min_correlation, doubt > most_doubt
     bad = far | unlike | unsure
@@ -86,26 +88,25 @@ def _judge_camera(found: Evidence, limits: GateLimits) -> Gate:
     return failed(round(float(doubt[k]), 3), most_doubt, message, remedy=remedy)
 
 
-def _another_scene(found: Evidence, unlike: Bools) -> Gate:
+def _another_scene(found: Evidence[ResultsUntilAlign], unlike: Bools) -> Gate:
     """Gate on shots (K,) that share no detail with the first one; if no shot does, the first is the odd one."""
     odd, least = _odd(unlike), found.align.min_correlation
     names = bad_shots(found.names, odd)
     message = f"The {' and '.join(names)} shot shows another scene than the others, or the camera moved far"
-    value = round(float(found.alignment.correlation[unlike].min()), 3)
+    value = round(float(found.results.alignment.correlation[unlike].min()), 3)
     return Gate("alignment", "fail", value, least, message, _check_files(found, odd), MOST_DEG, names, unit="")
 
 
-def _contradiction(found: Evidence) -> float:
+def _contradiction(image: StokesImage) -> float:
     """Share of the object where the shots would need more polarized light than there is light."""
-    image = found.stokes
     s0, s1, s2 = (cv2.blur(np.ascontiguousarray(part, np.float32), (5, 5)) for part in frames.total(image.stokes))
     inside = image.mask & (image.quality & int(Quality.CLIPPED | Quality.OUTSIDE) == 0)
     return float((np.hypot(s1, s2) > s0)[inside].mean()) if inside.any() else 0.0
 
 
-def _one_object(found: Evidence, share: float) -> Gate:
+def _one_object(found: Evidence[ResultsUntilMask], share: float) -> Gate:
     """Gate on shots that contradict each other: the odd one is that which resembles the others least."""
-    light = np.log(np.maximum(frames.total(found.radiance.value), 1e-6))[:, found.object_.mask]
+    light = np.log(np.maximum(frames.total(found.results.radiance.value), 1e-6))[:, found.results.object_.mask]
     with np.errstate(divide="ignore", invalid="ignore"):  # an even shot
         alike = np.nan_to_num(np.corrcoef(light)).sum(0)
     odd = np.arange(len(alike)) == int(np.argmin(alike))
@@ -120,20 +121,20 @@ def _odd(unlike: Bools) -> Bools:
     return ~unlike if unlike[1:].all() else unlike
 
 
-def _check_files(found: Evidence, odd: Bools) -> str:
+def _check_files(found: Evidence[ResultsUntilHdr], odd: Bools) -> str:
     """Advice for shots (K,) that may be of another object."""
     folders = sorted({str(PurePath(files[0]).parent) for files, one in zip(found.files, odd) if one} - {"."})
     where = f" in {', '.join(folders)}" if folders else ""
     return f"Check the files of that shot{where}: are they of this object? Otherwise take the shot again"
 
 
-def _judge_shift(found: Evidence, limits: GateLimits) -> Gate:
+def _judge_shift(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     """Gate on a shift of the object against its surroundings, beyond its error.
 
     It warns from a share of the object's radius on, and fails beyond a limit in px.
     """
     names, measured, limit = found.names, _measure_shift(found), limits.max_object_shift_px
-    radius = max(outline.disc_radius(found.object_.mask) * found.grid_px, 1.0)
+    radius = max(outline.disc_radius(found.results.object_.mask) * found.grid_px, 1.0)
     length = np.nan_to_num(measured.length, posinf=np.inf) * found.grid_px
     sigma = measured.sigma * found.grid_px
     sure = length - _SIGMAS * sigma
@@ -157,7 +158,7 @@ def _judge_shift(found: Evidence, limits: GateLimits) -> Gate:
     return Gate("alignment", "pass", figure, limit, message, cost_deg=cost, unit="px")
 
 
-def _judge_turn(found: Evidence, limits: GateLimits) -> Gate:
+def _judge_turn(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     """Gate on a turn of the object between shots, beyond twice its error."""
     measured, names, limit = _measure_turn(found, limits), found.names, limits.max_object_turn_deg
     least = measured.degrees - 2 * np.hypot(measured.sigma, _FALSE_TURN_DEG)
@@ -172,23 +173,24 @@ def _judge_turn(found: Evidence, limits: GateLimits) -> Gate:
     return Gate("alignment", "warn", figure, limit, message, _HOLD_STILL, cost, bad_shots(names, least > limit), "°")
 
 
-def _measure_shift(found: Evidence) -> object_motion.ObjectShift:
-    return object_motion.measure(found.radiance, found.alignment, found.object_)
+def _measure_shift(found: Evidence[ResultsUntilMask]) -> object_motion.ObjectShift:
+    results = found.results
+    return object_motion.measure(results.radiance, results.alignment, results.object_)
 
 
-def _measure_turn(found: Evidence, limits: GateLimits) -> object_turn.ObjectTurn:
+def _measure_turn(found: Evidence[ResultsUntilMask], limits: GateLimits) -> object_turn.ObjectTurn:
     """Turn of the object, by the depth of the maps only if these explain the photographs."""
-    maps = found.maps if found.has("infer") else None
-    if maps is not None and not rerendering.explains(rerendering.measure(found), limits):
-        maps = None
-    return object_turn.measure(found.radiance, found.alignment, found.object_, maps)
+    results, maps = found.results, None
+    if isinstance(results, ResultsUntilInfer) and rerendering.explains(rerendering.measure(results), limits):
+        maps = results.maps
+    return object_turn.measure(results.radiance, results.alignment, results.object_, maps)
 
 
-def mask(found: Evidence, limits: GateLimits) -> Gate:
+def mask(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     """Gate on the object's mask: a chart inside, uncertain pixels, contact with the picture's border, parts, holes."""
-    object_, limit, doubt = found.object_, limits.max_mask_doubt, found.object_.doubt
+    object_, limit, doubt = found.results.object_, limits.max_mask_doubt, found.results.object_.doubt
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
-    charted = _chart_share(found) if found.color.place is None else 0.0
+    charted = _chart_share(found) if found.results.color.place is None else 0.0
     if charted:
         faults.append((f"{charted:.0%} of the object's mask looks like a color chart that was not found", charted, 0))
     doubted = doubt is not None and doubt > limit
@@ -220,8 +222,8 @@ def mask(found: Evidence, limits: GateLimits) -> Gate:
     return Gate("mask", state, round(value, 5), most, "; ".join(fault[0] for fault in faults), remedy, cost)
 
 
-def _chart_share(found: Evidence) -> float:
-    return float(chart_in_mask.share(found.radiance, found.object_.mask, shipped_data.colorchecker()))
+def _chart_share(found: Evidence[ResultsUntilMask]) -> float:
+    return float(chart_in_mask.share(found.results.radiance, found.results.object_.mask, shipped_data.colorchecker()))
 
 
 def mesh(surface: Mesh, limits: GateLimits) -> Gate:
@@ -256,7 +258,7 @@ def mesh(surface: Mesh, limits: GateLimits) -> Gate:
     return Gate("mesh", "pass", round(surface.cuts, 4), cuts, message + (where if surface.cut_px else "without a cut"))
 
 
-def sharpness(found: Evidence, limits: GateLimits) -> Gate:
+def sharpness(found: Evidence[ResultsUntilHdr], limits: GateLimits) -> Gate:
     """Gate on the blur of each frame relative to the sharpest frame of the same exposure.
 
     It fails if the reference frame of a shot is blurred, because ghosts take their light from it; others only warn.
@@ -264,7 +266,7 @@ def sharpness(found: Evidence, limits: GateLimits) -> Gate:
     blur, limit = found.blur_px, limits.max_blur_px
     if np.isnan(blur).all():
         return Gate("sharpness", "not measured", None, limit, "There is too little bright detail", unit="px")
-    if found.has("align") and not _show_one_place(found):
+    if reaches(found, ResultsUntilAlign) and not _show_one_place(found):
         return Gate("sharpness", "not measured", None, limit, "The shots show different places", unit="px")
     k, e = (int(i) for i in np.unravel_index(int(np.nanargmax(blur)), blur.shape))
     text = f"Frame {e + 1} of the {found.names[k]} shot is blurred by {{:.1f}} px more than the sharpest"
@@ -274,7 +276,7 @@ def sharpness(found: Evidence, limits: GateLimits) -> Gate:
     remedy = "Focus by hand and tape the ring, use a remote release, and take that shot again"
     if rescue := shot_exposure.leave_out(found, unsharp, limits):
         remedy = f"{rescue}; or take that shot again: focus by hand, tape the ring, use a remote release"
-    reference = np.abs(np.log(found.radiance.bracket.exposure_ratio.mean(2))).argmin(1)  # (K,)
+    reference = np.abs(np.log(found.results.radiance.bracket.exposure_ratio.mean(2))).argmin(1)  # (K,)
     worst = float(np.nan_to_num(blur)[np.arange(len(blur)), reference].max())
     cost = _DEGREES_PER_FRAME_BLUR_PX * max(worst - limit, 0.0)
     return at_most(
@@ -282,13 +284,13 @@ def sharpness(found: Evidence, limits: GateLimits) -> Gate:
     )
 
 
-def _show_one_place(found: Evidence) -> bool:
+def _show_one_place(found: Evidence[ResultsUntilAlign]) -> bool:
     """Whether the tiles of all shots show the same detail, sharp or not."""
-    moved = float(np.abs(found.alignment.transform[:, :2, 2]).max()) * found.grid_px
-    return moved <= TILE / 2 and bool((found.alignment.correlation >= found.align.min_correlation).all())
+    moved = float(np.abs(found.results.alignment.transform[:, :2, 2]).max()) * found.grid_px
+    return moved <= TILE / 2 and bool((found.results.alignment.correlation >= found.align.min_correlation).all())
 
 
-def focus(found: Evidence, limits: GateLimits) -> Gate:
+def focus(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     """Gate on focus: blur of the sharpest edges on the object and its outline, merged px."""
     blur, limit = _edge_blur(found), limits.max_edge_blur_px
     if found.grid_px > 1:
@@ -302,13 +304,13 @@ def focus(found: Evidence, limits: GateLimits) -> Gate:
     return msgspec.structs.replace(gate, cost_deg=round(_DEGREES_PER_BLUR_PX * excess, 1))
 
 
-def _edge_blur(found: Evidence) -> float:
+def _edge_blur(found: Evidence[ResultsUntilMask]) -> float:
     """Blur (1σ) of the object's sharpest edges [px]: a step of height h, blurred by σ, has the slope h/(σ√2π).
 
     Heights are ratios of light, so that the outline counts before a dark backdrop, however smooth the object is. Edges
     are the tenth of the object with most contrast within 7 px; the sharpest are the twentieth of these.
     """
-    light, mask = np.maximum(found.radiance.value[0].sum(-1), 0), found.object_.mask
+    light, mask = np.maximum(found.results.radiance.value[0].sum(-1), 0), found.results.object_.mask
     near = dilate(mask, 4)
     if not near.any():
         return float("nan")
@@ -321,12 +323,12 @@ def _edge_blur(found: Evidence) -> float:
     return float(1 / (np.sqrt(2 * np.pi) * max(float(sharpest), 1e-3)))
 
 
-def focal_length(found: Evidence) -> Gate:
+def focal_length(found: Evidence[ResultsUntilInfer]) -> Gate:
     """Gate on the focal length: an unknown or contradicted one tilts view rays and normals."""
     least, most = found.focal_doubt
     if not most - least:
         return Gate("focal length", "pass", "known", "known", "The focal length is known", unit="")
-    cost = _lean(found.maps, least, most)
+    cost = _lean(found.results.maps, least, most)
     times = np.exp(max(most, -least))
     message = f"The focal length is in doubt and may be wrong by a factor of {times:.1f}, which bends shape and depth"
     remedy = (
@@ -336,12 +338,12 @@ def focal_length(found: Evidence) -> Gate:
     return Gate("focal length", "warn", "in doubt", "known", message, remedy, round(cost, 1), unit="")
 
 
-def inward_outline(found: Evidence, limits: GateLimits) -> Gate:
+def inward_outline(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
     """Gate on inside-out shapes: share of the normals at the outline that point into the object.
 
     On a closed surface all of them point outwards.
     """
-    share = _inward_share(found.maps)
+    share = _inward_share(found.results.maps)
     text = "{:.0f} % of the normals at the outline point into the object"
     message = worded(100 * share, text, "All normals at the outline point outwards")
     if share > limits.max_inward_outline:

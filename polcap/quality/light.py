@@ -14,6 +14,13 @@ from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
 from polcap.quality.gate import Evidence, Gate, at_most, grade, worded
 from polcap.quality.limits import GateLimits
+from polcap.results import (
+    ResultsUntilHdr,
+    ResultsUntilInfer,
+    ResultsUntilSelfcal,
+    ResultsUntilStokes,
+    ResultsUntilWhitebalance,
+)
 from polcap.stage_values import StokesImage
 from polcap.stages.whitebalance import patches
 
@@ -35,9 +42,9 @@ _WITH_FRAME = 1.5  # size of a chart with its frame over the size of its patches
 _DEGREES_PER_ROOM_DOLP = 50.0  # of the normals: 1.3 to 2.6° at 5.5 % (docs/benchmarks/gates.md)
 
 
-def chart(found: Evidence, limits: GateLimits) -> Gate:
+def chart(found: Evidence[ResultsUntilWhitebalance], limits: GateLimits) -> Gate:
     """Gate on the chart: whether it was found, and the mean color error of its patches."""
-    limit = limits.max_delta_e
+    limit, color = limits.max_delta_e, found.results.color
     if found.chart_missing and found.later_view:
         message = "This view shows no chart; `polcap fuse` takes the colors of the view that does"
         return Gate("chart", "not measured", None, limit, message, unit="ΔE2000")
@@ -48,27 +55,27 @@ def chart(found: Evidence, limits: GateLimits) -> Gate:
         )
         message = f"No chart was found ({found.chart_missing}); `polcap process` needs a chart or --no-chart"
         return Gate("chart", "warn", None, limit, message, remedy, unit="ΔE2000")
-    colors = found.color.patches
+    colors = color.patches
     if colors is None:
         return Gate("chart", "not measured", None, limit, "No chart was used", unit="ΔE2000")
     mean = float(np.nanmean(colors.delta_e))
-    where = "" if found.color.place else " in the capture that shows it"
+    where = "" if color.place else " in the capture that shows it"
     message = f"Chart colors match within ΔE {mean:.1f}{where}"
     if colors.predicted is not None:
         message += f" ({float(np.nanmean(colors.predicted)):.1f} when cross-checked)"
     if colors.use is not None and colors.use.any():
         message += f"; {patches.left_out(colors.use)}"
-    if found.color.light is not None and found.color.light.tilt > _TURNED:
-        message += f"; it is turned by {np.degrees(found.color.light.tilt):.0f}° from the lens, which is corrected"
-    if found.radiance.sensor.lossy:
+    if color.light is not None and color.light.tilt > _TURNED:
+        message += f"; it is turned by {np.degrees(color.light.tilt):.0f}° from the lens, which is corrected"
+    if found.results.radiance.sensor.lossy:
         message += "; the pictures have 8 bits or a tone curve, which no color matrix can undo"
     remedy = "Light the chart as the object, without glare, or name its corners with --chart"
     return at_most("chart", mean, limit, message, remedy, unit="ΔE2000")
 
 
-def albedo_scale(found: Evidence, limits: GateLimits) -> Gate:
+def albedo_scale(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
     """Gate on the common scale of all albedos: its uncertainty; without a chart the scale is unknown."""
-    sigma, limit, source = found.maps.albedo_sigma, limits.max_scale_doubt, found.color.source
+    sigma, limit, source = found.results.maps.albedo_sigma, limits.max_scale_doubt, found.results.color.source
     if found.chart_missing and found.later_view:
         message = "The view that shows the chart gives the albedos of this view their scale"
         return Gate("albedo scale", "not measured", None, limit, message)
@@ -83,7 +90,7 @@ def albedo_scale(found: Evidence, limits: GateLimits) -> Gate:
     message = f"All albedos share an error of scale of {100 * sigma:.0f} % (1σ)"
     if sigma <= limit and not of_session:  # the pictures do not show the chart's distance
         message += ", if the chart was as far from the flash as the object: 10 % farther makes them 20 % too bright"
-    light = found.color.light
+    light = found.results.color.light
     if sigma > limit and light is not None and light.uneven > limit / 2:
         message += ": the chart is lit unevenly, by another lamp or through a lens that darkens the corners"
     elif sigma > limit:
@@ -91,17 +98,17 @@ def albedo_scale(found: Evidence, limits: GateLimits) -> Gate:
     return at_most("albedo scale", sigma, limit, message, remedy, beyond="warn")
 
 
-def crossed(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
+def crossed(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Iterator[Gate]:
     """Gates on the cross-polarized shot: it must be darker than S0, and not clipped where S0 is."""
-    if found.radiance.crossed is None:
+    if found.results.radiance.crossed is None:
         return
     limit = limits.max_crossed_misfit
     remedy = "Set the lens's filter to the stated angle and turn the flash's filter until the highlights vanish"
-    if found.stokes.body is None:
+    if found.results.stokes.body is None:
         message = "The brightness of the cross-polarized shot relative to the others is unknown; it is not used"
         yield Gate("crossed", "warn", None, limit, message, "Put a ColorChecker next to the object, or expose more")
         return
-    seen = _compare_crossed(found.stokes)
+    seen = _compare_crossed(found.results.stokes)
     share = 100 * seen.mirrored
     text = "{:.1f} % of the object's light is mirrored at its surface; it is removed from the albedo"
     message = worded(share, text, "No light is mirrored at the object's surface")
@@ -140,12 +147,12 @@ def _compare_crossed(image: StokesImage) -> CrossedFigures:
     return CrossedFigures(left, int(clipped.sum()), over, mirrored)
 
 
-def ambient(found: Evidence, limits: GateLimits) -> Gate:
+def ambient(found: Evidence[ResultsUntilHdr], limits: GateLimits) -> Gate:
     """Gate on the share of ambient light; it is measured only if frames without flash were taken.
 
     The object polarizes the room's light too. Only an ambient frame at the same angle contains the same light.
     """
-    bracket, limit = found.radiance.bracket, limits.max_ambient
+    bracket, limit = found.results.radiance.bracket, limits.max_ambient
     if not np.isfinite(bracket.ambient_share).any():
         return Gate("ambient", "not measured", None, limit, "No frame was taken without the flash")
     worst = float(np.nanmax(bracket.ambient_share))
@@ -161,7 +168,7 @@ def ambient(found: Evidence, limits: GateLimits) -> Gate:
     return msgspec.structs.replace(at_most("ambient", worst, limit, message, remedy), cost_deg=cost)
 
 
-def room_light(found: Evidence, limits: GateLimits) -> Gate:
+def room_light(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate:
     """Gate on the common polarization of the object's surroundings.
 
     A flash at the lens leaves them unpolarized, a window or a glossy lamp does not.
@@ -174,7 +181,7 @@ def room_light(found: Evidence, limits: GateLimits) -> Gate:
     return at_most("room light", share, limit, message, remedy, cost_deg=_DEGREES_PER_ROOM_DOLP * share, beyond="warn")
 
 
-def side_light(found: Evidence, limits: GateLimits) -> Gate:
+def side_light(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
     """Gate "lighting" on the common polarization of the brightest parts that face the camera, relative to albedo.
 
     Under a flash at the lens their polarization points in all directions, as their normals do. Two flashes or softboxes
@@ -194,14 +201,15 @@ def side_light(found: Evidence, limits: GateLimits) -> Gate:
     return msgspec.structs.replace(gate, cost_deg=round(cost, 1))
 
 
-def _highlight_dolp(found: Evidence) -> float:
+def _highlight_dolp(found: Evidence[ResultsUntilInfer]) -> float:
     """Common DoLP of the tenth of the surfaces that face the camera with most light over albedo.
 
     Highlights of lamps at the sides are there, too. NaN if too little of the object faces the camera, or if most of it
     leans the same way, as a cylinder: it shares a polarization under any light.
     """
-    maps, both = found.maps, found.maps.mask & found.cues.mask
-    both &= found.cues.quality & int(Quality.CLIPPED) == 0
+    maps, cues = found.results.maps, found.results.cues
+    both = maps.mask & cues.mask
+    both &= cues.quality & int(Quality.CLIPPED) == 0
     towards = both & (dot(maps.normal, rays(maps.view, *maps.mask.shape)) > _TOWARDS_CAMERA)
     if towards.sum() < max(_LEAST_TOWARDS * both.sum(), _LEAST_FACING):
         return float("nan")
@@ -209,25 +217,25 @@ def _highlight_dolp(found: Evidence) -> float:
     polarized = 1 - maps.normal[towards, 2] ** 2  # DoLP of small tilts, but for a factor
     if np.abs((polarized * np.exp(2j * azimuth)).mean()) > _ONE_WAY * polarized.mean():
         return float("nan")
-    light = found.cues.radiance[towards].sum(-1) / np.maximum(maps.diffuse[towards].sum(-1), _LEAST_ALBEDO)
+    light = cues.radiance[towards].sum(-1) / np.maximum(maps.diffuse[towards].sum(-1), _LEAST_ALBEDO)
     bright = light >= np.percentile(light, 90)
-    dolp = float(np.hypot(*np.median(found.cues.ratio[:, towards][:, bright], axis=1)))
+    dolp = float(np.hypot(*np.median(cues.ratio[:, towards][:, bright], axis=1)))
     return dolp if dolp <= 1 else float("nan")  # the shots contradict each other
 
 
-def _surroundings_dolp(found: Evidence) -> float:
+def _surroundings_dolp(found: Evidence[ResultsUntilSelfcal]) -> float:
     """Common DoLP of the surroundings, without object and chart: median of tiles; NaN for too few tiles."""
-    radiance = found.radiance
-    outside = (radiance.quality & int(Quality.CLIPPED) == 0).all(0) & ~found.object_.mask
-    if found.color.place is not None:
-        middle = found.color.place.corners.mean(0)
-        frame = middle + _WITH_FRAME * (found.color.place.corners - middle)
+    radiance = found.results.radiance
+    outside = (radiance.quality & int(Quality.CLIPPED) == 0).all(0) & ~found.results.object_.mask
+    if (place := found.results.color.place) is not None:
+        middle = place.corners.mean(0)
+        frame = middle + _WITH_FRAME * (place.corners - middle)
         outside &= cv2.fillConvexPoly(np.zeros(outside.shape, np.uint8), frame.astype(np.int32), 1) == 0
     clear = block_means(outside, _ROOM_TILE) > 0.999
     if clear.sum() < _LEAST_ROOM_TILES:
         return float("nan")
-    shots = zip(radiance.value, found.selfcal.gains.gain)
+    shots = zip(radiance.value, found.results.selfcal.gains.gain)
     light = [block_means(shot, _ROOM_TILE)[clear] @ (1 / gain) for shot, gain in shots]
-    s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(found.selfcal.angle), np.stack(light), rcond=None)[0]
+    s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(found.results.selfcal.angle), np.stack(light), rcond=None)[0]
     dolp = float(np.hypot(np.median(s1 / np.maximum(s0, 1e-9)), np.median(s2 / np.maximum(s0, 1e-9))))
     return dolp if dolp <= 1 else float("nan")  # the shots contradict each other

@@ -16,7 +16,8 @@ from polcap.optics.resize import block_means
 from polcap.quality import rim
 from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, at_most, sentence, worded
 from polcap.quality.limits import GateLimits
-from polcap.stage_values import OrderTest, StokesImage, SurfaceMaps
+from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilSelfcal, ResultsUntilStokes
+from polcap.stage_values import AngleStack, ObjectMask, OrderTest, OutlineCheck, StokesImage, SurfaceMaps
 
 _LEAST_RIM = 200  # pixels of outline, to estimate an angle
 _LEAST_DOLP = 0.01  # of the most polarized tenth of the outline; there the least index has ten times that
@@ -43,21 +44,27 @@ _LOOSE_FIT_DEG = 7.0  # 24° for shots in a wrong order, nothing for objects wit
 _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
-def order(found: Evidence) -> Gate:
+def order(found: Evidence[ResultsUntilSelfcal]) -> Gate:
     """Gate on the order and sense of the polarizer angles.
 
     The polarization along the outline decides, or the error that the network expects for this order and for others.
     """
-    outline, names, statement = found.selfcal.outline, found.names, found.radiance.equipment.angles
-    test = _test(found)
-    better = None
+    results = found.results
+    return order_of_shots(results.radiance, results.object_, results.selfcal.outline, _test(results), found.names)
+
+
+def order_of_shots(
+    radiance: AngleStack, object_: ObjectMask, outline: OutlineCheck, test: OrderTest | None, names: list[str]
+) -> Gate:
+    """Gate on the order of shots, by the polarization along the outline and the test of the network."""
+    statement, better = radiance.equipment.angles, None
     if not outline.as_stated:
         better, because = outline.best, "The outline fits"
-    elif test is not None and test.ratio < 1 / (_LIKELIER if found.object_.mask.sum() > _SMALL_PX else _LIKELIER_SMALL):
+    elif test is not None and test.ratio < 1 / (_LIKELIER if object_.mask.sum() > _SMALL_PX else _LIKELIER_SMALL):
         better, because = test.rival, f"The network expects {1 / test.ratio:.1f} times smaller errors for"
     if better is not None:
         message = f"{because} the order {_order_text(better, names)} rather than the stated one"
-        remedy = sentence(angle_advice.correct(statement, better, found.radiance.angle))
+        remedy = sentence(angle_advice.correct(statement, better, radiance.angle))
         remedy += "; or take the shots again in order" if statement.place != "cells" else ""
         return Gate("order", "fail", _order_text(better, names), "as stated", message, remedy, 45.0, unit="")
     message = f"The outline supports the stated order (fit {outline.concentration:.2f} of 1)"
@@ -72,9 +79,9 @@ def order(found: Evidence) -> Gate:
     return Gate("order", "pass", "as stated", "as stated", message, unit="")
 
 
-def _test(found: Evidence) -> OrderTest | None:
+def _test(results: ResultsUntilSelfcal) -> OrderTest | None:
     """Test of the order by the network; None without one."""
-    return found.maps.order if found.has("infer") else None
+    return results.maps.order if isinstance(results, ResultsUntilInfer) else None
 
 
 def _is_confirmed(test: OrderTest | None) -> TypeGuard[OrderTest]:
@@ -86,41 +93,41 @@ def _order_text(order: ShotOrder, names: list[str]) -> str:
     return ", ".join(names[i] for i in order.shots) + (", counted clockwise" if order.mirrored else "")
 
 
-def turned_shot(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
+def turned_shot(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Iterator[Gate]:
     """Gate "angles", only if the polarizer angle of one shot contradicts those of three or more other shots."""
-    turned, limit = found.selfcal.turned, limits.max_turn_deg
+    turned, limit = found.results.selfcal.turned, limits.max_turn_deg
     if not turned.shots or abs(np.degrees(turned.angle)) <= limit:
         return
     degrees, doubt = np.degrees([turned.angle, turned.sigma])
     shots = tuple(found.names[k] for k in turned.shots)
     which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])}, by as much or less)"
     message = f"{which} looks turned by {degrees:+.0f}° ± {doubt:.0f}°: the shots contradict each other"
-    remedy = sentence(angle_advice.retake(found.radiance.equipment.angles))
+    remedy = sentence(angle_advice.retake(found.results.radiance.equipment.angles))
     yield Gate("angles", "fail", round(float(degrees), 1), limit, message, remedy, abs(float(degrees)) / 2, shots, "°")
 
 
-def polarized(found: Evidence) -> Iterator[Gate]:
+def polarized(found: Evidence[ResultsUntilStokes]) -> Iterator[Gate]:
     """Gate "polarized", only if no part of the outline is polarized."""
     most = _most_dolp(found)
     if not most < _LEAST_DOLP:
         return
     message = f"No part of the outline is polarized by more than {100 * most:.1f} %"
     remedy = "Check that the polarizer was on and turned; metal and translucent objects (wax, milk) hardly polarize"
-    if found.radiance.equipment.angles.place == "cells":
+    if found.results.radiance.equipment.angles.place == "cells":
         remedy = "Use the sensor's frames as they are, without binning or scaling; metal and wax hardly polarize"
     yield Gate("polarized", "fail", round(most, 4), _LEAST_DOLP, message, remedy, _UNPOLARIZED_DEG)
 
 
-def _most_dolp(found: Evidence) -> float:
+def _most_dolp(found: Evidence[ResultsUntilStokes]) -> float:
     """DoLP of the most polarized tenth of the outline; NaN for a short outline."""
-    angle = found.selfcal.angle - found.selfcal.ring.correction
-    band = rim.sample(*_reduce(found.stokes, angle))
+    angle = found.results.selfcal.angle - found.results.selfcal.ring.correction
+    band = rim.sample(*_reduce(found.results.stokes, angle))
     return rim.summarize(band, angle).dolp_most if len(band.azimuth) >= _LEAST_RIM else float("nan")
 
 
-def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
+def of_outline(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Iterator[Gate]:
     """Gates on angles, material and other light, judged by the polarization along the object's outline."""
-    angle, limit = found.selfcal.angle - found.selfcal.ring.correction, limits.max_turn_deg
+    angle, limit = found.results.selfcal.angle - found.results.selfcal.ring.correction, limits.max_turn_deg
     seen = _outline(found, limit, angle)
     if seen is None:
         yield Gate("angles", "not measured", None, limit, "The outline is too short", unit="°")
@@ -128,17 +135,17 @@ def of_outline(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     body = seen.body
     if body.dolp > 1:
         message = "The shots contradict each other: they are not of one object under one light"
-        remedy = sentence(angle_advice.check(found.radiance.equipment.angles))
+        remedy = sentence(angle_advice.check(found.results.radiance.equipment.angles))
         yield Gate("body", "fail", None, None, message, remedy, MOST_DEG)
         return
     of_shots = _angles(seen.turn, body, angle, found, limits)
-    closed = found.object_.border <= limits.max_mask_border
+    closed = found.results.object_.border <= limits.max_mask_border
     if of_shots.state == "fail" and not closed:  # a part of an outline can fit a turned shot by chance
         of_shots = msgspec.structs.replace(of_shots, state="warn")
     yield _with_ring(of_shots, body, found, limits)
     yield _light_of_body(body, found, limits)
     side = seen.side
-    if found.radiance.equipment.light == "one exposure":
+    if found.results.radiance.equipment.light == "one exposure":
         yield Gate("other light", "pass", 0.0, limits.max_side_light, "All angles come from one exposure")
         return
     if body.concentration <= _CLEAR or not closed:
@@ -161,19 +168,19 @@ class OutlineFigures:
     side: Floats  # (K,) excess brightness of one side over the other in each shot
 
 
-def _outline(found: Evidence, limit_deg: float, angle: Floats) -> OutlineFigures | None:
+def _outline(found: Evidence[ResultsUntilStokes], limit_deg: float, angle: Floats) -> OutlineFigures | None:
     """Measure polarization and light along the outline, for polarizer angles (K,) rad; None for a short outline.
 
     Angle errors smaller than `limit_deg` are not fitted.
     """
-    band = rim.sample(*_reduce(found.stokes, angle))
+    band = rim.sample(*_reduce(found.results.stokes, angle))
     if len(band.azimuth) < _LEAST_RIM:
         return None
     turn = rim.fit_angle_error(band, angle, np.radians(limit_deg))
     return OutlineFigures(rim.summarize(band, angle), turn, rim.side_light(band))
 
 
-def ill_posed(found: Evidence, limits: GateLimits) -> Gate:
+def ill_posed(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Gate:
     """Gate on the share of the object with a polarization that no dielectric has."""
     share = _ill_posed(found)
     message = "No part looks like metal or a mirror reflection"
@@ -184,16 +191,22 @@ def ill_posed(found: Evidence, limits: GateLimits) -> Gate:
     return at_most("ill-posed", share, limits.max_ill_posed, message, remedy, cost_deg=30 * share, beyond=state)
 
 
-def _ill_posed(found: Evidence) -> float:
-    image = found.stokes
+def _ill_posed(found: Evidence[ResultsUntilStokes]) -> float:
+    image = found.results.stokes
     inside = image.quality[image.mask & (image.quality & int(Quality.CLIPPED) == 0)]
     return float(((inside & int(Quality.ILL_POSED)) > 0).mean()) if inside.size else 0.0
 
 
-def _angles(found: rim.AngleError, body: rim.RimFigures, angle: Floats, evidence: Evidence, limits: GateLimits) -> Gate:
+def _angles(
+    found: rim.AngleError,
+    body: rim.RimFigures,
+    angle: Floats,
+    evidence: Evidence[ResultsUntilSelfcal],
+    limits: GateLimits,
+) -> Gate:
     """Gate on polarizer angles: it fails if one shot or all shots have a wrong angle, beyond the estimate's error."""
-    limit, selfcal, names = limits.max_turn_deg, evidence.selfcal, evidence.names
-    statement = evidence.radiance.equipment.angles
+    limit, selfcal, names = limits.max_turn_deg, evidence.results.selfcal, evidence.names
+    statement = evidence.results.radiance.equipment.angles
     known = selfcal.gains.source in ("grey patches", "one exposure")
     common = -float(np.degrees(body.turned))  # an AoLP too small is an angle stated too small
     if (
@@ -224,13 +237,13 @@ def _angles(found: rim.AngleError, body: rim.RimFigures, angle: Floats, evidence
     return Gate("angles", state, round(degrees, 1), limit, message, remedy, cost, (names[found.shot],), "°")
 
 
-def _with_ring(gate: Gate, body: rim.RimFigures, found: Evidence, limits: GateLimits) -> Gate:
+def _with_ring(gate: Gate, body: rim.RimFigures, found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate:
     """Replace a passed gate of the angles by one on the zero error of the ring, common to all shots.
 
     The path corrects this error where it is certain. With three angles, one turned shot looks like a smaller turn of
     all, so the gate warns, if the polarization follows the outline.
     """
-    selfcal, statement = found.selfcal, found.radiance.equipment.angles
+    selfcal, statement = found.results.selfcal, found.results.radiance.equipment.angles
     if selfcal.found_sigma is not None and gate.state == "pass":
         doubt, ring = float(np.degrees(selfcal.found_sigma)), np.degrees(selfcal.angle) % 180
         message = f"The angles were estimated: {', '.join(f'{one:.1f}°' for one in ring)} (± {doubt:.1f}°)"
@@ -244,7 +257,7 @@ def _with_ring(gate: Gate, body: rim.RimFigures, found: Evidence, limits: GateLi
     applied = selfcal.ring.correction != 0
     noted = len(selfcal.angle) == 3 and abs(turn) > max(limits.max_ring_turn_deg, _SURE * doubt)
     noted = noted and body.concentration > _CLEAR and abs(turn) < 45  # above: reflections, see "body"
-    noted = noted and found.radiance.equipment.light != "one exposure"  # a sensor's angles are exact
+    noted = noted and found.results.radiance.equipment.light != "one exposure"  # a sensor's angles are exact
     if gate.state != "pass" or not (applied or noted):
         return gate
     message = f"The ring's zero was off by {turn:+.1f}° ± {doubt:.1f}°"
@@ -260,7 +273,7 @@ def _with_ring(gate: Gate, body: rim.RimFigures, found: Evidence, limits: GateLi
     return Gate("angles", "warn", value, limit if noted else limits.max_turn_deg, message, remedy, cost, unit="°")
 
 
-def _light_of_body(body: rim.RimFigures, found: Evidence, limits: GateLimits) -> Gate:
+def _light_of_body(body: rim.RimFigures, found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
     """Gate "body" on diffuse polarization: under a flash, a dielectric's outline is polarized across the contour.
 
     Rough and translucent objects both polarize little. The estimators account for roughness, so the shape of a rough
@@ -268,8 +281,8 @@ def _light_of_body(body: rim.RimFigures, found: Evidence, limits: GateLimits) ->
     """
     limit = limits.min_outline_dolp
     remedy = "Darken the room, keep the flash next to the lens, and photograph an ambient frame"
-    zenith, roughness, albedo = _medians(found.maps)
-    confirmed = _is_confirmed(_test(found))
+    zenith, roughness, albedo = _medians(found.results.maps)
+    confirmed = _is_confirmed(found.results.maps.order)
     if body.along < _ALONG and not (confirmed and albedo < _DARK):  # dark gloss reflects itself
         return _along_contour(body.along, albedo, f"{remedy}; {_across(found)}")
     flat, dimmed = zenith < limits.min_zenith_deg, body.brightness < _DIMMED
@@ -317,11 +330,11 @@ def _along_contour(along: float, albedo: float, remedy: str) -> Gate:
     return Gate("body", "fail", round(along, 2), _ALONG, message, remedy, _ALONG_DEG, unit="")
 
 
-def _across(found: Evidence) -> str:
+def _across(found: Evidence[ResultsUntilHdr]) -> str:
     """Advice for angles that are all off by 90°."""
-    statement = found.radiance.equipment.angles
+    statement = found.results.radiance.equipment.angles
     if statement.place == "cells":
-        return f"if the room was dark, {angle_advice.turn(statement, found.radiance.angle, np.pi / 2)}"
+        return f"if the room was dark, {angle_advice.turn(statement, found.results.radiance.angle, np.pi / 2)}"
     return "if the room was dark, the ring was upright at 0°: state the angles plus 90°"
 
 

@@ -13,6 +13,7 @@ from polcap.optics import frames, shade
 from polcap.optics.reduction import ObjectReduction
 from polcap.quality.gate import Evidence, Gate
 from polcap.quality.limits import GateLimits
+from polcap.results import ResultsUntilInfer
 from polcap.stage_values import Cues, SurfaceMaps
 from polcap.stages.cues import NOMINAL_IOR
 
@@ -133,9 +134,9 @@ def _agreement(measured: Floats, rendered: Floats) -> float:
     return float((least * cosine).sum() / most.sum()) if most.sum() > 0 else float("nan")
 
 
-def measure(found: Evidence) -> Rerendering:
+def measure(results: ResultsUntilInfer) -> Rerendering:
     """Render the maps again on few pixels, for the gate."""
-    return rerender(reduce(found.maps, found.cues, found.selfcal.angle, _JUDGED_PX), NOMINAL_IOR)
+    return rerender(reduce(results.maps, results.cues, results.selfcal.angle, _JUDGED_PX), NOMINAL_IOR)
 
 
 def explains(found: Rerendering, limits: GateLimits) -> bool:
@@ -144,9 +145,9 @@ def explains(found: Rerendering, limits: GateLimits) -> bool:
     return alike and abs(np.log(found.scale)) <= np.log(limits.max_rerendering_scale)
 
 
-def rerendering(found: Evidence, limits: GateLimits) -> Gate:
+def rerendering(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
     """Gate on the maps: whether they explain the polarization and the brightness of the photographs."""
-    seen = measure(found)
+    seen = measure(found.results)
     if not np.isfinite(seen.agreement):
         return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, "All light is clipped")
     value, limit = round(seen.agreement, 3), limits.min_rerendering_agreement

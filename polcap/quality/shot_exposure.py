@@ -6,8 +6,9 @@ import numpy as np
 
 from polcap.images import Bools, Floats, Quality
 from polcap.quality import flatness
-from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots, compared, worded
+from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots, compared, reaches, worded
 from polcap.quality.limits import GateLimits
+from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilMask, ResultsUntilSelfcal, ResultsUntilStokes
 from polcap.stage_values import AngleStack, StokesImage
 
 _EVEN_STEPS = (1.3, 20.0)  # from one exposure to the next: less is no bracket, more leaves a gap
@@ -23,9 +24,9 @@ _WHOLE = 0.5  # share of the object that moving parts do not reach in every shot
 _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light patches
 
 
-def exposures(found: Evidence) -> Gate:
+def exposures(found: Evidence[ResultsUntilHdr]) -> Gate:
     """Gate on the bracket: exposure steps measured in the pixels, compared with the camera's."""
-    radiance = found.radiance
+    radiance = found.results.radiance
     ratio = np.sort(radiance.bracket.exposure_ratio.mean((0, 2)))  # (E,)
     if len(ratio) == 1:
         remedy = "Shoot a bracket: it holds highlights and shadows at once"
@@ -55,9 +56,9 @@ def _promised_steps(radiance: AngleStack) -> float:
     return float((stated[1:] / stated[:-1]).min()) if np.isfinite(stated).all() and len(stated) > 1 else float("nan")
 
 
-def tone(found: Evidence, limits: GateLimits) -> Gate:
+def tone(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate:
     """Gate on linearity of the pixel values: a tone curve makes the ratio of two exposures depend on brightness."""
-    radiance = found.radiance
+    radiance = found.results.radiance
     limit = limits.max_tone_curvature
     curved = np.abs(radiance.bracket.curvature)
     within = float(np.nanmedian(np.nanmax(curved, axis=-1))) if np.isfinite(curved).any() else 0.0
@@ -65,8 +66,9 @@ def tone(found: Evidence, limits: GateLimits) -> Gate:
     power = _exposure_power(radiance)
     if radiance.equipment.light == "steady" and abs(power - 1) > worst:
         worst, reason = abs(power - 1), f"Exposures follow the stated ones to the power {power:.2f}, not 1"
-    slope, chart_light = found.selfcal.gains.grey_slope, found.color.light
-    evenly = found.color.place is not None and (chart_light is None or chart_light.uneven < limits.max_scale_doubt / 2)
+    slope, color = found.results.selfcal.gains.grey_slope, found.results.color
+    chart_light = color.light
+    evenly = color.place is not None and (chart_light is None or chart_light.uneven < limits.max_scale_doubt / 2)
     if evenly and np.isfinite(slope) and abs(slope - 1) / 2 > worst:  # glare flattens grays too
         worst = abs(slope - 1) / 2
         reason = f"The chart's grays follow their reflectance to the power {slope:.2f}, not 1"
@@ -85,18 +87,18 @@ def _exposure_power(radiance: AngleStack) -> float:
     return float(np.polyfit(stated, seen, 1)[0])
 
 
-def source(found: Evidence) -> Gate:
+def source(found: Evidence[ResultsUntilHdr]) -> Gate:
     """Gate on the kind of files: whether the pictures are the sensor's unprocessed counts."""
-    if not found.radiance.sensor.lossy:
+    if not found.results.radiance.sensor.lossy:
         return Gate("source", "pass", "linear counts", "linear counts", "The pictures are linear", unit="")
     message = "The pictures have 8 bits or a display encoding: rounding and tone curve add false polarization"
     remedy = "Shoot RAW"
     return Gate("source", "warn", "lossy", "linear counts", message, remedy, 5.0, unit="")
 
 
-def black_level(found: Evidence, limits: GateLimits) -> Gate:
+def black_level(found: Evidence[ResultsUntilHdr], limits: GateLimits) -> Gate:
     """Gate on the black level that the files state, by the exposures of the first bracket."""
-    bracket, limit = found.radiance.bracket, limits.max_black_error
+    bracket, limit = found.results.radiance.bracket, limits.max_black_error
     if bracket.exposure_ratio.shape[1] == 1:
         return Gate("black level", "not measured", None, limit, "One exposure per shot does not show it")
     error = float(max(bracket.black.error, key=abs))
@@ -107,17 +109,17 @@ def black_level(found: Evidence, limits: GateLimits) -> Gate:
     return at_most("black level", abs(error), limit, message, _levels_remedy(found), beyond="warn")
 
 
-def _levels_remedy(found: Evidence) -> str:
+def _levels_remedy(found: Evidence[ResultsUntilHdr]) -> str:
     """Advice about wrong levels: only finished pictures take theirs from capture.toml."""
-    sensor = found.radiance.sensor
+    sensor = found.results.radiance.sensor
     if sensor.camera_matrix is None and sensor.white_balance is None:
         return "State `black`, `white` and `encoding` of these pictures in capture.toml, or shoot RAW"
     return "Use the camera's own RAW files: converted ones state wrong levels"
 
 
-def noise(found: Evidence, limits: GateLimits) -> Gate:
+def noise(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Gate:
     """Gate on noise: false polarization that noise causes in the object's median pixel."""
-    figure, limit = _noise(found.stokes), limits.max_dolp_noise
+    figure, limit = _noise(found.results.stokes), limits.max_dolp_noise
     message = worded(100 * figure, "Noise adds about {:.1f} % false polarization", "Noise adds no false polarization")
     remedy = "Use more light, a wider aperture, a longer exposure or more frames"
     return at_most("noise", figure, limit, message, remedy, cost_deg=300 * figure)
@@ -129,10 +131,11 @@ def _noise(image: StokesImage) -> float:
     return float(np.median(spread / light)) if len(light) else float("nan")
 
 
-def stillness(found: Evidence, limits: GateLimits) -> Gate:
+def stillness(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     """Gate on motion within a bracket: share of the object that differs between the exposures of a shot."""
-    ghost = (found.radiance.quality & int(Quality.GHOST)) > 0
-    fraction = ghost[:, found.object_.mask].mean(1) if found.object_.mask.any() else np.zeros(len(ghost))
+    ghost = (found.results.radiance.quality & int(Quality.GHOST)) > 0
+    mask = found.results.object_.mask
+    fraction = ghost[:, mask].mean(1) if mask.any() else np.zeros(len(ghost))
     k = int(np.argmax(fraction))
     text = f"{{:.2f}} % of the object differs between the exposures of the {found.names[k]} shot"
     message = worded(100 * float(fraction[k]), text, "The exposures of every shot show the same")
@@ -145,7 +148,7 @@ def stillness(found: Evidence, limits: GateLimits) -> Gate:
         return Gate("stillness", "not judged", None, None, "The gate 'sharpness' leaves nothing to judge here", unit="")
     if rescue := leave_out(found, np.asarray(blurred), limits):  # it shows something else, not less sharp
         remedy = f"{rescue}; or take the bracket again: a frame shows something else"
-    if _has_wrong_levels(found.radiance, fraction, limits):
+    if _has_wrong_levels(found.results.radiance, fraction, limits):
         message += ": their black level, white level or encoding is not as stated"
         remedy, bad = _levels_remedy(found), ()
     return at_most("stillness", float(fraction[k]), limits.max_ghost, message, remedy, bad, 5)
@@ -159,7 +162,7 @@ def _has_wrong_levels(radiance: AngleStack, ghost: Floats, limits: GateLimits) -
     return black or bool((ghost > _WHOLE).all() or ((ghost > _WHOLE) & curved).any())
 
 
-def leave_out(found: Evidence, bad: Bools, limits: GateLimits) -> str:
+def leave_out(found: Evidence[ResultsUntilHdr], bad: Bools, limits: GateLimits) -> str:
     """Advice to leave out the exposure of the bracket that has all bad frames (K, E); empty if there is none.
 
     The darkest exposure that remains must hold the object's highlights.
@@ -169,21 +172,23 @@ def leave_out(found: Evidence, bad: Bools, limits: GateLimits) -> str:
     if len(columns) != 1 or count < 2 or not found.files:
         return ""
     rest = [e for e in range(count) if e != columns[0]]
-    ratio = found.radiance.bracket.exposure_ratio  # (K, E, 3)
+    radiance = found.results.radiance
+    ratio = radiance.bracket.exposure_ratio  # (K, E, 3)
     darkest = min(rest, key=lambda e: float(ratio[:, e].mean()))
-    inside = found.object_.mask if found.has("mask") else np.ones(found.radiance.value.shape[1:3], bool)
-    full = (found.radiance.value[:, inside] * ratio[:, darkest, None]).max(2) > _FULL  # (K, N)
+    everywhere = np.ones(radiance.value.shape[1:3], bool)
+    inside = found.results.object_.mask if reaches(found, ResultsUntilMask) else everywhere
+    full = (radiance.value[:, inside] * ratio[:, darkest, None]).max(2) > _FULL  # (K, N)
     if full.mean(1).max() > limits.max_clipped:
         return ""
     names = ", ".join(files[columns[0]] for files in found.files)
     return f"Move {names} out of the folder: the same exposure of every shot, without which the others suffice"
 
 
-def clipping(found: Evidence, limits: GateLimits) -> Gate:
+def clipping(found: Evidence[ResultsUntilHdr], limits: GateLimits) -> Gate:
     """Gate on the share of the object that is clipped in the shortest exposure; of the picture without an object."""
-    known = found.has("mask")
-    where, limit = ("object", limits.max_clipped) if known else ("picture", _CLIPPED_PICTURE)
-    clipped = found.clipped[:, :, found.object_.mask] if known else found.clipped.reshape(*found.clipped.shape[:2], -1)
+    where, limit, clipped = "picture", _CLIPPED_PICTURE, found.clipped.reshape(*found.clipped.shape[:2], -1)
+    if known := reaches(found, ResultsUntilMask):
+        where, limit, clipped = "object", limits.max_clipped, found.clipped[:, :, found.results.object_.mask]
     shares = clipped.mean(2).min(1)  # (K,)
     share, few = float(shares.max()), min(_CLIPPED_HIGHLIGHTS, limits.max_clipped)
     name, stops = found.names[int(np.argmax(shares))], _stops_too_bright(share)
@@ -206,9 +211,9 @@ def _stops_too_bright(share: float) -> int:
     return int(np.ceil(_STOPS - _STOPS_PER_HALVING * np.log2(1 - min(share, _MOST_CLIPPED))))
 
 
-def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
+def gains(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Iterator[Gate]:
     """Gates on flash energy: shot against shot, uncertainty of that gain, frame against bracket."""
-    measured, radiance, names = found.selfcal.gains, found.radiance, found.names
+    measured, radiance, names = found.results.selfcal.gains, found.results.radiance, found.names
     shot = measured.gain.mean(1)
     light = shot[:, None] * radiance.bracket.exposure_ratio.mean(2)  # (K, E)
     off = light / np.median(light, axis=0) - 1
@@ -239,9 +244,9 @@ def gains(found: Evidence, limits: GateLimits) -> Iterator[Gate]:
     )
 
 
-def gain_doubt(found: Evidence, limits: GateLimits) -> Gate:
+def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate:
     """Gate on the uncertainty of the shots' gains."""
-    measured, limit = found.selfcal.gains, limits.max_gain_doubt
+    measured, limit = found.results.selfcal.gains, limits.max_gain_doubt
     if measured.source == "one exposure":
         return Gate("gain doubt", "pass", 0.0, limit, "All angles come from one exposure")
     doubt = float(measured.sigma.mean(1).max())
@@ -266,14 +271,16 @@ def gain_doubt(found: Evidence, limits: GateLimits) -> Gate:
         if measured.source == "none":
             message = f"The light of each shot is unknown; it is assumed equal within {100 * doubt:.1f} % (1σ)"
         remedy = "Put a ColorChecker next to the object"
-        remedy += "" if found.radiance.equipment.light == "steady" else ", or use a steady lamp"
+        remedy += "" if found.results.radiance.equipment.light == "steady" else ", or use a steady lamp"
         remedy += "" if len(found.names) > 3 else ", or shoot four angles"
     cost = DEGREES_PER_GAIN * doubt
     state: State = "fail" if cost > limits.max_normal_error_deg else "warn"
     return at_most("gain doubt", doubt, limit, message, remedy, cost_deg=cost, beyond=state)
 
 
-def _has_sharp_edges(found: Evidence) -> bool:
+def _has_sharp_edges(found: Evidence[ResultsUntilSelfcal]) -> bool:
     """Whether the object's outline is the edge of flat faces, whose polarization does not show the shots' light."""
-    seen = flatness.measure(found.stokes, found.maps) if found.has("infer") else None
+    if not reaches(found, ResultsUntilInfer):
+        return False
+    seen = flatness.measure(found.results.stokes, found.results.maps)
     return seen is not None and seen.sharp_edged

@@ -5,6 +5,7 @@ assumption. A gate that had nothing to measure is marked "not measured".
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -111,7 +112,7 @@ def judge(facts: Mapping[str, Any], results: Results, config: Config) -> tuple[l
     evidence = full_size(results, focal_doubt, config.align, files)
     judged = advise(gates.judge(evidence, config.gates))
     maps = error_maps.with_errors(evidence, judged)
-    return judged, Results.partial(**{**vars(results), "maps": maps})
+    return judged, replace(results, maps=maps)
 
 
 def document(

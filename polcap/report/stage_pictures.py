@@ -21,31 +21,31 @@ from polcap.optics.warp import warp
 from polcap.report import keys
 from polcap.report.sheets import WIDTH, Tile, sheet, write
 from polcap.report.sheets import Picture as Picture
-from polcap.results import Results
+from polcap.results import FirstResults, ResultsUntilHdr
 from polcap.stage_values import Alignment, AngleStack, Cues, Gains, ObjectMask, StokesImage, SurfaceMaps
 from polcap.stages.whitebalance import chart_search
 
 _RED = (230, 40, 30)
 
 
-def of_stage(results: Results, stage: str) -> Picture:
-    """Picture of the result of a stage of the path, for people to check."""
-    paint: dict[str, Callable[[], Picture | list[Tile]]] = {
-        "hdr": lambda: _merged(results.radiance),
-        "whitebalance": lambda: chart(results.radiance, results.color),
-        "align": lambda: registered(results.radiance, results.alignment),
-        "mask": lambda: outline(results.radiance, results.color, results.object_),
-        "selfcal": lambda: _gains(results.selfcal.gains, results.radiance.angle),
-        "stokes": lambda: _stokes(results.stokes),
-        "cues": lambda: _cues(results.cues),
-        "infer": lambda: _maps(results.maps),
-        "surface": lambda: _surface(results.mesh, results.maps),
+def of_stage(results: FirstResults, stage: str) -> Picture:
+    """Picture of the result of a stage that the path has reached, for people to check."""
+    paint: dict[str, Callable[[Any], Picture | list[Tile]]] = {
+        "hdr": lambda found: _merged(found.radiance),
+        "whitebalance": lambda found: chart(found.radiance, found.color),
+        "align": lambda found: registered(found.radiance, found.alignment),
+        "mask": lambda found: outline(found.radiance, found.color, found.object_),
+        "selfcal": lambda found: _gains(found.selfcal.gains, found.radiance.angle),
+        "stokes": lambda found: _stokes(found.stokes),
+        "cues": lambda found: _cues(found.cues),
+        "infer": lambda found: _maps(found.maps),
+        "surface": lambda found: _surface(found.mesh, found.maps),
     }
-    drawn = paint[stage]()
+    drawn = paint[stage](results)
     return sheet(drawn) if isinstance(drawn, list) else drawn
 
 
-def stopped(results: Results, colors: ChartReference | None) -> Picture:
+def stopped(results: ResultsUntilHdr, colors: ChartReference | None) -> Picture:
     """Picture of the shots of a path that an error ended: red where all exposures are clipped.
 
     With `colors`, of the chart that was not found, the first shot shows the patches of all that resembles it.

@@ -26,6 +26,7 @@ from polcap.optics import frames
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
+from polcap.results import ResultsUntilInfer
 from polcap.stage_values import Cues, Network
 from polcap.training.evaluation_page import grid
 from polcap.training.map_errors import LIMITS_DEG, Score
@@ -85,7 +86,7 @@ def score(folder: Path, angles: list[str], name: str, network: Network | None) -
             (Path(place) / "shots" / angle / name).symlink_to((folder / angle / name).resolve())
         capture = captures.read(Path(place) / "shots", None)
         supplied = UserInput(chart=ChartRequest("none"), mask=mask, network=network)
-        found = path(capture, supplied, Config(), MemoryCache(until="infer"))
+        found = path(capture, supplied, Config(), MemoryCache(), ResultsUntilInfer)
     maps, (x0, y0, x1, y1) = found.maps, found.object_.crop
     by = round(mask.shape[0] / found.radiance.value.shape[1])
     inside, crop = mask[::by, ::by], np.s_[y0:y1, x0:x1]

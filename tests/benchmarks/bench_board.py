@@ -26,7 +26,7 @@ from polcap.images import Bools, Floats, View
 from polcap.optics import projection
 from polcap.pipeline import models, run
 from polcap.pipeline.path import UserInput
-from polcap.results import Results
+from polcap.results import ResultsUntilAlign
 from polcap.stage_values import AngleStack
 from polcap.stages import mask
 from polcap.stages.mask import MaskSettings
@@ -34,22 +34,22 @@ from polcap.stages.mask import MaskSettings
 _AROUND = 0.03 * np.array([[1, 1, 0], [-1, 1, 0], [0, 1, 1], [0, 2, 0], [0, 3, -1]], float)  # m, points of the object
 
 
-def aligned(folder: Path) -> Results:
+def aligned(folder: Path) -> ResultsUntilAlign:
     """Results of a view up to `align`."""
     out = folder / "polcap"
     if not (out / "work" / "03-align").exists():
         run.process(reader.read(folder), UserInput(ChartRequest("none")), Config(), out, until="align")
-    return run.reopen(out, "align")[0]
+    return run.reopen(out, ResultsUntilAlign)[0]
 
 
-def overlap(radiance: AngleStack, results: Results, true: Bools) -> float:
+def overlap(radiance: AngleStack, results: ResultsUntilAlign, true: Bools) -> float:
     found = mask.segment(
         radiance, results.alignment, results.color, None, models.load_mask_network(1), onnx.run, MaskSettings()
     ).mask
     return float((found & true).sum() / (found | true).sum())
 
 
-def corners_of(results: Results) -> BoardCorners:
+def corners_of(results: ResultsUntilAlign) -> BoardCorners:
     found = board_corners.detect(results.radiance, results.color).corners
     assert found is not None
     return found

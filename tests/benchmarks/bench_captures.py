@@ -57,7 +57,7 @@ def measure(truth_file: Path, network: Network | None, rough: bool) -> list[floa
     meta = json.loads(Path(stem + ".meta.json").read_text())
     capture = captures.read(Path(stem), None)
     supplied = UserInput(network=network, mask_network=models.load_mask_network(2))
-    found = path(capture, supplied, Config(), MemoryCache(until="surface"))
+    found = path(capture, supplied, Config(), MemoryCache(), Results)
     with np.load(stem + ".truth.npz") as maps:
         errors = surface_errors(found, dict(maps), network, rough)
         detail = detail_errors(found, dict(maps))

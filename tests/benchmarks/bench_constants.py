@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("truth", type=Path)
     parser.add_argument("rooms", nargs="*", default=ROOMS, help=f"of {', '.join(ROOMS)}; all by default")
     options = parser.parse_args()
-    results, _ = pipeline.reopen(options.result)
+    results, _ = pipeline.reopen(options.result, Results)
     print(f"| number | as it is | × {FACTORS[0]:g} | × {FACTORS[1]:g} | |\n| --- | --- | --- | --- | --- |")
     if "align" in options.rooms:
         table(ALIGN, Moved(results), "px of a corner")

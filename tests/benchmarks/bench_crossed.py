@@ -26,7 +26,7 @@ from polcap.images import Floats, Quality
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
-from polcap.results import Results
+from polcap.results import ResultsUntilInfer
 from polcap.stage_values import Network
 from polcap.synth import scenes, shooting
 
@@ -78,11 +78,11 @@ def measure(place: Path, seed: int, width: int, network: Network | None, chart: 
     ]
 
 
-def solved(capture: Capture, out: Path, network: Network | None, chart: str) -> Results:
+def solved(capture: Capture, out: Path, network: Network | None, chart: str) -> ResultsUntilInfer:
     """The path's results."""
     request = ChartRequest("none" if chart == "none" else "auto")
     supplied = UserInput(chart=request, network=network, mask_network=models.load_mask_network(1))
-    return path(capture, supplied, Config(), MemoryCache(until="infer"))
+    return path(capture, supplied, Config(), MemoryCache(), ResultsUntilInfer)
 
 
 def _binned(image: Floats) -> Floats:

@@ -25,6 +25,7 @@ from polcap.pipeline import models, path
 from polcap.pipeline.cache import MemoryCache
 from polcap.quality import error_maps, gates
 from polcap.quality.gate import full_size
+from polcap.results import ResultsUntilInfer
 from polcap.stage_values import SurfaceMaps
 from polcap.synth import scenes, shooting
 from polcap.training import traced_views
@@ -55,8 +56,8 @@ def drawn(data: Path, kind: str, seed: int, width: int) -> Floats:
         place = Path(folder) / "capture"
         shoot(data, place, kind, seed, width)
         capture = reader.read(place)
-        networks = models.load_network(None, None), models.load_mask_network()
-        results = path.path(capture, path.UserInput(path.AUTO, None, *networks), Config(), MemoryCache(until="infer"))
+        user = path.UserInput(path.AUTO, None, models.load_network(None, None), models.load_mask_network())
+        results = path.path(capture, user, Config(), MemoryCache(), ResultsUntilInfer)
         truth = dict(np.load(place / "truth.npz"))
     evidence = full_size(results, capture.focal_doubt)
     maps = error_maps.with_errors(evidence, gates.judge(evidence, Config().gates))

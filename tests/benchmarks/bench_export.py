@@ -14,6 +14,8 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import msgspec
@@ -29,7 +31,6 @@ from polcap.images import Floats, View
 from polcap.mesh_values import Asset, ReliefMesh
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.asset_export import ExportRequest
-from polcap.results import Results
 from polcap.stage_values import Cues, StokesImage, SurfaceMaps
 from polcap.stages import asset, surface
 from tests import surfaces
@@ -134,7 +135,8 @@ def write(folder: Path, maps: SurfaceMaps, mesh: ReliefMesh, noise: Floats) -> N
         quality=np.zeros(size, np.uint8),
         view=maps.view,
     )
-    maps_folder.write(folder / "maps", Results.partial(maps=maps, mesh=mesh, stokes=stokes, cues=cues, keys={}))
+    results: Any = SimpleNamespace(maps=maps, mesh=mesh, stokes=stokes, cues=cues, keys={})
+    maps_folder.write(folder / "maps", results)
 
 
 if __name__ == "__main__":

@@ -63,7 +63,7 @@ def main() -> None:
                 folder, scene, shooting.Shoot(seed=number, width=options.width, height=options.width * 3 // 4)
             )
         capture = captures.read(folder)
-        found = path(capture, supplied, Config(), MemoryCache(until="surface"))
+        found = path(capture, supplied, Config(), MemoryCache(), Results)
         lines = gates.judge(full_size(found, capture.focal_doubt), Config().gates)
         warned = ", ".join(f"{line.name} {line.state}" for line in lines if line.state in ("warn", "fail"))
         row = errors(found, folder)

@@ -31,6 +31,7 @@ from polcap.mesh_values import Mesh
 from polcap.optics import color, frames, shade
 from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.pipeline import run
+from polcap.results import Results
 from polcap.stage_values import SurfaceMaps
 from polcap.stages.asset import AssetSettings
 from polcap.synth import render, trace
@@ -105,7 +106,7 @@ def truth_depth(folder: Path) -> float:
 
 def relief(folder: Path, near: Pose, pose: Pose, depth: float) -> TexturedMesh:
     """The result of a single view in another pose of the board, scaled to its true median depth."""
-    results = run.reopen(folder / "polcap", "surface")[0]
+    results = run.reopen(folder / "polcap", Results)[0]
     mesh = replace(results.mesh, vertices=results.mesh.vertices * (depth / float(np.nanmedian(results.mesh.depth))))
     turn = pose.rotation @ near.rotation.T
     return TexturedMesh(mesh, results.maps, Pose(turn, pose.translation - turn @ near.translation))

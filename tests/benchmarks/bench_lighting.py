@@ -28,7 +28,6 @@ from polcap.images import Floats
 from polcap.optics import fresnel, mueller
 from polcap.pipeline import models
 from polcap.quality import polarization
-from polcap.quality.gate import Evidence
 from polcap.quality.limits import GateLimits
 from polcap.stage_values import AngleStack, Network, ObjectMask, single_frames
 from polcap.stages import cues, infer, stokes
@@ -174,9 +173,10 @@ def _spoken(image: Any) -> dict[str, str]:
     maps = infer.estimate(
         cues.compute(image, scenes.no_color()), _network(), onnx.run, infer.InferSettings(symmetries=1, fine=False)
     )
-    found = Evidence.partial(
-        stokes=image, radiance=SimpleNamespace(angle=ANGLE), gains=scenes.equal(), names=["0°", "45°", "90°"], maps=maps
+    results = SimpleNamespace(
+        stokes=image, radiance=scenes.stack(), selfcal=scenes.equal(), object_=scenes.ball_object(), maps=maps
     )
+    found: Any = SimpleNamespace(results=results, names=["0°", "45°", "90°"])
     lines = [
         *polarization.polarized(found),
         *polarization.of_outline(found, GateLimits()),

@@ -29,6 +29,7 @@ from polcap.optics.frames import dot
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, distance_m, path
+from polcap.results import Results
 from polcap.stage_values import SurfaceMaps
 from polcap.stages import surface
 from polcap.synth import render, scenes, shooting
@@ -81,7 +82,7 @@ def measured(folder: Path, size: str, kind: str, seed: int) -> dict[str, Any]:
     shooting.write(folder, scene, msgspec.structs.replace(SHOOTS[size], seed=seed))
     network, mask_network = models.load_network(None, None), models.load_mask_network()
     supplied = UserInput(network=network, mask_network=mask_network)
-    found = path(captures.read(folder, None), supplied, Config(), MemoryCache(until="surface"))
+    found = path(captures.read(folder, None), supplied, Config(), MemoryCache(), Results)
     maps, mesh, distance = found.maps, found.mesh, distance_m(found.color, found.radiance)
     plain = surface.integrate(maps, distance, surface.SurfaceSettings(stiffness=0.0))
     of, normal = truth(scene, maps)

@@ -19,6 +19,7 @@ from polcap.formats.capture import reader as captures
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
+from polcap.results import Results
 from polcap.stage_values import SurfaceMaps
 from polcap.synth import shooting
 from polcap.synth.render import Scene
@@ -45,7 +46,7 @@ def main() -> None:
         if not folder.exists():
             shoot = shooting.Shoot(seed=number, width=options.width, height=options.width * 3 // 4)
             shooting.write(folder, scene, shoot)
-        found = path(captures.read(folder), supplied, Config(), MemoryCache(until="surface")).maps
+        found = path(captures.read(folder), supplied, Config(), MemoryCache(), Results).maps
         rows.append(measure(folder, found, scene.coat.materials[0]))
         print(f"| {folder.name} |", " | ".join(f"{x:.3g}" for x in rows[-1]), "|", flush=True)
     print("| mean |", " | ".join(f"{x:.3g}" for x in np.mean(rows, axis=0)), "|")

@@ -23,6 +23,7 @@ from polcap.errors import PolcapError
 from polcap.formats.capture import reader as captures
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput
+from polcap.results import Results
 from tests.rig import faults
 from tests.rig import pool as pools
 
@@ -72,7 +73,7 @@ def _processed(folder: Path) -> list[np.ndarray]:
     found = captures.read(folder)
     out = folder / "polcap"
     pipeline.process(found, UserInput(chart=ChartRequest("none")), Config(), out)
-    results, _ = pipeline.reopen(out)
+    results, _ = pipeline.reopen(out, Results)
     maps, mesh = results.maps, results.mesh
     return [np.asarray(maps.normal), np.asarray(maps.diffuse), np.asarray(mesh.vertices)]
 

@@ -38,6 +38,7 @@ from polcap.pipeline import check, models, path
 from polcap.pipeline.cache import MemoryCache
 from polcap.quality import gates
 from polcap.quality.gate import full_size
+from polcap.results import Results
 from polcap.stage_values import Network, SurfaceMaps
 
 Row = dict[str, Any]
@@ -109,7 +110,7 @@ def judge_process(capture: Capture, place: Path, no_chart: bool = False) -> Row:
     """The verdict; the expected error of the normals with all costs, and the actual one (medians, degrees)."""
     chart = ChartRequest("none" if no_chart else "auto")
     try:
-        found = path.path(capture, path.UserInput(chart, None, *networks()), Config(), MemoryCache(until="surface"))
+        found = path.path(capture, path.UserInput(chart, None, *networks()), Config(), MemoryCache(), Results)
         lines = gates.judge(full_size(found, capture.focal_doubt), Config().gates)
         actual = error_deg(found.maps, place)
     except InputError as error:

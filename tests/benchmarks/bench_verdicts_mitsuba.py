@@ -33,6 +33,7 @@ from polcap.pipeline import path
 from polcap.pipeline.cache import MemoryCache
 from polcap.quality import gates
 from polcap.quality.gate import Gate, full_size
+from polcap.results import Results
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Cluster
 from polcap.synth.forward_camera import SENSOR_WIDTH_MM
@@ -146,7 +147,7 @@ def judged(place: Path, scene: dict[str, Any], corner: tuple[int, int]) -> tuple
     """All gates of the capture, and the median error of its normals in degrees."""
     capture = captures.read(place)
     user = path.UserInput(ChartRequest("auto"), None, *networks())
-    found = path.path(capture, user, Config(), MemoryCache(until="surface"))
+    found = path.path(capture, user, Config(), MemoryCache(), Results)
     lines = gates.judge(full_size(found, capture.focal_doubt), Config().gates)
     maps = found.maps
     rows, columns = np.nonzero(maps.mask)

@@ -37,6 +37,7 @@ from polcap.pipeline import models, path
 from polcap.pipeline.cache import MemoryCache
 from polcap.quality import gates
 from polcap.quality.gate import full_size
+from polcap.results import Results
 from polcap.stage_values import Network, SurfaceMaps
 
 Row = dict[str, Any]
@@ -86,7 +87,7 @@ def judge(folder: Path, seed: int, kind: str) -> Row:
 
 def _processed(place: Path, chart: ChartRequest) -> Row:
     capture = captures.read(place)
-    found = path.path(capture, path.UserInput(chart, None, *networks()), Config(), MemoryCache(until="surface"))
+    found = path.path(capture, path.UserInput(chart, None, *networks()), Config(), MemoryCache(), Results)
     lines = gates.judge(full_size(found, capture.focal_doubt), Config().gates)
     spoke = {line.name: [line.state, line.value, line.cost_deg, line.message] for line in lines if line.state != "pass"}
     expected = next((line.value for line in lines if line.name == "normal error"), None)

@@ -7,6 +7,9 @@ not pass, refused where the gate fails; with --chart also where polcap does not 
 worst shot's of each capture, and the promised figures; with --parts also error and 1σ by each property of the object.
 """
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 
 from polcap.chart_values import ColorCalibration
@@ -14,7 +17,6 @@ from polcap.errors import ChartError
 from polcap.formats import shipped_data
 from polcap.pipeline.path import AUTO
 from polcap.quality import shot_exposure
-from polcap.quality.gate import Evidence
 from polcap.quality.limits import GateLimits
 from polcap.stage_values import AngleStack
 from polcap.stages import selfcal, whitebalance
@@ -46,7 +48,8 @@ def main() -> None:
             continue
         settings = selfcal.SelfcalSettings(check_order=False)
         found = selfcal.solve(radiance, scenes.still(len(angle)), object_, color, settings)
-        evidence = Evidence.partial(selfcal=found, radiance=radiance, names=stated.angles.split(","))
+        results = SimpleNamespace(selfcal=found, radiance=radiance)
+        evidence: Any = SimpleNamespace(results=results, names=stated.angles.split(","))
         states.append(shot_exposure.gain_doubt(evidence, GateLimits()).state)
         errors.append(float(np.abs(found.gains.gain.mean(1) / true - 1).max()))
         sigma = float(found.gains.sigma.max())

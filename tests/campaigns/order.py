@@ -22,6 +22,7 @@ from polcap.images import Floats
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
+from polcap.results import ResultsUntilMask
 from polcap.stage_values import Alignment, AngleStack, Equipment, ObjectMask
 from polcap.stages import selfcal
 from polcap.stages.selfcal import angles as polarizer_angles
@@ -67,7 +68,7 @@ def from_raw(seed: int, degrees: tuple[float, ...]) -> Case | None:
         supplied = UserInput(mask_network=models.load_mask_network(1))
         capture = captures.read(Path(place) / "capture")
         try:
-            results = path(capture, supplied, Config(), MemoryCache(until="mask"))
+            results = path(capture, supplied, Config(), MemoryCache(), ResultsUntilMask)
             return KINDS[seed % 3], results.radiance, results.alignment, results.object_, results.color
         except InputError as error:
             print(seed, "refused before:", error, flush=True)

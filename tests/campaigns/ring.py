@@ -22,6 +22,7 @@ from polcap.formats.capture import reader as captures
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
+from polcap.results import ResultsUntilSelfcal
 from polcap.stage_values import RingZero
 from polcap.stages import selfcal
 from polcap.synth import scenes as random_scenes
@@ -85,7 +86,7 @@ def from_raw(seed: int, turn: float) -> dict[str, Any]:
         shots = tuple(replace(shot, angle=float(a)) for shot, a in zip(capture.shots, nominal))
         supplied = UserInput(mask_network=models.load_mask_network(1))
         try:
-            results = path(replace(capture, shots=shots), supplied, Config(), MemoryCache(until="selfcal"))
+            results = path(replace(capture, shots=shots), supplied, Config(), MemoryCache(), ResultsUntilSelfcal)
             return error_of(results.selfcal.ring, kind)
         except InputError as error:
             return {"kind": kind, "refused": str(error)}

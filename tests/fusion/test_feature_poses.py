@@ -16,6 +16,7 @@ from polcap.fusion import feature_poses, object_features
 from polcap.fusion.object_features import ObjectFeatures
 from polcap.fusion.poses import SessionPoses
 from polcap.images import View
+from polcap.stage_values import OrderTest
 from polcap.synth import render, scene_materials
 from polcap.synth.distance_fields import Cluster
 from polcap.synth.scene_materials import Coat, Material
@@ -92,6 +93,13 @@ def test_a_view_of_something_else_is_left_out(patterned: dict[str, Any]) -> None
 def test_a_view_with_swapped_angles_is_refused_with_the_remedy(patterned: dict[str, Any]) -> None:
     with pytest.raises(CaptureError, match=r"The outline fits the order 90°, 0° .*Rename the folders 0° to 90°"):
         features(patterned["view01"], as_stated=False)
+
+
+def test_a_view_whose_angles_the_network_contradicts_is_refused(patterned: dict[str, Any]) -> None:
+    one = patterned["view01"]
+    with pytest.raises(CaptureError, match=r"2.0 times smaller errors for the order 90°, 0°"):
+        features(SimpleNamespace(**{**vars(one), "order": OrderTest(SWAPPED, 0.5)}))
+    assert len(features(SimpleNamespace(**{**vars(one), "order": OrderTest(SWAPPED, 2.0)})).ray)
 
 
 def test_an_object_without_pattern_is_refused() -> None:

@@ -195,7 +195,8 @@ def test_a_cache_in_memory_computes_each_stage_once_and_writes_nothing(
 
 
 def test_the_path_ends_after_the_stage_at_which_it_was_to_stop(tmp_path: Path) -> None:
-    cache = StageCache(tmp_path, until="passing")
+    cache = StageCache(tmp_path)
+    cache.until = "passing"
     with pytest.raises(StageReached):
         path(cache)
     assert calls == ["double", "passing"] and list(cache.results) == ["double", "passing"]
@@ -236,8 +237,10 @@ def test_keys_are_the_same_with_every_cache(tmp_path: Path) -> None:
 def test_stages_of_two_runs_are_never_joined(tmp_path: Path, gain: float) -> None:
     """Neither with the settings of the first run, nor with those of the second, which ended early."""
     path(StageCache(tmp_path))
+    ended = StageCache(tmp_path)
+    ended.until = "double"
     with pytest.raises(StageReached):
-        path(StageCache(tmp_path, until="double"), gain=3.0)
+        path(ended, gain=3.0)
     with pytest.raises(StorageError, match="of another run"):
         path(ArchiveCache(tmp_path), gain=gain)
     path(StageCache(tmp_path), gain=3.0)

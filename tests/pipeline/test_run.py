@@ -26,7 +26,7 @@ from polcap.images import View
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput, distance_m, on_grid
-from polcap.results import STAGES
+from polcap.results import STAGES, Results
 from polcap.stage_values import AngleStack, single_frames
 from polcap.synth.scenes import random_scene
 from polcap.synth.shooting import Shoot, write
@@ -60,7 +60,7 @@ def test_the_chart_of_one_capture_serves_another(polcap: Command, result: Path, 
     """As a file of the result: the same colors, and nothing of a chart in the other's result."""
     command = ("process", example, "--out", tmp_path, "--estimator", "analytic")
     assert polcap(*command, "--chart", result / "color.toml").returncode in (0, 3)
-    ours, theirs = (pipeline.reopen(folder)[0].color for folder in (tmp_path, result))
+    ours, theirs = (pipeline.reopen(folder, Results)[0].color for folder in (tmp_path, result))
     assert (ours.source, theirs.source) == ("profile", "chart")
     np.testing.assert_allclose(ours.matrix, theirs.matrix, atol=1e-8)
     assert not (tmp_path / "color.toml").exists()

@@ -11,49 +11,51 @@ from polcap.images import Floats, Quality
 from polcap.optics.morphology import dilate
 from polcap.optics.outline import disc_radius
 from polcap.quality import error_maps, gates
-from polcap.quality.gate import Evidence, Gate
-from tests.quality.test_gates import changed, found
+from polcap.quality.gate import Gate
+from tests.quality.test_gates import Seen, changed, found
 
 OWN = 4.0  # degrees, expected error of the estimator
 
 
 @pytest.fixture(scope="module")
-def good() -> Evidence:
+def good() -> Seen:
     return found()
 
 
-def flagged(good: Evidence, bit: Quality, width: int) -> tuple[Evidence, Any]:
+def flagged(good: Seen, bit: Quality, width: int) -> tuple[Seen, Any]:
     """The capture with a flagged square of this width in the middle of the object, and the square (H, W)."""
-    mask = good.maps.mask
+    mask = good.results.maps.mask
     row, column = (int(np.median(at)) for at in np.nonzero(mask))
     square = np.zeros(mask.shape, bool)
     square[row - width // 2 : row + width // 2, column - width // 2 : column + width // 2] = True
-    quality = good.stokes.quality | np.where(square, np.uint8(bit), np.uint8(0))
-    return changed(good, stokes=replace(good.stokes, quality=quality)), square
+    quality = good.results.stokes.quality | np.where(square, np.uint8(bit), np.uint8(0))
+    return changed(good, stokes=replace(good.results.stokes, quality=quality)), square
 
 
-def errors(of: Evidence, *judged: Gate) -> Floats:
+def errors(of: Seen, *judged: Gate) -> Floats:
     return error_maps.expected_normal_error(of, judged)
 
 
-def test_without_findings_the_error_is_the_estimators_own(good: Evidence) -> None:
+def test_without_findings_the_error_is_the_estimators_own(good: Seen) -> None:
     error = errors(good)
-    assert np.allclose(error[good.maps.mask], OWN) and not error[~good.maps.mask].any()
+    assert np.allclose(error[good.results.maps.mask], OWN) and not error[~good.results.maps.mask].any()
 
 
-def test_a_cost_without_a_place_counts_on_the_whole_object_and_costs_add_in_squares(good: Evidence) -> None:
+def test_a_cost_without_a_place_counts_on_the_whole_object_and_costs_add_in_squares(
+    good: Seen,
+) -> None:
     error = errors(good, *(Gate(name, "warn", None, None, "", cost_deg=6.0) for name in ("gains", "source")))
-    assert np.allclose(error[good.maps.mask], np.sqrt(OWN**2 + 2 * 6**2))
+    assert np.allclose(error[good.results.maps.mask], np.sqrt(OWN**2 + 2 * 6**2))
 
 
-def test_what_the_estimators_state_themselves_is_not_added_in_full(good: Evidence) -> None:
+def test_what_the_estimators_state_themselves_is_not_added_in_full(good: Seen) -> None:
     gates_ = [Gate(name, "fail", None, None, "", cost_deg=10.0) for name in ("sharpness", "ill-posed")]
-    blurred, ill_posed = (errors(good, gate)[good.maps.mask] for gate in gates_)
+    blurred, ill_posed = (errors(good, gate)[good.results.maps.mask] for gate in gates_)
     assert np.allclose(blurred, np.hypot(OWN, 3)) and np.allclose(ill_posed, OWN)
 
 
-def test_clipped_light_costs_in_its_place_alone_and_once(good: Evidence) -> None:
-    mask = good.maps.mask
+def test_clipped_light_costs_in_its_place_alone_and_once(good: Seen) -> None:
+    mask = good.results.maps.mask
     of, square = flagged(good, Quality.CLIPPED, round(0.6 * disc_radius(mask)))
     gate = Gate("clipping", "fail", 0.3, 0.02, "", cost_deg=20.0)
     error = errors(of, gate)
@@ -62,21 +64,23 @@ def test_clipped_light_costs_in_its_place_alone_and_once(good: Evidence) -> None
     assert error[square].min() > OWN + 2 and np.allclose(error[away], OWN, atol=0.3)
 
 
-def test_a_small_clipped_highlight_costs_less_than_a_wide_one(good: Evidence) -> None:
-    radius = disc_radius(good.maps.mask)
+def test_a_small_clipped_highlight_costs_less_than_a_wide_one(good: Seen) -> None:
+    radius = disc_radius(good.results.maps.mask)
     squares = (flagged(good, Quality.CLIPPED, round(share * radius)) for share in (0.05, 0.2, 0.8))
     cost = [errors(of)[square].max() for of, square in squares]
     assert OWN <= cost[0] < OWN + 0.5 < cost[1] < cost[2]
 
 
-def test_exposures_that_differ_cost_in_these_pixels(good: Evidence) -> None:
+def test_exposures_that_differ_cost_in_these_pixels(good: Seen) -> None:
     of, square = flagged(good, Quality.GHOST, 10)
     error = errors(of, Gate("stillness", "fail", 0.1, 0.02, "", cost_deg=5.0))
-    assert np.allclose(error[square], np.hypot(OWN, 5)) and np.allclose(error[good.maps.mask & ~square], OWN)
+    assert np.allclose(error[square], np.hypot(OWN, 5)) and np.allclose(error[good.results.maps.mask & ~square], OWN)
 
 
-def test_an_assumed_focal_length_costs_more_away_from_the_middle_of_the_picture(good: Evidence) -> None:
-    view, mask = good.maps.view, good.maps.mask
+def test_an_assumed_focal_length_costs_more_away_from_the_middle_of_the_picture(
+    good: Seen,
+) -> None:
+    view, mask = good.results.maps.view, good.results.maps.mask
     error = errors(changed(good, focal_doubt=(-0.7, 0.7)), Gate("focal length", "warn", None, None, "", cost_deg=9.0))
     y, x = np.nonzero(mask)
     off = np.hypot(x - view.center[0], y - view.center[1])
@@ -85,37 +89,39 @@ def test_an_assumed_focal_length_costs_more_away_from_the_middle_of_the_picture(
     assert error[mask][order[-1]] > error[mask][order[0]]
 
 
-def test_the_headline_is_the_median_of_the_map(good: Evidence) -> None:
-    of, _ = flagged(good, Quality.CLIPPED, round(1.2 * disc_radius(good.maps.mask)))
+def test_the_headline_is_the_median_of_the_map(good: Seen) -> None:
+    of, _ = flagged(good, Quality.CLIPPED, round(1.2 * disc_radius(good.results.maps.mask)))
     judged = gates.judge(of, Config().gates)
     (headline,) = (gate.value for gate in judged if gate.name == "normal error")
     error = error_maps.expected_normal_error(of, judged)
-    median = float(np.median(error[of.maps.mask]))
+    median = float(np.median(error[of.results.maps.mask]))
     assert headline == pytest.approx(median, abs=0.006) and median > OWN
 
 
-def material_errors(of: Evidence) -> tuple[Floats, Floats]:
+def material_errors(of: Seen) -> tuple[Floats, Floats]:
     maps = error_maps.with_errors(of, ())
     assert maps.diffuse_error is not None and maps.roughness_error is not None
     return maps.diffuse_error, maps.roughness_error
 
 
-def test_albedo_and_roughness_have_errors_on_the_object_only(good: Evidence) -> None:
-    mask = good.maps.mask
+def test_albedo_and_roughness_have_errors_on_the_object_only(good: Seen) -> None:
+    mask = good.results.maps.mask
     for error in material_errors(good):
         assert error[mask].min() > 0 and error.max() < 1 and not error[~mask].any()
 
 
-def test_the_error_of_the_albedo_follows_its_brightness_and_the_error_of_the_normals(good: Evidence) -> None:
-    mask = good.maps.mask
-    dark = changed(good, maps=replace(good.maps, diffuse=good.maps.diffuse / 10))
-    sure = changed(good, maps=replace(good.maps, confidence=good.maps.confidence / 4))
+def test_the_error_of_the_albedo_follows_its_brightness_and_the_error_of_the_normals(
+    good: Seen,
+) -> None:
+    mask = good.results.maps.mask
+    dark = changed(good, maps=replace(good.results.maps, diffuse=good.results.maps.diffuse / 10))
+    sure = changed(good, maps=replace(good.results.maps, confidence=good.results.maps.confidence / 4))
     usual, of_dark, of_sure = (material_errors(of)[0][mask].mean() for of in (good, dark, sure))
     assert 0.005 < of_dark < usual / 4 and of_sure == pytest.approx(usual / 2, rel=0.05)
 
 
-def test_clipped_light_makes_albedo_uncertain_there_and_roughness_everywhere(good: Evidence) -> None:
-    mask = good.maps.mask
+def test_clipped_light_makes_albedo_uncertain_there_and_roughness_everywhere(good: Seen) -> None:
+    mask = good.results.maps.mask
     of, square = flagged(good, Quality.CLIPPED, round(0.6 * disc_radius(mask)))
     away = mask & ~dilate(square, round(0.4 * disc_radius(mask)))
     (albedo, rough), (usual_albedo, usual_rough) = material_errors(of), material_errors(good)
@@ -124,7 +130,7 @@ def test_clipped_light_makes_albedo_uncertain_there_and_roughness_everywhere(goo
     assert (rough[mask] > 1.05 * usual_rough[mask]).all()
 
 
-def test_the_analytic_estimator_states_larger_errors_of_the_material(good: Evidence) -> None:
-    network = changed(good, maps=replace(good.maps, estimator="network"))
+def test_the_analytic_estimator_states_larger_errors_of_the_material(good: Seen) -> None:
+    network = changed(good, maps=replace(good.results.maps, estimator="network"))
     for error, of_network in zip(material_errors(good), material_errors(network)):
-        assert (error[good.maps.mask] > of_network[good.maps.mask]).all()
+        assert (error[good.results.maps.mask] > of_network[good.results.maps.mask]).all()

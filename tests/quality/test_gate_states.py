@@ -21,7 +21,7 @@ from polcap.config import Config
 from polcap.images import Quality
 from polcap.quality import flatness, gates, geometry, light, polarization, rerendering, rim, shot_exposure
 from polcap.quality.flatness import Flatness
-from polcap.quality.gate import Evidence, Gate
+from polcap.quality.gate import Gate
 from polcap.quality.object_turn import ObjectTurn
 from polcap.quality.rerendering import Rerendering
 from polcap.stage_values import AngleStack, BlackError, Equipment, OrderTest, OutlineCheck, RingZero, TurnedShot
@@ -283,7 +283,7 @@ def good() -> dict[str, Any]:
         "radiance": with_field(scenes.stack(), "bracket", exposures(1.0, 4.0)),
         "color": scenes.no_color(), "alignment": scenes.still(), "object_": replace(scenes.ball_object(), doubt=0.01),
         "selfcal": replace(scenes.equal(), gains=GAINS, outline=OutlineCheck(STATED, 0.95)),
-        "stokes": SimpleNamespace(body=True), "maps": SimpleNamespace(albedo_sigma=0.1, order=None),
+        "stokes": SimpleNamespace(body=True), "cues": None, "maps": SimpleNamespace(albedo_sigma=0.1, order=None),
         "mesh": SimpleNamespace(**MESH),
         "figures": FIGURES | outline(),
     }  # fmt: skip
@@ -318,7 +318,7 @@ def judge(good: dict[str, Any], config: Config, fields: dict[str, Any]) -> list[
     with pytest.MonkeyPatch.context() as patch:
         for figure, (module, function) in MEASURES.items():
             patch.setattr(module, function, partial(stated, in_numpy(figures[figure])))
-        return gates.judge(Evidence.partial(**parts, align=config.align), config.gates)
+        return gates.judge(scenes.evidence(**parts, align=config.align), config.gates)
 
 
 def stated(figure: Any, *_: Any) -> Any:

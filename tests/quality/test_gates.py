@@ -16,6 +16,7 @@ from polcap.optics import frames
 from polcap.quality import flatness, gates
 from polcap.quality.advice import advice, advise
 from polcap.quality.gate import Evidence, Gate, State
+from polcap.results import ResultsUntilInfer
 from polcap.stage_values import (
     AngleStack,
     BlackError,
@@ -29,10 +30,11 @@ from polcap.stage_values import (
 from polcap.stages import cues, selfcal, stokes
 from tests import scenes
 
+Seen = Evidence[ResultsUntilInfer]
 STOPPED = ("object_", "selfcal", "stokes", "cues", "maps")  # results after an error of the registration
 
 
-def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> Evidence:
+def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> Seen:
     """A ball well photographed, or with something of it changed."""
     radiance = changed.pop("radiance", scenes.stack(noise=0.002, angles=angles))
     shots = len(radiance.angle)
@@ -52,7 +54,7 @@ def found(angles: np.ndarray = scenes.ANGLES, **changed: Any) -> Evidence:
         "color": scenes.no_color(), "alignment": scenes.still(shots), "object_": object_, "selfcal": calibration,
         "stokes": image, "maps": maps, "cues": cues.compute(image, scenes.no_color()),
     }  # fmt: skip
-    return Evidence.partial(**{**given, **changed})
+    return scenes.evidence(**{**given, **changed})
 
 
 def clipped(second_shot: float = 0.0) -> np.ndarray:
@@ -63,25 +65,31 @@ def clipped(second_shot: float = 0.0) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def good() -> Evidence:
+def good() -> Seen:
     return found()
 
 
-def judged(of: Evidence) -> dict[str, Gate]:
+def judged(of: Seen) -> dict[str, Gate]:
     return {gate.name: gate for gate in gates.judge(of, Config().gates)}
 
 
-def failed(of: Evidence) -> list[str]:
+def failed(of: Seen) -> list[str]:
     return [name for name, gate in judged(of).items() if gate.state == "fail"]
 
 
-def test_nothing_fails_on_a_good_capture(good: Evidence) -> None:
+def test_nothing_fails_on_a_good_capture(good: Seen) -> None:
     assert failed(good) == []
     assert gates.verdict(judged(good).values()) == "warn"  # one exposure per shot
 
 
-def changed(good: Evidence, **fields: Any) -> Evidence:
-    return Evidence.partial(**{**vars(good), **fields})
+def changed(good: Seen, **fields: Any) -> Seen:
+    """The evidence with some results or measurements replaced."""
+    return scenes.evidence(**{**parts(good), **fields})
+
+
+def parts(good: Seen) -> dict[str, Any]:
+    """All results and measurements, by their names."""
+    return {name: value for name, value in (vars(good) | vars(good.results)).items() if name not in ("results", "keys")}
 
 
 def bracket(radiance: AngleStack, **measured: Any) -> AngleStack:
@@ -89,13 +97,13 @@ def bracket(radiance: AngleStack, **measured: Any) -> AngleStack:
     return replace(radiance, bracket=replace(radiance.bracket, **measured))
 
 
-def with_gains(good: Evidence, **fields: Any) -> dict[str, Any]:
-    return {"selfcal": replace(good.selfcal, gains=replace(good.selfcal.gains, **fields))}
+def with_gains(good: Seen, **fields: Any) -> dict[str, Any]:
+    return {"selfcal": replace(good.results.selfcal, gains=replace(good.results.selfcal.gains, **fields))}
 
 
-def test_each_gate_fails_alone(good: Evidence) -> None:
-    radiance, maps = good.radiance, good.maps
-    still = good.alignment
+def test_each_gate_fails_alone(good: Seen) -> None:
+    radiance, maps = good.results.radiance, good.results.maps
+    still = good.results.alignment
     away = still.transform.copy()
     away[1, 0, 2] = 50
     curved = np.array([[0.0, -0.2]] * 3)
@@ -129,28 +137,28 @@ def test_each_gate_fails_alone(good: Evidence) -> None:
     ],
 )
 def test_an_object_that_differs_as_a_whole_has_wrong_levels(
-    good: Evidence, shots: tuple[int, ...], measured: dict[str, Any], levels: bool
+    good: Seen, shots: tuple[int, ...], measured: dict[str, Any], levels: bool
 ) -> None:
-    quality = good.radiance.quality.copy()
+    quality = good.results.radiance.quality.copy()
     quality[list(shots)] |= int(Quality.GHOST)
-    radiance = bracket(replace(good.radiance, quality=quality), **measured)
+    radiance = bracket(replace(good.results.radiance, quality=quality), **measured)
     gate = judged(changed(good, radiance=radiance))["stillness"]
     assert gate.state == "fail"
     assert ("moved" in gate.remedy, "black level" in gate.message, bool(gate.shots)) == (not levels, levels, not levels)
 
 
-def test_wrong_levels_of_finished_pictures_are_stated_in_capture_toml(good: Evidence) -> None:
-    quality = np.full_like(good.radiance.quality, Quality.GHOST)
+def test_wrong_levels_of_finished_pictures_are_stated_in_capture_toml(good: Seen) -> None:
+    quality = np.full_like(good.results.radiance.quality, Quality.GHOST)
     for sensor, remedy in (
         (ColorSensor(), "capture.toml"),
         (ColorSensor(white_balance=np.ones(3)), "own RAW files"),
     ):
-        radiance = replace(good.radiance, quality=quality, sensor=sensor)
+        radiance = replace(good.results.radiance, quality=quality, sensor=sensor)
         assert remedy in judged(changed(good, radiance=radiance))["stillness"].remedy
 
 
 @pytest.mark.parametrize(("grid_px", "state"), [(1.0, "warn"), (2.0, "fail")])
-def test_a_push_counts_in_pixels_of_the_processed_picture(good: Evidence, grid_px: float, state: str) -> None:
+def test_a_push_counts_in_pixels_of_the_processed_picture(good: Seen, grid_px: float, state: str) -> None:
     """One pixel is under the limit of 1.5; on pictures averaged down to half the side it is two, and above it."""
     pushed = np.array([[1.0, 0, 1], [0, 1, 0], [0, 0, 1]])
     radiance = scenes.before_backdrop([np.eye(3), pushed, np.eye(3)])
@@ -168,17 +176,17 @@ def test_a_push_counts_in_pixels_of_the_processed_picture(good: Evidence, grid_p
     ],
 )
 def test_what_a_failed_gate_explains_is_not_judged(
-    good: Evidence, cause: str, silent: set[str], judged_still: set[str]
+    good: Seen, cause: str, silent: set[str], judged_still: set[str]
 ) -> None:
-    unlike = replace(good.alignment, correlation=np.array([1.0, 0.9, 0.1]))
-    quality = np.full_like(good.radiance.quality, Quality.GHOST)  # one of the consequences
+    unlike = replace(good.results.alignment, correlation=np.array([1.0, 0.9, 0.1]))
+    quality = np.full_like(good.results.radiance.quality, Quality.GHOST)  # one of the consequences
     faults: dict[str, dict[str, Any]] = {
-        "order": {"selfcal": replace(good.selfcal, outline=OutlineCheck(ShotOrder((2, 1, 0)), 0.9))},
+        "order": {"selfcal": replace(good.results.selfcal, outline=OutlineCheck(ShotOrder((2, 1, 0)), 0.9))},
         "clipping": {"clipped": clipped(0.3), "alignment": unlike},
-        "alignment": {"alignment": unlike, "radiance": replace(good.radiance, quality=quality)},
+        "alignment": {"alignment": unlike, "radiance": replace(good.results.radiance, quality=quality)},
         "sharpness": {
             "blur_px": np.array([[0.0], [3.0], [0.0]]),
-            "alignment": replace(good.alignment, residual_px=np.array([0.0, 1.0, 0.0])),
+            "alignment": replace(good.results.alignment, residual_px=np.array([0.0, 1.0, 0.0])),
         },
     }
     found = judged(changed(good, **faults[cause]))
@@ -189,18 +197,18 @@ def test_what_a_failed_gate_explains_is_not_judged(
     assert ("normal error" in found) is (cause != "order")
 
 
-def test_sharpness_is_not_compared_between_two_objects(good: Evidence) -> None:
-    unlike = replace(good.alignment, correlation=np.array([1.0, 0.3, 0.9]))
+def test_sharpness_is_not_compared_between_two_objects(good: Seen) -> None:
+    unlike = replace(good.results.alignment, correlation=np.array([1.0, 0.3, 0.9]))
     found = judged(changed(good, blur_px=np.array([[0.0], [3.0], [0.0]]), alignment=unlike))
     assert (found["sharpness"].state, found["alignment"].state) == ("not measured", "fail")
     assert "files" in found["alignment"].remedy
 
 
-def test_a_frame_without_light_is_named(good: Evidence) -> None:
+def test_a_frame_without_light_is_named(good: Seen) -> None:
     ratio = np.tile([[[0.25], [1.0], [4.0]]], (3, 1, 3))
     unlit = ratio.copy()
     unlit[2, 2] = 1e-4
-    radiance = bracket(good.radiance, exposure_ratio=unlit, exif_ratio=ratio[..., 0])
+    radiance = bracket(good.results.radiance, exposure_ratio=unlit, exif_ratio=ratio[..., 0])
     radiance = replace(radiance, equipment=Equipment("steady"))
     files = tuple(tuple(f"pol{k}/{e}.DNG" for e in range(3)) for k in range(3))
     found = changed(good, radiance=radiance, files=files, blur_px=np.zeros((3, 3)))
@@ -208,7 +216,7 @@ def test_a_frame_without_light_is_named(good: Evidence) -> None:
     assert advice(list(judged(found).values()))[0].name == "energy"
 
 
-def test_chart_and_flat_object_need_not_agree_on_the_light(good: Evidence, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chart_and_flat_object_need_not_agree_on_the_light(good: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
     disagreeing = changed(good, **with_gains(good, source="grey patches", disagreement=0.08))
     assert judged(disagreeing)["gain doubt"].state == "fail"
     edges = flatness.Flatness(contour=0.0, common=0.7, rim_dolp=0.2, rim_light=1.0, aligned=0.9)
@@ -217,8 +225,8 @@ def test_chart_and_flat_object_need_not_agree_on_the_light(good: Evidence, monke
     assert judged(disagreeing)["outline"].state == "not judged"
 
 
-def test_clipped_highlights_show_no_light_from_the_sides(good: Evidence) -> None:
-    cues = good.cues
+def test_clipped_highlights_show_no_light_from_the_sides(good: Seen) -> None:
+    cues = good.results.cues
     ratio, quality = cues.ratio.copy(), cues.quality.copy()
     light = cues.radiance.sum(-1)
     brightest = cues.mask & (light >= np.quantile(light[cues.mask], 0.9))
@@ -229,12 +237,12 @@ def test_clipped_highlights_show_no_light_from_the_sides(good: Evidence) -> None
     assert judged(changed(good, cues=replace(polarized, quality=quality)))["lighting"].state == "pass"
 
 
-def test_a_blurred_frame_alone_explains_ghosts(good: Evidence) -> None:
+def test_a_blurred_frame_alone_explains_ghosts(good: Seen) -> None:
     """One of three exposures is blurred: that warns, and says why a part differs; not why the whole object does."""
-    quality = np.zeros_like(good.radiance.quality)
+    quality = np.zeros_like(good.results.radiance.quality)
     quality[:, ::3] = int(Quality.GHOST)
     ratio = np.tile([[[0.25], [1.0], [4.0]]], (3, 1, 3))
-    radiance = bracket(replace(good.radiance, quality=quality), exposure_ratio=ratio, exif_ratio=ratio[..., 0])
+    radiance = bracket(replace(good.results.radiance, quality=quality), exposure_ratio=ratio, exif_ratio=ratio[..., 0])
     blur = np.array([[0.0, 0, 0], [0, 0, 3.0], [0, 0, 0]])
     found = judged(changed(good, radiance=radiance, blur_px=blur))
     assert (found["sharpness"].state, found["stillness"].state) == ("warn", "not judged")
@@ -256,11 +264,11 @@ def test_a_blurred_frame_alone_explains_ghosts(good: Evidence) -> None:
     ],
 )
 def test_the_exposure_that_a_bracket_can_do_without_is_named(
-    good: Evidence, frames: list[tuple[int, int]], brightness: float, state: str, rescued: bool
+    good: Seen, frames: list[tuple[int, int]], brightness: float, state: str, rescued: bool
 ) -> None:
     ratio = np.tile([[[0.25], [1.0], [4.0]]], (3, 1, 3))
-    value = np.full_like(good.radiance.value, brightness)
-    radiance = bracket(replace(good.radiance, value=value), exposure_ratio=ratio, exif_ratio=ratio[..., 0])
+    value = np.full_like(good.results.radiance.value, brightness)
+    radiance = bracket(replace(good.results.radiance, value=value), exposure_ratio=ratio, exif_ratio=ratio[..., 0])
     blur = np.zeros((3, 3))
     for place in frames:
         blur[place] = 2.5
@@ -271,11 +279,11 @@ def test_the_exposure_that_a_bracket_can_do_without_is_named(
     assert "take that shot again" in gate.remedy and (gate.cost_deg > 5) is (state == "fail")
 
 
-def test_an_error_is_a_gate_unless_an_earlier_cause_explains_it(good: Evidence) -> None:
+def test_an_error_is_a_gate_unless_an_earlier_cause_explains_it(good: Seen) -> None:
     error = Gate("alignment", "fail", None, None, "shot 45° has no detail", "shoot again")
-    reached = {name: value for name, value in vars(good).items() if name not in STOPPED}
+    reached = {name: value for name, value in parts(good).items() if name not in STOPPED}
     for share, names in ((0.0, ["alignment"]), (0.5, ["clipping"])):
-        found = gates.judge(Evidence.partial(**{**reached, "clipped": clipped(share)}), Config().gates, error)
+        found = gates.judge(scenes.evidence(**{**reached, "clipped": clipped(share)}), Config().gates, error)
         assert [gate.name for gate in found if gate.state == "fail"] == names
         assert len({gate.name for gate in found}) == len(found)
 
@@ -294,20 +302,20 @@ def test_at_most_two_remedies_are_given_causes_first() -> None:
     assert advice(uncertain) == advice(warned)
 
 
-def test_shots_of_another_scene_are_named_with_their_folder(good: Evidence) -> None:
+def test_shots_of_another_scene_are_named_with_their_folder(good: Seen) -> None:
     files = tuple((f"pol{angle}/IMG.DNG",) for angle in ("000", "045", "090"))
     for correlation, name, folder in (([1, 0.9, 0.1], "90°", "pol090"), ([1, 0.1, 0.2], "0°", "pol000")):
-        unlike = replace(good.alignment, correlation=np.array(correlation, float))
+        unlike = replace(good.results.alignment, correlation=np.array(correlation, float))
         gate = judged(changed(good, alignment=unlike, files=files))["alignment"]
         assert gate.shots == (name,) and folder in gate.remedy and name in gate.message
 
 
-def test_equal_light_is_called_equal(good: Evidence) -> None:
+def test_equal_light_is_called_equal(good: Seen) -> None:
     assert "as bright as the others" in judged(good)["gains"].message
     assert not re.search(r"\b0\.0+ (%|px) (brighter|darker|more)", " ".join(g.message for g in judged(good).values()))
 
 
-def test_a_clipped_capture_is_told_how_many_stops(good: Evidence) -> None:
+def test_a_clipped_capture_is_told_how_many_stops(good: Seen) -> None:
     every = np.zeros_like(good.clipped)
     for share, stops in ((0.05, 2), (0.4, 3), (0.9, 4)):
         every[:] = share
@@ -315,38 +323,38 @@ def test_a_clipped_capture_is_told_how_many_stops(good: Evidence) -> None:
     assert "as much light as the others" in judged(changed(good, clipped=clipped(0.4)))["clipping"].remedy
 
 
-def test_flash_bracketed_by_the_shutter_is_named(good: Evidence) -> None:
+def test_flash_bracketed_by_the_shutter_is_named(good: Seen) -> None:
     alike = np.tile([[[1.0], [1.01], [0.99]]], (3, 1, 3))
-    radiance = bracket(good.radiance, exposure_ratio=alike, exif_ratio=np.array([[0.25, 1, 4]] * 3))
+    radiance = bracket(good.results.radiance, exposure_ratio=alike, exif_ratio=np.array([[0.25, 1, 4]] * 3))
     radiance = replace(radiance, equipment=Equipment("flash"))
     gate = judged(changed(good, radiance=radiance))["exposures"]
     assert gate.state == "warn"
     assert "flash power, aperture or ISO" in gate.remedy
 
 
-def test_gains_nobody_knows_cost_degrees(good: Evidence) -> None:
+def test_gains_nobody_knows_cost_degrees(good: Seen) -> None:
     doubtful = with_gains(good, source="object", sigma=np.array([[0.0] * 3, [0.02] * 3, [0.02] * 3]))
     gate = judged(changed(good, **doubtful))["gain doubt"]
     assert gate.state == "warn" and gate.cost_deg == pytest.approx(12)
     assert judged(changed(good, **doubtful))["normal error"].value > 10  # type: ignore[operator]
 
 
-def test_one_angle_that_keeps_four_shots_from_closing_fails(good: Evidence) -> None:
-    turned = replace(good.selfcal, turned=TurnedShot((1,), np.radians(15), np.radians(2)))
+def test_one_angle_that_keeps_four_shots_from_closing_fails(good: Seen) -> None:
+    turned = replace(good.results.selfcal, turned=TurnedShot((1,), np.radians(15), np.radians(2)))
     gate = judged(changed(good, selfcal=turned))["angles"]
     assert gate.state == "fail" and gate.shots == ("45°",) and "+15° ± 2°" in gate.message
 
 
 @pytest.mark.parametrize(("turn", "state"), [(1.5, "pass"), (5.0, "warn")])
-def test_a_turn_of_the_ring_is_reported_though_corrected(good: Evidence, turn: float, state: str) -> None:
+def test_a_turn_of_the_ring_is_reported_though_corrected(good: Seen, turn: float, state: str) -> None:
     turned, doubt = np.radians([turn, 0.4])
-    gate = judged(changed(good, selfcal=replace(good.selfcal, ring=RingZero(turned, doubt, turned))))["angles"]
+    gate = judged(changed(good, selfcal=replace(good.results.selfcal, ring=RingZero(turned, doubt, turned))))["angles"]
     assert gate.state == state and f"{turn:+.1f}°" in gate.message and "corrected" in gate.message
 
 
-def shaped(good: Evidence, polarized: float, flattened: float, roughness: float, dimmed: bool = True) -> Any:
+def shaped(good: Seen, polarized: float, flattened: float, roughness: float, dimmed: bool = True) -> Any:
     """The ball with a part of its polarization and of its tangents' slope, and whether it dims towards its outline."""
-    image, maps = good.stokes, good.maps
+    image, maps = good.results.stokes, good.results.maps
     weak = image.stokes * np.array([1, polarized, polarized], np.float32)[:, None, None, None]
     shading = np.maximum(maps.normal[..., 2:], 0.1)
     slope = maps.normal[..., :2] / shading * flattened
@@ -368,39 +376,39 @@ def shaped(good: Evidence, polarized: float, flattened: float, roughness: float,
     ],
 )
 def test_body_that_polarizes_too_little_for_its_shape_is_reported(
-    good: Evidence, polarized: float, flattened: float, roughness: float, dimmed: bool, words: str
+    good: Seen, polarized: float, flattened: float, roughness: float, dimmed: bool, words: str
 ) -> None:
     gate = judged(shaped(good, polarized, flattened, roughness, dimmed))["body"]
     assert gate.state == ("warn" if words else "pass"), gate
     assert words in gate.message and (gate.cost_deg > 5) == bool(words)
 
 
-def test_a_flat_object_is_one_finding_with_one_remedy(good: Evidence) -> None:
+def test_a_flat_object_is_one_finding_with_one_remedy(good: Seen) -> None:
     """A coin, whose polarization is too weak to judge the order of the angles, its material or the light."""
     found = judged(shaped(good, 0.13, 0.3, 0.2, dimmed=False))
     assert found["flat"].state == "warn" and "polcap material" in found["flat"].remedy
     assert {found[name].state for name in ("order", "angles", "body", "other light", "lighting")} == {"not judged"}
 
 
-def test_room_light_costs_what_one_ambient_frame_cannot_remove(good: Evidence) -> None:
+def test_room_light_costs_what_one_ambient_frame_cannot_remove(good: Seen) -> None:
     """The object polarizes the room's light: only a frame at the same angle shows the same light."""
     share = {"ambient_share": np.full(3, 0.15)}
-    one = judged(changed(good, radiance=bracket(good.radiance, **share, ambient_shared=True)))["ambient"]
-    each = judged(changed(good, radiance=bracket(good.radiance, **share)))["ambient"]
+    one = judged(changed(good, radiance=bracket(good.results.radiance, **share, ambient_shared=True)))["ambient"]
+    each = judged(changed(good, radiance=bracket(good.results.radiance, **share)))["ambient"]
     assert (one.state, each.state) == ("warn", "pass") and "per angle" in one.remedy
     assert one.cost_deg > 1 and each.cost_deg == 0
 
 
-def test_light_from_both_sides_is_reported(good: Evidence) -> None:
+def test_light_from_both_sides_is_reported(good: Seen) -> None:
     """The brightest tenth of the object shares a polarization where two lamps mirror, not under a flash at the lens."""
     assert judged(good)["lighting"].state == "pass"
-    ratio = good.cues.ratio.copy()
+    ratio = good.results.cues.ratio.copy()
     ratio[0] += 0.01
-    gate = judged(changed(good, cues=replace(good.cues, ratio=ratio)))["lighting"]
+    gate = judged(changed(good, cues=replace(good.results.cues, ratio=ratio)))["lighting"]
     assert gate.state == "warn" and gate.cost_deg == pytest.approx(2.7, abs=0.5)
 
 
-def test_an_unsharp_picture_costs_degrees_before_it_warns(good: Evidence) -> None:
+def test_an_unsharp_picture_costs_degrees_before_it_warns(good: Seen) -> None:
     """A smooth object looks like one out of focus: the expected error counts the doubt."""
     sharp = scenes.before_backdrop([np.eye(3)] * 3)
     soft = replace(sharp, value=np.stack([cv2.GaussianBlur(shot, (0, 0), 1.3) for shot in sharp.value]))
@@ -409,7 +417,7 @@ def test_an_unsharp_picture_costs_degrees_before_it_warns(good: Evidence) -> Non
     assert before.cost_deg == 0 and after.cost_deg > 0.3
 
 
-def test_a_turned_object_is_reported_in_degrees(good: Evidence) -> None:
+def test_a_turned_object_is_reported_in_degrees(good: Seen) -> None:
     """Detail that rolls by 1° about the object's middle, before a camera that stood still."""
     x, y = scenes.CENTER
     moved = []
@@ -421,8 +429,8 @@ def test_a_turned_object_is_reported_in_degrees(good: Evidence) -> None:
     assert gate.value == pytest.approx(1.0, abs=0.15) and gate.cost_deg == pytest.approx(5, abs=1)
 
 
-def test_light_from_around_is_reported(good: Evidence) -> None:
-    image = good.stokes
+def test_light_from_around_is_reported(good: Seen) -> None:
+    image = good.results.stokes
     across = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]
     gate = judged(changed(good, stokes=replace(image, stokes=across)))["body"]
     assert gate.state == "fail" and "reflects" in gate.message
@@ -433,9 +441,9 @@ def test_light_from_around_is_reported(good: Evidence) -> None:
     ("uneven", "ambient", "state"),
     [(0.47, 0.0, "pass"), (0.7, 0.0, "pass"), (0.0, 1.5, "warn"), (0.0, 6.0, "warn")],
 )
-def test_a_lopsided_body_is_no_light_from_the_side(good: Evidence, uneven: float, ambient: float, state: str) -> None:
+def test_a_lopsided_body_is_no_light_from_the_side(good: Seen, uneven: float, ambient: float, state: str) -> None:
     """A body turned to one side is as polarized there as elsewhere; a lamp from there is not."""
-    image = good.stokes
+    image = good.results.stokes
     across = np.linspace(-1, 1, image.mask.shape[1])[:, None] / (scenes.RADIUS / (image.mask.shape[1] / 2))
     lit = image.stokes * np.maximum(1 + uneven * across, 0)
     lit[0] += ambient * np.maximum(across, 0) * image.stokes[0].mean()
@@ -451,21 +459,24 @@ def test_a_ring_that_was_mended_is_reported() -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [("border", 0.6), ("islands", 0.03), ("holes", 0.06)])
-def test_mask_of_a_doubtful_shape_warns(good: Evidence, name: str, value: Any) -> None:
-    gate = judged(changed(good, object_=replace(good.object_, **{name: value})))["mask"]
+def test_mask_of_a_doubtful_shape_warns(good: Seen, name: str, value: Any) -> None:
+    gate = judged(changed(good, object_=replace(good.results.object_, **{name: value})))["mask"]
     assert gate.state == "warn" and "--mask" in gate.remedy
 
 
-def test_mask_that_its_network_doubts_fails(good: Evidence) -> None:
-    assert failed(changed(good, object_=replace(good.object_, doubt=0.3))) == ["mask"]
+def test_mask_that_its_network_doubts_fails(good: Seen) -> None:
+    assert failed(changed(good, object_=replace(good.results.object_, doubt=0.3))) == ["mask"]
 
 
-def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: Evidence) -> None:
+def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: Seen) -> None:
     two = float(np.log(2.0))
     gate = judged(changed(good, focal_doubt=(-two, two)))["focal length"]
     longer = judged(changed(good, focal_doubt=(0.0, two)))["focal length"]
-    y, x = np.nonzero(good.maps.mask)
-    off = np.hypot(x - good.maps.view.center[0], y - good.maps.view.center[1]) / good.maps.view.focal
+    y, x = np.nonzero(good.results.maps.mask)
+    off = (
+        np.hypot(x - good.results.maps.view.center[0], y - good.results.maps.view.center[1])
+        / good.results.maps.view.focal
+    )
     lean = np.degrees(np.median(np.arctan(2 * off) - np.arctan(off)))  # a focal length half as long
     assert gate.state == "warn" and gate.cost_deg == pytest.approx(lean, abs=0.06)
     assert longer.state == "warn" and 0 < longer.cost_deg < gate.cost_deg
@@ -480,7 +491,7 @@ def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: Evi
     ],
 )
 def test_mesh_in_shreds_fails_by_the_figure_that_is_over(
-    good: Evidence, fault: dict[str, float], state: str, words: str, unit: str
+    good: Seen, fault: dict[str, float], state: str, words: str, unit: str
 ) -> None:
     whole = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
     passed = judged(changed(good, mesh=SimpleNamespace(**whole)))["mesh"]
@@ -499,8 +510,8 @@ def _within(gate: Gate, least: bool) -> bool:
     return value >= limit if least else value <= limit
 
 
-def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: Evidence) -> None:
-    object_, still, image = good.object_, good.alignment, good.stokes
+def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: Seen) -> None:
+    object_, still, image = good.results.object_, good.results.alignment, good.results.stokes
     unlike, unsure = np.array([1, 0.1, 1]), np.array([0, 0.5, 0])
     around = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]
     turned = image.stokes.copy()
@@ -514,35 +525,35 @@ def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: Evid
         ("alignment", False, {"alignment": replace(still, residual_px=unsure)}),
         ("body", True, {"stokes": replace(image, stokes=around)}),
         ("body", True, {"stokes": replace(image, stokes=turned)}),
-        ("body", True, {"stokes": dull.stokes, "maps": dull.maps}),
+        ("body", True, {"stokes": dull.results.stokes, "maps": dull.results.maps}),
     ):
         gate = judged(changed(good, **fields))[name]
         assert gate.state in ("warn", "fail") and not _within(gate, least), gate
 
 
 @pytest.mark.parametrize(("turned", "state"), [(0.0, "pass"), (0.03, "pass"), (0.3, "fail")])
-def test_a_shape_that_is_turned_inside_out_fails_at_its_outline(good: Evidence, turned: float, state: str) -> None:
+def test_a_shape_that_is_turned_inside_out_fails_at_its_outline(good: Seen, turned: float, state: str) -> None:
     """A ball of which a sector is its half-turn about the ray: as much of its outline points inward."""
-    rows, columns = np.mgrid[: good.maps.mask.shape[0], : good.maps.mask.shape[1]]
-    y, x = (part - part[good.maps.mask].mean() for part in (rows, columns))
+    rows, columns = np.mgrid[: good.results.maps.mask.shape[0], : good.results.maps.mask.shape[1]]
+    y, x = (part - part[good.results.maps.mask].mean() for part in (rows, columns))
     around = np.arctan2(y, x) / (2 * np.pi) + 0.5
     local = np.where((around < turned)[..., None], [-1, -1, 1], 1) * scenes.truth()[0]
-    view = frames.rays(good.maps.view, *good.maps.mask.shape)
+    view = frames.rays(good.results.maps.view, *good.results.maps.mask.shape)
     normal = frames.from_ray_frame(local, view).astype(np.float32)
-    gate = judged(changed(good, maps=replace(good.maps, normal=normal)))["outline"]
+    gate = judged(changed(good, maps=replace(good.results.maps, normal=normal)))["outline"]
     assert gate.state == state
     assert gate.value == pytest.approx(turned, abs=0.02)
 
 
-def test_four_angles_are_not_asked_of_who_has_shot_four(good: Evidence) -> None:
+def test_four_angles_are_not_asked_of_who_has_shot_four(good: Seen) -> None:
     four = found(angles=np.radians([0.0, 45, 90, 135]))
     for of, asked in ((good, True), (four, False)):
-        sigma = np.full_like(of.selfcal.gains.sigma, 0.2)
+        sigma = np.full_like(of.results.selfcal.gains.sigma, 0.2)
         doubtful = judged(changed(of, **with_gains(of, source="object", sigma=sigma)))
         assert ("four angles" in doubtful["gain doubt"].remedy) == asked
         assert doubtful["gain doubt"].cost_deg == doubtful["normal error"].value == 90  # no error is larger
 
 
-def test_a_passing_mask_tells_its_figure(good: Evidence) -> None:
-    gate = judged(changed(good, object_=replace(good.object_, doubt=0.024)))["mask"]
+def test_a_passing_mask_tells_its_figure(good: Seen) -> None:
+    gate = judged(changed(good, object_=replace(good.results.object_, doubt=0.024)))["mask"]
     assert gate.state == "pass" and "2.4 %" in gate.message

@@ -13,28 +13,28 @@ from polcap.formats import onnx
 from polcap.images import Floats, Quality
 from polcap.pipeline import models
 from polcap.quality import object_turn, rerendering
-from polcap.quality.gate import Evidence, Gate
+from polcap.quality.gate import Gate
 from polcap.stage_values import Network
 from polcap.stages import infer
 from tests import golden
-from tests.quality.test_gates import changed, found, judged
+from tests.quality.test_gates import Seen, changed, found, judged
 
 
 @pytest.fixture(scope="module")
-def good() -> Evidence:
+def good() -> Seen:
     return found()
 
 
-def of_normals(good: Evidence, normal: Floats) -> Evidence:
+def of_normals(good: Seen, normal: Floats) -> Seen:
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
-    return changed(good, maps=replace(good.maps, normal=normal.astype(np.float32)))
+    return changed(good, maps=replace(good.results.maps, normal=normal.astype(np.float32)))
 
 
-def judge(of: Evidence) -> Gate:
+def judge(of: Seen) -> Gate:
     return rerendering.rerendering(of, Config().gates)
 
 
-def test_the_true_maps_of_a_ball_pass(good: Evidence) -> None:
+def test_the_true_maps_of_a_ball_pass(good: Seen) -> None:
     gate = judge(good)
     assert gate.state == "pass" and isinstance(gate.value, float) and gate.value > 0.7 and gate.cost_deg == 0
 
@@ -47,20 +47,20 @@ def test_the_true_maps_of_a_ball_pass(good: Evidence) -> None:
         lambda n: n * [0.2, 0.2, 1],  # flat
     ],
 )
-def test_wrong_normals_fail_and_cost_degrees(good: Evidence, wrong: Callable[[Floats], Floats]) -> None:
-    of = of_normals(good, wrong(good.maps.normal))
+def test_wrong_normals_fail_and_cost_degrees(good: Seen, wrong: Callable[[Floats], Floats]) -> None:
+    of = of_normals(good, wrong(good.results.maps.normal))
     assert judge(of).state == "fail" and "--model" in judge(of).remedy
     gate = judged(of)["normal error"]
     assert gate.state == "fail" and "re-rendering" in gate.message
 
 
-def test_clipped_light_is_left_out(good: Evidence) -> None:
-    quality = np.full_like(good.cues.quality, Quality.CLIPPED)
-    assert judge(changed(good, cues=replace(good.cues, quality=quality))).state == "not measured"
+def test_clipped_light_is_left_out(good: Seen) -> None:
+    quality = np.full_like(good.results.cues.quality, Quality.CLIPPED)
+    assert judge(changed(good, cues=replace(good.results.cues, quality=quality))).state == "not measured"
 
 
 def test_maps_that_do_not_explain_the_photographs_do_not_measure_motion(
-    good: Evidence, monkeypatch: pytest.MonkeyPatch
+    good: Seen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given: list[Any] = []
     measure = object_turn.measure
@@ -70,9 +70,9 @@ def test_maps_that_do_not_explain_the_photographs_do_not_measure_motion(
         return measure(*values)
 
     monkeypatch.setattr(object_turn, "measure", noted)
-    for of in (good, of_normals(good, good.maps.normal * [0.2, 0.2, 1])):
+    for of in (good, of_normals(good, good.results.maps.normal * [0.2, 0.2, 1])):
         judged(of)
-    assert given == [good.maps, None]
+    assert given == [good.results.maps, None]
 
 
 def exchanged(network: Network, channels: Floats) -> dict[str, Floats]:

@@ -11,6 +11,7 @@ import pytest
 from polcap import report
 from polcap.pipeline import run as pipeline
 from polcap.report import chart_colors
+from polcap.results import Results
 
 
 def test_the_three_differences_make_up_the_difference_of_lab() -> None:
@@ -34,7 +35,7 @@ def test_report_json_has_a_row_per_patch_with_published_lab(result: Path) -> Non
 
 
 def test_a_patch_that_was_not_measured_has_no_numbers(result: Path) -> None:
-    results, facts = pipeline.reopen(result)
+    results, facts = pipeline.reopen(result, Results)
     fit = results.color.patches
     assert fit is not None
     color = replace(results.color, patches=replace(fit, delta_e=np.full(24, np.nan)))

@@ -9,6 +9,7 @@ import numpy as np
 from polcap import report
 from polcap.pipeline import run as pipeline
 from polcap.report import keys, labels, page
+from polcap.results import Results
 
 
 def test_the_page_opens_with_the_error_that_its_gates_judge(result: Path) -> None:
@@ -52,7 +53,7 @@ def test_an_empty_list_is_shown_as_none() -> None:
 def test_a_name_from_a_file_is_text_and_no_markup(result: Path, tmp_path: Path) -> None:
     about = report.read(result)
     about["capture"]["name"] = "<i>jug</i>"
-    page.write(tmp_path, about, pipeline.reopen(result)[0])
+    page.write(tmp_path, about, pipeline.reopen(result, Results)[0])
     text = (tmp_path / "report.html").read_text()
     assert "<i>jug" not in text and "&lt;i&gt;jug" in text
 
@@ -60,5 +61,5 @@ def test_a_name_from_a_file_is_text_and_no_markup(result: Path, tmp_path: Path) 
 def test_the_link_to_the_asset_leads_to_it_whatever_its_name(result: Path, tmp_path: Path) -> None:
     about = report.read(result)
     about["capture"]["name"] = "pot #3 50% Öl"
-    page.write(tmp_path, about, pipeline.reopen(result)[0])
+    page.write(tmp_path, about, pipeline.reopen(result, Results)[0])
     assert 'href="asset/pot%20%233%2050%25%20%C3%96l.glb"' in (tmp_path / "report.html").read_text()

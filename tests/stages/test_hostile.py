@@ -11,7 +11,7 @@ from polcap.errors import InputError
 from polcap.formats import onnx
 from polcap.images import Quality, View
 from polcap.quality import gates
-from polcap.quality.gate import Evidence, State
+from polcap.quality.gate import State
 from polcap.stage_values import AngleStack, Equipment, single_frames
 from polcap.stages import align, asset, cues, infer, mask, selfcal, stokes, surface
 from tests import scenes
@@ -96,7 +96,7 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
         "radiance": radiance, "color": color, "alignment": alignment, "object_": object_, "selfcal": calibration,
         "stokes": image, "cues": seen, "maps": maps, "mesh": mesh,
     }  # fmt: skip
-    judged = gates.judge(Evidence.partial(**found), config.gates)
+    judged = gates.judge(scenes.evidence(**found), config.gates)
     assert all(gate.message and gate.state in get_args(State) for gate in judged)
     assert built.base_color.dtype == np.uint8
 

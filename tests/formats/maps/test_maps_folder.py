@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from polcap.errors import DecodeError, StorageError
 from polcap.formats.maps import exr, png, result_maps
 from polcap.formats.maps import maps_folder as maps
 from polcap.mesh_values import ReliefMesh
-from polcap.results import Results
 from polcap.stage_values import Cues, StokesImage, SurfaceMaps
 from polcap.stages import cues, surface
 from tests import surfaces
@@ -30,7 +30,8 @@ Result = tuple[SurfaceMaps, ReliefMesh, StokesImage, Cues]
 
 
 def write(folder: Path, of: SurfaceMaps, mesh: ReliefMesh, stokes: StokesImage, cue: Cues) -> None:
-    maps.write(folder, Results.partial(maps=of, mesh=mesh, stokes=stokes, cues=cue, keys={}))
+    results: Any = SimpleNamespace(maps=of, mesh=mesh, stokes=stokes, cues=cue, keys={})
+    maps.write(folder, results)
 
 
 @pytest.fixture(scope="module")

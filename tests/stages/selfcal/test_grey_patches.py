@@ -1,6 +1,8 @@
 """Grey patches give the gains within their error; gloss shows on the dark ones; hidden ones do not count."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,8 +10,9 @@ import pytest
 from polcap.chart_values import ChartPlace, ColorCalibration, PatchColors
 from polcap.images import Bits
 from polcap.quality import shot_exposure
-from polcap.quality.gate import Evidence
+from polcap.quality.gate import Gate
 from polcap.quality.limits import GateLimits
+from polcap.stage_values import SelfCalibration
 from polcap.stages.selfcal import grey_patches
 from polcap.stages.whitebalance.patches import PatchUse
 from tests import scenes
@@ -60,10 +63,14 @@ def test_grey_patches_with_a_large_error_are_doubted():
     """Their distance from the object's gains is then within the error of both: the error itself is judged."""
     found = solve(SHOTS, board())
     gains = replace(found.gains, gain=found.gains.gain * [[1], [1.11], [1.13]], sigma=np.full((3, 3), 0.31))
-    vague = Evidence.partial(selfcal=replace(found, gains=replace(gains, disagreement=0.0)))
-    gate = shot_exposure.gain_doubt(vague, GateLimits())
+    gate = gain_doubt(replace(found, gains=replace(gains, disagreement=0.0)))
     assert gate.state == "fail" and gate.value == pytest.approx(0.31) and gate.limit == GateLimits().max_gain_doubt
-    assert shot_exposure.gain_doubt(Evidence.partial(selfcal=found), GateLimits()).state == "pass"
+    assert gain_doubt(found).state == "pass"
+
+
+def gain_doubt(found: SelfCalibration) -> Gate:
+    seen: Any = SimpleNamespace(results=SimpleNamespace(selfcal=found))
+    return shot_exposure.gain_doubt(seen, GateLimits())
 
 
 def test_a_polarized_chart_disagrees_with_the_object():
