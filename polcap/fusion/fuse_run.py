@@ -9,11 +9,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from polcap import __version__
-from polcap import report as reports
-from polcap.config import restore
+from polcap import report
 from polcap.errors import SettingError
-from polcap.formats.export import encoders, provenance
+from polcap.formats.export import encoders
 from polcap.formats.export.texture_set import Extra
 from polcap.fusion import fused_maps, fused_page, object_pictures, session_views
 from polcap.fusion import session as sessions
@@ -23,11 +21,11 @@ from polcap.fusion.each_view import Notify
 from polcap.fusion.fusion_path import FusionResults, SessionConfig, path
 from polcap.fusion.session import ProcessedSession
 from polcap.fusion.session_views import SessionInput
-from polcap.pipeline import asset_export, result_folder
+from polcap.pipeline import asset_export
 from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import Progress
 from polcap.pipeline.run import timings
-from polcap.quality import fused_object, gates
+from polcap.quality import fused_object
 from polcap.quality.advice import advise
 from polcap.quality.fused_object import SeenSurface
 from polcap.quality.gate import Gate
@@ -47,41 +45,25 @@ def fuse(session_input: SessionInput[SessionConfig], out: Path, notify: Notify, 
     config = session_input.config
     config.check()
     with session_views.opened(session_input, out, progress) as (session, cache):
-        processed = sessions.process(session, session_input, cache, notify)
+        processed = sessions.process(session, session_input, cache, notify)  # maps and poses of the views
         with cache.memory_explained(math.prod(session.capture.size_px)):
-            results = path(processed.views, config.fusion, cache)
+            results = path(processed.views, config.fusion, cache)  # closed mesh, atlas, textures
         results = replace(results, maps=_with_albedo_scale(results.maps, processed))
         cache.begin("write")
-        name = session_input.folder.resolve().name
-        about = document(name, processed, config, results, timings(out))
-        write(out, about, results, config)
+        about = _document(session_input.folder.resolve().name, processed, config, results, timings(out))
+        _write(out, about, results, config)
         cache.end()
         return about
 
 
-def export(out: Path, *requests: ExportRequest) -> list[Path]:
-    """Write the asset of a fused result again for each request, from maps/ and report.json; returns the files."""
-    requests = tuple(asset_export.without(request, OF_ONE_VIEW) for request in requests)
-    for request in requests:
-        asset_export.check(request)
-        for flag in {"exr", "iiif", "sfp"} & set(asset_export.effective(request).formats):
-            raise SettingError(
-                f"--{flag} is for results of one view, not for a fused object; leave it out, and use maps/"
-            )
-    about = reports.read(out)
-    with result_folder.locked(out):
-        source = fused_maps.read(out / "maps", restore(SessionConfig, about, out / "report.json").asset)
-        return [file for one in requests for file in asset_export.write(out, about, one, source)]
-
-
 def _with_albedo_scale(maps: AtlasMaps, processed: ProcessedSession) -> AtlasMaps:
     """The maps with the doubt of their scale: the median of the views', which share the chart and its errors."""
-    stated = [report["figures"]["chart"]["scale_doubt"] for report in processed.reports.values()]
+    stated = [about["figures"]["chart"]["scale_doubt"] for about in processed.reports.values()]
     known = [float(one) for one in stated if one is not None]
     return replace(maps, albedo_sigma=float(np.median(known)) if known else None)
 
 
-def document(
+def _document(
     name: str,
     processed: ProcessedSession,
     config: SessionConfig,
@@ -89,42 +71,17 @@ def document(
     seconds: Mapping[str, float],
 ) -> dict[str, Any]:
     """The content of report.json: facts, figures by view, gates; `seconds` are those of the stages."""
+    reports = processed.reports
     rows = _rows(processed, results)
     judged = advise(list(_gates(processed, results, rows, config.fusion.gates)))
-    first = next(iter(processed.reports.values()))
-    shots = session_views.shots({view: report["capture"] for view, report in processed.reports.items()})
-    of_views = {f"{view} infer": report["keys"]["infer"] for view, report in processed.reports.items()}
-    return {
-        "polcap": __version__,
-        "versions": provenance.versions(),
-        "verdict": gates.verdict(judged),
-        "capture": {**first["capture"], "name": name, "shots": shots},
-        "gates": msgspec.to_builtins(judged),
+    others = {
         "figures": _figures(processed, results, rows),
         "timings": dict(seconds),
-        "model": first["model"],
-        "keys": {**results.keys, **of_views},
+        "model": next(iter(reports.values()))["model"],
+        "keys": {**results.keys, **{f"{view} infer": one["keys"]["infer"] for view, one in reports.items()}},
         "settings": msgspec.to_builtins(config),
     }
-
-
-def _figures(processed: ProcessedSession, results: FusionResults, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Figures of the views, the sets of views, the camera and the mesh."""
-    return {
-        "views": {row["name"]: row for row in rows},
-        "left_out": dict(processed.left_out),
-        "sets": {one.folder: one.shared for one in results.joined},
-        "camera": asdict(processed.poses.camera),
-        "mesh": {
-            "metric": processed.poses.metric,
-            "triangles": len(results.atlas.mesh.faces),
-            "texture_px": results.maps.mask.shape[0],
-            "texels_per_mm": 0.001 / results.atlas.texel if processed.poses.metric else None,
-            "extent": np.ptp(results.mesh.vertices, axis=0).tolist(),
-            "closed": _closed(results),
-            "seen": _seen(results).seen,
-        },
-    }
+    return report.session_document(name, {view: one["capture"] for view, one in reports.items()}, judged, others)
 
 
 def _rows(processed: ProcessedSession, results: FusionResults) -> list[dict[str, Any]]:
@@ -152,16 +109,6 @@ def _verdict(about: Mapping[str, Any]) -> str:
     return next((state for state in ("fail", "warn") if state in states), "pass")
 
 
-def _seen(results: FusionResults) -> SeenSurface:
-    """Share of the surface that a view saw, and where the rest faces."""
-    return SeenSurface.measure(results.maps.seen[results.atlas.covered], results.atlas.normal[:, 1])
-
-
-def _closed(results: FusionResults) -> bool:
-    """Whether every edge of the mesh, as it is written, belongs to two triangles."""
-    return is_closed(fused_maps.weld(results.atlas.mesh))
-
-
 def _gates(
     processed: ProcessedSession, results: FusionResults, rows: Sequence[Mapping[str, Any]], limits: FusedGateLimits
 ) -> Iterator[Gate]:
@@ -176,7 +123,36 @@ def _gates(
     yield fused_object.closed(_closed(results))
 
 
-def write(out: Path, about: dict[str, Any], results: FusionResults, config: SessionConfig) -> None:
+def _seen(results: FusionResults) -> SeenSurface:
+    """Share of the surface that a view saw, and where the rest faces."""
+    return SeenSurface.measure(results.maps.seen[results.atlas.covered], results.atlas.normal[:, 1])
+
+
+def _closed(results: FusionResults) -> bool:
+    """Whether every edge of the mesh, as it is written, belongs to two triangles."""
+    return is_closed(fused_maps.weld(results.atlas.mesh))
+
+
+def _figures(processed: ProcessedSession, results: FusionResults, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Figures of the views, the sets of views, the camera and the mesh."""
+    return {
+        "views": {row["name"]: row for row in rows},
+        "left_out": dict(processed.left_out),
+        "sets": {one.folder: one.shared for one in results.joined},
+        "camera": asdict(processed.poses.camera),
+        "mesh": {
+            "metric": processed.poses.metric,
+            "triangles": len(results.atlas.mesh.faces),
+            "texture_px": results.maps.mask.shape[0],
+            "texels_per_mm": 0.001 / results.atlas.texel if processed.poses.metric else None,
+            "extent": np.ptp(results.mesh.vertices, axis=0).tolist(),
+            "closed": _closed(results),
+            "seen": _seen(results).seen,
+        },
+    }
+
+
+def _write(out: Path, about: dict[str, Any], results: FusionResults, config: SessionConfig) -> None:
     """Write maps/, asset/, the turntable and the report of a fused result; StorageError."""
     fused_maps.write(out / "maps", results.atlas, results.maps, about["keys"])
     source = fused_maps.read(out / "maps", config.asset)  # as stored, so that `polcap export` makes the same bytes
@@ -185,3 +161,15 @@ def write(out: Path, about: dict[str, Any], results: FusionResults, config: Sess
     turning = object_pictures.around(results.atlas, results.maps, object_pictures.FRAMES, _SIDE)
     encoders.animate(out / "asset" / "turntable", turning, animation.SECONDS)
     fused_page.write(out, about, results)
+
+
+def export(out: Path, *requests: ExportRequest) -> list[Path]:
+    """Write the asset of a fused result again for each request, from maps/ and report.json; returns the files."""
+    requests = tuple(asset_export.without(request, OF_ONE_VIEW) for request in requests)
+    for request in requests:
+        asset_export.check(request)
+        for flag in {"exr", "iiif", "sfp"} & set(asset_export.effective(request).formats):
+            raise SettingError(
+                f"--{flag} is for results of one view, not for a fused object; leave it out, and use maps/"
+            )
+    return asset_export.again(out, requests, SessionConfig, lambda maps, of: fused_maps.read(maps, of.asset))

@@ -130,12 +130,3 @@ def read(session_input: SessionInput[Any]) -> Session:
 def reason(error: InputError, name: str) -> str:
     """Why a view is left out, without its name or folder at the beginning."""
     return str(error).removeprefix(f"{name}: ")
-
-
-def shots(captures: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Facts of all shots, with files named from the session's folder; `captures` are the facts of each view."""
-    return [
-        {**shot, "frames": [{**frame, "file": f"{view}/{frame['file']}"} for frame in shot["frames"]]}
-        for view, capture in captures.items()
-        for shot in capture["shots"]
-    ]

@@ -9,11 +9,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from polcap import __version__
-from polcap import report as reports
-from polcap.config import restore
+from polcap import report
 from polcap.errors import SettingError
-from polcap.formats.export import provenance
 from polcap.formats.export.texture_set import Extra
 from polcap.fusion import session_views
 from polcap.fusion.each_view import Notify
@@ -21,11 +18,11 @@ from polcap.fusion.session_views import Session, SessionInput
 from polcap.material import material_maps, material_page, material_path, material_session
 from polcap.material.material_path import MaterialConfig, MaterialResults
 from polcap.material.material_session import FlatSession, Region
-from polcap.pipeline import asset_export, result_folder
+from polcap.pipeline import asset_export
 from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import Progress
 from polcap.pipeline.run import timings
-from polcap.quality import flat_sample, gates, several_views
+from polcap.quality import flat_sample, several_views
 from polcap.quality.advice import advise
 from polcap.quality.gate import Gate
 
@@ -48,38 +45,22 @@ def measure(
 
     Raises InputError: anything at fault with the user's input.
     """
+    config = session_input.config
     with session_views.opened(session_input, out, progress) as (session, cache):
-        flat = material_session.process(session, session_input, region, texel, cache, notify)
-        settings = session_input.config.material
+        flat = material_session.process(session, session_input, region, texel, cache, notify)  # Stokes parameters
         with cache.memory_explained(math.prod(session.capture.size_px)):
-            results = material_path.path(flat.views, flat.chart, flat.board, flat.grid, settings, tile, cache)
+            results = material_path.path(flat.views, flat.chart, flat.board, flat.grid, config.material, tile, cache)
         cache.begin("write")
-        name = session_input.folder.resolve().name
-        about = document(name, session, flat, session_input.config, results, timings(out))
+        about = _document(session_input.folder.resolve().name, session, flat, config, results, timings(out))
         material_maps.write(out / "maps", flat.grid, results.maps, about["keys"], tile)
-        source = material_maps.read(out / "maps", session_input.config.asset)  # as stored, as `polcap export` reads it
+        source = material_maps.read(out / "maps", config.asset)  # as stored, as `polcap export` reads it
         asset_export.write(out, about, ExportRequest(), source)
         material_page.write(out, about, source)
         cache.end()
         return about
 
 
-def export(out: Path, *requests: ExportRequest) -> list[Path]:
-    """Write the asset of a material again for each request, from maps/ and report.json; returns the files."""
-    requests = tuple(asset_export.without(request, _OF_SHAPE) for request in requests)
-    for request in requests:
-        asset_export.check(request)
-        for flag in _SINGLE_VIEW & set(asset_export.effective(request).formats):
-            raise SettingError(f"--{flag} is for results of one view; leave it out, and use the EXRs in maps/")
-        if request.lod or request.triangles:
-            raise SettingError("--lod and --triangles reduce a mesh, and a material is a plane; leave them out")
-    about = reports.read(out)
-    with result_folder.locked(out):
-        source = material_maps.read(out / "maps", restore(MaterialConfig, about, out / "report.json").asset)
-        return [file for one in requests for file in asset_export.write(out, about, one, source)]
-
-
-def document(
+def _document(
     name: str,
     session: Session,
     flat: FlatSession,
@@ -90,19 +71,15 @@ def document(
     """The content of report.json: facts, figures by view, gates; `seconds` are those of the stages."""
     rows = list(_rows(flat, results))
     judged = advise(list(_gates(flat, results, rows, config)))
-    captures = {name: reports.capture_facts(session.views[name].capture) for name in flat.names}
-    return {
-        "polcap": __version__,
-        "versions": provenance.versions(),
-        "verdict": gates.verdict(judged),
-        "capture": {**captures[flat.names[0]], "name": name, "shots": session_views.shots(captures)},
-        "gates": msgspec.to_builtins(judged),
+    others = {
         "figures": _figures(flat, results, rows),
         "timings": dict(seconds),
         "model": None,
         "keys": results.keys,
         "settings": msgspec.to_builtins(config),
     }
+    captures = {view: report.capture_facts(session.views[view].capture) for view in flat.names}
+    return report.session_document(name, captures, judged, others)
 
 
 def _rows(flat: FlatSession, results: MaterialResults) -> Iterator[dict[str, Any]]:
@@ -120,6 +97,18 @@ def _rows(flat: FlatSession, results: MaterialResults) -> Iterator[dict[str, Any
             "residual": float(results.fitted.residual[k]),
             "misfit": float(results.fitted.misfit[k]),
         }
+
+
+def _gates(
+    flat: FlatSession, results: MaterialResults, rows: list[dict[str, Any]], config: MaterialConfig
+) -> Iterator[Gate]:
+    """All gates of a flat sample."""
+    limits = config.material.gates
+    yield flat_sample.views(flat.names, flat.left_out, limits)
+    yield flat_sample.tilts(flat.tilt_deg, limits)
+    yield several_views.poses({row["name"]: row["reprojection_px"] for row in rows}, limits.max_corner_px, board=True)
+    yield flat_sample.agreement({row["name"]: row["residual"] for row in rows}, limits)
+    yield flat_sample.seen(float(results.maps.seen.mean()), limits)
 
 
 def _figures(flat: FlatSession, results: MaterialResults, rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -151,13 +140,13 @@ def _figures(flat: FlatSession, results: MaterialResults, rows: list[dict[str, A
     }
 
 
-def _gates(
-    flat: FlatSession, results: MaterialResults, rows: list[dict[str, Any]], config: MaterialConfig
-) -> Iterator[Gate]:
-    """All gates of a flat sample."""
-    limits = config.material.gates
-    yield flat_sample.views(flat.names, flat.left_out, limits)
-    yield flat_sample.tilts(flat.tilt_deg, limits)
-    yield several_views.poses({row["name"]: row["reprojection_px"] for row in rows}, limits.max_corner_px, board=True)
-    yield flat_sample.agreement({row["name"]: row["residual"] for row in rows}, limits)
-    yield flat_sample.seen(float(results.maps.seen.mean()), limits)
+def export(out: Path, *requests: ExportRequest) -> list[Path]:
+    """Write the asset of a material again for each request, from maps/ and report.json; returns the files."""
+    requests = tuple(asset_export.without(request, _OF_SHAPE) for request in requests)
+    for request in requests:
+        asset_export.check(request)
+        for flag in _SINGLE_VIEW & set(asset_export.effective(request).formats):
+            raise SettingError(f"--{flag} is for results of one view; leave it out, and use the EXRs in maps/")
+        if request.lod or request.triangles:
+            raise SettingError("--lod and --triangles reduce a mesh, and a material is a plane; leave them out")
+    return asset_export.again(out, requests, MaterialConfig, lambda maps, of: material_maps.read(maps, of.asset))

@@ -8,13 +8,13 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypeVar
 
 import msgspec
 import numpy as np
 
-from polcap import parallel
-from polcap.config import Config
+from polcap import parallel, report
+from polcap.config import Config, restore
 from polcap.errors import SettingError
 from polcap.formats import atomic, text_file
 from polcap.formats.export import (
@@ -40,10 +40,12 @@ from polcap.formats.export.presets import PRESETS, ExportPreset, Format
 from polcap.formats.export.texture_set import Extra, Key, Texture
 from polcap.formats.maps import maps_folder
 from polcap.mesh_values import Asset, Mesh, ReliefMesh
+from polcap.pipeline import result_folder
 from polcap.pipeline.cache import digest
 from polcap.stages import asset, surface
 from polcap.stages.asset import AssetSettings
 
+C = TypeVar("C", bound=Config)
 _Writer = Callable[[], list[Path]]  # returns the files that it has written
 _NEEDED: tuple[Extra, ...] = ("object-normal",)  # by the format `iiif`
 # of exported files
@@ -303,6 +305,19 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     if preset.gathers:
         written.append(archive.write_manifest(folder))
     return [*written, sidecar]
+
+
+def again(
+    out: Path, requests: Sequence[ExportRequest], kind: type[C], read_maps: Callable[[Path, C], ExportSource]
+) -> list[Path]:
+    """Write the asset of a finished result again for each request, from maps/ and report.json; returns the files.
+
+    `kind` is the class of the settings in report.json.
+    """
+    about = report.read(out)
+    with result_folder.locked(out):
+        source = read_maps(out / "maps", restore(kind, about, out / "report.json"))
+        return [file for request in requests for file in write(out, about, request, source)]
 
 
 def _loose_textures(

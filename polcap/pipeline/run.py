@@ -117,7 +117,7 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
     )
     parallel.both(
         partial(report.write, out, about, results),
-        partial(_write_assets, out, about, config, [ExportRequest()], results.mesh),
+        partial(_write_asset, out, about, config, results.mesh),
     )
     if results.color.source in ("chart", "corners"):
         color_profile.write(out / color_profile.NAME, results.color)
@@ -126,6 +126,11 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
     ):  # a profile may be this file
         own.remove(out / color_profile.NAME)
     return about
+
+
+def _write_asset(out: Path, about: dict[str, Any], config: Config, mesh: ReliefMesh) -> None:
+    """Write the asset of a finished path, from the files in maps/ and their mesh."""
+    asset_export.write(out, about, ExportRequest(), asset_export.read(out / "maps", config, mesh))
 
 
 def decode_with_progress(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
@@ -155,17 +160,7 @@ def export(out: Path, *wanted: ExportRequest) -> list[Path]:
     """
     for one in wanted:
         asset_export.check(one)
-    about = report.read(out)
-    with result_folder.locked(out):
-        return _write_assets(out, about, restore(Config, about, out / "report.json"), wanted)
-
-
-def _write_assets(
-    out: Path, about: dict[str, Any], config: Config, wanted: Sequence[ExportRequest], mesh: ReliefMesh | None = None
-) -> list[Path]:
-    """Write an asset for each request, from the files in maps/ and their mesh; returns the files."""
-    source = asset_export.read(out / "maps", config, mesh)
-    return [file for one in wanted for file in asset_export.write(out, about, one, source)]
+    return asset_export.again(out, wanted, Config, asset_export.read)
 
 
 def reopen(out: str | Path, wanted: type[R]) -> tuple[R, dict[str, Any]]:

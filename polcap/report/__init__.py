@@ -18,6 +18,7 @@ from polcap.capture_values import Capture, Frame
 from polcap.config import Config
 from polcap.errors import StorageError
 from polcap.formats import atomic, text_file
+from polcap.formats.export import provenance
 from polcap.quality import error_maps, gates
 from polcap.quality.advice import advise
 from polcap.quality.gate import Gate, full_size
@@ -136,6 +137,28 @@ def document(
         "model": facts["model"],
         "keys": dict(results.keys),
         "settings": facts["settings"],
+    }
+
+
+def session_document(
+    name: str, captures: Mapping[str, Mapping[str, Any]], judged: Sequence[Gate], others: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Assemble the content of report.json of several views: facts of their `captures`, gates, and `others`.
+
+    Its shots are those of all views, with files named from the session's folder.
+    """
+    shots = [
+        {**shot, "frames": [{**frame, "file": f"{view}/{frame['file']}"} for frame in shot["frames"]]}
+        for view, capture in captures.items()
+        for shot in capture["shots"]
+    ]
+    return {
+        "polcap": __version__,
+        "versions": provenance.versions(),
+        "verdict": gates.verdict(judged),
+        "capture": {**next(iter(captures.values())), "name": name, "shots": shots},
+        "gates": msgspec.to_builtins(judged),
+        **others,
     }
 
 
