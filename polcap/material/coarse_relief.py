@@ -1,12 +1,9 @@
-"""Height of the sample over the board, and the light of each view, on coarse texels, from parallax and normals.
+"""Height of the sample over the board, on coarse texels, from parallax and normals.
 
 1. The plane on which the textures of all views agree best gives the sample's thickness.
 2. Fits of coarse texels give normals, and the radiance that each view should show.
 3. Where a view shows the texture of a neighbor instead, the height is wrong: least squares over a window give it.
 4. Heights from normals and from parallax are joined, by the errors of both. Steps 2 to 4 are repeated.
-
-The radiance in excess of the fits, which is common to a view, corrects its gain; only what a tilt of the whole sample
-cannot explain.
 """
 
 from collections.abc import Sequence
@@ -42,11 +39,10 @@ _FIRST = TexelPrior(np.array([[0.45, 0.042]], np.float32), np.array([[0.2, 0.012
 
 @dataclass(frozen=True, repr=False)
 class CoarseRelief(ArrayValue):
-    """Height of the sample, and the light corrected with it."""
+    """Height of the sample."""
 
     height: Floats  # (H, W) m over the board, on the fine grid
     sigma: Floats  # (H, W) m, of the heights from parallax alone
-    light: FlashLight
 
 
 class ReliefSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -55,12 +51,11 @@ class ReliefSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     parallax_error: Annotated[
         float, Meta(gt=0, le=1, description="error of a view's radiance in the search for parallax [1]")
     ] = 0.03
-    refine_gains: Annotated[bool, Meta(description="correct the light of each view by the sample itself")] = True
 
 
-@stage(version=2)
+@stage(version=3)
 def solve(views: tuple[PosedStokes, ...], light: FlashLight, grid: TexelGrid, settings: ReliefSettings) -> CoarseRelief:
-    """Height on the fine grid, interpolated from coarse texels, and corrected light."""
+    """Height on the fine grid, interpolated from coarse texels."""
     step = max(1, round(max(grid.size) / _COARSE))
     coarse = grid.coarser(step)
     middle = _plane(views, grid, step)
@@ -69,8 +64,6 @@ def solve(views: tuple[PosedStokes, ...], light: FlashLight, grid: TexelGrid, se
         fine = _enlarge(height, grid, step)
         seen = resample(views, light, grid, fine, step)
         estimate = _fit(seen, views, light, coarse, height)
-        if settings.refine_gains:
-            light = texel_grid.with_gain(light, _gain_errors(seen, estimate, views, light, coarse, height))
         delta = coarse.texel
         raised = resample(views, light, grid, fine + delta, step)
         update, weight = _parallax(seen, raised, estimate, delta, settings)
@@ -79,7 +72,7 @@ def solve(views: tuple[PosedStokes, ...], light: FlashLight, grid: TexelGrid, se
         reach = np.inf if number == 0 else CROSSOVER / step  # slopes of misplaced views are wrong
         height = _join(stereo, weight, slope, coarse.texel, reach)
     sigma = 1 / np.sqrt(np.maximum(weight, 1e-30))
-    return CoarseRelief(_enlarge(height, grid, step), _enlarge(np.minimum(sigma, 1.0), grid, step), light)
+    return CoarseRelief(_enlarge(height, grid, step), _enlarge(np.minimum(sigma, 1.0), grid, step))
 
 
 def _enlarge(image: Floats, grid: TexelGrid, step: int) -> Floats:
@@ -143,26 +136,6 @@ def measurements(seen: TexelStokes, views: Sequence[PosedStokes]) -> Measurement
     parts = (seen.radiance, seen.polarized, seen.noise)
     radiance, polarized, noise = (one.reshape(len(one), -1, one.shape[-1]) for one in parts)
     return Measurements(radiance, polarized, noise, flash_light.gray_of_colors(views[0].matrix))
-
-
-def _gain_errors(
-    seen: TexelStokes,
-    estimate: TexelEstimate,
-    views: Sequence[PosedStokes],
-    light: FlashLight,
-    grid: TexelGrid,
-    height: Floats,
-) -> Floats:
-    """Factors (K,) on the gains: medians of measured over modelled radiance, less what a tilt would explain."""
-    gray = (seen.radiance @ flash_light.gray_of_colors(views[0].matrix)).reshape(len(views), -1)
-    known = np.isfinite(seen.noise[..., 0]).reshape(gray.shape) & (gray > 0)
-    ratio = np.log(np.where(known, gray, 1) / np.maximum(estimate.model, 1e-4))
-    excess = np.array([np.median(r[k]) if k.any() else 0.0 for r, k in zip(ratio, known, strict=True)])
-    middle = grid.points(height).reshape(-1, 3).mean(axis=0)
-    towards = np.stack([view.pose.center + view.pose.rotation.T @ light.place - middle for view in views])
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    terms = np.stack([np.ones(len(views)), *(towards / towards[:, 1:2])[:, [0, 2]].T], axis=-1)
-    return np.asarray(np.exp(excess - terms @ np.linalg.lstsq(terms, excess, rcond=None)[0]))
 
 
 def _parallax(

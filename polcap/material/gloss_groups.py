@@ -1,8 +1,8 @@
 """Materials of the sample: groups of texels of like albedo, with the roughness and F0 that all of a group share.
 
 A narrow highlight is met by few texels in few views. So every group gets the gloss that fits many of its texels best:
-first the best of a few values of roughness, then Newton steps on sums of the texels' normal equations. The law of
-diffuse reflection, of a smooth or a rough interface, is the one that fits better.
+a few values of roughness are tried, and Newton steps on sums of the texels' normal equations start from each that fits
+better than its neighbors. The law of diffuse reflection, of a smooth or a rough interface, is the one that fits better.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from polcap.material import texel_fit, texel_grid
 from polcap.material.coarse_relief import CoarseRelief, measurements
 from polcap.material.stokes_view import PosedStokes
 from polcap.material.texel_fit import LEAST_VIEWS, FitSettings, Measurements, TexelEstimate, TexelPrior
-from polcap.material.texel_grid import TexelGrid, TexelViews
+from polcap.material.texel_grid import FlashLight, TexelGrid, TexelViews
 from polcap.material.texel_stokes import TexelStokes
 from polcap.optics import body, clusters, color
 from polcap.stages import stage
@@ -73,9 +73,14 @@ def _encoded(albedo: Floats) -> Floats:
     return np.asarray(color.encode_srgb(np.clip(albedo, 0, 1)), np.float32)
 
 
-@stage(version=3)
+@stage(version=4)
 def find(
-    views: tuple[PosedStokes, ...], relief: CoarseRelief, grid: TexelGrid, seen: TexelStokes, settings: GlossSettings
+    views: tuple[PosedStokes, ...],
+    light: FlashLight,
+    relief: CoarseRelief,
+    grid: TexelGrid,
+    seen: TexelStokes,
+    settings: GlossSettings,
 ) -> GlossGroups:
     """Group texels on an even grid by their first albedo, and fit the gloss of each group.
 
@@ -92,7 +97,7 @@ def find(
             f"{_LEAST_SAMPLES} are needed; expose darker, or name the sample's part with --region"
         )
     point = grid.points(relief.height)[at].reshape(-1, 3)[known]
-    geometry = texel_grid.geometry(point, [view.pose for view in views], relief.light)
+    geometry = texel_grid.geometry(point, [view.pose for view in views], light)
     data = data.take(known)
     first = TexelPrior(*(np.repeat(np.array([a], np.float32), len(known), axis=0) for a in ((0.45, _F0), (0.2, 0.01))))
     begin = texel_fit.start(data, geometry, first, body.SMOOTH)
@@ -126,7 +131,16 @@ def _shared(data: Measurements, views: TexelViews, law: body.Law, fitting: FitSe
     """Roughness and F0 (2,) that all texels share, their 1σ (2,), and the mean cost of a texel."""
     few = slice(None, None, max(1, data.radiance.shape[1] // _TRIED))
     some, seen = data.take(few), views.take(few)
-    gloss = min((np.array([rough, _F0]) for rough in _ROUGHNESS), key=lambda one: _at(some, seen, one, law, fitting)[0])
+    tried = [np.inf, *(_at(some, seen, np.array([rough, _F0]), law, fitting)[0] for rough in _ROUGHNESS), np.inf]
+    starts = [rough for rough, (a, b, c) in zip(_ROUGHNESS, zip(tried, tried[1:], tried[2:])) if b < min(a, c)]
+    found = [_descend(data, views, np.array([rough, _F0]), law, fitting) for rough in starts]
+    return min(found, key=lambda one: one[2])
+
+
+def _descend(
+    data: Measurements, views: TexelViews, gloss: Floats, law: body.Law, fitting: FitSettings
+) -> tuple[Floats, Floats, float]:
+    """The nearest shared gloss (2,) of least cost, its 1σ (2,), and the mean cost of a texel."""
     cost, estimate = _at(data, views, gloss, law, fitting)
     for _ in range(_ROUNDS):
         step, _ = _newton(estimate, gloss)

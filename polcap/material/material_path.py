@@ -76,9 +76,9 @@ def path(
     """  # fmt: skip
     light = cache.run(flash_light.measure, views, chart, board)
     relief = cache.run(coarse_relief.solve, views, light, grid, config=settings.relief)
-    seen = cache.run(rectification.rectify, views, relief, grid)
-    gloss = cache.run(gloss_groups.find, views, relief, grid, seen, config=settings.gloss)
-    fitted = cache.run(texel_maps.estimate, views, relief, grid, seen, gloss, config=settings.gloss)
+    seen = cache.run(rectification.rectify, views, light, relief, grid)
+    gloss = cache.run(gloss_groups.find, views, light, relief, grid, seen, config=settings.gloss)
+    fitted = cache.run(texel_maps.estimate, views, light, relief, grid, seen, gloss, config=settings.gloss)
     maps = cache.run(height_map.build, fitted, relief, grid, cache.derive(albedo_sigma, light, chart))
     if tile:
         maps = cache.run(tiling.tile, maps)

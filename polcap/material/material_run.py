@@ -84,7 +84,7 @@ def _document(
 
 def _rows(flat: FlatSession, results: MaterialResults) -> Iterator[dict[str, Any]]:
     """Figures of each view."""
-    gain = results.relief.light.gain
+    gain = results.light.gain
     for k, name in enumerate(flat.names):
         posed = flat.poses.views[name]
         yield {
@@ -107,13 +107,14 @@ def _gates(
     yield flat_sample.views(flat.names, flat.left_out, limits)
     yield flat_sample.tilts(flat.tilt_deg, limits)
     yield several_views.poses({row["name"]: row["reprojection_px"] for row in rows}, limits.max_corner_px, board=True)
+    yield flat_sample.paper(results.light.shine, limits)
     yield flat_sample.agreement({row["name"]: row["residual"] for row in rows}, limits)
     yield flat_sample.seen(float(results.maps.seen.mean()), limits)
 
 
 def _figures(flat: FlatSession, results: MaterialResults, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Figures of the views, the light, the materials and the maps."""
-    maps, light, gloss = results.maps, results.relief.light, results.gloss
+    maps, light, gloss = results.maps, results.light, results.gloss
     height, width = maps.seen.shape
     seen = maps.seen if maps.seen.any() else np.ones_like(maps.seen)
     doubts = ("normal_sigma", "diffuse_sigma", "specular_sigma", "roughness_sigma")
@@ -121,7 +122,12 @@ def _figures(flat: FlatSession, results: MaterialResults, rows: list[dict[str, A
         "views": {row["name"]: row for row in rows},
         "left_out": dict(flat.left_out),
         "camera": asdict(flat.poses.camera),
-        "flash": {"place_m": light.place.tolist(), "paper_albedo": light.paper, "paper_scatter": light.sigma},
+        "flash": {
+            "place_m": light.place.tolist(),
+            "paper_albedo": light.paper,
+            "paper_scatter": light.sigma,
+            "paper_shine": light.shine,
+        },
         "chart": {"view": None if flat.chart is None else flat.names[flat.chart.view]},
         "materials": {
             "law": gloss.law,

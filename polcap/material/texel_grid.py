@@ -5,7 +5,7 @@ The plane's frame is x right, y up the printed page, z out of it; the world fram
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -46,6 +46,7 @@ class FlashLight:
     shot_matrix: Floats  # (K, 3, 3, 3) channel, corrected Stokes parameters from those of a view
     sigma: float  # relative, of the paper's radiance about the model
     paper: float  # albedo of the board's paper that the model implies
+    shine: float  # highlight of the paper over its diffuse light, at the brightest point
     used: int  # points of the paper
 
 
@@ -81,8 +82,3 @@ def geometry(point: Floats, poses: Sequence[Pose], light: FlashLight) -> TexelVi
         lights.append(frames.to_ray_frame(towards / np.sqrt(squared)[:, None], v).astype(np.float32))
         levels.append((gain / squared).astype(np.float32))
     return TexelViews(np.stack(rays), np.stack(lights), np.stack(levels))
-
-
-def with_gain(light: FlashLight, factor: Floats) -> FlashLight:
-    """The light with the gains of the views multiplied by factors (K,)."""
-    return replace(light, gain=light.gain * factor)

@@ -11,7 +11,7 @@ from polcap.material.coarse_relief import CoarseRelief, measurements
 from polcap.material.gloss_groups import LAWS, GlossGroups, GlossSettings
 from polcap.material.stokes_view import PosedStokes
 from polcap.material.texel_fit import LEAST_VIEWS, UNKNOWNS, TexelEstimate, TexelPrior
-from polcap.material.texel_grid import TexelGrid
+from polcap.material.texel_grid import FlashLight, TexelGrid
 from polcap.material.texel_stokes import TexelStokes
 from polcap.optics import body
 from polcap.stages import stage
@@ -32,9 +32,10 @@ class TexelMaps(ArrayValue):
     residual: Floats  # (K,) median of |measured − modelled| S0 over S0
 
 
-@stage(version=2)
+@stage(version=3)
 def estimate(
     views: tuple[PosedStokes, ...],
+    light: FlashLight,
     relief: CoarseRelief,
     grid: TexelGrid,
     seen: TexelStokes,
@@ -52,7 +53,7 @@ def estimate(
     for top in range(0, height, rows):
         strip = slice(top, min(top + rows, height))
         data = measurements(seen.rows(strip), views)
-        geometry = texel_grid.geometry(point[strip].reshape(-1, 3), poses, relief.light)
+        geometry = texel_grid.geometry(point[strip].reshape(-1, 3), poses, light)
         law: body.Law = LAWS[gloss.law]
         albedo = texel_fit.start(data, geometry, gloss.prior(_first_albedo(data, gloss), settings), law)
         prior = gloss.prior(albedo[:, 4:], settings)

@@ -1,4 +1,4 @@
-"""Gates of a flat sample: its views, their tilts, their agreement with the fit, the measured share."""
+"""Gates of a flat sample: its views, their tilts, the board's paper, agreement with the fit, the measured share."""
 
 from collections.abc import Mapping, Sequence
 
@@ -20,6 +20,15 @@ def tilts(tilt_deg: Mapping[str, float], limits: MaterialGateLimits) -> Gate:
     if value - min(tilt_deg.values()) >= limit:
         return Gate("tilts", "pass", value, limit, message, unit="°")
     return Gate("tilts", "fail", value, limit, message, "Shoot from the sides too, tilted by 20 to 45°", unit="°")
+
+
+def paper(shine: float, limits: MaterialGateLimits) -> Gate:
+    """Gate on the highlight of the board's paper, relative to its diffuse light: it disturbs the light of the views."""
+    message, limit = f"The board's paper has a highlight of {shine:.0%} of its diffuse light", limits.max_paper_shine
+    if shine <= limit:
+        return Gate("paper", "pass", shine, limit, message)
+    remedy = "Print the board on matt paper, and do not laminate it; each view's light is less certain"
+    return Gate("paper", "warn", shine, limit, message, remedy)
 
 
 def agreement(residual: Mapping[str, float], limits: MaterialGateLimits) -> Gate:

@@ -183,6 +183,9 @@ class MaterialGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     max_corner_px: Annotated[
         Positive, Meta(description="allowed rms distance of board corners from the pose; usually 0.1 to 0.2 [RAW px]")
     ] = 0.5
+    max_paper_shine: Annotated[
+        Positive, Meta(description="allowed highlight of the board's paper over its diffuse light [1]")
+    ] = 0.1
     max_residual: Annotated[
         Positive,
         Meta(description="allowed median of a view's radiance minus that of the fit, relative; usually 0.01 [1]"),

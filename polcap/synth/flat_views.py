@@ -47,6 +47,7 @@ class FlatShoot(Shoot, frozen=True, forbid_unknown_fields=True):
     by_hand_m: Annotated[float, Meta(ge=0, le=0.1)] = 0.004  # 1σ of the camera's aim and distance
     by_hand_deg: Annotated[float, Meta(ge=0, le=20)] = 2.0  # 1σ of the camera's direction
     flash_jitter: Annotated[float, Meta(ge=0, le=0.5)] = 0.02  # 1σ of the flash's energy from view to view, relative
+    board_roughness: Annotated[float, Meta(ge=0, le=1)] = 0.0  # of a board on glossy paper; 0: matt
     side_m: Annotated[float, Meta(gt=0, le=0.2)] = 0.094  # of the sample
     thickness_m: Annotated[float, Meta(ge=0, le=0.05)] = 0.001
     relief_m: Annotated[float, Meta(ge=0, le=0.02)] = 0.0006  # from the lowest to the highest point
@@ -78,7 +79,7 @@ def write(
                     frame_written(before + written, views * frames)
 
             one = msgspec.structs.replace(shoot, seed=shoot.seed + 1000 * k)
-            studio = Studio(_view(scene, slab, *pose, with_chart=k == 0), one, exposure)
+            studio = Studio(_view(scene, slab, shoot, *pose, with_chart=k == 0), one, exposure)
             exposure = studio.middle
             studio.middle *= float(power[k] * _closer(scene, poses[0], pose))
             shooting.write_capture(place / folder_names.view_name(k), studio, report)
@@ -109,13 +110,13 @@ def _poses(shoot: FlatShoot, views: int) -> Poses:
     return out
 
 
-def _view(scene: Scene, slab: Slab, turn: Rotation, position: Floats, with_chart: bool) -> Scene:
+def _view(scene: Scene, slab: Slab, shoot: FlatShoot, turn: Rotation, position: Floats, with_chart: bool) -> Scene:
     vector, at = tuple(turn.as_rotvec(degrees=True).tolist()), tuple(position.tolist())
     middle = turn.apply(_CHART) + position
     chart = Chart(tuple(middle.tolist()), tuple((turn * _CHART_TURN).as_rotvec(degrees=True).tolist()))
     return msgspec.structs.replace(
         scene, shape=slab, turn_deg=vector, position=at, chart=chart if with_chart else None,
-        board=LaidBoard(at, vector, _BOARD), cast_shadows=True, shadows=True,
+        board=LaidBoard(at, vector, _BOARD, shoot.board_roughness or msgspec.UNSET), cast_shadows=True, shadows=True,
     )  # fmt: skip
 
 

@@ -1,16 +1,18 @@
-"""Simulated board under the object: a flat, matt, unpolarized print, cut to a square as wide as its page."""
+"""Simulated board under the object: a flat print, matt or glossy, cut to a square as wide as its page."""
 
 from typing import Literal
 
 import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from polcap.images import Floats
 from polcap.optics import board as boards
 
-_PAPER, _INK = 0.8, 0.03  # albedos
+_PAPER, _INK = 0.8, 0.03  # albedos, unpolarized
+F0, IOR = 0.04, 1.5  # of a glossy print
 
 
 class LaidBoard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -19,6 +21,7 @@ class LaidBoard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     position: tuple[float, float, float]  # m, of the board's middle
     turn_deg: tuple[float, float, float]  # rotation vector, world to camera
     size: Literal["A4", "A3", "A2"] = "A4"
+    roughness: float | UnsetType = UNSET  # of a glossy print; unset: matt
 
     @property
     def turn(self) -> Rotation:

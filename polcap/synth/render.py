@@ -69,8 +69,7 @@ def stokes(
         column = np.clip(np.rint(x), 0, start.shape[1] - 1).astype(np.intp)
         start = start[row, column].ravel()
     hits, surroundings = _visible(scene, v, start)
-    out = np.zeros((3, x.size, 3), np.float32)
-    out[0] = surroundings
+    out = surroundings.astype(np.float32)
     out[:, hits.index] = _shade(scene, v[hits.index], hits, flash_axis)
     return out.reshape(3, *x.shape, 3)
 
@@ -110,25 +109,38 @@ def white_level(scene: Scene) -> float:
 
 
 def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits, Floats]:
-    """Visible hits of rays on the object, and S0 (P, 3) of the matt, unpolarized chart, board and backdrop behind."""
+    """Visible hits of rays on the object, and Stokes parameters (3, P, 3) of the chart, board and backdrop behind."""
     distance = scene.backdrop / v[:, 2]
     wall = scene.backdrop_albedo * _unshadowed_irradiance(scene, -v * distance[:, None], np.array([0.0, 0.0, 1.0]))
-    out = np.repeat(wall[:, None], 3, axis=1)
+    out = np.zeros((3, len(v), 3))
+    out[0] = wall[:, None]
     hits = trace.trace(scene.shape, scene.position, scene.turn, v, start)
-    for normal, (at, reach, albedo) in _flat_things(scene, v):
+    for normal, roughness, (at, reach, albedo) in _flat_things(scene, v):
         nearer = reach < distance[at]
         at, reach, albedo = at[nearer], reach[nearer], albedo[nearer]
         distance[at] = reach
-        out[at] = albedo * _unshadowed_irradiance(scene, -v[at] * reach[:, None], normal)[:, None]
+        point = -v[at] * reach[:, None]
+        out[:, at] = _highlight(scene, v[at], point, normal, roughness) if roughness else 0.0
+        out[0, at] += albedo * _unshadowed_irradiance(scene, point, normal)[:, None]
     return hits.take(np.flatnonzero(hits.distance < distance[hits.index])), out
 
 
-def _flat_things(scene: Scene, v: Floats) -> Iterator[tuple[Floats, tuple[Indices, Floats, Floats]]]:
-    """Normals of chart and board, and their intersections with rays: indices, lengths [m] and albedo."""
+def _flat_things(scene: Scene, v: Floats) -> Iterator[tuple[Floats, float, tuple[Indices, Floats, Floats]]]:
+    """Normals and roughness (0: matt) of chart and board, and the rays on them: indices, lengths [m] and albedo."""
     if scene.chart is not None:
-        yield scene.chart.axes[0], charts.intersect(scene.chart, v)
+        yield scene.chart.axes[0], 0.0, charts.intersect(scene.chart, v)
     if scene.board is not UNSET:
-        yield scene.board.normal, laid_board.intersect(scene.board, v)
+        yield scene.board.normal, scene.board.roughness or 0.0, laid_board.intersect(scene.board, v)
+
+
+def _highlight(scene: Scene, ray: Floats, point: Floats, normal: Floats, roughness: float) -> Floats:
+    """Stokes parameters (3, N, 3) of the flash's reflection by a glossy board at points (N, 3)."""
+    to_light = frames.unit(np.array(scene.light) - point)
+    irradiance, dark = _unshadowed_irradiance(scene, point, to_light), np.zeros((len(point), 3))
+    facing = frames.to_ray_frame(np.broadcast_to(normal, point.shape), ray)
+    gloss, ior = (np.full(len(point), value) for value in (roughness, laid_board.IOR))
+    light = frames.to_ray_frame(to_light, ray)
+    return np.asarray(shade.stokes(facing, dark, dark + laid_board.F0, gloss, ior, light, irradiance))
 
 
 def _unshadowed_irradiance(scene: Scene, point: Floats, normal: Floats) -> Floats:

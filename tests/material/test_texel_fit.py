@@ -5,7 +5,7 @@ import pytest
 
 from polcap.material import gloss_groups, texel_fit
 from polcap.material.gloss_groups import LAWS, GlossSettings
-from polcap.material.texel_fit import FitSettings, TexelEstimate, TexelPrior
+from polcap.material.texel_fit import FitSettings, Measurements, TexelEstimate, TexelPrior
 from polcap.optics import frames
 from tests.material.flat_texels import POLARIZATION_ERROR, RADIANCE_ERROR, materials, measured, views
 
@@ -83,3 +83,16 @@ def test_a_material_states_errors_that_all_its_texels_share() -> None:
     found = gloss_groups.group(data, seen, truth[:, 4:], GlossSettings(materials=1, fitting=SETTINGS))
     score = (np.array([found.roughness[0], found.f0[0]]) - [0.7, 0.036]) / found.sigma[0]
     assert np.abs(score).max() < 2 and (found.sigma[0] < [0.1, 0.009]).all()
+
+
+def test_roughness_of_a_dull_material_is_found_from_five_views() -> None:
+    """Without the highlight's flank, roughness 0.2 on other slopes fits nearly as well as 0.6."""
+    truth, every = materials(240), views(240)
+    truth[:, 2], truth[:, 3], truth[:, 4:] = 0.6, 0.045, [0.5, 0.4, 0.2]
+    truth[:, :2] *= 0.6
+    data = measured(truth, every)
+    data = Measurements(data.radiance[:5], data.polarized[:5], data.noise[:5], data.gray)
+    found = gloss_groups.group(
+        data, every.of_views(range(5)), truth[:, 4:], GlossSettings(materials=1, fitting=SETTINGS)
+    )
+    assert found.law == "smooth" and found.roughness[0] == pytest.approx(0.6, abs=0.03)
