@@ -165,7 +165,7 @@ def _bounded(roughness: float, f0: float, member: Bools, zenith: Floats, mirrore
         return roughness
     highlight = float(np.partition(mirrored[facing], -_BRIGHTEST)[-_BRIGHTEST])
     error = hypot(np.quantile(mirrored[away], _AWAY_QUANTILE), _ALBEDO_SIGMA * albedo[facing].mean())
-    if highlight <= error:
+    if highlight <= 0:
         return roughness
     bound: float = (f0 / (4 * highlight)) ** 0.25
     sigma = bound * hypot(_BOUND_SIGMA, error / (4 * highlight))

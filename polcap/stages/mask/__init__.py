@@ -3,8 +3,8 @@
 1. A network gives each pixel a probability of being the object (`network`, with the input of `mask_channels`).
 2. Pixels of high probability become a mask without specks (`regions`).
 3. The outline is moved to edges of color, where the probabilities allow it (`graph_cut`).
-4. For silhouettes, bright parts that the mask lacks are added (`bright_parts`), and the pixels on its outline are
-   decided by their coverage (`mask_border`).
+4. For silhouettes, bright parts that the mask lacks are added (`bright_parts`).
+5. The pixels on the outline are decided by their coverage (`mask_border`).
 
 Without a network, or if it finds nothing, the object is found by its difference from the `backdrop`. Of a mask drawn by
 the user only the part is chosen (`mask.part`).
@@ -43,13 +43,13 @@ class MaskSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     silhouette: Annotated[
         Literal["board", "always", "never"],
         Meta(
-            description="add thin bright parts, and decide pixels on the outline by their coverage. It needs a dark "
-            "backdrop; board: where polcap fuse has erased the board. Maps of one view are better without"
+            description="add thin bright parts to the mask. It needs a dark backdrop; "
+            "board: where polcap fuse has erased the board"
         ),
     ] = "board"
 
 
-@stage(version=9)
+@stage(version=10)
 def segment(
     radiance: AngleStack,
     alignment: Alignment,
@@ -85,8 +85,8 @@ def segment(
         doubt = regions.expected_error(mask, probability)
     erased = np.any((radiance.quality & int(Quality.ERASED)) > 0, axis=0)
     if settings.silhouette == "always" or (settings.silhouette == "board" and erased.any()):
-        mask = mask_border.refine(picture, bright_parts.add(picture, mask, erased))
-    return _object(mask, "automatic", doubt, settings)
+        mask = bright_parts.add(picture, mask, erased)
+    return _object(mask_border.refine(picture, mask), "automatic", doubt, settings)
 
 
 def _by_probability(picture: Floats, probability: Floats, zone: Bits, patches: Bits, min_area: float) -> Bools:

@@ -1,7 +1,4 @@
-"""Pixels on the outline of a mask: each belongs to the object if the object covers enough of it.
-
-Silhouettes of several views need it. Maps of one view do not: their roughness is better without mixed pixels.
-"""
+"""Pixels on the outline of a mask: each belongs to the object if the object covers enough of it."""
 
 import cv2
 import numpy as np

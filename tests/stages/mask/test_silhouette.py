@@ -1,7 +1,8 @@
-"""The setting `mask.silhouette`: where bright parts are added and pixels on the outline are decided by coverage."""
+"""The outline of the mask: bright parts by the setting `mask.silhouette`, and pixels decided by their coverage."""
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace as with_setting
@@ -38,3 +39,12 @@ def test_thin_parts_are_added_where_a_board_was_erased_or_always(monkeypatch: py
     assert found(erased=True, silhouette="board")[LEG][10:-4].all()
     assert np.array_equal(found(erased=False, silhouette="always"), found(erased=True, silhouette="board"))
     assert np.array_equal(found(erased=True, silhouette="never"), found(erased=False, silhouette="never"))
+
+
+def test_pixels_on_the_outline_are_decided_by_their_coverage(monkeypatch: pytest.MonkeyPatch) -> None:
+    coverage = cv2.GaussianBlur(BALL.astype(np.float32), (0, 0), 0.5)
+    view = board_views.stack(0.01 + coverage[..., None] * [0.5, 0.4, 0.3])
+    narrow = np.hypot(*(np.mgrid[:220, :200] - 100)) < 54
+    monkeypatch.setattr(backdrop, "find_object", lambda *_: narrow)
+    mask_ = mask.segment(view, STILL, board_views.COLOR, None, None, lambda *_: {}, MaskSettings()).mask
+    assert (mask_ ^ BALL).sum() < 0.2 * (narrow ^ BALL).sum()
