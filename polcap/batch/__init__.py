@@ -1,8 +1,8 @@
 """Batch processing: all captures below a folder, with one summary; a failed capture does not stop the others.
 
-`capture_search` finds the captures, `shards` selects those of this process, `unit` processes one capture, `processes`
-or `cluster` several at a time, and `contact_sheet` writes the summary. A capture that is processed again continues from
-its stage cache.
+`capture_search` finds the captures, `shards` selects those of this process, `unit` processes one capture, `cluster`
+those of several machines, and `contact_sheet` writes the summary. A capture that is processed again continues from its
+stage cache.
 """
 
 import os
@@ -10,10 +10,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from polcap.batch import capture_search, contact_sheet, processes
+from polcap.batch import capture_search, contact_sheet
 from polcap.batch import unit as units
 from polcap.batch.capture_search import Candidate
 from polcap.batch.shards import WHOLE, Shard
@@ -22,6 +23,12 @@ from polcap.errors import CaptureError
 from polcap.formats import atomic, own_files, own_folders, text_file
 from polcap.formats.capture import folder_names
 from polcap.pipeline.request import Request
+from polcap.process_pool import Died, Limits, ProcessPool
+
+_DIED = (
+    "its process died {attempts} times, most often from lack of memory; run fewer --workers, lower --memory, "
+    "or remove it from the batch"
+)
 
 
 @dataclass(frozen=True)
@@ -149,7 +156,24 @@ def _process(
         from polcap.batch import cluster
 
         return cluster.run(wanted, request, plan.scheduler, plan.workers, plan.retries, print_line)
-    return processes.run(wanted, request, plan.workers, plan.retries)
+    return _in_processes(wanted, request, plan.workers, plan.retries)
+
+
+def _in_processes(wanted: Sequence[Unit], request: Request, workers: int, retries: int) -> Iterator[UnitRecord]:
+    """Process captures in several child processes; yields records in the order in which captures end."""
+    limits = Limits(request.threads, request.memory_gb)
+    before = {unit: units.read_record(unit) for unit in wanted}
+    with ProcessPool(workers, retries, limits) as pool:
+        for unit, outcome in pool.run(partial(_process_unit, request), wanted):
+            if isinstance(outcome, Died):
+                message = _DIED.format(attempts=outcome.attempts)
+                yield units.record_crash(unit, before[unit], message, outcome.attempts)
+            else:
+                yield outcome
+
+
+def _process_unit(request: Request, unit: Unit, attempt: int) -> UnitRecord:
+    return units.run(unit, request, attempt)
 
 
 def status(found: Sequence[Unit]) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """`polcap process`: turn a capture folder into maps, asset and report."""
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -8,8 +9,7 @@ from typer import Context, Option
 
 from polcap import resource_limits, terminal
 from polcap.cli import options
-from polcap.cli.watch import at_every_change
-from polcap.errors import SettingError
+from polcap.errors import GateError, InputError, SettingError
 from polcap.formats import own_folders
 from polcap.results import STAGES
 
@@ -52,9 +52,28 @@ def process(
     resource_limits.set_limits(threads, memory)  # before the libraries start threads
     once = partial(_plan, stated, target) if dry_run else partial(_process, stated, target, asked)
     if watch:
-        at_every_change(capture, target, config, once)
+        _at_every_change(capture, target, config, once)
     else:
         once()
+
+
+def _at_every_change(capture: Path, target: Path, config: Path | None, once: Callable[[], None]) -> None:
+    """Call `once` now and after each change of the capture folder or the settings file; print its errors.
+
+    Raises SettingError if there is no such folder, or the settings are wrong from the start.
+    """
+    from polcap import config as settings
+    from polcap.formats.capture import arrivals
+
+    if not capture.is_dir():
+        raise SettingError(f"{capture} is no folder; --watch needs the folder that the photographs go to")
+    settings.load(config, ())
+    for _ in arrivals.settled(capture, target, edited=[] if config is None else [config]):
+        try:
+            once()
+        except (InputError, GateError, OSError) as error:  # a frame may have gone while it was read
+            terminal.print_message(f"polcap: {terminal.line(error)}")
+        terminal.print_progress(f"watching {capture}; Ctrl-C ends")
 
 
 def _plan(stated: dict[str, Any], target: Path) -> None:

@@ -1,4 +1,4 @@
-"""`polcap validate`: how well this rig measures normals, from a capture of a ball."""
+"""`polcap validate`: accuracy of the normals that this rig measures, from a capture of a ball."""
 
 from pathlib import Path
 from typing import Annotated, Any

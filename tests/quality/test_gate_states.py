@@ -27,6 +27,7 @@ from polcap.quality.rerendering import Rerendering
 from polcap.stage_values import AngleStack, BlackError, Equipment, OrderTest, OutlineCheck, RingZero, TurnedShot
 from polcap.stages.align.object_motion import ObjectShift
 from tests import scenes
+from tests.quality.test_gates import clipped
 
 NAN = float("nan")
 
@@ -99,13 +100,6 @@ def outline(turn: dict[str, Any] | None = None, side: float = 0.02, **body: floa
     """Measured figures with this outline."""
     found = rim.RimFigures(**in_numpy(BODY | body)), rim.AngleError(**in_numpy(TURN | (turn or {})))
     return {"outline": polarization.OutlineFigures(*found, np.array([0.0, 0.01, side]))}
-
-
-def clipped(second_shot: float = 0.0) -> Any:
-    """(K, E, H, W): the share of each pixel that is clipped in three shots of one exposure."""
-    share = np.zeros((3, 1, *scenes.ball_object().mask.shape))
-    share[1] = second_shot
-    return share
 
 
 def ghosts() -> Any:

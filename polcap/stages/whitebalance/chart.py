@@ -94,14 +94,14 @@ def from_corners(points: Floats, patch: float = USUAL_PATCH) -> Placement:
     return Placement(_homography(_outer(patch), points), patch)
 
 
-def from_sg_corners(points: Floats, patch: float = USUAL_PATCH) -> Placement:
+def from_sg_corners(points: Floats) -> Placement:
     """The placement of the 24-patch block of a ColorChecker SG, from the outer corners (4, 2) px of A1, N1, N10, A10.
 
     The block begins at column 5 of 14 and row 2 of 10.
     """
-    gap = (1 - patch) / 2
+    gap = (1 - USUAL_PATCH) / 2
     left, top, right, bottom = gap - 4, gap - 1, 10 - gap, 9 - gap
-    return Placement(_homography(np.array([[left, top], [right, top], [right, bottom], [left, bottom]]), points), patch)
+    return Placement(_homography(np.array([[left, top], [right, top], [right, bottom], [left, bottom]]), points))
 
 
 def is_view(homography: Floats) -> bool:
