@@ -23,7 +23,7 @@ class CrossedShot:
 
 @dataclass(frozen=True)
 class BlackError:
-    """By how much the black level that the files state is too low."""
+    """Error of the black level that the files state; positive if it is too low."""
 
     error: Floats  # (C,) or (1,) of the sensor's range; 0: none was found
     corrected: bool = False  # the frames were read with the measured level

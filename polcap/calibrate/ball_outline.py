@@ -70,7 +70,7 @@ class Ball:
 
 @dataclass(frozen=True)
 class BallOutline:
-    """A ball fitted to the outline of a mask, and how well the outline fits it."""
+    """A ball fitted to the outline of a mask, and the residuals of the fit."""
 
     ball: Ball
     misfit_px: float  # spread of the mask's outline about that of the ball, 1σ

@@ -177,7 +177,7 @@ def _class(error: Floats, expected: Floats, least: float, most: float, chosen: B
 
 
 def _by_chart_mm(maps: ResultMaps, light: BallLight, inside: Bools) -> float | None:
-    """Diameter of the ball by the depth map, whose scale is that of the color chart; None without a chart."""
+    """Diameter of the ball [mm] by the depth map, with the scale of the color chart; None without a chart."""
     if not maps.metric:
         return None
     point, _ = light.ball.points(frames.rays(maps.view, *inside.shape))

@@ -88,7 +88,7 @@ def chart_reduced(mesh: ClosedMesh, count: int, make: Callable[[ClosedMesh], Atl
 
 
 def _chart_sized(mesh: ClosedMesh, pixel: float, settings: AtlasSettings, metric: bool) -> Atlas:
-    """The atlas in the size of the settings, or in one whose texels are no larger than `pixel` [m]."""
+    """The atlas in the size of the settings, or in the first size with texels of at most `pixel` [m]."""
     if settings.size:
         return chart(mesh, settings.size, settings.margin, metric)
     side = _side(mesh, pixel)

@@ -1,4 +1,4 @@
-"""Textures of the atlas from all views: which view sees which texel, how much it counts, and robust means.
+"""Textures of the atlas from all views: visible texels of each view, their weights, and robust means.
 
 A view counts more where it sees the surface squarely, where its maps expect small errors, and far from the
 object's outline and from edges of parts that hide others. Weights fade to 0 there, so that no seam shows.
@@ -78,7 +78,7 @@ class AtlasMaps:
 
 @dataclass(frozen=True)
 class VisibleTexels:
-    """The M texels that one view sees, and how well."""
+    """The M texels that one view sees, with their weights."""
 
     texel: NDArray[np.intp]  # (M,) index among the atlas's N texels
     pixel: Floats  # (M, 2) x, y in the view's maps

@@ -118,7 +118,7 @@ def _find_markers(picture: Floats) -> list[tuple[int, Floats]]:
 
 
 def _choose_board(markers: list[tuple[int, Floats]]) -> tuple[Board | None, int]:
-    """The board that the markers belong to, or None; and how many belong to it. Raises CaptureError for several."""
+    """The board of the markers, or None, and the number of its markers. Raises CaptureError: several boards."""
     numbers = [number for number, _ in markers]
     twins = len(numbers) - len(set(numbers))
     seen = {

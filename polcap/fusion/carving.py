@@ -115,7 +115,7 @@ def _sweep(
 
 
 def _agreement(point: Floats, pixel: NDArray[np.intp], view: SmallView, others: Sequence[SmallView]) -> Floats:
-    """How well other views agree with pixels (N,) of a view at world points (N, 3), 0…1."""
+    """Agreement, 0…1, of other views with pixels (N,) of a view at world points (N, 3)."""
     normal, albedo = view.normal.reshape(-1, 3)[pixel], view.diffuse.reshape(-1, 3)[pixel]
     found = np.zeros((len(others), len(point)), np.float32)
     for row, other in zip(found, others):

@@ -86,7 +86,7 @@ class _Motion:
 
 @dataclass(frozen=True)
 class _AdjustedMotion:
-    """Motion with its errors, and how well the features fit."""
+    """Motion with its errors, and the residual of the features."""
 
     tracks: _FeatureTracks
     motion: _Motion
@@ -198,7 +198,7 @@ def _first_motion(
 
 
 def _turn(before: Floats, after: Floats) -> tuple[Rotation, int]:
-    """Rotation of most unit vectors `before` (N, 3) into `after`, and how many agree with it."""
+    """Rotation that most pairs of unit vectors (N, 3), before and after, agree with; and the number of these pairs."""
     if len(before) < _LEAST_MATCHES:
         return Rotation.identity(), 0
     pick = np.random.default_rng(0).integers(len(before), size=(_SAMPLES, 2))

@@ -203,7 +203,7 @@ def _refine(motion: Motion, moving: ObservedSurface, fixed: ObservedSurface, ste
 
 
 def _step_to_planes(motion: Motion, point: Floats, target: Floats, normal: Floats, weight: Floats) -> Motion:
-    """A motion followed by the small one that brings points nearest to the planes of their targets."""
+    """A motion, then a small motion that brings the points nearest to the planes of their targets (linearized)."""
     middle = point.mean(axis=0)
     axes = [normal, *(np.broadcast_to(_ALONG * axis, normal.shape) for axis in np.eye(3))]
     rows = [np.concatenate([np.cross(point - middle, axis), axis], axis=1) * weight[:, None] for axis in axes]

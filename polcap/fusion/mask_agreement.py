@@ -64,7 +64,7 @@ def agree(views: tuple[Silhouette, ...]) -> AgreedMasks:
 
 
 def compare_set(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str, str]]:
-    """The views whose masks agree, without parts that others do not confirm; and why others are left out, by name.
+    """Masks that agree, without parts that no other view confirms; and reasons for views left out, by name.
 
     Raises CaptureError: more than a third of the views contradict the others, fewer than three are left, or the masks
     have too little in common.

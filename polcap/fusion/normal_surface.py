@@ -67,7 +67,7 @@ class Anchors:
 
 @dataclass(frozen=True)
 class FittedSurface:
-    """A closed surface, and how far the views agree on its normals."""
+    """A closed surface, and the agreement of the views on its normals."""
 
     vertices: Floats  # (V, 3) m
     faces: NDArray[np.int32]  # (F, 3)
@@ -116,7 +116,7 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
 def visible(
     vertices: Floats, faces: NDArray[np.int32], outward: Floats, views: Sequence[SmallView], step: float
 ) -> Bools:
-    """Which view sees which vertex, (N, V): the vertex faces the lens, and the mesh does not hide it."""
+    """Visibility (N, V) of the vertices in the views: a vertex faces the lens, and the mesh does not hide it."""
     tracer = _tracer(vertices, faces)
     start = vertices + outward * (_LIFT * step)
     seen = np.zeros((len(views), len(vertices)), bool)

@@ -54,7 +54,7 @@ class Silhouette:
         return np.asarray(within & (grown[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] > 0))
 
     def covered(self, points: Floats, step: float) -> tuple[Bools, Bools]:
-        """Mask (h, w) on pixels as wide as a cell, and which of them the points (P, 3) cover."""
+        """Mask (h, w) reduced to pixels as wide as a cell, and the pixels (h, w) that points (P, 3) cover."""
         coarse = max(self.cell_px(step), 1.0)
         height, width = (int(np.ceil(side / coarse)) for side in self.mask.shape)
         mask = area_mean(self.mask, (height, width)) > 0.5

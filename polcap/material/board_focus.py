@@ -1,4 +1,4 @@
-"""How well each view shows the board: blur at the edges of its squares, and usable paper; unfit views are left out."""
+"""Fitness of each view of the board: blur at the edges of its squares, and usable paper; unfit views are left out."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ _MOST_OVER, _MOST_RATIO = 0.5, 1.6  # px over that of the median view, and its f
 
 @dataclass(frozen=True)
 class BoardSight:
-    """How the views show the board."""
+    """Blur and usable paper of the board in each view."""
 
     blur: tuple[float, ...]  # (K,) 1σ in pixels of the Stokes image; NaN where no edge is visible
     paper: tuple[int, ...]  # (K,) usable points of the paper

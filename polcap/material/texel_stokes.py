@@ -20,7 +20,7 @@ _SPLINE_NOISE = 0.7  # standard deviation of a spline between pixels, over that 
 
 @dataclass(frozen=True, repr=False)
 class TexelStokes(ArrayValue):
-    """What K views measured at each texel."""
+    """Radiance, polarization and noise that K views measured at each texel."""
 
     radiance: Floats  # (K, H, W, 3) S0, linear Rec.709
     polarized: Floats  # (K, H, W, 2) S1 and S2 of the gray sum of the channels, in the frame of the ray

@@ -67,7 +67,7 @@ def _length(texture: Floats, strip: int) -> int:
 
 
 def _blend(value: Floats, axis: int, strip: int, contrast: bool) -> Floats:
-    """An image whose last strip along `axis` has been blended into the first one, and removed."""
+    """Blend the last strip of an image along `axis` into its first strip; returns the image without the last strip."""
     image = np.moveaxis(value, axis, 0)
     length = len(image)
     share = ((np.arange(strip) + 0.5) / strip).reshape(-1, *(1,) * (image.ndim - 1))

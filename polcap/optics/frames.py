@@ -35,7 +35,7 @@ def basis(v: Any) -> tuple[Any, Any]:
 
 
 def _x_length(vx: Any) -> Any:
-    """Length of the camera's x axis after its projection across rays with x component vx."""
+    """Length of the camera's x axis, projected onto the plane across a ray with x component `vx`."""
     return (1 - vx * vx) ** 0.5
 
 

@@ -1,4 +1,4 @@
-"""Mueller calculus of a linear polarizer: how much of each Stokes parameter it transmits.
+"""Mueller calculus of a linear polarizer: the share of each Stokes parameter that it transmits.
 
 Signs: angles run from image x towards image up, counter-clockwise in the picture. So S1 > 0 is horizontal and
 S2 > 0 is 45° up-right. Works on NumPy and torch.

@@ -148,7 +148,7 @@ def _scale_chart(chart: ChartRequest, step: int) -> ChartRequest:
 
 
 def table(verdict: Verdict, everything: bool = False) -> str:
-    """The verdict as text for the terminal: what did not pass, or all gates."""
+    """The verdict as text for the terminal: the gates that did not pass, or all gates."""
     head = "keep" if verdict.keep else f"reshoot {', '.join(verdict.shots)}".rstrip()
     if not verdict.keep and not verdict.shots:  # the fault is of the whole capture
         head += f": {', '.join(line.name for line in verdict.lines if line.state == 'fail')}"

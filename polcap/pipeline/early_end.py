@@ -39,7 +39,7 @@ def explain(error: InputError, cache: StageCache, capture: Capture, config: Conf
 
 
 def _registered(reached: ResultsUntilWhitebalance, config: Config) -> ResultsUntilWhitebalance:
-    """The results with the motion of all shots, also of those that moved too far or show another scene."""
+    """The results with the motion of all shots, also of shots that moved too far or show another scene."""
     anything = msgspec.structs.replace(config.align, max_shift_px=500.0, min_correlation=0.0)
     try:
         alignment = align.register(reached.radiance, reached.color, anything)

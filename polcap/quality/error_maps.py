@@ -71,7 +71,7 @@ def _of_ghosts(found: Evidence[ResultsUntilInfer]) -> Floats:
 
 
 def _of_focal_length(found: Evidence[ResultsUntilInfer]) -> Floats:
-    """Cost (H, W) of an unknown focal length, in degrees: by how much it tilts the view ray."""
+    """Cost (H, W) of an unknown focal length, in degrees: the tilt of the view ray."""
     if not any(found.focal_doubt):
         return np.zeros(1)
     return geometry.lean(found.results.maps, *found.focal_doubt)

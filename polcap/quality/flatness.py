@@ -1,4 +1,4 @@
-"""Flat and sharp-edged objects: their outline is no occluding contour, and says nothing of polarization.
+"""Flat and sharp-edged objects: their outline is no occluding contour, so its polarization shows no tilt.
 
 At an occluding contour the surface turns away from the camera, so its polarization grows towards the outline. At the
 edge of a plate or a box it does not. The facing plane of a coin or a painting is hardly polarized at all, a tilted
@@ -34,7 +34,7 @@ _ONE_NORMAL = 0.92  # of the mean normal: beyond, the outline decides nothing
 
 @dataclass(frozen=True)
 class Flatness:
-    """How flat an object is, and how much of its outline is an occluding contour."""
+    """Flatness of an object, and share of its outline that is an occluding contour."""
 
     contour: float  # share of the outline's sectors in which the polarization grows towards the outline
     common: float  # 0…1, length of the mean polarization over its mean length: 1 for one plane, 0 for a sphere
@@ -86,7 +86,7 @@ def judge(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
 
 
 def measure(image: StokesImage, maps: SurfaceMaps) -> Flatness | None:
-    """Measure how flat an object is; None for one that is too small."""
+    """Measure the flatness of an object; None if the object is too small."""
     step = int(np.ceil(np.sqrt(max(image.mask.sum() / _MOST_PIXELS, 1))))
     inside = block_means(image.mask.astype(np.float32), step) > 0.99
     s0, s1, s2 = (block_means(part, step) for part in total(image.stokes))

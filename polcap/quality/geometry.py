@@ -105,7 +105,7 @@ def _contradiction(image: StokesImage) -> float:
 
 
 def _one_object(found: Evidence[ResultsUntilMask], share: float) -> Gate:
-    """Gate on shots that contradict each other: the odd one is that which resembles the others least."""
+    """Gate on shots that contradict each other; the shot that resembles the others least is named."""
     light = np.log(np.maximum(frames.total(found.results.radiance.value), 1e-6))[:, found.results.object_.mask]
     with np.errstate(divide="ignore", invalid="ignore"):  # an even shot
         alike = np.nan_to_num(np.corrcoef(light)).sum(0)
@@ -117,7 +117,7 @@ def _one_object(found: Evidence[ResultsUntilMask], share: float) -> Gate:
 
 
 def _odd(unlike: Bools) -> Bools:
-    """Which shots (K,) are the odd ones, from those that differ from the first shot."""
+    """Flags (K,) of the odd shots, from flags of the shots that differ from the first one."""
     return ~unlike if unlike[1:].all() else unlike
 
 

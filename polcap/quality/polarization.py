@@ -339,7 +339,7 @@ def _across(found: Evidence[ResultsUntilHdr]) -> str:
 
 
 def _lopsided(body: rim.RimFigures) -> float:
-    """Factor on the limit of uneven light: an outline whose bright half is well polarized is lit by the flash."""
+    """Factor on the limit of uneven light: the flash lights an outline with a well polarized bright half."""
     if body.dolp_lit < _WEAK_DOLP:
         return 1.0
     return _LOPSIDED if body.dolp_lit < _LIT_DOLP else np.inf

@@ -279,7 +279,7 @@ def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
 
 
 def _has_sharp_edges(found: Evidence[ResultsUntilSelfcal]) -> bool:
-    """Whether the object's outline is the edge of flat faces, whose polarization does not show the shots' light."""
+    """Whether the outline is the edge of flat faces: its polarization does not show the light of the shots."""
     if not reaches(found, ResultsUntilInfer):
         return False
     seen = flatness.measure(found.results.stokes, found.results.maps)

@@ -78,7 +78,7 @@ class Changes:
 
 
 def measure(one: SurfaceMaps, other: SurfaceMaps) -> Changes:
-    """Register the maps of a second result onto those of the first, and measure what changed."""
+    """Register the maps of a second result onto the maps of the first, and measure the differences."""
     matrix = _motion(one, other)
     at = _refined(one, other, matrix)
     moved, both = _resampled(one, other, at)

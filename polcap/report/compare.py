@@ -1,4 +1,4 @@
-"""Comparison of two results: what changed on the object, the figures and settings that differ, and a page of both."""
+"""Comparison of two results: changes of the object, differing figures and settings, and a page of both."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -48,7 +48,7 @@ def label_row(row: Row) -> tuple[str, str, str]:
 def write(
     file: Path, folders: tuple[Path, Path], abouts: tuple[Mapping[str, Any], Mapping[str, Any]]
 ) -> tuple[str, list[tuple[str, ...]]]:
-    """Write a page that shows two results and what changed; returns its sentence, and the rows of its table `HEAD`."""
+    """Write a page on the differences of two results; returns its sentence, and the rows of its table `HEAD`."""
     names = _names(folders)
     results = []
     for name, about in zip(names, abouts):
@@ -81,7 +81,7 @@ def _names(folders: tuple[Path, Path]) -> tuple[str, str]:
 
 
 def _maps(folders: tuple[Path, Path], names: tuple[str, str]) -> dict[str, Any]:
-    """What changed between the maps of two results: sentences, table, and figures by title."""
+    """Differences between the maps of two results: sentences, table, and figures by title."""
     try:
         one, other = (maps_folder.read(folder / "maps") for folder in folders)
     except DecodeError as error:
@@ -101,7 +101,7 @@ def _maps(folders: tuple[Path, Path], names: tuple[str, str]) -> dict[str, Any]:
 
 
 def sentence(found: Changes) -> str:
-    """One sentence on what changed beyond the doubt."""
+    """One sentence on the changes beyond the doubt."""
     changed = [_change(name, one) for name, one in found.differences.items() if one.changed.any()]
     if changed:
         return f"Changed beyond the doubt: {', '.join(changed)} of the object."

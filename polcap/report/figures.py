@@ -90,7 +90,7 @@ def _colors(color: ColorCalibration, albedo_sigma: float | None) -> dict[str, An
 
 
 def _surroundings(fit: PatchColors | None) -> str | None:
-    """Text for the report: how many patches around the block of a ColorChecker SG were used."""
+    """Text for the report: number of patches used around the block of a ColorChecker SG."""
     if fit is None or fit.surroundings is None:
         return None
     used = fit.surroundings[~np.isnan(fit.surroundings)]

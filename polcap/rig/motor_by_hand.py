@@ -18,7 +18,7 @@ class MotorByHand:
     wraps = False
 
     def __init__(self, log: Log, part: str = "polarizer") -> None:
-        """`part`: what the person turns. Raises SettingError without a terminal."""
+        """`part`: the part that the person turns. Raises SettingError without a terminal."""
         if not person.at_terminal():
             raise SettingError("rotator manual asks a person, and there is no terminal; run in one, or name a motor")
         self._log = log

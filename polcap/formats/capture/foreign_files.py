@@ -56,6 +56,6 @@ def files_below(folder: Path, result: Path | None = None) -> Iterator[Path]:
 
 
 def is_photograph(name: str, among_raw: bool) -> bool:
-    """Whether a file of this name is a photograph although it cannot be read; `among_raw`: one that RAW files need."""
+    """Whether a file of this name is a photograph, by its suffix; `among_raw`: other files of the folder are RAW."""
     suffix = PurePath(name).suffix.lower()
     return suffix in _RAW or (suffix in _PICTURES and not among_raw)

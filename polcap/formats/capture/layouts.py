@@ -330,6 +330,7 @@ def _jumped(by_clock: Sequence[Source]) -> bool:
 
 
 def _select(folder: Path, groups: dict[float, list[Source]], angles_deg: _Order) -> Shots:
+    """The shots at the user's angles, in their order; all shots without these. Raises CaptureError: one is missing."""
     wanted = list(groups) if angles_deg is None else list(angles_deg)
     for angle in wanted:
         if angle not in groups:

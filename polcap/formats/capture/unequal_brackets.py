@@ -72,7 +72,7 @@ def advise_shots(shots: Mapping[str, _Bracket]) -> str:
 
 
 def _take_or_leave_out(others: _Bracket) -> str:
-    """Advice for a missing photograph, of whose exposure the other shots have these."""
+    """Advice for a missing photograph; `others` are the photographs of the same exposure in the other shots."""
     names = ", ".join(one.name for one in others)
     return f"take it again, or move {names}, the same exposure of every other shot, out of the folder"
 

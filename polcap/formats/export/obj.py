@@ -23,7 +23,7 @@ _ROWS = 10_000  # of a table, formatted at a time
 
 
 def stem(name: str) -> str:
-    """File name without spaces, because OBJ and MTL cannot quote names, nor what web viewers and USD read as more.
+    """File name without spaces, which OBJ and MTL cannot quote, and without #, %, @ and brackets.
 
     Web viewers take the names of textures for addresses, USD takes brackets and @ for packages.
     """

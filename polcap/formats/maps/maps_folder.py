@@ -75,7 +75,7 @@ class LevelNote(Struct, frozen=True):
 
 
 class _Export(Struct, frozen=True):
-    """What maps.json notes about an export, as far as later exports add to it."""
+    """Facts of exports in maps.json; later exports add to these."""
 
     glb: dict[str, str] = {}
     lods: dict[str, LevelNote] = {}

@@ -92,7 +92,7 @@ def read(data: bytes, spec: Any) -> tuple[ColorEncoding, Curve]:
 
 
 def _statements(data: bytes, spec: Any) -> Iterator[_Statement]:
-    """The statements on the encoding, those that take precedence first."""
+    """The statements on the encoding, in order of precedence."""
     profile = spec.getattribute("ICCProfile")
     if data.startswith(file_kind.EXR):
         yield from _exr(spec)

@@ -69,7 +69,7 @@ def in_common(first: tuple[Floats, Bools], second: tuple[Floats, Bools]) -> tupl
 
 
 def black_error(tiles: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
-    """Measure by how much the stated black level is too low, (C,) of the sensor's range, from `common_tiles` of frames.
+    """Measure the error of the stated black level, (C,) of the sensor's range, > 0 if too low; from `common_tiles`.
 
     A level that is too low by δ adds δ to every frame, so that b = r a + (1 − r) δ: δ follows from the intercept of a
     line, and its slope r (N,) is the exposure ratio, NaN for too few tiles. The error is 0 where it is below 1e-4, or

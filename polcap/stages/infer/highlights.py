@@ -159,7 +159,7 @@ def _mirrored_light(maps: SurfaceMaps, cues: Cues) -> Floats:
 
 
 def _bounded(roughness: float, f0: float, member: Bools, zenith: Floats, mirrored: Floats, albedo: Floats) -> float:
-    """Roughness of a material of pixels `member` (H, W), at most what its highlights allow."""
+    """Roughness of a material of pixels `member` (H, W), at most the bound from its highlights."""
     facing, away = member & (zenith < _FACING_DEG), member & (zenith > _AWAY_DEG[0]) & (zenith < _AWAY_DEG[1])
     if facing.sum() < _FEWEST_PX or away.sum() < _FEWEST_PX:
         return roughness

@@ -243,7 +243,7 @@ def _ring(even: ObjectShots, angle: Floats, gains: GainEstimate, leaves_picture:
 
 
 def corrected(ring: RingZero, calibrated: float | None, settings: SelfcalSettings) -> RingZero:
-    """Decide by how much the polarizer angles are corrected for the measured error of the ring's zero.
+    """Decide on the correction of the polarizer angles for the measured error of the ring's zero.
 
     `calibrated` is 1σ [rad] of a zero that the angles already include, by calibration or because the angles were found;
     None without one. If it agrees with the measured error, the two are averaged by their errors. If not, the filter was

@@ -78,7 +78,7 @@ class PixelGrid:
         return sparse.csr_matrix((values, self._indices, self._starts), (self.size, self.size))
 
     def divergence(self, flux: Floats) -> Floats:
-        """Divergence (N,) of a flux (L,) along the links: what flows into each pixel minus what flows out."""
+        """Divergence (N,) of a flux (L,) along the links: inflow of each pixel minus outflow."""
         into = np.asarray(np.bincount(self.q, flux, self.size), dtype=np.float64)
         return np.asarray(into - np.bincount(self.p, flux, self.size))
 

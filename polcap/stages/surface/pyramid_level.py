@@ -130,7 +130,7 @@ class PyramidLevel:
             self.z, taken = conjugate_gradients(matrix, right, self.z, solver, _PRECISION, 30)
 
     def solve(self) -> None:
-        """Solve z again with the current choosing pixels and contours, from the current z."""
+        """Solve for the depth z, from the current z, with the current contours and choosing pixels."""
         taken = 0
         for _ in range((_PRECISE_SOLVES if self.chords else _DECISION_SOLVES) if self.choosing.any() else 1):
             matrix, right, _ = self.equations(self.stiffness, self.field.pull)
