@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from polcap.formats.export import iiif, openlime_page, relightable_layer
+from polcap.optics import color, shade
 from polcap.stages import asset
 from tests import surfaces
 from tests.render import browser, devtools
@@ -99,6 +100,25 @@ def test_the_light_follows_the_pointer(tmp_path: Path) -> None:
             assert page.complaints == []
     column, row = (share(picture) for picture in (pictures[2] - pictures[1], pictures[3] - pictures[0]))
     assert column[0] < 0 < column[1] and row[2] > 0 > row[3]  # right is brighter, and then above
+
+
+def test_under_a_frontal_light_the_page_is_as_bright_as_the_photograph(tmp_path: Path) -> None:
+    """OpenLIME divides the albedo by π under a light of irradiance 1; S0 of the photograph is under one of π."""
+    shutil.copy(Path(__file__).parent / "openlime_stand_in.js", tmp_path / openlime_page.SCRIPT)
+    with served(tmp_path) as address:
+        write(tmp_path, address)
+        with visited(f"{address}/index.html") as page:
+            page.wait("document.documentElement?.dataset.ready > 0")
+            page.screenshot(tmp_path / "page.png")
+    shown = cv2.resize(cv2.imread(str(tmp_path / "page.png")), (surfaces.WIDTH, surfaces.HEIGHT))
+    maps, front = surfaces.maps(roughness=0.5, specular=0.04), np.array([0.0, 0.0, 1.0])
+    one = np.ones(maps.mask.shape)
+    photograph = shade.stokes(
+        maps.normal, maps.diffuse, maps.specular, maps.roughness, 1.5 * one, front + 0 * maps.normal, one
+    )[0]
+    facing = maps.mask & (maps.normal[..., 2] > 0.7)
+    ratio = color.decode_srgb(shown[..., ::-1] / 255.0)[facing].mean() / photograph[facing].mean()
+    assert 0.95 < ratio < 1.1
 
 
 def share(difference: np.ndarray) -> tuple[float, ...]:

@@ -9,7 +9,8 @@ from polcap.formats.export import iiif
 
 SCRIPT = "openlime.min.js"
 
-# color space 1 is sRGB; OpenLIME makes Ward's parameter of gloss g and limits (a, b) as (b^¼ + g (a^¼ - b^¼))⁴
+# Color space 1 is sRGB. OpenLIME makes Ward's parameter of gloss g and limits (a, b) as (b^¼ + g (a^¼ - b^¼))⁴. Its light
+# has irradiance 1 and its gamma is 2.2; the photograph has irradiance π, so the page is brighter by π^(1/2.2).
 _PAGE = Template(
     """<!doctype html>
 <html lang="en">
@@ -17,9 +18,10 @@ _PAGE = Template(
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>$title</title><link rel="icon" href="data:,">
 <style>
-html, body { margin: 0; height: 100%; background: #222; color: #eee; font: 14px sans-serif; }
+html, body { margin: 0; height: 100%; background: #000; color: #eee; font: 14px sans-serif; }
 #view { position: relative; width: 100%; height: 100%; overflow: hidden; }
 #view canvas, .openlime-overlay { position: absolute; top: 0; left: 0; width: 100%; height: 100%; touch-action: none; }
+#view canvas { filter: brightness(1.683); }
 p { position: absolute; left: 12px; bottom: 0; pointer-events: none; }
 </style>
 <div id="view"></div>
@@ -35,7 +37,7 @@ else {
   const layer = new OpenLIME.Layer({
     type: 'brdf', layout: 'image', label: document.title,
     channels: { kd: 'albedo/$full', ks: 'specular/$full', normals: 'normal/$full', gloss: 'gloss/$full' },
-    colorspaces: { kd: 1, ks: 1 }, alphaLimits: [0, 1],
+    colorspaces: { kd: 1, ks: 1 }, alphaLimits: [0, 1], kAmbient: 0.02,
   });
   viewer.addLayer('object', layer);
   const panning = { priority: -1000, activeModifiers: [0, 1] };
