@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from polcap import parallel, report
+from polcap.capture_values import CatalogEntry
 from polcap.config import Config, restore
 from polcap.errors import SettingError
 from polcap.formats import atomic, text_file
@@ -38,7 +39,7 @@ from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.presets import PRESETS, ExportPreset, Format
 from polcap.formats.export.texture_set import Extra, Key, Texture
-from polcap.formats.maps import maps_folder
+from polcap.formats.maps import maps_folder, png
 from polcap.mesh_values import Asset, Mesh, ReliefMesh
 from polcap.pipeline import result_folder
 from polcap.pipeline.cache import digest
@@ -265,11 +266,13 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     unit, encoder = "m" if mesh.metric else "relative", TextureEncoder()
     record = provenance.record(about, wanted.catalog)
     facts = {"unit": unit, "normals": "+Y (OpenGL)", **provenance.words(record)}
+    entry = {key: record[key] for key in CatalogEntry.__struct_fields__ if record.get(key)}
     comment = f"polcap; unit of length: {unit}; normals +Y (OpenGL); made from: {stem}.provenance.json"
+    comment = "\n".join([comment, *(f"{key}: {' '.join(text.split())}" for key, text in entry.items())])
     writers: dict[Format, _Writer] = {
         "gltf": partial(_write_named, gltf.encode, folder / f"{stem}.glb", whole, options, facts, encoder),
         "obj": partial(obj.write, folder / f"{stem}.obj", whole, stem, shared, comment),
-        "ply": partial(_write_one, ply_stl.write, folder / f"{stem}.ply", whole),
+        "ply": partial(_write_one, ply_stl.write, folder / f"{stem}.ply", whole, comment),
         "stl": partial(_write_one, ply_stl.write, folder / f"{stem}.stl", whole),
         "usd": partial(_write_one, usd.write, folder / f"{stem}.usdc", whole, stem, shared, facts),
         "usdz": partial(_write_usdz, folder / f"{stem}.usdz", whole, facts, encoder),
@@ -282,7 +285,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     tasks = [writers[one] for one in preset.formats]
     write_glb = partial(_write_named, gltf.encode)
     tasks += [partial(write_glb, file, level.asset, options, facts, encoder) for file, level in coarser.items()]
-    tasks += [partial(_write_texture, folder / file, texture, encoder) for file, texture in loose.items()]
+    tasks += [partial(_write_texture, folder / file, texture, encoder, entry) for file, texture in loose.items()]
     written = [file for files in parallel.results(tasks) for file in files]  # pictures are encoded on threads
     if wanted.page is not None:
         page, glb = folder / f"{stem}.html", folder / f"{stem}.glb"
@@ -403,12 +406,18 @@ def _write_iiif(folder: Path, content: Asset, facts: Mapping[str, str], address:
     return [page, *iiif.write(folder, relightable_layer.pictures(content), facts, address)]
 
 
-def _write_texture(file: Path, texture: Texture, encoder: TextureEncoder) -> list[Path]:
+def _write_texture(file: Path, texture: Texture, encoder: TextureEncoder, entry: Mapping[str, str]) -> list[Path]:
     if file.suffix == ".exr":
         texture_set.write_exr(file, texture)
     else:
-        atomic.write(file, encoder(texture, "png", text=True))
+        atomic.write(file, png.described(encoder(texture, "png"), {"Description": texture.meaning, **_keywords(entry)}))
     return [file]
+
+
+def _keywords(entry: Mapping[str, str]) -> dict[str, str]:
+    """Facts for catalogs by keyword of a PNG's texts; its Description is that of the texture."""
+    known = {"title": "Title", "creator": "Author", "rights": "Copyright", "description": "Object"}
+    return {known.get(key, key.capitalize().replace("_", " ")): text for key, text in entry.items()}
 
 
 def _embedded(content: Asset, preset: ExportPreset) -> dict[str, str]:

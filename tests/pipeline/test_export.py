@@ -10,11 +10,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import trimesh
 
 from polcap.formats.export import encoders, texture_set
-from polcap.formats.export.presets import PRESETS
+from polcap.formats.export.presets import PRESETS, Format
 from polcap.formats.maps import exr, png
 from polcap.pipeline import asset_export
 from polcap.pipeline import run as pipeline
@@ -52,6 +53,27 @@ def test_validator_finds_no_error_and_no_warning(exported: Path, preset: str) ->
     done = subprocess.run([node, str(NODE / "validate.js"), str(glb)], capture_output=True, check=True, timeout=300)
     issues = json.loads(done.stdout)["issues"]
     assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
+
+
+def test_every_file_format_states_the_facts_for_catalogs(own: Path) -> None:
+    """By a second reader where there is one, else as text."""
+    Sdf = pytest.importorskip("pxr.Sdf", reason="needs usd-core")
+    facts = {"title": "Krug Ω", "object_number": "1897.12", "rights": "© Museum", "date": "um\n1720"}
+    formats: tuple[Format, ...] = ("gltf", "obj", "ply", "usd", "materialx", "exr", "iiif")
+    files = pipeline.export(own, ExportRequest(formats=formats, iiif="http://a.b", catalog=facts))
+    texts = {}
+    for file in files:
+        if file.suffix == ".glb":
+            texts[file.name] = json.dumps(document(file.read_bytes()), ensure_ascii=False)
+        elif file.suffix == ".usdc":
+            texts[file.name] = str(Sdf.Layer.FindOrOpen(str(file)).customLayerData)
+        elif file.suffix == ".png" or file.name.endswith("_layers.exr"):
+            attributes = oiio.ImageInput.open(str(file)).spec().extra_attribs
+            texts[file.name] = "\n".join(str(one.value) for one in attributes)
+        elif file.suffix in (".obj", ".mtl", ".mtlx", ".ply") or file.name == "manifest.json":
+            texts[file.name] = file.read_bytes()[:2500].decode(errors="replace")
+    missing = [(name, fact) for name, text in texts.items() for fact in facts.values() if fact.split()[-1] not in text]
+    assert len(texts) == 12 and not missing
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -45,8 +45,8 @@ class TextureEncoder:
         # holds the pixels too, so that no other array can get their id
         self._made: dict[tuple[int, Kind, bool], tuple[TexturePixels, Future[bytes]]] = {}
 
-    def __call__(self, texture: Texture, kind: Kind, *, text: bool = False) -> bytes:
-        """The bytes of one texture as for `encode`; with `text`, a PNG also states its meaning in a tEXt chunk."""
+    def __call__(self, texture: Texture, kind: Kind) -> bytes:
+        """The bytes of one texture as for `encode`."""
         key = (id(texture.pixels), kind, texture.color)
         with self._lock:
             first = key not in self._made
@@ -56,8 +56,7 @@ class TextureEncoder:
                 made.set_result(encode(texture, kind))
             except BaseException as error:
                 made.set_exception(error)
-        data = made.result()
-        return png.described(data, {"Description": texture.meaning}) if text and kind == "png" else data
+        return made.result()
 
     def all(self, textures: Mapping[str, Texture], kind: Kind) -> dict[str, bytes]:
         """Encode several textures on threads; returns bytes by texture name. Raises SettingError as `encode` does."""

@@ -9,8 +9,8 @@ from polcap.formats.export import iiif
 
 SCRIPT = "openlime.min.js"
 
-# Color space 1 is sRGB. OpenLIME makes Ward's parameter of gloss g and limits (a, b) as (b^¼ + g (a^¼ - b^¼))⁴. Its light
-# has irradiance 1 and its gamma is 2.2; the photograph has irradiance π, so the page is brighter by π^(1/2.2).
+# Color space 1 is sRGB. OpenLIME makes Ward's parameter of gloss g and limits (a, b) as (b^¼ + g (a^¼ - b^¼))⁴. Its
+# light has irradiance 1 and its gamma is 2.2; the photograph has irradiance π, so the page is brighter by π^(1/2.2).
 _PAGE = Template(
     """<!doctype html>
 <html lang="en">

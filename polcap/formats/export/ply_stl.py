@@ -12,10 +12,10 @@ from polcap.mesh_values import Asset
 _MM = 1000  # per m; STL states no unit, and printing programs read mm
 
 
-def write(path: Path, asset: Asset) -> None:
+def write(path: Path, asset: Asset, comment: str = "") -> None:
     """Write a mesh as PLY or STL, by the suffix of `path`; the origin is that of the GLB.
 
-    PLY has the unit of the GLB. STL is in mm where the mesh is metric.
+    PLY has the unit of the GLB, and the lines of `comment`. STL is in mm where the mesh is metric.
     """
     import trimesh
 
@@ -27,7 +27,8 @@ def write(path: Path, asset: Asset) -> None:
     else:
         colors = {"vertex_normals": mesh.normals, "vertex_colors": _vertex_colors(asset)}
         colored = trimesh.Trimesh(vertices, mesh.faces, process=False, **colors)
-        content = trimesh.exchange.ply.export_ply(colored, vertex_normal=True)
+        head, end, body = trimesh.exchange.ply.export_ply(colored, vertex_normal=True).partition(b"element")
+        content = head + "".join(f"comment {line}\n" for line in comment.splitlines()).encode() + end + body
     atomic.write(path, content)
 
 

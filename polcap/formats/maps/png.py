@@ -46,9 +46,14 @@ def encode(array: Pixels, srgb: bool = False) -> bytes:
 
 
 def described(data: bytes, text: Mapping[str, str]) -> bytes:
-    """Add texts to the bytes of a PNG: one tEXt chunk (Latin-1) per keyword of `text`."""
-    texts = [f"{key}\0{value}".encode("latin-1", "replace") for key, value in text.items()]
-    return b"".join([data[:_HEADER], *(_chunk(b"tEXt", one) for one in texts), data[_HEADER:]])
+    """Add texts to the bytes of a PNG: a chunk per keyword of `text`, tEXt for ASCII and iTXt (UTF-8) for others."""
+    chunks = [
+        _chunk(b"tEXt", f"{key}\0{value}".encode())
+        if value.isascii()
+        else _chunk(b"iTXt", f"{key}\0\0\0\0\0{value}".encode())
+        for key, value in text.items()
+    ]
+    return b"".join([data[:_HEADER], *chunks, data[_HEADER:]])
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

@@ -11,7 +11,6 @@ from polcap.errors import SettingError
 from polcap.formats.export import encoders
 from polcap.formats.export.encoders import TextureEncoder
 from polcap.formats.export.texture_set import Texture
-from polcap.formats.maps import png
 
 
 def picture(channels: int = 3) -> Texture:
@@ -33,13 +32,6 @@ def test_a_picture_is_encoded_once_for_several_files(monkeypatch: pytest.MonkeyP
     assert made == {whole(texture, "png")}
     assert asked == ["png"]
     assert encoder(texture, "webp") == whole(texture, "webp")
-
-
-def test_the_meaning_is_stored_in_loose_files_only() -> None:
-    texture, encoder = picture(), TextureEncoder()
-    plain, with_text = encoder(texture, "png"), encoder(texture, "png", text=True)
-    assert b"a color" in with_text and b"a color" not in plain
-    assert with_text == png.described(plain, {"Description": "a color"})
 
 
 def test_each_kind_of_file_is_encoded_for_itself() -> None:
