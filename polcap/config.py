@@ -165,5 +165,5 @@ def _check_known(key: str, value: Any, known: dict[str, Setting]) -> None:
         return
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
     sections = dict.fromkeys(name.partition(".")[0] for name in known)
-    hint = f"; did you mean {near[0]}?" if near else f"; the sections are {', '.join(sections)}"
+    hint = f"; did you mean {near[0]}?" if near else f"; there are {', '.join(sections)}"
     raise SettingError(f"{key} = {value!r}: there is no such setting{hint}")

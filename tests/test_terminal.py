@@ -43,6 +43,10 @@ def test_settings_are_listed_with_default_range_and_meaning(polcap: Command) -> 
     assert "hdr.clip = 0.98  (≥ 0.5, ≤ 1.0)\n    clipping threshold" in polcap("settings", "hdr").stdout
     assert "stokes.undistort = true\n" in polcap("settings", "stokes").stdout
     assert "there are hdr, whitebalance" in polcap("settings", "polish").stderr
+    of_synth = json.loads(polcap("settings", "synth", "--json").stdout)
+    assert all(row["meaning"] for row in of_synth)
+    assert any("write -45 as 135" in row["meaning"] for row in of_synth if row["name"] == "angles_deg")
+    assert {"--views", "--flat", "--calibration"} <= {row["meaning"].partition(":")[0][5:] for row in of_synth}
 
 
 def test_quiet_prints_only_data_and_errors_wherever_it_is(polcap: Command, tmp_path: Path) -> None:

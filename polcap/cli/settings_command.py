@@ -2,7 +2,7 @@
 
 import textwrap
 from json import dumps as to_json
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Context
 
@@ -10,11 +10,14 @@ from polcap import terminal
 from polcap.cli.options import Json
 from polcap.errors import SettingError
 
+if TYPE_CHECKING:
+    from polcap.config import Setting
+
 
 def settings(
     context: Context,
     stage: Annotated[
-        str | None, Argument(metavar="[STAGE]", help="Only this stage, such as hdr, gates or fusion.")
+        str | None, Argument(metavar="[STAGE]", help="Only this stage, such as hdr, gates or fusion; or synth.")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -22,13 +25,13 @@ def settings(
     from polcap.formats import text_file
     from polcap.material.material_path import all_settings
 
-    rows = all_settings()
+    rows = _synth_settings() if stage == "synth" else all_settings()
     stages = dict.fromkeys(row.key.partition(".")[0] for row in rows)
-    if stage is not None and stage not in stages:
-        raise SettingError(f"settings {stage}: no such stage; {text_file.suggestion(stage, stages)}")
+    if stage not in (None, "synth", *stages):
+        raise SettingError(f"settings {stage}: no such stage; {text_file.suggestion(str(stage), [*stages, 'synth'])}")
     found, lines = [], []
     for row in rows:
-        if stage in (None, row.key.partition(".")[0]):
+        if stage in (None, "synth", row.key.partition(".")[0]):
             choices = row.kind.removeprefix("Literal[").strip("]").replace("'", "")
             limits = choices if row.kind.startswith("Literal") else row.limits
             found.append({"name": row.key, "default": row.default, "range": limits, "meaning": row.description})
@@ -36,3 +39,19 @@ def settings(
             lines.append(f"{row.key} = {'unset' if row.default is None else default}{limits and f'  ({limits})'}")
             lines.append(textwrap.indent(textwrap.fill(row.description, 96), "    "))
     terminal.print_data(found if json else "\n".join(lines))
+
+
+def _synth_settings() -> "list[Setting]":
+    """The settings of `polcap synth`, then those that its options --views, --flat and --calibration change or add."""
+    from polcap import config
+    from polcap.synth.all_around import AroundShoot
+    from polcap.synth.calibration_frames import CalibrationShoot
+    from polcap.synth.flat_views import FlatShoot
+    from polcap.synth.shooting import Shoot
+
+    rows, seen = list(config.settings(Shoot)), list(config.settings(Shoot))
+    for option, kind in {"--views": AroundShoot, "--flat": FlatShoot, "--calibration": CalibrationShoot}.items():
+        new = [row for row in config.settings(kind) if row not in seen]
+        seen += new
+        rows += [row._replace(description=f"with {option}: {row.description}") for row in new]
+    return rows

@@ -45,14 +45,16 @@ _GRID = 96  # points along a side of the grid on which a shape's surface is foun
 class AroundShoot(Shoot, frozen=True, forbid_unknown_fields=True):
     """Camera, polarizer and turntable of captures from all sides. One flat list, because users set fields by name."""
 
-    focal_mm: Annotated[float, Meta(ge=1, le=10000)] = 76.0
-    board: Literal["A4", "A3", "A2", "none"] = "A4"
-    distance_m: Annotated[float, Meta(gt=0.1, le=100)] = 0.7  # from the lens to the object's middle
-    elevation_deg: Annotated[float, Meta(ge=5, le=85)] = 25.0  # of the lens above the board
-    turn_error_deg: Annotated[float, Meta(ge=0, le=45)] = 0.5  # 1σ of the table's angle
-    radius_m: Annotated[float, Meta(gt=0, le=10)] = 0.065  # of the sphere about the object, if it is a mesh
-    off_axis_m: Annotated[float, Meta(ge=0, le=0.1)] = 0.003  # from the table's axis to the board's middle
-    laid: Annotated[int, Meta(ge=0, le=99)] = 0  # further views, after the object was laid on its side
+    focal_mm: Annotated[float, Meta(ge=1, le=10000, description="focal length, on a sensor 36 mm wide [mm]")] = 76.0
+    board: Annotated[
+        Literal["A4", "A3", "A2", "none"], Meta(description="size of the printed board; none: no board")
+    ] = "A4"
+    distance_m: Annotated[float, Meta(gt=0.1, le=100, description="from the lens to the object's middle")] = 0.7
+    elevation_deg: Annotated[float, Meta(ge=5, le=85, description="of the lens above the board")] = 25.0
+    turn_error_deg: Annotated[float, Meta(ge=0, le=45, description="1σ of the table's angle")] = 0.5
+    radius_m: Annotated[float, Meta(gt=0, le=10, description="of the sphere about the object, if it is a mesh")] = 0.065
+    off_axis_m: Annotated[float, Meta(ge=0, le=0.1, description="from the table's axis to the board's middle")] = 0.003
+    laid: Annotated[int, Meta(ge=0, le=99, description="further views, after the object was laid on its side")] = 0
 
 
 @dataclass(frozen=True)

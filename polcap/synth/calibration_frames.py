@@ -33,29 +33,51 @@ _MOST_TILT_DEG = 35.0
 class CalibrationShoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The simulated equipment and the calibration photographs to take; users set the fields by name."""
 
-    seed: Annotated[int, Meta(ge=0)] = 0
-    width: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 384  # visible RAW px
-    height: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 256
+    seed: Annotated[int, Meta(ge=0, description="of light, noise and errors")] = 0
+    width: Annotated[int, Meta(ge=64, le=20000, multiple_of=2, description="width of the RAW [px]")] = 384
+    height: Annotated[int, Meta(ge=64, le=20000, multiple_of=2, description="height of the RAW [px]")] = 256
     sensor: Sensor = Sensor()
-    black_error: Annotated[float, Meta(ge=-1000, le=1000)] = 0.0  # counts, true black level minus the stated one
-    isos: tuple[Annotated[float, Meta(ge=1, le=1e6)], ...] = (100.0, 400.0)
-    levels: tuple[Annotated[float, Meta(gt=0, le=10)], ...] = (0.05, 0.15, 0.4, 0.8)  # green in the middle / white
-    power: Annotated[float, Meta(gt=0, le=10)] = 1.0  # exponent of the sensor's response; 1 is linear
-    falloff: tuple[float, float, float] = (-0.25, 0.05, 0.0)  # factors of r², r⁴, r⁶; r = 1 in the corners
-    slope: tuple[float, float] = (0.03, -0.02)  # of the flat surface's light per half diagonal, right and down
-    zero_deg: float = 1.7  # zero error of the polarizer's ring
-    sense: Literal[1, -1] = 1  # 1: the ring counts from image x towards image up; −1: the other way
-    extinction: tuple[Extinction, Extinction, Extinction] = (300.0, 500.0, 200.0)
-    axes_deg: tuple[Annotated[float, Meta(ge=0, le=360)], ...] = (0.0, 30.0)  # axes of the polarized light
-    ring_step_deg: Annotated[float, Meta(ge=1, le=180)] = 15.0
-    ring_error_deg: Annotated[float, Meta(ge=0, le=90)] = 0.05  # 1σ of the ring's angle
-    lamp_jitter: Annotated[float, Meta(ge=0, le=0.2)] = 0.0005  # 1σ of a steady lamp, relative
-    flash_jitter: Annotated[float, Meta(ge=0, le=0.2)] = 0.012  # 1σ of the flash's energy, relative
-    pops: Annotated[int, Meta(ge=0, le=10000)] = 24  # photographs with flash
-    boards: Annotated[int, Meta(ge=0, le=10000)] = 0  # photographs of a board in random poses
-    board: Literal["checkerboard", "chart"] = "checkerboard"
-    distortion: tuple[Bend, Bend] = (-0.12, 0.05)  # k1, k2 of `undistort`; only in photographs of boards
-    focal_mm: Annotated[float, Meta(ge=1, le=10000)] = 60.0  # on a sensor 36 mm wide
+    black_error: Annotated[
+        float, Meta(ge=-1000, le=1000, description="counts, true black level minus the stated one")
+    ] = 0.0
+    isos: Annotated[tuple[Annotated[float, Meta(ge=1, le=1e6)], ...], Meta(description="ISO of the frames")] = (
+        100.0,
+        400.0,
+    )
+    levels: Annotated[
+        tuple[Annotated[float, Meta(gt=0, le=10)], ...], Meta(description="green in the middle / white")
+    ] = (0.05, 0.15, 0.4, 0.8)
+    power: Annotated[float, Meta(gt=0, le=10, description="exponent of the sensor's response; 1 is linear")] = 1.0
+    falloff: Annotated[
+        tuple[float, float, float], Meta(description="factors of r², r⁴, r⁶ of the lens's light; r = 1 in the corners")
+    ] = (-0.25, 0.05, 0.0)
+    slope: Annotated[
+        tuple[float, float], Meta(description="of the flat surface's light per half diagonal, right and down")
+    ] = (0.03, -0.02)
+    zero_deg: Annotated[float, Meta(description="zero error of the polarizer's ring [degrees]")] = 1.7
+    sense: Annotated[
+        Literal[1, -1], Meta(description="1: the ring counts from image x towards image up; −1: the other way")
+    ] = 1
+    extinction: Annotated[
+        tuple[Extinction, Extinction, Extinction],
+        Meta(description="extinction ratio of the polarizer in red, green and blue"),
+    ] = (300.0, 500.0, 200.0)
+    axes_deg: Annotated[
+        tuple[Annotated[float, Meta(ge=0, le=360)], ...], Meta(description="axes of the polarized light")
+    ] = (0.0, 30.0)
+    ring_step_deg: Annotated[float, Meta(ge=1, le=180, description="between two positions of the ring [degrees]")] = (
+        15.0
+    )
+    ring_error_deg: Annotated[float, Meta(ge=0, le=90, description="1σ of the ring's angle")] = 0.05
+    lamp_jitter: Annotated[float, Meta(ge=0, le=0.2, description="1σ of a steady lamp, relative")] = 0.0005
+    flash_jitter: Annotated[float, Meta(ge=0, le=0.2, description="1σ of the flash's energy, relative")] = 0.012
+    pops: Annotated[int, Meta(ge=0, le=10000, description="photographs with flash")] = 24
+    boards: Annotated[int, Meta(ge=0, le=10000, description="photographs of a board in random poses")] = 0
+    board: Annotated[Literal["checkerboard", "chart"], Meta(description="pattern of the boards")] = "checkerboard"
+    distortion: Annotated[
+        tuple[Bend, Bend], Meta(description="k1 and k2 of the lens, in photographs of boards only")
+    ] = (-0.12, 0.05)
+    focal_mm: Annotated[float, Meta(ge=1, le=10000, description="focal length, on a sensor 36 mm wide [mm]")] = 60.0
 
     @property
     def view(self) -> View:

@@ -39,20 +39,24 @@ _TEXELS = 1024  # along a side of the true maps
 class FlatShoot(Shoot, frozen=True, forbid_unknown_fields=True):
     """Camera, sample and positions of captures of a flat sample. One flat list, because users set fields by name."""
 
-    width: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 1500
-    height: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 1000
-    focal_mm: Annotated[float, Meta(ge=1, le=10000)] = 80.0
-    distance_m: Annotated[float, Meta(gt=0.1, le=100)] = 0.6  # from the lens to the board's middle
-    tilts_deg: tuple[float, float] = (20.0, 40.0)  # of the oblique views; their mean for up to five views
-    by_hand_m: Annotated[float, Meta(ge=0, le=0.1)] = 0.004  # 1σ of the camera's aim and distance
-    by_hand_deg: Annotated[float, Meta(ge=0, le=20)] = 2.0  # 1σ of the camera's direction
-    flash_jitter: Annotated[float, Meta(ge=0, le=0.5)] = 0.02  # 1σ of the flash's energy from view to view, relative
-    board_roughness: Annotated[float, Meta(ge=0, le=1)] = 0.0  # of a board on glossy paper; 0: matt
-    side_m: Annotated[float, Meta(gt=0, le=0.2)] = 0.094  # of the sample
-    thickness_m: Annotated[float, Meta(ge=0, le=0.05)] = 0.001
-    relief_m: Annotated[float, Meta(ge=0, le=0.02)] = 0.0006  # from the lowest to the highest point
-    feature_m: Annotated[float, Meta(gt=0, le=0.1)] = 0.008  # size of the features of random relief
-    height_map: str = ""  # picture file in place of random relief, white is high
+    width: Annotated[int, Meta(ge=64, le=20000, multiple_of=2, description="width of the RAW [px]")] = 1500
+    height: Annotated[int, Meta(ge=64, le=20000, multiple_of=2, description="height of the RAW [px]")] = 1000
+    focal_mm: Annotated[float, Meta(ge=1, le=10000, description="focal length, on a sensor 36 mm wide [mm]")] = 80.0
+    distance_m: Annotated[float, Meta(gt=0.1, le=100, description="from the lens to the board's middle")] = 0.6
+    tilts_deg: Annotated[
+        tuple[float, float], Meta(description="of the oblique views; their mean for up to five views")
+    ] = (20.0, 40.0)
+    by_hand_m: Annotated[float, Meta(ge=0, le=0.1, description="1σ of the camera's aim and distance")] = 0.004
+    by_hand_deg: Annotated[float, Meta(ge=0, le=20, description="1σ of the camera's direction")] = 2.0
+    flash_jitter: Annotated[
+        float, Meta(ge=0, le=0.5, description="1σ of the flash's energy from view to view, relative")
+    ] = 0.02
+    board_roughness: Annotated[float, Meta(ge=0, le=1, description="of a board on glossy paper; 0: matt")] = 0.0
+    side_m: Annotated[float, Meta(gt=0, le=0.2, description="of the sample")] = 0.094
+    thickness_m: Annotated[float, Meta(ge=0, le=0.05, description="of the sample [m]")] = 0.001
+    relief_m: Annotated[float, Meta(ge=0, le=0.02, description="from the lowest to the highest point")] = 0.0006
+    feature_m: Annotated[float, Meta(gt=0, le=0.1, description="size of the features of random relief")] = 0.008
+    height_map: Annotated[str, Meta(description="picture file in place of random relief, white is high")] = ""
 
 
 def write(

@@ -30,10 +30,10 @@ COLOR_MATRIX = (0.87, -0.27, -0.075, -0.44, 1.23, 0.235, -0.09, 0.19, 0.69)  # X
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Properties of one photosite of the simulated sensor at base ISO: full well, read noise, black, white."""
 
-    full_well: Annotated[float, Meta(gt=0, le=1e9)] = 30000.0  # e⁻ at the white level
-    read_noise: Annotated[float, Meta(ge=0, le=1e6)] = 3.0  # e⁻, 1σ
-    black: Annotated[int, Meta(ge=0, lt=65535)] = 512  # counts
-    white: Annotated[int, Meta(gt=0, le=65535)] = 15871  # counts
+    full_well: Annotated[float, Meta(gt=0, le=1e9, description="at the white level [e⁻]")] = 30000.0
+    read_noise: Annotated[float, Meta(ge=0, le=1e6, description="1σ [e⁻]")] = 3.0
+    black: Annotated[int, Meta(ge=0, lt=65535, description="black level [counts]")] = 512
+    white: Annotated[int, Meta(gt=0, le=65535, description="white level [counts]")] = 15871
 
 
 def pinhole(focal_mm: float, width: int, height: int) -> View:

@@ -54,28 +54,50 @@ _CONVENTIONS = (
 class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The simulated camera, polarizer and errors of the photographer; users set the fields by name."""
 
-    seed: Annotated[int, Meta(ge=0)] = 0
-    width: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 1152  # visible RAW px
-    height: Annotated[int, Meta(ge=64, le=20000, multiple_of=2)] = 864
-    focal_mm: Annotated[float, Meta(ge=1, le=10000)] = 60.0  # on a sensor 36 mm wide
-    angles_deg: Annotated[tuple[Angle, ...], Meta(min_length=1)] = (0.0, 45.0, 90.0)  # stated
-    exposures: Annotated[int, Meta(ge=1, le=9)] = 3
-    step: Annotated[float, Meta(gt=1, le=1000)] = 4.0  # exposure ratio of neighboring frames
-    exposure_factor: Annotated[float, Meta(gt=0, le=1000)] = 1.0  # on the automatic exposure; above 1 highlights clip
-    bracket: Literal["time", "aperture", "iso", "flash"] = "time"  # time: steady light; others: flash
-    gain_jitter: Annotated[float, Meta(ge=0, le=0.2)] = 0.01  # 1σ of the light's energy from frame to frame, relative
-    nudge_px: Annotated[float, Meta(ge=0, le=1000)] = 1.5  # largest camera shift between angles
-    nudge_deg: Annotated[float, Meta(ge=0, le=45)] = 0.05  # largest camera roll between angles
-    angle_error_deg: Annotated[float, Meta(ge=0, le=90)] = 0.5  # 1σ of the polarizer's true angle
-    extinction_ratio: Annotated[float, Meta(ge=1)] = 1000.0
-    cross: bool = False  # one more shot, its flash polarized at right angles to the first angle
-    flash_extinction: Annotated[float, Meta(ge=1)] = 1000.0  # extinction ratio of the flash's polarizer
-    distortion: tuple[Bend, Bend] = (0.0, 0.0)  # k1, k2 of `forward_camera.undistort`
-    blur_px: Annotated[float, Meta(ge=0, le=50)] = 0.4  # 1σ of the lens's point spread
-    samples: Annotated[int, Meta(ge=1, le=4)] = 2  # rays per pixel side
+    seed: Annotated[int, Meta(ge=0, description="of light, noise and errors")] = 0
+    width: Annotated[int, Meta(ge=64, le=20000, multiple_of=2, description="width of the RAW [px]")] = 1152
+    height: Annotated[int, Meta(ge=64, le=20000, multiple_of=2, description="height of the RAW [px]")] = 864
+    focal_mm: Annotated[float, Meta(ge=1, le=10000, description="focal length, on a sensor 36 mm wide [mm]")] = 60.0
+    angles_deg: Annotated[
+        tuple[Angle, ...],
+        Meta(
+            min_length=1,
+            description="stated polarizer angles, 0 to 360, counter-clockwise; write -45 as 135 [degrees]",
+        ),
+    ] = (0.0, 45.0, 90.0)
+    exposures: Annotated[int, Meta(ge=1, le=9, description="frames of a bracket")] = 3
+    step: Annotated[float, Meta(gt=1, le=1000, description="exposure ratio of neighboring frames")] = 4.0
+    exposure_factor: Annotated[
+        float, Meta(gt=0, le=1000, description="on the automatic exposure; above 1 highlights clip")
+    ] = 1.0
+    bracket: Annotated[
+        Literal["time", "aperture", "iso", "flash"],
+        Meta(description="what differs between the frames; time: steady light, others: a flash"),
+    ] = "time"
+    gain_jitter: Annotated[
+        float, Meta(ge=0, le=0.2, description="1σ of the light's energy from frame to frame, relative")
+    ] = 0.01
+    nudge_px: Annotated[float, Meta(ge=0, le=1000, description="largest camera shift between angles")] = 1.5
+    nudge_deg: Annotated[float, Meta(ge=0, le=45, description="largest camera roll between angles")] = 0.05
+    angle_error_deg: Annotated[float, Meta(ge=0, le=90, description="1σ of the polarizer's true angle")] = 0.5
+    extinction_ratio: Annotated[float, Meta(ge=1, description="of the polarizer on the lens")] = 1000.0
+    cross: Annotated[
+        bool, Meta(description="one more shot, its flash polarized at right angles to the first angle")
+    ] = False
+    flash_extinction: Annotated[float, Meta(ge=1, description="extinction ratio of the flash's polarizer")] = 1000.0
+    distortion: Annotated[tuple[Bend, Bend], Meta(description="k1 and k2 of the lens")] = (0.0, 0.0)
+    blur_px: Annotated[float, Meta(ge=0, le=50, description="1σ of the lens's point spread")] = 0.4
+    samples: Annotated[int, Meta(ge=1, le=4, description="rays per pixel side")] = 2
     sensor: Sensor = Sensor()
-    cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG", "X-Trans"] = "RGGB"
-    color_matrix: Annotated[tuple[float, ...], Meta(min_length=9, max_length=9)] = COLOR_MATRIX
+    cfa: Annotated[
+        Literal["RGGB", "BGGR", "GRBG", "GBRG", "X-Trans"], Meta(description="pattern of the color filters")
+    ] = "RGGB"
+    color_matrix: Annotated[
+        tuple[float, ...],
+        Meta(
+            min_length=9, max_length=9, description="from the scene's XYZ to the camera's colors, nine numbers by rows"
+        ),
+    ] = COLOR_MATRIX
 
     @property
     def view(self) -> View:
@@ -267,13 +289,19 @@ def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) ->
     return shoot.exposure_factor * min(0.35 / level, 0.95 / peak * shoot.step ** (shoot.exposures // 2))
 
 
+def _equivalent(shoot: Shoot) -> float:
+    """Full-frame equivalent of the focal length, mm: by equal diagonals, also for a sensor that is not 3:2."""
+    diagonal = SENSOR_WIDTH_MM * np.hypot(1, shoot.height / shoot.width)
+    return float(shoot.focal_mm * np.hypot(36, 24) / diagonal)
+
+
 def _exposure(shoot: Shoot, take: Take, middle: float) -> tuple[Exif, float, float]:
     """EXIF data of a simulated photograph, the light it receives, and its amplification."""
     stops, number = take.stops, take.shot * shoot.exposures + take.frame
     taken = datetime(2026, 3, 14, 12) + timedelta(seconds=4.25 * number + 20 * (number // shoot.exposures))
     exif = Exif(
         make="Polcap", model="Synthetic", lens=f"Synthetic {shoot.focal_mm:g}mm", exposure_time=1 / 160, f_number=11.0,
-        iso=100.0, focal_length_mm=shoot.focal_mm, focal_length_35mm=shoot.focal_mm,
+        iso=100.0, focal_length_mm=shoot.focal_mm, focal_length_35mm=_equivalent(shoot),
         pixel_pitch_um=1000 * SENSOR_WIDTH_MM / shoot.width, taken=taken.isoformat(timespec="milliseconds"),
         flash_fired=shoot.bracket != "time" and take.lit,
     )  # fmt: skip

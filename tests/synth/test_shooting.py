@@ -10,8 +10,10 @@ import pytest
 import rawpy
 from msgspec.structs import replace
 
+from polcap.capture_values import Exif
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import shipped_data
+from polcap.formats.capture import focal_length
 from polcap.optics import projection
 from polcap.synth import color_checker, render, shooting
 from polcap.synth.color_checker import Chart
@@ -205,3 +207,11 @@ def test_a_camera_that_rolls_turns_its_polarizer_with_it() -> None:
     found = studio.radiance(shooting.ShotPose(30.0, rot_deg=20.0))
     inside = studio.buffer.mask & (studio.buffer.normal[..., 2] > 0.35)
     assert np.abs(found - upright)[inside].max() < 0.02 * np.abs(other - upright)[inside].max()
+
+
+@pytest.mark.parametrize("size", [(1152, 768), (640, 480), (400, 600)])
+def test_the_full_frame_equivalent_has_the_cameras_diagonal(size: tuple[int, int]) -> None:
+    shoot = Shoot(width=size[0], height=size[1])
+    exif = shooting._exposure(shoot, shooting.Take(0, 0, 1.0), 1.0)[0]
+    stated = Exif(focal_length_35mm=exif.focal_length_35mm, width=size[0], height=size[1])
+    assert focal_length.find(stated, None, None).px == pytest.approx(shoot.view.focal)

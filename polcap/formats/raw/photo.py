@@ -238,7 +238,11 @@ def _channels(path: str, spec: Any) -> list[int]:
     grey = [i for i, name in enumerate(names) if i != spec.alpha_channel]
     if len(grey) == 1:
         return grey
-    raise DecodeError(f"{path}: has the channels {', '.join(spec.channelnames)}; polcap reads R, G, B or one gray")
+    named = f"{', '.join(spec.channelnames[:4])}{', …' if len(spec.channelnames) > 4 else ''}"
+    raise DecodeError(
+        f"{path}: has {len(spec.channelnames)} channels ({named}), not R, G, B or one gray; give the folder of the "
+        "photographs, or take this file out of it"
+    )
 
 
 def _counts(pixels: NDArray[Any]) -> Any:
