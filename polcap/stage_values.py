@@ -260,4 +260,4 @@ class SurfaceMaps(ArrayValue):
     detail: Floats | None = None  # (2H, 2W) float16, ln of the albedo of RAW pixels over `diffuse`, enlarged
     order: OrderTest | None = None  # None without a network, or without other orders
     diffuse_error: Floats | None = None  # (H, W) 1σ of the mean of its channels; None until the gates judged
-    roughness_error: Floats | None = None  # (H, W) 1σ of `roughness`
+    roughness_error: Floats | None = None  # (H, W) 1σ of `roughness`; of the inversion None until the gates judged

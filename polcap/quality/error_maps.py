@@ -1,6 +1,6 @@
 """Expected errors of each pixel: of the normals, of the albedo and of the roughness.
 
-That of a normal is the estimator's own error, and the costs of all gates.
+That of the roughness is the estimator's own. That of a normal is the estimator's own error, and the costs of all gates.
 A finding of a gate costs the same on the whole object, unless it has a place in `_PLACES`: there its pixels have their
 own costs, also where they are too few for a finding.
 """
@@ -26,15 +26,17 @@ _CLIPPED_AROUND = (0.0, 0.15, 0.3, 0.45, 0.6, 0.8, 1.0)
 _CLIPPED_DEG = (0.0, 5.0, 9.5, 22.0, 28.0, 25.0, 18.0)
 _CLIPPED_PART = 0.3  # clipped part of the object with these costs; they grow with its root, as a highlight's width
 # part of a cost that the estimators do not state themselves, where the polarization contradicts itself
-_UNSTATED = {"sharpness": 0.3, "ill-posed": 0.0}
+_UNSTATED = {"sharpness": 0.7, "ill-posed": 0.0}
+# agreement of the re-rendering from which `body` is a false finding (docs/benchmarks/gates.md); of wax it is .22
+_CONFIRMED = 0.45
+_WHOLE = "re-rendering"  # its cost is the whole error, if the estimators state less
 _GHOST_DEG = 5.0  # where the exposures of a shot differ
 # 1σ by 150 simulated captures and the 4 rendered ones (docs/benchmarks/albedo.md); (network, analytic)
-_ALBEDO_FLOOR = 0.011  # of the diffuse albedo
-_ALBEDO = (0.08, 0.12)  # of it, relative, times the root of the expected normal error [degrees]
-_MOST_DEG = 9.0  # normal error: a larger one does not change the albedo more
+_ALBEDO = (0.04, 0.06)  # of the diffuse albedo, times the root of albedo times expected normal error [degrees]
+_DARKEST = 0.01  # albedo
+_MOST_DEG = 20.0  # normal error: a larger one does not change the albedo more
 _ALBEDO_CLIPPED = 3.0  # relative, times the clipped shares of the object and around: light that no shot shows
-_ROUGHNESS = ((0.065, 0.045), (0.25, 0.0))  # constant, and times the roughness
-_ROUGHNESS_CLIPPED = (0.29, 0.3)  # factor and power of the clipped share: without highlights it is a guess
+_ROUGHNESS_OF_INVERSION = 0.17  # it assumes one
 
 
 def with_errors(found: Evidence[ResultsUntilInfer], judged: Iterable[Gate]) -> SurfaceMaps:
@@ -43,17 +45,27 @@ def with_errors(found: Evidence[ResultsUntilInfer], judged: Iterable[Gate]) -> S
         found.results.maps,
         confidence=expected_normal_error(found, judged),
         diffuse_error=_diffuse_error(found),
-        roughness_error=_roughness_error(found),
+        roughness_error=_roughness_error(found.results.maps),
     )
 
 
 def expected_normal_error(found: Evidence[ResultsUntilInfer], judged: Iterable[Gate]) -> Floats:
     """Expected error of the normals (H, W), degrees: root of the squares of the estimator's own and all costs."""
     places = {name: cost(found) for name, cost in _PLACES.items()}
-    costs = ((gate.name, gate.cost_deg) for gate in judged if gate.name not in places)
-    everywhere = sum((_UNSTATED.get(name, 1.0) * cost) ** 2 for name, cost in costs)
-    squares = found.results.maps.confidence**2 + everywhere + sum(cost**2 for cost in places.values())
+    costs = [(name, cost) for name, cost in unstated_costs(judged) if name not in places]
+    everywhere = sum(cost**2 for name, cost in costs if name != _WHOLE)
+    own = np.maximum(found.results.maps.confidence, sum(cost for name, cost in costs if name == _WHOLE))
+    squares = own**2 + everywhere + sum(cost**2 for cost in places.values())
     return np.where(found.results.maps.mask, np.minimum(np.sqrt(squares), MOST_DEG), 0).astype(np.float32)
+
+
+def unstated_costs(judged: Iterable[Gate]) -> list[tuple[str, float]]:
+    """Names of the gates with their costs [degrees], as far as the estimators do not state these themselves."""
+    gates = list(judged)
+    agreement = (gate.value for gate in gates if gate.name == _WHOLE and gate.state == "pass")
+    confirmed = any(isinstance(value, float) and value > _CONFIRMED for value in agreement)
+    parts = _UNSTATED | ({"body": 0.0} if confirmed else {})
+    return [(gate.name, parts.get(gate.name, 1.0) * gate.cost_deg) for gate in gates]
 
 
 def _of_clipping(found: Evidence[ResultsUntilInfer]) -> Floats:
@@ -80,21 +92,18 @@ def _of_focal_length(found: Evidence[ResultsUntilInfer]) -> Floats:
 def _diffuse_error(found: Evidence[ResultsUntilInfer]) -> Floats:
     """1σ of the diffuse albedo (H, W), mean of the channels, if chart and object had the same light."""
     maps, clipped = found.results.maps, _flagged(found, Quality.CLIPPED)
-    relative = _ALBEDO[_is_analytic(maps)] * np.sqrt(np.minimum(maps.confidence, _MOST_DEG))
+    albedo = np.maximum(maps.diffuse.mean(axis=-1), _DARKEST)
+    error = _ALBEDO[_is_analytic(maps)] * np.sqrt(albedo * np.minimum(maps.confidence, _MOST_DEG))
     if clipped.any():
         hidden = _ALBEDO_CLIPPED * clipped.sum() / maps.mask.sum()
-        relative = np.hypot(relative, hidden * _share_around(clipped, maps.mask))
-    error = np.hypot(_ALBEDO_FLOOR, relative * maps.diffuse.mean(axis=-1))
+        error = np.hypot(error, hidden * _share_around(clipped, maps.mask) * albedo)
     return np.where(maps.mask, np.minimum(error, 1), 0).astype(np.float32)
 
 
-def _roughness_error(found: Evidence[ResultsUntilInfer]) -> Floats:
-    """1σ of the roughness (H, W). Highlights that are clipped leave it unknown on the whole object."""
-    maps, clipped = found.results.maps, _flagged(found, Quality.CLIPPED)
-    constant, slope = _ROUGHNESS[_is_analytic(maps)]
-    factor, power = _ROUGHNESS_CLIPPED
-    hidden = factor * float(clipped.sum() / max(maps.mask.sum(), 1)) ** power
-    return np.where(maps.mask, np.hypot(constant + slope * maps.roughness, hidden), 0).astype(np.float32)
+def _roughness_error(maps: SurfaceMaps) -> Floats:
+    """1σ of the roughness (H, W): that of the network's materials, or of the inversion."""
+    error = _ROUGHNESS_OF_INVERSION if maps.roughness_error is None else maps.roughness_error
+    return np.where(maps.mask, error, 0).astype(np.float32)
 
 
 def _is_analytic(maps: SurfaceMaps) -> bool:

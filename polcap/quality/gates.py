@@ -143,7 +143,8 @@ def verdict(gates: Iterable[Gate]) -> State:
 def _normal_error(found: Evidence[ResultsUntilInfer], judged: list[Gate], limits: GateLimits) -> Gate:
     """Gate on the median expected error of the normals, with all gates' costs."""
     expected, limit = _median_error(found, judged), limits.max_normal_error_deg
-    because = ", ".join(gate.name for gate in judged if gate.cost_deg > _LARGE_PART * expected)
+    costs = error_maps.unstated_costs(judged)
+    because = ", ".join(name for name, cost in costs if cost > _LARGE_PART * expected)
     message = f"Expected error of the normals: {expected:.1f}° (median)"
     if expected == MOST_DEG:
         message = "The normals are unknown"

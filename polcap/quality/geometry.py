@@ -40,6 +40,7 @@ _TEXTURE = (
     "--set align.model=none"
 )
 _HOLD_STILL = "Fix the object, do not touch it between shots, and take that shot again"
+_FOCAL_LENGTHS = 9  # within the doubt
 _INWARD = 0.2  # sine of the zenith from which a normal leans inward
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
 
@@ -369,13 +370,14 @@ def _inward_share(maps: SurfaceMaps) -> float:
 
 
 def _lean(maps: SurfaceMaps, least: float, most: float) -> float:
-    """Largest change of a view ray's tilt [degrees] within the doubt of the focal length; median over the object."""
+    """Change of a view ray's tilt [degrees] within the doubt of the focal length; median over the object."""
     return float(np.median(lean(maps, least, most)[maps.mask])) if maps.mask.any() else 0.0
 
 
 def lean(maps: SurfaceMaps, least: float, most: float) -> Floats:
-    """Largest change of each view ray's tilt (H, W) [degrees] within the doubt of the focal length."""
+    """Root mean square change of each view ray's tilt (H, W) [degrees], if all focal lengths in doubt are as likely."""
     y, x = np.indices(maps.mask.shape)
     off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
-    tilt, more, less = (np.arctan(off * factor) for factor in (1.0, np.exp(-least), np.exp(-most)))
-    return np.asarray(np.degrees(np.maximum(more - tilt, tilt - less)))
+    doubts = least + (most - least) * (np.arange(_FOCAL_LENGTHS) + 0.5) / _FOCAL_LENGTHS
+    changes = (np.arctan(off * np.exp(-doubt)) - np.arctan(off) for doubt in doubts)
+    return np.asarray(np.degrees(np.sqrt(sum(change**2 for change in changes) / _FOCAL_LENGTHS)))

@@ -22,7 +22,7 @@ _BRIGHTEST = 0.99  # quantile of the light from which a pixel is a highlight
 _JUDGED_PX = 256  # longest side on which the gate compares
 _OUTLIER = 5  # standard deviations of the differences
 _MOST_DOLP = 0.1  # more has no more weight: that of noise and of reflections
-_WRONG_DEG = 40.0  # error of normals that were turned, exchanged or flattened (docs/benchmarks/gates.md)
+_WRONG_DEG = 30.0  # mean error of the normals of captures that fail (docs/benchmarks/gates.md)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,9 @@ lens, in units of a white plane that faces it, the mirrored light is
 
 and reaches this limit where the surface faces the lens. So the brightest highlight bounds the roughness from above.
 Mirrored light is what S0 has beyond the albedo, and therefore less certain on a bright material.
+
+**Expected error of the roughness.** Its error is common to a material, and greater where no highlight confirms the
+network, or a clipped one; and where the network also expects large errors of the normals.
 """
 
 from dataclasses import replace
@@ -52,6 +55,10 @@ _FEWEST_PX = 50
 _ALBEDO_SIGMA = 0.2  # relative error of the albedo under a highlight
 _NETWORK_SIGMA = 0.08  # error of the network's roughness
 _BOUND_SIGMA = 0.06  # relative error of the bound without that of the mirrored light: F0, and highlights below a pixel
+# 1σ of a pooled roughness by simulated captures (docs/benchmarks/albedo.md), added in squares
+_SIGMA = 0.06
+_SIGMA_PER_DEGREE = 0.006  # of the material's mean expected normal error
+_SIGMA_UNCONFIRMED = 0.15  # without a highlight, or with a clipped one
 # median F0 of training surfaces by the predicted F0, if a twentieth of them has more than .06
 _PREDICTED_F0 = (0.03, 0.04, 0.05, 0.06, 0.08, 0.105, 0.16, 1.0)
 _MEDIAN_F0 = (0.039, 0.0415, 0.0425, 0.0435, 0.046, 0.0556, 0.16, 1.0)
@@ -117,7 +124,10 @@ def _specular_share(cues: Cues) -> Floats:
 
 
 def pool_gloss(maps: SurfaceMaps, cues: Cues) -> SurfaceMaps:
-    """Replace roughness and F0 of a network's maps (H, W, …) by those of the materials, with soft borders."""
+    """Replace roughness and F0 of a network's maps (H, W, …) by those of the materials, with soft borders.
+
+    Also states the expected error of the roughness, 1σ.
+    """
     if not maps.mask.any():
         return maps
     mask = maps.mask
@@ -131,11 +141,25 @@ def pool_gloss(maps: SurfaceMaps, cues: Cues) -> SurfaceMaps:
     weight = share / np.maximum(share.sum(axis=0), 1e-9)
     f0 = _calibrated(weight.T @ maps.specular[mask].mean(axis=-1))
     roughness = weight.T @ maps.roughness[mask]
+    sigma = np.hypot(_SIGMA, _SIGMA_PER_DEGREE * (weight.T @ maps.confidence[mask]))
+    clipped = (cues.quality & np.uint8(Quality.CLIPPED)) > 0
     for k in range(len(center)):
-        roughness[k] = _bounded(float(roughness[k]), float(f0[k]), member == k, zenith, mirrored, maps.diffuse)
-    out_f0, out_roughness = np.zeros(mask.shape, np.float32), np.zeros(mask.shape, np.float32)
-    out_f0[mask], out_roughness[mask] = share @ f0, share @ roughness
-    return replace(maps, specular=np.repeat(out_f0[..., None], 3, axis=-1), roughness=out_roughness)
+        facing = (member == k) & (zenith < _FACING_DEG)
+        away = (member == k) & (zenith > _AWAY_DEG[0]) & (zenith < _AWAY_DEG[1])
+        seen = _highlight(facing, away, mirrored, maps.diffuse)
+        if seen is not None:
+            roughness[k] = _bounded(float(roughness[k]), float(f0[k]), *seen)
+        if seen is None or seen[0] <= seen[1] or (clipped & facing).sum() >= _BRIGHTEST:
+            sigma[k] = hypot(sigma[k], _SIGMA_UNCONFIRMED)
+    specular, pooled, error = (_on_pixels(share @ of_material, mask) for of_material in (f0, roughness, sigma))
+    return replace(maps, specular=np.repeat(specular[..., None], 3, axis=-1), roughness=pooled, roughness_error=error)
+
+
+def _on_pixels(values: Floats, mask: Bools) -> Floats:
+    """Map (H, W) of the values (N,) of the pixels in the mask, 0 outside."""
+    image = np.zeros(mask.shape, np.float32)
+    image[mask] = values
+    return image
 
 
 def _fewest_groups(alike: Floats) -> tuple[Floats, float]:
@@ -158,15 +182,20 @@ def _mirrored_light(maps: SurfaceMaps, cues: Cues) -> Floats:
     return masked_mean(beyond, maps.mask, max(_LEAST_BLUR_PX, _BLUR * disc_radius(maps.mask)))
 
 
-def _bounded(roughness: float, f0: float, member: Bools, zenith: Floats, mirrored: Floats, albedo: Floats) -> float:
-    """Roughness of a material of pixels `member` (H, W), at most the bound from its highlights."""
-    facing, away = member & (zenith < _FACING_DEG), member & (zenith > _AWAY_DEG[0]) & (zenith < _AWAY_DEG[1])
+def _highlight(facing: Bools, away: Bools, mirrored: Floats, albedo: Floats) -> tuple[float, float] | None:
+    """Mirrored light of a material's highlight, and its 1σ; None if the material shows none.
+
+    `facing` (H, W) are the material's pixels that may have it, `away` those that cannot.
+    """
     if facing.sum() < _FEWEST_PX or away.sum() < _FEWEST_PX:
-        return roughness
+        return None
     highlight = float(np.partition(mirrored[facing], -_BRIGHTEST)[-_BRIGHTEST])
     error = hypot(np.quantile(mirrored[away], _AWAY_QUANTILE), _ALBEDO_SIGMA * albedo[facing].mean())
-    if highlight <= 0:
-        return roughness
+    return None if highlight <= 0 else (highlight, error)
+
+
+def _bounded(roughness: float, f0: float, highlight: float, error: float) -> float:
+    """Roughness of a material, at most the bound from its highlight with this 1σ error."""
     bound: float = (f0 / (4 * highlight)) ** 0.25
     sigma = bound * hypot(_BOUND_SIGMA, error / (4 * highlight))
     weight = _NETWORK_SIGMA**2 / (_NETWORK_SIGMA**2 + sigma**2)

@@ -5,7 +5,7 @@
 3. The analytic inversion gives normals of each pixel. Their detail replaces that of the network where noise is low.
 4. The refinement network adds relief.
 5. The picture over the shading of the normals, times a smooth factor of the network, is the albedo.
-6. Pixels of one material get one roughness and one F0.
+6. Pixels of one material get one roughness, with one expected error, and one F0.
 """
 
 from dataclasses import replace
@@ -22,8 +22,8 @@ from polcap.stages.infer import analytic, fine, half_turns, highlights, sizes_an
 from polcap.stages.infer.highlights import REACHED
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join, for the network's input holds the inversion
-# error = min(a·statedᵇ·exp(r·roughness), c), degrees: maximum likelihood on traced training meshes (decision 28)
-_CALIBRATION = (0.515, 1.12, 0.906, 50.0)
+# error = min(a·statedᵇ, c), degrees: maximum likelihood on simulated captures and on test pictures (decision 28)
+_CALIBRATION = (0.51, 1.19, 40.0)
 _SIZES = (1.5625, 0.875)  # of the network's pictures, over its native size: 400 and 224 px (decision 9)
 _OVERVIEWS, _OVERVIEW_POSITIONS = (0.5, 0.35), 2  # sizes of smaller pictures, evidence for the side of normals
 _TEST_SIZE = 0.35  # of the picture by which orders of the shots are compared
@@ -45,8 +45,8 @@ def estimate(
     normal = fine.refine(cues, coarse, network.fine, run) if fine_pass and network.fine else coarse.normal
     light = (np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"])
     diffuse = highlights.fill(light / _shading(normal, cues.rays) - FLOOR, _limit_radiance(cues))
-    scale, power, rougher, most = _CALIBRATION
-    error = np.minimum(scale * stated**power * np.exp(rougher * np.clip(maps["roughness"], 0, 1)), most)
+    scale, power, most = _CALIBRATION
+    error = np.minimum(scale * stated**power, most)
     error = half_turns.error_with_doubt(error, maps["doubt"], frames.dot(normal, cues.rays))
     inside = cues.mask[..., None]
     maps_by_pixel = SurfaceMaps(
@@ -83,8 +83,7 @@ def estimate_coarse(
     doubt = half_turns.NetworkDoubt(small["sigma"], small.pop("opposed"), overview)
     small["normal"], small["doubt"] = _correct_half_turns(small["normal"], seen, doubt)
     small["factor"] = _log_factor(small["diffuse"] * _shading(small["normal"], seen.rays), seen)
-    for name in ("specular", "roughness"):
-        small[name] = _smooth_gloss(small[name], seen.mask)
+    small["roughness"] = _smooth_roughness(small["roughness"], seen.mask)
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
     smooth = frames.unit(maps["normal"])
     guide = np.asarray(frames.to_ray_frame(smooth, cues.rays)), maps["sigma"]
@@ -211,10 +210,9 @@ def _log_factor(light: Floats, seen: Cues) -> Floats:
     return np.where(known[..., None], near, far)
 
 
-def _smooth_gloss(image: Floats, mask: Bools) -> Floats:
-    """Remove the network's grid artifact of one or two pixels from a map (H, W[, 3]) inside the mask."""
-    smooth = _masked_filter(image, mask, sizes_and_positions.BINOMIAL, REACHED)
-    return np.where(mask if image.ndim == 2 else mask[..., None], smooth, image)
+def _smooth_roughness(roughness: Floats, mask: Bools) -> Floats:
+    """Remove the network's grid artifact of one or two pixels from the roughness (H, W) inside the mask."""
+    return np.where(mask, _masked_filter(roughness, mask, sizes_and_positions.BINOMIAL, REACHED), roughness)
 
 
 def _masked_filter(

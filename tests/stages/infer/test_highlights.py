@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polcap.images import Floats
+from polcap.images import Floats, Quality
 from polcap.optics import frames, shade
 from polcap.stage_values import Cues, SurfaceMaps
 from polcap.stages import cues, stokes
@@ -44,6 +44,13 @@ def found(maps: SurfaceMaps, seen: Cues) -> Floats:
     return highlights.pool_gloss(maps, seen).roughness[maps.mask]
 
 
+def error(maps: SurfaceMaps, seen: Cues) -> float:
+    """Expected error of the ball's roughness, the same in all its pixels."""
+    stated = highlights.pool_gloss(maps, seen).roughness_error
+    assert stated is not None and np.ptp(stated[maps.mask]) < 1e-6
+    return float(stated[maps.mask][0])
+
+
 def test_a_bright_highlight_lowers_the_roughness_of_its_whole_material(ball: Cues) -> None:
     one = np.ones(ball.mask.shape)
     roughness = found(*lit(ball, 0.2 * one, ROUGH * one, 0.55 * one))
@@ -73,6 +80,24 @@ def test_two_materials_keep_their_two_roughnesses(ball: Cues) -> None:
     maps, seen = lit(ball, np.where(left, 0.1, 0.5), roughness, roughness)
     both = highlights.pool_gloss(maps, seen).roughness
     assert np.abs(both - roughness)[maps.mask].max() < 0.03
+
+
+def test_the_roughness_is_less_certain_without_a_highlight_or_with_a_clipped_one(ball: Cues) -> None:
+    one = np.ones(ball.mask.shape)
+    shown, hidden = (lit(ball, albedo * one, 0.65 * one, 0.65 * one) for albedo in (0.05, 0.8))
+    flagged = replace(
+        shown[1], quality=np.where(shown[1].radiance.sum(-1) > 0.3, np.uint8(Quality.CLIPPED), np.uint8(0))
+    )
+    clipped = shown[0], flagged
+    of_shown, of_hidden, of_clipped = (error(*of) for of in (shown, hidden, clipped))
+    assert of_hidden == of_clipped > 2 * of_shown > 0.1
+
+
+def test_the_roughness_is_less_certain_where_the_normals_are(ball: Cues) -> None:
+    one = np.ones(ball.mask.shape)
+    maps, seen = lit(ball, 0.05 * one, 0.65 * one, 0.65 * one)
+    unsure = replace(maps, confidence=np.where(maps.mask, np.float32(20), np.float32(0)))
+    assert error(unsure, seen) > 1.5 * error(maps, seen)
 
 
 @pytest.mark.parametrize(("predicted", "common"), [(0.06, 0.0435), (0.16, 0.16)])
