@@ -43,6 +43,8 @@ def settings(
 
 def _synth_settings() -> "list[Setting]":
     """The settings of `polcap synth`, then those that its options --views, --flat and --calibration change or add."""
+    from msgspec import Struct
+
     from polcap import config
     from polcap.synth.all_around import AroundShoot
     from polcap.synth.calibration_frames import CalibrationShoot
@@ -50,7 +52,10 @@ def _synth_settings() -> "list[Setting]":
     from polcap.synth.shooting import Shoot
 
     rows, seen = list(config.settings(Shoot)), list(config.settings(Shoot))
-    for option, kind in {"--views": AroundShoot, "--flat": FlatShoot, "--calibration": CalibrationShoot}.items():
+    kinds: dict[str, type[Struct]] = {
+        "--views": AroundShoot, "--flat": FlatShoot, "--calibration": CalibrationShoot,
+    }  # fmt: skip
+    for option, kind in kinds.items():
         new = [row for row in config.settings(kind) if row not in seen]
         seen += new
         rows += [row._replace(description=f"with {option}: {row.description}") for row in new]
