@@ -21,12 +21,12 @@ from polcap.stage_values import StokesImage, SurfaceMaps
 
 _MOST_PIXELS = 1e4  # of the object; a larger picture is averaged down
 _RIM, _INNER = 0.08, (0.2, 0.4)  # bands along the outline, by depth over the object's radius
-_LEAST_RIM_PX = 3.0
+_MIXED_PX, _LEAST_RIM_PX = 2.0, 4.0  # from the outline: mixed with the backdrop; least end of the outer band
 _FEW = 5  # px of a sector's band
 _GROWTH, _LEAST_DOLP = 1.5, 0.04  # of the DoLP in a sector with an occluding contour
 _ROUNDED = 0.2  # share of such sectors: plates, coins and sheets up to .17, unless tilted; bodies from .25
-_ONE_PLANE = 0.6  # common part of the polarization: rounded objects up to .45
-_LIT = 0.9  # light of an outline that is not dimmed: wax too is hardly polarized, but dimmed
+_ONE_PLANE = 0.5  # common part of the polarization: rounded objects up to .46; beyond, orders look alike
+_LIT = 0.85  # light of an outline that is not dimmed: wax too is hardly polarized, but dimmed to .8 and less
 _FACING_DOLP = 0.045  # most of the outline of a plane that faces the camera
 _ALIGNED = 0.84  # length of the mean normal: boxes up to .83, except one whose normals are wrong; bodies up to .77
 _ONE_NORMAL = 0.92  # of the mean normal: beyond, the outline decides nothing
@@ -93,7 +93,7 @@ def measure(image: StokesImage, maps: SurfaceMaps) -> Flatness | None:
     polarized = (s1 + 1j * s2) / np.maximum(s0, 1e-9)
     dolp = np.minimum(np.abs(polarized), outline.DOLP_CAP)
     depth, radius = outline.depth(inside), outline.disc_radius(inside)
-    body = inside & (depth > 1)
+    body = inside & (depth > _MIXED_PX)
     rim = body & (depth <= max(_RIM * radius, _LEAST_RIM_PX))
     inner = (depth > _INNER[0] * radius) & (depth < _INNER[1] * radius)
     of_rim, of_inner = (_by_sector(dolp, band) for band in (rim, inner))

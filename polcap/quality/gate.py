@@ -8,8 +8,9 @@ import numpy as np
 
 from polcap.errors import InputError
 from polcap.images import Bools, Floats, Quality
+from polcap.optics import frames
 from polcap.results import FirstResults, ResultsUntilHdr
-from polcap.stage_values import AngleStack
+from polcap.stage_values import AngleStack, StokesImage
 from polcap.stages.align import AlignSettings
 
 State = Literal["pass", "warn", "fail", "not measured", "not judged"]  # not judged: another gate is the cause
@@ -19,6 +20,7 @@ MOST_DEG = 90.0  # of an error: normals face the camera
 R = TypeVar("R", bound=FirstResults, covariant=True)
 H = TypeVar("H", bound=ResultsUntilHdr)
 _ALIGN = AlignSettings()
+_LIT = 0.02  # of the object's median light
 _ERROR_COST_DEG = 45.0  # of a stage that gives up: nothing is known of the normals
 DEGREES_PER_GAIN = 600.0  # 1 % of a shot's light tilts facing pixels by about 6° (error budget)
 
@@ -93,6 +95,14 @@ def of_error(error: InputError) -> Gate:
     reason, _, remedy = str(error).partition("; ")
     name = type(error).__name__.removesuffix("Error").lower()
     return Gate(name, "fail", None, None, reason, remedy, _ERROR_COST_DEG)
+
+
+def lit(image: StokesImage) -> Bools:
+    """Pixels (H, W) of the object that are neither clipped nor so dark that the shots show only noise."""
+    inside = image.mask & (image.quality & int(Quality.CLIPPED) == 0)
+    s0, s1, s2 = frames.total(image.stokes)
+    least = _LIT * float(np.median(s0[inside])) if inside.any() else 0.0
+    return np.asarray(inside & (np.maximum(s0, np.hypot(s1, s2)) > least))
 
 
 def shot_names(radiance: AngleStack) -> list[str]:

@@ -30,6 +30,8 @@ from polcap.results import (
 )
 
 R = TypeVar("R", bound=FirstResults)
+_NOISY_PART = 0.3  # of the expected error: with less noise, more light does not help
+_SMALL_PX = 3000  # of the object, merged; smaller ones have no room for detail
 _LARGE_PART = 0.45  # of the expected error: the message names the gates that cost more
 
 _Judged = Gate | Iterable[Gate]
@@ -153,11 +155,23 @@ def _normal_error(found: Evidence[ResultsUntilInfer], judged: list[Gate], limits
         return Gate("normal error", "not measured", None, limit, message, unit="°")
     if expected <= limit:
         return Gate("normal error", "pass", round(expected, 2), limit, message, unit="°")
-    more = "" if len(found.names) > 3 else " four angles,"
-    flat = any(gate.name == "flat" and gate.state == "warn" for gate in judged)
-    known = because or flat or any(gate.state == "fail" for gate in judged)  # these gates have the remedy
-    remedy = "" if known else f"Use more light or frames,{more} or a darker room"
-    return Gate("normal error", "warn" if flat else "fail", round(expected, 2), limit, message, remedy, unit="°")
+    state: State = "fail"
+    if any(gate.name == "flat" and gate.state == "warn" for gate in judged):
+        state, remedy = "warn", ""
+    elif because or any(gate.state == "fail" for gate in judged):  # these gates have the remedy
+        remedy = ""
+    else:
+        state, remedy = _of_object(found, expected)
+    return Gate("normal error", state, round(expected, 2), limit, message, remedy, unit="°")
+
+
+def _of_object(found: Evidence[ResultsUntilInfer], expected: float) -> tuple[State, str]:
+    """State and remedy of normals with large errors that no gate explains: noise, or an object that shows little."""
+    if _NOISY_PART * expected < shot_exposure.DEGREES_PER_NOISE * shot_exposure.noise_dolp(found.results.stokes):
+        return "fail", f"Use more light or frames,{'' if len(found.names) > 3 else ' four angles,'} or a darker room"
+    if found.results.object_.mask.sum() * found.grid_px**2 < _SMALL_PX:
+        return "warn", "Show the object larger: go nearer, or use a longer lens"
+    return "warn", "Tilt the object by 30°: surfaces that face camera and flash are hardly polarized"
 
 
 def _median_error(found: Evidence[ResultsUntilInfer], judged: list[Gate]) -> float:

@@ -11,16 +11,16 @@ from polcap.formats import shipped_data
 from polcap.images import Bools, Floats, Quality
 from polcap.mesh_values import Mesh
 from polcap.optics import frames, outline
-from polcap.optics.morphology import dilate
+from polcap.optics.morphology import dilate, erode
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean
 from polcap.optics.sharpness import TILE
 from polcap.quality import object_turn, rerendering, rim, shot_exposure
-from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, Unit, at_most, bad_shots, reaches, worded
+from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, Unit, at_most, bad_shots, lit, reaches, worded
 from polcap.quality.limits import GateLimits
 from polcap.results import ResultsUntilAlign, ResultsUntilHdr, ResultsUntilInfer, ResultsUntilMask, ResultsUntilStokes
-from polcap.stage_values import StokesImage, SurfaceMaps
+from polcap.stage_values import AngleStack, StokesImage, SurfaceMaps
 from polcap.stages.align import object_motion
 from polcap.stages.whitebalance import chart_in_mask
 
@@ -33,15 +33,17 @@ _SHARP_PX, _DEGREES_PER_BLUR_PX = 1.2, 2.5  # greatest blur of sharp edges; erro
 _DEGREES_PER_FRAME_BLUR_PX = 9.0  # of a reference frame beyond the limit: 12° at 2.2 and 2.7 px, 24° at 4.6
 _EDGE_FLOOR = 0.1  # of the object's median light: dark backdrops differ by less
 _SAME_SCENE = 0.8  # correlation of detail that no two objects have: they reach .4
+_STILL = 0.9  # correlation of detail that a shot has only if it moved by less than 1.5 px (docs/benchmarks/gates.md)
 _LOCK = "Lock the camera, do not touch the object, and take that shot again"
 _MOST_CONTRADICTION = 0.1  # of the object; set by hand: noise, glare and swapped angles leave less than .01
 _TEXTURE = (
     "Put something with texture next to the object, such as the chart, or use more light; of a locked camera, "
     "--set align.model=none"
 )
+_SAMPLED_PX = 1.0  # doubt of the outline that pixels alone cause: most of a thin object lies next to its outline
 _HOLD_STILL = "Fix the object, do not touch it between shots, and take that shot again"
 _FOCAL_LENGTHS = 9  # within the doubt
-_INWARD = 0.2  # sine of the zenith from which a normal leans inward
+_INWARD = 0.5  # sine of the zenith from which a normal leans inward: the inside of a bowl leans less at its lip
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
 
 
@@ -84,9 +86,10 @@ def _judge_camera(found: Evidence[ResultsUntilAlign], limits: GateLimits) -> Gat
     if far[k]:
         return failed(value, most, message, remedy=_LOCK)
     message = f"{message}: it shares too little texture with the first one"
-    plain = unsure[1:].all() or correlation[unsure].min() > _SAME_SCENE
-    remedy = _TEXTURE if plain else _check_files(found, unsure)
-    return failed(round(float(doubt[k]), 3), most_doubt, message, remedy=remedy)
+    least = correlation[unsure].min()
+    remedy = _TEXTURE if least > _SAME_SCENE or unsure[1:].all() else _check_files(found, unsure)
+    gate = failed(round(float(doubt[k]), 3), most_doubt, message, remedy=remedy)
+    return msgspec.structs.replace(gate, state="warn") if least > _STILL else gate
 
 
 def _another_scene(found: Evidence[ResultsUntilAlign], unlike: Bools) -> Gate:
@@ -99,9 +102,9 @@ def _another_scene(found: Evidence[ResultsUntilAlign], unlike: Bools) -> Gate:
 
 
 def _contradiction(image: StokesImage) -> float:
-    """Share of the object where the shots would need more polarized light than there is light."""
+    """Share of the lit object where the shots would need more polarized light than there is light."""
     s0, s1, s2 = (cv2.blur(np.ascontiguousarray(part, np.float32), (5, 5)) for part in frames.total(image.stokes))
-    inside = image.mask & (image.quality & int(Quality.CLIPPED | Quality.OUTSIDE) == 0)
+    inside = lit(image) & (image.quality & int(Quality.OUTSIDE) == 0)
     return float((np.hypot(s1, s2) > s0)[inside].mean()) if inside.any() else 0.0
 
 
@@ -190,12 +193,13 @@ def _measure_turn(found: Evidence[ResultsUntilMask], limits: GateLimits) -> obje
 def mask(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     """Gate on the object's mask: a chart inside, uncertain pixels, contact with the picture's border, parts, holes."""
     object_, limit, doubt = found.results.object_, limits.max_mask_doubt, found.results.object_.doubt
+    vague = doubt is not None and doubt * _width_px(object_.mask) > _SAMPLED_PX
     faults: list[tuple[str, float, float]] = []  # in words, its figure, its limit
     charted = _chart_share(found) if found.results.color.place is None else 0.0
     if charted:
         faults.append((f"{charted:.0%} of the object's mask looks like a color chart that was not found", charted, 0))
-    doubted = doubt is not None and doubt > limit
-    if doubt is not None and doubt > limit / 2:
+    doubted = doubt is not None and vague and doubt > limit
+    if doubt is not None and vague and doubt > limit / 2:
         faults.append((f"About {100 * doubt:.0f} % of the mask may be wrong", doubt, limit if doubted else limit / 2))
     for message, figure, most in (
         ("The object touches {:.0%} of the picture's border, where it has no outline",
@@ -221,6 +225,11 @@ def mask(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     cost = 10 * object_.border if state == "warn" else 5.0
     _, value, most = faults[0]
     return Gate("mask", state, round(value, 5), most, "; ".join(fault[0] for fault in faults), remedy, cost)
+
+
+def _width_px(mask: Bools) -> float:
+    """Area of a mask over the number of its pixels at the outline [px]."""
+    return float(mask.sum() / max(int((mask & ~erode(mask, 1)).sum()), 1))
 
 
 def _chart_share(found: Evidence[ResultsUntilMask]) -> float:
@@ -293,7 +302,7 @@ def _show_one_place(found: Evidence[ResultsUntilAlign]) -> bool:
 
 def focus(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     """Gate on focus: blur of the sharpest edges on the object and its outline, merged px."""
-    blur, limit = _edge_blur(found), limits.max_edge_blur_px
+    blur, limit = _sharpest_blur(found), limits.max_edge_blur_px
     if found.grid_px > 1:
         return Gate("focus", "not measured", None, limit, "Only `process` measures this", unit="px")
     message = worded(blur, "The sharpest edges of the object are blurred by {:.1f} px (1σ)", "Edges are sharp")
@@ -305,16 +314,29 @@ def focus(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     return msgspec.structs.replace(gate, cost_deg=round(_DEGREES_PER_BLUR_PX * excess, 1))
 
 
-def _edge_blur(found: Evidence[ResultsUntilMask]) -> float:
-    """Blur (1σ) of the object's sharpest edges [px]: a step of height h, blurred by σ, has the slope h/(σ√2π).
+def _sharpest_blur(found: Evidence[ResultsUntilMask]) -> float:
+    """Blur (1σ) of the sharpest edges of object and chart [px]: a ball's outline is never sharp, a chart next to it is.
+
+    NaN without an object.
+    """
+    radiance, mask, place = found.results.radiance, found.results.object_.mask, found.results.color.place
+    if not mask.any():
+        return float("nan")
+    blur = _edge_blur(radiance, mask)
+    if place is None:
+        return blur
+    chart = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), place.corners.astype(np.int32), 1) > 0
+    return min(blur, _edge_blur(radiance, chart)) if chart.any() else blur
+
+
+def _edge_blur(radiance: AngleStack, mask: Bools) -> float:
+    """Blur (1σ) of the sharpest edges in and around a mask [px]: a step of height h, blurred by σ, has slope h/(σ√2π).
 
     Heights are ratios of light, so that the outline counts before a dark backdrop, however smooth the object is. Edges
-    are the tenth of the object with most contrast within 7 px; the sharpest are the twentieth of these.
+    are the tenth of the mask with most contrast within 7 px; the sharpest are the twentieth of these.
     """
-    light, mask = np.maximum(found.results.radiance.value[0].sum(-1), 0), found.results.object_.mask
+    light = np.maximum(radiance.value[0].sum(-1), 0)
     near = dilate(mask, 4)
-    if not near.any():
-        return float("nan")
     log = np.log(light + max(_EDGE_FLOOR * float(np.median(light[mask])), 1e-9)).astype(np.float32)
     window = np.ones((7, 7), np.uint8)
     height = (cv2.dilate(log, window) - cv2.erode(log, window))[near]

@@ -14,7 +14,7 @@ from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
 from polcap.quality import rim
-from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, at_most, sentence, worded
+from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, at_most, lit, sentence, worded
 from polcap.quality.limits import GateLimits
 from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilSelfcal, ResultsUntilStokes
 from polcap.stage_values import AngleStack, ObjectMask, OrderTest, OutlineCheck, StokesImage, SurfaceMaps
@@ -29,6 +29,7 @@ _LIKELIER = 1.1  # factor between expected errors that decides on an order (docs
 _LIKELIER_SMALL, _SMALL_PX = 1.5, 5000  # the same for objects of fewer pixels, of which good ones reach 1.2
 _ALONG = -0.3  # below: the AoLP is along the contour
 _DARK = 0.1  # albedo below which a glossy object shows mostly reflections of itself
+_GRAZING = 0.05  # least cosine of the shading
 _WEAK_DOLP = 0.05  # of an outline: above, no shape counts as flattened; below, uneven light is light from the side
 _LIT_DOLP = 0.07  # of an outline's brighter half; above, the flash lights it (93 captures with a lamp: up to .049)
 _LOPSIDED = 1.4  # factor on the limit of uneven light for an object that is polarized all round: its shape is uneven
@@ -168,20 +169,24 @@ class OutlineFigures:
     side: Floats  # (K,) excess brightness of one side over the other in each shot
 
 
-def _outline(found: Evidence[ResultsUntilStokes], limit_deg: float, angle: Floats) -> OutlineFigures | None:
+def _outline(found: Evidence[ResultsUntilInfer], limit_deg: float, angle: Floats) -> OutlineFigures | None:
     """Measure polarization and light along the outline, for polarizer angles (K,) rad; None for a short outline.
 
     Angle errors smaller than `limit_deg` are not fitted.
     """
-    band = rim.sample(*_reduce(found.results.stokes, angle))
+    results = found.results
+    light, mask, usable = _reduce(results.stokes, angle)
+    band = rim.sample(light, mask, usable)
     if len(band.azimuth) < _LEAST_RIM:
         return None
+    facing = np.maximum(dot(results.maps.normal, rays(results.maps.view, *results.maps.mask.shape)), _GRAZING)
+    shading = rim.sample(block_means(facing, _step(results.stokes))[None], mask, usable).total
     turn = rim.fit_angle_error(band, angle, np.radians(limit_deg))
-    return OutlineFigures(rim.summarize(band, angle), turn, rim.side_light(band))
+    return OutlineFigures(rim.summarize(band, angle, shading), turn, rim.side_light(band))
 
 
 def ill_posed(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Gate:
-    """Gate on the share of the object with a polarization that no dielectric has."""
+    """Gate on the share of the lit object with a polarization that no dielectric has."""
     share = _ill_posed(found)
     message = "No part looks like metal or a mirror reflection"
     if share >= 0.0005:
@@ -192,8 +197,7 @@ def ill_posed(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Gate:
 
 
 def _ill_posed(found: Evidence[ResultsUntilStokes]) -> float:
-    image = found.results.stokes
-    inside = image.quality[image.mask & (image.quality & int(Quality.CLIPPED) == 0)]
+    inside = found.results.stokes.quality[lit(found.results.stokes)]
     return float(((inside & int(Quality.ILL_POSED)) > 0).mean()) if inside.size else 0.0
 
 
@@ -307,8 +311,8 @@ def _light_of_body(body: rim.RimFigures, found: Evidence[ResultsUntilInfer], lim
         return Gate("body", "warn", round(body.concentration, 2), least, message, remedy, _LOOSE_FIT_DEG, unit="")
     if body.one_sided > (most := limits.max_one_sided * _lopsided(body)):
         message = (
-            f"One side of the object is {100 * body.one_sided:.0f} % brighter than the mean: light from the side, "
-            "or an object with a dark and a bright half"
+            f"One side of the object is {100 * body.one_sided:.0f} % brighter than its shape explains: light from the "
+            "side, or an object with a dark and a bright half"
         )
         return Gate("body", "warn", round(body.one_sided, 2), round(most, 2), message, remedy, _SIDE_LIGHT_DEG, unit="")
     message = f"The outline is polarized by {100 * body.dolp:.1f} %"
@@ -356,9 +360,14 @@ def _medians(maps: SurfaceMaps) -> tuple[float, float, float]:
 
 def _reduce(image: StokesImage, angle: Floats) -> tuple[Floats, Bools, Bools]:
     """Reduced pictures: light of the shots (K, h, w) from the Stokes parameters, object (h, w), valid pixels (h, w)."""
-    step = int(np.ceil(np.sqrt(max(image.mask.size / _MOST_PIXELS, 1))))
+    step = _step(image)
     doubtful = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
     usable = (image.quality & int(doubtful)) == 0
     light = np.stack([block_means(part, step) for part in total(image.stokes)])
     mask, usable = (block_means(part.astype(np.float32), step) > 0.99 for part in (image.mask, usable))
     return np.einsum("kj,jhw->khw", mueller.analyzer(angle), light), mask, usable
+
+
+def _step(image: StokesImage) -> int:
+    """Pixels (one side) that are averaged to one of the reduced pictures."""
+    return int(np.ceil(np.sqrt(max(image.mask.size / _MOST_PIXELS, 1))))

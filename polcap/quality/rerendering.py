@@ -22,6 +22,7 @@ _BRIGHTEST = 0.99  # quantile of the light from which a pixel is a highlight
 _JUDGED_PX = 256  # longest side on which the gate compares
 _OUTLIER = 5  # standard deviations of the differences
 _MOST_DOLP = 0.1  # more has no more weight: that of noise and of reflections
+_UNSURE_DEG = 14.0  # median expected error; beyond, correct maps of shadowed objects agree little (the same page)
 _WRONG_DEG = 30.0  # mean error of the normals of captures that fail (docs/benchmarks/gates.md)
 
 
@@ -150,6 +151,9 @@ def rerendering(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
     seen = measure(found.results)
     if not np.isfinite(seen.agreement):
         return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, "All light is clipped")
+    if not explains(seen, limits) and _own_error_deg(found.results.maps) > _UNSURE_DEG:
+        message = "The estimator itself expects large errors, so its maps need not explain the photographs"
+        return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, message)
     value, limit = round(seen.agreement, 3), limits.min_rerendering_agreement
     message = f"Rendered again, the maps show {100 * max(seen.agreement, 0):.0f} % of the photographs' polarization"
     if explains(seen, limits):
@@ -160,3 +164,8 @@ def rerendering(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
         message = f"Rendered again, the maps are {times:.1f} times as {kind} as the photographs"
     remedy = "Compare with --estimator analytic; a model of your own may be wrong: leave out --model"
     return Gate("re-rendering", "fail", value, limit, f"{message}: the normals are wrong", remedy, _WRONG_DEG)
+
+
+def _own_error_deg(maps: SurfaceMaps) -> float:
+    """Median error of the normals that the estimator expects [degrees]."""
+    return float(np.median(maps.confidence[maps.mask])) if maps.mask.any() else 0.0

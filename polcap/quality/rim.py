@@ -51,7 +51,7 @@ class RimFigures:
     turned: float  # rad, common turn of the AoLP relative to φ
     turned_sigma: float  # rad
     brightness: float  # median light of the rim over the object's mean; below 1 under a flash
-    one_sided: float  # relative amplitude of the light's first harmonic in φ; about 0 under a flash at the lens
+    one_sided: float  # relative amplitude of the first harmonic in φ of light over shading; 0 under a flash at the lens
 
 
 def sample(light: Floats, mask: Bools, usable: Bools) -> Rim:
@@ -132,12 +132,12 @@ def _sigmas(at: Rim, angle: Floats, way: Floats) -> float:
     return float(moment.sum() / weight.sum() / max(float(jackknife(without)), 1e-9))
 
 
-def summarize(at: Rim, angle: Floats) -> RimFigures:
-    """Summarize polarization and brightness of the outline; angle (K,) rad."""
+def summarize(at: Rim, angle: Floats, shading: Floats | float = 1.0) -> RimFigures:
+    """Summarize polarization and brightness of the outline; angle (K,) rad, `shading` (N,) of its shape by a flash."""
     mean, turned_sigma = outline.mean_and_sigma(*outline.phasor(at, angle))
     dolp = np.abs(outline.polarization(at, angle))
     basis = np.stack([np.ones_like(at.azimuth), np.cos(at.azimuth), np.sin(at.azimuth)], axis=1)
-    found = np.linalg.lstsq(basis, at.total, rcond=None)[0]
+    found = np.linalg.lstsq(basis, at.total / shading, rcond=None)[0]
     return RimFigures(
         dolp=float(np.median(dolp)),
         dolp_lit=float(np.median(dolp[at.total >= np.median(at.total)])),

@@ -21,6 +21,7 @@ _MOST_CLIPPED = 0.9975  # from here on the pictures do not show how bright the o
 _STOPS, _STOPS_PER_HALVING = 1.5, 0.75  # too bright; per halving of the unclipped share (docs/benchmarks/gates.md)
 _CLIPPED_PICTURE = 0.1  # of a picture in which no object was found; a bright backdrop may clip
 _WHOLE = 0.5  # share of the object that moving parts do not reach in every shot
+DEGREES_PER_NOISE = 300.0  # of the normals, per false degree of polarization
 _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light patches
 
 
@@ -119,13 +120,14 @@ def _levels_remedy(found: Evidence[ResultsUntilHdr]) -> str:
 
 def noise(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Gate:
     """Gate on noise: false polarization that noise causes in the object's median pixel."""
-    figure, limit = _noise(found.results.stokes), limits.max_dolp_noise
+    figure, limit = noise_dolp(found.results.stokes), limits.max_dolp_noise
     message = worded(100 * figure, "Noise adds about {:.1f} % false polarization", "Noise adds no false polarization")
     remedy = "Use more light, a wider aperture, a longer exposure or more frames"
-    return at_most("noise", figure, limit, message, remedy, cost_deg=300 * figure)
+    return at_most("noise", figure, limit, message, remedy, cost_deg=DEGREES_PER_NOISE * figure)
 
 
-def _noise(image: StokesImage) -> float:
+def noise_dolp(image: StokesImage) -> float:
+    """False polarization that noise causes in the object's median pixel."""
     light = np.maximum(image.stokes[0][image.mask].sum(-1), 1e-9)
     spread = np.sqrt((image.covariance[3] + image.covariance[5])[image.mask].sum(-1) / 2)
     return float(np.median(spread / light)) if len(light) else float("nan")

@@ -81,7 +81,7 @@ def measure(number: int, falloff: float, printed: float) -> tuple[float, ...]:
     at_lens = replace(color, light=replace(color.light, flash=np.zeros(3)))
     factors = [scale.factor(stokes, way) for way in (replace(color, light=None), at_lens, color)]
     errors = [100 * (factor / true - 1) for factor in (*factors, bulge * factors[1], bulge * factors[2])]
-    doubt = scale.sigma(stokes, color, np.zeros((*object_.mask.shape, 3)))  # the chart is next to the object
+    doubt = scale.sigma(stokes, color)
     assert doubt is not None
     tilt = float(np.degrees(np.arccos(np.clip(color.light.normal @ scene.chart.axes[0], -1, 1))))
     flash = np.array(scene.light[:2]) / -scene.chart.center[2]

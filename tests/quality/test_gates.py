@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from polcap.capture_values import ShotOrder
+from polcap.chart_values import ChartPlace
 from polcap.config import Config
 from polcap.images import Quality
 from polcap.optics import frames
-from polcap.quality import flatness, gates
+from polcap.quality import flatness, gates, geometry
 from polcap.quality.advice import advice, advise
 from polcap.quality.gate import Evidence, Gate, State
 from polcap.results import ResultsUntilInfer
@@ -101,8 +102,16 @@ def with_gains(good: Seen, **fields: Any) -> dict[str, Any]:
     return {"selfcal": replace(good.results.selfcal, gains=replace(good.results.selfcal.gains, **fields))}
 
 
+def noisy(good: Seen, dolp: float) -> dict[str, Any]:
+    """Uncertain normals, and noise that adds this polarization."""
+    light = good.results.stokes.stokes[0].sum(-1, keepdims=True)
+    covariance = np.broadcast_to((dolp * light) ** 2 / 3, good.results.stokes.covariance.shape)
+    maps = replace(good.results.maps, confidence=np.full_like(good.results.maps.confidence, 25.0))
+    return {"maps": maps, "stokes": replace(good.results.stokes, covariance=covariance)}
+
+
 def test_each_gate_fails_alone(good: Seen) -> None:
-    radiance, maps = good.results.radiance, good.results.maps
+    radiance = good.results.radiance
     still = good.results.alignment
     away = still.transform.copy()
     away[1, 0, 2] = 50
@@ -118,7 +127,7 @@ def test_each_gate_fails_alone(good: Seen) -> None:
         "sharpness": {"blur_px": np.array([[0.0], [2.0], [0.1]])},
         "gains": with_gains(good, gain=np.array([[1.0] * 3, [1.0] * 3, [1.3] * 3])),
         "gain doubt": with_gains(good, disagreement=0.05),
-        "normal error": {"maps": replace(maps, confidence=np.full_like(maps.confidence, 25.0))},
+        "normal error": noisy(good, 0.03),
     }
     for name, fields in faults.items():
         gate = judged(changed(good, **fields))[name]
@@ -417,6 +426,26 @@ def test_an_unsharp_picture_costs_degrees_before_it_warns(good: Seen) -> None:
     assert before.cost_deg == 0 and after.cost_deg > 0.3
 
 
+def test_a_smooth_object_next_to_a_sharp_chart_is_in_focus(good: Seen) -> None:
+    """The outline of a smooth ball looks blurred; the edges of a chart next to it show whether the camera was."""
+    corners = np.array([[230.0, 150], [300, 150], [300, 200], [230, 200]])
+    color = replace(scenes.no_color(), place=ChartPlace(np.zeros((24, 4, 2)), corners))
+    blurred = np.stack([cv2.GaussianBlur(shot, (0, 0), 2.5) for shot in good.results.radiance.value])
+    beside = blurred.copy()
+    beside[:, 150:200, 230:300] = np.where(np.arange(70) // 14 % 2, 0.05, 0.4)[:, None].astype(np.float32)
+    for value, state in ((blurred, "warn"), (beside, "pass")):
+        seen = changed(good, radiance=replace(good.results.radiance, value=value), color=color)
+        assert judged(seen)["focus"].state == state
+
+
+def test_a_shadow_contradicts_nothing(good: Seen) -> None:
+    """Where no light falls, shots show noise, which is polarized more than it is bright."""
+    noise = np.random.default_rng(1).normal(size=good.results.stokes.stokes.shape).astype(np.float32)
+    dark = good.results.stokes.stokes.copy()
+    dark[:, 120:] = 1e-4 * noise[:, 120:]
+    assert judged(changed(good, stokes=replace(good.results.stokes, stokes=dark)))["alignment"].state == "pass"
+
+
 def test_a_turned_object_is_reported_in_degrees(good: Seen) -> None:
     """Detail that rolls by 1° about the object's middle, before a camera that stood still."""
     x, y = scenes.CENTER
@@ -439,7 +468,7 @@ def test_light_from_around_is_reported(good: Seen) -> None:
 
 @pytest.mark.parametrize(
     ("uneven", "ambient", "state"),
-    [(0.47, 0.0, "pass"), (0.7, 0.0, "pass"), (0.0, 1.5, "warn"), (0.0, 6.0, "warn")],
+    [(0.47, 0.0, "pass"), (0.7, 0.0, "pass"), (0.0, 3.0, "warn"), (0.0, 6.0, "warn")],
 )
 def test_a_lopsided_body_is_no_light_from_the_side(good: Seen, uneven: float, ambient: float, state: str) -> None:
     """A body turned to one side is as polarized there as elsewhere; a lamp from there is not."""
@@ -466,6 +495,23 @@ def test_mask_of_a_doubtful_shape_warns(good: Seen, name: str, value: Any) -> No
 
 def test_mask_that_its_network_doubts_fails(good: Seen) -> None:
     assert failed(changed(good, object_=replace(good.results.object_, doubt=0.3))) == ["mask"]
+
+
+def test_pixels_at_the_outline_of_a_thin_object_are_no_doubt_of_its_mask(good: Seen) -> None:
+    wire = np.zeros_like(good.results.object_.mask)
+    wire[100:106, 40:200] = True
+    for doubt in (0.14, 0.3):
+        thin = replace(good.results.object_, mask=wire, doubt=doubt)
+        assert geometry.mask(changed(good, object_=thin), Config().gates).state == "pass"
+
+
+def test_normals_of_a_difficult_object_warn_with_what_helps(good: Seen) -> None:
+    """Without noise more light does not help: a small object is shown larger, another one tilted."""
+    tilted = judged(changed(good, **noisy(good, 0.001)))["normal error"]
+    assert tilted.state == "warn" and "Tilt" in tilted.remedy
+    small = changed(good, **noisy(good, 0.001), grid_px=0.3)
+    assert "larger" in judged(small)["normal error"].remedy
+    assert "more light" in judged(changed(good, **noisy(good, 0.03)))["normal error"].remedy
 
 
 def test_assumed_focal_length_warns_and_costs_what_the_rays_would_lean(good: Seen) -> None:

@@ -54,6 +54,12 @@ def test_wrong_normals_fail_and_cost_degrees(good: Seen, wrong: Callable[[Floats
     assert gate.state == "fail" and "re-rendering" in gate.message
 
 
+def test_maps_with_large_expected_errors_need_not_explain_the_photographs(good: Seen) -> None:
+    maps = of_normals(good, good.results.maps.normal * [0.2, 0.2, 1]).results.maps
+    unsure = replace(maps, confidence=np.full_like(maps.confidence, 16.0))
+    assert judge(changed(good, maps=unsure)).state == "not measured"
+
+
 def test_clipped_light_is_left_out(good: Seen) -> None:
     quality = np.full_like(good.results.cues.quality, Quality.CLIPPED)
     assert judge(changed(good, cues=replace(good.results.cues, quality=quality))).state == "not measured"

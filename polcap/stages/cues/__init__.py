@@ -27,7 +27,7 @@ CHANNELS = (
 FLOOR = 0.02  # added to a radiance before its logarithm, in the channels and in their inverse
 
 
-@stage(version=8, keep=False)
+@stage(version=9, keep=False)
 def compute(stokes: StokesImage, color: ColorCalibration, other_orders: tuple[OtherOrder, ...] = ()) -> Cues:
     """Compute all cues (radiance, DoLP, AoLP, diffuse color…) of a crop (H, W) from its Stokes parameters.
 
@@ -62,7 +62,7 @@ def compute(stokes: StokesImage, color: ColorCalibration, other_orders: tuple[Ot
         mask=stokes.mask,
         quality=stokes.quality,
         view=stokes.view,
-        scale_sigma=scale.sigma(stokes, color, radiance),
+        scale_sigma=scale.sigma(stokes, color),
         body=body,
         body_known=body_known,
         other_orders=other_orders,

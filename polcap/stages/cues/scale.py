@@ -2,11 +2,11 @@
 
 The chart gives the ratio of reflectance to radiance for its own position and orientation. The object is elsewhere: its
 visible surface is nearer to the flash than its center, and in another direction from the lens. No picture shows how far
-the chart is. But a chart far behind the object makes the object too bright: brighter than most things are.
+the chart is; the stage `infer` adds this error where albedos are too bright.
 """
 
 from dataclasses import replace
-from math import exp, hypot, log, pi, sqrt
+from math import hypot, log, pi, sqrt
 
 import numpy as np
 
@@ -20,10 +20,6 @@ _BULGE = 0.5  # radii; mean distance of the visible surface in front of the cent
 _BULGE_SPREAD = 0.4  # radii; its 1σ over 204 views of training meshes and random shapes (decision 8)
 _CHART_SPREAD = 0.3  # radii: 1σ of the depth of a chart next to the middle of the object
 _LARGEST_RADIUS = 0.5  # of an object, over its distance; for larger ones the far-field law does not hold
-# The brightest parts of an object, in ln of the light of a white plane: mean and 1σ over 40 simulated captures. A chart
-# that gets half of the object's light adds ln 2; one chart in seven is assumed to (docs/benchmarks/gates.md).
-_BRIGHT, _BRIGHT_SPREAD, _BRIGHTEST = -0.65, 0.2, 95  # percentile
-_HALF, _ODDS = log(2), 1 / 6
 _STEP = 1e-4
 
 
@@ -48,33 +44,23 @@ def factor(stokes: StokesImage, color: ColorCalibration) -> float:
     return float(np.exp(_log_factor(color.light, _middle(stokes, ahead))))
 
 
-def sigma(stokes: StokesImage, color: ColorCalibration, radiance: Floats) -> float | None:
+def sigma(stokes: StokesImage, color: ColorCalibration) -> float | None:
     """Relative error (1σ) of the scale of all albedos; None where no chart gives it.
 
     Light falls with the square of the distance: a chart at the object's front makes the albedo too dark, a chart
     behind the object too bright. The position of the flash comes from the slope of the light across the chart.
-    `radiance` (H, W, 3) is relative to a white plane, as `factor` makes it.
     """
     if not is_known(color):
         return None
     radius = _radius(stokes.mask, stokes.view)
     ahead = surface_distance(stokes.mask, stokes.view)
-    depth = hypot(2 * radius * hypot(_BULGE_SPREAD, _CHART_SPREAD) / ahead, _far_chart(radiance[stokes.mask]))
+    depth = 2 * radius * hypot(_BULGE_SPREAD, _CHART_SPREAD) / ahead
     if color.light is None:
         return depth
     light, middle = color.light, _middle(stokes, ahead)
     here = _log_factor(light, middle)
     slope = np.array([_log_factor(_changed(light, step), middle) - here for step in _STEP * np.eye(5)]) / _STEP
     return hypot(depth, light.uneven, sqrt(slope @ light.covariance @ slope))
-
-
-def _far_chart(radiance: Floats) -> float:
-    """RMS error of ln scale, as the chart may get half of the object's light; radiance (N, 3) of the object."""
-    if not len(radiance):
-        return 0.0
-    bright = log(max(float(np.percentile(radiance.max(-1), _BRIGHTEST)), 1e-6))
-    log_odds = log(_ODDS) + _HALF / _BRIGHT_SPREAD**2 * (bright - _BRIGHT - _HALF / 2)  # of two normal distributions
-    return _HALF / sqrt(1 + exp(-log_odds))
 
 
 def _log_factor(light: ChartLight, middle: Floats) -> float:

@@ -34,6 +34,7 @@ from polcap.stages.hdr import exposure, noise, photosites, planes, weights
 from polcap.stages.hdr.bracket import Bracket, black_error, compare
 from polcap.stages.hdr.planes import Reader, same_size
 
+_ALL_AMBIENT = 0.9  # share of ambient light beyond which nothing of the flash is left
 _LEAST_PX = 48  # least side of a merged picture: noise and motion are measured in tiles
 
 
@@ -72,7 +73,8 @@ def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack
     are used only where pixels do not suffice and no flash fired. Ambient frames are subtracted in proportion to the
     exposure by their settings; they are not registered.
 
-    Raises CaptureError: frames of different size, unknown exposure ratios, or too much motion.
+    Raises CaptureError: frames of different size, unknown exposure ratios, too much motion, or ambient frames as bright
+    as their shot.
     """
     read = Reader(
         (frame for shot in capture.all_shots for frame in (*shot.frames, *shot.ambient)), decode, settings.clip
@@ -113,7 +115,7 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         if k < count:
             ratio.append([frame.ratio.astype(np.float64) for frame in compared.frames])
             curvature.append([frame.curvature for frame in compared.frames])
-            ambient_share.append(compared.ambient_share)
+            ambient_share.append(_checked_ambient(compared.ambient_share, shot))
             tiles.append([sharpness.take(read(frame), places, settings.clip) for frame in shot.frames])
         del weighted, compared
         read.forget((*shot.frames, *shot.ambient))
@@ -151,6 +153,16 @@ def _correct_falloff(pictures: list[MaskedImage], capture: Capture, view: View) 
     if falloff is not None:
         for picture in pictures:
             weights.divide_by_falloff(picture, view, capture.size_px, falloff)
+
+
+def _checked_ambient(share: float, shot: Shot) -> float:
+    """Share of ambient light in all light. Raises CaptureError if that is all: the flash was on in both, or in none."""
+    if share > _ALL_AMBIENT:
+        raise CaptureError(
+            f"the ambient frames of shot {shot.name} are as bright as the shot: the flash was on for both or for none; "
+            "take the ambient frames again without the flash, or take them out of the folder"
+        )
+    return share
 
 
 def _ambient_shared(shots: tuple[Shot, ...]) -> bool:

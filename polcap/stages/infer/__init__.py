@@ -12,14 +12,14 @@ the camera frame.
     highlights     the albedo in highlights, for both estimators; the gloss of materials, for the network
 
 Two properties of the albedo are estimated here. The error of its scale: a chart behind the object, or in a shadow, gets
-less light than the object. The picture of the chart does not show this, but then both albedos and F0 are higher
-than usual. And its detail: the reference shot at the RAW's pixels shows printed texture and fine relief
+less light than the object. The picture of the chart does not show this, but then the albedo is brighter than that of
+any object. And its detail: the reference shot at the RAW's pixels shows printed texture and fine relief
 alike. Relief continues from scale to scale, so the shading of the normals shows how strong finer shading may be. Where
 the normals are smooth and certain, fine detail of the light is detail of the albedo.
 """
 
 from dataclasses import replace
-from math import hypot, pi
+from math import exp, hypot, log, pi, sqrt
 from typing import Annotated, Literal
 
 import cv2
@@ -36,6 +36,10 @@ from polcap.stages import stage
 from polcap.stages.infer import analytic, highlights, learned
 
 _MAPS_SIGMA = 0.05  # of the estimators' own albedos, with a correct scale (docs/benchmarks/gates.md)
+# A chart that gets half of the object's light doubles the albedo, often beyond that of white things. Limit of the
+# brightest parts (ln) and its width; one chart in a hundred is assumed to (docs/benchmarks/gates.md).
+_WHITE, _WHITE_SPREAD, _BRIGHTEST = -0.2, 0.03, 95  # percentile
+_HALF, _ODDS = log(2), 0.01
 _BAND = 2.0  # px, 1σ: shading in finer detail predicts the shading that is finer than a superpixel
 _DETAIL_AROUND = 4.0  # px, 1σ of the means of power, and of the albedo
 # factors on the power of each explanation of fine detail (docs/benchmarks/albedo.md)
@@ -59,7 +63,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fine: Annotated[bool, Meta(description="a second network adds relief finer than the pixels of the first")] = True
 
 
-@stage(version=34)
+@stage(version=35)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Estimate normal, diffuse, specular, roughness and expected error from cues; without a network by inversion.
 
@@ -72,9 +76,19 @@ def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: Inf
     maps = highlights.correct(maps, cues, settings.ior)
     return replace(
         maps,
-        albedo_sigma=None if cues.scale_sigma is None else hypot(cues.scale_sigma, _MAPS_SIGMA),
+        albedo_sigma=None if cues.scale_sigma is None else hypot(cues.scale_sigma, _MAPS_SIGMA, _far_chart(maps)),
         detail=None if cues.detail is None else _select_detail(cues.detail, cues, maps),
     )
+
+
+def _far_chart(maps: SurfaceMaps) -> float:
+    """RMS error of ln scale, as the chart may get half of the object's light."""
+    albedo = maps.diffuse[maps.mask]
+    if not len(albedo):
+        return 0.0
+    bright = log(max(float(np.percentile(albedo.max(-1), _BRIGHTEST)), 1e-6))
+    odds = _ODDS * (1 + exp((bright - _WHITE) / _WHITE_SPREAD))
+    return _HALF * sqrt(odds / (1 + odds))
 
 
 def _select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:

@@ -171,6 +171,13 @@ def test_an_ambient_frame_of_several_angles_is_noted() -> None:
         assert merge(replace(both, shots=shots), hdr.HdrSettings()).bracket.ambient_shared == shared
 
 
+def test_ambient_frames_with_the_flash_on_are_refused() -> None:
+    quads, rng = ramp(256, 256, high=4e3, ripple=0), np.random.default_rng(0)
+    lit = [frame(expose(quads, 1, rng), iso=100.0, exposure_time=0.01) for _ in range(2)]
+    with pytest.raises(CaptureError, match="without the flash"):
+        merge(capture(lit[:1], ambient=lit[1:]), hdr.HdrSettings())
+
+
 def test_ghost_is_flagged_and_taken_from_the_reference_alone():
     """Something bright stands elsewhere in the brightest frame."""
     rng = np.random.default_rng(11)

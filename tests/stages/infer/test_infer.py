@@ -51,8 +51,14 @@ def errors_deg(maps, cues_) -> np.ndarray:
 
 
 def test_the_error_of_the_albedos_scale_is_that_of_the_chart_and_of_the_maps() -> None:
+    """Half of the light on the chart is possible, and probable if the object is brighter than any white thing."""
     found = seen(noise=0.002)
-    assert estimate(dataclasses.replace(found, scale_sigma=0.1)).albedo_sigma == pytest.approx(np.hypot(0.1, 0.05))
+    usual, bright = (
+        estimate(dataclasses.replace(found, scale_sigma=0.1, radiance=times * found.radiance)).albedo_sigma
+        for times in (1, 3)
+    )
+    assert usual == pytest.approx(np.hypot(0.1, 0.05), abs=0.03)
+    assert bright == pytest.approx(np.hypot(0.1, np.log(2)), abs=0.06)
     assert estimate(dataclasses.replace(found, scale_sigma=None)).albedo_sigma is None
 
 
