@@ -68,6 +68,14 @@ def test_a_white_albedo_hides_a_weak_highlight(ball: Cues) -> None:
     assert found(*lit(ball, 0.8 * one, 0.65 * one, 0.8 * one)) == pytest.approx(0.8, abs=1e-3)
 
 
+def test_a_whiter_albedo_hides_a_highlight_without_a_jump(ball: Cues) -> None:
+    one = np.ones(ball.mask.shape)
+    albedos = np.linspace(0.2, 0.8, 31)
+    roughness = np.array([found(*lit(ball, a * one, 0.5 * one, 0.62 * one)).mean() for a in albedos])
+    assert np.ptp(roughness) > 0.05
+    assert np.abs(np.diff(roughness)).max() < 0.01
+
+
 def test_speckle_of_the_network_is_pooled(ball: Cues) -> None:
     one = np.ones(ball.mask.shape)
     speckle = 0.35 + 0.02 * np.random.default_rng(0).standard_normal(one.shape)
