@@ -68,7 +68,7 @@ def found_as_planted(folder: Path, fault: str) -> Verdict:
 
 
 def test_one_turned_shot_of_three_is_reported_with_the_ring_that_it_looks_like(tmp_path: Path) -> None:
-    faulty.shoot(tmp_path / "bad", 1, "wrong angle", WIDTH)
+    faulty.shoot(tmp_path / "bad", 3, "wrong angle", WIDTH)
     line = next(line for line in verdict(tmp_path / "bad").lines if line.name == "angles")
     assert line.state == "warn" and line.cost_deg > 1
     assert "ring's zero" in line.message and "single shot" in line.message and "take it again" in line.remedy
