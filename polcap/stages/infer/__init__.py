@@ -63,7 +63,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fine: Annotated[bool, Meta(description="a second network adds relief finer than the pixels of the first")] = True
 
 
-@stage(version=35)
+@stage(version=36)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Estimate normal, diffuse, specular, roughness and expected error from cues; without a network by inversion.
 
@@ -74,9 +74,10 @@ def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: Inf
     else:
         maps = learned.estimate(cues, network, run, settings.ior, settings.symmetries, fine_pass=settings.fine)
     maps = highlights.correct(maps, cues, settings.ior)
+    far = 0.0 if network is None else _far_chart(maps)  # highlights make the albedo of the inversion too bright
     return replace(
         maps,
-        albedo_sigma=None if cues.scale_sigma is None else hypot(cues.scale_sigma, _MAPS_SIGMA, _far_chart(maps)),
+        albedo_sigma=None if cues.scale_sigma is None else hypot(cues.scale_sigma, _MAPS_SIGMA, far),
         detail=None if cues.detail is None else _select_detail(cues.detail, cues, maps),
     )
 
