@@ -5,7 +5,7 @@ The paper around the sample is flat, evenly white and unpolarized. Its radiance 
     S0 = c_k cos θ / d² (1 + s L)
 
 with the distance d to the flash, the angle θ between the page's normal and the flash, and the highlight L of GGX
-facets, which is weak and broad on matt paper. The flash's place beside the lens, the share s of the highlight and its
+facets, which is weak and broad on matt paper. The flash's place next to the lens, the share s of the highlight and its
 roughness are those that leave the least scatter; c_k are then means. Where S1 and S2 of the paper are not 0, the shots
 of a view had different energies, and a matrix corrects them.
 """

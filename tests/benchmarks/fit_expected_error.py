@@ -4,8 +4,8 @@
 
 Each round shows every training mesh once in each protocol and size, under training materials and patterns that are
 not the evaluation's; what is found there is kept in OUT, so that another fit costs nothing. Prints a and b of
-error = a·statedᵇ, those under which the errors are likeliest as draws of exponential distributions of these means, as
-the network's own were learned; and what is predicted by what is found, in tenths. RAW captures have smaller errors.
+error = a·statedᵇ, the most probable ones if errors are drawn from exponential distributions with these means, as in the
+network's own loss; and the ratio of stated to actual error, in tenths. RAW captures have smaller errors.
 """
 
 import argparse

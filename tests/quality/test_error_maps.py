@@ -54,7 +54,7 @@ def test_what_the_estimators_state_themselves_is_not_added_in_full(good: Seen) -
     assert np.allclose(blurred, np.hypot(OWN, 7)) and np.allclose(ill_posed, OWN)
 
 
-def test_normals_that_the_photographs_contradict_cost_once_not_beside_what_the_estimator_states(good: Seen) -> None:
+def test_a_failed_rerendering_replaces_the_error_that_the_estimator_states(good: Seen) -> None:
     gate = Gate("re-rendering", "fail", None, None, "", cost_deg=30.0)
     maps = good.results.maps
     unsure = changed(good, maps=replace(maps, confidence=np.where(maps.mask, np.float32(35), np.float32(0))))

@@ -431,9 +431,9 @@ def test_a_smooth_object_next_to_a_sharp_chart_is_in_focus(good: Seen) -> None:
     corners = np.array([[230.0, 150], [300, 150], [300, 200], [230, 200]])
     color = replace(scenes.no_color(), place=ChartPlace(np.zeros((24, 4, 2)), corners))
     blurred = np.stack([cv2.GaussianBlur(shot, (0, 0), 2.5) for shot in good.results.radiance.value])
-    beside = blurred.copy()
-    beside[:, 150:200, 230:300] = np.where(np.arange(70) // 14 % 2, 0.05, 0.4)[:, None].astype(np.float32)
-    for value, state in ((blurred, "warn"), (beside, "pass")):
+    with_chart = blurred.copy()
+    with_chart[:, 150:200, 230:300] = np.where(np.arange(70) // 14 % 2, 0.05, 0.4)[:, None].astype(np.float32)
+    for value, state in ((blurred, "warn"), (with_chart, "pass")):
         seen = changed(good, radiance=replace(good.results.radiance, value=value), color=color)
         assert judged(seen)["focus"].state == state
 
@@ -557,7 +557,7 @@ def _within(gate: Gate, least: bool) -> bool:
     return value >= limit if least else value <= limit
 
 
-def test_what_is_beside_a_gate_s_words_is_the_figure_that_they_are_of(good: Seen) -> None:
+def test_a_gate_s_value_is_the_figure_of_its_message(good: Seen) -> None:
     object_, still, image = good.results.object_, good.results.alignment, good.results.stokes
     unlike, unsure = np.array([1, 0.1, 1]), np.array([0, 0.5, 0])
     around = image.stokes * np.array([1, -1, -1], np.float32)[:, None, None, None]

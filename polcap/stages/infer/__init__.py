@@ -12,8 +12,8 @@ the camera frame.
     highlights     the albedo in highlights, for both estimators; the gloss of materials, for the network
 
 Two properties of the albedo are estimated here. The error of its scale: a chart behind the object, or in a shadow, gets
-less light than the object. The picture of the chart does not show this, but then the albedo is brighter than that of
-any object. And its detail: the reference shot at the RAW's pixels shows printed texture and fine relief
+less light than the object. The picture of the chart does not show this, but then the albedo may be brighter than that
+of white things. And its detail: the reference shot at the RAW's pixels shows printed texture and fine relief
 alike. Relief continues from scale to scale, so the shading of the normals shows how strong finer shading may be. Where
 the normals are smooth and certain, fine detail of the light is detail of the albedo.
 """

@@ -9,7 +9,7 @@ from polcap.stages.mask.regions import box_around
 _REACH = 3  # px from the outline: object and backdrop that mix in its pixels
 _WINDOW = 7  # px over which object and backdrop are averaged
 # least share of the object in the square root of a pixel's brightness; below .5, because objects darken towards the
-# outline, where they turn away from the flash; docs/benchmarks/fusion.md
+# outline, where they turn away from the flash; docs/benchmarks/mask.md
 _COVERED = 0.25
 _CONTRAST = 0.25  # least difference of object and backdrop, of their sum; pixels with less stay as they are
 
