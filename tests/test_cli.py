@@ -41,10 +41,16 @@ def test_help_answers_in_a_quarter_of_a_second() -> None:
     assert min(spent) < 0.25
 
 
-def test_help_imports_nothing_heavy() -> None:
-    code = "import sys; import polcap.cli; print(*sys.modules)"
+@pytest.mark.parametrize("command", [["--help"], ["help", "process"], ["status", "RESULT"]])
+def test_help_and_status_import_nothing_heavy(command: list[str], tiny_result: Path) -> None:
+    command = [str(tiny_result) if word == "RESULT" else word for word in command]
+    code = (
+        f"import sys; sys.argv[1:] = {command}; from polcap import cli\ntry: cli.main()\nfinally: print(*sys.modules)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert not {"numpy", "cv2", "scipy", "colour", "onnxruntime", "torch", "trimesh"} & set(done.stdout.split())
+    assert done.returncode == 0 and len(done.stdout.splitlines()) > 1
+    heavy = {"numpy", "cv2", "scipy", "colour", "onnxruntime", "torch", "trimesh"}
+    assert not heavy & set(done.stdout.splitlines()[-1].split())
 
 
 def test_stdout_carries_data_only(tiny: Path, tiny_result: Path, polcap: Command) -> None:

@@ -43,11 +43,11 @@ def show(
 
 def status(context: Context, result: Result, json: Json = False) -> None:
     """List the stored stages of a result folder, or the progress of a batch."""
-    from polcap.pipeline import cache
+    from polcap.pipeline import manifest
 
     if not result.is_dir():
         raise SettingError(f"{result}: no such folder; give the result folder of `polcap process`, or that of a batch")
-    found = cache.contents(result)
+    found = manifest.contents(result)
     if found:
         rows = [{name: about[name] for name in ("stage", "version", "key", "seconds", "bytes")} for about in found]
         complete = (result / "report.json").exists()

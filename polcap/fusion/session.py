@@ -26,7 +26,8 @@ from polcap.fusion.silhouettes import Silhouette
 from polcap.fusion.values import FusionView, ViewMask
 from polcap.fusion.view_path import SessionView
 from polcap.pipeline import run
-from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult, digest
+from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult
+from polcap.pipeline.manifest import digest
 from polcap.results import ResultsUntilInfer
 
 

@@ -24,7 +24,8 @@ from polcap.material.stokes_view import PosedStokes
 from polcap.material.texel_grid import TexelGrid
 from polcap.optics.board import RING, SQUARES, Board
 from polcap.pipeline import run
-from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult, digest
+from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult
+from polcap.pipeline.manifest import digest
 from polcap.results import ResultsUntilStokes
 
 Region = tuple[float, float, float, float]  # m, left, lower, right, upper side, from the board's middle; y up the page

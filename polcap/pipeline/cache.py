@@ -15,44 +15,27 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property, partial
-from hashlib import blake2b, sha256
+from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar, get_type_hints
+from typing import Any, Generic, TypeVar, get_type_hints
 
 import msgspec
 import numpy as np
-from msgspec import Meta
 
 from polcap import parallel, resource_limits
 from polcap.errors import StorageError
-from polcap.formats import atomic, npy_folder, text_file
+from polcap.formats import atomic, npy_folder
+from polcap.pipeline.manifest import FORMAT, digest, read_manifest, seal
 from polcap.stages import Stage
 
 T = TypeVar("T")
-FORMAT = 3  # of work/; raised when older folders can no longer be read
 _READERS = 2  # threads that compute digests: more do not read faster
 _verified: set[tuple[Any, ...]] = set()  # path, times, size and digest of the files that this process has compared
-_NOT_SEALED = ("seconds", "digest")  # fields of a manifest that its digest leaves out: no two runs take the same time
 Progress = Callable[[str, float | None, bool], None]  # stage, seconds (None: it begins), found in the cache
 
 
 def silent(stage: str, seconds: float | None, cached: bool) -> None:
     """Progress callback that shows nothing."""
-
-
-class _Manifest(msgspec.Struct, frozen=True):
-    """Fields of a manifest.json; `manifest` checks them, because another program may have changed the file."""
-
-    format: int
-    stage: str
-    version: int | list[Any]  # with those of used stages
-    settings: dict[str, Any] | None
-    inputs: list[str]
-    key: str
-    seconds: Annotated[float, Meta(ge=0, le=1e9)]
-    files: dict[str, tuple[int, str]]
-    value: Any
-    digest: str
 
 
 class StageReached(Exception):
@@ -170,7 +153,7 @@ class StageCache(MemoryCache):
 
     def _find(self, stage: Stage[..., T], key: str) -> T | None:
         place = self.place(stage)
-        if not stage.keep or manifest(place).get("key") != key:
+        if not stage.keep or read_manifest(place).get("key") != key:
             return None
         try:
             return read(place, stage)
@@ -222,7 +205,7 @@ class DryRunCache(StageCache):
     def _value(
         self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None, about: dict[str, Any]
     ) -> Any:
-        cached = not self._forced and manifest(self.place(stage)).get("key") == about["key"]
+        cached = not self._forced and read_manifest(self.place(stage)).get("key") == about["key"]
         self.states[stage.name] = "on demand" if not stage.keep else "cached" if cached else "compute"
 
 
@@ -240,7 +223,7 @@ class ArchiveCache(StageCache):
         if not stage.keep:
             return super().run(stage, *inputs, config=config)
         place = self.place(stage)
-        about, value = manifest(place), read(place, stage)
+        about, value = read_manifest(place), read(place, stage)
         expected = [one.key if isinstance(one, StageResult) else "" for one in inputs if not callable(one)]
         pairs = zip(expected, about["inputs"])
         same_inputs = len(expected) == len(about["inputs"]) and all(key in ("", stored) for key, stored in pairs)
@@ -275,27 +258,12 @@ def _derived_key(function: Callable[..., Any], inputs: tuple[Any, ...]) -> str:
     return digest(["derived", function.__name__, [key_of(one) for one in inputs]])
 
 
-def manifest(place: Path) -> dict[str, Any]:
-    """Read the manifest of a stored stage result; empty if there is none or it is damaged."""
-    try:
-        about: dict[str, Any] = text_file.read_json(place / "manifest.json")
-        msgspec.convert(about, _Manifest)
-    except (OSError, ValueError):
-        return {}
-    return about if about["format"] == FORMAT and about["digest"] == seal(about) else {}
-
-
-def seal(about: Mapping[str, Any]) -> str:
-    """Digest of a manifest's content, stored in it to detect later changes."""
-    return digest({name: value for name, value in about.items() if name not in _NOT_SEALED})
-
-
 def read(place: Path, stage: Stage[..., T], check: bool = True) -> T:
     """Read a stored stage result, its arrays as read-only memory maps; `check` compares digests.
 
     Raises StorageError: there is no result of this cache format, a file is missing, or a file was changed.
     """
-    about = manifest(place)
+    about = read_manifest(place)
     if not about:
         raise StorageError(f"{place}: no whole result of this polcap's cache format {FORMAT}; run `polcap process`")
     if check:
@@ -320,11 +288,6 @@ def _verify(file: Path, expected: list[Any]) -> None:
         identity = ()
     if identity not in _verified:
         raise StorageError(f"{file} is damaged; delete {file.parent} and run again")
-
-
-def digest(value: Any) -> str:
-    """Digest of plain, nested data; used as a cache key."""
-    return blake2b(json.dumps(value, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def value_of(value: Any) -> Any:
@@ -357,13 +320,3 @@ def fingerprint(value: Any) -> Any:
     if value is None or isinstance(value, (str, int, bool)):
         return value
     raise TypeError(f"a {type(value).__name__} cannot be an input of a stage")
-
-
-def contents(folder: Path) -> list[dict[str, Any]]:
-    """Manifests of all stored stage results of a result folder, in the order of the stages, with sizes in bytes."""
-    found = []
-    for place in sorted((folder / "work").glob("[0-9][0-9]-*")):
-        if about := manifest(place):
-            size = sum(entry.lstat().st_size for entry in place.iterdir())
-            found.append({**about, "folder": place.name, "bytes": size})
-    return found

@@ -17,7 +17,7 @@ from polcap.errors import CaptureError, SettingError, StorageError
 from polcap.formats import atomic, folder_lock, own_files, own_folders, system_errors, text_file
 from polcap.formats.capture import capture_toml, folder_names
 from polcap.formats.raw import probe
-from polcap.pipeline.cache import seal
+from polcap.pipeline.manifest import seal
 
 _HELD = ("lock", "owner")  # files in work/ that an open result needs
 _PARTS = ("maps", "asset", "work", "report.html", "report.json", "color.toml", "compare.html")  # of a result

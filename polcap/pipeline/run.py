@@ -25,7 +25,8 @@ from polcap.images import SensorImage
 from polcap.mesh_values import ReliefMesh
 from polcap.pipeline import asset_export, early_end, result_folder, unchanged
 from polcap.pipeline.asset_export import ExportRequest
-from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, contents, silent
+from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, silent
+from polcap.pipeline.manifest import contents
 from polcap.pipeline.path import UserInput, path
 from polcap.report import animation
 from polcap.report import stage_pictures as pictures

@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 from polcap.formats.maps import exr
-from polcap.pipeline import cache
+from polcap.pipeline import manifest
 from polcap.results import STAGES
 from tests.campaigns.mutations import mutated
 from tests.campaigns.rows import arguments, table
@@ -158,7 +158,7 @@ def _key(place: Path, random: Random) -> None:
 
 def _seal(place: Path, about: Any, random: Random) -> None:
     if place.name in ("manifest.json", "run.json") and random.random() < 0.5:
-        about["digest"] = cache.seal(about)
+        about["digest"] = manifest.seal(about)
     place.write_text(json.dumps(about))
 
 

@@ -19,7 +19,7 @@ from polcap.formats.export import web_page
 from polcap.formats.maps import maps_folder
 from polcap.formats.text_file import fault
 from polcap.fusion import fused_maps
-from polcap.pipeline import cache, result_folder, unchanged
+from polcap.pipeline import manifest, result_folder, unchanged
 from polcap.rig import capture_record
 from polcap.rig.device_log import Log
 from polcap.synth.shooting import Shoot
@@ -80,7 +80,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {  # place of the fil
     "run.json": ("work/run.json", result_folder.read_run),
     "unchanged.json": ("work/unchanged.json", lambda folder: unchanged.find(folder, "digest")),
     "owner": ("work/owner", lambda folder: result_folder._owner(folder / "work" / "owner")),
-    "manifest": ("manifest.json", cache.manifest),
+    "manifest": ("manifest.json", manifest.read_manifest),
     "array": ("a.npy", lambda folder: npy_folder.load(folder / "a.npy")),
     "checksum": ("a.npy", lambda folder: _checked(folder / "a.npy")),
     "mesh of a fusion": ("mesh.npz", lambda folder: fused_maps._mesh_arrays(folder / "mesh.npz")),

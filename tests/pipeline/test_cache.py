@@ -29,8 +29,8 @@ from polcap.pipeline.cache import (
     StageCache,
     StageReached,
     StageResult,
-    contents,
 )
+from polcap.pipeline.manifest import contents
 from polcap.stages import Stage, stage
 
 

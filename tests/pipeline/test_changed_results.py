@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from polcap.pipeline import cache
+from polcap.pipeline import manifest
 from tests.campaigns.changed_results import complete, tried
 from tests.conftest import TINY, Command
 
@@ -30,7 +30,7 @@ def root(template: Path, tmp_path: Path) -> Path:
 def change(file: Path, edit: Callable[[Any], Any], sealed: bool = False) -> None:
     about = edit(json.loads(file.read_text(encoding="utf-8")))
     if sealed:
-        about["digest"] = cache.seal(about)
+        about["digest"] = manifest.seal(about)
     file.write_text(json.dumps(about), encoding="utf-8")
 
 
