@@ -42,7 +42,7 @@ from polcap.formats.export.texture_set import Extra, Key, Texture
 from polcap.formats.maps import maps_folder, png
 from polcap.mesh_values import Asset, Mesh, ReliefMesh
 from polcap.pipeline import result_folder
-from polcap.pipeline.cache import digest
+from polcap.pipeline.manifest import digest
 from polcap.stages import asset, surface
 from polcap.stages.asset import AssetSettings
 
@@ -301,7 +301,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     }
     maps_folder.note_export(out / "maps", folder.relative_to(out).as_posix(), description)
     if preset.gathers:
-        written += archive.gather(out, folder)
+        written += [*archive.gather(out, folder), *report.archive(out, folder, about, entry)]
     sidecar = folder / f"{stem}.provenance.json"
     digests = {file.relative_to(folder).as_posix(): provenance.digest(file) for file in written}
     provenance.write(sidecar, record, digests)

@@ -4,6 +4,7 @@ A failed gate means that the asset was written but must be checked before use (e
 assumption. A gate that had nothing to measure is marked "not measured".
 """
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,8 @@ from polcap.quality.gate import Gate, full_size
 from polcap.report import chart_colors, figures, labels, page
 from polcap.results import Results
 from polcap.stage_values import Network
+
+_PAGE_BYTES = 64 << 20  # that of the bundled capture has 3 MB
 
 
 class _PhotographFacts(msgspec.Struct, frozen=True):
@@ -180,6 +183,27 @@ def write(folder: Path, about: dict[str, Any], results: Results) -> None:
     """Write report.json and report.html into a result folder."""
     atomic.write_json(folder / "report.json", about)
     page.write(folder, about, results)
+
+
+def archive(out: Path, folder: Path, about: Mapping[str, Any], entry: Mapping[str, str]) -> list[Path]:
+    """Write report.json and report.html of the result `out` into an archive, with its catalog facts; returns both.
+
+    `about` is the content of report.json, `entry` has the stated fields of `CatalogEntry`. A copy of an archive has no
+    page.
+
+    Raises StorageError: the page cannot be read.
+    """
+    files, source = [folder / "report.json"], out / "report.html"
+    stated = {**about, "capture": {**about["capture"], "catalog": dict(entry)}}
+    atomic.write_json(files[0], stated)
+    if os.path.lexists(source):
+        try:
+            text = text_file.read_text(source, _PAGE_BYTES)
+        except (OSError, ValueError) as error:
+            raise StorageError(f"{source} cannot be read ({error}); write it again by `polcap process`") from error
+        files.append(folder / source.name)
+        atomic.write(files[1], page.archived(text, stated))
+    return files
 
 
 def read(folder: Path) -> dict[str, Any]:

@@ -1,8 +1,9 @@
 """report.html: verdict, interactive pictures, maps, plots and tables of one result, by the template `report.html`."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import msgspec
 import numpy as np
@@ -21,6 +22,9 @@ from polcap.report.keys import Palette
 from polcap.results import Results
 from polcap.stages import surface
 
+if TYPE_CHECKING:
+    from jinja2 import Template
+
 _LONGEST = 1024  # px, longest side of a map
 _WIDEST = 1000  # px, of a photograph
 _MOST_VERTICES = 60_000  # of the mesh preview: 0.7 MB of the page
@@ -31,6 +35,8 @@ _HEADLINE = {
 }
 _SAME_LIGHT = (0.77, 1.3)  # ratio of highlights that agree, set by hand
 _SIMILAR = 0.15  # relative difference of pictures that agree, set by hand
+_CATALOG = re.compile(r'<section id="catalog">.*?</section>', re.DOTALL)
+_ASSET_LINK = re.compile(r'<a href="asset/([^"]*)">asset/')
 _ORDER = ("fail", "warn", "pass", "not measured", "not judged")  # of the gates in their table
 
 
@@ -81,15 +87,26 @@ def render(
     template: str, file: Path, title: str, content: Mapping[str, Any], data: Mapping[str, Any] | None = None
 ) -> None:
     """Write a page from one of the HTML templates; `data` is for the scripts of the page."""
+    body = _template(template).render(content, number=labels.number)
+    palettes = {name: html.text(keys.colors(name).tobytes()) for name in get_args(Palette)}
+    html.write(file, title, [body], {"palettes": palettes, **(data or {})})
+
+
+def archived(text: str, about: Mapping[str, Any]) -> str:
+    """A report's page as it lies in an archive: with the catalog facts of `about`, and with the GLB next to it."""
+    facts = _template("catalog.html").render(catalog=catalog(about))
+    return _ASSET_LINK.sub(r'<a href="\1">', _CATALOG.sub(lambda _: facts, text, count=1), count=1)
+
+
+def _template(name: str) -> "Template":
+    """One of the HTML templates."""
     import jinja2  # not needed by most commands
 
     loader = jinja2.FileSystemLoader(Path(__file__).parent / "templates")
     templates = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    body = templates.get_template(template).render(content, number=labels.number)
-    palettes = {name: html.text(keys.colors(name).tobytes()) for name in get_args(Palette)}
-    html.write(file, title, [body], {"palettes": palettes, **(data or {})})
+    return templates.get_template(name)
 
 
 def verdict(about: Mapping[str, Any]) -> tuple[str, str]:

@@ -340,6 +340,23 @@ def check_sums(archive: Path) -> list[str]:
     return list(listed)
 
 
+def test_the_report_of_an_archive_states_its_facts_and_links_its_files(
+    tiny_result: Path, polcap: Command, tmp_path: Path
+) -> None:
+    pytest.importorskip("pxr", reason="needs usd-core")
+    for title in ("Bowl", "Vase & <lid>"):
+        done = polcap("export", tiny_result, "--preset", "archive", "--about", f"title={title}")
+        assert done.returncode == 0, done.stderr
+    archive = tiny_result / "asset" / "archive"
+    page = (archive / "report.html").read_text(encoding="utf-8")
+    assert "<b>Vase &amp; &lt;lid&gt;</b>" in page and "Bowl" not in page and '<a href="C.glb">C.glb</a>' in page
+    assert json.loads((archive / "report.json").read_text())["capture"]["catalog"] == {"title": "Vase & <lid>"}
+    assert "Vase" not in (tiny_result / "report.html").read_text(encoding="utf-8")
+    (tiny_result / "report.html").write_bytes(b"\xff")
+    refused = polcap("export", tiny_result, "--preset", "archive")
+    assert refused.returncode == 2 and "report.html cannot be read" in refused.stderr
+
+
 def test_an_archive_checks_itself_after_two_exports_and_a_copy(
     tiny_result: Path, polcap: Command, tmp_path: Path
 ) -> None:
@@ -357,6 +374,7 @@ def test_an_archive_checks_itself_after_two_exports_and_a_copy(
     shutil.copytree(tiny_result / "asset/archive", tmp_path / "elsewhere")
     again = polcap("export", tmp_path / "elsewhere", "--out", tmp_path / "new", "--ply")
     assert again.returncode == 0 and (tmp_path / "new/asset/C.ply").exists()
+    assert json.loads((tmp_path / "new/asset/C.provenance.json").read_text())["title"] == "Vase"
     assert set(check_sums(tmp_path / "elsewhere")) == {*names, "C_occlusion.png"}
     if program := shutil.which("sha256sum"):
         command = [program, "-c", "--quiet", "manifest-sha256.txt"]

@@ -7,15 +7,14 @@ from polcap.formats import atomic, color_profile, own_files
 from polcap.formats.raw import file_bytes
 
 MANIFEST = "manifest-sha256.txt"
-_RECORDS = ("report.html", "report.json", color_profile.NAME)
 
 
 def gather(out: Path, folder: Path) -> list[Path]:
-    """Copy maps/, report and color profile of the result `out` into the folder of an export; returns the copies."""
+    """Copy maps/ and color profile of the result `out` into the folder of an export; returns the copies."""
     out = Path(os.path.abspath(out))
     own = own_files.owner(out / "report.json")
     maps = [] if own is None else own.below(out / "maps")
-    found = [*maps, *(file for name in _RECORDS if (file := out / name).is_file())]
+    found = [*maps, *(file for file in [out / color_profile.NAME] if file.is_file())]
     copies = [folder / file.relative_to(out) for file in found]
     for file, copy in zip(found, copies):
         atomic.copy(file, copy)
