@@ -249,6 +249,11 @@ def test_status_and_report_print_json(tiny: Path, tiny_result: Path, polcap: Com
 def test_a_folder_of_another_kind_is_exit_2(tmp_path: Path, polcap: Command, result: Path, example: Path) -> None:
     cases = [((name, tmp_path), "") for name in ("status", "report", "export")] + [(("show", tmp_path, "hdr"), "")]
     cases += [(("status", tmp_path / "none"), "no such folder"), (("process", result), "it is a result of polcap")]
+    shutil.copytree(result / "maps", tmp_path / "archive" / "maps")
+    shutil.copy(result / "report.json", tmp_path / "archive")
+    shutil.copy(tmp_path / "archive/maps/diffuse.exr", tmp_path / "archive" / "owl_layers.exr")
+    for place in (result / "maps", result / "asset", tmp_path / "archive"):
+        cases.append((("process", place, "--dry-run"), "a result of polcap or a part of one"))
     cases += [(("process", next(example.rglob("*.DNG"))), "give the folder that holds all photographs")]
     for command, words in cases:
         done = polcap(*command)

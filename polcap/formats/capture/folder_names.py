@@ -51,8 +51,17 @@ def few_names(names: Sequence[str]) -> str:
 
 
 def is_result(folder: Path) -> bool:
-    """Whether a folder is a result of `polcap process` or `polcap fuse`."""
+    """Whether a folder is a result of polcap, or an archive of one."""
     return (folder / "report.json").is_file() and (folder / "maps").is_dir()
+
+
+def is_in_result(folder: Path) -> bool:
+    """Whether a folder is a result of polcap, its maps/ or asset/, or the folder of an export."""
+    here = Path(os.path.abspath(folder))
+    results = [here]
+    results += [here.parent] if here.name in ("maps", "asset") else []
+    results += [here.parents[1]] if here.parent.name == "asset" else []
+    return any(map(is_result, results))
 
 
 def views(folder: Path) -> list[str]:

@@ -27,6 +27,7 @@ from polcap.formats.capture.folder_names import (
     degrees_of_cross,
     degrees_with_unit,
     few_names,
+    is_in_result,
     is_one_angle,
     is_result,
     natural,
@@ -89,6 +90,11 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
             f"{folder}: its sub-folders {few_names(found)} are views of one object: join them with `polcap fuse`, or "
             "give one of them"
         )
+    if is_in_result(folder):
+        raise CaptureError(
+            f"{folder}: it is a result of polcap or a part of one; give the folder of the photographs, and if they lie "
+            "here, move them into one of their own"
+        )
     pictures, notes = _list_photographs(folder)
     if not pictures:
         raise CaptureError(f"{folder}: holds no photograph that polcap reads; {_hint(folder)}")
@@ -118,8 +124,6 @@ def _hint(folder: Path) -> str:
             f"its sub-folders {named} hold captures: give one of them, or run `polcap batch` on the folder; for views "
             "of one object, name them view01, view02, … and run `polcap fuse`"
         )
-    if is_result(folder):
-        return "it is a result of polcap: give the folder of the photographs"
     if inside:
         new = ", ".join(f"{old} to {name}" for old, name in suggested_names([path.name for path in inside]))
         rename = f": if these are the angles, rename {new}" if new else ""
