@@ -90,6 +90,7 @@ def _rows(flat: FlatSession, results: MaterialResults) -> Iterator[dict[str, Any
         yield {
             "name": name,
             "tilt_deg": flat.tilt_deg[name],
+            "blur_px": flat.blur_px[name],
             "corners": posed.corners,
             "reprojection_px": posed.residual_px,
             "pose_sigma_deg": posed.sigma_deg,
@@ -107,6 +108,7 @@ def _gates(
     yield flat_sample.views(flat.names, flat.left_out, limits)
     yield flat_sample.tilts(flat.tilt_deg, limits)
     yield several_views.poses({row["name"]: row["reprojection_px"] for row in rows}, limits.max_corner_px, board=True)
+    yield flat_sample.focus(flat.blur_px, limits)
     yield flat_sample.paper(results.light.shine, limits)
     yield flat_sample.agreement({row["name"]: row["residual"] for row in rows}, limits)
     yield flat_sample.seen(float(results.maps.seen.mean()), limits)

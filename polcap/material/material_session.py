@@ -45,6 +45,7 @@ class FlatSession:
     grid: TexelGrid
     left_out: Mapping[str, str]  # reason, by view
     tilt_deg: Mapping[str, float]  # between the page's normal and the direction to the lens, by view
+    blur_px: Mapping[str, float]  # 1σ of the board's edges, merged px, by view
 
 
 def process(
@@ -78,7 +79,7 @@ def process(
     tilts = {name: _tilt_deg(solved, name) for name in names}
     return FlatSession(
         together, names, solved, _chart(masked, charted), board, texel_grid(solved, names, board, posed, region, texel),
-        masked.left_out, tilts,
+        masked.left_out, tilts, {name: blur for name, blur in zip(every, sight.blur, strict=True) if name in tilts},
     )  # fmt: skip
 
 

@@ -1,7 +1,9 @@
-"""Gates of a flat sample: its views, their tilts, the board's paper, agreement with the fit, the measured share."""
+"""Gates of a flat sample: views, their tilts and focus, the board's paper, agreement with the fit, measured share."""
 
+import math
 from collections.abc import Mapping, Sequence
 
+from polcap.formats.capture import folder_names
 from polcap.quality import several_views
 from polcap.quality.gate import Gate
 from polcap.quality.limits import MaterialGateLimits
@@ -20,6 +22,22 @@ def tilts(tilt_deg: Mapping[str, float], limits: MaterialGateLimits) -> Gate:
     if value - min(tilt_deg.values()) >= limit:
         return Gate("tilts", "pass", value, limit, message, unit="°")
     return Gate("tilts", "fail", value, limit, message, "Shoot from the sides too, tilted by 20 to 45°", unit="°")
+
+
+def focus(blur_px: Mapping[str, float], limits: MaterialGateLimits) -> Gate:
+    """Gate on the views' blur against that of the sharpest view, 1σ [merged px], measured on the board's edges."""
+    limit, sharpest = limits.max_blur_px, min(blur_px.values(), default=float("nan"))
+    more = {name: math.sqrt(max(blur**2 - sharpest**2, 0)) for name, blur in blur_px.items()}
+    blurred = [name for name, one in more.items() if one > limit]
+    value = max(more.values(), default=float("nan"))
+    if not math.isfinite(value):
+        return Gate("focus", "not measured", None, limit, "No edge of the board is visible", unit="px")
+    if not blurred:
+        return Gate("focus", "pass", value, limit, "The views are equally sharp", unit="px")
+    names, best = folder_names.few_names(blurred), min(blur_px, key=lambda name: blur_px[name])
+    message = f"{names}: less sharp than {best} by up to {value:.1f} px (1σ)"
+    remedy = f"Shoot {names} again: focus on the sample, close the aperture, hold the camera still"
+    return Gate("focus", "warn", value, limit, message, remedy, unit="px")
 
 
 def paper(shine: float, limits: MaterialGateLimits) -> Gate:

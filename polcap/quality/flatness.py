@@ -15,7 +15,7 @@ from polcap.images import Bools, Floats
 from polcap.optics import outline
 from polcap.optics.frames import total
 from polcap.optics.resize import block_means
-from polcap.quality.gate import Evidence, Gate
+from polcap.quality.gate import MOST_DEG, Evidence, Gate
 from polcap.results import ResultsUntilInfer
 from polcap.stage_values import StokesImage, SurfaceMaps
 
@@ -30,6 +30,8 @@ _LIT = 0.85  # light of an outline that is not dimmed: wax too is hardly polariz
 _FACING_DOLP = 0.045  # most of the outline of a plane that faces the camera
 _ALIGNED = 0.84  # length of the mean normal: boxes up to .83, except one whose normals are wrong; bodies up to .77
 _ONE_NORMAL = 0.92  # of the mean normal: beyond, the outline decides nothing
+_KNOWN_DEG = 7.0  # expected error of normals: a box that shows one face has 6, a tilted coin 9, plates 14 to 16
+_TILTED = np.cos(np.radians(20.0))  # of the mean normal: more tilt shows little more
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ class Flatness:
     rim_dolp: float  # 90th percentile along the outline
     rim_light: float  # median along the outline over that of the object
     aligned: float  # 0…1, length of the mean normal
+    facing: float  # cosine of the mean normal's tilt
+    expected_deg: float  # median expected error of the normals
 
     @property
     def sharp_edged(self) -> bool:
@@ -60,20 +64,20 @@ def judge(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
     if seen is None:
         yield Gate("flat", "not measured", None, _ONE_PLANE, "The object is too small")
         return
-    if seen.flat:
+    if seen.flat and seen.expected_deg > _KNOWN_DEG:
         message = (
             "The object is flat: a surface that faces camera and flash is hardly polarized, so one picture shows "
             "neither its relief nor its gloss"
         )
         if found.results.radiance.crossed is not None:
             message += "; the cross-polarized shot shows its color without highlights"
-        remedy = (
-            "Photograph it from five to nine sides for `polcap material`, which measures both; a single picture "
-            "shows more of it where it is tilted by 30°"
-        )
+        remedy = "Photograph it from five to nine sides for `polcap material`, which measures both"
+        if seen.facing > _TILTED:
+            remedy += "; a single picture shows more of it where it is tilted by 30°"
         yield Gate("flat", "warn", round(seen.common, 3), _ONE_PLANE, message, remedy)
     else:
-        yield Gate("flat", "pass", round(seen.common, 3), _ONE_PLANE, "The object is not flat")
+        message = "The object is flat, and its polarization shows its tilt" if seen.flat else "The object is not flat"
+        yield Gate("flat", "pass", round(seen.common, 3), _ONE_PLANE, message)
     value = round(seen.contour, 3)
     if seen.sharp_edged:
         message = (
@@ -101,12 +105,16 @@ def measure(image: StokesImage, maps: SurfaceMaps) -> Flatness | None:
     if not both.any():
         return None
     mean = (dolp * np.exp(1j * np.angle(polarized)))[body].mean()
+    normal = maps.normal[maps.mask].mean(axis=0) if maps.mask.any() else np.array([0.0, 0.0, 1e-9])
+    aligned = float(np.linalg.norm(normal))
     return Flatness(
         contour=float((of_rim > np.maximum(_GROWTH * of_inner, _LEAST_DOLP))[both].mean()),
         common=float(np.abs(mean) / max(float(dolp[body].mean()), 1e-9)),
         rim_dolp=float(np.quantile(dolp[rim], 0.9)),
         rim_light=float(np.median(s0[rim]) / max(float(np.median(s0[body])), 1e-9)),
-        aligned=float(np.linalg.norm(maps.normal[maps.mask].mean(axis=0))) if maps.mask.any() else 0.0,
+        aligned=aligned,
+        facing=float(normal[2] / aligned),
+        expected_deg=float(np.median(maps.confidence[maps.mask])) if maps.mask.any() else MOST_DEG,
     )
 
 

@@ -186,6 +186,10 @@ class MaterialGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     max_paper_shine: Annotated[
         Positive, Meta(description="allowed highlight of the board's paper over its diffuse light [1]")
     ] = 0.1
+    max_blur_px: Annotated[
+        Positive,
+        Meta(description="allowed blur of a view that the sharpest one does not have, 1σ; usually 0.2 [merged px]"),
+    ] = 0.4
     max_residual: Annotated[
         Positive,
         Meta(description="allowed median of a view's radiance minus that of the fit, relative; usually 0.01 [1]"),

@@ -182,7 +182,7 @@ def _outline(found: Evidence[ResultsUntilInfer], limit_deg: float, angle: Floats
     facing = np.maximum(dot(results.maps.normal, rays(results.maps.view, *results.maps.mask.shape)), _GRAZING)
     shading = rim.sample(block_means(facing, _step(results.stokes))[None], mask, usable).total
     turn = rim.fit_angle_error(band, angle, np.radians(limit_deg))
-    return OutlineFigures(rim.summarize(band, angle, shading), turn, rim.side_light(band))
+    return OutlineFigures(rim.summarize(band, angle, shading), turn, rim.side_light(band, angle))
 
 
 def ill_posed(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Gate:

@@ -11,6 +11,8 @@ from polcap.images import Floats
 from polcap.material import board_focus
 from polcap.material.board_focus import BoardSight
 from polcap.material.stokes_view import PosedStokes
+from polcap.quality import flat_sample
+from polcap.quality.limits import MaterialGateLimits
 from polcap.stage_values import StokesImage
 from tests.fusion.board_views import BOARD, COLOR, FOCAL, VIEW, picture, pose, scene
 
@@ -35,3 +37,12 @@ def test_blur_of_the_board_is_measured_and_a_blurred_view_is_named() -> None:
     sight = BoardSight((first, second, first), (900, 900, 12))
     named = board_focus.left_out(("view01", "view02", "view03"), sight)
     assert "out of focus" in named["view02"] and "12 points" in named["view03"] and "view01" not in named
+
+
+def test_a_view_less_sharp_than_the_sharpest_is_named() -> None:
+    blur = {"view01": 0.52, "view02": 0.48, "view03": 0.76}  # px, of five simulated views; 1.5 RAW px for the third
+    gate = flat_sample.focus(blur, MaterialGateLimits())
+    assert gate.state == "warn" and gate.value == pytest.approx(0.59, abs=0.01)
+    assert "view03: less sharp than view02" in gate.message and "view03 again" in gate.remedy
+    assert flat_sample.focus({**blur, "view03": 0.5}, MaterialGateLimits()).state == "pass"
+    assert flat_sample.focus({"view01": float("nan")}, MaterialGateLimits()).state == "not measured"

@@ -18,7 +18,7 @@ def measure(normal: Any, mask: Any, dolp: Any, light: Any) -> Flatness:
     azimuth = np.arctan2(normal[..., 1], normal[..., 0])
     stokes = light * np.stack([np.ones_like(dolp), dolp * np.cos(2 * azimuth), dolp * np.sin(2 * azimuth)])
     image: Any = SimpleNamespace(mask=mask, stokes=np.repeat((stokes * mask)[..., None] / 3, 3, axis=-1))
-    maps: Any = SimpleNamespace(mask=mask, normal=normal)
+    maps: Any = SimpleNamespace(mask=mask, normal=normal, confidence=np.full(mask.shape, 15.0))
     found = flatness.measure(image, maps)
     assert found is not None
     return found
@@ -56,7 +56,8 @@ def test_a_ball_that_hardly_polarizes_is_not_taken_for_a_plane() -> None:
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 20.0, 45.0])
 def test_a_plane_with_relief_is_flat(tilt_deg: float) -> None:
-    assert faces(tilt_deg, relief_deg=4.0).flat
+    seen = faces(tilt_deg, relief_deg=4.0)
+    assert seen.flat and seen.facing == pytest.approx(np.cos(np.radians(tilt_deg)), abs=0.01)
 
 
 def test_a_box_has_sharp_edges_and_is_not_flat() -> None:

@@ -45,7 +45,7 @@ BODY = {
     "turned_sigma": 0.01, "brightness": 0.5, "one_sided": 0.1,
 }  # fmt: skip
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
-ROUNDED = Flatness(contour=0.8, common=0.1, rim_dolp=0.2, rim_light=0.7, aligned=0.7)
+ROUNDED = Flatness(contour=0.8, common=0.1, rim_dolp=0.2, rim_light=0.7, aligned=0.7, facing=1.0, expected_deg=15.0)
 FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
     "pushed": pushed(0.1, 0.1), "turn": ObjectTurn(np.array([0.0, 0.2, 0.1]), np.full(3, 0.1)),
@@ -206,6 +206,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("body", "not judged", {"figures": {"flatness": replace(ROUNDED, common=0.9)}}),
     ("flat", "pass", {}),
     ("flat", "warn", {"figures": {"flatness": replace(ROUNDED, common=0.9, aligned=0.95)}}),
+    ("flat", "pass", {"figures": {"flatness": replace(ROUNDED, common=0.9, aligned=0.95, expected_deg=5.0)}}),
     ("flat", "not measured", {"figures": {"flatness": None}}),
     ("contour", "pass", {}),
     ("contour", "not measured", {"figures": {"flatness": replace(ROUNDED, common=0.9)}}),

@@ -228,7 +228,9 @@ def test_a_frame_without_light_is_named(good: Seen) -> None:
 def test_chart_and_flat_object_need_not_agree_on_the_light(good: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
     disagreeing = changed(good, **with_gains(good, source="grey patches", disagreement=0.08))
     assert judged(disagreeing)["gain doubt"].state == "fail"
-    edges = flatness.Flatness(contour=0.0, common=0.7, rim_dolp=0.2, rim_light=1.0, aligned=0.9)
+    edges = flatness.Flatness(
+        contour=0.0, common=0.7, rim_dolp=0.2, rim_light=1.0, aligned=0.9, facing=0.8, expected_deg=15.0
+    )
     monkeypatch.setattr(flatness, "measure", lambda *_: edges)
     assert judged(disagreeing)["gain doubt"].state == "pass"
     assert judged(disagreeing)["outline"].state == "not judged"
@@ -394,7 +396,10 @@ def test_body_that_polarizes_too_little_for_its_shape_is_reported(
 
 def test_a_flat_object_is_one_finding_with_one_remedy(good: Seen) -> None:
     """A coin, whose polarization is too weak to judge the order of the angles, its material or the light."""
-    found = judged(shaped(good, 0.13, 0.3, 0.2, dimmed=False))
+    flat = shaped(good, 0.13, 0.3, 0.2, dimmed=False)
+    maps = flat.results.maps
+    doubtful = replace(maps, confidence=np.full_like(maps.confidence, 15.0))
+    found = judged(changed(flat, maps=doubtful))
     assert found["flat"].state == "warn" and "polcap material" in found["flat"].remedy
     assert {found[name].state for name in ("order", "angles", "body", "other light", "lighting")} == {"not judged"}
 

@@ -1,8 +1,11 @@
 """The outline of a ball shows which shot's angle is wrong, and that a lamp shone from the side."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from polcap.images import Floats
 from polcap.optics import mueller
 from polcap.quality import rim
 from tests import scenes
@@ -54,10 +57,29 @@ def test_no_angle_error_fits_better_than_true_angles() -> None:
 
 
 def test_a_lamp_at_the_side_is_distinguished_from_polarization() -> None:
-    assert rim.side_light(ball_rim((0, 45, 90))).max() < 0.02
-    side = rim.side_light(ball_rim((0, 45, 90), lamp=0.15))
+    assert rim.side_light(ball_rim((0, 45, 90)), scenes.ANGLES).max() < 0.02
+    side = rim.side_light(ball_rim((0, 45, 90), lamp=0.15), scenes.ANGLES)
     assert int(np.argmax(side)) == 1
     assert side[1] == pytest.approx(0.15 * 2 / 3, abs=0.03)  # against the mean of all three
+
+
+def _rim_of(light: Floats, azimuth: Floats) -> rim.Rim:
+    return rim.Rim(light / light.mean(axis=0), azimuth, np.zeros(azimuth.size, int), np.ones(azimuth.size))
+
+
+@pytest.mark.parametrize("degrees", [(0, 45, 90), (0, 60, 120), (0, 45, 90, 135)])
+def test_a_lamp_from_any_side_is_found_and_a_box_with_one_polarized_side_is_not_a_lamp(degrees: Any) -> None:
+    angle, azimuth = np.radians(degrees), np.linspace(-np.pi, np.pi, 360, endpoint=False)
+    wave = np.cos(2 * (angle[:, None] - azimuth))
+    box = 1 + np.where(np.abs(azimuth - 0.6) < 0.8, 0.13, 0.02) * wave
+    uneven = np.abs(np.exp(1j * azimuth) @ (box / box.mean(axis=0)).T) / 180
+    assert uneven.max() > 0.02 and rim.side_light(_rim_of(box, azimuth), angle).max() < 0.01
+    for shot in range(len(angle)):
+        for side in np.radians(np.arange(0, 360, 15)):
+            ball = 1 + 0.1 * wave
+            ball[shot] += 0.15 * np.maximum(np.cos(azimuth - side), 0)
+            found = rim.side_light(_rim_of(ball, azimuth), angle)
+            assert int(np.argmax(found)) == shot and found[shot] == pytest.approx(0.05, rel=0.25)
 
 
 def test_diffuse_polarization_grows_towards_the_outline() -> None:
