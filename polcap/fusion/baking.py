@@ -135,11 +135,11 @@ def visible_texels(views: Sequence[FusionView], atlas: Atlas) -> list[VisibleTex
 
 
 def _visible(view: FusionView, atlas: Atlas, tracer: Tracer) -> VisibleTexels:
-    rotation, translation = view.pose.rotation, view.pose.translation
+    """The texels that face the view, and that neither the mesh nor the picture's edge hides."""
     height, width = view.mask.shape
-    surface = tracer.trace(rotation, translation, view.view, height, width)
-    point = atlas.position @ rotation.T + translation
-    cosine = frames.dot(atlas.normal @ rotation.T, frames.unit(-point))
+    surface = tracer.trace(view.pose.rotation, view.pose.translation, view.view, height, width)
+    point = view.pose.to_camera(atlas.position)
+    cosine = frames.dot(atlas.normal @ view.pose.rotation.T, frames.unit(-point))
     pixel = project(view.view, point)
     column, row = np.rint(pixel).astype(int).T
     inside = (cosine > _LEAST_COSINE) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -198,7 +198,7 @@ def _bake_normals(
     smooth, weights = _robust_mean(
         [one[:, :3] for one in differences], weights, visible, count, float(np.radians(_OUTLIER_DEG)), prior
     )
-    fine, _ = _weighted_mean([one[:, 3:] for one in differences], [w**_SHARPNESS for w in weights], visible, count)
+    fine = _weighted_mean([one[:, 3:] for one in differences], [w**_SHARPNESS for w in weights], visible, count)
     return frames.unit(atlas.normal + smooth + fine)
 
 
@@ -223,11 +223,12 @@ def _bake_bands(
     weights = [one.weight for one in visible]
     low = [one[:, :channels] for one in bands]
     mean, weights = _robust_mean(low, weights, visible, count, _OUTLIER * _typical(low))
-    fine, _ = _weighted_mean([one[:, channels:] for one in bands], [w**_SHARPNESS for w in weights], visible, count)
+    fine = _weighted_mean([one[:, channels:] for one in bands], [w**_SHARPNESS for w in weights], visible, count)
     return np.maximum(mean + fine, 0)
 
 
 def _typical(samples: Sequence[Floats]) -> float:
+    """Median length of the samples (M, C) of all views."""
     return float(np.median(np.concatenate([np.linalg.norm(one[::16], axis=-1) for one in samples])))
 
 
@@ -252,12 +253,12 @@ def _robust_mean(
     """
     robust = list(weights)
     for _ in range(_ROUNDS):
-        mean, _ = _weighted_mean(samples, robust, visible, count, prior)
+        mean = _weighted_mean(samples, robust, visible, count, prior)
         robust = [
             w / (1 + np.sum((value - mean[one.texel]) ** 2, axis=-1) / scale**2)
             for value, w, one in zip(samples, weights, visible)
         ]
-    return _weighted_mean(samples, robust, visible, count, prior)[0], robust
+    return _weighted_mean(samples, robust, visible, count, prior), robust
 
 
 def _weighted_mean(
@@ -266,10 +267,10 @@ def _weighted_mean(
     visible: Sequence[VisibleTexels],
     count: int,
     prior: float = 0.0,
-) -> tuple[Floats, Floats]:
-    """Weighted mean (N, C) over the views, 0 where none has weight, and the total weight (N,)."""
+) -> Floats:
+    """Weighted mean (N, C) over the views, 0 where none has weight."""
     total, mean = np.full(count, prior), np.zeros((count, samples[0].shape[-1]))
     for value, weight, one in zip(samples, weights, visible):
         total[one.texel] += weight
         mean[one.texel] += weight[:, None] * value
-    return mean / np.maximum(total, 1e-30)[:, None], total
+    return np.asarray(mean / np.maximum(total, 1e-30)[:, None])

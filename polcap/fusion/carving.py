@@ -100,7 +100,7 @@ def _sweep(
     behind = np.zeros(height * width, bool)
     behind[met.index] = doubtful[tracer.mesh.faces[met.face]].mean(axis=1) > 0.5
     pixel = np.flatnonzero(behind)
-    corners = hull.grid.corners() @ view.pose.rotation.T + view.pose.translation
+    corners = view.pose.to_camera(hull.grid.corners())
     planes = np.arange(-corners[:, 2].max(), -corners[:, 2].min(), _PLANES * step)
     score = np.zeros((len(planes), height, width), np.float32)
     for layer, depth in zip(score.reshape(len(planes), -1), planes):

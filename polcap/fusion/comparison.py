@@ -40,6 +40,7 @@ def compare(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps) -> Com
 
 
 def _agreement(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: AtlasMaps) -> ViewAgreement:
+    """Agreement of one view, where both it and the mesh have a normal."""
     both = view.mask & (frames.dot(visible.mesh_normal, visible.mesh_normal) > 0.5)
     angle_deg = float(np.median(frames.angle_deg(view.normal, visible.mesh_normal)[both])) if both.any() else 90.0
     if view.s0 is None or not len(visible.texel):
@@ -54,7 +55,7 @@ def _agreement(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: Atl
 def render(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: AtlasMaps) -> Floats:
     """S0 (M, 3) of the texels that a view sees, under its light; 1 on a white plane at the object's distance."""
     rotation, translation = view.pose.rotation, view.pose.translation
-    point = atlas.position[visible.texel] @ rotation.T + translation
+    point = view.pose.to_camera(atlas.position[visible.texel])
     to_lens = frames.unit(-point)
     normal, diffuse, specular, roughness = (
         part[atlas.covered][visible.texel].astype(np.float64)

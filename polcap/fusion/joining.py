@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from polcap.errors import CaptureError
+from polcap.formats.capture.folder_names import set_of_view
 from polcap.fusion.normal_surface import visible
 from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.small_views import reduce_views, sample
@@ -87,7 +88,7 @@ class Motion:
 class JoinedSet:
     """Motion of a further set of views onto the first one."""
 
-    folder: str
+    folder: str  # of the set
     motion: Motion
     shared: float  # share of the set's surface that the first one confirms
 
@@ -97,7 +98,7 @@ def join(views: tuple[FusionView, ...]) -> tuple[JoinedSet, ...]:
     """Find the motions of all further sets of views, each in a folder of its own, onto the first one."""
     sets: dict[str, list[FusionView]] = {}
     for view in views:
-        sets.setdefault(view.folder, []).append(view)
+        sets.setdefault(set_of_view(view.name), []).append(view)
     first, *others = sets
     if not others:
         return ()
@@ -121,9 +122,8 @@ def require_shared(joined: Sequence[JoinedSet], least: float) -> None:
 def place(views: tuple[FusionView, ...], joined: tuple[JoinedSet, ...]) -> tuple[FusionView, ...]:
     """The views of all sets in the frame of the first set's board."""
     motions = {one.folder: one.motion for one in joined}
-    return tuple(
-        replace(view, pose=motions[view.folder].pose(view.pose)) if view.folder in motions else view for view in views
-    )
+    moved = ((view, motions.get(set_of_view(view.name))) for view in views)
+    return tuple(view if motion is None else replace(view, pose=motion.pose(view.pose)) for view, motion in moved)
 
 
 def observed_surface(views: Sequence[FusionView]) -> ObservedSurface:

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 
 from polcap.errors import CaptureError
+from polcap.formats.capture.folder_names import set_of_view
 from polcap.fusion.poses import LEAST_VIEWS
 from polcap.fusion.silhouettes import Silhouette, grid_around, halve
 from polcap.images import Bools, Floats
@@ -56,8 +57,8 @@ def agree(views: tuple[Silhouette, ...]) -> AgreedMasks:
     the masks have too little in common.
     """
     used, left_out = list[Silhouette](), dict[str, str]()
-    for folder in dict.fromkeys(view.folder for view in views):
-        agreed, contradicting = compare_set([view for view in views if view.folder == folder])
+    for folder in dict.fromkeys(set_of_view(view.name) for view in views):
+        agreed, contradicting = compare_set([view for view in views if set_of_view(view.name) == folder])
         used, left_out = used + agreed, left_out | contradicting
     masks = tuple(regions.nth_part(view.mask, 1) for view in used)
     return AgreedMasks(tuple(view.name for view in used), masks, left_out)

@@ -111,7 +111,7 @@ def _samples(
     for view, one in zip(views, visible):
         assert view.s0 is not None
         steep = np.flatnonzero(one.cosine > _LEAST_COSINE)
-        point = atlas.position[one.texel[steep]] @ view.pose.rotation.T + view.pose.translation
+        point = view.pose.to_camera(atlas.position[one.texel[steep]])
         to_lens = frames.unit(-point)
         local = frames.to_ray_frame(normal[one.texel[steep]] @ view.pose.rotation.T, to_lens)
         far = float(np.linalg.norm(view.pose.rotation @ middle + view.pose.translation))

@@ -69,7 +69,7 @@ class SessionCamera:
 
     def project(self, pose: Pose, world: Floats) -> Floats:
         """Visible RAW pixels (N, 2) of the photograph that show world points (N, 3) [m]."""
-        x, y = projection.project(self.view, world @ pose.rotation.T + pose.translation).T
+        x, y = projection.project(self.view, pose.to_camera(world)).T
         return np.stack(distortion.distort(self.lens, x, y), axis=-1)
 
 
@@ -120,29 +120,18 @@ def solve(boards: Mapping[str, BoardCorners], capture: Capture) -> SessionPoses:
                 f"{len(names)} views can be posed, {LEAST_VIEWS} are needed; show the board in more views"
                 + (f" ({reasons})" if reasons else "")
             )
-        solved = _adjust({name: boards[name] for name in names}, capture)
-        worst = max(range(len(names)), key=lambda k: solved.residual[k])
-        if solved.residual[worst] <= _MOST_RESIDUAL:
-            break
-        name = names.pop(worst)
-        left_out[name] = (
-            f"its corners are {solved.residual[worst]:.1f} px (rms) from those of the board, the limit is "
+        camera, posed = _adjust({name: boards[name] for name in names}, capture)
+        worst = max(posed, key=lambda view: view.residual_px)
+        if worst.residual_px <= _MOST_RESIDUAL:
+            return SessionPoses(camera, tuple(posed), left_out, board=boards[names[0]].board)
+        names.remove(worst.name)
+        left_out[worst.name] = (
+            f"its corners are {worst.residual_px:.1f} px (rms) from those of the board, the limit is "
             f"{_MOST_RESIDUAL:g} px; keep the board flat, focus and zoom unchanged"
         )
-    return SessionPoses(solved.camera, tuple(solved.posed), left_out, board=boards[names[0]].board)
 
 
-@dataclass(frozen=True)
-class _Adjusted:
-    camera: SessionCamera
-    posed: list[PosedView]
-
-    @property
-    def residual(self) -> list[float]:
-        return [one.residual_px for one in self.posed]
-
-
-def _adjust(seen: Mapping[str, BoardCorners], capture: Capture) -> _Adjusted:
+def _adjust(seen: Mapping[str, BoardCorners], capture: Capture) -> tuple[SessionCamera, list[PosedView]]:
     """Bundle adjustment, twice: the second time without corners far from the first solution."""
     boards = list(seen.values())
     stated = View(capture.focal_px, capture.principal_px, 1.0)
@@ -171,6 +160,7 @@ def _place(k: int) -> slice:
 
 
 def _first_pose(corners: BoardCorners, view: View) -> Floats:
+    """Rotation vector and translation (6,) of a view, from its corners alone, for a camera without distortion."""
     flat = corners.world @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # into the plane z = 0, right-handed
     count, turns, shifts, errors = cv2.solvePnPGeneric(
         flat, corners.measured_px, view.intrinsic, None, flags=cv2.SOLVEPNP_IPPE
@@ -182,6 +172,7 @@ def _first_pose(corners: BoardCorners, view: View) -> Floats:
 
 
 def _camera(capture: Capture, unknown: Floats, sigma: float = 0.0) -> SessionCamera:
+    """The camera of the first unknowns; `sigma` is the relative 1σ of its focal length."""
     x, y = capture.principal_px
     focal = capture.focal_px * float(np.exp(unknown[0]))
     return SessionCamera(
@@ -199,6 +190,7 @@ def _residual(corners: BoardCorners, camera: SessionCamera, unknown: Floats) -> 
 
 
 def _minimize(boards: Sequence[BoardCorners], capture: Capture, start: Floats) -> OptimizeResult:
+    """Least squares of all unknowns from `start`, with weak priors of the camera's."""
     width = capture.size_px[0]
     doubt = max(abs(capture.focal_doubt[0]), abs(capture.focal_doubt[1]), 0.05 if capture.focal_known else 0.5)
     weak = np.array([doubt, *[_PRINCIPAL_SIGMA * width] * 2, *_BEND_SIGMA])
@@ -228,7 +220,9 @@ def _minimize(boards: Sequence[BoardCorners], capture: Capture, start: Floats) -
     )
 
 
-def _with_errors(boards: Mapping[str, BoardCorners], capture: Capture, found: OptimizeResult) -> _Adjusted:
+def _with_errors(
+    boards: Mapping[str, BoardCorners], capture: Capture, found: OptimizeResult
+) -> tuple[SessionCamera, list[PosedView]]:
     """Camera and poses with their errors, from the curvature at the solution and the actual residuals."""
     camera = _camera(capture, found.x)
     error = [_residual(one, camera, found.x[_place(k)]) for k, one in enumerate(boards.values())]
@@ -245,4 +239,4 @@ def _with_errors(boards: Mapping[str, BoardCorners], capture: Capture, found: Op
         )
         for k, ((name, one), e) in enumerate(zip(boards.items(), error, strict=True))
     ]
-    return _Adjusted(_camera(capture, found.x, float(sigma[0])), posed)
+    return _camera(capture, found.x, float(sigma[0])), posed

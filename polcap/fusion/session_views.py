@@ -54,7 +54,7 @@ class Session:
     @property
     def folders(self) -> list[str]:
         """Folders of the sets of views, such as setA; one empty name if there are no sets."""
-        return list(dict.fromkeys(name.rpartition("/")[0] for name in sorted([*self.views, *self.left_out])))
+        return list(dict.fromkeys(map(folder_names.set_of_view, sorted([*self.views, *self.left_out]))))
 
     @property
     def capture(self) -> Capture:
@@ -69,7 +69,7 @@ class Session:
         used = {name: view for name, view in self.views.items() if name not in reasons}
         left = Session(used, {**self.left_out, **reasons})
         for folder in left.folders:
-            count = sum(name.rpartition("/")[0] == folder for name in used)
+            count = sum(folder_names.set_of_view(name) == folder for name in used)
             if count < LEAST_VIEWS:
                 listed = "; ".join(f"{name}: {reason}" for name, reason in left.left_out.items())
                 raise CaptureError(

@@ -29,11 +29,6 @@ class Silhouette:
     pose: Pose
 
     @property
-    def folder(self) -> str:
-        """Folder of the view's set, such as setA; empty for views without one."""
-        return self.name.rpartition("/")[0]
-
-    @property
     def distance(self) -> float:
         """Distance of the board's middle along the optical axis [m]."""
         return float(-self.pose.translation[2])

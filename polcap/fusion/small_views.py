@@ -47,7 +47,7 @@ class SmallView:
 
     def pixels(self, point: Floats) -> Floats:
         """Pixels x, y (N, 2) of world points (N, 3)."""
-        return project(self.view, point @ self.pose.rotation.T + self.pose.translation)
+        return project(self.view, self.pose.to_camera(point))
 
     def towards(self, point: Floats) -> Floats:
         """Unit vectors (N, 3) from world points (N, 3) to the lens."""

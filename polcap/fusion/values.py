@@ -26,6 +26,10 @@ class Pose:
         """Position (3,) of the lens in the world, m."""
         return -self.rotation.T @ self.translation
 
+    def to_camera(self, point: Floats) -> Floats:
+        """World points (N, 3) in the camera frame, m."""
+        return point @ self.rotation.T + self.translation
+
 
 @dataclass(frozen=True)
 class FusionView:
@@ -44,11 +48,6 @@ class FusionView:
     s0: Floats | None = None  # (H, W, 3) white-balanced radiance under the flash; for highlights and residuals
     white_distance: float | None = None  # where a white plane has S0 = 1, over the object's distance; None: unknown
     metric: bool = True  # the pose is in metres; else its unit is the distance of the lens
-
-    @property
-    def folder(self) -> str:
-        """Folder of the view's set, such as setA; empty for views without one."""
-        return self.name.rpartition("/")[0]
 
 
 @dataclass(frozen=True)

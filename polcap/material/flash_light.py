@@ -99,8 +99,9 @@ def paper(view: PosedStokes, board: Board) -> PaperSamples:
     good = ((view.stokes.quality[row, column] & ~_USABLE) == 0) & (stokes[0].min(axis=-1) > 0)
     stokes, world = stokes[:, good], world[inside][good]
     radiance = gray(view.matrix) @ stokes[0].T
-    point = world @ view.pose.rotation.T + view.pose.translation
-    return PaperSamples(point, view.pose.rotation[:, 1], radiance, np.moveaxis(stokes[1:] / stokes[0], 0, 1))
+    return PaperSamples(
+        view.pose.to_camera(world), view.pose.rotation[:, 1], radiance, np.moveaxis(stokes[1:] / stokes[0], 0, 1)
+    )
 
 
 def gray(matrix: Floats) -> Floats:

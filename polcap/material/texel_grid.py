@@ -72,7 +72,7 @@ def geometry(point: Floats, poses: Sequence[Pose], light: FlashLight) -> TexelVi
     """Directions and irradiance at world points (N, 3) [m] in all views."""
     rays, lights, levels = [], [], []
     for pose, gain in zip(poses, light.gain, strict=True):
-        seen = point @ pose.rotation.T + pose.translation
+        seen = pose.to_camera(point)
         v = frames.unit(-seen)
         across, up = frames.basis(v)
         axes = np.stack([across, up, v], axis=-2)  # (N, 3, 3) in the camera frame

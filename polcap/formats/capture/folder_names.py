@@ -81,6 +81,11 @@ def session_views(folder: Path) -> list[str]:
     return sorted((path.relative_to(folder).as_posix() for path in found), key=natural)
 
 
+def set_of_view(name: str) -> str:
+    """Name of the set of a view: setA for setA/view01, "" for view01."""
+    return name.rpartition("/")[0]
+
+
 def missing_views(names: Iterable[str]) -> list[str]:
     """Views that the numbers of a session's views skip: of view01, setA/view02, setA/view04 these are setA/view03.
 
