@@ -47,6 +47,11 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     asset: AssetSettings = AssetSettings()
     gates: GateLimits = GateLimits()
 
+    @property
+    def of_views(self) -> "Config":
+        """The settings of each view, without the sections of several views together."""
+        return msgspec.convert(self, Config, from_attributes=True)
+
 
 class Setting(NamedTuple):
     """One row of the settings reference: key, type, default, limits and meaning."""

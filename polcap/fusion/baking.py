@@ -75,6 +75,11 @@ class AtlasMaps:
         """Texels (S, S) that a view saw."""
         return np.asarray(self.weight > _SEEN)
 
+    def texels(self, covered: Bools) -> Floats:
+        """Values (N, 11) of the covered texels, as `on_atlas` takes them."""
+        parts = (self.normal, self.diffuse, self.specular, self.roughness, self.weight)
+        return np.concatenate([part[covered].reshape(np.count_nonzero(covered), -1) for part in parts], axis=-1)
+
 
 @dataclass(frozen=True)
 class VisibleTexels:

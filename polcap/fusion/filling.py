@@ -4,7 +4,6 @@ Values at the vertices solve (W + λ L) x = W b: W is the weight of the views, b
 mesh. Far from seen surface x is harmonic, without steps.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,14 +34,12 @@ def fill(maps: AtlasMaps, atlas: Atlas) -> AtlasMaps:
     spread: Any = sparse.csr_matrix(
         (shares.ravel(), (rows, place[points.corners].ravel())), (len(shares), place.max() + 1)
     )
-    weight = maps.weight[atlas.covered].astype(np.float64)
-    parts = [part[atlas.covered].reshape(len(weight), -1) for part in (maps.diffuse, maps.specular, maps.roughness)]
-    values = np.concatenate(parts, axis=-1)
-    smooth = spread @ _harmonic(atlas, place, spread, weight, values)
+    values = maps.texels(atlas.covered)
+    material, weight = values[:, 3:10].copy(), values[:, 10].astype(np.float64)
+    smooth = spread @ _harmonic(atlas, place, spread, weight, material)
     share = np.clip(weight / _FADE, 0, 1)[:, None]
-    mixed = share * values + (1 - share) * smooth
-    filled = on_atlas(atlas, np.concatenate([maps.normal[atlas.covered], mixed, weight[:, None]], axis=-1))
-    return replace(filled, albedo_sigma=maps.albedo_sigma)
+    values[:, 3:10] = share * material + (1 - share) * smooth
+    return on_atlas(atlas, values)
 
 
 def _harmonic(atlas: Atlas, place: NDArray[np.intp], spread: Any, weight: Floats, values: Floats) -> Floats:

@@ -1,7 +1,7 @@
 """Fuses a session: processes its views, runs the path, writes maps, asset, animation, report and verdict."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from polcap.fusion import fused_maps, fused_page, object_pictures, session_views
 from polcap.fusion import session as sessions
 from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.closed_mesh import is_closed
+from polcap.fusion.comparison import ViewAgreement
 from polcap.fusion.each_view import Notify
 from polcap.fusion.fusion_path import FusionResults, SessionConfig, path
 from polcap.fusion.session import ProcessedSession
@@ -72,10 +73,10 @@ def _document(
 ) -> dict[str, Any]:
     """The content of report.json: facts, figures by view, gates; `seconds` are those of the stages."""
     reports = processed.reports
-    rows = _rows(processed, results)
-    judged = advise(list(_gates(processed, results, rows, config.fusion.gates)))
+    figures = _figures(processed, results)
+    judged = advise(list(_gates(processed, results, figures, config.fusion.gates)))
     others = {
-        "figures": _figures(processed, results, rows),
+        "figures": figures,
         "timings": dict(seconds),
         "model": next(iter(reports.values()))["model"],
         "keys": {**results.keys, **{f"{view} infer": one["keys"]["infer"] for view, one in reports.items()}},
@@ -84,23 +85,18 @@ def _document(
     return report.session_document(name, {view: one["capture"] for view, one in reports.items()}, judged, others)
 
 
-def _rows(processed: ProcessedSession, results: FusionResults) -> list[dict[str, Any]]:
-    """Figures of each view."""
-    rows = []
-    for one in results.comparison.views:
-        posed = processed.poses.views[one.name]
-        rows.append(
-            {
-                "name": one.name,
-                "corners": posed.corners,
-                "reprojection_px": posed.residual_px,
-                "pose_sigma_deg": posed.sigma_deg,
-                "normal_deg": one.normal_deg,
-                "residual": one.residual,
-                "verdict": _verdict(processed.reports[one.name]),
-            }
-        )
-    return rows
+def _view_figures(processed: ProcessedSession, compared: ViewAgreement) -> dict[str, Any]:
+    """Figures of one view: its pose, and its agreement with the fused object."""
+    posed = processed.poses.views[compared.name]
+    return {
+        "name": compared.name,
+        "corners": posed.corners,
+        "reprojection_px": posed.residual_px,
+        "pose_sigma_deg": posed.sigma_deg,
+        "normal_deg": compared.normal_deg,
+        "residual": compared.residual,
+        "verdict": _verdict(processed.reports[compared.name]),
+    }
 
 
 def _verdict(about: Mapping[str, Any]) -> str:
@@ -110,17 +106,18 @@ def _verdict(about: Mapping[str, Any]) -> str:
 
 
 def _gates(
-    processed: ProcessedSession, results: FusionResults, rows: Sequence[Mapping[str, Any]], limits: FusedGateLimits
+    processed: ProcessedSession, results: FusionResults, figures: Mapping[str, Any], limits: FusedGateLimits
 ) -> Iterator[Gate]:
     """All gates of a fused object."""
+    views = figures["views"]
     yield fused_object.views(list(processed.reports), processed.left_out, limits)
     by_board = processed.poses.board is not None
-    yield fused_object.poses({row["name"]: row["reprojection_px"] for row in rows}, by_board, limits)
-    yield fused_object.agreement({row["name"]: row["normal_deg"] for row in rows}, limits)
+    yield fused_object.poses({name: view["reprojection_px"] for name, view in views.items()}, by_board, limits)
+    yield fused_object.agreement({name: view["normal_deg"] for name, view in views.items()}, limits)
     for one in results.joined:
         yield fused_object.join(one.folder, one.shared, limits)
     yield fused_object.seen(_seen(results), len(processed.reports), limits)
-    yield fused_object.closed(_closed(results))
+    yield fused_object.closed(figures["mesh"]["closed"])
 
 
 def _seen(results: FusionResults) -> SeenSurface:
@@ -128,15 +125,10 @@ def _seen(results: FusionResults) -> SeenSurface:
     return SeenSurface.measure(results.maps.seen[results.atlas.covered], results.atlas.normal[:, 1])
 
 
-def _closed(results: FusionResults) -> bool:
-    """Whether every edge of the mesh, as it is written, belongs to two triangles."""
-    return is_closed(fused_maps.weld(results.atlas.mesh))
-
-
-def _figures(processed: ProcessedSession, results: FusionResults, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _figures(processed: ProcessedSession, results: FusionResults) -> dict[str, Any]:
     """Figures of the views, the sets of views, the camera and the mesh."""
     return {
-        "views": {row["name"]: row for row in rows},
+        "views": {one.name: _view_figures(processed, one) for one in results.comparison.views},
         "left_out": dict(processed.left_out),
         "sets": {one.folder: one.shared for one in results.joined},
         "camera": asdict(processed.poses.camera),
@@ -146,7 +138,7 @@ def _figures(processed: ProcessedSession, results: FusionResults, rows: Sequence
             "texture_px": results.maps.mask.shape[0],
             "texels_per_mm": 0.001 / results.atlas.texel if processed.poses.metric else None,
             "extent": np.ptp(results.mesh.vertices, axis=0).tolist(),
-            "closed": _closed(results),
+            "closed": is_closed(fused_maps.weld(results.atlas.mesh)),  # as it is written
             "seen": _seen(results).seen,
         },
     }

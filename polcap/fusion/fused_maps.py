@@ -163,15 +163,14 @@ def transfer(source: Atlas, maps: AtlasMaps, target: Atlas) -> AtlasMaps:
     distance, nearest = cKDTree(source.position).query(target.position, k=_NEIGHBORS)
     share: Floats = 1 / (np.asarray(distance) + 0.1 * source.texel)
     share /= share.sum(axis=1, keepdims=True)
-    parts = (maps.normal, maps.diffuse, maps.specular, maps.roughness, maps.weight)
-    values = np.concatenate([part[source.covered].reshape(len(source.position), -1) for part in parts], axis=-1)
-    mixed = np.einsum("nk,nkc->nc", share, values[nearest])
+    mixed = np.einsum("nk,nkc->nc", share, maps.texels(source.covered)[nearest])
     return replace(on_atlas(target, mixed), albedo_sigma=maps.albedo_sigma)
 
 
 def _asset(
     atlas: Atlas, maps: AtlasMaps, settings: AssetSettings, bits: Literal[8, 16], extras: tuple[Extra, ...]
 ) -> Asset:
+    """The glTF asset of an atlas, with the extra textures that a closed mesh has."""
     built = asset.build(maps, atlas.mesh, settings, bits)
     top, kind = np.iinfo(built.normal.dtype).max, built.normal.dtype
     if "object-normal" in extras:

@@ -46,11 +46,6 @@ class SessionConfig(Config, frozen=True, forbid_unknown_fields=True):
 
     fusion: FusionSettings = FusionSettings()
 
-    @property
-    def of_views(self) -> Config:
-        """The settings of the views."""
-        return msgspec.convert(self, Config, from_attributes=True)
-
     def check(self) -> None:
         """Refuse settings that would not change a fused object.
 

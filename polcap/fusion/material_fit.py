@@ -24,7 +24,7 @@ materials, lobes from few views); Walter et al. 2007 (GGX).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import msgspec
@@ -233,4 +233,4 @@ def _blend(atlas: Atlas, maps: AtlasMaps, share: Floats, lobes: Sequence[Lobe | 
     f0, rough, gain = (share @ each).T[..., None]
     specular *= f0 / np.maximum(color.luminance(specular), 1e-6)[:, None]
     values = [maps.normal[atlas.covered], gain * maps.diffuse[atlas.covered], specular, rough, seen[:, None]]
-    return replace(on_atlas(atlas, np.concatenate(values, axis=-1)), albedo_sigma=maps.albedo_sigma)
+    return on_atlas(atlas, np.concatenate(values, axis=-1))

@@ -26,7 +26,7 @@ from polcap.fusion.silhouettes import Silhouette
 from polcap.fusion.values import FusionView, ViewMask
 from polcap.fusion.view_path import SessionView
 from polcap.pipeline import run
-from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult
+from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult, together
 from polcap.pipeline.manifest import digest
 from polcap.results import ResultsUntilInfer
 
@@ -53,9 +53,8 @@ def process(
         session, solved, masks = _find_poses_and_masks(session, cache, run_step)
         session = _with_agreed_masks(session, masks, solved, cache)
         session, reports = run_step("maps", view_path.make_maps, session)
-    views = tuple(_fusion_view(view, solved, reports[name], cache) for name, view in session.views.items())
-    together = DeferredResult(digest([view.key for view in views]), lambda: tuple(view.value for view in views))
-    return ProcessedSession(together, solved, reports, session.left_out)
+    views = [_fusion_view(view, solved, reports[name], cache) for name, view in session.views.items()]
+    return ProcessedSession(together(views), solved, reports, session.left_out)
 
 
 def with_colors(session: Session, notify: Notify) -> Session:

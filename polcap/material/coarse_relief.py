@@ -34,7 +34,7 @@ _SLOPE_ERROR = 0.03  # 1σ of the coarse slopes
 # Parallax errs by 0.08 texels over long ranges, slopes by 0.001; slopes are better up to 500 texels = 2π · 80
 CROSSOVER = 80.0  # texels
 _MOST_STEP = 1.5  # coarse texels of height, in a round
-_FIRST = TexelPrior(np.array([[0.45, 0.042]], np.float32), np.array([[0.2, 0.012]], np.float32))
+_GLOSS, _GLOSS_SIGMA = (0.45, 0.042), (0.2, 0.012)  # roughness and F0 of common surfaces
 
 
 @dataclass(frozen=True, repr=False)
@@ -125,8 +125,7 @@ def _fit(
     """Fits of all coarse texels with a wide prior of their gloss."""
     data = measurements(seen, views)
     geometry = texel_grid.geometry(grid.points(height).reshape(-1, 3), [view.pose for view in views], light)
-    count = data.radiance.shape[1]
-    prior = TexelPrior(np.repeat(_FIRST.mean, count, axis=0), np.repeat(_FIRST.sigma, count, axis=0))
+    prior = TexelPrior.alike(_GLOSS, _GLOSS_SIGMA, data.radiance.shape[1])
     first = start(data, geometry, prior, body.SMOOTH)
     return fit(data, geometry, prior, first, body.SMOOTH, FitSettings())
 

@@ -65,11 +65,13 @@ class GlossGroups(ArrayValue):
         return self._mix(albedo, self.sigma)
 
     def _mix(self, albedo: Floats, value: Floats) -> Floats:
+        """Means (N, ·) of the groups' values (G, ·), by the share of each albedo (N, 3) in each group."""
         share = clusters.soft_share(_encoded(albedo), self.center, self.spread)
         return np.asarray(share @ value, np.float32)
 
 
 def _encoded(albedo: Floats) -> Floats:
+    """Albedo (N, 3), sRGB-encoded, in which groups are formed."""
     return np.asarray(color.encode_srgb(np.clip(albedo, 0, 1)), np.float32)
 
 
@@ -99,7 +101,7 @@ def find(
     point = grid.points(relief.height)[at].reshape(-1, 3)[known]
     geometry = texel_grid.geometry(point, [view.pose for view in views], light)
     data = data.take(known)
-    first = TexelPrior(*(np.repeat(np.array([a], np.float32), len(known), axis=0) for a in ((0.45, _F0), (0.2, 0.01))))
+    first = TexelPrior.alike((0.45, _F0), (0.2, 0.01), len(known))
     begin = texel_fit.start(data, geometry, first, body.SMOOTH)
     albedo = texel_fit.fit(data, geometry, first, begin, body.SMOOTH, settings.fitting, rounds=4).value[:, 4:]
     return group(data, geometry, albedo, settings)
@@ -164,10 +166,10 @@ def _at(
     first: Floats | None = None,
 ) -> tuple[float, TexelEstimate]:
     """Mean cost of texels that all have one gloss (2,), with its prior, and their estimates."""  # fmt: skip
-    count = data.radiance.shape[1]
-    prior = TexelPrior(np.tile(gloss.astype(np.float32), (count, 1)), np.tile(_TIGHT, (count, 1)))
-    begin = texel_fit.start(data, views, prior, law)
-    if first is not None:
+    prior = TexelPrior.alike(gloss, _TIGHT, data.radiance.shape[1])
+    if first is None:
+        begin = texel_fit.start(data, views, prior, law)
+    else:
         begin = np.concatenate([first[:, :2], prior.mean, first[:, 4:]], axis=-1)
     estimate = texel_fit.fit(data, views, prior, begin, law, fitting, rounds=5)
     away = (gloss[1] - _F0) / _F0_SIGMA

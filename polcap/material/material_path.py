@@ -37,11 +37,6 @@ class MaterialConfig(Config, frozen=True, forbid_unknown_fields=True):
 
     material: SampleSettings = SampleSettings()
 
-    @property
-    def of_views(self) -> Config:
-        """The settings of the views."""
-        return msgspec.convert(self, Config, from_attributes=True)
-
 
 def all_settings() -> list[Setting]:
     """The settings of all commands: of single captures, of `polcap fuse` and of `polcap material`."""

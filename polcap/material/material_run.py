@@ -69,10 +69,10 @@ def _document(
     seconds: Mapping[str, float],
 ) -> dict[str, Any]:
     """The content of report.json: facts, figures by view, gates; `seconds` are those of the stages."""
-    rows = list(_rows(flat, results))
-    judged = advise(list(_gates(flat, results, rows, config)))
+    figures = _figures(flat, results)
+    judged = advise(list(_gates(flat, results, figures["views"], config)))
     others = {
-        "figures": _figures(flat, results, rows),
+        "figures": figures,
         "timings": dict(seconds),
         "model": None,
         "keys": results.keys,
@@ -82,46 +82,46 @@ def _document(
     return report.session_document(name, captures, judged, others)
 
 
-def _rows(flat: FlatSession, results: MaterialResults) -> Iterator[dict[str, Any]]:
-    """Figures of each view."""
-    gain = results.light.gain
-    for k, name in enumerate(flat.names):
-        posed = flat.poses.views[name]
-        yield {
-            "name": name,
-            "tilt_deg": flat.tilt_deg[name],
-            "blur_px": flat.blur_px[name],
-            "corners": posed.corners,
-            "reprojection_px": posed.residual_px,
-            "pose_sigma_deg": posed.sigma_deg,
-            "light": float(gain[k] / gain[0]),
-            "residual": float(results.fitted.residual[k]),
-            "misfit": float(results.fitted.misfit[k]),
-        }
+def _view_figures(flat: FlatSession, results: MaterialResults, k: int) -> dict[str, Any]:
+    """Figures of view k: its pose, its light over that of the first view, and its agreement with the fit."""
+    name, gain = flat.names[k], results.light.gain
+    posed = flat.poses.views[name]
+    return {
+        "name": name,
+        "tilt_deg": flat.tilt_deg[name],
+        "blur_px": flat.blur_px[name],
+        "corners": posed.corners,
+        "reprojection_px": posed.residual_px,
+        "pose_sigma_deg": posed.sigma_deg,
+        "light": float(gain[k] / gain[0]),
+        "residual": float(results.fitted.residual[k]),
+        "misfit": float(results.fitted.misfit[k]),
+    }
 
 
 def _gates(
-    flat: FlatSession, results: MaterialResults, rows: list[dict[str, Any]], config: MaterialConfig
+    flat: FlatSession, results: MaterialResults, views: Mapping[str, Any], config: MaterialConfig
 ) -> Iterator[Gate]:
     """All gates of a flat sample."""
     limits = config.material.gates
     yield flat_sample.views(flat.names, flat.left_out, limits)
     yield flat_sample.tilts(flat.tilt_deg, limits)
-    yield several_views.poses({row["name"]: row["reprojection_px"] for row in rows}, limits.max_corner_px, board=True)
+    residual_px = {name: view["reprojection_px"] for name, view in views.items()}
+    yield several_views.poses(residual_px, limits.max_corner_px, board=True)
     yield flat_sample.focus(flat.blur_px, limits)
     yield flat_sample.paper(results.light.shine, limits)
-    yield flat_sample.agreement({row["name"]: row["residual"] for row in rows}, limits)
+    yield flat_sample.agreement({name: view["residual"] for name, view in views.items()}, limits)
     yield flat_sample.seen(float(results.maps.seen.mean()), limits)
 
 
-def _figures(flat: FlatSession, results: MaterialResults, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def _figures(flat: FlatSession, results: MaterialResults) -> dict[str, Any]:
     """Figures of the views, the light, the materials and the maps."""
     maps, light, gloss = results.maps, results.light, results.gloss
     height, width = maps.seen.shape
     seen = maps.seen if maps.seen.any() else np.ones_like(maps.seen)
     doubts = ("normal_sigma", "diffuse_sigma", "specular_sigma", "roughness_sigma")
     return {
-        "views": {row["name"]: row for row in rows},
+        "views": {name: _view_figures(flat, results, k) for k, name in enumerate(flat.names)},
         "left_out": dict(flat.left_out),
         "camera": asdict(flat.poses.camera),
         "flash": {

@@ -24,8 +24,7 @@ from polcap.material.stokes_view import PosedStokes
 from polcap.material.texel_grid import TexelGrid
 from polcap.optics.board import RING, SQUARES, Board
 from polcap.pipeline import run
-from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult
-from polcap.pipeline.manifest import digest
+from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult, together
 from polcap.results import ResultsUntilStokes
 
 Region = tuple[float, float, float, float]  # m, left, lower, right, upper side, from the board's middle; y up the page
@@ -71,24 +70,20 @@ def process(
         masked = charted.with_inputs(lambda view: _with_mask(view, solved, board))
         masked, keys = run_step("Stokes parameters", stokes_view.solve, masked)
     every = {name: _posed(view, solved, keys[name], cache) for name, view in masked.views.items()}
-    sight = cache.run(board_focus.measure, _together(list(every.values())), board).value
+    sight = cache.run(board_focus.measure, together(list(every.values())), board).value
     masked = masked.without(board_focus.left_out(tuple(every), sight))
     posed = [every[name] for name in masked.views]
-    together = _together(posed)
     names = tuple(masked.views)
     tilts = {name: _tilt_deg(solved, name) for name in names}
     return FlatSession(
-        together, names, solved, _chart(masked, charted), board, texel_grid(solved, names, board, posed, region, texel),
+        together(posed), names, solved, _chart(masked, charted), board,
+        sample_grid(solved, names, board, posed, region, texel),
         masked.left_out, tilts, {name: blur for name, blur in zip(every, sight.blur, strict=True) if name in tilts},
     )  # fmt: skip
 
 
-def _together(posed: list[StageResult[PosedStokes]]) -> StageResult[tuple[PosedStokes, ...]]:
-    """Views as one input of a stage, read when they are needed."""
-    return DeferredResult(digest([one.key for one in posed]), lambda: tuple(one.value for one in posed))
-
-
 def _with_mask(view: SessionView, solved: SessionPoses, board: Board) -> SessionView:
+    """The view with the part of its picture that shows the board as the mask."""
     pose = solved.views[view.name].pose
     mask = stokes_view.board_mask(view.capture.size_px, solved.camera, pose, board)
     return replace(view, supplied=replace(view.supplied, mask=mask))
@@ -118,11 +113,12 @@ def _chart(found: Session, charted: Session) -> ChartInView | None:
 
 
 def _tilt_deg(solved: SessionPoses, name: str) -> float:
+    """Angle between the page's normal and the direction to the lens [degrees]."""
     towards = solved.views[name].pose.center
     return float(np.degrees(np.arccos(towards[1] / np.linalg.norm(towards))))
 
 
-def texel_grid(
+def sample_grid(
     solved: SessionPoses,
     names: tuple[str, ...],
     board: Board,

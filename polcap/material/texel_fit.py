@@ -64,6 +64,11 @@ class TexelPrior(ArrayValue):
     mean: Floats  # (N, 2)
     sigma: Floats  # (N, 2)
 
+    @classmethod
+    def alike(cls, mean: Floats | tuple[float, float], sigma: Floats | tuple[float, float], count: int) -> "TexelPrior":
+        """The same prior for `count` texels; mean and 1σ (2,)."""
+        return cls(*(np.tile(np.asarray(one, np.float32), (count, 1)) for one in (mean, sigma)))
+
     def take(self, index: Indices | slice) -> "TexelPrior":
         """The priors of some of the texels."""
         return TexelPrior(self.mean[index], self.sigma[index])

@@ -10,7 +10,7 @@ once, as long as the file's size and times stay the same.
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
@@ -61,6 +61,12 @@ class DeferredResult(StageResult[T]):
         """The result."""
         made: T = vars(self)["make"]()
         return made
+
+
+def together(results: Sequence[StageResult[T]]) -> StageResult[tuple[T, ...]]:
+    """Several results as one input of a stage; their values are made when it needs them."""
+    key = digest([one.key for one in results])
+    return DeferredResult(key, lambda: tuple(one.value for one in results))
 
 
 class MemoryCache:
