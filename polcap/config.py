@@ -166,6 +166,7 @@ def _check_plain(stated: dict[str, Any]) -> None:
 
 
 def _check_known(key: str, value: Any, known: dict[str, Setting]) -> None:
+    """Raise SettingError for an unknown key, with the most similar one."""
     if key in known or (value == {} and any(name.startswith(f"{key}.") for name in known)):
         return
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)

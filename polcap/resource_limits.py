@@ -68,6 +68,7 @@ def set_memory(gigabytes: float) -> None:
 
 
 def _resource(gigabytes: float) -> Any:
+    """The module `resource`. Raises SettingError: this system has none."""
     try:
         import resource
     except ImportError as error:

@@ -51,12 +51,14 @@ def find(root: Path, out: Path | None = None) -> list[Unit]:
 
 
 def _search(root: Path) -> list[Candidate]:
+    """Candidates below a root folder. Raises CaptureError: there is no such folder."""
     if not root.is_dir():
         raise CaptureError(f"{root}: no such folder; give the folder that holds the captures")
     return capture_search.search(root)
 
 
 def _units(root: Path, out: Path | None, found: Sequence[Candidate]) -> list[Unit]:
+    """The captures among the candidates, each once, sorted by name. Raises CaptureError: there is none."""
     folders = sorted((each.folder for each in found if not each.reason), key=Path.is_symlink, reverse=True)
     once = {os.path.realpath(folder): folder for folder in folders}  # a folder before links to it
     captures = [_unit(root, folder, out) for folder in once.values()]
@@ -90,6 +92,7 @@ def _without_capture(root: Path, found: Sequence[Candidate]) -> list[str]:
 
 
 def _unit(root: Path, folder: Path, out: Path | None) -> Unit:
+    """A capture of the batch: its name below the root, and its result folder."""
     name = folder.relative_to(root).as_posix() if folder != root else folder.resolve().name
     target = folder / own_folders.OUTPUT if out is None else out / name
     return Unit(name, str(folder), str(target), str((out or root) / FOLDER))
@@ -152,6 +155,7 @@ def _run(
 def _process(
     wanted: Sequence[Unit], request: Request, plan: BatchPlan, print_line: Callable[[str], None]
 ) -> Iterator[UnitRecord]:
+    """Process captures on a Dask cluster, or in processes of this machine; yields their records as they end."""
     if plan.scheduler is not None:
         from polcap.batch import cluster
 

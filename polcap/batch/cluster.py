@@ -65,6 +65,7 @@ def run(
 def _gather(
     client: Any, wanted: Sequence[Unit], request: Request, resources: dict[str, float] | None, retries: int
 ) -> Iterator[UnitRecord]:
+    """Submit all captures to the cluster; yields their records as they end, and retries after a death."""
     import distributed
 
     def submit(unit: Unit, attempt: int) -> Any:

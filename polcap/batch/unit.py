@@ -89,6 +89,7 @@ def run(unit: Unit, request: Request, attempt: int = 1) -> UnitRecord:
 
 
 def _run(unit: Unit, request: Request, record: UnitRecord, start: float) -> UnitRecord:
+    """Process a capture; returns its record, with the error if there was one."""
     try:
         write_record(unit, record)
         about = _process(unit, request)
@@ -111,6 +112,7 @@ def _run(unit: Unit, request: Request, record: UnitRecord, start: float) -> Unit
 
 
 def _process(unit: Unit, request: Request) -> dict[str, Any]:
+    """Process a capture, remember its request and write its thumbnail; returns the content of report.json."""
     asked = request.digest(Path(unit.capture), Path(unit.out))
     capture, supplied = request.open(Path(unit.capture))
     about = pipeline.process(capture, supplied, request.config, Path(unit.out))
@@ -177,6 +179,7 @@ def record_crash(unit: Unit, before: UnitRecord, message: str, attempt: int) -> 
 
 
 def _alive(pid: int) -> bool:
+    """Whether a process of this id runs on this machine."""
     if sys.platform == "win32":  # there signal 0 is Ctrl-C
         listed = subprocess.run(["tasklist", "/fi", f"PID eq {pid}", "/fo", "csv"], capture_output=True, text=True)
         return f'"{pid}"' in listed.stdout

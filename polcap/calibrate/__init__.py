@@ -107,6 +107,7 @@ def _polarizer_shots(folder: Path, axis_deg: float) -> list[polarizer_ring.Polar
 
 
 def _check_one_camera(photographs: list[Photograph]) -> None:
+    """Raise CaptureError if the photographs are of several cameras or lenses."""
     first = photographs[0]
     for other in photographs:
         for tag in ("make", "model", "lens"):

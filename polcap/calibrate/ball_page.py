@@ -51,6 +51,7 @@ def _tables(found: BallReport) -> list[tuple[str, list[tuple[str, ...]]]]:
 
 
 def _row(one: ErrorClass, form: str) -> tuple[str, ...]:
+    """Row of a table: limits of a class, number of pixels, errors; `form` formats the limits."""
     limits = f"{one.least:{form or 'g'}}–{one.most:{form or 'g'}}°"
     errors = (f"{error:.2f}°" for error in (one.mean_deg, one.median_deg, one.expected_deg))
     return (limits, str(one.pixels), *errors)

@@ -186,6 +186,7 @@ def _by_chart_mm(maps: ResultMaps, light: BallLight, inside: Bools) -> float | N
 
 
 def _polarizer(stokes: Floats, light: BallLight, maps: ResultMaps, applied_deg: float) -> PolarizerReading:
+    """Error of the ring's zero, and the contrast of the polarizer, from the AoLP of the ball."""
     ring = ball_light.read_ring(stokes, light.ball, maps.view, maps.mask)
     contrast = ring.contrast
     return PolarizerReading(

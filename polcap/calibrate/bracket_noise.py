@@ -109,6 +109,7 @@ def _pair(a: Signals, b: Signals) -> BracketTiles | None:
 
 
 def _line(iso: float, pairs: list[BracketTiles], sites: Floats, folder: Path) -> NoiseLine:
+    """Noise line of an ISO from all pairs of its frames. Raises CaptureError: they show too few tiles."""
     level, variance, edges = (
         np.concatenate([getattr(pair, name) for pair in pairs]) for name in ("level", "variance", "edges")
     )

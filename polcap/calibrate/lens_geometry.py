@@ -75,6 +75,7 @@ def measure(photographs: list[Photograph], squares: tuple[int, int]) -> LensGeom
 
 
 def _fit_lens(boards: list[BoardView], size: tuple[int, int], first: Photograph, folder: str) -> LensGeometry:
+    """Fit focal length, distortion and, if they determine it, principal point. Raises CaptureError: too uncertain."""
     pinhole = _bundle_adjustment(boards, size, _ALIKE | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2)[0]
     residual, camera, bend, sigma = _bundle_adjustment(boards, size, _ALIKE)
     free = float(np.hypot(sigma[2], sigma[3])) < _MOST_PRINCIPAL_SIGMA * size[0]

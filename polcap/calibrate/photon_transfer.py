@@ -80,6 +80,7 @@ def photosites(image: SensorImage, channels: int) -> Floats:
 
 
 def _line(iso: float, points: list[tuple[Floats, Floats, Floats]], where: Photograph) -> NoiseLine:
+    """Noise line of an ISO from all pairs of its frames. Raises CaptureError: all are of one brightness."""
     level, variance = (np.concatenate([point[i] for point in points]) for i in (0, 1))
     if len(level) < 4 or level.max() < _LEAST_RANGE * max(float(level.min()), 1e-3):
         raise CaptureError(

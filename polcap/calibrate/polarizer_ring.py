@@ -71,6 +71,7 @@ def measure(turned: list[PolarizerShot]) -> Polarizer:
 
 
 def _fit_axis(shots: list[PolarizerShot]) -> _MalusFit:
+    """Fit a Malus curve to the light of one axis. Raises CaptureError: exposures, angles or contrast do not suffice."""
     where = shots[0].photograph.path.parent.parent
     if len({shot.photograph.setting for shot in shots}) > 1:
         raise CaptureError(f"{where}: frames of unequal exposure; take all angles of the ring with one setting")

@@ -99,6 +99,7 @@ def _decoder() -> Finding:
 
 
 def _model(file: Path | None) -> Finding:
+    """Check that the network opens, and the smaller ones with it."""
     if file is None:
         remedy = "name one with --model; without one the analytic estimator is used"
         return Finding("model", "warning", "this polcap has no network", remedy)
@@ -130,6 +131,7 @@ def _providers(model: Path) -> Iterator[Finding]:
 
 
 def _disk(folder: Path) -> Finding:
+    """Check the free space of the disk."""
     free = shutil.disk_usage(folder).free / 1e9
     message = f"{free:.1f} GB free at {folder}"
     if free >= _ENOUGH_GB:
@@ -139,6 +141,7 @@ def _disk(folder: Path) -> Finding:
 
 
 def _ports(rig: Rig) -> Iterator[Finding]:
+    """Find serial ports and, if allowed, the rotators on them."""
     try:
         ports = rig.ports()
     except PolcapError as error:
@@ -166,6 +169,7 @@ def _ports(rig: Rig) -> Iterator[Finding]:
 
 
 def _cameras(rig: Rig) -> Iterator[Finding]:
+    """Find the cameras on cables."""
     try:
         cameras = rig.cameras()
     except PolcapError as error:

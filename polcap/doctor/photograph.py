@@ -44,6 +44,7 @@ def examine_file(path: Path) -> Iterator[Finding]:
 
 
 def _metadata(exif: Exif) -> Iterator[Finding]:
+    """Check camera, exposure and focal length in the EXIF of a photograph."""
     if exif.camera:
         message = f"{exif.camera}, {exif.lens or 'lens not stated'}, taken {exif.taken or 'at no stated time'}"
         yield Finding("camera", "ok", message)
@@ -65,6 +66,7 @@ def _metadata(exif: Exif) -> Iterator[Finding]:
 
 
 def _pixels(image: SensorImage, exif: Exif) -> Iterator[Finding]:
+    """Check mosaic, size and levels of a decoded photograph."""
     height, width = image.value.shape[:2]
     size = f"{width}×{height} px"
     if image.cfa is not None:

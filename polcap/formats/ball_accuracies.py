@@ -43,6 +43,7 @@ def _rig(*names: str) -> list[str]:
 
 
 def _read(path: Path) -> BallAccuracy:
+    """Read a stored measurement. Raises CaptureError: it is damaged, or impossible."""
     try:
         found = msgspec.convert(text_file.read_toml(path), BallAccuracy)
     except OSError as error:

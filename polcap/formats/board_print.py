@@ -94,6 +94,7 @@ def _pdf_file(objects: list[str]) -> bytes:
 
 
 def _page(board: Board) -> _Page:
+    """The page in mm: black boxes, lines of text, and the ruler."""
     width, height = (1000 * side for side in board.page_m)
     side = 1000 * board.side_m
     margin = (width - side) / 2

@@ -106,6 +106,7 @@ def _alike(*pairs: tuple[float | None, float | None]) -> bool:
 
 
 def _parts(found: Calibration) -> list[str]:
+    """The measured parts of a calibration in words, such as the lens with its focal length."""
     parts = []
     if found.noise:
         parts.append("noise at ISO " + ", ".join(f"{line.iso:g}" for line in found.noise))

@@ -89,6 +89,7 @@ def _csv(text: str) -> tuple[list[str], Rows]:
 
 
 def _table(columns: list[str], rows: Rows) -> tuple[list[str], Rows]:
+    """Columns in capitals, and rows. Raises ValueError: a row has another number of values."""
     odd = next((number for number, row in enumerate(rows, 1) if len(row) != len(columns)), None)
     if odd is not None:
         raise ValueError(f"row {odd} has {len(rows[odd - 1])} values for {len(columns)} columns; correct it")

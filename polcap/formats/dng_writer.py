@@ -148,6 +148,7 @@ def _ifd(entries: list[_Entry], offset: int) -> bytes:
 
 
 def _encode(kind: int, value: Any) -> tuple[int, bytes]:
+    """Number of values of a TIFF entry, and their bytes."""
     if kind == _ASCII:
         value = value.encode() + b"\0"
     if isinstance(value, bytes):

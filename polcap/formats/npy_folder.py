@@ -87,6 +87,7 @@ def decode(tree: Any, hint: Any, folder: Path) -> Any:
 
 
 def _scalar(tree: Any, hint: Any, folder: Path) -> Any:
+    """A number, text or Enum of a manifest, checked against its type. Raises StorageError."""
     if hint is float and isinstance(tree, str):
         _expect(tree in ("nan", "inf", "-inf"), tree, "a number", folder)
         return float(tree)

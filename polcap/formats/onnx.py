@@ -161,6 +161,7 @@ def providers(path: Path) -> dict[str, str]:
 
 
 def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
+    """Open a session of onnxruntime. Raises ModelError: it cannot run this model."""
     onnxruntime = _onnxruntime()
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4  # failures are raised instead

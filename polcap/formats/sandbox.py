@@ -169,6 +169,7 @@ class Sandbox:
         return head, arrays
 
     def _spawn(self) -> subprocess.Popen[bytes]:
+        """Start a new child process."""
         self.close()
         # OpenCV adds a folder of its package to `sys.path`; a child would import `typing` from there, not Python's.
         folders = [one for one in sys.path if not os.path.isfile(os.path.join(one, "__init__.py"))]
@@ -197,6 +198,7 @@ class Sandbox:
             self._log = None
 
     def _cause_of_death(self, code: int, limit_s: float, overdue: bool) -> str:
+        """Why the child died, with a remedy, from its exit code and its last line."""
         if overdue:
             return f"not decoded within {limit_s:g} s; the file is damaged or far too large"
         if code == -9:  # by the kernel or by a person
@@ -275,6 +277,7 @@ def _run(module: str, name: str, path: str, options: dict[str, Any], memory_gib:
 
 
 def _limit_memory(memory_gib: float) -> None:
+    """In the child: limit its memory, and write no core file."""
     if sys.platform == "win32":  # only the time limit holds there
         return
     import resource
@@ -291,6 +294,7 @@ def _send(pipe: IO[bytes], message: bytes) -> None:
 
 
 def _receive(pipe: IO[bytes], limit: int) -> bytes:
+    """Read a message: its length, then its bytes. Raises EOFError, ValueError: it is longer than `limit`."""
     (length,) = _LENGTH.unpack(_exactly(pipe, _LENGTH.size))
     if length > limit:
         raise ValueError(f"{length} bytes where {limit} are allowed")

@@ -81,6 +81,7 @@ def read_height(path: Path, side: int) -> Floats:
 
 
 def _picture(path: Path, side: int) -> Floats:
+    """A picture of a texture set, (side, side, 3) in 0…1. Raises DecodeError: it is missing."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None  # OpenCV would print a warning
     if image is None:
         raise DecodeError(f"{path} is missing or not a picture; a texture set has an albedo.jpg and a roughness.jpg")

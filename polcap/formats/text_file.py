@@ -93,6 +93,7 @@ def to_toml(tree: dict[str, Any]) -> str:
 
 
 def _plain(tree: Any) -> Any:
+    """Nested data as TOML takes them: no None, no arrays, floats of nine digits."""
     if isinstance(tree, dict):
         return {key: _plain(value) for key, value in tree.items() if value is not None}
     if hasattr(tree, "tolist"):

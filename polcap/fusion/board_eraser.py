@@ -77,6 +77,7 @@ def erase(
 
 
 def _project(radiance: AngleStack, posed: PosedBoard) -> _Print:
+    """Share of paper in each pixel of the merged picture, through the pose of the board."""
     board = posed.board
     height, width = radiance.value.shape[1:3]
     scale = radiance.view.scale

@@ -149,6 +149,7 @@ def _corner(array: Bools, axes: tuple[int, int], at: tuple[int, int]) -> Bools:
 
 
 def _largest_part(body: Bools) -> Bools:
+    """The largest connected part of a body."""
     label, count = ndimage.label(body)
     if count < 2:
         return body
@@ -171,6 +172,7 @@ def _without_false_loops(body: Bools) -> Bools:
 
 
 def _take_over(body: Bools, change: Bools, value: bool) -> Bools:
+    """Set the parts of `change` to `value` that raise the Euler number and leave one body without enclosed holes."""
     label, _ = ndimage.label(change, np.ones((3, 3, 3)))
     largest = np.inf if value else _LARGEST_CUT * np.count_nonzero(body)
     for number, box in enumerate(ndimage.find_objects(label), 1):

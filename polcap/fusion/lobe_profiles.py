@@ -67,6 +67,7 @@ class LobeSamples:
         return self._shaded(to_light, 0.0, 1.0, np.sqrt(alpha))
 
     def _shaded(self, to_light: Floats, diffuse: float, specular: float, roughness: float) -> Floats:
+        """S0 (P,) of a gray material under unit light."""
         one = np.ones(len(to_light))
         material = diffuse * one[:, None], specular * one[:, None], roughness * one, _INDEX * one
         return np.asarray(shade.stokes(self.normal, *material, to_light, one)[0][:, 0])

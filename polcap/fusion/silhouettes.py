@@ -77,6 +77,7 @@ def grid_around(views: Sequence[Silhouette]) -> tuple[Floats, float]:
 
 
 def _grid(low: Floats, high: Floats, count: int) -> tuple[Floats, float]:
+    """Points (P, 3) of a box, `count` steps along its longest side, and the step."""
     step = float((high - low).max() / count)
     axes = [np.arange(first, last + step, step) for first, last in zip(low, high, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), step

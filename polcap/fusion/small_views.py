@@ -72,6 +72,7 @@ def reduce_views(views: Sequence[FusionView]) -> list[SmallView]:
 
 
 def _reduce(of: FusionView) -> SmallView:
+    """Crop one view to its object and reduce it to SIDE px."""
     rows, columns = (np.flatnonzero(of.mask.any(axis=axis)) for axis in (1, 0))
     step = max(1.0, max(np.ptp(rows) + 1, np.ptp(columns) + 1) / SIDE)
     margin = int(np.ceil(_MARGIN * step))

@@ -82,6 +82,7 @@ def variance_gain(cfa: Bits) -> Floats:
 
 @lru_cache(maxsize=8)
 def _variance_gain(colors: tuple[int, ...]) -> Floats:
+    """As `variance_gain`, from the demosaiced response to an impulse at each photosite."""
     cfa = np.array(colors, np.uint8).reshape(2, 2)
     size, middle = 16, 8
     gain = np.zeros((2, 2, 3, 3), np.float32)

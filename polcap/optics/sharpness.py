@@ -152,6 +152,7 @@ def _energy(tiles: Floats, way: tuple[int, int], lag: int) -> Floats:
 
 
 def _blurred(tiles: Floats, sigma: float) -> Floats:
+    """Tiles blurred by a Gaussian of 1σ = `sigma` px."""
     if not sigma:
         return tiles
     return np.stack([cv2.GaussianBlur(tile, (0, 0), sigma, borderType=cv2.BORDER_REFLECT) for tile in tiles])

@@ -395,18 +395,21 @@ def _write_named(make: Callable[..., str | bytes], file: Path, content: Asset, *
 
 
 def _write_usdz(file: Path, content: Asset, facts: Mapping[str, str], encoder: TextureEncoder) -> list[Path]:
+    """Write a USDZ with PNG textures; returns the file."""
     textures = {key: encoder(make(content), "png") for key, make in texture_set.LOOSE.items()}
     usd.package(file, content, file.stem, textures, facts)
     return [file]
 
 
 def _write_iiif(folder: Path, content: Asset, facts: Mapping[str, str], address: str) -> list[Path]:
+    """Write the tiles of a relightable layer and their page; returns the files."""
     page = folder / "index.html"
     openlime_page.write(page, facts.get("title") or facts["name"], facts.get("rights", ""))
     return [page, *iiif.write(folder, relightable_layer.pictures(content), facts, address)]
 
 
 def _write_texture(file: Path, texture: Texture, encoder: TextureEncoder, entry: Mapping[str, str]) -> list[Path]:
+    """Write a texture as EXR or PNG, with facts for catalogs; returns the file."""
     if file.suffix == ".exr":
         texture_set.write_exr(file, texture)
     else:

@@ -130,6 +130,7 @@ def _notes(found: Changes) -> list[str]:
 
 
 def _table(found: Changes) -> list[tuple[str, ...]]:
+    """Rows of the table of differences: median, 99 % quantile, doubt, changed share."""
     rows = []
     for name, one in found.differences.items():
         title, unit = _NAMES[name]

@@ -67,6 +67,7 @@ def rerendering(results: Results, ior: float) -> dict[str, Any]:
 
 
 def _colors(color: ColorCalibration, albedo_sigma: float | None) -> dict[str, Any]:
+    """Figures of the color calibration and of the chart's patches."""
     fit, light = color.patches, color.light
     delta_e, predicted = (None, None) if fit is None else (fit.delta_e, fit.predicted)
     return {
@@ -99,6 +100,7 @@ def _surroundings(fit: PatchColors | None) -> str | None:
 
 
 def _object(results: Results) -> dict[str, Any]:
+    """Figures of the mask, and the shares of flagged pixels."""
     image, maps, found = results.stokes, results.maps, results.object_
     inside = image.quality[image.mask]
     flagged = {flag: float(((inside & int(flag)) > 0).mean()) if inside.size else 0.0 for flag in _FLAGS}

@@ -132,6 +132,7 @@ def number(value: float, digits: int = 4) -> str:
 
 
 def _value_text(value: Any, factor: float) -> str:
+    """A value of report.json as text, times the factor of its unit."""
     if value is None:
         return "not measured"
     if isinstance(value, bool):

@@ -226,6 +226,7 @@ def polarization(dolp: Floats, aolp: Floats, inside: Bools) -> list[Tile]:
 
 
 def _maps(found: SurfaceMaps) -> list[Tile]:
+    """Tiles of the picture of the stage `infer`."""
     inside = found.mask
     specular, rough = display(found.specular, keys.F0.high), keys.ROUGHNESS.picture(found.roughness, inside)
     error = keys.ERROR.picture(found.confidence, inside)

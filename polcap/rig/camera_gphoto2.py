@@ -94,6 +94,7 @@ class Gphoto2Camera:
                 self._ask("disconnect", self._camera.exit)
 
     def _shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
+        """Set exposure and flash, and take one photograph."""
         done = {field: self._set(field, getattr(exposure, field)) for field in _WIDGETS}
         if self._flash_off is not None and self._flash_on is not None:
             self._choose(_FLASH_MODE, self._flash_on if flash else self._flash_off)
@@ -102,6 +103,7 @@ class Gphoto2Camera:
         return CameraFile(data, name, Exposure(**done))
 
     def _connect(self) -> Any:
+        """Connect to the one camera that fits. Raises HardwareError: there is none; SettingError: there are several."""
         found = connected_cameras()
         fitting = [(name, port) for name, port in found if self._which.lower() in name.lower() or port == self._which]
         listed = ", ".join(f"{name} at {port}" for name, port in fitting or found) or "none"

@@ -125,6 +125,7 @@ class WatchFolderCamera:
                 self._collect_one(file)
 
     def _collect_one(self, file: Path) -> None:
+        """Read a file that has arrived, unless it is known or was refused."""
         try:
             data = file.read_bytes()
         except OSError:  # removed: it is the program's

@@ -169,6 +169,7 @@ class CaptureRecord:
         return round(sum(angles) / len(angles), 4) if angles else None
 
     def _toml(self) -> dict[str, Any]:
+        """Content of capture.toml: file, angle, role and flash energy of each accepted frame."""
         entries = []
         for frame in (self.content.frames[slot.name] for slot in self.slots if slot.name in self.content.frames):
             stated = self.stated_deg(frame)

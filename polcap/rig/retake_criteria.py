@@ -98,6 +98,7 @@ def is_blurred(sharpness: float, sharpest: float) -> bool:
 
 
 def _wrong_exposure(stated: Exif, wanted: Exposure) -> str | None:
+    """The first setting of the camera that differs from the wanted one, in words; None if all agree."""
     rows = (
         ("exposure time [s]", wanted.time_s, stated.exposure_time, 1.0),
         ("f-number", wanted.f_number, stated.f_number, 2.0),

@@ -106,6 +106,7 @@ class CaptureLoop:
     filter_on_flash: bool = False
 
     def run(self) -> None:
+        """Take all missing frames; a background check may ask for some again."""
         self.rotator.home()
         while True:
             self.check.collect(block=len(self.check.pending) >= MOST_PENDING)
@@ -123,6 +124,7 @@ class CaptureLoop:
             )  # at the end, and before a person turns the ring, who should not turn it back
 
     def _take(self, slot: Slot, missing: list[Slot]) -> None:
+        """Turn the ring if needed, take a frame, submit it to the check. Raises SettingError: exposures repeat."""
         if slot.angle_deg is not None:
             self._turn(slot, slot.angle_deg)
         total, left = len(self.record.slots), self.pace.left(missing, self.angle_deg)
@@ -137,6 +139,7 @@ class CaptureLoop:
         self.check.submit(slot, None if slot.angle_deg is None else self.read_deg, photograph)
 
     def _turn(self, slot: Slot, angle_deg: float) -> None:
+        """Turn the ring, and take shots again whose angle it missed."""
         if self.read_deg is None or angle_deg != self.angle_deg:
             self.angle_deg, self.read_deg = angle_deg, None
             read_deg = self.rotator.move(angle_deg)
@@ -193,6 +196,7 @@ def _finish(record: CaptureRecord, check: BackgroundCheck) -> dict[str, Any]:
 
 
 def _check_disk(folder: Path, needed: float) -> None:
+    """Raise StorageError if the disk has too little room for the frames."""
     free = shutil.disk_usage(folder).free
     if free < _SPARE * needed:
         raise StorageError(

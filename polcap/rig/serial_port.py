@@ -133,6 +133,7 @@ class Port:
 
     @contextmanager
     def _named_failures(self) -> Iterator[None]:
+        """Context manager: errors of pyserial become NoAnswer or Unplugged."""
         try:
             yield
         except serial.SerialTimeoutException as error:

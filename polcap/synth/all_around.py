@@ -161,6 +161,7 @@ def _view(scene: Scene, shoot: AroundShoot, turn: Rotation, position: Floats, pl
 
 
 def _write_surface(file: Path, scene: Scene, mesh: Triangles, lift: float) -> None:
+    """Write vertices, faces and material of the true surface."""
     diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, mesh.vertices, mesh.vertex_normals())
     values = {
         "vertices": mesh.vertices + np.array([0.0, lift, 0.0]), "diffuse": diffuse, "specular": specular,
@@ -174,6 +175,7 @@ def _write_surface(file: Path, scene: Scene, mesh: Triangles, lift: float) -> No
 def _write_poses(
     file: Path, scene: Scene, shoot: AroundShoot, poses: dict[str, tuple[Rotation, Floats]], sets: Sequence[ObjectPose]
 ) -> None:
+    """Write camera, light and true poses of all views."""
     views = [
         {"name": name, "rotation": turn.as_matrix().tolist(), "translation": position.tolist()}
         for name, (turn, position) in poses.items()

@@ -157,6 +157,7 @@ def _length(p: Floats) -> Floats:
 
 
 def _waves(waves: tuple[Wave, ...], p: Floats) -> Floats:
+    """Sum of plane sine waves at points p (..., 3)."""
     total = np.zeros(p.shape[:-1])
     for amplitude, x, y, z, phase in waves:
         angle = p[..., 0] * x + p[..., 1] * y + p[..., 2] * z + phase

@@ -115,6 +115,7 @@ def _poses(shoot: FlatShoot, views: int) -> Poses:
 
 
 def _view(scene: Scene, slab: Slab, shoot: FlatShoot, turn: Rotation, position: Floats, with_chart: bool) -> Scene:
+    """The scene of one view: sample, board and chart before the camera."""
     vector, at = tuple(turn.as_rotvec(degrees=True).tolist()), tuple(position.tolist())
     middle = turn.apply(_CHART) + position
     chart = Chart(tuple(middle.tolist()), tuple((turn * _CHART_TURN).as_rotvec(degrees=True).tolist()))
@@ -142,6 +143,7 @@ def _write_maps(file: Path, scene: Scene, slab: Slab) -> None:
 
 
 def _write_poses(file: Path, scene: Scene, shoot: FlatShoot, poses: Poses, power: Floats) -> None:
+    """Write camera, light and true poses of all views."""
     views = [
         {"name": folder_names.view_name(k), "rotation": turn.as_matrix().tolist(), "translation": at.tolist(),
          "light": float(power[k])}

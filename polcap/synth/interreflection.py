@@ -75,6 +75,7 @@ def received(tracer: Tracer, lit: DiffuseLight, camera: Floats, ior: float) -> F
 
 
 def _smoothed(value: Floats, tracer: Tracer) -> Floats:
+    """Values (V, 3) at vertices, averaged over the triangles around, `_SMOOTH` times."""
     faces = tracer.mesh.faces
     count = np.maximum(np.bincount(faces.ravel(), minlength=len(value)), 1)[:, None]
     for _ in range(_SMOOTH):

@@ -87,6 +87,7 @@ def _choose(coat: Coat, position: Floats, parts: list[Floats]) -> Floats:
 
 
 def _evaluate_one(material: Material, position: Floats, facing: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Diffuse albedo, F0, roughness and refractive index of one material at points (N, 3)."""
     first, second = np.array(material.first), np.array(material.second)
     if material.texture is UNSET:
         share = _pattern(material, position / material.size)

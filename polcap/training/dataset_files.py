@@ -121,6 +121,7 @@ def encode(radiance: Floats) -> Floats:
 
 
 def _open_library(material: str) -> materials.MaterialLibrary:
+    """Texture sets of a folder. Raises InputError: it holds none."""
     library = materials.MaterialLibrary(Path(material) if material else None, torch.device("cpu"))
     if material and not library.has_textures:
         raise InputError(f"{material} holds no texture set; give a folder of folders, each with albedo.jpg")

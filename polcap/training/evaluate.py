@@ -178,6 +178,7 @@ def evaluate_picture(options: EvaluationOptions, means: Means, number: int) -> R
 
 
 def _summary(head: dict[str, Any], rows: list[Row]) -> dict[str, Any]:
+    """Content of the evaluation: means over all pictures, calibration by deciles, scores of each picture."""
     mean = {name: _mean([row["scores"][name] for row in rows]) for name in rows[0]["scores"]}
     f0, square = np.mean([row["f0"] for row in rows], axis=0)
     predicted, actual = (np.concatenate([row["calibration"][k] for row in rows]) for k in (0, 1))

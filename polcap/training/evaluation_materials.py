@@ -174,6 +174,7 @@ def _step(x: Floats, low: float, high: float) -> Floats:
 
 
 def _wood(rng: np.random.Generator) -> Field:
+    """Growth rings with fibers."""
     rings, bend = rng.uniform(8, 20), _waves(rng, 0.7, 4)
     grain, off = _waves(rng, 12, 40), rng.uniform(-0.5, 0.5, 2)
 
@@ -188,6 +189,7 @@ def _wood(rng: np.random.Generator) -> Field:
 
 
 def _marble(rng: np.random.Generator) -> Field:
+    """Veins that swirl."""
     cycles, swirl, width = rng.uniform(2, 5), _waves(rng, 1, 9, 14), rng.uniform(0.1, 0.35)
     cloud = _waves(rng, 0.8, 4)
 
@@ -205,6 +207,7 @@ def _scattered(rng: np.random.Generator, side: int) -> Floats:
 
 
 def _cells(rng: np.random.Generator) -> Field:
+    """Voronoi cells of one shade each, with joints."""
     points = _scattered(rng, int(rng.integers(10, 22)))
     tree, shade = cKDTree(points), rng.uniform(0, 1, len(points))
     joint = 0.12 * 2 / round(len(points) ** (1 / 3))
@@ -217,6 +220,7 @@ def _cells(rng: np.random.Generator) -> Field:
 
 
 def _stripes(rng: np.random.Generator) -> Field:
+    """Wavy stripes of two shades."""
     count, share, bend = rng.uniform(5, 16), rng.uniform(0.25, 0.75), _waves(rng, 0.7, 2)
 
     def field(p: Floats) -> tuple[Floats, Floats]:
@@ -227,6 +231,7 @@ def _stripes(rng: np.random.Generator) -> Field:
 
 
 def _checks(rng: np.random.Generator) -> Field:
+    """Cubes of two shades, with joints."""
     count, joint = rng.uniform(4, 10), rng.uniform(0.02, 0.08)
 
     def field(p: Floats) -> tuple[Floats, Floats]:
@@ -238,6 +243,7 @@ def _checks(rng: np.random.Generator) -> Field:
 
 
 def _dots(rng: np.random.Generator) -> Field:
+    """Balls of another shade at scattered points."""
     side = int(rng.integers(14, 30))
     tree, share = cKDTree(_scattered(rng, side)), rng.uniform(0.3, 0.5)
 
@@ -249,6 +255,7 @@ def _dots(rng: np.random.Generator) -> Field:
 
 
 def _brushed(rng: np.random.Generator) -> Field:
+    """Fine lines along one axis."""
     lines, cloud = _waves(rng, 8, 40, 24), _waves(rng, 1, 4)
 
     def field(p: Floats) -> tuple[Floats, Floats]:

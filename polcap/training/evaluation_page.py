@@ -106,6 +106,7 @@ def _table(columns: Table, published: Table) -> str:
 
 
 def _cell(key: str, value: float | None) -> str:
+    """A score as text."""
     if value is None:
         return "–"
     if "within" in key:

@@ -110,6 +110,7 @@ def _rmse(difference: Floats) -> float:
 
 
 def _depth(estimate: Floats, truth: Floats) -> Score:
+    """RMS error of the depth over its range: as predicted, and with the best scale."""
     estimate, truth = (x.astype(np.float64) - x.mean(dtype=np.float64) for x in (estimate, truth))
     scale = (estimate @ truth) / max(float(estimate @ estimate), 1e-12)
     span = float(np.ptp(truth))

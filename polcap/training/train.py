@@ -112,6 +112,7 @@ def main(options: TrainingOptions, report: Report = silent) -> Path:
 
 
 def _check(options: TrainingOptions) -> None:
+    """Raise InputError for options that contradict each other, the data or the output folder."""
     if (options.data / "dataset.json").exists():
         raise InputError(
             f"{options.data} is a data set of `polcap synth --dataset`, which holds pictures; `polcap train` renders "

@@ -151,6 +151,7 @@ def counted_clockwise(plan: Plan) -> Plan:
 
 
 def _toml(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
+    """Plan of the photographs that capture.toml lists. Raises CaptureError: one is missing, or is no photograph."""
     sources = []
     for entry in stated.frame:
         path = capture_toml.locate(folder, entry.file)
@@ -181,6 +182,7 @@ def _texts(shots: Shots) -> tuple[str, ...]:
 
 
 def _group(sources: Iterable[Source]) -> dict[float, list[Source]]:
+    """Photographs by their polarizer angle; those without an angle are left out."""
     groups: dict[float, list[Source]] = defaultdict(list)
     for source in sources:
         if source.angle_deg is not None:
@@ -189,6 +191,7 @@ def _group(sources: Iterable[Source]) -> dict[float, list[Source]]:
 
 
 def _folders(folder: Path, sub_folders: dict[float, Path], crossed: Path | None, angles_deg: _Order) -> Plan:
+    """Plan of the folders pol000, pol045, …, with notes on files that are not used."""
     groups: dict[float, list[Source]] = {}
     notes = []
     for angle, sub_folder in sub_folders.items():

@@ -61,6 +61,7 @@ def kinds(files: Iterable[Path]) -> list[file_kind.Kind]:
 
 
 def _kind(path: Path) -> file_kind.Kind:
+    """Kind of a file: by its content, or by its name where it is damaged."""
     try:
         kind = probe.kind(path)
         kind = probe.read(path).kind if kind == "unknown" else kind
@@ -77,6 +78,7 @@ def stem(path: Path) -> str:
 
 
 def _outcome(path: Path) -> Probe | CaptureError | DecodeError:
+    """Metadata of a file, or the error of its reading."""
     try:
         return read(path)
     except (CaptureError, DecodeError) as error:

@@ -52,6 +52,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
 
 
 def _read(folder: Path, angles_deg: tuple[float, ...] | None, clockwise: bool) -> Capture:
+    """As `read`. Raises CaptureError or DecodeError."""
     _check_folder(folder)
     stated = capture_toml.load(folder)
     clockwise = clockwise or stated.clockwise
@@ -109,6 +110,7 @@ def _read(folder: Path, angles_deg: tuple[float, ...] | None, clockwise: bool) -
 
 
 def _check_folder(folder: Path) -> None:
+    """Raise CaptureError for a file, an archive or a missing folder."""
     if folder.is_file():
         if zipfile.is_zipfile(folder):
             raise CaptureError(f"{folder} is a ZIP archive; unpack it and give the folder that it holds")
@@ -204,6 +206,7 @@ def table(capture: Capture) -> str:
 
 
 def _row(frame: Frame, folder: str) -> list[str]:
+    """Row of the capture's table: file, role, exposure, ISO, f-number, flash, time."""
     fact = frame.exif
     path = Path(frame.path)
     name = str(path.relative_to(folder)) if path.is_relative_to(folder) else frame.path
@@ -214,6 +217,7 @@ def _row(frame: Frame, folder: str) -> list[str]:
 
 
 def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Sequence[Source]) -> Shot:
+    """A shot of the plan, with its bracket and its ambient frames."""
     ambient = [s for s in plan.others if s.role == "ambient" and s.angle_deg in (None, angle_deg)]
     cell = _cell(plan, angle_deg)
     return Shot(
@@ -244,6 +248,7 @@ def _crossed(folder: Path, plan: layouts.Plan, stated: CaptureFile) -> Shot | No
 
 
 def _frame(plan: layouts.Plan, stated: CaptureFile, source: Source, angle_deg: float) -> Frame:
+    """A photograph of the plan, with the options for its decoding."""
     cell = _cell(plan, angle_deg)
     kind: Literal["raw", "photo"] = "raw" if source.probe.kind == "raw" else "photo"
     # the digest names how the file is read, because it enters the keys of the stage cache
@@ -274,6 +279,7 @@ def _encoding(probe: Probe, stated: CaptureFile) -> list[str]:
 
 
 def _stated_exposure(source: Source) -> float | None:
+    """Relative exposure that capture.toml states, from the flash energy if it is given; None: not stated."""
     if source.flash_energy:
         fact = source.probe.exif
         return source.flash_energy * (fact.iso or 100.0) / 100.0 / (fact.f_number or 1.0) ** 2
@@ -297,6 +303,7 @@ def _sorted_alike(frames: Iterable[Frame]) -> tuple[Frame, ...]:
 
 
 def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
+    """Raise CaptureError for fewer than three polarizer axes; `who` begins the message."""
     count = folder_names.count_axes(angles_deg)
     if count < 3:
         listed = ", ".join(f"{angle:g}" for angle in angles_deg) or "none"
@@ -321,6 +328,7 @@ def other_equipment(fact: Exif, first: Exif) -> str | None:
 
 
 def _check_one_camera(facts: dict[Path, Exif]) -> None:
+    """Raise CaptureError for photographs of different equipment."""
     first_path, first = next(iter(facts.items()))
     for path, fact in facts.items():
         if fault := other_equipment(fact, first):
@@ -328,6 +336,7 @@ def _check_one_camera(facts: dict[Path, Exif]) -> None:
 
 
 def _check_no_duplicate(every: dict[Path, Source]) -> None:
+    """Raise CaptureError for a photograph that occurs twice, also as a DNG converted from it."""
     first: dict[str, Path] = {}
     same = [(source.path, first.setdefault(source.probe.digest, path)) for path, source in every.items()]
     same += [(dng.path, raw.path) for dng, raw in layouts.conversions(list(every.values()))]
@@ -337,6 +346,7 @@ def _check_no_duplicate(every: dict[Path, Source]) -> None:
 
 
 def _check_brackets(shots: Sequence[Shot]) -> None:
+    """Raise CaptureError for brackets of unequal length or exposure, with the likely remedy."""
     counts = [len(shot.frames) for shot in shots]
     usual = max(set(counts), key=counts.count)
     model = next(shot for shot in shots if len(shot.frames) == usual)
@@ -362,6 +372,7 @@ def _exposed(frame: Frame) -> unequal_brackets.ExposedFile:
 
 
 def _settings(frame: Frame) -> str:
+    """Exposure of a photograph in words."""
     if frame.exposure:
         return f"exposure {frame.exposure:.4g} stated"
     fact = frame.exif
@@ -370,6 +381,7 @@ def _settings(frame: Frame) -> str:
 
 
 def _notes(plan: layouts.Plan, shots: Sequence[Shot], stated: CaptureFile, radiance: float) -> list[str]:
+    """Notes on what was understood or ignored, for table and report."""
     sources = [source for _, bracket in plan.shots for source in bracket]
     notes, first = [], sources[0].probe
     cross = sum(source.role == "cross" for source in plan.others)

@@ -97,6 +97,7 @@ def ktx2_encoder() -> str | None:
 
 
 def _ktx2(texture: Texture) -> bytes:
+    """Encode a texture as KTX2 by an installed program. Raises SettingError: there is none, or it fails."""
     program = ktx2_encoder()
     if program is None:
         raise SettingError("KTX2 needs `ktx` or `toktx` of Khronos' KTX software on the PATH; choose webp or png")

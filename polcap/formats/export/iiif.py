@@ -92,6 +92,7 @@ def manifest(pictures: Mapping[str, Texture], facts: Mapping[str, str], address:
 
 
 def _canvas(name: str, picture: Texture, address: str) -> dict[str, Any]:
+    """The canvas of one picture in the manifest, with its tiles at `address`."""
     canvas, service = f"{address}/canvas/{name}", f"{address}/{name}"
     height, width = picture.pixels.shape[:2]
     size = {"width": width, "height": height}

@@ -99,6 +99,7 @@ def _stage(asset: Asset, name: str, files: Mapping[Key, str], facts: Mapping[str
 
 
 def _mesh(stage: Any, path: Any, mesh: Mesh) -> Any:
+    """Define a mesh with texture coordinates on a USD stage; its origin is that of the GLB."""
     from pxr import Sdf, UsdGeom, Vt
 
     shape = UsdGeom.Mesh.Define(stage, path)

@@ -29,6 +29,7 @@ def depth_range(maps: SurfaceMaps, mesh: ReliefMesh) -> tuple[float, float, floa
 
 
 def _depth_picture(maps: SurfaceMaps, mesh: ReliefMesh) -> NDArray[np.uint16]:
+    """Depth as 16 bits from the nearest to the farthest point of the object; 0 outside."""
     near, _, far = depth_range(maps, mesh)
     depth = object_depth(maps, mesh)
     return png.sixteen_bits(np.where(depth > 0, (depth - near) / max(far - near, 1e-9), 0))

@@ -174,6 +174,7 @@ def _cicp(chunk: bytes) -> _Statement:
 
 
 def _gama(chunks: dict[bytes, bytes]) -> _Statement:
+    """Tone curve and primaries by the chunks gAMA and cHRM of a PNG."""
     gamma = 1e5 / max(int.from_bytes(chunks[b"gAMA"], "big"), 1)
     curve = decode_srgb if _SRGB_GAMMA[0] < gamma < _SRGB_GAMMA[1] else partial(_power, gamma)
     primaries = chunks.get(b"cHRM", b"")

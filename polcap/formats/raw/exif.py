@@ -48,6 +48,7 @@ class _Tags:
             self._found |= {name.replace("Image ", directory, 1): tag.values for name, tag in found.items()}
 
     def numbers(self, name: str) -> list[float]:
+        """Finite numbers of a tag; empty if there are none."""
         for directory in ("EXIF ", "Image "):
             values = self._found.get(directory + name, ())
             try:
@@ -62,6 +63,7 @@ class _Tags:
         return next(iter(self.numbers(name)), None)
 
     def text(self, name: str) -> str:
+        """Printable text of a tag; "" without one."""
         for directory in ("EXIF ", "Image "):
             # printable only: a name goes to the terminal, the report and other files
             text = "".join(c for c in str(self._found.get(directory + name, "")) if c.isprintable()).strip()

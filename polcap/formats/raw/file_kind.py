@@ -129,6 +129,7 @@ def raw_suffix(head: bytes) -> str | None:
 
 
 def _is_raw(tiff: TiffStructure) -> bool:
+    """Whether a TIFF structure is that of a RAW file."""
     if tiff.dng or any(
         is_sensor(directory) or first(directory, COMPRESSION) in _RAW_COMPRESSION for directory in tiff.directories
     ):

@@ -165,6 +165,7 @@ def _values(path: str, file: Any) -> NDArray[Any]:
 
 
 def _display_window(path: str, file: Any) -> NDArray[Any]:
+    """Pixels (H, W, C) of an EXR's display window; 0 where none is stored. Raises DecodeError."""
     spec, pixels = file.spec(), every_channel(path, file)
     left, upper, right, lower = _display(spec)
     if (left, upper, right, lower) == (spec.x, spec.y, spec.x + spec.width, spec.y + spec.height):

@@ -83,6 +83,7 @@ def examine(path: str) -> sandbox.Answer:
 
 
 def _photo(path: str, data: bytes) -> tuple[Probe, bool]:
+    """Facts of a finished picture, and whether its structure is cut off."""
     facts, structure = photo.describe(path, data), file_kind.structure(data)
     stated = exif.sized(exif.tags(data), facts.pop("width"), facts.pop("height"))
     gain_map = picture_count.has_gain_map(data, structure)
@@ -90,6 +91,7 @@ def _photo(path: str, data: bytes) -> tuple[Probe, bool]:
 
 
 def _raw(path: str, data: bytes) -> tuple[Probe, bool]:
+    """Facts of a RAW file, and whether its structure is cut off. Raises DecodeError."""
     structure = file_kind.structure(data)
     file_checks.check_structure(path, structure, data)
     picture_count.check_single_raw(path, structure)

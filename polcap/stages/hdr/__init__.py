@@ -86,6 +86,7 @@ def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack
 
 
 def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
+    """Merge shot after shot into one stack; the first shot gives the order of brightness, black level and noise."""
     shots, count, first = capture.all_shots, len(capture.shots), capture.shots[0]
     read.plan = _memory_plan(capture, read(first.frames[0]), settings)
     order = _by_brightness(first, read)

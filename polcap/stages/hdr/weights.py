@@ -68,6 +68,7 @@ class WeightedBracket:
         parallel.results(partial(self._block, out, rows) for rows, _, _ in blocks(height, rows=rows_of_block))
 
     def _block(self, out: MaskedImage, rows: slice) -> None:
+        """Write value, variance and quality of some rows to `out`."""
         value, variance = self._rows(rows)
         quality = _flagged(~self.served[rows], Quality.CLIPPED)
         quality |= _flagged(self.ghost[rows], Quality.GHOST)

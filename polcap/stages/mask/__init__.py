@@ -114,6 +114,7 @@ def _by_probability(picture: Floats, probability: Floats, zone: Bits, patches: B
 def _object(
     mask: Bools, source: Literal["automatic", "user"], doubt: float | None, settings: MaskSettings
 ) -> ObjectMask:
+    """The mask or its part `settings.part`, with crop and figures. Raises ObjectError: too few parts."""
     if settings.part:
         mask = regions.nth_part(mask, settings.part)
     crop = regions.box_around(mask, settings.margin, least=4)

@@ -25,6 +25,7 @@ def refine(picture: Floats, mask: Bools) -> Bools:
 
 
 def _covered(picture: Floats, mask: Bools) -> Bools:
+    """Decide pixels at the mask's border by their coverage, between the lights of object and backdrop."""
     display = np.sqrt(np.maximum(picture, 0, dtype=np.float32))
     inside = mask.astype(np.uint8)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))

@@ -37,6 +37,7 @@ def choose(colored: Bools, learned: Bools, probability: Floats) -> Bools:
 
 
 def _without_specks(mask: Bools) -> Bits:
+    """The mask without parts much smaller than its largest."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA].astype(float)
     area[0] = 0

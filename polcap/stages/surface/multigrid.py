@@ -155,6 +155,7 @@ class Multigrid:
         return self._cycle(0, right)
 
     def _cycle(self, depth: int, right: Floats) -> Floats:
+        """One V-cycle from level `depth` on: smoothing, correction from the coarser level, smoothing."""
         if depth == len(self.levels):
             return np.asarray(self.coarsest.solve(right))
         level = self.levels[depth]

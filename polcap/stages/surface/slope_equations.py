@@ -109,6 +109,7 @@ def block_numbers(mask: Bools) -> NDArray[np.intp]:
 
 
 def _any_of_blocks(mask: Bools) -> Bools:
+    """Whether any pixel of each block of 2 × 2 is in the mask."""
     padded = np.pad(mask, [(0, size % 2) for size in mask.shape])
     return np.asarray(padded[::2, ::2] | padded[1::2, ::2] | padded[::2, 1::2] | padded[1::2, 1::2])
 

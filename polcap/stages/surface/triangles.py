@@ -106,6 +106,7 @@ def measure_boundary(place: NDArray[np.int64], faces: Faces, mask: Bools, step: 
 
 
 def _count_pieces(faces: Faces, count: int) -> int:
+    """Number of connected pieces of a mesh, without specks."""
     from scipy import sparse
     from scipy.sparse.csgraph import connected_components
 
