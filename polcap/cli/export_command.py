@@ -1,7 +1,7 @@
 """`polcap export`: the asset of a result again, in other formats or for one program."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -12,13 +12,11 @@ from polcap import terminal
 from polcap.cli import options
 from polcap.cli.options import Json, Result, choice
 from polcap.errors import SettingError
+from polcap.formats.export.presets import EXTRAS, FORMATS, PRESETS
 
 if TYPE_CHECKING:
     from polcap.formats.export.texture_set import Extra
 
-# names in formats.export, which is not imported at start
-PRESETS = ("blender", "unreal", "unity", "godot", "web", "substance", "maya", "houdini", "archive")
-EXTRAS = ("displacement", "curvature", "cavity", "occlusion", "object-normal")
 _PRESET = f"Files for one program in asset/NAME/: {', '.join(PRESETS)}; repeatable."
 _EXTRA = f"A further texture: {', '.join(EXTRAS)}; repeatable."
 _FACTS = ("title", "creator", "rights", "license", "object_number", "date", "institution", "description")
@@ -35,7 +33,7 @@ Geometry = Annotated[Literal["float", "quantized", "draco"] | None, choice(_GEOM
 Bits = Annotated[Literal["8", "16"] | None, choice("Bits of a channel in PNG textures.", "8|16")]
 
 
-def _names(meaning: str, names: Sequence[str]) -> Any:
+def _names(meaning: str, names: Collection[str]) -> Any:
     """An option that may be repeated, with the names that the shell completes."""
     return Option(metavar="NAME", help=meaning, autocompletion=options.completion(names))
 
@@ -69,11 +67,10 @@ def export(
 ) -> None:
     """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
     from polcap import api
-    from polcap.formats.export import presets
     from polcap.pipeline import result_folder
     from polcap.pipeline.asset_export import ExportRequest
 
-    formats = tuple(name for name in presets.FORMATS if context.params[name] not in (None, False))
+    formats = tuple(name for name in FORMATS if context.params[name] not in (None, False))
     if preset and (others := [name for name in formats if name != "iiif"]):
         raise SettingError(f"--preset {preset[0]} brings its formats; write --{others[0]} by a second export")
     plain = ExportRequest(
@@ -124,7 +121,6 @@ def _warn_of_upsampling(result: Path, size: int) -> None:
 def _extra_textures(named: Sequence[str]) -> "tuple[Extra, ...]":
     """Parse --extra: names of further textures. Raises SettingError for an unknown name."""
     from polcap.formats import text_file
-    from polcap.formats.export.texture_set import EXTRAS
 
     for name in named:
         if name not in EXTRAS:

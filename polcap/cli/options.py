@@ -1,7 +1,7 @@
 """Options that several commands share, and the functions that parse them."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -51,7 +51,7 @@ def choice(meaning: str, metavar: str | None = None) -> Any:
     return Option(case_sensitive=False, help=meaning, metavar=metavar)
 
 
-def completion(names: Sequence[str]) -> Callable[[str], list[str]]:
+def completion(names: Collection[str]) -> Callable[[str], list[str]]:
     """A function that completes values of an option in the shell: those of `names` with the typed beginning."""
     return lambda incomplete: [name for name in names if name.startswith(incomplete.lower())]
 

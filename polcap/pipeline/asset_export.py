@@ -330,11 +330,11 @@ def _loose_textures(
 
     Textures whose values the asset lacks are left out: displacement and curvature of a closed mesh.
     """
-    makers = {f"{pattern.format(stem)}.png": make for pattern, make in preset.textures.items()}
-    makers |= {f"{stem}_{key.replace('-', '')}.png": texture_set.EXTRAS[key] for key in extras}
-    of_relief: dict[Any, Any] = {texture_set.displacement: whole.displacement}
-    of_relief |= dict.fromkeys((texture_set.curvature, texture_set.cavity), whole.curvature)
-    found = {file: make(whole) for file, make in makers.items() if of_relief.get(make, whole) is not None}
+    names = {f"{pattern.format(stem)}.png": name for pattern, name in preset.textures.items()}
+    names |= {f"{stem}_{key.replace('-', '')}.png": key.replace("-", "_") for key in extras}
+    of_relief = {"displacement": whole.displacement, "curvature": whole.curvature, "cavity": whole.curvature}
+    held = {file: name for file, name in names.items() if name not in of_relief or of_relief[name] is not None}
+    found = {file: texture_set.TEXTURES[name](whole) for file, name in held.items()}
     if _SHARING.intersection(preset.formats):
         made = {file: texture_set.LOOSE[key](whole) for key, file in shared.items()}
         found |= {file: texture_set.linear(one) for file, one in made.items()} if preset.shared == "exr" else made

@@ -73,7 +73,8 @@ def alone(folder: Path, built: Asset, preset: ExportPreset) -> None:
     encoder = TextureEncoder()
     for texture in gltf.textures(built).values():
         encoder(texture, preset.images)
-    for make in (*preset.textures.values(), *(texture_set.LOOSE.values() if "obj" in preset.formats else ())):
+    loose = texture_set.LOOSE.values() if "obj" in preset.formats else ()
+    for make in (*(texture_set.TEXTURES[name] for name in preset.textures.values()), *loose):
         encoder(make(built), "png")
     if "exr" in preset.formats:
         exr_layers.write(folder / "alone.exr", folder / "maps", exr_layers.LINEAR_REC709, {})

@@ -14,8 +14,8 @@ import OpenImageIO as oiio
 import pytest
 import trimesh
 
-from polcap.formats.export import encoders, texture_set
-from polcap.formats.export.presets import PRESETS, Format
+from polcap.formats.export import encoders
+from polcap.formats.export.presets import EXTRAS, PRESETS, Format
 from polcap.formats.maps import exr, png
 from polcap.pipeline import asset_export
 from polcap.pipeline import run as pipeline
@@ -397,7 +397,7 @@ def test_a_copied_result_lies_outside_the_result_and_the_shots(
 
 def test_extra_textures_and_sixteen_bits(tiny_result: Path, polcap: Command) -> None:
     """Displacement is depth.png turned round; object-space normals are the maps'; the GLB holds the occlusion."""
-    named = [part for name in texture_set.EXTRAS for part in ("--extra", name)]
+    named = [part for name in EXTRAS for part in ("--extra", name)]
     assert polcap("export", tiny_result, "--obj", "--gltf", "--bits", 16, *named).returncode == 0
     pictures = {name: png.read(tiny_result / "asset" / f"C_{name}.png") for name in ("displacement", "objectnormal")}
     mask = png.read(tiny_result / "maps" / "mask.png") > 127

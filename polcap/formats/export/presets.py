@@ -1,18 +1,19 @@
 """Presets of `polcap export`: file formats, file names, channel packing and normal-map direction for a program."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import partial
-from typing import Literal
+from __future__ import annotations
 
-from polcap.formats.export import texture_set
-from polcap.formats.export.encoders import Kind
-from polcap.formats.export.glb_geometry import Geometry
-from polcap.formats.export.texture_set import Extra, Texture
-from polcap.mesh_values import Asset
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:  # the command line needs the names before NumPy is imported
+    from polcap.formats.export.encoders import Kind
+    from polcap.formats.export.glb_geometry import Geometry
+    from polcap.formats.export.texture_set import Extra
 
 Format = Literal["gltf", "obj", "ply", "stl", "usd", "usdz", "materialx", "exr", "iiif", "sfp"]
 FORMATS: tuple[Format, ...] = ("gltf", "obj", "ply", "stl", "usd", "usdz", "materialx", "exr", "iiif", "sfp")
+EXTRAS: tuple[Extra, ...] = ("displacement", "curvature", "cavity", "occlusion", "object-normal")
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class ExportPreset:
     bits: Literal[8, 16] = 8  # of a texture's channel
     shared: Literal["png", "exr"] = "png"  # files of the textures of OBJ, USD and MaterialX
     extras: tuple[Extra, ...] = ()  # channels to compute; `--extra` also writes each as a file
-    textures: Mapping[str, Callable[[Asset], Texture]] = field(default_factory=dict)  # PNG files next to the asset
+    textures: Mapping[str, str] = field(default_factory=dict)  # PNG files next to the asset: `texture_set.TEXTURES`
 
 
 PRESETS: Mapping[str, ExportPreset] = {
@@ -44,10 +45,10 @@ PRESETS: Mapping[str, ExportPreset] = {
         name="SM_{}",
         powers=True,
         textures={
-            "T_{}_BC": texture_set.base_color,
-            "T_{}_N": partial(texture_set.normal, up=False),
-            "T_{}_ORM": texture_set.occlusion_roughness_metallic,
-            "T_{}_S": texture_set.specular_level,
+            "T_{}_BC": "base_color",
+            "T_{}_N": "normal_directx",
+            "T_{}_ORM": "occlusion_roughness_metallic",
+            "T_{}_S": "specular_level",
         },
     ),
     "unity": ExportPreset(
@@ -55,10 +56,10 @@ PRESETS: Mapping[str, ExportPreset] = {
         description="glTFast imports the GLB; loose maps for HDRP and for the specular set-ups of URP; normals +Y",
         powers=True,
         textures={
-            "{}_BaseMap": texture_set.base_color,
-            "{}_Normal": texture_set.normal,
-            "{}_MaskMap": texture_set.unity_mask,
-            "{}_SpecularMap": texture_set.unity_specular,
+            "{}_BaseMap": "base_color",
+            "{}_Normal": "normal",
+            "{}_MaskMap": "unity_mask",
+            "{}_SpecularMap": "unity_specular",
         },
     ),
     "godot": ExportPreset(
@@ -66,9 +67,9 @@ PRESETS: Mapping[str, ExportPreset] = {
         description="import the GLB, then set Specular; loose maps for an ORMMaterial3D; normals +Y (OpenGL)",
         powers=True,
         textures={
-            "{}_albedo": texture_set.base_color,
-            "{}_orm": texture_set.occlusion_roughness_metallic,
-            "{}_normal": texture_set.normal,
+            "{}_albedo": "base_color",
+            "{}_orm": "occlusion_roughness_metallic",
+            "{}_normal": "normal",
         },
     ),
     "web": ExportPreset(
@@ -84,12 +85,12 @@ PRESETS: Mapping[str, ExportPreset] = {
         bits=16,
         extras=("displacement", "occlusion"),
         textures={
-            "{}_basecolor": texture_set.base_color,
-            "{}_normal": texture_set.normal,
-            "{}_roughness": texture_set.roughness,
-            "{}_specularlevel": texture_set.specular_level,
-            "{}_height": texture_set.displacement,
-            "{}_ambientocclusion": texture_set.occlusion,
+            "{}_basecolor": "base_color",
+            "{}_normal": "normal",
+            "{}_roughness": "roughness",
+            "{}_specularlevel": "specular_level",
+            "{}_height": "displacement",
+            "{}_ambientocclusion": "occlusion",
         },
     ),
     "maya": ExportPreset(
@@ -98,7 +99,7 @@ PRESETS: Mapping[str, ExportPreset] = {
         bits=16,
         shared="exr",
         extras=("displacement",),
-        textures={"{}_displacement": texture_set.displacement},
+        textures={"{}_displacement": "displacement"},
     ),
     "houdini": ExportPreset(
         formats=("usd", "materialx"),
@@ -106,7 +107,7 @@ PRESETS: Mapping[str, ExportPreset] = {
         bits=16,
         shared="exr",
         extras=("displacement",),
-        textures={"{}_displacement": texture_set.displacement},
+        textures={"{}_displacement": "displacement"},
     ),
     "archive": ExportPreset(
         formats=("gltf", "obj", "usd", "materialx", "exr"),

@@ -37,10 +37,13 @@ def base_color(asset: Asset) -> Texture:
     return Texture(asset.base_color, True, "base color, sRGB-encoded Rec.709")
 
 
-def normal(asset: Asset, *, up: bool = True) -> Texture:
-    """Tangent-space normals with green up (OpenGL) or down (DirectX)."""
-    if up:
-        return Texture(asset.normal, False, "tangent-space normal n * 0.5 + 0.5, +Y (OpenGL, green up)")
+def normal(asset: Asset) -> Texture:
+    """Tangent-space normals with green up (OpenGL)."""
+    return Texture(asset.normal, False, "tangent-space normal n * 0.5 + 0.5, +Y (OpenGL, green up)")
+
+
+def normal_directx(asset: Asset) -> Texture:
+    """Tangent-space normals with green down (DirectX)."""
     flipped = asset.normal.copy()
     flipped[..., 1] = np.iinfo(flipped.dtype).max - flipped[..., 1]
     return Texture(flipped, False, "tangent-space normal n * 0.5 + 0.5, -Y (DirectX, green down)")
@@ -143,13 +146,11 @@ LOOSE: Mapping[Key, Callable[[Asset], Texture]] = {
 }
 
 
-EXTRAS: Mapping[Extra, Callable[[Asset], Texture]] = {
-    "displacement": displacement,
-    "curvature": curvature,
-    "cavity": cavity,
-    "occlusion": occlusion,
-    "object-normal": object_normal,
-}
+_OF_PRESETS = (
+    base_color, normal, normal_directx, roughness, displacement, curvature, cavity, occlusion, object_normal,
+    occlusion_roughness_metallic, specular_level, unity_mask, unity_specular,
+)  # fmt: skip
+TEXTURES = {make.__name__: make for make in _OF_PRESETS}  # by the name that presets give
 
 
 def linear(texture: Texture) -> Texture:
