@@ -88,8 +88,15 @@ class AngleStack(ArrayValue):
 
 def single_frames(shots: int) -> BracketMeasurement:
     """Measurement of brackets of one frame each, which cannot be compared."""
-    each, unknown = np.ones((shots, 1)), np.full((shots, 1), np.nan)
-    return BracketMeasurement(np.ones((shots, 1, 3)), each, unknown, np.zeros(shots), unknown[:, 0], unknown)
+    unknown = np.full((shots, 1), np.nan)
+    return BracketMeasurement(
+        exposure_ratio=np.ones((shots, 1, 3)),
+        exif_ratio=np.ones((shots, 1)),
+        curvature=unknown,
+        ghost_fraction=np.zeros(shots),
+        ambient_share=unknown[:, 0],
+        blur_px=unknown,
+    )
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ def run(unit: Unit, request: Request, attempt: int = 1) -> UnitRecord:
     if (finished := find_finished(unit, request)) is not None:
         return finished
     start = time.perf_counter()
-    record = UnitRecord(unit.name, "running", "", 0.0, socket.gethostname(), os.getpid(), attempt)
+    record = UnitRecord(unit.name, "running", host=socket.gethostname(), pid=os.getpid(), attempts=attempt)
     with own_files.opened(Path(unit.batch_folder)):
         return _run(unit, request, record, start)
 
@@ -173,7 +173,7 @@ def record_crash(unit: Unit, before: UnitRecord, message: str, attempt: int) -> 
     record = read_record(unit)
     if record.state in FINISHED and record != before:
         return record
-    record = UnitRecord(unit.name, "crashed", message, 0.0, socket.gethostname(), 0, attempt)
+    record = UnitRecord(unit.name, "crashed", message, host=socket.gethostname(), attempts=attempt)
     write_record(unit, record)
     return record
 

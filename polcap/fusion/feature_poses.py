@@ -107,23 +107,27 @@ def solve(features: Mapping[str, ObjectFeatures], capture: Capture) -> SessionPo
     names, seen = list(features), list(features.values())
     pairs = {(i, j): _match(seen[i], seen[j]) for i, j in combinations(range(len(names)), 2)}
     views, start = _first_motion(seen, pairs)
-    posed: list[PosedView] = []
-    camera, distance = SessionCamera(capture.focal_px, 0.0, capture.principal_px, 0.0, 0.0), seen[0].distance_m
-    if len(views) >= LEAST_VIEWS:
-        tracks = _tracks(seen, pairs, start, views)
-        doubt = max(*np.abs(capture.focal_doubt), 0.002 if capture.focal_known else 0.5)
-        found = _adjust(tracks, start, seen[0].focal, float(doubt))
-        posed = _pose_views(found, [names[k] for k in views], distance or 1.0, capture.focal_px)
-        camera = _camera(capture, seen[0].bend, found)
+    if len(views) < LEAST_VIEWS:
+        raise _too_few(0, len(names))
+    tracks, distance = _tracks(seen, pairs, start, views), seen[0].distance_m
+    doubt = max(*np.abs(capture.focal_doubt), 0.002 if capture.focal_known else 0.5)
+    found = _adjust(tracks, start, seen[0].focal, float(doubt))
+    posed = _pose_views(found, [names[k] for k in views], distance or 1.0, capture.focal_px)
     if len(posed) < LEAST_VIEWS:
-        raise CaptureError(
-            f"no view shows a board, and {len(posed)} of {len(names)} views have {_LEAST_MATCHES} features of the "
-            f"object in common with others, {LEAST_VIEWS} are needed; shoot with the object on the board of "
-            "`polcap board`, or turn it by 15° or less between the views and let it fill the picture"
-        )
+        raise _too_few(len(posed), len(names))
     reason = f"fewer than {_LEAST_MATCHES} features of the object match those of other views; turn it by 15° or less"
     left_out = {name: reason for name in names if name not in {one.name for one in posed}}
-    return SessionPoses(camera, tuple(posed), left_out, distance is not None)
+    camera = _camera(capture, seen[0].bend, found)
+    return SessionPoses(camera, tuple(posed), left_out, metric=distance is not None)
+
+
+def _too_few(posed: int, count: int) -> CaptureError:
+    """Error of a session with too few posed views of `count`."""
+    return CaptureError(
+        f"no view shows a board, and {posed} of {count} views have {_LEAST_MATCHES} features of the object in common "
+        f"with others, {LEAST_VIEWS} are needed; shoot with the object on the board of `polcap board`, or turn it by "
+        "15° or less between the views and let it fill the picture"
+    )
 
 
 def _camera(capture: Capture, bend: tuple[float, float], found: _AdjustedMotion) -> SessionCamera:

@@ -20,7 +20,7 @@ from scipy.sparse.linalg import spsolve
 from polcap.images import ArrayValue, Floats
 from polcap.material import flash_light, texel_grid, texel_stokes
 from polcap.material.stokes_view import PosedStokes
-from polcap.material.texel_fit import FitSettings, Measurements, TexelEstimate, TexelPrior, fit, start
+from polcap.material.texel_fit import SLOPES, FitSettings, Measurements, TexelEstimate, TexelPrior, fit, start
 from polcap.material.texel_grid import FlashLight, TexelGrid
 from polcap.material.texel_stokes import TexelStokes, resample
 from polcap.optics import body
@@ -68,7 +68,7 @@ def solve(views: tuple[PosedStokes, ...], light: FlashLight, grid: TexelGrid, se
         raised = resample(views, light, grid, fine + delta, step)
         update, weight = _parallax(seen, raised, estimate, delta, settings)
         stereo = height + np.clip(update, -_MOST_STEP * delta, _MOST_STEP * delta)
-        slope = estimate.value[:, :2].reshape(*height.shape, 2)
+        slope = estimate.value[:, SLOPES].reshape(*height.shape, 2)
         reach = np.inf if number == 0 else CROSSOVER / step  # slopes of misplaced views are wrong
         height = _join(stereo, weight, slope, coarse.texel, reach)
     sigma = 1 / np.sqrt(np.maximum(weight, 1e-30))

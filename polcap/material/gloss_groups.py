@@ -103,7 +103,9 @@ def find(
     data = data.take(known)
     first = TexelPrior.alike((0.45, _F0), (0.2, 0.01), len(known))
     begin = texel_fit.start(data, geometry, first, body.SMOOTH)
-    albedo = texel_fit.fit(data, geometry, first, begin, body.SMOOTH, settings.fitting, rounds=4).value[:, 4:]
+    albedo = texel_fit.fit(data, geometry, first, begin, body.SMOOTH, settings.fitting, rounds=4).value[
+        :, texel_fit.ALBEDO
+    ]
     return group(data, geometry, albedo, settings)
 
 
@@ -170,7 +172,7 @@ def _at(
     if first is None:
         begin = texel_fit.start(data, views, prior, law)
     else:
-        begin = np.concatenate([first[:, :2], prior.mean, first[:, 4:]], axis=-1)
+        begin = np.concatenate([first[:, texel_fit.SLOPES], prior.mean, first[:, texel_fit.ALBEDO]], axis=-1)
     estimate = texel_fit.fit(data, views, prior, begin, law, fitting, rounds=5)
     away = (gloss[1] - _F0) / _F0_SIGMA
     return float(estimate.cost.mean()) + away**2 / _INDEPENDENT, estimate
@@ -185,7 +187,7 @@ def _newton(estimate: TexelEstimate, gloss: Floats) -> tuple[Floats, Floats]:
     inner = np.linalg.inv(data[:, others[:, None], others] + 1e-6 * np.eye(5))
     schur = data[:, own[:, None], own] - cross @ inner @ np.swapaxes(cross, 1, 2)
     # at the texels' optimum the prior's pull equals the data's gradient
-    pull = (estimate.value[:, 2:4] - gloss) / _TIGHT.astype(float) ** 2
+    pull = (estimate.value[:, texel_fit.GLOSS] - gloss) / _TIGHT.astype(float) ** 2
     total = _INDEPENDENT * schur.mean(axis=0) + np.diag([1e-6, _F0_SIGMA**-2])
     right = _INDEPENDENT * pull.mean(axis=0) + np.array([0, (_F0 - gloss[1]) / _F0_SIGMA**2])
     inverse = np.linalg.inv(total)

@@ -16,9 +16,9 @@ from scipy.fft import dctn, idctn
 
 from polcap.images import ArrayValue, Bools, Floats
 from polcap.material.coarse_relief import CROSSOVER, CoarseRelief
+from polcap.material.texel_fit import ALBEDO, F0, ROUGHNESS, SLOPES, UNKNOWNS, normals
 from polcap.material.texel_grid import TexelGrid
 from polcap.material.texel_maps import TexelMaps
-from polcap.optics import frames
 from polcap.optics.outline import fill_outward
 from polcap.stages import stage
 
@@ -60,21 +60,21 @@ class MaterialMaps(ArrayValue):
 def build(found: TexelMaps, relief: CoarseRelief, grid: TexelGrid, albedo_sigma: float | None) -> MaterialMaps:
     """Integrate heights, fill texels that were not measured, and compute ambient occlusion."""
     filled = fill_outward(np.concatenate([found.value, found.sigma], axis=-1), found.seen)
-    value, sigma = filled[..., :7], filled[..., 7:]
-    height = integrate(value[..., :2], relief.height, grid.texel)
-    normal = frames.unit(np.concatenate([-value[..., :2], np.ones_like(value[..., :1])], axis=-1))
+    value, sigma = filled[..., :UNKNOWNS], filled[..., UNKNOWNS:]
+    height = integrate(value[..., SLOPES], relief.height, grid.texel)
+    normal = normals(value)
     middle = float(height.mean())
     return MaterialMaps(
         normal=np.asarray(normal, np.float32),
-        diffuse=value[..., 4:],
-        specular=np.repeat(value[..., 3:4], 3, axis=-1),
-        roughness=value[..., 2],
+        diffuse=value[..., ALBEDO],
+        specular=np.repeat(value[..., F0, None], 3, axis=-1),
+        roughness=value[..., ROUGHNESS],
         height=np.asarray(height - middle, np.float32),
         occlusion=ambient_occlusion(height, normal, grid.texel),
         normal_sigma=np.degrees(np.hypot(sigma[..., 0], sigma[..., 1])) * normal[..., 2] ** 2,
-        diffuse_sigma=_albedo_doubt(value[..., 4:], sigma[..., 4:].mean(axis=-1), albedo_sigma or 0.0),
-        roughness_sigma=sigma[..., 2],
-        specular_sigma=sigma[..., 3],
+        diffuse_sigma=_albedo_doubt(value[..., ALBEDO], sigma[..., ALBEDO].mean(axis=-1), albedo_sigma or 0.0),
+        roughness_sigma=sigma[..., ROUGHNESS],
+        specular_sigma=sigma[..., F0],
         seen=found.seen,
         thickness=middle,
         albedo_sigma=albedo_sigma,

@@ -18,7 +18,8 @@ from polcap.material.texel_grid import TexelViews
 from polcap.optics import body, frames, shade
 
 IOR = 1.5  # of the diffuse law and of Fresnel's terms; F0 is free
-UNKNOWNS = 7  # slopes to the right and up, roughness, F0, albedo of three colors
+UNKNOWNS = 7  # slopes to the right and up, roughness, F0, albedo of three colors; their places:
+SLOPES, ROUGHNESS, F0, GLOSS, ALBEDO = slice(0, 2), 2, 3, slice(2, 4), slice(4, 7)
 LEAST_VIEWS = 3
 _ROUNDS = 9
 _STEP = np.array([2e-3, 2e-3, 4e-3], np.float32)  # of the derivatives: slopes, roughness
@@ -91,9 +92,8 @@ class TexelEstimate(ArrayValue):
 
 
 def normals(value: Floats) -> Floats:
-    """Unit normals (N, 3) in the plane's frame, from slopes in the first two columns."""
-    ones = np.ones_like(value[:, :1])
-    return np.asarray(frames.unit(np.concatenate([-value[:, :2], ones], axis=-1)))
+    """Unit normals (..., 3) in the plane's frame, from slopes in the first two columns."""
+    return np.asarray(frames.unit(np.concatenate([-value[..., SLOPES], np.ones_like(value[..., :1])], axis=-1)))
 
 
 def responses(slope: Floats, roughness: Floats, views: TexelViews, law: body.Law) -> Floats:
@@ -187,7 +187,7 @@ def _linearize(
     data: Measurements, views: TexelViews, prior: TexelPrior, value: Floats, law: body.Law, sigma: Floats
 ) -> _Linearized:
     """Errors and normal equations at values (N, 7)."""
-    slope, rough = value[:, :2], value[:, 2]
+    slope, rough = value[:, SLOPES], value[:, ROUGHNESS]
     base = responses(slope, rough, views, law)
     across, up = _STEP[0] * np.array([[1, 0], [0, 1]], np.float32)
     moved = [
@@ -195,7 +195,7 @@ def _linearize(
         responses(slope + up, rough, views, law),
         responses(slope, rough + _STEP[2], views, law),
     ]
-    f0, albedo = value[:, 3], value[:, 4:]
+    f0, albedo = value[:, F0], value[:, ALBEDO]
     level = albedo @ data.gray.astype(np.float32)
 
     def light(one: Floats) -> Floats:  # (K, N, 5)
@@ -206,10 +206,10 @@ def _linearize(
     jacobian = np.empty((*model.shape, UNKNOWNS), np.float32)
     for k, (one, step) in enumerate(zip(moved, _STEP, strict=True)):
         jacobian[..., k] = (light(one) - model) / step
-    jacobian[..., :3, 3] = base[0, ..., 1:]
-    jacobian[..., 3:, 3] = np.moveaxis(base[1:, ..., 1], 0, -1)
-    jacobian[..., :3, 4:] = base[0, ..., 0, None, None] * np.eye(3, dtype=np.float32)
-    jacobian[..., 3:, 4:] = np.moveaxis(base[1:, ..., 0], 0, -1)[..., None] * data.gray.astype(np.float32)
+    jacobian[..., :3, F0] = base[0, ..., 1:]
+    jacobian[..., 3:, F0] = np.moveaxis(base[1:, ..., 1], 0, -1)
+    jacobian[..., :3, ALBEDO] = base[0, ..., 0, None, None] * np.eye(3, dtype=np.float32)
+    jacobian[..., 3:, ALBEDO] = np.moveaxis(base[1:, ..., 0], 0, -1)[..., None] * data.gray.astype(np.float32)
     known = np.isfinite(sigma)
     weight = np.where(known, 1 / sigma, 0).astype(np.float32)
     error = np.where(known, measured - model, 0) * weight

@@ -10,7 +10,7 @@ from polcap.material import texel_fit, texel_grid
 from polcap.material.coarse_relief import CoarseRelief, measurements
 from polcap.material.gloss_groups import LAWS, GlossGroups, GlossSettings
 from polcap.material.stokes_view import PosedStokes
-from polcap.material.texel_fit import LEAST_VIEWS, UNKNOWNS, TexelEstimate, TexelPrior
+from polcap.material.texel_fit import ALBEDO, GLOSS, LEAST_VIEWS, UNKNOWNS, TexelEstimate, TexelPrior
 from polcap.material.texel_grid import FlashLight, TexelGrid
 from polcap.material.texel_stokes import TexelStokes
 from polcap.optics import body
@@ -56,14 +56,14 @@ def estimate(
         geometry = texel_grid.geometry(point[strip].reshape(-1, 3), poses, light)
         law: body.Law = LAWS[gloss.law]
         albedo = texel_fit.start(data, geometry, gloss.prior(_first_albedo(data, gloss), settings), law)
-        prior = gloss.prior(albedo[:, 4:], settings)
+        prior = gloss.prior(albedo[:, ALBEDO], settings)
         begin = texel_fit.fit(data, geometry, prior, albedo, law, settings.fitting, _FIRST_ROUNDS)
-        prior = gloss.prior(begin.value[:, 4:], settings)
+        prior = gloss.prior(begin.value[:, ALBEDO], settings)
         found = texel_fit.fit(data, geometry, prior, begin.value, law, settings.fitting)
         shape = value[strip].shape
         value[strip] = found.value.reshape(shape)
         sigma[strip], common[strip] = (
-            one.reshape(shape) for one in _doubts(found, prior, gloss.sigma_of(begin.value[:, 4:]))
+            one.reshape(shape) for one in _doubts(found, prior, gloss.sigma_of(begin.value[:, ALBEDO]))
         )
         known = np.isfinite(data.noise[..., 0])
         cost[strip] = (found.cost / np.maximum(5 * known.sum(axis=0) - UNKNOWNS + 2, 5)).reshape(shape[:2])
@@ -83,7 +83,7 @@ def estimate(
 def _doubts(found: TexelEstimate, prior: TexelPrior, shared: Floats) -> tuple[Floats, Floats]:
     """1σ (N, 7) of texels from their own data, and from the 1σ `shared` (N, 2) of their material's gloss."""
     covariance = np.linalg.inv(found.information.astype(np.float64))
-    response = covariance[:, :, 2:4] / prior.sigma[:, None, :] ** 2  # to a change of the prior's mean
+    response = covariance[:, :, GLOSS] / prior.sigma[:, None, :] ** 2  # to a change of the prior's mean
     own = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0))
     return own, np.linalg.norm(response * shared[:, None, :], axis=-1)
 

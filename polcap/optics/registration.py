@@ -232,7 +232,7 @@ def _refine(
             matrix = scaled(matrix, 2)
     shape = reference[finest].picture.shape
     if not len(points) or agree < _LEAST_AGREE * len(points):
-        return Registration(np.eye(3), 0.0, np.inf, 0, covariance, shape), 0
+        return Registration(np.eye(3), 0.0, np.inf, tiles=0, covariance=covariance, shape=shape), 0
     matrix = matrix / matrix[2, 2]
     moved = transform_points(matrix, points) - points
     shift_px = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))

@@ -65,13 +65,24 @@ class CameraErrors:
     @staticmethod
     def none(count: int, device: torch.device) -> "CameraErrors":
         """Parameters of a camera without errors, except for a trace of shot noise."""
-        one, zero = torch.ones(count, device=device), torch.zeros(count, device=device)
-        three = torch.zeros(3, count, device=device)
+
+        def zeros(*shape: int) -> Tensor:
+            return torch.zeros(shape, device=device)
+
         return CameraErrors(
-            1e9 * (three + 1), 1e3 * one, zero, torch.zeros(3, 3, count, device=device), zero,
-            three + 1, three, torch.zeros(3, count, 2, device=device),
-            zero, one, zero, one,
-        )  # fmt: skip
+            full_well=zeros(3, count) + 1e9,
+            bracket=zeros(count) + 1e3,
+            read_noise=zeros(count),
+            black=zeros(3, 3, count),
+            rows=zeros(count),
+            gain=zeros(3, count) + 1,
+            angle=zeros(3, count),
+            shift=zeros(3, count, 2),
+            blur=zeros(count),
+            depolarization=zeros(count) + 1,
+            ambient=zeros(count),
+            noise_belief=zeros(count) + 1,
+        )
 
     @staticmethod
     def stated(count: int, device: torch.device) -> "CameraErrors":

@@ -25,6 +25,7 @@ from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, 
 from polcap.training import loop, mask_scenes, mask_views, materials, random_shapes, traced_views, unet
 
 _PICTURES, _SIZE = 1600, (288, 384)  # H, W, traced; files have half of it
+_OBJECT, _CHART = 5, 6  # layers of a file: masks, after three colors, S1 and S2
 _VIEWS, _SCENES = 3, 2  # views of each mesh, scenes of each view
 _MISSED = 0.15  # share of charts that are in the picture but not found
 _RATE = 1.5e-3  # of Muon
@@ -103,11 +104,11 @@ def load_varied(file: Path, rng: np.random.Generator, other: Path | None = None)
     layers = np.load(file).astype(np.float32)
     if other is not None:
         more = np.load(other).astype(np.float32)
-        more[..., 6] = 0
-        cover = more[..., 5:6] > 0.5
-        layers = np.where(cover & (layers[..., 6:] < 0.5), more, layers)
+        more[..., _CHART] = 0
+        inserted = (more[..., _OBJECT] > 0.5) & (layers[..., _CHART] < 0.5)
+        layers = np.where(inserted[..., None], more, layers)
     layers = _crop(layers, rng)
-    stokes, mask, chart = layers[..., :5], layers[..., 5], layers[..., 6] > 0.5
+    stokes, mask, chart = layers[..., :_OBJECT], layers[..., _OBJECT], layers[..., _CHART] > 0.5
     if not chart.any() and rng.random() < 0.3:
         stokes = stokes[..., [*rng.permutation(3), 3, 4]]
     if rng.random() < 0.5:
@@ -135,7 +136,7 @@ def _crop(layers: Floats, rng: np.random.Generator) -> Floats:
         tall, wide = int(height * share), int(width * share)
         y, x = rng.integers(height - tall + 1), rng.integers(width - wide + 1)
         part = layers[y : y + tall, x : x + wide]
-        if 0.01 < part[..., 5].mean() < 0.9:
+        if 0.01 < part[..., _OBJECT].mean() < 0.9:
             return np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR))
     return layers
 
