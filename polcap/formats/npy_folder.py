@@ -102,6 +102,7 @@ def _scalar(tree: Any, hint: Any, folder: Path) -> Any:
 
 
 def _array_file(tree: Any, folder: Path) -> Path:
+    """File of an array that a manifest names. Raises StorageError: the name is none of a file in this folder."""
     name = tree.get("array") if isinstance(tree, dict) else None
     _expect(isinstance(name, str) and Path(name).name == name, tree, "an array's file", folder)
     return folder / str(name)

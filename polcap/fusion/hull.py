@@ -66,7 +66,7 @@ def visual_hull(views: Sequence[SmallView], steps: int) -> DistanceGrid:
 
 
 def _object_grid(views: Sequence[SmallView], steps: int) -> VoxelGrid:
-    """VoxelGrid over the object's box, from a coarse hull in the space that the views share."""
+    """Grid over the object's box, from a coarse hull in the space that the views share."""
     middle, reach = _shared_space(views)
     step = 2 * reach / (_COARSE - 1)
     coarse = VoxelGrid(middle - reach, step, (_COARSE,) * 3)

@@ -138,11 +138,11 @@ class Simulator:
         thinned = np.arange(full) * size // full
         new_place[: full * full] = np.argsort(order)[(thinned[:, None] * size + thinned).reshape(-1)]
         new_place[[bounced_light.NOWHERE, bounced_light.ESCAPED]] = -1
-        row = np.where(mask.reshape(-1), np.cumsum(mask) - 1, -1)
+        number = np.where(mask.reshape(-1), np.cumsum(mask) - 1, -1)  # of each pixel among those of all objects
         cell = (view * coarse + y // bounced_light.COARSE) * coarse + x // bounced_light.COARSE
-        found = self.views["met"].take(cell, axis=0)  # (M, RAYS)
-        to, escaped = new_place[found], found == bounced_light.ESCAPED
-        met = np.where(to >= 0, row[to + owner[:, None] * area], -1)
+        hit = self.views["met"].take(cell, axis=0)  # (M, RAYS) pixel of the cache that each bounced ray meets
+        place, escaped = new_place[hit], hit == bounced_light.ESCAPED
+        met = np.where(place >= 0, number[place + owner[:, None] * area], -1)
         share = escaped[:, -bounced_light.SHARP :].mean(axis=1, dtype=np.float32)
         return met, share, 1 - escaped.mean(axis=1, dtype=np.float32)
 
