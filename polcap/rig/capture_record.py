@@ -195,4 +195,5 @@ def read(file: Path, kind: type[T]) -> T:
 
 
 def _bracket(of: AcceptedFrame | Slot) -> tuple[str, float | None]:
+    """Role and angle, which all frames of a bracket share."""
     return of.role, of.angle_deg

@@ -163,7 +163,7 @@ def _on_pixels(values: Floats, mask: Bools) -> Floats:
 
 
 def _fewest_groups(alike: Floats) -> tuple[Floats, float]:
-    """Centers (K, 4) of as few groups of pixels (N, 4) as are alike, and the spread within a group."""
+    """Centers (K, 4) of the fewest groups whose pixels (N, 4) are alike, and the spread within a group."""
     for count in range(1, _MOST_MATERIALS + 1):
         center, spread = clusters.color_clusters(alike, count)
         if spread < _LIKE:
