@@ -94,7 +94,7 @@ def shoot(folder: Path, seed: int, fault: str, width: int) -> str:
         change = lambda light, k, e: light + extra if k == victim else light  # noqa: E731
         done = f"shot {victim}, 15 % more light from one side"
     for k in range(3):
-        radiance = studio.radiance(ShotPose(actual[k], (shift[k, 0], shift[k, 1]), roll[k]))
+        radiance = _radiance(seed, width, ShotPose(actual[k], (shift[k, 0], shift[k, 1]), roll[k]))
         for e in range(3):
             stops = how.step ** (e - 1)
             file = folder / f"pol{_ANGLES[names[k]]:03.0f}" / f"IMG_{3 * k + e + 1:04d}.DNG"
@@ -106,7 +106,13 @@ def shoot(folder: Path, seed: int, fault: str, width: int) -> str:
     return done
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=8)
+def _radiance(seed: int, width: int, pose: ShotPose) -> Floats:
+    """Light of a shot, (H, W, 3), which most faults of a seed share."""
+    return _studio(seed, width).radiance(pose)
+
+
+@lru_cache(maxsize=2)
 def _studio(seed: int, width: int) -> Studio:
     how = Shoot(seed=seed, width=width, height=width * 3 // 4, samples=1)
     return Studio(random_scene(seed, _KINDS[seed % 3]), how)

@@ -1,6 +1,7 @@
 """Sets of views between which the object was laid on its side are joined by its shape and albedo."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -8,12 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from polcap.errors import CaptureError
 from polcap.fusion import joining
+from polcap.fusion.joining import JoinedSet
 from polcap.fusion.values import FusionView
 from polcap.optics.mesh_tracer import Tracer, smooth
 from polcap.quality.limits import FusedGateLimits
 from tests.fusion.traced_views import Body, capture, ring, solid_texture, stand, with_errors
 
 trimesh = pytest.importorskip("trimesh")
+COUNT = 8  # views of a set
 TIP = Rotation.from_euler("yxz", [40, 87, 5], degrees=True)
 
 
@@ -35,9 +38,9 @@ def laid(body: Body) -> tuple[Body, np.ndarray]:
 
 
 def views(body: Body, shift: np.ndarray | None, rng: np.random.Generator) -> list[FusionView]:
-    """Eight views with errors, of the standing body or of the laid one; its texture is fixed to the body."""
+    """Views with errors, of the standing body or of the laid one; its texture is fixed to the body."""
     out = []
-    for pose in ring(body, 8):
+    for pose in ring(body, COUNT):
         view = capture(body, pose, 160)
         if shift is not None:
             position = body.tracer.trace(pose.rotation, pose.translation, view.view, 160, 160).position
@@ -53,35 +56,48 @@ def named(some: list[FusionView], folder: str) -> tuple[FusionView, ...]:
     return tuple(replace(view, name=f"{folder}/view{k:02d}".lstrip("/")) for k, view in enumerate(some, 1))
 
 
-def test_a_laid_object_is_turned_back(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(joining, "_GRID", 60)
-    body = pear()
-    other, shift = laid(body)
-    first, second = views(body, None, rng), views(other, shift, rng)
-    views_ = named(first, "setA") + named(second, "setB")
-    (joined,) = joining.join(views_)
-    assert joined.folder == "setB" and joined.shared > 0.85
-    placed = joining.place(views_, (joined,))
-    assert placed[: len(first)] == views_[: len(first)]
-    true = [joining.Motion(TIP.inv().as_matrix(), -TIP.inv().apply(shift)).pose(view.pose) for view in second]
-    for view, pose in zip(placed[len(first) :], true, strict=True):
-        turn = Rotation.from_matrix(view.pose.rotation @ pose.rotation.T).magnitude()
+class Session(NamedTuple):
+    """Three sets of views, joined: setA of the standing body, setB of the laid one, setC of another body."""
+
+    body: Body
+    shift: np.ndarray  # (3,) m, after the turn TIP
+    views: tuple[FusionView, ...]
+    joined: tuple[JoinedSet, ...]
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    rng, body = np.random.default_rng(6), pear()
+    (other, shift), torus = laid(body), trimesh.creation.torus(1.0, 0.35, 48, 24)
+    sets = [views(body, None, rng), views(other, shift, rng), views(stand(torus.vertices, torus.faces), None, rng)]
+    made = sum((named(one, f"set{letter}") for one, letter in zip(sets, "ABC")), ())
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (("_GRID", 60), ("_TURNS", 1000)):
+            patch.setattr(joining, name, value)
+        return Session(body, shift, made, joining.join(made))
+
+
+def test_a_laid_object_is_turned_back(session: Session) -> None:
+    first, second = session.views[:COUNT], session.views[COUNT : 2 * COUNT]
+    assert session.joined[0].folder == "setB" and session.joined[0].shared > 0.85
+    placed = joining.place(session.views, session.joined)
+    assert placed[:COUNT] == first
+    back = joining.Motion(TIP.inv().as_matrix(), -TIP.inv().apply(session.shift))
+    for view, before in zip(placed[COUNT:], second):
+        true = back.pose(before.pose)
+        turn = Rotation.from_matrix(view.pose.rotation @ true.rotation.T).magnitude()
         assert np.degrees(turn) < 1.0  # a pixel of these views at the object's rim
-        away = (view.pose.rotation - pose.rotation) @ body.middle + view.pose.translation - pose.translation
-        assert np.linalg.norm(away) < 0.006 * body.size  # half a pixel and more
+        away = (view.pose.rotation - true.rotation) @ session.body.middle + view.pose.translation - true.translation
+        assert np.linalg.norm(away) < 0.006 * session.body.size  # half a pixel and more
 
 
-def test_another_object_is_recognized(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(joining, "_GRID", 40)
-    monkeypatch.setattr(joining, "_TURNS", 500)
-    torus = trimesh.creation.torus(1.0, 0.35, 48, 24)
-    other = stand(torus.vertices, torus.faces)
-    joined = joining.join(named(views(pear(), None, rng), "setA") + named(views(other, None, rng), "setB"))
-    with pytest.raises(CaptureError, match=r"setB: the first set confirms .* fusion.gates.min_shared = 70% is needed"):
-        joining.require_shared(joined, FusedGateLimits().min_shared)
-    joining.require_shared(joined, 0.0)
+def test_another_object_is_recognized(session: Session) -> None:
+    other = session.joined[1:]
+    with pytest.raises(CaptureError, match=r"setC: the first set confirms .* fusion.gates.min_shared = 70% is needed"):
+        joining.require_shared(other, FusedGateLimits().min_shared)
+    joining.require_shared(other, 0.0)
 
 
-def test_a_single_set_needs_no_joining(rng: np.random.Generator) -> None:
-    alone = named(views(pear(), None, rng), "")
+def test_a_single_set_needs_no_joining(session: Session) -> None:
+    alone = named(list(session.views[:COUNT]), "")
     assert joining.join(alone) == () and joining.place(alone, ()) == alone

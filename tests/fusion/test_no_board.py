@@ -53,7 +53,7 @@ def width(vertices: Floats) -> float:
 
 
 def test_an_object_without_pattern_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    folder = session(tmp_path / "object", "plain", 4, width=300)
+    folder = session(tmp_path / "object", "plain", 4, width=180)
     done = shell("fuse", folder, "--no-chart", "--estimator", "analytic")
     assert done.returncode == 2
     assert "no view shows a board" in done.stderr and "polcap board" in done.stderr
