@@ -108,11 +108,11 @@ def bake(views: tuple[FusionView, ...], atlas: Atlas, settings: BakingSettings) 
     normal = _bake_normals(views, visible, atlas, settings)
     diffuse = _bake_bands([view.diffuse for view in views], views, visible, count, settings.smooth)
     gloss = [np.concatenate([view.specular, view.roughness[..., None]], axis=-1) for view in views]
-    samples, plain = [one.sample(image) for one, image in zip(visible, gloss)], [one.weight for one in visible]
+    samples, plain = [texels.sample(image) for texels, image in zip(visible, gloss)], [one.weight for one in visible]
     specular_roughness, _ = _robust_mean(samples, plain, visible, count, _OUTLIER * _typical(samples))
     total = np.zeros(count)
-    for one in visible:
-        total[one.texel] += one.weight
+    for texels in visible:
+        total[texels.texel] += texels.weight
     values = np.concatenate([normal, diffuse, specular_roughness, total[:, None]], axis=-1, dtype=np.float32)
     return on_atlas(atlas, values)
 
@@ -157,11 +157,11 @@ def _visible(view: FusionView, atlas: Atlas, tracer: Tracer) -> VisibleTexels:
     seen = np.flatnonzero(weight > 0)
     texel = texel[seen]
     return VisibleTexels(
-        texel,
-        pixel[texel].astype(np.float32),
-        cosine[seen].astype(np.float32),
-        weight[seen].astype(np.float32),
-        surface.normal,
+        texel=texel,
+        pixel=pixel[texel].astype(np.float32),
+        cosine=cosine[seen].astype(np.float32),
+        weight=weight[seen].astype(np.float32),
+        mesh_normal=surface.normal,
     )
 
 
@@ -190,15 +190,16 @@ def _bake_normals(
 ) -> Floats:
     """Unit normals (N, 3) in the board frame: those of the mesh plus the mean differences of the views from it."""
     differences = []
-    for view, one in zip(views, visible):
-        both = view.mask & (frames.dot(one.mesh_normal, one.mesh_normal) > 0.5)
-        difference = np.where(both[..., None], view.normal - one.mesh_normal, 0).astype(np.float32)
-        bands = one.sample(_bands(difference, both, settings.smooth * diameter_px(view)))
+    for view, texels in zip(views, visible):
+        both = view.mask & (frames.dot(texels.mesh_normal, texels.mesh_normal) > 0.5)
+        difference = np.where(both[..., None], view.normal - texels.mesh_normal, 0).astype(np.float32)
+        bands = texels.sample(_bands(difference, both, settings.smooth * diameter_px(view)))
         differences.append(np.concatenate([bands[:, k : k + 3] @ view.pose.rotation for k in (0, 3)], axis=-1))
     count = len(atlas.position)
     prior = (settings.mesh_sigma_deg or _mesh_sigma_deg(differences)) ** -2
     weights = [
-        one.weight / (one.sample(view.sigma_deg)[:, 0] ** 2 + _FLOOR_DEG**2) for one, view in zip(visible, views)
+        texels.weight / (texels.sample(view.sigma_deg)[:, 0] ** 2 + _FLOOR_DEG**2)
+        for texels, view in zip(visible, views)
     ]
     smooth, weights = _robust_mean(
         [one[:, :3] for one in differences], weights, visible, count, float(np.radians(_OUTLIER_DEG)), prior
@@ -221,8 +222,8 @@ def _bake_bands(
 ) -> Floats:
     """Robust mean (N, C) of images (H, W, C) of the views: smooth band from all, fine band from the best."""
     bands = [
-        one.sample(_bands(image, view.mask, smooth * diameter_px(view)))
-        for one, image, view in zip(visible, images, views)
+        texels.sample(_bands(image, view.mask, smooth * diameter_px(view)))
+        for texels, image, view in zip(visible, images, views)
     ]
     channels = images[0].shape[-1]
     weights = [one.weight for one in visible]
@@ -260,8 +261,8 @@ def _robust_mean(
     for _ in range(_ROUNDS):
         mean = _weighted_mean(samples, robust, visible, count, prior)
         robust = [
-            w / (1 + np.sum((value - mean[one.texel]) ** 2, axis=-1) / scale**2)
-            for value, w, one in zip(samples, weights, visible)
+            w / (1 + np.sum((value - mean[texels.texel]) ** 2, axis=-1) / scale**2)
+            for value, w, texels in zip(samples, weights, visible)
         ]
     return _weighted_mean(samples, robust, visible, count, prior), robust
 
@@ -275,7 +276,7 @@ def _weighted_mean(
 ) -> Floats:
     """Weighted mean (N, C) over the views, 0 where none has weight."""
     total, mean = np.full(count, prior), np.zeros((count, samples[0].shape[-1]))
-    for value, weight, one in zip(samples, weights, visible):
-        total[one.texel] += weight
-        mean[one.texel] += weight[:, None] * value
+    for value, weight, texels in zip(samples, weights, visible):
+        total[texels.texel] += weight
+        mean[texels.texel] += weight[:, None] * value
     return np.asarray(mean / np.maximum(total, 1e-30)[:, None])

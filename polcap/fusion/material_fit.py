@@ -108,16 +108,16 @@ def _samples(
     normal, albedo = maps.normal[atlas.covered], color.luminance(maps.diffuse[atlas.covered])
     parts = []
     middle = atlas.position.mean(axis=0)
-    for view, one in zip(views, visible):
+    for view, texels in zip(views, visible):
         assert view.s0 is not None
-        steep = np.flatnonzero(one.cosine > _LEAST_COSINE)
-        point = view.pose.to_camera(atlas.position[one.texel[steep]])
+        steep = np.flatnonzero(texels.cosine > _LEAST_COSINE)
+        point = view.pose.to_camera(atlas.position[texels.texel[steep]])
         to_lens = frames.unit(-point)
-        local = frames.to_ray_frame(normal[one.texel[steep]] @ view.pose.rotation.T, to_lens)
+        local = frames.to_ray_frame(normal[texels.texel[steep]] @ view.pose.rotation.T, to_lens)
         far = float(np.linalg.norm(view.pose.rotation @ middle + view.pose.translation))
         light = irradiance(point, view.light[:2], 0.0) * (far * (view.white_distance or 1)) ** 2
-        radiance = color.luminance(one.sample(view.s0))[steep] / light
-        parts.append((radiance, albedo[one.texel[steep]], local, point, one.weight[steep], one.texel[steep]))
+        radiance = color.luminance(texels.sample(view.s0))[steep] / light
+        parts.append((radiance, albedo[texels.texel[steep]], local, point, texels.weight[steep], texels.texel[steep]))
     radiance, base, local, point, weight, texel = (np.concatenate(column) for column in zip(*parts))
     best = share.argmax(axis=1)
     material, gloss = best[texel], _typical_gloss(views, visible, best, share.shape[1])
@@ -137,9 +137,13 @@ def _typical_gloss(
 ) -> list[tuple[float, float]]:
     """F0 and roughness of each material in the maps: medians over the views that see enough of it."""
     rows = np.zeros((len(views), count, 3))  # means of F0 and roughness, weight
-    for row, view, one in zip(rows, views, visible):
-        gloss = color.luminance(one.sample(view.specular)), one.sample(view.roughness)[:, 0], np.ones(len(one.texel))
-        row[:] = np.stack([np.bincount(material[one.texel], one.weight * x, count) for x in gloss], axis=-1)
+    for row, view, texels in zip(rows, views, visible):
+        gloss = (
+            color.luminance(texels.sample(view.specular)),
+            texels.sample(view.roughness)[:, 0],
+            np.ones(len(texels.texel)),
+        )
+        row[:] = np.stack([np.bincount(material[texels.texel], texels.weight * x, count) for x in gloss], axis=-1)
         row[:, :2] /= np.maximum(row[:, 2:], 1e-9)
     enough = rows[..., 2] > _LEAST_SHARE * rows[..., 2].max(axis=0)
     return [tuple(np.median(rows[enough[:, k], k, :2], axis=0)) if enough[:, k].any() else (0.0, 0.0)
@@ -151,10 +155,10 @@ def _normal_sigma(
 ) -> float:
     """Error of the baked normals per axis [rad], from the angles between them and the views' normals."""
     normal, angles = maps.normal[atlas.covered], []
-    for view, one in zip(views, visible):
-        facing = np.flatnonzero(one.cosine > _NORMAL_FACING)
-        own = frames.unit(one.sample(view.normal)[facing]) @ view.pose.rotation
-        angles.append(np.arccos(np.clip(frames.dot(own, normal[one.texel[facing]]), -1, 1)))
+    for view, texels in zip(views, visible):
+        facing = np.flatnonzero(texels.cosine > _NORMAL_FACING)
+        own = frames.unit(texels.sample(view.normal)[facing]) @ view.pose.rotation
+        angles.append(np.arccos(np.clip(frames.dot(own, normal[texels.texel[facing]]), -1, 1)))
     angle = np.concatenate(angles)
     return _NORMAL_ERROR * float(np.median(angle)) / np.sqrt(2 * np.log(2)) if len(angle) else 0.0  # Rayleigh's law
 

@@ -86,14 +86,15 @@ def _reduce(of: FusionView) -> SmallView:
     world = weighted_area_mean(of.normal[box], mask, shape) @ of.pose.rotation  # of the pixels in the mask
     length = np.linalg.norm(world, axis=-1, keepdims=True)
     outline = area_mean(_outline(mask), shape) / np.float32(scale.mean())
+    certainty = np.where(mask, 1 / np.maximum(of.sigma_deg[box], _LEAST_SIGMA) ** 2, 0).astype(np.float32)
     return SmallView(
-        of.pose,
-        view,
-        outline,
-        np.stack([np.gradient(outline, axis=axis) for axis in (1, 0)], axis=-1),
-        (world / np.maximum(length, 1e-9)).astype(np.float32),
-        area_mean(np.where(mask, 1 / np.maximum(of.sigma_deg[box], _LEAST_SIGMA) ** 2, 0).astype(np.float32), shape),
-        weighted_area_mean(of.diffuse[box], mask, shape),
+        pose=of.pose,
+        view=view,
+        outline=outline,
+        slope=np.stack([np.gradient(outline, axis=axis) for axis in (1, 0)], axis=-1),
+        normal=(world / np.maximum(length, 1e-9)).astype(np.float32),
+        certainty=area_mean(certainty, shape),
+        diffuse=weighted_area_mean(of.diffuse[box], mask, shape),
     )
 
 

@@ -69,7 +69,15 @@ def measure(views: tuple[PosedStokes, ...], chart: ChartInView | None, board: Bo
     place, shine = law[:3], max(float(_highlight(one, law).max()) for one in samples)
     albedo = PAPER if chart is None else float(level[chart.view] * _chart_irradiance(views[chart.view], chart, place))
     matrix = np.stack([_shot_matrix(view, one, k) for view, one, k in zip(views, samples, keep, strict=True)])
-    return FlashLight(place, level / albedo, matrix, float(rest.std()), albedo, shine, len(rest))
+    return FlashLight(
+        place=place,
+        gain=level / albedo,
+        shot_matrix=matrix,
+        sigma=float(rest.std()),
+        paper=albedo,
+        shine=shine,
+        used=len(rest),
+    )
 
 
 @dataclass(frozen=True)

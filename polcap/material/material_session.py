@@ -74,12 +74,17 @@ def process(
     masked = masked.without(board_focus.left_out(tuple(every), sight))
     posed = [every[name] for name in masked.views]
     names = tuple(masked.views)
-    tilts = {name: _tilt_deg(solved, name) for name in names}
     return FlatSession(
-        together(posed), names, solved, _chart(masked, charted), board,
-        sample_grid(solved, names, board, posed, region, texel),
-        masked.left_out, tilts, {name: blur for name, blur in zip(every, sight.blur, strict=True) if name in tilts},
-    )  # fmt: skip
+        views=together(posed),
+        names=names,
+        poses=solved,
+        chart=_chart(masked, charted),
+        board=board,
+        grid=sample_grid(solved, names, board, posed, region, texel),
+        left_out=masked.left_out,
+        tilt_deg={name: _tilt_deg(solved, name) for name in names},
+        blur_px={name: blur for name, blur in zip(every, sight.blur, strict=True) if name in names},
+    )
 
 
 def _with_mask(view: SessionView, solved: SessionPoses, board: Board) -> SessionView:

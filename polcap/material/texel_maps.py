@@ -10,10 +10,17 @@ from polcap.material import texel_fit, texel_grid
 from polcap.material.coarse_relief import CoarseRelief, measurements
 from polcap.material.gloss_groups import LAWS, GlossGroups, GlossSettings
 from polcap.material.stokes_view import PosedStokes
-from polcap.material.texel_fit import ALBEDO, GLOSS, LEAST_VIEWS, UNKNOWNS, TexelEstimate, TexelPrior
-from polcap.material.texel_grid import FlashLight, TexelGrid
+from polcap.material.texel_fit import (
+    ALBEDO,
+    GLOSS,
+    LEAST_VIEWS,
+    UNKNOWNS,
+    Measurements,
+    TexelEstimate,
+    TexelPrior,
+)
+from polcap.material.texel_grid import FlashLight, TexelGrid, TexelViews
 from polcap.material.texel_stokes import TexelStokes
-from polcap.optics import body
 from polcap.stages import stage
 
 _TILE = 16_000  # texels
@@ -54,17 +61,10 @@ def estimate(
         strip = slice(top, min(top + rows, height))
         data = measurements(seen.rows(strip), views)
         geometry = texel_grid.geometry(point[strip].reshape(-1, 3), poses, light)
-        law: body.Law = LAWS[gloss.law]
-        albedo = texel_fit.start(data, geometry, gloss.prior(_first_albedo(data, gloss), settings), law)
-        prior = gloss.prior(albedo[:, ALBEDO], settings)
-        begin = texel_fit.fit(data, geometry, prior, albedo, law, settings.fitting, _FIRST_ROUNDS)
-        prior = gloss.prior(begin.value[:, ALBEDO], settings)
-        found = texel_fit.fit(data, geometry, prior, begin.value, law, settings.fitting)
+        found, own_sigma, shared_sigma = _fit(data, geometry, gloss, settings)
         shape = value[strip].shape
-        value[strip] = found.value.reshape(shape)
-        sigma[strip], common[strip] = (
-            one.reshape(shape) for one in _doubts(found, prior, gloss.sigma_of(begin.value[:, ALBEDO]))
-        )
+        value[strip], sigma[strip] = found.value.reshape(shape), own_sigma.reshape(shape)
+        common[strip] = shared_sigma.reshape(shape)
         known = np.isfinite(data.noise[..., 0])
         cost[strip] = (found.cost / np.maximum(5 * known.sum(axis=0) - UNKNOWNS + 2, 5)).reshape(shape[:2])
         square += np.stack([(found.error**2).sum(axis=(1, 2)), 5.0 * known.sum(axis=1)], axis=-1)
@@ -75,9 +75,29 @@ def estimate(
     with np.errstate(all="ignore"):
         middle = np.nanmedian(residual[:, measured].astype(np.float32), axis=1)
     return TexelMaps(
-        value, np.hypot(sigma * scale[..., None], common), measured,
-        np.sqrt(square[:, 0] / np.maximum(square[:, 1], 1)), middle,
-    )  # fmt: skip
+        value=value,
+        sigma=np.hypot(sigma * scale[..., None], common),
+        seen=measured,
+        misfit=np.sqrt(square[:, 0] / np.maximum(square[:, 1], 1)),
+        residual=middle,
+    )
+
+
+def _fit(
+    data: Measurements, geometry: TexelViews, gloss: GlossGroups, settings: GlossSettings
+) -> tuple[TexelEstimate, Floats, Floats]:
+    """Estimates of N texels, and their 1σ as of `_doubts`. Priors are those of the materials, chosen by the albedo.
+
+    The albedo is better known at each step: median radiance of the views, fit of flat texels, fit of a few rounds.
+    """
+    law = LAWS[gloss.law]
+    radiance = np.median(np.where(np.isfinite(data.noise[..., :1]), data.radiance, 0), axis=0)
+    flat = texel_fit.start(data, geometry, gloss.prior(np.clip(radiance, 0, 1), settings), law)
+    prior = gloss.prior(flat[:, ALBEDO], settings)
+    few = texel_fit.fit(data, geometry, prior, flat, law, settings.fitting, _FIRST_ROUNDS).value
+    prior = gloss.prior(few[:, ALBEDO], settings)
+    found = texel_fit.fit(data, geometry, prior, few, law, settings.fitting)
+    return found, *_doubts(found, prior, gloss.sigma_of(few[:, ALBEDO]))
 
 
 def _doubts(found: TexelEstimate, prior: TexelPrior, shared: Floats) -> tuple[Floats, Floats]:
@@ -86,9 +106,3 @@ def _doubts(found: TexelEstimate, prior: TexelPrior, shared: Floats) -> tuple[Fl
     response = covariance[:, :, GLOSS] / prior.sigma[:, None, :] ** 2  # to a change of the prior's mean
     own = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0))
     return own, np.linalg.norm(response * shared[:, None, :], axis=-1)
-
-
-def _first_albedo(data: texel_fit.Measurements, gloss: GlossGroups) -> Floats:
-    """Rough albedo (N, 3) of each texel: the median radiance over the views, at the level of the groups."""
-    level = np.median(np.where(np.isfinite(data.noise[..., :1]), data.radiance, 0), axis=0)
-    return np.asarray(np.clip(level, 0, 1))
