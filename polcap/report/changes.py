@@ -4,7 +4,8 @@
 2. Pictures of the maps under one lamp are registered by a similarity and a homography, then by a smooth flow, because
    a camera that moved sees depth from another side. The normals are turned by the rotation that fits them best.
 3. Color, normal and roughness are subtracted. The doubt of a pixel is the difference that is usual in this pair, more
-   where the normals' expected error is larger. Regions that differ by more than `LIMIT` doubts are changes.
+   where the normals' expected error is larger. Two results share most of their errors, but not those of the
+   roughness of a material that only one of them divides. Regions that differ by more than `LIMIT` doubts are changes.
 
 References
 ----------
@@ -18,6 +19,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from polcap.images import Bools, Floats
 from polcap.optics import color, frames
@@ -39,6 +41,8 @@ _OVER_QUARTER = 2.0  # usual difference over the 25th percentile
 _LEAST_DOUBT = {"color": 0.6, "roughness": 0.02}  # ΔE2000, 1
 _LARGEST_DOUBT = {"color": 2.5, "normal": 4.0, "roughness": 0.03}  # usual difference, so that a change of all is one
 _OF_EXPECTED = 0.3  # least doubt of normals, over the expected error of the pair: two results share most of it
+_GLOSS_STEP = 0.02  # of a histogram of roughness
+_LEAST_MATERIAL = 0.05  # of the compared pixels, in one step: borders mix two materials
 _MISREGISTRATION_PX = 0.4
 _PATTERN = 0.7, 2.0  # range of a pixel's doubt over the usual one
 
@@ -170,7 +174,9 @@ def _resampled(one: SurfaceMaps, other: SurfaceMaps, at: Floats) -> tuple[Surfac
         sampled: Any = cv2.remap(np.ascontiguousarray(value, np.float32), x, y, cv2.INTER_CUBIC)
         return np.asarray(sampled)
 
-    layers = [other.normal, other.diffuse, other.specular, other.roughness[..., None], other.confidence[..., None]]
+    error = np.zeros_like(other.roughness) if other.roughness_error is None else other.roughness_error
+    scalars = np.stack([other.roughness, other.confidence, error], axis=-1)
+    layers = [other.normal, other.diffuse, other.specular, scalars]
     filled = fill_outward(np.concatenate(layers, axis=-1), other.mask)
     moved = np.concatenate([sample(filled[..., k : k + 3]) for k in (0, 3, 6)] + [sample(filled[..., 9:])], axis=-1)
     seen = cv2.remap(_inner(other.mask).astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0
@@ -188,7 +194,7 @@ def _resampled(one: SurfaceMaps, other: SurfaceMaps, at: Floats) -> tuple[Surfac
             depth_prior=None,
             detail=None,
             diffuse_error=None,
-            roughness_error=None,
+            roughness_error=None if other.roughness_error is None else moved[..., 11],
         ),
         both,
     )
@@ -244,8 +250,33 @@ def _differences(one: SurfaceMaps, other: SurfaceMaps, both: Bools) -> dict[str,
         misplaced = _MISREGISTRATION_PX * np.hypot(steps[0], steps[1])
         doubt = np.hypot(_usual(name, value[both]) * pattern, misplaced)
         least = _OF_EXPECTED * expected if name == "normal" else _LEAST_DOUBT[name]
+        if name == "roughness" and one.roughness_error is not None and other.roughness_error is not None:
+            unshared = np.hypot(one.roughness_error, other.roughness_error)
+            least = np.where(_divided(one.roughness, other.roughness, both), unshared, least)
         found[name] = _difference(value, np.maximum(doubt, least), both)
     return found
+
+
+def _divided(one: Floats, other: Floats, both: Bools) -> Bools:
+    """Pixels (H, W) of a material of one result that is two or more materials in the other, by their roughness."""
+    if not both.any():
+        return both
+    first, second = _materials(one, both), _materials(other, both)
+    overlap = np.zeros((first.max() + 1, second.max() + 1), int)
+    np.add.at(overlap, (first[both], second[both]), 1)
+    divided = np.bincount(overlap.argmax(axis=0), minlength=len(overlap)) > 1
+    also_divided = np.bincount(overlap.argmax(axis=1), minlength=overlap.shape[1]) > 1
+    return np.asarray(divided[first] | also_divided[second])
+
+
+def _materials(roughness: Floats, both: Bools) -> NDArray[np.intp]:
+    """Number (H, W) of each pixel's material: the nearest peak in the histogram of roughness."""
+    step = np.rint(np.maximum(roughness, 0) / _GLOSS_STEP).astype(int)
+    counts = np.pad(np.bincount(step[both]), 1)
+    middle = counts[1:-1]
+    peaks = (middle > counts[:-2]) & (middle >= counts[2:]) & (middle >= _LEAST_MATERIAL * both.sum())
+    places = np.flatnonzero(peaks)
+    return np.asarray(np.searchsorted((places[1:] + places[:-1]) / 2, step))
 
 
 def _usual(name: str, value: Floats) -> float:

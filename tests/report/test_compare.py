@@ -128,6 +128,22 @@ def test_a_new_varnish_on_a_part_or_on_all_is_a_change_of_roughness(before: Surf
     assert found(before, noisy(varnished, 2)) == {"roughness": pytest.approx(share, abs=0.12)}
 
 
+def glossed(maps: SurfaceMaps, part: np.ndarray, inside: float, outside: float) -> SurfaceMaps:
+    """The maps with two roughnesses, each with an expected error of 0.06."""
+    roughness = np.where(part, inside, outside).astype(np.float32)
+    return replace(maps, roughness=roughness, roughness_error=np.full_like(roughness, 0.06))
+
+
+def test_a_material_that_only_one_result_divides_is_no_change_of_roughness() -> None:
+    maps = patterned()
+    part = spot(maps, 20)
+    whole, divided = glossed(noisy(maps, 1), part, 0.4, 0.4), glossed(noisy(maps, 2), part, 0.54, 0.38)
+    assert found(whole, divided) == {} and found(divided, whole) == {}
+    assert found(whole, glossed(noisy(maps, 2), part, 0.25, 0.25)) == {"roughness": pytest.approx(1, abs=0.05)}
+    polished = glossed(noisy(maps, 2), part, 0.74, 0.38)
+    assert found(divided, polished) == {"roughness": pytest.approx(part.sum() / maps.mask.sum(), rel=0.3)}
+
+
 def test_albedos_of_unknown_scale_are_compared_by_their_pattern(before: SurfaceMaps) -> None:
     darker = noisy(replace(patterned(), diffuse=patterned().diffuse * np.float32(0.6)), 2)
     assert found(before, darker) == {}
