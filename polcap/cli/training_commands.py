@@ -40,6 +40,9 @@ def train(
     ] = None,
     threads: Annotated[int, Option("--threads", "-j", min=1, help="Batches computed at a time.")] = 2,
     seed: Annotated[int, Option(min=0, help="Of views, batches and first weights.")] = 1,
+    license_: Annotated[
+        str, Option("--license", metavar="SPDX", help="License of the weights, stated in the model, such as CC-BY-4.0.")
+    ] = "NOASSERTION",
 ) -> None:
     """Train the main network (extra [train])."""
     terminal.print_progress("loading PyTorch, meshes and materials")
@@ -47,7 +50,7 @@ def train(
     run = options.training("ablation_study").main if ablation else trainer.main
     stated = {"preset": preset, "data": data, "out": out, "minutes": minutes, "samples": samples, "variant": variant}
     stated |= {"resume": resume, "start": start, "done": done, "rate": rate, "views": views}
-    stated |= {"procedural": procedural, "flat": flat, "threads": threads, "seed": seed}
+    stated |= {"procedural": procedural, "flat": flat, "threads": threads, "seed": seed, "licence": license_}
     terminal.print_data(str(run(trainer.TrainingOptions(**stated), terminal.print_progress)))
 
 

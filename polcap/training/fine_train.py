@@ -26,6 +26,7 @@ from polcap.stages import cues
 from polcap.stages.infer import fine, learned
 from polcap.training import evaluation_protocol, loop, materials, relief, traced_views, unet
 from polcap.training.camera_errors import CameraErrors
+from polcap.training.onnx_export import UNSTATED
 from polcap.training.simulator import Simulator
 
 _PICTURES = 400
@@ -41,7 +42,7 @@ _VECTORS = tuple(fine.CHANNELS.index(name) for name in ("ray_x", "normal_x", "sm
 _NORMAL, _COUNT = fine.CHANNELS.index("normal_x"), len(fine.CHANNELS)
 
 
-def main(data: Path, model: Path, out: Path, minutes: float) -> None:
+def main(data: Path, model: Path, out: Path, minutes: float, licence: str = UNSTATED) -> None:
     """Train the refinement network: make the missing pictures, train for `minutes`, export."""
     torch.set_num_threads(1)
     files = [out / "pictures" / f"{number:05d}.npy" for number in range(_PICTURES)]
@@ -58,7 +59,7 @@ def main(data: Path, model: Path, out: Path, minutes: float) -> None:
     torch.manual_seed(1)
     training = FineTraining(_RATE, files)
     training.train(minutes, out)
-    training.export(out / "fine.onnx")
+    training.export(out / "fine.onnx", licence)
 
 
 def make_picture(simulator: Simulator, network: Network, number: int) -> NDArray[np.float16]:
@@ -176,4 +177,4 @@ def _predict(network: nn.Module, pictures: Floats) -> tuple[Tensor, Tensor, Tens
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), float(sys.argv[4]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), float(sys.argv[4]), *sys.argv[5:6])

@@ -134,10 +134,10 @@ class PictureTraining(Trainee):
         """Draw the picture files of a training step."""
         return [self.files[n] for n in self.random.integers(self.held_out, len(self.files), self.per_step)]
 
-    def export(self, path: Path) -> None:
-        """Write the averaged weights as an ONNX model that `formats/onnx.py` loads."""
+    def export(self, path: Path, licence: str) -> None:
+        """Write the averaged weights as an ONNX model that `formats/onnx.py` loads; SPDX name of their licence."""
         training = f"{self.samples} samples in {self.step} steps"
-        metadata = {"licence": "Apache-2.0", "training": training, **self.metadata}
+        metadata = {"licence": licence, "training": training, **self.metadata}
         onnx_export.export_network(self.average, path, (self.output,), metadata)
 
 

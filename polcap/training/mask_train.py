@@ -23,6 +23,7 @@ from polcap.optics.mesh_tracer import Tracer, Triangles, centred
 from polcap.optics.resize import area_mean, block_means
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, ReducedPicture, brightness, encode
 from polcap.training import loop, mask_scenes, mask_views, materials, random_shapes, traced_views, unet
+from polcap.training.onnx_export import UNSTATED
 
 _PICTURES, _SIZE = 1600, (288, 384)  # H, W, traced; files have half of it
 _OBJECT, _CHART = 5, 6  # layers of a file: masks, after three colors, S1 and S2
@@ -37,14 +38,14 @@ _REPEATED = 0.3  # share of steps with another second pass before, as the source
 _INSERTED = 0.12  # share of pictures into which the object of another one is inserted
 
 
-def main(data: Path, out: Path, minutes: float) -> None:
+def main(data: Path, out: Path, minutes: float, licence: str = UNSTATED) -> None:
     """Train the mask network: make the missing pictures, train for `minutes`, export."""
     torch.set_num_threads(1)
     make_pictures(out / "pictures", data, _PICTURES)
     torch.manual_seed(1)
     training = MaskTraining(_RATE, sorted((out / "pictures").glob("[0-9]*.npy")))
     training.train(minutes, out)
-    training.export(out / "mask.onnx")
+    training.export(out / "mask.onnx", licence)
 
 
 def make_pictures(out: Path, data: Path, count: int) -> None:
@@ -264,4 +265,4 @@ def _stack(truths: list[Floats]) -> Tensor:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3]), *sys.argv[4:5])

@@ -22,6 +22,7 @@ from polcap.stages.cues import CHANNELS
 from polcap.training import main_network
 
 OPSET = 17
+UNSTATED = "NOASSERTION"  # SPDX name of a licence that nobody stated
 NATIVE_SIZE = 256  # px of the longer side in inference, which uses sizes around it; larger than in training
 _PREFIX, _HALF = "network.", ".half"  # of the names of stored weights
 _GREATEST_IR = 10  # read by onnxruntime 1.20 and later

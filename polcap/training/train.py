@@ -44,6 +44,7 @@ class TrainingOptions:
     seed: int = 1
     rate: float = 1e-3  # of Muon; at twice this rate weights grew until training diverged
     variant: str = "ours"  # key of VARIANTS
+    licence: str = onnx_export.UNSTATED  # SPDX name, of the trained weights
     traced: Path | None = None  # holds the traced views, instead of `out`
 
 
@@ -107,7 +108,7 @@ def main(options: TrainingOptions, report: Report = silent) -> Path:
     batches = _run_ahead(made)
     loop.run(network, lambda: [next(batches) for _ in range(learners)], budget, options.out, report)
     batches.close()
-    network.export(options.out / "model.onnx", version=options.out.resolve().name)
+    network.export(options.out / "model.onnx", options.out.resolve().name, options.licence)
     return options.out / "model.onnx"
 
 
@@ -118,6 +119,8 @@ def _check(options: TrainingOptions) -> None:
             f"{options.data} is a data set of `polcap synth --dataset`, which holds pictures; `polcap train` renders "
             "its own pictures: give a folder with meshes/ and materials/"
         )
+    if not options.licence.strip():
+        raise InputError("--license is empty; name the license of the weights, such as CC-BY-4.0, or leave it out")
     for name, value, known in (("preset", options.preset, PRESETS), ("variant", options.variant, VARIANTS)):
         if value not in known:
             raise InputError(f"{name} {value!r} is not one of {', '.join(known)}")
@@ -244,11 +247,11 @@ class NetworkTraining(loop.Trainee):
         for k, generator in enumerate(self.lights):  # not the same lights again
             generator.manual_seed(1000 * self.step + k)
 
-    def export(self, path: Path, version: str) -> None:
+    def export(self, path: Path, version: str, licence: str) -> None:
         """Write the averaged weights as an ONNX model, with metadata on their training."""
         training = f"{self.samples - self.done} samples in {self.step} steps, {self.elapsed / 60:.0f} minutes"
         training += f", after {self.begun}" if self.begun else ""
-        facts = {"version": version, "licence": "Apache-2.0", "variant": self.network.variant, "training": training}
+        facts = {"version": version, "licence": licence, "variant": self.network.variant, "training": training}
         onnx_export.export_main(self.average, path, facts)
 
 

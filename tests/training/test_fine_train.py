@@ -47,7 +47,7 @@ def test_the_network_learns_and_is_exported(tmp_path: Path, picture: NDArray[np.
     run = fine_train.FineTraining(3e-3, [file])
     losses = [run.advance([file], 0.0)["loss"] for _ in range(40)]
     assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
-    run.export(tmp_path / "fine.onnx")
+    run.export(tmp_path / "fine.onnx", "MIT")
     network = onnx.load(tmp_path / "fine.onnx", threads=1, encoding=fine.ENCODING)
     assert network.channels == fine.CHANNELS
     shown = fine_train.load_example(file)[:COUNT].astype(np.float32)[None]

@@ -70,7 +70,7 @@ def test_the_network_learns_and_is_exported(tmp_path: Path, picture: mask_scenes
     run = mask_train.MaskTraining(3e-3, [file])
     losses = [run.advance([file] * 4, 0.0)["loss_whole"] for _ in range(40)]
     assert losses[-1] < 0.9 * losses[0]
-    run.export(tmp_path / "mask.onnx")
+    run.export(tmp_path / "mask.onnx", "MIT")
     network = onnx.load(tmp_path / "mask.onnx", threads=1, encoding=ENCODING)
     logit = onnx.run(network, np.zeros((1, len(CHANNELS), 48, 80), np.float32))["logit"]
     assert logit.shape == (1, 1, 48, 80) and network.channels == CHANNELS

@@ -41,12 +41,14 @@ class Clock:
 def test_run_stops_in_time_and_resumes(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "time", Clock())
     lines: list[str] = []
-    made = train.main(train.TrainingOptions(data=data, out=tmp_path, minutes=0.07, threads=1), lines.append)
+    options = train.TrainingOptions(data=data, out=tmp_path, minutes=0.07, threads=1, licence="CC-BY-4.0")
+    made = train.main(options, lines.append)
     assert lines[0].startswith("tracing ") and lines[-1].startswith("100 %, step ") and lines[-1].endswith("0 min left")
     assert any(line.startswith("30 %") or "step 1," in line for line in lines)  # after the first step
     first, facts = train.load_average(tmp_path / "last.pt")
     weights, metadata = onnx_export.read_weights(made)
     assert metadata["training"].startswith(f"{facts['samples']} samples") and metadata["version"] == tmp_path.name
+    assert metadata["licence"] == "CC-BY-4.0"
     assert all(torch.allclose(w, weights[k], rtol=1e-3, atol=1e-4) for k, w in first.state_dict().items())  # halves
     assert 4.2 <= facts["elapsed"] < 5 and facts["samples"] > facts["step"] > 0
     metrics, watched = (list(csv.DictReader((tmp_path / f"{name}.csv").open())) for name in ("metrics", "watch"))
@@ -54,7 +56,8 @@ def test_run_stops_in_time_and_resumes(data: Path, tmp_path: Path, monkeypatch: 
     panel = cv2.imread(str(tmp_path / "watch.png"))
     assert panel.shape == (8 * 128, 11 * 128, 3) and panel[:, :128].max() > 100  # S0, truth and estimate of five maps
 
-    train.main(train.TrainingOptions(data=data, out=tmp_path, minutes=0.1, threads=1, resume=True))
+    again = train.main(train.TrainingOptions(data=data, out=tmp_path, minutes=0.1, threads=1, resume=True))
+    assert onnx_export.read_weights(again)[1]["licence"] == "NOASSERTION"  # nobody stated it
     second, later = train.load_average(tmp_path / "last.pt")
     assert later["step"] > facts["step"] and later["elapsed"] > facts["elapsed"]
     assert any(not torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters()))
@@ -107,6 +110,7 @@ def test_rate_falls_to_zero_over_the_last_part_of_the_budget(simulator: Simulato
         ({"preset": "tpu"}, "'tpu' is not one of cpu, gpu"),
         ({"resume": True, "start": Path("m.onnx")}, "give one of them"),
         ({"resume": True}, "nothing to resume"),
+        ({"licence": " "}, "--license is empty"),
         ({"data": Path("nowhere")}, "meshes/test holds no mesh"),
     ],
 )
