@@ -71,9 +71,12 @@ def api_page() -> str:
         "`examples/from_python.py` is a complete program. Names are imported at their first use. The package is typed.",
         "",
         "**Single stages.** `examples/stage_by_stage.py` calls the stages one after the other and uses their values.",
-        "`polcap.pipeline.run.reopen(folder)[0]` reads the values that an earlier `process` stored in a result folder:",
-        "`radiance`, `color`, `alignment`, `object_`, `selfcal`, `stokes`, `cues`, `maps`, `mesh`. They are read-only",
-        "arrays, and `polcap clean` removes them. The values and the calls of stages may change between versions.",
+        "`reopen` reads the values that an earlier `process` stored in a result folder: `radiance`, `color`,",
+        "`alignment`, `object_`, `selfcal`, `stokes`, `cues`, `maps`, `mesh`. They are read-only arrays, and",
+        "`polcap clean` removes them. The values and the calls of stages may change between versions.", "",
+        "```python", "from polcap.pipeline.run import reopen", "from polcap.results import Results", "",
+        'results, facts = reopen("CAPTURE/polcap", Results)',
+        "print(results.stokes.stokes.shape, results.cues.dolp.shape, results.maps.normal.shape)", "```",
     ]  # fmt: skip
     for name in sorted(polcap.__all__, key=lambda name: (name[0].isupper(), name)):
         source = inspect.getsource(getattr(polcap, name)).removeprefix("@_in_python\n")

@@ -73,7 +73,7 @@ class Result:
 
     @property
     def expected_error_deg(self) -> float | None:
-        """Median expected error of the normals with the costs of all checks, degrees; None: it was not measured."""
+        """Median expected error of the normals with the costs of all gates, degrees; None: it was not measured."""
         error = self.report.get("expected_error_deg")
         return None if error is None else float(error)
 

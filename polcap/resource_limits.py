@@ -27,7 +27,12 @@ def set_limits(threads: int, gigabytes: float) -> None:
 
 
 def set_threads(count: int) -> None:
-    """Set the number of threads before any numerical library starts its own; 0 leaves it to them."""
+    """Set the number of threads before any numerical library starts its own; 0 leaves it to them.
+
+    Raises SettingError: the number is negative.
+    """
+    if count < 0:
+        raise SettingError(f"--threads {count}: give a number of threads, or 0 for all")
     if count:
         for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ[name] = str(count)

@@ -1,5 +1,7 @@
 """The public surface: what it names, what it costs, and that it does what the command line does."""
 
+import json
+import re
 import shutil
 import subprocess
 import sys
@@ -11,7 +13,7 @@ import pytest
 
 import polcap
 from polcap.api import Result
-from polcap.errors import SettingError
+from polcap.errors import PolcapError, SettingError
 from polcap.formats.maps import result_maps as maps
 from polcap.images import MaskedImage
 from polcap.pipeline import models, request
@@ -100,6 +102,23 @@ def test_check_export_and_reopen_take_strings(result: Path, example: Path, tmp_p
     assert pipeline.reopen(str(copy), ResultsUntilMask)[0].object_.mask.any()
 
 
+def test_the_python_of_the_reference_pages_runs(
+    result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("CAPTURE", "capture"):
+        shutil.copytree(result, tmp_path / name / "polcap")
+    monkeypatch.chdir(tmp_path)
+    about = json.loads((result / "report.json").read_text(encoding="utf-8"))
+    monkeypatch.setattr(polcap, "process", lambda folder: Result(Path(folder) / "polcap", about), raising=False)
+    programs = 0
+    for page in (Path(__file__).parents[1] / "docs" / "reference").glob("*.md"):
+        for block in re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE):
+            if block.startswith(("import ", "from ")):  # others are definitions
+                exec(compile(block, str(page), "exec"), {})
+                programs += 1
+    assert programs >= 3 and capsys.readouterr().out.count("\n") >= 3
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -107,12 +126,39 @@ def test_check_export_and_reopen_take_strings(result: Path, example: Path, tmp_p
         ({"formats": ("obj",), "geometry": "draco"}, "^images and geometry change the GLB"),
         ({"iiif": "http://museum.example", "texture_size": 64}, "leave out texture_size"),
         ({"preset": "unrael"}, "^preset unrael: there is no such preset; did you mean unreal"),
+        ({"formats": ("usdx",)}, r"^formats usdx: there is no such format; did you mean usd\?"),
+        ({"extras": ["curvatur"]}, "^extras curvatur: there is no such texture; did you mean curvature"),
+        ({"catalog": {"titel": "x"}}, "^catalog titel: there is no such fact; did you mean title"),
+        ({"catalog": {"object_number": 7}}, "^catalog object_number = 7: it is no text"),
+        ({"images": "gif"}, "^images gif: there is no such picture format"),
+        ({"bits": 12}, "^bits 12: there is no such depth"),
+        ({"texture_size": -3}, "^texture_size -3: it is at least 16"),
+        ({"lod": -1}, "^lod -1: it is at least 0"),
     ],
 )
 def test_errors_name_the_argument_and_not_the_flag(result: Path, options: dict[str, Any], words: str) -> None:
     with pytest.raises(SettingError, match=words) as caught:
         polcap.export(result, **options)
     assert "--texture" not in str(caught.value) and "--color" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"threads": -1}, "^threads -1: give a number of threads, or 0 for all"),
+        (
+            {"angles_deg": "0,45,90"},
+            r"^angles_deg = '0,45,90': it holds no numbers; give degrees",
+        ),
+        ({"angles_deg": ("0", "45", "90")}, "it holds no numbers"),
+    ],
+)
+def test_process_refuses_what_the_command_refuses(
+    example: Path, tmp_path: Path, options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(PolcapError, match=words):
+        polcap.process(example, tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
 
 
 def test_fuse_refuses_what_the_command_refuses(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from typer import Context, Option
 
@@ -67,7 +67,7 @@ def export(
 ) -> None:
     """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
     from polcap import api
-    from polcap.pipeline import result_folder
+    from polcap.pipeline import asset_export, result_folder
     from polcap.pipeline.asset_export import ExportRequest
 
     formats = tuple(name for name in FORMATS if context.params[name] not in (None, False))
@@ -81,7 +81,7 @@ def export(
         color=color,
         texture_size=texture_size,
         bits=None if bits is None else 8 if bits == "8" else 16,
-        extras=_extra_textures(extra or []),
+        extras=cast("tuple[Extra, ...]", tuple(dict.fromkeys(extra or []))),  # checked by the export
         page=page,
         iiif=None if iiif is None else options.utf8("--iiif", iiif),
         catalog=_catalog_fields(about or []),
@@ -89,6 +89,8 @@ def export(
     )
     wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
     if out is not None:
+        for one in wanted:
+            asset_export.check(one)
         result_folder.copy(result, out)
         result = out
     files = api.write_exports(result, *wanted)
@@ -118,27 +120,11 @@ def _warn_of_upsampling(result: Path, size: int) -> None:
         )
 
 
-def _extra_textures(named: Sequence[str]) -> "tuple[Extra, ...]":
-    """Parse --extra: names of further textures. Raises SettingError for an unknown name."""
-    from polcap.formats import text_file
-
-    for name in named:
-        if name not in EXTRAS:
-            raise SettingError(f"--extra {name}: there is no such texture; {text_file.suggestion(name, EXTRAS)}")
-    return tuple(extra for extra in EXTRAS if extra in named)
-
-
 def _catalog_fields(stated: Sequence[str]) -> dict[str, str]:
-    """Parse --about K=V: fields of `CatalogEntry` by name. Raises SettingError for an unknown field."""
-    from polcap.capture_values import CatalogEntry
-    from polcap.formats import text_file
-
-    known = CatalogEntry.__struct_fields__
+    """Parse --about K=V: fields of `CatalogEntry` by name, not yet checked. Raises SettingError for another form."""
     found = {}
     for text in stated:
         key, equals, found[key] = options.utf8("--about", text).partition("=")
         if not equals:
             raise SettingError(f'--about {text}: write FACT=TEXT, for example title="Vase with handles"')
-        if key not in known:
-            raise SettingError(f"--about {key}: there is no such fact; {text_file.suggestion(key, known)}")
     return found

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar, get_args
 
 import msgspec
 import numpy as np
@@ -37,7 +37,7 @@ from polcap.formats.export import (
 )
 from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.glb_geometry import Geometry
-from polcap.formats.export.presets import PRESETS, ExportPreset, Format
+from polcap.formats.export.presets import EXTRAS, FORMATS, PRESETS, ExportPreset, Format
 from polcap.formats.export.texture_set import Extra, Key, Texture
 from polcap.formats.maps import maps_folder, png
 from polcap.mesh_values import Asset, Mesh, ReliefMesh
@@ -147,7 +147,8 @@ class DetailLevel:
 
 
 def check(wanted: ExportRequest) -> None:
-    """Raise a SettingError for an unknown preset, a missing package or an option without effect, before any work."""
+    """Raise a SettingError for an unknown name, a missing package or an option without effect, before any work."""
+    _check_values(wanted)
     preset = effective(wanted)
     if wanted.color != exr_layers.LINEAR_REC709 and "exr" not in preset.formats:
         raise SettingError(
@@ -174,6 +175,31 @@ def check(wanted: ExportRequest) -> None:
             raise SettingError("--page shows the GLB, which is not written; choose --preset web")
         if preset.geometry == "draco":
             raise SettingError("--page holds no decoder of Draco; leave out --geometry draco")
+
+
+def _check_values(wanted: ExportRequest) -> None:
+    """Raise a SettingError for a name that does not exist, or a number below the least one."""
+    names: tuple[tuple[str, str, Collection[Any], Collection[Any]], ...] = (
+        ("formats", "format", wanted.formats, FORMATS),
+        ("--preset", "preset", [wanted.preset], PRESETS),
+        ("--images", "picture format", [wanted.images], get_args(Kind)),
+        ("--geometry", "encoding", [wanted.geometry], get_args(Geometry)),
+        ("--bits", "depth", [wanted.bits], (8, 16)),
+        ("--extra", "texture", wanted.extras, EXTRAS),
+        ("--about", "fact", wanted.catalog, CatalogEntry.__struct_fields__),
+    )
+    for option, noun, stated, known in names:
+        for name in stated:
+            if name is not None and name not in known:
+                hint = text_file.suggestion(str(name), map(str, known))
+                raise SettingError(f"{option} {name}: there is no such {noun}; {hint}")
+    for name, text in wanted.catalog.items():
+        if not isinstance(text, str):
+            raise SettingError(f"--about {name} = {text!r:.60}: it is no text; put it in quotes")
+    numbers = (("texture-size", wanted.texture_size, 16), ("triangles", wanted.triangles, 16), ("lod", wanted.lod, 0))
+    for option, number, least in numbers:
+        if number is not None and number < least:
+            raise SettingError(f"--{option} {number}: it is at least {least}; give a larger number, or leave it out")
 
 
 def _has_png(preset: ExportPreset) -> bool:
@@ -364,13 +390,7 @@ def find_outdated(records: Sequence[Path], keys: Mapping[str, str]) -> list[Path
 
 def effective(wanted: ExportRequest) -> ExportPreset:
     """The preset that an export uses: the requested one, with its values replaced by the request's other options."""
-    if wanted.preset is None:
-        preset = ExportPreset(wanted.formats, "normals +Y")
-    elif wanted.preset in PRESETS:
-        preset = PRESETS[wanted.preset]
-    else:
-        hint = text_file.suggestion(wanted.preset, PRESETS)
-        raise SettingError(f"--preset {wanted.preset}: there is no such preset; {hint}")
+    preset = ExportPreset(wanted.formats, "normals +Y") if wanted.preset is None else PRESETS[wanted.preset]
     added: tuple[Format, ...] = () if wanted.iiif is None else ("iiif",)
     formats = tuple(one for one in dict.fromkeys((*preset.formats, *added)) if one not in wanted.without)
     return replace(

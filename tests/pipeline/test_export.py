@@ -146,6 +146,12 @@ def test_exporting_again_gives_the_bytes_that_process_wrote(tiny: Path, tiny_res
     assert (tiny_result / "maps/maps.json").read_bytes() == (tiny / "C/polcap/maps/maps.json").read_bytes()
 
 
+def test_a_wrong_name_makes_no_copy(tiny_result: Path, polcap: Command, tmp_path: Path) -> None:
+    for wrong in (("--preset", "unrael"), ("--extra", "oclusion"), ("--about", "titel=Vase")):
+        assert polcap("export", tiny_result, *wrong, "--out", tmp_path / "new").returncode == 2
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.parametrize(
     ("flags", "words"),
     [

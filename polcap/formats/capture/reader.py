@@ -5,6 +5,7 @@ import os
 import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from numbers import Real
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +13,7 @@ import msgspec
 
 from polcap.calibration_values import Calibration
 from polcap.capture_values import AngleStatement, Capture, Exif, Frame, FrameReading, Shot
-from polcap.errors import CaptureError
+from polcap.errors import CaptureError, SettingError
 from polcap.formats import atomic, ball_accuracies, calibrations
 from polcap.formats.capture import capture_toml, focal_length, folder_names, layouts, unequal_brackets, unfinished
 from polcap.formats.capture.capture_toml import CaptureFile
@@ -303,7 +304,12 @@ def _sorted_alike(frames: Iterable[Frame]) -> tuple[Frame, ...]:
 
 
 def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
-    """Raise CaptureError for fewer than three polarizer axes; `who` begins the message."""
+    """Check the polarizer angles [°]; `who` begins the message.
+
+    Raises SettingError: they are no numbers. CaptureError: they are fewer than three polarizer axes.
+    """
+    if not all(isinstance(angle, Real) for angle in angles_deg):  # from Python
+        raise SettingError(f"--angles = {angles_deg!r:.60}: it holds no numbers; give degrees, such as (0, 45, 90)")
     count = folder_names.count_axes(angles_deg)
     if count < 3:
         listed = ", ".join(f"{angle:g}" for angle in angles_deg) or "none"
