@@ -69,13 +69,18 @@ def report(
     compare: Annotated[
         Path | None, Option(metavar="OTHER", help="Another result folder.", callback=options.result_folder)
     ] = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", metavar="DIR", help="Folder for compare.html; by default RESULT.")
+    ] = None,
     json: Json = False,
     open_: options.OpenPage = False,
 ) -> None:
     """Judge a result again from its stage cache, or compare it with another."""
     if compare is not None:
-        _compare(result, compare, json, open_)
+        _compare((result, compare), out or result, json, open_)
         return
+    if out is not None:
+        raise SettingError("--out is the folder of the comparison; add --compare OTHER, or leave it out")
     from polcap.pipeline import run as pipeline
 
     _check_single(result, "report")
@@ -86,16 +91,16 @@ def report(
     terminal.print_gates(about)
 
 
-def _compare(result: Path, other: Path, json: bool, open_: bool) -> None:
-    """Write the page compare.html into a result folder, and print what changed on the object."""
+def _compare(results: tuple[Path, Path], out: Path, json: bool, open_: bool) -> None:
+    """Write compare.html, the page on two results, into the folder `out`, and print what changed on the object."""
     from polcap import report as reports
     from polcap.pipeline import result_folder
     from polcap.report import compare as pairs
 
-    abouts = reports.read(result), reports.read(other)
-    file = result / "compare.html"
-    with result_folder.opened(result):
-        sentence, table = pairs.write(file, (result, other), abouts)
+    abouts = reports.read(results[0]), reports.read(results[1])
+    file = out / "compare.html"
+    with result_folder.opened(out):
+        sentence, table = pairs.write(file, results, abouts)
     rows = pairs.rows(*abouts)
     if json:
         named = [dict(zip(("quantity", *pairs.HEAD[1:]), row)) for row in table]

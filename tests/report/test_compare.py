@@ -1,6 +1,7 @@
 """A comparison lists the figures and settings that differ, and finds the changes of an object and nothing else."""
 
 import json
+import shutil
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
@@ -16,6 +17,7 @@ from polcap.optics import frames
 from polcap.report import changes, compare
 from polcap.stage_values import SurfaceMaps
 from tests import surfaces
+from tests.conftest import Command
 
 
 @pytest.fixture(scope="module")
@@ -178,3 +180,19 @@ def test_comparison_is_a_page_like_the_report(result: Path, tmp_path: Path) -> N
     assert sentence.startswith("Nothing changed") and sentence in page and len(rows) == 3
     assert "<td>Maps: Median roughness</td>" in page and "<td>0.5</td>" in page
     assert page.count('class="map"') == 12 and 'type="range"' in page
+
+
+def test_archives_are_compared_and_stay_as_they_are(result: Path, tmp_path: Path, polcap: Command) -> None:
+    archives = [tmp_path / "first", tmp_path / "second"]
+    for archive in archives:  # a copy without the record of polcap's files
+        shutil.copytree(result / "maps", archive / "maps")
+        shutil.copy(result / "report.json", archive)
+    before = sorted(tmp_path.rglob("*"))
+    assert polcap("report", archives[0], "--compare", archives[1]).returncode == 2
+    assert sorted(tmp_path.rglob("*")) == before
+    for _ in range(2):
+        done = polcap("report", archives[0], "--compare", archives[1], "--out", tmp_path / "page")
+        assert done.returncode == 0 and done.stdout.startswith("Nothing changed beyond the doubt"), done.stderr
+    assert {file.name for file in (tmp_path / "page").iterdir()} == {"compare.html", "polcap-files.txt"}
+    assert set(tmp_path.rglob("*")) - set(before) == {tmp_path / "page", *(tmp_path / "page").iterdir()}
+    assert "add --compare OTHER" in polcap("report", archives[0], "--out", tmp_path / "page").stderr
