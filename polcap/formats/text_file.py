@@ -70,6 +70,9 @@ def parse_toml(text: str, finite: bool = True) -> dict[str, Any]:
     try:
         found = tomllib.loads(text)
         check_plain(found, finite)
+    except tomllib.TOMLDecodeError as error:
+        hint = "; put a text in quotes" if str(error).startswith("Invalid value") else ""
+        raise ValueError(f"{error}{hint}") from None
     except RecursionError:
         raise ValueError("nested too deeply") from None
     return found

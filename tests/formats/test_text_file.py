@@ -136,3 +136,8 @@ def test_deep_nesting_is_refused_or_read(depth: int) -> None:
         text_file.parse_json("[" * depth + "]" * depth)
     except ValueError as error:
         assert "nested too deeply" in str(error)
+
+
+def test_a_text_without_quotes_has_a_remedy() -> None:
+    with pytest.raises(ValueError, match=r"Invalid value \(at line 1, column 9\); put a text in quotes"):
+        text_file.parse_toml("title = Vase\n")
