@@ -124,7 +124,7 @@ class AngleStatement:
     clockwise: Literal["", "stated", "calibrated"] = ""  # by the user, or by the ring's calibration
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Capture:
     """A capture: all photographs of one object, and the camera's geometry. The input of a run."""
 
@@ -147,6 +147,10 @@ class Capture:
     angles: AngleStatement = AngleStatement()
     lens_filter: str = field(default="", metadata=NOT_IN_KEY)  # the polarizer's name, from capture.toml
     accuracy: BallAccuracy | None = field(default=None, metadata=NOT_IN_KEY)  # of these, on a ball; None: not validated
+
+    def __repr__(self) -> str:
+        shots = ", ".join(f"{shot.name}: {len(shot.frames)}" for shot in self.shots)
+        return f"Capture({self.name!r}, {self.layout}, frames {shots}; {self.size_px[0]} × {self.size_px[1]} px)"
 
     def file_name(self, frame: Frame) -> str:
         """A photograph's file as the user finds it in the capture's folder."""

@@ -82,7 +82,9 @@ def test_values_of_another_type_are_refused_before_anything_is_written(tmp_path:
     assert not list(tmp_path.iterdir())
 
 
-def test_results_and_values_have_a_short_repr(tmp_path: Path) -> None:
+def test_results_and_values_have_a_short_repr(tmp_path: Path, example: Path) -> None:
+    read = repr(polcap.read_capture(example))
+    assert read.startswith("Capture('capture', folders, frames 0°: 3, 45°: 3, 90°: 3; ") and read.endswith(" px)")
     made = Result(tmp_path / "polcap", {"verdict": "pass", "gates": [{}] * 99})
     assert repr(made) == f"Result({str(tmp_path / 'polcap')!r}, verdict pass)"
     mask = np.ones((400, 300), bool)
