@@ -93,7 +93,7 @@ class Sandbox:
         Raises ChildBug: the function has a defect.
         """
         name, limit = os.fspath(path), min(self.timeout_s, limit_s or self.timeout_s)
-        request = [function.__module__, function.__qualname__, name, options, limit]
+        request = [function.__module__, function.__qualname__, name, options, limit, _working_folder()]
         with self._lock:
             try:
                 head, arrays = self._exchange(name, request, limit)
@@ -238,6 +238,14 @@ def end_idle() -> None:
         sandbox.close()
 
 
+def _working_folder() -> str:
+    """Path of this process's working folder; "" if somebody removed it."""
+    try:
+        return os.getcwd()
+    except OSError:
+        return ""
+
+
 def serve(memory_gib: float) -> None:
     """Main loop of the child process: answer requests from stdin until it is closed."""
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
@@ -245,9 +253,11 @@ def serve(memory_gib: float) -> None:
     _limit_memory(memory_gib)
     while True:
         try:
-            module, name, path, options, limit_s = json.loads(_receive(requests, _HEAD_BYTES))
+            module, name, path, options, limit_s, folder = json.loads(_receive(requests, _HEAD_BYTES))
         except EOFError:
             return
+        with contextlib.suppress(OSError):
+            os.chdir(folder)  # the parent may have changed its own, from which relative paths count
         with contextlib.suppress(Exception):  # `_run` reports it
             importlib.import_module(module)
         _send(answers, _READY)

@@ -46,6 +46,9 @@ FUNCTIONS = """
     def objects(path):
         return {}, {"pointers": np.array([None])}
 
+    def working_folder(path):
+        return {"folder": os.getcwd()}, {}
+
     def huge(path):
         return {}, {"much": np.broadcast_to(np.uint8(0), (2**20, 2**20))}
 
@@ -97,6 +100,13 @@ def test_arrays_come_back_as_they_were(sandbox):
 
 def test_one_child_serves_several_files(sandbox):
     assert pid(sandbox) == pid(sandbox)
+
+
+def test_a_child_follows_the_parent_into_another_folder(sandbox, tmp_path, monkeypatch):
+    first = pid(sandbox)
+    monkeypatch.chdir(tmp_path)
+    assert sandbox.call(sandbox.module.working_folder, "a.raw")[0]["folder"] == os.getcwd()
+    assert pid(sandbox) == first
 
 
 def test_a_child_imports_no_modules_from_inside_a_package(sandbox, tmp_path, monkeypatch):
