@@ -1,7 +1,8 @@
 """Metric height of each texel, integrated from its slopes, and low frequencies from parallax.
 
 Slopes give detail, but add up to large errors over many texels; parallax gives the coarse shape. Their least squares
-solution is a Poisson equation with a tie to the coarse height, which cosine transforms solve.
+solution is a Poisson equation with a tie to the coarse height. It is solved by conjugate gradients, because every slope
+counts by its doubt; cosine transforms, which solve it for equal doubts, are the preconditioner.
 
 References
 ----------
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from scipy.fft import dctn, idctn
+from scipy.sparse.linalg import LinearOperator, cg
 
 from polcap.images import ArrayValue, Bools, Floats
 from polcap.material.coarse_relief import CROSSOVER, CoarseRelief
@@ -25,6 +27,11 @@ from polcap.stages import stage
 _DIRECTIONS, _GROWTH = 12, 1.25  # of the horizon's search; ratio of successive distances
 _FARTHEST = 0.1  # of the longer side
 _MISPLACED = 0.25  # texels, 1σ of a texel's place in a view
+_PRINT = 0.1  # texels that a texture is misplaced at most; what follows the albedo by more is relief
+_PRINT_LEFT = 0.02  # texels, 1σ of that place; as large as it is itself, because it differs by view
+_SIDE, _WINDOW = 160, 1 / 9  # texels along the longer side of reduced maps; 1σ of a window over that side
+_MOST_WEIGHT = 4.0  # of a slope, over that of the median doubt
+_TOLERANCE, _MOST_STEPS = 1e-3, 60  # of the conjugate gradients; about 15 steps are needed
 
 
 @dataclass(frozen=True, repr=False)
@@ -56,12 +63,14 @@ class MaterialMaps(ArrayValue):
         return None
 
 
-@stage(version=2)
+@stage(version=3)
 def build(found: TexelMaps, relief: CoarseRelief, grid: TexelGrid, albedo_sigma: float | None) -> MaterialMaps:
     """Integrate heights, fill texels that were not measured, and compute ambient occlusion."""
     filled = fill_outward(np.concatenate([found.value, found.sigma], axis=-1), found.seen)
     value, sigma = filled[..., :UNKNOWNS], filled[..., UNKNOWNS:]
-    height = integrate(value[..., SLOPES], relief.height, grid.texel)
+    value[..., SLOPES], print_doubt = without_print(value[..., SLOPES], value[..., ALBEDO].mean(axis=-1))
+    doubt = np.linalg.norm([*np.moveaxis(sigma[..., SLOPES], -1, 0), print_doubt], axis=0)
+    height = integrate(value[..., SLOPES], doubt, relief.height, grid.texel)
     normal = normals(value)
     middle = float(height.mean())
     return MaterialMaps(
@@ -88,21 +97,70 @@ def _albedo_doubt(albedo: Floats, sigma: Floats, scale: float) -> Floats:
     return np.asarray(np.sqrt(sigma**2 + (scale * gray) ** 2 + _MISPLACED**2 * (down**2 + across**2)), np.float32)
 
 
-def integrate(slope: Floats, coarse: Floats, texel: float) -> Floats:
-    """Height (H, W) [m] with slopes (H, W, 2) to the right and up, near the height `coarse` (H, W) over long ranges."""
+def without_print(slope: Floats, albedo: Floats) -> tuple[Floats, Floats]:
+    """Slopes (H, W, 2) without the part that a misplaced texture of the albedo (H, W) causes, and what is left, 1σ.
+
+    Under a light at the lens, a texture that a view at the tilt θ shows e tan θ away from its texel looks like a slope
+    of e d ln ρ/dx. Over a window this part has the share e of the slopes along the gradient of ln ρ. e is about 0.02
+    texels. A relief that follows the albedo, as a groove does, has a larger share and keeps its slopes.
+    """
+    height, width = albedo.shape
+    step = max(1, round(max(albedo.shape) / _SIDE))
+    small = max(1, width // step), max(1, height // step)
+
+    def window(value: Floats) -> Floats:
+        mean = cv2.resize(np.asarray(value, np.float32), small, interpolation=cv2.INTER_AREA)
+        smooth = cv2.GaussianBlur(mean, (0, 0), _WINDOW * max(small))
+        return np.asarray(cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR))
+
+    down, across = np.gradient(np.log(np.maximum(albedo, 1e-3)))
+    out = np.empty_like(slope)
+    for k, gradient in enumerate((across, -down)):
+        own = slope[..., k]
+        share = window(own * gradient) / (window(gradient**2) + window(own**2) / _PRINT**2 + 1e-12)
+        out[..., k] = own - share * gradient
+    return out, _PRINT_LEFT * np.hypot(across, down)
+
+
+def integrate(slope: Floats, sigma: Floats, coarse: Floats, texel: float) -> Floats:
+    """Height (H, W) [m] with slopes (H, W, 2) to the right and up, of doubt (H, W), near the height `coarse` (H, W).
+
+    Over long ranges the coarse height decides.
+    """
     height, width = coarse.shape
-    across = (slope[:, :-1, 0] + slope[:, 1:, 0]) * (texel / 2)  # rises between neighbors
-    down = -(slope[:-1, :, 1] + slope[1:, :, 1]) * (texel / 2)
-    divergence = np.zeros((height, width))
-    divergence[:, :-1] -= across
-    divergence[:, 1:] += across
-    divergence[:-1] -= down
-    divergence[1:] += down
+    weight = np.minimum((np.median(sigma) / np.maximum(sigma, 1e-9)) ** 2, _MOST_WEIGHT)
+    weights = np.minimum(weight[:, 1:], weight[:, :-1]), np.minimum(weight[1:], weight[:-1])
+    rises = (
+        (slope[:, :-1, 0] + slope[:, 1:, 0]) * (texel / 2) - np.diff(coarse, axis=1),  # between neighbors
+        -(slope[:-1, :, 1] + slope[1:, :, 1]) * (texel / 2) - np.diff(coarse, axis=0),
+    )
     tie = CROSSOVER**-2
     waves = [2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in (height, width)]
     laplacian = waves[0][:, None] + waves[1][None]
-    right = dctn(divergence + tie * coarse, norm="ortho")
-    return np.asarray(idctn(right / (laplacian + tie), norm="ortho"))
+
+    def divergence(across: Floats, down: Floats) -> Floats:
+        total = np.zeros((height, width))
+        total[:, :-1] -= across
+        total[:, 1:] += across
+        total[:-1] -= down
+        total[1:] += down
+        return total
+
+    def equation(flat: Floats) -> Floats:
+        rise = flat.reshape(height, width)
+        steps = weights[0] * np.diff(rise, axis=1), weights[1] * np.diff(rise, axis=0)
+        return np.asarray((divergence(*steps) + tie * rise).ravel())
+
+    def equal_doubts(flat: Floats) -> Floats:
+        return np.asarray(
+            idctn(dctn(flat.reshape(height, width), norm="ortho") / (laplacian + tie), norm="ortho")
+        ).ravel()
+
+    count = height * width
+    matrix, inverse = (LinearOperator((count, count), matvec=one) for one in (equation, equal_doubts))
+    right = divergence(weights[0] * rises[0], weights[1] * rises[1]).ravel()
+    found, _ = cg(matrix, right, rtol=_TOLERANCE, maxiter=_MOST_STEPS, M=inverse)
+    return np.asarray(coarse + found.reshape(height, width))
 
 
 def ambient_occlusion(height: Floats, normal: Floats, texel: float) -> Floats:

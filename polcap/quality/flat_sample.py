@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from statistics import median
 
 from polcap.formats.capture import folder_names
 from polcap.quality import several_views
@@ -25,17 +26,17 @@ def tilts(tilt_deg: Mapping[str, float], limits: MaterialGateLimits) -> Gate:
 
 
 def focus(blur_px: Mapping[str, float], limits: MaterialGateLimits) -> Gate:
-    """Gate on the views' blur against that of the sharpest view, 1σ [merged px], measured on the board's edges."""
-    limit, sharpest = limits.max_blur_px, min(blur_px.values(), default=float("nan"))
-    more = {name: math.sqrt(max(blur**2 - sharpest**2, 0)) for name, blur in blur_px.items()}
-    blurred = [name for name, one in more.items() if one > limit]
-    value = max(more.values(), default=float("nan"))
-    if not math.isfinite(value):
+    """Gate on the views' blur against that of the median view, 1σ [merged px], measured on the board's edges."""
+    limit, known = limits.max_blur_px, {name: blur for name, blur in blur_px.items() if math.isfinite(blur)}
+    if not known:
         return Gate("focus", "not measured", None, limit, "No edge of the board is visible", unit="px")
+    middle = median(known.values())
+    more = {name: math.sqrt(max(blur**2 - middle**2, 0)) for name, blur in known.items()}
+    value, blurred = max(more.values()), [name for name, one in more.items() if one > limit]
     if not blurred:
         return Gate("focus", "pass", value, limit, "The views are equally sharp", unit="px")
-    names, best = folder_names.few_names(blurred), min(blur_px, key=lambda name: blur_px[name])
-    message = f"{names}: less sharp than {best} by up to {value:.1f} px (1σ)"
+    names = folder_names.few_names(blurred)
+    message = f"{names}: less sharp than the median view by up to {value:.1f} px (1σ)"
     remedy = f"Shoot {names} again: focus on the sample, close the aperture, hold the camera still"
     return Gate("focus", "warn", value, limit, message, remedy, unit="px")
 

@@ -188,8 +188,8 @@ class MaterialGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     ] = 0.1
     max_blur_px: Annotated[
         Positive,
-        Meta(description="allowed blur of a view that the sharpest one does not have, 1σ; usually 0.2 [merged px]"),
-    ] = 0.4
+        Meta(description="allowed blur of a view that the median one does not have, 1σ; usually 0.2 [merged px]"),
+    ] = 0.5
     max_residual: Annotated[
         Positive,
         Meta(description="allowed median of a view's radiance minus that of the fit, relative; usually 0.01 [1]"),

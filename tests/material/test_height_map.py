@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 
 from polcap.images import Floats
@@ -25,9 +26,25 @@ def test_heights_have_the_slopes_and_the_coarse_shape() -> None:
     height, slope = waves(200)
     bowl = 2e-4 * np.linspace(-1, 1, 200)[None] ** 2 + np.zeros((200, 1))
     bowl_slope = np.stack([np.broadcast_to(np.gradient(bowl[0], TEXEL), bowl.shape), 0 * bowl], axis=-1)
-    found = height_map.integrate(slope + bowl_slope + 0.001, bowl, TEXEL)  # slopes with an error common to all
+    doubt = np.full(height.shape, 0.01)
+    wrong = np.zeros_like(slope)
+    wrong[::10, ::10], doubt[::10, ::10] = 0.1, 1.0
+    found = height_map.integrate(slope + bowl_slope + wrong + 0.001, doubt, bowl, TEXEL)  # with an error common to all
     error = found - height - bowl
     assert (error - error.mean()).std() < 0.05 * np.ptp(height)
+
+
+def test_slopes_of_a_misplaced_print_are_removed_and_a_groove_that_is_darker_stays() -> None:
+    """A chequered print seen 0.02 texels from its place, and mortar one texel deeper than dark bricks."""
+    _, relief = waves(200)
+    square = (np.arange(200) // 9 % 2).astype(np.float32)
+    albedo = cv2.GaussianBlur(np.where(square[:, None] == square, 0.8, 0.1).astype(np.float32), (0, 0), 0.8)
+    down, across = np.gradient(np.log(albedo))
+    edges = np.stack([across, -down], axis=-1)
+    found, _ = height_map.without_print(0.05 * relief + 0.02 * edges, albedo)
+    assert (found - 0.05 * relief).std() < 0.3 * (0.02 * edges).std()
+    groove, _ = height_map.without_print(relief - edges, albedo)
+    assert (groove - relief + edges).std() < 0.03 * edges.std()
 
 
 def test_a_groove_is_darker_than_the_plane() -> None:
