@@ -42,6 +42,7 @@ _TEXTURE = (
 )
 _SAMPLED_PX = 1.0  # doubt of the outline that pixels alone cause: most of a thin object lies next to its outline
 _HOLD_STILL = "Fix the object, do not touch it between shots, and take that shot again"
+_HOLD_BOTH_STILL = "Fix the object and the chart, do not touch them between shots, and take that shot again"
 _FOCAL_LENGTHS = 9  # within the doubt
 _INWARD = 0.5  # sine of the zenith from which a normal leans inward: the inside of a bowl leans less at its lip
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
@@ -148,6 +149,9 @@ def _judge_shift(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     k = int(np.argmax(sure))
     figure = round(float(length[k]), 3)
     message = f"The object moved by {figure:.1f} ± {sigma[k]:.1f} px against its surroundings in {names[k]}"
+    charted = found.results.color.place is not None  # the surroundings that moved may be the chart
+    message += ", or the chart did" if charted else ""
+    remedy = _HOLD_BOTH_STILL if charted else _HOLD_STILL
     bad = bad_shots(names, sure > limit)
     moved = bad_shots(names, length > np.maximum(_SIGMAS * np.hypot(sigma, _FALSE_PUSH * radius), least))
     if (unlike := np.isinf(length)).any():
@@ -156,9 +160,9 @@ def _judge_shift(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
         message = f"The {' and '.join(other)} shot shows another object in the same surroundings"
         return Gate("alignment", "fail", None, limit, message, _check_files(found, odd), MOST_DEG, other, "px")
     if bad:
-        return Gate("alignment", "fail", figure, limit, message, _HOLD_STILL, max(cost, 5.0), bad, "px")
+        return Gate("alignment", "fail", figure, limit, message, remedy, max(cost, 5.0), bad, "px")
     if moved:
-        return Gate("alignment", "warn", figure, least, message, _HOLD_STILL, cost, moved, "px")
+        return Gate("alignment", "warn", figure, least, message, remedy, cost, moved, "px")
     return Gate("alignment", "pass", figure, limit, message, cost_deg=cost, unit="px")
 
 

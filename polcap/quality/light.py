@@ -12,6 +12,7 @@ from polcap.optics import mueller
 from polcap.optics.frames import dot, rays
 from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
+from polcap.quality import albedo_slope
 from polcap.quality.gate import Evidence, Gate, at_most, grade, worded
 from polcap.quality.limits import GateLimits
 from polcap.results import (
@@ -36,6 +37,10 @@ _LEAST_TOWARDS = 0.12  # of the object: five bodies from .18, boxes and cans mos
 _LEAST_FACING = 500  # px, a tenth of which is judged
 _ONE_WAY = 0.6  # 0…1, of the facing normals: five bodies up to .46, cans up to .9 (tests/benchmarks/bench_flat.py)
 _DEGREES_PER_ROOT_OF_HIGHLIGHT_DOLP = 30.0  # of the normals: 2 to 4° at 1 %, 4 to 8° at 2 %, 2 to 11° at 3 to 15 %
+_ONE_FLASH = "Use one flash next to the lens, leave it where it is, and darken the room"
+_SIDES = ("right", "upper right", "top", "upper left", "left", "lower left", "bottom", "lower right")
+_LEANING = np.pi / 6  # the message compares parts that lean by this angle to both sides
+_LAMP_DEG, _DEGREES_PER_ALBEDO_SLOPE = 4.0, 2.5  # of the normals: 2 to 7° with a lamp, 4 to 10° with two softboxes
 _FALSE_HIGHLIGHT_DOLP = 0.002  # under one flash: up to .0025 (24 captures)
 _ROOM_TILE, _LEAST_ROOM_TILES = 16, 20  # px; tiles
 _WITH_FRAME = 1.5  # size of a chart with its frame over the size of its patches
@@ -182,7 +187,29 @@ def room_light(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
 
 
 def side_light(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
-    """Gate "lighting" on the common polarization of the brightest parts that face the camera, relative to albedo.
+    """Gate "lighting" on light from the sides: by its highlights, then by the albedo."""
+    gate = _judge_highlights(found, limits)
+    if gate.state in ("warn", "fail"):
+        return gate
+    seen, limit = _albedo_slope(found), limits.max_albedo_slope
+    if seen is None or seen.amount <= limit:
+        return gate
+    times = np.exp(2 * np.sin(_LEANING) * seen.amount) - 1
+    message = (
+        f"Parts that lean to the {_SIDES[round(seen.azimuth / (np.pi / 4)) % len(_SIDES)]} are {100 * times:.0f} % "
+        "brighter than under a flash at the lens: a lamp or window there, which bends normals and albedo (or the "
+        "object is brighter there)"
+    )
+    cost = float(np.hypot(gate.cost_deg, _LAMP_DEG + _DEGREES_PER_ALBEDO_SLOPE * seen.amount))
+    return at_most("lighting", seen.amount, limit, message, _ONE_FLASH, cost_deg=cost, beyond="warn")
+
+
+def _albedo_slope(found: Evidence[ResultsUntilInfer]) -> albedo_slope.AlbedoSlope | None:
+    return albedo_slope.measure(found.results.maps, found.results.cues.quality & int(Quality.CLIPPED) == 0)
+
+
+def _judge_highlights(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
+    """Gate on the common polarization of the brightest parts that face the camera, relative to albedo.
 
     Under a flash at the lens their polarization points in all directions, as their normals do. Two flashes or softboxes
     at the sides polarize them in the same direction.
@@ -195,9 +222,8 @@ def side_light(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
             ": light from the sides (two flashes, softboxes, a window), or light that changed across the picture "
         )
         message += "between shots (the flash moved, the lamp drifted); it bends normals and roughness"
-    remedy = "Use one flash next to the lens, leave it where it is, and darken the room"
     cost = float(_DEGREES_PER_ROOT_OF_HIGHLIGHT_DOLP * np.sqrt(max(np.nan_to_num(share) - _FALSE_HIGHLIGHT_DOLP, 0.0)))
-    gate = at_most("lighting", share, limit, message, remedy, beyond=grade(cost))
+    gate = at_most("lighting", share, limit, message, _ONE_FLASH, beyond=grade(cost))
     return msgspec.structs.replace(gate, cost_deg=round(cost, 1))
 
 

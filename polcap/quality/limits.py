@@ -100,9 +100,6 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_concentration: Annotated[
         Share, Meta(description="least allowed agreement of polarization and outline; 1 is perfect [1]")
     ] = 0.5
-    max_one_sided: Annotated[
-        Positive, Meta(description="allowed uneven light round the outline, amplitude over mean [1]")
-    ] = 0.5
     max_side_light: Annotated[PositiveShare, Meta(description="allowed excess light on one side in one shot [1]")] = (
         0.07
     )
@@ -118,6 +115,9 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_highlight_dolp: Annotated[
         PositiveShare, Meta(description="allowed polarization common to the brightest parts that face the camera [1]")
     ] = 0.004
+    max_albedo_slope: Annotated[
+        Positive, Meta(description="allowed growth of ln albedo towards one side, per lateral part of the normal [1]")
+    ] = 0.15
     max_room_dolp: Annotated[
         PositiveShare, Meta(description="allowed polarization of the surroundings, common to all of them [1]")
     ] = 0.015

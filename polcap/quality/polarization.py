@@ -29,10 +29,7 @@ _LIKELIER = 1.1  # factor between expected errors that decides on an order (docs
 _LIKELIER_SMALL, _SMALL_PX = 1.5, 5000  # the same for objects of fewer pixels, of which good ones reach 1.2
 _ALONG = -0.3  # below: the AoLP is along the contour
 _DARK = 0.1  # albedo below which a glossy object shows mostly reflections of itself
-_GRAZING = 0.05  # least cosine of the shading
-_WEAK_DOLP = 0.05  # of an outline: above, no shape counts as flattened; below, uneven light is light from the side
-_LIT_DOLP = 0.07  # of an outline's brighter half; above, the flash lights it (93 captures with a lamp: up to .049)
-_LOPSIDED = 1.4  # factor on the limit of uneven light for an object that is polarized all round: its shape is uneven
+_WEAK_DOLP = 0.05  # of an outline: above, no shape counts as flattened
 _DIMMED = 0.9  # of the mean light: below, an outline turns away
 _MOST_ILL_POSED = 0.15  # of the object; gloss with shadows and thin parts reaches .12 (docs/benchmarks/gates.md)
 _ROUGH = 0.5  # roughness from which facets alone leave little polarization
@@ -40,7 +37,6 @@ _ROUGH = 0.5  # roughness from which facets alone leave little polarization
 _UNPOLARIZED_DEG = 11.0
 _ALONG_DEG = 30.0
 _TRANSLUCENT_DEG = 9.0
-_SIDE_LIGHT_DEG = 6.0
 _LOOSE_FIT_DEG = 7.0  # 24° for shots in a wrong order, nothing for objects with sharp edges, which are usual
 _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
@@ -179,10 +175,9 @@ def _outline(found: Evidence[ResultsUntilInfer], limit_deg: float, angle: Floats
     band = rim.sample(light, mask, usable)
     if len(band.azimuth) < _LEAST_RIM:
         return None
-    facing = np.maximum(dot(results.maps.normal, rays(results.maps.view, *results.maps.mask.shape)), _GRAZING)
-    shading = rim.sample(block_means(facing, _step(results.stokes))[None], mask, usable).total
-    turn = rim.fit_angle_error(band, angle, np.radians(limit_deg))
-    return OutlineFigures(rim.summarize(band, angle, shading), turn, rim.side_light(band, angle))
+    shots, mask, usable = _reduce(results.stokes, results.selfcal.angle)  # a correction of the ring hides a turned shot
+    turn = rim.fit_angle_error(rim.sample(shots, mask, usable), angle, np.radians(limit_deg))
+    return OutlineFigures(rim.summarize(band, angle), turn, rim.side_light(band, angle))
 
 
 def ill_posed(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Gate:
@@ -309,12 +304,6 @@ def _light_of_body(body: rim.RimFigures, found: Evidence[ResultsUntilInfer], lim
             "shots in a wrong order, or an object with sharp edges as outline"
         )
         return Gate("body", "warn", round(body.concentration, 2), least, message, remedy, _LOOSE_FIT_DEG, unit="")
-    if body.one_sided > (most := limits.max_one_sided * _lopsided(body)):
-        message = (
-            f"One side of the object is {100 * body.one_sided:.0f} % brighter than its shape explains: light from the "
-            "side, or an object with a dark and a bright half"
-        )
-        return Gate("body", "warn", round(body.one_sided, 2), round(most, 2), message, remedy, _SIDE_LIGHT_DEG, unit="")
     message = f"The outline is polarized by {100 * body.dolp:.1f} %"
     if body.dolp < limit:
         message += ", as little as a flat object" if flat else ", as little as a rough object"
@@ -340,13 +329,6 @@ def _across(found: Evidence[ResultsUntilHdr]) -> str:
     if statement.place == "cells":
         return f"if the room was dark, {angle_advice.turn(statement, found.results.radiance.angle, np.pi / 2)}"
     return "if the room was dark, the ring was upright at 0°: state the angles plus 90°"
-
-
-def _lopsided(body: rim.RimFigures) -> float:
-    """Factor on the limit of uneven light: the flash lights an outline with a well polarized bright half."""
-    if body.dolp_lit < _WEAK_DOLP:
-        return 1.0
-    return _LOPSIDED if body.dolp_lit < _LIT_DOLP else np.inf
 
 
 def _medians(maps: SurfaceMaps) -> tuple[float, float, float]:

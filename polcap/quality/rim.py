@@ -6,6 +6,7 @@ outline shows which stated angle is wrong, or that a second light shone from one
 follows the true outline. Pixels at the picture's border are left out.
 """
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,9 +35,9 @@ class Rim(outline.OutlineBand):
 class AngleError:
     """The error of one shot's polarizer angle, or of all angles, that fits the outline best."""
 
-    shot: int | None  # None: all shots share the error
+    shot: int | None  # None: no error of one shot fits better than one that all shots share
     angle: float  # rad, true minus stated angle
-    misfit: float  # residual with this error, relative to the residual without it; 1: no error fits better
+    misfit: float  # residual with this error, relative to that with the best error that all shots share
     sigmas: float  # significance of the error by a jackknife over the outline's sectors
 
 
@@ -45,14 +46,12 @@ class RimFigures:
     """Polarization and brightness of the whole outline."""
 
     dolp: float  # median degree of linear polarization
-    dolp_lit: float  # median of the brighter half
     dolp_most: float  # 90th percentile: a flat object is polarized at some parts of its outline only
     along: float  # −1…1: mean of cos 2(AoLP − φ); 1 is diffuse, −1 is specular reflection
     concentration: float  # 0…1, of the AoLP relative to φ, after removal of the common turn
     turned: float  # rad, common turn of the AoLP relative to φ
     turned_sigma: float  # rad
     brightness: float  # median light of the rim over the object's mean; below 1 under a flash
-    one_sided: float  # relative amplitude of the first harmonic in φ of light over shading; 0 under a flash at the lens
 
 
 def sample(light: Floats, mask: Bools, usable: Bools) -> Rim:
@@ -87,15 +86,21 @@ def off_border(band: Bools) -> Bools:
 
 
 def fit_angle_error(at: Rim, angle: Floats, least: float) -> AngleError:
-    """Fit an angle error of at least `least` rad, of one shot or of all, to the outline; angle (K,) rad as stated."""
-    middle = float(np.median(_misfit(at, angle))) + 1e-9
-    best = AngleError(None, 0.0, 1.0, 0.0)
-    steps = np.radians(np.arange(_STEP_DEG, _MOST_DEG + 1, _STEP_DEG))
-    for step in (s for size in steps if size >= least for s in (-size, size)):
-        for shot in (*range(len(angle)), None):
-            misfit = float(np.median(_misfit(at, angle + step * _turns(shot, angle)))) / middle
-            if misfit < best.misfit:
-                best = AngleError(shot, float(step), misfit, 0.0)
+    """Fit an angle error to the outline, of all shots or of at least `least` rad of one; angle (K,) rad as stated.
+
+    An error of one shot imitates a smaller one of all, which fits worse.
+    """
+    sizes = np.radians(np.arange(_STEP_DEG, _MOST_DEG + 1, _STEP_DEG))
+    steps = np.sort([*-sizes, 0.0, *sizes])
+
+    def misfit(shot: int | None, step: float) -> float:
+        return float(np.median(_misfit(at, angle + step * _turns(shot, angle)))) + 1e-9
+
+    shared, step = min((misfit(None, step), step) for step in steps)
+    best = AngleError(None, float(step), 1.0, 0.0)
+    for shot, step in itertools.product(range(len(angle)), steps[np.abs(steps) >= least]):
+        if (ratio := misfit(shot, step) / shared) < best.misfit:
+            best = AngleError(shot, float(step), ratio, 0.0)
     return replace(best, sigmas=_sigmas(at, angle, np.sign(best.angle) * _turns(best.shot, angle)))
 
 
@@ -138,22 +143,18 @@ def _sigmas(at: Rim, angle: Floats, way: Floats) -> float:
     return float(moment.sum() / weight.sum() / max(float(jackknife(without)), 1e-9))
 
 
-def summarize(at: Rim, angle: Floats, shading: Floats | float = 1.0) -> RimFigures:
-    """Summarize polarization and brightness of the outline; angle (K,) rad, `shading` (N,) of its shape by a flash."""
+def summarize(at: Rim, angle: Floats) -> RimFigures:
+    """Summarize polarization and brightness of the outline; angle (K,) rad."""
     mean, turned_sigma = outline.mean_and_sigma(*outline.phasor(at, angle))
     dolp = np.abs(outline.polarization(at, angle))
-    basis = np.stack([np.ones_like(at.azimuth), np.cos(at.azimuth), np.sin(at.azimuth)], axis=1)
-    found = np.linalg.lstsq(basis, at.total / shading, rcond=None)[0]
     return RimFigures(
         dolp=float(np.median(dolp)),
-        dolp_lit=float(np.median(dolp[at.total >= np.median(at.total)])),
         dolp_most=float(np.quantile(dolp, 0.9)),
         along=mean.real,
         concentration=abs(mean),
         turned=float(np.angle(mean) / 2),
         turned_sigma=turned_sigma,
         brightness=float(np.median(at.total)),
-        one_sided=float(np.hypot(found[1], found[2]) / max(float(found[0]), 1e-9)),
     )
 
 

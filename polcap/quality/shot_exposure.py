@@ -273,6 +273,11 @@ def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
         if measured.source == "none":
             message = f"The light of each shot is unknown; it is assumed equal within {100 * doubt:.1f} % (1σ)"
         remedy = "Put a ColorChecker next to the object"
+        if found.results.color.place is not None:
+            message = (
+                f"The chart moved or its gray patches are hidden: the light is known within {100 * doubt:.1f} % (1σ)"
+            )
+            remedy = "Fix the chart next to the object, with the whole gray row lit evenly"
         remedy += "" if found.results.radiance.equipment.light == "steady" else ", or use a steady lamp"
         remedy += "" if len(found.names) > 3 else ", or shoot four angles"
     cost = DEGREES_PER_GAIN * doubt

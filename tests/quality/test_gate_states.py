@@ -20,6 +20,7 @@ from polcap.chart_values import PatchColors
 from polcap.config import Config
 from polcap.images import Quality
 from polcap.quality import flatness, gates, geometry, light, polarization, rerendering, rim, shot_exposure
+from polcap.quality.albedo_slope import AlbedoSlope
 from polcap.quality.flatness import Flatness
 from polcap.quality.gate import Gate
 from polcap.quality.object_turn import ObjectTurn
@@ -41,13 +42,14 @@ def rendered(agreement: float = 0.7, scale: float = 1.0) -> Rerendering:
 
 
 BODY = {
-    "dolp": 0.1, "dolp_lit": 0.1, "dolp_most": 0.1, "along": 0.9, "concentration": 0.95, "turned": 0.0,
-    "turned_sigma": 0.01, "brightness": 0.5, "one_sided": 0.1,
+    "dolp": 0.1, "dolp_most": 0.1, "along": 0.9, "concentration": 0.95, "turned": 0.0,
+    "turned_sigma": 0.01, "brightness": 0.5,
 }  # fmt: skip
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 ROUNDED = Flatness(contour=0.8, common=0.1, rim_dolp=0.2, rim_light=0.7, aligned=0.7, facing=1.0, expected_deg=15.0)
 FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
+    "albedo_slope": AlbedoSlope(0.01, 0.1),
     "pushed": pushed(0.1, 0.1), "turn": ObjectTurn(np.array([0.0, 0.2, 0.1]), np.full(3, 0.1)),
     "edge_blur": 0.8, "contradiction": 0.0, "own_error": 4.0,
     "flatness": ROUNDED, "most_dolp": 0.1, "charted": 0.0, "rendered": rendered(), "noise": 0.001, "ill_posed": 0.0,
@@ -56,6 +58,7 @@ FIGURES = {
 }  # fmt: skip
 MEASURES = {  # the function that measures each figure
     "surroundings": (light, "_surroundings_dolp"), "highlight": (light, "_highlight_dolp"),
+    "albedo_slope": (light, "_albedo_slope"),
     "contradiction": (geometry, "_contradiction"),
     "pushed": (geometry, "_measure_shift"), "turn": (geometry, "_measure_turn"),
     "edge_blur": (geometry, "_sharpest_blur"),
@@ -212,7 +215,6 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("contour", "not measured", {"figures": {"flatness": replace(ROUNDED, common=0.9)}}),
     ("body", "warn", {"figures": {**outline(dolp=0.02), "medians": [10.0, 0.6, 0.3]}}),
     ("body", "warn", {"figures": outline(dolp=0.02)}),
-    ("body", "warn", {"figures": outline(one_sided=0.9, dolp_lit=0.03)}),
     ("other light", "pass", {}),
     ("other light", "fail", {"figures": outline(side=0.2)}),
     ("noise", "pass", {}),
@@ -225,6 +227,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("lighting", "pass", {}),
     ("lighting", "warn", {"figures": {"highlight": 0.05}}),
     ("lighting", "fail", {"figures": {"highlight": 0.3}}),
+    ("lighting", "warn", {"figures": {"albedo_slope": AlbedoSlope(0.3, 0.1)}}),
+    ("lighting", "not measured", {"figures": {"highlight": NAN, "albedo_slope": None}}),
     ("room light", "pass", {}),
     ("room light", "warn", {"figures": {"surroundings": 0.05}}),
     ("ambient", "not measured", {}),

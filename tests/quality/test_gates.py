@@ -471,18 +471,24 @@ def test_light_from_around_is_reported(good: Seen) -> None:
     assert "90°" in gate.message and "plus 90°" in gate.remedy  # a ring set upright at 0° looks the same
 
 
-@pytest.mark.parametrize(
-    ("uneven", "ambient", "state"),
-    [(0.47, 0.0, "pass"), (0.7, 0.0, "pass"), (0.0, 3.0, "warn"), (0.0, 6.0, "warn")],
-)
-def test_a_lopsided_body_is_no_light_from_the_side(good: Seen, uneven: float, ambient: float, state: str) -> None:
-    """A body turned to one side is as polarized there as elsewhere; a lamp from there is not."""
-    image = good.results.stokes
-    across = np.linspace(-1, 1, image.mask.shape[1])[:, None] / (scenes.RADIUS / (image.mask.shape[1] / 2))
-    lit = image.stokes * np.maximum(1 + uneven * across, 0)
-    lit[0] += ambient * np.maximum(across, 0) * image.stokes[0].mean()
-    gate = judged(changed(good, stokes=replace(image, stokes=lit.astype(np.float32))))["body"]
-    assert gate.state == state and ("side" in gate.message) == (state == "warn")
+@pytest.mark.parametrize(("azimuth", "side"), [(0.0, "right"), (np.pi / 2, "top"), (-3.0, "left")])
+def test_a_lamp_at_the_side_is_found_in_the_albedo(good: Seen, azimuth: float, side: str) -> None:
+    """The albedo takes the light of a lamp 40° beside the lens, four fifths of the flash's (Lambert's law)."""
+    maps, lamp = good.results.maps, np.radians(40)
+    towards = np.array([np.cos(azimuth) * np.sin(lamp), np.sin(azimuth) * np.sin(lamp), np.cos(lamp)])
+    light = 1 + 0.8 * np.maximum(maps.normal @ towards, 0) / np.maximum(maps.normal[..., 2], 0.05)
+    lit = replace(maps, diffuse=(0.3 * light[..., None] * np.ones(3)).astype(np.float32))
+    gate = judged(changed(good, maps=lit))["lighting"]
+    assert gate.state == "warn" and f"lean to the {side} " in gate.message and 3 < gate.cost_deg < 7
+
+
+def test_a_dark_and_a_bright_half_are_no_light_from_the_side(good: Seen) -> None:
+    maps = good.results.maps
+    random = np.random.default_rng(2)
+    halves = np.where(np.arange(maps.mask.shape[1]) < maps.mask.shape[1] / 2, 0.15, 0.6) * np.ones(maps.mask.shape)
+    halves = (halves * np.exp(0.05 * random.normal(size=halves.shape)))[..., None] * np.ones(3)
+    painted = replace(maps, diffuse=halves.astype(np.float32))
+    assert judged(changed(good, maps=painted))["lighting"].state == "pass"
 
 
 def test_a_ring_that_was_mended_is_reported() -> None:
@@ -490,6 +496,15 @@ def test_a_ring_that_was_mended_is_reported() -> None:
     gate = judged(found(radiance=clocked))["angles"]
     assert gate.state == "warn" and gate.value == pytest.approx(4.0, abs=0.5)  # it may be a single shot's
     assert "corrected" in gate.message and 0 < gate.cost_deg < 2.5
+
+
+def test_a_turned_shot_is_named_though_the_ring_was_corrected() -> None:
+    """One shot that is turned by 20° imitates a smaller turn of all three, which fits worse."""
+    actual = scenes.ANGLES + np.radians([0.0, 20.0, 0.0])
+    seen = found(radiance=replace(scenes.stack(noise=0.002, angles=actual), angle=scenes.ANGLES))
+    gate = judged(seen)["angles"]
+    assert seen.results.selfcal.ring.correction != 0
+    assert gate.state == "fail" and gate.shots == ("45°",) and gate.value == pytest.approx(20, abs=3)
 
 
 @pytest.mark.parametrize(("name", "value"), [("border", 0.6), ("islands", 0.03), ("holes", 0.06)])

@@ -94,7 +94,7 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 12.0
 
 
-@stage(version=19)
+@stage(version=20)
 def solve(
     radiance: AngleStack,
     alignment: Alignment,

@@ -19,6 +19,7 @@ _GREYS = (18, 19, 20, 21, 22, 23)  # white to black
 _LIGHT = 4  # number of light patches, used for the gains; the two dark ones reflect 9 and 3 % and are mostly noise
 _REFLECTANCE = np.array([0.900, 0.591, 0.362, 0.198])  # of the light patches, from the chart's maker
 _SCATTER = 0.001  # between patches, by print, registration and falloff; measured gains err by 0.0009 (decision 6)
+_MOST_SCATTER = 0.2  # the same, relative: a chart that moved by half a patch has .7
 _LEAST_PX, _MARGIN_PX = 9, 0.5  # of a patch
 _SURE = 4.0  # least significance of gloss, σ
 
@@ -34,7 +35,7 @@ class GreyPatches:
 
 
 def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> GreyPatches | None:
-    """Gains of the shots from the chart's light grey patches; None without a usable patch.
+    """Gains of the shots from the chart's light grey patches; None without a usable patch, or if the chart moved.
 
     Each patch is averaged in the pixels of each shot; the patches are then summed.
     """
@@ -50,6 +51,8 @@ def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration)
     gain = pooled / pooled[0]
     photon = gain * np.sqrt(noise / pooled**2 + (noise / pooled**2)[0])
     each = mean[:, light] / mean[:1, light]  # (K, P, 3)
+    if (each.std(1) > _MOST_SCATTER * each.mean(1)).any():
+        return None
     sigma = np.hypot(photon, each.std(1) / np.sqrt(light.sum()))
     sigma[0] = 0
     gain, sigma = _one_for_all_channels(gain, sigma)

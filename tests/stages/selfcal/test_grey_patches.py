@@ -59,6 +59,26 @@ def test_hidden_grey_patches_do_not_count(reason):
     assert np.abs(half.gain.mean(1) / GAIN - 1).max() < 0.003
 
 
+def test_a_chart_that_moved_gives_no_gains():
+    """In one shot other parts of the chart are where the grey row was: the object gives the gains."""
+    value = SHOTS.value.copy()
+    for column, times in enumerate([0.04, 0.03, 0.1, 0.2, 0.5, 1.0]):
+        value[1, 150:190, 230 + 11 * column : 241 + 11 * column] *= times
+    moved = solve(replace(SHOTS, value=value), board())
+    assert moved.gains.source == "object"
+    assert np.abs(moved.gains.gain.mean(1) / GAIN - 1).max() < 0.005
+    gains = replace(moved.gains, sigma=np.full((3, 3), 0.01))
+    gate = gain_doubt(replace(moved, gains=gains), color=board(), radiance=SHOTS)
+    assert gate.state == "warn" and "moved" in gate.message and "Fix the chart" in gate.remedy
+
+
+def test_strong_gloss_does_not_look_like_a_chart_that_moved():
+    """A gloss of 6 % of the white patch, polarized to two fifths."""
+    value = SHOTS.value.copy()
+    value[:, 30:190, 224:300] += 0.06 * (0.6 + 0.4 * np.array([1.0, 0.0, -1.0]))[:, None, None, None]
+    assert solve(replace(SHOTS, value=value), board()).gains.source == "grey patches"
+
+
 def test_grey_patches_with_a_large_error_are_doubted():
     """Their distance from the object's gains is then within the error of both: the error itself is judged."""
     found = solve(SHOTS, board())
@@ -68,8 +88,8 @@ def test_grey_patches_with_a_large_error_are_doubted():
     assert gain_doubt(found).state == "pass"
 
 
-def gain_doubt(found: SelfCalibration) -> Gate:
-    seen: Any = SimpleNamespace(results=SimpleNamespace(selfcal=found))
+def gain_doubt(found: SelfCalibration, **results: Any) -> Gate:
+    seen: Any = SimpleNamespace(results=SimpleNamespace(selfcal=found, **results), names=["0°", "45°", "90°"])
     return shot_exposure.gain_doubt(seen, GateLimits())
 
 
