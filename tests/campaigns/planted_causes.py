@@ -358,9 +358,9 @@ CAUSES = {
         files(lambda folder: shutil.copy(file_of(folder, 1, 1), folder / "pol045" / "IMG_0005b.DNG")), r"remove one"
     ),
     "pol090 missing": Cause(files(lambda folder: shutil.rmtree(folder / "pol090")), r"missing shot|90"),
-    "chart 25 cm behind": Cause(chart(0.25), r"chart|ColorChecker"),
-    "chart 20 cm before": Cause(chart(-0.2), r"chart|ColorChecker"),
-    "chart in the shade": Cause(chart_lit_less, r"chart|ColorChecker"),
+    "chart 25 cm behind": Cause(chart(0.25), r"[Ll]ight the chart|ColorChecker"),
+    "chart 20 cm before": Cause(chart(-0.2), r"[Ll]ight the chart|ColorChecker"),
+    "chart in the shade": Cause(chart_lit_less, r"[Ll]ight the chart|ColorChecker"),
     "chart moved in 45°": Cause(chart_moved(1), r"chart|ColorChecker", True),
     "chart half covered": Cause(chart_in_mirror, r"chart"),
     "no chart": Cause(scene(chart=None), r"chart|ColorChecker"),

@@ -67,11 +67,11 @@ def found_as_planted(folder: Path, fault: str) -> Verdict:
     return found
 
 
-def test_one_turned_shot_of_three_is_reported_with_the_ring_that_it_looks_like(tmp_path: Path) -> None:
-    faulty.shoot(tmp_path / "bad", 3, "wrong angle", WIDTH)
+def test_one_turned_shot_of_three_is_named_and_not_taken_for_the_ring(tmp_path: Path) -> None:
+    faulty.shoot(tmp_path / "bad", 3, "wrong angle", WIDTH)  # 0°, by −15°
     line = next(line for line in verdict(tmp_path / "bad").lines if line.name == "angles")
-    assert line.state == "warn" and line.cost_deg > 1
-    assert "ring's zero" in line.message and "single shot" in line.message and "take it again" in line.remedy
+    assert line.state == "warn" and line.cost_deg > 1 and "take the shot again" in line.remedy
+    assert line.shots == ("0°",) and line.value == pytest.approx(-15, abs=4)
 
 
 def test_a_clockwise_ring_gets_a_remedy_that_works(tmp_path: Path) -> None:
