@@ -21,7 +21,7 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
         [sys.executable, ROOT / "examples" / "flat_sample.py", folder],
         env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
     )  # fmt: skip
-    assert done.returncode == 0 and "texels of 0.9" in done.stdout, done.stderr
+    assert done.returncode == 0 and "texels of 1.1" in done.stdout, done.stderr
     return folder
 
 
