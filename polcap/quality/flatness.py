@@ -27,6 +27,7 @@ _GROWTH, _LEAST_DOLP = 1.5, 0.04  # of the DoLP in a sector with an occluding co
 _ROUNDED = 0.2  # share of such sectors: plates, coins and sheets up to .17, unless tilted; bodies from .25
 _ONE_PLANE = 0.5  # common part of the polarization: rounded objects up to .46; beyond, orders look alike
 _LIT = 0.85  # light of an outline that is not dimmed: wax too is hardly polarized, but dimmed to .8 and less
+_WALL_DOLP = 0.1  # of a part of the outline: where it does not grow outwards, a wall of a can or a box; wax has less
 _FACING_DOLP = 0.045  # most of the outline of a plane that faces the camera
 _ALIGNED = 0.84  # length of the mean normal: boxes up to .83, except one whose normals are wrong; bodies up to .77
 _ONE_NORMAL = 0.92  # of the mean normal: beyond, the outline decides nothing
@@ -49,7 +50,8 @@ class Flatness:
     @property
     def sharp_edged(self) -> bool:
         """Whether the outline is the edge of faces, at least in most parts."""
-        return (self.contour < _ROUNDED and self.rim_light > _LIT) or self.common > _ONE_PLANE
+        unlike_wax = self.rim_light > _LIT or self.rim_dolp > _WALL_DOLP
+        return (self.contour < _ROUNDED and unlike_wax) or self.common > _ONE_PLANE
 
     @property
     def flat(self) -> bool:

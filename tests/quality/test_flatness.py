@@ -1,5 +1,6 @@
 """What is flat, what has sharp edges, and what is rounded, by polarization, light and normals of ideal objects."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -63,6 +64,15 @@ def test_a_plane_with_relief_is_flat(tilt_deg: float) -> None:
 def test_a_box_has_sharp_edges_and_is_not_flat() -> None:
     seen = faces(-50.0, 40.0)
     assert seen.sharp_edged and not seen.flat
+
+
+def test_a_can_seen_from_above_has_sharp_edges_although_its_wall_is_dim() -> None:
+    """Figures of a simulated can, whose lid faces the camera."""
+    can = Flatness(
+        contour=0.17, common=0.41, rim_dolp=0.166, rim_light=0.52, aligned=0.7, facing=0.99, expected_deg=3.3
+    )
+    assert can.sharp_edged and not can.flat
+    assert not replace(can, rim_dolp=0.05).sharp_edged  # wax
 
 
 def test_a_small_object_is_not_measured() -> None:
