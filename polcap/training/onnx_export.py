@@ -50,6 +50,7 @@ def export_network(network: nn.Module, path: Path, outputs: tuple[str, ...], met
             input_names=["channels"], output_names=list(outputs),
             dynamic_axes={name: {2: "height", 3: "width"} for name in ("channels", *outputs)},
             opset_version=OPSET, dynamo=False, do_constant_folding=False,  # folding would rename weights
+            training=torch.onnx.TrainingMode.TRAINING,  # evaluation would store equal weights only once
         )  # fmt: skip
         graph = onnx.load(str(temporary))
         _halve(graph)
