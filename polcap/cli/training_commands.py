@@ -75,7 +75,7 @@ def evaluate(
         Path | None, Option(metavar="DIR", help="Photographs with normals instead: pol000/ … mask/ normal/.")
     ] = None,
 ) -> None:
-    """Score a model on test meshes and materials, with baselines and published figures (extra [train])."""
+    """Score a model on test meshes and materials (extra [train]), or on photographs with --real (without the extra)."""
     if (data is None) == (real is None):
         raise SettingError("evaluate takes DATA, a folder with meshes/ and materials/, or --real DIR; give one of them")
     if real is not None:

@@ -30,7 +30,8 @@ Evaluation:
     evaluation_protocol     the fixed pictures: `evaluation_materials` under the light of `light_transport`
     evaluation_page         the result as a page
     ablation_study          all variants of the network, trained and evaluated
-    evaluation_photographs  errors of the normals on photographs with measured normals
+    evaluation_photographs  errors of the normals on photographs with measured normals, without torch
+    scores                  figures by name and their table
 
 Data:
 

@@ -27,8 +27,9 @@ from polcap.stages import cues, infer
 from polcap.training import evaluation_baselines, evaluation_page, evaluation_protocol
 from polcap.training.evaluation_baselines import Estimator, Means
 from polcap.training.evaluation_protocol import Protocol
-from polcap.training.map_errors import MAPS, Judge, Score, angle, deciles
+from polcap.training.map_errors import MAPS, Judge, angle, deciles
 from polcap.training.progress import Report, silent
+from polcap.training.scores import Score
 
 _PANEL = 8  # pictures in panel.png
 _SAMPLE = 500  # pixels of a picture for the check of the expected error

@@ -1,6 +1,6 @@
 """Writes the evaluation's result as a page (evaluation.md, with published figures) and a picture (panel.png)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import cv2
@@ -12,7 +12,8 @@ from polcap.report.stage_pictures import Picture
 from polcap.stage_values import SurfaceMaps
 from polcap.training import traced_views
 from polcap.training.evaluation_protocol import Case
-from polcap.training.map_errors import LIMITS_DEG, angle, render_intensity
+from polcap.training.map_errors import angle, render_intensity
+from polcap.training.scores import LIMITS_DEG, grid
 
 # Deschaintre, Lin & Ghosh, CVPR 2021, tables 1 and 2, on the authors' own test set
 _FIGURES = ("normal_mean", "diffuse", "roughness", "specular", "depth", "rendering")
@@ -112,11 +113,6 @@ def _cell(key: str, value: float | None) -> str:
     if "within" in key:
         return f"{100 * value:.1f}"
     return f"{value:.2f}" if key.startswith("normal") else f"{value:.4f}"
-
-
-def grid(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """Markdown table from a header row and body rows."""
-    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body))
 
 
 def make_row(case: Case, maps: SurfaceMaps) -> Picture:

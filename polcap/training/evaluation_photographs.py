@@ -28,9 +28,8 @@ from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
 from polcap.results import ResultsUntilInfer
 from polcap.stage_values import Cues, Network
-from polcap.training.evaluation_page import grid
-from polcap.training.map_errors import LIMITS_DEG, Score
 from polcap.training.progress import Report, silent
+from polcap.training.scores import LIMITS_DEG, Score, grid
 
 _MISSED_DEG = 90.0  # error of a pixel of the object without an estimated normal
 _MIN_DOLP, _MIN_TILT = 0.03, 0.3  # for the comparison of AoLP and azimuth; tilt: sine of the zenith

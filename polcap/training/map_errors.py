@@ -11,16 +11,14 @@ from polcap.optics.outline import disc_radius
 from polcap.stage_values import SurfaceMaps
 from polcap.stages import surface
 from polcap.training.evaluation_protocol import Case, render_lights
+from polcap.training.scores import LIMITS_DEG, Score
 
 MAPS = ("diffuse", "specular", "roughness")
-LIMITS_DEG = (11.25, 22.5, 30.0)  # of the shares of pixels with a smaller normal error
 _IOR = 1.5  # for renderings; it is not among the maps
 _MAX_PIXELS = 20_000  # of a rendering: every second, third … pixel of the mask
 _INTEGRATED = 128  # px, approximate side for integration, which takes too long at 512²
 _FLASH = np.array([0.0, 0.0, 1.0])  # direction to the light that defines white
 _MIN_CLIPPED = 10  # clipped pixels needed for an error in highlights
-
-Score = dict[str, float]
 
 
 class Judge:

@@ -1,5 +1,7 @@
 """Errors of normals from photographs of a ball; missing files are named."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -62,3 +64,8 @@ def test_a_folder_of_another_layout_is_refused(folder: Path, tmp_path: Path) -> 
         (tmp_path / part).symlink_to(folder / part)
     with pytest.raises(InputError, match=r"mask/ball\.png is missing"):
         evaluation_photographs.main(tmp_path, Path("model.onnx"), tmp_path)
+
+
+def test_photographs_are_evaluated_without_torch() -> None:
+    program = "import sys; sys.modules['torch'] = None; import polcap.training.evaluation_photographs"
+    subprocess.run([sys.executable, "-c", program], check=True)
