@@ -27,6 +27,7 @@ from trimesh import Trimesh
 from trimesh.sample import sample_surface
 
 from polcap.config import restore
+from polcap.formats.capture.folder_names import set_of_view
 from polcap.fusion import baking, fused_maps, joining, session, session_views
 from polcap.fusion.fusion_path import FusionResults, FusionSettings, SessionConfig, path
 from polcap.fusion.session_views import SessionInput
@@ -121,7 +122,7 @@ def joined(folder: Path) -> str:
     point, size = sample_surface(surface, 30_000, seed=0)[0], float(np.ptp(truth["vertices"], axis=0).max())
     laid = pose_of(about["laid"])
     boards = {one["name"]: pose_of(one) for one in about["views"]}
-    first, second = ([view for view in placed if view.folder == name] for name in ("setA", "setB"))
+    first, second = ([view for view in placed if set_of_view(view.name) == name] for name in ("setA", "setB"))
     true = [after(laid, boards[view.name]) for view in second]
     pairs = [(view.pose, pose) for view, pose in zip(second, true)]
     turns = [Rotation.from_matrix(one.rotation @ other.rotation.T).magnitude() for one, other in pairs]
