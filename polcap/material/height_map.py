@@ -27,8 +27,8 @@ from polcap.stages import stage
 _DIRECTIONS, _GROWTH = 12, 1.25  # of the horizon's search; ratio of successive distances
 _FARTHEST = 0.1  # of the longer side
 _MISPLACED = 0.25  # texels, 1σ of a texel's place in a view
-_PRINT = 0.1  # texels that a texture is misplaced at most; what follows the albedo by more is relief
-_PRINT_LEFT = 0.02  # texels, 1σ of that place; as large as it is itself, because it differs by view
+_PRINT = 0.1  # texels, largest shift of a print; slopes that follow the albedo by more are relief
+_PRINT_LEFT = 0.02  # texels, 1σ of the shift that is left, as large as usual shifts because these differ by view
 _SIDE, _WINDOW = 160, 1 / 9  # texels along the longer side of reduced maps; 1σ of a window over that side
 _MOST_WEIGHT = 4.0  # of a slope, over that of the median doubt
 _TOLERANCE, _MOST_STEPS = 1e-3, 60  # of the conjugate gradients; about 15 steps are needed
@@ -98,11 +98,11 @@ def _albedo_doubt(albedo: Floats, sigma: Floats, scale: float) -> Floats:
 
 
 def without_print(slope: Floats, albedo: Floats) -> tuple[Floats, Floats]:
-    """Slopes (H, W, 2) without the part that a misplaced texture of the albedo (H, W) causes, and what is left, 1σ.
+    """Slopes (H, W, 2) without the part that a shifted print causes, and 1σ (H, W) of the part that is left.
 
-    Under a light at the lens, a texture that a view at the tilt θ shows e tan θ away from its texel looks like a slope
-    of e d ln ρ/dx. Over a window this part has the share e of the slopes along the gradient of ln ρ. e is about 0.02
-    texels. A relief that follows the albedo, as a groove does, has a larger share and keeps its slopes.
+    `albedo` (H, W) is ρ. If a view at the tilt θ shows the print e tan θ texels off, under a light at the lens this
+    looks like a slope of e d ln ρ/dx. So e is fitted to slopes and gradients of ln ρ in a window; it is about 0.02
+    texels. A relief that follows the albedo, as a groove does, has a larger e and keeps its slopes.
     """
     height, width = albedo.shape
     step = max(1, round(max(albedo.shape) / _SIDE))

@@ -81,7 +81,7 @@ class BackgroundCheck:
                 self._reject(earlier, self._record.folder / other.file, other.read_deg, retake_criteria.BLURRED)
 
     def _reject(self, slot_name: str, file: Path, read_deg: float | None, reason: str) -> None:
-        """Move a frame aside to be taken again. Raises CaptureError: it was rejected too often."""
+        """Move a frame to the rejected ones; it is taken again. Raises CaptureError: it was rejected too often."""
         moved = self._record.reject(slot_name, file, read_deg, reason)
         self._rejections[slot_name] += 1
         self._log.write("check", "!", f"{slot_name}: {reason}; moved to {moved}")

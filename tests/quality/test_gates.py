@@ -473,7 +473,7 @@ def test_light_from_around_is_reported(good: Seen) -> None:
 
 @pytest.mark.parametrize(("azimuth", "side"), [(0.0, "right"), (np.pi / 2, "top"), (-3.0, "left")])
 def test_a_lamp_at_the_side_is_found_in_the_albedo(good: Seen, azimuth: float, side: str) -> None:
-    """The albedo takes the light of a lamp 40° beside the lens, four fifths of the flash's (Lambert's law)."""
+    """The albedo takes the light of a lamp 40° to the side of the lens, 0.8 times the flash's (Lambert's law)."""
     maps, lamp = good.results.maps, np.radians(40)
     towards = np.array([np.cos(azimuth) * np.sin(lamp), np.sin(azimuth) * np.sin(lamp), np.cos(lamp)])
     light = 1 + 0.8 * np.maximum(maps.normal @ towards, 0) / np.maximum(maps.normal[..., 2], 0.05)
