@@ -25,6 +25,7 @@ _IIIF = "asset/NAME_iiif/, a relightable layer for museums; URL is where this fo
 _PAGE = "Web page that shows the GLB with this model-viewer.min.js, without a network."
 _COLOR = "Color space or OCIO role of the colors in the EXR, such as ACEScg."
 _SIZE = "Longer side of the textures, px; by default each keeps its own size."
+_TRIANGLES = "Most triangles of the mesh; engines have 20,000, web 50,000."
 _GEOMETRY = "Mesh in the GLB: 32-bit floats, integers, or Draco (extra [draco])."
 _OUT = "New result folder for the files, with a copy of the maps; an archive stays as it is."
 _LEVEL = re.compile(r"_lod\d\.glb$")
@@ -53,7 +54,7 @@ def export(
     preset: Annotated[list[str] | None, _names(_PRESET, PRESETS)] = None,
     images: Images = None,
     geometry: Geometry = None,
-    triangles: Annotated[int | None, Option(min=16, help="Most triangles of the mesh; web has 50,000.")] = None,
+    triangles: Annotated[int | None, Option(min=16, help=_TRIANGLES)] = None,
     color: Annotated[str, Option(metavar="SPACE", help=_COLOR)] = "lin_rec709",
     texture_size: Annotated[int | None, Option(min=16, max=16384, help=_SIZE)] = None,
     page: Annotated[Path | None, Option(metavar="JS", help=_PAGE)] = None,
@@ -95,6 +96,8 @@ def export(
         result = out
     files = api.write_exports(result, *wanted)
     options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
+    if triangles is None:
+        _print_reduced(result, [one.preset for one in wanted])
     if (missing := lod * len(wanted) - sum(bool(_LEVEL.search(file.name)) for file in files)) > 0:
         terminal.print_message(f"polcap: {missing} levels of --lod would differ by over 1 % of the size: not written")
     for name in plain.extras:
@@ -103,6 +106,20 @@ def export(
     if texture_size is not None:
         _warn_of_upsampling(result, texture_size)
     terminal.print_written(files, json)
+
+
+def _print_reduced(result: Path, presets: Sequence[str | None]) -> None:
+    """Print the number of triangles of presets that reduce the mesh, and the option that changes it."""
+    from polcap.formats import text_file
+
+    exports = text_file.read_json(result / "maps" / "maps.json")["exports"]
+    for folder in (f"asset/{preset}" for preset in presets if preset is not None):
+        mesh = exports[folder]["mesh"]
+        if "error" in mesh:
+            terminal.print_progress(
+                f"polcap: {folder} has {mesh['triangles']:,} triangles; 99 % of the full mesh are within "
+                f"{mesh['error']}, its detail is in the normal texture; --triangles N changes the number"
+            )
 
 
 def _warn_of_upsampling(result: Path, size: int) -> None:

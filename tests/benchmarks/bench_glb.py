@@ -29,6 +29,7 @@ CASES = {
     "float": ExportRequest(formats=("gltf",), geometry="float"),
     "quantized": ExportRequest(formats=("gltf",), geometry="quantized"),
     "draco": ExportRequest(formats=("gltf",), geometry="draco"),
+    "engines": ExportRequest(formats=("gltf",), triangles=20_000),
     "web": ExportRequest(preset="web"),
     "web, draco": ExportRequest(preset="web", geometry="draco"),
 }

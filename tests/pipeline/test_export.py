@@ -271,6 +271,16 @@ def test_textures_for_engines_have_powers_of_two(exported: Path, preset: str) ->
     assert all(0.84 * stated[0] <= width for _, width in sizes)
 
 
+def test_a_preset_for_an_engine_has_20_000_triangles_unless_stated(own: Path, polcap: Command) -> None:
+    done = polcap("export", own, "--preset", "unity")
+    count = json.loads((own / "maps" / "maps.json").read_text())["exports"]["asset/unity"]["mesh"]["triangles"]
+    assert 19_000 < count <= 20_000
+    said = f"asset/unity has {count:,} triangles; 99 % of the full mesh are within 0."
+    assert said in done.stderr and "--triangles N changes" in done.stderr
+    assert polcap("export", own, "--preset", "unity", "--triangles", 1_000_000).stderr == ""
+    assert trimesh.load(own / "asset/unity/capture.glb", force="mesh").faces.shape[0] > 100_000
+
+
 def test_larger_textures_than_the_maps_hold_are_reported(tiny_result: Path, polcap: Command) -> None:
     size = max(json.loads((tiny_result / "maps" / "maps.json").read_text())["size"])
     done = polcap("export", tiny_result, "--gltf", "--texture-size", 4 * size)
@@ -314,7 +324,9 @@ def test_the_report_lists_the_levels(own: Path) -> None:
 
 
 def test_exports_of_earlier_maps_are_named(own: Path, polcap: Command) -> None:
-    assert polcap("export", own, "--preset", "unreal", "--lod", 2, "--texture-size", 64).stderr == ""
+    assert (
+        polcap("export", own, "--preset", "unreal", "--triangles", 99999, "--lod", 2, "--texture-size", 64).stderr == ""
+    )
     asset, about = own / "asset", json.loads((own / "report.json").read_text())
     assert asset_export.find_outdated(asset_export.sidecars(own), about["keys"]) == []
     about["keys"]["surface"] = "of other maps"

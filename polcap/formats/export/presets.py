@@ -14,6 +14,7 @@ if TYPE_CHECKING:  # the command line needs the names before NumPy is imported
 Format = Literal["gltf", "obj", "ply", "stl", "usd", "usdz", "materialx", "exr", "iiif", "sfp"]
 FORMATS: tuple[Format, ...] = ("gltf", "obj", "ply", "stl", "usd", "usdz", "materialx", "exr", "iiif", "sfp")
 EXTRAS: tuple[Extra, ...] = ("displacement", "curvature", "cavity", "occlusion", "object-normal")
+_OF_ENGINES = 20_000  # triangles; the full mesh is within a map pixel: docs/benchmarks/exports.md
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ PRESETS: Mapping[str, ExportPreset] = {
         description="Interchange imports the GLB (normals +Y); the loose T_*_N is -Y, as Unreal's materials need it",
         name="SM_{}",
         powers=True,
+        triangles=_OF_ENGINES,
         textures={
             "T_{}_BC": "base_color",
             "T_{}_N": "normal_directx",
@@ -55,6 +57,7 @@ PRESETS: Mapping[str, ExportPreset] = {
         formats=("gltf",),
         description="glTFast imports the GLB; loose maps for HDRP and for the specular set-ups of URP; normals +Y",
         powers=True,
+        triangles=_OF_ENGINES,
         textures={
             "{}_BaseMap": "base_color",
             "{}_Normal": "normal",
@@ -66,6 +69,7 @@ PRESETS: Mapping[str, ExportPreset] = {
         formats=("gltf",),
         description="import the GLB, then set Specular; loose maps for an ORMMaterial3D; normals +Y (OpenGL)",
         powers=True,
+        triangles=_OF_ENGINES,
         textures={
             "{}_albedo": "base_color",
             "{}_orm": "occlusion_roughness_metallic",
