@@ -49,7 +49,7 @@ class ChartInView:
     color: ColorCalibration
 
 
-@stage(version=2)
+@stage(version=3)
 def measure(views: tuple[PosedStokes, ...], chart: ChartInView | None, board: Board) -> FlashLight:
     """Flash and light of all views; without a chart the paper's albedo gives the scale.
 
@@ -76,7 +76,6 @@ def measure(views: tuple[PosedStokes, ...], chart: ChartInView | None, board: Bo
         sigma=float(rest.std()),
         paper=albedo,
         shine=shine,
-        used=len(rest),
     )
 
 

@@ -74,13 +74,13 @@ def path(
     seen = cache.run(rectification.rectify, views, light, relief, grid)
     gloss = cache.run(gloss_groups.find, views, light, relief, grid, seen, config=settings.gloss)
     fitted = cache.run(texel_maps.estimate, views, light, relief, grid, seen, gloss, config=settings.gloss)
-    maps = cache.run(height_map.build, fitted, relief, grid, cache.derive(albedo_sigma, light, chart))
+    maps = cache.run(height_map.build, fitted, relief, grid, cache.derive(albedo_sigma, chart))
     if tile:
         maps = cache.run(tiling.tile, maps)
     keys = {name: result.key for name, result in cache.results.items()}
     return MaterialResults(light.value, relief.value, gloss.value, fitted.value, maps.value, keys)
 
 
-def albedo_sigma(light: FlashLight, chart: ChartInView | None) -> float:
+def albedo_sigma(chart: ChartInView | None) -> float:
     """Relative 1σ of the scale of all albedos: of the paper's albedo, or of the light that reaches the chart."""
     return 0.1 if chart is None else 0.02

@@ -47,7 +47,6 @@ class FlashLight:
     sigma: float  # relative, of the paper's radiance about the model
     paper: float  # albedo of the board's paper that the model implies
     shine: float  # highlight of the paper over its diffuse light, at the brightest point
-    used: int  # points of the paper
 
 
 @dataclass(frozen=True)

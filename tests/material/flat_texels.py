@@ -25,7 +25,7 @@ def poses() -> list[Pose]:
 def views(count: int, seed: int = 0) -> TexelViews:
     """Geometry of random points on 9 cm."""
     x, z = np.random.default_rng([seed, 1]).uniform(-0.045, 0.045, (2, count))
-    light = FlashLight(np.array([0.0, 0.05, 0.0]), np.full(9, 0.36), np.empty(0), 0.0, 0.8, 0.0, 0)
+    light = FlashLight(np.array([0.0, 0.05, 0.0]), np.full(9, 0.36), np.empty(0), 0.0, 0.8, 0.0)
     return texel_grid.geometry(np.stack([x, 0 * x, z], axis=-1), poses(), light)
 
 
