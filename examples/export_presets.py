@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from polcap.pipeline import run as pipeline
-from polcap.pipeline.asset_export import ExportRequest
+from polcap.pipeline.export_request import ExportRequest
 
 result = Path(sys.argv[1])
 layers = ExportRequest(formats=("exr",), color="ACEScg")

@@ -23,8 +23,8 @@ from polcap.images import Bools, Device
 from polcap.pipeline import check as checks
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
-from polcap.pipeline.asset_export import ExportRequest
 from polcap.pipeline.cache import Progress, silent
+from polcap.pipeline.export_request import ExportRequest
 from polcap.pipeline.path import AUTO
 from polcap.pipeline.request import Request
 

@@ -68,8 +68,8 @@ def export(
 ) -> None:
     """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
     from polcap import api
-    from polcap.pipeline import asset_export, result_folder
-    from polcap.pipeline.asset_export import ExportRequest
+    from polcap.pipeline import export_request, result_folder
+    from polcap.pipeline.export_request import ExportRequest
 
     formats = tuple(name for name in FORMATS if context.params[name] not in (None, False))
     if preset and (others := [name for name in formats if name != "iiif"]):
@@ -91,7 +91,7 @@ def export(
     wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
     if out is not None:
         for one in wanted:
-            asset_export.check(one)
+            export_request.check(one)
         result_folder.copy(result, out)
         result = out
     files = api.write_exports(result, *wanted)

@@ -22,9 +22,9 @@ from polcap.fusion.each_view import Notify
 from polcap.fusion.fusion_path import FusionResults, SessionConfig, path
 from polcap.fusion.session import ProcessedSession
 from polcap.fusion.session_views import SessionInput
-from polcap.pipeline import asset_export
-from polcap.pipeline.asset_export import ExportRequest
+from polcap.pipeline import asset_export, export_request
 from polcap.pipeline.cache import Progress
+from polcap.pipeline.export_request import ExportRequest
 from polcap.pipeline.run import timings
 from polcap.quality import fused_object
 from polcap.quality.advice import advise
@@ -157,10 +157,10 @@ def _write(out: Path, about: dict[str, Any], results: FusionResults, config: Ses
 
 def export(out: Path, *requests: ExportRequest) -> list[Path]:
     """Write the asset of a fused result again for each request, from maps/ and report.json; returns the files."""
-    requests = tuple(asset_export.without(request, OF_ONE_VIEW) for request in requests)
+    requests = tuple(export_request.without(request, OF_ONE_VIEW) for request in requests)
     for request in requests:
-        asset_export.check(request)
-        for flag in {"exr", "iiif", "sfp"} & set(asset_export.effective(request).formats):
+        export_request.check(request)
+        for flag in {"exr", "iiif", "sfp"} & set(export_request.effective(request).formats):
             raise SettingError(
                 f"--{flag} is for results of one view, not for a fused object; leave it out, and use maps/"
             )

@@ -24,7 +24,7 @@ from polcap.fusion.mesh_occlusion import ambient_occlusion
 from polcap.fusion.values import ClosedMesh
 from polcap.images import Floats
 from polcap.mesh_values import Asset, Mesh
-from polcap.pipeline.asset_export import DetailLevel
+from polcap.pipeline.detail_levels import DetailLevel
 from polcap.stages import asset
 from polcap.stages.asset import AssetSettings
 from polcap.stages.surface import DecimatedMesh

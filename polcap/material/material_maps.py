@@ -16,7 +16,7 @@ from polcap.formats.maps import maps_folder, png
 from polcap.material.height_map import MaterialMaps
 from polcap.material.texel_grid import TexelGrid
 from polcap.mesh_values import Asset, Mesh
-from polcap.pipeline.asset_export import DetailLevel
+from polcap.pipeline.detail_levels import DetailLevel
 from polcap.stages import asset
 from polcap.stages.asset import AssetSettings
 

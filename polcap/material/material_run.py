@@ -18,9 +18,9 @@ from polcap.fusion.session_views import Session, SessionInput
 from polcap.material import material_maps, material_page, material_path, material_session
 from polcap.material.material_path import MaterialConfig, MaterialResults
 from polcap.material.material_session import FlatSession, Region
-from polcap.pipeline import asset_export
-from polcap.pipeline.asset_export import ExportRequest
+from polcap.pipeline import asset_export, export_request
 from polcap.pipeline.cache import Progress
+from polcap.pipeline.export_request import ExportRequest
 from polcap.pipeline.run import timings
 from polcap.quality import flat_sample, several_views
 from polcap.quality.advice import advise
@@ -150,10 +150,10 @@ def _figures(flat: FlatSession, results: MaterialResults) -> dict[str, Any]:
 
 def export(out: Path, *requests: ExportRequest) -> list[Path]:
     """Write the asset of a material again for each request, from maps/ and report.json; returns the files."""
-    requests = tuple(asset_export.without(request, _OF_SHAPE) for request in requests)
+    requests = tuple(export_request.without(request, _OF_SHAPE) for request in requests)
     for request in requests:
-        asset_export.check(request)
-        for flag in _SINGLE_VIEW & set(asset_export.effective(request).formats):
+        export_request.check(request)
+        for flag in _SINGLE_VIEW & set(export_request.effective(request).formats):
             raise SettingError(f"--{flag} is for results of one view; leave it out, and use the EXRs in maps/")
         if request.lod or request.triangles:
             raise SettingError("--lod and --triangles reduce a mesh, and a material is a plane; leave them out")

@@ -23,9 +23,9 @@ from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
 from polcap.images import SensorImage
 from polcap.mesh_values import ReliefMesh
-from polcap.pipeline import asset_export, early_end, result_folder, unchanged
-from polcap.pipeline.asset_export import ExportRequest
+from polcap.pipeline import asset_export, detail_levels, early_end, export_request, result_folder, unchanged
 from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, silent
+from polcap.pipeline.export_request import ExportRequest
 from polcap.pipeline.manifest import contents
 from polcap.pipeline.path import UserInput, path
 from polcap.report import animation
@@ -131,7 +131,7 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
 
 def _write_asset(out: Path, about: dict[str, Any], config: Config, mesh: ReliefMesh) -> None:
     """Write the asset of a finished path, from the files in maps/ and their mesh."""
-    asset_export.write(out, about, ExportRequest(), asset_export.read(out / "maps", config, mesh))
+    asset_export.write(out, about, ExportRequest(), detail_levels.read(out / "maps", config, mesh))
 
 
 def decode_with_progress(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
@@ -160,8 +160,8 @@ def export(out: Path, *wanted: ExportRequest) -> list[Path]:
     Raises SettingError: a preset or color space does not exist, or a package or encoder is missing.
     """
     for one in wanted:
-        asset_export.check(one)
-    return asset_export.again(out, wanted, Config, asset_export.read)
+        export_request.check(one)
+    return asset_export.again(out, wanted, Config, detail_levels.read)
 
 
 def reopen(out: str | Path, wanted: type[R]) -> tuple[R, dict[str, Any]]:
@@ -193,7 +193,7 @@ def _textures(out: Path, results: FirstResults) -> pictures.Picture:
     """Picture of the textures of a finished result's asset. Raises StorageError: as `_report_of`."""
     assert isinstance(results, Results)
     config = restore(Config, _report_of(out, results), out / "report.json")
-    return pictures.textures(asset_export.read(out / "maps", config, results.mesh).whole(8, ()))
+    return pictures.textures(detail_levels.read(out / "maps", config, results.mesh).whole(8, ()))
 
 
 def _report_of(out: Path, results: FirstResults) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from polcap.formats.maps import maps_folder
 from polcap.images import Floats, View
 from polcap.mesh_values import Asset, ReliefMesh
 from polcap.pipeline import run as pipeline
-from polcap.pipeline.asset_export import ExportRequest
+from polcap.pipeline.export_request import ExportRequest
 from polcap.stage_values import Cues, StokesImage, SurfaceMaps
 from polcap.stages import asset, surface
 from tests import surfaces

@@ -22,8 +22,8 @@ from polcap.images import Floats
 from polcap.mesh_values import Asset, Mesh
 from polcap.optics import frames
 from polcap.optics.texture_rasterizer import rasterize_frames
-from polcap.pipeline import asset_export
-from polcap.pipeline.asset_export import ExportRequest
+from polcap.pipeline import detail_levels, export_request
+from polcap.pipeline.export_request import ExportRequest
 
 CASES = {
     "float": ExportRequest(formats=("gltf",), geometry="float"),
@@ -37,13 +37,13 @@ COMPONENT: dict[int, Any] = {5120: np.int8, 5122: np.int16, 5123: np.uint16, 512
 
 
 def main(folder: Path) -> None:
-    source = asset_export.read(folder / "maps", Config())
+    source = detail_levels.read(folder / "maps", Config())
     maps = source.maps
     print(f"{'case':12}{'MB':>7}{'triangles':>11}{'texture: median, 95 %':>24}{'float: median, 99 %':>22}")
     first = None
     for name, wanted in CASES.items():
-        asset = asset_export.levels(source, wanted)[0].asset
-        preset = asset_export.effective(wanted)
+        asset = detail_levels.levels(source, wanted)[0].asset
+        preset = export_request.effective(wanted)
         data = gltf.encode(asset, "asset", gltf.GlbOptions("webp", preset.geometry))
         seen = rendered(read(data, asset.mesh), asset)
         first = seen if first is None else first

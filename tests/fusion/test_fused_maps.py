@@ -16,8 +16,8 @@ from polcap.fusion.baking import BakingSettings
 from polcap.fusion.closed_mesh import is_closed
 from polcap.fusion.fused_maps import FusedSource
 from polcap.fusion.values import ClosedMesh
-from polcap.pipeline import asset_export
-from polcap.pipeline.asset_export import ExportRequest
+from polcap.pipeline import detail_levels, export_request
+from polcap.pipeline.export_request import ExportRequest
 from polcap.stages.asset import AssetSettings
 from tests.fusion import ellipsoid
 
@@ -42,7 +42,7 @@ def test_maps_and_mesh_come_back_as_written(source: FusedSource, tmp_path: Path)
 def test_coarser_levels_have_the_unit_and_the_margin_of_the_full_mesh(source: FusedSource, tmp_path: Path) -> None:
     atlas = atlases.chart(ellipsoid.mesh(), 256, 16, metric=False)
     fused_maps.write(tmp_path, atlas, fused_maps.transfer(source.atlas, source.maps, atlas), {})
-    level = asset_export.levels(fused_maps.read(tmp_path, AssetSettings()), ExportRequest(lod=1))[1].asset.mesh
+    level = detail_levels.levels(fused_maps.read(tmp_path, AssetSettings()), ExportRequest(lod=1))[1].asset.mesh
     coarse = fused_maps.weld(atlas.mesh)
     again = atlases.chart(closed_mesh.decimate(coarse, round(len(coarse.faces) / 4)), 256, 16)
     assert not level.metric and np.array_equal(level.uv, again.mesh.uv)
@@ -51,7 +51,7 @@ def test_coarser_levels_have_the_unit_and_the_margin_of_the_full_mesh(source: Fu
 def test_a_coarser_level_that_cannot_be_charted_is_reduced_further(
     source: FusedSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, level = (one.asset.mesh for one in asset_export.levels(source, ExportRequest(lod=1)))
+    whole, level = (one.asset.mesh for one in detail_levels.levels(source, ExportRequest(lod=1)))
     charted, calls = atlases.chart, list[int]()
 
     def failing(mesh: ClosedMesh, side: int, margin: int, metric: bool) -> atlases.Atlas:
@@ -61,20 +61,20 @@ def test_a_coarser_level_that_cannot_be_charted_is_reduced_further(
         return charted(mesh, side, margin, metric)
 
     monkeypatch.setattr(atlases, "chart", failing)
-    again = asset_export.levels(source, ExportRequest(lod=1))[1].asset.mesh
+    again = detail_levels.levels(source, ExportRequest(lod=1))[1].asset.mesh
     assert 0.85 < len(again.faces) / len(level.faces) < 0.95 and len(level.faces) < len(whole.faces)
 
 
 def test_extra_textures_are_of_the_mesh(source: FusedSource, monkeypatch: pytest.MonkeyPatch) -> None:
     half = np.tile(np.linspace(0, 1, 256), (256, 1))
     monkeypatch.setattr(fused_maps, "ambient_occlusion", lambda atlas: half)
-    for level in asset_export.levels(source, ExportRequest(extras=("occlusion",), lod=1)):
+    for level in detail_levels.levels(source, ExportRequest(extras=("occlusion",), lod=1)):
         pixels = texture_set.occlusion(level.asset).pixels
         expected = half.reshape(len(pixels), -1, len(pixels), 256 // len(pixels)).mean(axis=(1, 3))
         assert pixels == pytest.approx(255 * expected, abs=1)
-    (turned,) = asset_export.levels(source, ExportRequest(extras=("object-normal",)))
+    (turned,) = detail_levels.levels(source, ExportRequest(extras=("object-normal",)))
     assert "camera" not in texture_set.object_normal(turned.asset).meaning  # the object has no side of its own
-    plain = asset_export.levels(source, ExportRequest(lod=1))
+    plain = detail_levels.levels(source, ExportRequest(lod=1))
     assert all((texture_set.occlusion(level.asset).pixels == 255).all() for level in plain)
 
 
@@ -90,10 +90,10 @@ def test_a_reader_of_one_view_and_an_export_refuse_what_a_fused_object_lacks(
 
 
 def test_an_export_leaves_out_what_a_closed_mesh_lacks_and_writes_the_rest() -> None:
-    request = asset_export.without(
+    request = export_request.without(
         ExportRequest(preset="archive", extras=("displacement", "occlusion")), fuse_run.OF_ONE_VIEW
     )
-    found = asset_export.effective(request)
+    found = export_request.effective(request)
     assert found.extras == ("occlusion",) and found.formats == ("gltf", "obj", "usd", "materialx")
 
 
@@ -111,7 +111,7 @@ def test_the_glb_is_closed_when_it_is_read_back(source: FusedSource, tmp_path: P
 
 
 def test_coarser_levels_are_closed_and_keep_their_textures(source: FusedSource) -> None:
-    full, coarse = asset_export.levels(source, ExportRequest(lod=1))
+    full, coarse = detail_levels.levels(source, ExportRequest(lod=1))
     assert len(coarse.asset.mesh.faces) == pytest.approx(len(full.asset.mesh.faces) / 4, rel=0.1)
     assert is_closed(fused_maps.weld(coarse.asset.mesh))
     for textured in (full.asset, coarse.asset):

@@ -19,7 +19,7 @@ from polcap.formats.export.presets import EXTRAS, PRESETS, Format
 from polcap.formats.maps import exr, png
 from polcap.pipeline import asset_export
 from polcap.pipeline import run as pipeline
-from polcap.pipeline.asset_export import ExportRequest
+from polcap.pipeline.export_request import ExportRequest
 from polcap.report import levels
 from tests.conftest import ROOT, Command, python, shell
 from tests.formats.export.test_gltf import NODE, document

@@ -13,9 +13,11 @@ grazing stays 1); MaterialX 1.39, standard nodes.
 import re
 from collections.abc import Mapping
 from importlib.resources import files as resources
+from pathlib import Path
 from string import Template
 from xml.sax.saxutils import quoteattr
 
+from polcap.formats import atomic
 from polcap.formats.export.texture_set import SPECULAR_RANGE, Key
 from polcap.mesh_values import Asset
 from polcap.optics import color, fresnel
@@ -37,6 +39,11 @@ def document(asset: Asset, name: str, files: Mapping[Key, str], doc: str) -> str
         darkest=f"{_DARKEST:.7g}",
         ior=f"{asset.ior:.7g}",
     )
+
+
+def write(path: Path, asset: Asset, files: Mapping[Key, str], doc: str) -> None:
+    """Write the MaterialX document of an asset, named after the file; otherwise as `document`."""
+    atomic.write(path, document(asset, path.stem, files, doc))
 
 
 def identifier(name: str) -> str:
