@@ -64,8 +64,9 @@ class _Files:
     stem: str  # of the names
     asset: Asset
     shared: Mapping[Key, str]  # names of the textures of OBJ, USD and MaterialX
-    facts: Mapping[str, str]  # on origin and object, for headers
-    comment: str  # the same for files of text, without the origin
+    facts: Mapping[str, str]  # origin and catalog entry, for headers
+    entry: Mapping[str, str]  # stated fields of `CatalogEntry`
+    comment: str  # the same for files of text
     glb: gltf.GlbOptions
     encoder: TextureEncoder
 
@@ -84,15 +85,14 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     """
     found, record = levels(source, wanted), provenance.record(about, wanted.catalog)
     preset, whole = effective(wanted), found[0].asset
-    entry = {key: record[key] for key in CatalogEntry.__struct_fields__ if record.get(key)}
     name = atomic.safe_name(str(about["capture"].get("name")))  # files stay in the folder, whatever name the report has
-    files = _files(out / "asset" / (wanted.preset or ""), name, whole, preset, record, entry)
+    files = _files(out / "asset" / (wanted.preset or ""), name, whole, preset, record)
     loose = _loose_textures(preset, wanted.extras, whole, obj.stem(name), files.shared)
     coarser = {files.path(f"_lod{k}.glb"): level for k, level in enumerate(found[1:], 1)}
     writers = _writers(files, out / "maps", wanted)
     tasks = [writers[one] for one in preset.formats]
     tasks += [partial(_write_glb, files, file, level.asset) for file, level in coarser.items()]
-    tasks += [partial(_write_texture, files, files.folder / file, texture, entry) for file, texture in loose.items()]
+    tasks += [partial(_write_texture, files, files.folder / file, texture) for file, texture in loose.items()]
     written = [file for group in parallel.results(tasks) for file in group]  # pictures are encoded on threads
     if wanted.page is not None:
         written.append(files.path(".html"))
@@ -104,10 +104,11 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
         "mesh": _size(found[0]),
         "lods": _level_notes({files.path(".glb"): found[0], **coarser}) if wanted.lod else {},
         "textures": {file: texture.meaning for file, texture in sorted(loose.items())},
+        **({"facts": files.entry} if files.entry else {}),
     }
     maps_folder.note_export(out / "maps", files.folder.relative_to(out).as_posix(), description)
     if preset.gathers:
-        written += [*archive.gather(out, files.folder), *report.archive(out, files.folder, about, entry)]
+        written += [*archive.gather(out, files.folder), *report.archive(out, files.folder, about, files.entry)]
     sidecar = files.path(".provenance.json")
     digests = {file.relative_to(files.folder).as_posix(): provenance.digest(file) for file in written}
     provenance.write(sidecar, record, digests)
@@ -116,10 +117,9 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     return [*written, sidecar]
 
 
-def _files(
-    folder: Path, name: str, whole: Asset, preset: ExportPreset, record: Mapping[str, Any], entry: Mapping[str, str]
-) -> _Files:
-    """The files of an export of the object `name`, with its `record` of provenance and its catalog `entry`."""
+def _files(folder: Path, name: str, whole: Asset, preset: ExportPreset, record: Mapping[str, Any]) -> _Files:
+    """The files of an export of the object `name`, with its `record` of provenance."""
+    entry = {key: record[key] for key in CatalogEntry.__struct_fields__ if record.get(key)}
     stem = preset.name.format(obj.stem(name) if preset.textures else name)
     unit = "m" if whole.mesh.metric else "relative"
     head = f"polcap; unit of length: {unit}; normals +Y (OpenGL); made from: {stem}.provenance.json"
@@ -129,6 +129,7 @@ def _files(
         asset=whole,
         shared={key: f"{obj.stem(stem)}_{key}.{preset.shared}" for key in texture_set.LOOSE},
         facts={"unit": unit, "normals": "+Y (OpenGL)", **provenance.words(record)},
+        entry=entry,
         comment="\n".join([head, *(f"{key}: {' '.join(text.split())}" for key, text in entry.items())]),
         glb=gltf.GlbOptions(preset.images, preset.geometry, gltf.center(whole.mesh.vertices)),
         encoder=TextureEncoder(),
@@ -140,14 +141,14 @@ def _writers(files: _Files, maps: Path, wanted: ExportRequest) -> dict[Format, _
     whole, stem, shared, facts, comment = files.asset, files.stem, files.shared, files.facts, files.comment
     return {
         "gltf": partial(_write_glb, files, files.path(".glb"), whole),
-        "obj": partial(obj.write, files.path(".obj"), whole, stem, shared, comment),
+        "obj": partial(obj.write, files.path(".obj"), whole, stem, shared, comment, files.entry),
         "ply": partial(_write_one, ply_stl.write, files.path(".ply"), whole, comment),
         "stl": partial(_write_one, ply_stl.write, files.path(".stl"), whole),
         "usd": partial(_write_one, usd.write, files.path(".usdc"), whole, stem, shared, facts),
         "usdz": partial(_write_usdz, files),
         "materialx": partial(_write_one, materialx.write, files.path(".mtlx"), whole, shared, comment),
         "exr": partial(_write_one, exr_layers.write, files.path("_layers.exr"), maps, wanted.color, facts),
-        "sfp": partial(sfp.write, files.path("_sfp"), maps),
+        "sfp": partial(sfp.write, files.path("_sfp"), maps, comment),
         "iiif": partial(_write_iiif, files, wanted.iiif or ""),
     }
 
@@ -225,19 +226,19 @@ def _write_usdz(files: _Files) -> list[Path]:
 
 def _write_iiif(files: _Files, address: str) -> list[Path]:
     """Write the tiles of a relightable layer and their page; returns the files."""
-    folder, facts = files.path("_iiif"), files.facts
+    folder = files.path("_iiif")
     page = folder / "index.html"
-    openlime_page.write(page, facts.get("title") or facts["name"], facts.get("rights", ""))
-    return [page, *iiif.write(folder, relightable_layer.pictures(files.asset), facts, address)]
+    openlime_page.write(page, files.facts)
+    return [page, *iiif.write(folder, relightable_layer.pictures(files.asset), files.facts, address)]
 
 
-def _write_texture(files: _Files, file: Path, texture: Texture, entry: Mapping[str, str]) -> list[Path]:
+def _write_texture(files: _Files, file: Path, texture: Texture) -> list[Path]:
     """Write a texture as EXR or PNG, with facts for catalogs; returns the file."""
     if file.suffix == ".exr":
-        texture_set.write_exr(file, texture)
+        texture_set.write_exr(file, texture, files.entry)
     else:
         encoded = files.encoder(texture, "png")
-        atomic.write(file, png.described(encoded, {"Description": texture.meaning, **_keywords(entry)}))
+        atomic.write(file, png.described(encoded, {"Description": texture.meaning, **_keywords(files.entry)}))
     return [file]
 
 

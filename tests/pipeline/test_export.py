@@ -3,10 +3,14 @@
 import hashlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
+from html import unescape
 from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -15,7 +19,7 @@ import pytest
 import trimesh
 
 from polcap.formats.export import encoders
-from polcap.formats.export.presets import EXTRAS, PRESETS, Format
+from polcap.formats.export.presets import EXTRAS, FORMATS, PRESETS
 from polcap.formats.maps import exr, png
 from polcap.pipeline import asset_export
 from polcap.pipeline import run as pipeline
@@ -55,25 +59,61 @@ def test_validator_finds_no_error_and_no_warning(exported: Path, preset: str) ->
     assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
 
 
-def test_every_file_format_states_the_facts_for_catalogs(own: Path) -> None:
-    """By a second reader where there is one, else as text."""
-    Sdf = pytest.importorskip("pxr.Sdf", reason="needs usd-core")
-    facts = {"title": "Krug Ω", "object_number": "1897.12", "rights": "© Museum", "date": "um\n1720"}
-    formats: tuple[Format, ...] = ("gltf", "obj", "ply", "usd", "materialx", "exr", "iiif")
-    files = pipeline.export(own, ExportRequest(formats=formats, iiif="http://a.b", catalog=facts))
-    texts = {}
-    for file in files:
-        if file.suffix == ".glb":
-            texts[file.name] = json.dumps(document(file.read_bytes()), ensure_ascii=False)
-        elif file.suffix == ".usdc":
-            texts[file.name] = str(Sdf.Layer.FindOrOpen(str(file)).customLayerData)
-        elif file.suffix == ".png" or file.name.endswith("_layers.exr"):
-            attributes = oiio.ImageInput.open(str(file)).spec().extra_attribs
-            texts[file.name] = "\n".join(str(one.value) for one in attributes)
-        elif file.suffix in (".obj", ".mtl", ".mtlx", ".ply") or file.name == "manifest.json":
-            texts[file.name] = file.read_bytes()[:2500].decode(errors="replace")
-    missing = [(name, fact) for name, text in texts.items() for fact in facts.values() if fact.split()[-1] not in text]
-    assert len(texts) == 12 and not missing
+FACTS = {
+    "title": "Krug Ω",
+    "creator": "Frieda <F.>",
+    "rights": "© Museum",
+    "license": "https://creativecommons.org/licenses/by/4.0/",
+    "object_number": "1897.12",
+    "date": "um 1720",
+    "institution": "Haus Nord",
+    "description": "Glasiert, mit Deckel",
+}
+_UNNAMED = re.compile(  # files whose format has no place for facts, or that belong to a file which states them
+    r".*\.stl|.*_sfp/(K\.txt|sfp\.mat|.*\.png)|.*_iiif/\w+/(info\.json|full/max/0/default\.jpg)|"
+    r"archive/(color\.toml|manifest-sha256\.txt|maps/.*\.(exr|png))"
+)
+
+
+def _stated(file: Path) -> str:
+    """The texts that a reader of this format finds in a file: another program's reader, or the rules of the format."""
+    kind = file.suffix
+    if kind == ".glb":
+        return json.dumps(document(file.read_bytes())["extensions"]["KHR_xmp_json_ld"], ensure_ascii=False)
+    if kind in (".usdc", ".usdz"):
+        return str(pytest.importorskip("pxr.Sdf").Layer.FindOrOpen(str(file)).customLayerData)
+    if kind in (".png", ".exr"):
+        return "\n".join(str(one.value) for one in oiio.ImageInput.open(str(file)).spec().extra_attribs)
+    text = file.read_bytes().decode(errors="replace")
+    if kind in (".obj", ".mtl"):
+        return "\n".join(line for line in text.splitlines() if line.startswith("#"))
+    if kind == ".ply":
+        return "\n".join(line for line in text.partition("end_header")[0].splitlines() if line.startswith("comment "))
+    if kind == ".mtlx":
+        return ElementTree.fromstring(text).attrib["doc"]
+    if kind == ".html":
+        return unescape(text)
+    return json.dumps(json.loads(text), ensure_ascii=False) if kind == ".json" else text
+
+
+def test_every_file_states_all_facts_for_catalogs(own: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pxr", reason="needs usd-core")
+    (tmp_path / "viewer.js").write_text("// model-viewer")
+    formats = tuple(one for one in FORMATS if one != "iiif")
+    plain = ExportRequest(formats=formats, extras=("occlusion",), triangles=2000, catalog=FACTS, iiif="http://a.b")
+    pipeline.export(
+        own,
+        replace(plain, page=tmp_path / "viewer.js"),
+        *(ExportRequest(preset=preset, triangles=2000, catalog=FACTS) for preset in PRESETS),
+    )
+    names = [file.relative_to(own / "asset").as_posix() for file in (own / "asset").rglob("*") if file.is_file()]
+    named = {name for name in names if not _UNNAMED.fullmatch(name) and not re.match(r".*_iiif/\w+/(full|\d)", name)}
+    texts = {name: _stated(own / "asset" / name) for name in sorted(named)}
+    assert [(name, key) for name, text in texts.items() for key, fact in FACTS.items() if fact not in text] == []
+    assert {Path(name).suffix for name in named} == {
+        ".glb", ".obj", ".mtl", ".ply", ".usdc", ".usdz", ".mtlx", ".exr", ".png", ".html", ".json", ".txt",
+    }  # fmt: skip
+    assert {"archive/maps/maps.json", "capture_iiif/manifest.json", "archive/report.html"} < named
 
 
 @pytest.mark.parametrize("preset", PRESETS)

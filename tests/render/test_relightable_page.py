@@ -65,7 +65,7 @@ def write(folder: Path, address: str, scale: int = 1) -> None:
     if scale != 1:
         built = asset.resize_textures(built, scale * surfaces.WIDTH)
     iiif.write(folder, relightable_layer.pictures(built), {"name": "ball"}, address)
-    openlime_page.write(folder / "index.html", "A <ball>", "© Museum")
+    openlime_page.write(folder / "index.html", {"title": "A <ball>", "rights": "© Museum"})
 
 
 def test_a_deep_zoom_viewer_finds_every_tile(tmp_path: Path) -> None:

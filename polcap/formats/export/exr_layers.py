@@ -75,10 +75,7 @@ def write(path: Path, maps: Path, color: str, header: Mapping[str, str]) -> None
 
 def _attributes(space: ColorSpace, header: Mapping[str, str]) -> dict[str, exr.Attribute]:
     """Header of the EXR: meanings of the layers, color space, provenance."""
-    attributes: dict[str, exr.Attribute] = {f"polcap:{key}": value for key, value in header.items()}
-    attributes |= {f"polcap:layer {key}": value for key, value in MEANINGS.items()}
-    if "rights" in header:
-        attributes["Copyright"] = header["rights"]
+    attributes = exr.described({**header, **{f"layer {key}": meaning for key, meaning in MEANINGS.items()}})
     attributes["polcap:colors"] = f"{', '.join(_COLORS)} in {space.name}"
     if space.interop_id is not None:
         attributes["colorInteropID"] = space.interop_id

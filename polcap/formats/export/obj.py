@@ -30,16 +30,24 @@ def stem(name: str) -> str:
     return re.sub(r"[\s#%@\[\]]+", "_", name)
 
 
-def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], comment: str = "") -> list[Path]:
+def write(
+    path: Path,
+    asset: Asset,
+    name: str,
+    files: Mapping[Key, str],
+    comment: str = "",
+    entry: Mapping[str, str] = {},
+) -> list[Path]:
     """Write a mesh as `path` (.obj), its .mtl and two EXR textures; returns the paths.
 
-    `files` are the names of the PNG textures in the same folder, by kind.
+    `files` are the names of the PNG textures in the same folder, by kind. `comment` is for OBJ and MTL, the catalog
+    `entry` for the EXRs.
     """
     base = stem(path.stem)
     written = [path, *(path.with_name(f"{base}{ending}") for ending in (".mtl", "_roughness.exr", "_normal.exr"))]
     _, library, roughness, normal = written
-    texture_set.write_exr(normal, texture_set.normal(asset))
-    texture_set.write_exr(roughness, texture_set.roughness(asset))
+    texture_set.write_exr(normal, texture_set.normal(asset), entry)
+    texture_set.write_exr(roughness, texture_set.roughness(asset), entry)
     data: dict[Key, str] = {"roughness": roughness.name, "normal": normal.name}
     header = "".join(f"# {line}\n" for line in comment.splitlines())
     atomic.write(library, header + _material(asset, stem(name), files, data))

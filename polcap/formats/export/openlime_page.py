@@ -1,11 +1,11 @@
 """Writes a web page on which the viewer OpenLIME shows a relightable layer; its script is in the same folder."""
 
-from html import escape
+from collections.abc import Mapping
 from pathlib import Path
 from string import Template
 
 from polcap.formats import atomic
-from polcap.formats.export import iiif
+from polcap.formats.export import iiif, web_page
 
 SCRIPT = "openlime.min.js"
 
@@ -16,6 +16,7 @@ _PAGE = Template(
 <html lang="en">
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="description" content="$description">
 <title>$title</title><link rel="icon" href="data:,">
 <style>
 html, body { margin: 0; height: 100%; background: #000; color: #eee; font: 14px sans-serif; }
@@ -25,7 +26,7 @@ html, body { margin: 0; height: 100%; background: #000; color: #eee; font: 14px 
 p { position: absolute; left: 12px; bottom: 0; pointer-events: none; }
 </style>
 <div id="view"></div>
-<p id="words">$title. Move the pointer to move the light, drag to pan, turn the wheel to zoom. $rights</p>
+<p id="words">$caption. Move the pointer to move the light, drag to pan, turn the wheel to zoom.</p>
 <script src="$script"></script>
 <script>
 'use strict';
@@ -54,7 +55,7 @@ else {
 )
 
 
-def write(path: Path, title: str, rights: str) -> None:
-    """Write the page into the folder that contains the folders of the pictures."""
-    page = _PAGE.substitute(title=escape(title), rights=escape(rights), script=SCRIPT, full=iiif.FULL)
+def write(path: Path, facts: Mapping[str, str]) -> None:
+    """Write the page into the folder that contains the folders of the pictures; `facts` as for `web_page.write`."""
+    page = _PAGE.substitute(web_page.texts(facts), script=SCRIPT, full=iiif.FULL)
     atomic.write(path, page)

@@ -33,8 +33,8 @@ _README = (
 )
 
 
-def write(folder: Path, maps: Path) -> list[Path]:
-    """Write the folder from the folder maps/ of a result; returns the files.
+def write(folder: Path, maps: Path, comment: str = "") -> list[Path]:
+    """Write the folder from the folder maps/ of a result, with a `comment` in README.txt; returns the files.
 
     Raises DecodeError: a map is missing or damaged.
     """
@@ -62,7 +62,7 @@ def write(folder: Path, maps: Path) -> list[Path]:
     }
     texts: dict[str, str | bytes] = {
         "K.txt": table,
-        "README.txt": _README.format(white=white),
+        "README.txt": _README.format(white=white) + "".join(f"{line}\n" for line in comment.splitlines()),
         "sfp.mat": _mat(variables),
     }
     for file, content in texts.items():

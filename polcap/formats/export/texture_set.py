@@ -158,12 +158,12 @@ def linear(texture: Texture) -> Texture:
     return replace(texture, meaning=texture.meaning.replace("sRGB-encoded", "linear"))
 
 
-def write_exr(path: Path, texture: Texture) -> None:
-    """Write a texture as an EXR of half floats, its colors linear Rec.709; StorageError."""
+def write_exr(path: Path, texture: Texture, entry: Mapping[str, str] = {}) -> None:
+    """Write a texture as an EXR of half floats, its colors linear Rec.709, with a catalog entry; StorageError."""
     value = texture.pixels / np.float32(np.iinfo(texture.pixels.dtype).max)
     planes = np.moveaxis(np.atleast_3d(color.decode_srgb(value) if texture.color else value), -1, 0)
     names = "Y" if len(planes) == 1 else "RGBA"
-    exr.write(path, dict(zip(names, planes)), {"polcap:meaning": texture.meaning}, half=True)
+    exr.write(path, dict(zip(names, planes)), exr.described({"meaning": texture.meaning, **entry}), half=True)
 
 
 def reflectance(asset: Asset) -> Floats:

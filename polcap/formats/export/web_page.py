@@ -9,7 +9,7 @@ from string import Template
 from polcap.errors import SettingError
 from polcap.formats import atomic, text_file
 
-_SHOWN = ("object_number", "date", "institution", "creator", "rights")
+_SHOWN = ("object_number", "date", "institution", "creator", "rights", "license")
 # the page may load nothing but its own parts
 _PAGE = Template(
     """<!doctype html>
@@ -18,6 +18,7 @@ _PAGE = Template(
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval';
  style-src 'unsafe-inline'; img-src data: blob:; connect-src data: blob:; worker-src blob:">
+<meta name="description" content="$description">
 <title>$title</title>
 <style>
 html, body { margin: 0; height: 100%; font: 14px sans-serif; background: #eee; }
@@ -31,6 +32,13 @@ p { position: absolute; left: 12px; bottom: 4px; margin: 0; color: #333; pointer
 </html>
 """
 )
+
+
+def texts(facts: Mapping[str, str]) -> dict[str, str]:
+    """Title, caption and description of a page on an object, as HTML; `facts` as for `write`."""
+    title = facts.get("title") or facts["name"]
+    caption = " · ".join([title, *(facts[name] for name in _SHOWN if facts.get(name))])
+    return {"title": escape(title), "caption": escape(caption), "description": escape(facts.get("description", ""))}
 
 
 def read_script(file: Path) -> str:
@@ -50,12 +58,10 @@ def read_script(file: Path) -> str:
 def write(path: Path, glb: Path, script: str, facts: Mapping[str, str]) -> None:
     """Write the page of a GLB without Draco, with the text of model-viewer's script.
 
-    `facts` are fields of `CatalogEntry`; the page shows title, number, date, institution, creator and rights.
+    `facts` are fields of `CatalogEntry` and the capture's `name`; the page shows them.
     """
-    title = facts.get("title", path.stem)
     page = _PAGE.substitute(
-        title=escape(title),
-        caption=escape(" · ".join([title, *(facts[name] for name in _SHOWN if facts.get(name))])),
+        texts(facts),
         glb=base64.b64encode(glb.read_bytes()).decode(),
         script=script.replace("</script", "<\\/script"),
     )

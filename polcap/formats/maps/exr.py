@@ -56,6 +56,12 @@ def write(
             raise StorageError(f"cannot write {path}: {photo.reason(output)}; check the disk's free space")
 
 
+def described(texts: Mapping[str, str]) -> dict[str, Attribute]:
+    """Attributes of a header for texts by key; a copyright notice (`rights`) is also OpenEXR's `owner`."""
+    copyright_ = {"Copyright": texts["rights"]} if texts.get("rights") else {}
+    return {**{f"polcap:{key}": text for key, text in texts.items()}, **copyright_}
+
+
 def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
     """Read an EXR: its channels by name, each (H, W) float32, and its attributes.
 

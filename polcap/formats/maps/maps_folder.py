@@ -194,7 +194,7 @@ def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
     exports = known.get("exports", {})
     earlier = exports.get(where, {})
     note = {
-        key: {**earlier.get(key, {}), **value} if isinstance(value, dict) and key != "mesh" else value
+        key: {**earlier.get(key, {}), **value} if isinstance(value, dict) and key not in ("mesh", "facts") else value
         for key, value in about.items()
     }
     known["exports"] = dict(sorted({**exports, where: note}.items()))
