@@ -191,7 +191,8 @@ def _correct_half_turns(normal: Floats, seen: Cues, doubt: half_turns.NetworkDou
 
     Also returns the probability (H, W) that the chosen side is wrong.
     """
-    found = half_turns.resolve(frames.to_ray_frame(frames.unit(normal), seen.rays), seen.mask, doubt)
+    flash = half_turns.FlashPicture(seen.radiance, seen.rays)
+    found = half_turns.resolve(frames.to_ray_frame(frames.unit(normal), seen.rays), seen.mask, doubt, flash)
     opposite = 2 * frames.dot(normal, seen.rays)[..., None] * seen.rays - normal
     return np.where(found.turned[..., None], opposite, normal).astype(np.float32), found.doubt
 

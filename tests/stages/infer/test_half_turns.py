@@ -128,3 +128,43 @@ def test_an_empty_mask_has_no_half_turns() -> None:
     normal, mask = ball()
     found = half_turns.resolve(normal, np.zeros_like(mask))
     assert not found.turned.any() and not found.doubt.any()
+
+
+def tilted_plane(tilt_deg, focal_px=500.0):
+    """A plane that leans to the right in a frontal flash: normals in ray frames, mask, light without albedo, rays."""
+    rays = np.stack([-(X - 59.5) / focal_px, (Y - 59.5) / focal_px, np.ones_like(X)], axis=-1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    normal = np.array([np.sin(np.radians(tilt_deg)), 0, np.cos(np.radians(tilt_deg))])
+    light = frames.dot(normal, rays) ** 3  # its distance from the flash is in proportion to 1 / (n · ray)
+    mask = (np.abs(X - 59.5) < 50) & (np.abs(Y - 59.5) < 40)
+    return frames.to_ray_frame(np.broadcast_to(normal, rays.shape), rays), mask, light, rays
+
+
+def chequered(light):
+    """Radiance (H, W, 3) of a print of two colors, with noise."""
+    noise = np.random.default_rng(0).normal(1, 0.01, (*light.shape, 1))
+    squares = ((X // 12 + Y // 12) % 2 == 0)[..., None]
+    return light[..., None] * np.where(squares, [0.6, 0.3, 0.2], [0.1, 0.2, 0.4]) * noise
+
+
+@pytest.mark.parametrize("wrong", [X > -1, X > 70], ids=["whole", "part"])
+@pytest.mark.parametrize("tilt", [30.0, 50.0])
+def test_a_plane_leans_to_where_the_light_of_the_flash_decreases(tilt: float, wrong: np.ndarray) -> None:
+    """The network is wrong in all positions and sizes, and neither the outline nor the albedo contradicts it."""
+    normal, mask, light, rays = tilted_plane(tilt)
+    normals = np.where(wrong[..., None], opposite(normal), normal)
+    flash = half_turns.FlashPicture(chequered(light), rays)
+    found = half_turns.resolve(normals, mask, doubt(normals, 12.0), flash)
+    inner = mask & (np.abs(X - 70) > 3)
+    assert (found.turned == wrong)[inner].mean() > 0.97
+    assert not half_turns.resolve(normals, mask, doubt(normals, 12.0)).turned[inner].any()
+
+
+def test_light_that_no_plane_explains_decides_nothing() -> None:
+    """A bump's light, across the lean of the plane; a ball has no planes."""
+    normal, mask, _, rays = tilted_plane(35.0)
+    across = half_turns.FlashPicture(chequered(np.exp(2 * rays[..., 1])), rays)
+    assert not half_turns.plane_odds(half_turns.coarse(normal, mask), across, mask).any()
+    round_, disc = ball()
+    odds = half_turns.plane_odds(half_turns.coarse(round_, disc), half_turns.FlashPicture(chequered(X), rays), disc)
+    assert (odds != 0).mean() < 0.02
