@@ -36,6 +36,7 @@ class BracketMeasurement:
     exposure_ratio: Floats  # (K, E, 3) of each frame to its shot's reference frame, from the pixels
     exif_ratio: Floats  # (K, E) the same from the metadata
     curvature: Floats  # (K, E) of each frame's values against those of the reference frame; 0: linear
+    flicker: Floats  # (K, E) RMS change of its light from row to row, against the reference frame, relative
     ghost_fraction: Floats  # (K,) share of pixels with exposures that differ by more than noise
     ambient_share: Floats  # (K,) share of the light that is present without the flash
     blur_px: Floats  # (K, E) beyond the sharpest frame of the same exposure, 1σ [RAW px]
@@ -93,6 +94,7 @@ def single_frames(shots: int) -> BracketMeasurement:
         exposure_ratio=np.ones((shots, 1, 3)),
         exif_ratio=np.ones((shots, 1)),
         curvature=unknown,
+        flicker=unknown,
         ghost_fraction=np.zeros(shots),
         ambient_share=unknown[:, 0],
         blur_px=unknown,

@@ -54,7 +54,7 @@ def _without_limits(judge: Callable[[Evidence[R]], _Judged]) -> Callable[[Eviden
 
 
 _FILES = ("tone curve", "exposures")
-_LIT = ("clipping", "noise")  # no shot is measured
+_LIT = ("clipping", "flicker", "noise")  # no shot is measured
 _PAIRED = (*_LIT, "sharpness", "alignment")  # the shots cannot be compared
 _EVEN = (*_PAIRED, "stillness", "gains", "energy")  # the light of the shots is not known
 _POLARIZED = (*_EVEN, "angles", "polarized", "order")  # the Stokes parameters are wrong
@@ -68,12 +68,13 @@ _STEPS = (
     Step(("clipping",), shot_exposure.clipping, ResultsUntilHdr),
     Step(("tone curve",), shot_exposure.tone, ResultsUntilSelfcal, ("clipping",)),
     Step(("black level",), shot_exposure.black_level, ResultsUntilHdr, ("clipping",)),
-    Step(("noise",), shot_exposure.noise, ResultsUntilStokes, ("clipping",)),
+    Step(("flicker",), light.flicker, ResultsUntilHdr, ("clipping",)),
+    Step(("noise",), shot_exposure.noise, ResultsUntilStokes, ("clipping", "flicker")),
     Step(("sharpness",), geometry.sharpness, ResultsUntilHdr, _LIT),
     Step(("alignment",), geometry.alignment, ResultsUntilAlign, (*_LIT, "sharpness")),
     Step(("chart",), light.chart, ResultsUntilWhitebalance, ("clipping",)),
     Step(("mask",), geometry.mask, ResultsUntilMask, ("clipping", "alignment")),
-    Step(("stillness",), shot_exposure.stillness, ResultsUntilMask, (*_FILES, *_PAIRED), ("black level",)),
+    Step(("stillness",), shot_exposure.stillness, ResultsUntilMask, (*_FILES, *_PAIRED), ("black level", "flicker")),
     Step(("focus",), geometry.focus, ResultsUntilMask, _PAIRED),
     Step(("gains", "gain doubt", "energy"), shot_exposure.gains, ResultsUntilSelfcal, (*_PAIRED, "stillness")),
     Step(("angles",), polarization.turned_shot, ResultsUntilSelfcal, _EVEN),
@@ -82,10 +83,14 @@ _STEPS = (
     Step(("order",), _without_limits(polarization.order), ResultsUntilSelfcal, (*_EVEN, "polarized"), **_ROUND),
     Step(("angles", "body", "other light"), polarization.of_outline, ResultsUntilInfer, _POLARIZED, **_ROUND),
     Step(("ambient",), light.ambient, ResultsUntilHdr),
-    Step(("room light",), light.room_light, ResultsUntilInfer, _ONE_LIGHT, ("sharpness",)),
-    Step(("lighting",), light.side_light, ResultsUntilInfer, _ONE_LIGHT, ("flat", "sharpness"), ("contour",)),
+    Step(("room light",), light.room_light, ResultsUntilInfer, _ONE_LIGHT, ("sharpness", "flicker")),
+    Step(
+        ("lighting",), light.side_light, ResultsUntilInfer, _ONE_LIGHT, ("flat", "sharpness", "flicker"), ("contour",)
+    ),
     Step(("crossed",), light.crossed, ResultsUntilStokes, _PAIRED),
-    Step(("ill-posed",), polarization.ill_posed, ResultsUntilStokes, (*_ONE_LIGHT, "lighting"), ("sharpness",)),
+    Step(
+        ("ill-posed",), polarization.ill_posed, ResultsUntilStokes, (*_ONE_LIGHT, "lighting"), ("sharpness", "flicker")
+    ),
     Step(("re-rendering",), rerendering.rerendering, ResultsUntilInfer, _SHAPED, ("flat",)),
     Step(("outline",), geometry.inward_outline, ResultsUntilInfer, (*_SHAPED, "re-rendering"), ("flat",)),
     Step(("albedo scale",), light.albedo_scale, ResultsUntilInfer, ("clipping", "chart")),

@@ -31,6 +31,7 @@ _EDGE_PX = 2.0  # 1σ of the blur before two shots are compared, so that misalig
 _STILL_CLIPPED = 0.5  # share of highlights that a crossed filter should have stopped
 _FEW = 20  # px
 _DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame for all angles: 1 to 2° at 15 %
+_DEGREES_PER_FLICKER = 400.0  # of the normals: 4.3 and 7.3° at 1.2 and 3.6 % of the light (docs/benchmarks/gates.md)
 _LEAST_ALBEDO = 0.02  # sum of the channels
 _TOWARDS_CAMERA = float(np.cos(np.radians(30)))  # cosine; lamps 45° to the side are mirrored at 22°
 _LEAST_TOWARDS = 0.12  # of the object: five bodies from .18, boxes and cans mostly below
@@ -171,6 +172,27 @@ def ambient(found: Evidence[ResultsUntilHdr], limits: GateLimits) -> Gate:
         return Gate("ambient", "warn", round(worst, 5), limit, message, remedy, cost)
     remedy = "Darken the room: the noise and changes of so much ambient light remain"
     return msgspec.structs.replace(at_most("ambient", worst, limit, message, remedy), cost_deg=cost)
+
+
+def flicker(found: Evidence[ResultsUntilHdr], limits: GateLimits) -> Gate:
+    """Gate on lamps that flicker: the frames of a bracket differ by stripes of rows."""
+    value, limit = found.results.radiance.bracket.flicker, limits.max_flicker
+    flash = found.results.radiance.equipment.light == "flash"
+    if not np.isfinite(value).any():
+        return Gate("flicker", "not measured", None, limit, "No two exposures of a shot show it")
+    rms = float(np.sqrt(np.nanmean(value**2)))
+    message = "All rows of a picture got the same light"
+    if rms > limit:
+        cause = "the shutter is faster than the flash, or a lamp flickers" if flash else "the lamp flickers"
+        message = f"The light changes by {100 * rms:.1f} % from row to row: {cause}"
+    remedy = "Use a lamp that does not flicker, or a flash, or shutter times that are multiples of 1/100 s (1/120 s in "
+    remedy += "countries with 60 Hz)"
+    if flash:
+        remedy = (
+            "Use a shutter time of the camera's flash synchronization or longer, without high-speed synchronization"
+        )
+    cost = _DEGREES_PER_FLICKER * rms
+    return at_most("flicker", rms, limit, message, remedy, cost_deg=cost, beyond=grade(cost))
 
 
 def room_light(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate:

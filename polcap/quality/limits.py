@@ -23,6 +23,9 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_tone_curvature: Annotated[
         PositiveShare, Meta(description="allowed slope of ln exposure ratio over ln brightness; 0 is linear [1]")
     ] = 0.1
+    max_flicker: Annotated[
+        PositiveShare, Meta(description="allowed change of the light from row to row of a picture, RMS [1]")
+    ] = 0.004
     max_black_error: Annotated[
         PositiveShare, Meta(description="allowed error of the stated black level, which is corrected [white level]")
     ] = 0.001

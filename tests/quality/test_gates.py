@@ -120,6 +120,7 @@ def test_each_gate_fails_alone(good: Seen) -> None:
     pairs: dict[str, Any] = {"exposure_ratio": ratios, "exif_ratio": np.array([[1.0, 4.0]] * 3)}
     faults: dict[str, dict[str, Any]] = {
         "tone curve": {"radiance": bracket(radiance, curvature=curved, **pairs)},
+        "flicker": {"radiance": bracket(radiance, flicker=np.array([[np.nan, 0.05]] * 3), **pairs)},
         "stillness": {"radiance": replace(radiance, quality=np.full_like(radiance.quality, Quality.GHOST))},
         "ambient": {"radiance": bracket(radiance, ambient_share=np.array([0.4, 0.4, 0.4]))},
         "alignment": {"alignment": replace(still, transform=away)},

@@ -62,7 +62,7 @@ class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=19)
+@stage(version=20)
 def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack:
     """Merge every bracket: radiance (K, H, W, 3) of all shots, on the scale of each shot's reference frame.
 
@@ -102,7 +102,7 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     places = sharpness.places(read(middle(first.frames)), settings.clip)
     lines = noise.Lines(() if capture.calibration is None else capture.calibration.noise)
     shape, stack, mosaic = (0, 0, 0), _empty(0, (0, 0, 0)), None
-    ratio, curvature, ambient_share, tiles = [], [], [], []
+    figures, ambient_share, tiles = [], [], []
     for k, shot in enumerate(shots):
         # the crossed shot is merged on the scale of its own middle frame: its flash has another energy
         bracket = Bracket(shot, _by_brightness(shot, read) if k == count else order)
@@ -114,16 +114,15 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         same_size("the cross-polarized shot" if k == count else f"shot {shot.name}", weighted.shape, shape)
         weighted.merge_into(MaskedImage(stack.value[k], stack.variance[k], stack.quality[k]))
         if k < count:
-            ratio.append([frame.ratio.astype(np.float64) for frame in compared.frames])
-            curvature.append([frame.curvature for frame in compared.frames])
+            figures.append([(frame.ratio, frame.curvature, frame.flicker) for frame in compared.frames])
             ambient_share.append(_checked_ambient(compared.ambient_share, shot))
             tiles.append([sharpness.take(read(frame), places, settings.clip) for frame in shot.frames])
         del weighted, compared
         read.forget((*shot.frames, *shot.ambient))
         lines.settle()
+    ratio, curvature, flicker = _by_frame(figures)
     pictures = [MaskedImage(*shot) for shot in zip(stack.value, stack.variance, stack.quality, strict=True)]
-    if settings.falloff:
-        _correct_falloff(pictures, capture, view)
+    _correct_falloff(pictures, capture, view, settings)
     return AngleStack(
         value=stack.value[:count],
         variance=stack.variance[:count],
@@ -133,7 +132,8 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         bracket=BracketMeasurement(
             exposure_ratio=np.repeat(ratio, 3 // shape[0], axis=2),
             exif_ratio=_stated_ratios(capture.shots, middle(order)),
-            curvature=np.array(curvature),
+            curvature=curvature,
+            flicker=flicker,
             ghost_fraction=np.array([np.mean((quality & Quality.GHOST) > 0) for quality in stack.quality[:count]]),
             ambient_share=np.array(ambient_share),
             blur_px=sharpness.frames_blur(tiles, side),
@@ -148,10 +148,15 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     )
 
 
-def _correct_falloff(pictures: list[MaskedImage], capture: Capture, view: View) -> None:
-    """Divide the merged pictures by the lens's calibrated falloff, in place."""
+def _by_frame(figures: list[list[tuple[Floats, float, float]]]) -> list[Floats]:
+    """Exposure ratios (K, E, C), curvatures (K, E) and flicker (K, E) of all frames, from those of each."""
+    return [np.array([[frame[i] for frame in shot] for shot in figures], np.float64) for i in range(3)]
+
+
+def _correct_falloff(pictures: list[MaskedImage], capture: Capture, view: View, settings: HdrSettings) -> None:
+    """Divide the merged pictures by the lens's calibrated falloff, in place, unless the settings forbid it."""
     falloff = None if capture.calibration is None else capture.calibration.falloff
-    if falloff is not None:
+    if settings.falloff and falloff is not None:
         for picture in pictures:
             weights.divide_by_falloff(picture, view, capture.size_px, falloff)
 

@@ -183,7 +183,8 @@ def _compare_frame(
             source.learn(number, samples)
     misfit = np.zeros_like(ratio)
     shaded, curvature = exposure.vignetting(still, found, ratio), exposure.curvature(*tiles)
-    frame = RegisteredFrame(found, ratio, source.line(e), misfit, motion, gain, shaded, curvature)
+    flicker = exposure.flicker(still, found)
+    frame = RegisteredFrame(found, ratio, source.line(e), misfit, motion, gain, shaded, curvature, flicker)
     lines = source.line(reference), frame.noise
     return replace(frame, misfit=noise.misfit(still, found, ratio, lines, frame.mean_gain))
 

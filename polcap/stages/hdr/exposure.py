@@ -23,6 +23,9 @@ _DIM, _DIMMEST = 4e-3, 4e-4  # of the sensor's range: darker tiles suffer from e
 # frames may differ. Good captures reach 2e-5 (docs/benchmarks/gates.md)
 _BLACK_STEP, _LEAST_BLACK, _BLACK_AGREES = 1.3, 1e-4, (0.1, 5e-5)
 _AS_STATED = 1.3  # factor between measured and stated exposure below which steady light follows too
+# To measure flicker: tiles along a column of the picture; least size [px]; least lit rows and tiles of a row
+_FLICKER_ROWS, _LEAST_FLICKER_TILE, _LEAST_ROWS, _LEAST_IN_ROW = 60, 4, 12, 4
+_SHADOW = 0.01  # of the expected light: rows with less count as this
 _UNLIT, _LEAST_RATIO = 0.01, 1e-4  # of the stated exposure: less is none; for a frame without light
 _TILE_NOISE = (1e-7, 0.005, 3e-6)  # of a tile's mean: variance per signal, relative error, error of a black tile
 
@@ -57,9 +60,9 @@ def common_tiles(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
     return in_common(tiles(reference), tiles(other))
 
 
-def tiles(picture: Signals) -> tuple[Floats, Bools]:
+def tiles(picture: Signals, size: int = TILE) -> tuple[Floats, Bools]:
     """Means (rows, columns, C) of all tiles of a frame, and which tiles (rows, columns) are fully usable."""
-    return tile_means(picture, TILE).astype(np.float64), block_means(picture.usable, TILE) == 1
+    return tile_means(picture, size).astype(np.float64), block_means(picture.usable, size) == 1
 
 
 def in_common(first: tuple[Floats, Bools], second: tuple[Floats, Bools]) -> tuple[Floats, Floats]:
@@ -209,6 +212,37 @@ def curvature(a: Floats, b: Floats) -> float:
     if np.ptp(x) < _TONE_SPAN:
         return float("nan")
     return float(np.polyfit(x, y, 1)[0])
+
+
+def flicker(reference: Signals, other: Signals) -> float:
+    """Measure flickering light: RMS change of two frames' exposure ratio from row to row, relative; NaN if unknown.
+
+    A shutter exposes a picture row after row, so flicker makes stripes of rows. Anything else that changes the ratio
+    (a room's light, motion, an error of the black level) changes it along the rows, too. So the power of the means of
+    columns is subtracted from that of the rows.
+    """
+    size = min(max(reference.shape[1] // _FLICKER_ROWS, _LEAST_FLICKER_TILE), TILE)
+    (a, inside), (b, other_inside) = tiles(reference, size), tiles(other, size)
+    a, b = a.sum(axis=-1), b.sum(axis=-1)
+    lit = inside & other_inside & (a > 3 * _DIM)
+    expected = a * (np.median(b[lit] / a[lit]) if lit.any() else 0)
+    lit &= expected > 3 * _DIM
+    change = np.full(a.shape, np.nan)
+    change[lit] = np.log(np.maximum(b[lit] / expected[lit], _SHADOW))  # a shutter may hide rows from the flash
+    return float(np.sqrt(max(_stripe_power(change) - _stripe_power(change.T), 0.0)))
+
+
+def _stripe_power(change: Floats) -> float:
+    """Power of the medians of the rows of `change`, less a parabola and their own errors; NaN: too few rows."""
+    change = change[np.isfinite(change).sum(axis=1) >= _LEAST_IN_ROW]
+    if len(change) < _LEAST_ROWS:
+        return float("nan")
+    median = np.nanmedian(change, axis=1)
+    sigma = MAD_TO_SIGMA * np.nanmedian(np.abs(change - median[:, None]), axis=1)
+    variance = np.pi / 2 * sigma**2 / np.isfinite(change).sum(axis=1)  # of a median
+    row = np.arange(len(median))
+    rest = median - np.polyval(np.polyfit(row, median, 2), row)  # apertures differ in vignetting
+    return float(np.mean(rest**2) - np.mean(variance))
 
 
 def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:

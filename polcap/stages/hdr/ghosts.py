@@ -39,6 +39,7 @@ class RegisteredFrame:
     gain: Floats | None = None  # (H, W) factor on the noise variance by resampling; None: not resampled
     vignetting: Floats | None = None  # (H, W) float32 factor on the ratio, as wide apertures darken corners; None: 1
     curvature: float = 0.0  # of `exposure.curvature`; 0: linear, NaN: unknown
+    flicker: float = float("nan")  # of `exposure.flicker`; NaN: unknown, or the reference frame
 
     @property
     def mean_gain(self) -> float:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from polcap.quality.limits import GateLimits
 from polcap.stages.hdr import exposure
 from tests.stages.hdr.brackets import planes
 
@@ -106,3 +107,21 @@ def test_other_changes_are_no_error_of_the_black_level():
     moved[2][40:120, 100:300] *= 1.6
     for case in (shaded, [np.maximum(frame, 0) ** 0.45 for frame in frames], moved):
         assert not black_error(*case)[0].any()
+
+
+def flicker(factor, size=(960, 640)):
+    """Flicker of a frame whose light is multiplied by `factor` (H, W)."""
+    a, b = (picture(np.random.default_rng(seed), 1, 0.05, 0.4, size) for seed in (9, 10))
+    return exposure.flicker(planes(a), planes(b * np.asarray(factor, np.float32)[..., None]))
+
+
+def test_stripes_of_rows_are_flicker_and_other_changes_are_not():
+    y, x = np.mgrid[:960, :640]
+    stripes = 1 + 0.01 * np.sin(y / 25)
+    assert flicker(stripes) == pytest.approx(0.01 / np.sqrt(2), rel=0.1)
+    corners = 1 - 0.1 * ((x / 640 - 0.5) ** 2 + (y / 960 - 0.5) ** 2)  # another aperture
+    spot = 1 + 0.05 * np.exp(-((x - 200) ** 2 + (y - 400) ** 2) / 2e4)  # a lamp that is not the flash
+    columns = 1 + 0.01 * np.sin(x / 25)
+    for other in (np.ones((960, 640)), corners, spot, columns):
+        assert flicker(other) < GateLimits().max_flicker
+    assert np.isnan(flicker(np.ones((40, 40)), (40, 40)))
