@@ -35,6 +35,7 @@ _FLAG = re.compile(r"--([a-z]+(?:-[a-z]+)*)")
 _ARGUMENTS = {"angles": "angles_deg", "set": "config", "about": "catalog", "extra": "extras", "no-chart": "chart"}
 _Arguments = ParamSpec("_Arguments")
 _Returned = TypeVar("_Returned")
+_Name = TypeVar("_Name", bound=str)
 
 
 def _in_python(function: Callable[_Arguments, _Returned]) -> Callable[_Arguments, _Returned]:
@@ -182,13 +183,13 @@ def export(
     result: str | Path | Result,
     preset: str | None = None,
     *,
-    formats: Sequence[Format] = ("gltf", "obj"),
+    formats: Format | Sequence[Format] = ("gltf", "obj"),
     images: Kind | None = None,
     geometry: Geometry | None = None,
     triangles: int | None = None,
     color: str = "lin_rec709",
     bits: Literal[8, 16] | None = None,
-    extras: Sequence[Extra] = (),
+    extras: Extra | Sequence[Extra] = (),
     texture_size: int | None = None,
     page: str | Path | None = None,
     iiif: str | None = None,
@@ -200,7 +201,7 @@ def export(
     Parameters
     ----------
     result
-        Result folder of `process` or `fuse`, or its `Result`.
+        Result folder of `process` or `fuse`, its `Result`, or the folder of the capture or the views.
     preset
         Program, such as "unreal"; it brings its formats. All are in `docs/how-to/export.md`.
     formats
@@ -208,7 +209,7 @@ def export(
     images, geometry
         Inside the GLB: "png", "jpeg", "webp" or "ktx2"; "float", "quantized" or "draco".
     triangles, texture_size
-        Most triangles; px of the longer side of the textures.
+        Most triangles, by default those of the preset or all; px of the longer side of the textures.
     color
         Color space or OCIO role of the colors in the layered EXR.
     bits
@@ -229,10 +230,10 @@ def export(
     PolcapError
         Its message is one line: the thing, its value, the limit and the remedy.
     """
-    folder = result.folder if isinstance(result, Result) else Path(result)
+    folder = result.folder if isinstance(result, Result) else own_folders.find_result(Path(result))
     request = ExportRequest(
-        formats=tuple(formats), preset=preset, images=images, geometry=geometry, triangles=triangles, color=color,
-        bits=bits, extras=tuple(extras), texture_size=texture_size, page=None if page is None else Path(page),
+        formats=_names(formats), preset=preset, images=images, geometry=geometry, triangles=triangles, color=color,
+        bits=bits, extras=_names(extras), texture_size=texture_size, page=None if page is None else Path(page),
         iiif=iiif, catalog=catalog or {}, lod=lod,
     )  # fmt: skip
     return write_exports(folder, request)
@@ -300,6 +301,11 @@ def fuse(
     target = place / own_folders.FUSED if out is None else Path(out)
     about = fuse_run.fuse(SessionInput(place, chosen, request, workers), target, notify, progress)
     return Result(target, about)
+
+
+def _names(stated: _Name | Sequence[_Name]) -> tuple[_Name, ...]:
+    """Names as a tuple; a text alone is one name."""
+    return (stated,) if isinstance(stated, str) else tuple(stated)
 
 
 def _check_types(config: object, chart: object, mask: object) -> None:

@@ -96,11 +96,11 @@ def test_results_and_values_have_a_short_repr(tmp_path: Path, example: Path) -> 
 
 
 def test_check_export_and_reopen_take_strings(result: Path, example: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(result, copy)
+    copy = tmp_path / "capture"  # whose result is in polcap/
+    shutil.copytree(result, copy / "polcap")
     assert polcap.check(str(example)).keep
-    files = polcap.export(str(copy), "godot", texture_size=64, catalog={"title": "Vase"})
-    assert {"capture.glb", "capture_orm.png"} <= {file.name for file in files}
+    files = polcap.export(str(copy), "godot", extras="cavity", texture_size=64, catalog={"title": "Vase"})
+    assert {"capture.glb", "capture_orm.png", "capture_cavity.png"} <= {file.name for file in files}
     assert pipeline.reopen(str(copy), ResultsUntilMask)[0].object_.mask.any()
 
 
@@ -134,8 +134,10 @@ def test_the_python_of_the_reference_pages_runs(
         ({"catalog": {"object_number": 7}}, "^catalog object_number = 7: it is no text"),
         ({"images": "gif"}, "^images gif: there is no such picture format"),
         ({"bits": 12}, "^bits 12: there is no such depth"),
-        ({"texture_size": -3}, "^texture_size -3: it is at least 16"),
-        ({"lod": -1}, "^lod -1: it is at least 0"),
+        ({"texture_size": -3}, "^texture_size -3: it is a whole number of at least 16"),
+        ({"triangles": 2.5}, "^triangles 2.5: it is a whole number"),
+        ({"lod": "2"}, "^lod '2': it is a whole number of at least 0"),
+        ({"formats": "fbx"}, "^formats fbx: there is no such format"),
     ],
 )
 def test_errors_name_the_argument_and_not_the_flag(result: Path, options: dict[str, Any], words: str) -> None:

@@ -28,13 +28,8 @@ _NO_EFFECT = ("capture", "folder", "out", "json", "dry_run", "watch", "open_", "
 
 
 def result_folder(named: Path | None) -> Path | None:
-    """The result folder that an argument names: itself, or the result in the folder of a capture or of views."""
-    if named is None or any((named / name).exists() for name in ("work", "report.json", "maps")):
-        return named
-    for inside in (named / name for name in (own_folders.OUTPUT, own_folders.FUSED, own_folders.MATERIAL)):
-        if (inside / "report.json").exists() or (inside / "work").is_dir():
-            return inside
-    return named
+    """The result folder that an argument names, as `own_folders.find_result`."""
+    return None if named is None else own_folders.find_result(named)
 
 
 def utf8(option: str, text: str) -> str:

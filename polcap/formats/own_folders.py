@@ -14,6 +14,15 @@ MATERIAL = "material"  # default folder of the result of `polcap material`, next
 OURS = (OUTPUT, BATCH)  # these folders hold no photographs
 
 
+def find_result(named: Path) -> Path:
+    """The result folder that a path names: itself, or the result in the folder of a capture or of views."""
+    if not any((named / name).exists() for name in ("work", "report.json", "maps")):
+        for inside in (named / name for name in (OUTPUT, FUSED, MATERIAL)):
+            if (inside / "report.json").exists() or (inside / "work").is_dir():
+                return inside
+    return named
+
+
 def calibrations() -> Path:
     """Path of the folder with the user's calibrations; it may not exist."""
     if stated := os.environ.get("POLCAP_CALIB"):

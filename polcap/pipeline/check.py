@@ -4,6 +4,7 @@ The path runs on pictures averaged down to at most 0.6 MP, with a cache in memor
 averaging hides (clipping, sharpness) are measured at full size while frames are decoded.
 """
 
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -168,10 +169,10 @@ def table(verdict: Verdict, everything: bool = False) -> str:
         rows.append(f"{line.state:13}{line.name:{width}}{line.message}{limit}{cost}")
         if line.remedy:
             rows.append(f"{'':{13 + width}}→ {line.remedy}")
-    count = {state: sum(line.state == state for line in verdict.lines) for state in ("pass", "not judged")}
     if not everything:
-        after = f", {count['not judged']} are not judged" * (count["not judged"] > 0)
-        rows.append(f"{count['pass']} of {len(verdict.lines)} gates passed{after}; -v prints all")
+        count = Counter(line.state for line in verdict.lines)
+        after = [f", {count[state]} {state}" for state in ("not measured", "not judged") if count[state]]
+        rows.append(f"{count['pass']} of {len(verdict.lines)} gates passed{''.join(after)}; -v prints all")
     return "\n".join(rows)
 
 

@@ -89,8 +89,8 @@ def _check_values(wanted: ExportRequest) -> None:
             raise SettingError(f"--about {name} = {text!r:.60}: it is no text; put it in quotes")
     numbers = (("texture-size", wanted.texture_size, 16), ("triangles", wanted.triangles, 16), ("lod", wanted.lod, 0))
     for option, number, least in numbers:
-        if number is not None and number < least:
-            raise SettingError(f"--{option} {number}: it is at least {least}; give a larger number, or leave it out")
+        if number is not None and (not isinstance(number, int) or number < least):
+            raise SettingError(f"--{option} {number!r}: it is a whole number of at least {least}; give one, or none")
 
 
 def _has_png(preset: ExportPreset) -> bool:

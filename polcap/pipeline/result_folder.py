@@ -46,6 +46,9 @@ def check(out: Path, photographs: Path) -> None:
     among = any(name in names or folder_names.is_angle_folder(name) for name in inside)
     if among or any(map(_holds_shots, (here, *here.parents))):
         raise SettingError(f"--out {out} lies among the capture's shots; choose {photographs / own_folders.OUTPUT}")
+    held = folder_names.children(here) if here.is_dir() and not own_files.is_claimed(out) else []
+    if photograph := next((path for path in held if path.is_file() and probe.kind(path) == "raw"), None):
+        raise SettingError(f"--out {out} holds photographs ({photograph.name}); choose a folder of its own")
 
 
 def _holds_shots(folder: Path) -> bool:

@@ -17,7 +17,7 @@ from polcap import parallel, report
 from polcap.capture_values import Capture, Decode, Frame
 from polcap.config import Config, restore
 from polcap.errors import InputError, SettingError, StorageError
-from polcap.formats import color_profile, own_files
+from polcap.formats import color_profile, own_files, own_folders
 from polcap.formats.export import encoders, provenance
 from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
@@ -169,7 +169,7 @@ def reopen(out: str | Path, wanted: type[R]) -> tuple[R, dict[str, Any]]:
 
     Raises StorageError: `out` has no stage cache, or the result of a stage is missing.
     """
-    out = Path(out)
+    out = own_folders.find_result(Path(out))
     about = result_folder.read_run(out)
     config = restore(Config, about, out / "work" / "run.json")
     return path(None, UserInput(), config, ArchiveCache(out), wanted), about

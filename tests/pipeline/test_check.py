@@ -6,6 +6,7 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -225,6 +226,9 @@ def test_shares_are_per_cent_on_the_terminal_and_shares_in_json() -> None:
     verdict = Verdict(True, (), (Gate("mask", "pass", 0.03, 0.25, "About 3 % of the outline may be wrong"),), "bowl", 1)
     assert "(limit 25 %)" in check.table(verdict, everything=True)
     assert check.table(verdict).splitlines()[1:] == ["1 of 1 gates passed; -v prints all"]
+    unmeasured = Gate("ambient", "not measured", None, 0.3, "No frame was taken without the flash")
+    with_it = check.table(msgspec.structs.replace(verdict, lines=(*verdict.lines, unmeasured)))
+    assert with_it.endswith("1 of 2 gates passed, 1 not measured; -v prints all")
     (line,) = json.loads(json.dumps(check.to_json(verdict)))["lines"]
     assert (line["value"], line["limit"], line["unit"]) == (0.03, 0.25, "1")
     assert page.gate_row(line)["limit"] == "25 %"

@@ -47,6 +47,18 @@ def test_a_result_is_refused_among_the_shots_of_any_capture(
     assert not (place / "result").exists()
 
 
+def test_no_result_is_written_between_the_photographs_of_another_capture(
+    capture: Path, polcap: Command, tmp_path: Path
+) -> None:
+    """They would stay, but `process` refuses results as captures."""
+    other = tmp_path / "flat"
+    shutil.copytree(capture / "pol045", other)
+    before = sorted(other.rglob("*"))
+    done = polcap("process", capture, "--out", other, *TINY)
+    assert done.returncode == 2 and done.stderr.endswith("choose a folder of its own\n")
+    assert f"--out {other} holds photographs (" in done.stderr and sorted(other.rglob("*")) == before
+
+
 @pytest.mark.parametrize("name", ["maps", "work", "asset", "report.json", "color.toml"])
 def test_a_folder_that_holds_parts_of_a_result_without_record_is_refused(
     capture: Path, polcap: Command, tmp_path: Path, name: str
