@@ -9,7 +9,7 @@ import pytest
 
 from polcap.errors import DecodeError, ObjectError, SettingError
 from polcap.formats.export import gltf, texture_set
-from polcap.formats.maps import result_maps
+from polcap.formats.maps import maps_folder, result_maps
 from polcap.fusion import atlas as atlases
 from polcap.fusion import baking, closed_mesh, filling, fuse_run, fused_maps
 from polcap.fusion.baking import BakingSettings
@@ -85,6 +85,10 @@ def test_a_reader_of_one_view_and_an_export_refuse_what_a_fused_object_lacks(
     for place in (tmp_path, tmp_path / "fused"):
         with pytest.raises(DecodeError, match=r"textures of a fused object.*give one of its views"):
             result_maps.read(place)
+    for kind in ("fused", "material"):
+        (tmp_path / "maps.json").write_text(json.dumps({"format": f"polcap {kind} maps 1"}))
+        with pytest.raises(DecodeError, match="of a fused object or of a material"):
+            maps_folder.read(tmp_path)  # as a comparison does
     with pytest.raises(SettingError, match="--exr is for results of one view"):
         fuse_run.export(tmp_path / "fused", ExportRequest(formats=("exr",)))
 

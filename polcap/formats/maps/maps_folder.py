@@ -1,6 +1,7 @@
 """Writes and reads the folder maps/ of a result (docs/reference/result.md)."""
 
 from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -141,9 +142,10 @@ def _write(file: Path, content: Callable[[], Any]) -> None:
 def read(folder: Path) -> ResultMaps:
     """Read the folder maps/ of a result that `write` wrote: EXRs, mask.png and maps.json.
 
-    Raises DecodeError: a file is missing, damaged, or not of the size in maps.json.
+    Raises DecodeError: a file is missing, damaged, or not of the size in maps.json, or as `require_picture`.
     """
     folder = Path(folder)
+    require_picture(folder)
     try:
         about = msgspec.convert(text_file.read_json(folder / "maps.json"), _Description)
     except OSError as error:
@@ -207,6 +209,16 @@ def read_exports(folder: Path) -> dict[str, _Export]:
         return msgspec.convert(text_file.read_json(folder / "maps.json"), MapsFile).exports
     except (OSError, ValueError):
         return {}
+
+
+def require_picture(folder: Path) -> None:
+    """Raise a DecodeError for the folder maps/ of a fused object or of a material."""
+    with suppress(OSError, ValueError, KeyError, TypeError):  # which `read` explains
+        if str(text_file.read_json(folder / "maps.json")["format"]).startswith(("polcap fused", "polcap material")):
+            raise DecodeError(
+                f"{folder} holds the textures of a fused object or of a material, not the maps of a picture; give one "
+                "of its views, or read the files listed in its maps.json"
+            )
 
 
 def read_format(out: Path) -> str:

@@ -69,13 +69,10 @@ def read_cues(result: str | Path) -> dict[str, Floats]:
 def _folder(result: str | Path) -> Path:
     """The folder of the maps."""
     named = Path(result)
-    places = [named, *(named / part / "maps" for part in ("", own_folders.OUTPUT, own_folders.FUSED))]
+    parts = ("", own_folders.OUTPUT, own_folders.FUSED, own_folders.MATERIAL)
+    places = [named, *(named / part / "maps" for part in parts)]
     found = next((place for place in places if (place / "maps.json").exists()), named)
-    if (found / "mesh.npz").exists():
-        raise DecodeError(
-            f"{found} holds the textures of a fused object, not the maps of a picture; give one of its views, "
-            "or read the files listed in its maps.json"
-        )
+    maps_folder.require_picture(found)
     return found
 
 
