@@ -7,6 +7,7 @@ import numpy as np
 from polcap.images import Floats
 
 MAD_TO_SIGMA = 1.4826  # 1/Φ⁻¹(¾): median absolute deviation → standard deviation of a normal distribution
+MEDIAN_SE = float((np.pi / 2) ** 0.5)  # standard error of a median over that of a mean, of normal scatter
 BIWEIGHT = 4.685  # σ at which Tukey's biweight ends: 95 % as efficient as least squares (Holland & Welsch, 1977)
 _NEVER_ZERO = 1e-9  # added to a spread before something is divided by it
 _OUTLIER = 2.5  # σ beyond which a variance counts less in a noise line

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from polcap.images import Bools, Floats, SensorImage
 from polcap.optics import sensor
 from polcap.optics.resize import block_means
+from polcap.optics.robust import MEDIAN_SE
 from polcap.optics.tiles import spread_over_cells
 
 TILE = 32  # px of the binned frames
@@ -25,7 +26,6 @@ _LADDER = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # px, 1σ
 _LEAST_TILES = 4
 _LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise would count as detail
 _SURE = 0.999  # quantile of Student's t beyond which a loss of detail is significant
-_MEDIAN_SE = (np.pi / 2) ** 0.5  # standard error of a median over that of a mean, of normal scatter
 _DETAIL = -0.5  # largest log of fine over coarse energy of a tile with detail; noise has 0
 
 
@@ -128,7 +128,7 @@ def extra_blur(tiles: Floats, usable: Bools) -> Floats:
     lost = np.median(each, axis=2)  # (K, 4)
     scatter = np.delete(each, sharpest, axis=0).std(axis=2, ddof=1).min(axis=0, initial=np.inf)  # (4,)
     count = each.shape[2]
-    sure = stdtrit(count - 1, _SURE) * _MEDIAN_SE * scatter / np.sqrt(count)
+    sure = stdtrit(count - 1, _SURE) * MEDIAN_SE * scatter / np.sqrt(count)
     lost = np.where(lost > sure, lost, 0.0)
     if not lost.any():
         return np.zeros(len(tiles))

@@ -27,7 +27,7 @@ from polcap.stages.whitebalance import chart_in_mask
 _LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ
 _DEGREES_PER_PUSH = 200.0  # error of the normals per movement by the object's radius
 _SIGMAS, _FALSE_PUSH = 3.0, 0.003  # of a push; 1σ that polarization imitates, of the object's radius
-_DEGREES_PER_TURN = 5.0  # error of the normals per degree by which the object turned (docs/benchmarks/gates.md)
+_DEGREES_PER_TURN = 600.0  # error of the normals per turn's shift of the surface, of the radius
 _FALSE_TURN_DEG = 0.2  # 1σ of a turn that polarization imitates
 _SHARP_PX, _DEGREES_PER_BLUR_PX = 1.2, 2.5  # greatest blur of sharp edges; error of the normals per px beyond it
 _DEGREES_PER_FRAME_BLUR_PX = 9.0  # of a reference frame beyond the limit: 12° at 2.2 and 2.7 px, 24° at 4.6
@@ -171,7 +171,7 @@ def _judge_turn(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     measured, names, limit = _measure_turn(found, limits), found.names, limits.max_object_turn_deg
     least = measured.degrees - 2 * np.hypot(measured.sigma, _FALSE_TURN_DEG)
     k = int(np.argmax(least))
-    true = np.sqrt(np.maximum(measured.degrees**2 - measured.sigma**2 - _FALSE_TURN_DEG**2, 0))
+    true = np.sqrt(np.maximum(measured.shift**2 - measured.shift_sigma**2, 0))
     figure, cost = round(float(measured.degrees[k]), 3), _DEGREES_PER_TURN * float(true.max())
     message = (
         f"The object turned by {figure:.1f}° ± {measured.sigma[k]:.1f}° in {names[k]}, as its visible detail shows"

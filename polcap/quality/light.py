@@ -12,6 +12,7 @@ from polcap.optics import mueller
 from polcap.optics.frames import dot, rays
 from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
+from polcap.optics.robust import MEDIAN_SE
 from polcap.quality import albedo_slope
 from polcap.quality.gate import Evidence, Gate, at_most, grade, worded
 from polcap.quality.limits import GateLimits
@@ -100,7 +101,7 @@ def albedo_scale(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate
     if sigma > limit and light is not None and light.uneven > limit / 2:
         message += ": the chart is lit unevenly, by another lamp or through a lens that darkens the corners"
     elif sigma > limit:
-        message += ": they are higher than usual, as of a very bright object or a chart with less light"
+        message += ": they are higher than those of white things, as if the chart had less light than the object"
     return at_most("albedo scale", sigma, limit, message, remedy, beyond="warn")
 
 
@@ -237,7 +238,7 @@ def _judge_highlights(found: Evidence[ResultsUntilInfer], limits: GateLimits) ->
     at the sides polarize them in the same direction.
     """
     share, limit = _highlight_dolp(found), limits.max_highlight_dolp
-    text = "The brightest parts that face the camera share a polarization of {:.1f} %"
+    text = "The brightest parts that face the camera share a polarization of {:.1f} % or more"
     message = worded(100 * share, text, "The brightest parts that face the camera share no polarization")
     if share > limit:
         message += (
@@ -250,12 +251,13 @@ def _judge_highlights(found: Evidence[ResultsUntilInfer], limits: GateLimits) ->
 
 
 def _highlight_dolp(found: Evidence[ResultsUntilInfer]) -> float:
-    """Common DoLP of the tenth of the surfaces that face the camera with most light over albedo.
+    """Least common DoLP, within 1σ, of the tenth of the surfaces that face the camera with most light over albedo.
 
     Highlights of lamps at the sides are there, too. NaN if too little of the object faces the camera, or if most of it
-    leans the same way, as a cylinder: it shares a polarization under any light.
+    leans the same way, as a cylinder: it shares a polarization under any light. The error is that of the median of the
+    pixels and that of the shots' gains.
     """
-    maps, cues = found.results.maps, found.results.cues
+    maps, cues, selfcal = found.results.maps, found.results.cues, found.results.selfcal
     both = maps.mask & cues.mask
     both &= cues.quality & int(Quality.CLIPPED) == 0
     towards = both & (dot(maps.normal, rays(maps.view, *maps.mask.shape)) > _TOWARDS_CAMERA)
@@ -266,9 +268,13 @@ def _highlight_dolp(found: Evidence[ResultsUntilInfer]) -> float:
     if np.abs((polarized * np.exp(2j * azimuth)).mean()) > _ONE_WAY * polarized.mean():
         return float("nan")
     light = cues.radiance[towards].sum(-1) / np.maximum(maps.diffuse[towards].sum(-1), _LEAST_ALBEDO)
-    bright = light >= np.percentile(light, 90)
-    dolp = float(np.hypot(*np.median(cues.ratio[:, towards][:, bright], axis=1)))
-    return dolp if dolp <= 1 else float("nan")  # the shots contradict each other
+    ratio = cues.ratio[:, towards][:, light >= np.percentile(light, 90)]  # (2, N)
+    dolp = float(np.hypot(*np.median(ratio, axis=1)))
+    if dolp > 1:  # the shots contradict each other
+        return float("nan")
+    scatter = MEDIAN_SE * np.hypot(*ratio.std(axis=1)) / np.sqrt(ratio.shape[1])
+    of_gains = np.linalg.pinv(mueller.analyzer(selfcal.angle))[1:] * selfcal.gains.sigma.mean(axis=1) / 2  # (2, K)
+    return max(dolp - float(np.hypot(scatter, np.linalg.norm(of_gains))), 0.0)
 
 
 def _surroundings_dolp(found: Evidence[ResultsUntilSelfcal]) -> float:

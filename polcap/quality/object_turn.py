@@ -32,15 +32,21 @@ _LEAST_PIXELS = 1000
 _PRIOR = np.array([1.0, 1.0, 0.03, 0.03, 0.03, 0.03])  # 1σ of shift [px], zoom [1], roll, tilts [rad]
 _CAUCHY = 2.0  # robust standard deviations
 _STEPS = 5
+_FALSE_SHIFT_PX = 0.06  # 1σ of a shift that polarization imitates (docs/benchmarks/gates.md)
 _CELL = 12  # px: residuals of different cells are independent
 
 
 @dataclass(frozen=True)
 class ObjectTurn:
-    """Turn of the object from the first shot to each other one: (K,) degrees, and its 1σ."""
+    """Turn of the object from the first shot to each other one (K,), and the shift of its surface by this turn.
+
+    Errors are 1σ. They include a shift that polarization imitates: the flatter the object, the larger a turn it makes.
+    """
 
     degrees: Floats
-    sigma: Floats
+    sigma: Floats  # degrees
+    shift: Floats  # root mean square over the object, relative to the object's radius
+    shift_sigma: Floats
 
 
 def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask, maps: SurfaceMaps | None) -> ObjectTurn:
@@ -48,7 +54,7 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask, map
 
     Without `maps`, or without a depth in them, the object is taken as a ball inflated from its outline.
     """
-    found = ObjectTurn(*np.zeros((2, len(radiance.angle))))
+    found = ObjectTurn(*np.zeros((4, len(radiance.angle))))
     step = averaging_step(object_.mask.shape, _MOST_PIXELS)
     relief = _relief(maps, object_, step)
     clipped = np.any(radiance.quality & int(Quality.CLIPPED) > 0, axis=0)
@@ -56,13 +62,19 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask, map
     if radiance.offset_px is not None or inside.sum() < _LEAST_PIXELS:  # shots cut from one mosaic, or a tiny object
         return found
     field, cell = _displacements(relief, inside)
+    power = np.einsum("nij,nik->jk", field[..., 3:], field[..., 3:]) / len(field)  # (3, 3) px² per rad²
+    radius = outline.disc_radius(relief > 0)
     reference = _signals(radiance.shot(0), step)
     for k in range(1, len(radiance.angle)):
         camera = registration.scaled(alignment.transform[k], 1 / step)
         moved = [warp(signal, camera) for signal in _signals(radiance.shot(k), step)]
         motion, covariance = _fit(reference, moved, field, inside, cell)
-        found.degrees[k] = np.degrees(np.sqrt((motion[3:] ** 2).sum()))
-        found.sigma[k] = np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))
+        turn, doubt = motion[3:], covariance[3:, 3:]
+        angle, shift = np.linalg.norm(turn), np.sqrt(turn @ power @ turn)  # rad, px
+        found.degrees[k] = np.degrees(angle)
+        found.sigma[k] = np.degrees(np.hypot(np.sqrt(np.trace(doubt)), _FALSE_SHIFT_PX * angle / max(shift, 1e-9)))
+        found.shift[k] = shift / radius
+        found.shift_sigma[k] = np.hypot(np.sqrt(np.trace(power @ doubt)), _FALSE_SHIFT_PX) / radius
     return found
 
 

@@ -13,7 +13,7 @@ from polcap.images import Bools, Floats, Quality
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
-from polcap.quality import rim
+from polcap.quality import rerendering, rim
 from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, at_most, lit, sentence, worded
 from polcap.quality.limits import GateLimits
 from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilSelfcal, ResultsUntilStokes
@@ -32,6 +32,9 @@ _DARK = 0.1  # albedo below which a glossy object shows mostly reflections of it
 _WEAK_DOLP = 0.05  # of an outline: above, no shape counts as flattened
 _DIMMED = 0.9  # of the mean light: below, an outline turns away
 _MOST_ILL_POSED = 0.15  # of the object; gloss with shadows and thin parts reaches .12 (docs/benchmarks/gates.md)
+# agreement of the re-rendering from which a finding is false (docs/benchmarks/gates.md): of wrong orders up to .26, of
+# wax .30, under light from around .48
+_ORDER_EXPLAINED, _BODY_EXPLAINED = 0.4, 0.5
 _ROUGH = 0.5  # roughness from which facets alone leave little polarization
 # What a finding adds to the expected error of the normals, by captures with known normals: docs/benchmarks/gates.md
 _UNPOLARIZED_DEG = 11.0
@@ -47,13 +50,23 @@ def order(found: Evidence[ResultsUntilSelfcal]) -> Gate:
     The polarization along the outline decides, or the error that the network expects for this order and for others.
     """
     results = found.results
-    return order_of_shots(results.radiance, results.object_, results.selfcal.outline, _test(results), found.names)
+    explained = isinstance(results, ResultsUntilInfer) and _explained(results) > _ORDER_EXPLAINED
+    outline, test = results.selfcal.outline, _test(results)
+    return order_of_shots(results.radiance, results.object_, outline, test, found.names, explained)
 
 
 def order_of_shots(
-    radiance: AngleStack, object_: ObjectMask, outline: OutlineCheck, test: OrderTest | None, names: list[str]
+    radiance: AngleStack,
+    object_: ObjectMask,
+    outline: OutlineCheck,
+    test: OrderTest | None,
+    names: list[str],
+    explained: bool = False,
 ) -> Gate:
-    """Gate on the order of shots, by the polarization along the outline and the test of the network."""
+    """Gate on the order of shots, by the polarization along the outline and the test of the network.
+
+    Where another order is as good, the stated one counts if its maps explain the photographs.
+    """
     statement, better = radiance.equipment.angles, None
     if not outline.as_stated:
         better, because = outline.best, "The outline fits"
@@ -67,6 +80,8 @@ def order_of_shots(
     message = f"The outline supports the stated order (fit {outline.concentration:.2f} of 1)"
     if _is_confirmed(test):
         message = f"In any other order, the network expects errors that are at least {test.ratio:.1f} times as large"
+    elif outline.rival is not None and explained:
+        message = "The maps of the stated order, rendered again, show the polarization of the photographs"
     elif outline.rival is not None:
         other = _order_text(outline.rival, names)
         message = f"The outline fits the order {other} as well as the stated one (fit {outline.concentration:.2f} of 1)"
@@ -74,6 +89,14 @@ def order_of_shots(
         remedy = sentence(f"{angle_advice.check(statement)}; {surer} would decide")
         return Gate("order", "warn", "cannot tell", "as stated", message, remedy, unit="")
     return Gate("order", "pass", "as stated", "as stated", message, unit="")
+
+
+def _explained(results: ResultsUntilInfer) -> float:
+    """Part of the polarization that the maps explain by a shape that explains the shading too, at most 1.
+
+    0 for the inversion: it makes a shape of any polarization.
+    """
+    return 0.0 if results.maps.estimator == "analytic" else rerendering.measure(results).agreement
 
 
 def _test(results: ResultsUntilSelfcal) -> OrderTest | None:
@@ -276,7 +299,8 @@ def _light_of_body(body: rim.RimFigures, found: Evidence[ResultsUntilInfer], lim
     """Gate "body" on diffuse polarization: under a flash, a dielectric's outline is polarized across the contour.
 
     Rough and translucent objects both polarize little. The estimators account for roughness, so the shape of a rough
-    object is as round as its shading suggests. Any other loss of polarization flattens the shape.
+    object is as round as its shading suggests. Any other loss of polarization flattens the shape, which then does not
+    explain the polarization of the whole object.
     """
     limit = limits.min_outline_dolp
     remedy = "Darken the room, keep the flash next to the lens, and photograph an ambient frame"
@@ -284,6 +308,9 @@ def _light_of_body(body: rim.RimFigures, found: Evidence[ResultsUntilInfer], lim
     confirmed = _is_confirmed(found.results.maps.order)
     if body.along < _ALONG and not (confirmed and albedo < _DARK):  # dark gloss reflects itself
         return _along_contour(body.along, albedo, f"{remedy}; {_across(found)}")
+    if _explained(found.results) > _BODY_EXPLAINED:
+        message = f"The outline is polarized by {100 * body.dolp:.1f} %, as the shape explains"
+        return Gate("body", "pass", round(body.dolp, 4), limit, message)
     flat, dimmed = zenith < limits.min_zenith_deg, body.brightness < _DIMMED
     hint = "Trust the shape less: translucent objects polarize little"
     if flat and dimmed and body.dolp < max(limit, _WEAK_DOLP):

@@ -37,6 +37,17 @@ def pushed(second: float, third: float = 0.0, sigma: float = 0.1) -> ObjectShift
     return ObjectShift(np.array([0.0, second, third]), np.array([0.0, sigma, sigma]))
 
 
+def network_maps(albedo_sigma: float | None, ratio: float | None = None) -> SimpleNamespace:
+    """Maps of a network that expects `ratio` times the errors for another order."""
+    order = None if ratio is None else OrderTest(ShotOrder((2, 1, 0)), ratio)
+    return SimpleNamespace(estimator="network", albedo_sigma=albedo_sigma, order=order)
+
+
+def turned(degrees: float, sigma: float) -> ObjectTurn:
+    """The second shot turned by so many degrees."""
+    return ObjectTurn(np.array([0.0, degrees, 0.0]), np.full(3, sigma), *np.zeros((2, 3)))
+
+
 def rendered(agreement: float = 0.7, scale: float = 1.0) -> Rerendering:
     return Rerendering(np.zeros(0), np.zeros(0), np.zeros(0), scale, agreement)
 
@@ -50,7 +61,7 @@ ROUNDED = Flatness(contour=0.8, common=0.1, rim_dolp=0.2, rim_light=0.7, aligned
 FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
     "albedo_slope": AlbedoSlope(0.01, 0.1),
-    "pushed": pushed(0.1, 0.1), "turn": ObjectTurn(np.array([0.0, 0.2, 0.1]), np.full(3, 0.1)),
+    "pushed": pushed(0.1, 0.1), "turn": turned(0.2, 0.1),
     "edge_blur": 0.8, "contradiction": 0.0, "own_error": 4.0,
     "flatness": ROUNDED, "most_dolp": 0.1, "charted": 0.0, "rendered": rendered(), "noise": 0.001, "ill_posed": 0.0,
     "medians": [45.0, 0.2, 0.3],
@@ -113,6 +124,7 @@ def ghosts() -> Any:
     return quality
 
 
+UNCLEAR = {"selfcal": {"outline": OutlineCheck(STATED, 0.9, ShotOrder((0, 2, 1)))}}
 CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields that lead to it
     ("exposures", "pass", {}),
     ("exposures", "warn", {"bracket": exposures(1.0)}),
@@ -147,8 +159,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("alignment", "fail", {"alignment": {"residual_px": np.array([0.0, 0.5, 0.0]), "correlation": np.full(3, 0.7)}}),
     ("alignment", "fail", {"alignment": {"transform": np.full((3, 3, 3), NAN)}}),
     ("alignment", "warn", {"figures": {"pushed": pushed(1.2)}}),
-    ("alignment", "warn", {"figures": {"turn": ObjectTurn(np.array([0.0, 0.9, 0.0]), np.full(3, 0.1))}}),
-    ("alignment", "pass", {"figures": {"turn": ObjectTurn(np.array([0.0, 0.8, 0.0]), np.full(3, 0.2))}}),
+    ("alignment", "warn", {"figures": {"turn": turned(0.9, 0.1)}}),
+    ("alignment", "pass", {"figures": {"turn": turned(0.8, 0.2)}}),
     ("alignment", "warn", {"figures": {"pushed": pushed(1.8, sigma=0.2)}}),
     ("alignment", "pass", {"figures": {"pushed": pushed(1.8, sigma=0.9)}}),
     ("alignment", "fail", {"figures": {"pushed": pushed(5.0)}}),
@@ -188,12 +200,13 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("gain doubt", "fail", gains(source="none", sigma=np.full((3, 3), 0.2))),
     ("gain doubt", "not measured", gains(source="none", sigma=np.full((3, 3), NAN))),
     ("order", "pass", {}),
-    ("order", "warn", {"selfcal": {"outline": OutlineCheck(STATED, 0.9, ShotOrder((0, 2, 1)))}}),
+    ("order", "warn", {**UNCLEAR, "figures": {"rendered": rendered(0.35)}}),
+    ("order", "pass", {**UNCLEAR, "figures": {"rendered": rendered(0.45)}}),
     ("order", "fail", {"selfcal": {"outline": OutlineCheck(ShotOrder((2, 1, 0)), 0.9)}}),
-    ("order", "fail", {"maps": SimpleNamespace(albedo_sigma=0.1, order=OrderTest(ShotOrder((2, 1, 0)), 0.5))}),
-    ("order", "pass", {"maps": SimpleNamespace(albedo_sigma=0.1, order=OrderTest(ShotOrder((2, 1, 0)), 2.0))}),
-    ("order", "fail", {"maps": SimpleNamespace(albedo_sigma=0.1, order=OrderTest(ShotOrder((2, 1, 0)), 0.8))}),
-    ("order", "pass", {"maps": SimpleNamespace(albedo_sigma=0.1, order=OrderTest(ShotOrder((2, 1, 0)), 0.8)),
+    ("order", "fail", {"maps": network_maps(0.1, 0.5)}),
+    ("order", "pass", {"maps": network_maps(0.1, 2.0)}),
+    ("order", "fail", {"maps": network_maps(0.1, 0.8)}),
+    ("order", "pass", {"maps": network_maps(0.1, 0.8),
                        "object_": {"mask": SMALL}}),
     ("angles", "pass", {}),
     ("angles", "not measured", {"figures": {"outline": None}}),
@@ -209,7 +222,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("body", "pass", {}),
     ("body", "fail", {"figures": outline(along=-0.9)}),
     ("body", "warn", {"figures": {**outline(along=-0.9), "medians": [45.0, 0.2, 0.04]}}),
-    ("body", "warn", {"figures": outline(concentration=0.3)}),
+    ("body", "warn", {"figures": {**outline(concentration=0.3), "rendered": rendered(0.45)}}),
+    ("body", "pass", {"figures": {**outline(concentration=0.3), "rendered": rendered(0.55)}}),
     ("body", "not judged", {"figures": {"flatness": replace(ROUNDED, common=0.9)}}),
     ("flat", "pass", {}),
     ("flat", "warn", {"figures": {"flatness": replace(ROUNDED, common=0.9, aligned=0.95)}}),
@@ -217,8 +231,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("flat", "not measured", {"figures": {"flatness": None}}),
     ("contour", "pass", {}),
     ("contour", "not measured", {"figures": {"flatness": replace(ROUNDED, common=0.9)}}),
-    ("body", "warn", {"figures": {**outline(dolp=0.02), "medians": [10.0, 0.6, 0.3]}}),
-    ("body", "warn", {"figures": outline(dolp=0.02)}),
+    ("body", "warn", {"figures": {**outline(dolp=0.02), "medians": [10.0, 0.6, 0.3], "rendered": rendered(0.3)}}),
+    ("body", "warn", {"figures": {**outline(dolp=0.02), "rendered": rendered(0.3)}}),
     ("other light", "pass", {}),
     ("other light", "fail", {"figures": outline(side=0.2)}),
     ("noise", "pass", {}),
@@ -252,8 +266,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("re-rendering", "fail", {"figures": {"rendered": rendered(scale=2.5)}}),
     ("re-rendering", "not measured", {"figures": {"rendered": rendered(agreement=NAN)}}),
     ("albedo scale", "pass", {}),
-    ("albedo scale", "warn", {"maps": SimpleNamespace(albedo_sigma=0.5, order=None)}),
-    ("albedo scale", "warn", {"maps": SimpleNamespace(albedo_sigma=None, order=None)}),
+    ("albedo scale", "warn", {"maps": network_maps(0.5)}),
+    ("albedo scale", "warn", {"maps": network_maps(None)}),
     ("albedo scale", "not measured", {"chart_missing": "nothing like one", "later_view": True}),
     ("focal length", "pass", {}),
     ("focal length", "warn", {"focal_doubt": (-0.7, 0.7)}),
@@ -289,7 +303,7 @@ def good() -> dict[str, Any]:
         "radiance": with_field(scenes.stack(), "bracket", exposures(1.0, 4.0)),
         "color": scenes.no_color(), "alignment": scenes.still(), "object_": replace(scenes.ball_object(), doubt=0.01),
         "selfcal": replace(scenes.equal(), gains=GAINS, outline=OutlineCheck(STATED, 0.95)),
-        "stokes": SimpleNamespace(body=True), "cues": None, "maps": SimpleNamespace(albedo_sigma=0.1, order=None),
+        "stokes": SimpleNamespace(body=True), "cues": None, "maps": network_maps(0.1),
         "mesh": SimpleNamespace(**MESH),
         "figures": FIGURES | outline(),
     }  # fmt: skip

@@ -34,6 +34,18 @@ def measured(radiance: AngleStack, maps: SurfaceMaps | None = None) -> object_tu
     return object_turn.measure(radiance, scenes.still(), scenes.ball_object(), maps)
 
 
+def of_relief(share: float) -> SurfaceMaps:
+    """Maps of the ball with its depth times `share`."""
+    normal, mask = scenes.truth()
+    radius = np.sqrt(mask.sum() / np.pi)
+    flat = np.ones(mask.shape, np.float32)
+    color = np.repeat(flat[..., None], 3, -1)
+    x0, y0, _, _ = scenes.ball_object().crop
+    view = replace(scenes.VIEW, origin=(float(x0), float(y0)))
+    prior = -share * scenes.RADIUS / radius * normal[..., 2]
+    return SurfaceMaps(normal, color, color, flat, prior, flat, mask, view, "network")
+
+
 @pytest.mark.parametrize("turn", [(0.5, 0.0, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5), (0.3, 0.3, -0.3)])
 def test_a_turn_about_any_axis_is_measured_in_degrees(turn: tuple[float, float, float]) -> None:
     """Twice as large in the third shot as in the second; the shape of a ball follows from its outline."""
@@ -50,18 +62,21 @@ def test_polarization_of_a_still_object_is_no_turn() -> None:
 
 def test_the_depth_of_the_maps_gives_the_turn_where_it_is_known() -> None:
     """A surface of half the relief turns by twice the angle for the same displacements."""
-    normal, mask = scenes.truth()
-    radius = np.sqrt(mask.sum() / np.pi)
-    flat = np.ones(mask.shape, np.float32)
-    color = np.repeat(flat[..., None], 3, -1)
-    x0, y0, _, _ = scenes.ball_object().crop
-    view = replace(scenes.VIEW, origin=(float(x0), float(y0)))
-    turns = []
-    for share in (1.0, 0.5):
-        prior = -share * scenes.RADIUS / radius * normal[..., 2]
-        maps = SurfaceMaps(normal, color, color, flat, prior, flat, mask, view, "network")
-        turns.append(measured(photographs((0.0, 0.4, 0.0)), maps).degrees[2])
+    turns = [measured(photographs((0.0, 0.4, 0.0)), of_relief(share)).degrees[2] for share in (1.0, 0.5)]
     assert turns == pytest.approx([0.8, 1.6], rel=0.2)
+
+
+def test_a_small_shift_of_a_flat_object_is_no_large_turn() -> None:
+    """Polarization shifts detail by a twentieth of a pixel, which a flat surface does only if it turns far."""
+    found = measured(photographs((0.0, 0.06, 0.0)), of_relief(0.05))
+    assert found.degrees[2] > 1.5 and found.degrees[2] < 2 * found.sigma[2]
+    assert found.shift[2] < 0.002  # of the radius
+
+
+def test_the_surface_shifts_as_far_as_the_turn_moves_it() -> None:
+    """A roll by ω moves a disc by ω r; root mean square of r over a disc of radius 1: 1/√2."""
+    found = measured(photographs((0.0, 0.0, 0.5)))
+    assert found.shift[1] == pytest.approx(np.radians(0.5) / np.sqrt(2), rel=0.15)
 
 
 def test_the_error_covers_what_noise_does() -> None:

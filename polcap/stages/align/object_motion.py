@@ -22,7 +22,8 @@ _MOST_PIXELS = 0.8e6  # a larger picture is averaged down first
 _RIM_PX = 6  # around the object, which its outline needs
 _SURE_CORRELATION = 0.6  # of detail: from here on a region was found in the shot
 _OTHER_CORRELATION = 0.4  # of the object: below, it is another or too far away; noise has less
-_ERROR_SCALE = 1.3  # actual error of the shift over that of the tiles, in 80 still shots (docs/benchmarks/gates.md)
+_ERROR_SCALE = 1.1  # actual error of the shift over that of the tiles, in 152 still shots (docs/benchmarks/gates.md)
+_PARAMETERS = 4  # of a similarity; a tile measures two
 _SAME_PX = 0.5  # two starts that differ by less lead to one place
 
 
@@ -63,8 +64,15 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
             places = [transform_points(found.matrix, middle) for found in (whole, outer)]
             per_axis = np.hypot(whole.sigma_at(middle), outer.sigma_at(middle))
             pushed.length[k] = step * np.hypot(*(places[0] - places[1]))
-            pushed.sigma[k] = step * _ERROR_SCALE * np.sqrt(2) * per_axis
+            pushed.sigma[k] = step * _ERROR_SCALE * np.sqrt(2) * per_axis * _student(min(whole.tiles, outer.tiles))
     return pushed
+
+
+def _student(tiles: int) -> float:
+    """Factor on an error that so few tiles state themselves, so that three times it is as rare as 3σ (Student's t)."""
+    from scipy.special import ndtr, stdtrit  # here: the import takes 0.2 s
+
+    return float(stdtrit(max(2 * tiles - _PARAMETERS, 1), ndtr(3.0)) / 3)
 
 
 def _registered(region: Pyramid, shot: Pyramid, start: Floats) -> tuple[Registration, float]:

@@ -19,7 +19,7 @@ the normals are smooth and certain, fine detail of the light is detail of the al
 """
 
 from dataclasses import replace
-from math import exp, hypot, log, pi, sqrt
+from math import exp, hypot, inf, log, pi, sqrt
 from typing import Annotated, Literal
 
 import cv2
@@ -37,8 +37,10 @@ from polcap.stages.infer import analytic, highlights, learned
 
 _MAPS_SIGMA = 0.05  # of the estimators' own albedos, with a correct scale (docs/benchmarks/gates.md)
 # A chart that gets half of the object's light doubles the albedo, often beyond that of white things. Limit of the
-# brightest parts (ln) and its width; one chart in a hundred is assumed to (docs/benchmarks/gates.md).
-_WHITE, _WHITE_SPREAD, _BRIGHTEST = -0.2, 0.03, 95  # percentile
+# brightest parts (ln) and its width; one chart in a hundred is assumed to (docs/benchmarks/gates.md). Cosines of the
+# surfaces that are judged: they lean too far to show a highlight.
+_WHITE, _WHITE_SPREAD, _BRIGHTEST = -0.2, 0.04, 95  # percentile
+_LEANING = (0.5, 0.87)
 _HALF, _ODDS = log(2), 0.01
 _BAND = 2.0  # px, 1σ: shading in finer detail predicts the shading that is finer than a superpixel
 _DETAIL_AROUND = 4.0  # px, 1σ of the means of power, and of the albedo
@@ -63,7 +65,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fine: Annotated[bool, Meta(description="a second network adds relief finer than the pixels of the first")] = True
 
 
-@stage(version=38)
+@stage(version=39)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Estimate normal, diffuse, specular, roughness and expected error from cues; without a network by inversion.
 
@@ -74,22 +76,25 @@ def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: Inf
     else:
         maps = learned.estimate(cues, network, run, settings.ior, settings.symmetries, fine_pass=settings.fine)
     maps = highlights.correct(maps, cues, settings.ior)
-    far = 0.0 if network is None else _far_chart(maps)  # highlights make the albedo of the inversion too bright
     return replace(
         maps,
-        albedo_sigma=None if cues.scale_sigma is None else hypot(cues.scale_sigma, _MAPS_SIGMA, far),
+        albedo_sigma=None if cues.scale_sigma is None else _scale_error(cues, maps, cues.scale_sigma),
         detail=None if cues.detail is None else _select_detail(cues.detail, cues, maps),
     )
 
 
-def _far_chart(maps: SurfaceMaps) -> float:
-    """RMS error of ln scale, as the chart may get half of the object's light."""
-    albedo = maps.diffuse[maps.mask]
-    if not len(albedo):
-        return 0.0
-    bright = log(max(float(np.percentile(albedo.max(-1), _BRIGHTEST)), 1e-6))
-    odds = _ODDS * (1 + exp((bright - _WHITE) / _WHITE_SPREAD))
-    return _HALF * sqrt(odds / (1 + odds))
+def _scale_error(cues: Cues, maps: SurfaceMaps, sigma: float) -> float:
+    """Relative error (1σ) of the scale of all albedos: `sigma` of the chart's light, which may have been half of it.
+
+    White objects are no evidence. The albedo must be above that of white things even if the scale errs by `sigma`, and
+    by the light alone: divided by the root of the shading, it is at most the albedo.
+    """
+    cosine = frames.dot(maps.normal, cues.rays)
+    leaning = cues.mask & (cues.quality == 0) & (cosine > _LEANING[0]) & (cosine < _LEANING[1])
+    light = cues.radiance[leaning].max(axis=-1) / np.sqrt(cosine[leaning])
+    least = log(max(float(np.percentile(light, _BRIGHTEST)), 1e-6)) - sigma if len(light) else -inf
+    odds = _ODDS * (1 + exp((least - _WHITE) / _WHITE_SPREAD))
+    return hypot(sigma, _MAPS_SIGMA, _HALF * sqrt(odds / (1 + odds)))
 
 
 def _select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:

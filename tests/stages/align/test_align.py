@@ -143,3 +143,12 @@ def test_an_object_that_moved_before_a_still_backdrop_is_distinguished_from_a_mo
         assert object_motion.measure(stack, found, ball).length[1] == pytest.approx(expected, abs=0.5)
     radiance = scenes.stack(noise=0.002)
     assert np.nanmax(object_motion.measure(radiance, scenes.still(3), ball).length) < 0.5
+
+
+@pytest.mark.parametrize("tiles", [4, 6, 20])
+def test_three_times_the_error_of_few_tiles_is_as_rare_as_three_sigma(tiles: int) -> None:
+    """Normal errors over the scatter of so many tiles, of which each measures two of four parameters."""
+    random, freedom = np.random.default_rng(tiles), 2 * tiles - 4
+    ratio = random.normal(size=400_000) / np.sqrt(random.chisquare(freedom, 400_000) / freedom)
+    beyond = (np.abs(ratio) > 3 * object_motion._student(tiles)).mean()
+    assert beyond == pytest.approx(0.0027, rel=0.15)

@@ -50,19 +50,20 @@ def errors_deg(maps, cues_) -> np.ndarray:
     return np.degrees(np.arccos(np.clip((maps.normal * true).sum(-1), -1, 1)))[inside]
 
 
-def test_the_error_of_the_albedos_scale_is_that_of_the_chart_and_of_the_maps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half of the light on the chart is possible, and probable if a network finds an albedo above that of white things.
-
-    The albedo of the inversion holds highlights, so it tells nothing.
-    """
+@pytest.mark.parametrize(("albedo", "doubled"), [(0.5, False), (0.95, False), (1.4, True)])
+def test_white_things_are_no_evidence_of_a_chart_with_less_light(
+    albedo: float, doubled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The chart got half of the light only where more comes back than from the whitest surface; highlights are none."""
     monkeypatch.setattr(learned, "estimate", lambda found, *_, **__: analytic.estimate(found, 1.5))
-    found = seen(noise=0.002)
-    lit = [dataclasses.replace(found, scale_sigma=0.1, radiance=times * found.radiance) for times in (1, 3)]
-    usual, bright = (estimate(one, object()).albedo_sigma for one in lit)
-    assert usual == pytest.approx(np.hypot(0.1, 0.05), abs=0.03)
-    assert bright == pytest.approx(np.hypot(0.1, np.log(2)), abs=0.06)
-    assert estimate(lit[1]).albedo_sigma == pytest.approx(np.hypot(0.1, 0.05))
-    assert estimate(dataclasses.replace(found, scale_sigma=None)).albedo_sigma is None
+    found = seen(noise=0.002, textured=False)
+    local, _ = scenes.truth()
+    highlight = 3.0 * (local[..., 2:] > 0.95)
+    lit = dataclasses.replace(found, scale_sigma=0.1, radiance=albedo / 0.5 * found.radiance + highlight)
+    expected = np.sqrt(0.1**2 + 0.05**2 + np.log(2) ** 2 * (1.0 if doubled else 0.01))
+    for model in (None, object()):
+        assert estimate(lit, model).albedo_sigma == pytest.approx(expected, abs=0.06)
+    assert estimate(dataclasses.replace(lit, scale_sigma=None)).albedo_sigma is None
 
 
 def test_a_clean_ball_is_recovered():
