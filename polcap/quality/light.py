@@ -96,7 +96,10 @@ def albedo_scale(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate
         return Gate("albedo scale", "warn", "relative", "known", message, remedy, unit="")
     message = f"All albedos share an error of scale of {100 * sigma:.0f} % (1σ)"
     if sigma <= limit and not of_session:  # the pictures do not show the chart's distance
-        message += ", if the chart was as far from the flash as the object: 10 % farther makes them 20 % too bright"
+        message += (
+            ", if the chart was as far from the flash as the object, which no picture shows: 10 % farther or nearer "
+            "makes them 20 % too bright or too dark"
+        )
     light = found.results.color.light
     if sigma > limit and light is not None and light.uneven > limit / 2:
         message += ": the chart is lit unevenly, by another lamp or through a lens that darkens the corners"
