@@ -63,7 +63,7 @@ class MaterialSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     materials: Annotated[int, Meta(ge=1, le=32, description="greatest number of materials, grouped by albedo [1]")] = 8
     f0_sigma: Annotated[
         float, Meta(gt=0, le=1, description="error of F0 in the views' maps, where highlights are narrow [1]")
-    ] = 0.025
+    ] = 0.012
     roughness_sigma: Annotated[float, Meta(gt=0, le=1, description="error of roughness in the views' maps [1]")] = 0.06
 
 
@@ -77,7 +77,7 @@ class Lobe:
     misfit: float  # sum of squared errors, in units of the expected ones
 
 
-@stage(version=6)
+@stage(version=7)
 def fit(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps, settings: MaterialSettings) -> AtlasMaps:
     """Refine F0, roughness and albedo by the radiance in all views; without S0 the maps stay as they are."""
     lit = [view for view in views if view.s0 is not None]
@@ -184,16 +184,24 @@ def _lobes(profiles: Sequence[LobeProfile | None], widening: float, settings: Ma
     best = int(np.argmin([misfit(float(f0)) for f0 in _F0S]))
     around = _F0S[max(best - 1, 0)], _F0S[min(best + 1, len(_F0S) - 1)]
     f0 = float(minimize_scalar(misfit, bounds=around, options={"xatol": _F0_ERROR}).x)
-    return [None if one is None else _lobe(one, f0, widening, settings.roughness_sigma) for one in profiles]
+    return [None if one is None else _final_lobe(one, f0, widening, settings) for one in profiles]
 
 
-def _lobe(profile: LobeProfile, f0: float, widening: float, roughness_sigma: float) -> Lobe:
+def _final_lobe(profile: LobeProfile, f0: float, widening: float, settings: MaterialSettings) -> Lobe:
+    """The lobe of a material; the more the errors of the normals widen it, the nearer it stays to the maps and `f0`."""
+    trust = 1 / (1 + widening / profile.alpha**2)
+    return _lobe(profile, f0, widening, settings.roughness_sigma * trust, _OWN_F0_SIGMA * trust)
+
+
+def _lobe(
+    profile: LobeProfile, f0: float, widening: float, roughness_sigma: float, f0_sigma: float = _OWN_F0_SIGMA
+) -> Lobe:
     """The lobe that fits a profile best, with an F0 near `f0`; `widening`: of α² by the errors of the normals."""
     terms = np.empty((len(ALPHAS), len(profile.radiance), 3))
     terms[..., 0], terms[..., 1:] = profile.gloss, profile.diffuse
     terms /= profile.error[:, None]
     radiance = profile.radiance / profile.error
-    sigma = np.tile([_OWN_F0_SIGMA, _GAIN_SIGMA, _LAW_SIGMA], (len(ALPHAS), 1))
+    sigma = np.tile([f0_sigma, _GAIN_SIGMA, _LAW_SIGMA], (len(ALPHAS), 1))
     expected = np.tile([f0, 1.0, 0.0], (len(ALPHAS), 1))
     amplitude = _amplitudes(terms, radiance, expected, sigma)
     low = amplitude[:, 0] < _LEAST_F0
