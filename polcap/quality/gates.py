@@ -80,7 +80,7 @@ _STEPS = (
     Step(("angles",), polarization.turned_shot, ResultsUntilSelfcal, _EVEN),
     Step(("flat", "contour"), _without_limits(flatness.judge), ResultsUntilInfer, _EVEN),
     Step(("polarized",), _without_limits(polarization.polarized), ResultsUntilInfer, _EVEN, ("flat",)),
-    Step(("order",), _without_limits(polarization.order), ResultsUntilSelfcal, (*_EVEN, "polarized"), **_ROUND),
+    Step(("order",), _without_limits(polarization.order), ResultsUntilSelfcal, (*_EVEN, "polarized"), ("flat",)),
     Step(("angles", "body", "other light"), polarization.of_outline, ResultsUntilInfer, _POLARIZED, **_ROUND),
     Step(("ambient",), light.ambient, ResultsUntilHdr),
     Step(("room light",), light.room_light, ResultsUntilInfer, _ONE_LIGHT, ("sharpness", "flicker")),

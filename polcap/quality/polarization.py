@@ -1,7 +1,7 @@
 """Gates of polarization: order and zero of the polarizer angles, material of the object, stray light."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeGuard
 
 import msgspec
@@ -13,7 +13,7 @@ from polcap.images import Bools, Floats, Quality
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
-from polcap.quality import rerendering, rim
+from polcap.quality import flatness, rerendering, rim
 from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, at_most, lit, sentence, worded
 from polcap.quality.limits import GateLimits
 from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilSelfcal, ResultsUntilStokes
@@ -47,12 +47,20 @@ _MOST_PIXELS = 6e5  # a larger picture is averaged down
 def order(found: Evidence[ResultsUntilSelfcal]) -> Gate:
     """Gate on the order and sense of the polarizer angles.
 
-    The polarization along the outline decides, or the error that the network expects for this order and for others.
+    The polarization along the outline decides, or the error that the network expects for this order and for others. An
+    outline that is the edge of flat faces decides nothing.
     """
-    results = found.results
-    explained = isinstance(results, ResultsUntilInfer) and _explained(results) > _ORDER_EXPLAINED
-    outline, test = results.selfcal.outline, _test(results)
-    return order_of_shots(results.radiance, results.object_, outline, test, found.names, explained)
+    results, outline, test = found.results, found.results.selfcal.outline, _test(found.results)
+    explained = edges = False
+    if isinstance(results, ResultsUntilInfer):
+        explained = _explained(results) > _ORDER_EXPLAINED
+        edges = flatness.sharp_edged(results)
+    if edges:
+        outline = replace(outline, best=ShotOrder(tuple(range(len(found.names)))), rival=None)
+    gate = order_of_shots(results.radiance, results.object_, outline, test, found.names, explained)
+    if edges and gate.state == "pass" and not _is_confirmed(test):
+        return Gate("order", "not measured", None, "as stated", "Flat faces show no order of the angles", unit="")
+    return gate
 
 
 def order_of_shots(

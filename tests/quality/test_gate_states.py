@@ -58,6 +58,7 @@ BODY = {
 }  # fmt: skip
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 ROUNDED = Flatness(contour=0.8, common=0.1, rim_dolp=0.2, rim_light=0.7, aligned=0.7, facing=1.0, expected_deg=15.0)
+EDGES = replace(ROUNDED, common=0.9)  # of flat faces
 FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
     "albedo_slope": AlbedoSlope(0.01, 0.1),
@@ -203,6 +204,11 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("order", "warn", {**UNCLEAR, "figures": {"rendered": rendered(0.35)}}),
     ("order", "pass", {**UNCLEAR, "figures": {"rendered": rendered(0.45)}}),
     ("order", "fail", {"selfcal": {"outline": OutlineCheck(ShotOrder((2, 1, 0)), 0.9)}}),
+    ("order", "not measured", {"figures": {"flatness": EDGES}}),
+    ("order", "not measured", {"selfcal": {"outline": OutlineCheck(ShotOrder((2, 1, 0)), 0.9)},
+                               "figures": {"flatness": EDGES}}),
+    ("order", "fail", {"maps": network_maps(0.1, 0.5), "figures": {"flatness": EDGES}}),
+    ("order", "pass", {"maps": network_maps(0.1, 2.0), "figures": {"flatness": EDGES}}),
     ("order", "fail", {"maps": network_maps(0.1, 0.5)}),
     ("order", "pass", {"maps": network_maps(0.1, 2.0)}),
     ("order", "fail", {"maps": network_maps(0.1, 0.8)}),
@@ -230,7 +236,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("flat", "pass", {"figures": {"flatness": replace(ROUNDED, common=0.9, aligned=0.95, expected_deg=5.0)}}),
     ("flat", "not measured", {"figures": {"flatness": None}}),
     ("contour", "pass", {}),
-    ("contour", "not measured", {"figures": {"flatness": replace(ROUNDED, common=0.9)}}),
+    ("contour", "not measured", {"figures": {"flatness": EDGES}}),
     ("body", "warn", {"figures": {**outline(dolp=0.02), "medians": [10.0, 0.6, 0.3], "rendered": rendered(0.3)}}),
     ("body", "warn", {"figures": {**outline(dolp=0.02), "rendered": rendered(0.3)}}),
     ("other light", "pass", {}),
