@@ -13,7 +13,8 @@ which follows from the differences between the views' normals and the baked ones
 
 F0 and roughness of the views' maps have a weight in the fit, by their errors. They are medians over the views, because
 the errors of one view are alike everywhere. Dielectrics of one object have nearly the same F0, so one F0 is fitted to
-all materials, and each may deviate a little from it. The flash's place near the lens is found first, as the one for
+all materials, and each may deviate a little from it. The more the errors of the normals widen a highlight, the nearer
+its gloss stays to that of the maps. The flash's place near the lens is found first, as the one for
 which the half-angle explains the radiance best. Where a chart gives the scale of radiance, the albedo of a material
 becomes that of its radiance without the gloss.
 

@@ -183,18 +183,15 @@ def flicker(found: Evidence[ResultsUntilHdr], limits: GateLimits) -> Gate:
     value, limit = found.results.radiance.bracket.flicker, limits.max_flicker
     flash = found.results.radiance.equipment.light == "flash"
     if not np.isfinite(value).any():
-        return Gate("flicker", "not measured", None, limit, "No two exposures of a shot show it")
+        return Gate("flicker", "not measured", None, limit, "Two exposures of a shot have too few lit rows in common")
     rms = float(np.sqrt(np.nanmean(value**2)))
     message = "All rows of a picture got the same light"
     if rms > limit:
         cause = "the shutter is faster than the flash, or a lamp flickers" if flash else "the lamp flickers"
         message = f"The light changes by {100 * rms:.1f} % from row to row: {cause}"
-    remedy = "Use a lamp that does not flicker, or a flash, or shutter times that are multiples of 1/100 s (1/120 s in "
-    remedy += "countries with 60 Hz)"
+    remedy = "Use a lamp that does not flicker, a flash, or shutter times in multiples of 1/100 s (60 Hz: 1/120 s)"
     if flash:
-        remedy = (
-            "Use a shutter time of the camera's flash synchronization or longer, without high-speed synchronization"
-        )
+        remedy = "Use the camera's flash synchronization time or a longer one, without high-speed synchronization"
     cost = _DEGREES_PER_FLICKER * rms
     return at_most("flicker", rms, limit, message, remedy, cost_deg=cost, beyond=grade(cost))
 

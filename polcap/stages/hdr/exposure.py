@@ -9,7 +9,7 @@ from polcap.capture_values import Frame
 from polcap.errors import CaptureError
 from polcap.images import Bools, Floats
 from polcap.optics.resize import block_means
-from polcap.optics.robust import MAD_TO_SIGMA, biweight, spread
+from polcap.optics.robust import MAD_TO_SIGMA, MEDIAN_SE, biweight, spread
 from polcap.stages.hdr.planes import Signals, tile_means
 
 # For the tone curve: brightness in the sensor's range, bins of brightness, and their least span in ln (one stop).
@@ -239,7 +239,7 @@ def _stripe_power(change: Floats) -> float:
         return float("nan")
     median = np.nanmedian(change, axis=1)
     sigma = MAD_TO_SIGMA * np.nanmedian(np.abs(change - median[:, None]), axis=1)
-    variance = np.pi / 2 * sigma**2 / np.isfinite(change).sum(axis=1)  # of a median
+    variance = (MEDIAN_SE * sigma) ** 2 / np.isfinite(change).sum(axis=1)  # of a median
     row = np.arange(len(median))
     rest = median - np.polyval(np.polyfit(row, median, 2), row)  # apertures differ in vignetting
     return float(np.mean(rest**2) - np.mean(variance))
