@@ -47,6 +47,7 @@ def batch(
     from polcap.batch import shards, unit
     from polcap.pipeline import models
 
+    options.check_out(out)
     resource_limits.check_memory(memory)
     if model is not None or estimator == "network":  # refuse an unusable model before any capture is processed
         models.load_network(estimator, model, "cpu", 1)  # the GPU may be in other machines

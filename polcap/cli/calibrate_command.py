@@ -36,6 +36,7 @@ def calibrate(
     from polcap import calibrate as calibration
     from polcap.formats import calibrations, own_folders
 
+    options.check_out(out)
     made = datetime.now(UTC).isoformat(timespec="seconds")
     found = calibration.measure(folder, made, options.utf8("--filter", lens_filter), axis, parse_board(board))
     path = calibrations.write(out or own_folders.calibrations(), found)

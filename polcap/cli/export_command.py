@@ -68,7 +68,7 @@ def export(
 ) -> None:
     """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
     from polcap import api
-    from polcap.pipeline import export_request, result_folder
+    from polcap.pipeline import asset_export, export_request
     from polcap.pipeline.export_request import ExportRequest
 
     formats = tuple(name for name in FORMATS if context.params[name] not in (None, False))
@@ -92,7 +92,7 @@ def export(
     if out is not None:
         for one in wanted:
             export_request.check(one)
-        result_folder.copy(result, out)
+        asset_export.copy(result, out)
         result = out
     files = api.write_exports(result, *wanted)
     options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])

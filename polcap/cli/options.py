@@ -32,6 +32,14 @@ def result_folder(named: Path | None) -> Path | None:
     return None if named is None else own_folders.find_result(named)
 
 
+def check_out(named: Path | None) -> None:
+    """Raise a SettingError for a folder --out that holds photographs or lies among those of a capture."""
+    from polcap.pipeline import result_place
+
+    if named is not None:
+        result_place.check_free(named)
+
+
 def utf8(option: str, text: str) -> str:
     """The text of an option that is written into files. Raises SettingError: it is not UTF-8."""
     try:

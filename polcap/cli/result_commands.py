@@ -77,6 +77,7 @@ def report(
 ) -> None:
     """Judge a result again from its stage cache, or compare it with another."""
     if compare is not None:
+        options.check_out(out)
         _compare((result, compare), out or result, json, open_)
         return
     if out is not None:

@@ -45,6 +45,7 @@ def train(
     ] = "NOASSERTION",
 ) -> None:
     """Train the main network (extra [train])."""
+    options.check_out(out)
     terminal.print_progress("loading PyTorch, meshes and materials")
     trainer = options.training("train")
     run = options.training("ablation_study").main if ablation else trainer.main
@@ -76,6 +77,7 @@ def evaluate(
     ] = None,
 ) -> None:
     """Score a model on test meshes and materials (extra [train]), or on photographs with --real (without the extra)."""
+    options.check_out(out)
     if (data is None) == (real is None):
         raise SettingError("evaluate takes DATA, a folder with meshes/ and materials/, or --real DIR; give one of them")
     if real is not None:

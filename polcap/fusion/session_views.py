@@ -25,7 +25,7 @@ from polcap.formats import own_folders
 from polcap.formats.capture import folder_names
 from polcap.fusion.poses import LEAST_VIEWS
 from polcap.fusion.view_path import SessionView
-from polcap.pipeline import result_folder
+from polcap.pipeline import result_folder, result_place
 from polcap.pipeline.cache import LazyCache, Progress
 from polcap.pipeline.request import Request
 
@@ -93,7 +93,7 @@ def opened(session_input: SessionInput[Any], out: Path, progress: Progress) -> I
     """
     session = read(session_input)  # first: a folder without views stays as it is
     for view in folder_names.session_views(session_input.folder):
-        result_folder.check(out, session_input.folder / view)
+        result_place.check(out, session_input.folder / view)
     with result_folder.locked(out):
         yield session, LazyCache(out, progress)
 

@@ -4,6 +4,7 @@
 same bytes, with any number of threads.
 """
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,6 +16,7 @@ import msgspec
 from polcap import parallel, report
 from polcap.capture_values import CatalogEntry
 from polcap.config import Config, restore
+from polcap.errors import SettingError
 from polcap.formats import atomic
 from polcap.formats.export import (
     archive,
@@ -37,7 +39,7 @@ from polcap.formats.export.presets import ExportPreset, Format
 from polcap.formats.export.texture_set import Extra, Key, Texture
 from polcap.formats.maps import maps_folder, png
 from polcap.mesh_values import Asset
-from polcap.pipeline import result_folder
+from polcap.pipeline import result_folder, result_place
 from polcap.pipeline.detail_levels import DetailLevel, ExportSource, levels
 from polcap.pipeline.export_request import ExportRequest, effective
 from polcap.pipeline.manifest import digest
@@ -164,6 +166,24 @@ def again(
     with result_folder.locked(out):
         source = read_maps(out / "maps", restore(kind, about, out / "report.json"))
         return [file for request in requests for file in write(out, about, request, source)]
+
+
+def copy(result: Path, out: Path) -> None:
+    """Make a result folder with the maps and the report of another one, such as an archive, which stays as it is.
+
+    Raises SettingError: `out` holds something already, lies in `result`, or as `result_place.check_free`.
+    StorageError: `result` is no result, or `out` is not writable.
+    """
+    if Path(os.path.realpath(out)).is_relative_to(os.path.realpath(result)):
+        raise SettingError(f"--out {out} lies in {result}, which is to stay as it is; choose a folder outside")
+    result_place.check_free(out)
+    if os.path.lexists(out) and (not out.is_dir() or any(out.iterdir())):
+        raise SettingError(f"--out {out} is not an empty folder; choose another folder")
+    report.read(result)
+    with result_folder.opened(out):
+        for file in (result / "report.json", *sorted((result / "maps").iterdir())):
+            if file.is_file():
+                atomic.copy(file, out / file.relative_to(result))
 
 
 def _loose_textures(

@@ -23,7 +23,16 @@ from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
 from polcap.images import SensorImage
 from polcap.mesh_values import ReliefMesh
-from polcap.pipeline import asset_export, detail_levels, early_end, export_request, result_folder, unchanged
+from polcap.pipeline import (
+    asset_export,
+    detail_levels,
+    early_end,
+    export_request,
+    result_folder,
+    result_place,
+    run_facts,
+    unchanged,
+)
 from polcap.pipeline.cache import ArchiveCache, DryRunCache, Progress, StageCache, silent
 from polcap.pipeline.export_request import ExportRequest
 from polcap.pipeline.manifest import contents
@@ -88,10 +97,10 @@ def opened(capture: Capture, supplied: UserInput, config: Config, cache: StageCa
 
     Raises SettingError: the folder is not allowed, or memory is too small. StorageError: it is locked.
     """
-    result_folder.check(cache.folder, Path(capture.folder))
+    result_place.check(cache.folder, Path(capture.folder))
     with cache.memory_explained(capture.size_px[0] * capture.size_px[1]), result_folder.locked(cache.folder):
         facts = _facts(capture, supplied, config)
-        result_folder.write_run(cache.folder, facts)
+        run_facts.write(cache.folder, facts)
         yield facts
 
 
@@ -170,7 +179,7 @@ def reopen(out: str | Path, wanted: type[R]) -> tuple[R, dict[str, Any]]:
     Raises StorageError: `out` has no stage cache, or the result of a stage is missing.
     """
     out = own_folders.find_result(Path(out))
-    about = result_folder.read_run(out)
+    about = run_facts.read(out)
     config = restore(Config, about, out / "work" / "run.json")
     return path(None, UserInput(), config, ArchiveCache(out), wanted), about
 

@@ -19,7 +19,7 @@ from polcap.formats.export import web_page
 from polcap.formats.maps import maps_folder
 from polcap.formats.text_file import fault
 from polcap.fusion import fused_maps
-from polcap.pipeline import manifest, result_folder, unchanged
+from polcap.pipeline import manifest, result_folder, result_place, run_facts, unchanged
 from polcap.rig import capture_record
 from polcap.rig.device_log import Log
 from polcap.synth.shooting import Shoot
@@ -77,7 +77,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {  # place of the fil
     "rig.log": ("rig.log", lambda folder: Log(folder / "rig.log").write("rotator", ">", "go")),
     "report.json": ("report.json", report.read),
     "maps.json": ("maps.json", maps_folder.read),
-    "run.json": ("work/run.json", result_folder.read_run),
+    "run.json": ("work/run.json", run_facts.read),
     "unchanged.json": ("work/unchanged.json", lambda folder: unchanged.find(folder, "digest")),
     "owner": ("work/owner", lambda folder: result_folder._owner(folder / "work" / "owner")),
     "manifest": ("manifest.json", manifest.read_manifest),
@@ -121,7 +121,7 @@ def test_a_nul_character_in_the_name_of_a_file_is_an_error_of_the_file(tmp_path:
     with pytest.raises(OSError, match="its name holds a NUL character"):
         text_file.read_bytes(tmp_path / "a\0b", 10)
     with pytest.raises(SettingError, match="holds a NUL character"):
-        result_folder.check(tmp_path / "a\0b", tmp_path)
+        result_place.check(tmp_path / "a\0b", tmp_path)
 
 
 @pytest.mark.parametrize("text", ["NaN", "[1e999]", '{"a": -Infinity}'])

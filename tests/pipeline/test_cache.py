@@ -20,7 +20,7 @@ from polcap import capture_values, images
 from polcap.errors import SettingError, StorageError
 from polcap.formats import npy_folder, own_files
 from polcap.formats.npy_folder import checksum, decode, encode, save
-from polcap.pipeline import result_folder
+from polcap.pipeline import result_folder, result_place
 from polcap.pipeline.cache import (
     ArchiveCache,
     DryRunCache,
@@ -435,11 +435,9 @@ def test_a_result_folder_is_refused_inside_every_kind_of_angle_folder(tmp_path: 
     for name in listed:
         (tmp_path / name).mkdir()
     with pytest.raises(SettingError, match="lies among the capture's shots"):
-        result_folder.check(tmp_path / listed[1] / "out", tmp_path)
-    result_folder.check(tmp_path / "out", tmp_path)
-    result_folder.check(
-        tmp_path / "new" / "out", tmp_path / "new"
-    )  # a capture that does not exist is refused elsewhere
+        result_place.check(tmp_path / listed[1] / "out", tmp_path)
+    result_place.check(tmp_path / "out", tmp_path)
+    result_place.check(tmp_path / "new" / "out", tmp_path / "new")  # a capture that does not exist is refused elsewhere
 
 
 def test_a_digest_is_compared_once_per_process_until_its_file_changes(

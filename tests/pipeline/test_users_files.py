@@ -59,6 +59,22 @@ def test_no_result_is_written_between_the_photographs_of_another_capture(
     assert f"--out {other} holds photographs (" in done.stderr and sorted(other.rglob("*")) == before
 
 
+@pytest.mark.parametrize(
+    "command",
+    ["batch CAPTURE", "report RESULT --compare RESULT", "export RESULT", "calibrate CAPTURE", "evaluate x.onnx y"],
+)
+def test_no_command_writes_between_photographs(
+    result: Path, capture: Path, polcap: Command, tmp_path: Path, command: str
+) -> None:
+    other = tmp_path / "flat"
+    shutil.copytree(capture / "pol045", other)
+    before = sorted(other.rglob("*"))
+    words = command.replace("RESULT", str(result)).replace("CAPTURE", str(capture)).split()
+    done = polcap(*words, "--out", other)
+    assert done.returncode == 2 and f"--out {other} holds photographs (" in done.stderr
+    assert sorted(other.rglob("*")) == before
+
+
 @pytest.mark.parametrize("name", ["maps", "work", "asset", "report.json", "color.toml"])
 def test_a_folder_that_holds_parts_of_a_result_without_record_is_refused(
     capture: Path, polcap: Command, tmp_path: Path, name: str

@@ -1,0 +1,39 @@
+"""work/run.json of a result: facts of a run that `show` and `report` need when the photographs are missing."""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from polcap import report
+from polcap.errors import StorageError
+from polcap.formats import atomic, text_file
+from polcap.pipeline.manifest import seal
+
+
+def write(out: Path, about: Mapping[str, Any]) -> None:
+    """Write work/run.json; a file of the same facts stays as it is, so that a finished result is recognized."""
+    with suppress(StorageError):
+        if read(out)["digest"] == seal(about):
+            return
+    atomic.write_json(out / "work" / "run.json", {**about, "digest": seal(about)}, synced=False)
+
+
+def read(out: Path) -> dict[str, Any]:
+    """Read work/run.json of a result folder.
+
+    Raises StorageError: there is none, or it is damaged.
+    """
+    file = out / "work" / "run.json"
+    try:
+        about: dict[str, Any] = text_file.read_json(file)
+        msgspec.convert(about, report.RunFacts)
+    except OSError as error:
+        raise StorageError(f"{out} holds no stage cache of this polcap; run `polcap process` again") from error
+    except ValueError as error:
+        raise StorageError(f"{file} is no run of this polcap ({error}); run `polcap process` again") from error
+    if about.get("digest") != seal(about):
+        raise StorageError(f"{file} is damaged, or of another polcap; run `polcap process` again")
+    return about
