@@ -12,13 +12,8 @@ sin θ, the energy is the sum of
     network      −0.16 L for turning, L the log odds that the network erred in this cell: where its positions disagree,
                  where it says the opposite of smaller pictures, in which it sees more of the object at once, and
                  where it expects a large error
-    planes      part of L: the light of the flash decreases across a plane towards t
+    planes      part of L: the light of the flash decreases across a plane towards t (`planar_faces`)
     neighbors   ∓2 min(sin θ, sin θ′)² cos Δ |cos Δ| for equal and unequal choices, Δ the angle between t and t′
-
-A plane recedes towards t. At the distance ρ from the flash, its irradiance is proportional to ρ⁻³: one factor 1/ρ is
-the cosine of incidence. So its log light decreases towards t by 3 tan θ per radian of the picture, if the albedo is
-constant. Parts of the grid with nearly one normal, up to half-turns, count as planes. There, a robust fit separates the
-gradient from changes of the albedo, which mostly change the color, too.
 
 Half of the neighbor terms favor unequal choices, so the minimum is found by quadratic pseudo-Boolean optimization:
 one minimum cut with two nodes for each cell. The cells that it leaves open keep their normals.
@@ -29,11 +24,9 @@ by its mean L. All laws of odds were fitted to path-traced captures with known n
 
 References
 ----------
-Page, Approximations to the cumulative normal function and its inverse, Applied Statistics 1977.
 Kolmogorov, Rother, Minimizing nonsubmodular functions with graph cuts, IEEE TPAMI 2007.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -41,9 +34,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.images import Bools, Floats
-from polcap.optics import clusters, frames, outline, robust
-from polcap.optics.morphology import erode
+from polcap.optics import outline
 from polcap.optics.resize import area_mean, weighted_area_mean
+from polcap.stages.infer import planar_faces
 
 _LONGEST = 128  # cells of the grid's longer side
 _OUTLINE, _INVERSION_OUTLINE, _INSIDE, _NETWORK = 1.0, 3.0, 0.015, 0.16  # weights of the terms; the neighbors' is 1
@@ -59,18 +52,6 @@ _REGION = (0.46, 0.68)  # ln odds that a region is turned: constant, mean ln odd
 # links around it that contradict each other, mean lean away from the inside around it; same benchmark
 _CELL = (2.94, -0.176, 1.04, -2.31)
 _AROUND = 8.0  # cells, 1σ
-# planes; docs/benchmarks/half-turns.md
-_PLANE_DEG, _PLANE_SPREAD_DEG = 20.0, 9.0  # from one normal, up to a half-turn: every cell, and their RMS
-_PLANE_SHARE, _PLANE_CELLS = 0.08, 50  # of the grid, and number of cells: least size
-_CANDIDATES = 300  # normals of planes
-_COLORS = 6
-_ALBEDO_SIGMAS = 2.0  # factor on the fit's 1σ: albedo that changes without a change of color
-_FLASH_GRADIENT = 0.5  # per rad, 1σ: place of the flash, its beam, vignetting; 7 cm at 0.7 m are 0.3
-_STEEPEST = 11.0  # per rad: a plane tilted by 75°
-_ALONG = 0.7  # least cosine between gradient and axis of the plane
-_MOST_ODDS = 6.0  # ln odds
-_STEPS, _LEAST_RESIDUAL = 8, 0.003  # of the robust fit; ln light
-_TILE = 8  # cells, side of a tile in which residuals of the fit may be correlated
 
 
 @dataclass(frozen=True)
@@ -80,14 +61,6 @@ class NetworkDoubt:
     sigma: Floats  # (H, W) expected error, degrees
     opposed: Floats  # (H, W) share of its positions in which the normal leans to the other side
     overview: Floats  # (2, H, W) lean of the normals that it predicts from smaller pictures, see `Grid`
-
-
-@dataclass(frozen=True)
-class FlashPicture:
-    """Picture of an object under a flash near the lens, with its view rays."""
-
-    radiance: Floats  # (H, W, 3)
-    rays: Floats  # (H, W, 3) unit vectors to the camera
 
 
 @dataclass(frozen=True)
@@ -107,7 +80,7 @@ class Grid:
 
 
 def resolve(
-    normal: Floats, mask: Bools, network: NetworkDoubt | None = None, flash: FlashPicture | None = None
+    normal: Floats, mask: Bools, network: NetworkDoubt | None = None, flash: planar_faces.FlashPicture | None = None
 ) -> HalfTurns:
     """Decide for each normal (H, W, 3), ray frames, in a mask (H, W) whether to turn its azimuth by 180°.
 
@@ -123,7 +96,9 @@ def resolve(
         doubt = _chance(terms @ np.array(_CELL))
         return HalfTurns(x * normal[..., 0] + y * normal[..., 1] < 0, _enlarged(doubt, mask.shape))
     wrong = wrong_terms(grid, network, mask) @ np.array(_WRONG)
-    region, odds = proposals(grid, wrong if flash is None else wrong + plane_odds(grid, flash, mask))
+    region, odds = proposals(
+        grid, wrong if flash is None else wrong + planar_faces.light_odds(grid.lean, grid.mask, flash, mask)
+    )
     chance = _chance(_REGION[0] + _REGION[1] * odds)
     chance[0] = 0  # cells that the cut does not turn: the network's error covers them
     doubt = np.minimum(chance, 1 - chance)[region]
@@ -204,91 +179,6 @@ def proposals(grid: Grid, odds: Floats) -> tuple[NDArray[np.int32], Floats]:
     count, region = cv2.connectedComponents(turned.astype(np.uint8), connectivity=4)
     cells = np.maximum(np.bincount(region.ravel(), minlength=count), 1)
     return region.astype(np.int32), np.bincount(region.ravel(), odds.ravel(), count) / cells
-
-
-def plane_odds(grid: Grid, flash: FlashPicture, mask: Bools) -> Floats:
-    """Log odds (h, w) that normals of planes lean to the wrong side, by the light of the flash; 0 where no plane is.
-
-    `flash` and `mask` have the size of the picture.
-    """
-    shape = grid.mask.shape
-    light = np.log(np.maximum([weighted_area_mean(c, mask, shape) for c in np.moveaxis(flash.radiance, -1, 0)], 1e-3))
-    rays = [area_mean(c.astype(np.float32), shape) for c in np.moveaxis(flash.rays, -1, 0)]
-    place = -np.stack(rays[:2]) / rays[2]  # (2, h, w) tangents of the picture angles, x right, y up
-    sine = np.hypot(*grid.lean)
-    axis = grid.lean / np.maximum(sine, 1e-6)
-    odds = np.zeros(shape)
-    for plane in _planes(grid):
-        inside = erode(plane, 1)  # without the mixed light of edges
-        if inside.sum() < _PLANE_CELLS:
-            continue
-        double = ((axis[0] + 1j * axis[1]) ** 2 * sine)[inside].sum()
-        common = np.array([np.sqrt(double).real, np.sqrt(double).imag]) / max(np.sqrt(abs(double)), 1e-9)
-        gradient, covariance = _light_gradient(light[:, inside].T, place[:, inside].T, _tiles(inside))
-        along = abs(gradient @ common) > _ALONG * np.hypot(*gradient)
-        if along and np.hypot(*gradient) < _STEEPEST and _spread_deg(grid.lean[:, inside], common) < _PLANE_SPREAD_DEG:
-            across = axis[:, plane]
-            variance = np.einsum("in,ij,jn->n", across, covariance, across) + _FLASH_GRADIENT**2
-            sure = gradient @ across / np.sqrt(variance)
-            odds[plane] = 1.6 * sure + 0.07 * sure**3  # ln Φ / (1 − Φ), Page 1977
-    return np.clip(odds, -_MOST_ODDS, _MOST_ODDS)
-
-
-def _planes(grid: Grid) -> Iterator[Bools]:
-    """Connected parts (h, w) of the grid with nearly one normal, up to half-turns, the largest first."""
-    lean = grid.lean.reshape(2, -1).T
-    normal = np.concatenate([lean, np.sqrt(np.maximum(1 - (lean**2).sum(axis=1, keepdims=True), 0))], axis=1)
-    least = max(_PLANE_CELLS, _PLANE_SHARE * grid.mask.sum())
-    left = grid.mask.copy()
-    while left.sum() >= least:
-        cells = np.flatnonzero(left)
-        candidates = normal[cells[:: max(1, len(cells) // _CANDIDATES)]].T
-        cosine = np.maximum(normal[cells] @ candidates, (normal[cells] * [-1, -1, 1]) @ candidates)
-        alike = cosine > np.cos(np.radians(_PLANE_DEG))
-        part = np.zeros(left.shape, np.uint8)
-        part.flat[cells] = alike[:, alike.sum(axis=0).argmax()]
-        _, label, statistics, _ = cv2.connectedComponentsWithStats(part, connectivity=4)
-        largest = 1 + int(statistics[1:, cv2.CC_STAT_AREA].argmax())
-        if statistics[largest, cv2.CC_STAT_AREA] < least:
-            return
-        left &= label != largest
-        yield label == largest
-
-
-def _light_gradient(light: Floats, place: Floats, tile: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Gradient (2,) of the log light (N, 3) of a plane over its places (N, 2), beyond that of its colors.
-
-    Also returns its covariance (2, 2). Residuals in the same `tile` (N,) may be correlated.
-    """
-    color = light[:, [0, 2]] - light[:, [1]]
-    share = clusters.soft_share(color, *clusters.color_clusters(color, _COLORS))
-    design = np.concatenate([share, place - place.mean(axis=0)], axis=1)
-    gray = light.mean(axis=1)
-    weight: Floats = np.ones(len(light))
-    ridge = np.diag([1e-6] * share.shape[1] + [1e-9] * 2) * len(light)  # for colors with few cells, and thin planes
-    for _ in range(_STEPS):
-        inverse = np.linalg.inv(design.T @ (weight[:, None] * design) + ridge)
-        fitted = inverse @ design.T @ (weight * gray)
-        residual = gray - design @ fitted
-        weight = robust.biweight(residual, robust.spread(residual) + _LEAST_RESIDUAL)
-    score = np.zeros((tile.max() + 1, design.shape[1]))
-    np.add.at(score, tile, (weight * residual)[:, None] * design)
-    covariance = inverse @ score.T @ score @ inverse
-    return fitted[-2:], _ALBEDO_SIGMAS**2 * covariance[-2:, -2:]
-
-
-def _tiles(inside: Bools) -> NDArray[np.intp]:
-    """Number of the tile of each cell in a mask (h, w), (N,)."""
-    row, column = np.nonzero(inside)
-    return np.unique(row // _TILE * inside.shape[1] + column // _TILE, return_inverse=True)[1]
-
-
-def _spread_deg(lean: Floats, axis: Floats) -> float:
-    """RMS angle of normals with these leans (2, N) to their mean, each turned to the side of the axis (2,), degrees."""
-    lean = lean * np.where(axis @ lean < 0, -1, 1)
-    normal = np.stack([*lean, np.sqrt(np.maximum(1 - (lean**2).sum(axis=0), 0))], axis=1)
-    angle = frames.angle_deg(normal, frames.unit(normal.mean(axis=0)))
-    return float(np.sqrt(np.mean(angle**2)))
 
 
 def _chance(odds: Floats) -> Floats:

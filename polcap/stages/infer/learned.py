@@ -4,8 +4,9 @@
 2. The network predicts normals, material, depth and error; half-turns of whole regions are corrected.
 3. The analytic inversion gives normals of each pixel. Their detail replaces that of the network where noise is low.
 4. The refinement network adds relief.
-5. The picture over the shading of the normals, times a smooth factor of the network, is the albedo.
-6. Pixels of one material get one roughness, with one expected error, and one F0.
+5. Planar faces lose the variation that the expected error explains.
+6. The picture over the shading of the normals, times a smooth factor of the network, is the albedo.
+7. Pixels of one material get one roughness, with one expected error, and one F0.
 """
 
 from dataclasses import replace
@@ -18,7 +19,7 @@ from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stage_values import Cues, Network, OrderTest, RunNetwork, SurfaceMaps
 from polcap.stages.cues import FLOOR
-from polcap.stages.infer import analytic, fine, half_turns, highlights, sizes_and_positions
+from polcap.stages.infer import analytic, fine, half_turns, highlights, planar_faces, sizes_and_positions
 from polcap.stages.infer.highlights import REACHED
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join, for the network's input holds the inversion
@@ -43,11 +44,12 @@ def estimate(
     """
     maps, coarse, stated = estimate_coarse(cues, network, run, ior, symmetries)
     normal = fine.refine(cues, coarse, network.fine, run) if fine_pass and network.fine else coarse.normal
-    light = (np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"])
-    diffuse = highlights.fill(light / _shading(normal, cues.rays) - FLOOR, _limit_radiance(cues))
     scale, power, most = _CALIBRATION
     error = np.minimum(scale * stated**power, most)
     error = half_turns.error_with_doubt(error, maps["doubt"], frames.dot(normal, cues.rays))
+    normal = planar_faces.flatten(normal, error, cues.mask)
+    light = (np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"])
+    diffuse = highlights.fill(light / _shading(normal, cues.rays) - FLOOR, _limit_radiance(cues))
     inside = cues.mask[..., None]
     maps_by_pixel = SurfaceMaps(
         normal=(normal * inside).astype(np.float32),
@@ -191,7 +193,7 @@ def _correct_half_turns(normal: Floats, seen: Cues, doubt: half_turns.NetworkDou
 
     Also returns the probability (H, W) that the chosen side is wrong.
     """
-    flash = half_turns.FlashPicture(seen.radiance, seen.rays)
+    flash = planar_faces.FlashPicture(seen.radiance, seen.rays)
     found = half_turns.resolve(frames.to_ray_frame(frames.unit(normal), seen.rays), seen.mask, doubt, flash)
     opposite = 2 * frames.dot(normal, seen.rays)[..., None] * seen.rays - normal
     return np.where(found.turned[..., None], opposite, normal).astype(np.float32), found.doubt

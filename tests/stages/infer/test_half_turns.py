@@ -5,7 +5,7 @@ import pytest
 
 from polcap.optics import frames
 from polcap.stages import cues, infer, stokes
-from polcap.stages.infer import half_turns
+from polcap.stages.infer import half_turns, planar_faces
 from tests import scenes
 
 SIZE = 120
@@ -147,13 +147,18 @@ def chequered(light):
     return light[..., None] * np.where(squares, [0.6, 0.3, 0.2], [0.1, 0.2, 0.4]) * noise
 
 
+def plane_odds(normal, mask, flash):
+    grid = half_turns.coarse(normal, mask)
+    return planar_faces.light_odds(grid.lean, grid.mask, flash, mask)
+
+
 @pytest.mark.parametrize("wrong", [X > -1, X > 70], ids=["whole", "part"])
 @pytest.mark.parametrize("tilt", [30.0, 50.0])
 def test_a_plane_leans_to_where_the_light_of_the_flash_decreases(tilt: float, wrong: np.ndarray) -> None:
     """The network is wrong in all positions and sizes, and neither the outline nor the albedo contradicts it."""
     normal, mask, light, rays = tilted_plane(tilt)
     normals = np.where(wrong[..., None], opposite(normal), normal)
-    flash = half_turns.FlashPicture(chequered(light), rays)
+    flash = planar_faces.FlashPicture(chequered(light), rays)
     found = half_turns.resolve(normals, mask, doubt(normals, 12.0), flash)
     inner = mask & (np.abs(X - 70) > 3)
     assert (found.turned == wrong)[inner].mean() > 0.97
@@ -163,8 +168,7 @@ def test_a_plane_leans_to_where_the_light_of_the_flash_decreases(tilt: float, wr
 def test_light_that_no_plane_explains_decides_nothing() -> None:
     """A bump's light, across the lean of the plane; a ball has no planes."""
     normal, mask, _, rays = tilted_plane(35.0)
-    across = half_turns.FlashPicture(chequered(np.exp(2 * rays[..., 1])), rays)
-    assert not half_turns.plane_odds(half_turns.coarse(normal, mask), across, mask).any()
+    across = planar_faces.FlashPicture(chequered(np.exp(2 * rays[..., 1])), rays)
+    assert not plane_odds(normal, mask, across).any()
     round_, disc = ball()
-    odds = half_turns.plane_odds(half_turns.coarse(round_, disc), half_turns.FlashPicture(chequered(X), rays), disc)
-    assert (odds != 0).mean() < 0.02
+    assert (plane_odds(round_, disc, planar_faces.FlashPicture(chequered(X), rays)) != 0).mean() < 0.02
