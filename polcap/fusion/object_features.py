@@ -19,9 +19,8 @@ from polcap.errors import CaptureError
 from polcap.fusion.values import ViewMask
 from polcap.images import Floats
 from polcap.optics import projection
-from polcap.quality import polarization
-from polcap.quality.gate import shot_names
-from polcap.stage_values import AngleStack, ObjectMask, SelfCalibration, SurfaceMaps
+from polcap.quality import flatness, polarization
+from polcap.stage_values import AngleStack, ObjectMask, SelfCalibration, StokesImage, SurfaceMaps
 from polcap.stages import stage
 
 _CONTRAST = 0.004  # least, of a feature; OpenCV's 0.04 is for photographs of high contrast
@@ -40,20 +39,22 @@ class ObjectFeatures:
     mask: ViewMask
 
 
-@stage(version=1)
+@stage(version=2)
 def find(
     radiance: AngleStack,
     color: ColorCalibration,
     object_: ObjectMask,
     calibration: SelfCalibration,
+    stokes: StokesImage,
     maps: SurfaceMaps,
 ) -> ObjectFeatures:
     """Find features of the object in its diffuse map.
 
-    Raises CaptureError: the outline contradicts the order of the polarizer angles, so the normals are wrong everywhere.
+    Raises CaptureError: the outline or the network contradicts the order of the polarizer angles, so the normals are
+    wrong everywhere.
     """
-    outline, names = calibration.outline, shot_names(radiance)
-    order = polarization.order_of_shots(radiance, object_, outline, maps.order, names)
+    seen = flatness.measure(stokes, maps)
+    order = polarization.order_of_shots(radiance, object_, calibration.outline, maps.order, seen)
     if order.state == "fail":
         raise CaptureError(f"{order.message}. {order.remedy}")
     lens = radiance.equipment.distortion

@@ -54,10 +54,10 @@ def path(view: SessionView, cache: LazyCache) -> ViewStages:
     """Lay out the stages in order; none runs before its result is needed."""
     posed, finder, settings = view.board, view.supplied.mask_network, view.config.mask
     single.run_stages(view.capture, view.supplied, view.config, cache)
-    names = ("hdr", "whitebalance", "align", "mask", "selfcal", "infer")
-    radiance, color, alignment, object_, calibration, maps = (cache.results[name] for name in names)
+    names = ("hdr", "whitebalance", "align", "mask", "selfcal", "stokes", "infer")
+    radiance, color, alignment, object_, calibration, stokes, maps = (cache.results[name] for name in names)
     board = cache.run(board_corners.detect, radiance, color)
-    features = cache.run(object_features.find, radiance, color, object_, calibration, maps)
+    features = cache.run(object_features.find, radiance, color, object_, calibration, stokes, maps)
     found = cache.run(mask_without_board.find, radiance, alignment, color, posed, finder, onnx.run, config=settings)
     return ViewStages(color, board, features, found)
 

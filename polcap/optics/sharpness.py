@@ -26,6 +26,7 @@ _LADDER = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # px, 1σ
 _LEAST_TILES = 4
 _LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise would count as detail
 _SURE = 0.999  # quantile of Student's t beyond which a loss of detail is significant
+_PHASES = 4.0  # effective number of rows with edges in a tile; fewer share one place within a pixel
 _DETAIL = -0.5  # largest log of fine over coarse energy of a tile with detail; noise has 0
 
 
@@ -114,7 +115,7 @@ def extra_blur(tiles: Floats, usable: Bools) -> Floats:
 
     tiles (K, T, n, n) are from K photographs of equal exposure, usable (K, T). A blur smaller than the scatter between
     tiles counts as 0. The scatter is taken from the photograph with the least scatter, because blur itself adds some:
-    tiles with much detail lose more.
+    tiles with much detail lose more. So does a loss that a shift explains.
     """
     from scipy.special import stdtrit  # here: the import takes 0.2 s
 
@@ -129,7 +130,8 @@ def extra_blur(tiles: Floats, usable: Bools) -> Floats:
     scatter = np.delete(each, sharpest, axis=0).std(axis=2, ddof=1).min(axis=0, initial=np.inf)  # (4,)
     count = each.shape[2]
     sure = stdtrit(count - 1, _SURE) * MEDIAN_SE * scatter / np.sqrt(count)
-    lost = np.where(lost > sure, lost, 0.0)
+    of_blur = np.median(each - _phase_loss(tiles[sharpest][every]), axis=2)
+    lost = np.where(of_blur > sure, lost, 0.0)
     if not lost.any():
         return np.zeros(len(tiles))
     ladder = np.stack([_fineness(_blurred(tiles[sharpest][every], sigma)) for sigma in _LADDER])  # (L, 4, T)
@@ -140,6 +142,20 @@ def extra_blur(tiles: Floats, usable: Bools) -> Floats:
 def _fineness(tiles: Floats) -> Floats:
     """Logarithm (4, T) of fine over coarse detail of tiles, in four directions; blur lowers it."""
     return np.stack([np.log(_energy(tiles, way, _FINE) / _energy(tiles, way, _COARSE)) for way in _WAYS])
+
+
+def _phase_loss(tiles: Floats) -> Floats:
+    """Fineness (4, T) that sharp tiles lose by a shift of half a pixel; 0 if their edges lie at many places in a pixel.
+
+    An edge along the pixel rows is sharpest between two rows: there a shift of the camera looks like blur.
+    """
+    moved = tiles.copy()
+    for axis in (1, 2):  # rows, columns
+        energy = (np.diff(tiles, axis=axis) ** 2).mean(axis=3 - axis)  # (T, n − 1)
+        few = energy.sum(axis=1) ** 2 < _PHASES * (energy**2).sum(axis=1)
+        lines = np.moveaxis(moved, axis, 1)  # a view
+        lines[few, 1:] = (lines[few, 1:] + lines[few, :-1]) / 2
+    return _fineness(tiles) - _fineness(moved)
 
 
 def _energy(tiles: Floats, way: tuple[int, int], lag: int) -> Floats:

@@ -91,12 +91,6 @@ def judge(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
         yield Gate("contour", "pass", value, _ROUNDED, message)
 
 
-def sharp_edged(results: ResultsUntilInfer) -> bool:
-    """Whether the outline of an object is the edge of flat faces, at least in most parts."""
-    seen = measure(results.stokes, results.maps)
-    return seen is not None and seen.sharp_edged
-
-
 def measure(image: StokesImage, maps: SurfaceMaps) -> Flatness | None:
     """Measure the flatness of an object; None if the object is too small."""
     step = int(np.ceil(np.sqrt(max(image.mask.sum() / _MOST_PIXELS, 1))))

@@ -54,7 +54,7 @@ def _without_limits(judge: Callable[[Evidence[R]], _Judged]) -> Callable[[Eviden
 
 
 _FILES = ("tone curve", "exposures")
-_LIT = ("clipping", "flicker", "noise")  # no shot is measured
+_LIT = ("clipping", "ambient", "flicker", "noise")  # no shot is measured
 _PAIRED = (*_LIT, "sharpness", "alignment")  # the shots cannot be compared
 _EVEN = (*_PAIRED, "stillness", "gains", "energy")  # the light of the shots is not known
 _POLARIZED = (*_EVEN, "angles", "polarized", "order")  # the Stokes parameters are wrong
@@ -68,8 +68,9 @@ _STEPS = (
     Step(("clipping",), shot_exposure.clipping, ResultsUntilHdr),
     Step(("tone curve",), shot_exposure.tone, ResultsUntilSelfcal, ("clipping",)),
     Step(("black level",), shot_exposure.black_level, ResultsUntilHdr, ("clipping",)),
+    Step(("ambient",), light.ambient, ResultsUntilHdr),
     Step(("flicker",), light.flicker, ResultsUntilHdr, ("clipping",)),
-    Step(("noise",), shot_exposure.noise, ResultsUntilStokes, ("clipping", "flicker")),
+    Step(("noise",), shot_exposure.noise, ResultsUntilStokes, ("clipping", "ambient", "flicker")),
     Step(("sharpness",), geometry.sharpness, ResultsUntilHdr, _LIT),
     Step(("alignment",), geometry.alignment, ResultsUntilAlign, (*_LIT, "sharpness")),
     Step(("chart",), light.chart, ResultsUntilWhitebalance, ("clipping",)),
@@ -80,9 +81,8 @@ _STEPS = (
     Step(("angles",), polarization.turned_shot, ResultsUntilSelfcal, _EVEN),
     Step(("flat", "contour"), _without_limits(flatness.judge), ResultsUntilInfer, _EVEN),
     Step(("polarized",), _without_limits(polarization.polarized), ResultsUntilInfer, _EVEN, ("flat",)),
-    Step(("order",), _without_limits(polarization.order), ResultsUntilSelfcal, (*_EVEN, "polarized"), ("flat",)),
+    Step(("order",), _without_limits(polarization.order), ResultsUntilSelfcal, (*_EVEN, "polarized")),
     Step(("angles", "body", "other light"), polarization.of_outline, ResultsUntilInfer, _POLARIZED, **_ROUND),
-    Step(("ambient",), light.ambient, ResultsUntilHdr),
     Step(("room light",), light.room_light, ResultsUntilInfer, _ONE_LIGHT, ("sharpness", "flicker")),
     Step(
         ("lighting",), light.side_light, ResultsUntilInfer, _ONE_LIGHT, ("flat", "sharpness", "flicker"), ("contour",)

@@ -14,7 +14,7 @@ from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
 from polcap.optics.robust import MEDIAN_SE
 from polcap.quality import albedo_slope
-from polcap.quality.gate import Evidence, Gate, at_most, grade, worded
+from polcap.quality.gate import MOST_DEG, Evidence, Gate, at_most, grade, worded
 from polcap.quality.limits import GateLimits
 from polcap.results import (
     ResultsUntilHdr,
@@ -32,6 +32,8 @@ _EDGE_PX = 2.0  # 1σ of the blur before two shots are compared, so that misalig
 _STILL_CLIPPED = 0.5  # share of highlights that a crossed filter should have stopped
 _FEW = 20  # px
 _DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame for all angles: 1 to 2° at 15 %
+# of the room's light between two ambient frames: beyond, more than its polarization (60 %) causes
+_UNLIKE, _LEAST_AMBIENT, _DEGREES_PER_UNLIKE = 4.0, 0.02, 80.0  # ratio; share; 12° at .15
 _DEGREES_PER_FLICKER = 400.0  # of the normals: 4.3 and 7.3° at 1.2 and 3.6 % of the light (docs/benchmarks/gates.md)
 _LEAST_ALBEDO = 0.02  # sum of the channels
 _TOWARDS_CAMERA = float(np.cos(np.radians(30)))  # cosine; lamps 45° to the side are mirrored at 22°
@@ -163,9 +165,12 @@ def ambient(found: Evidence[ResultsUntilHdr], limits: GateLimits) -> Gate:
     The object polarizes the room's light too. Only an ambient frame at the same angle contains the same light.
     """
     bracket, limit = found.results.radiance.bracket, limits.max_ambient
-    if not np.isfinite(bracket.ambient_share).any():
+    share = bracket.ambient_share
+    if not np.isfinite(share).any():
         return Gate("ambient", "not measured", None, limit, "No frame was taken without the flash")
-    worst = float(np.nanmax(bracket.ambient_share))
+    worst = float(np.nanmax(share))
+    if not bracket.ambient_shared and (gate := _unlike_ambient(found)) is not None:
+        return gate
     text = "{:.1f} % of the light does not come from the flash; the ambient frames are subtracted"
     message = worded(100 * worst, text, "All light comes from the flash")
     cost = round(_DEGREES_PER_AMBIENT * worst, 1) if bracket.ambient_shared else 0.0
@@ -174,8 +179,32 @@ def ambient(found: Evidence[ResultsUntilHdr], limits: GateLimits) -> Gate:
         message = f"{100 * worst:.1f} % of the light is the room's, and one ambient frame serves several angles"
         remedy = "Darken the room, or take one ambient frame per angle: subtracting them is exact"
         return Gate("ambient", "warn", round(worst, 5), limit, message, remedy, cost)
-    remedy = "Darken the room: the noise and changes of so much ambient light remain"
+    remedy = (
+        "Take the ambient frames again in a darker room, without the flash and with the settings of the shots: the "
+        "noise and changes of so much light remain"
+    )
     return msgspec.structs.replace(at_most("ambient", worst, limit, message, remedy), cost_deg=cost)
+
+
+def _unlike_ambient(found: Evidence[ResultsUntilHdr]) -> Gate | None:
+    """Gate on an ambient frame with far more or less light than those of the other angles; None if there is none.
+
+    The room's polarization alone changes its light through the polarizer by less.
+    """
+    share = np.maximum(found.results.radiance.bracket.ambient_share, 1e-6)
+    level = np.log(share / np.maximum(1 - share, 1e-6))
+    if not np.nanmax(share) > _LEAST_AMBIENT or not np.ptp(level) > np.log(_UNLIKE):
+        return None
+    off = level - np.median(level)
+    k = int(np.argmax(np.abs(off)))
+    name, gap = found.names[k], float(abs(share[k] - np.median(share)))
+    amount, cause = "less", "the lens was covered, or it was exposed less than stated"
+    if off[k] > 0:
+        amount, cause = "more", "it contains flash light"
+    message = f"The ambient frame of the {name} shot has {amount} light than the others: {cause}"
+    remedy = "Take that ambient frame again, without the flash and with the settings of the others"
+    cost = round(min(_DEGREES_PER_UNLIKE * gap, MOST_DEG), 1)
+    return Gate("ambient", "fail", round(gap, 5), _LEAST_AMBIENT, message, remedy, cost, (name,))
 
 
 def flicker(found: Evidence[ResultsUntilHdr], limits: GateLimits) -> Gate:
@@ -206,6 +235,12 @@ def room_light(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
     if share > limit:
         message += ": polarized light from the room, or glossy surroundings"
     remedy = "Darken the room, or take one ambient frame per angle: subtracting them is exact"
+    bracket = found.results.radiance.bracket
+    if np.isfinite(bracket.ambient_share).all() and not bracket.ambient_shared:
+        remedy = (
+            "Take the ambient frames again, with the settings of the shots and an open lens: they do not hold this "
+            "light; or darken the room"
+        )
     return at_most("room light", share, limit, message, remedy, cost_deg=_DEGREES_PER_ROOM_DOLP * share, beyond="warn")
 
 

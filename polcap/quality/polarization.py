@@ -1,7 +1,7 @@
 """Gates of polarization: order and zero of the polarizer angles, material of the object, stray light."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeGuard
 
 import msgspec
@@ -14,7 +14,7 @@ from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
 from polcap.quality import flatness, rerendering, rim
-from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, at_most, lit, sentence, worded
+from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, at_most, lit, sentence, shot_names, worded
 from polcap.quality.limits import GateLimits
 from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilSelfcal, ResultsUntilStokes
 from polcap.stage_values import AngleStack, ObjectMask, OrderTest, OutlineCheck, StokesImage, SurfaceMaps
@@ -27,6 +27,7 @@ _CERTAIN = 0.8  # of the limit of the misfit: above, also good captures fit a tu
 _CLEAR = 0.8  # least concentration of the AoLP about the outline, to estimate a common turn
 _LIKELIER = 1.1  # factor between expected errors that decides on an order (docs/benchmarks/gates.md)
 _LIKELIER_SMALL, _SMALL_PX = 1.5, 5000  # the same for objects of fewer pixels, of which good ones reach 1.2
+_LIKELIER_FLAT = 1.8  # the same for flat objects: good ones reach 1.5, wrong orders 2.2
 _ALONG = -0.3  # below: the AoLP is along the contour
 _DARK = 0.1  # albedo below which a glossy object shows mostly reflections of itself
 _WEAK_DOLP = 0.05  # of an outline: above, no shape counts as flattened
@@ -45,22 +46,12 @@ _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
 def order(found: Evidence[ResultsUntilSelfcal]) -> Gate:
-    """Gate on the order and sense of the polarizer angles.
-
-    The polarization along the outline decides, or the error that the network expects for this order and for others. An
-    outline that is the edge of flat faces decides nothing.
-    """
-    results, outline, test = found.results, found.results.selfcal.outline, _test(found.results)
-    explained = edges = False
+    """Gate on the order and sense of the polarizer angles."""
+    results, explained, seen = found.results, False, None
     if isinstance(results, ResultsUntilInfer):
         explained = _explained(results) > _ORDER_EXPLAINED
-        edges = flatness.sharp_edged(results)
-    if edges:
-        outline = replace(outline, best=ShotOrder(tuple(range(len(found.names)))), rival=None)
-    gate = order_of_shots(results.radiance, results.object_, outline, test, found.names, explained)
-    if edges and gate.state == "pass" and not _is_confirmed(test):
-        return Gate("order", "not measured", None, "as stated", "Flat faces show no order of the angles", unit="")
-    return gate
+        seen = flatness.measure(results.stokes, results.maps)
+    return order_of_shots(results.radiance, results.object_, results.selfcal.outline, _test(results), seen, explained)
 
 
 def order_of_shots(
@@ -68,17 +59,21 @@ def order_of_shots(
     object_: ObjectMask,
     outline: OutlineCheck,
     test: OrderTest | None,
-    names: list[str],
+    seen: flatness.Flatness | None,
     explained: bool = False,
 ) -> Gate:
     """Gate on the order of shots, by the polarization along the outline and the test of the network.
 
-    Where another order is as good, the stated one counts if its maps explain the photographs.
+    An outline that is the edge of flat faces decides nothing. Where another order is as good, the stated one counts if
+    its maps explain the photographs.
     """
-    statement, better = radiance.equipment.angles, None
-    if not outline.as_stated:
+    statement, names, better = radiance.equipment.angles, shot_names(radiance), None
+    edges = seen is not None and seen.sharp_edged
+    likelier = _LIKELIER if object_.mask.sum() > _SMALL_PX else _LIKELIER_SMALL
+    likelier = _LIKELIER_FLAT if seen is not None and seen.flat else likelier
+    if not outline.as_stated and not edges:
         better, because = outline.best, "The outline fits"
-    elif test is not None and test.ratio < 1 / (_LIKELIER if object_.mask.sum() > _SMALL_PX else _LIKELIER_SMALL):
+    elif test is not None and test.ratio < 1 / likelier:
         better, because = test.rival, f"The network expects {1 / test.ratio:.1f} times smaller errors for"
     if better is not None:
         message = f"{because} the order {_order_text(better, names)} rather than the stated one"
@@ -88,6 +83,8 @@ def order_of_shots(
     message = f"The outline supports the stated order (fit {outline.concentration:.2f} of 1)"
     if _is_confirmed(test):
         message = f"In any other order, the network expects errors that are at least {test.ratio:.1f} times as large"
+    elif edges:
+        return Gate("order", "not measured", None, "as stated", "Flat faces show no order of the angles", unit="")
     elif outline.rival is not None and explained:
         message = "The maps of the stated order, rendered again, show the polarization of the photographs"
     elif outline.rival is not None:

@@ -41,7 +41,12 @@ def maps(name: str, coat: Coat, seed: int = 0) -> Any:
     diffuse += 0.003 * random.normal(size=diffuse.shape)
     normal = seen.normal + np.radians(6.0) / np.sqrt(2) * random.normal(size=diffuse.shape)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    return SimpleNamespace(mask=seen.mask, diffuse=diffuse, normal=normal, view=VIEW, order=None)
+    lean = seen.normal[..., 0] + 1j * seen.normal[..., 1]  # of a rounded object
+    stokes = np.stack([seen.mask + 0.0, 0.3 * (lean**2).real, 0.3 * (lean**2).imag])[..., None] * np.ones(3)
+    confidence = np.full(seen.mask.shape, 6.0)
+    return SimpleNamespace(
+        mask=seen.mask, diffuse=diffuse, normal=normal, view=VIEW, order=None, stokes=stokes, confidence=confidence
+    )
 
 
 def features(one: Any, metres_per_px: float | None = None, as_stated: bool = True) -> ObjectFeatures:
@@ -50,7 +55,7 @@ def features(one: Any, metres_per_px: float | None = None, as_stated: bool = Tru
     color = replace_field(board_views.COLOR, metres_per_px=metres_per_px)
     outline = SimpleNamespace(as_stated=as_stated, best=SWAPPED, rival=None, concentration=0.9)
     calibration: Any = SimpleNamespace(outline=outline)
-    return object_features.find(replace_field(radiance, view=VIEW), color, one, calibration, one)
+    return object_features.find(replace_field(radiance, view=VIEW), color, one, calibration, one, one)
 
 
 def solve(seen: dict[str, Any], metres_per_px: float | None = None) -> SessionPoses:

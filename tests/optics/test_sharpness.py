@@ -57,3 +57,15 @@ def test_motion_along_one_direction_counts_as_its_standard_deviation() -> None:
 def test_pictures_without_detail_tell_nothing() -> None:
     flat = np.full((256, 384), 0.3, np.float32)
     assert np.isnan(measured([flat, flat, flat])).all()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("shift", [0.25, 0.5])
+def test_a_shift_of_edges_along_the_pixel_rows_is_no_blur(shift: float, turned: bool) -> None:
+    """An edge is sharpest between two rows, so a camera that moved by half a pixel shows it blurred."""
+    rows = np.where(np.abs(np.arange(256) - 127.5) < 60, 0.4, 0.03)
+    sharp = np.repeat(rows[:, None], 384, axis=1)
+    moved = (1 - shift) * sharp + shift * np.roll(sharp, 1, axis=0)
+    pictures = [sharp, moved, gaussian_filter(sharp, 2.0)]
+    blur = measured([picture.T if turned else picture for picture in pictures])
+    assert blur[:2].max() < 0.2 and blur[2] > 0.8

@@ -59,6 +59,7 @@ BODY = {
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 ROUNDED = Flatness(contour=0.8, common=0.1, rim_dolp=0.2, rim_light=0.7, aligned=0.7, facing=1.0, expected_deg=15.0)
 EDGES = replace(ROUNDED, common=0.9)  # of flat faces
+PLANE = replace(EDGES, aligned=0.95)
 FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
     "albedo_slope": AlbedoSlope(0.01, 0.1),
@@ -209,6 +210,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
                                "figures": {"flatness": EDGES}}),
     ("order", "fail", {"maps": network_maps(0.1, 0.5), "figures": {"flatness": EDGES}}),
     ("order", "pass", {"maps": network_maps(0.1, 2.0), "figures": {"flatness": EDGES}}),
+    ("order", "not measured", {"maps": network_maps(0.1, 0.8), "figures": {"flatness": PLANE}}),
+    ("order", "fail", {"maps": network_maps(0.1, 0.5), "figures": {"flatness": PLANE}}),
     ("order", "fail", {"maps": network_maps(0.1, 0.5)}),
     ("order", "pass", {"maps": network_maps(0.1, 2.0)}),
     ("order", "fail", {"maps": network_maps(0.1, 0.8)}),
@@ -248,6 +251,10 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("ambient", "pass", {"bracket": {"ambient_share": np.full(3, 0.15)}}),
     ("ambient", "warn", {"bracket": {"ambient_share": np.full(3, 0.15), "ambient_shared": True}}),
     ("ambient", "fail", {"bracket": {"ambient_share": np.full(3, 0.4)}}),
+    ("ambient", "fail", {"bracket": {"ambient_share": np.array([0.15, 1e-9, 0.15])}}),  # a black one
+    ("ambient", "fail", {"bracket": {"ambient_share": np.array([0.01, 0.01, 0.2])}}),  # one with the flash
+    ("ambient", "pass", {"bracket": {"ambient_share": np.array([0.1, 0.2, 0.25])}}),  # polarized
+    ("ambient", "pass", {"bracket": {"ambient_share": np.array([0.01, 1e-9, 0.001])}}),
     ("lighting", "pass", {}),
     ("lighting", "warn", {"figures": {"highlight": 0.05}}),
     ("lighting", "fail", {"figures": {"highlight": 0.3}}),

@@ -412,7 +412,8 @@ def test_a_flat_object_is_one_finding_with_one_remedy(good: Seen) -> None:
     doubtful = replace(maps, confidence=np.full_like(maps.confidence, 15.0))
     found = judged(changed(flat, maps=doubtful))
     assert found["flat"].state == "warn" and "polcap material" in found["flat"].remedy
-    assert {found[name].state for name in ("order", "angles", "body", "other light", "lighting")} == {"not judged"}
+    assert {found[name].state for name in ("angles", "body", "other light", "lighting")} == {"not judged"}
+    assert found["order"].state == "not measured"
 
 
 def test_room_light_costs_what_one_ambient_frame_cannot_remove(good: Seen) -> None:

@@ -218,8 +218,9 @@ def _row(frame: Frame, folder: str) -> list[str]:
 
 
 def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Sequence[Source]) -> Shot:
-    """A shot of the plan, with its bracket and its ambient frames."""
-    ambient = [s for s in plan.others if s.role == "ambient" and s.angle_deg in (None, angle_deg)]
+    """A shot of the plan, with its bracket and its ambient frames; without own ones, with those of all angles."""
+    every = [source for source in plan.others if source.role == "ambient"]
+    ambient = [source for source in every if source.angle_deg in (None, angle_deg)] or every
     cell = _cell(plan, angle_deg)
     return Shot(
         angle=math.radians(angle_deg),
