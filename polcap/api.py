@@ -183,7 +183,7 @@ def export(
     result: str | Path | Result,
     preset: str | None = None,
     *,
-    formats: Format | Sequence[Format] = ("gltf", "obj"),
+    formats: Format | Sequence[Format] = (),
     images: Kind | None = None,
     geometry: Geometry | None = None,
     triangles: int | None = None,
@@ -205,7 +205,7 @@ def export(
     preset
         Program, such as "unreal"; it brings its formats. All are in `docs/how-to/export.md`.
     formats
-        Without a preset: of gltf, obj, ply, stl, usd, usdz, materialx, exr, iiif, sfp.
+        Without a preset: of gltf, obj, ply, stl, usd, usdz, materialx, exr, iiif, sfp; by default gltf and obj.
     images, geometry
         Inside the GLB: "png", "jpeg", "webp" or "ktx2"; "float", "quantized" or "draco".
     triangles, texture_size

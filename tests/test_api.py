@@ -127,6 +127,7 @@ def test_the_python_of_the_reference_pages_runs(
         ({"preset": "maya", "color": "ACEScg"}, "^color ACEScg converts"),
         ({"formats": ("obj",), "geometry": "draco"}, "^images and geometry change the GLB"),
         ({"iiif": "http://museum.example", "texture_size": 64}, "leave out texture_size"),
+        ({"preset": "unreal", "formats": "usd"}, "^preset unreal brings its formats; write usd by a second export"),
         ({"preset": "unrael"}, "^preset unrael: there is no such preset; did you mean unreal"),
         ({"formats": ("usdx",)}, r"^formats usdx: there is no such format; did you mean usd\?"),
         ({"extras": ["curvatur"]}, "^extras curvatur: there is no such texture; did you mean curvature"),

@@ -72,10 +72,8 @@ def export(
     from polcap.pipeline.export_request import ExportRequest
 
     formats = tuple(name for name in FORMATS if context.params[name] not in (None, False))
-    if preset and (others := [name for name in formats if name != "iiif"]):
-        raise SettingError(f"--preset {preset[0]} brings its formats; write --{others[0]} by a second export")
     plain = ExportRequest(
-        formats=formats or ("gltf", "obj"),
+        formats=formats,
         images=images,
         geometry=geometry,
         triangles=triangles,

@@ -108,7 +108,7 @@ def warn_of_outdated_exports(out: Path, records: Sequence[Path]) -> None:
     from polcap.formats import text_file
     from polcap.pipeline import asset_export
 
-    old = asset_export.find_outdated(records, text_file.read_json(out / "report.json").get("keys", {}))
+    old = asset_export.find_outdated(out, records, text_file.read_json(out / "report.json").get("keys", {}))
     if old:
         named = ", ".join([path.relative_to(out).as_posix() for path in old[:_NAMED]] + ["…"] * (len(old) > _NAMED))
         text = f"{named} in {out}: exported earlier, with other maps, settings or facts; export again, or remove"

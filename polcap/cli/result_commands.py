@@ -60,7 +60,9 @@ def status(context: Context, result: Result, json: Json = False) -> None:
         about = batches.status(batches.reopen(result))
         terminal.print_data(about if json else batches.table(about))
     else:
-        raise SettingError(f"{result} holds no stage cache; run `polcap process` or `polcap batch` on it first")
+        from polcap.pipeline import run_facts
+
+        raise run_facts.no_cache(result)
 
 
 def report(

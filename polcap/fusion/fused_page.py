@@ -34,6 +34,7 @@ def write(folder: Path, about: Mapping[str, Any], results: FusionResults) -> Non
         "left_out": list(about["figures"]["left_out"].items()),
         "size": _size(about["figures"]["mesh"]),
         "levels": (levels.HEAD, levels.rows(folder)),
+        "turning": "asset/turntable.webp",
     }
     data = {"view": view, "mesh": {**page.mesh_data(results.atlas.mesh), "closed": True}}
     page.write_report("fused.html", folder, about, content, data)

@@ -4,8 +4,9 @@
 same bytes, with any number of threads.
 """
 
+import glob
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from polcap import parallel, report
 from polcap.capture_values import CatalogEntry
 from polcap.config import Config, restore
 from polcap.errors import SettingError
-from polcap.formats import atomic
+from polcap.formats import atomic, own_files
 from polcap.formats.export import (
     archive,
     exr_layers,
@@ -35,11 +36,11 @@ from polcap.formats.export import (
     web_page,
 )
 from polcap.formats.export.encoders import TextureEncoder
-from polcap.formats.export.presets import ExportPreset, Format
+from polcap.formats.export.presets import PRESETS, ExportPreset, Format
 from polcap.formats.export.texture_set import Extra, Key, Texture
 from polcap.formats.maps import maps_folder, png
 from polcap.mesh_values import Asset
-from polcap.pipeline import result_folder, result_place
+from polcap.pipeline import result_folder, result_place, unchanged
 from polcap.pipeline.detail_levels import DetailLevel, ExportSource, levels
 from polcap.pipeline.export_request import ExportRequest, effective
 from polcap.pipeline.manifest import digest
@@ -81,7 +82,8 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     """Write an object's asset and its levels of detail into a result folder; returns the files, the provenance last.
 
     Without a preset the files go to asset/, with one to asset/PRESET/. `about` is report.json's content. All GLBs have
-    the origin of the first level. The records of an earlier export of the same maps into the same folder are merged.
+    the origin of the first level. The records of an earlier export of the same maps into the same folder are merged;
+    levels of its GLB are replaced or removed.
 
     Raises SettingError: no such preset or color space, or an encoder is missing. ObjectError: as `levels`.
     """
@@ -96,6 +98,9 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     tasks += [partial(_write_glb, files, file, level.asset) for file, level in coarser.items()]
     tasks += [partial(_write_texture, files, files.folder / file, texture) for file, texture in loose.items()]
     written = [file for group in parallel.results(tasks) for file in group]  # pictures are encoded on threads
+    anew = "gltf" in preset.formats or wanted.lod  # the GLB or its levels
+    if anew:
+        _remove_levels(files, coarser)
     if wanted.page is not None:
         written.append(files.path(".html"))
         web_page.write(written[-1], files.path(".glb"), web_page.read_script(wanted.page), files.facts)
@@ -104,7 +109,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
         "unit": files.facts["unit"],
         "glb": {f"{files.stem}_{key}": text for key, text in _embedded(whole, preset).items()},
         "mesh": _size(found[0]),
-        "lods": _level_notes({files.path(".glb"): found[0], **coarser}) if wanted.lod else {},
+        **({"lods": _level_notes({files.path(".glb"): found[0], **coarser}) if wanted.lod else {}} if anew else {}),
         "textures": {file: texture.meaning for file, texture in sorted(loose.items())},
         **({"facts": files.entry} if files.entry else {}),
     }
@@ -163,7 +168,7 @@ def again(
     `kind` is the class of the settings in report.json.
     """
     about = report.read(out)
-    with result_folder.locked(out):
+    with result_folder.locked(out), unchanged.preserved(out):
         source = read_maps(out / "maps", restore(kind, about, out / "report.json"))
         return [file for request in requests for file in write(out, about, request, source)]
 
@@ -209,20 +214,22 @@ def sidecars(out: Path) -> list[Path]:
     return sorted((out / "asset").glob("**/*.provenance.json"))
 
 
-def find_outdated(records: Sequence[Path], keys: Mapping[str, str]) -> list[Path]:
-    """Exports of other maps than those of the result with these cache keys: whole folders, then single files.
+def find_outdated(out: Path, records: Sequence[Path], keys: Mapping[str, str]) -> list[Path]:
+    """Exports of other maps than those of the result `out` with these cache keys: whole folders, then parts of others.
 
-    `records` are sidecars. A folder has one; a file that it does not list was exported with another record.
+    `records` are sidecars. A folder has one; a file of polcap that it does not list was exported with another record.
     """
-    folders, files = [], []
+    folders, parts, own = [], dict[Path, None](), own_files.OwnFiles(out)
     for sidecar in records:
         about, folder = provenance.read(sidecar), sidecar.parent
         if about.get("stages") != keys:
             folders.append(folder)
-        else:
-            known = {folder / name for name in about.get("files", {})} | {sidecar}
-            files += [file for file in sorted(folder.iterdir()) if file.suffix in _SUFFIXES and file not in known]
-    return folders + files
+            continue
+        for file in own.below(folder):
+            name = file.relative_to(os.path.abspath(folder))
+            if file.suffix in _SUFFIXES and name.as_posix() not in about["files"] and name.parts[0] not in PRESETS:
+                parts[folder / name.parts[0]] = None
+    return [*folders, *parts]
 
 
 def _write_one(write_file: Callable[..., None], file: Path, *arguments: Any) -> list[Path]:
@@ -234,6 +241,14 @@ def _write_glb(files: _Files, file: Path, content: Asset) -> list[Path]:
     """Write the GLB of one level of detail; returns the file."""
     atomic.write(file, gltf.encode(content, file.stem, files.glb, files.facts, files.encoder))
     return [file]
+
+
+def _remove_levels(files: _Files, written: Collection[Path]) -> None:
+    """Remove the levels of an earlier GLB that polcap wrote in this place, except those just written."""
+    own = own_files.owner(files.path(".glb"))
+    for old in files.folder.glob(f"{glob.escape(files.stem)}_lod[0-9].glb"):
+        if own is not None and old not in written:
+            own.remove(old)
 
 
 def _write_usdz(files: _Files) -> list[Path]:

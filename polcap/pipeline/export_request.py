@@ -19,9 +19,9 @@ _NEEDED: tuple[Extra, ...] = ("object-normal",)  # by the format `iiif`
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """The user's choice for an export: file formats or a preset, and options; with a preset, `formats` is ignored."""
+    """The user's choice for an export: file formats or a preset, and options."""
 
-    formats: tuple[Format, ...] = ("gltf", "obj")
+    formats: tuple[Format, ...] = ()  # by default the preset's, or gltf and obj
     preset: str | None = None
     images: Kind | None = None  # inside the GLB; by default the preset's, or PNG
     geometry: Geometry | None = None  # inside the GLB; by default the preset's, or floats
@@ -40,6 +40,8 @@ class ExportRequest:
 def check(wanted: ExportRequest) -> None:
     """Raise a SettingError for an unknown name, a missing package or an option without effect, before any work."""
     _check_values(wanted)
+    if wanted.preset and (others := [name for name in wanted.formats if name != "iiif"]):
+        raise SettingError(f"--preset {wanted.preset} brings its formats; write {others[0]} by a second export")
     preset = effective(wanted)
     if wanted.color != exr_layers.LINEAR_REC709 and "exr" not in preset.formats:
         raise SettingError(
@@ -108,7 +110,8 @@ def without(request: ExportRequest, extras: Collection[Extra]) -> ExportRequest:
 
 def effective(wanted: ExportRequest) -> ExportPreset:
     """The preset that an export uses: the requested one, with its values replaced by the request's other options."""
-    preset = ExportPreset(wanted.formats, "normals +Y") if wanted.preset is None else PRESETS[wanted.preset]
+    plain = ExportPreset(wanted.formats or ("gltf", "obj"), "normals +Y")
+    preset = plain if wanted.preset is None else PRESETS[wanted.preset]
     added: tuple[Format, ...] = () if wanted.iiif is None else ("iiif",)
     formats = tuple(one for one in dict.fromkeys((*preset.formats, *added)) if one not in wanted.without)
     return replace(

@@ -229,7 +229,7 @@ def judge_again(out: Path) -> dict[str, Any]:
     Raises StorageError: a stage's result is missing, or work/, maps/ and report.json are not of one run.
     """
     results, facts = reopen(out, Results)
-    with result_folder.locked(out):
+    with result_folder.locked(out), unchanged.preserved(out):
         keys = _report_of(out, results)["keys"]
         config = restore(Config, facts, out / "work" / "run.json")
         judged, results = report.judge(facts, results, config)

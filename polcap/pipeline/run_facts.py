@@ -10,6 +10,7 @@ import msgspec
 from polcap import report
 from polcap.errors import StorageError
 from polcap.formats import atomic, text_file
+from polcap.formats.export import archive
 from polcap.pipeline.manifest import seal
 
 
@@ -19,6 +20,16 @@ def write(out: Path, about: Mapping[str, Any]) -> None:
         if read(out)["digest"] == seal(about):
             return
     atomic.write_json(out / "work" / "run.json", {**about, "digest": seal(about)}, synced=False)
+
+
+def no_cache(out: Path) -> StorageError:
+    """The error for a result folder without a stage cache, with the remedy."""
+    if archive.is_archive(out):
+        return StorageError(
+            f"{out} is an archive, which holds no stage cache: see its report.html; `polcap export {out} --out NEW` "
+            f"writes files from it, `polcap report {out} --compare OTHER --out NEW` compares it"
+        )
+    return StorageError(f"{out} holds no stage cache of this polcap; run `polcap process` on its photographs")
 
 
 def read(out: Path) -> dict[str, Any]:
@@ -31,7 +42,7 @@ def read(out: Path) -> dict[str, Any]:
         about: dict[str, Any] = text_file.read_json(file)
         msgspec.convert(about, report.RunFacts)
     except OSError as error:
-        raise StorageError(f"{out} holds no stage cache of this polcap; run `polcap process` again") from error
+        raise no_cache(out) from error
     except ValueError as error:
         raise StorageError(f"{file} is no run of this polcap ({error}); run `polcap process` again") from error
     if about.get("digest") != seal(about):

@@ -8,7 +8,8 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from hashlib import blake2b
 from pathlib import Path
@@ -18,7 +19,7 @@ from polcap.formats import atomic, own_files, own_folders, text_file
 from polcap.formats.export import provenance
 
 _FILE = "unchanged.json"
-_OF_A_RUN = {own_files.RECORD, *(os.path.join("work", name) for name in ("lock", "owner", _FILE))}  # differ by run
+_PARTS = ("maps", "asset", "report.html", "report.json", "color.toml")  # of a result, besides stages in work/
 _PACKAGE = Path(__file__).parents[1]
 _SETTLED_NS = 3_000_000_000  # some file systems have clocks of 2 s steps; within one a file may change unseen
 Stat = list[int]  # size, time of the content, time of the last change of any kind, inode
@@ -56,7 +57,7 @@ def find(out: Path, asked: str | None) -> Finished | None:
     """The earlier run with this request digest, if nothing in its result folder has changed since; else None."""
     try:
         known = text_file.read_json(out / "work" / _FILE)
-        if asked is None or known["request"] != asked or known["result"] != _result(out):
+        if asked is None or known["request"] != asked or not _holds(known["result"], out):
             return None
         if any(_stat(file) != stat for file, stat in known["files"].items()):
             return None
@@ -77,6 +78,20 @@ def remember(out: Path, asked: str | None, table: str = "", files: Iterable[Path
             atomic.write_json(out / "work" / _FILE, content, synced=False)
 
 
+@contextmanager
+def preserved(out: Path) -> Iterator[None]:
+    """Context manager: what polcap changes in a locked result meanwhile leaves it up to date, if it was before."""
+    known: dict[str, Any] = {}
+    with suppress(OSError, ValueError, TypeError, KeyError):
+        known = text_file.read_json(out / "work" / _FILE)
+        if not _holds(known["result"], out):
+            known = {}
+    yield
+    if known:
+        with own_files.opened(out):
+            atomic.write_json(out / "work" / _FILE, {**known, "result": _result(out)}, synced=False)
+
+
 @cache
 def _program() -> str:
     """Digest of the program: sizes and times of its files, and versions of the packages that affect pixels."""
@@ -89,7 +104,18 @@ def _digest(value: Any) -> str:
 
 
 def _result(out: Path) -> dict[str, Stat]:
-    return {name: stat for name, stat in _stats(out).items() if name not in _OF_A_RUN}
+    """Stats of the files that a run writes; those of `show` and of comparisons are left out."""
+    return {name: stat for name, stat in _stats(out).items() if _is_of_run(Path(name).parts)}
+
+
+def _is_of_run(parts: tuple[str, ...]) -> bool:
+    return parts[0] in _PARTS or (parts[0] == "work" and (len(parts) > 2 or parts[1] == "run.json"))
+
+
+def _holds(known: dict[str, Stat], out: Path) -> bool:
+    """Whether all files of a result are as known; files that others added do not matter."""
+    found = _result(out)
+    return all(found.get(name) == stat for name, stat in known.items())
 
 
 def _stats(folder: Path, except_: str = "", ignored: tuple[str, ...] = (own_folders.BATCH,)) -> dict[str, Stat]:

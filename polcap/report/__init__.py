@@ -4,7 +4,6 @@ A failed gate means that the asset was written but must be checked before use (e
 assumption. A gate that had nothing to measure is marked "not measured".
 """
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -191,18 +190,20 @@ def archive(out: Path, folder: Path, about: Mapping[str, Any], entry: Mapping[st
     `about` is the content of report.json, `entry` has the stated fields of `CatalogEntry`. A copy of an archive has no
     page.
 
-    Raises StorageError: the page cannot be read.
+    Raises StorageError: the page is a link or not that of this polcap, or cannot be read.
     """
     files, source = [folder / "report.json"], out / "report.html"
     stated = {**about, "capture": {**about["capture"], "catalog": dict(entry)}}
     atomic.write_json(files[0], stated)
-    if os.path.lexists(source):
+    if source.is_symlink():
+        raise StorageError(f"{source} is a link; remove it, and write the page again by `polcap process`")
+    if source.exists():
         try:
-            text = text_file.read_text(source, _PAGE_BYTES)
+            text = page.archived(text_file.read_text(source, _PAGE_BYTES), stated)
         except (OSError, ValueError) as error:
             raise StorageError(f"{source} cannot be read ({error}); write it again by `polcap process`") from error
         files.append(folder / source.name)
-        atomic.write(files[1], page.archived(text, stated))
+        atomic.write(files[1], text)
     return files
 
 

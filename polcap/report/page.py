@@ -1,6 +1,5 @@
 """report.html: verdict, interactive pictures, maps, plots and tables of one result, by the template `report.html`."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -35,8 +34,6 @@ _HEADLINE = {
 }
 _SAME_LIGHT = (0.77, 1.3)  # ratio of highlights that agree, set by hand
 _SIMILAR = 0.15  # relative difference of pictures that agree, set by hand
-_CATALOG = re.compile(r'<section id="catalog">.*?</section>', re.DOTALL)
-_ASSET_LINK = re.compile(r'<a href="asset/([^"]*)">asset/')
 _ORDER = ("fail", "warn", "pass", "not measured", "not judged")  # of the gates in their table
 
 
@@ -93,9 +90,18 @@ def render(
 
 
 def archived(text: str, about: Mapping[str, Any]) -> str:
-    """A report's page as it lies in an archive: with the catalog facts of `about`, and with the GLB next to it."""
-    facts = _template("catalog.html").render(catalog=catalog(about))
-    return _ASSET_LINK.sub(r'<a href="\1">', _CATALOG.sub(lambda _: facts, text, count=1), count=1)
+    """A report's page as it lies in an archive: with the catalog facts of `about`, and with the GLB next to it.
+
+    Two templates write these parts between comments with their names. Raises ValueError: the page has no such part.
+    """
+    parts = {"catalog": {"catalog": catalog(about)}, "glb_link": {"asset": f"{about['capture']['name']}.glb"}}
+    for name, content in parts.items():
+        before, _, rest = text.partition(f"<!--{name}-->")
+        _, found, after = rest.partition(f"<!--/{name}-->")
+        if not found:
+            raise ValueError(f"it has no part {name}")
+        text = before + _template(f"{name}.html").render(content) + after
+    return text
 
 
 def _template(name: str) -> "Template":

@@ -199,7 +199,7 @@ def test_a_wrong_name_makes_no_copy(tiny_result: Path, polcap: Command, tmp_path
         (["--preset", "unrael"], "--preset unrael: there is no such preset; did you mean unreal?"),
         (["--extra", "oclusion"], "--extra oclusion: there is no such texture; did you mean occlusion?"),
         (["--about", "titel=Vase"], "--about titel: there is no such fact; did you mean title?"),
-        (["--preset", "web", "--obj"], "write --obj by a second export"),
+        (["--preset", "web", "--obj"], "write obj by a second export"),
         (["--preset", "maya", "--color", "ACEScg"], "converts the colors of the layered EXR only"),
         (["--obj", "--geometry", "draco"], "change the GLB, which is not written"),
         (["--preset", "web", "--bits", "16"], "--bits 16 is for PNG textures, and none is written; add --images png"),
@@ -356,6 +356,26 @@ def test_a_level_off_by_over_one_percent_of_the_size_is_not_written(own: Path, p
         assert np.abs(level.bounds - written[0].bounds).max() <= 0.0101 * size
 
 
+def test_a_later_export_of_the_glb_removes_levels_that_polcap_wrote(own: Path) -> None:
+    asset = own / "asset"
+    pipeline.export(own, ExportRequest(formats=("gltf",), lod=2), ExportRequest(preset="web", lod=1))
+    (asset / "mine_lod2.glb").write_bytes(b"of the user")
+    (asset / "capture_lod9.glb").write_bytes(b"of the user")
+    pipeline.export(own, ExportRequest(formats=("obj",)))
+    assert (asset / "capture_lod2.glb").exists() and len(levels.rows(own)) == 5
+    pipeline.export(own, ExportRequest(formats=("gltf",), lod=1))
+    assert sorted(file.name for file in asset.glob("*_lod*")) == [
+        "capture_lod1.glb",
+        "capture_lod9.glb",
+        "mine_lod2.glb",
+    ]
+    assert (asset / "web" / "capture_lod1.glb").exists() and len(levels.rows(own)) == 4
+    pipeline.export(own, ExportRequest(formats=("gltf",)))
+    assert not (asset / "capture_lod1.glb").exists() and len(levels.rows(own)) == 2
+    listed = json.loads((asset / "capture.provenance.json").read_text())["files"]
+    assert all((asset / name).exists() for name in listed)
+
+
 def test_the_report_lists_the_levels(own: Path) -> None:
     pipeline.export(own, ExportRequest(formats=("gltf",), lod=1))
     rows = levels.rows(own)
@@ -367,15 +387,20 @@ def test_exports_of_earlier_maps_are_named(own: Path, polcap: Command) -> None:
     assert (
         polcap("export", own, "--preset", "unreal", "--triangles", 99999, "--lod", 2, "--texture-size", 64).stderr == ""
     )
+    polcap("export", own, "--sfp")
     asset, about = own / "asset", json.loads((own / "report.json").read_text())
-    assert asset_export.find_outdated(asset_export.sidecars(own), about["keys"]) == []
+    assert asset_export.find_outdated(own, asset_export.sidecars(own), about["keys"]) == []
     about["keys"]["surface"] = "of other maps"
     (own / "report.json").write_text(json.dumps(about))
     maps = json.loads((own / "maps" / "maps.json").read_text())
     (own / "maps" / "maps.json").write_text(json.dumps({**maps, "keys": about["keys"]}))
-    assert asset_export.find_outdated(asset_export.sidecars(own), about["keys"]) == [asset, asset / "unreal"]
-    again = polcap("export", own, "--preset", "unreal", "--lod", 1, "--texture-size", 64)
-    assert again.returncode == 0 and "asset/unreal/SM_capture_lod2.glb in" in again.stderr
+    assert asset_export.find_outdated(own, asset_export.sidecars(own), about["keys"]) == [asset, asset / "unreal"]
+    (asset / "mine.png").write_bytes(b"of the user")
+    again = polcap("export", own, "--gltf", "--texture-size", 64)
+    named = "asset/capture.mtl, asset/capture.obj, asset/capture_basecolor.png, asset/capture_normal.exr, "
+    assert again.returncode == 0 and named in again.stderr and "mine.png" not in again.stderr
+    found = asset_export.find_outdated(own, asset_export.sidecars(own), about["keys"])
+    assert asset / "capture_sfp" in found and asset / "unreal" in found
 
 
 def test_presets_of_one_command_each_get_their_folder(own: Path, polcap: Command) -> None:
@@ -410,9 +435,14 @@ def test_the_report_of_an_archive_states_its_facts_and_links_its_files(
     assert "<b>Vase &amp; &lt;lid&gt;</b>" in page and "Bowl" not in page and '<a href="C.glb">C.glb</a>' in page
     assert json.loads((archive / "report.json").read_text())["capture"]["catalog"] == {"title": "Vase & <lid>"}
     assert "Vase" not in (tiny_result / "report.html").read_text(encoding="utf-8")
-    (tiny_result / "report.html").write_bytes(b"\xff")
-    refused = polcap("export", tiny_result, "--preset", "archive")
-    assert refused.returncode == 2 and "report.html cannot be read" in refused.stderr
+    for content, fault in ((b"\xff", "cannot be read"), (b"notes", "has no part catalog"), (None, "is a link")):
+        if content is None:
+            (tiny_result / "report.html").unlink()
+            (tiny_result / "report.html").symlink_to(tmp_path / "notes")
+        else:
+            (tiny_result / "report.html").write_bytes(content)
+        refused = polcap("export", tiny_result, "--preset", "archive")
+        assert refused.returncode == 2 and "report.html" in refused.stderr and fault in refused.stderr
 
 
 def test_an_archive_checks_itself_after_two_exports_and_a_copy(
@@ -433,6 +463,9 @@ def test_an_archive_checks_itself_after_two_exports_and_a_copy(
     again = polcap("export", tmp_path / "elsewhere", "--out", tmp_path / "new", "--ply")
     assert again.returncode == 0 and (tmp_path / "new/asset/C.ply").exists()
     assert json.loads((tmp_path / "new/asset/C.provenance.json").read_text())["title"] == "Vase"
+    for words in (["status"], ["report"], ["show", "--all"]):
+        done = polcap(*words, tmp_path / "elsewhere")
+        assert done.returncode == 2 and "is an archive, which holds no stage cache" in done.stderr
     assert set(check_sums(tmp_path / "elsewhere")) == {*names, "C_occlusion.png"}
     if program := shutil.which("sha256sum"):
         command = [program, "-c", "--quiet", "manifest-sha256.txt"]

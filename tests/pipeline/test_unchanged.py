@@ -91,6 +91,27 @@ def test_result_that_was_touched_is_no_answer(capture: Path) -> None:
     assert unchanged.find(out, "asked") is None
 
 
+def test_files_that_a_run_does_not_write_do_not_matter(capture: Path) -> None:
+    out = capture / "polcap"
+    (out / "work").mkdir(parents=True)
+    (out / "asset").mkdir()
+    (out / "report.json").write_text("{}")
+    unchanged.remember(out, "asked")
+    for name in ("work/hdr.png", "compare.html", "asset/mine.blend"):
+        (out / name).write_text("of `show`, of `report --compare`, of the user")
+    assert unchanged.find(out, "asked") is not None
+
+
+def test_an_export_and_another_report_leave_a_result_up_to_date(copy: Path, polcap: Command) -> None:
+    unchanged.remember(copy, "asked")
+    for first, *words in (["export", "--gltf", "--lod", "1"], ["report"], ["show", "mask"]):
+        assert polcap(first, copy, *words).returncode == 0
+        assert unchanged.find(copy, "asked") is not None
+    (copy / "report.html").write_text("of the user")
+    assert polcap("export", copy).returncode == 0
+    assert unchanged.find(copy, "asked") is None
+
+
 def test_run_with_nothing_to_do_loads_no_library(copy: Path, example: Path, polcap: Command, tmp_path: Path) -> None:
     capture = tmp_path / "capture"
     shutil.copytree(example, capture)

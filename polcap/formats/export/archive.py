@@ -9,15 +9,26 @@ from polcap.formats.raw import file_bytes
 MANIFEST = "manifest-sha256.txt"
 
 
+def is_archive(folder: Path) -> bool:
+    """Whether a folder is an archive, or a copy of one, with the digests of its files."""
+    return (folder / MANIFEST).is_file() and not (folder / "work").is_dir()
+
+
 def gather(out: Path, folder: Path) -> list[Path]:
-    """Copy maps/ and color profile of the result `out` into the folder of an export; returns the copies."""
+    """Copy maps/ and color profile of the result `out` into the folder of an export; returns the copies.
+
+    Copies of an earlier export that the result no longer has are removed.
+    """
     out = Path(os.path.abspath(out))
     own = own_files.owner(out / "report.json")
     maps = [] if own is None else own.below(out / "maps")
-    found = [*maps, *(file for file in [out / color_profile.NAME] if file.is_file())]
+    found = [*maps, *(file for file in [out / color_profile.NAME] if file.is_file() and not file.is_symlink())]
     copies = [folder / file.relative_to(out) for file in found]
     for file, copy in zip(found, copies):
         atomic.copy(file, copy)
+    for old in (*(folder / "maps").glob("*"), folder / color_profile.NAME):
+        if own is not None and old not in copies:
+            own.remove(old)
     return copies
 
 

@@ -195,10 +195,12 @@ def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
     known = text_file.read_json(file)  # as `read` has checked it
     exports = known.get("exports", {})
     earlier = exports.get(where, {})
+    replaced = ("mesh", "facts", "lods")
     note = {
-        key: {**earlier.get(key, {}), **value} if isinstance(value, dict) and key not in ("mesh", "facts") else value
+        key: {**earlier.get(key, {}), **value} if isinstance(value, dict) and key not in replaced else value
         for key, value in about.items()
     }
+    note.setdefault("lods", earlier.get("lods", {}))  # of a GLB that this export does not write
     known["exports"] = dict(sorted({**exports, where: note}.items()))
     atomic.write_json(file, known)
 
