@@ -20,6 +20,7 @@ from polcap.optics import body, frames, shade
 IOR = 1.5  # of the diffuse law and of Fresnel's terms; F0 is free
 UNKNOWNS = 7  # slopes to the right and up, roughness, F0, albedo of three colors; their places:
 SLOPES, ROUGHNESS, F0, GLOSS, ALBEDO = slice(0, 2), 2, 3, slice(2, 4), slice(4, 7)
+KINDS = slice(0, 3), slice(3, 5)  # places of S0 and of S1 and S2 in a view's data
 LEAST_VIEWS = 3
 _ROUNDS = 9
 _STEP = np.array([2e-3, 2e-3, 4e-3], np.float32)  # of the derivatives: slopes, roughness
@@ -81,6 +82,7 @@ class TexelEstimate(ArrayValue):
 
     value: Floats  # (N, 7)
     information: Floats  # (N, 7, 7) of data and priors
+    by_kind: Floats  # (2, N, 7, 7) information of S0, and of S1 and S2
     cost: Floats  # (N,) of the data, robust
     error: Floats  # (K, N, 5) measured minus modelled, in standard deviations; 0 where not measured
     model: Floats  # (K, N) modelled S0, gray
@@ -151,13 +153,14 @@ def fit(
         better = trial.total < best.total[active]
         damping[active] = np.clip(np.where(better, damping[active] / 4, damping[active] * 8), 1e-6, 1e4)
         best.put(active[better], trial, better)
-    return TexelEstimate(best.value, best.information, best.cost, best.error, best.model)
+    return TexelEstimate(best.value, best.information, best.by_kind, best.cost, best.error, best.model)
 
 
 @dataclass(frozen=True)
 class _Linearized:
     value: Floats  # (N, 7)
     information: Floats  # (N, 7, 7)
+    by_kind: Floats  # (2, N, 7, 7)
     gradient: Floats  # (N, 7) descent
     cost: Floats  # (N,) data
     total: Floats  # (N,) with priors
@@ -167,7 +170,7 @@ class _Linearized:
     def put(self, index: Indices, other: "_Linearized", where: Bools) -> None:
         """Replace the texels at `index` by the chosen ones of another linearization."""
         for name, array in vars(self).items():
-            along = (slice(None),) if name in ("error", "model") else ()
+            along = (slice(None),) if name in ("by_kind", "error", "model") else ()
             array[*along, index] = getattr(other, name)[*along, where]
 
 
@@ -181,6 +184,22 @@ def _sigma(data: Measurements, settings: FitSettings) -> Floats:
     polarized = np.hypot(data.noise[..., 1], settings.polarization_error * level)
     both = np.concatenate([colors, np.repeat(polarized[..., None], 2, axis=-1)], axis=-1)
     return np.where(np.isfinite(both), np.maximum(both, 1e-6), np.inf).astype(np.float32)
+
+
+def misfit(data: Measurements, found: TexelEstimate, settings: FitSettings) -> tuple[Floats, Floats]:
+    """Sums of squared errors (N, 2) of S0 and of S1 and S2, in 1σ as stated, and their degrees of freedom (N, 2).
+
+    S0 is gray: its colors share the errors of light and geometry, and noise of color does not bend a normal.
+    """
+    known = np.isfinite(data.noise[..., 0])
+    level = np.maximum(data.radiance, 0) @ data.gray
+    stated = np.where(known, np.hypot(data.noise[..., 0], settings.radiance_error * level), np.inf)
+    gray = np.where(known, data.radiance @ data.gray - found.model, 0) / np.maximum(stated, 1e-6)
+    squares = np.stack([gray**2, (found.error[..., KINDS[1]] ** 2).sum(axis=-1)], axis=-1)
+    share = np.einsum("nij,knji->nk", np.linalg.inv(found.information.astype(np.float64)), found.by_kind)
+    fitted = np.maximum(share - [2, 0], 0)  # two unknowns of the albedo are of color, not gray
+    freedom = np.maximum(known.sum(axis=0)[:, None] * [1, 2] - fitted, 0)
+    return (_robust_weight(found.error)[..., None] * squares).sum(axis=0), freedom
 
 
 def _linearize(
@@ -214,20 +233,28 @@ def _linearize(
     weight = np.where(known, 1 / sigma, 0).astype(np.float32)
     error = np.where(known, measured - model, 0) * weight
     rms2 = (error**2).sum(axis=-1) / 5
-    robust = 1 / (1 + rms2 / _CAUCHY**2)  # (K, N)
-    root = np.sqrt(robust)[..., None]
+    root = np.sqrt(_robust_weight(error))[..., None]
     jacobian *= (weight * root)[..., None]
-    rows = np.moveaxis(jacobian, 0, 1).reshape(len(value), -1, UNKNOWNS)  # (N, 5K, 7)
-    left = np.moveaxis(error * root, 0, 1).reshape(len(value), -1)
-    transposed = np.swapaxes(rows, 1, 2)
-    information = transposed @ rows
-    gradient = (transposed @ left[..., None])[..., 0]
+    by_kind, gradient = np.empty((len(KINDS), len(value), UNKNOWNS, UNKNOWNS), np.float32), np.zeros_like(value)
+    for part, kind in zip(by_kind, KINDS, strict=True):
+        rows = np.moveaxis(jacobian[:, :, kind], 0, 1).reshape(len(value), -1, UNKNOWNS)  # (N, 3K or 2K, 7)
+        left = np.moveaxis((error * root)[..., kind], 0, 1).reshape(len(value), -1, 1)
+        transposed = np.swapaxes(rows, 1, 2)
+        part[:] = transposed @ rows
+        gradient += (transposed @ left)[..., 0]
+    information = by_kind.sum(axis=0)
     cost = 5 * _CAUCHY**2 * np.log1p(rms2 / _CAUCHY**2).sum(axis=0)
     pull, tie = _priors(prior, value)
     information[:, range(4), range(4)] += tie
     gradient[:, :4] += pull * tie
     total = cost + (pull**2 * tie).sum(axis=-1)
-    return _Linearized(value, information, gradient, cost, total, error, model[..., :3] @ data.gray.astype(np.float32))
+    gray = model[..., :3] @ data.gray.astype(np.float32)
+    return _Linearized(value, information, by_kind, gradient, cost, total, error, gray)
+
+
+def _robust_weight(error: Floats) -> Floats:
+    """Weight (K, N) of each view, from its errors (K, N, 5) in standard deviations (Cauchy)."""
+    return np.asarray(1 / (1 + (error**2).mean(axis=-1) / _CAUCHY**2))
 
 
 def _priors(prior: TexelPrior, value: Floats) -> tuple[Floats, Floats]:

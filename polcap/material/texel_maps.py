@@ -13,6 +13,7 @@ from polcap.material.stokes_view import PosedStokes
 from polcap.material.texel_fit import (
     ALBEDO,
     GLOSS,
+    KINDS,
     LEAST_VIEWS,
     UNKNOWNS,
     Measurements,
@@ -25,6 +26,7 @@ from polcap.stages import stage
 
 _TILE = 16_000  # texels
 _AROUND = 3  # texels, 1σ, over which the misfit is averaged
+_STATED = 0.1  # degrees of freedom that stated errors count for; they decide where three views leave none
 _FIRST_ROUNDS = 3  # of the fits that give the albedo, by which the material is chosen
 
 
@@ -39,7 +41,7 @@ class TexelMaps(ArrayValue):
     residual: Floats  # (K,) median of |measured − modelled| S0 over S0
 
 
-@stage(version=3)
+@stage(version=4)
 def estimate(
     views: tuple[PosedStokes, ...],
     light: FlashLight,
@@ -52,8 +54,9 @@ def estimate(
     """Fit all texels of the sample."""  # fmt: skip
     width, height = grid.size
     value = np.zeros((height, width, UNKNOWNS), np.float32)
-    sigma, common = np.full_like(value, np.inf), np.zeros_like(value)
-    cost, residual = np.zeros((height, width), np.float32), np.zeros((len(views), height, width), np.float16)
+    variance = np.zeros((height, width, len(KINDS) + 1, UNKNOWNS), np.float32)
+    squares, freedom = np.zeros((2, height, width, len(KINDS)), np.float32)
+    residual = np.zeros((len(views), height, width), np.float16)
     square: Floats = np.zeros((len(views), 2))  # sum of squared errors, number
     point, poses = grid.points(relief.height), [view.pose for view in views]
     rows = max(1, _TILE // width)
@@ -61,22 +64,22 @@ def estimate(
         strip = slice(top, min(top + rows, height))
         data = measurements(seen.rows(strip), views)
         geometry = texel_grid.geometry(point[strip].reshape(-1, 3), poses, light)
-        found, own_sigma, shared_sigma = _fit(data, geometry, gloss, settings)
-        shape = value[strip].shape
-        value[strip], sigma[strip] = found.value.reshape(shape), own_sigma.reshape(shape)
-        common[strip] = shared_sigma.reshape(shape)
+        found, own = _fit(data, geometry, gloss, settings)
+        parts = (found.value, own, *texel_fit.misfit(data, found, settings.fitting))
+        for target, part in zip((value, variance, squares, freedom), parts, strict=True):
+            target[strip] = part.reshape(target[strip].shape)
         known = np.isfinite(data.noise[..., 0])
-        cost[strip] = (found.cost / np.maximum(5 * known.sum(axis=0) - UNKNOWNS + 2, 5)).reshape(shape[:2])
         square += np.stack([(found.error**2).sum(axis=(1, 2)), 5.0 * known.sum(axis=1)], axis=-1)
         error = np.abs(data.radiance @ data.gray - found.model) / np.maximum(found.model, 1e-3)
-        residual[:, strip] = np.where(known, error, np.nan).reshape(-1, *shape[:2])
+        residual[:, strip] = np.where(known, error, np.nan).reshape(residual[:, strip].shape)
     measured = np.isfinite(seen.noise[..., 0]).sum(axis=0) >= LEAST_VIEWS
-    scale = np.sqrt(np.maximum(cv2.GaussianBlur(cost, (0, 0), _AROUND), 0.2))
+    squares, freedom = (cv2.GaussianBlur(one, (0, 0), _AROUND) + _STATED for one in (squares, freedom))
+    variance[:, :, : len(KINDS)] *= (squares / freedom)[..., None]
     with np.errstate(all="ignore"):
         middle = np.nanmedian(residual[:, measured].astype(np.float32), axis=1)
     return TexelMaps(
         value=value,
-        sigma=np.hypot(sigma * scale[..., None], common),
+        sigma=np.sqrt(variance.sum(axis=2)),
         seen=measured,
         misfit=np.sqrt(square[:, 0] / np.maximum(square[:, 1], 1)),
         residual=middle,
@@ -85,8 +88,8 @@ def estimate(
 
 def _fit(
     data: Measurements, geometry: TexelViews, gloss: GlossGroups, settings: GlossSettings
-) -> tuple[TexelEstimate, Floats, Floats]:
-    """Estimates of N texels, and their 1σ as of `_doubts`. Priors are those of the materials, chosen by the albedo.
+) -> tuple[TexelEstimate, Floats]:
+    """Estimates of N texels, and their variances as of `variances`. Priors are those of the materials, by the albedo.
 
     The albedo is better known at each step: median radiance of the views, fit of flat texels, fit of a few rounds.
     """
@@ -97,12 +100,17 @@ def _fit(
     few = texel_fit.fit(data, geometry, prior, flat, law, settings.fitting, _FIRST_ROUNDS).value
     prior = gloss.prior(few[:, ALBEDO], settings)
     found = texel_fit.fit(data, geometry, prior, few, law, settings.fitting)
-    return found, *_doubts(found, prior, gloss.sigma_of(few[:, ALBEDO]))
+    return found, variances(found, prior, gloss.sigma_of(few[:, ALBEDO]))
 
 
-def _doubts(found: TexelEstimate, prior: TexelPrior, shared: Floats) -> tuple[Floats, Floats]:
-    """1σ (N, 7) of texels from their own data, and from the 1σ `shared` (N, 2) of their material's gloss."""
+def variances(found: TexelEstimate, prior: TexelPrior, shared: Floats) -> Floats:
+    """Variances (N, 3, 7) of texels by cause: S0, S1 and S2, both with errors as stated, and the priors.
+
+    The 1σ `shared` (N, 2) of the gloss of the texels' material belongs to the priors.
+    """
     covariance = np.linalg.inv(found.information.astype(np.float64))
     response = covariance[:, :, GLOSS] / prior.sigma[:, None, :] ** 2  # to a change of the prior's mean
-    own = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0))
-    return own, np.linalg.norm(response * shared[:, None, :], axis=-1)
+    data = np.einsum("knij,nij->nki", covariance @ found.by_kind, covariance)
+    priors = np.maximum(np.einsum("nii->ni", covariance) - data.sum(axis=1), 0)
+    priors += np.square(response * shared[:, None, :]).sum(axis=-1)
+    return np.concatenate([data, priors[:, None]], axis=1)

@@ -1,6 +1,9 @@
 """Errors of materials of simulated flat samples against their truth.
 
 python tests/benchmarks/bench_material.py FOLDER [--views 9] [--width 3000] [--samples NAME,…] [--polarization no]
+    [--f0 FACTOR]
+
+Most samples have an F0 near the mean of its prior, so that its errors are small; `--f0` multiplies it.
 """
 
 import argparse
@@ -56,9 +59,10 @@ SAMPLES: dict[str, tuple[float, float, str, float, tuple[Material, ...]]] = {
 }  # fmt: skip
 
 
-def scene(name: str) -> tuple[Scene, FlatShoot]:
-    """Scene and sample of a name."""
+def scene(name: str, f0: float = 1.0) -> tuple[Scene, FlatShoot]:
+    """Scene and sample of a name, with its F0 times a factor."""
     relief, feature, law, region, parts = SAMPLES[name]
+    parts = tuple(msgspec.structs.replace(part, specular=part.specular * f0) for part in parts)
     shoot = FlatShoot(relief_m=relief, feature_m=feature, seed=list(SAMPLES).index(name))
     made = Scene(Bumps((0.01, 0.01, 0.01), ()), Coat(parts, region or 0.08, seed=5), light=(0.01, 0.05, 0.0))
     return (msgspec.structs.replace(made, law="rough") if law == "rough" else made), shoot
@@ -127,9 +131,10 @@ def main() -> None:
     parser.add_argument("--rays", type=int, default=1)
     parser.add_argument("--exposures", type=int, default=1)
     parser.add_argument("--polarization", default="yes")
+    parser.add_argument("--f0", type=float, default=1.0)
     given = parser.parse_args()
     for name in given.samples.split(","):
-        made, shoot = scene(name)
+        made, shoot = scene(name, given.f0)
         shoot = msgspec.structs.replace(
             shoot,
             width=given.width,
@@ -137,7 +142,7 @@ def main() -> None:
             samples=given.rays,
             exposures=given.exposures,
         )
-        session = given.folder / f"{name}-{given.views}-{given.width}"
+        session = given.folder / f"{name}-{given.views}-{given.width}{'' if given.f0 == 1 else f'-f0-{given.f0:g}'}"
         if not session.exists():
             flat_views.write(session, made, shoot, given.views)
         out = "material" if given.polarization == "yes" else "without"

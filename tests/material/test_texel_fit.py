@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.material import gloss_groups, texel_fit
+from polcap.material import gloss_groups, texel_fit, texel_maps
 from polcap.material.gloss_groups import LAWS, GlossSettings
 from polcap.material.texel_fit import FitSettings, Measurements, TexelEstimate, TexelPrior
 from polcap.optics import frames
@@ -42,6 +42,23 @@ def test_errors_are_as_large_as_stated() -> None:
     score = np.sqrt(np.mean(((fitted.value - truth) / sigma) ** 2, axis=0))
     assert score[:4] == pytest.approx(1, rel=0.5)
     assert (score[4:] < 1.3).all()  # three colors with the same error count as three: stated too large
+
+
+@pytest.mark.parametrize("count", [9, 5])
+def test_doubts_follow_the_misfit_where_stated_errors_are_too_large(count: int) -> None:
+    """S0 errs by half the stated error, S1 and S2 as stated."""
+    truth, every = materials(600), views(600)
+    seen, data = every.of_views(range(count)), measured(truth, every)
+    data = Measurements(data.radiance[:count], data.polarized[:count], data.noise[:count], data.gray)
+    settings, prior = FitSettings(2 * RADIANCE_ERROR, POLARIZATION_ERROR), prior_of(600)
+    first = texel_fit.start(data, seen, prior, LAWS["smooth"])
+    fitted = texel_fit.fit(data, seen, prior, first, LAWS["smooth"], settings)
+    squares, freedom = (one.sum(axis=0) for one in texel_fit.misfit(data, fitted, settings))
+    assert np.sqrt(squares / freedom) == pytest.approx([0.55, 1], rel=0.25)  # the priors add to the error of S0
+    scale = np.append(squares / freedom, 1)
+    sigma = np.sqrt(np.einsum("nki,k->ni", texel_maps.variances(fitted, prior, np.zeros((600, 2))), scale))
+    score = np.sqrt(np.mean(((fitted.value - truth) / sigma) ** 2, axis=0))
+    assert np.delete(score, texel_fit.ROUGHNESS) == pytest.approx(1, rel=0.4)
 
 
 def test_polarization_improves_every_value_a_little() -> None:
