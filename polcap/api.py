@@ -20,8 +20,8 @@ from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.presets import Format
 from polcap.formats.export.texture_set import Extra
 from polcap.images import Bools, Device
+from polcap.pipeline import asset_export, export_request, models
 from polcap.pipeline import check as checks
-from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.cache import Progress, silent
 from polcap.pipeline.export_request import ExportRequest
@@ -183,6 +183,7 @@ def export(
     result: str | Path | Result,
     preset: str | None = None,
     *,
+    out: str | Path | None = None,
     formats: Format | Sequence[Format] = (),
     images: Kind | None = None,
     geometry: Geometry | None = None,
@@ -204,6 +205,8 @@ def export(
         Result folder of `process` or `fuse`, its `Result`, or the folder of the capture or the views.
     preset
         Program, such as "unreal"; it brings its formats. All are in `docs/how-to/export.md`.
+    out
+        New result folder for the files, with a copy of the maps; for an archive, which stays as it is.
     formats
         Without a preset: of gltf, obj, ply, stl, usd, usdz, materialx, exr, iiif, sfp; by default gltf and obj.
     images, geometry
@@ -236,17 +239,24 @@ def export(
         bits=bits, extras=_names(extras), texture_size=texture_size, page=None if page is None else Path(page),
         iiif=iiif, catalog=catalog or {}, lod=lod,
     )  # fmt: skip
-    return write_exports(folder, request)
+    return write_exports(folder, request, out=None if out is None else Path(out))
 
 
-def write_exports(folder: Path, *requests: ExportRequest) -> list[Path]:
+def write_exports(folder: Path, *requests: ExportRequest, out: Path | None = None) -> list[Path]:
     """Write the asset of a result for each request: of one view, of a fused object or of a material; returns the files.
 
-    Raises SettingError: a preset or color space does not exist, or a package or encoder is missing.
+    They go into the result's folder, or into the new folder `out`, with a copy of the maps.
+
+    Raises SettingError: a preset or color space does not exist, a package or encoder is missing, or `out` is in use.
     """
     from polcap.fusion import fuse_run, fused_maps
     from polcap.material import material_maps, material_run
 
+    if out is not None:
+        for one in requests:
+            export_request.check(one)
+        asset_export.copy(folder, out)
+        folder = out
     if fused_maps.is_fused(folder):
         return fuse_run.export(folder, *requests)
     if material_maps.is_material(folder):

@@ -68,7 +68,6 @@ def export(
 ) -> None:
     """Write the asset again from a result's maps; without a flag as GLB and OBJ."""
     from polcap import api
-    from polcap.pipeline import asset_export, export_request
     from polcap.pipeline.export_request import ExportRequest
 
     formats = tuple(name for name in FORMATS if context.params[name] not in (None, False))
@@ -87,17 +86,14 @@ def export(
         lod=lod,
     )
     wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
-    if out is not None:
-        for one in wanted:
-            export_request.check(one)
-        asset_export.copy(result, out)
-        result = out
-    files = api.write_exports(result, *wanted)
+    files = api.write_exports(result, *wanted, out=out)
+    result = out or result
     options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
     if triangles is None:
         _print_reduced(result, [one.preset for one in wanted])
     if (missing := lod * len(wanted) - sum(bool(_LEVEL.search(file.name)) for file in files)) > 0:
-        terminal.print_message(f"polcap: {missing} levels of --lod would differ by over 1 % of the size: not written")
+        stated = f"{missing} of {lod * len(wanted)} levels of --lod"
+        terminal.print_message(f"polcap: {stated} would differ by over 1 % of the size: not written")
     for name in plain.extras:
         if not any(file.name.endswith(f"_{name.replace('-', '')}.png") for file in files):
             terminal.print_message(f"polcap: --extra {name} is left out: this kind of result has none", "WARNING")

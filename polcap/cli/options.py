@@ -111,7 +111,8 @@ def warn_of_outdated_exports(out: Path, records: Sequence[Path]) -> None:
     old = asset_export.find_outdated(out, records, text_file.read_json(out / "report.json").get("keys", {}))
     if old:
         named = ", ".join([path.relative_to(out).as_posix() for path in old[:_NAMED]] + ["…"] * (len(old) > _NAMED))
-        text = f"{named} in {out}: exported earlier, with other maps, settings or facts; export again, or remove"
+        why = "exported earlier, under another name or with other maps, settings or facts"
+        text = f"{named} in {out}: {why}; export again, or remove"
         terminal.print_message(f"polcap: warning: {text}", "WARNING")
 
 

@@ -11,6 +11,7 @@ OUTPUT = "polcap"  # default folder of results
 FUSED = "fused"  # default folder of the result of `polcap fuse`, next to the views
 BATCH = "polcap-batch"  # folder of a batch's records, in ROOT or in --out; safe to delete
 MATERIAL = "material"  # default folder of the result of `polcap material`, next to the views
+MANIFEST = "manifest-sha256.txt"  # of an archive: digests of its files
 OURS = (OUTPUT, BATCH)  # these folders hold no photographs
 
 
@@ -21,6 +22,11 @@ def find_result(named: Path) -> Path:
             if (inside / "report.json").exists() or (inside / "work").is_dir():
                 return inside
     return named
+
+
+def is_archive(folder: Path) -> bool:
+    """Whether a folder is an archive of `polcap export --preset archive`, or a copy of one."""
+    return (folder / MANIFEST).is_file() and not (folder / "work").is_dir()
 
 
 def calibrations() -> Path:

@@ -8,7 +8,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from polcap.errors import StorageError
-from polcap.formats import atomic, folder_lock, own_files, system_errors, text_file
+from polcap.formats import atomic, folder_lock, own_files, own_folders, system_errors, text_file
 
 _HELD = ("lock", "owner")  # files in work/ that an open result needs
 _PARTS = ("maps", "asset", "work", "report.html", "report.json", "color.toml", "compare.html")  # of a result
@@ -18,8 +18,10 @@ _PARTS = ("maps", "asset", "work", "report.html", "report.json", "color.toml", "
 def opened(out: Path) -> Iterator[None]:
     """Context manager: files are written into a result folder, which gets its record if it has none.
 
-    Raises StorageError: the folder holds maps or other parts of a result that are not in a record of polcap.
+    Raises StorageError: it is an archive, or holds maps or other parts of a result that are not in a record of polcap.
     """
+    if own_folders.is_archive(out):
+        raise StorageError(f"{out} is an archive, which stays as it is; name a folder for the files with --out")
     own_files.claim(out, _PARTS)
     with own_files.opened(out):
         yield

@@ -9,8 +9,7 @@ import msgspec
 
 from polcap import report
 from polcap.errors import StorageError
-from polcap.formats import atomic, text_file
-from polcap.formats.export import archive
+from polcap.formats import atomic, own_folders, text_file
 from polcap.pipeline.manifest import seal
 
 
@@ -24,7 +23,7 @@ def write(out: Path, about: Mapping[str, Any]) -> None:
 
 def no_cache(out: Path) -> StorageError:
     """The error for a result folder without a stage cache, with the remedy."""
-    if archive.is_archive(out):
+    if own_folders.is_archive(out):
         return StorageError(
             f"{out} is an archive, which holds no stage cache: see its report.html; `polcap export {out} --out NEW` "
             f"writes files from it, `polcap report {out} --compare OTHER --out NEW` compares it"

@@ -463,9 +463,12 @@ def test_an_archive_checks_itself_after_two_exports_and_a_copy(
     again = polcap("export", tmp_path / "elsewhere", "--out", tmp_path / "new", "--ply")
     assert again.returncode == 0 and (tmp_path / "new/asset/C.ply").exists()
     assert json.loads((tmp_path / "new/asset/C.provenance.json").read_text())["title"] == "Vase"
-    for words in (["status"], ["report"], ["show", "--all"]):
-        done = polcap(*words, tmp_path / "elsewhere")
+    for name, *rest in (["status"], ["report"], ["show", "--all"]):
+        done = polcap(name, tmp_path / "elsewhere", *rest)
         assert done.returncode == 2 and "is an archive, which holds no stage cache" in done.stderr
+    for name, *rest in (["export"], ["report", "--compare", str(tiny_result)]):
+        done = polcap(name, tmp_path / "elsewhere", *rest)
+        assert done.returncode == 2 and "is an archive, which stays as it is" in done.stderr
     assert set(check_sums(tmp_path / "elsewhere")) == {*names, "C_occlusion.png"}
     if program := shutil.which("sha256sum"):
         command = [program, "-c", "--quiet", "manifest-sha256.txt"]

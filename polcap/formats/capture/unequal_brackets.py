@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 EQUAL_STOPS = 0.15  # EXIF rounds exposure times to a sixth of a stop at most
 
@@ -32,6 +32,11 @@ def advise_sequence(files: _Bracket, angles_deg: Sequence[float]) -> str:
     Empty where the exposures do not show the reason.
     """
     count, shots = len(files), len(angles_deg)
+    if all(one.exposure and not same_exposure(one.exposure, two.exposure) for one, two in combinations(files, 2)):
+        return (
+            "all exposures differ: they are one bracket at one angle, or the camera changed the exposure with the "
+            "angle; take the same exposures at every angle"
+        )
     for size in range(2, count // 3 + 1):
         if count % size == 0 and count // size != shots and _repeats(files, size):
             return f"they are {count // size} brackets of {size}: state {count // size} angles with --angles"

@@ -4,14 +4,8 @@ import os
 from pathlib import Path
 
 from polcap.formats import atomic, color_profile, own_files
+from polcap.formats.own_folders import MANIFEST
 from polcap.formats.raw import file_bytes
-
-MANIFEST = "manifest-sha256.txt"
-
-
-def is_archive(folder: Path) -> bool:
-    """Whether a folder is an archive, or a copy of one, with the digests of its files."""
-    return (folder / MANIFEST).is_file() and not (folder / "work").is_dir()
 
 
 def gather(out: Path, folder: Path) -> list[Path]:

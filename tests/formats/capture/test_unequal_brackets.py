@@ -13,6 +13,13 @@ def ordered(root):
     return sorted(root.iterdir(), key=lambda path: path.name.replace("IMG_99", "A"))
 
 
+def test_a_single_bracket_is_no_capture(tmp_path):
+    for file in ordered(flat(tmp_path, times=TIMES))[3:]:
+        file.unlink()
+    with pytest.raises(CaptureError, match="one bracket at one angle, or the camera changed the exposure"):
+        capture.read(tmp_path)
+
+
 @pytest.mark.parametrize("number", [1, 4, 8])
 def test_the_missing_frame_of_a_flat_folder_is_named(tmp_path, number):
     files = ordered(flat(tmp_path, times=TIMES))
