@@ -1,7 +1,8 @@
 """Runs inside Blender's Python: `python inside.py JOB.json`. In: files and what to do. Out: arrays in JOB.npz.
 
-A job is {"files": [...], "bake": [width, height] or null, "camera": {...} or null, "lights": [[x, y, z], ...]}; lights
-are directions to a sun in the frame of the asset (y up). Arrays are named NUMBER/WHAT.
+A job is {"files": [...], "bake": [width, height] or null, "camera": {...} or null, "lights": [[x, y, z], ...], "lamp":
+"SUN" or "POINT"}; lights are directions to suns, or positions of points, in the frame of the asset (y up). A camera's
+"axes", right, up and backward, are those of the asset if not given. Arrays are named NUMBER/WHAT.
 """
 
 import json
@@ -88,8 +89,8 @@ def baked(tree: Any, target: Any, size: tuple[int, int], kind: str) -> np.ndarra
     return np.array(target.image.pixels[:]).reshape(size[1], size[0], 4)[::-1, :, :3]
 
 
-def render(camera: dict[str, Any], lights: list[list[float]], samples: int) -> list[np.ndarray]:
-    """Linear pictures (H, W, 3) through a photograph's camera, one per sun; a white sheet facing it has 1."""
+def render(camera: dict[str, Any], lights: list[list[float]], kind: str, samples: int) -> list[np.ndarray]:
+    """Linear pictures (H, W, 3) through a photograph's camera, one per light; a white sheet facing a sun has 1."""
     scene, (width, height) = bpy.context.scene, camera["size"]
     lens = bpy.data.cameras.new("camera")
     lens.sensor_fit, lens.sensor_width, lens.lens = "HORIZONTAL", 36.0, camera["focal"] * 36.0 / width
@@ -97,11 +98,15 @@ def render(camera: dict[str, Any], lights: list[list[float]], samples: int) -> l
     lens.shift_y = (camera["center"][1] - (height - 1) / 2) / width
     lens.clip_start = 0.01
     placed = bpy.data.objects.new("camera", lens)
-    placed.matrix_world = Matrix.Translation(TO_BLENDER @ Vector(camera["position"])) @ TO_BLENDER.to_4x4()
-    sun = bpy.data.lights.new("sun", "SUN")
-    sun.energy, sun.angle = np.pi, 0.0
-    sun.use_shadow = False
-    lamp = bpy.data.objects.new("sun", sun)
+    turn = TO_BLENDER @ Matrix(camera.get("axes") or ((1, 0, 0), (0, 1, 0), (0, 0, 1))).transposed()
+    placed.matrix_world = Matrix.Translation(TO_BLENDER @ Vector(camera["position"])) @ turn.to_4x4()
+    light = bpy.data.lights.new("light", kind)
+    light.energy, light.use_shadow = np.pi, False
+    if kind == "SUN":
+        light.angle = 0.0
+    else:
+        light.shadow_soft_size = 0.0
+    lamp = bpy.data.objects.new("light", light)
     for one in (placed, lamp):
         scene.collection.objects.link(one)
     scene.camera, scene.cycles.samples, scene.cycles.max_bounces = placed, samples, 0
@@ -110,8 +115,9 @@ def render(camera: dict[str, Any], lights: list[list[float]], samples: int) -> l
     scene.render.film_transparent = True
     scene.render.image_settings.file_format = "OPEN_EXR"
     pictures = []
-    for light in lights:
-        lamp.rotation_euler = (TO_BLENDER @ Vector(light)).to_track_quat("Z", "Y").to_euler()
+    for place in lights:
+        lamp.location = TO_BLENDER @ Vector(place)
+        lamp.rotation_euler = lamp.location.to_track_quat("Z", "Y").to_euler()
         scene.render.filepath = str(Path(sys.argv[1]).with_suffix(".exr"))
         bpy.ops.render.render(write_still=True)
         picture = bpy.data.images.load(scene.render.filepath)
@@ -128,7 +134,8 @@ def main() -> None:
         found[f"{number}/vertices"] = corners(mesh)
         if job["bake"]:
             found |= {f"{number}/{name}": value for name, value in bake(mesh, tuple(job["bake"])).items()}
-        for k, picture in enumerate(render(job["camera"], job["lights"], job["samples"]) if job["lights"] else []):
+        pictures = render(job["camera"], job["lights"], job["lamp"], job["samples"]) if job["lights"] else []
+        for k, picture in enumerate(pictures):
             found[f"{number}/light {k}"] = picture
     np.savez(Path(sys.argv[1]).with_suffix(".npz"), **found)  # type: ignore[arg-type]  # NumPy: `allow_pickle` stands among the names
 

@@ -38,6 +38,7 @@ def ask(folder: Path, files: list[Path], **job: Any) -> list[dict[str, Floats]]:
         "bake": None,
         "camera": None,
         "lights": [],
+        "lamp": "SUN",
         "samples": 16,
         **job,
         "files": [str(file) for file in files],
