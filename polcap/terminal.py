@@ -283,7 +283,7 @@ class Steps:
             print_progress(self._frames_text(done, total, now))
 
     def _stage_text(self, name: str, seconds: float, cached: bool) -> str:
-        return f"{name:14}{'cached' if cached else f'{seconds:.2f} s'}"
+        return f"{name:13} {'cached' if cached else f'{seconds:.2f} s'}"
 
     def _frames_text(self, done: int, total: int, now: float) -> str:
         seconds = (now - self._begun) / done * (total - done)

@@ -15,12 +15,12 @@ def check(out: Path, photographs: Path) -> None:
 
     Raises SettingError: `out` contains the capture, lies among its shots, is a link out of it, or as `check_free`.
     """
-    here, there = _real(out), _real(photographs)
+    here, there = _real(out), Path(os.path.realpath(photographs))
     if here == there:
         raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")
     if there.is_relative_to(here):
         raise SettingError(f"--out {out} contains the capture {photographs}; choose a folder of its own")
-    if out.is_symlink() and here.parent != there and _real(out.parent) == there:
+    if out.is_symlink() and here.parent != there and Path(os.path.realpath(out.parent)) == there:
         raise SettingError(f"--out {out} is a link; name the folder that it leads to")
     inside = here.relative_to(there).parts[:1] if here.is_relative_to(there) else ()
     if any(name in folder_names.angle_folder_names(there) or folder_names.is_angle_folder(name) for name in inside):
