@@ -30,6 +30,7 @@ _SIGMAS, _FALSE_PUSH = 3.0, 0.003  # of a push; 1σ that polarization imitates, 
 _DEGREES_PER_TURN = 600.0  # error of the normals per turn's shift of the surface, of the radius
 _FALSE_TURN_DEG = 0.2  # 1σ of a turn that polarization imitates
 _SHARP_PX, _DEGREES_PER_BLUR_PX = 1.2, 2.5  # greatest blur of sharp edges; error of the normals per px beyond it
+_SMOOTH_OUTLINE = 1.1  # of the limit: smooth balls reach .96 of it, objects out of focus from 1.13 (10 objects)
 _DEGREES_PER_FRAME_BLUR_PX = 9.0  # of a reference frame beyond the limit: 12° at 2.2 and 2.7 px, 24° at 4.6
 _EDGE_FLOOR = 0.1  # of the object's median light: dark backdrops differ by less
 _SAME_SCENE = 0.8  # correlation of detail that no two objects have: they reach .4
@@ -305,32 +306,35 @@ def _show_one_place(found: Evidence[ResultsUntilAlign]) -> bool:
 
 
 def focus(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
-    """Gate on focus: blur of the sharpest edges on the object and its outline, merged px."""
-    blur, limit = _sharpest_blur(found), limits.max_edge_blur_px
+    """Gate on focus: blur of the sharpest edges of object, outline and chart, merged px; then that of the object.
+
+    The outline of a smooth ball is never as sharp as a chart, so the object's own limit is higher.
+    """
+    limit, (of_object, of_chart) = limits.max_edge_blur_px, _edge_blurs(found)
+    blur = float(np.fmin(of_object, of_chart))
     if found.grid_px > 1:
         return Gate("focus", "not measured", None, limit, "Only `process` measures this", unit="px")
     message = worded(blur, "The sharpest edges of the object are blurred by {:.1f} px (1σ)", "Edges are sharp")
     if blur > limit:
         message += ": all shots are out of focus, which costs about 0.04 of roughness"
+    elif of_object > _SMOOTH_OUTLINE * limit:
+        blur, limit = of_object, _SMOOTH_OUTLINE * limit
+        message = f"The object's sharpest edges are blurred by {blur:.1f} px (1σ), the chart's by {of_chart:.1f} px: "
+        message += "the object is out of focus"
     remedy = "Focus by hand on the front of the object, with f/8 to f/11"
     gate = at_most("focus", blur, limit, message, remedy, unit="px", beyond="warn")
     excess = max(blur - _SHARP_PX, 0.0) if np.isfinite(blur) else 0.0  # a smooth object looks the same
     return msgspec.structs.replace(gate, cost_deg=round(_DEGREES_PER_BLUR_PX * excess, 1))
 
 
-def _sharpest_blur(found: Evidence[ResultsUntilMask]) -> float:
-    """Blur (1σ) of the sharpest edges of object and chart [px]: a ball's outline is never sharp, a chart next to it is.
-
-    NaN without an object.
-    """
+def _edge_blurs(found: Evidence[ResultsUntilMask]) -> tuple[float, float]:
+    """Blur (1σ) of the sharpest edges of the object and of the chart [px]; NaN without one."""
     radiance, mask, place = found.results.radiance, found.results.object_.mask, found.results.color.place
-    if not mask.any():
-        return float("nan")
-    blur = _edge_blur(radiance, mask)
-    if place is None:
-        return blur
+    of_object = _edge_blur(radiance, mask) if mask.any() else float("nan")
+    if place is None or not mask.any():
+        return of_object, float("nan")
     chart = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), place.corners.astype(np.int32), 1) > 0
-    return min(blur, _edge_blur(radiance, chart)) if chart.any() else blur
+    return of_object, _edge_blur(radiance, chart) if chart.any() else float("nan")
 
 
 def _edge_blur(radiance: AngleStack, mask: Bools) -> float:

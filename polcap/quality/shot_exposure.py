@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from polcap.images import Bools, Floats, Quality
-from polcap.quality import flatness
+from polcap.quality import flatness, rerendering
 from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots, compared, reaches, worded
 from polcap.quality.limits import GateLimits
 from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilMask, ResultsUntilSelfcal, ResultsUntilStokes
@@ -22,6 +22,8 @@ _STOPS, _STOPS_PER_HALVING = 1.5, 0.75  # too bright; per halving of the unclipp
 _CLIPPED_PICTURE = 0.1  # of a picture in which no object was found; a bright backdrop may clip
 _WHOLE = 0.5  # share of the object that moving parts do not reach in every shot
 DEGREES_PER_NOISE = 300.0  # of the normals, per false degree of polarization
+_USUAL_CHANGE = 0.02  # of the light of a shot, 1σ; the polarization of flat faces looks like 8 to 12 %
+_EXPLAINED = 0.5  # agreement of the re-rendering: a can .84, with a chart that mirrors −.1 (three objects)
 _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light patches
 
 
@@ -255,8 +257,10 @@ def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
     if measured.source == "grey patches" and max(doubt, gloss := _GLOSS_PART * measured.chart_gloss) <= limit:
         gap, limit = measured.disagreement, limits.max_gain_disagreement
         message = f"Gray patches and object agree on the light of each shot (1σ {100 * doubt:.2f} %)"
-        if gap > limit and _has_sharp_edges(found):
-            message = f"Gray patches give the light of each shot (1σ {100 * doubt:.2f} %); flat faces do not confirm it"
+        if gap > limit and (_has_sharp_edges(found) or _is_explained(found)):
+            message = (
+                f"Gray patches give the light of each shot (1σ {100 * doubt:.2f} %); the object does not confirm it"
+            )
             return Gate("gain doubt", "pass", doubt, limits.max_gain_doubt, message)
         if gap > limit:
             message = f"Gray patches and object disagree by {100 * gap:.1f} % on a shot's light, beyond their errors"
@@ -270,6 +274,10 @@ def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
         remedy = "Show the whole gray row of the chart, evenly lit, or use --no-chart"
     else:
         message = f"Without gray patches the light of each shot is known within {100 * doubt:.1f} % (1σ)"
+        if doubt > _USUAL_CHANGE and _has_sharp_edges(found):
+            doubt = _USUAL_CHANGE
+            message = "Without gray patches flat faces do not show the light of each shot; it is assumed equal within "
+            message += f"{100 * doubt:.0f} % (1σ)"
         if measured.source == "none":
             message = f"The light of each shot is unknown; it is assumed equal within {100 * doubt:.1f} % (1σ)"
         remedy = "Put a ColorChecker next to the object"
@@ -291,3 +299,10 @@ def _has_sharp_edges(found: Evidence[ResultsUntilSelfcal]) -> bool:
         return False
     seen = flatness.measure(found.results.stokes, found.results.maps)
     return seen is not None and seen.sharp_edged
+
+
+def _is_explained(found: Evidence[ResultsUntilSelfcal]) -> bool:
+    """Whether the maps, rendered again, show the photographs: then the light of the shots is right."""
+    if not reaches(found, ResultsUntilInfer) or found.results.maps.estimator == "analytic":
+        return False
+    return rerendering.measure(found.results).agreement > _EXPLAINED

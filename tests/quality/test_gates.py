@@ -443,16 +443,17 @@ def test_an_unsharp_picture_costs_degrees_before_it_warns(good: Seen) -> None:
     assert before.cost_deg == 0 and after.cost_deg > 0.3
 
 
-def test_a_smooth_object_next_to_a_sharp_chart_is_in_focus(good: Seen) -> None:
-    """The outline of a smooth ball looks blurred; the edges of a chart next to it show whether the camera was."""
+@pytest.mark.parametrize("charted", [False, True])
+def test_an_object_out_of_focus_is_reported_beside_a_sharp_chart_too(good: Seen, charted: bool) -> None:
     corners = np.array([[230.0, 150], [300, 150], [300, 200], [230, 200]])
-    color = replace(scenes.no_color(), place=ChartPlace(np.zeros((24, 4, 2)), corners))
-    blurred = np.stack([cv2.GaussianBlur(shot, (0, 0), 2.5) for shot in good.results.radiance.value])
-    with_chart = blurred.copy()
-    with_chart[:, 150:200, 230:300] = np.where(np.arange(70) // 14 % 2, 0.05, 0.4)[:, None].astype(np.float32)
-    for value, state in ((blurred, "warn"), (with_chart, "pass")):
+    color = replace(scenes.no_color(), place=ChartPlace(np.zeros((24, 4, 2)), corners) if charted else None)
+    for sigma, state in ((0.5, "pass"), (2.5, "warn")):
+        value = np.stack([cv2.GaussianBlur(shot, (0, 0), sigma) for shot in good.results.radiance.value])
+        value[:, 150:200, 230:300] = np.where(np.arange(70) // 14 % 2, 0.05, 0.4)[:, None].astype(np.float32)
         seen = changed(good, radiance=replace(good.results.radiance, value=value), color=color)
-        assert judged(seen)["focus"].state == state
+        gate = judged(seen)["focus"]
+        assert gate.state == state
+    assert ("chart's" in gate.message) == charted
 
 
 def test_a_shadow_contradicts_nothing(good: Seen) -> None:
