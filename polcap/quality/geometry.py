@@ -38,7 +38,7 @@ _STILL = 0.9  # correlation of detail that a shot has only if it moved by less t
 _LOCK = "Lock the camera, do not touch the object, and take that shot again"
 _MOST_CONTRADICTION = 0.1  # of the object; set by hand: noise, glare and swapped angles leave less than .01
 _TEXTURE = (
-    "Put something with texture next to the object, such as the chart, or use more light; of a locked camera, "
+    "Put a ColorChecker or something else with texture next to the object, or use more light; of a locked camera, "
     "--set align.model=none"
 )
 _SAMPLED_PX = 1.0  # doubt of the outline that pixels alone cause: most of a thin object lies next to its outline

@@ -65,7 +65,7 @@ def order_of_shots(
     """Gate on the order of shots, by the polarization along the outline and the test of the network.
 
     An outline that is the edge of flat faces decides nothing. Where another order is as good, the stated one counts if
-    its maps explain the photographs.
+    its maps explain the photographs and the network does not expect smaller errors in another one.
     """
     statement, names, better = radiance.equipment.angles, shot_names(radiance), None
     edges = seen is not None and seen.sharp_edged
@@ -85,7 +85,7 @@ def order_of_shots(
         message = f"In any other order, the network expects errors that are at least {test.ratio:.1f} times as large"
     elif edges:
         return Gate("order", "not measured", None, "as stated", "Flat faces show no order of the angles", unit="")
-    elif outline.rival is not None and explained:
+    elif outline.rival is not None and explained and (test is None or test.ratio >= 1):
         message = "The maps of the stated order, rendered again, show the polarization of the photographs"
     elif outline.rival is not None:
         other = _order_text(outline.rival, names)

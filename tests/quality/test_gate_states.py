@@ -212,6 +212,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("order", "pass", {}),
     ("order", "warn", {**UNCLEAR, "figures": {"rendered": rendered(0.35)}}),
     ("order", "pass", {**UNCLEAR, "figures": {"rendered": rendered(0.45)}}),
+    ("order", "warn", {**UNCLEAR, "maps": network_maps(0.1, 0.95), "figures": {"rendered": rendered(0.45)}}),
     ("order", "fail", {"selfcal": {"outline": OutlineCheck(ShotOrder((2, 1, 0)), 0.9)}}),
     ("order", "not measured", {"figures": {"flatness": EDGES}}),
     ("order", "not measured", {"selfcal": {"outline": OutlineCheck(ShotOrder((2, 1, 0)), 0.9)},
