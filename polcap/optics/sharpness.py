@@ -26,6 +26,7 @@ _LADDER = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # px, 1σ
 _LEAST_TILES = 4
 _LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise would count as detail
 _SURE = 0.999  # quantile of Student's t beyond which a loss of detail is significant
+_BEYOND = 0.1  # least log of a loss of detail beyond that of a shift
 _PHASES = 4.0  # effective number of rows with edges in a tile; fewer share one place within a pixel
 _DETAIL = -0.5  # largest log of fine over coarse energy of a tile with detail; noise has 0
 
@@ -131,7 +132,7 @@ def extra_blur(tiles: Floats, usable: Bools) -> Floats:
     count = each.shape[2]
     sure = stdtrit(count - 1, _SURE) * MEDIAN_SE * scatter / np.sqrt(count)
     of_blur = np.median(each - _phase_loss(tiles[sharpest][every]), axis=2)
-    lost = np.where(of_blur > sure, lost, 0.0)
+    lost = np.where((lost > sure) & (of_blur > _BEYOND), lost, 0.0)
     if not lost.any():
         return np.zeros(len(tiles))
     ladder = np.stack([_fineness(_blurred(tiles[sharpest][every], sigma)) for sigma in _LADDER])  # (L, 4, T)
