@@ -15,12 +15,15 @@ lens, in units of a white plane that faces it, the mirrored light is
 and reaches this limit where the surface faces the lens. So the brightest highlight bounds the roughness from above.
 Mirrored light is what S0 has beyond the albedo, and therefore less certain on a bright material.
 
+If a material does not show both parts, those that may mirror the flash and those that cannot, a broad highlight looks
+like a bright albedo, and the network's roughness is joined with that of usual materials.
+
 **Expected error of the roughness.** Its error is common to a material, and greater where no highlight confirms the
 network, or a clipped one; and where the network also expects large errors of the normals.
 """
 
 from dataclasses import replace
-from math import hypot
+from math import hypot, sqrt
 
 import cv2
 import numpy as np
@@ -46,11 +49,12 @@ _COLOR = 0.1  # weight of the encoded albedo, relative to the roughness
 _LIKE = 0.06  # rms distance from the mean of a material: a larger one asks for one more material
 _BLUR = 0.004  # 1σ over the object's radius, of S0 before the brightest pixel is taken
 _LEAST_BLUR_PX = 0.7
+_LEAST_HIGHLIGHT = 1e-6
 _BRIGHTEST = 3  # this pixel counts as the highlight, not the brightest
 _FACING_DEG = 35.0  # greatest zenith angle of a highlight
 _AWAY_DEG = (25.0, 60.0)  # zenith angles without highlight; what S0 has there beyond the albedo is its error
 _AWAY_QUANTILE = 0.99
-_FEWEST_PX = 50
+_FEWEST_PX, _FEWEST_AWAY = 50, 0.2  # pixels of each part, and share of the material's that cannot mirror the flash
 # measured on path-traced pictures (docs/benchmarks/network.md)
 _ALBEDO_SIGMA = 0.2  # relative error of the albedo under a highlight
 _NETWORK_SIGMA = 0.08  # error of the network's roughness
@@ -59,6 +63,7 @@ _BOUND_SIGMA = 0.06  # relative error of the bound without that of the mirrored 
 _SIGMA = 0.06
 _SIGMA_PER_DEGREE = 0.006  # of the material's mean expected normal error
 _SIGMA_UNCONFIRMED = 0.15  # without a highlight, or with a clipped one
+_USUAL, _USUAL_SIGMA = 0.5, 0.2  # mean roughness of 47 materials, and its standard deviation
 # median F0 of training surfaces by the predicted F0, if a twentieth of them has more than .06
 _PREDICTED_F0 = (0.03, 0.04, 0.05, 0.06, 0.08, 0.105, 0.16, 1.0)
 _MEDIAN_F0 = (0.039, 0.0415, 0.0425, 0.0435, 0.046, 0.0556, 0.16, 1.0)
@@ -144,12 +149,13 @@ def pool_gloss(maps: SurfaceMaps, cues: Cues) -> SurfaceMaps:
     sigma = np.hypot(_SIGMA, _SIGMA_PER_DEGREE * (weight.T @ maps.confidence[mask]))
     clipped = (cues.quality & np.uint8(Quality.CLIPPED)) > 0
     for k in range(len(center)):
-        facing = (member == k) & (zenith < _FACING_DEG)
-        away = (member == k) & (zenith > _AWAY_DEG[0]) & (zenith < _AWAY_DEG[1])
-        seen = _highlight(facing, away, mirrored, maps.diffuse)
-        if seen is not None:
-            roughness[k] = _bounded(float(roughness[k]), float(f0[k]), *seen)
-        if seen is None or seen[0] <= seen[1] or (clipped & facing).sum() >= _BRIGHTEST:
+        of_material = member == k
+        seen = _highlight(of_material, zenith, mirrored, maps.diffuse)
+        if seen is None:
+            roughness[k], sigma[k] = _joined_with_usual(roughness[k], hypot(sigma[k], _SIGMA_UNCONFIRMED))
+            continue
+        roughness[k] = _bounded(float(roughness[k]), float(f0[k]), *seen)
+        if seen[0] <= seen[1] or (clipped & of_material & (zenith < _FACING_DEG)).sum() >= _BRIGHTEST:
             sigma[k] = hypot(sigma[k], _SIGMA_UNCONFIRMED)
     specular, pooled, error = (_on_pixels(share @ of_material, mask) for of_material in (f0, roughness, sigma))
     return replace(maps, specular=np.repeat(specular[..., None], 3, axis=-1), roughness=pooled, roughness_error=error)
@@ -182,16 +188,21 @@ def _mirrored_light(maps: SurfaceMaps, cues: Cues) -> Floats:
     return masked_mean(beyond, maps.mask, max(_LEAST_BLUR_PX, _BLUR * disc_radius(maps.mask)))
 
 
-def _highlight(facing: Bools, away: Bools, mirrored: Floats, albedo: Floats) -> tuple[float, float] | None:
-    """Mirrored light of a material's highlight, and its 1σ; None if the material shows none.
+def _joined_with_usual(roughness: float, sigma: float) -> tuple[float, float]:
+    """Mean of a roughness with error `sigma` and that of usual materials, weighted by their errors, and its 1σ."""
+    weight = _USUAL_SIGMA**2 / (_USUAL_SIGMA**2 + sigma**2)
+    return _USUAL + weight * (roughness - _USUAL), sigma * sqrt(weight)
 
-    `facing` (H, W) are the material's pixels that may have it, `away` those that cannot.
-    """
-    if facing.sum() < _FEWEST_PX or away.sum() < _FEWEST_PX:
+
+def _highlight(of_material: Bools, zenith: Floats, mirrored: Floats, albedo: Floats) -> tuple[float, float] | None:
+    """Mirrored light of a material's highlight, and its 1σ; None if the material (H, W) may not show it."""
+    facing = of_material & (zenith < _FACING_DEG)
+    away = of_material & (zenith > _AWAY_DEG[0]) & (zenith < _AWAY_DEG[1])
+    if min(facing.sum(), away.sum()) < _FEWEST_PX or away.sum() < _FEWEST_AWAY * of_material.sum():
         return None
     highlight = float(np.partition(mirrored[facing], -_BRIGHTEST)[-_BRIGHTEST])
     error = hypot(np.quantile(mirrored[away], _AWAY_QUANTILE), _ALBEDO_SIGMA * albedo[facing].mean())
-    return None if highlight <= 0 else (highlight, error)
+    return max(highlight, _LEAST_HIGHLIGHT), error
 
 
 def _bounded(roughness: float, f0: float, highlight: float, error: float) -> float:

@@ -101,6 +101,18 @@ def test_the_roughness_is_less_certain_without_a_highlight_or_with_a_clipped_one
     assert of_hidden == of_clipped > 2 * of_shown > 0.1
 
 
+@pytest.mark.parametrize("said", [0.3, 0.8])
+def test_a_material_that_only_faces_the_flash_gets_a_usual_roughness(ball: Cues, said: float) -> None:
+    """A facing plane shows no place without highlight, so that the network's roughness is half a guess."""
+    one = np.ones(ball.mask.shape)
+    maps, seen = lit(ball, 0.2 * one, said * one, said * one)
+    facing = frames.from_ray_frame(np.broadcast_to([0.0, 0, 1], maps.normal.shape), ball.rays)
+    flat = highlights.pool_gloss(replace(maps, normal=facing), seen)
+    roughness, whole = flat.roughness[maps.mask], found(maps, seen)
+    assert np.abs(roughness - 0.5).max() < 0.7 * np.abs(whole - 0.5).min()
+    assert error(replace(maps, normal=facing), seen) > 0.12
+
+
 def test_the_roughness_is_less_certain_where_the_normals_are(ball: Cues) -> None:
     one = np.ones(ball.mask.shape)
     maps, seen = lit(ball, 0.05 * one, 0.65 * one, 0.65 * one)
