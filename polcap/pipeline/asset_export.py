@@ -98,8 +98,8 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     tasks += [partial(_write_glb, files, file, level.asset) for file, level in coarser.items()]
     tasks += [partial(_write_texture, files, files.folder / file, texture) for file, texture in loose.items()]
     written = [file for group in parallel.results(tasks) for file in group]  # pictures are encoded on threads
-    anew = "gltf" in preset.formats or wanted.lod  # the GLB or its levels
-    if anew:
+    writes_glb = "gltf" in preset.formats or wanted.lod  # the GLB or its levels
+    if writes_glb:
         _remove_levels(files, coarser)
     if wanted.page is not None:
         written.append(files.path(".html"))
@@ -109,7 +109,11 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
         "unit": files.facts["unit"],
         "glb": {f"{files.stem}_{key}": text for key, text in _embedded(whole, preset).items()},
         "mesh": _size(found[0]),
-        **({"lods": _level_notes({files.path(".glb"): found[0], **coarser}) if wanted.lod else {}} if anew else {}),
+        **(
+            {"lods": _level_notes({files.path(".glb"): found[0], **coarser}) if wanted.lod else {}}
+            if writes_glb
+            else {}
+        ),
         "textures": {file: texture.meaning for file, texture in sorted(loose.items())},
         **({"facts": files.entry} if files.entry else {}),
     }

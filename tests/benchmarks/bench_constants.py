@@ -27,7 +27,7 @@ from polcap.pipeline import run as pipeline
 from polcap.results import Results
 from polcap.stage_values import Network
 from polcap.stages import align, infer, selfcal
-from polcap.stages.infer import analytic, fine, half_turns, learned, zenith
+from polcap.stages.infer import analytic, fine, half_turns, learned, planar_faces, zenith
 from polcap.stages.selfcal import object_gains
 
 FACTORS = (0.5, 2.0)
@@ -49,17 +49,19 @@ SELFCAL: Mapping[ModuleType, tuple[str, ...]] = {
 }
 ANALYTIC = {
     analytic: ("_BLURS_PX", "_SAME", "_MODEL_ERROR_DEG"),
-    half_turns: ("_LONGEST", "_INVERSION_OUTLINE", "_INSIDE", "_AHEAD", "_BLUR", "_AROUND"),
+    planar_faces: ("_LONGEST",),
+    half_turns: ("_INVERSION_OUTLINE", "_INSIDE", "_AHEAD", "_BLUR", "_AROUND"),
     zenith: (
         "_FLAT", "_FLATTEST", "_SMOOTH_LIKELIER", "_DEPOLARIZED_LIKELIER", "_PATCHES", "_UNEVEN", "_RADIUS_SPREAD",
         "_OUTLINE_DEG", "_SHARP",
     ),
 }  # fmt: skip
 LEARNED: Mapping[ModuleType, tuple[str, ...]] = {
-    learned: ("_INVERSION", "_CELLS", "_BRIGHTEST"),
+    learned: ("_INVERSION", "_BRIGHTEST"),
     fine: ("_COARSEST",),
     analytic: ("_MODEL_ERROR_DEG", "_SAME"),
-    half_turns: ("_LONGEST", "_OUTLINE", "_INSIDE", "_NETWORK", "_AHEAD", "_BLUR", "_NEAR"),
+    planar_faces: ("_LONGEST", "_OF_ERROR", "_CURVED_DEG", "_SMOOTH"),
+    half_turns: ("_OUTLINE", "_INSIDE", "_NETWORK", "_AHEAD", "_BLUR", "_NEAR"),
 }
 
 

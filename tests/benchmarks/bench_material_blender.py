@@ -1,4 +1,4 @@
-"""Blender's render of a material beside the photograph of a view that was left out.
+"""Blender's render of a material next to the photograph of a view that was left out.
 
 PYTHONPATH=. python tests/benchmarks/bench_material_blender.py SESSION [--view view08]     (needs $POLCAP_BPY)
 

@@ -38,7 +38,6 @@ from polcap.optics import outline
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.infer import planar_faces
 
-_LONGEST = 128  # cells of the grid's longer side
 _OUTLINE, _INVERSION_OUTLINE, _INSIDE, _NETWORK = 1.0, 3.0, 0.015, 0.16  # weights of the terms; the neighbors' is 1
 _AHEAD = 1.5  # cells from a cell to the places ahead and behind
 _BLUR = 3.0  # cells, 1σ, of the depth inside the mask
@@ -112,8 +111,7 @@ def error_with_doubt(error: Floats, doubt: Floats, cos_zenith: Floats) -> Floats
 
 def coarse(normal: Floats, mask: Bools) -> Grid:
     """Average normals (H, W, 3) over the cells of a coarse grid: double azimuth, zenith, and the side of the mean."""
-    shrink = max(1.0, max(mask.shape) / _LONGEST)
-    shape = tuple(max(8, round(side / shrink)) for side in mask.shape)
+    shape = planar_faces.grid_shape(mask.shape)
     x, y = normal[..., 0] * mask, normal[..., 1] * mask
     parts = (mask, x, y, x * x - y * y, 2 * x * y, np.hypot(x, y), np.maximum(normal[..., 2] * mask, 0))
     share, x, y, cos2, sin2, sine, cosine = (area_mean(part.astype(np.float32), shape) for part in parts)

@@ -6,8 +6,8 @@ irradiance is proportional to ρ⁻³: one factor 1/ρ is the cosine of incidenc
 albedo, which mostly change the color, too.
 
 **Their variation.** An estimated normal map of a plane is not constant: it follows prints, highlights and noise. A
-face counts as a plane if its smoothed normals vary by less than their expected error, and by less than those of a
-curved surface with the same range of normals, which vary by 7° RMS or more. Their mean replaces the smoothed normals;
+face counts as a plane if its smoothed normals vary by less than their expected error, and by less than 7° RMS. Normals
+of a curved surface that fill the same 20° around one direction vary by more. The mean replaces the smoothed normals;
 finer relief stays.
 
 References
@@ -27,6 +27,7 @@ from polcap.optics import clusters, frames, robust
 from polcap.optics.morphology import erode, masked_mean
 from polcap.optics.resize import area_mean, weighted_area_mean
 
+_LONGEST = 128  # cells of the grid's longer side
 _ALIKE_DEG = 20.0  # greatest angle between one normal and those of its face
 _SHARE, _FEWEST_CELLS = 0.08, 50  # of the grid, and number of cells: least size of a face
 _CANDIDATES = 300  # normals of faces
@@ -41,7 +42,6 @@ _MOST_ODDS = 6.0  # ln odds
 _STEPS, _LEAST_RESIDUAL = 8, 0.003  # of the robust fit; ln light
 _TILE = 8  # cells, side of a tile in which residuals of the fit may be correlated
 # the variation; docs/benchmarks/surface.md
-_LONGEST = 128  # cells of the grid's longer side
 _SMOOTH = 0.03  # 1σ over the grid's longer side
 # greatest RMS angle of a plane's smoothed normals to their mean: over their expected error, and in degrees; beyond this
 # share of it, they are flattened in part only
@@ -54,6 +54,12 @@ class FlashPicture:
 
     radiance: Floats  # (H, W, 3)
     rays: Floats  # (H, W, 3) unit vectors to the camera
+
+
+def grid_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Shape (h, w) of the coarse grid of a picture (H, W)."""
+    shrink = max(1.0, max(shape) / _LONGEST)
+    return tuple(max(8, round(side / shrink)) for side in shape)
 
 
 def faces(normal: Floats, mask: Bools, *, half_turns: bool = False) -> Iterator[Bools]:
@@ -116,8 +122,7 @@ def flatten(normal: Floats, error: Floats, mask: Bools) -> Floats:
 
     `error` (H, W) is their expected error, degrees.
     """
-    shrink = max(1.0, max(mask.shape) / _LONGEST)
-    shape = tuple(max(8, round(side / shrink)) for side in mask.shape)
+    shape = grid_shape(mask.shape)
     inside = area_mean(mask, shape) > 0.5
     coarse, expected = frames.unit(weighted_area_mean(normal, mask, shape)), weighted_area_mean(error, mask, shape)
     change = np.zeros(coarse.shape, np.float32)
@@ -134,7 +139,7 @@ def flatten(normal: Floats, error: Floats, mask: Bools) -> Floats:
 def _continued(face: Bools, normal: Floats, mask: Bools) -> Bools:
     """Extend a face (h, w) by connected cells that are like its mean normal, also those of other faces.
 
-    A strip of a curved surface, between two other faces, varies little; with the cells beside it, it varies as they do.
+    A strip of a curved surface, between two other faces, varies little; with the cells around it, it varies as they do.
     """
     mean = frames.unit(np.median(normal[face], axis=0))
     alike = mask & (face | (frames.dot(normal, mean) > np.cos(np.radians(_ALIKE_DEG))))

@@ -103,7 +103,7 @@ def test_the_roughness_is_less_certain_without_a_highlight_or_with_a_clipped_one
 
 @pytest.mark.parametrize("said", [0.3, 0.8])
 def test_a_material_that_only_faces_the_flash_gets_a_usual_roughness(ball: Cues, said: float) -> None:
-    """A facing plane shows no place without highlight, so that the network's roughness is half a guess."""
+    """A facing plane shows no place without highlight, so the roughness of usual materials counts, too."""
     one = np.ones(ball.mask.shape)
     maps, seen = lit(ball, 0.2 * one, said * one, said * one)
     facing = frames.from_ray_frame(np.broadcast_to([0.0, 0, 1], maps.normal.shape), ball.rays)
