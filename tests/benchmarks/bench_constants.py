@@ -27,7 +27,8 @@ from polcap.pipeline import run as pipeline
 from polcap.results import Results
 from polcap.stage_values import Network
 from polcap.stages import align, infer, selfcal
-from polcap.stages.infer import analytic, fine, half_turns, learned, planar_faces, zenith
+from polcap.stages.infer import analytic, fine, learned, zenith
+from polcap.stages.infer.shape import half_turns, planar_faces
 from polcap.stages.selfcal import object_gains
 
 FACTORS = (0.5, 2.0)

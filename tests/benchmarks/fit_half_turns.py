@@ -1,4 +1,4 @@
-"""Fits `_WRONG`, `_REGION` and `_CELL` of `infer/half_turns.py` (odds of a wrong azimuth side) on known normals.
+"""Fits `_WRONG`, `_REGION` and `_CELL` of `infer/shape/half_turns.py` (odds of a wrong azimuth side) on known normals.
 
     python tests/benchmarks/fit_half_turns.py DATA SCENES … [--sixths 27] [--model ONNX]
 
@@ -29,7 +29,8 @@ from polcap.optics import frames
 from polcap.optics.resize import area_mean
 from polcap.pipeline import models
 from polcap.stage_values import Cues, Network
-from polcap.stages.infer import analytic, half_turns, learned, sizes_and_positions
+from polcap.stages.infer import analytic, learned, sizes_and_positions
+from polcap.stages.infer.shape import half_turns
 from polcap.training import evaluation_materials, evaluation_protocol, traced_views
 from polcap.training.evaluation_protocol import Case, Protocol
 

@@ -6,10 +6,9 @@ the camera frame.
     learned        the network, joined with the inversion
         sizes_and_positions   its predictions at several sizes, in turned and mirrored positions, averaged
         fine                  relief finer than its pixels, by a second network
-        planar_faces          their normals, and their side by the light of the flash
     analytic       the inversion: zenith from DoLP, azimuth from AoLP
         zenith                by the object's law of diffuse polarization
-    half_turns     the side of the ray to which a normal leans, for both estimators
+    shape          corrections of normals by the shape of the whole object, for both estimators
     highlights     the albedo in highlights, for both estimators; the gloss of materials, for the network
 
 Two properties of the albedo are estimated here. The error of its scale: a chart behind the object, or in a shadow, gets
@@ -66,7 +65,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fine: Annotated[bool, Meta(description="a second network adds relief finer than the pixels of the first")] = True
 
 
-@stage(version=42)
+@stage(version=43)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Estimate normal, diffuse, specular, roughness and expected error from cues; without a network by inversion.
 

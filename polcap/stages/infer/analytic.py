@@ -9,7 +9,8 @@ import numpy as np
 from polcap.images import Floats, Quality
 from polcap.optics import brdf, frames, fresnel
 from polcap.stage_values import Cues, SurfaceMaps
-from polcap.stages.infer import half_turns, highlights
+from polcap.stages.infer import highlights
+from polcap.stages.infer.shape import half_turns, integrable_normals
 from polcap.stages.infer.zenith import ZenithEstimate, estimate_zenith
 
 _BLURS_PX = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0)  # in steps of 1.5, in which noise falls by a third
@@ -27,6 +28,7 @@ def estimate(cues: Cues, ior: float) -> SurfaceMaps:
     refractive index.
     """
     normal, error, cos_zenith = invert(cues, ior)
+    normal = integrable_normals.make_integrable(normal, error, cues.mask, cues.rays)
     diffuse, highlight = _albedo(cues, cos_zenith, ior)
     roughness, specular = _gloss(highlight, cos_zenith, cues)
     shape = cues.mask.shape

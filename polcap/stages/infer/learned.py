@@ -4,9 +4,10 @@
 2. The network predicts normals, material, depth and error; half-turns of whole regions are corrected.
 3. The analytic inversion gives normals of each pixel. Their detail replaces that of the network where noise is low.
 4. The refinement network adds relief.
-5. Planar faces lose the variation that the expected error explains.
-6. The picture over the shading of the normals, times a smooth factor of the network, is the albedo.
-7. Pixels of one material get one roughness, with one expected error, and one F0.
+5. The coarse part of the normals becomes that of one surface where there is one.
+6. Planar faces lose the variation that the expected error explains.
+7. The picture over the shading of the normals, times a smooth factor of the network, is the albedo.
+8. Pixels of one material get one roughness, with one expected error, and one F0.
 """
 
 from dataclasses import replace
@@ -19,8 +20,9 @@ from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stage_values import Cues, Network, OrderTest, RunNetwork, SurfaceMaps
 from polcap.stages.cues import FLOOR
-from polcap.stages.infer import analytic, fine, half_turns, highlights, planar_faces, sizes_and_positions
+from polcap.stages.infer import analytic, fine, highlights, sizes_and_positions
 from polcap.stages.infer.highlights import REACHED
+from polcap.stages.infer.shape import half_turns, integrable_normals, planar_faces
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join, for the network's input holds the inversion
 # error = min(a·statedᵇ, c), degrees: maximum likelihood on simulated captures and on test pictures (decision 28)
@@ -47,6 +49,7 @@ def estimate(
     scale, power, most = _CALIBRATION
     error = np.minimum(scale * stated**power, most)
     error = half_turns.error_with_doubt(error, maps["doubt"], frames.dot(normal, cues.rays))
+    normal = integrable_normals.make_integrable(normal, error, cues.mask, cues.rays)
     normal = planar_faces.flatten(normal, error, cues.mask)
     light = (np.maximum(cues.radiance, 0) + FLOOR) * np.exp(maps["factor"])
     diffuse = highlights.fill(light / _shading(normal, cues.rays) - FLOOR, _limit_radiance(cues))

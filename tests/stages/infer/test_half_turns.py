@@ -5,7 +5,7 @@ import pytest
 
 from polcap.optics import frames
 from polcap.stages import cues, infer, stokes
-from polcap.stages.infer import half_turns, planar_faces
+from polcap.stages.infer.shape import half_turns, planar_faces
 from tests import scenes
 
 SIZE = 120

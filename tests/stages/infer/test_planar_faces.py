@@ -5,7 +5,7 @@ import pytest
 
 from polcap.images import Bools, Floats
 from polcap.optics import frames
-from polcap.stages.infer import planar_faces
+from polcap.stages.infer.shape import planar_faces
 
 SIZE = 96
 Y, X = np.mgrid[-1 : 1 : SIZE * 1j, -1 : 1 : SIZE * 1j]

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from polcap.images import Bools, Floats
 from polcap.optics import outline
 from polcap.optics.resize import area_mean, weighted_area_mean
-from polcap.stages.infer import planar_faces
+from polcap.stages.infer.shape import planar_faces
 
 _OUTLINE, _INVERSION_OUTLINE, _INSIDE, _NETWORK = 1.0, 3.0, 0.015, 0.16  # weights of the terms; the neighbors' is 1
 _AHEAD = 1.5  # cells from a cell to the places ahead and behind
