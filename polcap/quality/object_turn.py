@@ -2,7 +2,8 @@
 
 A rigid turn moves a point of the surface across the picture by its angle times the point's depth, and a roll moves it
 about the object's middle. The polarizer moves nothing. It changes brightness with the relief, which imitates motion,
-but not with this pattern; and it changes colors less than brightness. So both are fitted: brightness and colors.
+but not with this pattern; and it changes colors less than brightness. So both are fitted: brightness and colors. The
+polarization that the maps explain is taken out of the brightness first.
 
 References
 ----------
@@ -18,15 +19,19 @@ import numpy as np
 from polcap.images import Bools, Floats, MaskedImage, Quality
 from polcap.optics import outline, registration
 from polcap.optics.morphology import erode
+from polcap.optics.reduction import ObjectReduction
 from polcap.optics.resize import block_means
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.optics.warp import warp
+from polcap.quality import rerendering
 from polcap.stage_values import Alignment, AngleStack, ObjectMask, SurfaceMaps
-from polcap.stages.align.detail import averaging_step, detail
+from polcap.stages.align.detail import averaging_step, detail, fine_detail
+from polcap.stages.cues import NOMINAL_IOR
 
 _MOST_PIXELS = 0.8e6  # a larger picture is averaged down first
 _DETAIL_PX, _COLOR_PX, _BLUR_PX = 4.0, 8.0, 0.7  # 1σ: coarser structure is left out; smoothing before
 _INWARD_PX = 2  # of the mask that are left out: the outline does not turn with the surface
+_LEAST_SHOT = 0.05  # of half the light: no shot of a dielectric is darker, except in mirrors
 _FLOOR = 0.01  # of the 99th percentile of the light, added before the logarithm
 _LEAST_PIXELS = 1000
 _PRIOR = np.array([1.0, 1.0, 0.03, 0.03, 0.03, 0.03])  # 1σ of shift [px], zoom [1], roll, tilts [rad]
@@ -52,7 +57,8 @@ class ObjectTurn:
 def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask, maps: SurfaceMaps | None) -> ObjectTurn:
     """Turn of the object in each shot, in degrees, about any axis; 0 where there is too little detail.
 
-    Without `maps`, or without a depth in them, the object is taken as a ball inflated from its outline.
+    Without `maps`, or without a depth in them, the object is taken as a ball inflated from its outline, and no
+    polarization is taken out.
     """
     found = ObjectTurn(*np.zeros((4, len(radiance.angle))))
     step = averaging_step(object_.mask.shape, _MOST_PIXELS)
@@ -64,10 +70,12 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask, map
     field, cell = _displacements(relief, inside)
     power = np.einsum("nij,nik->jk", field[..., 3:], field[..., 3:]) / len(field)  # (3, 3) px² per rad²
     radius = outline.disc_radius(relief > 0)
+    polarized = _polarization(maps, radiance.angle, object_.mask.shape, step)
     reference = _signals(radiance.shot(0), step)
     for k in range(1, len(radiance.angle)):
         camera = registration.scaled(alignment.transform[k], 1 / step)
         moved = [warp(signal, camera) for signal in _signals(radiance.shot(k), step)]
+        moved[0] = moved[0] - (polarized[k] - polarized[0])
         motion, covariance = _fit(reference, moved, field, inside, cell)
         turn, doubt = motion[3:], covariance[3:, 3:]
         angle, shift = np.linalg.norm(turn), np.sqrt(turn @ power @ turn)  # rad, px
@@ -90,6 +98,20 @@ def _relief(maps: SurfaceMaps | None, object_: ObjectMask, step: int) -> Floats:
         height[y : y + tall, x : x + wide] = np.where(maps.mask, prior - prior[maps.mask].min(), 0)
     whole = block_means(object_.mask, step) > 0.99
     return np.where(whole, block_means(height, step) / step + 1, 0)
+
+
+def _polarization(maps: SurfaceMaps | None, angle: Floats, shape: tuple[int, ...], step: int) -> Floats:
+    """Fine detail (K, h, w) of the logarithm of the shots' brightness that polarization causes, by the maps."""
+    found = np.zeros((len(angle), *(side // step for side in shape)), np.float32)
+    if maps is None or maps.depth_prior is None:
+        return found
+    (x, y), (tall, wide) = (round(at) for at in maps.view.origin), maps.mask.shape
+    small = ObjectReduction(maps.mask, -(-max(tall, wide) // step)).maps(maps)
+    for k, shot in enumerate(rerendering.under_flash(small, angle, NOMINAL_IOR)[1]):
+        log = np.zeros(shape, np.float32)
+        log[y : y + tall, x : x + wide] = cv2.resize(np.log(np.maximum(shot, _LEAST_SHOT)), (wide, tall)) * maps.mask
+        found[k] = fine_detail(block_means(log, step), _DETAIL_PX)
+    return found
 
 
 def _displacements(relief: Floats, inside: Bools) -> tuple[Floats, Floats]:

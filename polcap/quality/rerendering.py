@@ -87,31 +87,20 @@ class Rerendering:
 def rerender(small: ReducedResult, ior: float) -> Rerendering:
     """Render the maps under the flash for each polarizer angle, for comparison with the photographs."""
     maps = small.maps
-    ray = frames.rays(maps.view, *maps.mask.shape)
-    normal = frames.to_ray_frame(maps.normal, ray)
-    ahead = np.zeros_like(ray)
-    ahead[..., 2] = 1.0
-    one = np.ones(maps.mask.shape, np.float32)
-    rough = np.maximum(maps.roughness, 0.02)
-    stokes = np.asarray(shade.stokes(normal, maps.diffuse, maps.specular, rough, ior * one, ahead, one))
-    s0, s1, s2 = frames.total(stokes) / 3 * maps.mask
+    stokes, shots = under_flash(maps, np.array([*small.angle, 0.0, np.pi / 4]), ior)
+    s0 = frames.total(stokes[0]) / 3 * maps.mask
     seen = frames.total(small.radiance) / 3 * maps.mask
     light, lit = seen[maps.mask], s0[maps.mask]
     scale = float(np.median(light[lit > 0] / lit[lit > 0])) if (lit > 0).any() else 1.0
     white = max(float(np.quantile(light, WHITE_QUANTILE)), 1e-6) if light.size else 1.0
 
-    def modulation(angle: float) -> Floats:
-        """S1 cos 2θ + S2 sin 2θ of the maps (H, W), for an angle θ in the picture."""
-        on_ray = frames.axis_on_ray(np.float32(angle), ray)
-        return np.asarray(s1 * np.cos(2 * on_ray) + s2 * np.sin(2 * on_ray))
-
     shown = scale * lit
     bright = (either := np.maximum(light, shown)) >= (np.quantile(either, _BRIGHTEST) if either.size else 0.0)
     measured, predicted = [], []
-    for angle in small.angle:
+    for angle, shot in zip(small.angle, shots):
         measured.append(seen * (1 + small.ratio[0] * np.cos(2 * angle) + small.ratio[1] * np.sin(2 * angle)) / white)
-        predicted.append(scale * (s0 + modulation(angle)) / white)
-    rendered = np.stack([modulation(0.0), modulation(np.pi / 4)]) / np.maximum(s0, 1e-6)
+        predicted.append(scale * shot * s0 / white)
+    rendered = shots[-2:] - 1
     return Rerendering(
         measured=np.minimum(measured, 1.0),
         predicted=np.minimum(predicted, 1.0),
@@ -121,6 +110,23 @@ def rerender(small: ReducedResult, ior: float) -> Rerendering:
         difference=float(np.median(np.abs(light - shown) / np.maximum(light, 1e-6))) if light.size else 0.0,
         highlights=float(light[bright].sum() / max(float(shown[bright].sum()), 1e-9)) if light.size else 1.0,
     )
+
+
+def under_flash(maps: SurfaceMaps, angle: Floats, ior: float) -> tuple[Floats, Floats]:
+    """Maps under a flash at the lens: Stokes parameters (3, H, W, 3) in the frame of each ray, and shots (K, H, W).
+
+    A shot is the light through a polarizer at an angle (K,) rad in the picture, over half the light S0.
+    """
+    ray = frames.rays(maps.view, *maps.mask.shape)
+    ahead = np.zeros_like(ray)
+    ahead[..., 2] = 1.0
+    one = np.ones(maps.mask.shape, np.float32)
+    rough, normal = np.maximum(maps.roughness, 0.02), frames.to_ray_frame(maps.normal, ray)
+    stokes = np.asarray(shade.stokes(normal, maps.diffuse, maps.specular, rough, ior * one, ahead, one))
+    s0, s1, s2 = frames.total(stokes) / 3 * maps.mask
+    axes = [2 * frames.axis_on_ray(np.float32(axis), ray) for axis in angle]
+    shots = [1 + (s1 * np.cos(twice) + s2 * np.sin(twice)) / np.maximum(s0, 1e-6) for twice in axes]
+    return stokes, np.stack(shots)
 
 
 def _agreement(measured: Floats, rendered: Floats) -> float:

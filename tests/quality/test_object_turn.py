@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from polcap.optics import mueller, shade
+from polcap.optics import frames, mueller, shade
 from polcap.quality import object_turn
+from polcap.quality.rerendering import under_flash
 from polcap.stage_values import AngleStack, SurfaceMaps
 from tests import scenes
 
@@ -87,3 +88,20 @@ def test_the_error_covers_what_noise_does() -> None:
 def test_a_mosaic_holds_all_angles_at_once() -> None:
     radiance = replace(photographs((0.0, 2.0, 0.0)), offset_px=np.zeros((3, 2)))
     assert not measured(radiance).degrees.any()
+
+
+def test_polarization_that_the_maps_explain_is_no_turn() -> None:
+    """A gray ball with fine relief: the polarizer changes its shading almost as motion would."""
+    normal, mask = scenes.truth()
+    x0, y0, _, _ = scenes.ball_object().crop
+    y, x = np.mgrid[: mask.shape[0], : mask.shape[1]]
+    relief = np.stack([np.sin(0.6 * x), np.sin(0.5 * y + 0.3 * x), 0 * x], -1)
+    rough = frames.unit(normal + 0.15 * relief).astype(np.float32)
+    maps = replace(of_relief(1.0), normal=np.where(mask[..., None], rough, normal).astype(np.float32))
+    radiance = scenes.stack()
+    stokes, shots = under_flash(maps, radiance.angle, 1.5)
+    value = np.full(radiance.value.shape, 1e-3, np.float32)
+    light = stokes[0] * shots[..., None] * mask[..., None]
+    value[:, y0 : y0 + mask.shape[0], x0 : x0 + mask.shape[1]] += light.astype(np.float32)
+    still = replace(radiance, value=value)
+    assert measured(still, replace(maps, normal=normal)).shift[1:].max() > 4 * measured(still, maps).shift[1:].max()

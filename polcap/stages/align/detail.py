@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from polcap.images import MaskedImage, Quality
+from polcap.images import Floats, MaskedImage, Quality
 from polcap.optics import frames
 from polcap.optics.morphology import dilate
 from polcap.optics.registration import Pyramid, squared_gradient
@@ -38,13 +38,19 @@ def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
     level = np.maximum(total, 0)
     level += np.float32(floor)
     log = np.asarray(cv2.log(level))
-    reach = 2 * int(np.ceil(3 * detail_px)) + 1
-    fine = np.asarray(cv2.GaussianBlur(log, (0, 0), _BLUR_PX))
-    fine -= cv2.GaussianBlur(log, (reach, reach), detail_px)
+    fine = fine_detail(log, detail_px)
     sigma /= level
     fine /= 1 + (sigma / np.float32(_TYPICAL_DETAIL)) ** 2
     clipped = block_means(shot.quality & Quality.CLIPPED > 0, step) > 0
     return Pyramid(fine, ~dilate(clipped, int(np.ceil(2 * detail_px)) // 2))
+
+
+def fine_detail(log: Floats, detail_px: float) -> Floats:
+    """A picture (H, W) minus its Gaussian mean of 1σ = `detail_px`, slightly smoothed."""
+    reach = 2 * int(np.ceil(3 * detail_px)) + 1
+    fine = np.asarray(cv2.GaussianBlur(log, (0, 0), _BLUR_PX))
+    fine -= cv2.GaussianBlur(log, (reach, reach), detail_px)
+    return fine
 
 
 def edge_strength(shot: Pyramid) -> Pyramid:
