@@ -13,6 +13,7 @@ from typer.main import get_command
 
 import polcap
 from polcap.cli import app
+from polcap.fusion.fusion_path import WITHOUT_EFFECT
 from polcap.material.material_path import all_settings
 
 REFERENCE = Path(__file__).parent / "reference"
@@ -44,13 +45,14 @@ def options_table(command_name: str) -> str:
 
 def settings_page() -> str:
     """The page of all settings with type, default, range and meaning."""
+    without = [f"`{key}…`" if key.endswith(".") else f"`{key}`" for key in WITHOUT_EFFECT]
     lines = [
         "# Settings", "", _MADE, "",
         "`--config FILE.toml` (sections as below) overrides the defaults; `--set stage.name=value` overrides both.",
         "An unknown name or a value outside its range is an error that names it.",
         "In a file, `fusion.shape.grid` is `grid` below `[fusion.shape]`. Only `polcap material` takes `material.…`,",
         "only `polcap fuse` takes `fusion.…`;",
-        "it refuses `surface.…`, `mask.part` and `asset.raw_pixels`, which would not change a fused object.", "",
+        f"it refuses {', '.join(without)}, which would not change a fused object.", "",
     ]  # fmt: skip
     for name, rows in groupby(all_settings(), lambda setting: setting.key.partition(".")[0]):
         lines += ["", f"## {name}", "", "| setting | type | default | range | meaning [unit] |"]

@@ -105,6 +105,7 @@ def test_wrong_flag_is_one_line_and_exit_2(
         (["proces", "x"], ["'proces'", "Did you mean 'process'?"]),
         (["synth", "x", "--seed", "-3"], ["'--seed'", "0"]),
         (["export", "x", "--images", "gif"], ["'gif'", "'jpeg'"]),
+        (["export", "x", "--about", "date=2020", "--about", "date=2021"], ["date", "twice", "'2020'", "'2021'"]),
     ],
 )
 def test_a_faulty_command_line_is_one_line_and_exit_2(polcap: Command, arguments: list[str], words: list[str]) -> None:

@@ -86,6 +86,7 @@ def export(
         lod=lod,
     )
     wanted = [replace(plain, preset=name) for name in dict.fromkeys(map(str.lower, preset) if preset else [None])]
+    options.warn_of_altered_archive(result)
     files = api.write_exports(result, *wanted, out=out)
     result = out or result
     options.warn_of_outdated_exports(result, [file for file in files if file.name.endswith(".provenance.json")])
@@ -125,7 +126,7 @@ def _warn_of_upsampling(result: Path, size: int) -> None:
     if size > held:
         setting = "fusion.atlas.size" if fused_maps.is_fused(result) else "hdr.demosaic=full"
         terminal.print_message(
-            f"polcap: textures of {size} px are {size / held:.2g} x larger than the maps of {held} px hold; "
+            f"polcap: textures of {size} px are {size / held:.2g} times as wide as the maps ({held} px); "
             f"for more detail use --set {setting}, or photograph from nearer",
             "WARNING",
         )
@@ -133,9 +134,12 @@ def _warn_of_upsampling(result: Path, size: int) -> None:
 
 def _catalog_fields(stated: Sequence[str]) -> dict[str, str]:
     """Parse --about K=V: fields of `CatalogEntry` by name, not yet checked. Raises SettingError for another form."""
-    found = {}
+    found: dict[str, str] = {}
     for text in stated:
-        key, equals, found[key] = options.utf8("--about", text).partition("=")
+        key, equals, value = options.utf8("--about", text).partition("=")
         if not equals:
             raise SettingError(f'--about {text}: write FACT=TEXT, for example title="Vase with handles"')
+        if key in found:
+            raise SettingError(f"--about {key} is stated twice: {found[key]!r} and {value!r}; give it once")
+        found[key] = value
     return found

@@ -116,6 +116,17 @@ def warn_of_outdated_exports(out: Path, records: Sequence[Path]) -> None:
         terminal.print_message(f"polcap: warning: {text}", "WARNING")
 
 
+def warn_of_altered_archive(folder: Path) -> None:
+    """Print a warning if a folder is an archive and files of it differ from its manifest."""
+    from polcap.formats import own_folders
+    from polcap.formats.export import archive
+
+    if changed := archive.altered(folder):
+        named = ", ".join(changed[:_NAMED] + ["…"] * (len(changed) > _NAMED))
+        text = f"{named} in {folder}: missing, or not as in {own_folders.MANIFEST}; take another copy of the archive"
+        terminal.print_message(f"polcap: warning: {text}", "WARNING")
+
+
 def chart_request(text: str | None, no_chart: bool) -> "ChartRequest":
     """Parse --chart and --no-chart: corners, a profile or no chart; by default the chart is searched for."""
     import numpy as np

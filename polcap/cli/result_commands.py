@@ -100,6 +100,8 @@ def _compare(results: tuple[Path, Path], out: Path, json: bool, open_: bool) -> 
     from polcap.pipeline import result_folder
     from polcap.report import compare as pairs
 
+    for result in results:
+        options.warn_of_altered_archive(result)
     abouts = reports.read(results[0]), reports.read(results[1])
     file = out / "compare.html"
     with result_folder.opened(out):

@@ -79,7 +79,9 @@ def evaluate(
     """Score a model on test meshes and materials (extra [train]), or on photographs with --real (without the extra)."""
     options.check_out(out)
     if (data is None) == (real is None):
-        raise SettingError("evaluate takes DATA, a folder with meshes/ and materials/, or --real DIR; give one of them")
+        raise SettingError(
+            "write evaluate MODEL DATA, with meshes/ and materials/ in DATA, or evaluate MODEL --real DIR"
+        )
     if real is not None:
         options.training("evaluation_photographs").main(real, model, out, terminal.print_progress)
         terminal.print_data(str(out / "real.md"))

@@ -187,7 +187,9 @@ def _check(path: Path, session: Any, encoding: str) -> tuple[tuple[str, ...], di
         raise ModelError(f"{path}: its metadata are not text ({error}); export it with polcap") from error
     missing = [name for name in REQUIRED if not metadata.get(name)]
     if missing:
-        raise ModelError(f"{path}: its metadata does not state {', '.join(missing)}; export it with polcap")
+        raise ModelError(
+            f"{path}: its metadata does not state {', '.join(missing)}; add them as docs/explanations/network.md shows"
+        )
     if metadata["encoding"] != encoding:
         raise ModelError(
             f"{path}: input encoding {metadata['encoding']}, this polcap makes {encoding}; "

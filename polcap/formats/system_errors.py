@@ -9,9 +9,9 @@ MISSING = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENODEV)  # of ne
 _REASONS = {
     errno.ENOSPC: "the disk is full; free some space",
     errno.EDQUOT: "the disk quota is used up; free some space",
-    errno.EROFS: "the file system is read-only; choose another folder",
-    errno.EACCES: "permission denied; choose a folder that may be written",
-    errno.EPERM: "permission denied; choose a folder that may be written",
+    errno.EROFS: "the file system is read-only; choose another folder with -o",
+    errno.EACCES: "permission denied; choose a folder that may be written with -o",
+    errno.EPERM: "permission denied; choose a folder that may be written with -o",
     errno.EEXIST: "there is a file where a folder is needed; choose another path",
     errno.ENOTDIR: "there is a file where a folder is needed; choose another path",
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",

@@ -24,7 +24,7 @@ from polcap.pipeline.cache import MemoryCache, StageResult
 from polcap.quality.limits import FusedGateLimits
 
 # settings of `polcap process` that would not change a fused object, by the beginning of their keys
-_WITHOUT_EFFECT = {
+WITHOUT_EFFECT = {
     "surface.": "its mesh is of all views: set fusion.shape.grid",
     "mask.part": "it is the largest part of the masks of all views",
     "asset.raw_pixels": "its textures are means of all views: set fusion.atlas.size",
@@ -54,7 +54,7 @@ class SessionConfig(Config, frozen=True, forbid_unknown_fields=True):
         for setting in settings_.settings(Config):
             section, name = setting.key.split(".")
             value = getattr(getattr(self, section), name)
-            reason = next((why for key, why in _WITHOUT_EFFECT.items() if setting.key.startswith(key)), None)
+            reason = next((why for key, why in WITHOUT_EFFECT.items() if setting.key.startswith(key)), None)
             if reason and value != setting.default:
                 raise SettingError(
                     f"{setting.key} = {value} has no effect on a fused object; {reason}, and leave this one out"

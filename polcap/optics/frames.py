@@ -52,8 +52,8 @@ def dot(a: Any, b: Any) -> Any:
 
 
 def angle_deg(a: Floats, b: Floats) -> Floats:
-    """Angles (...,) between unit vectors (..., 3), degrees."""
-    return np.asarray(np.degrees(np.arccos(np.clip(dot(a, b), -1, 1))))
+    """Angles (...,) between unit vectors (..., 3), degrees; from their distance, for a cosine near 1 is imprecise."""
+    return np.asarray(np.degrees(2 * np.arcsin(np.clip(dot(a - b, a - b) ** 0.5 / 2, 0, 1))))
 
 
 def total(a: Any) -> Any:

@@ -219,21 +219,22 @@ def sidecars(out: Path) -> list[Path]:
 
 
 def find_outdated(out: Path, records: Sequence[Path], keys: Mapping[str, str]) -> list[Path]:
-    """Exports of other maps than those of the result `out` with these cache keys: whole folders, then parts of others.
+    """Exports of other maps than those of the result `out` with these cache keys: folders of presets, and files.
 
     `records` are sidecars. A folder has one; a file of polcap that it does not list was exported with another record.
     """
-    folders, parts, own = [], dict[Path, None](), own_files.OwnFiles(out)
+    old, parts, own = list[Path](), dict[Path, None](), own_files.OwnFiles(out)
     for sidecar in records:
         about, folder = provenance.read(sidecar), sidecar.parent
         if about.get("stages") != keys:
-            folders.append(folder)
+            listed = dict.fromkeys(folder / Path(name).parts[0] for name in about.get("files", ()))
+            old += [folder] if folder.name in PRESETS else [path for path in listed if path.exists()]
             continue
         for file in own.below(folder):
             name = file.relative_to(os.path.abspath(folder))
             if file.suffix in _SUFFIXES and name.as_posix() not in about["files"] and name.parts[0] not in PRESETS:
                 parts[folder / name.parts[0]] = None
-    return [*folders, *parts]
+    return [*old, *parts]
 
 
 def _write_one(write_file: Callable[..., None], file: Path, *arguments: Any) -> list[Path]:

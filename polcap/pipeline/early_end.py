@@ -13,7 +13,7 @@ from polcap.quality import gates
 from polcap.quality.advice import advice
 from polcap.quality.gate import full_size, of_error
 from polcap.report import stage_pictures
-from polcap.results import ResultsUntilAlign, ResultsUntilHdr, ResultsUntilWhitebalance
+from polcap.results import ResultsUntilAlign, ResultsUntilHdr, ResultsUntilMask, ResultsUntilWhitebalance
 from polcap.stages import align
 
 PICTURE = "stopped.png"  # in work/
@@ -21,7 +21,10 @@ _OF_PIXELS = (CaptureError, ChartError, AlignmentError, ObjectError)  # the pict
 
 
 def explain(error: InputError, cache: StageCache, capture: Capture, config: Config) -> InputError | None:
-    """The error with the cause that gates find in the stages so far, and a picture of these; None without pixels."""
+    """The error with the cause that gates find in the stages so far, and a picture of the shots if they show the cause.
+
+    None without pixels.
+    """
     reached = results_so_far(cache)
     if not isinstance(error, _OF_PIXELS) or not isinstance(reached, ResultsUntilHdr):
         return None
@@ -31,10 +34,12 @@ def explain(error: InputError, cache: StageCache, capture: Capture, config: Conf
     files = tuple(tuple(capture.file_name(frame) for frame in shot.frames) for shot in capture.shots)
     evidence = full_size(found, capture.focal_doubt, config.align, files)
     first = next(iter(advice(gates.judge(evidence, config.gates, of_error(error)))), of_error(error))
+    message = str(error) if first.message == of_error(error).message else f"{first.message}; {first.remedy}"
+    if isinstance(reached, ResultsUntilMask):  # the cause is in the polarization, which the shots do not show
+        return type(error)(message)
     picture = cache.folder / "work" / PICTURE
     colors = shipped_data.colorchecker(config.whitebalance.chart) if isinstance(error, ChartError) else None
     png.write(picture, stage_pictures.stopped(reached, colors))
-    message = str(error) if first.message == of_error(error).message else f"{first.message}; {first.remedy}"
     return type(error)(f"{message}; see {picture}")
 
 

@@ -111,6 +111,6 @@ def _settings(url: str, query: str, settings_class: type[msgspec.Struct]) -> Any
                 raise SettingError(f"rotator {url!r}: unknown setting {key!r}; the settings are {', '.join(names)}")
         return msgspec.convert({key: text.removeprefix("+") for key, text in pairs}, settings_class, strict=False)
     except msgspec.ValidationError as error:
-        raise SettingError(f"rotator {url!r}: wrong setting: {error}; see the reference page on rotators") from None
+        raise SettingError(f"rotator {url!r}: wrong setting: {error}; see docs/reference/rotators.md") from None
     except ValueError as error:
         raise SettingError(f"rotator {url!r}: {error}; write settings as ?offset=12&settle=0.5") from None

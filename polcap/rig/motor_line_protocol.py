@@ -1,6 +1,6 @@
 """Motor driver for home-made rotators: the line protocol of `examples/rotator_firmware` (Arduino, RP2040).
 
-115200 8N1, lines of ASCII; the reference page on rotators has the whole protocol.
+115200 8N1, lines of ASCII; docs/reference/rotators.md has the whole protocol.
 ::
 
     ?          polcap-rotator 1 NAME SPEED     degrees/s; also sent, with ` started` at the end, when the board starts

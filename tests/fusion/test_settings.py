@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from polcap import config as configs
-from polcap.config import Config, Setting
+from polcap.config import Setting
 from polcap.errors import SettingError
 from polcap.fusion import atlas as atlases
 from polcap.fusion import baking, filling, fusion_path, view_path
@@ -21,11 +21,7 @@ from polcap.quality.fused_object import SeenSurface
 from tests.fusion import board_views, ellipsoid
 
 SETTINGS = list(configs.settings(SessionConfig))
-REFUSED = {
-    *(f"surface.{name}" for name in Config().surface.__struct_fields__),
-    "mask.part",
-    "asset.raw_pixels",
-}
+REFUSED = {setting.key for setting in SETTINGS if setting.key.startswith(tuple(fusion_path.WITHOUT_EFFECT))}
 
 
 def another(setting: Setting) -> str:

@@ -53,3 +53,9 @@ def test_axes_keep_their_angle_in_the_middle_and_horizontal_stays_horizontal() -
         turned = frames.axis_on_ray(np.array(angle), v)[10, 20]
         assert np.cos(2 * (turned - angle)) == pytest.approx(1.0)
     np.testing.assert_allclose(frames.axis_on_ray(np.array(0.0), v), 0.0, atol=1e-9)
+
+
+def test_equal_vectors_in_float32_have_no_angle_and_opposite_ones_180_degrees() -> None:
+    v = some_rays().astype(np.float32)
+    assert (frames.angle_deg(v, v) == 0).all()
+    np.testing.assert_allclose(frames.angle_deg(v, -v), 180, atol=0.1)

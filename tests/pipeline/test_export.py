@@ -324,7 +324,7 @@ def test_a_preset_for_an_engine_has_20_000_triangles_unless_stated(own: Path, po
 def test_larger_textures_than_the_maps_hold_are_reported(tiny_result: Path, polcap: Command) -> None:
     size = max(json.loads((tiny_result / "maps" / "maps.json").read_text())["size"])
     done = polcap("export", tiny_result, "--gltf", "--texture-size", 4 * size)
-    assert f"4 x larger than the maps of {size} px hold" in done.stderr and "hdr.demosaic=full" in done.stderr
+    assert f"4 times as wide as the maps ({size} px)" in done.stderr and "hdr.demosaic=full" in done.stderr
 
 
 def test_levels_have_a_quarter_of_triangles_and_texels_and_one_origin(own: Path) -> None:
@@ -394,7 +394,8 @@ def test_exports_of_earlier_maps_are_named(own: Path, polcap: Command) -> None:
     (own / "report.json").write_text(json.dumps(about))
     maps = json.loads((own / "maps" / "maps.json").read_text())
     (own / "maps" / "maps.json").write_text(json.dumps({**maps, "keys": about["keys"]}))
-    assert asset_export.find_outdated(own, asset_export.sidecars(own), about["keys"]) == [asset, asset / "unreal"]
+    old = asset_export.find_outdated(own, asset_export.sidecars(own), about["keys"])
+    assert {asset / "capture.glb", asset / "capture_sfp", asset / "unreal"} < set(old) and asset not in old
     (asset / "mine.png").write_bytes(b"of the user")
     again = polcap("export", own, "--gltf", "--texture-size", 64)
     named = "asset/capture.mtl, asset/capture.obj, asset/capture_basecolor.png, asset/capture_normal.exr, "
@@ -470,6 +471,10 @@ def test_an_archive_checks_itself_after_two_exports_and_a_copy(
         done = polcap(name, tmp_path / "elsewhere", *rest)
         assert done.returncode == 2 and "is an archive, which stays as it is" in done.stderr
     assert set(check_sums(tmp_path / "elsewhere")) == {*names, "C_occlusion.png"}
+    (tmp_path / "elsewhere/maps/mask.png").write_bytes((tmp_path / "elsewhere/maps/normal.png").read_bytes())
+    altered = polcap("export", tmp_path / "elsewhere", "--out", tmp_path / "newer", "--ply")
+    assert "maps/mask.png in" in altered.stderr and "not as in manifest-sha256.txt" in altered.stderr
+    shutil.copy(tiny_result / "maps/mask.png", tmp_path / "elsewhere/maps/mask.png")
     if program := shutil.which("sha256sum"):
         command = [program, "-c", "--quiet", "manifest-sha256.txt"]
         assert subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True).returncode == 0

@@ -67,9 +67,9 @@ def load(folder: Path) -> CaptureFile:
         stated = msgspec.convert(document, CaptureFile)
     except msgspec.ValidationError as error:
         fault = text_file.fault(error, document, CaptureFile)
-        raise CaptureError(f"{path}: {fault}; see the reference page on captures") from None
+        raise CaptureError(f"{path}: {fault}; see docs/reference/captures.md") from None
     except ValueError as error:  # of TOML, of UTF-8
-        raise CaptureError(f"{path}: {error}; see the reference page on captures") from None
+        raise CaptureError(f"{path}: {error}; see docs/reference/captures.md") from None
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
     if stated.cells is not None and {angle % 180 for row in stated.cells for angle in row} != {0, 45, 90, 135}:

@@ -194,8 +194,9 @@ def _folders(folder: Path, sub_folders: dict[float, Path], crossed: Path | None,
     """Plan of the folders pol000, pol045, …, with notes on files that are not used."""
     groups: dict[float, list[Source]] = {}
     notes = []
+    remedy = "shoot this angle again" + (", or remove the folder" if len(sub_folders) > 3 else "")
     for angle, sub_folder in sub_folders.items():
-        groups[angle], found = _list_photographs(sub_folder, "shoot this angle again, or remove the folder")
+        groups[angle], found = _list_photographs(sub_folder, remedy)
         notes += [f"{sub_folder.name}: {note}" for note in found]
     others: tuple[Source, ...] = ()
     if crossed is not None:

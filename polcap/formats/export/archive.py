@@ -3,8 +3,7 @@
 import os
 from pathlib import Path
 
-from polcap.formats import atomic, color_profile, own_files
-from polcap.formats.own_folders import MANIFEST
+from polcap.formats import atomic, color_profile, own_files, own_folders, text_file
 from polcap.formats.raw import file_bytes
 
 
@@ -31,9 +30,24 @@ def write_manifest(folder: Path) -> Path:
 
     The lines are those of sha256sum, with paths relative to the folder.
     """
-    manifest, here = folder / MANIFEST, Path(os.path.abspath(folder))
+    manifest, here = folder / own_folders.MANIFEST, Path(os.path.abspath(folder))
     own = own_files.owner(manifest)
-    files = [] if own is None else [file for file in own.below(here) if file != here / MANIFEST]
+    files = [] if own is None else [file for file in own.below(here) if file != here / own_folders.MANIFEST]
     lines = [f"{file_bytes.digest(file.read_bytes())}  {file.relative_to(here).as_posix()}\n" for file in files]
     atomic.write(manifest, "".join(lines))
     return manifest
+
+
+def altered(folder: Path) -> list[str]:
+    """Files that an archive's manifest lists and that are missing or have another digest; none for other folders."""
+    if not own_folders.is_archive(folder):
+        return []
+    try:
+        listed = [line.split("  ", 1) for line in text_file.read_text(folder / own_folders.MANIFEST).splitlines()]
+        return [
+            name
+            for digest, name in listed
+            if not (folder / name).is_file() or file_bytes.digest((folder / name).read_bytes()) != digest
+        ]
+    except (OSError, ValueError):
+        return [own_folders.MANIFEST]

@@ -248,10 +248,17 @@ def write_textures(folder: Path, maps: Any, letters: Mapping[str, str], full: Co
 
 def read_mask(file: Path, size: tuple[int, int]) -> Bools:
     """Read a mask (H, W) that has this size (W, H). Raises DecodeError: it is missing, damaged, or of another size."""
-    levels = png.read(file)
+    levels = png.read(_existing(file))
     if levels.shape != size[::-1]:
         raise DecodeError(f"{file} is not {size[0]} × {size[1]}; process again")
     return np.asarray(levels > 127)
+
+
+def _existing(file: Path) -> Path:
+    """The path of a file that exists. Raises DecodeError."""
+    if not file.exists():
+        raise DecodeError(f"{file} is missing; run `polcap process` on the photographs again")
+    return file
 
 
 def read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Floats:
@@ -259,7 +266,7 @@ def read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Fl
 
     Raises DecodeError: the file is missing, damaged, not of this size (W, H), or a value is not finite.
     """
-    file = folder / f"{name}.exr"
+    file = _existing(folder / f"{name}.exr")
     found, _ = exr.read(file)
     planes = [found[letter] for letter in letters if letter in found]
     if len(planes) != len(letters) or planes[0].shape != size[::-1]:

@@ -208,6 +208,14 @@ def test_relative_depth_is_described_as_relative(result: Result, tmp_path: Path)
     assert json.loads((tmp_path / "maps.json").read_text("utf-8"))["depth"]["unit"] == "relative"
 
 
+def test_a_missing_map_is_named_with_a_remedy(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "maps")
+    for name in ("normal.exr", "mask.png"):
+        (tmp_path / "maps" / name).unlink()
+        with pytest.raises(DecodeError, match=rf"{name} is missing; run `polcap process`"):
+            maps.read(tmp_path / "maps")
+
+
 def test_damaged_folder_is_one_line(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(DecodeError, match="cannot be read"):
         maps.read(tmp_path)
