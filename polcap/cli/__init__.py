@@ -37,7 +37,7 @@ from polcap.errors import SettingError
 _ANYWHERE = ("--debug", "-q", "--quiet", "-v", "--verbose", "--log")  # options that may follow the command
 
 
-class OneLine(TyperGroup):
+class OneLineErrors(TyperGroup):
     """Command group that reports a wrong command line in one line, as all other errors."""
 
     def main(self, args: Sequence[str] | None = None, *rest: Any, standalone_mode: bool = True, **extra: Any) -> Any:
@@ -53,7 +53,7 @@ class OneLine(TyperGroup):
                 raise
             text, code = _one_line(error), error.exit_code
             terminal.print_message(text, "ERROR")
-            asked = {"json": "--json" in words}
+            asked = {"json": "--json" in words}  # a faulty command line has no parsed options
             terminal.print_error_document(asked, SettingError(), text.removeprefix("polcap: error: "), code)
         except typer.Abort:  # a question without an answer
             terminal.print_message("polcap: aborted")
@@ -93,7 +93,7 @@ COMMANDS = (
     synth, board, capture, train, evaluate,
 )  # fmt: skip
 app = typer.Typer(
-    cls=OneLine,
+    cls=OneLineErrors,
     help="Turns flash photographs taken through a rotating polarizer into a relightable 3-D asset.",
     epilog="`polcap help COMMAND` explains a command, `polcap settings STAGE` the settings of a stage. "
     "--debug, -q, -v and --log may follow the command.",

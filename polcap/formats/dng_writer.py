@@ -52,14 +52,15 @@ def write(
     main = [
         *_layout_tags(width, height),
         *_camera_tags(exif),
-        (33421, _SHORT, np.shape(cfa)),
-        (33422, _BYTE, bytes(np.asarray(cfa, np.uint8).ravel())),
-        (50714, _RATIONAL, np.broadcast_to(black, (2, 2)).ravel()),
-        (50717, _LONG, int(white)),
-        (50721, _SRATIONAL, np.asarray(color_matrix).ravel()),
-        (50728, _RATIONAL, as_shot_neutral),
-        (50778, _SHORT, _D65),
+        (33421, _SHORT, np.shape(cfa)),  # CFARepeatPatternDim
+        (33422, _BYTE, bytes(np.asarray(cfa, np.uint8).ravel())),  # CFAPattern
+        (50714, _RATIONAL, np.broadcast_to(black, (2, 2)).ravel()),  # BlackLevel
+        (50717, _LONG, int(white)),  # WhiteLevel
+        (50721, _SRATIONAL, np.asarray(color_matrix).ravel()),  # ColorMatrix1
+        (50728, _RATIONAL, as_shot_neutral),  # AsShotNeutral
+        (50778, _SHORT, _D65),  # CalibrationIlluminant1
     ]
+    # the length of the directory does not depend on the two offsets in it
     start = 8 + len(_ifd(main, 8))
     exif_ifd = _ifd(_exif_tags(exif), start)
     offsets = {34665: start, 273: start + len(exif_ifd)}

@@ -102,7 +102,7 @@ class VisibleTexels:
 
 @stage(version=4)
 def bake(views: tuple[FusionView, ...], atlas: Atlas, settings: BakingSettings) -> AtlasMaps:
-    """Bake the maps of all views into the atlas; values where no view sees the surface are those of no light, 0."""
+    """Bake the maps of all views into the atlas; where no view sees the surface, they are 0."""
     visible = visible_texels(views, atlas)
     count = len(atlas.position)
     normal = _bake_normals(views, visible, atlas, settings)

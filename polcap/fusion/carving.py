@@ -46,7 +46,7 @@ _SUPPORT = 3.0  # steps within which another view confirms a depth
 _TRUNCATION = 2.5  # steps
 _SOLID = 0.1  # weight of a vote for solid at every point, so that points without depths stay
 _SMOOTHING = 1.0  # steps, 1σ
-_WALL = 1.5  # steps; thickness that stays behind a wall, which is surface through which no view looks
+_WALL = 1.5  # steps; thickness that stays behind a wall: surface through which no view looks
 _OPEN = 0.2  # a vertex with a larger share of vertices around it through which views look is no wall
 
 

@@ -40,7 +40,7 @@ _NORMAL_SIGMA = np.radians(5.0)  # 1σ of a normal, in the first turns
 _SCALES_PX = (12.0, 6.0, 3.0, 1.5, 1.0, 1.0)  # of the Cauchy weights, by round; the first turns err by some pixels
 _FAR = 3.0  # times the last of these; features beyond are wrong matches
 _SHIFT_SIGMA = 0.02  # 1σ of an object's motion on the table besides the turn, over the distance of the lens
-_HELD = 1e-4  # 1σ of the origin's height and of the first turn, which are free
+_HELD = 1e-4  # 1σ by which the origin's height and the first turn are held near 0: the features do not determine them
 _STEPS = 12  # of the adjustment in a round
 _WRONG = 0.01  # share of the features at the lower and at the upper end that may be wrong
 _BELOW = 0.15  # of the features' height, from the lowest of them to y = 0; the foot itself often shows none

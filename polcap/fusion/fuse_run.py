@@ -58,7 +58,7 @@ def fuse(session_input: SessionInput[SessionConfig], out: Path, notify: Notify, 
 
 
 def _with_albedo_scale(maps: AtlasMaps, processed: ProcessedSession) -> AtlasMaps:
-    """The maps with the doubt of their scale: the median of the views', which share the chart and its errors."""
+    """The maps with the 1σ of the albedo scale: the median over the views, for all share the errors of one chart."""
     stated = [about["figures"]["chart"]["scale_doubt"] for about in processed.reports.values()]
     known = [float(one) for one in stated if one is not None]
     return replace(maps, albedo_sigma=float(np.median(known)) if known else None)
@@ -100,7 +100,7 @@ def _view_figures(processed: ProcessedSession, compared: ViewAgreement) -> dict[
 
 
 def _verdict(about: Mapping[str, Any]) -> str:
-    """Verdict on a view by its report.json without its albedo scale, which the view with the chart gives to all."""
+    """Verdict on a view by the gates in its report.json, except `albedo scale`, which all views share."""
     states = {gate["state"] for gate in about["gates"] if gate["name"] != "albedo scale"}
     return next((state for state in ("fail", "warn") if state in states), "pass")
 
@@ -145,7 +145,7 @@ def _figures(processed: ProcessedSession, results: FusionResults) -> dict[str, A
 
 
 def _write(out: Path, about: dict[str, Any], results: FusionResults, config: SessionConfig) -> None:
-    """Write maps/, asset/, the turntable and the report of a fused result; StorageError."""
+    """Write maps/, asset/, the turntable and the report of a fused result. Raises StorageError."""
     fused_maps.write(out / "maps", results.atlas, results.maps, about["keys"])
     source = fused_maps.read(out / "maps", config.asset)  # as stored, so that `polcap export` makes the same bytes
     request = ExportRequest(lod=_LODS if source.triangles > 16 * 4**_LODS else 0)

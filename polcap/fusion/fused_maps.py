@@ -52,7 +52,7 @@ class _FusedMapsFile(maps_folder.MapsFile, frozen=True, kw_only=True):
 
 
 def write(folder: Path, atlas: Atlas, maps: AtlasMaps, keys: Mapping[str, str]) -> None:
-    """Write the maps as EXR and PNG, seen.png, mask.png, mesh.npz and maps.json; StorageError."""
+    """Write the maps as EXR and PNG, seen.png, mask.png, mesh.npz and maps.json. Raises StorageError."""
     about = {
         "format": FORMAT,
         "keys": dict(keys),

@@ -22,7 +22,7 @@ _WHITE_QUANTILE = 0.995  # of the albedo; under the lamp it becomes nearly white
 
 
 def write(folder: Path, about: Mapping[str, Any], results: FusionResults) -> None:
-    """Write report.json and report.html into a result folder; StorageError."""
+    """Write report.json and report.html into a result folder. Raises StorageError."""
     atomic.write_json(folder / "report.json", about)
     drawn = object_pictures.around(results.atlas, results.maps, _SIDES, _SIDE)
     figures, view = _atlas_figures(results.maps)

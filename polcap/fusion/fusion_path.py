@@ -1,4 +1,4 @@
-"""READ FIRST. The path of a session, one line per stage: from the maps of its views to the textures of a closed mesh.
+"""READ SECOND, after `view_path.py`. The path of a session, one line per stage: from maps of views to textures.
 
 `view_path.py` makes the maps of each view, `session.py` the poses. Each stage is in the module of its name in this
 folder; `shape` uses five more. The docstring of the package lists all modules. `cache.run` finds a stored

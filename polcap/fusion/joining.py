@@ -28,7 +28,7 @@ from polcap.optics.vertex_frames import vertex_normals
 from polcap.stages import stage
 
 _GRID = 80  # steps along a set's own mesh, which is for this registration alone
-_LEAST_SEEN = 0.3  # sum of the cosines to the views of a point that they know
+_LEAST_SEEN = 0.3  # least sum of the cosines between normal and views of a point that counts as seen
 _TURNS = 3000  # sampled: every turn is within about 15° of one of them
 _SHIFTS = 3  # tried with each turn
 _TRIED = 40  # of the turns are refined

@@ -33,8 +33,9 @@ COMPARED = "work/compared_masks"  # folder in the result of a session: the masks
 _SLIT = 0.05  # of the object's diameter in a view; wider gaps in a mask are gaps between the object's parts
 _HOLE = 0.01  # of a mask's area; larger holes may be holes of the object
 _MOST_UNCOVERED = 0.01  # of a mask's area; masks whose outlines err by one cell of the grid leave 0.000
-# An object that slid uncovers small parts of several other masks: the sum of their shares. The greatest share is not
-# counted, since that mask may hold a piece of the board.
+# Least sum of shares of masks by which a view counts as slid. If the object slid in one view, the hull of the others
+# covers a little more of several masks when this view is left out. The greatest of these gains is not counted, since
+# that mask may hold a piece of the board.
 _SLIDE = 0.002
 _MOST_LEFT_OUT = 1 / 3  # of the views; where more contradict, nobody knows which are right
 _MOST_TRIMMED = 1 / 2  # of the views may be left out, or hold more than the object
@@ -135,9 +136,8 @@ def _find_contradicting(
         for k in range(len(views)):
             others = [j for j in range(len(views)) if j != k]
             rest = _uncovered([views[j] for j in others], points[inside[others].all(axis=0)], step)
-            # without the largest, which a piece of the board in one other mask would cause
-            newly_covered = np.sort(shares[others] - rest)[:-1]
-            missing_share = newly_covered[-1]
+            newly_covered = np.sort(shares[others] - rest)[:-1]  # without the greatest
+            missing_share = newly_covered[-1]  # the second greatest
             slide_share = shares[k] if newly_covered.sum() > _SLIDE else 0.0
             contradiction[k] = max(missing_share, slide_share)
             if contradiction[k] > _MOST_UNCOVERED:

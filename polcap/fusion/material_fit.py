@@ -5,11 +5,12 @@ which one view cannot. Texels of like albedo are taken for one material. Its rad
 
     S0 = E ((g + c (1 − cos θ)) ρ_d D(n, l, v) + F0 S(n, l, v, α))
 
-with the diffuse and the specular law of `optics/shade.py`, E the flash's light at the distance of the point, θ the
-zenith angle, and c the error of the diffuse law. The samples of a material are averaged in bins of the half-angle, so
-that the few samples of a highlight count as much as the many others. For each α, weighted least squares give F0, g and
-c; the α with the least misfit is the fit. Errors of the normals widen the lobe: α² is less by twice their variance,
-which follows from the differences between the views' normals and the baked ones.
+with the diffuse and the specular law of `optics/shade.py`, E the flash's light at the distance of the point, n, l, v
+the normal and the directions to flash and lens, θ the zenith angle, g the factor on the baked albedo ρ_d (1 if it is
+right), c the error of the diffuse law, and α the square of the roughness. The samples of a material are averaged in
+bins of the half-angle, so that the few samples of a highlight count as much as the many others. For each α, weighted
+least squares give F0, g and c; the α with the least misfit is the fit. Errors of the normals widen the lobe: α² is less
+by twice their variance, which follows from the differences between the views' normals and the baked ones.
 
 F0 and roughness of the views' maps have a weight in the fit, by their errors. They are medians over the views, because
 the errors of one view are alike everywhere. Dielectrics of one object have nearly the same F0, so one F0 is fitted to

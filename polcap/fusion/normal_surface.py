@@ -1,4 +1,4 @@
-"""Surface that has the measured normals and touches the silhouettes; the first one is the hull's.
+"""Surface that has the measured normals and touches the silhouettes. The fit begins with the surface of the hull.
 
 It may leave the hull, which is too small wherever a single mask is too narrow.
 
@@ -151,7 +151,7 @@ def mean_normals(vertices: Floats, outward: Floats, seen: Bools, views: Sequence
         agreeing = w / (1 + _angle2(n, mean) / _CAUCHY**2)
         mean = unit(np.sum(agreeing[..., None] * n, axis=0))
     close, total = np.sum(agreeing, axis=0), np.sum(w, axis=0)
-    agreeing_views = close / np.maximum(w.max(axis=0), 1e-12)  # their number
+    agreeing_views = close / np.maximum(w.max(axis=0), 1e-12)  # number of them, in units of the view that weighs most
     agreement = np.where(total > 0, close / np.maximum(total, 1e-12), 1.0)
     normal = np.where(agreeing_views[:, None] > 0, mean, outward)
     return SurfaceNormals(normal, agreeing_views / (1 + agreeing_views), agreement)

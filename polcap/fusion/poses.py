@@ -29,7 +29,7 @@ from polcap.stages import stage
 
 LEAST_VIEWS = 3
 _MOST_RESIDUAL = 1.0  # px rms of a view's corners; a flat, sharp board leaves 0.02 to 0.1
-_CORNER_SIGMA = 0.05  # px, of a corner; where the robust loss begins, in this unit, is 3
+_CORNER_SIGMA = 0.05  # px, 1σ of a corner; the robust loss begins at 3σ
 _OUTLIER = 5.0  # times the robust spread of all corners, at least `_LEAST_OUTLIER` px
 _LEAST_OUTLIER = 0.5  # px
 _LEAST_KEPT = 0.75  # of a view's corners; where more are outliers, none is one

@@ -1,8 +1,8 @@
 """Processes all views of a session: one color calibration, one camera, poses, masks, maps. `process` has the order.
 
 The result of a view is in viewNN/polcap; `view_path.py` has its stages. A view that cannot be used is left out, with
-the reason; the others go on. Without a board the poses come from features of the maps. `joining.py` gives several sets
-of views one frame later.
+the reason; the others go on. Without a board the poses come from features of the maps. Where the object was laid on
+another side between sets of views, `joining.py` afterwards moves all sets into the frame of the first one.
 """
 
 from collections.abc import Mapping
@@ -123,7 +123,7 @@ def pose_by_board(
 
 
 def _with_boards(session: Session, solved: SessionPoses) -> Session:
-    """The session with the board before each view."""
+    """The session with the board's place in each view's input, so that the board can be erased there."""
     assert solved.board is not None
     boards = {name: PosedBoard(solved.board, solved.camera, one.pose) for name, one in solved.views.items()}
     return session.with_inputs(lambda view: replace(view, board=boards[view.name]))
@@ -157,7 +157,7 @@ def _silhouette(name: str, found: ViewMask, solved: SessionPoses) -> Silhouette:
 
 
 def _write_compared(out: Path, silhouettes: tuple[Silhouette, ...]) -> None:
-    """Write masks as pictures; StorageError."""
+    """Write masks as pictures. Raises StorageError."""
     for one in silhouettes:
         name = one.name.replace("/", "-")
         png.write(out / mask_agreement.COMPARED / f"{name}.png", np.where(one.mask, 255, 0).astype(np.uint8))

@@ -1,7 +1,7 @@
 """The views of a session: read from their folders, less those that cannot be used; the session's result folder.
 
-A session is a folder with view01, view02, … or, between which the object was laid on another side, setA/view01, …,
-setB/view01, …. Each view is a capture that `polcap process` takes.
+A session is a folder with view01, view02, …. If the object was laid on another side in between, it has a folder of
+views for each side: setA/view01, …, setB/view01, …. Each view is a capture that `polcap process` takes.
 """
 
 from collections.abc import Callable, Iterator, Mapping

@@ -14,7 +14,7 @@ from polcap.stages import stage
 
 _REACH_PX, _STEPS = 4.0, 33  # of the profile across an edge, at most
 _BESIDE = 0.11  # squares from an edge, up to which both sides are even
-_MOST_OVER, _MOST_RATIO = 0.5, 1.6  # px over that of the median view, and its factor; both
+_MOST_OVER, _MOST_RATIO = 0.5, 1.6  # largest blur of a view: px above that of the median view, and times it
 
 
 @dataclass(frozen=True)

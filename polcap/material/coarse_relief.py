@@ -31,7 +31,8 @@ _ROUNDS = 3
 _WINDOW = 2.5  # coarse texels, 1σ, over which parallax is summed
 _THICKEST_M, _LOWEST_M = 0.02, -0.002  # range of the plane
 _SLOPE_ERROR = 0.03  # 1σ of the coarse slopes
-# Parallax errs by 0.08 texels over long ranges, slopes by 0.001; slopes are better up to 500 texels = 2π · 80
+# Heights from parallax err by 0.08 texels. Slopes err by 0.001, and their errors add up: heights from slopes are better
+# over waves of up to 500 texels = 2π · CROSSOVER
 CROSSOVER = 80.0  # texels
 _MOST_STEP = 1.5  # coarse texels of height, in a round
 _GLOSS, _GLOSS_SIGMA = (0.45, 0.042), (0.2, 0.012)  # roughness and F0 of common surfaces

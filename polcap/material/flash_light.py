@@ -57,15 +57,15 @@ def measure(views: tuple[PosedStokes, ...], chart: ChartInView | None, board: Bo
     """
     samples = [paper(view, board) for view in views]
     keep = [np.ones(len(one.radiance), bool) for one in samples]
-    trials = [np.array([0.0, 0.0, 0.0, 0.02, rough]) for rough in _GLOSS]
+    trials = [np.array([0.0, 0.0, 0.0, 0.02, rough]) for rough in _GLOSS]  # place [m], share and roughness of the gloss
     for _ in range(_ROUNDS):
         law = _fit(samples, keep, trials)
         trials, error = [law], [_log_error(one, law) for one in samples]
-        middle = [float(np.median(e[k])) for e, k in zip(error, keep, strict=True)]
+        middle = [float(np.median(e[used])) for e, used in zip(error, keep, strict=True)]
         spread = 1.48 * np.median(np.abs(np.concatenate([e - m for e, m in zip(error, middle, strict=True)])))
         keep = [np.abs(e - m) < _OUTLIER * spread for e, m in zip(error, middle, strict=True)]
-    level = np.exp([float(e[k].mean()) for e, k in zip(error, keep, strict=True)])  # c_k
-    rest = np.concatenate([(e - np.log(c))[k] for e, c, k in zip(error, level, keep, strict=True)])
+    level = np.exp([float(e[used].mean()) for e, used in zip(error, keep, strict=True)])  # c_k
+    rest = np.concatenate([(e - np.log(c))[used] for e, c, used in zip(error, level, keep, strict=True)])
     place, shine = law[:3], max(float(_highlight(one, law).max()) for one in samples)
     albedo = PAPER if chart is None else float(level[chart.view] * _chart_irradiance(views[chart.view], chart, place))
     matrix = np.stack([_shot_matrix(view, one, k) for view, one, k in zip(views, samples, keep, strict=True)])
@@ -164,8 +164,9 @@ def _fit(samples: Sequence[PaperSamples], keep: Sequence[Bools], starts: Sequenc
 
     def residuals(law: Floats) -> Floats:
         parts = [_log_error(one, law) for one in some]
-        even = [(part - np.median(part)) / _SCATTER / np.sqrt(len(part) / LEAST_POINTS) for part in parts]
-        return np.concatenate([*even, law[:3] / _FLASH_SIGMA_M, law[3:4] / _SHARE_SIGMA])
+        # each view counts as LEAST_POINTS points
+        scatter = [(part - np.median(part)) / _SCATTER / np.sqrt(len(part) / LEAST_POINTS) for part in parts]
+        return np.concatenate([*scatter, law[:3] / _FLASH_SIGMA_M, law[3:4] / _SHARE_SIGMA])
 
     found = [least_squares(residuals, start, bounds=(_LOW, _HIGH), loss="soft_l1", x_scale=_STEP) for start in starts]
     return np.asarray(min(found, key=lambda one: float(one.cost)).x)

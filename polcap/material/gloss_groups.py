@@ -28,8 +28,8 @@ _SIDE = 70  # texels along the longer side of the sampled grid
 _SAMPLES, _TRIED = 400, 120  # texels of a group; with each of the roughnesses tried first
 _LEAST_SAMPLES = 40
 _ROUNDS = 4
-_INDEPENDENT = 6.0  # texels, as many as a group counts for: light, pose and law err alike in all of them
-_TIGHT = np.array([1e-3, 1e-4], np.float32)  # of roughness and F0, while their group's are varied
+_INDEPENDENT = 6.0  # texels: a whole group counts as so many, because light, pose and law err alike in all of them
+_TIGHT = np.array([1e-3, 1e-4], np.float32)  # 1σ that ties roughness and F0 of a texel to those of its group
 _F0, _F0_SIGMA = 0.042, 0.008
 LAWS = {"smooth": body.SMOOTH, "rough": body.Law(rough=1.0)}
 

@@ -47,7 +47,7 @@ class _MaterialFile(maps_folder.MapsFile, frozen=True, kw_only=True):
 
 
 def write(folder: Path, grid: TexelGrid, maps: MaterialMaps, keys: Mapping[str, str], tiles: bool) -> None:
-    """Write the maps as EXR and PNG, seen.png and maps.json; StorageError."""
+    """Write the maps as EXR and PNG, seen.png and maps.json. Raises StorageError."""
     height, width = maps.seen.shape
     low, high = float(maps.height.min()), float(maps.height.max())
     about = {

@@ -22,7 +22,7 @@ _LIGHT = np.array([-0.45, 0.35, 0.82], np.float32)  # first direction; from the 
 
 
 def write(folder: Path, about: Mapping[str, Any], source: MaterialSource) -> None:
-    """Write report.json and report.html into a result folder; StorageError."""
+    """Write report.json and report.html into a result folder. Raises StorageError."""
     atomic.write_json(folder / "report.json", about)
     small = _reduced(source.maps)
     inside = np.ones(small["roughness"].shape[:2], bool)

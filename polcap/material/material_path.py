@@ -23,6 +23,8 @@ from polcap.optics.board import Board
 from polcap.pipeline.cache import MemoryCache, StageResult
 from polcap.quality.limits import MaterialGateLimits
 
+_PAPER_SIGMA, _CHART_SIGMA = 0.1, 0.02  # relative 1σ: of the paper's albedo; of the light that reaches a chart
+
 
 class SampleSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of a material: a section for each stage with settings, and one for the gates."""
@@ -83,4 +85,4 @@ def path(
 
 def albedo_sigma(chart: ChartInView | None) -> float:
     """Relative 1σ of the scale of all albedos: of the paper's albedo, or of the light that reaches the chart."""
-    return 0.1 if chart is None else 0.02
+    return _PAPER_SIGMA if chart is None else _CHART_SIGMA

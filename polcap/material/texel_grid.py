@@ -1,7 +1,7 @@
 """Grid of texels on the plane of the sample, and the geometry of each view at its points.
 
-The plane's frame is x right, y up the printed page, z out of it; the world frame of the board is (x, z, −y) of it. Row
-0 of a map is at the top of the page.
+The plane's frame is x right, y up the printed page, z out of it; its point (x, y, z) is (x, z, −y) in the board's world
+frame. Row 0 of a map is at the top of the page.
 """
 
 from collections.abc import Sequence

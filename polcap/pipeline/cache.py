@@ -230,6 +230,7 @@ class ArchiveCache(StageCache):
             return super().run(stage, *inputs, config=config)
         place = self.place(stage)
         about, value = read_manifest(place), read(place, stage)
+        # "": an input that is no stage's result, whose key cannot be known here
         expected = [one.key if isinstance(one, StageResult) else "" for one in inputs if not callable(one)]
         pairs = zip(expected, about["inputs"])
         same_inputs = len(expected) == len(about["inputs"]) and all(key in ("", stored) for key, stored in pairs)

@@ -70,7 +70,7 @@ def run_stages(capture: Capture | None, supplied: UserInput, config: Config, cac
 
 
 def results_so_far(cache: MemoryCache) -> FirstResults:
-    """The results of the stages that have run; after an error, these are the first ones."""
+    """The results of the stages that have run; after an error, those of the stages before it."""
     keys = {stage: result.key for stage, result in cache.results.items()}
     return collect({stage: result.value for stage, result in cache.results.items()}, keys)
 
@@ -85,6 +85,7 @@ def on_grid(drawn: Bools | None, radiance: AngleStack) -> Bools | None:
     if drawn is None:
         return None
     height, width = radiance.value.shape[1:3]
+    # pixels of the file per pixel of the merged picture: a polarization sensor's cells are 2×2
     step = 2 if radiance.offset_px is not None else round(radiance.view.scale)
     tall, wide = drawn.shape
     if (tall, wide) == (height, width):

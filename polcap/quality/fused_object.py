@@ -36,7 +36,7 @@ def agreement(normal_deg: Mapping[str, float], limits: FusedGateLimits) -> Gate:
 
 
 def join(folder: str, shared: float, limits: FusedGateLimits) -> Gate:
-    """Gate on the share of a further set's surface that the first set confirms; below the limit, `fuse` has ended."""
+    """Gate on the share of a further set's surface that the first set confirms; it passes, else `fuse` ends earlier."""
     message = f"The first set confirms {shared:.0%} of the surface of {folder}"
     return Gate(f"join {folder}", "pass", shared, limits.min_shared, message)
 

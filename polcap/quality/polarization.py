@@ -91,7 +91,7 @@ def order_of_shots(
         other = _order_text(outline.rival, names)
         message = f"The outline fits the order {other} as well as the stated one (fit {outline.concentration:.2f} of 1)"
         surer = "a rounded object or a chart" + ("" if len(names) > 3 else " or four angles")
-        remedy = sentence(f"{angle_advice.check(statement)}; {surer} would decide")
+        remedy = sentence(f"{angle_advice.check_statement(statement)}; {surer} would decide")
         return Gate("order", "warn", "cannot tell", "as stated", message, remedy, unit="")
     return Gate("order", "pass", "as stated", "as stated", message, unit="")
 
@@ -160,7 +160,7 @@ def of_outline(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Iterat
     body = seen.body
     if body.dolp > 1:
         message = "The shots contradict each other: they are not of one object under one light"
-        remedy = sentence(angle_advice.check(found.results.radiance.equipment.angles))
+        remedy = sentence(angle_advice.check_statement(found.results.radiance.equipment.angles))
         yield Gate("body", "fail", None, None, message, remedy, MOST_DEG)
         return
     of_shots = _angles(seen.turn, body, angle, found, limits)
@@ -275,7 +275,7 @@ def _with_ring(gate: Gate, body: rim.RimFigures, found: Evidence[ResultsUntilSel
         doubt, ring = float(np.degrees(selfcal.found_sigma)), np.degrees(selfcal.angle) % 180
         message = f"The angles were estimated: {', '.join(f'{one:.1f}°' for one in ring)} (± {doubt:.1f}°)"
         remedy = (
-            sentence(angle_advice.check(statement))
+            sentence(angle_advice.check_statement(statement))
             if statement.place == "cells"
             else "Note the ring's mark of every shot"
         )

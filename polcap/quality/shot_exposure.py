@@ -294,7 +294,7 @@ def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
 
 
 def _has_sharp_edges(found: Evidence[ResultsUntilSelfcal]) -> bool:
-    """Whether the outline is the edge of flat faces: its polarization does not show the light of the shots."""
+    """Whether sharp edges of flat faces make the outline: then its polarization says nothing of the shots' light."""
     if not reaches(found, ResultsUntilInfer):
         return False
     seen = flatness.measure(found.results.stokes, found.results.maps)

@@ -98,7 +98,7 @@ class CaptureRecord:
             self.write()
 
     def reject(self, slot_name: str, file: Path, read_deg: float | None, reason: str) -> str:
-        """Move a photograph to the folder `rejected`, never over another; its slot is empty again. StorageError."""
+        """Move a photograph to the folder `rejected`, never over another, and empty its slot. Raises StorageError."""
         with self._lock:
             stem = slot_name.replace("/", "_")
             names = (f"{REJECTED}/{stem}.try{n}{file.suffix}" for n in range(1, 1 << 20))

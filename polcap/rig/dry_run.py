@@ -66,7 +66,8 @@ def dry_run(order: CaptureOrder) -> dict[str, Any]:
     usual = bracket_by_iso(_DIAL) if uses_flash(order) and not simulated else bracket_by_shutter(_USUAL_S)
     order = msgspec.structs.replace(order, bracket=order.bracket or usual)
     slots = plan_slots(order, simulated)
-    parts = _parts(pace.steps(slots, 0.0), 0.0 if order.rotator == "manual" else 360.0 / speed)
+    homing_s = 0.0 if order.rotator == "manual" else 360.0 / speed
+    parts = _parts(pace.steps(slots, 0.0), homing_s)
     return {
         "rotator": order.rotator,
         "camera": order.camera,

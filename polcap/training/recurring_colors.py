@@ -43,9 +43,9 @@ class Recolor(nn.Module):  # type: ignore[misc]  # torch comes without types her
 
     def __init__(self) -> None:
         super().__init__()
-        light = torch.log(torch.tensor(_LIGHT_DOUBT))
-        hue = light + torch.log(torch.tensor(_HUE_DOUBT))
-        self.knots = nn.Parameter(torch.stack([light, hue]))  # log of 1σ against zenith
+        lightness = torch.log(torch.tensor(_LIGHT_DOUBT))
+        hue = lightness + torch.log(torch.tensor(_HUE_DOUBT))
+        self.knots = nn.Parameter(torch.stack([lightness, hue]))  # (2, n) ln of 1σ at n zenith angles
 
     def forward(
         self, diffuse: Tensor, doubt: Tensor, cosine: Tensor, inside: Tensor, clipped: Tensor

@@ -38,11 +38,11 @@ def turn(statement: AngleStatement, angle: Floats, by: float) -> str:
 def retake(statement: AngleStatement) -> str:
     """Advice for one shot of another angle than stated."""
     ring = "set the ring to its mark and take the shot again, or state its true angle"
-    return check(statement) if statement.place == "cells" else ring
+    return check_statement(statement) if statement.place == "cells" else ring
 
 
-def check(statement: AngleStatement) -> str:
-    """Advice for angles that the pictures contradict, or do not confirm, without showing others."""
+def check_statement(statement: AngleStatement) -> str:
+    """Advice to check the stated angles: the pictures contradict them, and do not show which are right."""
     return {
         "folders": "check the names of the folders and the ring's marks",
         "file names": "check the names of the files and the ring's marks",

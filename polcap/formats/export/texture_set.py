@@ -159,7 +159,7 @@ def linear(texture: Texture) -> Texture:
 
 
 def write_exr(path: Path, texture: Texture, entry: Mapping[str, str] = {}) -> None:
-    """Write a texture as an EXR of half floats, its colors linear Rec.709, with a catalog entry; StorageError."""
+    """Write a texture as an EXR of half floats, in linear Rec.709, with a catalog entry. Raises StorageError."""
     value = texture.pixels / np.float32(np.iinfo(texture.pixels.dtype).max)
     planes = np.moveaxis(np.atleast_3d(color.decode_srgb(value) if texture.color else value), -1, 0)
     names = "Y" if len(planes) == 1 else "RGBA"

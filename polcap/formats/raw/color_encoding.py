@@ -196,7 +196,7 @@ def _transfer_function(table: Floats, codes: int) -> _Statement:
 
 
 def _icc(profile: bytes) -> _Statement:
-    """Statement of an ICC profile of curves and a matrix. Raises _UnusableError for profiles of tables."""
+    """Statement of an ICC profile of curves and a matrix. Raises _UnusableError."""
     try:
         count = struct.unpack_from(">I", profile, 128)[0]
         tags = {

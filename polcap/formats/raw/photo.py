@@ -42,8 +42,8 @@ def read(path: str | Path, reading: FrameReading = _DEFAULT, digest: str | None 
     meta, arrays = sandbox.call(decode, path, digest=digest, stated=reading.encoding)
     pixels, matrix = arrays["pixels"], meta["to_rec709"]
     lossy, black, white = meta["lossy"], reading.black, reading.white or meta["full"]
-    if "light" in arrays:
-        pixels, black, white = arrays["light"][pixels], 0.0, 1.0
+    if "light_of_code" in arrays:
+        pixels, black, white = arrays["light_of_code"][pixels], 0.0, 1.0
     elif meta["decoded"]:
         black, white = 0.0, 1.0
     if pixels.shape[2] == 1:
@@ -89,7 +89,7 @@ def encoding_of(bits: int, found: ColorEncoding) -> str:
 
 
 def describe(path: str, data: bytes) -> dict[str, Any]:
-    """In the child process: size, channels, bits and encoding of a picture, and the greatest value of floating point.
+    """In the child process: size, channels, bits and encoding of a picture; its greatest value if it has floats.
 
     Raises DecodeError.
     """
@@ -130,7 +130,7 @@ def decode(
     if name != "linear" and floats:
         arrays["pixels"] = curve(pixels).astype(np.float32)
     elif name != "linear":
-        arrays["light"] = curve(np.arange(full + 1) / full).astype(np.float32)
+        arrays["light_of_code"] = curve(np.arange(full + 1) / full).astype(np.float32)
     lossy = name != "linear" or pixels.dtype == np.uint8
     return {"full": full, "lossy": lossy, "decoded": name != "linear", "to_rec709": found.to_rec709}, arrays
 

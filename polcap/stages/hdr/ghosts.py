@@ -1,7 +1,8 @@
 """Finds ghosts (pixels where something moved between frames), and makes a first estimate of the radiance.
 
-Frames are registered. Signals are in units of the sensor's range; radiance is on the scale of the reference frame. All
-work is done in blocks of rows, channel by channel.
+This estimate is the *anchor*: the reference frame, and the darkest frame where the reference is clipped. Frames are
+registered. Signals are in units of the sensor's range; radiance is on the scale of the reference frame. All work is
+done in blocks of rows, channel by channel.
 """
 
 from dataclasses import dataclass

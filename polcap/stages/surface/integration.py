@@ -124,7 +124,7 @@ def remove_useless_cuts(level: PyramidLevel) -> None:
 
 
 def _useless_cuts(level: PyramidLevel, found: OcclusionMap, uncut: PyramidLevel) -> Bools:
-    """Mask (N,) of pixels near cuts where the slope residuals are larger than without any cut."""
+    """Mask (N,) of pixels near cuts where the slope residuals (`strain`) are larger than without any cut."""
     mask, p = level.field.mask, level.grid.p
     cut = level.grid.links(found.right, found.down)
     contour = label_contours(found.near(0))

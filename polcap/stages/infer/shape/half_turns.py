@@ -153,7 +153,9 @@ def sides(grid: Grid) -> tuple[Bools, Floats]:
 def wrong_terms(grid: Grid, network: NetworkDoubt, mask: Bools) -> Floats:
     """Evidence (h, w, 4) that the network's normals lean to the wrong side: the terms of the odds `_WRONG`.
 
-    `network` and `mask` have the size of the picture. Outline and neighbors are not part of this evidence.
+    They are 1; the share of its positions that disagree, near a cell; the agreement −1…1 with the lean in smaller
+    pictures; and ln of the expected error. `network` and `mask` have the size of the picture. Outline and neighbors are
+    not part of this evidence.
     """
     images = (network.sigma, network.opposed, *network.overview)
     sigma, opposed, *overview = (weighted_area_mean(image, mask, grid.mask.shape) for image in images)
