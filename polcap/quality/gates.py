@@ -83,7 +83,7 @@ _STEPS = (
     Step(("polarized",), _without_limits(polarization.polarized), ResultsUntilInfer, _EVEN, ("flat",)),
     Step(("order",), _without_limits(polarization.order), ResultsUntilSelfcal, (*_EVEN, "polarized")),
     Step(("angles", "body", "other light"), polarization.of_outline, ResultsUntilInfer, _POLARIZED, **_ROUND),
-    Step(("room light",), light.room_light, ResultsUntilInfer, _ONE_LIGHT, ("sharpness", "flicker")),
+    Step(("room light",), light.room_light, ResultsUntilInfer, _ONE_LIGHT, ("sharpness", "flicker", "gain doubt")),
     Step(
         ("lighting",), light.side_light, ResultsUntilInfer, _ONE_LIGHT, ("flat", "sharpness", "flicker"), ("contour",)
     ),
@@ -92,7 +92,7 @@ _STEPS = (
         ("ill-posed",), polarization.ill_posed, ResultsUntilStokes, (*_ONE_LIGHT, "lighting"), ("sharpness", "flicker")
     ),
     Step(("re-rendering",), rerendering.rerendering, ResultsUntilInfer, _SHAPED, ("flat",)),
-    Step(("outline",), geometry.inward_outline, ResultsUntilInfer, (*_SHAPED, "re-rendering"), ("flat",)),
+    Step(("outline",), geometry.inward_outline, ResultsUntilInfer, (*_SHAPED, "re-rendering"), **_ROUND),
     Step(("albedo scale",), light.albedo_scale, ResultsUntilInfer, ("clipping", "chart")),
     Step(("focal length",), _without_limits(geometry.focal_length), ResultsUntilInfer),
 )

@@ -28,14 +28,16 @@ _CLEAR = 0.8  # least concentration of the AoLP about the outline, to estimate a
 _LIKELIER = 1.1  # factor between expected errors that decides on an order (docs/benchmarks/gates.md)
 _LIKELIER_SMALL, _SMALL_PX = 1.5, 5000  # the same for objects of fewer pixels, of which good ones reach 1.2
 _LIKELIER_FLAT = 1.8  # the same for flat objects: good ones reach 1.5, wrong orders 2.2
+_LIKELIER_UNEXPLAINED, _ORDER_UNEXPLAINED = 1.3, 0.3  # the same where maps explain less polarization: good ones 1.2
+_BOX_CONTOUR, _BOX_DEG, _BOX_EXPLAINED = 0.35, 8.0, 0.6  # two good boxes: factors 1.6 and 2.1, .76 and .69 explained
 _ALONG = -0.3  # below: the AoLP is along the contour
 _DARK = 0.1  # albedo below which a glossy object shows mostly reflections of itself
 _WEAK_DOLP = 0.05  # of an outline: above, no shape counts as flattened
 _DIMMED = 0.9  # of the mean light: below, an outline turns away
 _MOST_ILL_POSED = 0.15  # of the object; gloss with shadows and thin parts reaches .12 (docs/benchmarks/gates.md)
 # agreement of the re-rendering from which a finding is false (docs/benchmarks/gates.md): of wrong orders up to .26, of
-# wax .30, under light from around .48
-_ORDER_EXPLAINED, _BODY_EXPLAINED = 0.4, 0.5
+# wax .30, under light from around .48, without a polarizer .04
+_ORDER_EXPLAINED, _BODY_EXPLAINED, _UNPOLARIZED_EXPLAINED = 0.4, 0.5, 0.1
 _ROUGH = 0.5  # roughness from which facets alone leave little polarization
 # What a finding adds to the expected error of the normals, by captures with known normals: docs/benchmarks/gates.md
 _UNPOLARIZED_DEG = 11.0
@@ -47,10 +49,9 @@ _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 def order(found: Evidence[ResultsUntilSelfcal]) -> Gate:
     """Gate on the order and sense of the polarizer angles."""
-    results, explained, seen = found.results, False, None
+    results, explained, seen = found.results, None, None
     if isinstance(results, ResultsUntilInfer):
-        explained = _explained(results) > _ORDER_EXPLAINED
-        seen = flatness.measure(results.stokes, results.maps)
+        explained, seen = _explained(results), flatness.measure(results.stokes, results.maps)
     return order_of_shots(results.radiance, results.object_, results.selfcal.outline, _test(results), seen, explained)
 
 
@@ -60,21 +61,24 @@ def order_of_shots(
     outline: OutlineCheck,
     test: OrderTest | None,
     seen: flatness.Flatness | None,
-    explained: bool = False,
+    explained: float | None = None,
 ) -> Gate:
     """Gate on the order of shots, by the polarization along the outline and the test of the network.
 
     An outline that is the edge of flat faces decides nothing. Where another order is as good, the stated one counts if
-    its maps explain the photographs and the network does not expect smaller errors in another one.
+    its maps explain the photographs and the network does not expect smaller errors in another one. The network's test
+    is one look at a small picture, which misjudges boxes: maps that explain much of the polarization (`explained`, 1
+    is all) and have small errors leave its finding undecided, maps that explain little confirm it.
     """
     statement, names, better = radiance.equipment.angles, shot_names(radiance), None
     edges = seen is not None and seen.sharp_edged
-    likelier = _LIKELIER if object_.mask.sum() > _SMALL_PX else _LIKELIER_SMALL
-    likelier = _LIKELIER_FLAT if seen is not None and seen.flat else likelier
+    likelier = _likelier(object_, seen, explained)
     if not outline.as_stated and not edges:
         better, because = outline.best, "The outline fits"
     elif test is not None and test.ratio < 1 / likelier:
         better, because = test.rival, f"The network expects {1 / test.ratio:.1f} times smaller errors for"
+    if better is not None and outline.as_stated and _is_box(seen) and (explained or 0.0) > _BOX_EXPLAINED:
+        return _undecided(_order_text(better, names), outline, radiance)
     if better is not None:
         message = f"{because} the order {_order_text(better, names)} rather than the stated one"
         remedy = sentence(angle_advice.correct(statement, better, radiance.angle))
@@ -85,15 +89,32 @@ def order_of_shots(
         message = f"In any other order, the network expects errors that are at least {test.ratio:.1f} times as large"
     elif edges:
         return Gate("order", "not measured", None, "as stated", "Flat faces show no order of the angles", unit="")
-    elif outline.rival is not None and explained and (test is None or test.ratio >= 1):
+    elif outline.rival is not None and (explained or 0.0) > _ORDER_EXPLAINED and (test is None or test.ratio >= 1):
         message = "The maps of the stated order, rendered again, show the polarization of the photographs"
     elif outline.rival is not None:
-        other = _order_text(outline.rival, names)
-        message = f"The outline fits the order {other} as well as the stated one (fit {outline.concentration:.2f} of 1)"
-        surer = "a rounded object or a chart" + ("" if len(names) > 3 else " or four angles")
-        remedy = sentence(f"{angle_advice.check_statement(statement)}; {surer} would decide")
-        return Gate("order", "warn", "cannot tell", "as stated", message, remedy, unit="")
+        return _undecided(_order_text(outline.rival, names), outline, radiance)
     return Gate("order", "pass", "as stated", "as stated", message, unit="")
+
+
+def _likelier(object_: ObjectMask, seen: flatness.Flatness | None, explained: float | None) -> float:
+    """Factor between expected errors that decides on an order: larger where good captures reach more."""
+    likelier = _LIKELIER if object_.mask.sum() > _SMALL_PX else _LIKELIER_SMALL
+    likelier = _LIKELIER_FLAT if seen is not None and seen.flat else likelier
+    unexplained = explained is not None and explained < _ORDER_UNEXPLAINED
+    return min(likelier, _LIKELIER_UNEXPLAINED) if unexplained else likelier
+
+
+def _is_box(seen: flatness.Flatness | None) -> bool:
+    """Whether an object is not flat, has hardly any occluding contour, and its normals have small expected errors."""
+    return seen is not None and not seen.flat and seen.contour < _BOX_CONTOUR and seen.expected_deg < _BOX_DEG
+
+
+def _undecided(other: str, outline: OutlineCheck, radiance: AngleStack) -> Gate:
+    """Gate on an order of the shots that another one matches."""
+    message = f"The order {other} fits as well as the stated one (fit of the outline {outline.concentration:.2f} of 1)"
+    surer = "a rounded object or a chart" + ("" if len(radiance.angle) > 3 else " or four angles")
+    remedy = sentence(f"{angle_advice.check_statement(radiance.equipment.angles)}; {surer} would decide")
+    return Gate("order", "warn", "cannot tell", "as stated", message, remedy, unit="")
 
 
 def _explained(results: ResultsUntilInfer) -> float:
@@ -131,10 +152,10 @@ def turned_shot(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Ite
     yield Gate("angles", "fail", round(float(degrees), 1), limit, message, remedy, abs(float(degrees)) / 2, shots, "°")
 
 
-def polarized(found: Evidence[ResultsUntilStokes]) -> Iterator[Gate]:
-    """Gate "polarized", only if no part of the outline is polarized."""
+def polarized(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
+    """Gate "polarized", only if no part of the outline is polarized, and maps explain none of the little there is."""
     most = _most_dolp(found)
-    if not most < _LEAST_DOLP:
+    if not most < _LEAST_DOLP or _explained(found.results) > _UNPOLARIZED_EXPLAINED:
         return
     message = f"No part of the outline is polarized by more than {100 * most:.1f} %"
     remedy = "Check that the polarizer was on and turned; metal and translucent objects (wax, milk) hardly polarize"

@@ -4,7 +4,7 @@ The maps come from an estimator, which may be wrong. Their rendering does not de
 makes a shading and a polarization, and both are in the photographs.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from polcap.stages.cues import NOMINAL_IOR
 WHITE_QUANTILE = 0.995  # of the object's light; it becomes white
 _BRIGHTEST = 0.99  # quantile of the light from which a pixel is a highlight
 _JUDGED_PX = 256  # longest side on which the gate compares
+_NOISE = 2.0  # DoLP over its 1σ: that of noise alone is 1.2; a rough cube that faces the camera 1.3
 _OUTLIER = 5  # standard deviations of the differences
 _MOST_DOLP = 0.1  # more has no more weight: that of noise and of reflections
 _UNSURE_DEG = 14.0  # median expected error; beyond, correct maps of shadowed objects agree little (the same page)
@@ -66,6 +67,7 @@ class Rerendering:
     scale: float  # brightness of the photographs over that of the re-rendering, median of the pixels
     agreement: float = float("nan")  # of the polarizations, see `_agreement`
     difference: float = 0.0  # of both lights S0, relative, median of the pixels
+    significance: float = float("inf")  # DoLP of the photographs' median pixel over its 1σ
     highlights: float = 1.0  # S0 of the photographs over that of the re-rendering, where either is brightest
 
     def residuals(self, inside: Bools) -> dict[str, list[float]]:
@@ -143,7 +145,13 @@ def _agreement(measured: Floats, rendered: Floats) -> float:
 
 def measure(results: ResultsUntilInfer) -> Rerendering:
     """Render the maps again on few pixels, for the gate."""
-    return rerender(reduce(results.maps, results.cues, results.selfcal.angle, _JUDGED_PX), NOMINAL_IOR)
+    cues = results.cues
+    small = reduce(results.maps, cues, results.selfcal.angle, _JUDGED_PX)
+    found = rerender(small, NOMINAL_IOR)
+    if not small.sound.any():
+        return found
+    sigma = float(np.median(cues.ratio_sigma[cues.mask])) * max(small.sound.shape) / max(cues.mask.shape)
+    return replace(found, significance=float(np.median(np.hypot(*small.ratio)[small.sound])) / max(sigma, 1e-9))
 
 
 def explains(found: Rerendering, limits: GateLimits) -> bool:
@@ -157,6 +165,9 @@ def rerendering(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
     seen = measure(found.results)
     if not np.isfinite(seen.agreement):
         return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, "All light is clipped")
+    if seen.significance < _NOISE:
+        message = "The polarization of the object is not above its noise"
+        return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, message)
     if not explains(seen, limits) and _own_error_deg(found.results.maps) > _UNSURE_DEG:
         message = "The estimator itself expects large errors, so its maps need not explain the photographs"
         return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, message)

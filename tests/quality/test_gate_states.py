@@ -59,6 +59,7 @@ BODY = {
 TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 ROUNDED = Flatness(contour=0.8, common=0.1, rim_dolp=0.2, rim_light=0.7, aligned=0.7, facing=1.0, expected_deg=15.0)
 EDGES = replace(ROUNDED, common=0.9)  # of flat faces
+BOX = replace(EDGES, contour=0.2, expected_deg=6.0)
 PLANE = replace(EDGES, aligned=0.95)
 FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
@@ -222,6 +223,9 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("order", "not measured", {"maps": network_maps(0.1, 0.8), "figures": {"flatness": PLANE}}),
     ("order", "fail", {"maps": network_maps(0.1, 0.5), "figures": {"flatness": PLANE}}),
     ("order", "fail", {"maps": network_maps(0.1, 0.5)}),
+    ("order", "warn", {"maps": network_maps(0.1, 0.5), "figures": {"flatness": BOX}}),
+    ("order", "fail", {"maps": network_maps(0.1, 0.5), "figures": {"flatness": BOX, "rendered": rendered(0.5)}}),
+    ("order", "fail", {"maps": network_maps(0.1, 0.7), "figures": {"flatness": PLANE, "rendered": rendered(0.2)}}),
     ("order", "pass", {"maps": network_maps(0.1, 2.0)}),
     ("order", "fail", {"maps": network_maps(0.1, 0.8)}),
     ("order", "pass", {"maps": network_maps(0.1, 0.8),
@@ -236,7 +240,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("angles", "warn", {"selfcal": {"found_sigma": 0.02}}),
     ("angles", "warn", {"selfcal": {"ring": RingZero(0.2, 0.01)}}),
     ("angles", "pass", {"selfcal": {"ring": RingZero(0.03, 0.01, 0.03)}}),
-    ("polarized", "fail", {"figures": {"most_dolp": 0.004}}),
+    ("polarized", "fail", {"figures": {"most_dolp": 0.004, "rendered": rendered(0.04)}}),
     ("body", "pass", {}),
     ("body", "fail", {"figures": outline(along=-0.9)}),
     ("body", "warn", {"figures": {**outline(along=-0.9), "medians": [45.0, 0.2, 0.04]}}),
@@ -281,7 +285,9 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("ill-posed", "pass", {}),
     ("ill-posed", "fail", {"figures": {"ill_posed": 0.5}}),
     ("outline", "pass", {}),
+    ("outline", "not judged", {"figures": {"inward_outline": 0.3, "flatness": EDGES}}),
     ("outline", "fail", {"figures": {"inward_outline": 0.3}}),
+    ("re-rendering", "not measured", {"figures": {"rendered": replace(rendered(0.13), significance=1.3)}}),
     ("re-rendering", "pass", {}),
     ("re-rendering", "fail", {"figures": {"rendered": rendered(agreement=-0.5)}}),
     ("re-rendering", "fail", {"figures": {"rendered": rendered(scale=0.4)}}),
