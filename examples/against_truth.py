@@ -10,7 +10,9 @@ import numpy as np
 
 import polcap
 
-capture, result = map(Path, sys.argv[1:3])
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
+capture, result = map(Path, sys.argv[1:])
 found = polcap.read_maps(result)
 step, (height, width) = int(found.view.scale), found.mask.shape
 left, top = (round(place * found.view.scale) for place in found.view.origin)  # RAW px
@@ -24,6 +26,7 @@ def truth(name: str) -> np.ndarray:
 
 
 both = found.mask & (truth("mask") == 1)
+print(f"mask: {both.sum() / (found.mask | (truth('mask') == 1)).sum():.0%} overlap with the true one")
 normal = truth("normal")[both]
 normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
 angle = np.degrees(np.arccos(np.clip(np.sum(normal * found.normal[both], axis=-1), -1, 1)))

@@ -9,6 +9,8 @@ import numpy as np
 
 import polcap
 
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
 source, out = sys.argv[1:3]
 result = polcap.process(source, out, config=polcap.load_config(assignments=["infer.symmetries=1"]))
 found = polcap.read_maps(result.folder)

@@ -13,6 +13,8 @@ import numpy as np
 
 from polcap.training import main_network, random_shapes, train
 
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
 source, out = map(Path, sys.argv[1:3])
 for seed, split in enumerate(("train", "test")):  # training looks at pictures of the latter as it goes
     mesh, folder = random_shapes.compose(np.random.default_rng(seed)), out / "data" / "meshes" / split

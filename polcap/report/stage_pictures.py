@@ -167,7 +167,8 @@ def _merged(radiance: AngleStack) -> list[Tile]:
         tile = display(value, top)
         tile[(quality & int(Quality.CLIPPED)) > 0] = (255, 40, 40)
         tile[(quality & int(Quality.GHOST)) > 0] = (255, 0, 255)
-        tiles.append(Tile(tile, f"Polarizer at {angle:g}°", note="red: clipped in every exposure; magenta: moved"))
+        note = "not white-balanced; red: clipped in every exposure; magenta: moved"
+        tiles.append(Tile(tile, f"Polarizer at {angle:g}°", note=note))
     return tiles
 
 
