@@ -83,7 +83,13 @@ _STEPS = (
     Step(("polarized",), _without_limits(polarization.polarized), ResultsUntilInfer, _EVEN, ("flat",)),
     Step(("order",), _without_limits(polarization.order), ResultsUntilSelfcal, (*_EVEN, "polarized")),
     Step(("angles", "body", "other light"), polarization.of_outline, ResultsUntilInfer, _POLARIZED, **_ROUND),
-    Step(("room light",), light.room_light, ResultsUntilInfer, _ONE_LIGHT, ("sharpness", "flicker", "gain doubt")),
+    Step(
+        ("room light",),
+        light.room_light,
+        ResultsUntilInfer,
+        (*_ONE_LIGHT, "gain doubt"),
+        ("sharpness", "flicker", "gain doubt"),
+    ),
     Step(
         ("lighting",), light.side_light, ResultsUntilInfer, _ONE_LIGHT, ("flat", "sharpness", "flicker"), ("contour",)
     ),

@@ -7,7 +7,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from polcap.images import Quality
+from polcap.images import Floats, Quality
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays
 from polcap.optics.morphology import erode
@@ -234,7 +234,7 @@ def room_light(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
 
     A flash at the lens leaves them unpolarized, a window or a glossy lamp does not.
     """
-    share, limit = _surroundings_dolp(found), limits.max_room_dolp
+    share, limit = _surroundings_dolp(found, found.results.selfcal.gains.gain), limits.max_room_dolp
     message = worded(100 * share, "The surroundings are polarized by {:.1f} %", "The surroundings are not polarized")
     if share > limit:
         message += ": polarized light from the room, or glossy surroundings"
@@ -316,8 +316,18 @@ def _highlight_dolp(found: Evidence[ResultsUntilInfer]) -> float:
     return max(dolp - float(np.hypot(scatter, np.linalg.norm(of_gains))), 0.0)
 
 
-def _surroundings_dolp(found: Evidence[ResultsUntilSelfcal]) -> float:
-    """Common DoLP of the surroundings, without object and chart: median of tiles; NaN for too few tiles."""
+def contradicts_gains(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> bool:
+    """Whether the surroundings are polarized with the measured gains, and hardly with equal light in all shots."""
+    limit, equal = limits.max_room_dolp, np.ones_like(found.results.selfcal.gains.gain)
+    measured = _surroundings_dolp(found, found.results.selfcal.gains.gain)
+    return measured > limit and _surroundings_dolp(found, equal) < min(limit, measured / 2)
+
+
+def _surroundings_dolp(found: Evidence[ResultsUntilSelfcal], gain: Floats) -> float:
+    """Common DoLP of the surroundings, without object and chart, for gains (K, 3) of the shots.
+
+    The median of tiles; NaN for too few tiles.
+    """
     radiance = found.results.radiance
     outside = (radiance.quality & int(Quality.CLIPPED) == 0).all(0) & ~found.results.object_.mask
     if (place := found.results.color.place) is not None:
@@ -327,8 +337,7 @@ def _surroundings_dolp(found: Evidence[ResultsUntilSelfcal]) -> float:
     clear = block_means(outside, _ROOM_TILE) > 0.999
     if clear.sum() < _LEAST_ROOM_TILES:
         return float("nan")
-    shots = zip(radiance.value, found.results.selfcal.gains.gain)
-    light = [block_means(shot, _ROOM_TILE)[clear] @ (1 / gain) for shot, gain in shots]
+    light = [block_means(shot, _ROOM_TILE)[clear] @ (1 / of_shot) for shot, of_shot in zip(radiance.value, gain)]
     s0, s1, s2 = np.linalg.lstsq(mueller.analyzer(found.results.selfcal.angle), np.stack(light), rcond=None)[0]
     dolp = float(np.hypot(np.median(s1 / np.maximum(s0, 1e-9)), np.median(s2 / np.maximum(s0, 1e-9))))
     return dolp if dolp <= 1 else float("nan")  # the shots contradict each other

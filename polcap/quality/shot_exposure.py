@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from polcap.images import Bools, Floats, Quality
-from polcap.quality import flatness, rerendering
+from polcap.quality import flatness, light, rerendering
 from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots, compared, reaches, worded
 from polcap.quality.limits import GateLimits
 from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilMask, ResultsUntilSelfcal, ResultsUntilStokes
@@ -278,6 +278,9 @@ def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
             doubt = _USUAL_CHANGE
             message = "Without gray patches flat faces do not show the light of each shot; it is assumed equal within "
             message += f"{100 * doubt:.0f} % (1σ)"
+        if measured.source == "object" and light.contradicts_gains(found, limits):
+            doubt = max(doubt, float(np.abs(np.log(measured.gain)).max()))
+            message = f"The object shows changes of the light by up to {100 * doubt:.1f} %, its surroundings show none"
         if measured.source == "none":
             message = f"The light of each shot is unknown; it is assumed equal within {100 * doubt:.1f} % (1σ)"
         remedy = "Put a ColorChecker next to the object"

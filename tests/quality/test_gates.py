@@ -344,6 +344,20 @@ def test_flash_bracketed_by_the_shutter_is_named(good: Seen) -> None:
     assert "flash power, aperture or ISO" in gate.remedy
 
 
+def test_gains_of_the_object_that_polarize_the_surroundings_are_in_doubt(good: Seen) -> None:
+    """Its surroundings had equal light in all shots; a room's polarization does not vanish with equal gains."""
+    equal = np.ones_like(good.results.selfcal.gains.gain)
+    wrong = equal * np.array([1.0, 0.95, 1.0])[:, None]
+    seen = judged(changed(good, **with_gains(good, source="object", gain=wrong)))
+    assert seen["gain doubt"].state == "fail" and "ColorChecker" in seen["gain doubt"].remedy
+    assert seen["room light"].state == "not judged"
+    polarized = replace(
+        good.results.radiance, value=(good.results.radiance.value * wrong[:, None, None]).astype(np.float32)
+    )
+    sure = with_gains(good, source="object", gain=equal)
+    assert "surroundings" not in judged(changed(good, radiance=polarized, **sure))["gain doubt"].message
+
+
 def test_gains_nobody_knows_cost_degrees(good: Seen) -> None:
     doubtful = with_gains(good, source="object", sigma=np.array([[0.0] * 3, [0.02] * 3, [0.02] * 3]))
     gate = judged(changed(good, **doubtful))["gain doubt"]
