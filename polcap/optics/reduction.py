@@ -6,7 +6,7 @@ import numpy as np
 
 from polcap.images import Bools, Floats, View
 from polcap.optics import frames
-from polcap.optics.resize import area_mean, weighted_area_mean
+from polcap.optics.resize import area_mean
 from polcap.stage_values import SurfaceMaps
 
 
@@ -22,8 +22,9 @@ class ObjectReduction:
 
     def mean(self, image: Floats) -> Floats:
         """Reduce an image (H, W) or (H, W, C) by means over the object's pixels; 0 outside the object."""
-        inside = self.inside[(..., *[None] * (image.ndim - 2))]
-        return weighted_area_mean(np.where(inside, image, 0), self.inside, self.shape)
+        extra = (None,) * (image.ndim - 2)
+        inside = np.where(self.inside[..., *extra], image, 0).astype(np.float32, copy=False)
+        return np.asarray(area_mean(inside, self.shape) / np.maximum(self.share, 1e-9)[..., *extra])
 
     def maps(self, maps: SurfaceMaps) -> SurfaceMaps:
         """Reduce all maps of a result; the network's coarse depth is left out."""

@@ -1,6 +1,7 @@
 """Defines a quality gate, and the evidence (results and measurements) that gates judge."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Generic, Literal, TypeGuard, TypeVar
 
 import msgspec
@@ -9,7 +10,8 @@ import numpy as np
 from polcap.errors import InputError
 from polcap.images import Bools, Floats, Quality
 from polcap.optics import frames
-from polcap.results import FirstResults, ResultsUntilHdr
+from polcap.quality import rerendering
+from polcap.results import FirstResults, ResultsUntilHdr, ResultsUntilInfer
 from polcap.stage_values import AngleStack, StokesImage
 from polcap.stages.align import AlignSettings
 
@@ -64,6 +66,11 @@ class Evidence(Generic[R]):
     grid_px: float = 1.0  # px of the picture that `process` works on per px of these
     chart_missing: str = ""  # the reason, where a chart was expected and none was found
     later_view: bool = False  # of a session whose first view shows the chart
+
+    @cached_property
+    def rerendered(self: "Evidence[ResultsUntilInfer]") -> rerendering.Rerendering:
+        """The maps, rendered again on few pixels; several gates compare it with the photographs."""
+        return rerendering.measure(self.results)
 
 
 def reaches(found: Evidence[Any], results: type[R]) -> TypeGuard[Evidence[R]]:

@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from polcap.quality import error_maps, flatness, geometry, light, polarization, rerendering, shot_exposure
+from polcap.quality import error_maps, flatness, geometry, light, polarization, shot_exposure
 from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, reaches
 from polcap.quality.limits import GateLimits
 from polcap.results import (
@@ -97,7 +97,7 @@ _STEPS = (
     Step(
         ("ill-posed",), polarization.ill_posed, ResultsUntilStokes, (*_ONE_LIGHT, "lighting"), ("sharpness", "flicker")
     ),
-    Step(("re-rendering",), rerendering.rerendering, ResultsUntilInfer, _SHAPED, ("flat",)),
+    Step(("re-rendering",), polarization.explained_by_maps, ResultsUntilInfer, _SHAPED, ("flat",)),
     Step(("outline",), geometry.inward_outline, ResultsUntilInfer, (*_SHAPED, "re-rendering"), **_ROUND),
     Step(("albedo scale",), light.albedo_scale, ResultsUntilInfer, ("clipping", "chart")),
     Step(("focal length",), _without_limits(geometry.focal_length), ResultsUntilInfer),

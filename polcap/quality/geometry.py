@@ -44,7 +44,7 @@ _TEXTURE = (
 _SAMPLED_PX = 1.0  # doubt of the outline that pixels alone cause: most of a thin object lies next to its outline
 _HOLD_STILL = "Fix the object, do not touch it between shots, and take that shot again"
 _HOLD_BOTH_STILL = "Fix the object and the chart, do not touch them between shots, and take that shot again"
-_FOCAL_LENGTHS = 9  # within the doubt
+_FOCAL_LENGTHS, _RADII = 9, 1000  # within the doubt; distances from the picture's center between which it interpolates
 _INWARD = 0.5  # sine of the zenith from which a normal leans inward: the inside of a bowl leans less at its lip
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
 
@@ -190,8 +190,8 @@ def _measure_shift(found: Evidence[ResultsUntilMask]) -> object_motion.ObjectShi
 def _measure_turn(found: Evidence[ResultsUntilMask], limits: GateLimits) -> object_turn.ObjectTurn:
     """Turn of the object, by the depth of the maps only if these explain the photographs."""
     results, maps = found.results, None
-    if isinstance(results, ResultsUntilInfer) and rerendering.explains(rerendering.measure(results), limits):
-        maps = results.maps
+    if reaches(found, ResultsUntilInfer) and rerendering.explains(found.rerendered, limits):
+        maps = found.results.maps
     return object_turn.measure(results.radiance, results.alignment, results.object_, maps)
 
 
@@ -409,5 +409,6 @@ def lean(maps: SurfaceMaps, least: float, most: float) -> Floats:
     y, x = np.indices(maps.mask.shape)
     off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
     doubts = least + (most - least) * (np.arange(_FOCAL_LENGTHS) + 0.5) / _FOCAL_LENGTHS
-    changes = (np.arctan(off * np.exp(-doubt)) - np.arctan(off) for doubt in doubts)
-    return np.asarray(np.degrees(np.sqrt(sum(change**2 for change in changes) / _FOCAL_LENGTHS)))
+    table = np.linspace(0, off.max(), _RADII)
+    changes = np.arctan(table * np.exp(-doubts[:, None])) - np.arctan(table)
+    return np.asarray(np.interp(off, table, np.degrees(np.sqrt((changes**2).mean(0)))))

@@ -13,9 +13,10 @@ from polcap.images import Bools, Floats, Quality
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
-from polcap.quality import flatness, rerendering, rim
-from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, at_most, lit, sentence, shot_names, worded
+from polcap.quality import flatness, rim
+from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, at_most, lit, reaches, sentence, shot_names, worded
 from polcap.quality.limits import GateLimits
+from polcap.quality.rerendering import explains
 from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilSelfcal, ResultsUntilStokes
 from polcap.stage_values import AngleStack, ObjectMask, OrderTest, OutlineCheck, StokesImage, SurfaceMaps
 
@@ -44,14 +45,17 @@ _UNPOLARIZED_DEG = 11.0
 _ALONG_DEG = 30.0
 _TRANSLUCENT_DEG = 9.0
 _LOOSE_FIT_DEG = 7.0  # 24° for shots in a wrong order, nothing for objects with sharp edges, which are usual
+_NOISE = 2.0  # DoLP over its 1σ: that of noise alone is 1.2; a rough cube that faces the camera 1.3
+_UNSURE_DEG = 14.0  # median expected error; beyond, correct maps of shadowed objects agree little (the same page)
+_WRONG_DEG = 30.0  # mean error of the normals of captures that fail (docs/benchmarks/gates.md)
 _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
 def order(found: Evidence[ResultsUntilSelfcal]) -> Gate:
     """Gate on the order and sense of the polarizer angles."""
     results, explained, seen = found.results, None, None
-    if isinstance(results, ResultsUntilInfer):
-        explained, seen = _explained(results), flatness.measure(results.stokes, results.maps)
+    if reaches(found, ResultsUntilInfer):
+        explained, seen = _explained(found), flatness.measure(found.results.stokes, found.results.maps)
     return order_of_shots(results.radiance, results.object_, results.selfcal.outline, _test(results), seen, explained)
 
 
@@ -117,12 +121,12 @@ def _undecided(other: str, outline: OutlineCheck, radiance: AngleStack) -> Gate:
     return Gate("order", "warn", "cannot tell", "as stated", message, remedy, unit="")
 
 
-def _explained(results: ResultsUntilInfer) -> float:
+def _explained(found: Evidence[ResultsUntilInfer]) -> float:
     """Part of the polarization that the maps explain by a shape that explains the shading too, at most 1.
 
     0 for the inversion: it makes a shape of any polarization.
     """
-    return 0.0 if results.maps.estimator == "analytic" else rerendering.measure(results).agreement
+    return 0.0 if found.results.maps.estimator == "analytic" else found.rerendered.agreement
 
 
 def _test(results: ResultsUntilSelfcal) -> OrderTest | None:
@@ -155,7 +159,7 @@ def turned_shot(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Ite
 def polarized(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
     """Gate "polarized", only if no part of the outline is polarized, and maps explain none of the little there is."""
     most = _most_dolp(found)
-    if not most < _LEAST_DOLP or _explained(found.results) > _UNPOLARIZED_EXPLAINED:
+    if not most < _LEAST_DOLP or _explained(found) > _UNPOLARIZED_EXPLAINED:
         return
     message = f"No part of the outline is polarized by more than {100 * most:.1f} %"
     remedy = "Check that the polarizer was on and turned; metal and translucent objects (wax, milk) hardly polarize"
@@ -243,6 +247,34 @@ def ill_posed(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Gate:
 def _ill_posed(found: Evidence[ResultsUntilStokes]) -> float:
     inside = found.results.stokes.quality[lit(found.results.stokes)]
     return float(((inside & int(Quality.ILL_POSED)) > 0).mean()) if inside.size else 0.0
+
+
+def explained_by_maps(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
+    """Gate on the maps: whether they explain the polarization and the brightness of the photographs."""
+    seen = found.rerendered
+    if not np.isfinite(seen.agreement):
+        return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, "All light is clipped")
+    if seen.significance < _NOISE:
+        message = "The polarization of the object is not above its noise"
+        return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, message)
+    if not explains(seen, limits) and _own_error_deg(found.results.maps) > _UNSURE_DEG:
+        message = "The estimator itself expects large errors, so its maps need not explain the photographs"
+        return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, message)
+    value, limit = round(seen.agreement, 3), limits.min_rerendering_agreement
+    message = f"Rendered again, the maps show {100 * max(seen.agreement, 0):.0f} % of the photographs' polarization"
+    if explains(seen, limits):
+        return Gate("re-rendering", "pass", value, limit, message)
+    if seen.agreement >= limit:
+        value, limit = round(seen.scale, 2), limits.max_rerendering_scale
+        times, kind = max(value, 1 / value), "dark" if value > 1 else "bright"
+        message = f"Rendered again, the maps are {times:.1f} times as {kind} as the photographs"
+    remedy = "Compare with --estimator analytic; a model of your own may be wrong: leave out --model"
+    return Gate("re-rendering", "fail", value, limit, f"{message}: the normals are wrong", remedy, _WRONG_DEG)
+
+
+def _own_error_deg(maps: SurfaceMaps) -> float:
+    """Median error of the normals that the estimator expects [degrees]."""
+    return float(np.median(maps.confidence[maps.mask])) if maps.mask.any() else 0.0
 
 
 def _angles(
@@ -334,7 +366,7 @@ def _light_of_body(body: rim.RimFigures, found: Evidence[ResultsUntilInfer], lim
     confirmed = _is_confirmed(found.results.maps.order)
     if body.along < _ALONG and not (confirmed and albedo < _DARK):  # dark gloss reflects itself
         return _along_contour(body.along, albedo, f"{remedy}; {_across(found)}")
-    if _explained(found.results) > _BODY_EXPLAINED:
+    if _explained(found) > _BODY_EXPLAINED:
         message = f"The outline is polarized by {100 * body.dolp:.1f} %, as the shape explains"
         return Gate("body", "pass", round(body.dolp, 4), limit, message)
     flat, dimmed = zenith < limits.min_zenith_deg, body.brightness < _DIMMED

@@ -1,4 +1,4 @@
-"""Renders the maps under the flash again, and judges whether they explain the photographs.
+"""Renders the maps under the flash again, for the comparison with the photographs.
 
 The maps come from an estimator, which may be wrong. Their rendering does not depend on it: on the normals, the flash
 makes a shading and a polarization, and both are in the photographs.
@@ -11,7 +11,6 @@ import numpy as np
 from polcap.images import Bools, Floats, Quality
 from polcap.optics import frames, shade
 from polcap.optics.reduction import ObjectReduction
-from polcap.quality.gate import Evidence, Gate
 from polcap.quality.limits import GateLimits
 from polcap.results import ResultsUntilInfer
 from polcap.stage_values import Cues, SurfaceMaps
@@ -20,11 +19,8 @@ from polcap.stages.cues import NOMINAL_IOR
 WHITE_QUANTILE = 0.995  # of the object's light; it becomes white
 _BRIGHTEST = 0.99  # quantile of the light from which a pixel is a highlight
 _JUDGED_PX = 256  # longest side on which the gate compares
-_NOISE = 2.0  # DoLP over its 1σ: that of noise alone is 1.2; a rough cube that faces the camera 1.3
 _OUTLIER = 5  # standard deviations of the differences
 _MOST_DOLP = 0.1  # more has no more weight: that of noise and of reflections
-_UNSURE_DEG = 14.0  # median expected error; beyond, correct maps of shadowed objects agree little (the same page)
-_WRONG_DEG = 30.0  # mean error of the normals of captures that fail (docs/benchmarks/gates.md)
 
 
 @dataclass(frozen=True)
@@ -158,31 +154,3 @@ def explains(found: Rerendering, limits: GateLimits) -> bool:
     """Whether maps explain the photographs: polarization and brightness are about those of their re-rendering."""
     alike = not found.agreement < limits.min_rerendering_agreement
     return alike and abs(np.log(found.scale)) <= np.log(limits.max_rerendering_scale)
-
-
-def rerendering(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
-    """Gate on the maps: whether they explain the polarization and the brightness of the photographs."""
-    seen = measure(found.results)
-    if not np.isfinite(seen.agreement):
-        return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, "All light is clipped")
-    if seen.significance < _NOISE:
-        message = "The polarization of the object is not above its noise"
-        return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, message)
-    if not explains(seen, limits) and _own_error_deg(found.results.maps) > _UNSURE_DEG:
-        message = "The estimator itself expects large errors, so its maps need not explain the photographs"
-        return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, message)
-    value, limit = round(seen.agreement, 3), limits.min_rerendering_agreement
-    message = f"Rendered again, the maps show {100 * max(seen.agreement, 0):.0f} % of the photographs' polarization"
-    if explains(seen, limits):
-        return Gate("re-rendering", "pass", value, limit, message)
-    if seen.agreement >= limit:
-        value, limit = round(seen.scale, 2), limits.max_rerendering_scale
-        times, kind = max(value, 1 / value), "dark" if value > 1 else "bright"
-        message = f"Rendered again, the maps are {times:.1f} times as {kind} as the photographs"
-    remedy = "Compare with --estimator analytic; a model of your own may be wrong: leave out --model"
-    return Gate("re-rendering", "fail", value, limit, f"{message}: the normals are wrong", remedy, _WRONG_DEG)
-
-
-def _own_error_deg(maps: SurfaceMaps) -> float:
-    """Median error of the normals that the estimator expects [degrees]."""
-    return float(np.median(maps.confidence[maps.mask])) if maps.mask.any() else 0.0

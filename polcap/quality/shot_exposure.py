@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from polcap.images import Bools, Floats, Quality
-from polcap.quality import flatness, light, rerendering
+from polcap.quality import flatness, light
 from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots, compared, reaches, worded
 from polcap.quality.limits import GateLimits
 from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilMask, ResultsUntilSelfcal, ResultsUntilStokes
@@ -308,4 +308,4 @@ def _is_explained(found: Evidence[ResultsUntilSelfcal]) -> bool:
     """Whether the maps, rendered again, show the photographs: then the light of the shots is right."""
     if not reaches(found, ResultsUntilInfer) or found.results.maps.estimator == "analytic":
         return False
-    return rerendering.measure(found.results).agreement > _EXPLAINED
+    return found.rerendered.agreement > _EXPLAINED

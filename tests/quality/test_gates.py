@@ -90,7 +90,11 @@ def changed(good: Seen, **fields: Any) -> Seen:
 
 def parts(good: Seen) -> dict[str, Any]:
     """All results and measurements, by their names."""
-    return {name: value for name, value in (vars(good) | vars(good.results)).items() if name not in ("results", "keys")}
+    return {
+        name: value
+        for name, value in (vars(good) | vars(good.results)).items()
+        if name not in ("results", "keys", "rerendered")
+    }
 
 
 def bracket(radiance: AngleStack, **measured: Any) -> AngleStack:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from polcap.config import Config
 from polcap.formats import onnx
 from polcap.images import Floats, Quality
 from polcap.pipeline import models
-from polcap.quality import object_turn, rerendering
+from polcap.quality import object_turn, polarization, rerendering
 from polcap.quality.gate import Gate
 from polcap.stage_values import Network
 from polcap.stages import infer
@@ -31,12 +32,18 @@ def of_normals(good: Seen, normal: Floats) -> Seen:
 
 
 def judge(of: Seen) -> Gate:
-    return rerendering.rerendering(of, Config().gates)
+    return polarization.explained_by_maps(of, Config().gates)
 
 
 def test_the_true_maps_of_a_ball_pass(good: Seen) -> None:
     gate = judge(good)
     assert gate.state == "pass" and isinstance(gate.value, float) and gate.value > 0.7 and gate.cost_deg == 0
+
+
+def test_all_gates_share_one_rerendering(good: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rerendering, "measure", measure := Mock(wraps=rerendering.measure))
+    judged(replace(good))
+    measure.assert_called_once()
 
 
 @pytest.mark.parametrize(
