@@ -30,7 +30,7 @@ _LIT = 0.85  # light of an outline that is not dimmed: wax too is hardly polariz
 _WALL_DOLP = 0.1  # of a part of the outline: where it does not grow outwards, a wall of a can or a box; wax has less
 _FACING_DOLP = 0.045  # most of the outline of a plane that faces the camera
 _ALIGNED = 0.84  # length of the mean normal: boxes up to .83, except one whose normals are wrong; bodies up to .77
-_ONE_NORMAL = 0.92  # of the mean normal: beyond, the outline decides nothing
+_ONE_NORMAL = 0.92  # of the mean normal: beyond, the outline decides nothing, even if bars polarize it
 _KNOWN_DEG = 7.0  # expected error of normals: a box that shows one face has 6, a tilted coin 9, plates 14 to 16
 _TILTED = np.cos(np.radians(20.0))  # of the mean normal: more tilt shows little more
 
@@ -51,13 +51,19 @@ class Flatness:
     def sharp_edged(self) -> bool:
         """Whether the outline is the edge of faces, at least in most parts."""
         unlike_wax = self.rim_light > _LIT or self.rim_dolp > _WALL_DOLP
-        return (self.contour < _ROUNDED and unlike_wax) or self.common > _ONE_PLANE
+        one_plane = self.common > _ONE_PLANE or (self.aligned > _ONE_NORMAL and self.rim_light > _LIT)
+        return (self.contour < _ROUNDED and unlike_wax) or one_plane
+
+    @property
+    def one_normal(self) -> bool:
+        """Whether the normals are about those of one plane: a rounded object of wax has up to .81."""
+        return self.aligned > _ALIGNED
 
     @property
     def flat(self) -> bool:
         """Whether the object is one plane, except for its relief."""
         one_plane = self.rim_dolp < _FACING_DOLP or self.common > _ONE_PLANE or self.aligned > _ONE_NORMAL
-        return self.sharp_edged and self.aligned > _ALIGNED and one_plane
+        return self.sharp_edged and self.one_normal and one_plane
 
 
 def judge(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:

@@ -157,9 +157,14 @@ def turned_shot(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Ite
 
 
 def polarized(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
-    """Gate "polarized", only if no part of the outline is polarized, and maps explain none of the little there is."""
+    """Gate "polarized", only if no part of the outline is polarized.
+
+    It passes over a plane that faces the camera, of which maps explain the little that there is.
+    """
     most = _most_dolp(found)
-    if not most < _LEAST_DOLP or _explained(found) > _UNPOLARIZED_EXPLAINED:
+    if not most < _LEAST_DOLP:
+        return
+    if _is_plane(found) and _explained(found) > _UNPOLARIZED_EXPLAINED:
         return
     message = f"No part of the outline is polarized by more than {100 * most:.1f} %"
     remedy = "Check that the polarizer was on and turned; metal and translucent objects (wax, milk) hardly polarize"
@@ -254,7 +259,7 @@ def explained_by_maps(found: Evidence[ResultsUntilInfer], limits: GateLimits) ->
     seen = found.rerendered
     if not np.isfinite(seen.agreement):
         return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, "All light is clipped")
-    if seen.significance < _NOISE:
+    if seen.significance < _NOISE and _is_plane(found):
         message = "The polarization of the object is not above its noise"
         return Gate("re-rendering", "not measured", None, limits.min_rerendering_agreement, message)
     if not explains(seen, limits) and _own_error_deg(found.results.maps) > _UNSURE_DEG:
@@ -270,6 +275,12 @@ def explained_by_maps(found: Evidence[ResultsUntilInfer], limits: GateLimits) ->
         message = f"Rendered again, the maps are {times:.1f} times as {kind} as the photographs"
     remedy = "Compare with --estimator analytic; a model of your own may be wrong: leave out --model"
     return Gate("re-rendering", "fail", value, limit, f"{message}: the normals are wrong", remedy, _WRONG_DEG)
+
+
+def _is_plane(found: Evidence[ResultsUntilInfer]) -> bool:
+    """Whether the object is about one plane, which may be hardly polarized: a rounded object is, unless it is wax."""
+    seen = flatness.measure(found.results.stokes, found.results.maps)
+    return seen is not None and seen.one_normal
 
 
 def _own_error_deg(maps: SurfaceMaps) -> float:

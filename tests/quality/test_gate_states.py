@@ -60,6 +60,7 @@ TURN = {"shot": None, "angle": 0.0, "misfit": 1.0, "sigmas": 0.0}
 ROUNDED = Flatness(contour=0.8, common=0.1, rim_dolp=0.2, rim_light=0.7, aligned=0.7, facing=1.0, expected_deg=15.0)
 EDGES = replace(ROUNDED, common=0.9)  # of flat faces
 BOX = replace(EDGES, contour=0.2, expected_deg=6.0)
+BLOCK = replace(ROUNDED, aligned=0.95)  # faces the camera
 PLANE = replace(EDGES, aligned=0.95)
 FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
@@ -240,13 +241,15 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("angles", "warn", {"selfcal": {"found_sigma": 0.02}}),
     ("angles", "warn", {"selfcal": {"ring": RingZero(0.2, 0.01)}}),
     ("angles", "pass", {"selfcal": {"ring": RingZero(0.03, 0.01, 0.03)}}),
-    ("polarized", "fail", {"figures": {"most_dolp": 0.004, "rendered": rendered(0.04)}}),
+    ("polarized", "fail", {"figures": {"most_dolp": 0.004, "rendered": rendered(0.13)}}),
+    ("polarized", "fail", {"figures": {"most_dolp": 0.004, "rendered": rendered(0.04), "flatness": BLOCK}}),
     ("body", "pass", {}),
     ("body", "fail", {"figures": outline(along=-0.9)}),
     ("body", "warn", {"figures": {**outline(along=-0.9), "medians": [45.0, 0.2, 0.04]}}),
     ("body", "warn", {"figures": {**outline(concentration=0.3), "rendered": rendered(0.45)}}),
     ("body", "pass", {"figures": {**outline(concentration=0.3), "rendered": rendered(0.55)}}),
     ("body", "not judged", {"figures": {"flatness": replace(ROUNDED, common=0.9)}}),
+    ("body", "not judged", {"figures": {"flatness": replace(ROUNDED, aligned=0.95, rim_light=0.94)}}),
     ("flat", "pass", {}),
     ("flat", "warn", {"figures": {"flatness": replace(ROUNDED, common=0.9, aligned=0.95)}}),
     ("flat", "pass", {"figures": {"flatness": replace(ROUNDED, common=0.9, aligned=0.95, expected_deg=5.0)}}),
@@ -287,7 +290,9 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("outline", "pass", {}),
     ("outline", "not judged", {"figures": {"inward_outline": 0.3, "flatness": EDGES}}),
     ("outline", "fail", {"figures": {"inward_outline": 0.3}}),
-    ("re-rendering", "not measured", {"figures": {"rendered": replace(rendered(0.13), significance=1.3)}}),
+    ("re-rendering", "not measured", {"figures": {"rendered": replace(rendered(0.13), significance=1.3),
+                                                  "flatness": BLOCK}}),
+    ("re-rendering", "fail", {"figures": {"rendered": replace(rendered(0.13), significance=1.3)}}),
     ("re-rendering", "pass", {}),
     ("re-rendering", "fail", {"figures": {"rendered": rendered(agreement=-0.5)}}),
     ("re-rendering", "fail", {"figures": {"rendered": rendered(scale=0.4)}}),
