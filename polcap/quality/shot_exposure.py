@@ -6,7 +6,18 @@ import numpy as np
 
 from polcap.images import Bools, Floats, Quality
 from polcap.quality import flatness, light
-from polcap.quality.gate import DEGREES_PER_GAIN, Evidence, Gate, State, at_most, bad_shots, compared, reaches, worded
+from polcap.quality.gate import (
+    DEGREES_PER_GAIN,
+    Evidence,
+    Gate,
+    State,
+    at_most,
+    bad_shots,
+    compared,
+    grade,
+    reaches,
+    worded,
+)
 from polcap.quality.limits import GateLimits
 from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilMask, ResultsUntilSelfcal, ResultsUntilStokes
 from polcap.stage_values import AngleStack, StokesImage
@@ -125,7 +136,8 @@ def noise(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Gate:
     figure, limit = noise_dolp(found.results.stokes), limits.max_dolp_noise
     message = worded(100 * figure, "Noise adds about {:.1f} % false polarization", "Noise adds no false polarization")
     remedy = "Use more light, a wider aperture, a longer exposure or more frames"
-    return at_most("noise", figure, limit, message, remedy, cost_deg=DEGREES_PER_NOISE * figure)
+    cost = DEGREES_PER_NOISE * figure
+    return at_most("noise", figure, limit, message, remedy, cost_deg=cost, beyond=grade(cost))
 
 
 def noise_dolp(image: StokesImage) -> float:

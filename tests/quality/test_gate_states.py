@@ -261,6 +261,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("other light", "pass", {}),
     ("other light", "fail", {"figures": outline(side=0.2)}),
     ("noise", "pass", {}),
+    ("noise", "warn", {"figures": {"noise": 0.045}}),
     ("noise", "fail", {"figures": {"noise": 0.1}}),
     ("noise", "not measured", {"figures": {"noise": NAN}}),
     ("ambient", "pass", {"bracket": {"ambient_share": np.full(3, 0.001)}}),
