@@ -219,7 +219,7 @@ def flicker(reference: Signals, other: Signals) -> float:
 
     A shutter exposes a picture row after row, so flicker makes stripes of rows. Anything else that changes the ratio
     (a room's light, motion, an error of the black level) changes it along the rows, too. So the power of the means of
-    columns is subtracted from that of the rows.
+    columns is subtracted from that of the rows, and so is twice the error of the difference, by noise.
     """
     size = min(max(reference.shape[1] // _FLICKER_ROWS, _LEAST_FLICKER_TILE), TILE)
     (a, inside), (b, other_inside) = tiles(reference, size), tiles(other, size)
@@ -229,20 +229,25 @@ def flicker(reference: Signals, other: Signals) -> float:
     lit &= expected > 3 * _DIM
     change = np.full(a.shape, np.nan)
     change[lit] = np.log(np.maximum(b[lit] / expected[lit], _SHADOW))  # a shutter may hide rows from the flash
-    return float(np.sqrt(max(_stripe_power(change) - _stripe_power(change.T), 0.0)))
+    (rows, sigma), (columns, other_sigma) = _stripe_power(change), _stripe_power(change.T)
+    return float(np.sqrt(max(rows - columns - 2 * np.hypot(sigma, other_sigma), 0.0)))
 
 
-def _stripe_power(change: Floats) -> float:
-    """Power of the medians of the rows of `change`, less a parabola and their own errors; NaN: too few rows."""
+def _stripe_power(change: Floats) -> tuple[float, float]:
+    """Power of the medians of the rows of `change`, less a parabola and their own errors, and its 1σ by these errors.
+
+    NaN: too few rows.
+    """
     change = change[np.isfinite(change).sum(axis=1) >= _LEAST_IN_ROW]
     if len(change) < _LEAST_ROWS:
-        return float("nan")
+        return float("nan"), float("nan")
     median = np.nanmedian(change, axis=1)
     sigma = MAD_TO_SIGMA * np.nanmedian(np.abs(change - median[:, None]), axis=1)
     variance = (MEDIAN_SE * sigma) ** 2 / np.isfinite(change).sum(axis=1)  # of a median
     row = np.arange(len(median))
     rest = median - np.polyval(np.polyfit(row, median, 2), row)  # apertures differ in vignetting
-    return float(np.mean(rest**2) - np.mean(variance))
+    noise = float(np.mean(variance))
+    return float(np.mean(rest**2)) - noise, noise * float(np.sqrt(2 / len(rest)))
 
 
 def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:
