@@ -71,8 +71,8 @@ def order_of_shots(
 
     An outline that is the edge of flat faces decides nothing. Where another order is as good, the stated one counts if
     its maps explain the photographs and the network does not expect smaller errors in another one. The network's test
-    is one look at a small picture, which misjudges boxes: maps that explain much of the polarization (`explained`, 1
-    is all) and have small errors leave its finding undecided, maps that explain little confirm it.
+    sees one small picture, and misjudges boxes and planes: maps that explain much of the polarization (`explained`, 1
+    is all) leave its finding undecided, maps that explain little confirm it.
     """
     statement, names, better = radiance.equipment.angles, shot_names(radiance), None
     edges = seen is not None and seen.sharp_edged
@@ -81,7 +81,7 @@ def order_of_shots(
         better, because = outline.best, "The outline fits"
     elif test is not None and test.ratio < 1 / likelier:
         better, because = test.rival, f"The network expects {1 / test.ratio:.1f} times smaller errors for"
-    if better is not None and outline.as_stated and _is_box(seen) and (explained or 0.0) > _BOX_EXPLAINED:
+    if better is not None and outline.as_stated and _hides_order(seen) and (explained or 0.0) > _BOX_EXPLAINED:
         return _undecided(_order_text(better, names), outline, radiance)
     if better is not None:
         message = f"{because} the order {_order_text(better, names)} rather than the stated one"
@@ -108,9 +108,9 @@ def _likelier(object_: ObjectMask, seen: flatness.Flatness | None, explained: fl
     return min(likelier, _LIKELIER_UNEXPLAINED) if unexplained else likelier
 
 
-def _is_box(seen: flatness.Flatness | None) -> bool:
-    """Whether an object is not flat, has hardly any occluding contour, and its normals have small expected errors."""
-    return seen is not None and not seen.flat and seen.contour < _BOX_CONTOUR and seen.expected_deg < _BOX_DEG
+def _hides_order(seen: flatness.Flatness | None) -> bool:
+    """Whether an object is flat, or has hardly any occluding contour and normals with small expected errors."""
+    return seen is not None and (seen.flat or (seen.contour < _BOX_CONTOUR and seen.expected_deg < _BOX_DEG))
 
 
 def _undecided(other: str, outline: OutlineCheck, radiance: AngleStack) -> Gate:

@@ -65,7 +65,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fine: Annotated[bool, Meta(description="a second network adds relief finer than the pixels of the first")] = True
 
 
-@stage(version=43)
+@stage(version=44)
 def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: InferSettings) -> SurfaceMaps:
     """Estimate normal, diffuse, specular, roughness and expected error from cues; without a network by inversion.
 

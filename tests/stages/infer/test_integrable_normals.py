@@ -85,3 +85,13 @@ def test_an_object_of_few_pixels_or_none_passes() -> None:
     assert not integrable(ball()[0], few).any()
     few[60:62, 60] = True
     assert np.isfinite(integrable(ball()[0], few)).all()
+
+
+def test_separate_parts_have_finite_normals() -> None:
+    """The distance of each part is free, and the corners of a single cell are too."""
+    true, _ = ball()
+    mask = np.zeros_like(EVERYWHERE)
+    mask[10:19, 10:19] = True
+    mask[30:60:2, 30:60:2] = True
+    found = integrable(np.where(np.isfinite(true), true, [0.0, 0.0, 1.0]), mask, 0.01)
+    assert np.isfinite(found).all() and np.allclose(np.linalg.norm(found[mask], axis=-1), 1, atol=1e-5)

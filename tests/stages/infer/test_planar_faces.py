@@ -65,3 +65,10 @@ def test_an_object_of_few_pixels_or_none_passes() -> None:
     assert not flattened(normal, 5.0, few).any()
     few[2, 3] = True
     assert np.allclose(flattened(normal, 5.0, few)[2, 3], PLANE)
+
+
+def test_normals_of_which_none_is_like_another_make_no_face():
+    """Nor like itself: a mean of opposite normals is shorter than one."""
+    mask = np.ones((40, 40), bool)
+    normal = np.tile(np.array([0.0, 0.0, 0.5], np.float32), (40, 40, 1))
+    assert list(planar_faces.faces(normal, mask)) == []

@@ -28,6 +28,7 @@ _PASSES = 4  # of the reweighted least squares
 _TWIST = 0.05  # weight of the second mixed difference, which no slope of a cell determines
 _MOST_ERROR_DEG = 6.0  # expected error that counts; a greater one is a wrong side or an unknown law of whole regions
 _LEAST_COSINE = 0.05
+_DAMPING = 1e-9  # of the mean diagonal element
 
 
 def make_integrable(normal: Floats, error: Floats, mask: Bools, rays: Floats) -> Floats:
@@ -92,7 +93,9 @@ def _fit_surface(normal: Floats, sigma: Floats, inside: Bools, rays: Floats) -> 
     weight = continuous
     for _ in range(_PASSES):
         weighted = equations.T @ sparse.diags(np.tile(weight, 3))
-        log_distance = spsolve((weighted @ equations + 1e-9 * sparse.identity(size)).tocsc(), weighted @ right)
+        matrix = (weighted @ equations).tocsc()
+        damping = _DAMPING * float(matrix.diagonal().mean())  # each separate part has a free distance
+        log_distance = spsolve(matrix + damping * sparse.identity(size, format="csc"), weighted @ right)
         residual = (equations @ log_distance - right).reshape(3, -1)[:2]
         weight = continuous / (1 + (residual**2).sum(axis=0) / _OUTLIER**2)
     g_a, g_b = derivative(0.0) @ log_distance, derivative(np.pi / 2) @ log_distance

@@ -79,6 +79,8 @@ def faces(normal: Floats, mask: Bools, *, half_turns: bool = False) -> Iterator[
         alike = cosine > np.cos(np.radians(_ALIKE_DEG))
         part = np.zeros(left.shape, np.uint8)
         part.flat[cells] = alike[:, alike.sum(axis=0).argmax()]
+        if not part.any():  # means of opposite normals are like none, not even themselves
+            return
         _, label, statistics, _ = cv2.connectedComponentsWithStats(part, connectivity=4)
         largest = 1 + int(statistics[1:, cv2.CC_STAT_AREA].argmax())
         if statistics[largest, cv2.CC_STAT_AREA] < least:
