@@ -43,6 +43,13 @@ def test_ball_has_the_depth_and_normals_of_a_sphere() -> None:
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 1.5
 
 
+def test_first_hits_are_infinitely_far_where_a_ray_misses() -> None:
+    origin, ahead = np.array([[0.0, 0, 3], [0.3, 0, 3], [2, 0, 3]]), np.tile([0.0, 0, -1], (3, 1))
+    distance, normal = mesh_tracer.Tracer(ball()).first_hits(origin, ahead)
+    np.testing.assert_allclose(distance, [2.6, 3 - np.sqrt(0.4**2 - 0.3**2), np.inf], atol=2e-3)
+    np.testing.assert_allclose(normal[:2], [[0, 0, 1], [0.75, 0, np.sqrt(1 - 0.75**2)]], atol=0.03)
+
+
 def test_turned_camera_sees_turned_normals() -> None:
     """Normals are in the camera's frame, positions in the object's: n_camera = R n_object on a ball."""
     turn = np.array([[0.0, -1, 0], [0.6, 0, -0.8], [0.8, 0, 0.6]])

@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from polcap.optics.projection import transform_points
-from polcap.optics.registration import Pyramid, register
+from polcap.optics.registration import Pyramid, register, scaled
 
 
 def _texture():
@@ -48,6 +48,13 @@ def test_motion_is_recovered_to_a_fiftieth_of_a_pixel(name):
     error = transform_points(found.matrix, corners()) - transform_points(MOTIONS[name], corners())
     assert np.abs(error).max() < 0.02
     assert found.sigma_px < 0.02
+
+
+def test_motions_of_averaged_pixels_are_those_of_the_full_grid():
+    """The middle of a block of step px is half of step − 1 px from its first pixel's."""
+    small = np.array([[3.0, 5.0], [40.0, 11.0]])
+    moved = transform_points(scaled(MOTIONS["tilt"], 4), 4 * small + 1.5)
+    np.testing.assert_allclose(moved, 4 * transform_points(MOTIONS["tilt"], small) + 1.5)
 
 
 def test_parts_that_move_on_their_own_are_outvoted():

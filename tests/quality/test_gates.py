@@ -344,8 +344,24 @@ def test_flash_bracketed_by_the_shutter_is_named(good: Seen) -> None:
     radiance = bracket(good.results.radiance, exposure_ratio=alike, exif_ratio=np.array([[0.25, 1, 4]] * 3))
     radiance = replace(radiance, equipment=Equipment("flash"))
     gate = judged(changed(good, radiance=radiance))["exposures"]
-    assert gate.state == "warn"
+    assert gate.state == "warn" and "the camera states steps of 4 times" in gate.message
     assert "flash power, aperture or ISO" in gate.remedy
+
+
+def test_stripes_ask_for_the_flash_synchronization_time_only_of_a_flash(good: Seen) -> None:
+    striped = bracket(good.results.radiance, flicker=np.array([[np.nan, 0.05]] * 3))
+    for equipment in (Equipment("flash"), Equipment("steady")):
+        gate = judged(changed(good, radiance=replace(striped, equipment=equipment)))["flicker"]
+        assert ("synchronization" in gate.remedy) == ("than the flash" in gate.message) == (equipment.light == "flash")
+
+
+def test_grays_with_a_tone_curve_count_half_as_glare_flattens_them_too(good: Seen) -> None:
+    color = replace(scenes.no_color(), place=ChartPlace(np.zeros((24, 4, 2)), np.zeros((4, 2))))
+    parts = {"color": color, **with_gains(good, grey_slope=0.7)}
+    gate = judged(changed(good, **parts))["tone curve"]
+    assert gate.state == "fail" and gate.value == pytest.approx(0.15) and "power 0.70" in gate.message
+    curved = bracket(good.results.radiance, curvature=np.array([[0.0, -0.2]] * 3))
+    assert judged(changed(good, radiance=curved, **parts))["tone curve"].value == pytest.approx(0.2)
 
 
 def test_gains_of_the_object_that_polarize_the_surroundings_are_in_doubt(good: Seen) -> None:

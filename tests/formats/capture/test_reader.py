@@ -39,7 +39,15 @@ def test_table_shows_every_frame_and_assumption(tmp_path):
     understood = capture.read(folders(tmp_path / "vase"))
     text = capture.table(understood)
     assert text.count("1/200 s") == 3 and text.count("1/50 s") == 3
-    for part in ("pol045/IMG_1.dng", "45°", "Acme Z1, 48×32 px", "Macro 60", "80 px (assumed)", "3 shots, 2 + 2 + 2"):
+    for part in (
+        "pol045/IMG_1.dng",
+        "45°",
+        "Acme Z1, 48×32 px",
+        "Macro 60",
+        "80 px (assumed)",
+        "3 shots, 2 + 2 + 2",
+        "2026-01-02 00",
+    ):
         assert part in text, part
 
 

@@ -169,3 +169,11 @@ def test_packed_mesh_is_smaller_and_names_its_extension(asset: Asset, geometry: 
         )
         assert set(glb_geometry.EXTENSIONS[one]) == set(parsed.get("extensionsRequired", []))
     assert held[geometry] < share * held["float"]
+
+
+def test_quantized_positions_span_the_mesh(asset: Asset) -> None:
+    parsed = document(gltf.encode(asset, "ball", gltf.GlbOptions(geometry="quantized")))
+    at = parsed["accessors"][parsed["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+    node = next(node for node in parsed["nodes"] if "mesh" in node)
+    span = (np.array(at["max"]) - at["min"]) / 65535 * node["scale"]
+    np.testing.assert_allclose(span, np.ptp(asset.mesh.vertices, axis=0), rtol=1e-4)
