@@ -10,8 +10,6 @@ from polcap.images import Bools, Floats, SensorImage
 from polcap.optics import demosaic
 from polcap.optics.morphology import dilate
 
-_FLOAT_STEP = 1e-7  # of white: precision of floating-point pictures
-
 
 def signal(image: SensorImage, full: bool = False) -> Floats:
     """Convert sensor counts to a linear signal (H, W, C) float32, black = 0 and white = 1.
@@ -123,6 +121,5 @@ def is_radiance(image: SensorImage) -> bool:
 
 def rounding_variance(image: SensorImage) -> float:
     """Noise variance from rounding to integer counts, in units of `signal`; nearly 0 for floating-point images."""
-    counts = image.white - float(image.black.mean())
-    step = 1 / counts if np.issubdtype(image.value.dtype, np.integer) else _FLOAT_STEP
-    return float(step**2 / 12)
+    step = 1.0 if np.issubdtype(image.value.dtype, np.integer) else 1e-3
+    return float(step**2 / 12 / (image.white - float(image.black.mean())) ** 2)

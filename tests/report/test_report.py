@@ -57,7 +57,7 @@ def test_photograph_and_rerendering_agree_only_where_the_page_says_so(
     difference: float, highlights: float, words: str
 ) -> None:
     none = np.zeros((1, 1, 1))
-    rendered = Rerendering(none, none, np.zeros((1, 1, 3)), 1.0, 1.0, difference, highlights)
+    rendered = Rerendering(none, none, np.zeros((1, 1, 3)), 1.0, difference=difference, highlights=highlights)
     said = page.light_agreement(rendered)
     assert words in said and ("agree" in said) is (words.startswith("Both pictures agree"))
 

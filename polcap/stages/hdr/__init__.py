@@ -62,7 +62,7 @@ class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
 
 
-@stage(version=24)
+@stage(version=25)
 def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack:
     """Merge every bracket: radiance (K, H, W, 3) of all shots, on the scale of each shot's reference frame.
 

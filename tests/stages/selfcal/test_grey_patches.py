@@ -68,7 +68,7 @@ def test_a_chart_that_moved_gives_no_gains():
     assert moved.gains.source == "object"
     assert np.abs(moved.gains.gain.mean(1) / GAIN - 1).max() < 0.005
     gains = replace(moved.gains, sigma=np.full((3, 3), 0.01))
-    gate = gain_doubt(replace(moved, gains=gains), color=board(), radiance=SHOTS)
+    gate = gain_doubt(replace(moved, gains=gains), color=board(), radiance=SHOTS, object_=scenes.ball_object())
     assert gate.state == "warn" and "moved" in gate.message and "Fix the chart" in gate.remedy
 
 
