@@ -1,6 +1,7 @@
 """Integrable normals: those of a surface do not change, others come nearer to one surface; depth steps stay."""
 
 import numpy as np
+import pytest
 
 from polcap.images import Bools, Floats, View
 from polcap.optics import frames
@@ -95,3 +96,9 @@ def test_separate_parts_have_finite_normals() -> None:
     mask[30:60:2, 30:60:2] = True
     found = integrable(np.where(np.isfinite(true), true, [0.0, 0.0, 1.0]), mask, 0.01)
     assert np.isfinite(found).all() and np.allclose(np.linalg.norm(found[mask], axis=-1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("expected_deg", [0.0, 90.0])
+def test_any_stated_error_gives_normals(expected_deg: float) -> None:
+    true, mask = ball()
+    assert error(integrable(true, mask, expected_deg), true, mask) < 0.1

@@ -26,7 +26,7 @@ _ALONG, _ACROSS = 0.8, 0.4  # 1σ of zenith angle and azimuth (as an arc), over 
 _OUTLIER, _CURL = 2.5, 1.0  # σ: Cauchy's scales of the residuals, and of the curl
 _PASSES = 4  # of the reweighted least squares
 _TWIST = 0.05  # weight of the second mixed difference, which no slope of a cell determines
-_MOST_ERROR_DEG = 6.0  # expected error that counts; a greater one is a wrong side or an unknown law of whole regions
+_ERROR_DEG = (0.1, 6.0)  # range of the expected error that counts; more is a wrong side or an unknown law of regions
 _LEAST_COSINE = 0.05
 _DAMPING = 1e-9  # of the mean diagonal element
 
@@ -42,7 +42,7 @@ def make_integrable(normal: Floats, error: Floats, mask: Bools, rays: Floats) ->
     if not inside.any():
         return normal * mask[..., None]
     coarse = frames.unit(weighted_area_mean(normal, mask, shape))
-    sigma = np.radians(weighted_area_mean(np.minimum(error, _MOST_ERROR_DEG), mask, shape))[inside]
+    sigma = np.radians(weighted_area_mean(np.clip(error, *_ERROR_DEG), mask, shape))[inside]
     towards = frames.unit(area_mean(rays, shape))
     found, certain = _fit_surface(coarse, sigma, inside, towards)
     change = np.zeros(coarse.shape, np.float32)
