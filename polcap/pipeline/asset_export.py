@@ -104,16 +104,13 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     if wanted.page is not None:
         written.append(files.path(".html"))
         web_page.write(written[-1], files.path(".glb"), web_page.read_script(wanted.page), files.facts)
+    notes = _level_notes({files.path(".glb"): found[0], **coarser}) if wanted.lod else {}
     description = {
         "for": preset.description,
         "unit": files.facts["unit"],
         "glb": {f"{files.stem}_{key}": text for key, text in _embedded(whole, preset).items()},
         "mesh": _size(found[0]),
-        **(
-            {"lods": _level_notes({files.path(".glb"): found[0], **coarser}) if wanted.lod else {}}
-            if writes_glb
-            else {}
-        ),
+        **({"lods": notes} if writes_glb else {}),
         "textures": {file: texture.meaning for file, texture in sorted(loose.items())},
         **({"facts": files.entry} if files.entry else {}),
     }

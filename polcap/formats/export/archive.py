@@ -1,4 +1,4 @@
-"""Gathers a result's records next to an export, and lists digests of all its files for `sha256sum -c`."""
+"""Gathers a result's records next to an export, lists digests of all its files for `sha256sum -c`, and checks them."""
 
 import os
 from pathlib import Path

@@ -257,7 +257,7 @@ def read_mask(file: Path, size: tuple[int, int]) -> Bools:
 def _existing(file: Path) -> Path:
     """The path of a file that exists. Raises DecodeError."""
     if not file.exists():
-        raise DecodeError(f"{file} is missing; run `polcap process` on the photographs again")
+        raise DecodeError(f"{file} is missing; make the result again from the photographs")
     return file
 
 

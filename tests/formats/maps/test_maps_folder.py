@@ -212,7 +212,7 @@ def test_a_missing_map_is_named_with_a_remedy(folder: Path, tmp_path: Path) -> N
     shutil.copytree(folder, tmp_path / "maps")
     for name in ("normal.exr", "mask.png"):
         (tmp_path / "maps" / name).unlink()
-        with pytest.raises(DecodeError, match=rf"{name} is missing; run `polcap process`"):
+        with pytest.raises(DecodeError, match=rf"{name} is missing; make the result again"):
             maps.read(tmp_path / "maps")
 
 
