@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from polcap.formats.maps.maps_folder import ResultMaps
     from polcap.formats.maps.result_maps import read as read_maps
     from polcap.formats.maps.result_maps import read_cues, read_stokes, read_stokes_covariance
-    from polcap.images import View
+    from polcap.image_values import View
     from polcap.mesh_values import Asset, Mesh
     from polcap.stage_values import Cues, StokesImage, SurfaceMaps
 
@@ -47,7 +47,7 @@ _HOME = {  # public name → module and its name there
     "read_stokes_covariance": ("polcap.formats.maps.result_maps", "read_stokes_covariance"),
     **{name: ("polcap.capture_values", name) for name in ("Capture", "Frame", "Shot")},
     "ChartRequest": ("polcap.chart_values", "ChartRequest"),
-    "View": ("polcap.images", "View"),
+    "View": ("polcap.image_values", "View"),
     **{name: ("polcap.mesh_values", name) for name in ("Asset", "Mesh")},
     **{name: ("polcap.stage_values", name) for name in ("Cues", "StokesImage", "SurfaceMaps")},
 }

@@ -19,7 +19,7 @@ from polcap.formats.export.encoders import Kind
 from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.presets import Format
 from polcap.formats.export.texture_set import Extra
-from polcap.images import Bools, Device
+from polcap.image_values import Bools, Device
 from polcap.pipeline import asset_export, export_request, models
 from polcap.pipeline import check as checks
 from polcap.pipeline import run as pipeline

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Struct
 
 from polcap.calibration_values import BallAccuracy, Calibration
-from polcap.images import NOT_IN_KEY, Floats, SensorImage
+from polcap.image_values import NOT_IN_KEY, Floats, SensorImage
 
 T = TypeVar("T")
 Role = Literal["shot", "ambient", "repeat", "chart", "cross"]

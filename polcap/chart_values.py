@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from polcap.images import Bits, Floats
+from polcap.image_values import Bits, Floats
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from polcap.images import ArrayValue, Faces, Floats, TexturePixels
+from polcap.image_values import ArrayValue, Faces, Floats, TexturePixels
 
 
 @dataclass(frozen=True, repr=False)

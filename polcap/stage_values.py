@@ -1,6 +1,6 @@
 """Results of the stages `hdr` to `infer`, except the color calibration, and the networks that they run.
 
-Shapes are those of `images.py`.
+Shapes are those of `image_values.py`.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,7 +10,18 @@ from typing import Literal
 import numpy as np
 
 from polcap.capture_values import AngleStatement, ShotOrder
-from polcap.images import NOT_IN_KEY, ArrayValue, Bits, Bools, Device, Distortion, Floats, MaskedImage, Mosaic, View
+from polcap.image_values import (
+    NOT_IN_KEY,
+    ArrayValue,
+    Bits,
+    Bools,
+    Device,
+    Distortion,
+    Floats,
+    MaskedImage,
+    Mosaic,
+    View,
+)
 
 
 @dataclass(frozen=True)

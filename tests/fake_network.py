@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from polcap.formats import onnx
-from polcap.images import NOT_IN_KEY, Floats
+from polcap.image_values import NOT_IN_KEY, Floats
 from polcap.stage_values import Network
 
 _run_model = onnx.run

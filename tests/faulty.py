@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.synth.scenes import Kind, random_scene
 from polcap.synth.shooting import Shoot, ShotPose, Studio, Take
 

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap import Config, chart_values, images, mesh_values, read_capture, stage_values
+from polcap import Config, chart_values, image_values, mesh_values, read_capture, stage_values
 from polcap.formats import onnx, shipped_data
 from polcap.formats.raw import frame_decoder
-from polcap.images import View
+from polcap.image_values import View
 from polcap.optics import frames
 from polcap.pipeline import models
 from polcap.stages import Stage, align, asset, cues, hdr, infer, mask, selfcal, stokes, surface, whitebalance
@@ -182,13 +182,13 @@ def radiance() -> stage_values.AngleStack:
     return stage_values.AngleStack(
         value=value,
         variance=np.float32(3e-5) * (np.maximum(value, 0) + np.float32(0.02)),
-        quality=np.stack(clipped).astype(np.uint8) * np.uint8(images.Quality.CLIPPED),
+        quality=np.stack(clipped).astype(np.uint8) * np.uint8(image_values.Quality.CLIPPED),
         angle=capture.angle,
         view=VIEW,
         bracket=stage_values.single_frames(len(value)),
         sensor=stage_values.ColorSensor(first.camera_matrix, first.white_balance, first.site_px),
         equipment=stage_values.Equipment("flash"),
-        mosaic=images.Mosaic(((first.value - np.float32(256)) / (4095 - 256)).astype(np.float16), RGGB),
+        mosaic=image_values.Mosaic(((first.value - np.float32(256)) / (4095 - 256)).astype(np.float16), RGGB),
     )
 
 

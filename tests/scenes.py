@@ -12,10 +12,10 @@ from scipy.ndimage import gaussian_filter
 
 from polcap.capture_values import ShotOrder
 from polcap.chart_values import ColorCalibration
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames, mueller, shade
 from polcap.optics.warp import warp
-from polcap.quality.gate import Evidence
+from polcap.quality.gate_values import Evidence
 from polcap.results import FIELDS, collect
 from polcap.stage_values import (
     Alignment,

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.mesh_values import Asset, Mesh, ReliefMesh
 from polcap.stage_values import SurfaceMaps
 from polcap.stages import asset, surface

@@ -15,7 +15,7 @@ import polcap
 from polcap.api import Result
 from polcap.errors import PolcapError, SettingError
 from polcap.formats.maps import result_maps as maps
-from polcap.images import MaskedImage
+from polcap.image_values import MaskedImage
 from polcap.pipeline import models, request
 from polcap.pipeline import run as pipeline
 from polcap.results import ResultsUntilMask

@@ -136,7 +136,7 @@ LARGE = {  # functions beyond that, and why
     "polcap.api.fuse": "the options of `polcap fuse`, by keyword",
     "polcap.formats.dng_writer.write": "the tags of a DNG, by keyword",
     "polcap.optics.shade.stokes": "geometry, material and light of each pixel; training calls it with tensors",
-    "polcap.quality.gate.at_most": "the fields of a gate",
+    "polcap.quality.gate_values.at_most": "the fields of a gate",
 }
 
 

@@ -14,7 +14,7 @@ from polcap.config import Config
 from polcap.errors import CaptureError
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import maps_folder
-from polcap.images import Quality
+from polcap.image_values import Quality
 from polcap.pipeline import check
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
 from polcap.calibrate.ball_outline import Ball
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics import frames, fresnel, outline, robust, shade
 from polcap.optics.resize import area_mean
 

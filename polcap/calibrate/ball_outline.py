@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from polcap.errors import ObjectError
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics import frames, robust
 
 LEAST_RADIUS_PX = 24.0  # of a ball on the maps; an error of half a pixel of its outline is one degree at 45°

@@ -7,7 +7,7 @@ import numpy as np
 
 from polcap.calibrate.ball_validation import BallReport, ErrorClass, MeasuredBall
 from polcap.formats.maps import png
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import frames
 from polcap.optics.reduction import ObjectReduction
 from polcap.report import keys, map_figures, page, sheets

@@ -21,7 +21,7 @@ from polcap.calibrate.ball_light import BallLight
 from polcap.calibration_values import BallAccuracy
 from polcap.formats.maps import result_maps
 from polcap.formats.maps.maps_folder import ResultMaps
-from polcap.images import ArrayValue, Bools, Floats
+from polcap.image_values import ArrayValue, Bools, Floats
 from polcap.optics import frames
 
 _ZENITHS = (0, 15, 30, 45, 60, 75, 90)  # degrees, limits of the classes

@@ -21,7 +21,7 @@ from polcap.calibrate.calibration_photographs import CLIP, Photograph, photograp
 from polcap.calibration_values import NoiseLine
 from polcap.errors import CaptureError
 from polcap.formats.capture import folder_names
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import robust
 from polcap.stages.hdr import bracket, exposure, noise, planes
 from polcap.stages.hdr.planes import Signals

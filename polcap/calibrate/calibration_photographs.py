@@ -11,7 +11,7 @@ from polcap.capture_values import Exif
 from polcap.errors import CaptureError
 from polcap.formats.capture import folder_names, photograph_files
 from polcap.formats.raw import libraw as raw
-from polcap.images import Floats, SensorImage
+from polcap.image_values import Floats, SensorImage
 from polcap.optics import sensor
 
 CLIP = 0.95  # of the saturated count; nothing is measured above

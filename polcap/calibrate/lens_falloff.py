@@ -8,7 +8,7 @@ import numpy as np
 from polcap.calibrate.calibration_photographs import CLIP, Photograph, by_setting
 from polcap.calibration_values import Falloff
 from polcap.errors import CaptureError
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import sensor
 from polcap.optics.resize import area_mean
 

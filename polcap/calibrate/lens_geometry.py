@@ -20,7 +20,7 @@ from polcap.calibration_values import LensGeometry
 from polcap.chart_values import ChartRequest
 from polcap.errors import CaptureError, ChartError
 from polcap.formats import shipped_data
-from polcap.images import Distortion, Floats, SensorImage, View
+from polcap.image_values import Distortion, Floats, SensorImage, View
 from polcap.optics import distortion, sensor
 from polcap.optics.projection import from_grid, transform_points
 from polcap.stage_values import AngleStack, ColorSensor, single_frames

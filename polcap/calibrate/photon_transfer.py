@@ -15,7 +15,7 @@ import numpy as np
 from polcap.calibrate.calibration_photographs import CLIP, Photograph, by_setting
 from polcap.calibration_values import NoiseLine
 from polcap.errors import CaptureError
-from polcap.images import Bools, Floats, SensorImage
+from polcap.image_values import Bools, Floats, SensorImage
 from polcap.optics import robust, sensor
 
 _TILE = 16  # px; within a tile the lens's falloff changes nothing

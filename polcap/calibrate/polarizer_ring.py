@@ -16,7 +16,7 @@ import numpy as np
 from polcap.calibrate.calibration_photographs import Photograph, exposed_center
 from polcap.calibration_values import Polarizer
 from polcap.errors import CaptureError
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 _LEAST = 5  # angles of the ring, for three unknowns and a scatter
 _LAMP = 1e-3  # 1σ of a steady lamp from frame to frame, relative

@@ -5,7 +5,7 @@ import numpy as np
 from polcap.calibrate.calibration_photographs import Photograph
 from polcap.calibration_values import Levels
 from polcap.errors import CaptureError
-from polcap.images import SensorImage
+from polcap.image_values import SensorImage
 from polcap.optics import sensor
 
 _DARK = 0.05  # of white; a frame above is not dark

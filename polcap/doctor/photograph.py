@@ -11,7 +11,7 @@ from polcap.doctor import Finding
 from polcap.errors import DecodeError
 from polcap.formats.capture import focal_length
 from polcap.formats.raw import libraw, photo, probe
-from polcap.images import SensorImage
+from polcap.image_values import SensorImage
 from polcap.optics import sensor
 from polcap.stages import hdr
 

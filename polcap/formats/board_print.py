@@ -12,7 +12,7 @@ from html import escape
 
 import numpy as np
 
-from polcap.images import Bools
+from polcap.image_values import Bools
 from polcap.optics import board as boards
 from polcap.optics.board import Board
 

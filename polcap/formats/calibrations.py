@@ -15,7 +15,7 @@ from polcap.calibration_values import Calibration, LensGeometry
 from polcap.capture_values import Exif
 from polcap.errors import CaptureError
 from polcap.formats import atomic, own_folders, text_file
-from polcap.images import Distortion
+from polcap.image_values import Distortion
 from polcap.optics import distortion
 
 _FULL_TURN = 360.0  # degrees

@@ -15,7 +15,7 @@ import numpy as np
 from polcap.chart_values import ChartReference, SurroundingPatches
 from polcap.errors import ChartError
 from polcap.formats import text_file
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.color import REC709_TO_XYZ
 
 _SG = [f"{column}{row}" for row in range(1, 11) for column in "ABCDEFGHIJKLMN"]  # patches of an SG, row by row

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from polcap.capture_values import Exif
 from polcap.formats import atomic
-from polcap.images import Bits, Floats
+from polcap.image_values import Bits, Floats
 
 _BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 _CODE = {_SHORT: "H", _LONG: "I", _RATIONAL: "II", _SRATIONAL: "ii"}

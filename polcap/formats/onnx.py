@@ -26,7 +26,7 @@ import numpy as np
 from polcap import parallel
 from polcap.errors import DecodeError, ModelError, one_line
 from polcap.formats import sandbox, shipped_data, text_file
-from polcap.images import Device, Floats
+from polcap.image_values import Device, Floats
 from polcap.stage_values import Network
 
 ENCODING = "1"

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import DecodeError
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import color
 from polcap.optics.resize import area_mean
 

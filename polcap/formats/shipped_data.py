@@ -8,7 +8,7 @@ import numpy as np
 from polcap.chart_values import ChartReference
 from polcap.errors import StorageError
 from polcap.formats import chart_file, text_file
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.color import decode_srgb
 
 _NAMES = {

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from polcap.errors import ObjectError, SettingError, package_for
 from polcap.fusion.closed_mesh import decimate
 from polcap.fusion.values import ClosedMesh, FusionView
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.mesh_values import Mesh
 from polcap.optics import frames
 from polcap.optics.texture_rasterizer import rasterize

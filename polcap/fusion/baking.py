@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.values import FusionView
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import frames
 from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.optics.morphology import masked_mean

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 from polcap.chart_values import ColorCalibration
 from polcap.errors import CaptureError
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import board as boards
 from polcap.optics.board import BOARDS, Board
 from polcap.optics.projection import from_grid, transform_points

@@ -15,7 +15,7 @@ from scipy.ndimage import maximum_filter
 from polcap.chart_values import ColorCalibration
 from polcap.fusion.poses import SessionCamera
 from polcap.fusion.values import Pose
-from polcap.images import Bools, Floats, Quality
+from polcap.image_values import Bools, Floats, Quality
 from polcap.optics import board as boards
 from polcap.optics import distortion
 from polcap.optics.board import Board

@@ -26,7 +26,7 @@ from polcap.fusion.closed_mesh import iso_surface
 from polcap.fusion.hull import DistanceGrid, plain_body
 from polcap.fusion.normal_surface import FittedSurface, visible
 from polcap.fusion.small_views import SmallView, sample
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.frames import dot, unit
 from polcap.optics.mesh_tracer import Tracer
 from polcap.optics.projection import back_project

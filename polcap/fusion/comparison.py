@@ -7,7 +7,7 @@ import numpy as np
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, VisibleTexels, visible_texels
 from polcap.fusion.values import FusionView
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import frames, shade
 from polcap.optics.point_light import irradiance
 from polcap.stages import stage

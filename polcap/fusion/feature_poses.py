@@ -27,7 +27,7 @@ from polcap.errors import CaptureError
 from polcap.fusion.object_features import ObjectFeatures
 from polcap.fusion.poses import LEAST_VIEWS, PosedView, SessionCamera, SessionPoses
 from polcap.fusion.values import Pose
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.frames import dot, unit
 from polcap.stages import stage
 

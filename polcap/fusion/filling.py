@@ -13,7 +13,7 @@ from scipy.sparse.linalg import splu
 
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, on_atlas
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.texture_rasterizer import rasterize
 from polcap.stages import stage
 

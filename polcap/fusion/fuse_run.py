@@ -29,7 +29,7 @@ from polcap.pipeline.run import timings
 from polcap.quality import fused_object
 from polcap.quality.advice import advise
 from polcap.quality.fused_object import SeenSurface
-from polcap.quality.gate import Gate
+from polcap.quality.gate_values import Gate
 from polcap.quality.limits import FusedGateLimits
 from polcap.report import animation
 

@@ -22,7 +22,7 @@ from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, on_atlas
 from polcap.fusion.mesh_occlusion import ambient_occlusion
 from polcap.fusion.values import ClosedMesh
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.mesh_values import Asset, Mesh
 from polcap.pipeline.detail_levels import DetailLevel
 from polcap.stages import asset

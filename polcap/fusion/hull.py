@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from polcap.errors import ObjectError
 from polcap.fusion.small_views import SmallView
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 
 _COARSE = 48  # steps of the grid that finds the object's box
 _MARGIN = 3  # steps around the object

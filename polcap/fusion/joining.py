@@ -22,7 +22,7 @@ from polcap.fusion.normal_surface import visible
 from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.small_views import reduce_views, sample
 from polcap.fusion.values import FusionView, Pose
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.frames import dot
 from polcap.optics.vertex_frames import vertex_normals
 from polcap.stages import stage

@@ -23,7 +23,7 @@ from polcap.errors import CaptureError
 from polcap.formats.capture.folder_names import set_of_view
 from polcap.fusion.poses import LEAST_VIEWS
 from polcap.fusion.silhouettes import Silhouette, grid_around, halve
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.outline import disc_radius
 from polcap.stages import stage
 from polcap.stages.mask import regions

@@ -39,7 +39,7 @@ from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, VisibleTexels, on_atlas, visible_texels
 from polcap.fusion.lobe_profiles import ALPHAS, LobeProfile, LobeSamples, flash_place, profile
 from polcap.fusion.values import FusionView
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import clusters, color, frames
 from polcap.optics.point_light import irradiance
 from polcap.stages import stage

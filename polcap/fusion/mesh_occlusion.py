@@ -3,7 +3,7 @@
 import numpy as np
 
 from polcap.fusion.atlas import Atlas
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.mesh_values import Mesh
 from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.optics.outline import fill_outward

@@ -24,7 +24,7 @@ from polcap.fusion.closed_mesh import neighbor_means
 from polcap.fusion.hull import DistanceGrid
 from polcap.fusion.small_views import SmallView, sample
 from polcap.fusion.values import ClosedMesh
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.frames import dot, unit
 from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.optics.vertex_frames import area_vectors, vertex_normals

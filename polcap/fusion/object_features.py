@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from polcap.chart_values import ColorCalibration
 from polcap.errors import CaptureError
 from polcap.fusion.values import ViewMask
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import projection
 from polcap.quality import flatness, polarization
 from polcap.stage_values import AngleStack, ObjectMask, SelfCalibration, StokesImage, SurfaceMaps

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.values import Pose
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import color, frames
 from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.report import animation

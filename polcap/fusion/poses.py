@@ -22,7 +22,7 @@ from polcap.capture_values import Capture
 from polcap.errors import CaptureError
 from polcap.fusion.board_corners import BoardCorners
 from polcap.fusion.values import Pose
-from polcap.images import Distortion, Floats, View
+from polcap.image_values import Distortion, Floats, View
 from polcap.optics import distortion, projection
 from polcap.optics.board import Board
 from polcap.stages import stage

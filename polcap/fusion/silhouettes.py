@@ -12,7 +12,7 @@ import numpy as np
 
 from polcap.fusion.poses import SessionCamera
 from polcap.fusion.values import Pose
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.resize import area_mean
 
 _GRID = 80  # points along the longest side of the object's box

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from polcap import parallel
 from polcap.fusion.values import FusionView, Pose
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics.frames import dot, unit
 from polcap.optics.projection import project
 from polcap.optics.resize import area_mean, weighted_area_mean

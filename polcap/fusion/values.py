@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 
 
 @dataclass(frozen=True)

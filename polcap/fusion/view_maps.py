@@ -7,7 +7,7 @@ import numpy as np
 
 from polcap.fusion.poses import SessionCamera
 from polcap.fusion.values import FusionView, Pose
-from polcap.images import Distortion, Floats, View
+from polcap.image_values import Distortion, Floats, View
 from polcap.optics import distortion, frames, projection
 from polcap.results import ResultsUntilInfer
 from polcap.stages.cues import scale

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.material import flash_light
 from polcap.material.stokes_view import PosedStokes
 from polcap.optics import board as boards

@@ -17,7 +17,7 @@ from msgspec import Meta
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
-from polcap.images import ArrayValue, Floats
+from polcap.image_values import ArrayValue, Floats
 from polcap.material import flash_light, texel_grid, texel_stokes
 from polcap.material.stokes_view import PosedStokes
 from polcap.material.texel_fit import SLOPES, FitSettings, Measurements, TexelEstimate, TexelPrior, fit, start

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from polcap.chart_values import ColorCalibration
-from polcap.images import Bools, Floats, Indices, Quality
+from polcap.image_values import Bools, Floats, Indices, Quality
 from polcap.material.stokes_view import PosedStokes
 from polcap.material.texel_grid import FlashLight
 from polcap.optics import board as boards

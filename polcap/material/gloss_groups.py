@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import CaptureError
-from polcap.images import ArrayValue, Floats
+from polcap.image_values import ArrayValue, Floats
 from polcap.material import texel_fit, texel_grid
 from polcap.material.coarse_relief import CoarseRelief, measurements
 from polcap.material.stokes_view import PosedStokes

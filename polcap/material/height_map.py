@@ -16,7 +16,7 @@ import numpy as np
 from scipy.fft import dctn, idctn
 from scipy.sparse.linalg import LinearOperator, cg
 
-from polcap.images import ArrayValue, Bools, Floats
+from polcap.image_values import ArrayValue, Bools, Floats
 from polcap.material.coarse_relief import CROSSOVER, CoarseRelief
 from polcap.material.texel_fit import ALBEDO, F0, ROUGHNESS, SLOPES, UNKNOWNS, normals
 from polcap.material.texel_grid import TexelGrid

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from polcap.formats import atomic, html
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.material.height_map import MaterialMaps
 from polcap.material.material_maps import MaterialSource
 from polcap.material.texel_fit import IOR

@@ -24,7 +24,7 @@ from polcap.pipeline.export_request import ExportRequest
 from polcap.pipeline.run import timings
 from polcap.quality import flat_sample, several_views
 from polcap.quality.advice import advise
-from polcap.quality.gate import Gate
+from polcap.quality.gate_values import Gate
 
 _OF_SHAPE: tuple[Extra, ...] = ("curvature", "cavity")  # extra textures that a plane does not have
 _SINGLE_VIEW = {"exr", "sfp"}  # formats that need the maps of one picture

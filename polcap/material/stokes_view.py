@@ -15,7 +15,7 @@ from polcap.config import Config
 from polcap.fusion.poses import SessionCamera
 from polcap.fusion.values import Pose
 from polcap.fusion.view_path import SessionView
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.board import Board
 from polcap.optics.projection import to_grid
 from polcap.pipeline import path as single

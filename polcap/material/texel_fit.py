@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polcap.images import ArrayValue, Bools, Floats, Indices
+from polcap.image_values import ArrayValue, Bools, Floats, Indices
 from polcap.material.texel_grid import TexelViews
 from polcap.optics import body, frames, shade
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from polcap.fusion.values import Pose
-from polcap.images import Floats, Indices
+from polcap.image_values import Floats, Indices
 from polcap.optics import frames
 
 TO_WORLD = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # from the plane's frame

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from polcap.images import ArrayValue, Bools, Floats
+from polcap.image_values import ArrayValue, Bools, Floats
 from polcap.material import texel_fit, texel_grid
 from polcap.material.coarse_relief import CoarseRelief, measurements
 from polcap.material.gloss_groups import LAWS, GlossGroups, GlossSettings

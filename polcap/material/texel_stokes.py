@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from polcap.images import ArrayValue, Floats, Quality
+from polcap.image_values import ArrayValue, Floats, Quality
 from polcap.material import flash_light
 from polcap.material.stokes_view import PosedStokes
 from polcap.material.texel_grid import FlashLight, TexelGrid

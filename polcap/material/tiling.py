@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.material.height_map import MaterialMaps
 from polcap.optics import frames
 from polcap.stages import stage

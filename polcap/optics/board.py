@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 
 SQUARES, RING = 8, 2  # squares along a side; width of the ring
 CELLS = 8  # along a square: a marker of 4 × 4 bits, its frame of one bit, and a margin of one bit

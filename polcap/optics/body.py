@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from array_api_compat import device
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import fresnel
 from polcap.optics.namespace import array_namespace
 

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 _LEAST_SPREAD = 0.02
 _SOME = 40_000  # colors that are grouped, at most

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.namespace import array_namespace
 
 # Linear Rec.709 → CIE XYZ (white: Y = 1), IEC 61966-2-1:1999.

@@ -16,7 +16,7 @@ Atkinson and Hancock, Recovery of surface orientation from diffuse polarization,
 
 import numpy as np
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 
 def polarization_along(s1: Floats, s2: Floats, angle: float) -> Floats:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from polcap.images import Bits, Floats
+from polcap.image_values import Bits, Floats
 
 
 def superpixel(mosaic: Any, cfa: Bits) -> Floats:

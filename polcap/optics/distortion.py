@@ -10,7 +10,7 @@ Brown, Close-range camera calibration, Photogrammetric Engineering 1971; as cv2.
 
 import numpy as np
 
-from polcap.images import Distortion, Floats
+from polcap.image_values import Distortion, Floats
 
 _STEPS = 12  # of Newton's method; four are enough for any lens but a fisheye
 

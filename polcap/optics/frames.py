@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics.namespace import array_namespace
 from polcap.optics.projection import back_project
 

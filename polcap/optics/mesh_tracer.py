@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import InputError, package_for
-from polcap.images import ArrayValue, Bools, Floats, View
+from polcap.image_values import ArrayValue, Bools, Floats, View
 from polcap.optics import frames
 from polcap.optics.vertex_frames import area_vectors
 

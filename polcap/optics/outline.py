@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import mueller
 
 SECTORS = 24  # parts of an outline, 15° each from the object's center; their scatter gives the error

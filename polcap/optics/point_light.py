@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 
 def irradiance(point: Floats, flash: Floats, power: float, normal: Floats | None = None) -> Floats:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 
 
 def transform_points(matrix: Floats, point: Floats) -> Floats:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics import frames
 from polcap.optics.resize import area_mean
 from polcap.stage_values import SurfaceMaps

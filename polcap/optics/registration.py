@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.projection import coordinates, transform_points
 from polcap.optics.resize import block_means
 from polcap.optics.tiles import spread_over_cells

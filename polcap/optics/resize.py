@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 
 def area_mean(image: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:

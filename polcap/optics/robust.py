@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 MAD_TO_SIGMA = 1.4826  # 1/Φ⁻¹(¾): median absolute deviation → standard deviation of a normal distribution
 MEDIAN_SE = float((np.pi / 2) ** 0.5)  # standard error of a median over that of a mean, of normal scatter

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats, SensorImage
+from polcap.image_values import Bools, Floats, SensorImage
 from polcap.optics import demosaic
 from polcap.optics.morphology import dilate
 

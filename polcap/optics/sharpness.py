@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats, SensorImage
+from polcap.image_values import Bools, Floats, SensorImage
 from polcap.optics import sensor
 from polcap.optics.resize import block_means
 from polcap.optics.robust import MEDIAN_SE

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.mesh_values import Mesh
 
 _SLACK = 1e-4  # px and barycentric coordinates by which a pixel may miss a triangle, so that none falls between two

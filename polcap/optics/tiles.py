@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 
 def spread_over_cells(score: Floats, cells: tuple[int, int], per_cell: int) -> NDArray[np.int64]:

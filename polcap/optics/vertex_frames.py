@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from polcap.images import Faces, Floats
+from polcap.image_values import Faces, Floats
 from polcap.optics.frames import cross, dot, unit
 
 

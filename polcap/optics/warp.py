@@ -15,7 +15,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from polcap.images import Bits, Bools, Distortion, Floats
+from polcap.image_values import Bits, Bools, Distortion, Floats
 from polcap.optics import distortion
 from polcap.optics.projection import coordinates
 

@@ -25,7 +25,7 @@ from polcap.pipeline.path import AUTO, UserInput, path, results_so_far
 from polcap.pipeline.small_capture import SmallCapture
 from polcap.quality import gates
 from polcap.quality.advice import advise
-from polcap.quality.gate import Evidence, Gate, of_error
+from polcap.quality.gate_values import Evidence, Gate, of_error
 from polcap.results import ResultsUntilInfer, ResultsUntilWhitebalance
 from polcap.stage_values import Network
 

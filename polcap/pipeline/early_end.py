@@ -11,7 +11,7 @@ from polcap.pipeline.cache import StageCache
 from polcap.pipeline.path import results_so_far
 from polcap.quality import gates
 from polcap.quality.advice import advice
-from polcap.quality.gate import full_size, of_error
+from polcap.quality.gate_values import full_size, of_error
 from polcap.report import stage_pictures
 from polcap.results import ResultsUntilAlign, ResultsUntilHdr, ResultsUntilMask, ResultsUntilWhitebalance
 from polcap.stages import align

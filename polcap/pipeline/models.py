@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 from polcap.errors import ModelError, SettingError
 from polcap.formats import onnx, shipped_data
-from polcap.images import Device
+from polcap.image_values import Device
 from polcap.stage_values import Network
 from polcap.stages.infer import fine
 from polcap.stages.mask import mask_channels

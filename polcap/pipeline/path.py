@@ -18,7 +18,7 @@ from polcap.config import Config
 from polcap.errors import ObjectError
 from polcap.formats import onnx, shipped_data
 from polcap.formats.raw import frame_decoder
-from polcap.images import Bools
+from polcap.image_values import Bools
 from polcap.pipeline.cache import MemoryCache, StageReached
 from polcap.results import FirstResults, R, collect, last_stage
 from polcap.stage_values import AngleStack, Network, OtherOrder, SelfCalibration

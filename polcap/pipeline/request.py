@@ -9,7 +9,7 @@ from polcap.capture_values import Capture
 from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.formats.capture import reader
-from polcap.images import Bools, Device
+from polcap.image_values import Bools, Device
 from polcap.pipeline import models, unchanged
 from polcap.pipeline.cache import fingerprint
 from polcap.pipeline.path import AUTO, UserInput

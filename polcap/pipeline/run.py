@@ -21,7 +21,7 @@ from polcap.formats import color_profile, own_files, own_folders
 from polcap.formats.export import encoders, provenance
 from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
-from polcap.images import SensorImage
+from polcap.image_values import SensorImage
 from polcap.mesh_values import ReliefMesh
 from polcap.pipeline import (
     asset_export,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from polcap.capture_values import Capture, Frame, middle
 from polcap.formats.raw import frame_decoder
-from polcap.images import Floats, SensorImage
+from polcap.image_values import Floats, SensorImage
 from polcap.optics import sensor, sharpness
 from polcap.optics.projection import to_grid
 from polcap.optics.resize import block_means

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from polcap.quality.gate import Gate
+from polcap.quality.gate_values import Gate
 
 _MOST = 2
 _NOTABLE_DEG = 1.0  # error of the normals from which a warning comes before those that cost less

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
 from polcap.optics.robust import jackknife, spread

@@ -11,11 +11,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from polcap.images import Bools, Floats, Quality
+from polcap.image_values import Bools, Floats, Quality
 from polcap.optics.outline import disc_radius
 from polcap.optics.resize import area_mean
 from polcap.quality import geometry
-from polcap.quality.gate import MOST_DEG, Evidence, Gate
+from polcap.quality.gate_values import MOST_DEG, Evidence, Gate
 from polcap.results import ResultsUntilInfer
 from polcap.stage_values import SurfaceMaps
 

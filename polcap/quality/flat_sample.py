@@ -6,7 +6,7 @@ from statistics import median
 
 from polcap.formats.capture import folder_names
 from polcap.quality import several_views
-from polcap.quality.gate import Gate
+from polcap.quality.gate_values import Gate
 from polcap.quality.limits import MaterialGateLimits
 
 

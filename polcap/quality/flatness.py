@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import outline
 from polcap.optics.frames import total
 from polcap.optics.resize import block_means
-from polcap.quality.gate import MOST_DEG, Evidence, Gate
+from polcap.quality.gate_values import MOST_DEG, Evidence, Gate
 from polcap.results import ResultsUntilInfer
 from polcap.stage_values import StokesImage, SurfaceMaps
 

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.quality import several_views
-from polcap.quality.gate import Gate
+from polcap.quality.gate_values import Gate
 from polcap.quality.limits import FusedGateLimits
 
 _STEEP = 0.5  # upward component of a normal: faces up or down by more than 30°

@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from polcap.quality import error_maps, flatness, geometry, light, polarization, shot_exposure
-from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, reaches
+from polcap.quality.gate_values import MOST_DEG, Evidence, Gate, State, reaches
 from polcap.quality.limits import GateLimits
 from polcap.results import (
     FirstResults,

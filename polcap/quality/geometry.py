@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from polcap.formats import shipped_data
-from polcap.images import Bools, Floats, Quality
+from polcap.image_values import Bools, Floats, Quality
 from polcap.mesh_values import Mesh
 from polcap.optics import frames, outline
 from polcap.optics.morphology import dilate, erode
@@ -17,7 +17,7 @@ from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean
 from polcap.optics.sharpness import TILE
 from polcap.quality import object_turn, rerendering, rim, shot_exposure
-from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, Unit, at_most, bad_shots, lit, reaches, worded
+from polcap.quality.gate_values import MOST_DEG, Evidence, Gate, State, Unit, at_most, bad_shots, lit, reaches, worded
 from polcap.quality.limits import GateLimits
 from polcap.results import ResultsUntilAlign, ResultsUntilHdr, ResultsUntilInfer, ResultsUntilMask, ResultsUntilStokes
 from polcap.stage_values import AngleStack, StokesImage, SurfaceMaps

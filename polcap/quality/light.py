@@ -7,14 +7,14 @@ import cv2
 import msgspec
 import numpy as np
 
-from polcap.images import Floats, Quality
+from polcap.image_values import Floats, Quality
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays
 from polcap.optics.morphology import erode
 from polcap.optics.resize import block_means
 from polcap.optics.robust import MEDIAN_SE
 from polcap.quality import albedo_slope
-from polcap.quality.gate import MOST_DEG, Evidence, Gate, at_most, grade, worded
+from polcap.quality.gate_values import MOST_DEG, Evidence, Gate, at_most, grade, worded
 from polcap.quality.limits import GateLimits
 from polcap.results import (
     ResultsUntilHdr,

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from polcap.images import Bools, Floats, MaskedImage, Quality
+from polcap.image_values import Bools, Floats, MaskedImage, Quality
 from polcap.optics import outline, registration
 from polcap.optics.morphology import erode
 from polcap.optics.reduction import ObjectReduction

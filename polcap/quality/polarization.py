@@ -9,12 +9,23 @@ import numpy as np
 
 from polcap.capture_values import ShotOrder
 from polcap.formats.capture import angle_advice
-from polcap.images import Bools, Floats, Quality
+from polcap.image_values import Bools, Floats, Quality
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
 from polcap.quality import flatness, rim
-from polcap.quality.gate import MOST_DEG, Evidence, Gate, State, at_most, lit, reaches, sentence, shot_names, worded
+from polcap.quality.gate_values import (
+    MOST_DEG,
+    Evidence,
+    Gate,
+    State,
+    at_most,
+    lit,
+    reaches,
+    sentence,
+    shot_names,
+    worded,
+)
 from polcap.quality.limits import GateLimits
 from polcap.quality.rerendering import explains
 from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilSelfcal, ResultsUntilStokes

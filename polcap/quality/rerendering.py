@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from polcap.images import Bools, Floats, Quality
+from polcap.image_values import Bools, Floats, Quality
 from polcap.optics import frames, shade
 from polcap.optics.reduction import ObjectReduction
 from polcap.quality.limits import GateLimits

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import outline
 from polcap.optics.morphology import masked_mean
 from polcap.optics.robust import jackknife

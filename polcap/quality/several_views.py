@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from polcap.formats.capture import folder_names
-from polcap.quality.gate import Gate
+from polcap.quality.gate_values import Gate
 
 
 def views(used: Sequence[str], left_out: Mapping[str, str], least: int, few: str, remedy: str) -> Gate:

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from polcap.images import Bools, Floats, Quality
+from polcap.image_values import Bools, Floats, Quality
 from polcap.quality import flatness, light
-from polcap.quality.gate import (
+from polcap.quality.gate_values import (
     DEGREES_PER_GAIN,
     Evidence,
     Gate,

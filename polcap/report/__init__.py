@@ -21,7 +21,7 @@ from polcap.formats import atomic, text_file
 from polcap.formats.export import provenance
 from polcap.quality import error_maps, gates
 from polcap.quality.advice import advise
-from polcap.quality.gate import Gate, full_size
+from polcap.quality.gate_values import Gate, full_size
 from polcap.report import chart_colors, figures, labels, page
 from polcap.results import Results
 from polcap.stage_values import Network

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import cv2
 import numpy as np
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.mesh_values import ReliefMesh
 from polcap.optics import color, frames, outline, projection, shade
 from polcap.optics.reduction import scaled_view

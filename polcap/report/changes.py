@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import color, frames
 from polcap.optics.morphology import erode
 from polcap.optics.outline import fill_outward

@@ -13,7 +13,7 @@ import numpy as np
 from polcap.chart_values import ChartReference, ColorCalibration
 from polcap.formats import shipped_data
 from polcap.formats.raw import file_bytes
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.color import REC709_TO_XYZ
 from polcap.report import page_data
 from polcap.stage_values import AngleStack

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from polcap.errors import DecodeError
 from polcap.formats import html
 from polcap.formats.maps import maps_folder
-from polcap.images import Bools
+from polcap.image_values import Bools
 from polcap.optics.color import luminance, srgb_eight_bits
 from polcap.optics.reduction import ObjectReduction
 from polcap.report import changes, keys, labels, map_figures, page

@@ -7,7 +7,7 @@ import numpy as np
 
 from polcap.chart_values import ColorCalibration, PatchColors
 from polcap.formats.maps import maps_folder
-from polcap.images import Floats, Quality
+from polcap.image_values import Floats, Quality
 from polcap.mesh_values import Mesh
 from polcap.quality.rerendering import reduce, rerender
 from polcap.results import Results

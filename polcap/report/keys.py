@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 
 Palette = Literal["inferno", "viridis", "wheel", "balance"]
 LEVELS = 255

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.formats import html
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import outline
 from polcap.optics.color import srgb_eight_bits
 from polcap.optics.morphology import dilate

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from polcap.chart_values import ColorCalibration
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.mesh_values import ReliefMesh
 from polcap.optics.reduction import ObjectReduction
 from polcap.optics.resize import area_mean

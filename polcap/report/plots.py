@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from polcap.chart_values import ChartReference, PatchColors
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.color import srgb_eight_bits
 from polcap.report.labels import number
 from polcap.report.map_figures import css_colors

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.chart_values import ChartReference, ColorCalibration
-from polcap.images import Bools, Floats, Quality
+from polcap.image_values import Bools, Floats, Quality
 from polcap.mesh_values import Asset, ReliefMesh
 from polcap.optics import color, frames
 from polcap.optics import outline as outlines

@@ -5,7 +5,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
 from polcap.errors import CaptureError, DecodeError
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.rig import retake_criteria
 from polcap.rig.camera import CameraFile
 from polcap.rig.capture_record import AcceptedFrame, CaptureRecord

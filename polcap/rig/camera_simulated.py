@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl
 from polcap import config
 from polcap.capture_values import Role
 from polcap.errors import SettingError
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.rig.camera import CameraFile
 from polcap.rig.device_log import Log
 from polcap.rig.exposure_bracket import Exposure

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from polcap.formats.maps import png
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import mueller
 from polcap.report import stage_pictures as pictures
 from polcap.report.sheets import Tile, sheet

@@ -16,7 +16,7 @@ from polcap.formats import sandbox
 from polcap.formats.capture import reader
 from polcap.formats.raw import libraw as raw
 from polcap.formats.raw import probe
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import sensor
 from polcap.optics.resize import area_mean, block_means
 from polcap.rig.exposure_bracket import Exposure

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from polcap.errors import package_for
 from polcap.formats import atomic
 from polcap.formats.capture import folder_names
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.mesh_tracer import Triangles, smooth
 from polcap.synth import forward_camera, scene_materials, shooting, trace
 from polcap.synth.color_checker import Chart

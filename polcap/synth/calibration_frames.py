@@ -15,7 +15,7 @@ from msgspec import Meta
 from polcap.capture_values import Exif
 from polcap.formats import atomic
 from polcap.formats.capture import folder_names
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames
 from polcap.synth import color_checker, forward_camera
 from polcap.synth.color_checker import Chart

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from polcap.formats import shipped_data
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 _PATCH, _FRAME, _FRAME_ALBEDO = 0.88, 0.18, 0.03  # side of a patch and width of the frame, in patch pitches
 _MIDDLE = np.array([3, 2]) - (1 - _PATCH) / 2  # column and row of the chart's middle

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from polcap.formats import scene_files
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 _GRID = 1024  # points along a side of a slab's relief
 Wave = tuple[float, float, float, float, float]  # amplitude, wave vector x y z [rad/unit], phase [rad]

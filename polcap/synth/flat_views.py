@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from polcap.formats import atomic
 from polcap.formats.capture import folder_names
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.synth import forward_camera, scene_materials, shooting, trace
 from polcap.synth.all_around import CONVENTIONS, Poses
 from polcap.synth.color_checker import Chart

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from polcap.capture_values import Exif
 from polcap.errors import CaptureError
 from polcap.formats import dng_writer
-from polcap.images import Bits, Floats, View
+from polcap.image_values import Bits, Floats, View
 from polcap.optics.color import REC709_TO_XYZ
 
 SENSOR_WIDTH_MM = 36.0

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import frames, fresnel
 from polcap.optics.mesh_tracer import Tracer
 

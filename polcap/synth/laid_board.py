@@ -8,7 +8,7 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import board as boards
 
 _PAPER, _INK = 0.8, 0.03  # albedos, unpolarized

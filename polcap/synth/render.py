@@ -16,7 +16,7 @@ from scipy.ndimage import minimum_filter
 from scipy.spatial.transform import Rotation
 
 from polcap.errors import SettingError
-from polcap.images import Floats, Indices, View
+from polcap.image_values import Floats, Indices, View
 from polcap.optics import body, frames, fresnel, mesh_tracer, shade
 from polcap.optics.mesh_tracer import GBuffer
 from polcap.synth import color_checker as charts

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
 from polcap.formats import scene_files
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import frames, fresnel
 
 Color = tuple[float, float, float]  # linear Rec.709

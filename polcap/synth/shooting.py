@@ -24,7 +24,7 @@ from polcap.capture_values import Exif
 from polcap.errors import CaptureError
 from polcap.formats import atomic
 from polcap.formats.capture import folder_names
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames, mueller, projection
 from polcap.optics.mesh_tracer import GBuffer
 from polcap.synth import color_checker as charts

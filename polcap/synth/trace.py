@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from polcap.errors import InputError
 from polcap.formats import scene_files
-from polcap.images import Bools, Floats, Indices
+from polcap.image_values import Bools, Floats, Indices
 from polcap.optics.mesh_tracer import Tracer, face_camera, smooth
 from polcap.synth.distance_fields import Model, Shape
 

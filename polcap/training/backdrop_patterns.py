@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.training import random_shapes
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from polcap.images import Bools, Floats, Indices
+from polcap.image_values import Bools, Floats, Indices
 from polcap.optics import brdf, frames, mesh_tracer, shade
 from polcap.optics.mesh_tracer import GBuffer, Tracer
 from polcap.optics.projection import project

@@ -29,7 +29,7 @@ from msgspec import Meta
 from polcap.errors import InputError
 from polcap.formats import atomic, text_file
 from polcap.formats.maps import png
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import frames, mueller
 from polcap.optics.mesh_tracer import Tracer, centred
 from polcap.stages import cues

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from polcap.formats import scene_files
-from polcap.images import Floats, Indices
+from polcap.image_values import Floats, Indices
 
 TEXTURES, PATTERNS = 10, 20  # of the figures in polcap's pages
 _SEED = 2021

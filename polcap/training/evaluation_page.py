@@ -6,7 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.report import stage_pictures as pictures
 from polcap.report.stage_pictures import Picture
 from polcap.stage_values import SurfaceMaps

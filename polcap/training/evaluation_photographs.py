@@ -21,7 +21,7 @@ from polcap.errors import InputError
 from polcap.formats import atomic
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import png
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import frames
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache

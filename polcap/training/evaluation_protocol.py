@@ -14,7 +14,7 @@ from torch import Tensor
 
 from polcap.chart_values import ColorCalibration
 from polcap.errors import InputError
-from polcap.images import Bits, Bools, Floats, Indices, Quality, View
+from polcap.image_values import Bits, Bools, Floats, Indices, Quality, View
 from polcap.optics import frames, resize
 from polcap.optics.body import SMOOTH, Law
 from polcap.optics.mesh_tracer import Tracer, Triangles, centred

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from polcap.formats import atomic, onnx
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames
 from polcap.stage_values import Network
 from polcap.stages import cues

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.mesh_tracer import Triangles, centred, smooth, union
 from polcap.training import random_shapes
 from polcap.training.random_shapes import log_uniform

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from polcap.images import Bools, Floats, Indices
+from polcap.image_values import Bools, Floats, Indices
 from polcap.optics import brdf, frames, fresnel, shade
 from polcap.optics.body import SMOOTH, Law
 from polcap.optics.mesh_tracer import Tracer

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from polcap.images import Bools, Floats, Quality
+from polcap.image_values import Bools, Floats, Quality
 from polcap.optics import frames, shade
 from polcap.optics.morphology import erode
 from polcap.optics.outline import disc_radius

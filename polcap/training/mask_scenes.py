@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polcap.formats import shipped_data
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import frames
 from polcap.optics.body import SMOOTH
 from polcap.stages.mask.mask_channels import ReducedPicture, grid

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from polcap.formats import atomic
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.mesh_tracer import Tracer, Triangles, centred
 from polcap.optics.resize import area_mean, block_means
 from polcap.stages.mask.mask_channels import CHANNELS, ENCODING, SIZE_MULTIPLE, ReducedPicture, brightness, encode

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics import frames
 from polcap.optics.mesh_tracer import GBuffer, Tracer, Triangles, centred, union
 from polcap.training import random_shapes

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from polcap.images import Faces, Floats
+from polcap.image_values import Faces, Floats
 from polcap.optics.mesh_tracer import Triangles, centred, smooth, union
 
 _RINGS, _SECTORS = 96, 128  # vertices of a body

@@ -8,7 +8,7 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 _WAVES = 16  # plane waves in a random height field
 _LONGEST, _SHORTEST = 40.0, 4.0  # wavelengths, px

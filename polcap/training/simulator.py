@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from polcap.images import Bools, Indices, Quality
+from polcap.image_values import Bools, Indices, Quality
 from polcap.stages import cues
 from polcap.training import bounced_light, materials, traced_views
 from polcap.training.bounced_light import ObjectPixels

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from polcap.errors import InputError, StorageError
 from polcap.formats import atomic, scene_files, text_file
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics.mesh_tracer import GBuffer, Tracer, Triangles, scatter, smooth
 from polcap.optics.outline import disc_radius
 from polcap.training import bounced_light, flat_shapes, light_transport, random_shapes

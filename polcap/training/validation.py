@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.report import stage_pictures as pictures
 from polcap.report.stage_pictures import Picture
 from polcap.stages.cues import FLOOR

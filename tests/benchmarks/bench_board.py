@@ -22,7 +22,7 @@ from polcap.formats.capture import reader
 from polcap.fusion import board_corners, board_eraser, poses
 from polcap.fusion.board_corners import BoardCorners
 from polcap.fusion.board_eraser import PosedBoard
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics import projection
 from polcap.pipeline import models, run
 from polcap.pipeline.path import UserInput

@@ -18,7 +18,7 @@ from polcap.capture_values import Capture
 from polcap.config import Config
 from polcap.formats import onnx
 from polcap.formats.capture import reader as captures
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import body, frames
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from polcap.errors import ChartError
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.color import decode_srgb, encode_srgb
 from polcap.stage_values import AngleStack
 from polcap.stages import whitebalance

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 import polcap
 from polcap import report
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.report import compare
 from polcap.synth import scene_materials, scenes, shooting
 from polcap.synth.render import Scene

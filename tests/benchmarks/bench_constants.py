@@ -20,7 +20,7 @@ import numpy as np
 
 from polcap.config import Config
 from polcap.formats import onnx
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import registration
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline

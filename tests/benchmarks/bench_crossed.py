@@ -22,7 +22,7 @@ from polcap.capture_values import Capture
 from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.formats.capture import reader as captures
-from polcap.images import Floats, Quality
+from polcap.image_values import Floats, Quality
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.formats import onnx
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.pipeline import models
 from polcap.stage_values import Network
 from polcap.stages import infer

@@ -19,12 +19,12 @@ from scipy.ndimage import gaussian_filter
 
 from polcap.config import Config
 from polcap.formats.capture import reader
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.resize import weighted_area_mean
 from polcap.pipeline import models, path
 from polcap.pipeline.cache import MemoryCache
 from polcap.quality import error_maps, gates
-from polcap.quality.gate import full_size
+from polcap.quality.gate_values import full_size
 from polcap.results import ResultsUntilInfer
 from polcap.stage_values import SurfaceMaps
 from polcap.synth import scenes, shooting

@@ -27,7 +27,7 @@ from polcap.formats.export import exr_layers, gltf, texture_set
 from polcap.formats.export.encoders import TextureEncoder
 from polcap.formats.export.presets import PRESETS, ExportPreset
 from polcap.formats.maps import maps_folder
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.mesh_values import Asset, ReliefMesh
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.export_request import ExportRequest

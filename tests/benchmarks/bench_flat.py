@@ -18,13 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from polcap.config import Config
 from polcap.formats.capture import reader as captures
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.mesh_tracer import Triangles, centred
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path
 from polcap.quality import gates
-from polcap.quality.gate import full_size
+from polcap.quality.gate_values import full_size
 from polcap.results import Results
 from polcap.synth import shooting
 from polcap.synth.distance_fields import Model

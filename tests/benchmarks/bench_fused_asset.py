@@ -33,7 +33,7 @@ from polcap.fusion.fusion_path import FusionResults, FusionSettings, SessionConf
 from polcap.fusion.session_views import SessionInput
 from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.values import FusionView, Pose
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import color, frames
 from polcap.optics.mesh_tracer import Tracer, Triangles, smooth
 from polcap.pipeline.cache import LazyCache, MemoryCache, StageResult

@@ -28,7 +28,7 @@ from polcap.fusion.hull import visual_hull
 from polcap.fusion.shape import ShapeSettings, fuse_shape
 from polcap.fusion.small_views import reduce_views
 from polcap.fusion.values import ClosedMesh
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.frames import dot, unit
 from polcap.optics.mesh_tracer import Tracer, smooth
 from tests.fusion.traced_views import (

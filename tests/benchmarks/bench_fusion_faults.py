@@ -23,7 +23,7 @@ from polcap.errors import InputError
 from polcap.fusion import fuse_run
 from polcap.fusion.fusion_path import SessionConfig
 from polcap.fusion.session_views import SessionInput
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import projection
 from polcap.optics.board import BOARDS
 from polcap.pipeline.cache import silent

@@ -26,7 +26,7 @@ from bench_mitsuba import scene_light
 from make_mitsuba import MATERIALS, plain, shoot
 
 from polcap.formats import atomic
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames
 from polcap.synth import all_around, forward_camera, render, trace
 from polcap.synth.all_around import AroundShoot

@@ -18,7 +18,7 @@ import numpy as np
 
 from polcap.config import Config
 from polcap.formats.export import gltf
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.mesh_values import Asset, Mesh
 from polcap.optics import frames
 from polcap.optics.texture_rasterizer import rasterize_frames

@@ -26,7 +26,7 @@ from polcap.formats.maps import png
 from polcap.fusion import fused_maps
 from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.values import Pose
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.mesh_values import Mesh
 from polcap.optics import color, frames, shade
 from polcap.optics.mesh_tracer import Tracer, Triangles

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from polcap.formats import onnx
 from polcap.formats.maps import png
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import fresnel, mueller
 from polcap.pipeline import models
 from polcap.quality import polarization

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.formats.export import encoders, gltf, texture_set, usd
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.mesh_values import Asset
 from polcap.optics import frames, shade
 from polcap.stage_values import SurfaceMaps

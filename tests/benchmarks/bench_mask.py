@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from polcap.chart_values import ChartPlace, ColorCalibration
 from polcap.errors import ObjectError
 from polcap.formats import onnx
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import mueller
 from polcap.optics.mesh_tracer import Tracer, Triangles, centred
 from polcap.stage_values import Alignment, AngleStack, Network, ObjectMask, single_frames

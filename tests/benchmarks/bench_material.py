@@ -19,7 +19,7 @@ import numpy as np
 
 from polcap.cli import app
 from polcap.formats.maps import maps_folder
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import frames
 from polcap.synth import flat_views
 from polcap.synth.distance_fields import Bumps

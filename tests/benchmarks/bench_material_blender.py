@@ -17,7 +17,7 @@ from unittest.mock import patch
 import numpy as np
 
 from polcap.cli import app, options
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.material import material_path
 from polcap.material.stokes_view import PosedStokes
 from polcap.material.texel_grid import TO_WORLD, TexelGrid

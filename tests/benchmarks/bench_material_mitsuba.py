@@ -17,7 +17,7 @@ import numpy as np
 from bench_captures import kept
 from make_mitsuba import scene, seen, shot
 
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics import frames, fresnel
 from polcap.synth import render, scene_materials, trace
 from polcap.synth.flat_views import FlatShoot

@@ -22,7 +22,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.mesh_values import ReliefMesh
 from polcap.optics import frames
 from polcap.stage_values import SurfaceMaps

@@ -21,7 +21,7 @@ from scipy import ndimage
 
 from polcap.chart_values import ColorCalibration
 from polcap.formats import onnx
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames
 from polcap.pipeline import models
 from polcap.stage_values import SurfaceMaps

@@ -28,7 +28,7 @@ from polcap.fusion import session, session_views
 from polcap.fusion.fusion_path import FusionResults, FusionSettings, SessionConfig, path
 from polcap.fusion.session_views import SessionInput
 from polcap.fusion.values import FusionView, Pose
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.pipeline.cache import LazyCache, MemoryCache
 from polcap.pipeline.request import Request
 from polcap.synth import all_around, scenes

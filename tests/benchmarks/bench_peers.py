@@ -31,7 +31,7 @@ from polcap.chart_values import ChartRequest
 from polcap.formats import shipped_data
 from polcap.formats.capture import reader as captures
 from polcap.formats.raw import frame_decoder
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.stage_values import Alignment, AngleStack, ObjectMask, SelfCalibration, SurfaceMaps
 from polcap.stages import align, hdr, stokes, surface, whitebalance
 from polcap.stages.whitebalance import WhitebalanceSettings

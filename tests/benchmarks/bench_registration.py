@@ -17,7 +17,7 @@ from scipy import ndimage
 from polcap.config import Config
 from polcap.formats.capture import reader
 from polcap.formats.raw.frame_decoder import decode
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.projection import transform_points
 from polcap.optics.registration import Pyramid, register, scaled
 from polcap.stages import align, hdr

@@ -21,7 +21,7 @@ import numpy as np
 from polcap.chart_values import ChartRequest
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
-from polcap.images import View
+from polcap.image_values import View
 from polcap.optics import frames, point_light, projection
 from polcap.optics.mesh_tracer import GBuffer
 from polcap.stage_values import AngleStack, StokesImage, single_frames

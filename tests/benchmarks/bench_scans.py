@@ -22,7 +22,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.mesh_values import ReliefMesh
 from polcap.stage_values import SurfaceMaps
 from polcap.stages import surface

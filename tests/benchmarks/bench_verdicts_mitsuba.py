@@ -28,11 +28,11 @@ from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats.capture import reader as captures
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.pipeline import path
 from polcap.pipeline.cache import MemoryCache
 from polcap.quality import gates
-from polcap.quality.gate import Gate, full_size
+from polcap.quality.gate_values import Gate, full_size
 from polcap.results import Results
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Cluster

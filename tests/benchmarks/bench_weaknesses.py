@@ -36,7 +36,7 @@ from polcap.formats.capture import reader as captures
 from polcap.pipeline import models, path
 from polcap.pipeline.cache import MemoryCache
 from polcap.quality import gates
-from polcap.quality.gate import full_size
+from polcap.quality.gate_values import full_size
 from polcap.results import Results
 from polcap.stage_values import Network, SurfaceMaps
 

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from polcap.formats import atomic, onnx
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.pipeline import models
 from polcap.stage_values import Network
 from polcap.stages import infer

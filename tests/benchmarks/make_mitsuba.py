@@ -25,7 +25,7 @@ import plastic
 import trimesh
 
 from polcap.formats import atomic, scene_files
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames, fresnel
 from polcap.optics.mesh_tracer import Triangles
 from polcap.synth import scene_materials

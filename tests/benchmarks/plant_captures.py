@@ -16,7 +16,7 @@ from bench_flat import draw
 from scipy.ndimage import gaussian_filter
 
 from polcap.formats.maps import png
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import mueller
 from polcap.synth.color_checker import Chart
 from polcap.synth.render import Scene

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.synth import scene_materials
 from polcap.synth import shooting as synthetic
 from polcap.synth.distance_fields import Cluster

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames
 
 

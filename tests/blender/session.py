@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 HERE = Path(__file__).parent
 LIMIT_S = 300

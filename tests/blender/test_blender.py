@@ -9,7 +9,7 @@ import pytest
 
 from polcap.formats.export import encoders, gltf, obj, texture_set, usd
 from polcap.formats.export.glb_geometry import Geometry
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.mesh_values import ReliefMesh
 from polcap.stage_values import SurfaceMaps
 from tests import surfaces

@@ -8,7 +8,7 @@ import pytest
 
 from polcap.calibrate import ball_light
 from polcap.calibrate.ball_outline import Ball
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames, mueller
 from polcap.synth import render, scenes
 from polcap.synth.distance_fields import Cluster

@@ -6,7 +6,7 @@ import pytest
 
 from polcap.calibrate import ball_outline
 from polcap.errors import ObjectError
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 
 VIEW = View(focal=900.0, center=(-60.0, 110.0), scale=2.0)  # the ball is far from the optical axis
 SHAPE = (260, 300)

@@ -12,7 +12,7 @@ from polcap.capture_values import Exif
 from polcap.cli import calibrate_command
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import calibrations
-from polcap.images import Distortion
+from polcap.image_values import Distortion
 from polcap.optics import distortion
 from polcap.synth import calibration_frames
 from polcap.synth.calibration_frames import CalibrationShoot

@@ -35,7 +35,7 @@ from polcap.formats import atomic, calibrations, color_profile, npy_folder, text
 from polcap.formats.capture import capture_toml
 from polcap.formats.maps import maps_folder as maps
 from polcap.formats.raw import exif, file_checks, file_kind
-from polcap.images import View
+from polcap.image_values import View
 from polcap.rig import exposure_bracket, serial_port
 from polcap.rig.device_log import Log
 from polcap.rig.motor_elliptec_ell14 import ElliptecMotor, ElliptecSettings

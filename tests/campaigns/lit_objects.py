@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats, Quality
+from polcap.image_values import Floats, Quality
 from polcap.optics import frames, mueller
 from polcap.stage_values import AngleStack, Equipment, ObjectMask, single_frames
 from polcap.synth.scenes import random_scene

@@ -22,7 +22,7 @@ from polcap.config import Config
 from polcap.errors import GateError, InputError
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import maps_folder as maps
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput
 from tests.campaigns.rows import arguments, table

@@ -18,7 +18,7 @@ from polcap.chart_values import ColorCalibration
 from polcap.config import Config
 from polcap.errors import CaptureError, InputError
 from polcap.formats.capture import reader as captures
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.pipeline import models
 from polcap.pipeline.cache import MemoryCache
 from polcap.pipeline.path import UserInput, path

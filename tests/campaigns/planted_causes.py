@@ -29,11 +29,11 @@ from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats.capture import reader as captures
 from polcap.formats.raw import libraw, probe
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.pipeline import check, run
 from polcap.pipeline.path import UserInput
 from polcap.quality.advice import advice
-from polcap.quality.gate import Gate
+from polcap.quality.gate_values import Gate
 from polcap.stage_values import Network
 from polcap.synth import forward_camera, scenes
 from polcap.synth.shooting import Shoot, ShotPose, Studio, Take

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from polcap.errors import CaptureError
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import mueller
 from polcap.stage_values import Equipment
 from polcap.stages import selfcal

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from polcap.capture_values import Capture
 from polcap.chart_values import ColorCalibration
 from polcap.fusion.values import Pose
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import board as boards
 from polcap.stage_values import AngleStack, single_frames
 from polcap.synth import forward_camera, render

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polcap.fusion.values import ClosedMesh, FusionView, Pose
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics import frames, shade
 from polcap.optics.mesh_tracer import Tracer, smooth
 from polcap.optics.projection import back_project

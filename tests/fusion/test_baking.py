@@ -10,7 +10,7 @@ from polcap.fusion import baking, comparison, fused_page
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import BakingSettings
 from polcap.fusion.values import ClosedMesh
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.stages import asset
 from tests.fusion import ellipsoid
 

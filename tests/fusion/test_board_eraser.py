@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from polcap.fusion import board_eraser
 from polcap.fusion.board_eraser import PosedBoard
 from polcap.fusion.poses import SessionCamera
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.morphology import dilate
 from polcap.stage_values import Alignment
 from polcap.synth import render

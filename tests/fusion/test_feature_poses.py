@@ -15,7 +15,7 @@ from polcap.errors import CaptureError
 from polcap.fusion import feature_poses, object_features
 from polcap.fusion.object_features import ObjectFeatures
 from polcap.fusion.poses import SessionPoses
-from polcap.images import View
+from polcap.image_values import View
 from polcap.stage_values import OrderTest
 from polcap.synth import render, scene_materials
 from polcap.synth.distance_fields import Cluster

@@ -10,7 +10,7 @@ from polcap.errors import CaptureError
 from polcap.fusion import mask_agreement, silhouettes
 from polcap.fusion.poses import SessionCamera
 from polcap.fusion.silhouettes import Silhouette
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.synth import render
 from polcap.synth.distance_fields import Cluster
 from tests.fusion import board_views

@@ -11,7 +11,7 @@ from scipy.spatial.distance import pdist
 
 from polcap.fusion import fused_maps
 from polcap.fusion.closed_mesh import is_closed
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.stages.asset import AssetSettings
 from polcap.synth import all_around, scenes
 from tests.conftest import shell, slow

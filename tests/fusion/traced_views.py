@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from polcap.fusion.values import ClosedMesh, FusionView, Pose
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames
 from polcap.optics.mesh_tracer import Tracer, Triangles, smooth
 

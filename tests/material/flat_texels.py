@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from polcap.fusion.values import Pose
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.material import texel_fit, texel_grid
 from polcap.material.texel_fit import Measurements
 from polcap.material.texel_grid import FlashLight, TexelViews

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from polcap.fusion.poses import SessionCamera
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.material import board_focus
 from polcap.material.board_focus import BoardSight
 from polcap.material.stokes_view import PosedStokes

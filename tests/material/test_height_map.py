@@ -5,7 +5,7 @@ import dataclasses
 import cv2
 import numpy as np
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.material import height_map, tiling
 from polcap.material.height_map import MaterialMaps
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from array_api_compat import array_namespace
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import body, fresnel, shade
 
 # Ratio of the DoLP to the smooth interface's, n = 1.5, by an integral over visible facets that is not this code

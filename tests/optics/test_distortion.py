@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.images import Distortion, View
+from polcap.image_values import Distortion, View
 from polcap.optics import distortion
 from polcap.optics.warp import covered, warp
 from polcap.synth import forward_camera as simulated

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.images import View
+from polcap.image_values import View
 from polcap.optics import frames
 
 VIEW = View(focal=100.0, center=(20.0, 10.0), scale=1.0)

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("embreex")
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames, mesh_tracer
 from polcap.training import random_shapes
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import mueller, outline
 
 Y, X = np.mgrid[-40:41, -40:41].astype(float)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.images import SensorImage
+from polcap.image_values import SensorImage
 from polcap.optics import sensor
 
 GRBG = np.array([[1, 0], [2, 1]], np.uint8)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import sharpness
 from polcap.optics.sharpness import TILE
 

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from polcap import capture_values, images
+from polcap import capture_values, image_values
 from polcap.errors import SettingError, StorageError
 from polcap.formats import npy_folder, own_files
 from polcap.formats.npy_folder import checksum, decode, encode, save
@@ -40,8 +40,8 @@ class Settings(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Inner:
-    array: images.Floats
-    maybe: images.Floats | None
+    array: image_values.Floats
+    maybe: image_values.Floats | None
     shift: tuple[float, float]
 
 
@@ -51,12 +51,12 @@ class Everything:
     source: Literal["a", "b"]
     cost: float
     order: tuple[int, ...]
-    empty: images.Bits
-    large: images.Floats
+    empty: image_values.Bits
+    large: image_values.Floats
     flag: bool
     known: float | None
     table: Mapping[str, str]
-    quality: images.Quality
+    quality: image_values.Quality
 
 
 def everything() -> Everything:
@@ -70,7 +70,7 @@ def everything() -> Everything:
         True,
         None,
         {"licence": "CC0"},
-        images.Quality.CLIPPED | images.Quality.DARK,
+        image_values.Quality.CLIPPED | image_values.Quality.DARK,
     )
 
 

@@ -21,7 +21,7 @@ from polcap.pipeline import check
 from polcap.pipeline.check import Verdict
 from polcap.pipeline.path import AUTO
 from polcap.pipeline.small_capture import reduce
-from polcap.quality.gate import Gate
+from polcap.quality.gate_values import Gate
 from polcap.report import page
 from polcap.stages import hdr, whitebalance
 from tests import faulty

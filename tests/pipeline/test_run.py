@@ -22,7 +22,7 @@ from polcap.errors import ObjectError, StorageError
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import maps_folder as maps
 from polcap.formats.maps.result_maps import read_cues
-from polcap.images import View
+from polcap.image_values import View
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput, distance_m, on_grid

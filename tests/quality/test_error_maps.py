@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from polcap.config import Config
-from polcap.images import Floats, Quality
+from polcap.image_values import Floats, Quality
 from polcap.optics.morphology import dilate
 from polcap.optics.outline import disc_radius
 from polcap.quality import error_maps, gates
-from polcap.quality.gate import Gate
+from polcap.quality.gate_values import Gate
 from tests.quality.test_gates import Seen, changed, found
 
 OWN = 4.0  # degrees, expected error of the estimator

@@ -18,11 +18,11 @@ import pytest
 from polcap.capture_values import AngleStatement, ShotOrder
 from polcap.chart_values import PatchColors
 from polcap.config import Config
-from polcap.images import Quality
+from polcap.image_values import Quality
 from polcap.quality import flatness, gates, geometry, light, polarization, rerendering, rim, shot_exposure
 from polcap.quality.albedo_slope import AlbedoSlope
 from polcap.quality.flatness import Flatness
-from polcap.quality.gate import Gate
+from polcap.quality.gate_values import Gate
 from polcap.quality.object_turn import ObjectTurn
 from polcap.quality.rerendering import Rerendering
 from polcap.stage_values import AngleStack, BlackError, Equipment, OrderTest, OutlineCheck, RingZero, TurnedShot

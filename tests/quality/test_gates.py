@@ -12,11 +12,11 @@ import pytest
 from polcap.capture_values import ShotOrder
 from polcap.chart_values import ChartPlace
 from polcap.config import Config
-from polcap.images import Quality
+from polcap.image_values import Quality
 from polcap.optics import frames
 from polcap.quality import flatness, gates, geometry
 from polcap.quality.advice import advice, advise
-from polcap.quality.gate import Evidence, Gate, State
+from polcap.quality.gate_values import Evidence, Gate, State
 from polcap.results import ResultsUntilInfer
 from polcap.stage_values import (
     AngleStack,

@@ -11,10 +11,10 @@ import pytest
 
 from polcap.config import Config
 from polcap.formats import onnx
-from polcap.images import Floats, Quality
+from polcap.image_values import Floats, Quality
 from polcap.pipeline import models
 from polcap.quality import object_turn, polarization, rerendering
-from polcap.quality.gate import Gate
+from polcap.quality.gate_values import Gate
 from polcap.stage_values import Network
 from polcap.stages import infer
 from tests import golden

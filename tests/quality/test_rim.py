@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import mueller
 from polcap.quality import rim
 from tests import scenes

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from polcap.formats.export import gltf
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.mesh_values import ReliefMesh
 
 HERE = Path(__file__).parent

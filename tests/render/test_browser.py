@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from polcap.formats.export import encoders, gltf, obj, texture_set
 from polcap.formats.export.glb_geometry import Geometry
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.stage_values import SurfaceMaps
 from tests import surfaces
 from tests.render import browser

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from polcap import report
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import frames
 from polcap.report import changes, compare
 from polcap.stage_values import SurfaceMaps

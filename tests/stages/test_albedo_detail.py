@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage
 
 from polcap.formats import onnx
-from polcap.images import Distortion, Floats, Mosaic
+from polcap.image_values import Distortion, Floats, Mosaic
 from polcap.optics import color, demosaic, distortion, mueller, shade
 from polcap.optics.resize import block_means
 from polcap.stage_values import ObjectMask, StokesImage, SurfaceMaps

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.stage_values import SurfaceMaps
 from polcap.stages.asset.ambient_occlusion import ambient_occlusion
 from tests import surfaces

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.mesh_values import Asset
 from polcap.optics import color
 from polcap.optics.morphology import erode

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from polcap.chart_values import ChartLight
-from polcap.images import Quality
+from polcap.image_values import Quality
 from polcap.optics import body, fresnel
 from polcap.stages import cues, stokes
 from tests import scenes

@@ -9,9 +9,9 @@ import pytest
 from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats import onnx
-from polcap.images import Quality, View
+from polcap.image_values import Quality, View
 from polcap.quality import gates
-from polcap.quality.gate import State
+from polcap.quality.gate_values import State
 from polcap.stage_values import AngleStack, Equipment, single_frames
 from polcap.stages import align, asset, cues, infer, mask, selfcal, stokes, surface
 from tests import scenes

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
-from polcap.images import MaskedImage, Quality, SensorImage
+from polcap.image_values import MaskedImage, Quality, SensorImage
 from polcap.stage_values import (
     AngleStack,
     ColorSensor,

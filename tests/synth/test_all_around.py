@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from polcap.images import View
+from polcap.image_values import View
 from polcap.optics import board as boards
 from polcap.optics import frames, projection
 from polcap.synth import all_around, laid_board, render

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 pytest.importorskip("embreex")
 
 from polcap.errors import DecodeError, SettingError
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames, mesh_tracer
 from polcap.synth import interreflection, render
 from polcap.synth.distance_fields import Cluster, Model

@@ -9,7 +9,7 @@ import numpy as np
 import plastic
 import pytest
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames
 from polcap.synth import distance_fields, render, trace
 from polcap.synth.render import Scene

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import body, frames
 from polcap.synth import render, scenes
 from polcap.synth.scene_materials import Coat

@@ -12,7 +12,7 @@ pytest.importorskip("embreex")
 import torch
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.training import evaluation_materials, materials, random_shapes, traced_views
 from polcap.training.simulator import Simulator
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames, shade
 from polcap.optics.mesh_tracer import Tracer, Triangles, smooth, union
 from polcap.training import bounced_light, light_transport, random_shapes, traced_views

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.training import evaluation_materials
 
 

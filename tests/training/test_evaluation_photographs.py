@@ -10,7 +10,7 @@ import pytest
 from polcap.errors import InputError
 from polcap.formats import onnx
 from polcap.formats.maps import png
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import fresnel
 from polcap.pipeline import models
 from polcap.training import evaluation_photographs

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import InputError
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import body, frames
 from polcap.training import evaluation_protocol
 from polcap.training.evaluation_protocol import Protocol

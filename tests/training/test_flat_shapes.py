@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from polcap.images import Bools
+from polcap.image_values import Bools
 from polcap.optics.mesh_tracer import Tracer, Triangles, centred
 from polcap.training import flat_shapes, traced_views
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import fresnel
 from polcap.optics.mesh_tracer import Tracer, Triangles, smooth
 from polcap.training import light_transport, random_shapes

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap.images import Quality
+from polcap.image_values import Quality
 from polcap.training import map_errors
 from polcap.training.evaluation_protocol import Case, Protocol
 from polcap.training.map_errors import Judge

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from polcap.chart_values import ColorCalibration
-from polcap.images import View
+from polcap.image_values import View
 from polcap.stages import cues
 from polcap.training import evaluation_protocol
 from polcap.training.camera_errors import CameraErrors

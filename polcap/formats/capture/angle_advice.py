@@ -3,7 +3,7 @@
 import numpy as np
 
 from polcap.capture_values import AngleStatement, ShotOrder
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 
 def correct(statement: AngleStatement, order: ShotOrder, angle: Floats) -> str:

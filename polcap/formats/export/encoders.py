@@ -23,7 +23,7 @@ from polcap.errors import SettingError, StorageError
 from polcap.formats import atomic
 from polcap.formats.export.texture_set import Texture
 from polcap.formats.maps import png
-from polcap.images import TexturePixels
+from polcap.image_values import TexturePixels
 
 Kind = Literal["png", "jpeg", "webp", "ktx2"]
 MIME: dict[Kind, str] = {"png": "image/png", "jpeg": "image/jpeg", "webp": "image/webp", "ktx2": "image/ktx2"}

@@ -15,7 +15,7 @@ import numpy as np
 from polcap.errors import SettingError
 from polcap.formats.maps import exr, png
 from polcap.formats.raw import photo
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 LINEAR_REC709 = "lin_rec709"  # its alias in OpenColorIO configurations
 _COLORS = ("diffuse", "specular")

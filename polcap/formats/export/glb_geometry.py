@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.errors import StorageError, package_for
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.mesh_values import Mesh
 
 Geometry = Literal["float", "quantized", "draco"]

@@ -23,7 +23,7 @@ from polcap.formats.export.encoders import Kind, TextureEncoder
 from polcap.formats.export.glb_geometry import Blob, Geometry
 from polcap.formats.export.texture_set import Texture
 from polcap.formats.maps import maps_folder
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.mesh_values import Asset, Mesh
 
 _LINEAR, _LINEAR_MIPMAP, _CLAMP = 9729, 9987, 33071

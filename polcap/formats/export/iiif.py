@@ -13,7 +13,7 @@ from polcap.errors import SettingError
 from polcap.formats import addresses, atomic
 from polcap.formats.export import encoders
 from polcap.formats.export.texture_set import Texture
-from polcap.images import TexturePixels
+from polcap.image_values import TexturePixels
 from polcap.optics.resize import area_mean
 
 TILE = 512  # px of a tile's sides

@@ -6,7 +6,7 @@ import numpy as np
 
 from polcap.formats import atomic
 from polcap.formats.export import gltf
-from polcap.images import TexturePixels
+from polcap.image_values import TexturePixels
 from polcap.mesh_values import Asset
 
 _MM = 1000  # per m; STL states no unit, and printing programs read mm

@@ -12,7 +12,7 @@ import numpy as np
 
 from polcap.formats.export import encoders, texture_set
 from polcap.formats.export.texture_set import Texture
-from polcap.images import TexturePixels
+from polcap.image_values import TexturePixels
 from polcap.mesh_values import Asset, ReliefMesh
 from polcap.optics import color, outline
 

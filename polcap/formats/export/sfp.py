@@ -17,7 +17,7 @@ import numpy as np
 
 from polcap.formats import atomic
 from polcap.formats.maps import maps_folder, png, result_maps
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import mueller
 
 ANGLES_DEG = (0, 45, 90, 135)

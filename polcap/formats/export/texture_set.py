@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from polcap.formats.maps import exr
-from polcap.images import Floats, TexturePixels
+from polcap.image_values import Floats, TexturePixels
 from polcap.mesh_values import Asset
 from polcap.optics import color, fresnel
 

@@ -8,7 +8,7 @@ import numpy as np
 from polcap.errors import DecodeError, StorageError
 from polcap.formats import atomic, sandbox
 from polcap.formats.raw import file_bytes, file_kind, photo
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 Attribute = str | int | float | tuple[float, ...]
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.formats.maps import png
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.mesh_values import ReliefMesh
 from polcap.optics import color
 from polcap.stage_values import Cues, StokesImage, SurfaceMaps

@@ -15,7 +15,7 @@ from polcap import parallel
 from polcap.errors import DecodeError
 from polcap.formats import atomic, text_file
 from polcap.formats.maps import exr, map_files, png
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics import color
 from polcap.results import Results
 from polcap.stage_values import SurfaceMaps

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from polcap.errors import DecodeError, StorageError
 from polcap.formats import atomic, sandbox
 from polcap.formats.raw import file_bytes, file_kind, photo
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 _LEVEL = 2  # of compression; 4 is a third slower, 1 to 4 % smaller

@@ -9,7 +9,7 @@ from polcap.formats import own_folders
 from polcap.formats.maps import exr, maps_folder
 from polcap.formats.maps.map_files import STOKES_PAIRS
 from polcap.formats.maps.maps_folder import ResultMaps
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 
 def read(result: str | Path) -> ResultMaps:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from polcap.formats.raw import file_kind
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.color import REC709_TO_XYZ, decode_srgb
 
 _STATE = 'state encoding = "linear" or "srgb" in capture.toml'

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from polcap.formats.raw import file_kind
 from polcap.formats.raw.file_kind import Directory, TiffStructure, first
-from polcap.images import Floats
+from polcap.image_values import Floats
 
 _FLOATING = 3  # SampleFormat; LibRaw scales such counts to integers
 

@@ -7,7 +7,7 @@ from typing import Any
 from polcap.capture_values import Frame
 from polcap.formats import sandbox
 from polcap.formats.raw import libraw, photo
-from polcap.images import SensorImage
+from polcap.image_values import SensorImage
 
 
 def decode(frame: Frame) -> SensorImage:

@@ -19,7 +19,7 @@ from polcap.capture_values import Exif
 from polcap.errors import DecodeError
 from polcap.formats import sandbox
 from polcap.formats.raw import dng_black, exif, file_bytes, file_checks, file_kind
-from polcap.images import Bits, Floats, SensorImage
+from polcap.image_values import Bits, Floats, SensorImage
 from polcap.optics import demosaic
 from polcap.optics.color import REC709_TO_XYZ
 

@@ -17,7 +17,7 @@ from polcap.errors import DecodeError
 from polcap.formats import sandbox
 from polcap.formats.raw import color_encoding, file_bytes, file_checks, file_kind, libraw, picture_count
 from polcap.formats.raw.color_encoding import ColorEncoding
-from polcap.images import SensorImage
+from polcap.image_values import SensorImage
 from polcap.optics import color
 
 Encoding = Literal["linear", "srgb"]

@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from polcap.chart_values import ColorCalibration
 from polcap.errors import AlignmentError
-from polcap.images import Floats, MaskedImage, Quality
+from polcap.image_values import Floats, MaskedImage, Quality
 from polcap.optics import registration
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import Pyramid

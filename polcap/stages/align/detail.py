@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from polcap.images import Floats, MaskedImage, Quality
+from polcap.image_values import Floats, MaskedImage, Quality
 from polcap.optics import frames
 from polcap.optics.morphology import dilate
 from polcap.optics.registration import Pyramid, squared_gradient

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import registration
 from polcap.optics.morphology import dilate
 from polcap.optics.projection import picture_corners, transform_points

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polcap.images import Bools, Floats, TexturePixels
+from polcap.image_values import Bools, Floats, TexturePixels
 from polcap.mesh_values import Asset, Mesh
 from polcap.optics import color, frames, fresnel
 from polcap.optics.morphology import dilate, erode

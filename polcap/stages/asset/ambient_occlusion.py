@@ -8,7 +8,7 @@ Jimenez et al., Practical real-time strategies for accurate indirect occlusion, 
 import cv2
 import numpy as np
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import frames
 from polcap.optics.projection import back_project
 from polcap.stage_values import SurfaceMaps

@@ -7,7 +7,7 @@ no cv2, no torch. Pixel axes are (..., H, W).
 from typing import Any
 
 from polcap.chart_values import ColorCalibration
-from polcap.images import Quality
+from polcap.image_values import Quality
 from polcap.optics import frames, fresnel
 from polcap.optics.namespace import array_namespace
 from polcap.stage_values import Cues, OtherOrder, StokesImage

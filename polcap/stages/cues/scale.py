@@ -11,7 +11,7 @@ from math import hypot, log, pi, sqrt
 import numpy as np
 
 from polcap.chart_values import ChartLight, ColorCalibration
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics import point_light
 from polcap.optics.projection import back_project
 from polcap.stage_values import StokesImage

@@ -25,7 +25,7 @@ from msgspec import Meta
 
 from polcap.capture_values import Capture, Decode, Frame, Shot, middle
 from polcap.errors import CaptureError
-from polcap.images import Distortion, Floats, MaskedImage, Quality, SensorImage, View
+from polcap.image_values import Distortion, Floats, MaskedImage, Quality, SensorImage, View
 from polcap.optics import sharpness
 from polcap.optics.projection import to_grid
 from polcap.stage_values import AngleStack, BracketMeasurement, ColorSensor, CrossedShot, Equipment

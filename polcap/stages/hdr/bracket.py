@@ -11,7 +11,7 @@ import numpy as np
 
 from polcap.capture_values import Shot, middle
 from polcap.errors import CaptureError
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import sensor
 from polcap.optics.registration import Pyramid, register
 from polcap.stage_values import BlackError

@@ -7,7 +7,7 @@ import numpy as np
 
 from polcap.capture_values import Frame
 from polcap.errors import CaptureError
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.resize import block_means
 from polcap.optics.robust import MAD_TO_SIGMA, MEDIAN_SE, biweight, spread
 from polcap.stages.hdr.planes import Signals, tile_means

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from polcap import parallel
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.morphology import dilate, erode
 from polcap.optics.registration import squared_gradient
 from polcap.stages.hdr.noise import Noise

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from polcap.calibration_values import NoiseLine
-from polcap.images import Bits, Bools, Floats
+from polcap.image_values import Bits, Bools, Floats
 from polcap.optics import demosaic
 from polcap.optics.registration import squared_gradient
 from polcap.optics.resize import area_mean

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 from polcap import parallel
-from polcap.images import Bits, Floats, Mosaic, SensorImage
+from polcap.image_values import Bits, Floats, Mosaic, SensorImage
 from polcap.stages.hdr.bracket import Bracket
 from polcap.stages.hdr.planes import Reader, blocks
 from polcap.stages.hdr.weights import WeightedBracket, WeightedFrame

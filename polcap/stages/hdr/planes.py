@@ -17,7 +17,7 @@ import numpy as np
 from polcap import parallel
 from polcap.capture_values import Decode, Frame
 from polcap.errors import CaptureError, SettingError
-from polcap.images import Bools, Floats, SensorImage
+from polcap.image_values import Bools, Floats, SensorImage
 from polcap.optics import sensor
 from polcap.optics.projection import coordinates
 from polcap.optics.resize import block_means

@@ -17,7 +17,7 @@ import numpy as np
 from polcap import parallel
 from polcap.calibration_values import Falloff
 from polcap.capture_values import Frame
-from polcap.images import Bits, Bools, Floats, MaskedImage, Quality, View
+from polcap.image_values import Bits, Bools, Floats, MaskedImage, Quality, View
 from polcap.optics.registration import scaled, squared_gradient
 from polcap.stages.hdr import exposure, noise
 from polcap.stages.hdr.bracket import AmbientLight, Bracket, ComparedBracket, ambient_light

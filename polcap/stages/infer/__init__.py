@@ -27,7 +27,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polcap.images import Floats, Quality
+from polcap.image_values import Floats, Quality
 from polcap.optics import brdf, frames
 from polcap.optics.morphology import erode, masked_mean
 from polcap.optics.resize import area_mean

@@ -6,7 +6,7 @@ Gives normals with their expected error, an albedo map, and one roughness and on
 import cv2
 import numpy as np
 
-from polcap.images import Floats, Quality
+from polcap.image_values import Floats, Quality
 from polcap.optics import brdf, frames, fresnel
 from polcap.stage_values import Cues, SurfaceMaps
 from polcap.stages.infer import highlights

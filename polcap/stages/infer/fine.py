@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from polcap import parallel
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import frames
 from polcap.optics.resize import area_mean
 from polcap.stage_values import Cues, Network, RunNetwork

@@ -29,7 +29,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats, Quality
+from polcap.image_values import Bools, Floats, Quality
 from polcap.optics import clusters, color, frames, fresnel
 from polcap.optics.morphology import dilate, masked_mean
 from polcap.optics.outline import disc_radius

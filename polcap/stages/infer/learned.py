@@ -15,7 +15,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from polcap.images import Bools, Floats, Quality
+from polcap.image_values import Bools, Floats, Quality
 from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stage_values import Cues, Network, OrderTest, RunNetwork, SurfaceMaps

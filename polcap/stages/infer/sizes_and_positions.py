@@ -12,7 +12,7 @@ import numpy as np
 
 from polcap import parallel
 from polcap.errors import ModelError
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import frames
 from polcap.optics.morphology import erode
 from polcap.stage_values import Cues, Network, RunNetwork

@@ -18,7 +18,7 @@ from itertools import pairwise, product
 import cv2
 import numpy as np
 
-from polcap.images import Floats, Quality
+from polcap.image_values import Floats, Quality
 from polcap.optics import body, frames
 from polcap.optics.outline import disc_radius
 from polcap.stage_values import Cues

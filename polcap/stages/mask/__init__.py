@@ -20,7 +20,7 @@ from msgspec import Meta
 
 from polcap.chart_values import ColorCalibration
 from polcap.errors import ObjectError
-from polcap.images import Bits, Bools, Floats, Quality
+from polcap.image_values import Bits, Bools, Floats, Quality
 from polcap.optics.warp import warp
 from polcap.stage_values import Alignment, AngleStack, Network, ObjectMask, RunNetwork
 from polcap.stages import stage

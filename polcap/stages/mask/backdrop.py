@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from polcap.errors import ObjectError
-from polcap.images import Bits, Bools, Floats
+from polcap.image_values import Bits, Bools, Floats
 from polcap.stages.mask import graph_cut
 from polcap.stages.mask.regions import fill_holes
 

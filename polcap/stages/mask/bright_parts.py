@@ -6,7 +6,7 @@ Only where the board's print was erased, the backdrop is known to be dark.
 import cv2
 import numpy as np
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.morphology import dilate
 from polcap.stages.mask.regions import box_around
 

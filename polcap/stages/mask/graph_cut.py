@@ -8,7 +8,7 @@ Rother, Kolmogorov & Blake, GrabCut, SIGGRAPH 2004.
 import cv2
 import numpy as np
 
-from polcap.images import Bits, Bools, Floats
+from polcap.image_values import Bits, Bools, Floats
 from polcap.optics.resize import area_mean
 
 _WORK_PIXELS = 3e5  # approximate size of the reduced picture that is cut

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from polcap.images import Bits, Bools, Floats
+from polcap.image_values import Bits, Bools, Floats
 from polcap.stages.mask.regions import box_around
 
 _REACH = 3  # px from the outline: object and backdrop that mix in its pixels

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.stages.mask import backdrop
 from polcap.stages.mask.backdrop import STOPS, brightness
 

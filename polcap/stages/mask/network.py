@@ -10,7 +10,7 @@ import numpy as np
 
 from polcap import parallel
 from polcap.chart_values import ColorCalibration
-from polcap.images import Bits, Floats
+from polcap.image_values import Bits, Floats
 from polcap.optics import mueller
 from polcap.optics.resize import area_mean
 from polcap.optics.warp import warp

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from polcap.images import Bits, Bools, Floats
+from polcap.image_values import Bits, Bools, Floats
 
 Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px, end exclusive
 

@@ -22,7 +22,7 @@ from polcap.capture_values import AngleStatement
 from polcap.chart_values import ColorCalibration
 from polcap.errors import CaptureError
 from polcap.formats.capture import angle_advice
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import frames
 from polcap.optics.outline import OutlineBand
 from polcap.stage_values import Alignment, AngleStack, Gains, ObjectMask, RingZero, SelfCalibration

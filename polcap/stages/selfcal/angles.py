@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.capture_values import ShotOrder
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import mueller, outline
 from polcap.optics.outline import OutlineBand
 from polcap.optics.robust import biweight, jackknife, spread

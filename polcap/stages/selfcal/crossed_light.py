@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.chart_values import ColorCalibration
-from polcap.images import Floats, Quality
+from polcap.image_values import Floats, Quality
 from polcap.optics import crossing, mueller
 from polcap.optics.warp import warp
 from polcap.stage_values import Alignment, AngleStack

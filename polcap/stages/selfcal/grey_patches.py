@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from polcap.chart_values import ColorCalibration
-from polcap.images import Floats, MaskedImage, Quality
+from polcap.image_values import Floats, MaskedImage, Quality
 from polcap.optics.projection import pixels_inside, transform_points
 from polcap.stage_values import Alignment, AngleStack
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap import parallel
-from polcap.images import Bits, Bools, Floats, Quality
+from polcap.image_values import Bits, Bools, Floats, Quality
 from polcap.optics import frames, mueller
 from polcap.optics.morphology import erode
 from polcap.optics.outline import OutlineBand

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import mueller, outline
 from polcap.optics.morphology import masked_mean
 from polcap.optics.resize import area_mean

@@ -11,7 +11,7 @@ remaining common turn.
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics import outline
 from polcap.optics.outline import OutlineBand
 from polcap.optics.robust import jackknife

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import CaptureError
-from polcap.images import Bits, Bools, Distortion, Floats, MaskedImage, Quality, View
+from polcap.image_values import Bits, Bools, Distortion, Floats, MaskedImage, Quality, View
 from polcap.optics import crossing, distortion, frames, fresnel, mueller
 from polcap.optics.warp import covered, warp
 from polcap.stage_values import Alignment, AngleStack, ObjectMask, SelfCalibration, StokesImage

@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from polcap.images import Distortion, Floats, Mosaic
+from polcap.image_values import Distortion, Floats, Mosaic
 from polcap.optics import demosaic
 from polcap.optics.resize import block_means
 from polcap.optics.warp import Box, source_box, warp

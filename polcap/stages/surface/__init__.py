@@ -22,7 +22,7 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import ObjectError
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.mesh_values import ReliefMesh
 from polcap.optics.projection import back_project
 from polcap.optics.vertex_frames import vertex_frames

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from polcap.errors import ObjectError
-from polcap.images import Faces, Floats, View
+from polcap.image_values import Faces, Floats, View
 from polcap.mesh_values import Mesh, ReliefMesh
 from polcap.optics.frames import unit
 from polcap.optics.projection import project

@@ -24,7 +24,7 @@ Cao, Santo, Shi, Okura & Matsushita, Bilateral normal integration, ECCV 2022.
 
 import numpy as np
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.morphology import dilate
 from polcap.optics.outline import disc_radius
 from polcap.stages.surface import occlusion

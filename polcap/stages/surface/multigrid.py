@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 
 _COARSEST = 400  # unknowns that are solved directly
 _STRONG = 0.02  # least link, over √(a_ii a_jj), along which unknowns are aggregated

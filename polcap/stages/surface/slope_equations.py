@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics.frames import dot
 from polcap.optics.outline import disc_radius
 from polcap.optics.projection import ray_slopes

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Faces, Floats
+from polcap.image_values import Bools, Faces, Floats
 from polcap.mesh_values import ReliefMesh
 from polcap.optics.morphology import erode
 from polcap.stages.surface.occlusion import depth_steps, least_step

@@ -20,7 +20,7 @@ from msgspec import Meta
 
 from polcap.chart_values import ChartPlace, ChartReference, ChartRequest, ColorCalibration, PatchColors
 from polcap.errors import ChartError
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics.projection import to_grid
 from polcap.stage_values import AngleStack
 from polcap.stages import stage

@@ -5,7 +5,7 @@ import numpy as np
 
 from polcap.chart_values import ChartReference
 from polcap.errors import ChartError
-from polcap.images import Bools
+from polcap.image_values import Bools
 from polcap.stage_values import AngleStack
 from polcap.stages.whitebalance import chart, patches
 

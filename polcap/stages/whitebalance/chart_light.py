@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from polcap.chart_values import ChartLight
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import point_light
 from polcap.stages.whitebalance import chart, patches
 from polcap.stages.whitebalance.chart import Placement

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.optics.projection import transform_points
 from polcap.stages.whitebalance.chart import resize, scaling, white
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics.color import delta_e, luminance
 
 _ROUNDS = 20  # of reweighting the patches

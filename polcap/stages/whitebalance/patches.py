@@ -11,7 +11,7 @@ import numpy as np
 
 from polcap.chart_values import ChartReference
 from polcap.errors import ChartError
-from polcap.images import Bits, Bools, Floats, Quality
+from polcap.image_values import Bits, Bools, Floats, Quality
 from polcap.optics.projection import pixels_inside
 from polcap.stages.whitebalance import chart, color_matrix
 from polcap.stages.whitebalance.chart import Placement

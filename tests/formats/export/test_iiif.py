@@ -13,7 +13,7 @@ import pytest
 from polcap.errors import SettingError
 from polcap.formats.export import iiif, relightable_layer
 from polcap.formats.export.texture_set import Texture
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.mesh_values import Asset, ReliefMesh
 from polcap.optics import color, shade
 from polcap.stages import asset

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from polcap.capture_values import Capture, Exif, Frame, Shot
-from polcap.images import Quality, SensorImage
+from polcap.image_values import Quality, SensorImage
 from polcap.stages import hdr
 from polcap.stages.hdr.planes import in_memory, planar
 

@@ -7,7 +7,7 @@ import pytest
 
 from polcap.capture_values import Shot
 from polcap.errors import CaptureError
-from polcap.images import Quality, SensorImage
+from polcap.image_values import Quality, SensorImage
 from polcap.optics.registration import squared_gradient
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages import hdr

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import CaptureError
-from polcap.images import Quality, SensorImage
+from polcap.image_values import Quality, SensorImage
 from polcap.stages import hdr
 from tests.stages.hdr.brackets import (
     BLACK,

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from polcap.errors import CaptureError
 from polcap.formats.capture import reader as captures
 from polcap.formats.raw import frame_decoder
-from polcap.images import Quality, SensorImage
+from polcap.image_values import Quality, SensorImage
 from polcap.stages import hdr
 from polcap.synth import shooting
 from polcap.synth.scenes import random_scene

@@ -8,7 +8,7 @@ import pytest
 
 from polcap.capture_values import Exif
 from polcap.errors import SettingError
-from polcap.images import SensorImage
+from polcap.image_values import SensorImage
 from polcap.stages import hdr
 from polcap.stages.hdr import planes
 from tests.stages.hdr.brackets import (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from polcap.calibration_values import Falloff
-from polcap.images import MaskedImage, View
+from polcap.image_values import MaskedImage, View
 from polcap.stages.hdr import weights
 
 LAW = Falloff(((-0.25, 0.05, 0.0),) * 3, ((0.0, 0.0, 0.0),) * 3, (0.8, 0.8, 0.8), 11.0, 60.0)

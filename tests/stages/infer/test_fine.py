@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polcap.errors import ModelError
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import frames
 from polcap.pipeline import models
 from polcap.stage_values import Cues

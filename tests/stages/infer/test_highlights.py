@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polcap.images import Floats, Quality
+from polcap.image_values import Floats, Quality
 from polcap.optics import frames, shade
 from polcap.stage_values import Cues, SurfaceMaps
 from polcap.stages import cues, stokes

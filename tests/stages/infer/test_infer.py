@@ -8,7 +8,7 @@ import pytest
 
 from polcap.capture_values import ShotOrder
 from polcap.errors import ModelError
-from polcap.images import Quality
+from polcap.image_values import Quality
 from polcap.optics import frames
 from polcap.pipeline import models
 from polcap.stage_values import OutlineCheck

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.images import Bools, Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics import frames
 from polcap.stages.infer.shape import integrable_normals
 

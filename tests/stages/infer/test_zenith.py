@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics import body, frames, fresnel
 from polcap.stage_values import Cues
 from polcap.stages.infer.zenith import estimate_zenith

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.stages.mask import bright_parts
 
 NOWHERE = np.zeros((120, 130), bool)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as with_setting
 
-from polcap.images import Bools, Quality
+from polcap.image_values import Bools, Quality
 from polcap.stage_values import AngleStack
 from polcap.stages import mask
 from polcap.stages.mask import MaskSettings, backdrop

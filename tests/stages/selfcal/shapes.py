@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from polcap.chart_values import ColorCalibration
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import body, mueller
 from polcap.stage_values import AngleStack, ObjectMask, SelfCalibration
 from polcap.stages import selfcal

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from polcap.chart_values import ChartPlace, ColorCalibration, PatchColors
-from polcap.images import Bits
+from polcap.image_values import Bits
 from polcap.quality import shot_exposure
-from polcap.quality.gate import Gate
+from polcap.quality.gate_values import Gate
 from polcap.quality.limits import GateLimits
 from polcap.stage_values import SelfCalibration
 from polcap.stages.selfcal import grey_patches

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.stages.selfcal import integrability
 from polcap.stages.selfcal.object_gains import GainEstimate
 from tests.stages.selfcal.shapes import ANGLES, SHAPES, SIZE, inside, shots

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.stage_values import Equipment, RingZero
 from polcap.stages import selfcal, stokes
 from polcap.stages.selfcal import ring_zero

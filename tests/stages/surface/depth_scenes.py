@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.mesh_values import ReliefMesh
 from polcap.stage_values import SurfaceMaps
 

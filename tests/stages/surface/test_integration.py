@@ -11,7 +11,7 @@ import pytest
 from scipy import ndimage
 
 from polcap.errors import ObjectError
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.stages import surface
 from polcap.stages.surface import integration
 from polcap.stages.surface.pyramid_level import PyramidLevel

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polcap.images import Floats
+from polcap.image_values import Floats
 from polcap.stages.surface.multigrid import PixelGrid
 from polcap.stages.surface.occlusion import contact_links
 

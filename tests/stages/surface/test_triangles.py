@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from polcap.images import View
+from polcap.image_values import View
 from polcap.stages import surface
 from polcap.stages.surface.triangles import boundary_edges
 from tests.stages.surface.depth_scenes import SHAPE, VIEW, sphere

@@ -7,7 +7,7 @@ import numpy as np
 
 from polcap.chart_values import ChartRequest
 from polcap.formats import shipped_data
-from polcap.images import Floats, Quality, View
+from polcap.image_values import Floats, Quality, View
 from polcap.optics.projection import transform_points
 from polcap.stage_values import AngleStack, ColorSensor, single_frames
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.stages.whitebalance import chart, chart_light, patches
 
 VIEW = View(900.0, (255.5, 191.5), 2.0)

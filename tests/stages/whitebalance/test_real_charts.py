@@ -11,7 +11,7 @@ import pytest
 
 from polcap.chart_values import ChartReference, ColorCalibration
 from polcap.errors import ChartError
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics.color import decode_srgb
 from polcap.stage_values import AngleStack
 from polcap.stages import whitebalance

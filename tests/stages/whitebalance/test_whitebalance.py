@@ -11,7 +11,7 @@ import pytest
 from polcap.chart_values import ChartReference, ChartRequest, ColorCalibration
 from polcap.errors import ChartError
 from polcap.formats import shipped_data
-from polcap.images import Floats, View
+from polcap.image_values import Floats, View
 from polcap.optics.projection import transform_points
 from polcap.stage_values import AngleStack, ColorSensor
 from polcap.stages import whitebalance

@@ -33,7 +33,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import outline
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stages.infer.shape import planar_faces

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.images import Bools, Floats
+from polcap.image_values import Bools, Floats
 from polcap.optics import clusters, frames, robust
 from polcap.optics.morphology import erode, masked_mean
 from polcap.optics.resize import area_mean, weighted_area_mean

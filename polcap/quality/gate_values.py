@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from polcap.errors import InputError
-from polcap.images import Bools, Floats, Quality
+from polcap.image_values import Bools, Floats, Quality
 from polcap.optics import frames
 from polcap.quality import rerendering
 from polcap.results import FirstResults, ResultsUntilHdr, ResultsUntilInfer
