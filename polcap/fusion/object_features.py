@@ -19,7 +19,7 @@ from polcap.errors import CaptureError
 from polcap.fusion.values import ViewMask
 from polcap.image_values import Floats
 from polcap.optics import projection
-from polcap.quality import flatness, polarization
+from polcap.quality import flatness, shot_order
 from polcap.stage_values import AngleStack, ObjectMask, SelfCalibration, StokesImage, SurfaceMaps
 from polcap.stages import stage
 
@@ -54,7 +54,7 @@ def find(
     wrong everywhere.
     """
     seen = flatness.measure(stokes, maps)
-    order = polarization.order_of_shots(radiance, object_, calibration.outline, maps.order, seen)
+    order = shot_order.order_of_shots(radiance, object_, calibration.outline, maps.order, seen)
     if order.state == "fail":
         raise CaptureError(f"{order.message}. {order.remedy}")
     lens = radiance.equipment.distortion

@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from polcap.quality import error_maps, flatness, geometry, light, polarization, shot_exposure
+from polcap.quality import error_maps, flatness, geometry, light, polarization, shot_exposure, shot_order
 from polcap.quality.gate_values import MOST_DEG, Evidence, Gate, State, reaches
 from polcap.quality.limits import GateLimits
 from polcap.results import (
@@ -78,10 +78,10 @@ _STEPS = (
     Step(("stillness",), shot_exposure.stillness, ResultsUntilMask, (*_FILES, *_PAIRED), ("black level", "flicker")),
     Step(("focus",), geometry.focus, ResultsUntilMask, _PAIRED),
     Step(("gains", "gain doubt", "energy"), shot_exposure.gains, ResultsUntilSelfcal, (*_PAIRED, "stillness")),
-    Step(("angles",), polarization.turned_shot, ResultsUntilSelfcal, _EVEN),
+    Step(("angles",), shot_order.turned_shot, ResultsUntilSelfcal, _EVEN),
     Step(("flat", "contour"), _without_limits(flatness.judge), ResultsUntilInfer, _EVEN),
     Step(("polarized",), _without_limits(polarization.polarized), ResultsUntilInfer, _EVEN, ("flat",)),
-    Step(("order",), _without_limits(polarization.order), ResultsUntilSelfcal, (*_EVEN, "polarized")),
+    Step(("order",), _without_limits(shot_order.order), ResultsUntilSelfcal, (*_EVEN, "polarized")),
     Step(("angles", "body", "other light"), polarization.of_outline, ResultsUntilInfer, _POLARIZED, **_ROUND),
     Step(
         ("room light",),

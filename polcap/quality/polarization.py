@@ -1,13 +1,11 @@
-"""Gates of polarization: order and zero of the polarizer angles, material of the object, stray light."""
+"""Gates of polarization: zero of the polarizer angles, material of the object, stray light."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TypeGuard
 
 import msgspec
 import numpy as np
 
-from polcap.capture_values import ShotOrder
 from polcap.formats.capture import angle_advice
 from polcap.image_values import Bools, Floats, Quality
 from polcap.optics import mueller
@@ -21,15 +19,14 @@ from polcap.quality.gate_values import (
     State,
     at_most,
     lit,
-    reaches,
     sentence,
-    shot_names,
     worded,
 )
 from polcap.quality.limits import GateLimits
 from polcap.quality.rerendering import explains
+from polcap.quality.shot_order import is_confirmed
 from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilSelfcal, ResultsUntilStokes
-from polcap.stage_values import AngleStack, ObjectMask, OrderTest, OutlineCheck, StokesImage, SurfaceMaps
+from polcap.stage_values import StokesImage, SurfaceMaps
 
 _LEAST_RIM = 200  # pixels of outline, to estimate an angle
 _LEAST_DOLP = 0.01  # of the most polarized tenth of the outline; there the least index has ten times that
@@ -37,19 +34,14 @@ _SAME_DEG = 5.0  # axes nearer than this are the same angle
 _SURE = 2.5  # σ between sectors of the outline: least significance of a turn
 _CERTAIN = 0.8  # of the limit of the misfit: above, also good captures fit a turn (docs/benchmarks/gates.md)
 _CLEAR = 0.8  # least concentration of the AoLP about the outline, to estimate a common turn
-_LIKELIER = 1.1  # factor between expected errors that decides on an order (docs/benchmarks/gates.md)
-_LIKELIER_SMALL, _SMALL_PX = 1.5, 5000  # the same for objects of fewer pixels, of which good ones reach 1.2
-_LIKELIER_FLAT = 1.8  # the same for flat objects: good ones reach 1.5, wrong orders 2.2
-_LIKELIER_UNEXPLAINED, _ORDER_UNEXPLAINED = 1.3, 0.3  # the same where maps explain less polarization: good ones 1.2
-_BOX_CONTOUR, _BOX_DEG, _BOX_EXPLAINED = 0.35, 8.0, 0.6  # two good boxes: factors 1.6 and 2.1, .76 and .69 explained
 _ALONG = -0.3  # below: the AoLP is along the contour
 _DARK = 0.1  # albedo below which a glossy object shows mostly reflections of itself
 _WEAK_DOLP = 0.05  # of an outline: above, no shape counts as flattened
 _DIMMED = 0.9  # of the mean light: below, an outline turns away
 _MOST_ILL_POSED = 0.15  # of the object; gloss with shadows and thin parts reaches .12 (docs/benchmarks/gates.md)
-# agreement of the re-rendering from which a finding is false (docs/benchmarks/gates.md): of wrong orders up to .26, of
-# wax .30, under light from around .48, without a polarizer .04
-_ORDER_EXPLAINED, _BODY_EXPLAINED, _UNPOLARIZED_EXPLAINED = 0.4, 0.5, 0.1
+# agreement of the re-rendering from which a finding is false (docs/benchmarks/gates.md): of wax .30, under light from
+# around .48, without a polarizer .04
+_BODY_EXPLAINED, _UNPOLARIZED_EXPLAINED = 0.5, 0.1
 _ROUGH = 0.5  # roughness from which facets alone leave little polarization
 # What a finding adds to the expected error of the normals, by captures with known normals: docs/benchmarks/gates.md
 _UNPOLARIZED_DEG = 11.0
@@ -62,111 +54,6 @@ _WRONG_DEG = 30.0  # mean error of the normals of captures that fail (docs/bench
 _MOST_PIXELS = 6e5  # a larger picture is averaged down
 
 
-def order(found: Evidence[ResultsUntilSelfcal]) -> Gate:
-    """Gate on the order and sense of the polarizer angles."""
-    results, explained, seen = found.results, None, None
-    if reaches(found, ResultsUntilInfer):
-        explained, seen = _explained(found), flatness.measure(found.results.stokes, found.results.maps)
-    return order_of_shots(results.radiance, results.object_, results.selfcal.outline, _test(results), seen, explained)
-
-
-def order_of_shots(
-    radiance: AngleStack,
-    object_: ObjectMask,
-    outline: OutlineCheck,
-    test: OrderTest | None,
-    seen: flatness.Flatness | None,
-    explained: float | None = None,
-) -> Gate:
-    """Gate on the order of shots, by the polarization along the outline and the test of the network.
-
-    An outline that is the edge of flat faces decides nothing. Where another order is as good, the stated one counts if
-    its maps explain the photographs and the network does not expect smaller errors in another one. The network's test
-    sees one small picture, and misjudges boxes and planes: maps that explain much of the polarization (`explained`, 1
-    is all) leave its finding undecided, maps that explain little confirm it.
-    """
-    statement, names, better = radiance.equipment.angles, shot_names(radiance), None
-    edges = seen is not None and seen.sharp_edged
-    likelier = _likelier(object_, seen, explained)
-    if not outline.as_stated and not edges:
-        better, because = outline.best, "The outline fits"
-    elif test is not None and test.ratio < 1 / likelier:
-        better, because = test.rival, f"The network expects {1 / test.ratio:.1f} times smaller errors for"
-    if better is not None and outline.as_stated and _hides_order(seen) and (explained or 0.0) > _BOX_EXPLAINED:
-        return _undecided(_order_text(better, names), outline, radiance)
-    if better is not None:
-        message = f"{because} the order {_order_text(better, names)} rather than the stated one"
-        remedy = sentence(angle_advice.correct(statement, better, radiance.angle))
-        remedy += "; or take the shots again in order" if statement.place != "cells" else ""
-        return Gate("order", "fail", _order_text(better, names), "as stated", message, remedy, 45.0, unit="")
-    message = f"The outline supports the stated order (fit {outline.concentration:.2f} of 1)"
-    if _is_confirmed(test):
-        message = f"In any other order, the network expects errors that are at least {test.ratio:.1f} times as large"
-    elif edges:
-        return Gate("order", "not measured", None, "as stated", "Flat faces show no order of the angles", unit="")
-    elif outline.rival is not None and (explained or 0.0) > _ORDER_EXPLAINED and (test is None or test.ratio >= 1):
-        message = "The maps of the stated order, rendered again, show the polarization of the photographs"
-    elif outline.rival is not None:
-        return _undecided(_order_text(outline.rival, names), outline, radiance)
-    return Gate("order", "pass", "as stated", "as stated", message, unit="")
-
-
-def _likelier(object_: ObjectMask, seen: flatness.Flatness | None, explained: float | None) -> float:
-    """Factor between expected errors that decides on an order: larger where good captures reach more."""
-    likelier = _LIKELIER if object_.mask.sum() > _SMALL_PX else _LIKELIER_SMALL
-    likelier = _LIKELIER_FLAT if seen is not None and seen.flat else likelier
-    unexplained = explained is not None and explained < _ORDER_UNEXPLAINED
-    return min(likelier, _LIKELIER_UNEXPLAINED) if unexplained else likelier
-
-
-def _hides_order(seen: flatness.Flatness | None) -> bool:
-    """Whether an object is flat, or has hardly any occluding contour and normals with small expected errors."""
-    return seen is not None and (seen.flat or (seen.contour < _BOX_CONTOUR and seen.expected_deg < _BOX_DEG))
-
-
-def _undecided(other: str, outline: OutlineCheck, radiance: AngleStack) -> Gate:
-    """Gate on an order of the shots that another one matches."""
-    message = f"The order {other} fits as well as the stated one (fit of the outline {outline.concentration:.2f} of 1)"
-    surer = "a rounded object or a chart" + ("" if len(radiance.angle) > 3 else " or four angles")
-    remedy = sentence(f"{angle_advice.check_statement(radiance.equipment.angles)}; {surer} would decide")
-    return Gate("order", "warn", "cannot tell", "as stated", message, remedy, unit="")
-
-
-def _explained(found: Evidence[ResultsUntilInfer]) -> float:
-    """Part of the polarization that the maps explain by a shape that explains the shading too, at most 1.
-
-    0 for the inversion: it makes a shape of any polarization.
-    """
-    return 0.0 if found.results.maps.estimator == "analytic" else found.rerendered.agreement
-
-
-def _test(results: ResultsUntilSelfcal) -> OrderTest | None:
-    """Test of the order by the network; None without one."""
-    return results.maps.order if isinstance(results, ResultsUntilInfer) else None
-
-
-def _is_confirmed(test: OrderTest | None) -> TypeGuard[OrderTest]:
-    """Whether the network expects clearly larger errors in any other order: the object is polarized as it should be."""
-    return test is not None and test.ratio > _LIKELIER
-
-
-def _order_text(order: ShotOrder, names: list[str]) -> str:
-    return ", ".join(names[i] for i in order.shots) + (", counted clockwise" if order.mirrored else "")
-
-
-def turned_shot(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Iterator[Gate]:
-    """Gate "angles", only if the polarizer angle of one shot contradicts those of three or more other shots."""
-    turned, limit = found.results.selfcal.turned, limits.max_turn_deg
-    if not turned.shots or abs(np.degrees(turned.angle)) <= limit:
-        return
-    degrees, doubt = np.degrees([turned.angle, turned.sigma])
-    shots = tuple(found.names[k] for k in turned.shots)
-    which = shots[0] if len(shots) == 1 else f"{shots[0]} (or {', '.join(shots[1:])}, by as much or less)"
-    message = f"{which} looks turned by {degrees:+.0f}° ± {doubt:.0f}°: the shots contradict each other"
-    remedy = sentence(angle_advice.retake(found.results.radiance.equipment.angles))
-    yield Gate("angles", "fail", round(float(degrees), 1), limit, message, remedy, abs(float(degrees)) / 2, shots, "°")
-
-
 def polarized(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
     """Gate "polarized", only if no part of the outline is polarized.
 
@@ -175,7 +62,7 @@ def polarized(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
     most = _most_dolp(found)
     if not most < _LEAST_DOLP:
         return
-    if _is_plane(found) and _explained(found) > _UNPOLARIZED_EXPLAINED:
+    if _is_plane(found) and found.explained > _UNPOLARIZED_EXPLAINED:
         return
     message = f"No part of the outline is polarized by more than {100 * most:.1f} %"
     remedy = "Check that the polarizer was on and turned; metal and translucent objects (wax, milk) hardly polarize"
@@ -385,10 +272,10 @@ def _light_of_body(body: rim.RimFigures, found: Evidence[ResultsUntilInfer], lim
     limit = limits.min_outline_dolp
     remedy = "Darken the room, keep the flash next to the lens, and photograph an ambient frame"
     zenith, roughness, albedo = _medians(found.results.maps)
-    confirmed = _is_confirmed(found.results.maps.order)
+    confirmed = is_confirmed(found.results.maps.order)
     if body.along < _ALONG and not (confirmed and albedo < _DARK):  # dark gloss reflects itself
         return _along_contour(body.along, albedo, f"{remedy}; {_across(found)}")
-    if _explained(found) > _BODY_EXPLAINED:
+    if found.explained > _BODY_EXPLAINED:
         message = f"The outline is polarized by {100 * body.dolp:.1f} %, as the shape explains"
         return Gate("body", "pass", round(body.dolp, 4), limit, message)
     flat, dimmed = zenith < limits.min_zenith_deg, body.brightness < _DIMMED

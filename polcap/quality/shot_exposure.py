@@ -269,7 +269,8 @@ def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
     if measured.source == "grey patches" and max(doubt, gloss := _GLOSS_PART * measured.chart_gloss) <= limit:
         gap, limit = measured.disagreement, limits.max_gain_disagreement
         message = f"Gray patches and object agree on the light of each shot (1σ {100 * doubt:.2f} %)"
-        if gap > limit and (_has_sharp_edges(found) or _is_explained(found)):
+        explained = reaches(found, ResultsUntilInfer) and found.explained > _EXPLAINED
+        if gap > limit and (explained or _has_sharp_edges(found)):
             message = (
                 f"Gray patches give the light of each shot (1σ {100 * doubt:.2f} %); the object does not confirm it"
             )
@@ -309,15 +310,8 @@ def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
 
 
 def _has_sharp_edges(found: Evidence[ResultsUntilSelfcal]) -> bool:
-    """Whether sharp edges of flat faces make the outline: then its polarization says nothing of the shots' light."""
+    """Whether sharp edges of flat faces make the outline: then its polarization does not show the shots' light."""
     if not reaches(found, ResultsUntilInfer):
         return False
     seen = flatness.measure(found.results.stokes, found.results.maps)
     return seen is not None and seen.sharp_edged
-
-
-def _is_explained(found: Evidence[ResultsUntilSelfcal]) -> bool:
-    """Whether the maps, rendered again, show the photographs: then the light of the shots is right."""
-    if not reaches(found, ResultsUntilInfer) or found.results.maps.estimator == "analytic":
-        return False
-    return found.rerendered.agreement > _EXPLAINED
