@@ -33,6 +33,7 @@ class Exif:
     width: int | None = None  # visible RAW pixels
     height: int | None = None
     serial: str = field(default="", metadata=NOT_IN_KEY)  # of the camera
+    upright_deg: int = field(default=0, metadata=NOT_IN_KEY)  # counter-clockwise turn of the stored pixels
     color_matrix: tuple[float, ...] | None = None  # 9, XYZ (D65 or the nearest stated illuminant) → camera
 
     @property
@@ -161,6 +162,12 @@ class Capture:
     def all_shots(self) -> tuple[Shot, ...]:
         """The capture's shots, and the cross-polarized shot if there is one."""
         return self.shots if self.crossed is None else (*self.shots, self.crossed)
+
+    @property
+    def upright_deg(self) -> int:
+        """Counter-clockwise turn [degrees] that sets the pictures upright; 0 unless all photographs state the same."""
+        turns = {frame.exif.upright_deg for shot in self.all_shots for frame in shot.frames}
+        return turns.pop() if len(turns) == 1 else 0
 
     @property
     def angle(self) -> Floats:

@@ -23,6 +23,7 @@ class Mesh(ArrayValue):
     cut_px: float = 0.0  # length of the cuts inside the mask, one side, px of the maps
     raggedness: float = 0.0  # length of the boundary over its smoothed length, minus 1; before smoothing
     frame: Literal["camera", "board"] = "camera"
+    turned_deg: int = 0  # counter-clockwise from that frame, about its z axis
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from polcap.capture_values import Exif
 from polcap.formats import atomic
+from polcap.formats.raw.exif import UPRIGHT_DEG
 from polcap.image_values import Bits, Floats
 
 _BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
@@ -78,7 +79,6 @@ def _layout_tags(width: int, height: int) -> list[_Entry]:
         (259, _SHORT, 1),  # uncompressed
         (262, _SHORT, 32803),  # color filter array
         (273, _LONG, 0),  # strip offset, set by the caller
-        (274, _SHORT, 1),
         (277, _SHORT, 1),
         (278, _LONG, height),
         (279, _LONG, 2 * width * height),
@@ -99,6 +99,7 @@ def _camera_tags(exif: Exif) -> list[_Entry]:
     return [
         (271, _ASCII, exif.make),
         (272, _ASCII, exif.model),
+        (274, _SHORT, next(tag for tag, turn in UPRIGHT_DEG.items() if turn == exif.upright_deg)),
         (305, _ASCII, "polcap"),
         (306, _ASCII, _stamp(exif, "%Y:%m:%d %H:%M:%S")),
         (50708, _ASCII, exif.camera or "unknown"),

@@ -7,7 +7,7 @@ same bytes, with any number of threads.
 import glob
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -88,6 +88,9 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     Raises SettingError: no such preset or color space, or an encoder is missing. ObjectError: as `levels`.
     """
     found, record = levels(source, wanted), provenance.record(about, wanted.catalog)
+    if found[0].asset.mesh.frame == "camera":  # one view
+        turn_deg = about["capture"].get("upright_deg", 0)
+        found = [replace(level, asset=asset.turn(level.asset, turn_deg)) for level in found]
     preset, whole = effective(wanted), found[0].asset
     name = atomic.safe_name(str(about["capture"].get("name")))  # files stay in the folder, whatever name the report has
     files = _files(out / "asset" / (wanted.preset or ""), name, whole, preset, record)

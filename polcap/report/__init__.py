@@ -88,6 +88,7 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
         "ball": None if capture.accuracy is None else msgspec.to_builtins(capture.accuracy),
         "taken": first.taken,
         "size_px": list(capture.size_px),
+        "upright_deg": capture.upright_deg,
         "focal_px": capture.focal_px,
         "focal_known": capture.focal_known,
         "focal_doubt": list(capture.focal_doubt),

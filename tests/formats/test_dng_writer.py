@@ -10,6 +10,7 @@ import rawpy
 from polcap.capture_values import Exif
 from polcap.errors import StorageError
 from polcap.formats import dng_writer
+from polcap.formats.raw import exif
 
 EXIF = Exif(
     make="Polcap",
@@ -33,14 +34,14 @@ PHASES = {
 MATRIX = np.array([[0.9, -0.29, -0.07], [-0.45, 1.24, 0.23], [-0.09, 0.19, 0.71]])
 
 
-def write(path: Path, mosaic: np.ndarray, phase: str = "RGGB", **exif: object) -> Path:
+def write(path: Path, mosaic: np.ndarray, phase: str = "RGGB", **settings: object) -> Path:
     dng_writer.write(
         path,
         mosaic,
         cfa=np.array(PHASES[phase], np.uint8),
         black=[[510, 511], [512, 513]],
         white=15871,
-        exif=Exif(**{**vars(EXIF), **exif}),
+        exif=Exif(**{**vars(EXIF), **settings}),
         color_matrix=MATRIX,
         as_shot_neutral=np.array([0.5, 1.0, 0.8]),
     )
@@ -87,6 +88,17 @@ def test_other_readers_find_the_exif(tmp_path: Path) -> None:
     with rawpy.imread(str(path)) as r:
         assert r.other.iso_speed == 200 and r.other.aperture == 8
         assert r.other.shutter_speed == pytest.approx(1 / 160)
+
+
+@pytest.mark.parametrize(
+    ("turn", "words"), [(0, "Horizontal"), (90, "Rotated 90 CCW"), (180, "Rotated 180"), (270, "Rotated 90 CW")]
+)
+def test_orientation_is_a_tag_and_moves_no_pixel(tmp_path: Path, turn: int, words: str) -> None:
+    path = write(tmp_path / "a.DNG", picture(3), upright_deg=turn)
+    with path.open("rb") as file:
+        assert words in str(exifread.process_file(file, details=False)["Image Orientation"])
+    assert exif.tags(path.read_bytes()).upright_deg == turn
+    np.testing.assert_array_equal(raw(path), picture(3))
 
 
 def test_facts_not_known_are_left_out(tmp_path: Path) -> None:

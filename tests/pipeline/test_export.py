@@ -21,6 +21,7 @@ import trimesh
 from polcap.formats.export import encoders
 from polcap.formats.export.presets import EXTRAS, FORMATS, PRESETS
 from polcap.formats.maps import exr, png
+from polcap.formats.raw.exif import UPRIGHT_DEG
 from polcap.pipeline import asset_export
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.export_request import ExportRequest
@@ -510,6 +511,20 @@ def test_extra_textures_and_sixteen_bits(tiny_result: Path, polcap: Command) -> 
     assert material["occlusionTexture"] == {"index": 1}
     stated = json.loads((tiny_result / "maps" / "maps.json").read_text())["exports"]["asset"]["glb"]
     assert stated["C_orm"].startswith("R ambient occlusion, G")
+
+
+@pytest.mark.parametrize(("orientation", "up"), [(6, (-1, 0)), (8, (1, 0)), (3, (0, -1))])
+def test_an_asset_of_a_turned_camera_stands_upright(own: Path, orientation: int, up: tuple[int, int]) -> None:
+    """EXIF 2.3: with Orientation 6 the left side of the stored picture is the top; `up` points to it."""
+    lying = trimesh.load(pipeline.export(own, ExportRequest())[0], force="mesh", process=False)
+    about = json.loads((own / "report.json").read_text())
+    about["capture"]["upright_deg"] = UPRIGHT_DEG[orientation]
+    (own / "report.json").write_text(json.dumps(about))
+    upright = trimesh.load(pipeline.export(own, ExportRequest())[0], force="mesh", process=False)
+    assert upright.vertices[:, 1] == pytest.approx(lying.vertices[:, :2] @ up, abs=1e-6)
+    assert upright.vertex_normals[:, 1] == pytest.approx(lying.vertex_normals[:, :2] @ up, abs=1e-4)
+    assert upright.vertices[:, 2] == pytest.approx(lying.vertices[:, 2], abs=1e-6)
+    assert np.array_equal(upright.visual.uv, lying.visual.uv)
 
 
 def test_cavities_are_the_concave_part_of_the_curvature(tiny_result: Path) -> None:

@@ -22,9 +22,10 @@ NO_NORMAL = 128  # a normal of length 0, by which viewers leave a pixel out
 def pictures(asset: Asset) -> dict[str, Texture]:
     """Albedo, F0, gloss and normals of an asset as 8-bit pictures of the size of its base color.
 
-    Gloss is 1 − √roughness, so that Ward's slope parameter is (1 − gloss)⁴ = roughness². Outside the object the normal
-    is the zero vector and all other pictures are 0; along its outline the colors blend into black. The asset must be of
-    one view or a plane, with its object-space normals; a plane has no outside.
+    Gloss is 1 − √roughness, so that Ward's slope parameter is (1 − gloss)⁴ = roughness². The pictures are turned as
+    the mesh is. Outside the object the normal is the zero vector and all other pictures are 0; along its outline the
+    colors blend into black. The asset must be of one view or a plane, with its object-space normals; a plane has no
+    outside.
     """
     assert asset.object_normal is not None
     height, width = asset.base_color.shape[:2]
@@ -48,6 +49,10 @@ def pictures(asset: Asset) -> dict[str, Texture]:
         return np.where(inside if whole.ndim == 2 else inside[..., None], whole, np.uint8(outside))
 
     return {
-        name: Texture(on_object(one, NO_NORMAL if name == "normal" else 0), one.color, one.meaning)
+        name: Texture(
+            np.rot90(on_object(one, NO_NORMAL if name == "normal" else 0), asset.mesh.turned_deg // 90),
+            one.color,
+            one.meaning,
+        )
         for name, one in made.items()
     }

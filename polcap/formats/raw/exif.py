@@ -18,6 +18,7 @@ from polcap.capture_values import Exif
 from polcap.errors import SettingError
 
 _D65_FIRST = (21, 20, 22, 23, 1, 4, 9, 10, 11, 12, 13, 14, 15)  # EXIF LightSource, the daylights
+UPRIGHT_DEG = {1: 0, 8: 90, 3: 180, 6: 270}  # by EXIF Orientation; mirrored pictures are used as stored
 _UNIT_MM = {1: 25.4, 2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # FocalPlaneResolutionUnit; 1 "none" is inch in practice
 _SENSOR_MM = (2.0, 70.0)  # plausible widths; others come from a wrong unit
 _RESIZED = 1.12  # ratio of pixel counts above which a picture was resized, not cropped; mRAW has 4/3
@@ -115,6 +116,7 @@ def tags(data: bytes) -> Exif:
         model=found.text("Model"),
         lens=found.text("LensModel"),
         serial=found.text("BodySerialNumber") or found.text("Tag 0xC62F"),  # the second is that of DNG
+        upright_deg=UPRIGHT_DEG.get(int(found.number("Orientation") or 1), 0),
         exposure_time=time or None,
         f_number=found.number("FNumber") or None,
         # 65535 means a value above 16 bits, which is in another tag; of a pair (0, 200) the second counts

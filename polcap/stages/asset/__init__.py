@@ -130,6 +130,24 @@ def with_extras(asset: Asset, maps: SurfaceMaps, depth: Floats, occlusion: bool)
     )
 
 
+def turn(asset: Asset, angle_deg: int) -> Asset:
+    """The asset turned counter-clockwise about the optical axis, by a multiple of 90°, with its object-space normals.
+
+    Textures stay as the maps are: their coordinates and tangents belong to the mesh.
+    """
+    if angle_deg == 0:
+        return asset
+    cosine, sine = np.rint([np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))])
+    mesh, rotation = asset.mesh, np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    tangents = np.concatenate([mesh.tangents[:, :3] @ rotation.T, mesh.tangents[:, 3:]], axis=1)
+    turned = {"vertices": mesh.vertices @ rotation.T, "normals": mesh.normals @ rotation.T, "tangents": tangents}
+    kinds = {name: value.astype(getattr(mesh, name).dtype) for name, value in turned.items()}
+    space = asset.object_normal
+    if space is not None:
+        space = _as(space, (2 * (space / np.iinfo(space.dtype).max) - 1) @ rotation.T / 2 + 0.5)
+    return replace(asset, mesh=replace(mesh, **kinds, turned_deg=mesh.turned_deg + angle_deg), object_normal=space)
+
+
 def curvature(maps: SurfaceMaps) -> Floats:
     """Mean curvature (H, W) from the normals: ½ where flat, 1 convex and 0 concave with a tenth of the object's radius.
 

@@ -120,6 +120,13 @@ def unit(coded: np.ndarray) -> Floats:
     return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9))
 
 
+def test_pictures_of_an_upright_camera_stand_upright(ball: Asset) -> None:
+    lying, upright = relightable_layer.pictures(ball), relightable_layer.pictures(asset.turn(ball, 90))
+    np.testing.assert_array_equal(upright["albedo"].pixels, np.rot90(lying["albedo"].pixels))
+    x, y, z = np.moveaxis(np.rot90(lying["normal"].pixels).astype(int), -1, 0)
+    assert np.abs(upright["normal"].pixels - np.stack([255 - y, x, z], axis=-1)).max() <= 1
+
+
 @pytest.mark.parametrize("light", [(0.0, 0.0, 1.0), (0.5, 0.0, 0.8), (-0.3, -0.6, 0.7)])
 def test_wards_law_shows_the_layer_as_polcap_shades_the_maps(
     ball: Asset, tmp_path: Path, light: tuple[float, ...]
