@@ -101,6 +101,8 @@ def test_wrong_flag_is_one_line_and_exit_2(
     [
         (["process", "x", "--wath"], ["--wath", "--watch", "`polcap process --help`"]),
         (["process", "My", "vase"], ["put a path with spaces in quotes", "`polcap process --help`"]),
+        (["synth", "x", "--width", "500"], ["--width", "it is a setting: --set width=…"]),
+        (["process", "x", "--clip=1"], ["--clip", "it is a setting: --set hdr.clip=…"]),
         (["process"], ["missing argument 'capture'", "`polcap process --help`"]),
         (["proces", "x"], ["'proces'", "Did you mean 'process'?"]),
         (["synth", "x", "--seed", "-3"], ["'--seed'", "0"]),

@@ -28,7 +28,7 @@ from polcap.cli.fuse_command import fuse
 from polcap.cli.material_command import material
 from polcap.cli.process_command import process
 from polcap.cli.result_commands import clean, report, show, status
-from polcap.cli.settings_command import settings
+from polcap.cli.settings_command import keys_named, settings
 from polcap.cli.synth_command import synth
 from polcap.cli.training_commands import evaluate, train
 from polcap.cli.validate_command import validate
@@ -82,7 +82,10 @@ def _one_line(error: TyperException) -> str:
     text = text.rstrip(".").replace("Value error, ", "")
     if "unexpected extra argument" in text:
         text += "; put a path with spaces in quotes"
-    context = getattr(error, "ctx", None)
+    context, option = getattr(error, "ctx", None), getattr(error, "option_name", None)
+    if option and context is not None and any("--set" in known.opts for known in context.command.params):
+        keys = keys_named(option, str(context.info_name))
+        text = f"no such option: {option}; it is a setting: --set {keys[0]}=…" if len(keys) == 1 else text
     asked = "polcap" if context is None or context.parent is None else f"polcap {context.info_name}"
     see = "" if text.endswith("?") else f"; see `{asked} --help`"
     return f"polcap: error: {text[:1].lower()}{text[1:]}{see}"

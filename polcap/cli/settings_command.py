@@ -41,6 +41,16 @@ def settings(
     terminal.print_data(found if json else "\n".join(lines))
 
 
+def keys_named(option: str, command: str) -> list[str]:
+    """Keys of the settings of a command whose last part is the name of an option that does not exist."""
+    from polcap import config
+    from polcap.material.material_path import all_settings
+
+    several = all_settings() if command in ("fuse", "material") else config.settings()
+    rows, name = _synth_settings() if command == "synth" else several, option.lstrip("-").replace("-", "_")
+    return list(dict.fromkeys(row.key for row in rows if row.key.rpartition(".")[2] == name))
+
+
 def _synth_settings() -> "list[Setting]":
     """The settings of `polcap synth`, then those that its options --views, --flat and --calibration change or add."""
     from msgspec import Struct
