@@ -93,9 +93,9 @@ def measure(brackets: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
 def _pair(a: Signals, b: Signals) -> BracketTiles | None:
     """Measure signal and variance in tiles of two frames, darker `a` and brighter `b`; None for similar exposures."""
     found = exposure.of_tiles(*exposure.common_tiles(a, b))
-    if found is None or not np.all(np.maximum(found.value, 1 / found.value) > _LEAST_RATIO):
+    if found is None or not np.all(np.maximum(found, 1 / found) > _LEAST_RATIO):
         return None
-    r = found.value.astype(np.float32)[:, None, None]
+    r = found.astype(np.float32)[:, None, None]
     weight = 1 / (1 + r * r)
 
     def maps(one: Floats, two: Floats) -> tuple[Floats, ...]:

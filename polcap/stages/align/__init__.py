@@ -41,8 +41,7 @@ class AlignSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(ge=0, le=1, description="least correlation of detail after registration")
     ] = 0.5
     detail_px: Annotated[
-        float,
-        Meta(ge=1, le=50, description="structure coarser than this Gaussian sigma is ignored [merged px]"),
+        float, Meta(ge=1, le=50, description="structure coarser than this Gaussian sigma is ignored [merged px]")
     ] = 4.0
 
 
@@ -60,20 +59,13 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: AlignSetti
     if settings.model == "none":
         return Alignment(transform, residual, correlation, crossed)
     step = averaging_step(radiance.value.shape[1:3], _MOST_PIXELS)
-    detail_px = settings.detail_px / np.sqrt(step)  # detail lies between the pixels of either grid
-    reference = detail(radiance.shot(0), detail_px, step)
+    reference = _detail(radiance.shot(0), step, settings)
     for k in range(1, shots):
-        shot = detail(radiance.shot(k), detail_px, step)
         name = f"shot {np.degrees(radiance.angle[k]):g}°"
-        if not (shows_detail(reference) and shows_detail(shot)):
-            raise _no_detail(name, radiance.shot(k))
-        transform[k], residual[k], correlation[k] = _register_shot(name, reference, shot, step, settings)
+        transform[k], residual[k], correlation[k] = _register_shot(name, radiance.shot(k), reference, step, settings)
     if radiance.crossed is not None:
-        shot = detail(radiance.crossed.picture, detail_px, step)
         name = "the cross-polarized shot"
-        if not (shows_detail(reference) and shows_detail(shot)):
-            raise _no_detail(name, radiance.crossed.picture)
-        crossed, _, _ = _register_shot(name, reference, shot, step, settings)
+        crossed, _, _ = _register_shot(name, radiance.crossed.picture, reference, step, settings)
     return Alignment(transform, residual, correlation, crossed)
 
 
@@ -82,6 +74,11 @@ def _of_mosaic(offset_px: Floats) -> Alignment:
     transform = np.tile(np.eye(3), (len(offset_px), 1, 1))
     transform[:, :2, 2] = -offset_px
     return Alignment(transform, np.zeros(len(offset_px)), np.ones(len(offset_px)))
+
+
+def _detail(shot: MaskedImage, step: int, settings: AlignSettings) -> Pyramid:
+    """Fine detail of a shot, averaged over `step` × `step` px."""
+    return detail(shot, settings.detail_px / np.sqrt(step), step)  # detail lies between the pixels of either grid
 
 
 def _no_detail(name: str, picture: MaskedImage) -> AlignmentError:
@@ -100,12 +97,15 @@ def _no_detail(name: str, picture: MaskedImage) -> AlignmentError:
 
 
 def _register_shot(
-    name: str, reference: Pyramid, shot: Pyramid, step: int, settings: AlignSettings
+    name: str, picture: MaskedImage, reference: Pyramid, step: int, settings: AlignSettings
 ) -> tuple[Floats, float, float]:
     """Register one shot: transform (3, 3) and its 1σ in merged px, and the correlation of detail.
 
-    Raises AlignmentError.
+    `reference` is the detail of the reference shot, averaged over `step` × `step` px. Raises AlignmentError.
     """
+    shot = _detail(picture, step, settings)
+    if not (shows_detail(reference) and shows_detail(shot)):
+        raise _no_detail(name, picture)
     found, correlation = _best_match(reference, shot, settings)
     transform = registration.scaled(found.matrix, step)
     corners = picture_corners(step * reference.shape[1], step * reference.shape[0])

@@ -16,6 +16,7 @@ Hanji, Zhong, Mantiuk, Noise-aware merging of high dynamic range image stacks wi
 ECCV Workshops 2020. Granados et al., Optimal HDR reconstruction with linear digital cameras, CVPR 2010.
 """
 
+from contextlib import closing
 from dataclasses import replace
 from typing import Annotated, Literal
 
@@ -32,7 +33,7 @@ from polcap.stage_values import AngleStack, BracketMeasurement, ColorSensor, Cro
 from polcap.stages import stage
 from polcap.stages.hdr import exposure, noise, photosites, planes, weights
 from polcap.stages.hdr.bracket import Bracket, black_error, compare
-from polcap.stages.hdr.planes import Reader, same_size
+from polcap.stages.hdr.planes import Reader, check_size
 
 _ALL_AMBIENT = 0.9  # share of ambient light beyond which nothing of the flash is left
 _LEAST_PX = 48  # least side of a merged picture: noise and motion are measured in tiles
@@ -76,53 +77,49 @@ def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack
     Raises CaptureError: frames of different size, unknown exposure ratios, too much motion, or ambient frames as bright
     as their shot.
     """
-    read = Reader(
-        (frame for shot in capture.all_shots for frame in (*shot.frames, *shot.ambient)), decode, settings.clip
-    )
-    try:
+    frames = (frame for shot in capture.all_shots for frame in (*shot.frames, *shot.ambient))
+    with closing(Reader(frames, decode, settings.clip)) as read:
+        read.plan = _memory_plan(capture, read(capture.shots[0].frames[0]), settings)
         return _merge(capture, read, settings)
-    finally:
-        read.close()
 
 
 def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     """Merge shot after shot into one stack; the first shot gives the order of brightness, black level and noise."""
     shots, count, first = capture.all_shots, len(capture.shots), capture.shots[0]
-    read.plan = _memory_plan(capture, read(first.frames[0]), settings)
     order = _by_brightness(first, read)
-    reference = first.frames[middle(order)]
-    image = read(reference)
-    _check_grid(reference, image, settings)
+    image = _read_reference(first.frames[middle(order)], read, settings)
     sensor, view, side = _sensor(capture, image, settings), _view(capture, image, settings), image.superpixel
     full = settings.demosaic == "full" and image.cfa is not None
     bayer = image.cfa if sensor.site_px is not None and side == 2 else None  # binned
+    stack = _empty(len(shots), *(size // side * (side if full else 1) for size in image.value.shape[:2]))
+    pictures = [MaskedImage(*shot) for shot in zip(stack.value, stack.variance, stack.quality)]
     del image  # so that the reader can free the frame
     read.black = black_error(Bracket(first, order), read)
-    # in the middle frame by the metadata, as in `check`, which reads each frame only once
-    places = sharpness.places(read(middle(first.frames)), settings.clip)
+    places = sharpness.places(read(middle(first.frames)), settings.clip)  # of the same frame as in `check`
     lines = noise.Lines(() if capture.calibration is None else capture.calibration.noise)
-    shape, stack, mosaic = (0, 0, 0), _empty(0, (0, 0, 0)), None
-    figures, ambient_share, tiles = [], [], []
+    figures, ambient_share, tiles = [], [], []  # of each shot
     for k, shot in enumerate(shots):
         # the crossed shot is merged on the scale of its own middle frame: its flash has another energy
         bracket = Bracket(shot, _by_brightness(shot, read) if k == count else order)
         compared = compare(bracket, lines, read, settings.max_motion_px)
         weighted = weights.prepare(bracket, compared, lines, read, full)
         if k == 0:
-            shape, stack = weighted.shape, _empty(len(shots), weighted.shape)
+            shape = weighted.shape
             mosaic = None if bayer is None else photosites.merge(bracket, weighted, bayer, read)
-        same_size("the cross-polarized shot" if k == count else f"shot {shot.name}", weighted.shape, shape)
-        weighted.merge_into(MaskedImage(stack.value[k], stack.variance[k], stack.quality[k]))
+        check_size("the cross-polarized shot" if k == count else f"shot {shot.name}", weighted.shape, shape)
+        weighted.merge_into(pictures[k])
         if k < count:
+            _check_ambient(compared.ambient_share, shot)
+            ambient_share.append(compared.ambient_share)
             figures.append([(frame.ratio, frame.curvature, frame.flicker) for frame in compared.frames])
-            ambient_share.append(_checked_ambient(compared.ambient_share, shot))
             tiles.append([sharpness.take(read(frame), places, settings.clip) for frame in shot.frames])
         del weighted, compared
         read.forget((*shot.frames, *shot.ambient))
         lines.settle()
-    ratio, curvature, flicker = _by_frame(figures)
-    pictures = [MaskedImage(*shot) for shot in zip(stack.value, stack.variance, stack.quality, strict=True)]
-    _correct_falloff(pictures, capture, view, settings)
+    ratio, curvature, flicker = (np.array([[one[i] for one in shot] for shot in figures], np.float64) for i in range(3))
+    if settings.falloff and capture.calibration is not None and capture.calibration.falloff is not None:
+        for picture in pictures:
+            weights.divide_by_falloff(picture, view, capture.size_px, capture.calibration.falloff)
     return AngleStack(
         value=stack.value[:count],
         variance=stack.variance[:count],
@@ -148,27 +145,13 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     )
 
 
-def _by_frame(figures: list[list[tuple[Floats, float, float]]]) -> list[Floats]:
-    """Exposure ratios (K, E, C), curvatures (K, E) and flicker (K, E) of all frames, from those of each."""
-    return [np.array([[frame[i] for frame in shot] for shot in figures], np.float64) for i in range(3)]
-
-
-def _correct_falloff(pictures: list[MaskedImage], capture: Capture, view: View, settings: HdrSettings) -> None:
-    """Divide the merged pictures by the lens's calibrated falloff, in place, unless the settings forbid it."""
-    falloff = None if capture.calibration is None else capture.calibration.falloff
-    if settings.falloff and falloff is not None:
-        for picture in pictures:
-            weights.divide_by_falloff(picture, view, capture.size_px, falloff)
-
-
-def _checked_ambient(share: float, shot: Shot) -> float:
-    """Share of ambient light in all light. Raises CaptureError if that is all: the flash was on in both, or in none."""
+def _check_ambient(share: float, shot: Shot) -> None:
+    """Raise CaptureError if almost all light of a shot is ambient: the flash was on for its ambient frames too."""
     if share > _ALL_AMBIENT:
         raise CaptureError(
             f"the ambient frames of shot {shot.name} are as bright as the shot: the flash was on for both or for none; "
             "take the ambient frames again without the flash, or take them out of the folder"
         )
-    return share
 
 
 def _ambient_shared(shots: tuple[Shot, ...]) -> bool:
@@ -204,8 +187,9 @@ def _by_brightness(shot: Shot, read: Reader) -> tuple[int, ...]:
     return tuple(int(e) for e in np.argsort([level(frame) for frame in shot.frames], kind="stable"))
 
 
-def _check_grid(frame: Frame, image: SensorImage, settings: HdrSettings) -> None:
-    """Raise CaptureError if the mosaic cannot be demosaiced as requested, or the frame has too few pixels."""
+def _read_reference(frame: Frame, read: Reader, settings: HdrSettings) -> SensorImage:
+    """Decode the reference frame. Raises CaptureError: it cannot be demosaiced as requested, or has too few pixels."""
+    image = read(frame)
     (height, width), side = image.value.shape[:2], image.superpixel
     if settings.demosaic == "full" and side == 3:
         raise CaptureError(
@@ -216,6 +200,7 @@ def _check_grid(frame: Frame, image: SensorImage, settings: HdrSettings) -> None
             f"{frame.path}: {width}×{height} px are too few to measure noise and movement; "
             f"polcap needs {_LEAST_PX * side} px a side"
         )
+    return image
 
 
 def _sensor(capture: Capture, image: SensorImage, settings: HdrSettings) -> ColorSensor:
@@ -231,22 +216,19 @@ def _view(capture: Capture, image: SensorImage, settings: HdrSettings) -> View:
     return View(capture.focal_px / scale, (x, y), scale, known=capture.focal_known)
 
 
-def _empty(shots: int, shape: tuple[int, int, int]) -> MaskedImage:
-    """Uninitialized memory (K, H, W, 3) for the merged shots, of shape (C, H, W) each."""
-    _, height, width = shape
+def _empty(shots: int, height: int, width: int) -> MaskedImage:
+    """Uninitialized memory (K, H, W, 3) for the merged shots."""
     value, variance = (np.empty((shots, height, width, 3), np.float32) for _ in range(2))
     return MaskedImage(value, variance, np.empty((shots, height, width), np.uint8))
 
 
 def _equipment(capture: Capture, view: View) -> Equipment:
     """Light, lens distortion (in pixels of `view`) and polarizer of a capture, from metadata and calibration."""
-    light, known = _light(capture), capture.calibration
-    if known is None:
-        return Equipment(light, angles=capture.angles)
-    ring, lens = known.polarizer, known.geometry
+    known = capture.calibration
+    flash, ring, lens = (None, None, None) if known is None else (known.flash, known.polarizer, known.geometry)
     return Equipment(
-        light=light,
-        flash_spread=None if known.flash is None else known.flash.spread,
+        light=_light(capture),
+        flash_spread=None if flash is None else flash.spread,
         extinction=None if ring is None else np.array(ring.extinction),
         ring_sigma=None if ring is None else np.radians(ring.zero_sigma_deg),
         distortion=None if lens is None else Distortion(view.focal, view.center, lens.k1, lens.k2),

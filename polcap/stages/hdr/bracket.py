@@ -4,6 +4,7 @@ Each frame is compared with the bracket's reference frame, after binning: one pi
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -17,12 +18,12 @@ from polcap.optics.registration import Pyramid, register
 from polcap.stage_values import BlackError
 from polcap.stages.hdr import exposure, noise
 from polcap.stages.hdr.ghosts import Anchor, RegisteredFrame, first_estimate
-from polcap.stages.hdr.planes import Reader, Signals, blocks, in_memory, planar, resample, same_size
+from polcap.stages.hdr.planes import Reader, Signals, blocks, check_size, in_memory, planar, resample
 
 _SMOOTH = cv2.getGaussianKernel(7, 0.8, cv2.CV_32F)
-_STILL_PX = 0.05  # frames that moved less are not resampled
-_ANY_CAUSE = 1e-3  # of the sensor's range: so little light may be taken off, too, if it is not an error of black
-_MOTION_SIGMAS = 3.0  # nor are frames that moved by less than this many of its standard deviations
+# Frames that moved less than either of these are not resampled: px, and standard deviations of the measured motion.
+_STILL_PX, _MOTION_SIGMAS = 0.05, 3.0
+_ANY_CAUSE = 1e-3  # of the sensor's range: light up to here is subtracted even if it is no error of the black level
 
 
 @dataclass(frozen=True)
@@ -68,17 +69,15 @@ def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float)
     size.
     """
     source = _BracketSignals(bracket, lines, read)
-    still = source.signals(bracket.reference)
+    still = source.still
     one = np.ones(still.shape[0], np.float32)
     if not bracket.others and source.ambient is None:
         source.learn(bracket.reference, noise.sample_frame(still))
     ghost = np.zeros(still.usable.shape, bool)
     frames, parts = {}, []
     anchor: Anchor | None = None
-    pyramid = brightness_pyramid(still) if bracket.others else None
     for e in bracket.others:
-        assert pyramid is not None
-        frames[e] = _compare_frame(source, e, still, pyramid, limit_px)
+        frames[e] = _compare_frame(source, e, limit_px)
         anchor = anchor or Anchor(RegisteredFrame(still, one, source.line(bracket.reference), 0 * one))
         new = anchor.ghosts(frames[e])
         parts.append((frames[e], frames[e].signals.usable & ~new))
@@ -131,6 +130,16 @@ class _BracketSignals:
         self._rounding = sensor.rounding_variance(still) / 2  # variance of binned green, the mean of two photosites
         self.ambient = ambient_light(bracket, lines, read)
 
+    @cached_property
+    def still(self) -> Signals:
+        """Signals of the reference frame."""
+        return self.signals(self.reference)
+
+    @cached_property
+    def still_pyramid(self) -> Pyramid:
+        """Brightness pyramid of the reference frame."""
+        return brightness_pyramid(self.still)
+
     def signals(self, e: int) -> Signals:
         """Signals of frame e of the bracket, with its ambient light subtracted."""
         found = self._read.signals(self.frames[e])
@@ -148,6 +157,7 @@ class _BracketSignals:
         return self.sensor_line(e).with_ambient(self._ambient_exposure(e) * self.ambient.value.mean(axis=(1, 2)))
 
     def sensor_line(self, e: int) -> noise.Noise:
+        """Noise line of frame e by the sensor alone."""
         return self._lines.line(self._iso[e], self._rounding, self._radiance)
 
     def settled(self, *frames: int) -> bool:
@@ -161,15 +171,13 @@ class _BracketSignals:
         return np.float32(exposure.of_ambient(self.frames[e], self.frames[self.reference]))
 
 
-def _compare_frame(
-    source: _BracketSignals, e: int, still: Signals, pyramid: Pyramid, limit_px: float
-) -> RegisteredFrame:
+def _compare_frame(source: _BracketSignals, e: int, limit_px: float) -> RegisteredFrame:
     """Measure motion, exposure ratio, noise and misfit of frame e relative to the reference frame."""
-    reference, file = source.reference, Path(source.frames[e].path)
-    name = f"{file.name}, frame {e + 1} of {source.name},"
+    still, reference = source.still, source.reference
+    name = f"{Path(source.frames[e].path).name}, frame {e + 1} of {source.name},"
     found, gain = source.signals(e), None
-    same_size(name, found.shape, still.shape)
-    motion = measure_motion(name, pyramid, brightness_pyramid(found), limit_px / source.raw_px)
+    check_size(name, found.shape, still.shape)
+    motion = measure_motion(name, source.still_pyramid, brightness_pyramid(found), limit_px / source.raw_px)
     learn = source.ambient is None and not source.settled(e, reference)
     if motion is not None:  # before resampling, the scene's detail does not cancel between the frames
         if learn:
@@ -177,25 +185,23 @@ def _compare_frame(
             source.learn(reference, noise.sample_frame(still))
         found, gain = resample(found, motion)
     tiles = exposure.common_tiles(still, found)
-    ratio = _exposure_ratio(source, e, name, tiles)
+    ratio = exposure.of_frame(name, tiles, source.frames[e], source.frames[reference])
     if motion is None and learn:
         for number, samples in zip((reference, e), noise.sample_pair(still, found, ratio)):
             source.learn(number, samples)
-    misfit = np.zeros_like(ratio)
-    shaded, curvature = exposure.vignetting(still, found, ratio), exposure.curvature(*tiles)
-    flicker = exposure.flicker(still, found)
-    frame = RegisteredFrame(found, ratio, source.line(e), misfit, motion, gain, shaded, curvature, flicker)
+    frame = RegisteredFrame(
+        signals=found,
+        ratio=ratio,
+        noise=source.line(e),
+        misfit=np.zeros_like(ratio),
+        motion=motion,
+        gain=gain,
+        vignetting=exposure.vignetting(still, found, ratio),
+        curvature=exposure.curvature(*tiles),
+        flicker=exposure.flicker(still, found),
+    )
     lines = source.line(reference), frame.noise
     return replace(frame, misfit=noise.misfit(still, found, ratio, lines, frame.mean_gain))
-
-
-def _exposure_ratio(source: _BracketSignals, e: int, name: str, tiles: tuple[Floats, Floats]) -> Floats:
-    """Exposure ratio (C,) of frame e, called `name` in errors, to the reference frame, from tiles (T, C) of both."""
-    frame, reference = source.frames[e], source.frames[source.reference]
-    measured = exposure.of_tiles(*tiles)
-    if measured is None and (unlit := exposure.of_unlit(*tiles, exposure.stated(frame, reference))) is not None:
-        return np.full(tiles[0].shape[1], unlit, np.float32)
-    return exposure.measured_or_stated(name, measured, tiles[0].shape[1], frame, reference)
 
 
 def brightness_pyramid(frame: Signals) -> Pyramid:
@@ -203,9 +209,7 @@ def brightness_pyramid(frame: Signals) -> Pyramid:
     _, height, width = frame.shape
     out = np.empty((height, width), np.float32)
     for rows, inner, target in blocks(height, _SMOOTH.size // 2):
-        total, *others = frame.rows(rows)
-        for plane in others:
-            total = total + plane
+        total = sum(frame.rows(rows))
         smooth = np.asarray(cv2.sepFilter2D(total, -1, _SMOOTH, _SMOOTH))[inner]
         np.maximum(smooth, 0, out=smooth)
         smooth += np.float32(1e-4)
@@ -238,14 +242,12 @@ def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool
     shot, reference = bracket.shot, bracket.shot.frames[bracket.reference]
     if not shot.ambient:
         return None
-    value: Floats | None = None
     share = [exposure.of_ambient(frame, reference) for frame in shot.ambient]
-    for frame in shot.ambient:
+    value = planar(sensor.signal(read(shot.ambient[0]), full))
+    for frame in shot.ambient[1:]:
         part = planar(sensor.signal(read(frame), full))
-        if value is not None:
-            same_size(f"an ambient frame of shot {shot.name}", part.shape, value.shape)
-        value = part if value is None else value + part
-    assert value is not None
+        check_size(f"an ambient frame of shot {shot.name}", part.shape, value.shape)
+        value += part
     value /= np.float32(sum(share))
     variance = np.zeros_like(value)
     for frame, one in zip(shot.ambient, share):

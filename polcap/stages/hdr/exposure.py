@@ -1,7 +1,6 @@
 """Exposure ratio of two frames: measured in their pixels, or from metadata."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,29 +29,43 @@ _UNLIT, _LEAST_RATIO = 0.01, 1e-4  # of the stated exposure: less is none; for a
 _TILE_NOISE = (1e-7, 0.005, 3e-6)  # of a tile's mean: variance per signal, relative error, error of a black tile
 
 
-@dataclass(frozen=True)
-class Ratio:
-    """Exposure ratio of two frames, per channel."""
+def of_frame(name: str, tiles: tuple[Floats, Floats], frame: Frame, reference: Frame) -> Floats:
+    """Exposure ratio (C,) float32 of a frame to the reference frame, measured, or else as stated.
 
-    value: Floats  # (C,)
-    sigma: Floats  # (C,) 1σ, relative
+    `tiles` are the `common_tiles` (T, C) of reference frame and frame. A ratio from EXIF does not count if the flash
+    fired.
+
+    Raises CaptureError: the frame `name` has neither a measured nor a stated ratio.
+    """
+    measured = of_tiles(*tiles)
+    if measured is not None:
+        return measured.astype(np.float32)
+    ratio = stated(frame, reference)
+    unlit = of_unlit(*tiles, ratio)
+    by_hand = frame.exposure is not None and reference.exposure is not None
+    if unlit is None and (not np.isfinite(ratio) or (frame.exif.flash_fired and not by_hand)):
+        why = "it states no exposure"
+        if np.isfinite(ratio):
+            why = "the flash fired, so its shutter time does not set the exposure"
+        raise CaptureError(
+            f"{name} shares too few well exposed pixels with the reference frame to measure its exposure, "
+            f"and {why}; state `exposure` in capture.toml, or leave the frame out, with the same exposure of every shot"
+        )
+    return np.full(tiles[0].shape[1], ratio if unlit is None else unlit, np.float32)
 
 
-def of_tiles(a: Floats, b: Floats) -> Ratio | None:
+def of_tiles(a: Floats, b: Floats) -> Floats | None:
     """Measure the exposure ratio b / a (C,) of two frames from tiles (T, C) of `common_tiles`; None for too few.
 
     It is the quotient of sums over tiles: the maximum-likelihood estimate for Poisson counts, without the bias of a
     mean of quotients or of logarithms. Tiles that disagree, because something moved, are left out. A channel with an
     error above 1 % gets the ratio of all channels together.
     """
-    if not len(a):
-        return None
     found = [_quotient(a[:, c], b[:, c]) for c in range(a.shape[1])]
     sums = _quotient(a.sum(axis=1), b.sum(axis=1))
     if sums is None or sums[1] > _LEAST_SURE:
         return None
-    value, sigma = np.array([one if one is not None and one[1] < _SURE else sums for one in found]).T
-    return Ratio(value, sigma)
+    return np.array([one[0] if one is not None and one[1] < _SURE else sums[0] for one in found])
 
 
 def common_tiles(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
@@ -110,8 +123,7 @@ def _lines(a: Floats, b: Floats) -> Floats:
 
 def scales_as_stated(ratio: float, frame: Frame, reference: Frame) -> bool:
     """Whether a measured exposure ratio is that of the camera settings, so that steady light has the same ratio."""
-    known = frame.exif.relative_exposure and reference.exif.relative_exposure
-    return bool(known) and abs(np.log(ratio / of_ambient(frame, reference))) < np.log(_AS_STATED)
+    return bool(abs(np.log(ratio / _by_settings(frame, reference))) < np.log(_AS_STATED))  # False if they are unknown
 
 
 def vignetting(reference: Signals, other: Signals, ratio: Floats) -> Floats | None:
@@ -155,30 +167,8 @@ def of_unlit(a: Floats, b: Floats, stated: float) -> float | None:
     return max(float(b[seen].sum() / a[seen].sum()), _LEAST_RATIO)
 
 
-def measured_or_stated(name: str, measured: Ratio | None, channels: int, frame: Frame, reference: Frame) -> Floats:
-    """Exposure ratio (C,) float32 to the reference frame: the measured one, else the stated one.
-
-    A ratio from EXIF does not count if the flash fired.
-
-    Raises CaptureError: the frame `name` has neither a measured nor a stated ratio.
-    """
-    if measured is not None:
-        return measured.value.astype(np.float32)
-    by_metadata = stated(frame, reference)
-    by_hand = frame.exposure is not None and reference.exposure is not None
-    if not np.isfinite(by_metadata) or (frame.exif.flash_fired and not by_hand):
-        why = "it states no exposure"
-        if np.isfinite(by_metadata):
-            why = "the flash fired, so its shutter time does not set the exposure"
-        raise CaptureError(
-            f"{name} shares too few well exposed pixels with the reference frame to measure its exposure, "
-            f"and {why}; state `exposure` in capture.toml, or leave the frame out, with the same exposure of every shot"
-        )
-    return np.full(channels, by_metadata, np.float32)
-
-
 def stated(frame: Frame, reference: Frame) -> float:
-    """Exposure ratio to the reference frame by capture.toml or camera settings; NaN if unknown."""
+    """Exposure ratio to the reference frame by capture.toml, else by camera settings; NaN if unknown."""
     if frame.exposure and reference.exposure:
         return frame.exposure / reference.exposure
     return _by_settings(frame, reference)
@@ -191,6 +181,7 @@ def of_ambient(frame: Frame, reference: Frame) -> float:
 
 
 def _by_settings(frame: Frame, reference: Frame) -> float:
+    """Exposure ratio to the reference frame by the camera settings; NaN if unknown."""
     a, b = frame.exif.relative_exposure, reference.exif.relative_exposure
     return a / b if a and b else float("nan")
 

@@ -108,7 +108,7 @@ def tile_columns(
     usable = np.logical_and.reduce([frame.usable for frame in frames])
     columns = []
     for rows in strips(usable.shape[0], usable.shape[1], most):
-        whole = usable_tiles(usable[rows])
+        whole = _usable_tiles(usable[rows])
         columns.append([_tiles(values, whole) for values in maps(*(frame.rows(rows) for frame in frames))])
     return [np.concatenate(column) for column in zip(*columns, strict=True)]
 
@@ -154,9 +154,11 @@ def fit(samples: list[Samples], iso: float | None, least_floor: float, radiance:
     line is implausible. `least_floor` is the variance from rounding to whole counts. `radiance`: its scale is
     arbitrary, so the brightest tile takes the place of the sensor's white.
     """
-    channels = samples[0].signal.shape[1]
-    white = [_brightest(samples, c) if radiance else 1.0 for c in range(channels)]
-    line = np.array([_line(samples, c, iso, least_floor, white[c]) for c in range(channels)], np.float32)
+    white = np.ones(samples[0].signal.shape[1])
+    if radiance:
+        brightest = np.nanmax(np.concatenate([one.signal for one in samples]), axis=0, initial=0.0)
+        white = np.where(brightest > 0, brightest, 1.0)
+    line = np.array([_line(samples, c, iso, least_floor, float(one)) for c, one in enumerate(white)], np.float32)
     return Noise(line[:, 0], line[:, 1])
 
 
@@ -224,10 +226,7 @@ class Lines:
         return iso in self._settled
 
     def settle(self) -> None:
-        """Freeze the noise lines (variance over signal) estimated so far, and drop all samples.
-
-        Later shots use these lines.
-        """
+        """Make the noise lines so far final, for all later shots, and drop their samples."""
         self._settled = set(self._known)
         self._samples.clear()
 
@@ -259,11 +258,6 @@ def _line(samples: list[Samples], channel: int, iso: float | None, least: float,
     return slope, floor
 
 
-def _brightest(samples: list[Samples], channel: int) -> float:
-    """Signal of the brightest tile; 1 without any."""
-    return max(float(np.nanmax(one.signal[:, channel], initial=0.0)) for one in samples) or 1.0
-
-
 def _quotient(relative: Floats, flat: bool) -> float:
     """Mean of a bin's relative tile variances (n,): median, or from the 15 % quantile for `flat` samples."""
     if not flat:
@@ -272,7 +266,7 @@ def _quotient(relative: Floats, flat: bool) -> float:
     return float(np.quantile(relative, 0.15) / (1 - spread - 1.0364 * spread**0.5) ** 3)
 
 
-def usable_tiles(usable: Bools) -> Bools:
+def _usable_tiles(usable: Bools) -> Bools:
     """Mask (T,) of a strip's tiles that have only usable pixels, also around them. `usable` (h, W) is the strip."""
     bad = np.asarray(~usable.all(axis=0))  # (W,)
     before = np.concatenate([[0], np.cumsum(bad)])

@@ -235,8 +235,8 @@ class Reader:
                 self._decoding[id(following)] = self._pool.submit(self._decode, following)
 
 
-def same_size(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:
-    """Raise CaptureError for a frame (C, H, W) with another shape than the frames before it."""
+def check_size(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    """Raise CaptureError if the frame `name` has another shape (C, H, W) than the frames before it."""
     if shape != expected:
         a, b = (f"{s[2]}×{s[1]}×{s[0]}" for s in (shape, expected))
         raise CaptureError(f"{name} is {a}, the frames before it {b} [px × px × channels]: use one camera")

@@ -11,6 +11,7 @@ McCamy, Marcus, Davidson, A Color-Rendition Chart, J. Applied Photographic Engin
 """
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -26,7 +27,7 @@ from polcap.stage_values import AngleStack
 from polcap.stages import stage
 from polcap.stages.whitebalance import chart, chart_light, chart_search, patches
 from polcap.stages.whitebalance.chart import Placement
-from polcap.stages.whitebalance.patches import ChartFit
+from polcap.stages.whitebalance.patches import ChartFit, PatchSamples
 
 _LEAST_PITCH_PX = 8.0  # with less, a patch has too few pixels
 _CLEARLY_BETTER = 0.5  # residual with another edition of the chart over that with the stated one: 15 charts had ≥ 0.93
@@ -55,8 +56,7 @@ class WhitebalanceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         float, Meta(gt=0, le=100, description="greatest accepted mean residual of the patches [CIEDE2000]")
     ] = 15.0
     min_explained: Annotated[
-        float,
-        Meta(ge=0, le=1, description="least share of the chart's variance that 24 flat patches explain"),
+        float, Meta(ge=0, le=1, description="least share of the chart's variance that 24 flat patches explain")
     ] = 0.9
     patch_share: Annotated[float, Meta(ge=0.2, le=0.95, description="sampled share of each patch's side")] = 0.6
 
@@ -82,31 +82,29 @@ def measure(
         if request.profile is None:
             raise ChartError("a color profile is needed; name its file with --chart FILE")
         return replace(request.profile, source="profile", place=None)
-    if request.mode == "corners":
-        found = _at_corners(radiance, reference, request.corners, settings)
-    else:
-        found = _search(radiance, reference, settings)
-    found, edition = _edition(radiance, found, reference, settings)
-    fit, predicted = found.seen.fit, patches.cross_validate(found.seen, edition)
+    finder = _ChartFinder(radiance, reference, settings)
+    found = finder.at_corners(request.corners) if request.mode == "corners" else finder.search()
+    edition = finder.edition(found)
+    seen = found.seen if edition is reference else replace(finder, reference=edition).find(found.place).seen
+    fit, predicted = seen.fit, patches.cross_validate(seen, edition)
     if edition.surroundings is not None:
-        at, share = edition.surroundings.center, settings.patch_share
-        around = patches.sample(radiance.value[0], radiance.quality[0], found.place, share, at)
-        fit, predicted = patches.fit_with_surroundings(found.seen, around, edition)
+        around = finder.sample(found.place, edition.surroundings.center)
+        fit, predicted = patches.fit_with_surroundings(seen, around, edition)
     return ColorCalibration(
         matrix=fit.matrix,
         source="corners" if request.mode == "corners" else "chart",
         cost=found.cost,
         metres_per_px=_scale(found.place, radiance.view, settings.chart_width_m),
         place=ChartPlace(found.place.quads(settings.patch_share), found.place.corners()),
-        light=chart_light.measure(found.place, radiance.view, fit.slope, found.error),
+        light=chart_light.measure(found.place, radiance.view, fit.slope, seen.error),
         patches=PatchColors(
-            delta_e=fit.delta_e[: len(found.seen.use)],
-            use=found.seen.use,
+            delta_e=fit.delta_e[: len(seen.use)],
+            use=seen.use,
             predicted=predicted,
             falloff=(float(fit.slope[0]), float(fit.slope[1])),
             glare=fit.glare,
             edition=edition.name,
-            surroundings=None if edition.surroundings is None else fit.delta_e[len(found.seen.use) :],
+            surroundings=None if edition.surroundings is None else fit.delta_e[len(seen.use) :],
         ),
     )
 
@@ -117,181 +115,162 @@ class _Find:
 
     place: Placement
     seen: ChartFit
-    cost: float  # the detector's; NaN at corners from the user
-
-    @property
-    def error(self) -> float:
-        return self.seen.mean
+    cost: float = float("nan")  # the detector's; NaN at corners from the user
 
 
-def _search(radiance: AngleStack, reference: ChartReference, settings: WhitebalanceSettings) -> _Find:
-    """Search the chart in the reference shot: the first candidate with a small color residual, else the best one."""
-    finds: list[_Find] = []
-    cheapest, small_px = np.inf, 0.0
-    exposed: ChartError | None = None
-    for centers, cost in chart_search.candidates(radiance.value[0], reference.is_block):
-        cheapest = min(cheapest, cost)
-        start = chart.from_centers(centers)
-        if cost > settings.max_cost or not chart.is_view(start.homography):
-            continue
-        place = chart.refine(radiance.value[0], start)
-        if not _plausible(place, settings.min_explained - _SMALL_PART):
-            if place.explained >= settings.min_explained:
-                small_px = max(small_px, place.pitch_px)
-            continue
-        try:
-            way = _read(radiance, place, reference, settings, cost)
-        except ChartError as error:
-            exposed = error
-            continue
-        most = np.inf if place.explained >= settings.min_explained else settings.max_delta_e / 3
-        finds += [way] if way.error <= most else []
-        if any(find.error <= settings.max_delta_e / 2 for find in finds):  # otherwise a later picture may be better
-            break
-    best = min(finds, key=lambda find: find.error, default=None)
-    if best is not None and best.error <= settings.max_delta_e:
-        return best
-    if exposed is not None:
-        raise exposed
-    scale = radiance.view.scale
-    if best is not None:
-        why = f"best mean residual ΔE {best.error:.1f}, whitebalance.max_delta_e = {settings.max_delta_e:g}"
-    elif 0 < small_px < _LEAST_PITCH_PX:
-        why = (
-            f"its patches are spaced by {small_px * scale:.0f} RAW px, at least {_LEAST_PITCH_PX * scale:.0f} are "
-            "needed: show it larger"
-        )
-    elif cheapest == np.inf:
-        why = "the detector found nothing like it"
-    elif cheapest > settings.max_cost:
-        why = f"best detector cost {cheapest:.3f}, limit whitebalance.max_cost = {settings.max_cost:g}"
-    else:
-        why = f"the best candidate (cost {cheapest:.3f}) does not show 6 × 4 patches on a dark card"
-    name = "ColorChecker SG" if reference.is_block else "ColorChecker Classic"
-    raise ChartError(f"no {name} in the reference shot, at any scale or exposure ({why}); {_REMEDY}", why)
+@dataclass(frozen=True)
+class _ChartFinder:
+    """Locates a chart in the reference shot, and judges its place by the fit of its colors."""
 
+    radiance: AngleStack
+    reference: ChartReference
+    settings: WhitebalanceSettings
 
-def _read(
-    radiance: AngleStack, place: Placement, reference: ChartReference, settings: WhitebalanceSettings, cost: float
-) -> _Find:
-    """The chart at a place, either way up: that with the smaller color residual; of a ColorChecker SG its block."""
-    ways = [place, place.turned()]  # the detector may see it upside down
-    if reference.is_block:
-        block = chart.refine(radiance.value[0], _sg_block(radiance, place, reference, settings))
-        ways = [block if _plausible(block, settings.min_explained) else place]
-    finds, exposed = list[_Find](), ChartError("")
-    for way in ways:
-        try:
-            finds.append(_find(radiance, way, reference, settings, cost))
-        except ChartError as error:
-            exposed = error
-    if not finds:
-        raise exposed
-    return min(finds, key=lambda find: find.error)
-
-
-def _sg_block(
-    radiance: AngleStack, place: Placement, reference: ChartReference, settings: WhitebalanceSettings
-) -> Placement:
-    """Find the block of a ColorChecker SG: of the 6 × 4 patches around a place that with the least color residual.
-
-    Any 6 × 4 patches of an SG look like its block to the detector, and may be upside down. Raises ChartError.
-    """
-    column, row = (grid.ravel() for grid in np.meshgrid(np.arange(-4, 10), np.arange(-5, 9)))
-    around = np.stack([column, row], axis=-1) + 0.5
-    seen = patches.sample(radiance.value[0], radiance.quality[0], place, settings.patch_share, around)
-    found, exposed = list[tuple[float, Placement]](), ChartError("")
-    for right, down in itertools.product(range(-4, 5), range(-5, 6)):
-        inside = (column >= right) & (column < right + chart.COLUMNS) & (row >= down) & (row < down + chart.ROWS)
-        block, samples = place.shifted(right, down), seen.select(inside)
-        ways = [(block, samples)] if down < 2 else []  # the block is in rows 2 to 5 of ten
-        ways += [(block.turned(), samples.turned())] if down > -2 else []
-        for way, colors in ways:
+    def search(self) -> _Find:
+        """Search the chart: the first candidate with a small color residual, else the best one. Raises ChartError."""
+        settings, picture = self.settings, self.radiance.value[0]
+        finds: list[_Find] = []
+        cheapest, small_px = np.inf, 0.0
+        exposed: ChartError | None = None
+        for centers, cost in chart_search.candidates(picture, self.reference.is_block):
+            cheapest = min(cheapest, cost)
+            start = chart.from_centers(centers)
+            if cost > settings.max_cost or not chart.is_view(start.homography):
+                continue
+            place = chart.refine(picture, start)
+            explained = place.explained >= settings.min_explained
+            if not _plausible(place, settings.min_explained - _SMALL_PART):
+                small_px = max(small_px, place.pitch_px) if explained else small_px
+                continue
             try:
-                found.append((patches.fit(colors, reference).mean, way))
+                find = self._find_either_way_up(place, cost)
             except ChartError as error:
                 exposed = error
-    if not found:
-        raise exposed
-    return min(found, key=lambda one: one[0])[1]
+                continue
+            if explained or find.seen.error <= settings.max_delta_e / 3:
+                finds.append(find)
+            if any(find.seen.error <= settings.max_delta_e / 2 for find in finds):  # else a later one may be better
+                break
+        best = min(finds, key=lambda find: find.seen.error, default=None)
+        if best is not None and best.seen.error <= settings.max_delta_e:
+            return best
+        if exposed is not None:
+            raise exposed
+        scale = self.radiance.view.scale
+        if best is not None:
+            why = f"best mean residual ΔE {best.seen.error:.1f}, whitebalance.max_delta_e = {settings.max_delta_e:g}"
+        elif 0 < small_px < _LEAST_PITCH_PX:
+            why = (
+                f"its patches are spaced by {small_px * scale:.0f} RAW px, at least {_LEAST_PITCH_PX * scale:.0f} are "
+                "needed: show it larger"
+            )
+        elif cheapest == np.inf:
+            why = "the detector found nothing like it"
+        elif cheapest > settings.max_cost:
+            why = f"best detector cost {cheapest:.3f}, limit whitebalance.max_cost = {settings.max_cost:g}"
+        else:
+            why = f"the best candidate (cost {cheapest:.3f}) does not show 6 × 4 patches on a dark card"
+        name = "ColorChecker SG" if self.reference.is_block else "ColorChecker Classic"
+        raise ChartError(f"no {name} in the reference shot, at any scale or exposure ({why}); {_REMEDY}", why)
 
+    def _find_either_way_up(self, place: Placement, cost: float) -> _Find:
+        """The chart at a place, read either way up; of a ColorChecker SG its block. Raises ChartError."""
+        ways = [place, place.turned()]  # the detector may see it upside down
+        if self.reference.is_block:
+            block = chart.refine(self.radiance.value[0], self._sg_block(place))
+            ways = [block if _plausible(block, self.settings.min_explained) else place]
+        return replace(self._best((way, self.sample(way)) for way in ways), cost=cost)
 
-def _at_corners(
-    radiance: AngleStack, reference: ChartReference, corners_px: Floats | None, settings: WhitebalanceSettings
-) -> _Find:
-    """Locate the chart at corners (4, 2) RAW px from the user, refined in the picture where that is plausible.
+    def _sg_block(self, place: Placement) -> Placement:
+        """Find the block of a ColorChecker SG: of the 6 × 4 patches around a place those with the best colors.
 
-    Raises ChartError: there are not four corners; they are not clockwise, outside the picture, or too close together;
-    or the colors between them are not those of a chart.
-    """
-    if corners_px is None or np.shape(corners_px) != (4, 2):
-        raise ChartError("--chart needs the four outer corners of the patches x0,y0,…,x3,y3, clockwise from dark skin")
-    height, width = radiance.value.shape[1:3]
-    scale = radiance.view.scale
-    corners = to_grid(np.asarray(corners_px, np.float64), scale)
-    placement = chart.from_corners(corners)
-    if reference.surroundings is not None and _shows_more(radiance, corners, reference, settings):
-        placement = chart.from_sg_corners(corners)
-    stated = "chart corners " + ", ".join(f"({x:g}, {y:g})" for x, y in corners_px)
-    if not chart.is_view(placement.homography):
-        raise ChartError(f"{stated} are not clockwise; start at the dark-skin patch and go along its row")
-    if (corners < -0.5).any() or (corners > np.array([width, height]) - 0.5).any():
-        raise ChartError(f"{stated} are outside the picture of {width * scale:g} × {height * scale:g} px; check them")
-    if placement.pitch_px < _LEAST_PITCH_PX:
-        raise ChartError(
-            f"{stated} space the patches by {placement.pitch_px:.1f} px on the merged image, at least "
-            f"{_LEAST_PITCH_PX:g} are needed; show the chart larger, or demosaic at full size"
-        )
-    refined = chart.refine(radiance.value[0], placement)
-    moved = float(np.abs(refined.corners() - placement.corners()).max()) / placement.pitch_px
-    place = refined if _plausible(refined, settings.min_explained) and moved < _MOST_MOVED else placement
-    find = _find(radiance, place, reference, settings)
-    if find.error > settings.max_delta_e:
-        turned = _find(radiance, place.turned(), reference, settings)
-        upside_down = turned.error <= settings.max_delta_e
-        remedy = "the chart is upside down: start from the opposite corner" if upside_down else "check them"
-        raise ChartError(
-            f"{stated} do not show a ColorChecker Classic: mean color residual ΔE {find.error:.1f}, "
-            f"limit whitebalance.max_delta_e = {settings.max_delta_e:g}; {remedy}"
-        )
-    return find
+        Any 6 × 4 patches of an SG look like its block to the detector, and may be upside down. Raises ChartError.
+        """
+        column, row = (grid.ravel() for grid in np.meshgrid(np.arange(-4, 10), np.arange(-5, 9)))
+        seen = self.sample(place, np.stack([column, row], axis=-1) + 0.5)
+        ways = []
+        for right, down in itertools.product(range(-4, 5), range(-5, 6)):
+            inside = (column >= right) & (column < right + chart.COLUMNS) & (row >= down) & (row < down + chart.ROWS)
+            block, samples = place.shifted(right, down), seen.select(inside)
+            if down < 2:  # the block is in rows 2 to 5 of ten
+                ways.append((block, samples))
+            if down > -2:
+                ways.append((block.turned(), samples.turned()))
+        return self._best(ways).place
 
+    def _best(self, ways: Iterable[tuple[Placement, PatchSamples]]) -> _Find:
+        """The chart at the place with the smallest color residual. Raises ChartError: too few patches at each place."""
+        finds, failed = list[_Find](), ChartError("")
+        for place, samples in ways:
+            try:
+                finds.append(_Find(place, patches.fit(samples, self.reference)))
+            except ChartError as error:
+                failed = error
+        if not finds:
+            raise failed
+        return min(finds, key=lambda find: find.seen.error)
 
-def _shows_more(
-    radiance: AngleStack, corners: Floats, reference: ChartReference, settings: WhitebalanceSettings
-) -> bool:
-    """Whether corners (4, 2) px from the user enclose a whole ColorChecker SG, not its block, judged by the colors."""
-    errors = []
-    for place in (chart.from_corners(corners), chart.from_sg_corners(corners)):
+    def at_corners(self, corners_px: Floats | None) -> _Find:
+        """Locate the chart at corners (4, 2) RAW px from the user, refined in the picture where that is plausible.
+
+        Raises ChartError: there are not four corners; they are not clockwise, outside the picture, or too close
+        together; or the colors between them are not those of a chart.
+        """
+        if corners_px is None or np.shape(corners_px) != (4, 2):
+            raise ChartError(
+                "--chart needs the four outer corners of the patches x0,y0,…,x3,y3, clockwise from dark skin"
+            )
+        height, width = self.radiance.value.shape[1:3]
+        scale = self.radiance.view.scale
+        corners = to_grid(np.asarray(corners_px, np.float64), scale)
+        start = chart.from_corners(corners)
+        if self.reference.surroundings is not None:  # the corners may be those of the whole SG, or of its block
+            start = min(start, chart.from_sg_corners(corners), key=self._error)
+        stated = "chart corners " + ", ".join(f"({x:g}, {y:g})" for x, y in corners_px)
+        if not chart.is_view(start.homography):
+            raise ChartError(f"{stated} are not clockwise; start at the dark-skin patch and go along its row")
+        if (corners < -0.5).any() or (corners > np.array([width, height]) - 0.5).any():
+            raise ChartError(
+                f"{stated} are outside the picture of {width * scale:g} × {height * scale:g} px; check them"
+            )
+        if start.pitch_px < _LEAST_PITCH_PX:
+            raise ChartError(
+                f"{stated} space the patches by {start.pitch_px:.1f} px on the merged image, at least "
+                f"{_LEAST_PITCH_PX:g} are needed; show the chart larger, or demosaic at full size"
+            )
+        refined = chart.refine(self.radiance.value[0], start)
+        moved = float(np.abs(refined.corners() - start.corners()).max()) / start.pitch_px
+        find = self.find(refined if _plausible(refined, self.settings.min_explained) and moved < _MOST_MOVED else start)
+        if find.seen.error > self.settings.max_delta_e:
+            upside_down = self.find(find.place.turned()).seen.error <= self.settings.max_delta_e
+            remedy = "the chart is upside down: start from the opposite corner" if upside_down else "check them"
+            raise ChartError(
+                f"{stated} do not show a ColorChecker Classic: mean color residual ΔE {find.seen.error:.1f}, "
+                f"limit whitebalance.max_delta_e = {self.settings.max_delta_e:g}; {remedy}"
+            )
+        return find
+
+    def find(self, place: Placement) -> _Find:
+        """Sample and fit the chart's colors at a place. Raises ChartError: too few patches are usable."""
+        return _Find(place, patches.fit(self.sample(place), self.reference))
+
+    def _error(self, place: Placement) -> float:
+        """Color residual of the chart at a place; infinite if too few patches are usable."""
         try:
-            errors.append(_find(radiance, place, reference, settings).error)
-        except ChartError:  # too few patches are usable
-            errors.append(np.inf)
-    return errors[1] < errors[0]
+            return self.find(place).seen.error
+        except ChartError:
+            return np.inf
 
+    def sample(self, place: Placement, at: Floats | None = None) -> PatchSamples:
+        """Sample the patches of the chart, or those with centers `at` (N, 2) in chart coordinates."""
+        return patches.sample(self.radiance.value[0], self.radiance.quality[0], place, self.settings.patch_share, at)
 
-def _find(
-    radiance: AngleStack,
-    place: Placement,
-    reference: ChartReference,
-    settings: WhitebalanceSettings,
-    cost: float = float("nan"),
-) -> _Find:
-    """Sample and fit the colors of a chart at a place of the reference shot; `cost` is the detector's."""
-    samples = patches.sample(radiance.value[0], radiance.quality[0], place, settings.patch_share)
-    return _Find(place, patches.fit(samples, reference), cost)
-
-
-def _edition(
-    radiance: AngleStack, found: _Find, reference: ChartReference, settings: WhitebalanceSettings
-) -> tuple[_Find, ChartReference]:
-    """Choose the edition of the chart (by year of manufacture) with the colors that fit best."""
-    residuals = [patches.residual(found.seen, other) for other in (reference, *reference.editions)]
-    least = int(np.argmin(residuals))
-    if residuals[least] >= _CLEARLY_BETTER * residuals[0]:
-        return found, reference
-    edition = reference.editions[least - 1]
-    return _find(radiance, found.place, edition, settings, found.cost), edition
+    def edition(self, found: _Find) -> ChartReference:
+        """Choose the edition of the chart (by year of manufacture) with the colors that fit best."""
+        editions = (self.reference, *self.reference.editions)
+        residuals = [patches.residual(found.seen, edition) for edition in editions]
+        least = int(np.argmin(residuals))
+        return editions[least] if residuals[least] < _CLEARLY_BETTER * residuals[0] else self.reference
 
 
 def _plausible(place: Placement, min_explained: float) -> bool:

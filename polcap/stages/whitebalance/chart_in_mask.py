@@ -44,7 +44,7 @@ def _is_chart(radiance: AngleStack, part: Bools, reference: ChartReference) -> b
     seen = patches.sample(radiance.value[0], radiance.quality[0], place, _PATCH_SHARE)
     for way in (seen, seen.turned()):
         try:
-            if patches.fit(way, reference).mean < _DELTA_E:
+            if patches.fit(way, reference).error < _DELTA_E:
                 return True
         except ChartError:  # too few of its patches are usable
             continue

@@ -41,7 +41,7 @@ class ChartFit:
 
     fit: color_matrix.MatrixFit
     use: Bits  # (24,) PatchUse
-    mean: float  # mean ΔE2000 of all unclipped patches, excluded ones too: decides whether it is a chart
+    error: float  # mean ΔE2000 of all unclipped patches, excluded ones too: decides whether it is a chart
     color: Floats  # (24, 3) S0 of the patches, camera channels
 
 

@@ -39,11 +39,19 @@ def ramp(height, width, low=20.0, high=1.2e5, ripple=0.2):
     return level[..., None] * np.array([0.6, 1.0, 0.7])
 
 
+def through_filter(light):
+    """The light (H, W) of each photosite of a picture (H, W, 3)."""
+    colors = np.tile(RGGB, (light.shape[0] // 2, light.shape[1] // 2))[..., None].astype(int)
+    return np.take_along_axis(light, colors, 2)[..., 0]
+
+
 def expose(quads, exposure, rng, iso=100.0):
-    """One mosaic frame: Poisson light, read noise, gain of the ISO, rounding, clipping."""
-    light = np.empty((2 * quads.shape[0], 2 * quads.shape[1]))
-    for i, j in np.ndindex(2, 2):
-        light[i::2, j::2] = quads[..., RGGB[i, j]] * exposure
+    """One mosaic frame of quads (h, w, 3); see `record`."""
+    return record(through_filter(quads.repeat(2, 0).repeat(2, 1)) * exposure, rng, iso)
+
+
+def record(light, rng, iso=100.0):
+    """One frame of expected electrons (H, W): Poisson light, read noise, gain of the ISO, rounding, clipping."""
     counts = (rng.poisson(light) + rng.normal(0, READ, light.shape)) / (GAIN * 100 / iso) + BLACK
     value = np.clip(np.round(counts), 0, WHITE).astype(np.uint16)
     value.setflags(write=False)
@@ -68,10 +76,12 @@ def capture(*shots, ambient=()):
     )  # fmt: skip
 
 
-def scores(stack, truth, shot=0):
-    """z of the pixels that are not clipped, (N, 3)."""
-    clear = (stack.quality[shot] & Quality.CLIPPED) == 0
-    return ((stack.value[shot] - truth) / np.sqrt(stack.variance[shot]))[clear]
+def check_errors(stack, truth):
+    """The errors of the first shot's unclipped pixels over their 1σ have mean 0 and variance 1."""
+    clear = (stack.quality[0] & Quality.CLIPPED) == 0
+    z = ((stack.value[0] - truth) / np.sqrt(stack.variance[0]))[clear]
+    assert abs(z.mean()) < 0.05
+    assert abs(z.var() - 1) < 0.1
 
 
 def electrons_to_signal(electrons, iso=100.0):

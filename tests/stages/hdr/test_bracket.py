@@ -7,7 +7,7 @@ import pytest
 
 from polcap.capture_values import Shot
 from polcap.errors import CaptureError
-from polcap.image_values import Quality, SensorImage
+from polcap.image_values import Quality
 from polcap.optics.registration import squared_gradient
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.stages import hdr
@@ -15,12 +15,7 @@ from polcap.stages.hdr import noise
 from polcap.stages.hdr.bracket import Bracket, compare
 from polcap.stages.hdr.planes import Reader, signals
 from tests.stages.hdr.brackets import (
-    BLACK,
     DATA,
-    GAIN,
-    READ,
-    RGGB,
-    WHITE,
     capture,
     decode,
     electrons_to_signal,
@@ -28,6 +23,8 @@ from tests.stages.hdr.brackets import (
     merge,
     needs_data,
     raw_file,
+    record,
+    through_filter,
 )
 
 
@@ -47,11 +44,7 @@ def photograph(exposure, rng, matrix=None, size=(640, 800)):
     if matrix is not None:
         p = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(matrix).T
         x, y = p[..., 0] / p[..., 2], p[..., 1] / p[..., 2]
-    light = np.take_along_axis(scene(x, y), np.tile(RGGB, (size[0] // 2, size[1] // 2))[..., None].astype(int), 2)[
-        ..., 0
-    ]
-    counts = (rng.poisson(light * exposure) + rng.normal(0, READ, light.shape)) / GAIN + BLACK
-    return SensorImage(np.clip(np.round(counts), 0, WHITE).astype(np.uint16), np.full((2, 2), BLACK), WHITE, RGGB)
+    return record(through_filter(scene(x, y)) * exposure, rng)
 
 
 def turned(dx, dy, degrees):
@@ -73,7 +66,7 @@ def test_hand_held_bracket_is_registered(hand):
     still = merge(capture([frames[1]]), hdr.HdrSettings())
     np.testing.assert_allclose(stack.bracket.exposure_ratio[0, :, 1], [0.25, 1, 4], rtol=1e-3)
     assert stack.bracket.ghost_fraction[0] < 1e-3
-    y, x = np.mgrid[:640, :800].astype(float)
+    y, x = np.mgrid[:640, :800]
     full = scene(x, y)
     truth = np.stack([full[0::2, 0::2, 0], (full[0::2, 1::2, 1] + full[1::2, 0::2, 1]) / 2, full[1::2, 1::2, 2]], -1)
     inner = np.s_[20:-20, 20:-20]
@@ -90,9 +83,8 @@ def test_tripod_bracket_is_not_resampled():
     rng = np.random.default_rng(9)
     frames = [frame(photograph(e, rng), iso=100.0) for e in (0.25, 1, 4)]
     stack = merge(capture(frames), hdr.HdrSettings())
-    y, x = np.mgrid[:640, :800].astype(float)
-    full = scene(x, y)
-    error = stack.value[0, ..., 0] - electrons_to_signal(full[0::2, 0::2, 0])
+    y, x = np.mgrid[:640:2, :800:2]
+    error = stack.value[0, ..., 0] - electrons_to_signal(scene(x, y)[..., 0])
     z = error / np.sqrt(stack.variance[0, ..., 0])
     assert abs(np.mean(z[:, 1:] * z[:, :-1])) < 5 / np.sqrt(z.size)
     assert abs(z.var() - 1) < 0.1

@@ -24,9 +24,10 @@ def test_ratio_within_its_own_sigma_and_a_thousandth(factor):
     rng = np.random.default_rng(0)
     z = []
     for _ in range(6):
-        found = ratio(planes(picture(rng, 1)), planes(picture(rng, factor)))
-        z.append((found.value / factor - 1) / found.sigma)
-        assert np.all(np.abs(found.value / factor - 1) < max(1e-3, 4 * found.sigma.max()))
+        a, b = exposure.common_tiles(planes(picture(rng, 1)), planes(picture(rng, factor)))
+        found, sigma = np.transpose([exposure._quotient(a[:, c], b[:, c]) for c in range(3)])
+        z.append((found / factor - 1) / sigma)
+        assert np.all(np.abs(found / factor - 1) < max(1e-3, 4 * sigma.max()))
     assert np.sqrt(np.mean(np.square(z))) < 1.7  # 18 values
 
 
@@ -35,21 +36,20 @@ def test_each_channel_has_its_own_ratio():
     rng = np.random.default_rng(1)
     tint = np.array([0.48, 0.5, 0.53])
     found = ratio(planes(picture(rng, 1)), planes(picture(rng, tint)))
-    np.testing.assert_allclose(found.value, tint, rtol=1e-3)
+    np.testing.assert_allclose(found, tint, rtol=1e-3)
 
 
-def test_what_moved_does_not_count():
+def test_moved_things_do_not_count():
     rng = np.random.default_rng(2)
     a, b = picture(rng, 1), picture(rng, 0.5)
     b[40:120, 100:300] *= 1.6  # an eighth of the picture
-    found = ratio(planes(a), planes(b))
-    np.testing.assert_allclose(found.value, 0.5, rtol=1.5e-3)
+    np.testing.assert_allclose(ratio(planes(a), planes(b)), 0.5, rtol=1.5e-3)
 
 
 def test_unusable_pixels_do_not_count():
     rng = np.random.default_rng(3)
     a, b = picture(rng, 1), np.minimum(picture(rng, 4), 0.98)
-    np.testing.assert_allclose(ratio(planes(a), planes(b, (b < 0.9).all(axis=2))).value, 4, rtol=2e-3)
+    np.testing.assert_allclose(ratio(planes(a), planes(b, (b < 0.9).all(axis=2))), 4, rtol=2e-3)
 
 
 def test_too_few_bright_tiles_give_no_answer():

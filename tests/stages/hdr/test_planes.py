@@ -1,24 +1,16 @@
 """Memory bounds how many frames are held, never what comes out."""
 
 import weakref
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from polcap.capture_values import Exif
 from polcap.errors import SettingError
-from polcap.image_values import SensorImage
 from polcap.stages import hdr
 from polcap.stages.hdr import planes
-from tests.stages.hdr.brackets import (
-    PicturedFrame,
-    capture,
-    expose,
-    frame,
-    merge,
-    ramp,
-)
+from tests.stages.hdr.brackets import PicturedFrame, capture, expose, frame, merge, ramp
 
 
 def test_little_memory_gives_the_same_pixels_and_less_is_refused_by_its_least(monkeypatch):
@@ -41,25 +33,23 @@ def test_frames_stream(monkeypatch):
     """With room for three decoded frames, never more than these and the next are alive, of nine."""
     monkeypatch.setattr(planes, "plan_memory", lambda *_: planes.MemoryPlan(frames=3 * 2 * 256 * 256))
     quads = ramp(256, 256, high=2e4)
-    alive: weakref.WeakSet[Any] = weakref.WeakSet()
-    most = 0
+    alive, most = 0, 0
+
+    def freed():
+        nonlocal alive
+        alive -= 1
 
     def lazily(exposure, seed):
         def load():
-            nonlocal most
+            nonlocal alive, most
             image = expose(quads, exposure, np.random.default_rng(seed))
             array = np.array(image.value)  # weak references need an owner of memory
-            holder = SensorImage(array, image.black, image.white, image.cfa)
-            alive.add(_Tracked(array))
-            most = max(most, sum(1 for t in alive))
-            return holder
+            weakref.finalize(array, freed)
+            alive += 1
+            most = max(most, alive)
+            return replace(image, value=array)
 
         return PicturedFrame("x", Exif(iso=100.0), "shot", "", load=load)
-
-    class _Tracked:
-        def __init__(self, array):
-            weakref.finalize(array, lambda: alive.discard(self))
-            self.array_id = id(array)
 
     merge(capture([lazily(e, k) for k, e in enumerate(np.geomspace(0.2, 4, 9))]), hdr.HdrSettings())
     assert most <= 4  # one is being decoded

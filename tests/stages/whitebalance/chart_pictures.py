@@ -5,11 +5,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from polcap.chart_values import ChartRequest
+from polcap.chart_values import ChartReference, ChartRequest, ColorCalibration
 from polcap.formats import shipped_data
 from polcap.image_values import Floats, Quality, View
 from polcap.optics.projection import transform_points
 from polcap.stage_values import AngleStack, ColorSensor, single_frames
+from polcap.stages import whitebalance
 
 CLASSIC = shipped_data.colorchecker()
 CAMERA = np.array([[0.28, 0.10, 0.07], [0.08, 0.71, 0.22], [0.02, 0.18, 0.66]])  # linear Rec.709 → S0 in camera
@@ -63,6 +64,14 @@ def stack(image: Floats, view: View | None = None, clip: float = np.inf, sensor:
         bracket=single_frames(1),
         sensor=sensor,
     )
+
+
+def measure(
+    image: Floats | AngleStack, request: ChartRequest = AUTO, reference: ChartReference = CLASSIC, **settings: Any
+) -> ColorCalibration:
+    """The calibration of one shot, or of an image (H, W, 3) as the only shot."""
+    shot = image if isinstance(image, AngleStack) else stack(image)
+    return whitebalance.measure(shot, reference, request, whitebalance.WhitebalanceSettings(**settings))
 
 
 def photograph(homography: Floats, colors: Floats = CLASSIC.rec709, seed: int = 0, **drawing: Any) -> Floats:

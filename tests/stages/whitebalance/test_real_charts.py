@@ -14,9 +14,7 @@ from polcap.errors import ChartError
 from polcap.image_values import Floats, View
 from polcap.optics.color import decode_srgb
 from polcap.stage_values import AngleStack
-from polcap.stages import whitebalance
-from polcap.stages.whitebalance import WhitebalanceSettings
-from tests.stages.whitebalance.chart_pictures import AUTO, CLASSIC, stack
+from tests.stages.whitebalance.chart_pictures import CLASSIC, measure, stack
 
 DATA = os.environ.get("POLCAP_DATA")
 needs_data = pytest.mark.skipif(not DATA, reason="POLCAP_DATA is not set: no real charts")
@@ -81,7 +79,7 @@ def corners_off(color: ColorCalibration, marked: tuple[tuple[float, float], ...]
 @needs_data
 @pytest.mark.parametrize("path", PHOTOS, ids=lambda path: path.stem)
 def test_classic_is_found_in_every_real_photograph(path):
-    color = whitebalance.measure(photo(path), CLASSIC, AUTO, WhitebalanceSettings())
+    color = measure(photo(path))
     linear = path.stem in ("TL84_colorchecker", "exposure30")  # not gamma-encoded: decoding them bends their greys
     assert np.nanmean(color.patches.delta_e) < (14 if linear else 7)
     assert corners_off(color, MARKED[path.stem]) < _MARK
@@ -90,7 +88,7 @@ def test_classic_is_found_in_every_real_photograph(path):
 @needs_data
 @pytest.mark.parametrize(("name", "fitted", "ahead"), [("CRW_0101.CRW", 2.6, 3.2), ("P003910.KDC", 5.0, 6.0)])
 def test_classic_is_found_in_real_raw_files(name, fitted, ahead):
-    color = whitebalance.measure(stack(superpixels(REAL / "raw_chart" / name)), CLASSIC, AUTO, WhitebalanceSettings())
+    color = measure(stack(superpixels(REAL / "raw_chart" / name)))
     assert np.nanmean(color.patches.delta_e) < fitted
     assert np.nanmean(color.patches.predicted) < ahead
     assert corners_off(color, MARKED[name]) < _MARK
@@ -99,7 +97,7 @@ def test_classic_is_found_in_real_raw_files(name, fitted, ahead):
 @needs_data
 def test_a_chart_of_18_patches_is_refused():
     with pytest.raises(ChartError, match="no ColorChecker Classic"):
-        whitebalance.measure(photo(REAL / "charts" / "1.png"), CLASSIC, AUTO, WhitebalanceSettings())
+        measure(photo(REAL / "charts" / "1.png"))
 
 
 def rendered(name: str) -> tuple[AngleStack, dict[str, Any], dict[str, Any]]:
@@ -122,7 +120,7 @@ def rendered(name: str) -> tuple[AngleStack, dict[str, Any], dict[str, Any]]:
 def test_path_traced_chart_is_found_and_its_camera_matrix_recovered(name):
     radiance, meta, truth = rendered(name)
     printed = ChartReference("as rendered", np.array(meta["chart"]["reference_linear_srgb"]), CLASSIC.size_m)
-    color = whitebalance.measure(radiance, printed, AUTO, WhitebalanceSettings(chart_width_m=0.0165 * 5.862))
+    color = measure(radiance, reference=printed, chart_width_m=0.0165 * 5.862)
     true = (np.array(meta["chart"]["patch_corners_px"]) - 1) / 2  # RAW px with centers on +½ → binned px
     error = np.linalg.norm(color.place.quads.mean(axis=1) - true.mean(axis=1), axis=-1)
     assert np.median(error) < 0.05 and error.max() < 0.15
@@ -141,4 +139,4 @@ def test_path_traced_scene_without_its_chart_is_refused(name):
     image = radiance.value[0]
     rest = image[:, :x0] if x0 > image.shape[1] - x1 else image[:, x1:]
     with pytest.raises(ChartError, match="no ColorChecker Classic"):
-        whitebalance.measure(stack(rest), CLASSIC, AUTO, WhitebalanceSettings())
+        measure(stack(rest))

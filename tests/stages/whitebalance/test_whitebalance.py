@@ -2,7 +2,6 @@
 
 import functools
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,21 +12,20 @@ from polcap.errors import ChartError
 from polcap.formats import shipped_data
 from polcap.image_values import Floats, View
 from polcap.optics.projection import transform_points
-from polcap.stage_values import AngleStack, ColorSensor
-from polcap.stages import whitebalance
-from polcap.stages.whitebalance import WhitebalanceSettings, chart, chart_in_mask, patches
-from tests.stages.whitebalance.chart_pictures import AUTO, CAMERA, CLASSIC, HEIGHT, WIDTH, draw, photograph, pose, stack
-
-
-def measure(
-    image: Floats | AngleStack,
-    request: ChartRequest = AUTO,
-    reference: ChartReference = CLASSIC,
-    **settings: Any,
-) -> ColorCalibration:
-    """The calibration of one shot, or of an image (H, W, 3) as the only shot."""
-    shot = image if isinstance(image, AngleStack) else stack(image)
-    return whitebalance.measure(shot, reference, request, WhitebalanceSettings(**settings))
+from polcap.stage_values import ColorSensor
+from polcap.stages.whitebalance import chart, chart_in_mask, patches
+from tests.stages.whitebalance.chart_pictures import (
+    AUTO,
+    CAMERA,
+    CLASSIC,
+    HEIGHT,
+    WIDTH,
+    draw,
+    measure,
+    photograph,
+    pose,
+    stack,
+)
 
 
 @functools.cache
