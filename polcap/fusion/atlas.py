@@ -1,8 +1,6 @@
 """Texture atlas of a closed mesh: charts without overlap, and the surface point of each texel.
 
-References
-----------
-uvunwrap (segmentation into charts of low distortion, packing by shape).
+A chart is a piece of the surface that lies flat in the texture. The package uvunwrap cuts and packs them.
 """
 
 from collections.abc import Callable
@@ -20,6 +18,7 @@ from polcap.fusion.values import ClosedMesh, FusionView
 from polcap.image_values import Bools, Floats
 from polcap.mesh_values import Mesh
 from polcap.optics import frames
+from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.optics.texture_rasterizer import rasterize
 from polcap.optics.vertex_frames import area_vectors, vertex_normals, vertex_tangents
 from polcap.stages import stage
@@ -53,6 +52,10 @@ class Atlas:
         """Side of a texel on the surface, m."""
         return float(np.sqrt(_area(self.mesh) / max(len(self.position), 1)))
 
+    def tracer(self) -> Tracer:
+        """The mesh prepared for ray tracing."""
+        return Tracer(Triangles(self.mesh.vertices, self.mesh.faces, self.mesh.normals[self.mesh.faces]))
+
 
 @stage(version=3)
 def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSettings) -> Atlas:
@@ -61,12 +64,9 @@ def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSetti
     The mesh is reduced to a triangle for four pixels of the views' maps: smaller ones would cut it into charts of a few
     texels. Without a set size, the side is the least power of two whose texels are no larger than these pixels.
 
-    A mesh that cannot be charted is reduced further.
-
-    Raises SettingError: the package uvunwrap is missing, or the charts do not fit into a texture of this size.
-    Raises ObjectError: the mesh has no charts.
+    Raises SettingError, ObjectError: as `chart`, for the mesh and for coarser ones.
     """
-    pixel = _pixel(mesh, views)
+    pixel = _pixel_m(mesh, views)
     count = max(min(int(_area(mesh) / (_TRIANGLE * pixel**2)), len(mesh.faces)), _FEWEST)
     return chart_reduced(mesh, count, lambda coarse: _chart_sized(coarse, pixel, settings, views[0].metric))
 
@@ -76,24 +76,21 @@ def chart_reduced(mesh: ClosedMesh, count: int, make: Callable[[ClosedMesh], Atl
 
     Raises ObjectError: it fails on all, or these are too few triangles to enclose a body.
     """
-    failure: ObjectError | None = None
     for share in _SHARES:
         coarse = decimate(mesh, int(share * count))
         try:
             return make(coarse)
         except ObjectError as error:
             failure = error
-    assert failure is not None
     raise failure
 
 
 def _chart_sized(mesh: ClosedMesh, pixel: float, settings: AtlasSettings, metric: bool) -> Atlas:
     """The atlas in the size of the settings, or in the first size with texels of at most `pixel` [m]."""
-    if settings.size:
-        return chart(mesh, settings.size, settings.margin, metric)
-    side = _side(mesh, pixel)
+    least = 2 ** np.ceil(np.log2(np.sqrt(_area(mesh) / _FILLED) / pixel))
+    side = settings.size or int(np.clip(least, *_SIDES))
     found = chart(mesh, side, settings.margin, metric)
-    while found.texel > pixel and side < _SIDES[1]:  # the margins of the charts need room, too
+    while not settings.size and found.texel > pixel and side < _SIDES[1]:  # the charts' margins need room, too
         side *= 2
         found = chart(mesh, side, settings.margin, metric)
     return found
@@ -105,10 +102,11 @@ def chart(mesh: ClosedMesh, side: int, margin: int, metric: bool = True) -> Atla
     `metric`: the mesh is in metres.
 
     Raises SettingError: the package uvunwrap is missing, or the charts do not fit into a texture of this size.
+    ObjectError: uvunwrap fails on this mesh.
     """
-    uv, corner, faces = _charts(mesh, side, margin)
-    normals = vertex_normals(mesh.vertices.astype(np.float64), mesh.faces)[corner]
-    vertices = mesh.vertices[corner].astype(np.float64)
+    uv, vertex, faces = _cut_charts(mesh, side, margin)
+    normals = vertex_normals(mesh.vertices.astype(np.float64), mesh.faces)[vertex]
+    vertices = mesh.vertices[vertex].astype(np.float64)
     unwrapped = Mesh(
         vertices=vertices.astype(np.float32),
         normals=normals.astype(np.float32),
@@ -128,7 +126,7 @@ def of_mesh(mesh: Mesh, side: int, margin: int) -> Atlas:
     return Atlas(mesh, points.covered, points.interpolate(mesh.vertices), normal, margin)
 
 
-def _charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.int32]]:
+def _cut_charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.int32]]:
     """Texture coordinates (W, 2) with v down, the mesh's vertex of each (W,), and faces (F, 3) in their numbers."""
     with package_for("a texture atlas", "uvunwrap", "fusion"):
         import uvunwrap
@@ -148,13 +146,7 @@ def _charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[n
     return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=-1), np.asarray(found.xref, np.int64), faces
 
 
-def _side(mesh: ClosedMesh, pixel: float) -> int:
-    """Least side of the texture [px], a power of two, with which a texel may be no larger than `pixel` [m]."""
-    wanted = np.log2(np.sqrt(_area(mesh) / _FILLED) / pixel)
-    return int(np.clip(2 ** np.ceil(float(wanted)), *_SIDES))
-
-
-def _pixel(mesh: ClosedMesh, views: tuple[FusionView, ...]) -> float:
+def _pixel_m(mesh: ClosedMesh, views: tuple[FusionView, ...]) -> float:
     """Side of a pixel of the views' maps at the object [m]."""
     middle = mesh.vertices.mean(axis=0)
     return float(np.median([-(one.pose.rotation @ middle + one.pose.translation)[2] / one.view.focal for one in views]))

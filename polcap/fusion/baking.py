@@ -23,10 +23,11 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from polcap.fusion.atlas import Atlas
+from polcap.fusion.small_views import sample
 from polcap.fusion.values import FusionView
 from polcap.image_values import Bools, Floats
 from polcap.optics import frames
-from polcap.optics.mesh_tracer import Tracer, Triangles
+from polcap.optics.mesh_tracer import Tracer
 from polcap.optics.morphology import masked_mean
 from polcap.optics.outline import fill_outward
 from polcap.optics.projection import project
@@ -43,6 +44,9 @@ _FLOOR_DEG = 2.0  # error of every normal, added to the expected one
 _ROUNDS = 3  # of reweighting
 _SEEN = 0.02  # least total weight of a seen texel; that of a view along the normal, far from any edge, is 1
 _MARGIN_PX = 2  # around the charts, which belongs to the mask
+# columns of a texel's values (N, 11)
+_NORMAL, DIFFUSE, SPECULAR, ROUGHNESS, WEIGHT = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10
+MATERIAL = slice(3, 10)
 
 
 class BakingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -76,7 +80,7 @@ class AtlasMaps:
         return np.asarray(self.weight > _SEEN)
 
     def texels(self, covered: Bools) -> Floats:
-        """Values (N, 11) of the covered texels, as `on_atlas` takes them."""
+        """Values (N, 11) of the covered texels: normal, diffuse, specular, roughness, weight."""
         parts = (self.normal, self.diffuse, self.specular, self.roughness, self.weight)
         return np.concatenate([part[covered].reshape(np.count_nonzero(covered), -1) for part in parts], axis=-1)
 
@@ -89,15 +93,11 @@ class VisibleTexels:
     pixel: Floats  # (M, 2) x, y in the view's maps
     cosine: Floats  # (M,) between the mesh's normal and the view
     weight: Floats  # (M,) 0…1, without the doubt of the maps
-    mesh_normal: Floats  # (H, W, 3) of the mesh at the view's pixels, camera frame
+    mesh_normal: Floats  # (H, W, 3) of the mesh at the view's pixels, camera frame; 0 where it is missed
 
-    def sample(self, picture: Floats) -> Floats:
-        """Values (M, C) of a picture (H, W, C) of the view, interpolated linearly."""
-        x, y = np.array(self.pixel.T[:, None], np.float32)
-        parts = [slice(k, k + 30_000) for k in range(0, x.shape[1], 30_000)]  # OpenCV takes rows up to 32,767 px
-        image = np.ascontiguousarray(picture, np.float32)
-        found = [cv2.remap(image, x[:, part], y[:, part], cv2.INTER_LINEAR) for part in parts]
-        return np.concatenate(found, axis=1).reshape(len(self.pixel), -1) if found else np.zeros((0, 1), np.float32)
+    def sample(self, image: Floats) -> Floats:
+        """Values (M,) or (M, C) of an image (H, W) or (H, W, C) of the view, interpolated linearly."""
+        return sample(np.ascontiguousarray(image, np.float32), self.pixel, cv2.BORDER_CONSTANT)
 
 
 @stage(version=4)
@@ -106,19 +106,19 @@ def bake(views: tuple[FusionView, ...], atlas: Atlas, settings: BakingSettings) 
     visible = visible_texels(views, atlas)
     count = len(atlas.position)
     normal = _bake_normals(views, visible, atlas, settings)
-    diffuse = _bake_bands([view.diffuse for view in views], views, visible, count, settings.smooth)
-    gloss = [np.concatenate([view.specular, view.roughness[..., None]], axis=-1) for view in views]
-    samples, plain = [texels.sample(image) for texels, image in zip(visible, gloss)], [one.weight for one in visible]
-    specular_roughness, _ = _robust_mean(samples, plain, visible, count, _OUTLIER * _typical(samples))
+    albedo = _bake_albedo(views, visible, count, settings.smooth)
+    gloss = [texels.sample(np.dstack([view.specular, view.roughness])) for texels, view in zip(visible, views)]
+    weights = [texels.weight for texels in visible]
+    specular_roughness, _ = _robust_mean(gloss, weights, visible, count, _OUTLIER * _typical(gloss))
     total = np.zeros(count)
     for texels in visible:
         total[texels.texel] += texels.weight
-    values = np.concatenate([normal, diffuse, specular_roughness, total[:, None]], axis=-1, dtype=np.float32)
+    values = np.concatenate([normal, albedo, specular_roughness, total[:, None]], axis=-1, dtype=np.float32)
     return on_atlas(atlas, values)
 
 
 def on_atlas(atlas: Atlas, values: Floats) -> AtlasMaps:
-    """Maps from values (N, 11) of the texels: normal, diffuse, specular, roughness, weight.
+    """Maps from the values (N, 11) of an atlas's texels.
 
     Between the charts they have the values of the nearest texel, for reduced textures, and for charts so small that
     they cover no texel's middle.
@@ -128,19 +128,20 @@ def on_atlas(atlas: Atlas, values: Floats) -> AtlasMaps:
     size = np.ones((2 * _MARGIN_PX + 1,) * 2, np.uint8)
     mask = cv2.dilate(atlas.covered.astype(np.uint8), size) > 0
     image = fill_outward(image, atlas.covered)
-    normal, diffuse, specular = (np.ascontiguousarray(image[..., start : start + 3]) for start in (0, 3, 6))
-    return AtlasMaps(normal, diffuse, specular, image[..., 9].copy(), mask, np.where(mask, image[..., 10], 0))
+    normal, diffuse, specular, roughness = (
+        np.ascontiguousarray(image[..., part]) for part in (_NORMAL, DIFFUSE, SPECULAR, ROUGHNESS)
+    )
+    return AtlasMaps(normal, diffuse, specular, roughness, mask, np.where(mask, image[..., WEIGHT], 0))
 
 
 def visible_texels(views: Sequence[FusionView], atlas: Atlas) -> list[VisibleTexels]:
     """The texels that each view sees."""
-    mesh = atlas.mesh
-    tracer = Tracer(Triangles(mesh.vertices, mesh.faces, mesh.normals[mesh.faces]))
+    tracer = atlas.tracer()
     return [_visible(view, atlas, tracer) for view in views]
 
 
 def _visible(view: FusionView, atlas: Atlas, tracer: Tracer) -> VisibleTexels:
-    """The texels that face the view, and that neither the mesh nor the picture's edge hides."""
+    """The texels that face the view, in front of the rest of the mesh and inside the picture."""
     height, width = view.mask.shape
     surface = tracer.trace(view.pose.rotation, view.pose.translation, view.view, height, width)
     point = view.pose.to_camera(atlas.position)
@@ -189,23 +190,18 @@ def _bake_normals(
     views: Sequence[FusionView], visible: Sequence[VisibleTexels], atlas: Atlas, settings: BakingSettings
 ) -> Floats:
     """Unit normals (N, 3) in the board frame: those of the mesh plus the mean differences of the views from it."""
-    differences = []
+    smooth, fine, weights = list[Floats](), list[Floats](), list[Floats]()
     for view, texels in zip(views, visible):
         both = view.mask & (frames.dot(texels.mesh_normal, texels.mesh_normal) > 0.5)
         difference = np.where(both[..., None], view.normal - texels.mesh_normal, 0).astype(np.float32)
-        bands = texels.sample(_bands(difference, both, settings.smooth * diameter_px(view)))
-        differences.append(np.concatenate([bands[:, k : k + 3] @ view.pose.rotation for k in (0, 3)], axis=-1))
-    count = len(atlas.position)
-    prior = (settings.mesh_sigma_deg or _mesh_sigma_deg(differences)) ** -2
-    weights = [
-        texels.weight / (texels.sample(view.sigma_deg)[:, 0] ** 2 + _FLOOR_DEG**2)
-        for texels, view in zip(visible, views)
-    ]
-    smooth, weights = _robust_mean(
-        [one[:, :3] for one in differences], weights, visible, count, float(np.radians(_OUTLIER_DEG)), prior
-    )
-    fine = _weighted_mean([one[:, 3:] for one in differences], [w**_SHARPNESS for w in weights], visible, count)
-    return frames.unit(atlas.normal + smooth + fine)
+        low, high = _sample_bands(difference, both, texels, settings.smooth * diameter_px(view))
+        smooth.append(low @ view.pose.rotation)
+        fine.append(high @ view.pose.rotation)
+        weights.append(texels.weight / (texels.sample(view.sigma_deg) ** 2 + _FLOOR_DEG**2))
+    prior = (settings.mesh_sigma_deg or _mesh_sigma_deg(smooth)) ** -2
+    outlier = float(np.radians(_OUTLIER_DEG))
+    means = _mean_bands(smooth, fine, weights, visible, len(atlas.position), outlier, prior)
+    return frames.unit(atlas.normal + means[0] + means[1])
 
 
 def _mesh_sigma_deg(differences: Sequence[Floats]) -> float:
@@ -213,24 +209,22 @@ def _mesh_sigma_deg(differences: Sequence[Floats]) -> float:
 
     Twice, because the mesh was fitted to these normals; docs/benchmarks/fusion.md.
     """
-    angle = np.concatenate([np.linalg.norm(one[::8, :3], axis=-1) for one in differences])
+    angle = np.concatenate([np.linalg.norm(one[::8], axis=-1) for one in differences])
     return float(max(2 * np.degrees(np.median(angle)), _FLOOR_DEG))
 
 
-def _bake_bands(
-    images: Sequence[Floats], views: Sequence[FusionView], visible: Sequence[VisibleTexels], count: int, smooth: float
+def _bake_albedo(
+    views: Sequence[FusionView], visible: Sequence[VisibleTexels], count: int, smooth_share: float
 ) -> Floats:
-    """Robust mean (N, C) of images (H, W, C) of the views: smooth band from all, fine band from the best."""
+    """Albedo (N, 3) of the texels."""
     bands = [
-        texels.sample(_bands(image, view.mask, smooth * diameter_px(view)))
-        for texels, image, view in zip(visible, images, views)
+        _sample_bands(view.diffuse, view.mask, texels, smooth_share * diameter_px(view))
+        for texels, view in zip(visible, views)
     ]
-    channels = images[0].shape[-1]
-    weights = [one.weight for one in visible]
-    low = [one[:, :channels] for one in bands]
-    mean, weights = _robust_mean(low, weights, visible, count, _OUTLIER * _typical(low))
-    fine = _weighted_mean([one[:, channels:] for one in bands], [w**_SHARPNESS for w in weights], visible, count)
-    return np.maximum(mean + fine, 0)
+    smooth, fine = zip(*bands)
+    weights = [texels.weight for texels in visible]
+    means = _mean_bands(smooth, fine, weights, visible, count, _OUTLIER * _typical(smooth))
+    return np.maximum(means[0] + means[1], 0)
 
 
 def _typical(samples: Sequence[Floats]) -> float:
@@ -238,11 +232,26 @@ def _typical(samples: Sequence[Floats]) -> float:
     return float(np.median(np.concatenate([np.linalg.norm(one[::16], axis=-1) for one in samples])))
 
 
-def _bands(image: Floats, inside: Bools, sigma: float) -> Floats:
-    """Smooth band of an image (H, W, C) inside a mask, and the rest: (H, W, 2C)."""
-    inner = inside[..., None]
-    smooth = masked_mean(image, inside, sigma)
-    return np.concatenate([smooth, np.where(inner, image.astype(np.float32) - smooth, 0)], axis=-1)
+def _sample_bands(image: Floats, inside: Bools, texels: VisibleTexels, sigma_px: float) -> tuple[Floats, Floats]:
+    """Smooth and fine band (M, 3) of an image (H, W, 3) inside a mask, at the visible texels."""
+    smooth = masked_mean(image, inside, sigma_px)
+    fine = np.where(inside[..., None], image.astype(np.float32) - smooth, 0)
+    both = texels.sample(np.concatenate([smooth, fine], axis=-1))  # in one: OpenCV rounds by the number of channels
+    return both[:, :3], both[:, 3:]
+
+
+def _mean_bands(
+    smooth: Sequence[Floats],
+    fine: Sequence[Floats],
+    weights: Sequence[Floats],
+    visible: Sequence[VisibleTexels],
+    count: int,
+    outlier: float,
+    prior: float = 0.0,
+) -> tuple[Floats, Floats]:
+    """Robust mean (N, 3) of the smooth bands of all views, and mean (N, 3) of the fine bands of the best ones."""
+    mean, weights = _robust_mean(smooth, weights, visible, count, outlier, prior)
+    return mean, _weighted_mean(fine, [one**_SHARPNESS for one in weights], visible, count)
 
 
 def _robust_mean(
@@ -250,19 +259,19 @@ def _robust_mean(
     weights: Sequence[Floats],
     visible: Sequence[VisibleTexels],
     count: int,
-    scale: float,
+    outlier: float,
     prior: float = 0.0,
 ) -> tuple[Floats, list[Floats]]:
-    """Mean (N, C) of samples with Cauchy's weights, and these weights.
+    """Mean (N, C) of samples with Cauchy's weights of the scale `outlier`, and these weights.
 
-    A `prior` is the weight of a further sample of value 0.
+    `prior` is the weight of a further sample of value 0.
     """
     robust = list(weights)
     for _ in range(_ROUNDS):
         mean = _weighted_mean(samples, robust, visible, count, prior)
         robust = [
-            w / (1 + np.sum((value - mean[texels.texel]) ** 2, axis=-1) / scale**2)
-            for value, w, texels in zip(samples, weights, visible)
+            weight / (1 + np.sum((value - mean[texels.texel]) ** 2, axis=-1) / outlier**2)
+            for value, weight, texels in zip(samples, weights, visible)
         ]
     return _weighted_mean(samples, robust, visible, count, prior), robust
 

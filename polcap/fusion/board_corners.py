@@ -28,7 +28,7 @@ _WINDOW = 0.45  # half side of the print that is compared around a corner, squar
 _SAMPLES = 4  # of the print, per pixel side
 _BLUR_PX = 0.5  # 1σ of the lens and the photosites together
 _ROUNDS = 6  # of the registration
-_MOST_MOVED = 0.15  # squares; from the homography's prediction, which neglects distortion
+_MOST_SHIFT = 0.15  # squares; from the homography's prediction, which neglects distortion
 _LEAST_CORRELATION = 0.85  # of picture and print around a corner
 _MOST_TWINS = 2  # markers seen twice: more are a second board
 
@@ -88,18 +88,18 @@ def detect(radiance: AngleStack, color: ColorCalibration) -> BoardSearch:
     plan = np.asarray(boards.charuco(board).getObjPoints())[..., :2]  # (M, 4, 2) m, from the top left
     pairs = [(plan[known.index(number)], quad) for number, quad in markers if number in known]
     flat, seen = (np.concatenate(side).astype(np.float64) for side in zip(*pairs, strict=True))
-    place, _ = cv2.findHomography(flat, seen, cv2.RANSAC, 0.02 * float(np.ptp(seen, axis=0).max()))
-    if place is None:
+    homography, _ = cv2.findHomography(flat, seen, cv2.RANSAC, 0.02 * float(np.ptp(seen, axis=0).max()))
+    if homography is None:
         raise CaptureError("the board's markers contradict each other; show a flat board")
     number, world = boards.corners(board)
-    moved = _locate(picture, place, board)
-    good = np.isfinite(moved).all(axis=1)
+    pixel = _locate(picture, homography, board)
+    good = np.isfinite(pixel).all(axis=1)
     if good.sum() < _LEAST_CORNERS:
         raise CaptureError(
             f"{good.sum()} of {len(number)} corners of the board are visible, {_LEAST_CORNERS} are needed; "
             "let object and chart hide less of the board, and show it sharp"
         )
-    return BoardSearch(BoardCorners(board, number[good], world[good], from_grid(moved[good], scale)), count)
+    return BoardSearch(BoardCorners(board, number[good], world[good], from_grid(pixel[good], scale)), count)
 
 
 def _find_markers(picture: Floats) -> list[tuple[int, Floats]]:
@@ -109,8 +109,7 @@ def _find_markers(picture: Floats) -> list[tuple[int, Floats]]:
     zoom = _DETECTOR_PX / max(gray.shape)
     how = cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC
     sized = cv2.resize(gray, None, fx=zoom, fy=zoom, interpolation=how)
-    detector = cv2.aruco.ArucoDetector(boards.dictionary())
-    quads, numbers, _ = detector.detectMarkers(sized)
+    quads, numbers, _ = cv2.aruco.ArucoDetector(boards.dictionary()).detectMarkers(sized)
     if numbers is None:
         return []
     found = np.asarray(quads, np.float64).reshape(-1, 4, 2)
@@ -125,49 +124,52 @@ def _choose_board(markers: list[tuple[int, Floats]]) -> tuple[Board | None, int]
         board.name: len(set(numbers) & set(np.ravel(boards.charuco(board).getIds()).tolist()))
         for board in BOARDS.values()
     }
-    there = [size for size, count in seen.items() if count >= _LEAST_MARKERS]
-    if len(there) > 1 or twins > _MOST_TWINS:
-        which = " and ".join(there) if len(there) > 1 else f"{twins} markers twice"
+    sizes = [size for size, count in seen.items() if count >= _LEAST_MARKERS]
+    if len(sizes) > 1 or twins > _MOST_TWINS:
+        which = " and ".join(sizes) if len(sizes) > 1 else f"{twins} markers twice"
         raise CaptureError(f"two boards are visible ({which}); leave one in the picture")
-    return (BOARDS[there[0]] if there else None), max(seen.values())
+    return (BOARDS[sizes[0]] if sizes else None), max(seen.values())
 
 
-def _locate(picture: Floats, place: Floats, board: Board) -> Floats:
+def _locate(picture: Floats, homography: Floats, board: Board) -> Floats:
     """Corners (N, 2) px of the board; NaN where the print around a corner is not visible.
 
-    Around each corner the print is drawn through the homography `place`, and moved until it fits (Gauss-Newton).
+    Around each corner the print is drawn through the homography, and moved until it fits (Gauss-Newton).
     """
     _, world = boards.corners(board)
     out = np.full((len(world), 2), np.nan)
     for k, corner in enumerate(world[:, [0, 2]]):
-        at = corner + board.side_m / 2
-        x, y, drawn = _draw(place, at, board)
-        reach = np.array([np.ptp(x), np.ptp(y)]) / (2 * _WINDOW)  # px per square
+        flat = corner + board.side_m / 2
+        x, y, drawn = _draw(homography, flat, board)
         if min(x.min(), y.min()) < 0 or x.max() > picture.shape[1] - 1 or y.max() > picture.shape[0] - 1:
             continue
-        moved, correlation = _register(picture, x, y, drawn)
-        if correlation > _LEAST_CORRELATION and (np.abs(moved) < np.maximum(_MOST_MOVED * reach, 1.5)).all():
-            out[k] = transform_points(place, at) + moved
+        shift, correlation = _register(picture, x, y, drawn)
+        square_px = np.array([np.ptp(x), np.ptp(y)]) / (2 * _WINDOW)
+        if correlation > _LEAST_CORRELATION and (np.abs(shift) < np.maximum(_MOST_SHIFT * square_px, 1.5)).all():
+            out[k] = transform_points(homography, flat) + shift
     return out
 
 
-def _draw(place: Floats, at: Floats, board: Board) -> tuple[Floats, Floats, Floats]:
-    """Pixels x, y (h, w) around the flat point `at` (2,) [m], and the share of paper that they should show."""
-    half = _WINDOW * board.square_m * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
-    around = transform_points(place, at + half)
+def _draw(homography: Floats, flat: Floats, board: Board) -> tuple[Floats, Floats, Floats]:
+    """Pixels x, y (h, w) around a point (2,) [m] of the print, and the share of paper (h, w) that they should show."""
+    corners = _WINDOW * board.square_m * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    around = transform_points(homography, flat + corners)
     low, high = np.floor(around.min(axis=0)), np.ceil(around.max(axis=0))
     x, y = np.meshgrid(*(np.arange(first, last + 1) for first, last in zip(low, high, strict=True)))
-    back = np.linalg.inv(place)
+    back = np.linalg.inv(homography)
     steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
     drawn: Floats = np.zeros(x.shape)
     for dx, dy in itertools.product(steps, steps):
-        flat = transform_points(back, np.stack([x + dx, y + dy], axis=-1)) - board.side_m / 2
-        drawn += ~boards.is_ink(board, flat[..., 0], flat[..., 1]) / _SAMPLES**2
+        point = transform_points(back, np.stack([x + dx, y + dy], axis=-1)) - board.side_m / 2
+        drawn += ~boards.is_ink(board, point[..., 0], point[..., 1]) / _SAMPLES**2
     return x, y, gaussian_filter(drawn, _BLUR_PX)
 
 
 def _register(picture: Floats, x: Floats, y: Floats, drawn: Floats) -> tuple[Floats, float]:
-    """Shift (2,) px from the pixels x, y to where the picture looks as `drawn` (h, w), and their correlation."""
+    """Shift (2,) px from the pixels x, y to where the picture looks as `drawn` (h, w), and their correlation.
+
+    Each round fits the shifted picture by a · drawn + b · gradient + c; then the shift is off by b / a.
+    """
     down, across = np.gradient(drawn)
     terms = np.stack([drawn, across, down, np.ones_like(drawn)], axis=-1).reshape(-1, 4)
     shift: Floats = np.zeros(2)
@@ -177,6 +179,5 @@ def _register(picture: Floats, x: Floats, y: Floats, drawn: Floats) -> tuple[Flo
         weight = np.linalg.lstsq(terms, seen, rcond=None)[0]
         if weight[0] <= 1e-6 * np.abs(seen).max():  # no print is here
             return shift, 0.0
-        step = -weight[1:3] / weight[0]
-        shift = shift + np.clip(step, -2, 2)
+        shift = shift + np.clip(-weight[1:3] / weight[0], -2, 2)
     return shift, float(np.corrcoef(seen, terms[:, 0])[0, 1])

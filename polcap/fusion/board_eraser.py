@@ -51,26 +51,35 @@ class _Print:
     paper: Floats  # (H, W, 3) share of paper in a pixel of each channel, whose photosites lie side by side
     doubt: Floats  # (H, W, 3) error of this share from errors of the position
 
+    @property
+    def from_middle(self) -> Floats:
+        """Larger coordinate (H, W) of a pixel's place, in half sides."""
+        return np.asarray(np.abs(self.place).max(axis=-1))
 
-def erase(
-    radiance: AngleStack,
-    alignment: Alignment,
-    color: ColorCalibration,
-    posed: PosedBoard,
-) -> AngleStack:
+
+@dataclass(frozen=True)
+class _PrintLight:
+    """Brightness of the print in the picture, extended beyond the board."""
+
+    paper: Floats  # (H, W, 1)
+    ink: Floats  # (H, W, 1)
+    tint: Floats  # (3,) color of both, mean 1
+
+
+def erase(radiance: AngleStack, alignment: Alignment, color: ColorCalibration, posed: PosedBoard) -> AngleStack:
     """A copy of the merged shots in which the visible print of the board is as dark as its ink, and flagged ERASED.
 
     Where the board is not in the picture, or hidden, nothing changes.
     """
     board, print_ = posed.board, _project(radiance, posed)
     picture = mean_picture(radiance, alignment, color)
-    covered = np.abs(print_.place).max(axis=-1) <= _BEYOND * board.page_m[0] / board.side_m
+    covered = print_.from_middle <= _BEYOND * board.page_m[0] / board.side_m
     if not covered.any():
         return radiance
-    light, tint = _fit(picture, print_)
-    erased = covered & ~_object_like(picture / tint, print_, light, _strip_px(print_, board))
-    white = np.linalg.inv(np.asarray(color.matrix, np.float64)) @ tint
-    ink = (0.5 * light[1][..., None] * white).astype(np.float32)
+    light = _fit_light(picture, print_)
+    erased = covered & ~_find_object(picture / light.tint, print_, light, _strip_px(print_, board))
+    white = np.linalg.inv(np.asarray(color.matrix, np.float64)) @ light.tint
+    ink = (0.5 * light.ink * white).astype(np.float32)
     value = np.where(erased[..., None], ink, radiance.value)
     quality = radiance.quality | np.where(erased, np.uint8(Quality.ERASED), np.uint8(0))
     return replace(radiance, value=value, quality=quality, mosaic=None)
@@ -99,7 +108,7 @@ def _project(radiance: AngleStack, posed: PosedBoard) -> _Print:
 
 
 def _on_board(camera: SessionCamera, pose: Pose, x: Floats, y: Floats) -> Floats:
-    """Points x, z (H, W, 2) [m] of the board's plane that RAW pixels show; infinite above the plane's horizon."""
+    """Points x, z (H, W, 2) [m] of the board's plane that RAW pixels show; far away above the plane's horizon."""
     ray = back_project(camera.view, *distortion.undistort(camera.lens, x, y)) @ pose.rotation  # world frame
     start = pose.center
     down = np.where(ray[..., 1] < -1e-6, -ray[..., 1], np.nan)
@@ -107,16 +116,11 @@ def _on_board(camera: SessionCamera, pose: Pose, x: Floats, y: Floats) -> Floats
     return np.asarray(start[[0, 2]] + ray[..., [0, 2]] * reach[..., None])
 
 
-def _fit(picture: Floats, print_: _Print) -> tuple[tuple[Floats, Floats], Floats]:
-    """Brightness of paper and of ink (H, W), extended over the picture, and the print's color (3,) of mean 1.
-
-    Quadratic functions over the board, fitted without pixels that deviate.
-    """
-    on = (np.abs(print_.place).max(axis=-1) < 1) & (
-        np.abs(print_.place).max(axis=-1) > 1 - 2 * boards.RING / boards.SQUARES
-    )
-    gray, share = picture.mean(axis=-1)[on].astype(np.float64), print_.paper[on].mean(axis=-1)
-    base = _quadratic(print_.place[on])
+def _fit_light(picture: Floats, print_: _Print) -> _PrintLight:
+    """Brightness of paper (quadratic over the board) and of ink (linear), fitted without pixels that deviate."""
+    ring = (print_.from_middle < 1) & (print_.from_middle > 1 - 2 * boards.RING / boards.SQUARES)
+    gray, share = picture.mean(axis=-1)[ring].astype(np.float64), print_.paper[ring].mean(axis=-1)
+    base = _quadratic(print_.place[ring])
     terms = np.concatenate([base * share[:, None], base[:, :3] * (1 - share)[:, None]], axis=1)
     use = np.ones(len(gray), bool)
     for _ in range(_ROUNDS):
@@ -125,10 +129,11 @@ def _fit(picture: Floats, print_: _Print) -> tuple[tuple[Floats, Floats], Floats
         use = error < max(3 * 1.48 * float(np.median(error)), 1e-9)
     everywhere = _quadratic(np.clip(print_.place, -1.5, 1.5))
     paper, ink = everywhere @ weight[:6], everywhere[..., :3] @ weight[6:]
-    light = float(np.median(gray[use & (share > 0.8)])) if (use & (share > 0.8)).any() else float(gray.max())
-    white = picture[on][use & (share > 0.6)]
+    usual = float(np.median(gray[use & (share > 0.8)])) if (use & (share > 0.8)).any() else float(gray.max())
+    white = picture[ring][use & (share > 0.6)]
     tint = np.median(white, axis=0) if len(white) else np.ones(3)
-    return (np.maximum(paper, 0.1 * light), np.maximum(ink, 1e-3 * light)), np.asarray(tint / tint.mean())
+    paper, ink = np.maximum(paper, 0.1 * usual), np.maximum(ink, 1e-3 * usual)
+    return _PrintLight(paper[..., None], ink[..., None], np.asarray(tint / tint.mean()))
 
 
 def _quadratic(place: Floats) -> Floats:
@@ -139,20 +144,18 @@ def _quadratic(place: Floats) -> Floats:
 
 def _strip_px(print_: _Print, board: Board) -> tuple[int, int]:
     """Width of the print's strips of paper in the picture: across, and down [px]."""
-    inside = np.abs(print_.place).max(axis=-1) < 1
-    metres = 0.5 * board.side_m
     slope = [np.hypot(*np.moveaxis(np.gradient(print_.place, axis=axis), -1, 0)) for axis in (1, 0)]
-    across, down = (max(float(np.median(s[inside])) * metres, 1e-9) for s in slope)
+    inside, half_side = print_.from_middle < 1, 0.5 * board.side_m
+    across, down = (max(float(np.median(s[inside])) * half_side, 1e-9) for s in slope)  # m per pixel
     strip = _STRIP * board.square_m
     return int(np.ceil(strip / across)), int(np.ceil(strip / down))
 
 
-def _object_like(picture: Floats, print_: _Print, light: tuple[Floats, Floats], strip: tuple[int, int]) -> Bools:
+def _find_object(picture: Floats, print_: _Print, light: _PrintLight, strip: tuple[int, int]) -> Bools:
     """Pixels (H, W) that differ from the print, closed over the strips of paper, without lines and specks."""
-    paper, ink = light
-    paper, ink = paper[..., None], ink[..., None]
-    expected = print_.paper * (paper - ink) + ink
-    off = (np.abs(picture - expected) > _TOLERANCE * expected + (print_.doubt + _NOISE) * paper).any(axis=-1)
+    expected = print_.paper * (light.paper - light.ink) + light.ink
+    limit = _TOLERANCE * expected + (print_.doubt + _NOISE) * light.paper
+    off = (np.abs(picture - expected) > limit).any(axis=-1)
     element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * (strip[0] // 2) + 1, 2 * (strip[1] // 2) + 1))
     pair = np.ones((2, 2), np.uint8)  # removes edges of the print; with one anchor for both, the result would shift
     broad = cv2.dilate(cv2.erode(off.astype(np.uint8), pair, anchor=(0, 0)), pair, anchor=(1, 1))

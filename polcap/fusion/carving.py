@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from polcap import parallel
 from polcap.fusion.closed_mesh import iso_surface
 from polcap.fusion.hull import DistanceGrid, plain_body
-from polcap.fusion.normal_surface import FittedSurface, visible
+from polcap.fusion.normal_surface import FittedSurface, tracer, visible
 from polcap.fusion.small_views import SmallView, sample
 from polcap.image_values import Bools, Floats
 from polcap.optics.frames import dot, unit
@@ -33,7 +33,7 @@ from polcap.optics.projection import back_project
 from polcap.optics.vertex_frames import vertex_normals
 
 _DOUBT = 0.4  # share of the views' weight that contradicts the mean normal; this and below: docs/benchmarks/fusion.md
-_SPREAD = 6  # rounds of averaging of the doubt over neighbors
+_PASSES = 6  # of averaging over neighbors
 _LEAST_PART = 0.01  # share of the vertices on a doubtful part of the surface; smaller parts are no hollows
 _PLANES = 1.5  # steps between the sweep's planes
 _NORMAL_DEG = 15.0  # 1σ of the angle between two views' normals of one point
@@ -64,22 +64,23 @@ def carve(hull: DistanceGrid, surface: FittedSurface, views: Sequence[SmallView]
     doubtful = _find_doubtful(surface)
     if not doubtful.any():
         return hull
-    tracer = surface.tracer()
-    sweeps = [partial(_sweep, k, views, tracer, doubtful, hull) for k in range(len(views))]
-    depths = _confirm(parallel.results(sweeps), hull.grid.step)
+    step, trace = hull.grid.step, tracer(surface.mesh)
+    sweeps = [partial(_sweep, k, views, trace, doubtful, hull) for k in range(len(views))]
+    depths = _confirm(parallel.results(sweeps), step)
     free = _mean_distance(hull, depths)
-    wall = _find_walls(surface, depths, hull.grid.step)
+    wall = _find_walls(surface, depths, step)
     inner = iso_surface(hull).vertices[wall]  # where masks are too narrow, the fitted surface lies outside the hull
-    carved = np.maximum(hull.distance, _limit_at_walls(hull, np.concatenate([surface.vertices[wall], inner]), free))
-    height = hull.grid.origin[1] + hull.grid.step * np.arange(hull.grid.shape[1])
-    floor = height < _WALL * hull.grid.step  # the board is behind it
+    walls = np.concatenate([surface.mesh.vertices[wall], inner])
+    carved = np.maximum(hull.distance, _limit_at_walls(hull, walls, free))
+    height = hull.grid.origin[1] + step * np.arange(hull.grid.shape[1])
+    floor = height < _WALL * step  # the board is behind it
     carved[:, floor] = hull.distance[:, floor]
-    return replace(hull, distance=plain_body(carved, hull.grid.step))
+    return replace(hull, distance=plain_body(carved, step))
 
 
 def _find_doubtful(surface: FittedSurface) -> Bools:
     """Vertices (V,) of large parts of the surface on which views contradict each other."""
-    doubtful = surface.spread(1 - surface.agreement, _SPREAD) > _DOUBT
+    doubtful = surface.smooth(1 - surface.agreement, _PASSES) > _DOUBT
     index = np.flatnonzero(doubtful)
     _, part = connected_components(surface.neighbors[index][:, index], directed=False)
     large = np.bincount(part, minlength=1) >= _LEAST_PART * len(doubtful)
@@ -87,21 +88,19 @@ def _find_doubtful(surface: FittedSurface) -> Bools:
     return np.asarray(doubtful)
 
 
-def _sweep(
-    number: int, views: Sequence[SmallView], tracer: Tracer, doubtful: Bools, hull: DistanceGrid
-) -> HollowDepths:
-    """Best depth of each pixel of one view behind doubtful surface."""
+def _sweep(number: int, views: Sequence[SmallView], trace: Tracer, doubtful: Bools, hull: DistanceGrid) -> HollowDepths:
+    """Best depth of each pixel of one view behind doubtful vertices (V,) of the traced surface."""
     step = hull.grid.step
     view = _coarsen(views[number], step)
     height, width = view.outline.shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
     ray = back_project(view.view, x, y) @ view.pose.rotation  # (H, W, 3) world, at depth 1
-    met = tracer.meet(np.broadcast_to(view.pose.center, (height * width, 3)), ray.reshape(-1, 3))
+    met = trace.meet(np.broadcast_to(view.pose.center, (height * width, 3)), ray.reshape(-1, 3))
     behind = np.zeros(height * width, bool)
-    behind[met.index] = doubtful[tracer.mesh.faces[met.face]].mean(axis=1) > 0.5
+    behind[met.index] = doubtful[trace.mesh.faces[met.face]].mean(axis=1) > 0.5
     pixel = np.flatnonzero(behind)
-    corners = view.pose.to_camera(hull.grid.corners())
-    planes = np.arange(-corners[:, 2].max(), -corners[:, 2].min(), _PLANES * step)
+    corner_depths = -view.pose.to_camera(hull.grid.corners())[:, 2]
+    planes = np.arange(corner_depths.min(), corner_depths.max(), _PLANES * step)
     score = np.zeros((len(planes), height, width), np.float32)
     for layer, depth in zip(score.reshape(len(planes), -1), planes):
         point = view.pose.center + depth * ray.reshape(-1, 3)[pixel]
@@ -185,10 +184,10 @@ def _mean_distance(hull: DistanceGrid, depths: Sequence[HollowDepths]) -> Floats
 
 def _find_walls(surface: FittedSurface, depths: Sequence[HollowDepths], step: float) -> Bools:
     """Vertices (V,) through which no view looks at a depth behind them."""
-    outward = vertex_normals(surface.vertices, surface.faces)
-    seen = visible(surface.vertices, surface.faces, outward, [one.view for one in depths], step)
-    beyond = np.stack([_depth_beyond(one, surface.vertices) > _TRUNCATION * step for one in depths])
-    return np.asarray(surface.spread(np.any(seen & beyond, axis=0).astype(float), _SPREAD) < _OPEN)
+    mesh = surface.mesh
+    seen = visible(mesh, vertex_normals(mesh.vertices, mesh.faces), [one.view for one in depths], step)
+    beyond = np.stack([_depth_beyond(one, mesh.vertices) > _TRUNCATION * step for one in depths])
+    return np.asarray(surface.smooth(np.any(seen & beyond, axis=0).astype(float), _PASSES) < _OPEN)
 
 
 def _limit_at_walls(hull: DistanceGrid, walls: Floats, free: Floats) -> Floats:

@@ -8,7 +8,7 @@ from polcap.errors import ObjectError
 from polcap.fusion.hull import DistanceGrid
 from polcap.fusion.values import ClosedMesh
 
-_FEWEST = 16  # triangles of a level
+FEWEST = 16  # triangles of a level
 _SEPARATION = 1e-3  # of the way to the neighbors' middle, by which coincident vertices are moved
 
 
@@ -22,9 +22,9 @@ def iso_surface(of: DistanceGrid) -> ClosedMesh:
 
 def is_closed(mesh: ClosedMesh) -> bool:
     """Every edge belongs to two triangles that run along it in opposite directions."""
-    ends = np.concatenate([mesh.faces[:, [k, (k + 1) % 3]] for k in range(3)]).astype(np.int64)
-    count = len(mesh.vertices)
-    there, back = (np.sort(ends @ [a, b]) for a, b in ((count, 1), (1, count)))
+    faces, count = mesh.faces.astype(np.int64), len(mesh.vertices)
+    first, last = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    there, back = np.sort(first * count + last), np.sort(last * count + first)  # one number for each directed edge
     return bool(np.array_equal(there, back) and np.all(np.diff(there) > 0))
 
 
@@ -42,8 +42,7 @@ def solid(mesh: ClosedMesh, floor: float | None = None) -> ClosedMesh:
         raise ObjectError(f"the fused mesh is not closed ({body.status().name}); check poses and masks of the views")
     if floor is not None:
         body = body.trim_by_plane((0.0, 1.0, 0.0), floor)
-    parts = body.decompose()
-    written = max(parts, key=lambda part: part.volume()).to_mesh64()
+    written = max(body.decompose(), key=lambda part: part.volume()).to_mesh64()
     return _separate(ClosedMesh(np.array(written.vert_properties[:, :3]), np.array(written.tri_verts, np.int32)))
 
 
@@ -65,8 +64,8 @@ def decimate(mesh: ClosedMesh, count: int) -> ClosedMesh:
     """
     import fast_simplification
 
-    if count < _FEWEST:
-        raise ObjectError(f"a level of {count} triangles is under {_FEWEST}; ask for more triangles or fewer levels")
+    if count < FEWEST:
+        raise ObjectError(f"a level of {count} triangles is under {FEWEST}; ask for more triangles or fewer levels")
     if count >= len(mesh.faces):
         return mesh
     points, faces = fast_simplification.simplify(

@@ -160,24 +160,28 @@ def _match(one: ObjectFeatures, other: ObjectFeatures) -> _Matches:
         return np.zeros((0, 2), np.intp)
     distance = np.sqrt(np.maximum(2 - 2 * one.descriptor @ other.descriptor.T, 0))
     i, j = np.arange(len(distance)), distance.argmin(axis=1)
-    two = np.partition(distance, 1, axis=1)
-    good = (distance.argmin(axis=0)[j] == i) & (two[:, 0] < _RATIO * two[:, 1])
+    nearest, second = np.partition(distance, 1, axis=1)[:, :2].T
+    good = (distance.argmin(axis=0)[j] == i) & (nearest < _RATIO * second)
     return np.stack([i[good], j[good]], axis=-1)
 
 
 def _first_motion(
     features: Sequence[ObjectFeatures], pairs: Mapping[_Pair, _Matches]
 ) -> tuple[NDArray[np.intp], _Motion]:
-    """The largest group of views that matches connect, and their motion, from normals alone."""
-    found = {
-        pair: _turn(features[pair[0]].normal[match[:, 0]], features[pair[1]].normal[match[:, 1]])
-        for pair, match in pairs.items()
-    }
-    found = {pair: one for pair, one in found.items() if one[1] >= max(_LEAST_MATCHES, len(pairs[pair]) / 3)}
+    """The largest group of views that matches connect, and their motion, from normals alone.
+
+    The rotations between views are turns about one axis. A tree of the pairs with most matches gives a first turn of
+    each view, least squares of all pairs the final one.
+    """
+    found: dict[_Pair, tuple[Rotation, int]] = {}
+    for (one, other), match in pairs.items():
+        rotation, agreeing = _rotation(features[one].normal[match[:, 0]], features[other].normal[match[:, 1]])
+        if agreeing >= max(_LEAST_MATCHES, len(match) / 3):
+            found[one, other] = rotation, agreeing
     if not found:
         return np.zeros(0, np.intp), _Motion(Rotation.identity(), np.zeros(_TURNS))
-    (i, j), count = np.array(list(found)).T, np.array([one[1] for one in found.values()])
-    between = Rotation.concatenate([one[0] for one in found.values()])
+    (i, j), (rotations, counts) = np.array(list(found)).T, zip(*found.values())
+    between, count = Rotation.concatenate(rotations), np.array(counts)
     vector, quaternion = between.as_rotvec(), between.as_quat()
     axis = unit(np.sum(vector * (np.sign(vector[:, 1]) * count)[:, None], axis=0))
     step = 2 * np.arctan2(quaternion[:, :3] @ axis, quaternion[:, 3])  # [rad] about the axis
@@ -201,7 +205,7 @@ def _first_motion(
     return views, _Motion(base, np.concatenate([[0.0, 0.0], middle, [0.0], turn, np.zeros(2 * len(views))]))
 
 
-def _turn(before: Floats, after: Floats) -> tuple[Rotation, int]:
+def _rotation(before: Floats, after: Floats) -> tuple[Rotation, int]:
     """Rotation that most pairs of unit vectors (N, 3), before and after, agree with; and the number of these pairs."""
     if len(before) < _LEAST_MATCHES:
         return Rotation.identity(), 0

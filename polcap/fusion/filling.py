@@ -1,7 +1,7 @@
 """Fills texels that no view saw, smoothly over the surface, from those around them.
 
-Values at the vertices solve (W + λ L) x = W b: W is the weight of the views, b their values, L the Laplacian of the
-mesh. Far from seen surface x is harmonic, without steps.
+Values x at the vertices solve (W + λ L) x = W b. W is the diagonal of the mean weights w of the views around each
+vertex, b the mean of their values, L the Laplacian of the mesh. Far from seen surface x is harmonic, without steps.
 """
 
 from typing import Any
@@ -12,7 +12,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from polcap.fusion.atlas import Atlas
-from polcap.fusion.baking import AtlasMaps, on_atlas
+from polcap.fusion.baking import MATERIAL, WEIGHT, AtlasMaps, on_atlas
 from polcap.image_values import Floats
 from polcap.optics.texture_rasterizer import rasterize
 from polcap.stages import stage
@@ -24,35 +24,36 @@ _FADE = 0.1  # weight of the views below which the filling shows
 @stage(version=1)
 def fill(maps: AtlasMaps, atlas: Atlas) -> AtlasMaps:
     """Fill albedo, F0 and roughness where no view saw the surface; normals there are those of the mesh already."""
-    size = atlas.covered.shape
-    points = rasterize(atlas.mesh.uv, atlas.mesh.faces, *size)
-    _, place = np.unique(atlas.mesh.vertices, axis=0, return_inverse=True)  # vertices without the charts' seams
-    place = place.reshape(-1)
+    points = rasterize(atlas.mesh.uv, atlas.mesh.faces, *atlas.covered.shape)
+    _, vertex = np.unique(atlas.mesh.vertices, axis=0, return_inverse=True)  # numbers without the charts' seams
+    vertex = vertex.reshape(-1)
     second, third = points.weights.T.astype(np.float64)
-    shares = np.stack([1 - second - third, second, third], axis=-1)
-    rows = np.repeat(np.arange(len(shares)), 3)
-    spread: Any = sparse.csr_matrix(
-        (shares.ravel(), (rows, place[points.corners].ravel())), (len(shares), place.max() + 1)
+    corners = np.stack([1 - second - third, second, third], axis=-1)  # (N, 3) barycentric coordinates of the texels
+    rows = np.repeat(np.arange(len(corners)), 3)
+    interpolation: Any = sparse.csr_matrix(
+        (corners.ravel(), (rows, vertex[points.corners].ravel())), (len(corners), vertex.max() + 1)
     )
     values = maps.texels(atlas.covered)
-    material, weight = values[:, 3:10].copy(), values[:, 10].astype(np.float64)
-    smooth = spread @ _harmonic(atlas, place, spread, weight, material)
+    material, weight = values[:, MATERIAL].copy(), values[:, WEIGHT].astype(np.float64)
+    smooth = interpolation @ _solve_vertices(vertex[atlas.mesh.faces], interpolation, weight, material)
     share = np.clip(weight / _FADE, 0, 1)[:, None]
-    values[:, 3:10] = share * material + (1 - share) * smooth
+    values[:, MATERIAL] = share * material + (1 - share) * smooth
     return on_atlas(atlas, values)
 
 
-def _harmonic(atlas: Atlas, place: NDArray[np.intp], spread: Any, weight: Floats, values: Floats) -> Floats:
-    """Values (V, C) at the vertices without seams, by the equation above."""
-    count = spread.shape[1]
-    faces = place[atlas.mesh.faces]
+def _solve_vertices(faces: NDArray[np.intp], interpolation: Any, weight: Floats, values: Floats) -> Floats:
+    """Values (V, C) at the vertices by the equation above, from weights (N,) and values (N, C) of the texels.
+
+    `interpolation` (N, V) makes values at texels from values at vertices.
+    """
+    count = interpolation.shape[1]
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     links: Any = sparse.coo_matrix((np.ones(len(ends)), ends.T), (count, count)).tocsr()
     links = ((links + links.T) > 0).astype(np.float64)
     laplacian: Any = sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links
-    texels = np.asarray(spread.sum(axis=0)).ravel()  # of a vertex
-    gathered = np.asarray(spread.T @ weight).ravel()
-    seen = gathered / np.maximum(texels, 1e-9)
-    mean = (spread.T @ (weight[:, None] * values)) / np.maximum(gathered, 1e-9)[:, None]
-    system: Any = sparse.diags(seen + 1e-9) + _STIFFNESS * laplacian
-    return np.asarray(splu(system.tocsc()).solve(seen[:, None] * mean))
+    texels = np.asarray(interpolation.sum(axis=0)).ravel()  # number of them, by vertex
+    total = np.asarray(interpolation.T @ weight).ravel()
+    w = total / np.maximum(texels, 1e-9)
+    b = (interpolation.T @ (weight[:, None] * values)) / np.maximum(total, 1e-9)[:, None]
+    system: Any = sparse.diags(w + 1e-9) + _STIFFNESS * laplacian
+    return np.asarray(splu(system.tocsc()).solve(w[:, None] * b))

@@ -13,10 +13,9 @@ from polcap import report
 from polcap.errors import SettingError
 from polcap.formats.export import encoders
 from polcap.formats.export.texture_set import Extra
-from polcap.fusion import fused_maps, fused_page, object_pictures, session_views
+from polcap.fusion import closed_mesh, fused_maps, fused_page, object_pictures, session_views
 from polcap.fusion import session as sessions
 from polcap.fusion.baking import AtlasMaps
-from polcap.fusion.closed_mesh import is_closed
 from polcap.fusion.comparison import ViewAgreement
 from polcap.fusion.each_view import Notify
 from polcap.fusion.fusion_path import FusionResults, SessionConfig, path
@@ -33,7 +32,7 @@ from polcap.quality.gate_values import Gate
 from polcap.quality.limits import FusedGateLimits
 from polcap.report import animation
 
-OF_ONE_VIEW: tuple[Extra, ...] = ("displacement", "curvature", "cavity")  # extra textures
+OF_ONE_VIEW: tuple[Extra, ...] = ("displacement", "curvature", "cavity")  # extra textures that a fused object lacks
 _LODS = 2  # coarser levels, each with a quarter of the triangles
 _SIDE = 480  # px of an animation's frame
 
@@ -60,7 +59,7 @@ def fuse(session_input: SessionInput[SessionConfig], out: Path, notify: Notify, 
 def _with_albedo_scale(maps: AtlasMaps, processed: ProcessedSession) -> AtlasMaps:
     """The maps with the 1σ of the albedo scale: the median over the views, for all share the errors of one chart."""
     stated = [about["figures"]["chart"]["scale_doubt"] for about in processed.reports.values()]
-    known = [float(one) for one in stated if one is not None]
+    known = [sigma for sigma in stated if sigma is not None]
     return replace(maps, albedo_sigma=float(np.median(known)) if known else None)
 
 
@@ -73,8 +72,9 @@ def _document(
 ) -> dict[str, Any]:
     """The content of report.json: facts, figures by view, gates; `seconds` are those of the stages."""
     reports = processed.reports
-    figures = _figures(processed, results)
-    judged = advise(list(_gates(processed, results, figures, config.fusion.gates)))
+    seen = SeenSurface.measure(results.maps.seen[results.atlas.covered], results.atlas.normal[:, 1])
+    figures = _figures(processed, results, seen)
+    judged = advise(list(_gates(processed, seen, figures, config.fusion.gates)))
     others = {
         "figures": figures,
         "timings": dict(seconds),
@@ -106,7 +106,7 @@ def _verdict(about: Mapping[str, Any]) -> str:
 
 
 def _gates(
-    processed: ProcessedSession, results: FusionResults, figures: Mapping[str, Any], limits: FusedGateLimits
+    processed: ProcessedSession, seen: SeenSurface, figures: Mapping[str, Any], limits: FusedGateLimits
 ) -> Iterator[Gate]:
     """All gates of a fused object."""
     views = figures["views"]
@@ -114,18 +114,13 @@ def _gates(
     by_board = processed.poses.board is not None
     yield fused_object.poses({name: view["reprojection_px"] for name, view in views.items()}, by_board, limits)
     yield fused_object.agreement({name: view["normal_deg"] for name, view in views.items()}, limits)
-    for one in results.joined:
-        yield fused_object.join(one.folder, one.shared, limits)
-    yield fused_object.seen(_seen(results), len(processed.reports), limits)
+    for folder, shared in figures["sets"].items():
+        yield fused_object.join(folder, shared, limits)
+    yield fused_object.seen(seen, len(processed.reports), limits)
     yield fused_object.closed(figures["mesh"]["closed"])
 
 
-def _seen(results: FusionResults) -> SeenSurface:
-    """Share of the surface that a view saw, and where the rest faces."""
-    return SeenSurface.measure(results.maps.seen[results.atlas.covered], results.atlas.normal[:, 1])
-
-
-def _figures(processed: ProcessedSession, results: FusionResults) -> dict[str, Any]:
+def _figures(processed: ProcessedSession, results: FusionResults, seen: SeenSurface) -> dict[str, Any]:
     """Figures of the views, the sets of views, the camera and the mesh."""
     return {
         "views": {one.name: _view_figures(processed, one) for one in results.comparison.views},
@@ -138,18 +133,18 @@ def _figures(processed: ProcessedSession, results: FusionResults) -> dict[str, A
             "texture_px": results.maps.mask.shape[0],
             "texels_per_mm": 0.001 / results.atlas.texel if processed.poses.metric else None,
             "extent": np.ptp(results.mesh.vertices, axis=0).tolist(),
-            "closed": is_closed(fused_maps.weld(results.atlas.mesh)),  # as it is written
-            "seen": _seen(results).seen,
+            "closed": closed_mesh.is_closed(fused_maps.weld(results.atlas.mesh)),  # as it is written
+            "seen": seen.seen,
         },
     }
 
 
 def _write(out: Path, about: dict[str, Any], results: FusionResults, config: SessionConfig) -> None:
-    """Write maps/, asset/, the turntable and the report of a fused result. Raises StorageError."""
+    """Write maps/, asset/, the turntable and the report of a fused result."""
     fused_maps.write(out / "maps", results.atlas, results.maps, about["keys"])
     source = fused_maps.read(out / "maps", config.asset)  # as stored, so that `polcap export` makes the same bytes
-    request = ExportRequest(lod=_LODS if source.triangles > 16 * 4**_LODS else 0)
-    asset_export.write(out, about, request, source)
+    levels = _LODS if source.triangles > closed_mesh.FEWEST * 4**_LODS else 0
+    asset_export.write(out, about, ExportRequest(lod=levels), source)
     turning = object_pictures.around(results.atlas, results.maps, object_pictures.FRAMES, _SIDE)
     encoders.animate(out / "asset" / "turntable", turning, animation.SECONDS)
     fused_page.write(out, about, results)
@@ -161,7 +156,6 @@ def export(out: Path, *requests: ExportRequest) -> list[Path]:
     for request in requests:
         export_request.check(request)
         for flag in {"exr", "iiif", "sfp"} & set(export_request.effective(request).formats):
-            raise SettingError(
-                f"--{flag} is for results of one view, not for a fused object; leave it out, and use maps/"
-            )
+            message = f"--{flag} is for results of one view, not for a fused object; leave it out, and use maps/"
+            raise SettingError(message)
     return asset_export.again(out, requests, SessionConfig, lambda maps, of: fused_maps.read(maps, of.asset))

@@ -60,9 +60,8 @@ def visual_hull(views: Sequence[SmallView], steps: int) -> DistanceGrid:
 
     Raises ObjectError: the silhouettes have no point in common.
     """
-    fine = _object_grid(views, steps)
-    distance = _largest_distance(views, fine)
-    return DistanceGrid(fine, plain_body(distance, fine.step))
+    grid = _object_grid(views, steps)
+    return DistanceGrid(grid, plain_body(_largest_distance(views, grid), grid.step))
 
 
 def _object_grid(views: Sequence[SmallView], steps: int) -> VoxelGrid:
@@ -81,32 +80,32 @@ def _object_grid(views: Sequence[SmallView], steps: int) -> VoxelGrid:
 
 def _shared_space(views: Sequence[SmallView]) -> tuple[Floats, float]:
     """Point (3,) nearest to the rays of all masks' middles, and half the side of a cube around the object, m."""
-    normal, right, lenses = np.zeros((3, 3)), np.zeros(3), []
+    matrix, right = np.zeros((3, 3)), np.zeros(3)  # of the normal equations
     for view in views:
         height, width = view.outline.shape
         x, y = ((width - 1) / 2 - view.view.center[0], view.view.center[1] - (height - 1) / 2)
         ray = np.array([x, y, -view.view.focal]) @ view.pose.rotation
-        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
-        normal += across
+        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)  # projects onto the plane across the ray
+        matrix += across
         right += across @ view.pose.center
-        lenses.append(np.hypot(*view.outline.shape) / 2 / view.view.focal)
-    middle = np.linalg.lstsq(normal, right)[0]
-    far = [np.linalg.norm(middle - view.pose.center) for view in views]
-    return middle, float(np.max(np.multiply(far, lenses)))
+    middle = np.linalg.lstsq(matrix, right)[0]
+    distance = [np.linalg.norm(middle - view.pose.center) for view in views]
+    slope = [np.hypot(*view.outline.shape) / 2 / view.view.focal for view in views]  # of the picture's corners
+    return middle, float(np.max(np.multiply(distance, slope)))
 
 
 def _largest_distance(views: Sequence[SmallView], grid: VoxelGrid) -> Floats:
-    """Largest signed distance over the views, float32; away from the surface, that of the nearest second point."""
+    """Largest signed distance over the views, float32; away from the surface, that of every second point."""
     index = np.stack(np.meshgrid(*(np.arange(0, side, 2) for side in grid.shape), indexing="ij"), axis=-1)
-    second = _largest(views, grid, index.reshape(-1, 3)).reshape(index.shape[:3])
+    distance = _distance_at(views, grid, index.reshape(-1, 3)).reshape(index.shape[:3])
     for axis, side in enumerate(grid.shape):
-        second = second.repeat(2, axis=axis).take(range(side), axis=axis)
-    near = np.argwhere(np.abs(second) < _NEAR * grid.step)
-    second[tuple(near.T)] = _largest(views, grid, near)
-    return second
+        distance = distance.repeat(2, axis=axis).take(range(side), axis=axis)
+    near = np.argwhere(np.abs(distance) < _NEAR * grid.step)
+    distance[tuple(near.T)] = _distance_at(views, grid, near)
+    return distance
 
 
-def _largest(views: Sequence[SmallView], grid: VoxelGrid, index: NDArray[np.integer]) -> Floats:
+def _distance_at(views: Sequence[SmallView], grid: VoxelGrid, index: NDArray[np.integer]) -> Floats:
     """Largest signed distance (N,) m at the grid's points with indices (N, 3), from the silhouettes and the board."""
     point = (grid.origin + grid.step * index).astype(np.float32)
     distance = np.float32(-_BELOW * grid.step) - point[:, 1]  # views from above do not bound the object from below
@@ -117,8 +116,7 @@ def _largest(views: Sequence[SmallView], grid: VoxelGrid, index: NDArray[np.inte
 
 def plain_body(distance: Floats, step: float) -> Floats:
     """Signed distances of the largest body, without specks, enclosed holes, and false handles and tunnels."""
-    body = _largest_part(distance < 0)
-    body = ndimage.binary_fill_holes(body)
+    body = ndimage.binary_fill_holes(_largest_part(distance < 0))
     body = _without_false_loops(body)
     body = ndimage.binary_fill_holes(_largest_part(body))
     near = 0.05 * step  # where the body was changed, its surface is near the changed points
@@ -151,27 +149,22 @@ def _corner(array: Bools, axes: tuple[int, int], at: tuple[int, int]) -> Bools:
 def _largest_part(body: Bools) -> Bools:
     """The largest connected part of a body."""
     label, count = ndimage.label(body)
-    if count < 2:
-        return body
-    return np.asarray(label == 1 + np.argmax(np.bincount(label.ravel())[1:]))
+    return body if count < 2 else np.asarray(label == 1 + np.argmax(np.bincount(label.ravel())[1:]))
 
 
 def _without_false_loops(body: Bools) -> Bools:
-    """Body with its thin tunnels filled and thin handles cut, where either raises the Euler number.
-
-    A part that closing adds or opening removes is taken over if that leaves fewer loops, one body and no enclosed hole.
-    """
+    """Body with its thin tunnels filled and thin handles cut, where that leaves fewer loops."""
     for radius in range(1, _THIN + 1):
         ball = ndimage.iterate_structure(ndimage.generate_binary_structure(3, 1), radius)
         closed = ndimage.binary_closing(np.pad(body, radius + 1), ball)[(np.s_[radius + 1 : -radius - 1],) * 3]
-        body = _take_over(body, closed & ~body, True)
+        body = _change_parts(body, closed & ~body, True)
     for radius in range(1, _THIN + 1):  # after all tunnels are filled, so that no wall between two of them is cut
         ball = ndimage.iterate_structure(ndimage.generate_binary_structure(3, 1), radius)
-        body = _take_over(body, body & ~ndimage.binary_opening(body, ball), False)
+        body = _change_parts(body, body & ~ndimage.binary_opening(body, ball), False)
     return body
 
 
-def _take_over(body: Bools, change: Bools, value: bool) -> Bools:
+def _change_parts(body: Bools, change: Bools, value: bool) -> Bools:
     """Set the parts of `change` to `value` that raise the Euler number and leave one body without enclosed holes."""
     label, _ = ndimage.label(change, np.ones((3, 3, 3)))
     largest = np.inf if value else _LARGEST_CUT * np.count_nonzero(body)

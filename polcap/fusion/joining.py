@@ -9,7 +9,7 @@ Besl & McKay, A method for registration of 3-D shapes, IEEE TPAMI 1992; Chen & M
 of multiple range images, Image and Vision Computing 1992 (distances from planes).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,11 +31,11 @@ _GRID = 80  # steps along a set's own mesh, which is for this registration alone
 _LEAST_SEEN = 0.3  # least sum of the cosines between normal and views of a point that counts as seen
 _TURNS = 3000  # sampled: every turn is within about 15° of one of them
 _SHIFTS = 3  # tried with each turn
-_TRIED = 40  # of the turns are refined
-_FEW, _MANY = 400, 8000  # points, of the search and of the last rounds
+_TRIED = 40  # best of these motions, which are refined
+_FEW, _MANY = 400, 8000  # points, in the search and in the last rounds
 _NORMAL = 0.4  # 1σ of the difference of two normals of one point
 _ALBEDO = 0.1  # the same of albedos
-_CLOSE = (0.06, 0.03, 0.015, 0.008, 0.004)  # 1σ of distances, of the object's size; from the search to the last rounds
+_CLOSE = (0.06, 0.03, 0.015, 0.008, 0.004)  # 1σ of distances over the object's size, from the search to the last rounds
 _ROUNDS = 6  # with each of them
 _FAR = 3.0  # σ; points that differ by more have no partner
 _ALONG = 0.1  # weight of distances along the surface over that of distances from it
@@ -102,15 +102,12 @@ def join(views: tuple[FusionView, ...]) -> tuple[JoinedSet, ...]:
     first, *others = sets
     if not others:
         return ()
-    fixed = observed_surface(sets[first])
-    return tuple(JoinedSet(folder, *register(observed_surface(sets[folder]), fixed)) for folder in others)
+    fixed = observe_surface(sets[first])
+    return tuple(JoinedSet(folder, *register(observe_surface(sets[folder]), fixed)) for folder in others)
 
 
 def require_shared(joined: Sequence[JoinedSet], least: float) -> None:
-    """Check that the sets of views show one object: the first confirms a share `least` of the surface of each other.
-
-    Raises CaptureError: a set does not show the object of the first one.
-    """
+    """Raise CaptureError if the first set confirms less than the share `least` of the surface of another set."""
     for one in joined:
         if one.shared < least:
             raise CaptureError(
@@ -122,19 +119,21 @@ def require_shared(joined: Sequence[JoinedSet], least: float) -> None:
 def place(views: tuple[FusionView, ...], joined: tuple[JoinedSet, ...]) -> tuple[FusionView, ...]:
     """The views of all sets in the frame of the first set's board."""
     motions = {one.folder: one.motion for one in joined}
-    moved = ((view, motions.get(set_of_view(view.name))) for view in views)
-    return tuple(view if motion is None else replace(view, pose=motion.pose(view.pose)) for view, motion in moved)
+    out = []
+    for view in views:
+        motion = motions.get(set_of_view(view.name))  # None: of the first set
+        out.append(view if motion is None else replace(view, pose=motion.pose(view.pose)))
+    return tuple(out)
 
 
-def observed_surface(views: Sequence[FusionView]) -> ObservedSurface:
+def observe_surface(views: Sequence[FusionView]) -> ObservedSurface:
     """Points of the object that a set of views saw."""
     mesh, small = fuse_shape(views, ShapeSettings(grid=_GRID)), reduce_views(views)
     outward = vertex_normals(mesh.vertices, mesh.faces)
     step = float(np.ptp(mesh.vertices, axis=0).max()) / _GRID
-    seen = visible(mesh.vertices, mesh.faces, outward, small, step)
     cosine = np.stack([np.maximum(dot(outward, view.towards(mesh.vertices)), 0) for view in small])
     diffuse = np.stack([sample(view.diffuse, view.pixels(mesh.vertices)) for view in small])
-    weight = seen * cosine  # (N, V)
+    weight = visible(mesh, outward, small, step) * cosine  # (N, V)
     total = weight.sum(axis=0)
     there = np.flatnonzero(total > _LEAST_SEEN)
     albedo = np.einsum("nv,nvc->vc", weight[:, there], diffuse[:, there]) / total[there, None]
@@ -145,14 +144,16 @@ def register(moving: ObservedSurface, fixed: ObservedSurface) -> tuple[Motion, f
     """The motion of one surface onto another, and the share of its points that then have a partner there."""
     random = np.random.default_rng(0)
     few, coarse = moving.some(_FEW, random), fixed.some(10 * _FEW, random)
-    tried = [_refine(motion, few, coarse, _CLOSE[:2]) for motion in _search_turns(few, coarse)]
-    best = min(tried, key=lambda motion: _misfit(motion.apply(few), coarse, _CLOSE[1]))
+    find_coarse = _partner_search(coarse, _CLOSE[1])
+
+    def misfit(motion: Motion) -> float:
+        return float(np.mean(np.minimum(find_coarse(motion.apply(few))[0], _FAR) ** 2))
+
+    best = min((_refine(motion, few, coarse, _CLOSE[:2]) for motion in _search_turns(few, coarse)), key=misfit)
     many = moving.some(_MANY, random)
     motion = _refine(best, many, fixed, _CLOSE[1:])
-    partner, _ = _find_partners(
-        motion.apply(many), cKDTree(fixed.features(_CLOSE[2] * fixed.size)), _CLOSE[2] * fixed.size
-    )
-    return motion, float(np.isfinite(partner).mean())
+    difference, _ = _partner_search(fixed, _CLOSE[2])(motion.apply(many))
+    return motion, float(np.isfinite(difference).mean())
 
 
 def _search_turns(moving: ObservedSurface, fixed: ObservedSurface) -> list[Motion]:
@@ -165,40 +166,41 @@ def _search_turns(moving: ObservedSurface, fixed: ObservedSurface) -> list[Motio
         for _ in range(_SHIFTS):
             moved = motion.apply(moving)
             _, index = tree.query(moved.point)
-            off2 = np.sum((moved.features(close) - features[index]) ** 2, axis=1)
-            weight = np.exp(-off2 / 4) + 1e-9
+            squared = np.sum((moved.features(close) - features[index]) ** 2, axis=1)  # σ²
+            weight = np.exp(-squared / 4) + 1e-9
             shift = np.average(fixed.point[index] - moved.point, axis=0, weights=weight)
-            found.append((np.minimum(off2, _FAR**2).mean(), motion))
+            found.append((np.minimum(squared, _FAR**2).mean(), motion))
             motion = Motion(turn, motion.translation + shift)
     return [motion for _, motion in sorted(found, key=lambda one: one[0])[:_TRIED]]
 
 
-def _misfit(moved: ObservedSurface, fixed: ObservedSurface, close: float) -> float:
-    """Mean squared difference of points from their partners, σ²."""
-    away, _ = _find_partners(moved, cKDTree(fixed.features(close * fixed.size)), close * fixed.size)
-    return float(np.mean(np.minimum(away, _FAR) ** 2))
+def _partner_search(fixed: ObservedSurface, close: float) -> Callable[[ObservedSurface], tuple[Floats, Floats]]:
+    """Search for the points of a surface that are most like others; `close` is the 1σ of distances over its size.
+
+    For P points, it returns their differences (P,) σ from these partners, infinite beyond _FAR, and indices (P,).
+    """
+    sigma = close * fixed.size
+    tree = cKDTree(fixed.features(sigma))
+
+    def find(moved: ObservedSurface) -> tuple[Floats, Floats]:
+        difference, index = tree.query(moved.features(sigma), distance_upper_bound=_FAR)
+        return np.asarray(difference), np.asarray(index)
+
+    return find
 
 
-def _find_partners(moved: ObservedSurface, tree: "cKDTree[None]", close: float) -> tuple[Floats, Floats]:
-    """Differences (P,) σ of points from the most alike ones of a tree of features, infinite beyond _FAR; indices."""
-    away, index = tree.query(moved.features(close), distance_upper_bound=_FAR)
-    return np.asarray(away), np.asarray(index)
-
-
-def _refine(motion: Motion, moving: ObservedSurface, fixed: ObservedSurface, steps: Sequence[float]) -> Motion:
-    """A motion improved by iterated closest points, closer at each of `steps` [sizes]."""
-    for close in steps:
-        tree = cKDTree(fixed.features(close * fixed.size))
+def _refine(motion: Motion, moving: ObservedSurface, fixed: ObservedSurface, closes: Sequence[float]) -> Motion:
+    """A motion improved by iterated closest points, with the 1σ of distances `closes` [sizes] in turn."""
+    for close in closes:
+        find = _partner_search(fixed, close)
         for _ in range(_ROUNDS):
             moved = motion.apply(moving)
-            away, index = _find_partners(moved, tree, close * fixed.size)
-            there = np.isfinite(away)
+            difference, index = find(moved)
+            there = np.isfinite(difference)
             if there.sum() < 6:  # a motion has six unknowns
                 return motion
-            weight = 1 / (1 + away[there] ** 2)
-            motion = _step_to_planes(
-                motion, moved.point[there], fixed.point[index[there]], fixed.normal[index[there]], weight
-            )
+            partner, weight = index[there], 1 / (1 + difference[there] ** 2)
+            motion = _step_to_planes(motion, moved.point[there], fixed.point[partner], fixed.normal[partner], weight)
     return motion
 
 

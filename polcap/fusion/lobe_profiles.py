@@ -1,11 +1,7 @@
-"""Radiance of one material in all views by half-angle: samples, the flash's place, and mean profiles.
-
-The samples of a material are averaged in bins of the half-angle, so that the few samples of a highlight count as much
-as the many others.
-"""
+"""Radiance of one material in all views by half-angle: samples, the flash's place, and mean profiles."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,14 +36,9 @@ class LobeSamples:
 
     def take(self, index: NDArray[np.intp] | slice) -> "LobeSamples":
         """Some of the samples."""
-        return replace(
-            self,
-            radiance=self.radiance[index],
-            albedo=self.albedo[index],
-            normal=self.normal[index],
-            point=self.point[index],
-            weight=self.weight[index],
-        )
+        arrays = (self.radiance, self.albedo, self.normal, self.point, self.weight)
+        radiance, albedo, normal, point, weight = (one[index] for one in arrays)
+        return LobeSamples(radiance, albedo, normal, point, weight, self.f0, self.alpha)
 
     def to_light(self, flash: Floats) -> Floats:
         """Unit vectors (P, 3) to a flash at (3,) [m, camera frame], in the frames of the rays."""
@@ -60,27 +51,27 @@ class LobeSamples:
 
     def diffuse(self, to_light: Floats) -> Floats:
         """Radiance (P,) of diffuse reflection."""
-        return self.albedo * self._shaded(to_light, 1.0, 0.0, 0.5)
+        return self.albedo * self._shade(to_light, 1.0, 0.0, 0.5)
 
-    def gloss(self, to_light: Floats, alpha: float) -> Floats:
+    def specular(self, to_light: Floats, alpha: float) -> Floats:
         """Radiance (P,) of specular reflection for F0 = 1."""
-        return self._shaded(to_light, 0.0, 1.0, np.sqrt(alpha))
+        return self._shade(to_light, 0.0, 1.0, np.sqrt(alpha))
 
-    def _shaded(self, to_light: Floats, diffuse: float, specular: float, roughness: float) -> Floats:
+    def _shade(self, to_light: Floats, albedo: float, f0: float, roughness: float) -> Floats:
         """S0 (P,) of a gray material under unit light."""
         one = np.ones(len(to_light))
-        material = diffuse * one[:, None], specular * one[:, None], roughness * one, _INDEX * one
+        material = albedo * one[:, None], f0 * one[:, None], roughness * one, _INDEX * one
         return np.asarray(shade.stokes(self.normal, *material, to_light, one)[0][:, 0])
 
 
 @dataclass(frozen=True)
 class LobeProfile:
-    """Mean radiance of one material in B bins of the half-angle, and its parts for A lobes."""
+    """Mean radiance of one material in B bins of the half-angle, and the terms of its law for A lobes."""
 
     radiance: Floats  # (B,)
     error: Floats  # (B,) expected
-    diffuse: Floats  # (B, 2) for g = 1 and for c = 1
-    gloss: Floats  # (A, B) for F0 = 1 and each of `ALPHAS`
+    diffuse: Floats  # (B, 2) for g = 1 and for c = 1 in the law of `material_fit`
+    specular: Floats  # (A, B) for F0 = 1 and each of `ALPHAS`
     f0: float  # of the maps
     alpha: float  # of the maps
     weight: float
@@ -93,8 +84,8 @@ def flash_place(samples: Sequence[LobeSamples]) -> Floats:
         return np.zeros(3)
 
     def misfit(place: Floats) -> float:
-        far = max(float(np.hypot(*place)) / _FARTHEST_FLASH - 1, 0)
-        return float(np.mean([_scatter(one, np.append(place, 0.0)) for one in half])) + 10 * far
+        beyond = max(float(np.hypot(*place)) / _FARTHEST_FLASH - 1, 0)
+        return float(np.mean([_scatter(one, np.append(place, 0.0)) for one in half])) + 10 * beyond
 
     simplex = np.array([[0.0, 0.0], [0.03, 0.0], [0.0, 0.03]])
     best = minimize(misfit, np.zeros(2), method="Nelder-Mead",
@@ -107,25 +98,25 @@ def _scatter(samples: LobeSamples, flash: Floats) -> float:
     to_light = samples.to_light(flash)
     diffuse = samples.diffuse(to_light)
     ratio = np.clip(samples.radiance / np.maximum(diffuse, 1e-3), 0.3, 6)
-    number = (samples.half_angle_deg(to_light) / _FLASH_BIN_DEG).astype(int)
+    bin_ = (samples.half_angle_deg(to_light) / _FLASH_BIN_DEG).astype(int)
     weight = samples.weight * (samples.normal[:, 2] > np.cos(np.radians(_LARGEST_DEG)))
-    mean = np.bincount(number, weight * ratio) / np.maximum(np.bincount(number, weight), 1e-9)
-    squared = ((ratio - mean[number]) / _FLASH_SCATTER) ** 2
+    mean = np.bincount(bin_, weight * ratio) / np.maximum(np.bincount(bin_, weight), 1e-9)
+    squared = ((ratio - mean[bin_]) / _FLASH_SCATTER) ** 2
     return float((weight * np.log1p(squared)).sum() / max(weight.sum(), 1e-9))
 
 
 def profile(samples: LobeSamples, flash: Floats) -> LobeProfile | None:
     """Means of a material's samples in bins of the half-angle; None for too few bins."""
     to_light = samples.to_light(flash)
-    number = (samples.half_angle_deg(to_light) / _BIN_DEG).astype(int)
-    weight = samples.weight * _select_usual(samples, number)
-    total = np.bincount(number, weight)
+    bin_ = (samples.half_angle_deg(to_light) / _BIN_DEG).astype(int)
+    weight = samples.weight * _select_usual(samples, bin_)
+    total = np.bincount(bin_, weight)
     filled = total > 0
     if filled.sum() < _LEAST_BINS:
         return None
 
     def mean(value: Floats) -> Floats:
-        return np.asarray(np.bincount(number, weight * value)[filled] / total[filled])
+        return np.asarray(np.bincount(bin_, weight * value)[filled] / total[filled])
 
     radiance, diffuse, cosine = mean(samples.radiance), samples.diffuse(to_light), samples.normal[:, 2]
     tangent = np.tan(np.arccos(np.clip(mean(cosine), 0.01, 1)))
@@ -133,19 +124,19 @@ def profile(samples: LobeSamples, flash: Floats) -> LobeProfile | None:
         radiance=radiance,
         error=radiance * np.hypot(_RELATIVE, _PER_TANGENT * tangent),
         diffuse=np.stack([mean(diffuse), mean(diffuse * (1 - cosine))], axis=-1),
-        gloss=np.stack([mean(samples.gloss(to_light, alpha)) for alpha in ALPHAS]),
+        specular=np.stack([mean(samples.specular(to_light, alpha)) for alpha in ALPHAS]),
         f0=samples.f0,
         alpha=samples.alpha,
         weight=float(samples.weight.sum()),
     )
 
 
-def _select_usual(samples: LobeSamples, number: NDArray[np.intp]) -> Bools:
+def _select_usual(samples: LobeSamples, bin_: NDArray[np.intp]) -> Bools:
     """Samples (P,) in bins with enough of them, without the darkest and the brightest of each bin."""
     ratio = samples.radiance / np.maximum(samples.albedo, 1e-3)
     usual = np.zeros(len(ratio), bool)
-    for one in range(int(_LARGEST_DEG / _BIN_DEG)):
-        inside = np.flatnonzero(number == one)
+    for number in range(int(_LARGEST_DEG / _BIN_DEG)):
+        inside = np.flatnonzero(bin_ == number)
         if len(inside) >= _LEAST_IN_BIN:
             out = int(_OUTLIERS * len(inside))
             usual[inside[np.argsort(ratio[inside])][out : len(inside) - out]] = True

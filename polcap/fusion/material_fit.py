@@ -7,17 +7,18 @@ which one view cannot. Texels of like albedo are taken for one material. Its rad
 
 with the diffuse and the specular law of `optics/shade.py`, E the flash's light at the distance of the point, n, l, v
 the normal and the directions to flash and lens, θ the zenith angle, g the factor on the baked albedo ρ_d (1 if it is
-right), c the error of the diffuse law, and α the square of the roughness. The samples of a material are averaged in
-bins of the half-angle, so that the few samples of a highlight count as much as the many others. For each α, weighted
-least squares give F0, g and c; the α with the least misfit is the fit. Errors of the normals widen the lobe: α² is less
-by twice their variance, which follows from the differences between the views' normals and the baked ones.
+right), c the error of the diffuse law, and α the square of the roughness.
+
+The flash's place near the lens is the one for which the half-angle explains the radiance best. The samples of a
+material are averaged in bins of the half-angle, so that the few samples of a highlight count as much as the many
+others. For each α, weighted least squares give F0, g and c; the α with the least misfit is the fit. Errors of the
+normals widen the lobe: α² is less by twice their variance. Where a chart gives the scale of radiance, the albedo of a
+material becomes that of its radiance without the gloss.
 
 F0 and roughness of the views' maps have a weight in the fit, by their errors. They are medians over the views, because
 the errors of one view are alike everywhere. Dielectrics of one object have nearly the same F0, so one F0 is fitted to
 all materials, and each may deviate a little from it. The more the errors of the normals widen a highlight, the nearer
-its gloss stays to that of the maps. The flash's place near the lens is found first, as the one for
-which the half-angle explains the radiance best. Where a chart gives the scale of radiance, the albedo of a material
-becomes that of its radiance without the gloss.
+its gloss stays to that of the maps.
 
 References
 ----------
@@ -25,7 +26,7 @@ Lensch et al., Image-based reconstruction of spatial appearance and geometric de
 materials, lobes from few views); Walter et al. 2007 (GGX).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -35,8 +36,9 @@ from msgspec import Meta
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from polcap.fusion import baking
 from polcap.fusion.atlas import Atlas
-from polcap.fusion.baking import AtlasMaps, VisibleTexels, on_atlas, visible_texels
+from polcap.fusion.baking import AtlasMaps, VisibleTexels, visible_texels
 from polcap.fusion.lobe_profiles import ALPHAS, LobeProfile, LobeSamples, flash_place, profile
 from polcap.fusion.values import FusionView
 from polcap.image_values import Floats
@@ -44,9 +46,9 @@ from polcap.optics import clusters, color, frames
 from polcap.optics.point_light import irradiance
 from polcap.stages import stage
 
-_F0S = np.linspace(0.012, 0.09, 14)
-_F0_ERROR = 0.0003
-_LEAST_F0, _FIXED_SIGMA = 0.005, 0.0005  # where the fit has less, F0 is held there
+_F0S = np.linspace(0.012, 0.09, 14)  # of all materials, tried first
+_F0_ERROR = 0.0003  # of the search between them
+_LEAST_F0, _LEAST_F0_SIGMA = 0.005, 0.0005  # an F0 that would be less is held there, with this 1σ
 _SAMPLES = 6000  # of a material, at most
 _LEAST_SAMPLES = 300  # of a material, below which its maps are left as they are
 _LEAST_SHARE = 0.02  # of the weight in the view that sees most of a material, for a view's maps to count
@@ -75,7 +77,7 @@ class Lobe:
 
     f0: float
     alpha: float
-    gain: float  # of the albedo, with which the radiance agrees
+    gain: float  # g, by which the albedo agrees with the radiance if c = 0
     misfit: float  # sum of squared errors, in units of the expected ones
 
 
@@ -85,71 +87,66 @@ def fit(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps, settings: 
     lit = [view for view in views if view.s0 is not None]
     if not lit:
         return maps
-    share = _materials(maps, atlas, settings.materials)  # (N, K)
+    share = _cluster_materials(maps, atlas, settings.materials)  # (N, K)
     visible = visible_texels(lit, atlas)
-    samples = _samples(lit, visible, atlas, maps, share)
-    flash = flash_place([one for one in samples if one is not None])
-    profiles = [None if one is None else profile(one, flash) for one in samples]
+    samples = _collect_samples(lit, visible, atlas, maps, share)
+    flash = flash_place(list(samples.values()))
+    profiles = {k: found for k, one in samples.items() if (found := profile(one, flash))}
     widening = 2 * _normal_sigma(lit, visible, atlas, maps) ** 2
-    lobes = _lobes(profiles, widening, settings)
-    return _blend(atlas, maps, share, lobes, all(view.white_distance is not None for view in lit))
+    lobes = _fit_lobes(profiles, widening, settings)
+    return _apply(atlas, maps, share, lobes, all(view.white_distance is not None for view in lit))
 
 
-def _materials(maps: AtlasMaps, atlas: Atlas, count: int) -> Floats:
+def _cluster_materials(maps: AtlasMaps, atlas: Atlas, count: int) -> Floats:
     """Soft share (N, K) of each texel in each material, by clusters of the encoded albedo."""
     encoded = color.encode_srgb(np.clip(maps.diffuse[atlas.covered], 0, 1)).astype(np.float32)
-    seen = maps.seen[atlas.covered]
-    center, spread = clusters.color_clusters(encoded[seen], count)
+    center, spread = clusters.color_clusters(encoded[maps.seen[atlas.covered]], count)
     return clusters.soft_share(encoded, center, spread)
 
 
-def _samples(
+def _collect_samples(
     views: Sequence[FusionView], visible: Sequence[VisibleTexels], atlas: Atlas, maps: AtlasMaps, share: Floats
-) -> list[LobeSamples | None]:
-    """Samples of each material; None where it has too few."""
+) -> dict[int, LobeSamples]:
+    """Samples of each material that has enough of them, by its number."""
     normal, albedo = maps.normal[atlas.covered], color.luminance(maps.diffuse[atlas.covered])
-    parts = []
     middle = atlas.position.mean(axis=0)
+    parts = []
     for view, texels in zip(views, visible):
         assert view.s0 is not None
-        steep = np.flatnonzero(texels.cosine > _LEAST_COSINE)
-        point = view.pose.to_camera(atlas.position[texels.texel[steep]])
-        to_lens = frames.unit(-point)
-        local = frames.to_ray_frame(normal[texels.texel[steep]] @ view.pose.rotation.T, to_lens)
-        far = float(np.linalg.norm(view.pose.rotation @ middle + view.pose.translation))
-        light = irradiance(point, view.light[:2], 0.0) * (far * (view.white_distance or 1)) ** 2
-        radiance = color.luminance(texels.sample(view.s0))[steep] / light
-        parts.append((radiance, albedo[texels.texel[steep]], local, point, texels.weight[steep], texels.texel[steep]))
+        use = np.flatnonzero(texels.cosine > _LEAST_COSINE)
+        texel = texels.texel[use]
+        point = view.pose.to_camera(atlas.position[texel])
+        local = frames.to_ray_frame(normal[texel] @ view.pose.rotation.T, frames.unit(-point))
+        distance = float(np.linalg.norm(view.pose.rotation @ middle + view.pose.translation))
+        light = irradiance(point, view.light[:2], 0.0) * (distance * (view.white_distance or 1)) ** 2
+        radiance = color.luminance(texels.sample(view.s0))[use] / light
+        parts.append((radiance, albedo[texel], local, point, texels.weight[use], texel))
     radiance, base, local, point, weight, texel = (np.concatenate(column) for column in zip(*parts))
     best = share.argmax(axis=1)
-    material, gloss = best[texel], _typical_gloss(views, visible, best, share.shape[1])
-    found: list[LobeSamples | None] = []
-    for k, (f0, rough) in enumerate(gloss):
-        mine = np.flatnonzero((material == k) & (weight > 0))
-        if len(mine) < _LEAST_SAMPLES:
-            found.append(None)
-            continue
-        mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), _SAMPLES)).astype(int)]
-        found.append(LobeSamples(radiance, base, local, point, weight, f0, max(rough**2, ALPHAS[0])).take(mine))
+    found = {}
+    for k, (f0, roughness) in enumerate(_typical_gloss(views, visible, best, share.shape[1])):
+        mine = np.flatnonzero((best[texel] == k) & (weight > 0))
+        if len(mine) >= _LEAST_SAMPLES:
+            mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), _SAMPLES)).astype(int)]
+            every = LobeSamples(radiance, base, local, point, weight, f0, max(roughness**2, ALPHAS[0]))
+            found[k] = every.take(mine)
     return found
 
 
 def _typical_gloss(
     views: Sequence[FusionView], visible: Sequence[VisibleTexels], material: NDArray[np.intp], count: int
 ) -> list[tuple[float, float]]:
-    """F0 and roughness of each material in the maps: medians over the views that see enough of it."""
-    rows = np.zeros((len(views), count, 3))  # means of F0 and roughness, weight
-    for row, view, texels in zip(rows, views, visible):
-        gloss = (
-            color.luminance(texels.sample(view.specular)),
-            texels.sample(view.roughness)[:, 0],
-            np.ones(len(texels.texel)),
-        )
-        row[:] = np.stack([np.bincount(material[texels.texel], texels.weight * x, count) for x in gloss], axis=-1)
-        row[:, :2] /= np.maximum(row[:, 2:], 1e-9)
-    enough = rows[..., 2] > _LEAST_SHARE * rows[..., 2].max(axis=0)
-    return [tuple(np.median(rows[enough[:, k], k, :2], axis=0)) if enough[:, k].any() else (0.0, 0.0)
-            for k in range(count)]  # fmt: skip
+    """F0 and roughness of each material in the maps: medians over the views that see enough of it; else 0."""
+    gloss, total = np.zeros((len(views), count, 2)), np.zeros((len(views), count))  # means of each view, their weight
+    for mean, weight, view, texels in zip(gloss, total, views, visible):
+        mine = material[texels.texel]
+        weight[:] = np.bincount(mine, texels.weight, count)
+        for k, value in enumerate((color.luminance(texels.sample(view.specular)), texels.sample(view.roughness))):
+            mean[:, k] = np.bincount(mine, texels.weight * value, count) / np.maximum(weight, 1e-9)
+    enough = total > _LEAST_SHARE * total.max(axis=0)
+    return [
+        tuple(np.median(gloss[enough[:, k], k], axis=0)) if enough[:, k].any() else (0.0, 0.0) for k in range(count)
+    ]
 
 
 def _normal_sigma(
@@ -165,62 +162,59 @@ def _normal_sigma(
     return _NORMAL_ERROR * float(np.median(angle)) / np.sqrt(2 * np.log(2)) if len(angle) else 0.0  # Rayleigh's law
 
 
-def _lobes(profiles: Sequence[LobeProfile | None], widening: float, settings: MaterialSettings) -> list[Lobe | None]:
-    """Lobe of each material that has a profile, with nearly the same F0.
+def _fit_lobes(profiles: Mapping[int, LobeProfile], widening: float, settings: MaterialSettings) -> dict[int, Lobe]:
+    """Lobes of the materials, with nearly the same F0; errors of the normals add `widening` to each α².
 
     Errors of all materials are alike, so together they count as one: their misfits are averaged. A material whose law
     is another adds little.
     """
-    known = [one for one in profiles if one is not None]
-    if not known:
-        return [None] * len(profiles)
-    weight = [one.weight for one in known]
-    of_maps, alpha = (float(np.average(part, weights=weight)) for part in zip(*((one.f0, one.alpha) for one in known)))
-    sigma = settings.f0_sigma * min(1.0, (_BROAD_ALPHA / alpha) ** _BROAD_POWER)
+    if not profiles:
+        return {}
+    every = list(profiles.values())
+    weight = [one.weight for one in every]
+    f0_of_maps = float(np.average([one.f0 for one in every], weights=weight))
+    alpha_of_maps = float(np.average([one.alpha for one in every], weights=weight))
+    sigma = settings.f0_sigma * min(1.0, (_BROAD_ALPHA / alpha_of_maps) ** _BROAD_POWER)
 
     def misfit(f0: float) -> float:
-        each = [_lobe(one, f0, widening, settings.roughness_sigma).misfit for one in known]
-        robust = [len(one.radiance) * np.log1p(value / len(one.radiance)) for one, value in zip(known, each)]
-        return float(np.average(robust, weights=weight)) + ((f0 - of_maps) / sigma) ** 2
+        each = [_fit_lobe(one, f0, _OWN_F0_SIGMA, settings.roughness_sigma, widening).misfit for one in every]
+        robust = [len(one.radiance) * np.log1p(value / len(one.radiance)) for one, value in zip(every, each)]
+        return float(np.average(robust, weights=weight)) + ((f0 - f0_of_maps) / sigma) ** 2
 
     best = int(np.argmin([misfit(float(f0)) for f0 in _F0S]))
     around = _F0S[max(best - 1, 0)], _F0S[min(best + 1, len(_F0S) - 1)]
     f0 = float(minimize_scalar(misfit, bounds=around, options={"xatol": _F0_ERROR}).x)
-    return [None if one is None else _final_lobe(one, f0, widening, settings) for one in profiles]
+    lobes = {}
+    for k, one in profiles.items():
+        trust = 1 / (1 + widening / one.alpha**2)
+        lobes[k] = _fit_lobe(one, f0, _OWN_F0_SIGMA * trust, settings.roughness_sigma * trust, widening)
+    return lobes
 
 
-def _final_lobe(profile: LobeProfile, f0: float, widening: float, settings: MaterialSettings) -> Lobe:
-    """The lobe of a material; the more the errors of the normals widen it, the nearer it stays to the maps and `f0`."""
-    trust = 1 / (1 + widening / profile.alpha**2)
-    return _lobe(profile, f0, widening, settings.roughness_sigma * trust, _OWN_F0_SIGMA * trust)
-
-
-def _lobe(
-    profile: LobeProfile, f0: float, widening: float, roughness_sigma: float, f0_sigma: float = _OWN_F0_SIGMA
-) -> Lobe:
-    """The lobe that fits a profile best, with an F0 near `f0`; `widening`: of α² by the errors of the normals."""
-    terms = np.empty((len(ALPHAS), len(profile.radiance), 3))
-    terms[..., 0], terms[..., 1:] = profile.gloss, profile.diffuse
+def _fit_lobe(profile: LobeProfile, f0: float, f0_sigma: float, roughness_sigma: float, widening: float) -> Lobe:
+    """The lobe that fits a profile best, near `f0` and near the roughness of the maps."""
+    terms = np.empty((len(ALPHAS), len(profile.radiance), 3))  # of F0, g and c, in 1σ of the radiance
+    terms[..., 0], terms[..., 1:] = profile.specular, profile.diffuse
     terms /= profile.error[:, None]
     radiance = profile.radiance / profile.error
     sigma = np.tile([f0_sigma, _GAIN_SIGMA, _LAW_SIGMA], (len(ALPHAS), 1))
     expected = np.tile([f0, 1.0, 0.0], (len(ALPHAS), 1))
     amplitude = _amplitudes(terms, radiance, expected, sigma)
     low = amplitude[:, 0] < _LEAST_F0
-    expected[low, 0], sigma[low, 0] = _LEAST_F0, _FIXED_SIGMA
+    expected[low, 0], sigma[low, 0] = _LEAST_F0, _LEAST_F0_SIGMA
     amplitude = _amplitudes(terms, radiance, expected, sigma)
-    narrower = np.sqrt(np.maximum(ALPHAS**2 - widening, ALPHAS[0] ** 2))  # without the errors of the normals
+    alphas = np.sqrt(np.maximum(ALPHAS**2 - widening, ALPHAS[0] ** 2))  # without the errors of the normals
     misfit = np.sum((radiance - np.einsum("abt,at->ab", terms, amplitude)) ** 2, axis=-1)
     misfit += np.sum(((amplitude - expected) / sigma) ** 2, axis=-1)
-    misfit += ((np.sqrt(narrower) - np.sqrt(profile.alpha)) / roughness_sigma) ** 2
+    misfit += ((np.sqrt(alphas) - np.sqrt(profile.alpha)) / roughness_sigma) ** 2
     best = int(np.clip(np.argmin(misfit), 1, len(ALPHAS) - 2))
     before, least, after = misfit[best - 1 : best + 2]
     bend = before - 2 * least + after
-    place = best + float(np.clip((before - after) / (2 * bend), -1, 1) if bend > 0 else 0)  # between steps of α
-    f0_there, alpha = (float(np.interp(place, range(len(ALPHAS)), part)) for part in (amplitude[:, 0], narrower))
+    place = best + float(np.clip((before - after) / (2 * bend), -1, 1) if bend > 0 else 0)  # vertex of a parabola
+    own_f0, alpha = (float(np.interp(place, range(len(ALPHAS)), part)) for part in (amplitude[:, 0], alphas))
     diffuse = terms[best, :, 1]
     gain = float(diffuse @ (radiance - amplitude[best, 0] * terms[best, :, 0]) / (diffuse @ diffuse))
-    return Lobe(f0_there, alpha, gain, float(least))
+    return Lobe(own_f0, alpha, gain, float(least))
 
 
 def _amplitudes(terms: Floats, radiance: Floats, expected: Floats, sigma: Floats) -> Floats:
@@ -231,20 +225,21 @@ def _amplitudes(terms: Floats, radiance: Floats, expected: Floats, sigma: Floats
     return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
 
 
-def _blend(atlas: Atlas, maps: AtlasMaps, share: Floats, lobes: Sequence[Lobe | None], scaled: bool) -> AtlasMaps:
+def _apply(atlas: Atlas, maps: AtlasMaps, share: Floats, lobes: Mapping[int, Lobe], scaled: bool) -> AtlasMaps:
     """Maps with F0 and roughness of the lobes and, if `scaled`, the albedo with which the radiance agrees.
 
     A material without a lobe has the means of its maps.
     """
-    specular, roughness = maps.specular[atlas.covered].astype(np.float64), maps.roughness[atlas.covered]
-    seen = maps.weight[atlas.covered]
-    each = np.empty((len(lobes), 3))  # F0, roughness, gain of the albedo
-    for row, part, lobe in zip(each, share.T, lobes):
-        weight = part * seen / max(float(part @ seen), 1e-9)
-        row[:] = weight @ color.luminance(specular), weight @ roughness, 1
-        if lobe is not None:
-            row[:] = lobe.f0, np.sqrt(lobe.alpha), lobe.gain if scaled else 1
-    f0, rough, gain = (share @ each).T[..., None]
-    specular *= f0 / np.maximum(color.luminance(specular), 1e-6)[:, None]
-    values = [maps.normal[atlas.covered], gain * maps.diffuse[atlas.covered], specular, rough, seen[:, None]]
-    return on_atlas(atlas, np.concatenate(values, axis=-1))
+    values = maps.texels(atlas.covered)
+    specular, seen = values[:, baking.SPECULAR].astype(np.float64), values[:, baking.WEIGHT]
+    materials = np.empty((share.shape[1], 3))  # F0, roughness, gain of the albedo
+    for k, part in enumerate(share.T):
+        if k in lobes:
+            materials[k] = lobes[k].f0, np.sqrt(lobes[k].alpha), lobes[k].gain if scaled else 1
+        else:
+            weight = part * seen / max(float(part @ seen), 1e-9)
+            materials[k] = weight @ color.luminance(specular), weight @ values[:, baking.ROUGHNESS], 1
+    f0, values[:, baking.ROUGHNESS], gain = (share @ materials).T
+    values[:, baking.SPECULAR] = specular * (f0 / np.maximum(color.luminance(specular), 1e-6))[:, None]
+    values[:, baking.DIFFUSE] = gain[:, None] * values[:, baking.DIFFUSE]
+    return baking.on_atlas(atlas, values)

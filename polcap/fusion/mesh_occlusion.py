@@ -4,8 +4,6 @@ import numpy as np
 
 from polcap.fusion.atlas import Atlas
 from polcap.image_values import Floats
-from polcap.mesh_values import Mesh
-from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.optics.outline import fill_outward
 from polcap.optics.texture_rasterizer import rasterize
 
@@ -16,15 +14,15 @@ _GOLDEN = np.pi * (3 - np.sqrt(5))  # rad, between neighbors on Fibonacci's sphe
 
 def ambient_occlusion(atlas: Atlas) -> Floats:
     """Visible share (S, S) of a uniform sky around the object, weighted by the cosine, on the texels of its atlas."""
-    mesh, image = atlas.mesh, np.zeros((*atlas.covered.shape, 1), np.float32)
-    points = rasterize(mesh.uv, mesh.faces, *atlas.covered.shape)
-    image[points.covered] = points.interpolate(_visible_sky(mesh)[:, None])
+    image = np.zeros((*atlas.covered.shape, 1), np.float32)
+    points = rasterize(atlas.mesh.uv, atlas.mesh.faces, *atlas.covered.shape)
+    image[points.covered] = points.interpolate(_visible_sky(atlas)[:, None])
     return np.asarray(fill_outward(image, points.covered)[..., 0])
 
 
-def _visible_sky(mesh: Mesh) -> Floats:
+def _visible_sky(atlas: Atlas) -> Floats:
     """Visible share (V,) of the sky at each vertex: a unit normal plus a point of a unit sphere has Lambert's law."""
-    tracer = Tracer(Triangles(mesh.vertices, mesh.faces, mesh.normals[mesh.faces]))
+    mesh, tracer = atlas.mesh, atlas.tracer()
     start = mesh.vertices + _START * tracer.size * mesh.normals
     height, turn = 1 - (2 * np.arange(_RAYS) + 1) / _RAYS, _GOLDEN * np.arange(_RAYS)
     across = np.sqrt(1 - height**2)

@@ -29,13 +29,14 @@ from polcap.optics.frames import dot, unit
 from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.optics.vertex_frames import area_vectors, vertex_normals
 
-_LIFT = 0.3  # steps off the surface where rays towards the lenses start; the numbers: docs/benchmarks/fusion.md
+# the numbers: docs/benchmarks/fusion.md; steps are those of the hull's grid
+_LIFT = 0.3  # steps off the surface, where rays towards the lenses start
 _FACING = 0.1  # least cosine between a vertex's normal and the direction to a lens that sees it
 _CAUCHY = np.radians(12.0)  # rad; a view that differs by as much from the mean counts half
 _RIM_DEPTH = 3.0  # steps inside the silhouette where rims are searched
 _RIM_LAYER = 0.5  # steps; the rim is a vertex of the outermost layer of this thickness
 _RIM_SIGMA = np.radians(6.0)  # 1σ of the angle between a rim's mean normal and the silhouette's; weights fall with it
-_RIM_LIMIT = 3.0  # 1σ; vertices beyond are no rims
+_RIM_LIMIT = 3.0  # σ; vertices beyond are no rims
 _HOLLOW_WEIGHT = 0.5  # of the equation that holds a carved vertex
 _HOLLOW_DEPTH = 2.0  # steps inside the hull from where on the surface was carved
 _FACET_POWER = 4  # of the cosine between a mesh's normal and the measured one, in the weight of the measured one
@@ -69,24 +70,15 @@ class Anchors:
 class FittedSurface:
     """A closed surface, and the agreement of the views on its normals."""
 
-    vertices: Floats  # (V, 3) m
-    faces: NDArray[np.int32]  # (F, 3)
+    mesh: ClosedMesh
     agreement: Floats  # (V,) share of the views' weight near the mean normal
     neighbors: sparse.csr_matrix  # (V, V) mean of the neighbors' values
 
-    @property
-    def mesh(self) -> ClosedMesh:
-        return ClosedMesh(self.vertices, self.faces)
-
-    def spread(self, value: Floats, rounds: int) -> Floats:
-        """Values (V,) averaged `rounds` times with their neighbors'."""
+    def smooth(self, value: Floats, rounds: int) -> Floats:
+        """Values (V,), each replaced `rounds` times by the mean of its neighbors'."""
         for _ in range(rounds):
             value = self.neighbors @ value
         return value
-
-    def tracer(self) -> Tracer:
-        """The surface prepared for ray tracing."""
-        return _tracer(self.vertices, self.faces)
 
 
 def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid, rounds: int) -> FittedSurface:
@@ -95,66 +87,66 @@ def fit_normals(mesh: ClosedMesh, views: Sequence[SmallView], hull: DistanceGrid
     Rims hold the surface at the silhouettes. Hollows have none, so they are held where they were carved. `rounds`
     is at least 1.
     """
-    step, faces = hull.grid.step, mesh.faces
+    step = hull.grid.step
     start: Floats = mesh.vertices.astype(np.float64)
     hollow = np.flatnonzero(hull.at(start) < -_HOLLOW_DEPTH * step)
-    neighbors = neighbor_means(faces, len(start))
-    vertices = start
+    neighbors = neighbor_means(mesh.faces, len(start))
+    mesh = ClosedMesh(start, mesh.faces)
     for _ in range(rounds):
-        outward = vertex_normals(vertices, faces)
-        seen = visible(vertices, faces, outward, views, step)
-        target = mean_normals(vertices, outward, seen, views)
-        rims = find_rims(vertices, outward, target, views, step)
-        sunk = dot(outward[hollow], start[hollow] - vertices[hollow])
+        outward = vertex_normals(mesh.vertices, mesh.faces)
+        target = _mean_normals(mesh.vertices, outward, visible(mesh, outward, views, step), views)
+        rims = _find_rims(mesh.vertices, outward, target, views, step)
+        sunk = dot(outward[hollow], start[hollow] - mesh.vertices[hollow])
         carved = Anchors(hollow, np.ones(len(hollow)), sunk, np.full(len(hollow), _HOLLOW_WEIGHT))
-        move = _displacements(vertices, faces, outward, target, [rims, carved])
+        move = _displacements(mesh, outward, target, [rims, carved])
         move = np.clip(move, -_MOST_MOVE * step, _MOST_MOVE * step)
-        vertices = _smooth(vertices + outward * move[:, None], faces, neighbors, target)
-    return FittedSurface(vertices, faces, target.agreement, neighbors)
+        moved = _smooth(mesh.vertices + outward * move[:, None], mesh.faces, neighbors, target)
+        mesh = ClosedMesh(moved, mesh.faces)
+    return FittedSurface(mesh, target.agreement, neighbors)
 
 
-def visible(
-    vertices: Floats, faces: NDArray[np.int32], outward: Floats, views: Sequence[SmallView], step: float
-) -> Bools:
-    """Visibility (N, V) of the vertices in the views: a vertex faces the lens, and the mesh does not hide it."""
-    tracer = _tracer(vertices, faces)
-    start = vertices + outward * (_LIFT * step)
-    seen = np.zeros((len(views), len(vertices)), bool)
+def visible(mesh: ClosedMesh, outward: Floats, views: Sequence[SmallView], step: float) -> Bools:
+    """Visibility (N, V) of a mesh's vertices in N views: a vertex faces the lens, and the mesh does not hide it.
+
+    `outward` (V, 3) are the normals; `step` [m] is that of the grid of which the mesh was made.
+    """
+    trace = tracer(mesh)
+    start = mesh.vertices + outward * (_LIFT * step)
+    seen = np.zeros((len(views), len(start)), bool)
     for row, view in zip(seen, views):
-        facing = np.flatnonzero(dot(outward, view.towards(vertices)) > _FACING)
-        row[facing] = ~tracer.hidden(start[facing], view.pose.center)
+        facing = np.flatnonzero(dot(outward, view.towards(mesh.vertices)) > _FACING)
+        row[facing] = ~trace.hidden(start[facing], view.pose.center)
     return seen
 
 
-def _tracer(vertices: Floats, faces: NDArray[np.int32]) -> Tracer:
-    corners = np.zeros((len(faces), 3, 3), np.float32)  # shading normals are not needed
-    return Tracer(Triangles(vertices.astype(np.float32), faces.astype(np.int32), corners))
+def tracer(mesh: ClosedMesh) -> Tracer:
+    """The mesh prepared for ray tracing, without shading normals."""
+    normals = np.zeros((len(mesh.faces), 3, 3), np.float32)
+    return Tracer(Triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), normals))
 
 
-def mean_normals(vertices: Floats, outward: Floats, seen: Bools, views: Sequence[SmallView]) -> SurfaceNormals:
+def _mean_normals(vertices: Floats, outward: Floats, seen: Bools, views: Sequence[SmallView]) -> SurfaceNormals:
     """Robust mean of the views' normals at each vertex, by expected error and by cosine to the ray.
 
     It begins at the view with the least Cauchy loss of all others, so that views outvote wrong half-turns.
     """
-    measured, weight = [], []
-    for view, row in zip(views, seen):
+    n = np.zeros((len(views), len(vertices), 3), np.float32)
+    w = np.zeros((len(views), len(vertices)), np.float32)
+    for normal, weight, view, row in zip(n, w, views, seen):
         pixel = view.pixels(vertices)
-        normal = unit(sample(view.normal, pixel))
-        facing = dot(normal, view.towards(vertices))
-        measured.append(normal)
-        weight.append(row * np.maximum(facing, 0) * sample(view.certainty, pixel))
-    n, w = np.stack(measured).astype(np.float32), np.stack(weight).astype(np.float32)  # (N, V, 3), (N, V)
+        measured = unit(sample(view.normal, pixel))
+        normal[:] = measured
+        weight[:] = row * np.maximum(dot(measured, view.towards(vertices)), 0) * sample(view.certainty, pixel)
     loss = [np.sum(w * np.log1p(_angle2(n, one) / _CAUCHY**2), axis=0) for one in n]
     best = np.argmin(np.where(w > 0, loss, np.inf), axis=0)
     mean = n[best, np.arange(len(vertices))]
     for _ in range(3):
-        agreeing = w / (1 + _angle2(n, mean) / _CAUCHY**2)
-        mean = unit(np.sum(agreeing[..., None] * n, axis=0))
-    close, total = np.sum(agreeing, axis=0), np.sum(w, axis=0)
-    agreeing_views = close / np.maximum(w.max(axis=0), 1e-12)  # number of them, in units of the view that weighs most
-    agreement = np.where(total > 0, close / np.maximum(total, 1e-12), 1.0)
-    normal = np.where(agreeing_views[:, None] > 0, mean, outward)
-    return SurfaceNormals(normal, agreeing_views / (1 + agreeing_views), agreement)
+        robust = w / (1 + _angle2(n, mean) / _CAUCHY**2)
+        mean = unit(np.sum(robust[..., None] * n, axis=0))
+    agreeing, total = np.sum(robust, axis=0), np.sum(w, axis=0)
+    count = agreeing / np.maximum(w.max(axis=0), 1e-12)  # of agreeing views, in units of the view that weighs most
+    agreement = np.where(total > 0, agreeing / np.maximum(total, 1e-12), 1.0)
+    return SurfaceNormals(np.where(count[:, None] > 0, mean, outward), count / (1 + count), agreement)
 
 
 def _angle2(a: Floats, b: Floats) -> Floats:
@@ -162,50 +154,47 @@ def _angle2(a: Floats, b: Floats) -> Floats:
     return np.asarray(2 - 2 * dot(a, b))
 
 
-def find_rims(
+def _find_rims(
     vertices: Floats, outward: Floats, target: SurfaceNormals, views: Sequence[SmallView], step: float
 ) -> Anchors:
-    """One vertex for each piece of each silhouette, a step long.
+    """One vertex for each piece of each silhouette, a step long, with its way to the silhouette.
 
-    Of the outermost vertices at the piece it is the one with the mean normal nearest to the silhouette's, which is
-    square to the ray. To pin all of them would freeze the hull, because each of its vertices touches some
-    silhouette's cone.
+    Of the outermost vertices at the piece it is the one with the mean normal nearest to the silhouette's. To pin all
+    of them would freeze the hull, because each of its vertices touches some silhouette's cone.
     """
     found = []
     for view in views:
         distance = view.distance(vertices)
         near = np.flatnonzero((distance > -_RIM_DEPTH * step) & (target.weight > 0))
-        pixel, out = view.nearest_outline(vertices[near])
+        pixel, rim_normal = view.nearest_rim(vertices[near])
         side = step * view.view.focal / np.linalg.norm(view.pose.center - vertices.mean(axis=0))
         piece = np.unique(np.round(pixel / side), axis=0, return_inverse=True)[1].ravel()
         outermost = np.full(piece.max(initial=0) + 1, -np.inf)
         np.maximum.at(outermost, piece, distance[near])
-        squared = _angle2(target.normal[near], out) / _RIM_SIGMA**2
+        squared = _angle2(target.normal[near], rim_normal) / _RIM_SIGMA**2  # σ²
         squared[distance[near] < outermost[piece] - _RIM_LAYER * step] = np.inf  # covered by others
         order = np.lexsort((squared, piece))
-        first = order[np.diff(piece[order], prepend=-1) > 0]
-        first = first[squared[first] < _RIM_LIMIT**2]
-        slope = dot(out[first], outward[near[first]])
-        found.append(np.stack([near[first], slope, -distance[near[first]], np.exp(-squared[first] / 2)]))
+        best = order[np.diff(piece[order], prepend=-1) > 0]  # of each piece
+        best = best[squared[best] < _RIM_LIMIT**2]
+        slope = dot(rim_normal[best], outward[near[best]])
+        found.append(np.stack([near[best], slope, -distance[near[best]], np.exp(-squared[best] / 2)]))
     vertex, slope, distance, weight = np.concatenate(found, axis=1)
     return Anchors(vertex.astype(np.intp), slope, distance, weight)
 
 
-def _displacements(
-    vertices: Floats, faces: NDArray[np.int32], outward: Floats, target: SurfaceNormals, anchors: Sequence[Anchors]
-) -> Floats:
+def _displacements(mesh: ClosedMesh, outward: Floats, target: SurfaceNormals, anchors: Sequence[Anchors]) -> Floats:
     """Displacements d (V,) m of the vertices along `outward` (V, 3) by which triangles get their measured normals.
 
     Weighted least squares of three kinds of equations, in normal form. An edge from i to j is to lie square to the
     measured normal t of its triangle: t·(x_j + d_j n_j − x_i − d_i n_i) = 0, with the outward normals n. An anchored
     vertex is to reach its place: slope · d_i = distance. Neighbors move alike, and little: d_i = d_j, d_i = 0.
     """
-    count = len(vertices)
-    tilt = unit(np.sum((target.normal * target.weight[:, None])[faces], axis=1))  # (F, 3) target of each triangle
-    facing = np.maximum(dot(tilt, unit(area_vectors(vertices, faces))), 0)
-    share = target.weight[faces].mean(axis=1) * facing**_FACET_POWER
+    vertices, faces, count = mesh.vertices, mesh.faces, len(mesh.vertices)
+    measured = unit(np.sum((target.normal * target.weight[:, None])[faces], axis=1))  # (F, 3)
+    facing = np.maximum(dot(measured, unit(area_vectors(vertices, faces))), 0)
+    weight = target.weight[faces].mean(axis=1) * facing**_FACET_POWER
     i, j = (np.concatenate([faces[:, (k + first) % 3] for k in range(3)]) for first in (0, 1))
-    t, w2 = np.tile(tilt, (3, 1)), np.tile(share**2, 3)
+    t, w2 = np.tile(measured, (3, 1)), np.tile(weight**2, 3)
     a_i, a_j = dot(t, outward[i]), dot(t, outward[j])
     b = -dot(t, vertices[j] - vertices[i])
     diagonal = np.full(count, _DAMPING**2)
@@ -229,8 +218,8 @@ def _smooth(vertices: Floats, faces: NDArray[np.int32], neighbors: sparse.csr_ma
     """
     for _ in range(_PASSES):
         outward = vertex_normals(vertices, faces)
-        measured = np.maximum(dot(outward, target.normal), 0) ** _FACET_POWER * target.agreement * (target.weight > 0)
-        way = neighbors @ vertices - vertices
-        along = way - outward * dot(way, outward)[:, None]
-        vertices = vertices + (1 - measured)[:, None] * way + _RELAXATION * measured[:, None] * along
+        trust = np.maximum(dot(outward, target.normal), 0) ** _FACET_POWER * target.agreement * (target.weight > 0)
+        step = neighbors @ vertices - vertices
+        along = step - outward * dot(step, outward)[:, None]
+        vertices = vertices + (1 - trust)[:, None] * step + _RELAXATION * trust[:, None] * along
     return np.asarray(vertices)

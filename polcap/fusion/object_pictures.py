@@ -10,7 +10,7 @@ from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.values import Pose
 from polcap.image_values import Floats, View
 from polcap.optics import color, frames
-from polcap.optics.mesh_tracer import Tracer, Triangles
+from polcap.optics.mesh_tracer import Tracer
 from polcap.report import animation
 from polcap.report.animation import TexturedPoints
 from polcap.report.sheets import Picture
@@ -26,10 +26,9 @@ _BACKGROUND = 0.012  # linear
 
 def around(atlas: Atlas, maps: AtlasMaps, count: int, side: int) -> list[Picture]:
     """Pictures (side, side, 3) of the object from `count` directions around the vertical, in sRGB."""
-    mesh = atlas.mesh
-    tracer = Tracer(Triangles(mesh.vertices, mesh.faces, mesh.normals[mesh.faces]))
-    middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
-    radius = float(np.linalg.norm(mesh.vertices - middle, axis=-1).max())
+    vertices, tracer = atlas.mesh.vertices, atlas.tracer()
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    radius = float(np.linalg.norm(vertices - middle, axis=-1).max())
     view = View(side * _FILLED / 2 * np.sqrt(_DISTANCE**2 - 1), ((side - 1) / 2, (side - 1) / 2), 1.0)
     drawn = []
     for azimuth in np.arange(count) * (360 / count):
@@ -43,13 +42,11 @@ def around(atlas: Atlas, maps: AtlasMaps, count: int, side: int) -> list[Picture
 def render(atlas: Atlas, maps: AtlasMaps, tracer: Tracer, pose: Pose, view: View, side: int) -> Floats:
     """Radiance (side, side, 3) of the object under a distant lamp next to the camera and a gray sky."""
     v = frames.rays(view, side, side).reshape(-1, 3)
-    origin = np.broadcast_to(pose.center, v.shape)
-    met = tracer.meet(origin, -v @ pose.rotation)
-    points, ray = sample_textures(atlas, maps, met.face, met.weight), v[met.index]
-    turned = points._replace(normal=points.normal @ pose.rotation.T)
-    lit = animation.render(turned, ray, _LIGHT, pose.rotation[:, 1], INDEX)
+    met = tracer.meet(np.broadcast_to(pose.center, v.shape), -v @ pose.rotation)
+    points = sample_textures(atlas, maps, met.face, met.weight)
+    points = points._replace(normal=points.normal @ pose.rotation.T)  # in the camera frame
     out = np.full((side * side, 3), _BACKGROUND, np.float32)
-    out[met.index] = lit
+    out[met.index] = animation.render(points, v[met.index], _LIGHT, pose.rotation[:, 1], INDEX)
     return out.reshape(side, side, 3)
 
 

@@ -11,7 +11,7 @@ IEEE TPAMI 2000.
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ from polcap.capture_values import Capture
 from polcap.errors import CaptureError
 from polcap.fusion.board_corners import BoardCorners
 from polcap.fusion.values import Pose
-from polcap.image_values import Distortion, Floats, View
+from polcap.image_values import Bools, Distortion, Floats, View
 from polcap.optics import distortion, projection
 from polcap.optics.board import Board
 from polcap.stages import stage
@@ -32,7 +32,7 @@ _MOST_RESIDUAL = 1.0  # px rms of a view's corners; a flat, sharp board leaves 0
 _CORNER_SIGMA = 0.05  # px, 1σ of a corner; the robust loss begins at 3σ
 _OUTLIER = 5.0  # times the robust spread of all corners, at least `_LEAST_OUTLIER` px
 _LEAST_OUTLIER = 0.5  # px
-_LEAST_KEPT = 0.75  # of a view's corners; where more are outliers, none is one
+_LEAST_INLIERS = 0.75  # of a view's corners; where more are outliers, all are used
 _PRINCIPAL_SIGMA = 0.002  # of the picture's width: where lenses have their axis; weak, see above
 _BEND_SIGMA = 0.3, 1.0  # of k₁ and k₂ where nothing else is known
 _CAMERA = 5  # unknowns of the camera: ln focal length, principal point, k₁, k₂
@@ -63,9 +63,7 @@ class SessionCamera:
     def reduced(self, scale: float) -> "SessionCamera":
         """The camera on a grid whose pixels are `scale` RAW pixels wide."""
         x, y = (projection.to_grid(at, scale) for at in self.principal_px)
-        return replace(
-            self, focal_px=self.focal_px / scale, focal_sigma_px=self.focal_sigma_px / scale, principal_px=(x, y)
-        )
+        return SessionCamera(self.focal_px / scale, self.focal_sigma_px / scale, (x, y), self.k1, self.k2)
 
     def project(self, pose: Pose, world: Floats) -> Floats:
         """Visible RAW pixels (N, 2) of the photograph that show world points (N, 3) [m]."""
@@ -137,37 +135,33 @@ def _adjust(seen: Mapping[str, BoardCorners], capture: Capture) -> tuple[Session
     stated = View(capture.focal_px, capture.principal_px, 1.0)
     start = np.concatenate([np.zeros(_CAMERA), *(_first_pose(one, stated) for one in boards)])
     found = _minimize(boards, capture, start)
-    error = [_residual(one, _camera(capture, found.x), found.x[_place(k)]) for k, one in enumerate(boards)]
-    far = max(_OUTLIER * 1.48 * float(np.median(np.abs(np.concatenate(error)))), _LEAST_OUTLIER)
-    used = [_remove_corners(one, np.linalg.norm(e, axis=1) > far) for one, e in zip(boards, error, strict=True)]
+    error = _residuals(boards, capture, found.x)
+    limit_px = max(_OUTLIER * 1.48 * float(np.median(np.abs(np.concatenate(error)))), _LEAST_OUTLIER)
+    used = [_select(one, np.linalg.norm(e, axis=1) <= limit_px) for one, e in zip(boards, error, strict=True)]
     found = _minimize(used, capture, found.x)
     return _with_errors(dict(zip(seen, used)), capture, found)
 
 
-def _remove_corners(corners: BoardCorners, bad: Floats) -> BoardCorners:
-    """Corners without the bad ones; all of them where the others are too few."""
-    keep = ~np.asarray(bad, bool)
-    if keep.sum() < _LEAST_KEPT * len(keep):
+def _select(corners: BoardCorners, near: Bools) -> BoardCorners:
+    """The corners (N,) that are near their measured places; all of them where these are too few."""
+    if near.sum() < _LEAST_INLIERS * len(near):
         return corners
-    return replace(
-        corners, number=corners.number[keep], world=corners.world[keep], measured_px=corners.measured_px[keep]
-    )
+    return BoardCorners(corners.board, corners.number[near], corners.world[near], corners.measured_px[near])
 
 
-def _place(k: int) -> slice:
+def _of_view(k: int) -> slice:
     """Unknowns of view k: rotation vector and translation [m], world to camera."""
     return slice(_CAMERA + 6 * k, _CAMERA + 6 * (k + 1))
 
 
 def _first_pose(corners: BoardCorners, view: View) -> Floats:
     """Rotation vector and translation (6,) of a view, from its corners alone, for a camera without distortion."""
-    flat = corners.world @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # into the plane z = 0, right-handed
+    to_flat = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # world to a frame with the board at z = 0
     count, turns, shifts, errors = cv2.solvePnPGeneric(
-        flat, corners.measured_px, view.intrinsic, None, flags=cv2.SOLVEPNP_IPPE
+        corners.world @ to_flat.T, corners.measured_px, view.intrinsic, None, flags=cv2.SOLVEPNP_IPPE
     )
     best = min(range(count), key=lambda k: float(np.ravel(errors[k])[0]))
-    turn = cv2.Rodrigues(turns[best])[0] @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).T
-    vector = Rotation.from_matrix(_TO_CV @ turn).as_rotvec()
+    vector = Rotation.from_matrix(_TO_CV @ cv2.Rodrigues(turns[best])[0] @ to_flat).as_rotvec()
     return np.concatenate([vector, _TO_CV @ np.ravel(shifts[best])])
 
 
@@ -185,33 +179,37 @@ def _pose(unknown: Floats) -> Pose:
 
 
 def _residual(corners: BoardCorners, camera: SessionCamera, unknown: Floats) -> Floats:
-    """Projected minus measured corners (N, 2) px."""
+    """Projected minus measured corners (N, 2) px of a view with these unknowns (6,)."""
     return camera.project(_pose(unknown), corners.world) - corners.measured_px
+
+
+def _residuals(boards: Sequence[BoardCorners], capture: Capture, unknown: Floats) -> list[Floats]:
+    """Projected minus measured corners (N, 2) px of each view, for all unknowns."""
+    camera = _camera(capture, unknown)
+    return [_residual(one, camera, unknown[_of_view(k)]) for k, one in enumerate(boards)]
 
 
 def _minimize(boards: Sequence[BoardCorners], capture: Capture, start: Floats) -> OptimizeResult:
     """Least squares of all unknowns from `start`, with weak priors of the camera's."""
     width = capture.size_px[0]
     doubt = max(abs(capture.focal_doubt[0]), abs(capture.focal_doubt[1]), 0.05 if capture.focal_known else 0.5)
-    weak = np.array([doubt, *[_PRINCIPAL_SIGMA * width] * 2, *_BEND_SIGMA])
+    prior = np.array([doubt, *[_PRINCIPAL_SIGMA * width] * 2, *_BEND_SIGMA])  # 1σ
+    rows = np.cumsum([_CAMERA, *(2 * len(one.number) for one in boards)])  # first of each view
 
-    counts = np.cumsum([_CAMERA, *(2 * len(one.number) for one in boards)])
-
-    def part(k: int, camera: Floats, place: Floats) -> Floats:
-        return _residual(boards[k], _camera(capture, camera), place).ravel() / _CORNER_SIGMA
+    def of_view(k: int, unknown: Floats) -> Floats:  # those of the camera and of view k
+        return _residual(boards[k], _camera(capture, unknown), unknown[_CAMERA:]).ravel() / _CORNER_SIGMA
 
     def residuals(unknown: Floats) -> Floats:
-        parts = [part(k, unknown[:_CAMERA], unknown[_place(k)]) for k in range(len(boards))]
-        return np.concatenate([unknown[:_CAMERA] / weak, *parts])
+        parts = [one.ravel() / _CORNER_SIGMA for one in _residuals(boards, capture, unknown)]
+        return np.concatenate([unknown[:_CAMERA] / prior, *parts])
 
     def jacobian(unknown: Floats) -> Floats:
-        out = np.zeros((counts[-1], len(unknown)))
-        out[range(_CAMERA), range(_CAMERA)] = 1 / weak
-        for k, (first, last) in enumerate(itertools.pairwise(counts)):
-            own = np.r_[:_CAMERA, _place(k)]
+        out = np.zeros((rows[-1], len(unknown)))
+        out[range(_CAMERA), range(_CAMERA)] = 1 / prior
+        for k, (first, last) in enumerate(itertools.pairwise(rows)):
+            own = np.r_[:_CAMERA, _of_view(k)]
             for column, step in zip(own, np.eye(len(own)) * _STEPS, strict=True):
-                ahead, back = (unknown[own] + sign * step for sign in (1, -1))
-                change = part(k, *np.split(ahead, [_CAMERA])) - part(k, *np.split(back, [_CAMERA]))
+                change = of_view(k, unknown[own] + step) - of_view(k, unknown[own] - step)
                 out[first:last, column] = change / (2 * step.max())
         return out
 
@@ -224,19 +222,12 @@ def _with_errors(
     boards: Mapping[str, BoardCorners], capture: Capture, found: OptimizeResult
 ) -> tuple[SessionCamera, list[PosedView]]:
     """Camera and poses with their errors, from the curvature at the solution and the actual residuals."""
-    camera = _camera(capture, found.x)
-    error = [_residual(one, camera, found.x[_place(k)]) for k, one in enumerate(boards.values())]
-    scale = float(np.sqrt(np.mean(np.concatenate(error) ** 2))) / _CORNER_SIGMA
-    jacobian = found.jac
-    sigma = max(scale, 0.1) * np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)))
-    posed = [
-        PosedView(
-            name=name,
-            pose=_pose(found.x[_place(k)]),
-            corners=len(one.number),
-            residual_px=float(np.sqrt(2 * np.mean(e**2))),
-            sigma_deg=float(np.degrees(sigma[_place(k)][:3].max())),
-        )
-        for k, ((name, one), e) in enumerate(zip(boards.items(), error, strict=True))
-    ]
+    errors = _residuals(list(boards.values()), capture, found.x)
+    scale = float(np.sqrt(np.mean(np.concatenate(errors) ** 2))) / _CORNER_SIGMA
+    sigma = max(scale, 0.1) * np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))
+    posed = []
+    for k, (name, error) in enumerate(zip(boards, errors, strict=True)):
+        rms_px = float(np.sqrt(2 * np.mean(error**2)))
+        sigma_deg = float(np.degrees(sigma[_of_view(k)][:3].max()))
+        posed.append(PosedView(name, _pose(found.x[_of_view(k)]), len(error), rms_px, sigma_deg))
     return _camera(capture, found.x, float(sigma[0])), posed

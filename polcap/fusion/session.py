@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from polcap.chart_values import ChartRequest, ColorCalibration
+from polcap.chart_values import ChartRequest
 from polcap.errors import CaptureError, ChartError
 from polcap.formats.maps import png
 from polcap.fusion import each_view, feature_poses, mask_agreement, poses, view_maps, view_path
@@ -64,26 +64,23 @@ def with_colors(session: Session, notify: Notify) -> Session:
     """
     if any(view.supplied.chart.mode != "auto" for view in session.views.values()):
         return session
-    charted, profile = _find_chart(session, notify)
+    for charted, view in session.views.items():
+        notify(f"{charted}: chart")
+        try:
+            profile = replace(view_path.find_chart(view), source="profile", place=None)
+            break
+        except ChartError:
+            continue
+    else:
+        raise ChartError(
+            "no view shows the ColorChecker; show it in one view, give a color profile with --chart, or --no-chart"
+        )
     chart = ChartRequest("profile", profile=profile)
 
     def with_chart(view: SessionView) -> SessionView:
         return view if view.name == charted else replace(view, supplied=replace(view.supplied, chart=chart))
 
     return session.with_inputs(with_chart)
-
-
-def _find_chart(session: Session, notify: Notify) -> tuple[str, ColorCalibration]:
-    """The first view that shows the chart, and its color calibration as a profile. Raises ChartError: none shows it."""
-    for name, view in session.views.items():
-        notify(f"{name}: chart")
-        try:
-            return name, replace(view_path.find_chart(view), source="profile", place=None)
-        except ChartError:
-            continue
-    raise ChartError(
-        "no view shows the ColorChecker; show it in one view, give a color profile with --chart, or --no-chart"
-    )
 
 
 def _find_poses_and_masks(
@@ -138,7 +135,10 @@ def _with_agreed_masks(
 
     Raises CaptureError: too many views contradict the others.
     """
-    silhouettes = tuple(_silhouette(name, masks[name], solved) for name in session.views)
+    silhouettes = tuple(
+        Silhouette(name, masks[name].mask, solved.camera.reduced(masks[name].scale), solved.views[name].pose)
+        for name in session.views
+    )
     try:
         agreed = cache.run(mask_agreement.agree, silhouettes).value
     except CaptureError:
@@ -151,13 +151,8 @@ def _with_agreed_masks(
     return used.with_inputs(lambda view: replace(view, supplied=replace(view.supplied, mask=masked[view.name])))
 
 
-def _silhouette(name: str, found: ViewMask, solved: SessionPoses) -> Silhouette:
-    """The mask of a view, which is on its merged picture, with the session's camera in merged px."""
-    return Silhouette(name, found.mask, solved.camera.reduced(found.scale), solved.views[name].pose)
-
-
 def _write_compared(out: Path, silhouettes: tuple[Silhouette, ...]) -> None:
-    """Write masks as pictures. Raises StorageError."""
+    """Write masks as pictures into the result folder `out` of the session."""
     for one in silhouettes:
         name = one.name.replace("/", "-")
         png.write(out / mask_agreement.COMPARED / f"{name}.png", np.where(one.mask, 255, 0).astype(np.uint8))
@@ -168,6 +163,5 @@ def _fusion_view(
 ) -> StageResult[FusionView]:
     """Maps of a processed view with its pose, which are read when they are needed."""
     results = DeferredResult(digest(report["keys"]), lambda: run.reopen(view.out, ResultsUntilInfer)[0])
-    undistort = view.config.stokes.undistort
-    pose = solved.views[view.name].pose
+    pose, undistort = solved.views[view.name].pose, view.config.stokes.undistort
     return cache.derive(view_maps.fusion_view, view.name, results, solved.camera, pose, solved.metric, undistort)

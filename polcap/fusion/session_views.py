@@ -88,8 +88,7 @@ class Session:
 def opened(session_input: SessionInput[Any], out: Path, progress: Progress) -> Iterator[tuple[Session, LazyCache]]:
     """Context manager: the views of a session, and the cache of its result folder `out`, which is locked.
 
-    Raises SettingError: there is no such folder, or `out` is not allowed. CaptureError: there are too few views.
-    StorageError: `out` is locked.
+    Raises SettingError, CaptureError: as `read`, and if `out` is not allowed. StorageError: `out` is locked.
     """
     session = read(session_input)  # first: a folder without views stays as it is
     for view in folder_names.session_views(session_input.folder):

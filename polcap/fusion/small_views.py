@@ -21,7 +21,7 @@ from polcap.optics.resize import area_mean, weighted_area_mean
 SIDE = 420  # px of the object's box in a small view, at most: three to a step of the default grid
 _MARGIN = 3  # px around the box
 _LEAST_SIGMA = 1.0  # deg
-_ROW = 1024  # points that cv2.remap takes in a row
+_ROW = 1024  # points in a row of cv2.remap, which takes 32,767 at most
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class SmallView:
 
     pose: Pose
     view: View
-    outline: Floats  # (H, W) px from the silhouette, negative inside
+    outline: Floats  # (H, W) signed distance from the silhouette's border, px, negative inside
     slope: Floats  # (H, W, 2) gradient of `outline` along x and y
     normal: Floats  # (H, W, 3) unit, world frame; 0 outside
     certainty: Floats  # (H, W) 1/σ² of the normals, 1/deg²; 0 outside
@@ -53,17 +53,18 @@ class SmallView:
         """Unit vectors (N, 3) from world points (N, 3) to the lens."""
         return unit(self.pose.center - point)
 
-    def nearest_outline(self, point: Floats) -> tuple[Floats, Floats]:
-        """For world points (N, 3): the silhouette's nearest pixels x, y (N, 2), and the unit directions (N, 3) there.
+    def nearest_rim(self, point: Floats) -> tuple[Floats, Floats]:
+        """Pixels x, y (N, 2) of the silhouette nearest to world points (N, 3), and normals (N, 3) of a surface there.
 
-        The directions are square to the rays, in the world frame.
+        These unit normals point out of the silhouette, square to the rays of the points, in the world frame.
         """
         pixel = self.pixels(point)
-        way = sample(self.slope, pixel)
-        way = way / np.maximum(np.hypot(*way.T), 1e-9)[:, None]
+        slope = sample(self.slope, pixel)
+        outward_px = slope / np.maximum(np.hypot(*slope.T), 1e-9)[:, None]
+        outward = np.concatenate([outward_px * [1, -1], np.zeros((len(pixel), 1))], axis=1) @ self.pose.rotation
         ray = self.towards(point)
-        out = np.concatenate([way * [1, -1], np.zeros((len(way), 1))], axis=1) @ self.pose.rotation
-        return pixel - way * sample(self.outline, pixel)[:, None], unit(out - ray * dot(out, ray)[:, None])
+        normal = unit(outward - ray * dot(outward, ray)[:, None])
+        return pixel - outward_px * sample(self.outline, pixel)[:, None], normal
 
 
 def reduce_views(views: Sequence[FusionView]) -> list[SmallView]:
@@ -72,7 +73,6 @@ def reduce_views(views: Sequence[FusionView]) -> list[SmallView]:
 
 
 def _reduce(of: FusionView) -> SmallView:
-    """Crop one view to its object and reduce it to SIDE px."""
     rows, columns = (np.flatnonzero(of.mask.any(axis=axis)) for axis in (1, 0))
     step = max(1.0, max(np.ptp(rows) + 1, np.ptp(columns) + 1) / SIDE)
     margin = int(np.ceil(_MARGIN * step))
@@ -83,22 +83,22 @@ def _reduce(of: FusionView) -> SmallView:
     scale = np.array(mask.shape[::-1]) / shape[::-1]  # px of the map per small px, x and y, equal within 1/SIDE
     x, y = ((np.array(of.view.center) - (left, top)) + 0.5) / scale - 0.5
     view = View(of.view.focal / float(scale.mean()), (float(x), float(y)), of.view.scale * float(scale.mean()))
-    world = weighted_area_mean(of.normal[box], mask, shape) @ of.pose.rotation  # of the pixels in the mask
-    length = np.linalg.norm(world, axis=-1, keepdims=True)
-    outline = area_mean(_outline(mask), shape) / np.float32(scale.mean())
+    normal = weighted_area_mean(of.normal[box], mask, shape) @ of.pose.rotation
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    outline = area_mean(_signed_distance(mask), shape) / np.float32(scale.mean())
     certainty = np.where(mask, 1 / np.maximum(of.sigma_deg[box], _LEAST_SIGMA) ** 2, 0).astype(np.float32)
     return SmallView(
         pose=of.pose,
         view=view,
         outline=outline,
         slope=np.stack([np.gradient(outline, axis=axis) for axis in (1, 0)], axis=-1),
-        normal=(world / np.maximum(length, 1e-9)).astype(np.float32),
+        normal=(normal / np.maximum(length, 1e-9)).astype(np.float32),
         certainty=area_mean(certainty, shape),
         diffuse=weighted_area_mean(of.diffuse[box], mask, shape),
     )
 
 
-def _outline(mask: Bools) -> Floats:
+def _signed_distance(mask: Bools) -> Floats:
     """Signed distance (H, W) px from the border of a mask's pixels, negative inside."""
     framed = np.pad(mask, 1)
     # not OpenCV's precise transform: its last bits differ from run to run
@@ -107,13 +107,10 @@ def _outline(mask: Bools) -> Floats:
     return np.asarray(cv2.GaussianBlur(signed.astype(np.float32), (0, 0), 1.0))  # evens the pixels' stairs
 
 
-def sample(image: Floats, pixel: Floats) -> Floats:
-    """Values (N,) or (N, C) of an image (H, W) or (H, W, C) at pixels x, y (N, 2), linear; edges repeat."""
-    count = len(pixel)
-    places = np.zeros((max(1, -(-count // _ROW)) * _ROW, 2), np.float32)
-    places[:count] = pixel
-    x, y = places.T.reshape(2, -1, _ROW)
-    out = cv2.remap(
-        image, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    return np.asarray(out.reshape(-1, *image.shape[2:])[:count])
+def sample(image: Floats, pixel: Floats, border: int = cv2.BORDER_REPLICATE) -> Floats:
+    """Values (N,) or (N, C) of an image (H, W) or (H, W, C) at pixels x, y (N, 2), linear; `border` as in OpenCV."""
+    rows = max(1, -(-len(pixel) // _ROW))
+    x, y = np.zeros((2, rows, _ROW), np.float32)
+    x.flat[: len(pixel)], y.flat[: len(pixel)] = pixel.T
+    out = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=border)
+    return np.asarray(out.reshape(-1, *image.shape[2:])[: len(pixel)])

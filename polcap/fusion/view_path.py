@@ -52,14 +52,14 @@ class ViewStages:
 
 def path(view: SessionView, cache: LazyCache) -> ViewStages:
     """Lay out the stages in order; none runs before its result is needed."""
-    posed, finder, settings = view.board, view.supplied.mask_network, view.config.mask
     single.run_stages(view.capture, view.supplied, view.config, cache)
     names = ("hdr", "whitebalance", "align", "mask", "selfcal", "stokes", "infer")
     radiance, color, alignment, object_, calibration, stokes, maps = (cache.results[name] for name in names)
     board = cache.run(board_corners.detect, radiance, color)
     features = cache.run(object_features.find, radiance, color, object_, calibration, stokes, maps)
-    found = cache.run(mask_without_board.find, radiance, alignment, color, posed, finder, onnx.run, config=settings)
-    return ViewStages(color, board, features, found)
+    search = (radiance, alignment, color, view.board, view.supplied.mask_network, onnx.run)
+    mask = cache.run(mask_without_board.find, *search, config=view.config.mask)
+    return ViewStages(color, board, features, mask)
 
 
 def _value(view: SessionView, choose: Callable[[ViewStages], StageResult[T]]) -> T:
@@ -75,17 +75,17 @@ def find_chart(view: SessionView) -> ColorCalibration:
 
 
 def find_board(view: SessionView) -> BoardSearch:
-    """Search the board in a view. Raises CaptureError: as `board_corners.detect`."""
+    """Search of the board in a view. Raises CaptureError: as `board_corners.detect`."""
     return _value(view, lambda stages: stages.board)
 
 
 def find_features(view: SessionView) -> ObjectFeatures:
-    """Find features of the object, and a first mask. Raises CaptureError: as `object_features.find`."""
+    """Features of the object, and a first mask. Raises CaptureError: as `object_features.find`."""
     return _value(view, lambda stages: stages.features)
 
 
 def find_mask(view: SessionView) -> ViewMask:
-    """Find the mask of the object before the board. Raises ObjectError: no object is found."""
+    """The mask of the object in front of the board. Raises ObjectError: no object is found."""
     return _value(view, lambda stages: stages.mask)
 
 
