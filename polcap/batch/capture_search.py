@@ -45,7 +45,7 @@ def search(folder: Path, linked: bool = False) -> list[Candidate]:
     if stated or folder_names.states_angles(path.name for path in inside):
         return [Candidate(folder)]
     below = [] if linked else [found for path in inside for found in search(path, path.is_symlink())]
-    kinds = photograph_files.kinds(path for path in listed if not path.is_dir())
+    kinds = [photograph_files.kind(path) for path in listed if not path.is_dir()]
     here = Candidate(folder, Rank.RAW if "raw" in kinds else Rank.PICTURES, kinds.count("raw") or kinds.count("photo"))
     return _chosen(here, below, any(map(_is_fused, inside)))
 

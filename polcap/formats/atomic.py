@@ -13,14 +13,15 @@ import os
 import re
 import shutil
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from secrets import token_hex
 from typing import Any
 
 import msgspec
 
+from polcap import parallel
 from polcap.errors import StorageError
 from polcap.formats import own_files, system_errors
 
@@ -35,10 +36,7 @@ _UNSYNCED = {  # errors of fsync on drives without it
 
 
 def write(final: str | Path, content: str | bytes, synced: bool = True) -> None:
-    """Write `content` into the file `final`, completely or not at all; text is encoded as UTF-8.
-
-    Without `synced` the file may be incomplete after a power cut. Raises StorageError as `path` does.
-    """
+    """Write `content` into the file `final`, as `path` does; text is encoded as UTF-8."""
     if isinstance(content, str):
         content = content.encode("utf-8", "backslashreplace")  # the name of a file may not be text
     with path(final, synced) as temporary:
@@ -46,7 +44,7 @@ def write(final: str | Path, content: str | bytes, synced: bool = True) -> None:
 
 
 def write_json(final: str | Path, content: Any, synced: bool = True) -> None:
-    """Write plain data, msgspec structs and dataclasses as a JSON file, otherwise as `write`; NaN is a ValueError."""
+    """Write plain data, msgspec structs and dataclasses as a JSON file, as `path` does; NaN is a ValueError."""
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False, default=msgspec.to_builtins)
     write(final, text + "\n", synced)
 
@@ -71,7 +69,7 @@ def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
         if final.is_symlink():
             raise StorageError(f"cannot write {final}: it is a link; remove it, or choose another path")
         final.parent.mkdir(parents=True, exist_ok=True)
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        temporary.touch(exist_ok=False)
         yield temporary
         if synced:
             sync(temporary)
@@ -85,17 +83,14 @@ def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
 
 
 def copy(source: Path, final: Path) -> None:
-    """Write a copy of the content of a file. Raises StorageError: it cannot be read or written."""
+    """Write a copy of the content of a file, as `path` does."""
     with path(final) as temporary:
         shutil.copyfile(source, temporary)
 
 
 @contextmanager
 def new_folder(final: str | Path) -> Iterator[Path]:
-    """Context manager: a temporary folder to fill, renamed to `final` at the end; `final` may be an empty folder.
-
-    Raises StorageError: any OSError of making, writing, syncing or renaming, inside the block too; `final` holds files.
-    """
+    """Context manager: a temporary folder to fill, renamed to `final` at the end; `final` may be an empty folder."""
     with _temporary_folder(Path(final)) as temporary:
         yield temporary
         _sync_all(temporary)
@@ -110,8 +105,6 @@ def folder_of_files(final: str | Path, index: str, synced: bool = True) -> Itera
 
     Files of polcap that `final` held before are replaced or removed; others stay. `index` is the file without which
     readers do not accept the folder: it is removed first and moved last, so they never see files of two generations.
-
-    Raises StorageError: as `path`, for any of the files.
     """
     final = Path(final)
     with _temporary_folder(final) as temporary:
@@ -160,8 +153,7 @@ def is_temporary(name: str) -> bool:
 
 
 def _sync_all(folder: Path) -> None:
-    with ThreadPoolExecutor(_SYNCED_AT_ONCE) as pool:
-        list(pool.map(sync, [*sorted(folder.rglob("*")), folder]))
+    parallel.results([partial(sync, one) for one in (*sorted(folder.rglob("*")), folder)], _SYNCED_AT_ONCE)
 
 
 def sync(target: Path) -> None:

@@ -6,12 +6,13 @@ capture uses the newest that fits it.
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 from unicodedata import normalize
 
 import msgspec
 import numpy as np
 
-from polcap.calibration_values import Calibration, LensGeometry
+from polcap.calibration_values import BallAccuracy, Calibration, LensGeometry
 from polcap.capture_values import Exif
 from polcap.errors import CaptureError
 from polcap.formats import atomic, own_folders, text_file
@@ -24,6 +25,7 @@ _MAX_DISTORTION = 1000.0  # of k1 and k2; only a picture that folds over itself 
 _LEAST_LIGHT = 0.02  # in a corner of the lens, relative to the middle
 _SAME_SETTING = 0.05  # relative change of f-number or focal length
 _CHANNELS = (1, 3)
+_Measurement = TypeVar("_Measurement", Calibration, BallAccuracy)
 _HEAD = """\
 # polcap calibration. Signals: 1 is the sensor's white. Each sigma is 1σ. Angles from image x towards image up.
 # noise: variance of a pixel of the merged picture (half size) = slope * signal + floor.
@@ -34,10 +36,15 @@ _HEAD = """\
 
 def write(place: Path, found: Calibration) -> Path:
     """Write a calibration as a dated TOML file into the folder `place` and return the file's path."""
-    parts = [found.made[:19].replace(":", ""), found.camera, found.lens, found.filter]
-    path = place / (atomic.safe_name(" ".join(part for part in parts if part)) + ".toml")
+    path = dated_file(place, found)
     atomic.write(path, text(found))
     return path
+
+
+def dated_file(place: Path, found: Calibration | BallAccuracy) -> Path:
+    """Path of a TOML file in the folder `place`, named by time, camera, lens and filter of a measurement."""
+    parts = [found.made[:19].replace(":", ""), found.camera, found.lens, found.filter]
+    return place / (atomic.safe_name(" ".join(part for part in parts if part)) + ".toml")
 
 
 def text(found: Calibration) -> str:
@@ -46,19 +53,21 @@ def text(found: Calibration) -> str:
 
 
 def read(path: Path) -> Calibration:
-    """Read a calibration file that `write` wrote.
-
-    Raises CaptureError: it is not such a file, or cannot be read.
-    """
-    try:
-        found = msgspec.convert(text_file.read_toml(path), Calibration)
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be read ({error.strerror}); repair or remove it") from None
-    except ValueError as error:
-        raise CaptureError(f"{path}: not a polcap calibration ({error}); calibrate again, or remove it") from None
+    """Read a calibration file that `write` wrote. Raises CaptureError."""
+    found = read_measurement(path, Calibration, "not a polcap calibration", "calibrate again")
     if wrong := _impossible_parts(found):
         raise CaptureError(f"{path}: its {', '.join(wrong)} is impossible; calibrate again, or remove the file")
     return found
+
+
+def read_measurement(path: Path, kind: type[_Measurement], fault: str, remedy: str) -> _Measurement:
+    """Read a TOML file of this kind. Raises CaptureError, with `fault` and `remedy` where it is of another kind."""
+    try:
+        return msgspec.convert(text_file.read_toml(path), kind)
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read ({error.strerror}); repair or remove it") from None
+    except ValueError as error:
+        raise CaptureError(f"{path}: {fault} ({error}); {remedy}, or remove it") from None
 
 
 def choose(exif: Exif, lens_filter: str | None, focal_length_mm: float | None) -> tuple[Calibration | None, list[str]]:
@@ -70,7 +79,7 @@ def choose(exif: Exif, lens_filter: str | None, focal_length_mm: float | None) -
     Raises CaptureError: a file in the folder is not a calibration.
     """
     fitting = []
-    for path in own_folders.calibration_files():
+    for path in own_folders.toml_files(own_folders.calibrations()):
         found = read(path)
         if exif.camera and found.camera == exif.camera and (not found.lens or not exif.lens or found.lens == exif.lens):
             fitting.append((found, path))

@@ -35,21 +35,10 @@ class _Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def write(path: Path, color: ColorCalibration) -> None:
     """Write a color matrix as a profile file for other captures of the same camera, light and exposure."""
-    patches = color.patches
-    document: dict[str, Any] = {
-        "matrix": color.matrix,
-        "source": color.source,
-        "cost": float(color.cost),
-        "metres_per_px": color.metres_per_px,
-    }
-    if patches is not None:
-        document |= {
-            "delta_e": patches.delta_e,
-            "falloff": patches.falloff,
-            "glare": patches.glare,
-            "predicted": patches.predicted,
-            "patch_use": patches.use,
-        }
+    document = {name: getattr(color, name) for name in ("matrix", "source", "cost", "metres_per_px")}
+    if (patches := color.patches) is not None:
+        document |= {name: getattr(patches, name) for name in ("delta_e", "falloff", "glare", "predicted")}
+        document["patch_use"] = patches.use
     head = (
         "# polcap color profile. matrix: camera radiance (I0 + I90) -> linear Rec.709 reflectance.\n"
         "# metres_per_px: at the chart's distance.\n"
@@ -58,10 +47,7 @@ def write(path: Path, color: ColorCalibration) -> None:
 
 
 def read(path: Path) -> ColorCalibration:
-    """Read a color profile that `write` wrote.
-
-    Raises ChartError: the file is missing, not a profile, or its matrix cannot be inverted.
-    """
+    """Read a color profile that `write` wrote. Raises ChartError."""
     document: dict[str, Any] = {}
     try:
         document = text_file.read_toml(path, finite=False)
@@ -76,15 +62,10 @@ def read(path: Path) -> ColorCalibration:
     matrix = np.array(profile.matrix)
     if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix, rtol=1e-6) < 3:
         raise ChartError(f"{path}: its color matrix cannot be inverted; write the profile again")
-    delta_e, predicted = (
-        None if values is None else np.array(values, np.float64) for values in (profile.delta_e, profile.predicted)
-    )
-    use = None if profile.patch_use is None else np.array(profile.patch_use, np.uint8)
-    patches = delta_e is not None and PatchColors(delta_e, use, predicted, profile.falloff, profile.glare)
-    return ColorCalibration(
-        matrix=matrix,
-        source=profile.source,
-        cost=profile.cost,
-        metres_per_px=profile.metres_per_px,
-        patches=patches or None,
-    )
+    patches = None
+    if profile.delta_e is not None:
+        use = None if profile.patch_use is None else np.array(profile.patch_use, np.uint8)
+        predicted = None if profile.predicted is None else np.array(profile.predicted)
+        patches = PatchColors(np.array(profile.delta_e), use, predicted, profile.falloff, profile.glare)
+    metres = profile.metres_per_px
+    return ColorCalibration(matrix, profile.source, cost=profile.cost, metres_per_px=metres, patches=patches)

@@ -25,10 +25,7 @@ _MAPPED = 1 << 16  # bytes; smaller files are read at once, as a map costs a pag
 
 
 def encode(value: Any, name: str, arrays: Arrays) -> Any:
-    """Convert a value to JSON data; its arrays are added to `arrays` under dotted names.
-
-    Raises TypeError for unknown types.
-    """
+    """Convert a value to JSON data; its arrays are added to `arrays` under dotted names. TypeError: unknown type."""
     if isinstance(value, np.ndarray):
         if value.dtype.hasobject:
             raise TypeError(f"{name}: an array of Python objects cannot be stored")
@@ -114,10 +111,7 @@ def _expect(holds: bool, tree: Any, wanted: str, folder: Path) -> None:
 
 
 def save(file: Path, array: NDArray[Any]) -> list[Any]:
-    """Write an array of any shape as an .npy file; returns the file's size and SHA-256 digest, as `checksum` does.
-
-    Raises OSError: the file cannot be written.
-    """
+    """Write an array of any shape as an .npy file; returns the file's size and SHA-256 digest, as `checksum` does."""
     array = np.asarray(array, order="C")
     head = io.BytesIO()
     np.lib.format.write_array_header_2_0(head, np.lib.format.header_data_from_array_1_0(array))

@@ -80,10 +80,7 @@ def run(network: Network, inputs: Floats) -> dict[str, Floats]:
 
 
 def run_session(session: Any, path: Path, inputs: Floats, limit_s: float = _RUN_S) -> dict[str, Floats]:
-    """Run an open onnxruntime session on channels (1, N, H, W) within a time limit; `path` is only for messages.
-
-    Raises ModelError.
-    """
+    """Run an open onnxruntime session on channels (1, N, H, W); `path` is only for messages. Raises ModelError."""
     entry = session.get_inputs()[0]
     dtype = np.float16 if entry.type == "tensor(float16)" else np.float32
     names = [output.name for output in session.get_outputs()]
@@ -144,7 +141,7 @@ def _bytes(path: Path) -> bytes:
 
 
 def providers(path: Path) -> dict[str, str]:
-    """The execution providers of this onnxruntime (CPU, CUDA…), each with the reason why it fails, or ""."""
+    """The execution providers of this onnxruntime (CPU, CUDA…), each with the reason why it fails on a model, or ""."""
     found = {}
     for name in _onnxruntime().get_available_providers():
         if name == _REMOTE:
@@ -177,10 +174,7 @@ def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
 
 
 def _check(path: Path, session: Any, encoding: str) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Names of the model's input channels, and its metadata.
-
-    Raises ModelError if metadata are missing or invalid, state another encoding, or do not fit the input.
-    """
+    """Names of the model's input channels, and its metadata. ModelError: these do not fit polcap or the input."""
     try:
         metadata = {str(k): str(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
     except UnicodeError as error:

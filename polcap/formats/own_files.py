@@ -82,11 +82,10 @@ class OwnFiles:
 def is_claimed(folder: Path) -> bool:
     """Whether a folder has a record of polcap's files."""
     record = folder / RECORD
-    if record.is_symlink():
+    try:
+        return not record.is_symlink() and text_file.read_bytes(record, text_file.TEXT_BYTES).startswith(_FIRST_LINE)
+    except (OSError, ValueError):
         return False
-    with suppress(OSError, ValueError):
-        return text_file.read_bytes(record, text_file.TEXT_BYTES).startswith(_FIRST_LINE)
-    return False
 
 
 def wrote(folder: Path, file: Path) -> bool:

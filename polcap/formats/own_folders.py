@@ -46,10 +46,6 @@ def ball_accuracies() -> Path:
     return calibrations() / "balls"
 
 
-def calibration_files() -> list[Path]:
-    """All calibration files of the user, by name."""
-    try:
-        found = [path for path in calibrations().iterdir() if path.suffix == ".toml" and path.is_file()]
-        return sorted(path for path in found if not path.name.startswith("."))  # of macOS, or of a killed run
-    except OSError:
-        return []
+def toml_files(folder: Path) -> list[Path]:
+    """TOML files of a folder by name; none if there is no folder. Hidden files are of macOS, or of a killed run."""
+    return sorted(path for path in folder.glob("[!.]*.toml") if path.is_file())

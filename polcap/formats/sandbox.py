@@ -37,22 +37,19 @@ _GRACE_S = 5.0  # the child's own time limit, which ends it without its parent, 
 
 Arrays = dict[str, NDArray[Any]]
 Answer = tuple[dict[str, Any], Arrays]
+Function = Callable[..., Answer]
 _LENGTH = struct.Struct("<Q")
 _READY = b"ready"  # the child has imported the function's module: its time starts to count
 _CHILD = "import sys; sys.path[:] = sys.argv[2:]; from polcap.formats import sandbox; sandbox.serve(float(sys.argv[1]))"
+_Type = Annotated[str, Meta(pattern=r"^[<>|=]?[biuf]\d{1,2}$")]
+_Side = Annotated[int, Meta(ge=0, lt=2**31)]
 
 
 class _Head(msgspec.Struct):
     """The child's answer without the values of its arrays: a result, a refusal of the file, or a defect of polcap."""
 
     meta: dict[str, Any] | None = None
-    arrays: list[
-        tuple[
-            str,
-            Annotated[str, Meta(pattern=r"^[<>|=]?[biuf]\d{1,2}$")],
-            tuple[Annotated[int, Meta(ge=0, lt=2**31)], ...],
-        ]
-    ] = []  # name, type, shape
+    arrays: list[tuple[str, _Type, tuple[_Side, ...]]] = []  # name, type, shape
     error: str | None = None
     kind: str = ""  # class of the error; "" for `DecodeError`
     bug: str | None = None
@@ -77,12 +74,7 @@ class Sandbox:
         self._log: IO[bytes] | None = None  # the child's stderr
 
     def call(
-        self,
-        function: Callable[..., Answer],
-        path: str | os.PathLike[str],
-        *,
-        limit_s: float | None = None,
-        **options: Any,
+        self, function: Function, path: str | os.PathLike[str], limit_s: float | None = None, **options: Any
     ) -> Answer:
         """Run `function(path, **options)` in the child process and return its answer.
 
@@ -160,12 +152,9 @@ class Sandbox:
                 raise ValueError(f"{name} is {dtype} of {shape}")
             left -= size
             arrays[name] = np.empty(shape, kind)
-            view = memoryview(cast(Any, arrays[name].reshape(-1).view(np.uint8)))
-            while view:
-                count = cast(Any, pipe).readinto(view)
-                if not count:
-                    raise EOFError
-                view = view[count:]
+            content = arrays[name].reshape(-1).view(np.uint8)
+            if cast(Any, pipe).readinto(content.data) < content.size:  # it fills the array, or the pipe is at its end
+                raise EOFError
         return head, arrays
 
     def _spawn(self) -> subprocess.Popen[bytes]:
@@ -218,14 +207,12 @@ if hasattr(os, "register_at_fork"):  # a fork must not share the pipes
     os.register_at_fork(after_in_child=_idle.clear)
 
 
-def call(
-    function: Callable[..., Answer], path: str | os.PathLike[str], *, limit_s: float | None = None, **options: Any
-) -> Answer:
-    """Run a function on an untrusted file in a child process: an idle one, or a new one for each thread."""
+def call(function: Function, path: str | os.PathLike[str], **options: Any) -> Answer:
+    """Run a function on an untrusted file in an idle child process, or in a new one, as `Sandbox.call` does."""
     with _hold:
         sandbox = _idle.pop() if _idle else Sandbox()
     try:
-        return sandbox.call(function, path, limit_s=limit_s, **options)
+        return sandbox.call(function, path, **options)
     finally:
         with _hold:
             _idle.append(sandbox)

@@ -61,17 +61,14 @@ def read_textures(folder: Path, side: int = 256) -> Floats:
         n = _picture(folder / "normal.jpg", side)[..., ::-1] * 2 - 1
         slope = -n[..., :2] / np.maximum(n[..., 2:], 0.3)
     elif (folder / "height.jpg").exists():
-        height = _picture(folder / "height.jpg", side).mean(axis=-1)
+        height = _picture(folder / "height.jpg", side).mean(axis=-1)  # white is a 32nd of the side high
         slope = np.stack([np.roll(height, -1, a) - np.roll(height, 1, a) for a in (1, 0)], axis=-1) * side / 64
     maps = np.concatenate([linear, rough[..., None], np.clip(slope, -2, 2)], axis=-1)
     return np.ascontiguousarray(maps.transpose(2, 0, 1), dtype=np.float32)
 
 
 def read_height(path: Path, side: int) -> Floats:
-    """Read a height map, (side, side), 0…1: the gray of a picture of 8 or 16 bits.
-
-    Raises DecodeError: the file is missing or cannot be read.
-    """
+    """Read a height map, (side, side), 0…1: the gray of a picture of 8 or 16 bits. Raises DecodeError."""
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if path.is_file() else None
     if image is None:
         raise DecodeError(f"{path} is missing or not a picture; give a height map as PNG, white is high")

@@ -53,20 +53,17 @@ def read_text(path: str | Path, limit: int = TEXT_BYTES) -> str:
 
 
 def read_toml(path: str | Path, finite: bool = True) -> dict[str, Any]:
-    """Read a TOML file from an untrusted source as plain data; with `finite`, NaN and infinity are errors.
-
-    Raises OSError or ValueError.
-    """
+    """Read a TOML file of any origin as plain data, as `parse_toml`. Raises OSError or ValueError."""
     return parse_toml(read_text(path), finite)
 
 
 def read_json(path: str | Path) -> Any:
-    """Read a JSON file from an untrusted source as plain data. Raises OSError or ValueError."""
+    """Read a JSON file of any origin as plain data. Raises OSError or ValueError."""
     return parse_json(read_text(path))
 
 
 def parse_toml(text: str, finite: bool = True) -> dict[str, Any]:
-    """Parse TOML text; ValueError if it is not TOML, or as `check_plain`."""
+    """Parse TOML text; `finite` refuses NaN and infinity. ValueError if it is not TOML, or as `check_plain`."""
     try:
         found = tomllib.loads(text)
         check_plain(found, finite)

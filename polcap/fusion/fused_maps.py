@@ -79,7 +79,7 @@ def write(folder: Path, atlas: Atlas, maps: AtlasMaps, keys: Mapping[str, str]) 
 
 def is_fused(out: Path) -> bool:
     """Whether a result folder is that of `polcap fuse`."""
-    return maps_folder.read_format(out) == FORMAT
+    return maps_folder.read_format(out / "maps") == FORMAT
 
 
 @dataclass(frozen=True)

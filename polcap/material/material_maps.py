@@ -78,7 +78,7 @@ def write(folder: Path, grid: TexelGrid, maps: MaterialMaps, keys: Mapping[str, 
 
 def is_material(out: Path) -> bool:
     """Whether a result folder is that of `polcap material`."""
-    return maps_folder.read_format(out) == FORMAT
+    return maps_folder.read_format(out / "maps") == FORMAT
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ from polcap.formats.export.encoders import TextureEncoder
 from polcap.formats.export.presets import PRESETS, ExportPreset, Format
 from polcap.formats.export.texture_set import Extra, Key, Texture
 from polcap.formats.maps import maps_folder, png
+from polcap.formats.raw import file_bytes
 from polcap.mesh_values import Asset
 from polcap.pipeline import result_folder, result_place, unchanged
 from polcap.pipeline.detail_levels import DetailLevel, ExportSource, levels
@@ -121,7 +122,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     if preset.gathers:
         written += [*archive.gather(out, files.folder), *report.archive(out, files.folder, about, files.entry)]
     sidecar = files.path(".provenance.json")
-    digests = {file.relative_to(files.folder).as_posix(): provenance.digest(file) for file in written}
+    digests = {file.relative_to(files.folder).as_posix(): file_bytes.digest(file.read_bytes()) for file in written}
     provenance.write(sidecar, record, digests)
     if preset.gathers:
         written.append(archive.write_manifest(files.folder))

@@ -110,7 +110,7 @@ def without(request: ExportRequest, extras: Collection[Extra]) -> ExportRequest:
 
 def effective(wanted: ExportRequest) -> ExportPreset:
     """The preset that an export uses: the requested one, with its values replaced by the request's other options."""
-    plain = ExportPreset(wanted.formats or ("gltf", "obj"), "normals +Y")
+    plain = ExportPreset("normals +Y", wanted.formats or ("gltf", "obj"))
     preset = plain if wanted.preset is None else PRESETS[wanted.preset]
     added: tuple[Format, ...] = () if wanted.iiif is None else ("iiif",)
     formats = tuple(one for one in dict.fromkeys((*preset.formats, *added)) if one not in wanted.without)

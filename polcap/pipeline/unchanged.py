@@ -39,7 +39,8 @@ def request(options: Any, capture: Path, out: Path, files: Iterable[Path] = ()) 
     """
     try:
         photographs = _stats(capture, os.path.realpath(out), own_folders.OURS)
-        others = {os.path.abspath(file): _stat(file) for file in (*files, *own_folders.calibration_files())}
+        files = (*files, *own_folders.toml_files(own_folders.calibrations()))
+        others = {os.path.abspath(file): _stat(file) for file in files}
     except OSError:
         return None
     newest = max((stat[1] for stat in [*photographs.values(), *others.values()]), default=0)

@@ -168,7 +168,7 @@ def encoding(out: Path) -> float:
         picture = png.read(file)
         total += spent(partial(png.encode, picture))
     for file in sorted([*out.glob("maps/*.exr"), *out.glob("asset/*.exr")]):
-        channels, _ = exr.read(file)
+        channels = exr.read(file)
         half = file.stem not in ("normal", "depth")
         total += spent(partial(exr.write, again, channels, half=half))
         again.unlink()

@@ -189,7 +189,7 @@ def _picture(place: Path, random: Random) -> None:
 
 def _channels(place: Path, random: Random) -> None:
     """Channels of another size or name, or with NaN."""
-    found, _ = exr.read(place)
+    found = exr.read(place)
     name, plane = next(iter(found.items()))
     others = ({key: np.full_like(one, np.nan) for key, one in found.items()}, {name: plane}, {"odd": plane},
               {key: np.ascontiguousarray(one[1:]) for key, one in found.items()})  # fmt: skip

@@ -2,6 +2,7 @@
 
 import os
 import struct
+import zlib
 from fractions import Fraction
 from pathlib import Path
 
@@ -82,6 +83,13 @@ def jpeg(exif_tiff):
     return b"\xff\xd8\xff\xe1" + struct.pack(">H", len(body) + 2) + body + b"\xff\xd9"
 
 
+def add_chunks(path, *chunks):
+    """Add chunks, types and contents, to a PNG behind its header."""
+    data = path.read_bytes()
+    new = [struct.pack(">I", len(one)) + kind + one + struct.pack(">I", zlib.crc32(kind + one)) for kind, one in chunks]
+    path.write_bytes(data[:33] + b"".join(new) + data[33:])
+
+
 def raf(exif_tiff):
     preview = jpeg(exif_tiff)
     head = b"FUJIFILMCCD-RAW 0201FF129502".ljust(84, b"\0")
@@ -105,20 +113,28 @@ def mrw(exif_tiff):
     return block(b"\0MRM", blocks)
 
 
+def of_picture(pixels):
+    """Tags of an uncompressed RGB picture (H, W, C) in a TIFF."""
+    height, width, channels = pixels.shape
+    return {
+        256: (4, (width,)), 257: (4, (height,)), 258: (3, (8 * pixels.itemsize,) * channels), 259: (3, (1,)),
+        262: (3, (2,)), 277: (3, (channels,)), 278: (4, (height,)), 279: (4, (pixels.nbytes,)), 284: (3, (1,)),
+    }  # fmt: skip
+
+
 def dng(pixels, photometric=32803, cfa=((0, 1), (1, 2)), black=None, area=None, photo=None, maker=None, **levels):
     """An uncompressed DNG of uint16 (H, W[, C]); `area` = top, left, bottom, right of the visible pixels.
 
     `black` is a repeating pattern (h, w[, C]), `columns` and `rows` of `levels` are added to it.
     """
-    pixels = np.ascontiguousarray(pixels, "<u2")
-    height, width = pixels.shape[:2]
-    samples = pixels.shape[2] if pixels.ndim == 3 else 1
-    main = (maker or camera()) | {
-        254: (4, (0,)), 256: (4, (width,)), 257: (4, (height,)), 258: (3, (16,) * samples), 259: (3, (1,)),
-        262: (3, (photometric,)), 277: (3, (samples,)), 278: (4, (height,)), 279: (4, (pixels.nbytes,)),
-        284: (3, (1,)), 50706: (1, (1, 4, 0, 0)), 50708: (2, b"Acme Z1"),
+    pixels = np.atleast_3d(np.ascontiguousarray(pixels, "<u2"))
+    main = (maker or camera()) | of_picture(pixels) | {262: (3, (photometric,))}
+    main |= {
+        254: (4, (0,)),
+        50706: (1, (1, 4, 0, 0)),
+        50708: (2, b"Acme Z1"),
         50717: (4, (levels.get("white", 16383),)),
-    }  # fmt: skip
+    }
     if photometric == 32803:
         main |= {33421: (3, (len(cfa), len(cfa[0]))), 33422: (1, [c for row in cfa for c in row])}
         main |= {50710: (1, (0, 1, 2)), 50711: (3, (1,))}
@@ -128,7 +144,7 @@ def dng(pixels, photometric=32803, cfa=((0, 1), (1, 2)), black=None, area=None, 
         main |= {tag: (10, levels[name])} if name in levels else {}
     if area is not None:
         main[50829] = (4, area)
-    if samples == 3 or photometric == 32803:
+    if pixels.shape[2] == 3 or photometric == 32803:
         matrix = (0.9, -0.3, -0.07, -0.45, 1.24, 0.23, -0.09, 0.19, 0.71)
         main |= {50721: (10, matrix), 50728: (5, levels.get("neutral", (0.5, 1, 0.8))), 50778: (3, (21,))}
     return tiff(main, {EXIF_IFD: photo if photo is not None else settings()}, image=pixels.tobytes())

@@ -21,16 +21,8 @@ FLASH = FlashEnergy(0.01, 0.002, 0.0, 0.001, 12)
 LENS = LensGeometry(
     1066.7, 0.4, (319.5, 239.5), 0.3, -0.05, 1e-3, 0.01, 2e-3, (640, 480), 0.2, 3.0, 6, "checkerboard", 60.0
 )
-KNOWN = Calibration(
-    made="2026-11-22T20:00:00+00:00",
-    camera="Polcap Synthetic",
-    lens="Synthetic 60mm",
-    filter="B+W",
-    noise=(LINE,),
-    falloff=FALLOFF,
-    polarizer=RING,
-    flash=FLASH,
-)
+RIG = ("Polcap Synthetic", "Synthetic 60mm", "B+W")
+KNOWN = Calibration("2026-11-22T20:00:00+00:00", *RIG, noise=(LINE,), falloff=FALLOFF, polarizer=RING, flash=FLASH)
 
 
 @pytest.fixture
@@ -39,16 +31,13 @@ def users(tmp_path, monkeypatch) -> Path:
     return tmp_path / "calib"
 
 
-def test_hidden_files_are_no_calibrations(users):
-    path = calibrations.write(users, KNOWN)
-    (users / f"._{path.name}").write_bytes(b"\0\5\x16\7")
-    assert calibrations.choose(EXIF, None, None)[0] == KNOWN
-
-
-def test_a_calibration_is_read_back_unchanged(users):
+def test_a_calibration_is_read_back_unchanged_and_a_hidden_file_is_none(users):
+    assert calibrations.choose(EXIF, None, None) == (None, [])
     path = calibrations.write(users, KNOWN)
     assert calibrations.read(path) == KNOWN
     assert path.name.startswith("2026-11-22")
+    (users / f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    assert calibrations.choose(EXIF, None, None)[0] == KNOWN
 
 
 def test_parts_that_were_not_measured_come_back_as_none(users):
@@ -56,10 +45,6 @@ def test_parts_that_were_not_measured_come_back_as_none(users):
     unsaid = dataclasses.replace(FALLOFF, f_number=None, focal_length_mm=None)
     bare = dataclasses.replace(KNOWN, levels=levels, falloff=unsaid, polarizer=None)
     assert calibrations.read(calibrations.write(users, bare)) == bare
-
-
-def test_without_a_folder_there_is_none(users):
-    assert calibrations.choose(EXIF, None, None) == (None, [])
 
 
 def test_newest_of_camera_lens_and_filter_is_chosen(users):
@@ -71,15 +56,13 @@ def test_newest_of_camera_lens_and_filter_is_chosen(users):
     assert calibrations.choose(EXIF, "Hoya", None)[0] is None
     calibrations.write(users, dataclasses.replace(KNOWN, filter="Hoya"))
     nothing, notes = calibrations.choose(EXIF, None, None)
-    assert nothing is None
-    assert "B+W, Hoya" in notes[0]
+    assert nothing is None and "B+W, Hoya" in notes[0]
     assert calibrations.choose(EXIF, "Hoya", None)[0].filter == "Hoya"
     assert calibrations.choose(Exif(), None, None) == (None, [])
 
 
 def test_ring_s_angles_and_notes_reach_the_capture(users):
-    known = dataclasses.replace(KNOWN, lens="")
-    calibrations.write(users, known)
+    calibrations.write(users, dataclasses.replace(KNOWN, lens=""))
     read = capture.read(EXAMPLE)
     assert read.calibration is not None
     assert np.degrees(read.angle) == pytest.approx([1.5, 1.5 - 45, 1.5 - 90])

@@ -32,19 +32,8 @@ def rows(names: list[str], values: np.ndarray, between: str) -> list[str]:
 
 
 def cgats(fields: str, listed: list[str]) -> str:
-    return "\n".join(
-        [
-            "CTI3",
-            'DESCRIPTOR "x"',
-            "BEGIN_DATA_FORMAT",
-            fields,
-            "END_DATA_FORMAT",
-            "BEGIN_DATA",
-            *listed,
-            "END_DATA",
-            "",
-        ]
-    )
+    head = ["CTI3", 'DESCRIPTOR "x"', "BEGIN_DATA_FORMAT", fields, "END_DATA_FORMAT"]
+    return "\n".join([*head, "BEGIN_DATA", *listed, "END_DATA", ""])
 
 
 FILES = {

@@ -10,38 +10,26 @@ from polcap.chart_values import ColorCalibration, PatchColors
 from polcap.errors import ChartError
 from polcap.formats import color_profile
 
-PROFILE = ColorCalibration(
-    matrix=np.array([[2.1, -0.4, 0.1], [-0.2, 1.5, -0.3], [0.05, -0.6, 1.9]]),
-    source="chart",
-    cost=0.004,
-    metres_per_px=0.00072,
-    patches=PatchColors(
-        delta_e=np.where(np.arange(24) == 18, np.nan, 1.25),
-        use=np.where(np.arange(24) == 18, 1, 0).astype(np.uint8),
-        predicted=np.where(np.arange(24) == 18, np.nan, 1.5),
-        falloff=(0.01, -0.02),
-        glare=0.015,
-    ),
+MATRIX = np.array([[2.1, -0.4, 0.1], [-0.2, 1.5, -0.3], [0.05, -0.6, 1.9]])
+LEFT_OUT = np.arange(24) == 18
+PATCHES = PatchColors(
+    np.where(LEFT_OUT, np.nan, 1.25), LEFT_OUT.astype(np.uint8), np.where(LEFT_OUT, np.nan, 1.5), (0.01, -0.02), 0.015
 )
+PROFILE = ColorCalibration(MATRIX, "chart", cost=0.004, metres_per_px=0.00072, patches=PATCHES)
 
 
 def test_a_profile_is_read_back_unchanged(tmp_path):
     path = tmp_path / "set-up.toml"
     color_profile.write(path, PROFILE)
     back = color_profile.read(path)
-    for part, names in (
-        ("", ["matrix", "cost", "metres_per_px"]),
-        ("patches.", ["delta_e", "use", "predicted", "falloff", "glare"]),
-    ):
-        for name in names:
-            found, expected = (attrgetter(part + name)(profile) for profile in (back, PROFILE))
-            np.testing.assert_allclose(found, expected, atol=1e-8)  # NaN equals NaN
+    patches = [f"patches.{name}" for name in ("delta_e", "use", "predicted", "falloff", "glare")]
+    for name in ("matrix", "cost", "metres_per_px", *patches):
+        np.testing.assert_allclose(attrgetter(name)(back), attrgetter(name)(PROFILE), atol=1e-8)  # NaN equals NaN
     assert back.source == "chart"
 
 
 def test_profile_without_a_chart_comes_back_without(tmp_path):
-    bare = ColorCalibration(PROFILE.matrix, "camera")
-    color_profile.write(tmp_path / "p.toml", bare)
+    color_profile.write(tmp_path / "p.toml", ColorCalibration(MATRIX, "camera"))
     back = color_profile.read(tmp_path / "p.toml")
     assert (back.patches, back.metres_per_px) == (None, None)
 

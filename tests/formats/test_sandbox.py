@@ -98,11 +98,7 @@ def test_arrays_come_back_as_they_were(sandbox):
     assert arrays["bits"].tolist() == [[True, False]]
 
 
-def test_one_child_serves_several_files(sandbox):
-    assert pid(sandbox) == pid(sandbox)
-
-
-def test_a_child_follows_the_parent_into_another_folder(sandbox, tmp_path, monkeypatch):
+def test_one_child_serves_several_files_and_follows_the_parent_into_another_folder(sandbox, tmp_path, monkeypatch):
     first = pid(sandbox)
     monkeypatch.chdir(tmp_path)
     assert sandbox.call(sandbox.module.working_folder, "a.raw")[0]["folder"] == os.getcwd()
@@ -136,21 +132,13 @@ def test_a_failure_names_the_file_and_the_next_file_is_read(sandbox, function, l
     assert pid(sandbox)
 
 
+ARRAYS = ('"a"', '"a", "<u2", [1.5]', f'"a", "<u2", [0, {2**70}]', '"a", "nothing", [1]', '"a", "f4,(", [1]')
+
+
 @pytest.mark.parametrize(
     "text",
-    [
-        "",
-        "[]",
-        "{}",
-        "[" * 10**5,
-        '{"error": 1}',
-        '{"meta": []}',
-        '{"meta": {}, "arrays": [["a"]]}',
-        '{"meta": {}, "arrays": [["a", "<u2", [1.5]]]}',
-        '{"meta": {}, "arrays": [["a", "<u2", [0, 1180591620717411303424]]]}',
-        '{"meta": {}, "arrays": [["a", "nothing", [1]]]}',
-        '{"meta": {}, "arrays": [["a", "f4,(", [1]]]}',
-    ],
+    ["", "[]", "{}", "[" * 10**5, '{"error": 1}', '{"meta": []}']
+    + [f'{{"meta": {{}}, "arrays": [[{one}]]}}' for one in ARRAYS],
 )
 def test_a_malformed_answer_is_an_error_of_the_file(sandbox, text):
     with pytest.raises(DecodeError, match=r"broken\.raw: the decoder's answer is damaged"):

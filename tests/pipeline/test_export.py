@@ -123,7 +123,7 @@ def test_maps_json_and_the_files_say_what_they_hold(exported: Path, preset: str)
     assert stated["unit"] in ("m", "relative") and "+Y" in stated["for"]
     for name, meaning in stated["textures"].items():
         if name.endswith(".exr"):
-            assert meaning == exr.read(exported / "asset" / preset / name)[1]["polcap:meaning"]
+            assert meaning == oiio.ImageBuf(str(exported / "asset" / preset / name)).spec()["polcap:meaning"]
             continue
         assert meaning.encode() in (exported / "asset" / preset / name).read_bytes()[:300]
 

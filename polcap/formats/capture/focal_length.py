@@ -67,7 +67,7 @@ def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> 
 def _sources(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> list[_Source]:
     """All statements from which the focal length follows, the most precise first."""
     width, focal = exif.width or 0, stated_mm or exif.focal_length_mm
-    widths = (
+    widths = (  # mm, source, words of a contradiction, trust
         (stated_width_mm, "capture.toml", "capture.toml states", 3),
         (exif.pixel_pitch_um and exif.pixel_pitch_um * width / 1e3, "EXIF", "FocalPlaneResolution of EXIF states", 0),
         (sensor_widths().get(exif.model), "table of cameras", "the table of cameras has", 1),

@@ -24,10 +24,7 @@ _VIEW = re.compile(r"view[ _-]?\d+", re.IGNORECASE)
 
 
 def children(folder: Path) -> list[Path]:
-    """Files and folders in a folder, sorted by name, without those that `foreign_files` ignores.
-
-    Raises CaptureError.
-    """
+    """Files and folders in a folder by name, without those that `foreign_files` ignores. Raises CaptureError."""
     try:
         return sorted(path for path in folder.iterdir() if not _is_ignored(path))
     except OSError as error:

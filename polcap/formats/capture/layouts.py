@@ -15,25 +15,9 @@ from typing import Literal
 
 from polcap.capture_values import AngleStatement, Exif, Role
 from polcap.errors import CaptureError
-from polcap.formats.capture import capture_toml, photograph_files, unequal_brackets
+from polcap.formats.capture import capture_toml, folder_names, photograph_files, unequal_brackets
 from polcap.formats.capture.capture_toml import CaptureFile
-from polcap.formats.capture.folder_names import (
-    NUMBER,
-    SEPARATION_DEG,
-    angle_folder_names,
-    angle_folders,
-    children,
-    count_axes,
-    degrees_of_cross,
-    degrees_with_unit,
-    few_names,
-    is_in_result,
-    is_one_angle,
-    is_result,
-    natural,
-    suggested_names,
-    views,
-)
+from polcap.formats.capture.folder_names import NUMBER, children, few_names, natural
 from polcap.formats.capture.unequal_brackets import ExposedFile, same_exposure
 from polcap.formats.own_folders import OURS
 from polcap.formats.raw import photo
@@ -82,15 +66,15 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     """
     if stated.frame:
         return _toml(folder, stated, angles_deg)
-    sub_folders, crossed = angle_folders(folder)
+    sub_folders, crossed = folder_names.angle_folders(folder)
     if sub_folders:
         return _folders(folder, sub_folders, crossed, angles_deg)
-    if found := views(folder):
+    if found := folder_names.views(folder):
         raise CaptureError(
             f"{folder}: its sub-folders {few_names(found)} are views of one object: join them with `polcap fuse`, or "
             "give one of them"
         )
-    if is_in_result(folder):
+    if folder_names.is_in_result(folder):
         raise CaptureError(
             f"{folder}: it is a result of polcap or a part of one; give the folder of the photographs, and if they lie "
             "here, move them into one of their own"
@@ -101,7 +85,7 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     if stated.of_sensor or _is_sensor(pictures, angles_deg):
         return _sensor(pictures, stated, angles_deg, notes=notes)
     whole = Path(os.path.abspath(folder))
-    if is_one_angle(whole):
+    if folder_names.is_one_angle(whole):
         raise CaptureError(f"{folder}: holds one angle of a capture; give the folder of all, {whole.parent}")
     groups = _by_name(pictures)
     if groups:
@@ -115,19 +99,19 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
 
 def _hint(folder: Path) -> str:
     """A sentence on the likely mistake of a user who named a folder without photographs."""
-    inside = [path for path in children(folder) if path.is_dir() and not is_result(path)]
-    named = few_names([path.name for path in inside])
+    inside = [path for path in children(folder) if path.is_dir() and not folder_names.is_result(path)]
+    names = [path.name for path in inside]
     if remedy := _lossy_or_packed(folder):
         return remedy
-    if any(map(angle_folder_names, inside)):
+    if any(map(folder_names.angle_folder_names, inside)):
         return (
-            f"its sub-folders {named} hold captures: give one of them, or run `polcap batch` on the folder; for views "
-            "of one object, name them view01, view02, … and run `polcap fuse`"
+            f"its sub-folders {few_names(names)} hold captures: give one of them, or run `polcap batch` on the folder; "
+            "for views of one object, name them view01, view02, … and run `polcap fuse`"
         )
     if inside:
-        new = ", ".join(f"{old} to {name}" for old, name in suggested_names([path.name for path in inside]))
+        new = ", ".join(f"{old} to {name}" for old, name in folder_names.suggested_names(names))
         rename = f": if these are the angles, rename {new}" if new else ""
-        return f"its sub-folders are {named}, but polcap looks for pol000, pol045, …{rename}"
+        return f"its sub-folders are {few_names(names)}, but polcap looks for pol000, pol045, …{rename}"
     return "give the folder that holds the photographs"
 
 
@@ -144,9 +128,7 @@ def _lossy_or_packed(folder: Path) -> str:
 def counted_clockwise(plan: Plan) -> Plan:
     """Negate all angles of a plan, because they were counted clockwise in the picture."""
     turned = tuple((-angle if angle else 0.0, bracket) for angle, bracket in plan.shots)
-    others = tuple(
-        replace(source, angle_deg=-source.angle_deg if source.angle_deg else source.angle_deg) for source in plan.others
-    )
+    others = tuple(replace(one, angle_deg=-one.angle_deg if one.angle_deg else one.angle_deg) for one in plan.others)
     return replace(plan, shots=turned, others=others, notes=(*plan.notes, "angles counted clockwise, as stated"))
 
 
@@ -170,10 +152,10 @@ def _toml(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     repeated = [
         (angle, tuple(bracket))
         for angle, bracket in repeats.items()  # a motor repeats an angle within its tolerance
-        if any(abs((angle - known + 90) % 180 - 90) < SEPARATION_DEG for known, _ in brackets)
+        if any(abs((angle - known + 90) % 180 - 90) < folder_names.SEPARATION_DEG for known, _ in brackets)
     ]
-    shots_by_angle = (*brackets, *repeated)
-    return Plan("toml", shots_by_angle, others, angles=AngleStatement("capture.toml", _texts(shots_by_angle)))
+    every = (*brackets, *repeated)
+    return Plan("toml", every, others, angles=AngleStatement("capture.toml", _texts(every)))
 
 
 def _texts(shots: Shots) -> tuple[str, ...]:
@@ -201,7 +183,8 @@ def _folders(folder: Path, sub_folders: dict[float, Path], crossed: Path | None,
     others: tuple[Source, ...] = ()
     if crossed is not None:
         pictures, _ = _list_photographs(crossed, "shoot it again, or remove the folder")
-        others = tuple(replace(source, role="cross", angle_deg=degrees_of_cross(crossed)) for source in pictures)
+        crossed_deg = folder_names.degrees_of_cross(crossed)
+        others = tuple(replace(source, role="cross", angle_deg=crossed_deg) for source in pictures)
     inside = children(folder)
     used = {*sub_folders.values(), crossed}
     unused = [path.name for path in inside if path.is_dir() and path not in used and path.name not in OURS]
@@ -241,7 +224,7 @@ def _by_name(pictures: list[Source]) -> dict[float, list[Source]]:
 
     For pictures other than RAW, a plain number counts, if exactly one number differs and can be an angle.
     """
-    marked = degrees_with_unit([source.path.stem for source in pictures])
+    marked = folder_names.degrees_with_unit([source.path.stem for source in pictures])
     if len(marked) == len(pictures):
         return dict(sorted(_group(replace(one, angle_deg=marked[one.path.stem]) for one in pictures).items()))
     stems = [source.path.stem for source in pictures]
@@ -252,7 +235,7 @@ def _by_name(pictures: list[Source]) -> dict[float, list[Source]]:
     if len(columns) != 1 or any(len(text.partition(".")[0]) > 3 for text in columns[0]):
         return {}
     groups = {float(text): [source] for text, source in zip(columns[0], pictures)}
-    if max(groups) >= 180 or count_axes(groups) < max(3, len(pictures)):
+    if max(groups) >= 180 or folder_names.count_axes(groups) < max(3, len(pictures)):
         return {}
     return dict(sorted(groups.items()))
 

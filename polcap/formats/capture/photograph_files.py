@@ -2,7 +2,6 @@
 
 import os
 import unicodedata
-from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
@@ -55,21 +54,16 @@ def read_all(folder: Path) -> tuple[dict[Path, Probe], list[str]]:
     return found, unread
 
 
-def kinds(files: Iterable[Path]) -> list[file_kind.Kind]:
-    """Kinds of files by their first bytes; those of damaged photographs by their names."""
-    return [_kind(path) for path in files]
-
-
-def _kind(path: Path) -> file_kind.Kind:
+def kind(path: Path) -> file_kind.Kind:
     """Kind of a file: by its content, or by its name where it is damaged."""
     try:
-        kind = probe.kind(path)
-        kind = probe.read(path).kind if kind == "unknown" else kind
+        found = probe.kind(path)
+        found = probe.read(path).kind if found == "unknown" else found
     except DecodeError:
-        kind = "unknown"
-    if kind == "unknown" and foreign_files.is_photograph(path.name, among_raw=False):
+        found = "unknown"
+    if found == "unknown" and foreign_files.is_photograph(path.name, among_raw=False):
         return "raw" if foreign_files.is_photograph(path.name, among_raw=True) else "photo"
-    return kind
+    return found
 
 
 def stem(path: Path) -> str:

@@ -194,12 +194,11 @@ def table(capture: Capture) -> str:
     widths = [max(map(len, column)) for column in zip(*rows)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
     fact = capture.shots[0].frames[0].exif
-    width, height = capture.size_px
     frames = " + ".join(str(len(shot.frames)) for shot in capture.shots)
     lines += [
         "",
         f"capture  {capture.name} ({capture.layout}): {len(capture.shots)} shots, {frames} frames",
-        f"camera   {fact.camera or 'not stated'}, {width}×{height} px",
+        f"camera   {fact.camera or 'not stated'}, {capture.size_px[0]}×{capture.size_px[1]} px",
         f"lens     {fact.lens or 'not stated'}",
         f"focal    {capture.focal_px:.0f} px" + ("" if capture.focal_known else " (assumed)"),
     ]
@@ -298,8 +297,7 @@ def _sorted_alike(frames: Iterable[Frame]) -> tuple[Frame, ...]:
     Which of them is darkest, the stage `hdr` measures in the pixels: of a flash the camera states no power.
     """
     listed = sorted(frames, key=lambda frame: folder_names.natural(Path(frame.path).name))
-    exposures = [_exposure(frame) for frame in listed]
-    if None in exposures:
+    if not all(map(_exposure, listed)):
         return tuple(listed)
     return tuple(sorted(listed, key=lambda frame: _exposure(frame) or 0.0))
 

@@ -40,12 +40,12 @@ def advise_sequence(files: _Bracket, angles_deg: Sequence[float]) -> str:
     for size in range(2, count // 3 + 1):
         if count % size == 0 and count // size != shots and _repeats(files, size):
             return f"they are {count // size} brackets of {size}: state {count // size} angles with --angles"
-    size = (count - 1) // shots
+    size = (count - 1) // shots  # without one photograph
     surplus = [at for at in range(count) if _repeats([*files[:at], *files[at + 1 :]], size)]
     if (count - 1) % shots == 0 and surplus:
         names = " or ".join(files[at].name for at in surplus)
         return f"{names} is one too many, by its exposure ({files[surplus[0]].text}): move it out of the folder"
-    size = (count + 1) // shots
+    size = (count + 1) // shots  # with one more
     filled = {at: [*files[:at], None, *files[at:]] for at in range(count + 1)}
     gaps = [at for at, one in filled.items() if _repeats(one, size)]
     if (count + 1) % shots == 0 and gaps:

@@ -13,14 +13,13 @@ def gather(out: Path, folder: Path) -> list[Path]:
     Copies of an earlier export that the result no longer has are removed.
     """
     out = Path(os.path.abspath(out))
-    own = own_files.owner(out / "report.json")
-    maps = [] if own is None else own.below(out / "maps")
-    found = [*maps, *(file for file in [out / color_profile.NAME] if file.is_file() and not file.is_symlink())]
+    own, profile = own_files.OwnFiles(out), out / color_profile.NAME
+    found = own.below(out / "maps") + [profile] * (profile.is_file() and not profile.is_symlink())
     copies = [folder / file.relative_to(out) for file in found]
     for file, copy in zip(found, copies):
         atomic.copy(file, copy)
     for old in (*(folder / "maps").glob("*"), folder / color_profile.NAME):
-        if own is not None and old not in copies:
+        if old not in copies:
             own.remove(old)
     return copies
 

@@ -4,12 +4,11 @@ Data (normals, roughness, packed channels) is lossless where the kind allows it;
 their kind. KTX2 needs one of Khronos' encoders (`ktx`, `toktx`) on the PATH, MP4 needs FFmpeg.
 """
 
-import os
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from threading import Lock
@@ -19,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polcap import parallel
 from polcap.errors import SettingError, StorageError
 from polcap.formats import atomic
 from polcap.formats.export.texture_set import Texture
@@ -60,8 +60,7 @@ class TextureEncoder:
 
     def all(self, textures: Mapping[str, Texture], kind: Kind) -> dict[str, bytes]:
         """Encode several textures on threads; returns bytes by texture name. Raises SettingError as `encode` does."""
-        with ThreadPoolExecutor(min(len(textures), os.cpu_count() or 1) or 1) as pool:
-            return dict(zip(textures, pool.map(partial(self, kind=kind), textures.values())))
+        return dict(zip(textures, parallel.results(partial(self, texture, kind) for texture in textures.values())))
 
 
 def encode(texture: Texture, kind: Kind) -> bytes:

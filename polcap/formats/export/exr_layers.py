@@ -48,9 +48,7 @@ class ColorSpace:
 
 
 def write(path: Path, maps: Path, color: str, header: Mapping[str, str]) -> None:
-    """Write the maps of the result folder `maps` as layers of one EXR.
-
-    Colors are converted to the color space or role `color`.
+    """Write the folder maps/ of a result as layers of one EXR, with colors in the color space or role `color`.
 
     Raises SettingError: there is no such space.
     Raises DecodeError: a map is missing or damaged.
@@ -58,18 +56,18 @@ def write(path: Path, maps: Path, color: str, header: Mapping[str, str]) -> None
     space = find_space(color)
     layers: dict[str, Floats] = {}
     for name in _COLORS:
-        found, _ = exr.read(maps / f"{name}.exr")
+        found = exr.read(maps / f"{name}.exr")
         converted = convert(np.stack([found[c] for c in "RGB"], axis=-1), space)
         layers |= {f"{name}.{c}": converted[..., k] for k, c in enumerate("RGB")}
-    normal, _ = exr.read(maps / "normal.exr")
+    normal = exr.read(maps / "normal.exr")
     layers |= {f"normal.{axis}": normal[c] for axis, c in zip("xyz", "RGB")}
     errors = {name: "Y" for name in _ERRORS if (maps / f"{name}.exr").exists()}  # older results have none
     for name, letter in {**_PLAIN, **errors}.items():
-        layers[f"{name}.{letter}"] = exr.read(maps / f"{name}.exr")[0][letter]
-    cues, _ = exr.read(maps / "cues.exr")
+        layers[f"{name}.{letter}"] = exr.read(maps / f"{name}.exr")[letter]
+    cues = exr.read(maps / "cues.exr")
     layers |= {f"{name}.Y": cues[name] for name in ("dolp", "aolp")}
     layers["mask.Y"] = (png.read(maps / "mask.png") > 127).astype(np.float32)
-    layers |= exr.read(maps / "stokes.exr")[0]
+    layers |= exr.read(maps / "stokes.exr")
     exr.write(path, layers, _attributes(space, header), half=[name for name in layers if not name.startswith(_FLOAT)])
 
 
@@ -85,10 +83,7 @@ def _attributes(space: ColorSpace, header: Mapping[str, str]) -> dict[str, exr.A
 
 
 def find_space(wanted: str) -> ColorSpace:
-    """Look up a color space of the OpenColorIO configuration by role, name or alias.
-
-    Raises SettingError: the configuration has no such space, or it is data or a display.
-    """
+    """Look up a color space of the OpenColorIO configuration by role, name or alias. Raises SettingError."""
     import OpenImageIO as oiio
 
     source = _source()
@@ -108,10 +103,7 @@ def find_space(wanted: str) -> ColorSpace:
 
 
 def convert(rgb: Floats, space: ColorSpace) -> Floats:
-    """Convert an image (H, W, 3) from linear Rec.709 to another color space.
-
-    Raises SettingError: the configuration cannot convert from linear Rec.709.
-    """
+    """Convert an image (H, W, 3) from linear Rec.709 to another color space. Raises SettingError."""
     import OpenImageIO as oiio
 
     source = oiio.ImageBuf(np.ascontiguousarray(rgb, dtype=np.float32))

@@ -31,12 +31,7 @@ def stem(name: str) -> str:
 
 
 def write(
-    path: Path,
-    asset: Asset,
-    name: str,
-    files: Mapping[Key, str],
-    comment: str = "",
-    entry: Mapping[str, str] = {},
+    path: Path, asset: Asset, name: str, files: Mapping[Key, str], comment: str = "", entry: Mapping[str, str] = {}
 ) -> list[Path]:
     """Write a mesh as `path` (.obj), its .mtl and two EXR textures; returns the paths.
 

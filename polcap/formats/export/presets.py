@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 if TYPE_CHECKING:  # the command line needs the names before NumPy is imported
     from polcap.formats.export.encoders import Kind
@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # the command line needs the names before NumPy is imported
     from polcap.formats.export.texture_set import Extra
 
 Format = Literal["gltf", "obj", "ply", "stl", "usd", "usdz", "materialx", "exr", "iiif", "sfp"]
-FORMATS: tuple[Format, ...] = ("gltf", "obj", "ply", "stl", "usd", "usdz", "materialx", "exr", "iiif", "sfp")
+FORMATS: tuple[Format, ...] = get_args(Format)
 EXTRAS: tuple[Extra, ...] = ("displacement", "curvature", "cavity", "occlusion", "object-normal")
 _OF_ENGINES = 20_000  # triangles; the full mesh is within a map pixel: docs/benchmarks/exports.md
 
@@ -21,8 +21,8 @@ _OF_ENGINES = 20_000  # triangles; the full mesh is within a map pixel: docs/ben
 class ExportPreset:
     """The files that one export writes for one program; in file names, {} is replaced by the asset's name."""
 
-    formats: tuple[Format, ...]
     description: str
+    formats: tuple[Format, ...] = ("gltf",)
     name: str = "{}"  # of the asset itself
     images: Kind = "png"  # inside the GLB
     geometry: Geometry = "float"  # inside the GLB
@@ -37,11 +37,9 @@ class ExportPreset:
 
 PRESETS: Mapping[str, ExportPreset] = {
     "blender": ExportPreset(
-        formats=("gltf",),
         description="File > Import > glTF, or polcap's extension for camera, flash and photograph; normals +Y",
     ),
     "unreal": ExportPreset(
-        formats=("gltf",),
         description="Interchange imports the GLB (normals +Y); the loose T_*_N is -Y, as Unreal's materials need it",
         name="SM_{}",
         powers=True,
@@ -54,7 +52,6 @@ PRESETS: Mapping[str, ExportPreset] = {
         },
     ),
     "unity": ExportPreset(
-        formats=("gltf",),
         description="glTFast imports the GLB; loose maps for HDRP and for the specular set-ups of URP; normals +Y",
         powers=True,
         triangles=_OF_ENGINES,
@@ -66,25 +63,18 @@ PRESETS: Mapping[str, ExportPreset] = {
         },
     ),
     "godot": ExportPreset(
-        formats=("gltf",),
         description="import the GLB, then set Specular; loose maps for an ORMMaterial3D; normals +Y (OpenGL)",
         powers=True,
         triangles=_OF_ENGINES,
-        textures={
-            "{}_albedo": "base_color",
-            "{}_orm": "occlusion_roughness_metallic",
-            "{}_normal": "normal",
-        },
+        textures={"{}_albedo": "base_color", "{}_orm": "occlusion_roughness_metallic", "{}_normal": "normal"},
     ),
     "web": ExportPreset(
-        formats=("gltf",),
         description="one small GLB: quantized mesh; colors lossy, data lossless WebP (EXT_texture_webp); normals +Y",
         images="webp",
         geometry="quantized",
         triangles=50_000,
     ),
     "substance": ExportPreset(
-        formats=("gltf",),
         description="import the GLB as the mesh, and the loose maps into a material; normals +Y (OpenGL)",
         bits=16,
         extras=("displacement", "occlusion"),

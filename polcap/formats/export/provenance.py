@@ -12,7 +12,6 @@ import msgspec
 
 from polcap import __version__
 from polcap.formats import atomic, text_file
-from polcap.formats.raw import file_bytes
 
 _PARTS = (
     "numpy", "scipy", "opencv-contrib-python-headless", "onnxruntime", "rawpy", "OpenImageIO", "trimesh",
@@ -93,8 +92,3 @@ def read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return about
-
-
-def digest(file: Path) -> str:
-    """SHA-256 of an exported file, as in the sidecar file."""
-    return file_bytes.digest(file.read_bytes())

@@ -33,7 +33,7 @@ def pictures(asset: Asset) -> dict[str, Texture]:
     if isinstance(asset.mesh, ReliefMesh):
         coverage = np.asarray(cv2.resize(outline.matte(np.isfinite(asset.mesh.depth)), (width, height)))
     rough = encoders.eight_bits(texture_set.roughness(asset))
-    gloss = np.rint(255 - np.sqrt(255.0 * np.arange(256))).astype(np.uint8)[rough]
+    gloss = np.rint(255 - np.sqrt(255.0 * np.arange(256))).astype(np.uint8)[rough]  # 255 (1 - √(rough/255))
     made = {
         "albedo": Texture(asset.base_color, True, "base color, sRGB-encoded Rec.709"),
         "specular": Texture(color.srgb_eight_bits(texture_set.reflectance(asset)), True, "F0, sRGB-encoded"),

@@ -18,9 +18,7 @@ from polcap.optics import color, fresnel
 SPECULAR_RANGE = 0.08  # F0 of white in the loose specular textures: Disney's, Blender's and Unreal's "specular"
 
 Key = Literal["basecolor", "roughness", "normal", "specular"]  # the texture files of OBJ, USD and MaterialX
-Extra = Literal[
-    "displacement", "occlusion", "object-normal", "curvature", "cavity"
-]  # channels that are computed on request
+Extra = Literal["displacement", "occlusion", "object-normal", "curvature", "cavity"]  # computed on request
 
 
 @dataclass(frozen=True)
@@ -73,9 +71,8 @@ def cavity(asset: Asset) -> Texture:
     assert asset.curvature is not None
     top = np.iinfo(asset.curvature.dtype).max
     dark = np.minimum(2 * asset.curvature.astype(np.uint32), top).astype(asset.curvature.dtype)
-    return Texture(
-        dark, False, "cavities, linear: 1 flat or convex, 0 concave with a tenth of the object's radius or less"
-    )
+    meaning = "cavities, linear: 1 flat or convex, 0 concave with a tenth of the object's radius or less"
+    return Texture(dark, False, meaning)
 
 
 def occlusion(asset: Asset) -> Texture:

@@ -180,7 +180,7 @@ def _preview(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tint
     st = reader.CreateOutput("result", kinds.Float2)
     whole = SPECULAR_RANGE / (float(fresnel.normal_reflectance(asset.ior)) if tint else 1.0)
     color = "raw" if files["basecolor"].endswith(".exr") else "sRGB"
-    textures: tuple[tuple[Key, str, Any, str, str, Any, Any], ...] = (
+    textures: tuple[tuple[Key, str, Any, str, str, Any, Any], ...] = (  # file, input, type, channel, space, scale, bias
         ("basecolor", "diffuseColor", kinds.Color3f, "rgb", color, None, None),
         ("specular", "specularColor", kinds.Color3f, "rgb", color, (whole, whole, whole, 1.0), None),
         ("roughness", "roughness", kinds.Float, "r", "raw", None, None),

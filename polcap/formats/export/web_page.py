@@ -42,10 +42,7 @@ def texts(facts: Mapping[str, str]) -> dict[str, str]:
 
 
 def read_script(file: Path) -> str:
-    """The text of model-viewer.min.js.
-
-    Raises SettingError: the file cannot be read, or is not model-viewer.
-    """
+    """The text of model-viewer.min.js. Raises SettingError: the file cannot be read, or is not model-viewer."""
     try:
         script = text_file.read_text(file)
     except (OSError, ValueError) as error:
@@ -61,8 +58,6 @@ def write(path: Path, glb: Path, script: str, facts: Mapping[str, str]) -> None:
     `facts` are fields of `CatalogEntry` and the capture's `name`; the page shows them.
     """
     page = _PAGE.substitute(
-        texts(facts),
-        glb=base64.b64encode(glb.read_bytes()).decode(),
-        script=script.replace("</script", "<\\/script"),
+        texts(facts), glb=base64.b64encode(glb.read_bytes()).decode(), script=script.replace("</script", "<\\/script")
     )
     atomic.write(path, page)

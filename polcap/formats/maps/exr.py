@@ -47,7 +47,6 @@ def write(
         else:
             spec.attribute(key, value)
     with atomic.path(path) as temporary:
-        temporary.touch()  # an OSError here is clearer than OpenImageIO's message
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:
             raise StorageError(f"cannot write {path}: {photo.reason(oiio)}; end its name in .exr")
@@ -62,13 +61,12 @@ def described(texts: Mapping[str, str]) -> dict[str, Attribute]:
     return {**{f"polcap:{key}": text for key, text in texts.items()}, **copyright_}
 
 
-def read(path: Path) -> tuple[dict[str, Floats], dict[str, object]]:
-    """Read an EXR: its channels by name, each (H, W) float32, and its attributes.
+def read(path: Path) -> dict[str, Floats]:
+    """Read the channels of an EXR by name, each (H, W) float32.
 
     Raises DecodeError: the file is missing, cut short, not an OpenEXR file, or larger than any picture.
     """
-    meta, channels = sandbox.call(decode, path)
-    return {name: channels[name] for name in meta["names"]}, meta["attributes"]
+    return sandbox.call(decode, path)[1]
 
 
 def decode(path: str) -> sandbox.Answer:
@@ -78,11 +76,5 @@ def decode(path: str) -> sandbox.Answer:
         raise DecodeError(f"{path} is not an OpenEXR file; write it again")
     with photo.opened(path, data) as file:
         pixels = photo.every_channel(path, file)
-        names = tuple(file.spec().channelnames)
-        attributes = {item.name: item.value for item in file.spec().extra_attribs}
-    plain = {
-        key: list(value) if isinstance(value, tuple) else value
-        for key, value in attributes.items()
-        if all(isinstance(part, (str, int, float)) for part in (value if isinstance(value, tuple) else (value,)))
-    }
-    return {"names": names, "attributes": plain}, {name: pixels[..., k] for k, name in enumerate(names)}
+        names = file.spec().channelnames
+    return {}, {name: pixels[..., k] for k, name in enumerate(names)}

@@ -1,7 +1,6 @@
 """Writes and reads the folder maps/ of a result (docs/reference/result.md)."""
 
 from collections.abc import Callable, Collection, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -118,13 +117,12 @@ def write(folder: Path, results: Results) -> None:
     threads. If one cannot be written, all files of an earlier run stay.
     """
     maps, mesh = results.maps, results.mesh
-    made = {"maps": maps, "mesh": mesh, "stokes": results.stokes, "cues": results.cues}
     near, median, far = map_files.depth_range(maps, mesh)
     depth = {"unit": "m" if mesh.metric else "relative", "near": near, "median": median, "far": far}
     stated = _description(maps, depth)
     with atomic.folder_of_files(folder, "maps.json") as temporary:
         parallel.results(
-            partial(_write, temporary / name, partial(encode, *(made[source] for source in sources)))
+            partial(_write, temporary / name, partial(encode, *(getattr(results, source) for source in sources)))
             for name, (sources, encode) in map_files.FILES.items()
             if name in stated["maps"]
         )
@@ -190,7 +188,7 @@ def _read_detail(folder: Path, size: tuple[int, int]) -> Floats:
 
 
 def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
-    """Add a record `about` an export to maps.json, merged with earlier records of the folder `where`."""
+    """Add a record `about` an export to maps.json; of earlier ones of the folder `where`, names and files stay."""
     file = folder / "maps.json"
     known = text_file.read_json(file)  # as `read` has checked it
     exports = known.get("exports", {})
@@ -215,18 +213,17 @@ def read_exports(folder: Path) -> dict[str, _Export]:
 
 def require_picture(folder: Path) -> None:
     """Raise a DecodeError for the folder maps/ of a fused object or of a material."""
-    with suppress(OSError, ValueError, KeyError, TypeError):  # which `read` explains
-        if str(text_file.read_json(folder / "maps.json")["format"]).startswith(("polcap fused", "polcap material")):
-            raise DecodeError(
-                f"{folder} holds the textures of a fused object or of a material, not the maps of a picture; give one "
-                "of its views, or read the files listed in its maps.json"
-            )
+    if read_format(folder).startswith(("polcap fused", "polcap material")):
+        raise DecodeError(
+            f"{folder} holds the textures of a fused object or of a material, not the maps of a picture; give one "
+            "of its views, or read the files listed in its maps.json"
+        )
 
 
-def read_format(out: Path) -> str:
-    """The format of the maps of a result folder, which names the kind of result; empty without maps."""
+def read_format(folder: Path) -> str:
+    """The format that maps.json of a folder maps/ states, which names the kind of result; empty without one."""
     try:
-        return str(text_file.read_json(out / "maps" / "maps.json")["format"])
+        return str(text_file.read_json(folder / "maps.json")["format"])
     except (OSError, ValueError, KeyError, TypeError):
         return ""
 
@@ -267,7 +264,7 @@ def read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Fl
     Raises DecodeError: the file is missing, damaged, not of this size (W, H), or a value is not finite.
     """
     file = _existing(folder / f"{name}.exr")
-    found, _ = exr.read(file)
+    found = exr.read(file)
     planes = [found[letter] for letter in letters if letter in found]
     if len(planes) != len(letters) or planes[0].shape != size[::-1]:
         raise DecodeError(f"{file} is not {size[0]} × {size[1]} of {letters}; process again")

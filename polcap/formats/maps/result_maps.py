@@ -80,7 +80,7 @@ def _channels(file: Path, names: list[str]) -> list[Floats]:
     """Channels (H, W) of an EXR file, in the order of `names`."""
     if not file.exists():
         raise DecodeError(f"{file}: there is no such file; give a result's folder, or process the capture again")
-    found, _ = exr.read(file)
+    found = exr.read(file)
     missing = [name for name in names if name not in found]
     if missing:
         raise DecodeError(f"{file} has no channel {missing[0]}; process the capture again")

@@ -28,16 +28,18 @@ _CONTRADICTION = 0.1  # ln of the ratio of light at half the code
 _UNEQUAL = 0.01  # of a color matrix to the identity, above which primaries are not those of Rec.709
 _SRGB_GAMMA = 2.1, 2.3  # of a gAMA chunk: 1/2.2 means sRGB (PNG, 13.13)
 _ABSOLUTE = b"\3"  # rendering intent of an sRGB chunk; OpenImageIO writes it into linear pictures of 16 bits too
-_PRIMARIES = {  # x, y of red, green, blue and white
-    "rec709": (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290),
-    "rec2020": (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290),
-    "p3": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290),
+_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # x, y of red, green, blue and white
+_REC2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+_P3 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
+_H273_PRIMARIES = {1: _REC709, 2: _REC709, 9: _REC2020, 12: _P3}  # 2: not stated
+_NAMED_PRIMARIES = {  # by names of color spaces in lower case
+    "rec709|bt709|srgb": _REC709,
+    "rec2020|bt2020": _REC2020,
+    "p3": _P3,
     "adobe": (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290),
-    "ap0": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767),
-    "ap1": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),
+    "ap0|aces2065": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767),
+    "ap1|acescg": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),
 }
-_H273_PRIMARIES = {1: "rec709", 9: "rec2020", 12: "p3"}
-_H273_UNSTATED = 2
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 _D50 = np.array([0.9642, 1.0, 0.8249])  # white of an ICC profile
 _EXR_NAMES = ("colorspace", "colorinteropid")  # attributes, without prefix and underscores
@@ -80,11 +82,11 @@ def read(data: bytes, spec: Any) -> tuple[ColorEncoding, Curve]:
     if not found:
         return ColorEncoding(), _linear
     first, name = found[0], names[0]
-    middle = [max(float(one.curve(np.array([0.5]))[0]), 1e-6) for one in found]
-    against = [k for k, light in enumerate(middle) if abs(np.log(light / middle[0])) > _CONTRADICTION]
+    half = [max(float(one.curve(np.array([0.5]))[0]), 1e-6) for one in found]  # light of half the code
+    k = next((k for k, light in enumerate(half) if abs(np.log(light / half[0])) > _CONTRADICTION), None)
     fault = ""
-    if against:
-        fault = f"its {first.source} states {name}, but its {found[against[0]].source} {names[against[0]]}; {_STATE}"
+    if k is not None:
+        fault = f"its {first.source} states {name}, but its {found[k].source} {names[k]}; {_STATE}"
     elif first.doubt and not eight:
         fault = f"its {first.source} states {name}, but {first.doubt}; {_STATE}"
     matrix = () if first.to_rec709 is None else tuple(map(float, first.to_rec709.ravel()))
@@ -164,13 +166,12 @@ def _cicp(chunk: bytes) -> _Statement:
         **dict.fromkeys((1, 6, 14, 15), _rec709), 4: partial(_power, 2.2), 5: partial(_power, 2.8),
         8: _linear, 13: decode_srgb,
     }  # fmt: skip
-    if transfer not in curves or matrix or full_range != 1 or primaries not in {*_H273_PRIMARIES, _H273_UNSTATED}:
+    if transfer not in curves or matrix or full_range != 1 or primaries not in _H273_PRIMARIES:
         raise _UnusableError(
             f"its cICP chunk states the code points {primaries}/{transfer}/{matrix}/{full_range} of H.273, which "
             f"polcap does not decode; {_DEVELOP}"
         )
-    known = _H273_PRIMARIES.get(primaries, "rec709")
-    return _Statement("cICP chunk", curves[transfer], _from_primaries(_PRIMARIES[known]))
+    return _Statement("cICP chunk", curves[transfer], _from_primaries(_H273_PRIMARIES[primaries]))
 
 
 def _gama(chunks: dict[bytes, bytes]) -> _Statement:
@@ -196,15 +197,11 @@ def _transfer_function(table: Floats, codes: int) -> _Statement:
 
 
 def _icc(profile: bytes) -> _Statement:
-    """Statement of an ICC profile of curves and a matrix. Raises _UnusableError."""
+    """Statement of an ICC profile of curves and a matrix. Raises _UnusableError: damaged, of tables, unequal curves."""
     try:
         count = struct.unpack_from(">I", profile, 128)[0]
-        tags = {
-            name: profile[offset : offset + size]
-            for name, offset, size in (
-                struct.unpack_from(">4sII", profile, 132 + 12 * k) for k in range(min(count, 100))
-            )
-        }
+        table = [struct.unpack_from(">4sII", profile, 132 + 12 * k) for k in range(min(count, 100))]
+        tags = {name: profile[offset : offset + size] for name, offset, size in table}
         curves = [_icc_curve(tags[name]) for name in (b"kTRC", b"rTRC", b"gTRC", b"bTRC") if name in tags]
         columns = [struct.unpack_from(">3i", tags[name], 8) for name in (b"rXYZ", b"gXYZ", b"bXYZ") if name in tags]
     except (struct.error, IndexError):
@@ -246,7 +243,7 @@ def _exr(spec: Any) -> Iterator[_Statement]:
         curve = _named_curve(text)
         if curve is None:
             continue
-        xy = next((xy for name, xy in _PRIMARIES.items() if name in _plain(text)), None)
+        xy = next((xy for names, xy in _NAMED_PRIMARIES.items() if re.search(names, text)), None)
         if stated is not None and xy is not None and np.abs(np.subtract(xy, stated)).max() > _UNEQUAL:
             raise _UnusableError(f"its attribute {attribute.name} contradicts its chromaticities; {_STATE}")
         named = True
@@ -256,7 +253,7 @@ def _exr(spec: Any) -> Iterator[_Statement]:
 
 
 def _named_curve(text: str) -> Curve | None:
-    """Curve of a color space by its name in lower case; None if the name tells none."""
+    """Curve of a color space by its name in lower case; None if the name states none."""
     if _LINEAR_NAMES.search(text):
         return _linear
     if "srgb" in text:
@@ -264,13 +261,6 @@ def _named_curve(text: str) -> Curve | None:
     if gamma := _GAMMA_NAME.search(text):
         return partial(_power, float(f"{gamma[1]}.{gamma[2]}"))
     return _rec709 if "709" in text else None
-
-
-def _plain(name: str) -> str:
-    """Name of a color space in lower case, with the primaries by their names in `_PRIMARIES`."""
-    return re.sub("aces2065", "ap0", re.sub("acescg", "ap1", re.sub("srgb|bt709", "rec709", name))).replace(
-        "bt2", "rec2"
-    )
 
 
 def _from_primaries(xy: Sequence[float]) -> Floats | None:

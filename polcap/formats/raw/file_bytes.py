@@ -30,10 +30,7 @@ def digest(data: bytes) -> str:
 
 
 def load(path: str, expected: str | None = None) -> bytes:
-    """All bytes of a file; with `expected` they must have this digest, so that cache key and pixels agree.
-
-    Raises DecodeError: the file cannot be read, or has changed.
-    """
+    """All bytes of a file. Raises DecodeError: it cannot be read, or has no longer the digest of the cache key."""
     with opened(path) as file:
         data = file.read()
     if expected is not None and digest(data) != expected:

@@ -163,16 +163,17 @@ def check_no_mosaic(path: str, pixels: NDArray[Any]) -> None:
     light = blocks.mean(axis=(1, 2), dtype=np.float64)
     uneven = np.flatnonzero((np.ptp(blocks, axis=(1, 2)) > 0) & (light > 0))
     brightest = uneven[np.argsort(-light[uneven])][: max(1, min(_MOST_BLOCKS, len(uneven) // 4))]
-    value, count = blocks[brightest].astype(np.float32), (_BLOCK // _PERIOD) ** 2
+    value = blocks[brightest].astype(np.float32)
     if not len(value):
         return
+    samples = (_BLOCK // _PERIOD - 1) * (_BLOCK // _PERIOD)  # of each place in the mosaic: one period less along `axis`
     repeated, contrast = [], []
     for axis in (1, 2):
         moved = np.moveaxis(value, axis, 1)
         second = (moved[:, 1:-1] - (moved[:, :-2] + moved[:, 2:]) / 2)[:, : _BLOCK - _PERIOD]
         means = second.reshape(len(value), -1, _PERIOD, _BLOCK // _PERIOD, _PERIOD).mean(axis=(1, 3))
-        power, per_place = np.mean(means**2, axis=(1, 2)), count - _BLOCK // _PERIOD
-        repeated.append(per_place * power / np.maximum(np.mean(second**2, axis=(1, 2)), 1e-12))
+        power = np.mean(means**2, axis=(1, 2))
+        repeated.append(samples * power / np.maximum(np.mean(second**2, axis=(1, 2)), 1e-12))
         contrast.append(np.sqrt(power) / light[brightest])
     if np.median(repeated) > _REPEATED and np.median(contrast) > _CONTRAST:
         raise DecodeError(

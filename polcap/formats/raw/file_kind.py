@@ -33,8 +33,7 @@ _TAGS_READ = {
     STRIP_OFFSETS, STRIP_BYTES, TILE_OFFSETS, TILE_BYTES, SUB_IFDS, TRANSFER_FUNCTION, ORIGINAL_RAW_NAME,
     SAMPLE_FORMAT, CFA_REPEAT, ACTIVE_AREA, BLACK_REPEAT, BLACK, BLACK_BY_COLUMN, BLACK_BY_ROW, *OPCODE_LISTS,
 }  # fmt: skip
-_INTEGERS = {1: "B", 2: "B", 3: "H", 4: "I", 7: "B", 13: "I"}  # texts and bytes as the numbers of their bytes
-_QUOTIENTS = {5: "I", 10: "i"}  # numerator, denominator
+_FORMS = {1: "B", 2: "B", 3: "H", 4: "I", 5: "II", 7: "B", 10: "ii", 13: "I"}  # of values; a text is its bytes
 MAX_DIRECTORIES, _MAX_VALUES = 64, 1 << 18  # per file: stops at a loop or a forged count
 _SIDECARS = {".pdf", ".zip", ".txt"}  # binary, or text in UTF-16; `foreign_files` has those of photographs
 _TEXT_BYTES = 1 << 16  # some makers put lines of text in front of their pixels
@@ -179,22 +178,18 @@ def _entries(data: bytes | mmap, order: str, places: range, most: int) -> Iterat
     """
     for at in places:
         tag, form, count = struct.unpack_from(order + "HHI", data, at)
-        if tag in GAIN_TABLES:  # only its presence counts
+        if tag in GAIN_TABLES or (tag in _TAGS_READ and form not in _FORMS):  # only its presence counts
             yield tag, ()
+            continue
         if tag not in _TAGS_READ or count > most:
             continue
-        if form in _QUOTIENTS:
-            code = f"{order}{2 * count}{_QUOTIENTS[form]}"
-        else:
-            code = f"{order}{count}{_INTEGERS.get(form, 'x')}"  # other forms have no numbers
+        numbers = _FORMS[form]
+        code = f"{order}{len(numbers) * count}{numbers[0]}"
         length = struct.calcsize(code)
         start = at + 8 if length <= 4 else struct.unpack_from(order + "I", data, at + 8)[0]
-        if form not in _INTEGERS and form not in _QUOTIENTS:
-            yield tag, ()
-        elif start + length <= len(data):
+        if start + length <= len(data):
             most -= count
             values = struct.unpack_from(code, data, start)
-            if form in _QUOTIENTS:
-                pairs = tuple(zip(values[::2], values[1::2], strict=True))
-                values = tuple(a / b for a, b in pairs) if all(b for _, b in pairs) else ()
+            if len(numbers) == 2:  # numerators and denominators
+                values = tuple(a / b for a, b in zip(values[::2], values[1::2])) if all(values[1::2]) else ()
             yield tag, values

@@ -155,10 +155,11 @@ def _counts(path: str, raw: Any, structure: file_kind.TiffStructure) -> tuple[di
     """Visible sensor counts as stored in the RAW file, with their levels and colors; uneven blacks are evened out."""
     value: NDArray[Any] = raw.raw_image_visible
     value = value[..., :3] if value.ndim == 3 else value
-    uneven, level = dng_black.uneven(structure, raw.sizes, math.prod(value.shape[2:])), None
+    channels = math.prod(value.shape[2:])
+    uneven, level = dng_black.uneven(structure, raw.sizes, channels), None
     if uneven is None and value.ndim == 3:
-        uneven = np.array(raw.black_level_per_channel[: value.shape[2]], np.float64)
-    if uneven is not None:
+        uneven = np.array(raw.black_level_per_channel[:channels], np.float64)
+    if uneven is not None:  # `level` is then the black of all photosites
         value, level = dng_black.even_out(value, uneven)
     balance, matrix = raw.camera_whitebalance[:3], raw.rgb_xyz_matrix[:3]
     meta: dict[str, Any] = {

@@ -89,10 +89,7 @@ def encoding_of(bits: int, found: ColorEncoding) -> str:
 
 
 def describe(path: str, data: bytes) -> dict[str, Any]:
-    """In the child process: size, channels, bits and encoding of a picture; its greatest value if it has floats.
-
-    Raises DecodeError.
-    """
+    """In the child process: size, channels, bits, encoding and greatest float of a picture. Raises DecodeError."""
     with opened(path, data) as file:
         picture_count.check_single(path, data, file)
         spec = file.spec()
@@ -109,8 +106,8 @@ def decode(
 ) -> sandbox.Answer:
     """In the child process: the stored values of a picture (H, W, 1 or 3) in their stored type.
 
-    `stated` replaces the encoding that the file states. `light` is the linear light 0…1 of each stored integer, if the
-    picture is not linear; floating point is `decoded` already. `mosaic`: a gray picture is expected to be one.
+    `stated` replaces the encoding that the file states. `light_of_code` is the linear light 0…1 of each stored
+    integer, if the picture is not linear; floating point is `decoded` already. `mosaic`: a gray picture may be one.
 
     Raises DecodeError.
     """
@@ -203,10 +200,7 @@ def reason(source: Any) -> str:
 
 @contextmanager
 def opened(path: str, data: bytes) -> Iterator[Any]:
-    """Context manager: the bytes of a picture opened by OpenImageIO, which opens files by name only.
-
-    Raises DecodeError.
-    """
+    """Context manager: bytes of a picture opened by OpenImageIO, which opens files by name only. DecodeError."""
     import OpenImageIO as oiio
 
     if data.startswith(file_kind.JPEG):

@@ -81,7 +81,7 @@ def _multi_picture_count(data: bytes) -> int:
     try:
         at = base + struct.unpack_from(order + "I", data, base + 4)[0]
         for k in range(struct.unpack_from(order + "H", data, at)[0]):
-            tag, _, length, offset = struct.unpack_from(order + "HHII", data, at + 2 + 12 * k)
+            tag, _type, length, offset = struct.unpack_from(order + "HHII", data, at + 2 + 12 * k)
             if tag == _MPF_ENTRIES:
                 entries = [
                     struct.unpack_from(order + "III", data, base + offset + 16 * n) for n in range(1, length // 16)

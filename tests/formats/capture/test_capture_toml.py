@@ -7,7 +7,9 @@ import pytest
 from polcap.errors import CaptureError
 from polcap.formats.capture import reader as capture
 from polcap.formats.raw import frame_decoder
-from tests.formats.capture.capture_folders import degrees, folders, names, pictures, shoot
+from tests.formats.capture.capture_folders import degrees, each, folders, names, pictures, shoot, state
+
+OUTSIDE = ("../", "sub/../../", "/", "..\\\\")
 
 
 def test_a_clockwise_ring_negates_the_angles(tmp_path):
@@ -27,7 +29,7 @@ def test_capture_toml_states_angles_roles_and_exposures(tmp_path):
         *[{"angle": angle, "flash_energy": energy} for angle in (0, 60, 120) for energy in (1.0, 0.25)],
         {"angle": 0, "role": "ambient"}, {"role": "chart"}, {"role": "ambient"},
     ]  # fmt: skip
-    lines = ['name = "bowl"', "focal_length_mm = 60", "sensor_width_mm = 36", "[rotator]", 'log = "log.csv"']
+    lines = ['name = "bowl"', "focal_length_mm = 60", "sensor_width_mm = 36", 'rotator = { log = "log.csv" }']
     for number, entry in enumerate(entries):
         lines += ["[[frame]]", f'file = "{number}.dng"']
         lines += [f'{key} = "{value}"' if key == "role" else f"{key} = {value}" for key, value in entry.items()]
@@ -43,23 +45,19 @@ def test_capture_toml_states_angles_roles_and_exposures(tmp_path):
 
 
 def test_capture_toml_may_come_from_windows(tmp_path):
-    text = 'name = "bowl"\r\n'
-    for angle in (0, 45, 90):
-        shoot(tmp_path / f"pol{angle:03d}" / "a.dng")
-        text += f"[[frame]]\r\nfile = 'pol{angle:03d}\\a.dng'\r\nangle = {angle}\r\n"
-    (tmp_path / "capture.toml").write_bytes(b"\xef\xbb\xbf" + text.encode())  # with a byte order mark
+    each(tmp_path, ("pol000", "pol045", "pol090"))
+    state(tmp_path, {f"pol{angle:03d}\\\\a.dng": angle for angle in (0, 45, 90)}, name='"bowl"')
+    text = (tmp_path / "capture.toml").read_bytes().replace(b"\n", b"\r\n")
+    (tmp_path / "capture.toml").write_bytes(b"\xef\xbb\xbf" + text)  # with a byte order mark
     understood = capture.read(tmp_path)
     assert (understood.name, degrees(understood)) == ("bowl", [0, 45, 90])
 
 
 def test_a_repeat_is_a_shot_of_its_own_at_about_its_angle(tmp_path):
     """A motor that returns to 45° may report 45.02°; at 0° it may report 179.99°."""
-    text = ""
-    for name, angle in {"a": 0, "b": 45, "c": 90, "d": 45.02, "e": 179.99, "f": 60}.items():
-        shoot(tmp_path / f"{name}.dng")
-        role = '\nrole = "repeat"' if name in "def" else ""
-        text += f'[[frame]]\nfile = "{name}.dng"\nangle = {angle}{role}\n'
-    (tmp_path / "capture.toml").write_text(text)
+    repeat = '\nrole = "repeat"'
+    angles = {"a": 0, "b": 45, "c": 90, "d": f"45.02{repeat}", "e": f"179.99{repeat}", "f": f"60{repeat}"}
+    state(tmp_path, {shoot(tmp_path / f"{name}.dng").name: angle for name, angle in angles.items()})
     understood = capture.read(tmp_path)
     assert degrees(understood) == pytest.approx([0, 45, 90, 45.02, 179.99])
     assert understood.shots[3].frames[0].role == "repeat"
@@ -84,16 +82,19 @@ def test_capture_toml_without_frames_only_adds_facts(tmp_path):
         ("focal_length_mm = -1", "focal_length_mm"),
         ('[[frame]]\nfile = "a.dng"', "has role shot and no angle"),
         ('[[frame]]\nfile = "gone.dng"\nangle = 0', r"no file gone\.dng"),
-        ('[[frame]]\nfile = "../a.dng"\nangle = 0', "lies outside the folder"),
         ('[[frame]]\nfile = "a.dng"\nangle = 0\nexposure = 1\nflash_energy = 1', "both exposure and flash_energy"),
         ('[[frame]]\nfile = "a.dng"\nangle = 0\nrole = "sample"', "sample"),
         ("focal_length_mm = ", "capture.toml"),
         ('[rotator]\nlog = "no.csv"', r"no rotator log no\.csv"),
+        ("cells = [[0, 45], [90, 90]]", "the angles of the sensor's 2×2 cell, row by row: 0, 45, 90 and 135"),
+        ("cells = [[0, 30], [60, 90]]", "the angles of the sensor's 2×2 cell"),  # no sensor has these
+        *((f'[[frame]]\nfile = "{path}a.dng"\nangle = 0', "lies outside the folder") for path in OUTSIDE),
         ("\n".join(f'[[frame]]\nfile = "a.dng"\nangle = {a}' for a in (0, 45, 90)), "names a file twice"),
     ],
 )
 def test_capture_toml_is_strict(tmp_path, text, message):
-    shoot(tmp_path / "a.dng")
-    (tmp_path / "capture.toml").write_text(text)
+    for folder in (tmp_path, tmp_path / "vase"):
+        shoot(folder / "a.dng")
+    (folder / "capture.toml").write_text(text)
     with pytest.raises(CaptureError, match=message):
-        capture.read(tmp_path)
+        capture.read(folder)

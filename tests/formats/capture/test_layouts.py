@@ -9,8 +9,7 @@ from polcap.errors import CaptureError
 from polcap.formats.capture import folder_names
 from polcap.formats.capture import reader as capture
 from polcap.formats.raw import frame_decoder
-from tests.formats import headers
-from tests.formats.capture.capture_folders import degrees, flat, folders, names, pictures, shoot
+from tests.formats.capture.capture_folders import degrees, each, flat, folders, names, pictures, shoot, state
 from tests.formats.raw.test_photo import mosaic, save
 
 
@@ -35,10 +34,8 @@ def test_sub_folders_state_the_angles(tmp_path):
     ],
 )
 def test_angles_are_read_from_folder_names_that_differ_in_one_number(tmp_path, listed):
-    for name in listed:
-        shoot(tmp_path / name / "a.dng")
     (tmp_path / "notes 7").mkdir()
-    understood = capture.read(tmp_path)
+    understood = capture.read(each(tmp_path, listed))
     assert understood.layout == "folders"
     assert degrees(understood) == [float(re.sub(r"[^\d,]", "", name).replace(",", ".")) for name in listed]
     assert "not used: the folders notes 7" in understood.notes
@@ -56,9 +53,7 @@ def test_angles_are_read_from_folder_names_that_differ_in_one_number(tmp_path, l
     ],
 )
 def test_a_number_with_a_unit_is_the_angle_whatever_else_counts(tmp_path, listed, expected):
-    for name in listed:
-        shoot(tmp_path / name / "a.dng")
-    assert degrees(capture.read(tmp_path)) == expected
+    assert degrees(capture.read(each(tmp_path, listed))) == expected
 
 
 def test_file_names_with_a_unit_state_the_angles_of_brackets(tmp_path):
@@ -74,35 +69,18 @@ def test_file_names_with_a_unit_state_the_angles_of_brackets(tmp_path):
         (("1-0", "2-45", "3-90"), "rename 1-0 to pol000, 2-45 to pol045, 3-90 to pol090"),
         (("left", "middle", "right"), "rename left to pol000, middle to pol045, right to pol090"),
         (("a1", "a2", "a3", "a4"), "a3 to pol090, a4 to pol135"),
+        *((numbered, "") for numbered in (("1", "2", "3"), ("10", "20", "30"), ("0", "100", "200"))),
+        (("vase 0", "cup 45", "90"), ""),
     ],
 )
-def test_other_names_get_a_suggestion_for_each_folder(tmp_path, listed, advice):
-    for name in listed:
-        shoot(tmp_path / name / "a.dng")
-    with pytest.raises(CaptureError, match="but polcap looks for pol000") as error:
-        capture.read(tmp_path)
-    assert advice in str(error.value)
-
-
-@pytest.mark.parametrize(
-    "listed", [("1", "2", "3"), ("10", "20", "30"), ("0", "100", "200"), ("vase 0", "cup 45", "90")]
-)
-def test_numbered_folders_of_objects_are_not_angles(tmp_path, listed):
-    for name in listed:
-        shoot(tmp_path / name / "a.dng")
-    with pytest.raises(CaptureError, match="but polcap looks for pol000"):
-        capture.read(tmp_path)
+def test_other_names_such_as_numbers_of_objects_get_a_suggestion_for_each_folder(tmp_path, listed, advice):
+    with pytest.raises(CaptureError, match=f"but polcap looks for pol000.*{advice}"):
+        capture.read(each(tmp_path, listed))
 
 
 def test_a_batch_distinguishes_angle_folders_from_numbered_captures():
     assert folder_names.states_angles(("0 Grad", "45 Grad", "90 Grad"))
     assert not folder_names.states_angles(("10", "20", "30"))
-
-
-def test_a_polarization_sensor_is_never_clockwise(tmp_path):
-    save(tmp_path / "frame.png", mosaic())
-    with pytest.raises(CaptureError, match="a polarization sensor has no ring; leave it out"):
-        capture.read(tmp_path, clockwise=True)
 
 
 def test_angles_pick_from_those_stated_and_set_the_reference(tmp_path):
@@ -115,98 +93,52 @@ def test_angles_pick_from_those_stated_and_set_the_reference(tmp_path):
 def test_flat_folder_is_cut_into_equal_brackets_by_time(tmp_path):
     understood = capture.read(flat(tmp_path))
     assert understood.layout == "flat" and degrees(understood) == [0, 45, 90]
-    assert [names(shot) for shot in understood.shots] == [
-        ["IMG_9998.dng", "IMG_9999.dng"],
-        ["IMG_0000.dng", "IMG_0001.dng"],
-        ["IMG_0002.dng", "IMG_0003.dng"],
-    ]
+    numbers = [["9998", "9999"], ["0000", "0001"], ["0002", "0003"]]
+    assert [names(shot) for shot in understood.shots] == [[f"IMG_{one}.dng" for one in pair] for pair in numbers]
 
 
-def renumbered(root, *numbers):
-    """Give the frames of a flat folder other numbers in their names, in the order of their times."""
-    frames = sorted(root.iterdir(), key=lambda path: path.name.replace("IMG_99", "A"))
-    for frame, number in zip(frames, numbers, strict=True):
-        frame.rename(root / f"DSC_{number:04d}.dng")
-
-
-def retimed(root, *clocks, time=(1 / 200, 1 / 50)):
-    """Frames 1, 2, … of a flat folder at these times of day."""
-    for number, clock in enumerate(clocks):
-        shoot(root / f"DSC_{number + 1:04d}.dng", time[number % len(time)], clock)
-
-
-def test_numbers_decide_where_the_clock_makes_no_equal_brackets(tmp_path):
-    """The clock was set back after the third frame."""
-    retimed(tmp_path, *(f"10:0{k}:00" for k in range(3)), *(f"09:0{k}:00" for k in range(3, 6)))
+@pytest.mark.parametrize(
+    ("times", "order", "note"),
+    [  # of the frames 1 to 6; set back after the third frame, set back between two brackets, renamed, equal
+        ("10:00 10:01 10:02 09:03 09:04 09:05", "1 3 5", "by the numbers in their names (their EXIF times contradict"),
+        ("10:00 10:01 10:02 10:03 09:04 09:05", "1 3 5", "their EXIF times contradict: was the clock set?"),
+        ("10:02 10:03 10:00 10:01 10:04 10:05", "3 1 5", "the numbers in their names contradict: were they renamed?"),
+        ("10:00 10:00 10:00 10:00 10:00 10:00", "1 3 5", "6 frames by name taken as 3 brackets"),
+    ],
+)
+def test_numbers_decide_where_the_clock_was_set_and_the_clock_where_files_were_renamed(tmp_path, times, order, note):
+    for number, clock in enumerate(times.split()):
+        shoot(tmp_path / f"DSC_000{number + 1}.dng", (1 / 200, 1 / 50)[number % 2], f"{clock}:00")
     understood = capture.read(tmp_path)
-    assert [names(shot)[0] for shot in understood.shots] == ["DSC_0001.dng", "DSC_0003.dng", "DSC_0005.dng"]
-    assert any("by the numbers in their names (their EXIF times contradict" in note for note in understood.notes)
-
-
-def test_numbers_decide_where_the_clock_jumped(tmp_path):
-    """Set back by an hour between two brackets, so that both orders make equal brackets."""
-    retimed(tmp_path, *(f"10:0{k}:00" for k in range(4)), *(f"09:0{k}:00" for k in range(4, 6)))
-    understood = capture.read(tmp_path)
-    assert [names(shot)[0] for shot in understood.shots] == ["DSC_0001.dng", "DSC_0003.dng", "DSC_0005.dng"]
-    assert any("their EXIF times contradict: was the clock set?" in note for note in understood.notes)
-
-
-def test_the_clock_decides_where_files_were_renamed(tmp_path):
-    flat(tmp_path)
-    renumbered(tmp_path, 3, 4, 1, 2, 5, 6)
-    understood = capture.read(tmp_path)
-    assert [names(shot)[0] for shot in understood.shots] == ["DSC_0003.dng", "DSC_0001.dng", "DSC_0005.dng"]
-    assert any("the numbers in their names contradict: were they renamed?" in note for note in understood.notes)
-
-
-def test_frames_of_one_time_are_ordered_by_number(tmp_path):
-    retimed(tmp_path, *["10:00:00"] * 6)
-    understood = capture.read(tmp_path)
-    assert [names(shot)[0] for shot in understood.shots] == ["DSC_0001.dng", "DSC_0003.dng", "DSC_0005.dng"]
-    assert any("6 frames by name taken as 3 brackets" in note for note in understood.notes)
+    assert [names(shot)[0] for shot in understood.shots] == [f"DSC_000{number}.dng" for number in order.split()]
+    assert any(note in one for one in understood.notes)
 
 
 def test_the_time_of_writing_orders_nothing(tmp_path):
     """DateTime is when a converter wrote the file, here in the opposite order."""
     for number in range(6):
-        clock = {306: (2, f"2026:01:02 00:{59 - number}:00".encode())}
-        photo = {
-            tag: value for tag, value in headers.settings(time=(1 / 200, 1 / 50)[number % 2]).items() if tag != 36867
-        }
-        pixels = np.random.default_rng(number).integers(500, 4000, (32, 48))
-        path = tmp_path / f"DSC_{number}.dng"
-        path.write_bytes(headers.dng(pixels, photo=photo, maker=headers.camera() | clock))
+        written = {306: (2, f"2026:01:02 00:{59 - number}:00".encode())}
+        shoot(tmp_path / f"DSC_{number}.dng", (1 / 200, 1 / 50)[number % 2], clock=None, tags=written)
     with pytest.raises(CaptureError, match="6 frames without EXIF times cannot be assigned to angles"):
         capture.read(tmp_path)
-
-
-def converted(path, **states):
-    """A DNG of other bytes than the RAW next to it, as a converter writes it."""
-    shoot(path, **states)
-    path.write_bytes(path.read_bytes() + b"converted")
 
 
 @pytest.mark.parametrize(("raw", "dng"), [("IMG_7.NEF", "IMG_7.dng"), ("IMG_7.nef", "img_7.DNG")])
 def test_a_raw_and_its_converted_dng_are_one_photograph(tmp_path, raw, dng):
     for minute, angle in enumerate(("000", "045", "090")):
         for name in (raw, dng):
-            converted(tmp_path / f"pol{angle}" / name, clock=f"00:0{minute}:00")
+            shoot(tmp_path / f"pol{angle}" / name, clock=f"00:0{minute}:00")
     understood = capture.read(tmp_path)
     assert [names(shot) for shot in understood.shots] == [[raw]] * 3
-    assert (
-        sum("1 DNGs are converted from a RAW in the folder: the RAW is used" in note for note in understood.notes) == 3
-    )
+    used = ["1 DNGs are converted from a RAW in the folder: the RAW is used" in note for note in understood.notes]
+    assert sum(used) == 3
 
 
 def test_a_dng_that_names_its_raw_is_that_photograph(tmp_path):
     """OriginalRawFileName of DNG 1.2."""
     for minute, angle in enumerate(("000", "045", "090")):
-        folder = tmp_path / f"pol{angle}"
-        shoot(folder / "a.dng", clock=f"00:0{minute}:00")
-        photo = headers.settings() | {36867: (2, f"2026:01:02 00:0{minute}:00".encode()), 42036: (2, b"Macro 60")}
-        maker = headers.camera() | {50827: (2, b"A.dng")}
-        pixels = np.random.default_rng(minute).integers(500, 4000, (32, 48))
-        (folder / "b.dng").write_bytes(headers.dng(pixels, photo=photo, maker=maker))
+        for name, tags in (("a.dng", None), ("b.dng", {50827: (2, b"A.dng")})):
+            shoot(tmp_path / f"pol{angle}" / name, clock=f"00:0{minute}:00", tags=tags)
     assert [names(shot) for shot in capture.read(tmp_path).shots] == [["a.dng"]] * 3
 
 
@@ -218,19 +150,17 @@ def test_frames_of_one_name_and_another_time_are_two_photographs(tmp_path):
 
 
 def test_a_shot_listed_as_raw_and_as_dng_is_named(tmp_path):
-    listed = []
-    for name, angle in (("a.nef", 0), ("a.dng", 45), ("b.nef", 90)):
+    state(tmp_path, listed := {"a.nef": 0, "a.dng": 45, "b.nef": 90})
+    for name, angle in listed.items():
         shoot(tmp_path / name, clock=f"00:0{angle // 90}:00")
-        listed.append(f'[[frame]]\nfile = "{name}"\nangle = {angle}\n')
-    (tmp_path / "capture.toml").write_text("\n".join(listed))
     with pytest.raises(CaptureError, match=r"a\.dng: is the same photograph as .*a\.nef"):
         capture.read(tmp_path)
 
 
 def test_flat_folder_follows_the_stated_order(tmp_path):
-    understood = capture.read(flat(tmp_path, shots=4), (0.0, 45.0, 90.0, 135.0))
-    assert degrees(understood) == [0, 45, 90, 135]
-    assert degrees(capture.read(flat(tmp_path, shots=4), (135.0, 90.0, 45.0, 0.0))) == [135, 90, 45, 0]
+    flat(tmp_path, shots=4)
+    for order in ((0, 45, 90, 135), (135, 90, 45, 0)):
+        assert degrees(capture.read(tmp_path, tuple(map(float, order)))) == list(order)
 
 
 def test_angles_are_read_from_names_of_pictures(tmp_path):
@@ -251,11 +181,12 @@ def test_the_frame_of_a_polarization_sensor_is_four_shots(tmp_path):
     save(tmp_path / "frame.png", mosaic())
     understood = capture.read(tmp_path)
     assert understood.layout == "sensor" and degrees(understood) == [0, 45, 90, 135]
-    assert understood.size_px == (20, 16) and understood.focal_px == pytest.approx(
-        50 / 43.2666 * np.hypot(20, 16), 1e-4
-    )
+    assert understood.size_px == (20, 16)
+    assert understood.focal_px == pytest.approx(50 / 43.2666 * np.hypot(20, 16), 1e-4)
     assert [frame_decoder.decode(shot.frames[0]).value.mean() for shot in understood.shots] == [1300, 1150, 700, 850]
     assert len({shot.frames[0].digest for shot in understood.shots}) == 4
+    with pytest.raises(CaptureError, match="a polarization sensor has no ring; leave it out"):
+        capture.read(tmp_path, clockwise=True)
 
 
 def test_the_folder_of_one_angle_is_no_capture(tmp_path):
@@ -336,7 +267,7 @@ def test_a_flat_folder_that_does_not_divide_into_equal_brackets_is_refused(tmp_p
 
 
 def test_flat_folder_of_unequal_brackets_names_the_first_frame_that_differs(tmp_path):
-    flat(tmp_path, times=(1 / 200, 1 / 50))
+    flat(tmp_path)
     shoot(tmp_path / "IMG_0001.dng", 1 / 100, "00:03:00")
     with pytest.raises(CaptureError, match=r"IMG_0001\.dng: its exposure is 0\.5 times"):
         capture.read(tmp_path)

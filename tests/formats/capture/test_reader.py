@@ -11,10 +11,11 @@ from polcap.errors import CaptureError, DecodeError, InputError
 from polcap.formats.capture import reader as capture
 from polcap.formats.raw import frame_decoder
 from polcap.optics import sensor
-from tests.formats import headers
-from tests.formats.capture.capture_folders import degrees, folders, shoot
+from tests.formats.capture.capture_folders import degrees, each, folders, shoot
 from tests.formats.headers import DATA, needs_data
 from tests.formats.raw.test_photo import save
+
+POL = ("pol000", "pol045", "pol090")
 
 
 @pytest.mark.parametrize(
@@ -26,10 +27,7 @@ from tests.formats.raw.test_photo import save
     ],
 )
 def test_focal_length_is_found_or_assumed_with_a_note(tmp_path, settings, known, focal_px):
-    model = settings.pop("model", b"Z1")
-    for angle in ("000", "045", "090"):
-        shoot(tmp_path / f"pol{angle}" / "a.dng", model=model, **settings)
-    understood = capture.read(tmp_path)
+    understood = capture.read(each(tmp_path, POL, **settings))
     assert understood.focal_known is known
     assert understood.focal_px == pytest.approx(focal_px, rel=1e-4)
     assert known or any("state" in note and "capture.toml" in note for note in understood.notes)
@@ -39,29 +37,23 @@ def test_table_shows_every_frame_and_assumption(tmp_path):
     understood = capture.read(folders(tmp_path / "vase"))
     text = capture.table(understood)
     assert text.count("1/200 s") == 3 and text.count("1/50 s") == 3
-    for part in (
-        "pol045/IMG_1.dng",
-        "45°",
-        "Acme Z1, 48×32 px",
-        "Macro 60",
-        "80 px (assumed)",
-        "3 shots, 2 + 2 + 2",
-        "2026-01-02 00",
-    ):
+    parts = ("pol045/IMG_1.dng", "45°", "Acme Z1, 48×32 px", "Macro 60", "80 px (assumed)", "3 shots, 2 + 2 + 2")
+    for part in (*parts, "2026-01-02 00"):
         assert part in text, part
 
 
 def finished(root, suffix, pixels, **attributes):
     """A capture of finished pictures, one for each angle."""
-    for number, angle in enumerate(("000", "045", "090")):
-        (root / f"pol{angle}").mkdir(parents=True, exist_ok=True)
+    for number, folder in enumerate(POL):
+        (root / folder).mkdir(parents=True, exist_ok=True)
         one = pixels.copy()
         one[0, 0] = one[0, 0] * (1 + 0.01 * number)  # other bytes
-        save(root / f"pol{angle}" / f"a.{suffix}", one, **attributes)
+        save(root / folder / f"a.{suffix}", one, **attributes)
     return root
 
 
 SIXTEEN = np.full((24, 32, 3), 3000, np.uint16)
+RADIANCE = np.linspace(0.1, 700, 96 * 128 * 3, dtype=np.float32).reshape(96, 128, 3)
 
 
 def test_a_stated_encoding_is_noted_and_enters_the_digest(tmp_path):
@@ -98,22 +90,20 @@ def test_white_of_linear_pictures_contradicts_another_encoding(tmp_path):
 
 def test_radiance_above_one_is_not_over_exposed(tmp_path):
     """One white for all frames: they stay on one scale."""
-    radiance = np.linspace(0.1, 700, 96 * 128 * 3, dtype=np.float32).reshape(96, 128, 3)
-    understood = capture.read(finished(tmp_path / "radiance", "exr", radiance))
+    understood = capture.read(finished(tmp_path / "radiance", "exr", RADIANCE))
     images = [frame_decoder.decode(shot.frames[0]) for shot in understood.shots]
     assert len({image.white for image in images}) == 1
     assert not any(sensor.clipped_share(image, 0.98) for image in images)
     assert any("radiance up to 700: over-exposed from white = 735 on" in note for note in understood.notes)
-    below = capture.read(finished(tmp_path / "below", "exr", radiance / 1000))
+    below = capture.read(finished(tmp_path / "below", "exr", RADIANCE / 1000))
     assert frame_decoder.decode(below.shots[0].frames[0]).white == 1
     (tmp_path / "radiance" / "capture.toml").write_text("white = 500\n")
-    stated = capture.read(tmp_path / "radiance")
-    assert frame_decoder.decode(stated.shots[0].frames[0]).white == 500
-    assert sensor.clipped_share(frame_decoder.decode(stated.shots[0].frames[0]), 0.98) > 0.2
+    stated = frame_decoder.decode(capture.read(tmp_path / "radiance").shots[0].frames[0])
+    assert stated.white == 500 and sensor.clipped_share(stated, 0.98) > 0.2
 
 
 def test_a_few_wrong_pixels_do_not_set_the_scale_of_radiance(tmp_path):
-    radiance = np.linspace(0.1, 700, 96 * 128 * 3, dtype=np.float32).reshape(96, 128, 3)
+    radiance = RADIANCE.copy()
     radiance[5, 6] = 1e9
     understood = capture.read(finished(tmp_path, "exr", radiance))
     assert 700 < frame_decoder.decode(understood.shots[0].frames[0]).white < 20 * 700
@@ -122,13 +112,9 @@ def test_a_few_wrong_pixels_do_not_set_the_scale_of_radiance(tmp_path):
 def test_a_gain_map_that_is_not_applied_is_noted(tmp_path):
     """OpcodeList2 of a phone's DNG: against the lens's shading."""
     gain_map = struct.pack(">5I", 1, 9, 0x01030000, 0, 8) + bytes(8)
-    for minute, angle in enumerate(("000", "045", "090")):
-        pixels = np.random.default_rng(minute).integers(500, 4000, (32, 48))
-        path = tmp_path / f"pol{angle}" / "a.dng"
-        path.parent.mkdir()
-        path.write_bytes(headers.dng(pixels, maker=headers.camera() | {51009: (7, gain_map)}))
-    assert "not applied: the gain maps of 3 files" in capture.read(tmp_path).notes
-    assert not any("gain map" in note for note in capture.read(folders(tmp_path / "plain")).notes)
+    phone = capture.read(each(tmp_path / "phone", POL, tags={51009: (7, gain_map)}))
+    assert "not applied: the gain maps of 3 files" in phone.notes
+    assert not any("gain map" in note for note in capture.read(each(tmp_path / "plain", POL)).notes)
 
 
 def test_digest_follows_the_bytes(tmp_path):
@@ -152,9 +138,9 @@ def heic_only(folder):
 
 def zipped(folder):
     """Replace the folder by its archive."""
-    shutil.make_archive(str(folder) + " packed", "zip", folder)
+    packed = shutil.make_archive(f"{folder} packed", "zip", folder)
     shutil.rmtree(folder)
-    Path(str(folder) + " packed.zip").rename(folder)
+    Path(packed).rename(folder)
 
 
 def rewrite(place, change):
@@ -168,11 +154,7 @@ def empty(folder):
 
 
 FRAME = "pol045/IMG_1.dng"
-
-
 TOO_FEW = "2 different polarizer angles where 3 are needed"
-
-
 FAULTS = {
     "missing angle": (lambda vase: shutil.rmtree(vase / "pol045"), rf"angles are 0, 90: {TOO_FEW}"),
     "name of an angle": (
@@ -181,10 +163,7 @@ FAULTS = {
     ),
     "axes that coincide": (lambda vase: (vase / "pol045").rename(vase / "pol180"), TOO_FEW),
     "empty angle": (lambda vase: empty(vase / "pol045"), "pol045: holds no photograph"),
-    "empty folder": (
-        empty,
-        "holds no photograph that polcap reads; give the folder that holds the photographs",
-    ),
+    "empty folder": (empty, "holds no photograph that polcap reads; give the folder that holds the photographs"),
     "no folder": (shutil.rmtree, "no such folder"),
     "HEIC": (heic_only, "IMG_1.HEIC are compressed with loss: set the camera or phone to RAW or DNG, and shoot again"),
     "archive": (zipped, "is a ZIP archive; unpack it and give the folder that it holds"),
@@ -192,32 +171,23 @@ FAULTS = {
         lambda vase: (empty(vase), shutil.make_archive(str(vase / "shots"), "zip", Path(__file__).parent)),
         r"unpack shots\.zip first",
     ),
-    "camera": (
-        remake("pol045/IMG_0.dng", model=b"Other"),
-        r"pol045/IMG_0\.dng: was taken with Acme Other, not Acme Z1",
-    ),
+    "camera": (remake("pol045/IMG_0.dng", model=b"Other"), "pol045/IMG_0.dng: was taken with Acme Other, not Acme Z1"),
     "lens": (remake("pol090/IMG_0.dng", lens=b"Zoom"), r"IMG_0\.dng: was taken through Zoom, not Macro 60"),
     "zoom": (remake("pol090/IMG_0.dng", focal=70), "was taken at 70 mm, not 60 mm"),
     "size": (remake("pol090/IMG_0.dng", size=(32, 64)), "has 64×32 px, not 48×32"),
-    "bracket length": (
-        lambda vase: (vase / "pol090" / "IMG_0.dng").unlink(),
-        "pol090: 90° has 1 frames where 0° has 2",
-    ),
+    "bracket length": (lambda vase: (vase / "pol090/IMG_0.dng").unlink(), "pol090: 90° has 1 frames where 0° has 2"),
     "bracket exposure": (
         remake("pol090/IMG_0.dng", 1 / 25),
         r"pol090/IMG_0\.dng: 1/25 s f/8\.0 ISO 200\.0 where 0° has 1/50 s",
     ),
     "duplicate": (
-        lambda vase: shutil.copy(vase / "pol000" / "IMG_0.dng", vase / "pol090" / "IMG_0.dng"),
+        lambda vase: shutil.copy(vase / "pol000/IMG_0.dng", vase / "pol090/IMG_0.dng"),
         "is the same photograph as",
     ),
     "truncated": (rewrite(FRAME, lambda data: data[:-50]), rf"{FRAME}: its image data run past the end"),
     "zero bytes": (rewrite(FRAME, lambda data: b""), rf"{FRAME}: is empty"),
     "noise": (rewrite(FRAME, lambda data: np.random.default_rng(3).bytes(5000)), rf"{FRAME}: not a picture"),
-    "same angle twice": (
-        lambda vase: shutil.copytree(vase / "pol045", vase / "pol45"),
-        "45° is also in pol045",
-    ),
+    "same angle twice": (lambda vase: shutil.copytree(vase / "pol045", vase / "pol45"), "45° is also in pol045"),
 }
 
 

@@ -25,11 +25,10 @@ def test_the_missing_frame_of_a_flat_folder_is_named(tmp_path, number):
     files = ordered(flat(tmp_path, times=TIMES))
     files.pop(number).unlink()
     text, angle = ("1/200 s", "1/50 s", "1/12 s")[number % 3], 45 * (number // 3)
-    with pytest.raises(CaptureError, match="8 frames do not make 3 equal brackets") as error:
-        capture.read(tmp_path)
-    assert f"the frame of {text} at {angle}° is missing" in str(error.value)
     others = [file.name for k, file in enumerate(files) if (k + (k >= number)) % 3 == number % 3]
-    assert f"move {', '.join(others)}, the same exposure of every other shot, out of the folder" in str(error.value)
+    advice = f"the frame of {text} at {angle}° is missing.* move {', '.join(others)}, the same exposure of every other"
+    with pytest.raises(CaptureError, match=f"8 frames do not make 3 equal brackets.*{advice}"):
+        capture.read(tmp_path)
     for name in others:
         (tmp_path / name).unlink()
     assert len(capture.read(tmp_path).shots[0].frames) == 2

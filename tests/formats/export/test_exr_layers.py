@@ -1,8 +1,10 @@
 """The layered EXR of the small capture's result, read back and held against the maps."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 from polcap.errors import SettingError
@@ -15,26 +17,30 @@ REC709_TO_ACESCG = np.array(
 )
 
 
+def spec(file: Path) -> Any:
+    return oiio.ImageBuf(str(file)).spec()
+
+
 def test_layers_hold_the_maps_and_the_stokes_images(result: Path, tmp_path: Path) -> None:
     exr_layers.write(tmp_path / "all.exr", result / "maps", "lin_rec709", {"unit": "m"})
-    layers, attributes = exr.read(tmp_path / "all.exr")
+    layers, header = exr.read(tmp_path / "all.exr"), spec(tmp_path / "all.exr")
     assert {f"S{s}.{c}" for s in range(3) for c in "RGB"} | {"normal.x", "depth.Z", "mask.Y", "aolp.Y"} <= set(layers)
     for layer, file, channel in (("depth.Z", "depth", "Z"), ("normal.y", "normal", "G"), ("S1.G", "stokes", "S1.G")):
-        assert np.array_equal(layers[layer], exr.read(result / "maps" / f"{file}.exr")[0][channel])
-    assert attributes["colorInteropID"] == "lin_rec709_scene" and attributes["polcap:unit"] == "m"
-    assert np.allclose(np.asarray(attributes["chromaticities"])[:2], (0.64, 0.33))
+        assert np.array_equal(layers[layer], exr.read(result / "maps" / f"{file}.exr")[channel])
+    assert header["colorInteropID"] == "lin_rec709_scene" and header["polcap:unit"] == "m"
+    assert np.allclose(header["chromaticities"][:2], (0.64, 0.33))
 
 
 def test_colours_go_to_acescg_and_data_stays(result: Path, tmp_path: Path) -> None:
     exr_layers.write(tmp_path / "aces.exr", result / "maps", "ACEScg", {})
-    layers, attributes = exr.read(tmp_path / "aces.exr")
-    source, _ = exr.read(result / "maps" / "diffuse.exr")
+    layers, header = exr.read(tmp_path / "aces.exr"), spec(tmp_path / "aces.exr")
+    source = exr.read(result / "maps" / "diffuse.exr")
     rgb = np.stack([source[c] for c in "RGB"], axis=-1)
     found = np.stack([layers[f"diffuse.{c}"] for c in "RGB"], axis=-1)
     assert np.allclose(found, rgb @ REC709_TO_ACESCG.T, atol=2e-3)  # half
-    assert np.array_equal(layers["roughness.Y"], exr.read(result / "maps" / "roughness.exr")[0]["Y"])
-    assert attributes["colorInteropID"] == "lin_ap1_scene"
-    assert np.allclose(np.asarray(attributes["chromaticities"])[:2], (0.713, 0.293))  # AP1 red
+    assert np.array_equal(layers["roughness.Y"], exr.read(result / "maps" / "roughness.exr")["Y"])
+    assert header["colorInteropID"] == "lin_ap1_scene"
+    assert np.allclose(header["chromaticities"][:2], (0.713, 0.293))  # AP1 red
 
 
 def test_role_finds_its_space_and_a_wrong_name_is_refused() -> None:

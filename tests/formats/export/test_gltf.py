@@ -23,12 +23,6 @@ from tests import surfaces
 NODE = Path(__file__).parents[2] / "gltf"
 
 
-@pytest.fixture(scope="module")
-def asset() -> Asset:
-    maps = surfaces.maps(ripple=0.1, roughness=0.5, specular=0.05)
-    return surfaces.built(maps, surfaces.mesh(maps))
-
-
 def closed_ball() -> Mesh:
     """A closed mesh, the first of whose vertices no triangle has."""
     ball = trimesh.creation.icosphere(4)  # 2,562 vertices
@@ -47,6 +41,13 @@ def document(data: bytes) -> dict[str, Any]:
     return dict(json.loads(data[20 : 20 + length]))
 
 
+def packet(asset: Asset, **facts: str) -> dict[str, Any]:
+    """The XMP packet of a GLB with these facts."""
+    parsed = document(gltf.encode(asset, "ball", provenance=facts))
+    number = parsed["asset"]["extensions"]["KHR_xmp_json_ld"]["packet"]
+    return dict(parsed["extensions"]["KHR_xmp_json_ld"]["packets"][number])
+
+
 @pytest.mark.parametrize(
     ("images", "geometry"), [("png", "float"), ("jpeg", "float"), ("webp", "quantized"), ("png", "quantized")]
 )
@@ -55,11 +56,8 @@ def test_khronos_validator_finds_nothing(asset: Asset, tmp_path: Path, images: K
     if node is None or not (NODE / "node_modules" / "gltf-validator").is_dir():
         pytest.skip("needs node, and `npm ci` in tests/gltf")
     (tmp_path / "ball.glb").write_bytes(gltf.encode(asset, "ball", gltf.GlbOptions(images, geometry), {"unit": "m"}))
-    done = subprocess.run(
-        [node, str(NODE / "validate.js"), str(tmp_path / "ball.glb")],
-        capture_output=True, check=True, timeout=300,
-    )  # fmt: skip
-    report = json.loads(done.stdout)
+    command = [node, str(NODE / "validate.js"), str(tmp_path / "ball.glb")]
+    report = json.loads(subprocess.run(command, capture_output=True, check=True, timeout=300).stdout)
     issues = report["issues"]
     assert (issues["numErrors"], issues["numWarnings"], issues["numHints"]) == (0, 0, 0), issues["messages"]
     known = {"IMAGE_NPOT_DIMENSIONS", "UNSUPPORTED_EXTENSION"}  # fine since WebGL 2; XMP, which it does not know
@@ -96,57 +94,40 @@ def test_names_outside_ascii_survive(asset: Asset) -> None:
 
 
 def test_provenance_is_in_the_packet(asset: Asset) -> None:
-    parsed = document(gltf.encode(asset, "ball", provenance={"settings": "{}"}))
-    packet = parsed["extensions"]["KHR_xmp_json_ld"]["packets"][
-        parsed["asset"]["extensions"]["KHR_xmp_json_ld"]["packet"]
-    ]
-    assert packet["polcap:settings"] == "{}" and packet["dc:title"]["rdf:_1"]["@value"] == "ball"
-    assert packet["@context"]["dc"] == "http://purl.org/dc/elements/1.1/"
+    found = packet(asset, settings="{}")
+    assert found["polcap:settings"] == "{}" and found["dc:title"]["rdf:_1"]["@value"] == "ball"
+    assert found["@context"]["dc"] == "http://purl.org/dc/elements/1.1/"
 
 
 def test_catalog_entry_is_in_dublin_core_and_in_the_copyright(asset: Asset) -> None:
     stated = {"title": "Krug", "creator": "Haus", "rights": "© Haus", "license": "CC0", "object_number": "7"}
     stated |= {"date": "1897", "institution": "Haus", "description": "Blau"}
-    parsed = document(gltf.encode(asset, "ball", provenance=stated))
-    packet = parsed["extensions"]["KHR_xmp_json_ld"]["packets"][0]
-    assert packet["dc:title"]["rdf:_1"]["@value"] == "Krug" and packet["dc:creator"] == {"@list": ["Haus"]}
-    assert packet["dc:rights"]["rdf:_1"]["@value"] == parsed["asset"]["copyright"] == "© Haus"
-    assert packet["dc:identifier"] == "7" and packet["dc:date"] == {"@list": ["1897"]}
-    assert packet["dc:publisher"] == {"@set": ["Haus"]} and packet["dc:description"]["rdf:_1"]["@value"] == "Blau"
+    found = packet(asset, **stated)
+    assert found["dc:title"]["rdf:_1"]["@value"] == "Krug" and found["dc:creator"] == {"@list": ["Haus"]}
+    assert found["dc:rights"]["rdf:_1"]["@value"] == "© Haus"
+    assert document(gltf.encode(asset, "ball", provenance=stated))["asset"]["copyright"] == "© Haus"
+    assert found["dc:identifier"] == "7" and found["dc:date"] == {"@list": ["1897"]}
+    assert found["dc:publisher"] == {"@set": ["Haus"]} and found["dc:description"]["rdf:_1"]["@value"] == "Blau"
 
 
 def test_only_the_address_of_a_license_is_a_web_statement(asset: Asset) -> None:
-    def packet(text: str) -> dict[str, Any]:
-        parsed = document(gltf.encode(asset, "ball", provenance={"license": text}))
-        found: dict[str, Any] = parsed["extensions"]["KHR_xmp_json_ld"]["packets"][0]
-        return found
-
-    address = "https://creativecommons.org/licenses/by/4.0/"
-    assert packet(address)["xmpRights:WebStatement"] == address
-    assert packet("https://museum.example/our terms")["xmpRights:WebStatement"] == "https://museum.example/our%20terms"
-    named = packet("CC BY 4.0")
+    address = "https://museum.example/our"
+    assert packet(asset, license=address)["xmpRights:WebStatement"] == address
+    assert packet(asset, license=f"{address} terms")["xmpRights:WebStatement"] == f"{address}%20terms"
+    named = packet(asset, license="CC BY 4.0")
     assert named["xmpRights:UsageTerms"]["rdf:_1"]["@value"] == "CC BY 4.0" and "xmpRights:WebStatement" not in named
 
 
-def test_an_open_surface_is_double_sided(asset: Asset) -> None:
-    assert document(gltf.encode(asset, "ball"))["materials"][0]["doubleSided"] is True
-    ball = closed_ball()
-    assert not gltf.is_open(ball)
-
-
-@pytest.mark.parametrize("lost", [0, -1])
-def test_a_lost_triangle_opens_a_closed_surface_wherever_its_vertices_are_listed(lost: int) -> None:
-    ball = closed_ball()
-    assert gltf.is_open(replace(ball, faces=np.delete(ball.faces, lost, axis=0)))
-
-
-def test_seams_of_an_atlas_do_not_open_a_closed_surface() -> None:
-    """Each triangle is a chart of its own."""
+def test_a_lost_triangle_opens_a_surface_and_seams_of_an_atlas_do_not(asset: Asset) -> None:
+    """Wherever its vertices are listed; of the atlas, each triangle is a chart of its own."""
     ball = closed_ball()
     corners = ball.vertices[ball.faces].reshape(-1, 3)
     charts = replace(ball, vertices=corners, faces=np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
-    assert not gltf.is_open(charts)
-    assert gltf.is_open(replace(charts, faces=charts.faces[1:]))
+    for mesh in (ball, charts):
+        assert not gltf.is_open(mesh)
+        for lost in (0, -1):
+            assert gltf.is_open(replace(mesh, faces=np.delete(mesh.faces, lost, axis=0)))
+    assert document(gltf.encode(asset, "ball"))["materials"][0]["doubleSided"] is True
 
 
 def test_draco_without_its_package_is_one_line(asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,9 +145,8 @@ def test_packed_mesh_is_smaller_and_names_its_extension(asset: Asset, geometry: 
     for one in (geometry, "float"):
         data = gltf.encode(asset, "ball", gltf.GlbOptions(geometry=one))
         parsed = document(data)
-        held[one] = len(data) - sum(
-            parsed["bufferViews"][image["bufferView"]]["byteLength"] for image in parsed["images"]
-        )
+        pictures = [parsed["bufferViews"][image["bufferView"]]["byteLength"] for image in parsed["images"]]
+        held[one] = len(data) - sum(pictures)
         assert set(glb_geometry.EXTENSIONS[one]) == set(parsed.get("extensionsRequired", []))
     assert held[geometry] < share * held["float"]
 

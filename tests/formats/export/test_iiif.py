@@ -20,14 +20,8 @@ from polcap.stages import asset
 from tests import surfaces
 
 ADDRESS = "https://museum.example/objects/7"
-FACTS = {
-    "name": "IMG_1",
-    "title": "Vase",
-    "creator": "A. Photographer",
-    "rights": "© Museum",
-    "license": "https://creativecommons.org/licenses/by/4.0/",
-    "object_number": "7",
-}
+FACTS = {"name": "IMG_1", "title": "Vase", "creator": "A. Photographer", "rights": "© Museum", "object_number": "7"}
+FACTS |= {"license": "https://creativecommons.org/licenses/by/4.0/"}
 
 
 def waves(height: int, width: int) -> Texture:
@@ -136,9 +130,8 @@ def test_wards_law_shows_the_layer_as_polcap_shades_the_maps(
     to_light = np.array(light) / np.linalg.norm(light)
     maps = surfaces.maps(roughness=0.5, specular=0.04)
     one = np.ones(maps.mask.shape)
-    wanted = shade.stokes(
-        maps.normal, maps.diffuse, maps.specular, maps.roughness, 1.5 * one, to_light + 0 * maps.normal, one
-    )[0]
+    shown_as = maps.normal, maps.diffuse, maps.specular, maps.roughness, 1.5 * one
+    wanted = shade.stokes(*shown_as, to_light + 0 * maps.normal, one)[0]
     seen, drawn = ward(tmp_path, to_light)
     half = (slice(None, None, 2), slice(None, None, 2))
     shown = drawn[half] & maps.mask

@@ -8,13 +8,6 @@ import pytest
 
 from polcap.formats.export import gltf, ply_stl
 from polcap.mesh_values import Asset
-from tests import surfaces
-
-
-@pytest.fixture(scope="module")
-def asset() -> Asset:
-    maps = surfaces.maps(roughness=0.5, specular=0.05)
-    return surfaces.built(maps, surfaces.mesh(maps))
 
 
 @pytest.mark.parametrize(("metric", "unit"), [(True, 1000), (False, 1)])
@@ -40,8 +33,7 @@ def test_ply_has_color_and_normal_of_every_vertex(asset: Asset, tmp_path: Path, 
     head, _, body = (tmp_path / "ball.ply").read_bytes().partition(b"end_header\n")
     assert b"format binary_little_endian 1.0" in head
     words = [line.split()[1:] for line in head.decode().splitlines() if line.startswith("property")]
-    names = "x y z nx ny nz red green blue alpha vertex_indices"
-    assert " ".join(name for *_, name in words) == names
+    assert " ".join(name for *_, name in words) == "x y z nx ny nz red green blue alpha vertex_indices"
     vertex = np.dtype([("point", "<f4", 3), ("normal", "<f4", 3), ("color", "u1", 4)])
     count = len(asset.mesh.vertices)
     vertices = np.frombuffer(body, vertex, count)

@@ -61,10 +61,9 @@ def test_pictures_follow_the_readme(result: Path, folder: Path) -> None:
     normal = cv2.imread(str(folder / "normal.png"), cv2.IMREAD_UNCHANGED)[..., ::-1] / 32767.5 - 1
     np.testing.assert_allclose(normal[maps.mask], maps.normal[maps.mask], atol=3e-5)
     aolp = cv2.imread(str(folder / "aolp.png"), cv2.IMREAD_UNCHANGED) * np.pi / 65536
-    apart = np.abs(np.exp(2j * aolp) - np.exp(2j * result_maps.read_cues(result)["aolp"]))
-    assert apart[maps.mask].max() < 2e-4
-    matrix = np.loadtxt(folder / "K.txt")
-    np.testing.assert_allclose(matrix, maps.view.intrinsic, atol=1e-5)
+    difference = np.abs(np.exp(2j * aolp) - np.exp(2j * result_maps.read_cues(result)["aolp"]))
+    assert difference[maps.mask].max() < 2e-4
+    np.testing.assert_allclose(np.loadtxt(folder / "K.txt"), maps.view.intrinsic, atol=1e-5)
 
 
 def test_the_same_result_gives_the_same_bytes(result: Path, folder: Path, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """USD and MaterialX, checked by OpenUSD's validators and the MaterialX library."""
 
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -14,15 +15,8 @@ from polcap.formats.export.texture_set import LOOSE, Key
 from polcap.formats.maps import exr
 from polcap.mesh_values import Asset
 from polcap.optics import color
-from tests import surfaces
 
 FILES: dict[Key, str] = {key: f"ball_{key}.png" for key in LOOSE}
-
-
-@pytest.fixture(scope="module")
-def asset() -> Asset:
-    maps = surfaces.maps(ripple=0.1, roughness=0.5, specular=0.05)
-    return surfaces.built(maps, surfaces.mesh(maps))
 
 
 @pytest.fixture(scope="module")
@@ -30,13 +24,17 @@ def folder(asset: Asset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """ball.usdc, ball.mtlx and their textures."""
     pytest.importorskip("pxr", reason="needs usd-core")
     where = tmp_path_factory.mktemp("usd")
+    write(where, asset)
+    return where
+
+
+def write(where: Path, asset: Asset) -> None:
     usd.write(where / "ball.usdc", asset, "ball", FILES, {"unit": "m"})
     (where / "ball.mtlx").write_text(materialx.document(asset, "ball", FILES, "a ball"))
     textures: dict[Key, bytes] = {key: encoders.encode(LOOSE[key](asset), "png") for key in FILES}
     for key, file in FILES.items():
         (where / file).write_bytes(textures[key])
     usd.package(where / "ball.usdz", asset, "ball", textures, {"unit": "m"})
-    return where
 
 
 def opened(folder: Path, name: str = "ball.usdc") -> Any:
@@ -80,7 +78,7 @@ def test_linear_textures_are_declared_linear(asset: Asset, tmp_path: Path) -> No
     assert "srgb_texture" not in materialx.document(asset, "ball", files, "a ball")
     for key, file in files.items():
         texture_set.write_exr(tmp_path / file, LOOSE[key](asset))
-    channels, _ = exr.read(tmp_path / "ball_basecolor.exr")
+    channels = exr.read(tmp_path / "ball_basecolor.exr")
     linear = color.decode_srgb(asset.base_color / 255)
     assert np.allclose(np.stack([channels[c] for c in "RGB"], axis=-1), linear, atol=1e-3)
 
@@ -111,9 +109,8 @@ def test_every_reader_finds_a_surface_with_measured_reflectance(folder: Path) ->
         assert material.GetSurfaceOutput("mtlx").HasConnectedSource()
         preview = material.ComputeSurfaceSource()[0]
         source = preview.GetInput("specularColor").GetConnectedSources()[0][0].source
-        scales.append(
-            source.GetInput("scale").Get()[0] * (0.04 if not preview.GetInput("useSpecularWorkflow").Get() else 1)
-        )
+        unit = 1 if preview.GetInput("useSpecularWorkflow").Get() else 0.04
+        scales.append(source.GetInput("scale").Get()[0] * unit)
     assert np.allclose(scales, 0.08)
 
 
@@ -140,22 +137,12 @@ def test_nodes_follow_the_nodes_of_their_inputs(asset: Asset) -> None:
 
 
 def test_same_asset_gives_the_same_bytes(folder: Path, asset: Asset, tmp_path: Path) -> None:
-    usd.write(tmp_path / "ball.usdc", asset, "ball", FILES, {"unit": "m"})
-    usd.package(
-        tmp_path / "ball.usdz",
-        asset,
-        "ball",
-        {key: (folder / f).read_bytes() for key, f in FILES.items()},
-        {"unit": "m"},
-    )
-    (tmp_path / "ball.mtlx").write_text(materialx.document(asset, "ball", FILES, "a ball"))
+    write(tmp_path, asset)
     for name in ("ball.usdc", "ball.usdz", "ball.mtlx"):
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()
 
 
 def test_without_usd_core_one_line_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(SettingError, match=r"usd-core; pip install 'polcap\[usd\]'"):
         usd.require()

@@ -22,8 +22,7 @@ from tests import surfaces
 FILES = {
     "normal.exr", "normal.png", "depth.exr", "depth.png", "diffuse.exr", "diffuse.png", "specular.exr",
     "specular.png", "roughness.exr", "roughness.png", "mask.png", "confidence.exr", "diffuse_error.exr",
-    "roughness_error.exr", "stokes.exr", "stokes_covariance.exr",
-    "cues.exr", "photograph.png", "maps.json",
+    "roughness_error.exr", "stokes.exr", "stokes_covariance.exr", "cues.exr", "photograph.png", "maps.json",
 }  # fmt: skip
 
 Result = tuple[SurfaceMaps, ReliefMesh, StokesImage, Cues]
@@ -41,16 +40,9 @@ def result() -> Result:
     rng = np.random.default_rng(4)
     stokes = rng.normal(0, 0.1, (3, *of.mask.shape, 3)).astype(np.float32)
     stokes[0] = np.abs(stokes[0]) + 0.5
-    image = StokesImage(
-        stokes=stokes,
-        covariance=np.full((6, *of.mask.shape, 3), 1e-6, dtype=np.float32),
-        quality=np.zeros(of.mask.shape, dtype=np.uint8),
-        mask=of.mask,
-        view=of.view,
-        residual=None,
-    )
-    color = ColorCalibration(np.eye(3), "none")
-    return of, surfaces.mesh(of), image, cues.compute(image, color)
+    covariance, quality = np.full((6, *of.mask.shape, 3), 1e-6, np.float32), np.zeros(of.mask.shape, np.uint8)
+    image = StokesImage(stokes, covariance, quality, mask=of.mask, view=of.view, residual=None)
+    return of, surfaces.mesh(of), image, cues.compute(image, ColorCalibration(np.eye(3), "none"))
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +50,10 @@ def folder(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("result") / "maps"
     write(folder, *result)
     return folder
+
+
+def described(folder: Path) -> dict[str, Any]:
+    return dict(json.loads((folder / "maps.json").read_text("utf-8")))
 
 
 @pytest.mark.parametrize("threads", ["1", "3"])
@@ -68,9 +64,7 @@ def test_a_file_that_cannot_be_written_leaves_all_as_they_were(
     monkeypatch.setenv("OMP_NUM_THREADS", threads)
     write(tmp_path / "maps", *result)
     before = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "maps").iterdir()}
-    assert {name: (tmp_path / "maps" / name).read_bytes() for name in FILES} == {
-        name: (folder / name).read_bytes() for name in FILES
-    }
+    assert all((tmp_path / "maps" / name).read_bytes() == (folder / name).read_bytes() for name in FILES)
     keep = exr.write
 
     def refuse(path: Path, *values: Any, **more: Any) -> None:
@@ -89,7 +83,7 @@ def test_detail_of_raw_pixels_comes_back_and_maps_json_states_its_size(result: R
     size = (2 * surfaces.HEIGHT, 2 * surfaces.WIDTH)
     detailed = replace(of, detail=np.random.default_rng(2).normal(0, 0.5, size).astype(np.float16))
     write(tmp_path / "maps", detailed, mesh, image, seen)
-    stated = json.loads((tmp_path / "maps" / "maps.json").read_text("utf-8"))
+    stated = described(tmp_path / "maps")
     assert stated["sizes"] == {"detail.png": [size[1], size[0]]} and "detail.png" in stated["maps"]
     read = maps.read(tmp_path / "maps").detail
     assert detailed.detail is not None and read is not None
@@ -101,25 +95,25 @@ def test_detail_of_raw_pixels_comes_back_and_maps_json_states_its_size(result: R
 
 def test_every_promised_file_is_there_and_described(folder: Path) -> None:
     assert {path.name for path in folder.iterdir()} == FILES
-    described = json.loads((folder / "maps.json").read_text("utf-8"))
-    assert set(described["maps"]) == FILES - {"maps.json"}
+    assert set(described(folder)["maps"]) == FILES - {"maps.json"}
 
 
-def test_crop_is_in_visible_raw_pixels(folder: Path) -> None:
-    described = json.loads((folder / "maps.json").read_text("utf-8"))
-    assert described["crop"] == [600, 400, 600 + 2 * surfaces.WIDTH, 400 + 2 * surfaces.HEIGHT]
-    assert described["size"] == [surfaces.WIDTH, surfaces.HEIGHT] and described["scale"] == 2
-    assert described["camera"]["focal_px"] == 400 and described["depth"]["unit"] == "m"
+def test_crop_is_in_visible_raw_pixels_and_depth_in_a_stated_unit(folder: Path, result: Result, tmp_path: Path) -> None:
+    stated = described(folder)
+    assert stated["crop"] == [600, 400, 600 + 2 * surfaces.WIDTH, 400 + 2 * surfaces.HEIGHT]
+    assert stated["size"] == [surfaces.WIDTH, surfaces.HEIGHT] and stated["scale"] == 2
+    assert stated["camera"]["focal_px"] == 400 and stated["depth"]["unit"] == "m"
+    write(tmp_path, result[0], replace(result[1], metric=False), *result[2:])
+    assert described(tmp_path)["depth"]["unit"] == "relative"
 
 
 def test_pictures_hold_the_values_that_maps_json_describes(folder: Path, result: Result) -> None:
     of, mesh, *_ = result
-    described = json.loads((folder / "maps.json").read_text("utf-8"))
     inside = of.mask
     normal = png.read(folder / "normal.png")
     assert normal.dtype == np.uint16
     assert np.allclose(normal[inside] / 65535 * 2 - 1, of.normal[inside], atol=2e-5)
-    near, far = described["depth"]["near"], described["depth"]["far"]
+    near, far = (described(folder)["depth"][end] for end in ("near", "far"))
     depth = png.read(folder / "depth.png")[inside] / 65535 * (far - near) + near
     assert np.allclose(depth, mesh.depth[inside], atol=(far - near) * 1e-5)
     assert np.allclose(png.read(folder / "roughness.png")[inside] / 65535, 0.4, atol=1e-5)
@@ -138,10 +132,10 @@ def test_normals_point_right_up_and_towards_the_camera(folder: Path) -> None:
 
 def test_stokes_and_cues_are_readable_by_name(folder: Path, result: Result) -> None:
     _, _, stokes, of = result
-    read, _ = exr.read(folder / "stokes.exr")
+    read = exr.read(folder / "stokes.exr")
     assert sorted(read) == sorted(f"S{s}.{c}" for s in range(3) for c in "RGB")
     assert np.allclose(read["S2.B"], stokes.stokes[2, ..., 2], atol=3e-4)  # half
-    read, _ = exr.read(folder / "cues.exr")
+    read = exr.read(folder / "cues.exr")
     assert np.allclose(read["dolp"], of.dolp, atol=1e-3)
     double = np.radians(2 * read["aolp"])
     assert np.allclose(np.cos(double), of.normalized_stokes[0], atol=5e-3)
@@ -202,12 +196,6 @@ def test_expected_errors_of_the_material_come_back_and_a_result_without_them_is_
     assert without.diffuse_error is None and without.roughness_error is None
 
 
-def test_relative_depth_is_described_as_relative(result: Result, tmp_path: Path) -> None:
-    of, mesh, stokes, cue = result
-    write(tmp_path, of, replace(mesh, metric=False), stokes, cue)
-    assert json.loads((tmp_path / "maps.json").read_text("utf-8"))["depth"]["unit"] == "relative"
-
-
 def test_a_missing_map_is_named_with_a_remedy(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder, tmp_path / "maps")
     for name in ("normal.exr", "mask.png"):
@@ -241,13 +229,11 @@ def test_python_reads_the_maps_of_a_result_by_any_of_its_folders(
     assert found.metric is mesh.metric and repr(found) == repr(stored)
     assert len(repr(found)) < 700 and f"float32 {of.normal.shape}" in repr(found)
     inside = of.mask
-    np.testing.assert_allclose(
-        result_maps.read_stokes(tmp_path / name)[:, inside], stokes.stokes[:, inside], rtol=1e-3, atol=1e-4
-    )
+    s = result_maps.read_stokes(tmp_path / name)
+    np.testing.assert_allclose(s[:, inside], stokes.stokes[:, inside], rtol=1e-3, atol=1e-4)
     read = result_maps.read_cues(str(tmp_path / name))
     np.testing.assert_allclose(read["dolp"][inside], cues_.dolp[inside], rtol=1e-3, atol=1e-4)
-    double = 2 * read["aolp"][inside]
-    pointing = np.stack([np.cos(double), np.sin(double)])
+    pointing = np.stack([np.cos(2 * read["aolp"][inside]), np.sin(2 * read["aolp"][inside])])
     np.testing.assert_allclose(pointing, cues_.normalized_stokes[:, inside], atol=0.01)
     assert {name: value.shape for name, value in read.items()}["diffuse_color"] == of.normal.shape
 

@@ -10,6 +10,7 @@ import pytest
 from polcap.errors import DecodeError, StorageError
 from polcap.formats.maps import png
 from polcap.formats.raw import photo
+from tests.formats.raw.test_photo import save
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -28,11 +29,7 @@ def test_red_is_first_for_other_readers(tmp_path: Path) -> None:
 
 
 def test_alpha_of_a_grey_picture_is_left_out(tmp_path: Path) -> None:
-    spec = oiio.ImageSpec(3, 2, 2, "uint8")
-    output = oiio.ImageOutput.create(str(tmp_path / "a.png"))
-    assert output.open(str(tmp_path / "a.png"), spec)
-    assert output.write_image(np.full((2, 3, 2), [7, 255], np.uint8)) and output.close()
-    assert png.read(tmp_path / "a.png").tolist() == [[7] * 3] * 2
+    assert png.read(save(tmp_path / "a.png", np.full((2, 3, 2), [7, 255], np.uint8))).tolist() == [[7] * 3] * 2
 
 
 def test_only_whole_numbers_are_taken() -> None:

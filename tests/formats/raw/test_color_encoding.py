@@ -40,12 +40,7 @@ def eight(value: NDArray[Any]) -> NDArray[np.uint8]:
 def png(pixels: NDArray[Any], *chunks: tuple[bytes, bytes]) -> Write:
     def write(path: Path) -> None:
         cv2.imwrite(str(path), pixels[..., ::-1])
-        data = path.read_bytes()
-        new = [
-            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-            for kind, body in chunks
-        ]
-        path.write_bytes(data[:33] + b"".join(new) + data[33:])  # after the header
+        headers.add_chunks(path, *chunks)
 
     return write
 
@@ -95,11 +90,7 @@ def gama(gamma: float) -> tuple[bytes, bytes]:
 
 def transfer_function(pixels: NDArray[np.uint8], gamma: float) -> Write:
     table = tuple(np.round(65535 * (np.arange(256) / 255) ** gamma).astype(int).tolist())
-    height, width, channels = pixels.shape
-    tags = {
-        256: (4, (width,)), 257: (4, (height,)), 258: (3, (8,) * channels), 259: (3, (1,)), 262: (3, (2,)),
-        277: (3, (channels,)), 278: (4, (height,)), 279: (4, (pixels.nbytes,)), 284: (3, (1,)), 301: (3, table),
-    }  # fmt: skip
+    tags = headers.of_picture(pixels) | {301: (3, table)}
     return lambda path: path.write_bytes(headers.tiff(tags, image=pixels.tobytes()))
 
 
@@ -160,9 +151,8 @@ def test_contradictory_encodings_are_refused_unless_the_user_decides(
 ) -> None:
     path = tmp_path / name
     write(path)
-    with pytest.raises(
-        DecodeError, match=rf"{name}: .*{words}.*state encoding = \"linear\" or \"srgb\" in capture\.toml"
-    ):
+    remedy = 'state encoding = "linear" or "srgb" in capture.toml'
+    with pytest.raises(DecodeError, match=rf"{name}: .*{words}.*{remedy}"):
         photo.read(path)
     assert not photo.read(path, FrameReading("photo", "linear")).lossy
     assert photo.read(path, FrameReading("photo", "srgb")).lossy
@@ -209,9 +199,7 @@ def test_stated_primaries_give_the_color_matrix(
     path = tmp_path / name
     write(path)
     matrix = photo.read(path).camera_matrix
-    if expected is None:
-        assert matrix is None
-    else:
-        assert matrix is not None
+    assert (matrix is None) is (expected is None)
+    if matrix is not None and expected is not None:
         np.testing.assert_allclose(matrix.ravel(), expected, atol=3e-3)
         np.testing.assert_allclose(matrix.sum(axis=1), 1, atol=2e-3)  # white stays white

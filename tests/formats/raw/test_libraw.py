@@ -1,6 +1,7 @@
 """RAW decoding: counts, black, white and colours of the mosaic, against files of known content."""
 
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,11 +27,8 @@ def written(tmp_path, *args, **options):
 def test_mosaic_comes_back_bit_for_bit_with_black_in_its_phase(tmp_path, phase):
     image = raw.read(written(tmp_path, RAMP, cfa=phase, black=[[510, 511], [512, 513]], white=4000))
     np.testing.assert_array_equal(image.value, RAMP)
-    assert image.value.dtype == np.uint16
-    assert image.cfa.tolist() == [list(row) for row in phase]
-    assert image.black.tolist() == [[510, 511], [512, 513]]
-    assert image.white == 4000
-    assert not image.lossy
+    assert image.cfa.tolist() == [list(row) for row in phase] and image.black.tolist() == [[510, 511], [512, 513]]
+    assert image.value.dtype == np.uint16 and image.white == 4000 and not image.lossy
 
 
 @pytest.mark.parametrize("area", [(2, 4, 58, 84), (3, 5, 59, 83), (3, 4, 59, 84), (2, 5, 58, 83)])
@@ -47,17 +45,11 @@ def test_masked_border_is_cut_and_the_colours_keep_their_pixels(tmp_path, area):
     np.testing.assert_array_equal(image.value, level[seen])
 
 
-def test_linear_channels_have_no_mosaic(tmp_path):
-    pixels = np.stack([RAMP, RAMP + 1, RAMP + 2], -1)
-    image = raw.read(written(tmp_path, pixels, photometric=34892))
-    np.testing.assert_array_equal(image.value, pixels)
-    assert image.cfa is None and image.black.shape == (1, 1)
-
-
-def test_monochrome_sensor_fills_all_channels(tmp_path):
-    image = raw.read(written(tmp_path, RAMP, photometric=34892, black=[[7]]))
-    np.testing.assert_array_equal(image.value, np.stack([RAMP] * 3, -1))
-    assert image.cfa is None and image.black.tolist() == [[7]]
+@pytest.mark.parametrize(("pixels", "black"), [(np.stack([RAMP, RAMP + 1, RAMP + 2], -1), 0), (RAMP, 7)])
+def test_linear_channels_have_no_mosaic_and_a_single_one_fills_all(tmp_path, pixels, black):
+    image = raw.read(written(tmp_path, pixels, photometric=34892, black=[[black]] if black else None))
+    np.testing.assert_array_equal(image.value, pixels if pixels.ndim == 3 else np.stack([pixels] * 3, -1))
+    assert image.cfa is None and image.black.tolist() == [[black]]
 
 
 FOUR = np.kron([[500, 524, 512, 512], [512, 512, 500, 524]], np.ones((2, 1), int))
@@ -137,9 +129,6 @@ def test_super_ccd_is_refused_by_name(tmp_path, layout):
     path.write_bytes(path.read_bytes().replace(rectangular, struct.pack("<HHIHH", 50711, 3, 1, layout, 0)))
     with pytest.raises(DecodeError, match=rf"CFALayout {layout}, SuperCCD.*16-bit TIFF"):
         raw.read(path)
-
-
-def test_a_turned_mosaic_is_recognized_by_its_size():
     assert "SuperCCD, turned by 45°" in raw.unsupported((4, 4), rotated=True)
 
 
@@ -149,10 +138,14 @@ def test_foveon_is_refused_by_name(tmp_path):
         raw.read(tmp_path / "a.x3f")
 
 
-def test_camera_matrix_takes_the_grey_of_the_shot_to_white(tmp_path):
-    image = raw.read(written(tmp_path, RAMP, neutral=(0.5, 1, 0.8)))
+def test_camera_matrix_takes_the_grey_of_the_shot_to_white_and_agrees_with_libraw(tmp_path):
+    path = written(tmp_path, RAMP, neutral=(0.5, 1, 0.8))
+    image = raw.read(path)
     np.testing.assert_allclose(image.white_balance, [2, 1, 1.25], rtol=1e-6)
     np.testing.assert_allclose(image.camera_matrix @ [0.5, 1, 0.8], 1, rtol=1e-5)
+    with rawpy.imread(str(path)) as reference:
+        libraw = reference.color_matrix[:, :3].copy()  # white-balanced camera → Rec.709
+    np.testing.assert_allclose(image.camera_matrix / image.white_balance, libraw, atol=2e-3)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
@@ -164,21 +157,16 @@ def test_channels_that_see_the_same_give_no_camera_matrix(scale):
     assert raw.camera_matrix(scale * np.eye(3), None) is not None
 
 
-def test_camera_matrix_agrees_with_libraw(tmp_path):
-    path = written(tmp_path, RAMP, neutral=(0.5, 1, 0.8))
-    image = raw.read(path)
-    with rawpy.imread(str(path)) as reference:
-        libraw = reference.color_matrix[:, :3].copy()  # white-balanced camera → Rec.709
-    np.testing.assert_allclose(image.camera_matrix / image.white_balance, libraw, atol=2e-3)
+def cut(path, whole, lengths):
+    for length in lengths:
+        path.write_bytes(whole[:length])
+        with pytest.raises(DecodeError, match=path.name):
+            raw.read(path)
 
 
 def test_cut_file_is_one_error(tmp_path):
     whole = headers.dng(RAMP)
-    path = tmp_path / "cut.dng"
-    for length in (len(whole) - 100, len(whole) - RAMP.nbytes, 300, 9):
-        path.write_bytes(whole[:length])
-        with pytest.raises(DecodeError, match=r"cut\.dng"):
-            raw.read(path)
+    cut(tmp_path / "cut.dng", whole, (len(whole) - 100, len(whole) - RAMP.nbytes, 300, 9))
 
 
 @needs_data
@@ -202,10 +190,5 @@ def test_real_files_open():
 @needs_data
 @pytest.mark.parametrize("name", ["raw_other/IMG_5952.CR2", "raw_chart/CRW_0101.CRW", "raw_chart/P003910.KDC"])
 def test_real_file_cut_short_is_one_error(tmp_path, name):
-    source = DATA / "real" / name
-    whole = source.read_bytes()
-    path = tmp_path / source.name
-    for share in (0.9, 0.3, 0.01):
-        path.write_bytes(whole[: int(share * len(whole))])
-        with pytest.raises(DecodeError, match=source.name):
-            raw.read(path)
+    whole = (DATA / "real" / name).read_bytes()
+    cut(tmp_path / Path(name).name, whole, (int(share * len(whole)) for share in (0.9, 0.3, 0.01)))

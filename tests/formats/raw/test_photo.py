@@ -72,16 +72,12 @@ def test_encoding_and_levels_may_be_stated(tmp_path):
 
 
 def test_alpha_neither_counts_nor_multiplies(tmp_path):
-    with_alpha = np.dstack([SIXTEEN[..., ::-1], np.full((24, 32), 1000, np.uint16)])
-    assert cv2.imwrite(str(tmp_path / "a.png"), with_alpha)
-    image = photo.read(tmp_path / "a.png")
-    np.testing.assert_array_equal(image.value, SIXTEEN)
+    path = save(tmp_path / "a.png", np.dstack([SIXTEEN, np.full((24, 32), 1000, np.uint16)]), oiio__UnassociatedAlpha=1)
+    np.testing.assert_array_equal(photo.read(path).value, SIXTEEN)
 
 
 def test_jpeg_opens(tmp_path):
-    flat = np.full((24, 32, 3), 128, np.uint8)
-    assert cv2.imwrite(str(tmp_path / "a.jpg"), flat)
-    image = photo.read(tmp_path / "a.jpg")
+    image = photo.read(save(tmp_path / "a.jpg", np.full((24, 32, 3), 128, np.uint8)))
     np.testing.assert_allclose(image.value, 0.2158605, atol=2e-3)
     assert image.lossy
 
@@ -89,18 +85,24 @@ def test_jpeg_opens(tmp_path):
 def test_unreadable_pictures_are_one_error_each(tmp_path):
     whole = save(tmp_path / "a.png", SIXTEEN).read_bytes()
     (tmp_path / "cut.png").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(DecodeError, match=r"cut\.png.*truncated or damaged"):
-        photo.read(tmp_path / "cut.png")
     (tmp_path / "head.png").write_bytes(whole[:12])
-    with pytest.raises(DecodeError, match=r"head\.png"):
-        photo.read(tmp_path / "head.png")
     holes = SIXTEEN.astype(np.float32)
     holes[3, 4, 0] = np.nan
-    with pytest.raises(DecodeError, match=r"nan\.exr: 1 values are not finite"):
-        photo.read(save(tmp_path / "nan.exr", holes))
-    layers = save(tmp_path / "layers.exr", SIXTEEN[..., :2].astype(np.float32), ("U", "V"))
-    with pytest.raises(DecodeError, match=r"2 channels \(U, V\)"):
-        photo.read(layers)
+    save(tmp_path / "nan.exr", holes)
+    save(tmp_path / "layers.exr", SIXTEEN[..., :2].astype(np.float32), ("U", "V"))
+    tags = headers.of_picture(SIXTEEN) | {262: (3, (8,))}
+    (tmp_path / "lab.tif").write_bytes(headers.tiff(tags, image=SIXTEEN.tobytes()))
+    windows(tmp_path / "beyond.exr", (100, 100, 120, 120), (0, 0, 40, 24))
+    for name, words in {
+        "cut.png": ".*truncated or damaged",
+        "head.png": "",
+        "nan.exr": ": 1 values are not finite",
+        "layers.exr": r".*2 channels \(U, V\)",
+        "lab.tif": ": its colors are CIELAB; save it as RGB",
+        "beyond.exr": ": its data window lies outside its display window",
+    }.items():
+        with pytest.raises(DecodeError, match=name + words):
+            photo.read(tmp_path / name)
 
 
 CELLS = {0: (1, 1), 45: (0, 1), 90: (0, 0), 135: (1, 0)}  # row, column of each angle in the usual cell
@@ -121,18 +123,16 @@ def mosaic(height=32, width=40, tint=None):
 def test_sensor_planes_obey_malus_law(tmp_path):
     path = save(tmp_path / "a.png", mosaic())
     planes = {angle: photo.read_mosaic(path, cell) for angle, cell in CELLS.items()}
-    level = {angle: float(plane.value.mean()) for angle, plane in planes.items()}
-    assert level == {0: 1300, 45: 1150, 90: 700, 135: 850}
+    assert {angle: plane.value.mean() for angle, plane in planes.items()} == {0: 1300, 45: 1150, 90: 700, 135: 850}
     assert planes[0].value.shape == (16, 20, 3) and planes[0].cfa is None
 
 
 def test_sensor_pixel_is_the_one_of_its_angle(tmp_path):
     counts = np.arange(32 * 40, dtype=np.uint16).reshape(32, 40) + 20000
     path = save(tmp_path / "a.tif", counts)
-    np.testing.assert_array_equal(photo.read_mosaic(path, CELLS[90]).value[..., 0], counts[::2, ::2])
-    np.testing.assert_array_equal(photo.read_mosaic(path, CELLS[45]).value[..., 0], counts[::2, 1::2])
-    np.testing.assert_array_equal(photo.read_mosaic(path, CELLS[135]).value[..., 0], counts[1::2, ::2])
-    np.testing.assert_array_equal(photo.read_mosaic(path, CELLS[0]).value[..., 0], counts[1::2, 1::2])
+    for angle, (row, column) in {90: (0, 0), 45: (0, 1), 135: (1, 0), 0: (1, 1)}.items():
+        plane = photo.read_mosaic(path, CELLS[angle]).value[..., 0]
+        np.testing.assert_array_equal(plane, counts[row::2, column::2])
 
 
 def test_sensor_frame_may_be_raw(tmp_path):
@@ -142,20 +142,16 @@ def test_sensor_frame_may_be_raw(tmp_path):
     assert (plane.value.mean(), plane.black.tolist(), plane.white) == (1250, [[100]], 4000)
 
 
-def test_colour_sensors_are_refused(tmp_path):
-    three = save(tmp_path / "rgb.png", SIXTEEN)
-    with pytest.raises(DecodeError, match=r"rgb\.png: has 3 channels"):
-        photo.read_mosaic(three, CELLS[0])
-    bayer = save(tmp_path / "bayer.png", mosaic(tint=[[0.6, 1], [1, 0.7]]))
-    with pytest.raises(DecodeError, match=r"bayer\.png.*color polarization sensor"):
-        photo.read_mosaic(bayer, CELLS[0])
-
-
-def test_a_color_mosaic_is_not_taken_for_polarizers(tmp_path, rng):
+def test_sensors_of_colors_are_refused(tmp_path, rng):
     bayer = np.tile(np.array([[0, 1], [1, 2]]), (96, 120))
-    path = save(tmp_path / "bayer.tif", np.take_along_axis(scene(rng), bayer[..., None], axis=2))
-    with pytest.raises(DecodeError, match=r"bayer\.tif: the diagonals of its 2×2 cells differ by .*mosaic of colors"):
-        photo.read_mosaic(path, CELLS[0])
+    for pixels, words in (
+        (SIXTEEN, "has 3 channels"),
+        (mosaic(tint=[[0.6, 1], [1, 0.7]]), ".*color polarization sensor"),
+        (np.take_along_axis(scene(rng), bayer[..., None], axis=2), "the diagonals of its 2×2 .*mosaic of colors"),
+    ):
+        path = save(tmp_path / "a.png", pixels)
+        with pytest.raises(DecodeError, match=rf"a\.png: {words}"):
+            photo.read_mosaic(path, CELLS[0])
 
 
 @needs_data
@@ -191,20 +187,6 @@ def test_an_exr_is_read_in_its_display_window(tmp_path, data, display):
     assert (exif.width, exif.height) == (display[2] - display[0], display[3] - display[1])
 
 
-def test_an_exr_without_pixels_in_its_window_is_refused(tmp_path):
-    path = windows(tmp_path / "a.exr", (100, 100, 120, 120), (0, 0, 40, 24))
-    with pytest.raises(DecodeError, match=r"a\.exr: its data window lies outside its display window"):
-        photo.read(path)
-
-
-def test_colors_other_than_rgb_are_refused(tmp_path):
-    tags = {256: (4, (32,)), 257: (4, (24,)), 258: (3, (16,) * 3), 259: (3, (1,)), 262: (3, (8,)), 277: (3, (3,))}
-    tags |= {278: (4, (24,)), 279: (4, (SIXTEEN.nbytes,)), 284: (3, (1,))}
-    (tmp_path / "lab.tif").write_bytes(headers.tiff(tags, image=SIXTEEN.tobytes()))
-    with pytest.raises(DecodeError, match=r"lab\.tif: its colors are CIELAB; save it as RGB"):
-        photo.read(tmp_path / "lab.tif")
-
-
 def scene(rng, height=192, width=240):
     """A smooth colored picture (H, W, 3) with noise, 16 bits."""
     smooth = cv2.resize(rng.uniform(0.1, 0.6, (6, 8, 3)), (width, height), interpolation=cv2.INTER_CUBIC)
@@ -226,7 +208,6 @@ def test_a_mosaic_in_a_gray_file_is_named(tmp_path, rng, period):
 
 
 def test_a_polarization_mosaic_in_a_gray_file_is_named(tmp_path):
+    noise = (np.arange(96 * 96).reshape(96, 96) % 7).astype(np.uint16)
     with pytest.raises(DecodeError, match=r'is a sensor\'s mosaic.*sensor = "polarization" in capture\.toml'):
-        photo.read(
-            save(tmp_path / "mosaic.tif", mosaic(96, 96) + (np.arange(96 * 96).reshape(96, 96) % 7).astype(np.uint16))
-        )
+        photo.read(save(tmp_path / "mosaic.tif", mosaic(96, 96) + noise))

@@ -1,7 +1,6 @@
 """Files of several pictures are refused with their number; gain maps are recognized."""
 
 import struct
-import zlib
 from pathlib import Path
 
 import cv2
@@ -27,19 +26,11 @@ def pages(path: Path, count: int) -> None:
 
 def sub_pictures(path: Path, *kinds: tuple[int, int]) -> None:
     """A TIFF with a picture of 32 px, and another one of each (NewSubfileType, width), in a directory of its own."""
-    size = PIXELS.nbytes
-
-    def directory(kind: int, width: int) -> dict[int, tuple[int, tuple[int, ...]]]:
-        return {
-            254: (4, (kind,)), 256: (4, (width,)), 257: (4, (24,)), 258: (3, (16,) * 3), 259: (3, (1,)), 262: (3, (2,)),
-            273: (4, (8,)), 277: (3, (3,)), 278: (4, (24,)), 279: (4, (size,)), 284: (3, (1,)),
-        }  # fmt: skip
-
     # a file that begins with the pixels, so that all directories can point at them
-    start = 8 + size
-    blocks = [headers._directory(directory(0, 32), "<", start)]
-    for kind, width in kinds:
-        blocks.append(headers._directory(directory(kind, width), "<", start + sum(map(len, blocks))))
+    start, blocks = 8 + PIXELS.nbytes, list[bytes]()
+    for kind, width in ((0, 32), *kinds):
+        tags = headers.of_picture(PIXELS) | {254: (4, (kind,)), 256: (4, (width,)), 273: (4, (8,))}
+        blocks.append(headers._directory(tags, "<", start + sum(map(len, blocks))))
     data = bytearray(struct.pack("<2sHI", b"II", 42, start) + PIXELS.tobytes())
     for block in blocks:
         at, entries = len(data), struct.unpack_from("<H", block)[0]
@@ -63,10 +54,7 @@ def parts(path: Path, count: int) -> None:
 
 def animation(path: Path, frames: int) -> None:
     assert cv2.imwrite(str(path), PIXELS)
-    body = b"acTL" + struct.pack(">II", frames, 0)
-    chunk = struct.pack(">I", 8) + body + struct.pack(">I", zlib.crc32(body))
-    data = path.read_bytes()
-    path.write_bytes(data[:33] + chunk + data[33:])
+    headers.add_chunks(path, (b"acTL", struct.pack(">II", frames, 0)))
 
 
 def multi_picture(path: Path, *others: tuple[int, bytes]) -> None:
@@ -121,8 +109,11 @@ def test_previews_masks_and_gain_maps_are_no_pictures(tmp_path, name, write):
 
 
 def test_a_raw_of_several_exposures_is_refused_with_their_number():
-    sensor: file_kind.Directory = {file_kind.PHOTOMETRIC: (file_kind.CFA,), file_kind.WIDTH: (96,)}
-    sensor |= {file_kind.LENGTH: (64,)}
+    sensor: file_kind.Directory = {
+        file_kind.PHOTOMETRIC: (file_kind.CFA,),
+        file_kind.WIDTH: (96,),
+        file_kind.LENGTH: (64,),
+    }
     sensor |= {file_kind.STRIP_OFFSETS: (8,), file_kind.STRIP_BYTES: (12,), file_kind.SUBTYPE: (0,)}
     preview = sensor | {file_kind.PHOTOMETRIC: (2,), file_kind.SUBTYPE: (REDUCED,), file_kind.WIDTH: (200,)}
     small = sensor | {file_kind.WIDTH: (48,)}
