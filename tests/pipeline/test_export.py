@@ -20,7 +20,7 @@ import trimesh
 
 from polcap.formats.export import encoders
 from polcap.formats.export.presets import EXTRAS, FORMATS, PRESETS
-from polcap.formats.maps import exr, png
+from polcap.formats.maps import png
 from polcap.formats.raw.exif import UPRIGHT_DEG
 from polcap.pipeline import asset_export
 from polcap.pipeline import run as pipeline
