@@ -1,21 +1,15 @@
-"""Stage 8: normals and material from the cues, by network or by analytic inversion.
+"""Stage 8: surface normals and material of each pixel, from its cues.
+
+    learned         estimate by the network, joined with the inversion
+        sizes_and_positions   test-time augmentation of the network
+        fine                  fine relief by a second network
+    analytic        estimate without a network: inversion of polarization
+        zenith                zenith angles by the object's law of diffuse polarization
+    shape           corrections of normals by the shape of the whole object
+    highlights      albedo under highlights; gloss of materials
 
 Both estimators work in the frame of each view ray, where polarization depends on the surface alone, and return maps in
-the camera frame.
-
-    learned        the network, joined with the inversion
-        sizes_and_positions   its predictions at several sizes, in turned and mirrored positions, averaged
-        fine                  relief finer than its pixels, by a second network
-    analytic       the inversion: zenith from DoLP, azimuth from AoLP
-        zenith                by the object's law of diffuse polarization
-    shape          corrections of normals by the shape of the whole object, for both estimators
-    highlights     the albedo in highlights, for both estimators; the gloss of materials, for the network
-
-Two properties of the albedo are estimated here. The error of its scale: a chart behind the object, or in a shadow, gets
-less light than the object. The picture of the chart does not show this, but then the albedo may be brighter than that
-of white things. And its detail: the reference shot at the RAW's pixels shows printed texture and fine relief
-alike. Relief continues from scale to scale, so the shading of the normals shows how strong finer shading may be. Where
-the normals are smooth and certain, fine detail of the light is detail of the albedo.
+the camera frame. This module adds the error of the albedo's scale, and the albedo's detail at the RAW's pixels.
 """
 
 from dataclasses import replace
@@ -84,10 +78,11 @@ def estimate(cues: Cues, network: Network | None, run: RunNetwork, settings: Inf
 
 
 def _scale_error(cues: Cues, maps: SurfaceMaps, sigma: float) -> float:
-    """Relative error (1σ) of the scale of all albedos: `sigma` of the chart's light, which may have been half of it.
+    """Relative error (1σ) of the scale of all albedos: `sigma` of the chart's light, and the risk that it is doubled.
 
-    White objects are no evidence. The albedo must be above that of white things even if the scale errs by `sigma`, and
-    by the light alone: divided by the root of the shading, it is at most the albedo.
+    A chart behind the object, or in a shadow, gets less light than the object. The only sign is an albedo above that of
+    white things. It must be above even if the scale errs by `sigma`, and even as S0 over the root of the shading, which
+    is at most the albedo.
     """
     cosine = frames.dot(maps.normal, cues.rays)
     leaning = cues.mask & (cues.quality == 0) & (cosine > _LEANING[0]) & (cosine < _LEANING[1])
@@ -100,8 +95,9 @@ def _scale_error(cues: Cues, maps: SurfaceMaps, sigma: float) -> float:
 def _select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:
     """Select the part of the RAW's fine detail that belongs to the albedo, by a Wiener filter; (2H, 2W) float16.
 
-    `detail` (2H, 2W) is the logarithm of light of RAW pixels over that of superpixels (H, W). It is multiplied by the
-    share of its local power that neither shading nor noise explains.
+    `detail` (2H, 2W) is the logarithm of light of RAW pixels over that of superpixels (H, W): prints and fine relief
+    alike. It is multiplied by the share of its local power that neither shading nor noise explains. Relief continues
+    from scale to scale, so the shading of the normals shows how strong finer shading may be.
     """
     solid = cues.mask & ((cues.quality & np.uint8(_DEFECTS)) == 0)
     inside = erode(solid, _EDGE_PX, from_border=True)

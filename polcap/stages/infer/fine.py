@@ -1,8 +1,8 @@
 """Refinement of the normals: a second, small network adds relief finer than the main network resolves.
 
-Its input are tiles of the crop at full resolution, with the estimate so far. Its output is a deviation of the normals.
-Only the part finer than the main network's pixels is added, so the overall shape does not change. Training
-(`training/fine_*.py`) makes the input by `encode` too.
+It reads tiles of the crop at full resolution, with the estimate so far, and returns a deviation of the normals. Only
+the part finer than the main network's pixels is added, so the overall shape does not change. `encode` makes the input,
+also for training (`training/fine_*.py`).
 """
 
 from collections.abc import Iterator

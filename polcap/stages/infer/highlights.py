@@ -27,7 +27,6 @@ from math import hypot, sqrt
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap.image_values import Bools, Floats, Quality
 from polcap.optics import clusters, color, frames, fresnel
@@ -64,7 +63,8 @@ _SIGMA = 0.06
 _SIGMA_PER_DEGREE = 0.006  # of the material's mean expected normal error
 _SIGMA_UNCONFIRMED = 0.15  # without a highlight, or with a clipped one
 _USUAL, _USUAL_SIGMA = 0.5, 0.2  # mean roughness of 47 materials, and its standard deviation
-# median F0 of training surfaces by the predicted F0, if a twentieth of them has more than .06
+# F0 of common surfaces by the predicted one; the network learned from more coatings and gems than people own:
+# median F0 of training surfaces, if a twentieth of them has more than .06
 _PREDICTED_F0 = (0.03, 0.04, 0.05, 0.06, 0.08, 0.105, 0.16, 1.0)
 _MEDIAN_F0 = (0.039, 0.0415, 0.0425, 0.0435, 0.046, 0.0556, 0.16, 1.0)
 
@@ -82,9 +82,7 @@ def fill(image: Floats, cues: Cues) -> Floats:
     return out
 
 
-def mean_around(
-    image: Floats, known: NDArray[np.bool_], wanted: NDArray[np.bool_], blur: float, least: float
-) -> tuple[Floats, NDArray[np.bool_]]:
+def mean_around(image: Floats, known: Bools, wanted: Bools, blur: float, least: float) -> tuple[Floats, Bools]:
     """Interpolate an image (H, W, 3) at wanted pixels (H, W), as Gaussian means of the known pixels (H, W) around each.
 
     The Gaussian starts at 1σ = `blur` px and doubles until known pixels have a share of `least` of its weight. Also
@@ -107,7 +105,8 @@ def correct(maps: SurfaceMaps, cues: Cues, ior: float) -> SurfaceMaps:
     if cues.body is None or cues.body_known is None:
         return maps
     low, high = _GLOSS
-    share = np.clip((_specular_share(cues) - low) / (high - low), 0, 1) * cues.body_known  # of the crossed shot
+    specular = np.clip(1 - cues.body.sum(-1) / np.maximum(cues.radiance.sum(-1), 1e-6), 0, 1)  # share of S0
+    share = np.clip((specular - low) / (high - low), 0, 1) * (cues.body_known & cues.mask)  # of the crossed shot
     share = cv2.GaussianBlur(share.astype(np.float32), (0, 0), 1.0) * cues.body_known
     cosine = np.clip(frames.dot(maps.normal, cues.rays), _LEAST_COSINE, 1)
     shading = cosine * fresnel.transmission(cosine, ior)[0] * fresnel.transmission(1.0, ior)[0]
@@ -119,13 +118,6 @@ def correct(maps: SurfaceMaps, cues: Cues, ior: float) -> SurfaceMaps:
     corrected = np.exp(by_shading + continued)
     diffuse = np.where(share[..., None] > 0, maps.diffuse + share[..., None] * (corrected - maps.diffuse), maps.diffuse)
     return replace(maps, diffuse=(np.clip(diffuse, 0, 1) * cues.mask[..., None]).astype(np.float32))
-
-
-def _specular_share(cues: Cues) -> Floats:
-    """Specular share of S0, (H, W), from the cross-polarized shot; 0 where that shot is not valid."""
-    assert cues.body is not None and cues.body_known is not None
-    share = np.clip(1 - cues.body.sum(-1) / np.maximum(cues.radiance.sum(-1), 1e-6), 0, 1)
-    return np.where(cues.body_known & cues.mask, share, 0).astype(np.float32)
 
 
 def pool_gloss(maps: SurfaceMaps, cues: Cues) -> SurfaceMaps:
@@ -141,10 +133,11 @@ def pool_gloss(maps: SurfaceMaps, cues: Cues) -> SurfaceMaps:
     share = clusters.soft_share(alike, center, spread)  # (N, K)
     member = np.full(mask.shape, -1)
     member[mask] = share.argmax(axis=1)
-    mirrored = _mirrored_light(maps, cues)
+    beyond = (cues.radiance - maps.diffuse).mean(axis=-1)  # than the albedo of a surface that faces the lens
+    mirrored = masked_mean(beyond, mask, max(_LEAST_BLUR_PX, _BLUR * disc_radius(mask)))
     zenith = np.degrees(np.arccos(np.clip(frames.dot(maps.normal, cues.rays), 0, 1)))
     weight = share / np.maximum(share.sum(axis=0), 1e-9)
-    f0 = _calibrated(weight.T @ maps.specular[mask].mean(axis=-1))
+    f0 = np.interp(weight.T @ maps.specular[mask].mean(axis=-1), _PREDICTED_F0, _MEDIAN_F0)
     roughness = weight.T @ maps.roughness[mask]
     sigma = np.hypot(_SIGMA, _SIGMA_PER_DEGREE * (weight.T @ maps.confidence[mask]))
     clipped = (cues.quality & np.uint8(Quality.CLIPPED)) > 0
@@ -157,15 +150,10 @@ def pool_gloss(maps: SurfaceMaps, cues: Cues) -> SurfaceMaps:
         roughness[k] = _bounded(float(roughness[k]), float(f0[k]), *seen)
         if seen[0] <= seen[1] or (clipped & of_material & (zenith < _FACING_DEG)).sum() >= _BRIGHTEST:
             sigma[k] = hypot(sigma[k], _SIGMA_UNCONFIRMED)
-    specular, pooled, error = (_on_pixels(share @ of_material, mask) for of_material in (f0, roughness, sigma))
-    return replace(maps, specular=np.repeat(specular[..., None], 3, axis=-1), roughness=pooled, roughness_error=error)
-
-
-def _on_pixels(values: Floats, mask: Bools) -> Floats:
-    """Map (H, W) of the values (N,) of the pixels in the mask, 0 outside."""
-    image = np.zeros(mask.shape, np.float32)
-    image[mask] = values
-    return image
+    pooled = np.zeros((3, *mask.shape), np.float32)
+    pooled[:, mask] = [share @ of_material for of_material in (f0, roughness, sigma)]
+    specular = np.repeat(pooled[0][..., None], 3, axis=-1)
+    return replace(maps, specular=specular, roughness=pooled[1], roughness_error=pooled[2])
 
 
 def _fewest_groups(alike: Floats) -> tuple[Floats, float]:
@@ -175,17 +163,6 @@ def _fewest_groups(alike: Floats) -> tuple[Floats, float]:
         if spread < _LIKE:
             break
     return center, spread
-
-
-def _calibrated(f0: Floats) -> Floats:
-    """F0 of common surfaces for a predicted F0: the network learned from more coatings and gems than people own."""
-    return np.interp(f0, _PREDICTED_F0, _MEDIAN_F0)
-
-
-def _mirrored_light(maps: SurfaceMaps, cues: Cues) -> Floats:
-    """S0 (H, W), mean of the channels, beyond that of the albedo in a surface that faces the lens."""
-    beyond = (cues.radiance - maps.diffuse).mean(axis=-1)
-    return masked_mean(beyond, maps.mask, max(_LEAST_BLUR_PX, _BLUR * disc_radius(maps.mask)))
 
 
 def _joined_with_usual(roughness: float, sigma: float) -> tuple[float, float]:

@@ -17,6 +17,7 @@ import numpy as np
 
 from polcap.image_values import Bools, Floats, Quality
 from polcap.optics import frames
+from polcap.optics.reduction import scaled_view
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stage_values import Cues, Network, OrderTest, RunNetwork, SurfaceMaps
 from polcap.stages.cues import FLOOR
@@ -88,7 +89,8 @@ def estimate_coarse(
     doubt = half_turns.NetworkDoubt(small["sigma"], small.pop("opposed"), overview)
     small["normal"], small["doubt"] = _correct_half_turns(small["normal"], seen, doubt)
     small["factor"] = _log_factor(small["diffuse"] * _shading(small["normal"], seen.rays), seen)
-    small["roughness"] = _smooth_roughness(small["roughness"], seen.mask)
+    without_grid = _masked_filter(small["roughness"], seen.mask, sizes_and_positions.BINOMIAL, REACHED)
+    small["roughness"] = np.where(seen.mask, without_grid, small["roughness"])
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
     smooth = frames.unit(maps["normal"])
     guide = np.asarray(frames.to_ray_frame(smooth, cues.rays)), maps["sigma"]
@@ -156,15 +158,10 @@ def _reduce(cues: Cues, scale: float) -> Cues:
     small = max(16, round(height * scale)), max(16, round(width * scale))
     light = np.maximum(frames.total(cues.radiance), 1e-6) * cues.mask
     ratio = np.stack([weighted_area_mean(r, light, small) for r in cues.ratio])
-    averaging = min(1.0, scale * np.sqrt(width / small[1] * scale))
+    averaging = min(1.0, scale * np.sqrt(width / small[1] * scale))  # noise of a mean over (1/scale)² pixels
     sigma = weighted_area_mean(cues.ratio_sigma, light, small) * averaging
     mask = area_mean(cues.mask, small) > 0.5
-    view = replace(
-        cues.view,
-        focal=cues.view.focal * scale,
-        center=((cues.view.center[0] + 0.5) * scale - 0.5, (cues.view.center[1] + 0.5) * scale - 0.5),
-        scale=cues.view.scale / scale,
-    )
+    view = scaled_view(cues.view, scale)
     clipped = area_mean((cues.quality & Quality.CLIPPED) > 0, small) > 0.5
     return replace(
         _with_polarization(cues, ratio, sigma),
@@ -214,11 +211,6 @@ def _log_factor(light: Floats, seen: Cues) -> Floats:
         for kernel in (sizes_and_positions.BINOMIAL, cv2.getGaussianKernel(9, 2).astype(np.float32))
     )
     return np.where(known[..., None], near, far)
-
-
-def _smooth_roughness(roughness: Floats, mask: Bools) -> Floats:
-    """Remove the network's grid artifact of one or two pixels from the roughness (H, W) inside the mask."""
-    return np.where(mask, _masked_filter(roughness, mask, sizes_and_positions.BINOMIAL, REACHED), roughness)
 
 
 def _masked_filter(

@@ -1,4 +1,4 @@
-"""Solves the 180° ambiguity of the azimuth: to which side of the view ray each normal points, and how sure this is.
+"""The 180° ambiguity of the azimuth: to which side of the view ray each normal leans, and the doubt of this.
 
 Polarization determines the plane through a normal n and the view ray r, not the side: n and n′ = 2 (n·r) r − n give the
 same Stokes parameters; n′ is the half-turn of n. The network sometimes predicts the half-turn of a whole region, most

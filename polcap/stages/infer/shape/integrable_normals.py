@@ -111,9 +111,9 @@ def _weigh_curl(slope: Floats, sigma: Floats, inside: Bools) -> Floats:
     cells = np.ones((2, 2), np.uint8)
     curl = np.zeros((inside.shape[0] + 1, inside.shape[1] + 1))
     whole = cv2.erode(inside.astype(np.uint8), cells, borderValue=0)[1:, 1:] > 0  # all four cells around a corner
-    across = np.diff(b, axis=1)[:-1] + np.diff(b, axis=1)[1:] + np.diff(a, axis=0)[:, :-1] + np.diff(a, axis=0)[:, 1:]
+    twice = np.diff(b, axis=1)[:-1] + np.diff(b, axis=1)[1:] + np.diff(a, axis=0)[:, :-1] + np.diff(a, axis=0)[:, 1:]
     largest_error = cv2.dilate(error, cells)[1:, 1:]
-    curl[1:-1, 1:-1][whole] = (across / 2 / np.maximum(largest_error, 1e-9))[whole]
+    curl[1:-1, 1:-1][whole] = (twice / 2 / np.maximum(largest_error, 1e-9))[whole]
     return np.asarray(1 / (1 + (cv2.dilate(abs(curl), cells)[1:, 1:][inside] / _CURL) ** 2))
 
 
