@@ -32,27 +32,19 @@ def ambient_occlusion(maps: SurfaceMaps, depth: Floats) -> Floats:
     point = back_project(maps.view, x, y) * np.where(mask, depth[at], np.nan)[..., None]
     point, normal = point.astype(np.float32), maps.normal[at]
     distances = np.unique((_GROWTH ** np.arange(np.log(max(mask.shape)) / np.log(_GROWTH))).astype(int))
+    reach = max(mask.shape)  # px, more than any distance
+    around = np.pad(point, [(reach, reach), (reach, reach), (0, 0)], constant_values=np.nan)
     share = np.zeros(mask.shape, np.float32)
     for angle in 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
         along = normal[..., 0] * np.cos(angle) - normal[..., 1] * np.sin(angle)  # y runs up, rows run down
         tilt = np.arctan2(along, normal[..., 2])
         rise = -np.sin(tilt)  # cosine of the angle between horizon and optical axis; the tangent plane's at least
         for distance in distances:
-            towards = _shifted(point, round(distance * np.cos(angle)), round(distance * np.sin(angle))) - point
+            x, y = reach + round(distance * np.cos(angle)), reach + round(distance * np.sin(angle))
+            towards = around[y : y + mask.shape[0], x : x + mask.shape[1]] - point
             rise = np.fmax(rise, towards[..., 2] / np.maximum(np.sqrt(frames.dot(towards, towards)), 1e-12))
         horizon = np.arccos(np.clip(rise, -1, 1))
         lit = np.cos(tilt) - np.cos(2 * horizon - tilt) + 2 * horizon * np.sin(tilt)
         share += np.hypot(along, normal[..., 2]) * lit / (2 * _DIRECTIONS)
     small = np.where(mask, np.clip(share, 0, 1), 1).astype(np.float32)
     return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR))
-
-
-def _shifted(image: Floats, across: int, down: int) -> Floats:
-    """Shift an image (H, W, C): pixel (y, x) of the result is (y + down, x + across) of it; NaN outside."""
-    height, width = image.shape[:2]
-    out = np.full_like(image, np.nan)
-    if abs(across) >= width or abs(down) >= height:
-        return out
-    rows, columns = (slice(max(0, -step), min(side, side - step)) for step, side in ((down, height), (across, width)))
-    out[rows, columns] = image[rows.start + down : rows.stop + down, columns.start + across : columns.stop + across]
-    return out

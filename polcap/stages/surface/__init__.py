@@ -41,8 +41,7 @@ class SurfaceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of the stage `surface`, the section `surface` of a settings file."""
 
     stiffness: Annotated[
-        float,
-        Meta(ge=0.0, le=20.0, description="tendency to cut at depth steps; 0: plain least squares [1]"),
+        float, Meta(ge=0.0, le=20.0, description="tendency to cut at depth steps; 0: plain least squares [1]")
     ] = 2.0
     iterations: Annotated[
         int, Meta(ge=1, le=200, description="greatest number of reweightings on the grid that decides on depth steps")
@@ -51,20 +50,16 @@ class SurfaceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(ge=1e-8, le=0.1, description="relative change of the energy that ends the reweightings [1]")
     ] = 1e-3
     steepest_deg: Annotated[
-        float,
-        Meta(ge=45.0, le=89.0, description="greatest tilt of a normal from the camera; more is capped [degrees]"),
+        float, Meta(ge=45.0, le=89.0, description="greatest tilt of a normal from the camera; more is capped [degrees]")
     ] = 84.0
     prior_weight: Annotated[
-        float,
-        Meta(ge=0.0, le=1000.0, description="weight of the network's coarse depth against the normals [1]"),
+        float, Meta(ge=0.0, le=1000.0, description="weight of the network's coarse depth against the normals [1]")
     ] = 0.15
     jump: Annotated[
-        float,
-        Meta(ge=0.002, le=1.0, description="least depth step that cuts the mesh, over the object's radius [1]"),
+        float, Meta(ge=0.002, le=1.0, description="least depth step that cuts the mesh, over the object's radius [1]")
     ] = 0.02
     max_vertices: Annotated[
-        int,
-        Meta(ge=1000, le=10_000_000, description="most vertices of the mesh, on a regular grid of pixels"),
+        int, Meta(ge=1000, le=10_000_000, description="most vertices of the mesh, on a regular grid of pixels")
     ] = 250_000
     back: Annotated[
         Back, Meta(description="behind the front: nothing, walls (skirt), or walls and a flat back (closed)")

@@ -118,9 +118,6 @@ def remove_useless_cuts(level: PyramidLevel) -> None:
         if not useless.any():
             return
         level.close_cuts(useless)
-        if not level.occlusions().any():
-            level.replace_by(uncut)
-            return
 
 
 def _useless_cuts(level: PyramidLevel, found: OcclusionMap, uncut: PyramidLevel) -> Bools:
@@ -155,5 +152,3 @@ def join_contacts(level: PyramidLevel) -> None:
     at = np.zeros(grid.size, dtype=bool)
     at[grid.p[touch]] = at[grid.q[touch]] = True
     level.close_cuts(dilate(grid.image(at, outside=False), REACH)[level.field.mask])
-    if not level.occlusions().any():
-        level.replace_by(level.without_cuts())

@@ -34,21 +34,13 @@ class PixelGrid:
         self.mask = mask
         number = np.full(mask.shape, -1, dtype=np.int32)
         number[mask] = np.arange(int(mask.sum()), dtype=np.int32)
-        self.row, self.column = np.nonzero(mask)
+        self.pixel = np.argwhere(mask)  # (N, 2) row and column
+        self.row, self.column = self.pixel.T
+        self.size = len(self.pixel)  # N
         right, down = _links(number[:, :-1], number[:, 1:]), _links(number[:-1], number[1:])
         self.turn = len(right[0])
         self.p, self.q = (np.concatenate(ends) for ends in zip(right, down))
         self._lay_out(right, down)
-
-    @property
-    def size(self) -> int:
-        """Number N of the mask's pixels."""
-        return len(self.row)
-
-    @property
-    def pixel(self) -> NDArray[np.int64]:
-        """Row and column of each pixel of the grid, (N, 2)."""
-        return np.stack([self.row, self.column], axis=-1)
 
     def _lay_out(self, right: Any, down: Any) -> None:
         """Compute the sparsity pattern of matrices on this grid: a pixel with its neighbors up, left, right, down."""
@@ -99,6 +91,15 @@ def _links(first: NDArray[np.int32], second: NDArray[np.int32]) -> tuple[Any, An
     return first[both], second[both]
 
 
+def connected_parts(first: NDArray[Any], second: NDArray[Any], count: int) -> NDArray[np.int64]:
+    """Number (N,) of the connected part of each of N = `count` nodes, by edges between `first` and `second` (M,)."""
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
+    graph = sparse.coo_matrix((np.ones(len(first), np.int8), (first, second)), (count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
 def conjugate_gradients(
     matrix: Any, right: Floats, start: Floats, precondition: Callable[[Floats], Floats], tolerance: float, most: int
 ) -> tuple[Floats, int]:
@@ -138,7 +139,8 @@ class Multigrid:
         self.levels: list[MultigridLevel] = []
         while matrix.shape[0] > _COARSEST:
             cell = cell // 3
-            group, count = _aggregate(matrix, cell)
+            group = _aggregate(matrix, cell)
+            count = int(group.max()) + 1
             if count > _LEAST_COARSENING * matrix.shape[0]:
                 break
             prolong = _prolongation(matrix, group, count)
@@ -167,25 +169,15 @@ class Multigrid:
         return np.asarray(left)
 
 
-def _aggregate(matrix: Any, cell: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Aggregate unknowns for the next coarser level: group number of each, and their count.
-
-    A group is a part of a cell that strong links join.
-    """
-    from scipy import sparse
-    from scipy.sparse.csgraph import connected_components
-
+def _aggregate(matrix: Any, cell: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Number (N,) of each unknown's group on the next coarser level: a part of a cell that strong links join."""
     links = matrix.tocoo()
     diagonal = matrix.diagonal()
     row, column = links.row, links.col
     at = cell[:, 0] * (int(cell[:, 1].max()) + 1) + cell[:, 1]
     together = at[row] == at[column]
     together &= links.data**2 > _STRONG**2 * diagonal[row] * diagonal[column]
-    graph = sparse.coo_matrix(
-        (np.ones(int(together.sum()), dtype=np.int8), (row[together], column[together])), matrix.shape
-    )
-    count, group = connected_components(graph, directed=False)
-    return group.astype(np.int64), int(count)
+    return connected_parts(row[together], column[together], len(cell))
 
 
 def _prolongation(matrix: Any, group: NDArray[np.int64], count: int) -> Any:

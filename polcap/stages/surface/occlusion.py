@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from polcap.image_values import Bools, Floats
 from polcap.optics.morphology import dilate
 from polcap.optics.outline import disc_radius
-from polcap.stages.surface.multigrid import PixelGrid
+from polcap.stages.surface.multigrid import PixelGrid, connected_parts
 
 # lengths in shares of the object's radius
 _LEAST_LENGTH = 0.1  # of a contour, of both kinds
@@ -196,12 +196,7 @@ def contact_links(grid: PixelGrid, separate: Bools, excess: Floats, radius: floa
 
 def _parts(grid: PixelGrid, together: Bools) -> NDArray[np.int64]:
     """Number (N,) of each pixel's connected part; −1 for specks."""
-    from scipy import sparse
-    from scipy.sparse.csgraph import connected_components
-
-    ends = (grid.p[together], grid.q[together])
-    graph = sparse.coo_matrix((np.ones(len(ends[0]), dtype=np.int8), ends), (grid.size, grid.size))
-    part = connected_components(graph, directed=False)[1].astype(np.int64)
+    part = connected_parts(grid.p[together], grid.q[together], grid.size)
     return np.where(np.bincount(part)[part] > _PART * grid.size, part, -1)
 
 

@@ -21,7 +21,7 @@ from polcap.optics.outline import disc_radius
 from polcap.stages.surface import occlusion
 from polcap.stages.surface.multigrid import Multigrid, PixelGrid, TwoGrid, conjugate_gradients
 from polcap.stages.surface.occlusion import OcclusionMap
-from polcap.stages.surface.slope_equations import NormalField, block_numbers, slope_terms
+from polcap.stages.surface.slope_equations import LEAST_FACING, NormalField, block_numbers, slope_terms
 
 REACH = 2  # px around a cut within which pixels choose, also on the next finer grid
 GAP = 0.25  # expected depth step behind a contour, over the object's radius
@@ -34,7 +34,6 @@ _PRECISION = 1e-3  # of each linear solution, relative
 _SLOW = 12  # iterations of a linear solution that call for a new hierarchy, which costs as much as 28
 _PROXIMITY = 1e-8  # pull towards the last estimate: fixes the offset of each separate part
 _LEAST_TRUST = 1e-9  # of a link's ends in it: keeps the equations solvable
-_LEAST_FACING = 0.05  # cosine: flatter views give no slope
 _BEND = 1 / 12  # variance of a step anywhere between its ends' slopes, over their difference squared
 
 
@@ -55,29 +54,19 @@ _NO_CONTOURS = ContourLinks(np.zeros(0, dtype=np.intp), np.zeros(0), np.zeros(0)
 
 
 class PyramidLevel:
-    """Integration on one grid of the pyramid: its equations, and the current solution.
+    """Integration on one grid of the pyramid: its equations, and the current solution."""
 
-    Attributes
-    ----------
-    facing, side
-        (N,) coefficients m and (n_x, −n_y) of the slope equations.
-    slope
-        (N,) ∂z to the right and down by the normals.
-    step, weight
-        (L,) depth step of each link by the normals, and its weight.
-    z
-        (N,) scaled log depth [px].
-    choosing
-        (N,) pixels that may trust one neighbor more than the other, so that the surface may be cut there.
-    cuttable
-        (N,) pixels at which the next finer grid may be cut.
-    contours
-        Links across occluding contours, without a slope term.
-    chords
-        Whether choosing pixels weight the chord of a link instead of the slopes at its two ends.
-    solver
-        Preconditioner of the last matrix, also used for similar matrices.
-    """
+    facing: Floats  # (N,) coefficient m of the slope equations
+    side: tuple[Floats, Floats]  # (N,) each, their right sides n_x and −n_y
+    slope: tuple[Floats, Floats]  # (N,) each, ∂z to the right and down by the normals
+    step: Floats  # (L,) depth step of each link by the normals
+    weight: Floats  # (L,) of that step
+    z: Floats  # (N,) scaled log depth [px]
+    choosing: Bools  # (N,) pixels that may trust one neighbor more than the other, so that the surface may be cut there
+    cuttable: Bools  # (N,) pixels at which the next finer grid may be cut
+    contours: ContourLinks  # across occluding contours, without a slope term
+    chords: bool  # choosing pixels weight the chord of a link instead of the slopes at its two ends
+    solver: Any  # preconditioner of the last matrix, also used for similar matrices
 
     def __init__(self, field: NormalField, stiffness: float, jump: float) -> None:
         self.field, self.stiffness = field, stiffness
@@ -88,23 +77,21 @@ class PyramidLevel:
         p, q, turn = grid.p, grid.q, grid.turn
         target = np.concatenate([right[p[:turn]] + right[q[:turn]], down[p[turn:]] + down[q[turn:]]]) / 2
         facing = (self.facing[p] + self.facing[q]) / 2
-        steep = np.maximum(facing, _LEAST_FACING)
-        self.slope = tuple(side / np.maximum(self.facing, _LEAST_FACING) for side in self.side)
+        steep = np.maximum(facing, LEAST_FACING)
+        self.slope = right / np.maximum(self.facing, LEAST_FACING), down / np.maximum(self.facing, LEAST_FACING)
         bend = self.slope_at(p) - self.slope_at(q)
         # a chord's direction is the mean of its ends' tangents (exact on a circle); its variance is that of the
         # normals' angle plus that of where between the two slopes a bend puts the step
         noise = field.sigma**2 * (1 / field.weight[p] + 1 / field.weight[q]) / 2
-        self.step = target / steep  # (L,) by the normals
-        self.weight = field.sigma**2 / (  # (L,) of that step
-            noise * np.maximum(facing**2 + target**2, _LEAST_FACING**2) / steep**4 + _BEND * bend**2
+        self.step = target / steep
+        self.weight = field.sigma**2 / (
+            noise * np.maximum(facing**2 + target**2, LEAST_FACING**2) / steep**4 + _BEND * bend**2
         )
-        self.z: Floats = np.zeros(grid.size)
-        self.choosing: Bools = np.zeros(grid.size, dtype=bool)
-        self.cuttable: Bools = np.ones(grid.size, dtype=bool)
+        self.z = np.zeros(grid.size)
+        self.choosing, self.cuttable = np.zeros(grid.size, dtype=bool), np.ones(grid.size, dtype=bool)
         self.contours = _NO_CONTOURS
         self.precise = field.sigma < np.radians(_PRECISE_DEG)
-        self.chords = False
-        self.solver: Any = None
+        self.chords, self.solver = False, None
 
     def slope_at(self, ends: NDArray[np.intp]) -> Floats:
         """Slope (L,) along each link between pixels, from the normal at one of its ends."""
@@ -162,24 +149,25 @@ class PyramidLevel:
     def without_cuts(self) -> "PyramidLevel":
         """A copy of this grid solved by plain least squares, without cuts."""
         level = copy(self)
-        level.contours, level.choosing = _NO_CONTOURS, np.zeros(self.grid.size, dtype=bool)
-        level.z, level.solver = np.zeros_like(self.z), None
-        level.solve()
+        level._remove_all_cuts()
         return level
 
-    def replace_by(self, other: "PyramidLevel") -> None:
-        """Take over the solution of another level of the same grid."""
-        self.z, self.choosing = other.z, other.choosing
-        self.contours, self.solver = other.contours, other.solver
+    def _remove_all_cuts(self) -> None:
+        self.contours, self.choosing = _NO_CONTOURS, np.zeros(self.grid.size, dtype=bool)
+        self.z, self.solver = np.zeros_like(self.z), None
+        self.solve()
 
     def close_cuts(self, pixels: Bools) -> None:
         """Remove the surface's cuts at these pixels (N,), and solve z again.
 
-        The pixels no longer choose between neighbors, and their links have slopes again.
+        The pixels no longer choose between neighbors, and their links have slopes again. If no cut is left, z is that
+        of plain least squares.
         """
         self.choosing = self.choosing & ~pixels
         self.contours = self.contours.select(~pixels[self.grid.p[self.contours.link]])
         self.solve()
+        if not self.occlusions().any():
+            self._remove_all_cuts()
 
     def near_cuts(self) -> Bools:
         """Mask (N,) of the pixels near the cuts of the surface."""

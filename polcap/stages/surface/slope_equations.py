@@ -14,6 +14,7 @@ from polcap.stage_values import SurfaceMaps
 _LEAST_SIGMA_DEG = 1.0  # expected errors below count as this
 _SIGMA_RANGE_DEG = (1.0, 20.0)  # of the median error that scales all residuals
 _WEIGHTS = (0.02, 50.0)  # least and greatest weight of a normal, over the median's
+LEAST_FACING = 0.05  # least cosine m that divides: flatter views give no slope
 _LEAST_DEPTH = 0.05  # of the prior, over the object's distance
 
 

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from polcap.image_values import Bools, Faces, Floats
 from polcap.mesh_values import ReliefMesh
 from polcap.optics.morphology import erode
+from polcap.stages.surface.multigrid import connected_parts
 from polcap.stages.surface.occlusion import depth_steps, least_step
-from polcap.stages.surface.slope_equations import NormalField, slope_terms
+from polcap.stages.surface.slope_equations import LEAST_FACING, NormalField, slope_terms
 
 Back = Literal["open", "skirt", "closed"]
 
-_LEAST_FACING = 0.05  # cosine: flatter views give no slope
 _SPECK = 0.002  # of the mesh's triangles: smaller pieces do not count
 _ROUNDS = 4  # of averaging along the boundary; about two grid steps either side
 _DEPTH_ROUNDS = 64  # the same of depth, 1σ of six steps: where the surface is edge-on its stairs are ten times as deep
@@ -27,12 +27,9 @@ def unbroken_links(z: Floats, field: NormalField, jump: float) -> tuple[Bools, B
     """Links to the right (H, W−1) and down (H−1, W) inside the mask that cross no occlusion of z (H, W)."""
     mask = field.mask
     facing, *sides = slope_terms(field)
-    slopes = []
-    for side in sides:
-        slope = np.zeros(mask.shape)
-        slope[mask] = side / np.maximum(facing, _LEAST_FACING)
-        slopes.append(slope)
-    found = depth_steps(z, (slopes[0], slopes[1]), mask, least_step(mask, jump))
+    slope = np.zeros((2, *mask.shape))
+    slope[:, mask] = sides / np.maximum(facing, LEAST_FACING)
+    found = depth_steps(z, (slope[0], slope[1]), mask, least_step(mask, jump))
     return mask[:, :-1] & mask[:, 1:] & ~found.right, mask[:-1] & mask[1:] & ~found.down
 
 
@@ -107,12 +104,8 @@ def measure_boundary(place: NDArray[np.int64], faces: Faces, mask: Bools, step: 
 
 def _count_pieces(faces: Faces, count: int) -> int:
     """Number of connected pieces of a mesh, without specks."""
-    from scipy import sparse
-    from scipy.sparse.csgraph import connected_components
-
-    pairs = np.concatenate([faces[:, :2], faces[:, 1:]])
-    links = sparse.coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
-    _, piece = connected_components(links, directed=False)
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    piece = connected_parts(edges[:, 0], edges[:, 1], count)
     share = np.bincount(piece[faces[:, 0]]) / len(faces)
     return int((share > _SPECK).sum())
 
@@ -141,13 +134,8 @@ def boundary_edges(faces: Faces) -> NDArray[np.int64]:
     """Boundary edges (B, 2) of a mesh: those of one triangle only, in the direction of that triangle."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     low, high = ends.min(axis=1), ends.max(axis=1)
-    key = low * (int(faces.max()) + 1) + high
-    order = np.argsort(key, kind="stable")
-    same = key[order[1:]] == key[order[:-1]]
-    single = np.ones(len(key), dtype=bool)
-    single[order[1:]] &= ~same
-    single[order[:-1]] &= ~same
-    return np.asarray(ends[single])
+    _, edge, count = np.unique(low * (int(faces.max()) + 1) + high, return_inverse=True, return_counts=True)
+    return np.asarray(ends[count[edge] == 1])
 
 
 def _average_along(values: Floats, edge: NDArray[np.int64], rounds: int) -> Floats:
