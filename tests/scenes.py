@@ -20,6 +20,7 @@ from polcap.results import FIELDS, collect
 from polcap.stage_values import (
     Alignment,
     AngleStack,
+    Cues,
     Gains,
     ObjectMask,
     OutlineCheck,
@@ -27,6 +28,8 @@ from polcap.stage_values import (
     SelfCalibration,
     single_frames,
 )
+from polcap.stages import cues
+from polcap.stages import stokes as stokes_stage
 
 HEIGHT, WIDTH, FOCAL = 240, 320, 900.0
 CENTER, RADIUS = (120.0, 118.0), 84.0  # px; x, y of the ball's outline
@@ -139,6 +142,12 @@ def ball_object() -> ObjectMask:
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
     inside = normals(x, y)[1]
     return ObjectMask(inside, (30, 28, 212, 210), "user")
+
+
+def seen(noise: float = 0.0, textured: bool = True) -> Cues:
+    """Cues of the ball, whose shots do not move."""
+    radiance, settings = stack(noise=noise, textured=textured), stokes_stage.StokesSettings()
+    return cues.compute(stokes_stage.solve(radiance, still(), equal(), ball_object(), settings), no_color())
 
 
 def truth() -> tuple[Floats, NDArray[np.bool_]]:

@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from polcap.image_values import Floats
 from polcap.mesh_values import Asset
-from polcap.optics import color
+from polcap.optics import color, frames
 from polcap.optics.morphology import erode
 from polcap.optics.texture_rasterizer import rasterize_frames
 from polcap.stage_values import SurfaceMaps
@@ -24,8 +24,7 @@ def rendered_normals(of: Asset, maps: SurfaceMaps, within: float = 0.01) -> tupl
     column, row = np.rint(place[on]).astype(int).T
     x, y, z = (of.normal[row, column] / 127.5 - 1).T[..., None]
     n, t = mesh.normals[on], mesh.tangents[on]
-    normal = x * t[:, :3] + y * np.cross(n, t[:, :3]) * t[:, 3:] + z * n
-    return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True)), (row, column)
+    return frames.unit(x * t[:, :3] + y * np.cross(n, t[:, :3]) * t[:, 3:] + z * n), (row, column)
 
 
 @pytest.mark.parametrize("flat", [False, True])
@@ -37,8 +36,7 @@ def test_renderer_sees_the_maps_normals_on_any_mesh(flat: bool, coarse: bool) ->
         mesh = surfaces.mesh(surfaces.maps(), surface.SurfaceSettings(max_vertices=2000))
     built = surfaces.built(maps, mesh)
     seen, (row, column) = rendered_normals(built, maps)
-    cosine = np.sum(seen * maps.normal[row, column], axis=-1)
-    error = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    error = frames.angle_deg(seen, maps.normal[row, column])
     steep = maps.normal[row, column][:, 2] < 0.1  # a flat mesh cannot show normals that leave it backwards
     assert np.percentile(error[~steep], 99) < 0.6  # 8 bits: 0.22° per component
     assert np.median(error) < 0.3
@@ -55,12 +53,8 @@ def test_shape_is_not_counted_twice() -> None:
 def test_diffuse_and_specular_come_back_through_gltf_formulas() -> None:
     rng = np.random.default_rng(5)
     maps = surfaces.maps(roughness=0.37)
-    shape = maps.mask.shape
-    maps = replace(
-        maps,
-        diffuse=rng.uniform(0.05, 0.9, (*shape, 3)).astype(np.float32),
-        specular=rng.uniform(0.02, 0.08, (*shape, 3)).astype(np.float32),
-    )
+    diffuse, specular = (rng.uniform(*range_, (*maps.mask.shape, 3)) for range_ in ((0.05, 0.9), (0.02, 0.08)))
+    maps = replace(maps, diffuse=diffuse.astype(np.float32), specular=specular.astype(np.float32))
     built = surfaces.built(maps, surfaces.mesh(surfaces.maps()))
     inner = ndimage.binary_erosion(maps.mask, np.ones((3, 3), bool))  # the outermost pixels are filled from there
     base = color.decode_srgb(built.base_color[inner] / 255)
@@ -110,20 +104,14 @@ def test_walls_and_back_do_not_change_the_normal_texture() -> None:
     assert np.array_equal(surfaces.built(maps, closed).normal, surfaces.built(maps, seen).normal)
 
 
-@pytest.mark.parametrize(("size", "shape"), [(64, (64, 64)), (256, (256, 256)), (1024, (1024, 1024))])
-def test_textures_take_the_size_asked_for(size: int, shape: tuple[int, int]) -> None:
+def test_textures_take_the_size_asked_for_and_a_sliver_keeps_a_pixel() -> None:
     maps = surfaces.maps()
     built = surfaces.built(maps, surfaces.mesh(maps))
-    other = asset.resize_textures(built, size)
-    assert other.base_color.shape == other.normal.shape == (*shape, 3)
-    length = np.linalg.norm(other.normal / 127.5 - 1, axis=-1)
-    assert np.abs(length - 1).max() < 0.02
-    assert other.base_color.mean((0, 1)) == pytest.approx(built.base_color.mean((0, 1)), abs=1)
-
-
-def test_the_shorter_side_of_a_sliver_has_a_pixel() -> None:
-    maps = surfaces.maps()
-    built = surfaces.built(maps, surfaces.mesh(maps))
+    for size in (64, 256, 1024):
+        other = asset.resize_textures(built, size)
+        assert other.base_color.shape == other.normal.shape == (size, size, 3)
+        assert np.abs(np.linalg.norm(other.normal / 127.5 - 1, axis=-1) - 1).max() < 0.02
+        assert other.base_color.mean((0, 1)) == pytest.approx(built.base_color.mean((0, 1)), abs=1)
     textures = ("base_color", "occlusion_roughness_metallic", "normal", "specular_color")
     sliver = replace(built, **{name: getattr(built, name)[:1] for name in textures})
     assert asset.resize_textures(sliver, 16).normal.shape == (1, 16, 3)

@@ -8,7 +8,6 @@ import pytest
 from polcap.image_values import Floats, Quality
 from polcap.optics import frames, shade
 from polcap.stage_values import Cues, SurfaceMaps
-from polcap.stages import cues, stokes
 from polcap.stages.infer import highlights
 from tests import scenes
 
@@ -17,14 +16,15 @@ ROUGH, F0 = 0.4, 0.042
 
 @pytest.fixture(scope="module")
 def ball() -> Cues:
-    solved = stokes.solve(
-        scenes.stack(textured=False), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings()
-    )
-    return cues.compute(solved, scenes.no_color())
+    return scenes.seen(textured=False)
 
 
-def lit(ball: Cues, albedo: Floats, roughness: Floats, said: Floats) -> tuple[SurfaceMaps, Cues]:
-    """The ball's light for an albedo and a roughness (H, W), and the maps of a network that said `said` of it."""
+def lit(ball: Cues, *values: Floats | float) -> tuple[SurfaceMaps, Cues]:
+    """The ball's light for an albedo and a roughness, and the maps of a network that predicts another roughness.
+
+    All three `values` are maps (H, W) or the same everywhere.
+    """
+    albedo, roughness, predicted = (np.broadcast_to(value, ball.mask.shape) for value in values)
     normal, mask = scenes.truth()
     light = np.zeros_like(normal)
     light[..., 2] = 1
@@ -33,8 +33,8 @@ def lit(ball: Cues, albedo: Floats, roughness: Floats, said: Floats) -> tuple[Su
     seen = replace(ball, radiance=(radiance * ball.mask[..., None]).astype(np.float32))
     maps = SurfaceMaps(
         normal=np.asarray(frames.from_ray_frame(normal, ball.rays), np.float32),
-        diffuse=color.astype(np.float32), specular=f0.astype(np.float32), roughness=said.astype(np.float32),
-        depth_prior=np.zeros_like(said), confidence=np.zeros_like(said), mask=mask & ball.mask, view=ball.view,
+        diffuse=color.astype(np.float32), specular=f0.astype(np.float32), roughness=predicted.astype(np.float32),
+        depth_prior=None, confidence=np.zeros_like(predicted), mask=mask & ball.mask, view=ball.view,
         estimator="network",
     )  # fmt: skip
     return maps, seen
@@ -52,34 +52,29 @@ def error(maps: SurfaceMaps, seen: Cues) -> float:
 
 
 def test_a_bright_highlight_lowers_the_roughness_of_its_whole_material(ball: Cues) -> None:
-    one = np.ones(ball.mask.shape)
-    roughness = found(*lit(ball, 0.2 * one, ROUGH * one, 0.55 * one))
+    roughness = found(*lit(ball, 0.2, ROUGH, 0.55))
     assert np.ptp(roughness) < 1e-4
     assert roughness.mean() == pytest.approx(ROUGH, abs=0.04)
 
 
 def test_a_roughness_that_its_highlight_allows_stays(ball: Cues) -> None:
-    one = np.ones(ball.mask.shape)
-    assert found(*lit(ball, 0.2 * one, ROUGH * one, 0.3 * one)) == pytest.approx(0.3, abs=1e-3)
+    assert found(*lit(ball, 0.2, ROUGH, 0.3)) == pytest.approx(0.3, abs=1e-3)
 
 
 def test_a_white_albedo_hides_a_weak_highlight(ball: Cues) -> None:
-    one = np.ones(ball.mask.shape)
-    assert found(*lit(ball, 0.8 * one, 0.65 * one, 0.8 * one)) == pytest.approx(0.8, abs=1e-3)
+    assert found(*lit(ball, 0.8, 0.65, 0.8)) == pytest.approx(0.8, abs=1e-3)
 
 
 def test_a_whiter_albedo_hides_a_highlight_without_a_jump(ball: Cues) -> None:
-    one = np.ones(ball.mask.shape)
     albedos = np.linspace(0.2, 0.8, 31)
-    roughness = np.array([found(*lit(ball, a * one, 0.5 * one, 0.62 * one)).mean() for a in albedos])
+    roughness = np.array([found(*lit(ball, a, 0.5, 0.62)).mean() for a in albedos])
     assert np.ptp(roughness) > 0.05
     assert np.abs(np.diff(roughness)).max() < 0.01
 
 
 def test_speckle_of_the_network_is_pooled(ball: Cues) -> None:
-    one = np.ones(ball.mask.shape)
-    speckle = 0.35 + 0.02 * np.random.default_rng(0).standard_normal(one.shape)
-    assert found(*lit(ball, 0.2 * one, ROUGH * one, speckle)).std() < 0.02 * 0.7
+    speckle = 0.35 + 0.02 * np.random.default_rng(0).standard_normal(ball.mask.shape)
+    assert found(*lit(ball, 0.2, ROUGH, speckle)).std() < 0.02 * 0.7
 
 
 def test_two_materials_keep_their_two_roughnesses(ball: Cues) -> None:
@@ -91,8 +86,7 @@ def test_two_materials_keep_their_two_roughnesses(ball: Cues) -> None:
 
 
 def test_the_roughness_is_less_certain_without_a_highlight_or_with_a_clipped_one(ball: Cues) -> None:
-    one = np.ones(ball.mask.shape)
-    shown, hidden = (lit(ball, albedo * one, 0.65 * one, 0.65 * one) for albedo in (0.05, 0.8))
+    shown, hidden = (lit(ball, albedo, 0.65, 0.65) for albedo in (0.05, 0.8))
     flagged = replace(
         shown[1], quality=np.where(shown[1].radiance.sum(-1) > 0.3, np.uint8(Quality.CLIPPED), np.uint8(0))
     )
@@ -104,8 +98,7 @@ def test_the_roughness_is_less_certain_without_a_highlight_or_with_a_clipped_one
 @pytest.mark.parametrize("said", [0.3, 0.8])
 def test_a_material_that_only_faces_the_flash_gets_a_usual_roughness(ball: Cues, said: float) -> None:
     """A facing plane shows no place without highlight, so the roughness of usual materials counts, too."""
-    one = np.ones(ball.mask.shape)
-    maps, seen = lit(ball, 0.2 * one, said * one, said * one)
+    maps, seen = lit(ball, 0.2, said, said)
     facing = frames.from_ray_frame(np.broadcast_to([0.0, 0, 1], maps.normal.shape), ball.rays)
     flat = highlights.pool_gloss(replace(maps, normal=facing), seen)
     roughness, whole = flat.roughness[maps.mask], found(maps, seen)
@@ -114,22 +107,19 @@ def test_a_material_that_only_faces_the_flash_gets_a_usual_roughness(ball: Cues,
 
 
 def test_the_roughness_is_less_certain_where_the_normals_are(ball: Cues) -> None:
-    one = np.ones(ball.mask.shape)
-    maps, seen = lit(ball, 0.05 * one, 0.65 * one, 0.65 * one)
+    maps, seen = lit(ball, 0.05, 0.65, 0.65)
     unsure = replace(maps, confidence=np.where(maps.mask, np.float32(20), np.float32(0)))
     assert error(unsure, seen) > 1.5 * error(maps, seen)
 
 
 @pytest.mark.parametrize(("predicted", "common"), [(0.06, 0.0435), (0.16, 0.16)])
 def test_f0_is_that_of_common_surfaces_unless_it_is_far_above(ball: Cues, predicted: float, common: float) -> None:
-    one = np.ones(ball.mask.shape)
-    maps, seen = lit(ball, 0.2 * one, ROUGH * one, 0.3 * one)
+    maps, seen = lit(ball, 0.2, ROUGH, 0.3)
     bright = replace(maps, specular=np.full_like(maps.specular, predicted))
     assert highlights.pool_gloss(bright, seen).specular[maps.mask] == pytest.approx(common, abs=1e-4)
 
 
 def test_an_empty_mask_has_no_materials(ball: Cues) -> None:
-    one = np.ones(ball.mask.shape)
-    maps, seen = lit(ball, 0.2 * one, ROUGH * one, 0.3 * one)
+    maps, seen = lit(ball, 0.2, ROUGH, 0.3)
     nothing = replace(maps, mask=np.zeros_like(maps.mask))
     assert highlights.pool_gloss(nothing, seen) is nothing

@@ -32,7 +32,11 @@ from tests.stages.surface.depth_scenes import (
 SETTINGS = surface.SurfaceSettings()
 
 
-def test_sphere_in_perspective() -> None:
+@pytest.mark.parametrize("decision_pixels", [80_000, 500])
+def test_sphere_in_perspective_at_any_depth_of_the_pyramid(
+    decision_pixels: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(integration, "_DECISION_PIXELS", decision_pixels)
     truth_maps, truth = sphere()
     mesh = surface.integrate(truth_maps, 0.95, SETTINGS)
     assert error_share(mesh, truth, truth_maps.mask) < 0.01  # the outermost pixels are infinitely steep
@@ -45,13 +49,6 @@ def test_bumps_are_recovered_to_a_thousandth() -> None:
     mask = (a / 0.14) ** 2 + (b / 0.12) ** 2 < 1
     mesh = surface.integrate(maps(from_depth(truth), mask), None, SETTINGS)
     assert error_share(mesh, truth, mask) < 0.001
-
-
-def test_pyramid_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    truth_maps, truth = sphere()
-    monkeypatch.setattr(integration, "_DECISION_PIXELS", 500)
-    mesh = surface.integrate(truth_maps, 0.95, SETTINGS)
-    assert error_share(mesh, truth, truth_maps.mask) < 0.01
 
 
 def test_occlusion_is_a_depth_step_and_a_cut() -> None:
@@ -110,13 +107,11 @@ def test_distance_is_the_median_depth_in_metres() -> None:
 
 
 def test_empty_object_is_refused() -> None:
-    truth_maps, _ = sphere()
-    with pytest.raises(ObjectError, match="--mask"):
-        surface.integrate(replace(truth_maps, mask=np.zeros(SHAPE, dtype=bool)), None, SETTINGS)
-    lonely = np.zeros(SHAPE, dtype=bool)
+    nothing, lonely = np.zeros((2, *SHAPE), dtype=bool)
     lonely[::4, ::4] = True
-    with pytest.raises(ObjectError, match="--mask"):
-        surface.integrate(replace(truth_maps, mask=lonely), None, SETTINGS)
+    for mask in (nothing, lonely):
+        with pytest.raises(ObjectError, match="--mask"):
+            surface.integrate(replace(sphere()[0], mask=mask), None, SETTINGS)
 
 
 def test_pixels_without_a_normal_are_bridged() -> None:
