@@ -6,7 +6,6 @@ Prints a Markdown row per capture. Truth comes with the captures, from another r
 interface; with --rough, S1 and S2 are scaled to what the facets of each pixel's true roughness leave of them.
 """
 
-import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -20,12 +19,12 @@ from polcap.formats import onnx
 from polcap.formats.capture import reader as captures
 from polcap.image_values import Floats
 from polcap.optics import body, frames
-from polcap.pipeline import models
-from polcap.pipeline.cache import MemoryCache
-from polcap.pipeline.path import UserInput, distance_m, path
+from polcap.optics.resize import block_means
+from polcap.pipeline.path import distance_m
 from polcap.results import Results
 from polcap.stage_values import Network
 from polcap.stages import cues, infer, surface
+from tests.experiments import Networks, arguments, head, networks, process, rms, row
 
 COLUMNS = (
     "capture", "normal mean", "median", "chart px", "align px", "gain %", "ratio %",
@@ -35,31 +34,25 @@ COLUMNS = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--estimator", choices=("network", "analytic"))
-    parser.add_argument("--model", type=Path)
-    parser.add_argument("--rough", action="store_true")
-    options = parser.parse_args()
-    network = models.load_network(options.estimator, options.model, "cpu", 2)
-    print("|", " | ".join(COLUMNS), "|\n|", " | ".join("---" for _ in COLUMNS), "|")
+    options = arguments(__doc__, "folder", "--rough", estimator=(None, "network", "analytic"), model=Path)
+    using = networks(options.estimator, options.model)
+    print(head(*COLUMNS))
     rows = []
     for truth in sorted(options.folder.glob("*.truth.json")):
-        rows.append(measure(truth, network, options.rough))
-        print(f"| {truth.name.split('.')[0]} |", " | ".join(f"{value:.3g}" for value in rows[-1]), "|", flush=True)
-    print("| mean |", " | ".join(f"{value:.3g}" for value in np.mean(rows, axis=0)), "|")
+        rows.append(measure(truth, using, options.rough))
+        print(row(truth.name.split(".")[0], *rows[-1]), flush=True)
+    print(row("mean", *np.mean(rows, axis=0)))
 
 
-def measure(truth_file: Path, network: Network | None, rough: bool) -> list[float]:
+def measure(truth_file: Path, using: Networks, rough: bool) -> list[float]:
     """One capture's figures, in the order of COLUMNS."""
     stem = str(truth_file)[: -len(".truth.json")]
     applied = json.loads(truth_file.read_text())
     meta = json.loads(Path(stem + ".meta.json").read_text())
     capture = captures.read(Path(stem), None)
-    supplied = UserInput(network=network, mask_network=models.load_mask_network(2))
-    found = path(capture, supplied, Config(), MemoryCache(), Results)
+    found = process(capture, Results, using)
     with np.load(stem + ".truth.npz") as maps:
-        errors = surface_errors(found, dict(maps), network, rough)
+        errors = surface_errors(found, dict(maps), using[0], rough)
         detail = detail_errors(found, dict(maps))
     return [*errors[:2], *capture_errors(found, capture, applied, meta), *errors[2:], *detail]
 
@@ -82,11 +75,8 @@ def detail_errors(found: Results, truth: dict[str, Floats]) -> list[float]:
         gray = image.mean(axis=-1)
         return np.asarray(gray - cv2.GaussianBlur(gray, (0, 0), 0.75))
 
-    def rms(image: Floats) -> float:
-        return float(np.sqrt(np.mean(image[inside] ** 2)))
-
-    both = enlarged, detailed
-    return [*(rms(a - albedo) for a in both), *(rms(fine(a) - fine(albedo)) for a in both), rms(fine(albedo))]
+    pairs = [(part(image), part(albedo)) for part in (np.asarray, fine) for image in (enlarged, detailed)]
+    return [*(rms((one - true)[inside]) for one, true in pairs), rms(fine(albedo)[inside])]
 
 
 def capture_errors(found: Results, capture: Capture, applied: dict, meta: dict) -> list[float]:  # type: ignore[type-arg]
@@ -125,45 +115,37 @@ def surface_errors(found: Results, truth: dict[str, Floats], network: Network | 
     crop = np.s_[y0:y1, x0:x1]
 
     def binned(image: Floats) -> Floats:
-        full = image.astype(np.float32)
-        return np.asarray(
-            cv2.resize(full, (full.shape[1] // 2, full.shape[0] // 2), interpolation=cv2.INTER_AREA)[crop]
-        )
+        return np.asarray(block_means(image.astype(np.float32), 2)[crop])
 
     normal = binned(truth["normal"])
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     maps, depth = found.maps, found.mesh.depth
     if rough:
-        share = kept(normal, binned(truth["alpha"]), binned(truth["ior"]), found.cues.rays)
+        share = facet_share(normal, binned(truth["alpha"]), binned(truth["ior"]), found.cues.rays)
         parts = found.stokes.stokes.copy()
         parts[1:] *= np.where(binned(truth["mask"]) > 0, share, 1)[..., None]
         seen = cues.compute(replace(found.stokes, stokes=parts), found.color)
         maps = infer.estimate(seen, network, onnx.run, Config().infer)
         depth = surface.integrate(maps, distance_m(found.color, found.radiance), Config().surface).depth
     inside = (binned(truth["mask"]) == 1) & maps.mask
-    angle = np.degrees(np.arccos(np.clip((normal * maps.normal).sum(-1), -1, 1)))[inside]
+    angle = frames.angle_deg(normal, maps.normal)[inside]
     ior = np.maximum(binned(truth["ior"]), 1)
     f0 = ((ior - 1) / (ior + 1)) ** 2
-
-    def rmse(a: Floats, b: Floats) -> float:
-        return float(np.sqrt(np.mean((a[inside] - b[inside]) ** 2)))
 
     z = binned(truth["depth"])
     inside &= np.isfinite(z) & np.isfinite(depth)
     true, ours = z[inside] - z[inside].mean(), depth[inside] * np.mean(z[inside]) / np.mean(depth[inside])
-    relative = float(np.sqrt(np.mean((ours - ours.mean() - true) ** 2)) / np.ptp(true))
-    return [
-        float(angle.mean()),
-        float(np.median(angle)),
-        rmse(maps.diffuse, binned(truth["albedo"])),
-        rmse(maps.roughness, np.sqrt(binned(truth["alpha"]))),
-        rmse(maps.specular[..., 1], f0),
-        relative,
-    ]
+    materials = (
+        (maps.diffuse, binned(truth["albedo"])),
+        (maps.roughness, np.sqrt(binned(truth["alpha"]))),
+        (maps.specular[..., 1], f0),
+    )
+    errors = [rms((estimate - right)[inside]) for estimate, right in materials]
+    return [float(angle.mean()), float(np.median(angle)), *errors, rms(ours - ours.mean() - true) / float(np.ptp(true))]
 
 
-def kept(normal: Floats, alpha: Floats, ior: Floats, rays: Floats) -> Floats:
-    """Share of the smooth body's DoLP that facets leave (H, W)."""
+def facet_share(normal: Floats, alpha: Floats, ior: Floats, rays: Floats) -> Floats:
+    """DoLP of diffuse light through facets over that through a smooth interface (H, W)."""
     cosine = np.clip(frames.to_ray_frame(normal, rays)[..., 2], 0.05, 1 - 1e-6)
     index = np.clip(ior, 1.3, 1.7)
     return np.asarray(body.dolp(cosine, alpha, index) / body.dolp(cosine, 0.0, index), np.float32)

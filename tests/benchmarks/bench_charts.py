@@ -1,16 +1,15 @@
 """Benchmark of the chart detection: charts found and false detections, compared with OpenCV's `cv2.mcc` alone.
 
-    python tests/benchmarks/bench_charts.py [PICTURES [FIRST]]
+    python tests/benchmarks/bench_charts.py [--pictures 216] [--first 0]
 
 Needs POLCAP_DATA. Prints a row per photograph of a chart (corner error in percent of the chart's longer side against
-corners marked by eye, mean ΔE2000 of a 3 × 3 matrix, and of patches left out of the fit), and how many of PICTURES
-(216) pictures without a ColorChecker Classic were taken for one: views of the environments, textures of the
-materials, 6 × 4 swatches cut from them on a dark card, and an 18-patch chart seen from many sides. With FIRST > 0
-only those from that number on.
+corners marked by eye, mean ΔE2000 of a 3 × 3 matrix, and of patches left out of the fit), and how many of
+--pictures without a ColorChecker Classic were taken for one: views of the environments, textures of the
+materials, 6 × 4 swatches cut from them on a dark card, and an 18-patch chart seen from many sides. With --first
+above 0 only those from that number on.
 """
 
 import itertools
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,17 +25,12 @@ from polcap.stage_values import AngleStack
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import WhitebalanceSettings, patches
 from polcap.stages.whitebalance.color_matrix import fit_matrix
+from tests.experiments import arguments
 from tests.stages.whitebalance.chart_pictures import AUTO, CLASSIC, stack
 from tests.stages.whitebalance.test_real_charts import DATA, MARKED, PHOTOS, REAL, corners_off, photo, superpixels
 
 _SIDE = (480, 640)
 _ACCEPTED_COST = 0.06  # the same limit as polcap's own, so that the tests after it are what is compared
-
-
-def main(pictures: int, first: int) -> None:
-    if first == 0:
-        photographs()
-    chart_free(pictures, first)
 
 
 def photographs() -> None:
@@ -184,4 +178,7 @@ def noisy(picture: Floats, random: np.random.Generator) -> Floats:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 216, int(sys.argv[2]) if len(sys.argv) > 2 else 0)
+    options = arguments(__doc__, pictures=216, first=0)
+    if options.first == 0:
+        photographs()
+    chart_free(options.pictures, options.first)

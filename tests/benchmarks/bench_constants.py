@@ -1,28 +1,27 @@
 """Benchmark of constants in the stages: effect on one capture's errors if each is halved and doubled.
 
-    python tests/benchmarks/bench_constants.py RESULT TRUTH.npz [align selfcal analytic network]
+    python tests/benchmarks/bench_constants.py RESULT TRUTH.npz [--rooms align selfcal analytic network]
 
-RESULT is what `polcap process` made of a capture whose true normals TRUTH holds (`normal`, `mask`, on its RAW pixels or
+RESULT is the result of a capture, TRUTH holds its true normals (`normal`, `mask`, on its RAW pixels or
 on the grid that they were merged to). Prints one row per number: mean normal error in degrees for those of `infer`,
 greatest movement of a corner in px against the default for those of `align`, greatest change of a gain in per cent for
 those of `selfcal`, found without the chart. A number that the capture does not feel may matter to another one.
 """
 
-import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import cv2
 import numpy as np
 
 from polcap.config import Config
 from polcap.formats import onnx
 from polcap.image_values import Floats
-from polcap.optics import registration
-from polcap.pipeline import models
+from polcap.optics import frames, registration
+from polcap.optics.resize import area_mean
 from polcap.pipeline import run as pipeline
 from polcap.results import Results
 from polcap.stage_values import Network
@@ -30,6 +29,7 @@ from polcap.stages import align, infer, selfcal
 from polcap.stages.infer import analytic, fine, learned, zenith
 from polcap.stages.infer.shape import half_turns, planar_faces
 from polcap.stages.selfcal import object_gains
+from tests.experiments import arguments, head, networks
 
 FACTORS = (0.5, 2.0)
 ROOMS = ["align", "selfcal", "analytic", "network"]
@@ -39,15 +39,9 @@ ALIGN = {
 }
 SELFCAL: Mapping[ModuleType, tuple[str, ...]] = {
     object_gains: (
-        "_PEAK_WIDTH",
-        "_CELL_PX",
-        "_PARTS",
-        "_ANGLE_ERROR",
-        "_FACING_ERROR",
-        "_OUTLINE_ERROR",
-        "_CLOSURE_ERROR",
+        "_PEAK_WIDTH", "_CELL_PX", "_PARTS", "_ANGLE_ERROR", "_FACING_ERROR", "_OUTLINE_ERROR", "_CLOSURE_ERROR",
     ),
-}
+}  # fmt: skip
 ANALYTIC = {
     analytic: ("_BLURS_PX", "_SAME", "_MODEL_ERROR_DEG"),
     planar_faces: ("_LONGEST",),
@@ -67,22 +61,17 @@ LEARNED: Mapping[ModuleType, tuple[str, ...]] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("result", type=Path)
-    parser.add_argument("truth", type=Path)
-    parser.add_argument("rooms", nargs="*", default=ROOMS, help=f"of {', '.join(ROOMS)}; all by default")
-    options = parser.parse_args()
+    options = arguments(__doc__, "result", "truth", rooms=ROOMS)
     results, _ = pipeline.reopen(options.result, Results)
-    print(f"| number | as it is | × {FACTORS[0]:g} | × {FACTORS[1]:g} | |\n| --- | --- | --- | --- | --- |")
+    print(head("number", "as it is", *(f"× {factor:g}" for factor in FACTORS), ""))
     if "align" in options.rooms:
-        table(ALIGN, Moved(results), "px of a corner")
+        table(ALIGN, change(partial(corners, results)), "px of a corner")
     if "selfcal" in options.rooms:
-        table(SELFCAL, Gained(results), "% of a gain, no chart")
+        table(SELFCAL, change(partial(gains, results)), "% of a gain, no chart")
     if "analytic" in options.rooms:
-        table(ANALYTIC, Normals(Judge(results, options.truth), None), "° normals, analytic")
+        table(ANALYTIC, partial(normal_error, results, options.truth, None), "° normals, analytic")
     if "network" in options.rooms:
-        network = models.load_network(None, None, "cpu", 1)
-        table(LEARNED, Normals(Judge(results, options.truth), network), "° normals, network")
+        table(LEARNED, partial(normal_error, results, options.truth, networks()[0]), "° normals, network")
 
 
 def table(numbers: Mapping[ModuleType, tuple[str, ...]], measure: Callable[[], float], unit: str) -> None:
@@ -98,13 +87,13 @@ def table(numbers: Mapping[ModuleType, tuple[str, ...]], measure: Callable[[], f
 def measured(module: ModuleType, name: str, factor: float, measure: Callable[[], float]) -> float:
     """The measure with one number changed."""
     usual = getattr(module, name)
-    setattr(module, name, scaled(usual, factor))
-    clear_laws()
+    zenith.candidate_laws.cache_clear()  # a table that depends on the numbers
     try:
+        setattr(module, name, scaled(usual, factor))
         return measure()
     finally:
         setattr(module, name, usual)
-        clear_laws()
+        zenith.candidate_laws.cache_clear()
 
 
 def scaled(value: Any, factor: float) -> Any:
@@ -114,79 +103,35 @@ def scaled(value: Any, factor: float) -> Any:
     return type(value)(value * factor) if isinstance(value, float) else max(1, round(value * factor))
 
 
-def clear_laws() -> None:
-    """Clear the cached tables, which depend on the numbers."""
-    for name in ("candidate_laws",):
-        getattr(getattr(zenith, name), "cache_clear", lambda: None)()
+def normal_error(results: Results, truth: Path, network: Network | None) -> float:
+    """Mean error of the estimated normals against the true ones, degrees."""
+    cues, (x0, y0, x1, y1) = results.cues, results.object_.crop
+    size = results.radiance.value.shape[1:3]
+    with np.load(truth) as maps:
+        normal, mask = (area_mean(maps[name].astype(np.float32), size)[y0:y1, x0:x1] for name in ("normal", "mask"))
+    found = infer.estimate(cues, network, onnx.run, Config().infer).normal
+    return float(frames.angle_deg(frames.unit(normal), found)[(mask == 1) & cues.mask].mean())
 
 
-class Judge:
-    """The true normals on the crop of the maps."""
-
-    def __init__(self, results: Results, truth: Path) -> None:
-        self.cues = results.cues
-        x0, y0, x1, y1 = results.object_.crop
-        with np.load(truth) as maps:
-            normal, mask = maps["normal"].astype(np.float32), maps["mask"].astype(np.float32)
-        height, width = results.radiance.value.shape[1:3]
-        grid = [cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in (normal, mask)]
-        self.normal, inside = grid[0][y0:y1, x0:x1], grid[1][y0:y1, x0:x1]
-        self.normal = self.normal / np.maximum(np.linalg.norm(self.normal, axis=-1, keepdims=True), 1e-6)
-        self.inside = (inside == 1) & self.cues.mask
-
-    def error(self, normal: Floats) -> float:
-        """Mean error of normals (H, W, 3), degrees."""
-        cosine = np.clip((self.normal * normal).sum(-1)[self.inside], -1, 1)
-        return float(np.degrees(np.arccos(cosine)).mean())
+def change(measure: Callable[[], Floats]) -> Callable[[], float]:
+    """How far a measure is from what it is now, at most."""
+    usual = measure()
+    return lambda: float(np.abs(measure() - usual).max())
 
 
-class Normals:
-    """The estimator's mean normal error, degrees."""
-
-    def __init__(self, judge: Judge, network: Network | None) -> None:
-        self.judge, self.network = judge, network
-
-    def __call__(self) -> float:
-        return self.judge.error(infer.estimate(self.judge.cues, self.network, onnx.run, Config().infer).normal)
+def corners(results: Results) -> Floats:
+    """Corners (K, 2, 4) px of the picture on the shots."""
+    height, width = results.radiance.value.shape[1:3]
+    corner = np.array([[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]], np.float64)
+    moved = align.register(results.radiance, results.color, Config().align).transform @ corner
+    return np.asarray(moved[:, :2] / moved[:, 2:])
 
 
-class Moved:
-    """How far the corners of the shots move against the registration as it is, px."""
-
-    def __init__(self, results: Results) -> None:
-        self.radiance, self.color = results.radiance, results.color
-        height, width = self.radiance.value.shape[1:3]
-        self.corners = np.array([[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]], np.float64)
-        self.usual = self.places()
-
-    def places(self) -> Floats:
-        """Corners (K, 2, 4) px on the shots."""
-        moved = align.register(self.radiance, self.color, Config().align).transform @ self.corners
-        return np.asarray(moved[:, :2] / moved[:, 2:])
-
-    def __call__(self) -> float:
-        return float(np.abs(self.places() - self.usual).max())
-
-
-class Gained:
-    """How far gains without the chart are from those as they are, per cent."""
-
-    def __init__(self, results: Results) -> None:
-        self.results = results
-        self.usual = self.gains()
-
-    def gains(self) -> Floats:
-        """(K, 3)."""
-        return selfcal.solve(
-            self.results.radiance,
-            self.results.alignment,
-            self.results.object_,
-            replace(self.results.color, place=None),
-            Config().selfcal,
-        ).gains.gain
-
-    def __call__(self) -> float:
-        return float(100 * np.abs(self.gains() / self.usual - 1).max())
+def gains(results: Results) -> Floats:
+    """ln of the gains (K, 3) without the chart, per cent."""
+    color = replace(results.color, place=None)
+    found = selfcal.solve(results.radiance, results.alignment, results.object_, color, Config().selfcal)
+    return np.asarray(100 * np.log(found.gains.gain))
 
 
 if __name__ == "__main__":

@@ -8,9 +8,9 @@ The objects are test meshes in test materials, engraved with lettering, a relief
 the normals is split into three bands of wavelength: below two pixels of the first network, from there to the detail
 that the inversion adds, and above. Each figure is the rms difference of the band-passed normals inside the eroded
 mask, in degrees. The first band is split again: at edges where one part hides another, and elsewhere. Squares add up.
+--store keeps the pictures for another run, --look writes a part of each picture: light, before, after, truth.
 """
 
-import argparse
 import json
 import pickle
 from collections.abc import Iterator
@@ -19,39 +19,28 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from polcap.formats import onnx
-from polcap.image_values import Floats
-from polcap.pipeline import models
+from polcap.image_values import Bools, Floats
+from polcap.optics import frames
 from polcap.stage_values import Network
 from polcap.stages import infer
 from polcap.training.evaluation_protocol import Case, Protocol
+from tests.experiments import arguments, networks
 
-Mask = NDArray[np.bool_]  # (H, W)
 _HALF = 0.375  # σ of the Gaussian that halves a wave of two, in units of half its length: √(2 ln 2)/π
 _TEXELS, _PERIOD = 1024, 0.6  # of the lettering; its length in sides of the object
 _DEEP = 0.7  # its steepest slope
-_JUMP, _BESIDE = (
-    0.06,
-    3,
-)  # depth step of an edge [radii of the object]; px on either side of it
+_JUMP, _BESIDE = 0.06, 3  # depth step of an edge [radii of the object]; px on either side of it
 _COARSE = 2.0  # px of the first network, 1σ: finer detail comes from the refinement and the inversion
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--pictures", type=int, default=6)
-    parser.add_argument("--size", type=int, default=1024)
-    parser.add_argument("--protocol", type=int, default=1)
-    parser.add_argument("--store", type=Path, help="folder that keeps the pictures from one run to the next")
-    parser.add_argument("--look", type=Path, help="PNG of a part of each picture: light, before, after, truth")
-    given = parser.parse_args()
-    network = models.load_network("network", None, "cpu", 1)
+    options = arguments(__doc__, "data", pictures=6, size=1024, protocol=1, store=Path, look=Path)
+    network = networks("network")[0]
     rows: list[dict[str, dict[str, float]]] = []
     looks: list[Floats] = []
-    for case in _cases(given.data, given.size, given.protocol, given.pictures, given.store):
+    for case in _cases(options.data, options.size, options.protocol, options.pictures, options.store):
         before = infer.estimate(case.cues, network, onnx.run, infer.InferSettings(fine=False))
         after = infer.estimate(case.cues, network, onnx.run, infer.InferSettings())
         both = {"before": errors(before.normal, case, network), "after": errors(after.normal, case, network)}
@@ -61,8 +50,8 @@ def main() -> None:
     for band in rows[0]["before"]:
         was, now = (float(np.mean([row[when][band] for row in rows])) for when in ("before", "after"))
         print(f"{band:>16}  {was:6.2f}°  {now:6.2f}°  {100 * (now / was - 1):+.1f} %")
-    if given.look:
-        cv2.imwrite(str(given.look), np.concatenate(looks))
+    if options.look:
+        cv2.imwrite(str(options.look), np.concatenate(looks))
 
 
 def errors(normal: Floats, case: Case, network: Network | None) -> dict[str, float]:
@@ -73,7 +62,7 @@ def errors(normal: Floats, case: Case, network: Network | None) -> dict[str, flo
     solid = cv2.erode(inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     off = (normal - truth) * inside[..., None]
     fine, middle = off - _smooth(off, inside, _HALF * shrink), off - _smooth(off, inside, _COARSE * shrink)
-    angle = np.degrees(np.arccos(np.clip((normal * truth).sum(-1), -1, 1)))[solid]
+    angle = frames.angle_deg(normal, truth)[solid]
 
     def rms(image: Floats) -> float:
         return float(np.degrees(np.sqrt((image[solid] ** 2).sum(-1).mean())))
@@ -86,7 +75,7 @@ def errors(normal: Floats, case: Case, network: Network | None) -> dict[str, flo
     }  # fmt: skip
 
 
-def _edges(depth: Floats, inside: Mask) -> Mask:
+def _edges(depth: Floats, inside: Bools) -> Bools:
     """Pixels (H, W) next to those of one part of the object that hides another."""
     small, large = np.ones((3, 3), np.uint8), np.ones((2 * _BESIDE + 1, 2 * _BESIDE + 1), np.uint8)
     low, high = (np.where(inside, depth, beyond).astype(np.float32) for beyond in (1e3, -1e3))
@@ -94,13 +83,13 @@ def _edges(depth: Floats, inside: Mask) -> Mask:
     return np.asarray(cv2.dilate(jump.astype(np.uint8), large) > 0)
 
 
-def _smooth(image: Floats, inside: Mask, sigma: float) -> Floats:
+def _smooth(image: Floats, inside: Bools, sigma: float) -> Floats:
     share = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), sigma)
     return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma) / np.maximum(share, 1e-3)[..., None])
 
 
 class Lettering:
-    """Words cut into the three coordinate planes of an object whose longest side is 1."""
+    """Words cut into the three coordinate planes of an object of longest side 1."""
 
     def __init__(self) -> None:
         drawn = np.zeros((_TEXELS, _TEXELS), np.uint8)

@@ -7,7 +7,6 @@ interreflection under a flash at the lens ("mesh") or 20 cm away ("shadow"). Pri
 normal error in tenths of the stated one; root mean square of error over stated 1σ of albedo and roughness.
 """
 
-import argparse
 import tempfile
 from functools import partial
 from pathlib import Path
@@ -20,30 +19,26 @@ from scipy.ndimage import gaussian_filter
 from polcap.config import Config
 from polcap.formats.capture import reader
 from polcap.image_values import Bools, Floats
-from polcap.optics.resize import weighted_area_mean
-from polcap.pipeline import models, path
-from polcap.pipeline.cache import MemoryCache
+from polcap.optics import frames
+from polcap.optics.resize import block_means, weighted_area_mean
 from polcap.quality import error_maps, gates
 from polcap.quality.gate_values import full_size
 from polcap.results import ResultsUntilInfer
 from polcap.stage_values import SurfaceMaps
 from polcap.synth import scenes, shooting
 from polcap.training import traced_views
+from tests.experiments import arguments, process, raw_pixels
 
 KINDS = ("good", "clipped", "blur", "mesh", "shadow")
 PIXELS = 3000  # of each capture
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--seeds", default="1-12")
-    parser.add_argument("--width", type=int, default=640)
-    given = parser.parse_args()
-    first, last = map(int, given.seeds.split("-"))
+    options = arguments(__doc__, "data", seeds="1-12", width=640)
+    first, last = map(int, options.seeds.split("-"))
     for kind in KINDS:
         seeds = range(first, last + 1)
-        found = np.concatenate([drawn(given.data, kind, seed, given.width) for seed in seeds], axis=1)
+        found = np.concatenate([drawn(options.data, kind, seed, options.width) for seed in seeds], axis=1)
         order = np.argsort(found[0])
         tenths = " ".join(f"{found[0, p].mean() / found[1, p].mean():.2f}" for p in np.array_split(order, 10))
         albedo, rough = (np.sqrt(np.mean((found[k + 1] / found[k]) ** 2)) for k in (2, 4))
@@ -56,15 +51,14 @@ def drawn(data: Path, kind: str, seed: int, width: int) -> Floats:
         place = Path(folder) / "capture"
         shoot(data, place, kind, seed, width)
         capture = reader.read(place)
-        user = path.UserInput(path.AUTO, None, models.load_network(None, None), models.load_mask_network())
-        results = path.path(capture, user, Config(), MemoryCache(), ResultsUntilInfer)
+        results = process(capture, ResultsUntilInfer)
         truth = dict(np.load(place / "truth.npz"))
     evidence = full_size(results, capture.focal_doubt)
     maps = error_maps.with_errors(evidence, gates.judge(evidence, Config().gates))
     assert maps.diffuse_error is not None and maps.roughness_error is not None
     true, seen = on_grid(truth, maps)
     pairs = (
-        (maps.confidence, np.degrees(np.arccos(np.clip((true["normal"] * maps.normal).sum(-1), -1, 1)))),
+        (maps.confidence, frames.angle_deg(true["normal"], maps.normal)),
         (maps.diffuse_error, np.abs((maps.diffuse - true["diffuse"]).mean(-1))),
         (maps.roughness_error, np.abs(maps.roughness - true["roughness"])),
     )
@@ -97,15 +91,12 @@ def shoot(data: Path, place: Path, kind: str, seed: int, width: int) -> None:
 
 def on_grid(truth: dict[str, Any], maps: SurfaceMaps) -> tuple[dict[str, Floats], Bools]:
     """True maps on the grid of the maps, and the pixels (H, W) where both show the object."""
-    step, (x0, y0) = round(maps.view.scale), (round(at) for at in maps.view.origin)
-    height, width = maps.mask.shape
-    cut = np.s_[step * y0 : step * (y0 + height), step * x0 : step * (x0 + width)]
+    step, cut = raw_pixels(maps)
     inside = truth["mask"][cut]
     names = ("normal", "diffuse", "roughness")
     found = {n: weighted_area_mean(truth[n][cut].astype(np.float32), inside, maps.mask.shape) for n in names}
-    found["normal"] /= np.maximum(np.linalg.norm(found["normal"], axis=-1, keepdims=True), 1e-9)
-    whole = inside.reshape(height, step, width, step).all(axis=(1, 3))
-    return found, whole & maps.mask
+    found["normal"] = frames.unit(found["normal"])
+    return found, (block_means(inside > 0, step) == 1) & maps.mask
 
 
 if __name__ == "__main__":

@@ -1,16 +1,14 @@
 """Benchmark of export time: a whole export against encoding the same files alone.
 
-python tests/benchmarks/bench_export.py FOLDER [SIDE]     (usd-core for `archive`)
+python tests/benchmarks/bench_export.py FOLDER [--side 2048]     (usd-core for `archive`)
 
-Makes a result folder with maps of SIDE² pixels (2048), a ball with two paints, and exports every preset.
+Makes a result folder with maps of SIDE² pixels, a ball with two paints, and exports every preset.
 `export` builds mesh and textures from the maps, too. `alone` encodes the pictures of the preset, each once, and its
 layered EXR. CPU seconds of all threads together and of the child that reads files, its start included; the least of
 three rounds.
 """
 
-import resource
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -29,43 +27,43 @@ from polcap.formats.export.presets import PRESETS, ExportPreset
 from polcap.formats.maps import maps_folder
 from polcap.image_values import Floats, View
 from polcap.mesh_values import Asset, ReliefMesh
-from polcap.pipeline import run as pipeline
+from polcap.optics import frames
+from polcap.pipeline import asset_export, detail_levels
 from polcap.pipeline.export_request import ExportRequest
 from polcap.stage_values import Cues, StokesImage, SurfaceMaps
-from polcap.stages import asset, surface
 from tests import surfaces
+from tests.experiments import arguments, processor_s
 
 
 def main(folder: Path, side: int) -> None:
-    result(folder, side)
-    stored = maps_folder.read(folder / "maps")
-    mesh = surface.triangulate(stored.depth, stored, stored.metric, surface.SurfaceSettings())
-    built = asset.build(stored, mesh, asset.AssetSettings())
+    about = result(folder, side)
+    source = detail_levels.read(folder / "maps", Config())
     print(f"{'preset':10}{'alone s':>10}{'export s':>10}{'ratio':>8}{'MB':>8}")
     for name in PRESETS:
-        encode, whole = (min(times) for times in zip(*(both(folder, built, name) for _ in range(3))))
+        built = detail_levels.levels(source, ExportRequest(preset=name))[0].asset
+        encode, whole = (min(times) for times in zip(*(both(folder, about, built, name) for _ in range(3))))
         size = sum(file.stat().st_size for file in (folder / "asset" / name).iterdir()) / 1e6
         print(f"{name:10}{encode:10.2f}{whole:10.2f}{whole / encode:8.2f}{size:8.1f}", flush=True)
 
 
-def both(folder: Path, built: Asset, name: str) -> tuple[float, float]:
+def both(folder: Path, about: dict[str, Any], built: Asset, name: str) -> tuple[float, float]:
     """Seconds of the encoding alone, and of an export from the maps."""
+
+    def export() -> None:
+        asset_export.write(folder, about, ExportRequest(preset=name), detail_levels.read(folder / "maps", Config()))
+
     encode = seconds(lambda: alone(folder, built, PRESETS[name]))
     shutil.rmtree(folder / "asset", ignore_errors=True)
-    return encode, seconds(lambda: pipeline.export(folder, ExportRequest(preset=name)))
+    return encode, seconds(export)
 
 
 def seconds(work: Callable[[], object]) -> float:
     """CPU seconds of this process and of the children that it starts to read files."""
     sandbox.end_idle()
-    start = spent()
+    start = processor_s()
     work()
     sandbox.end_idle()
-    return spent() - start
-
-
-def spent() -> float:
-    return sum(sum(resource.getrusage(whose)[:2]) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return processor_s() - start
 
 
 def alone(folder: Path, built: Asset, preset: ExportPreset) -> None:
@@ -80,17 +78,16 @@ def alone(folder: Path, built: Asset, preset: ExportPreset) -> None:
         exr_layers.write(folder / "alone.exr", folder / "maps", exr_layers.LINEAR_REC709, {})
 
 
-def result(folder: Path, side: int) -> dict[str, object]:
-    """maps/ of a ball, side² pixels, and what report.json would tell of them."""
+def result(folder: Path, side: int) -> dict[str, Any]:
+    """Write maps/ of a ball, side² pixels; returns what its report.json would hold."""
     scale = side / surfaces.WIDTH
     view = View(surfaces.VIEW.focal * scale, (surfaces.VIEW.center[0] * scale, side / 2), 1.0)
     ball = surfaces.maps()
     grown = {name: enlarged(getattr(ball, name), side) for name in ("normal", "diffuse", "specular", "roughness")}
-    normal = grown["normal"] / np.maximum(np.linalg.norm(grown["normal"], axis=-1, keepdims=True), 1e-6)
     noise = np.random.default_rng(0).normal(scale=0.01, size=(side, side)).astype(np.float32)
     maps = replace(
         ball,
-        normal=normal,
+        normal=frames.unit(grown["normal"]),
         diffuse=np.clip(grown["diffuse"] + noise[..., None], 0, 1),
         specular=np.clip(0.04 + noise[..., None] / 4, 0, 1).repeat(3, axis=-1),
         roughness=np.clip(grown["roughness"] / 2 + noise, 0, 1),
@@ -101,13 +98,8 @@ def result(folder: Path, side: int) -> dict[str, object]:
     small = surfaces.mesh(ball)
     mesh = replace(small, depth=enlarged(np.nan_to_num(small.depth, nan=surfaces.DISTANCE), side))
     write(folder, maps, mesh, noise)
-    return {
-        "polcap": "0",
-        "capture": {"name": "ball", "camera": "", "shots": []},
-        "model": None,
-        "settings": msgspec.to_builtins(Config()),
-        "keys": {},
-    }
+    about = {"polcap": "0", "capture": {"name": "ball", "camera": "", "shots": []}, "model": None, "keys": {}}
+    return about | {"verdict": "pass", "gates": [], "settings": msgspec.to_builtins(Config())}
 
 
 def enlarged(values: Floats, side: int) -> Floats:
@@ -116,29 +108,20 @@ def enlarged(values: Floats, side: int) -> Floats:
 
 def write(folder: Path, maps: SurfaceMaps, mesh: ReliefMesh, noise: Floats) -> None:
     size = noise.shape
+    s0 = maps.diffuse + noise[..., None]
+    quality = np.zeros(size, np.uint8)
     stokes = StokesImage(
-        stokes=np.stack([np.stack([maps.diffuse + noise[..., None]] * 3)[k] / 3 for k in range(3)]),
-        covariance=np.zeros((6, *size, 3), np.float32),
-        quality=np.zeros(size, np.uint8),
-        mask=maps.mask,
-        view=maps.view,
-        residual=None,
+        np.stack([s0] * 3) / 3, np.zeros((6, *size, 3), np.float32), quality, maps.mask, maps.view, residual=None
     )
     cues = Cues(
-        radiance=maps.diffuse,
-        ratio=np.stack([noise, noise]),
-        ratio_sigma=np.full(size, 0.01, np.float32),
-        dolp=np.abs(noise),
-        normalized_stokes=maps.normal[..., :2].transpose(2, 0, 1),
-        diffuse_color=maps.diffuse,
-        rays=maps.normal,
-        mask=maps.mask,
-        quality=np.zeros(size, np.uint8),
-        view=maps.view,
-    )
+        radiance=maps.diffuse, ratio=np.stack([noise, noise]), ratio_sigma=np.full(size, 0.01, np.float32),
+        dolp=np.abs(noise), normalized_stokes=maps.normal[..., :2].transpose(2, 0, 1), diffuse_color=maps.diffuse,
+        rays=maps.normal, mask=maps.mask, quality=quality, view=maps.view,
+    )  # fmt: skip
     results: Any = SimpleNamespace(maps=maps, mesh=mesh, stokes=stokes, cues=cues, keys={})
     maps_folder.write(folder / "maps", results)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]).resolve(), int(sys.argv[2]) if len(sys.argv) > 2 else 2048)
+    options = arguments(__doc__, "folder", side=2048)
+    main(options.folder.resolve(), options.side)

@@ -8,7 +8,6 @@ which are made once. Prints a Markdown row per capture and the means by kind. `p
 with the true mean normal. `warned`: gates that are not quiet.
 """
 
-import argparse
 import zlib
 from pathlib import Path
 from typing import Any
@@ -16,21 +15,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from polcap.config import Config
-from polcap.formats.capture import reader as captures
-from polcap.image_values import Floats
+from polcap.optics import frames
 from polcap.optics.mesh_tracer import Triangles, centred
-from polcap.pipeline import models
-from polcap.pipeline.cache import MemoryCache
-from polcap.pipeline.path import UserInput, path
-from polcap.quality import gates
-from polcap.quality.gate_values import full_size
+from polcap.optics.resize import block_means
 from polcap.results import Results
 from polcap.synth import shooting
 from polcap.synth.distance_fields import Model
 from polcap.synth.render import Scene
 from polcap.synth.scenes import random_scene
 from polcap.training import flat_shapes
+from tests.experiments import arguments, head, judge, networks, raw_pixels, rms, row
 
 ROWS = ("normal mean", "median", "expected", "plane", "diffuse", "roughness", "F0")
 SOLID, PLANE = (25.0, 35.0, 45.0, 55.0, 40.0), (0.0, 5.0, 16.0, 30.0, 50.0)  # deg, tilts
@@ -43,35 +37,25 @@ SEED = 90210  # of shapes and poses
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--model", type=Path)
-    parser.add_argument("--captures", type=int, default=30)
-    parser.add_argument("--width", type=int, default=640, help="RAW px, 4:3")
-    options = parser.parse_args()
-    supplied = UserInput(
-        network=models.load_network(None, options.model, "cpu", 1), mask_network=models.load_mask_network(1)
-    )
-    print("| capture | law |", " | ".join(ROWS), "| warned |\n| --- | --- |", " --- |" * (len(ROWS) + 1))
+    options = arguments(__doc__, "folder", model=Path, captures=30, width=640)
+    using = networks(model=options.model)
+    print(head("capture", "law", *ROWS, "warned"))
     table: dict[str, list[list[float]]] = {}
     for number in range(options.captures):
         kind = list(KINDS)[number % len(KINDS)]
         folder = options.folder / f"{number:02d}_{kind}"
         scene = draw(number, kind, options.folder)
         if not folder.exists():
-            shooting.write(
-                folder, scene, shooting.Shoot(seed=number, width=options.width, height=options.width * 3 // 4)
-            )
-        capture = captures.read(folder)
-        found = path(capture, supplied, Config(), MemoryCache(), Results)
-        lines = gates.judge(full_size(found, capture.focal_doubt), Config().gates)
+            shoot = shooting.Shoot(seed=number, width=options.width, height=options.width * 3 // 4)
+            shooting.write(folder, scene, shoot)
+        found, lines = judge(folder, using)
         warned = ", ".join(f"{line.name} {line.state}" for line in lines if line.state in ("warn", "fail"))
-        row = errors(found, folder)
+        figures = errors(found, folder)
         for name in (kind, str(scene.law), "all"):
-            table.setdefault(name, []).append(row)
-        print(f"| {folder.name} | {scene.law} |", " | ".join(f"{x:.3g}" for x in row), f"| {warned} |", flush=True)
+            table.setdefault(name, []).append(figures)
+        print(row(folder.name, scene.law, *figures, warned), flush=True)
     for name, rows in table.items():
-        print(f"| mean of {len(rows)} | {name} |", " | ".join(f"{x:.3g}" for x in np.mean(rows, axis=0)), "| |")
+        print(row(f"mean of {len(rows)}", name, *np.mean(rows, axis=0), ""))
 
 
 def draw(number: int, kind: str, folder: Path) -> Scene:
@@ -107,24 +91,14 @@ def write_mesh(file: Path, mesh: Triangles) -> None:
 def errors(found: Results, folder: Path) -> list[float]:
     """Errors of the maps in the order of ROWS; angles in degrees, RMSE of the materials."""
     maps = found.maps
-    step, (x0, y0) = round(maps.view.scale), (round(at * maps.view.scale) for at in maps.view.origin)
-    height, width = maps.mask.shape
+    step, cut = raw_pixels(maps)
     with np.load(folder / "truth.npz") as file:
-        stored = {name: file[name] for name in ("normal", "mask", "diffuse", "specular", "roughness")}
-
-    def truth(name: str) -> Floats:
-        cut = stored[name][y0 : y0 + step * height, x0 : x0 + step * width].astype(np.float32)
-        return np.asarray(cut.reshape(height, step, width, step, *cut.shape[2:]).mean(axis=(1, 3)))
-
-    both = maps.mask & (truth("mask") == 1)
-    normal = truth("normal")[both]
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    mean = normal.mean(axis=0) / np.linalg.norm(normal.mean(axis=0))
-    angle, plane = (np.degrees(np.arccos(np.clip((normal * n).sum(-1), -1, 1))) for n in (maps.normal[both], mean))
-    rmse = [
-        float(np.sqrt(np.mean((truth(name)[both] - getattr(maps, name)[both]) ** 2)))
-        for name in ("diffuse", "roughness", "specular")
-    ]
+        names = ("normal", "mask", "diffuse", "roughness", "specular")
+        truth = {name: block_means(file[name][cut].astype(np.float32), step) for name in names}
+    both = maps.mask & (truth["mask"] == 1)
+    normal = frames.unit(truth["normal"][both])
+    angle, plane = (frames.angle_deg(normal, n) for n in (maps.normal[both], frames.unit(normal.mean(axis=0))))
+    rmse = [rms((truth[name] - getattr(maps, name))[both]) for name in names[2:]]
     means = float(angle.mean()), float(np.median(angle)), float(maps.confidence[both].mean()), float(plane.mean())
     return [*means, *rmse]
 

@@ -38,6 +38,7 @@ from polcap.optics import color, frames
 from polcap.optics.mesh_tracer import Tracer, Triangles, smooth
 from polcap.pipeline.cache import LazyCache, MemoryCache, StageResult
 from polcap.pipeline.request import Request
+from tests.experiments import row, true_pose
 
 LEAST_SEEN = 0.02  # weight of a texel
 SAMPLES = 400_000  # of the true surface
@@ -59,12 +60,11 @@ class Errors(NamedTuple):
 
 def main(folder: Path) -> None:
     found = errors(folder)
-    print(f"{'':18}{'normal':>9}{'albedo':>9}{'F0':>9}{'roughness':>11}")
+    print(f"{'':20}{'normal °':>11}{'albedo':>11}{'F0':>11}{'roughness':>11}")
     for name, part in (("best view", found.best), ("mean of views", slice(None))):
         single, fused = (np.mean(np.atleast_2d(rows[part]), axis=0) for rows in (found.single, found.fused))
-        print_row(name, single)
-        print_row("  same texels, fused", fused)
-        print("  reduction       " + "".join(f"{100 * one:8.0f}%" for one in 1 - fused / single))
+        for text, figures in ((name, single), ("  same texels, fused", fused), ("  reduction", 1 - fused / single)):
+            print(f"{text:20}" + "".join(f"{one:11.4f}" for one in figures))
     print(f"seen truth to mesh {100 * found.distance:.2f} %, seen texels to truth {100 * found.excess:.2f} %")
     if (folder / "setB").exists():
         print(joined(folder))
@@ -104,14 +104,9 @@ def fused(folder: Path) -> tuple[tuple[FusionView, ...], FusionResults]:
 def true_lenses(folder: Path) -> list[Floats]:
     """Places (3,) m of the lens in the frame of the first set."""
     about = json.loads((folder / "truth.json").read_text())
-    boards = [(one["name"], pose_of(one)) for one in about["views"]]
-    laid = pose_of(about["laid"]) if "laid" in about else None
+    boards = [(one["name"], true_pose(one)) for one in about["views"]]
+    laid = true_pose(about["laid"]) if "laid" in about else None
     return [(after(laid, pose) if laid and name.startswith("setB") else pose).center for name, pose in boards]
-
-
-def pose_of(stated: dict[str, Any]) -> Pose:
-    """A pose of truth.json."""
-    return Pose(np.array(stated["rotation"]), np.array(stated["translation"]))
 
 
 def joined(folder: Path) -> str:
@@ -120,37 +115,27 @@ def joined(folder: Path) -> str:
     truth, about = dict(np.load(folder / "truth.npz")), json.loads((folder / "truth.json").read_text())
     surface = Trimesh(truth["vertices"], truth["faces"], process=False)
     point, size = sample_surface(surface, 30_000, seed=0)[0], float(np.ptp(truth["vertices"], axis=0).max())
-    laid = pose_of(about["laid"])
-    boards = {one["name"]: pose_of(one) for one in about["views"]}
+    laid = true_pose(about["laid"])
+    boards = {one["name"]: true_pose(one) for one in about["views"]}
     first, second = ([view for view in placed if set_of_view(view.name) == name] for name in ("setA", "setB"))
     true = [after(laid, boards[view.name]) for view in second]
     pairs = [(view.pose, pose) for view, pose in zip(second, true)]
     turns = [Rotation.from_matrix(one.rotation @ other.rotation.T).magnitude() for one, other in pairs]
     middle = (point.min(axis=0) + point.max(axis=0)) / 2
-    places = [np.linalg.norm(move(one, middle) - move(other, middle)) for one, other in pairs]
+    places = [np.linalg.norm(one.to_camera(middle) - other.to_camera(middle)) for one, other in pairs]
     results = [path(StageResult("", tuple(first)), FusionSettings(), MemoryCache()), both]
     seen = [one.maps.seen[one.atlas.covered].mean() for one in results]
     right = first + [replace(view, pose=pose) for view, pose in zip(second, true)]
     meshes = [*(one.mesh for one in results), fuse_shape(right, ShapeSettings())]
     away = [100 * mean_distance(mesh, point) / size for mesh in meshes]
-    return (
-        f"| {folder.name} | {np.degrees(np.mean(turns)):.2f} | {100 * np.mean(places) / size:.2f} | "
-        f"{both.joined[0].shared:.2f} | {seen[0]:.2f} → {seen[1]:.2f} | {away[0]:.2f} → {away[1]:.2f} | {away[2]:.2f} |"
-    )
+    changes = (f"{one:.2f} → {two:.2f}" for one, two in (seen, away[:2]))
+    place = 100 * float(np.mean(places)) / size
+    return row(folder.name, float(np.degrees(np.mean(turns))), place, both.joined[0].shared, *changes, away[2])
 
 
 def after(first: Pose, second: Pose) -> Pose:
     """Two rigid motions, one after the other."""
     return Pose(second.rotation @ first.rotation, second.rotation @ first.translation + second.translation)
-
-
-def move(pose: Pose, point: Floats) -> Floats:
-    """A point (3,) in the camera frame, m."""
-    return pose.rotation @ point + pose.translation
-
-
-def print_row(name: str, row: Floats) -> None:
-    print(f"{name:18}{row[0]:8.2f}°{row[1]:9.4f}{row[2]:9.4f}{row[3]:11.4f}")
 
 
 def textures(results: FusionResults) -> list[Floats]:

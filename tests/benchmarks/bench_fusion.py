@@ -8,10 +8,6 @@ for each object the mean distance of the seen true surface from the bare hull an
 object's size, the Euler numbers, CPU seconds, vertices and the process's peak memory.
 """
 
-import argparse
-import os
-import resource
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -31,17 +27,9 @@ from polcap.fusion.values import ClosedMesh
 from polcap.image_values import Floats
 from polcap.optics.frames import dot, unit
 from polcap.optics.mesh_tracer import Tracer, smooth
-from tests.fusion.traced_views import (
-    Body,
-    all_around,
-    capture,
-    into_the_opening,
-    mean_error_deg,
-    ring,
-    solid,
-    stand,
-    with_errors,
-)  # fmt: skip
+from tests.experiments import arguments, data, head, peak_mb, row, timed
+from tests.fusion import traced_views
+from tests.fusion.traced_views import Body, capture, ring, solid
 
 OBJECTS = ("spot", "demosthenes", "penguin", "hand", "scorpion", "mug")
 POINTS = 30_000  # on the true surface, of which the seen ones count
@@ -50,42 +38,32 @@ NEAREST = 24  # triangles of which the distance is computed
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--views", type=int, nargs="*", default=[12, 24])
-    parser.add_argument("--only", nargs="*", default=OBJECTS)
-    parser.add_argument("--pictures", type=Path, help="folder for pictures of the fused meshes")
-    options = parser.parse_args()
-    print(
-        "| views | object | normals ° | hull % | fused % | Euler: truth | hull | fused | closed | s | vertices | MB |"
-    )
-    print("| --- " * 12 + "|")
+    options = arguments(__doc__, views=[12, 24], only=list(OBJECTS), pictures=Path)
+    names = "normals °", "hull %", "fused %", "Euler: truth", "hull", "fused", "closed", "s", "vertices", "MB"
+    print(head("views", "object", *names))
     for count in options.views:
         for name in options.only:
-            print(row(name, count, options.pictures), flush=True)
+            print(row(count, name, *measure(name, count, options.pictures)), flush=True)
 
 
-def row(name: str, count: int, pictures: Path | None) -> str:
-    vertices, faces = read_mesh(Path(os.environ["POLCAP_DATA"]) / "meshes/test" / f"{name}.npz")
-    body = stand(vertices, faces, Rotation.from_euler("x", -90, degrees=True) if name == "mug" else None)
-    poses = into_the_opening(body, count) if name == "mug" else all_around(body, count)
+def measure(name: str, count: int, pictures: Path | None) -> list[object]:
+    """Fuse views of an object; returns the cells of its row."""
+    vertices, faces = read_mesh(data() / "meshes/test" / f"{name}.npz")
+    body = traced_views.stand(vertices, faces, Rotation.from_euler("x", -90, degrees=True) if name == "mug" else None)
+    poses = (traced_views.into_the_opening if name == "mug" else traced_views.all_around)(body, count)
     rng = np.random.default_rng(0)
     true = [capture(body, pose) for pose in poses]
-    views = [with_errors(body, view, rng) for view in true]
-    off = np.mean([mean_error_deg(*pair) for pair in zip(true, views)])
+    views = [traced_views.with_errors(body, view, rng) for view in true]
+    off = float(np.mean([traced_views.mean_error_deg(*pair) for pair in zip(true, views)]))
     point = seen_points(body.tracer, [pose.center for pose in poses])
-    start = time.process_time()
-    fused = fuse_shape(views, ShapeSettings())
-    seconds = time.process_time() - start
+    fused, seconds = timed(lambda: fuse_shape(views, ShapeSettings()))
     hull = iso_surface(visual_hull(reduce_views(views), ShapeSettings().grid))
     percent = [100 * mean_distance(mesh, point) / body.size for mesh in (hull, fused)]
     closed = "yes" if is_closed(fused) and solid(fused).volume > 0 else "no"
     if pictures:
         cv2.imwrite(str(pictures / f"{name}{count}.png"), picture(fused))
-    return (
-        f"| {count} | {name} | {off:.1f} | {percent[0]:.2f} | {percent[1]:.2f} | {true_euler(vertices, faces)} | "
-        f"{solid(hull).euler_number} | {solid(fused).euler_number} | {closed} | {seconds:.0f} | "
-        f"{len(fused.vertices)} | {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000:.0f} |"
-    )
+    euler = true_euler(vertices, faces), solid(hull).euler_number, solid(fused).euler_number
+    return [off, *percent, *euler, closed, round(seconds), len(fused.vertices), round(peak_mb())]
 
 
 def true_euler(vertices: Floats, faces: NDArray[np.int64]) -> int:

@@ -8,9 +8,7 @@ stopped run continues. Prints for each object the mean errors of single views an
 distance of the seen truth from the mesh, % of the object's size.
 """
 
-import argparse
 import json
-import os
 import subprocess
 import sys
 import zlib
@@ -23,7 +21,7 @@ import bench_fused_asset
 import msgspec
 import numpy as np
 from bench_mitsuba import scene_light
-from make_mitsuba import MATERIALS, plain, shoot
+from make_mitsuba import MATERIALS, plain, shoot, square_crop
 
 from polcap.formats import atomic
 from polcap.image_values import Floats, View
@@ -33,6 +31,7 @@ from polcap.synth.all_around import AroundShoot
 from polcap.synth.distance_fields import Model
 from polcap.synth.render import Scene
 from polcap.synth.scene_materials import Coat, Material
+from tests.experiments import arguments, data, head, row
 
 OBJECTS = ("spot", "demosthenes")
 SHOOT = AroundShoot(width=960, height=720, samples=1, exposures=1, nudge_px=0, nudge_deg=0)  # all shots, same pixels
@@ -42,12 +41,8 @@ SIDE = 4  # rays per pixel side for the share that the object covers
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--views", type=int, default=12)
-    parser.add_argument("--only", nargs="*", default=OBJECTS)
-    options = parser.parse_args()
-    print("| object | views | normals ° | albedo | F0 | roughness | mesh % |", "\n|", "--- |" * 7)
+    options = arguments(__doc__, "out", views=12, only=list(OBJECTS))
+    print(head("object", "views", "normals °", "albedo", "F0", "roughness", "mesh %"))
     for name in options.only:
         folder = options.out / f"{name}_{options.views}"
         if not folder.exists():
@@ -55,12 +50,12 @@ def main() -> None:
         subprocess.run([sys.executable, "-m", "polcap", "fuse", str(folder)], check=True, stdout=subprocess.DEVNULL)
         errors = bench_fused_asset.errors(folder)
         cells = [f"{one:.3g} → {both:.3g}" for one, both in zip(errors.single.mean(axis=0), errors.fused.mean(axis=0))]
-        print(f"| {name} | {options.views} | {' | '.join(cells)} | {100 * errors.distance:.2f} |", flush=True)
+        print(row(name, options.views, *cells, 100 * errors.distance), flush=True)
 
 
 def write(folder: Path, name: str, views: int, traced: Path) -> None:
     """Write the RAW files of a session and its truth; `traced` caches Mitsuba's scenes."""
-    mesh = Path(os.environ["POLCAP_DATA"]) / "meshes/test" / f"{name}.npz"
+    mesh = data() / "meshes/test" / f"{name}.npz"
     scene = Scene(Model(str(mesh), SHOOT.radius_m), Coat((material(),)), law="rough")
     traced.mkdir(parents=True, exist_ok=True)
     with patch.object(render, "stokes", partial(path_traced, traced, render.stokes)):
@@ -79,16 +74,12 @@ def path_traced(traced: Path, stokes: Any, scene: Scene, view: View, x: Floats, 
     """Stokes parameters (3, H, W, 3) of `render.stokes`, with the object's pixels by Mitsuba."""
     out: Floats = stokes(scene, view, x, y, *others)
     mask = render.gbuffer(scene, view, *x.shape).mask
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    top, left = int(rows[0]) - MARGIN, int(columns[0]) - MARGIN
-    size = max(int(rows[-1]) - top, int(columns[-1]) - left) + 1 + MARGIN
-    crop = View(view.focal, (view.center[0] - left, view.center[1] - top), 1.0)
+    crop, size, inside = square_crop(mask, view, MARGIN)
     file = traced / f"{zlib.crc32(msgspec.json.encode(scene)):08x}.npz"
     if not file.exists():
         render_scene(file, scene, crop, size)
     with np.load(file) as stored:
         made = {name: stored[name] for name in stored.files}
-    inside = np.s_[top : top + size, left : left + size]
     at = mask[inside]
     squared = np.sum((np.array(scene.light) - np.array(scene.position)) ** 2)  # m², where polcap's white has S0 = 1
     light = scene_light(made) * (squared / made["middle"] ** 2) / covered(scene, crop, size)[..., None]

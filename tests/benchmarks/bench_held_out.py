@@ -3,14 +3,13 @@
 polcap synth FOLDER --views 12 --mesh spot.npz && polcap fuse FOLDER
 python tests/benchmarks/bench_held_out.py FOLDER [--pictures FOLDER]
 
-The held-out views stand halfway between two views, on opposite sides. Their light is 30 cm right of the lens and 15 cm
+The held-out views are halfway between two views, on opposite sides. Their light is 30 cm right of the lens and 15 cm
 above it. The fused mesh, and the relief of the nearest view at its true pose and median depth, are drawn with their
 maps, with shadows, and compared with the true picture. Prints for each held-out view the mean error of S0, % of the
 true mean, of both: over the pixels that the single view shows, and over the whole object, where missing surface is
 black; and the share of these pixels where the fused object errs less, after a blur of 2 % of the object's width.
 """
 
-import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -36,6 +35,7 @@ from polcap.stage_values import SurfaceMaps
 from polcap.stages.asset import AssetSettings
 from polcap.synth import render, trace
 from polcap.synth.render import Scene
+from tests.experiments import arguments, head, row, true_pose
 
 LIGHT = np.array([0.3, 0.15, 0.0])  # m, camera frame
 INDEX = 1.5
@@ -51,14 +51,10 @@ class TexturedMesh(NamedTuple):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--pictures", type=Path, help="folder for pictures: truth, fused, single")
-    options = parser.parse_args()
+    options = arguments(__doc__, "folder", pictures=Path)
     about = json.loads((options.folder / "truth.json").read_text())
-    poses = {one["name"]: Pose(np.array(one["rotation"]), np.array(one["translation"])) for one in about["views"]}
-    print("| view | shown by the single view | error there % | fused better | error % | fused better |")
-    print("| --- " * 6 + "|")
+    poses = {one["name"]: true_pose(one) for one in about["views"]}
+    print(head("view", "shown by the single view", "error there %", "fused better", "error %", "fused better"))
     source = fused_maps.read(options.folder / "fused" / "maps", AssetSettings())
     for first in (0, len(poses) // 2):
         (name, near), (_, beyond) = list(poses.items())[first : first + 2]
@@ -69,7 +65,7 @@ def main() -> None:
         fused = TexturedMesh(source.atlas.mesh, source.maps, pose)
         assets = (fused, relief(options.folder / name, near, pose, truth_depth(options.folder / name)))
         drawn = [picture(one, view, mask.shape, origin) for one in assets]
-        print(f"| {name} | {row(truth, mask, drawn)} |", flush=True)
+        print(row(name, *cells(truth, mask, drawn)), flush=True)
         if options.pictures:
             strip = np.hstack([truth, *(image for image, _ in drawn)]) / np.quantile(truth[mask], 0.998)
             png.write(options.pictures / f"{name}.png", color.srgb_eight_bits(strip))
@@ -139,17 +135,18 @@ def picture(asset: TexturedMesh, view: View, size: tuple[int, int], origin: Floa
     return out.reshape(*size, 3), there.reshape(size)
 
 
-def row(truth: Floats, mask: Bools, drawn: Sequence[tuple[Floats, Bools]]) -> str:
-    """Mean errors of the fused object and of the single view, and the share where the fused object errs less."""
+def cells(truth: Floats, mask: Bools, drawn: Sequence[tuple[Floats, Bools]]) -> list[object]:
+    """Cells of a view: share that the single view shows; mean errors of both, and the share that the fused one wins."""
     blur = BLUR * float(np.sqrt(4 * mask.sum() / np.pi))
     errors = [np.abs(color.luminance(image - truth)) for image, _ in drawn]
     smooth = [cv2.GaussianBlur(one * mask, (0, 0), blur) for one in errors]
-    cells = []
-    for where in (mask & drawn[1][1], mask):
+    shown = mask & drawn[1][1]
+    out: list[object] = [float(shown.sum() / mask.sum())]
+    for where in (shown, mask):
         mean = color.luminance(truth)[where].mean()
         fused, single = (100 * one[where].mean() / mean for one in errors)
-        cells.append(f"{single:.1f} → {fused:.1f} | {(smooth[0] <= smooth[1])[where].mean():.2f}")
-    return f"{(mask & drawn[1][1]).sum() / mask.sum():.2f} | {' | '.join(cells)}"
+        out += [f"{single:.1f} → {fused:.1f}", float((smooth[0] <= smooth[1])[where].mean())]
+    return out
 
 
 if __name__ == "__main__":

@@ -9,10 +9,7 @@ side, metal, and light from around with a share above a tenth are not good; ligh
 The gates are right if they pass the good captures and warn about the others. Prints a Markdown row per light.
 """
 
-import argparse
-import os
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,26 +23,21 @@ from polcap.formats import onnx
 from polcap.formats.maps import png
 from polcap.image_values import Floats
 from polcap.optics import fresnel, mueller
-from polcap.pipeline import models
 from polcap.quality import polarization
+from polcap.quality.gate_values import full_size
 from polcap.quality.limits import GateLimits
-from polcap.stage_values import AngleStack, Network, ObjectMask, single_frames
+from polcap.stage_values import AngleStack, ObjectMask, single_frames
 from polcap.stages import cues, infer, stokes
 from polcap.synth import scene_materials
 from polcap.synth.render import ObjectBuffer
 from polcap.synth.scenes import random_scene
 from polcap.synth.shooting import Shoot, Studio
 from tests import scenes
+from tests.experiments import arguments, data, head, networks, row
 
 ANGLE = np.radians([0.0, 45.0, 90.0])
 LIGHTS = ("flash", "flash", "off-axis flash", "around", "flash and around", "metal")
-LOOKS = {
-    "as drawn": (1.0, None),
-    "dark": (0.15, None),
-    "white": (None, None),
-    "glossy": (1.0, 0.2),
-    "matte": (1.0, 0.7),
-}
+LOOKS = ((1.0, None), (0.15, None), (None, None), (1.0, 0.2), (1.0, 0.7))  # albedo's factor, None: white; roughness
 METALS = {"gold": 0.2 + 3.3j, "copper": 0.4 + 2.9j, "aluminium": 1.1 + 6.8j, "iron": 2.9 + 3.0j}  # near 600 nm
 NOISE = 0.004  # 1σ at S0 = 1
 FLIPPED = 0.1
@@ -62,45 +54,36 @@ class Lit:
 
 @dataclass
 class Judged:
-    """What is true of it, and what the gates say."""
+    """True properties of an object under some light, and the gates that do not pass."""
 
-    flipped: float  # share of the polarized object that lies nearer to across
-    jumps: float  # share of neighbours whose polarization differs by over 45°
+    flipped: float  # share of the polarized object with an AoLP nearer to across than along the azimuth
+    jumps: float  # share of neighboring pixels with polarizations over 45° from each other
     normal_deg: float  # median error of the textbook's inversion, half-turns known
-    lines: dict[str, str]  # gate → what it says, where it does not pass
+    lines: dict[str, str]  # findings of the gates that do not pass, by gate
 
 
 def main() -> None:
-    parse = argparse.ArgumentParser()
-    parse.add_argument("--cases", type=int, default=100)
-    parse.add_argument("--first-seed", type=int, default=0)
-    parse.add_argument("--picture", type=Path)
-    given = parse.parse_args()
+    options = arguments(__doc__, cases=100, first_seed=0, picture=Path)
     rows: dict[str, list[tuple[bool, Judged]]] = {}
-    for seed in range(given.first_seed, given.first_seed + given.cases):
+    for seed in range(options.first_seed, options.first_seed + options.cases):
         light = LIGHTS[seed % len(LIGHTS)]
         case = lit(seed, light)
         found = judge(case, seed)
         good = light == "flash"
         neither = "around" in light and found.flipped <= FLIPPED
         right = neither or (not found.lines) == good
-        rows.setdefault(f"{light}, {'good' if good else 'neither' if neither else 'not good'}", []).append(
-            (right, found)
-        )
+        group = f"{light}, {'good' if good else 'neither' if neither else 'not good'}"
+        rows.setdefault(group, []).append((right, found))
         if not right:
             print(f"<!-- {seed} {light}: flipped {found.flipped:.2f}, {found.lines} -->", flush=True)
-    print("| light | captures | across | jumps | normals | right |\n| --- | --- | --- | --- | --- | --- |")
+    print(head("light", "captures", "across", "jumps", "normals °", "right"))
     for name in sorted(rows):
-        each = [found for _, found in rows[name]]
-        across, jumps, error = (
-            np.median([getattr(one, of) for one in each]) for of in ("flipped", "jumps", "normal_deg")
-        )
-        passed = sum(right for right, _ in rows[name])
-        print(f"| {name} | {len(each)} | {across:.0%} | {jumps:.1%} | {error:.0f}° | {passed} |")
-    every = [right for name, row in rows.items() for right, _ in row if "neither" not in name]
+        each = [(found.flipped, found.jumps, found.normal_deg) for _, found in rows[name]]
+        print(row(name, len(each), *np.median(each, axis=0), sum(right for right, _ in rows[name])))
+    every = [right for name, group in rows.items() for right, _ in group if "neither" not in name]
     print(f"\nright {sum(every)} of {len(every)}")
-    if given.picture:
-        draw(given.picture)
+    if options.picture:
+        draw(options.picture)
 
 
 def lit(seed: int, light: str) -> Lit:
@@ -111,14 +94,11 @@ def lit(seed: int, light: str) -> Lit:
     way = random.uniform(0, 2 * np.pi)
     flash = (0.7 * np.tan(turn) * np.cos(way), 0.7 * np.tan(turn) * np.sin(way), 0.0) if turn else scene.light
     scene = msgspec.structs.replace(scene, chart=None, position=(0.0, 0.0, scene.position[2]), light=flash)
-    albedo, rough = LOOKS[list(LOOKS)[seed // 2 % len(LOOKS)]]
-    coat = msgspec.structs.replace(
-        scene.coat, materials=tuple(_dressed(one, albedo, rough) for one in scene.coat.materials)
-    )
-    law = "rough" if seed % 2 else "smooth"
-    studio = Studio(
-        msgspec.structs.replace(scene, coat=coat, law=law), Shoot(width=320, height=240, focal_mm=70.0, samples=1)
-    )
+    albedo, rough = LOOKS[seed // 2 % len(LOOKS)]
+    materials = tuple(_dressed(one, albedo, rough) for one in scene.coat.materials)
+    coat = msgspec.structs.replace(scene.coat, materials=materials)
+    scene = msgspec.structs.replace(scene, coat=coat, law="rough" if seed % 2 else "smooth")
+    studio = Studio(scene, Shoot(width=320, height=240, focal_mm=70.0, samples=1))
     image, buffer = studio.reference, studio.buffer
     level = float(np.median(image[0][buffer.mask]))
     if light in ("around", "flash and around", "metal"):
@@ -134,7 +114,7 @@ def lit(seed: int, light: str) -> Lit:
 
 
 def judge(case: Lit, seed: int) -> Judged:
-    """Photograph it in noise, solve, and ask the gates of polarization."""
+    """Photograph it with noise, solve for the Stokes parameters, and judge by the gates of polarization."""
     image = solved(case, seed)
     total = image.stokes.sum(-1)
     mask = case.mask & (image.quality == 0)
@@ -150,7 +130,7 @@ def judge(case: Lit, seed: int) -> Judged:
         flipped=float((along[sloped] < 0).mean()) if sloped.any() else 1.0,
         jumps=float(jump[pairs].mean()) if pairs.any() else 0.0,
         normal_deg=_normal_error(ratio, case.normal, mask),
-        lines=_spoken(image),
+        lines=_findings(image),
     )
 
 
@@ -169,25 +149,20 @@ def solved(case: Lit, seed: int) -> Any:
     return stokes.solve(radiance, scenes.still(), scenes.equal(), object_, stokes.StokesSettings())
 
 
-def _spoken(image: Any) -> dict[str, str]:
-    maps = infer.estimate(
-        cues.compute(image, scenes.no_color()), _network(), onnx.run, infer.InferSettings(symmetries=1, fine=False)
-    )
-    results = SimpleNamespace(
-        stokes=image, radiance=scenes.stack(), selfcal=scenes.equal(), object_=scenes.ball_object(), maps=maps
-    )
-    found: Any = SimpleNamespace(results=results, names=["0°", "45°", "90°"])
+def _findings(image: Any) -> dict[str, str]:
+    seen = cues.compute(image, scenes.no_color())
+    maps = infer.estimate(seen, networks()[0], onnx.run, infer.InferSettings(symmetries=1, fine=False))
+    results: Any = SimpleNamespace(
+        stokes=image, radiance=scenes.stack(), selfcal=scenes.equal(), object_=scenes.ball_object(), maps=maps,
+        cues=seen, color=scenes.no_color(),
+    )  # fmt: skip
+    found: Any = full_size(results, (0.0, 0.0))
     lines = [
         *polarization.polarized(found),
         *polarization.of_outline(found, GateLimits()),
         polarization.ill_posed(found, GateLimits()),
     ]
     return {line.name: line.message for line in lines if line.state in ("fail", "warn")}
-
-
-@lru_cache
-def _network() -> Network | None:
-    return models.load_network(None, None, "cpu", threads=1)
 
 
 def _dressed(material: Any, albedo: float | None, rough: float | None) -> Any:
@@ -201,7 +176,7 @@ def _dressed(material: Any, albedo: float | None, rough: float | None) -> Any:
 
 def _probe(seed: int, turn: float) -> Floats:
     """A light probe (64, 128, 3) of mean 1, latitude down and longitude across, turned about the vertical."""
-    files = sorted((Path(os.environ["POLCAP_DATA"]) / "environments").glob("*.hdr"))
+    files = sorted((data() / "environments").glob("*.hdr"))
     picture = np.asarray(cv2.imread(str(files[seed % len(files)]), cv2.IMREAD_UNCHANGED))[..., ::-1]
     small = cv2.resize(np.minimum(picture, np.percentile(picture, 99.9)), (128, 64), interpolation=cv2.INTER_AREA)
     return np.roll(small / small.mean(), int(turn / (2 * np.pi) * 128), 1)

@@ -2,12 +2,10 @@
 
     python -m tests.benchmarks.bench_mask OUT calib/models/mask.onnx
 
-Scenes are kept in OUT/scenes; OUT/mask.json holds every IoU, OUT/NAME.png outlines for a person to look at.
+Scenes are stored in OUT/scenes; OUT/mask.json holds every IoU, OUT/NAME.png outlines for a person to look at.
 """
 
 import json
-import os
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +26,7 @@ from polcap.stages import mask
 from polcap.stages.mask.mask_channels import ENCODING
 from polcap.training import mask_scenes, mask_views, materials, traced_views
 from polcap.training.mask_views import ViewKind
+from tests.experiments import arguments, data
 
 SIZE = (360, 480)
 NEAR, FAR = (0.0, 0.12), (0.3, 0.7)  # flash from the lens [object distances]
@@ -56,16 +55,16 @@ class Case:
     truth: NDArray[np.bool_]  # (H, W)
 
 
-def cases(data: Path, kept: Path) -> Iterator[Case]:
-    """The sixty."""
-    kept.mkdir(parents=True, exist_ok=True)
-    files = sorted((data / "meshes" / "test").glob("*.npz"))
-    library = materials.MaterialLibrary(data / "materials" / "test", torch.device("cpu"))
+def cases(source: Path, folder: Path) -> Iterator[Case]:
+    """The sixty scenes, made once and stored in the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    files = sorted((source / "meshes" / "test").glob("*.npz"))
+    library = materials.MaterialLibrary(source / "materials" / "test", torch.device("cpu"))
     meshes = {file.stem: centred(traced_views.read_mesh(file)) for file in files}
     for number, difficulty in enumerate(DIFFICULTIES):
         for own, (stem, mesh) in enumerate(meshes.items()):
             rng = np.random.default_rng([77, number, own])
-            file = kept / f"{number:02d}-{stem}.npz"
+            file = folder / f"{number:02d}-{stem}.npz"
             if not file.exists():
                 torch.manual_seed(1000 * number + own)
                 if difficulty == "several parts":
@@ -89,9 +88,9 @@ def _write(
 
 
 def _photographed(name: str, file: Path, rng: np.random.Generator) -> Case:
-    """Three shots of the scene with noise, gains of 1.5 % and a hand's nudges, found to 0.05 px."""
-    held = np.load(file)
-    stokes, corners = held["stokes"].astype(np.float32), held["corners"]
+    """Three shots of the scene with noise, gains of 1.5 % and nudges, which are registered to 0.05 px."""
+    stored = np.load(file)
+    stokes, corners = stored["stokes"].astype(np.float32), stored["corners"]
     shots, transforms = [], []
     angle = np.radians([0.0, 45.0, 90.0])
     for k, weights in enumerate(mueller.analyzer(angle)):
@@ -113,11 +112,11 @@ def _photographed(name: str, file: Path, rng: np.random.Generator) -> Case:
     charted = len(corners) > 0
     place = ChartPlace(np.zeros((24, 4, 2)), corners) if charted else None
     color = ColorCalibration(np.eye(3), "chart" if charted else "none", place=place)
-    return Case(name, radiance, color, Alignment(np.stack(transforms), np.zeros(3), np.ones(3)), held["mask"])
+    return Case(name, radiance, color, Alignment(np.stack(transforms), np.zeros(3), np.ones(3)), stored["mask"])
 
 
 def found(case: Case, network: Network | None) -> ObjectMask | None:
-    """What the stage takes for the object; None where it says that there is none."""
+    """Mask found by the stage; None if it finds no object."""
     try:
         return mask.segment(case.radiance, case.alignment, case.color, None, network, onnx.run, mask.MaskSettings())
     except ObjectError:
@@ -130,7 +129,7 @@ def overlap(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
 
 
 def picture(case: Case, object_: ObjectMask | None) -> Floats:
-    """The scene as log radiance, with truth in green and what was found in red."""
+    """The scene as log radiance, with the true outline in green and the found one in red."""
     light = case.radiance.value.mean((0, -1))
     shown = np.clip(np.log2(np.maximum(light, 0) / np.percentile(light, 97) + 2**-8) / 8 + 1, 0, 1)
     out = cv2.cvtColor((255 * shown).astype(np.uint8), cv2.COLOR_GRAY2BGR)
@@ -141,10 +140,9 @@ def picture(case: Case, object_: ObjectMask | None) -> Floats:
 
 
 def main(out: Path, model: Path) -> None:
-    data = Path(os.environ["POLCAP_DATA"])
     network = onnx.load(model, threads=1, encoding=ENCODING)
     rows: dict[str, dict[str, float]] = {}
-    for case in cases(data, out / "scenes"):
+    for case in cases(data(), out / "scenes"):
         learned, plain = found(case, network), found(case, None)
         rows[case.name] = {
             name: 0.0 if one is None else overlap(one.mask, case.truth)
@@ -159,4 +157,5 @@ def main(out: Path, model: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    options = arguments(__doc__, "out", "model")
+    main(options.out, options.model)

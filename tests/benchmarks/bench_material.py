@@ -6,10 +6,7 @@ python tests/benchmarks/bench_material.py FOLDER [--views 9] [--width 3000] [--s
 Most samples have an F0 near the mean of its prior, so that its errors are small; `--f0` multiplies it.
 """
 
-import argparse
 import json
-import resource
-import time
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +23,7 @@ from polcap.synth.distance_fields import Bumps
 from polcap.synth.flat_views import FlatShoot
 from polcap.synth.render import Scene
 from polcap.synth.scene_materials import Coat, Color, Material
+from tests.experiments import arguments, peak_mb, rms, timed
 
 _EDGE_M = 0.0015  # of the sample, which is not compared
 
@@ -89,8 +87,7 @@ def errors(folder: Path, out: str = "material") -> dict[str, Any]:
         span = float(np.ptp(truth["height"]))
     inside = np.maximum(abs(x), abs(z)) < about["side_m"] / 2 - _EDGE_M
     true["normal"] = frames.unit(true["normal"])
-    cosine = frames.dot(true["normal"], read("normal", "RGB"))[inside]
-    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    angle = frames.angle_deg(true["normal"], read("normal", "RGB"))[inside]
     difference = {
         "albedo": read("diffuse", "RGB") - true["diffuse"],
         "roughness": read("roughness", "Y") - true["roughness"],
@@ -104,13 +101,13 @@ def errors(folder: Path, out: str = "material") -> dict[str, Any]:
         "normal": float(angle.mean()),
         "flat": float(np.degrees(np.arccos(np.clip(true["normal"][inside][:, 2], -1, 1))).mean()),
         "height": float(left.std() / span),
-        "score_normal": float(np.sqrt(np.mean(angle**2) / np.mean(read("normal_sigma", "Y")[inside] ** 2))),
+        "score_normal": rms(angle) / rms(read("normal_sigma", "Y")[inside]),
     }
     for name, value in difference.items():
-        found[name] = float(np.sqrt(np.mean(value[inside] ** 2)))
+        found[name] = rms(value[inside])
         found[f"bias_{name}"] = float(value[inside].mean())
         error = value.mean(axis=-1) if value.ndim == 3 else value
-        found[f"score_{name}"] = float(np.sqrt(np.mean((error / read(sigma[name], "Y"))[inside] ** 2)))
+        found[f"score_{name}"] = rms((error / read(sigma[name], "Y"))[inside])
     return found
 
 
@@ -123,37 +120,23 @@ def _sampled(value: Floats, x: Floats, z: Floats, side: float, texel: float) -> 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--views", type=int, default=9)
-    parser.add_argument("--width", type=int, default=1500)
-    parser.add_argument("--samples", default=",".join(SAMPLES))
-    parser.add_argument("--rays", type=int, default=1)
-    parser.add_argument("--exposures", type=int, default=1)
-    parser.add_argument("--polarization", default="yes")
-    parser.add_argument("--f0", type=float, default=1.0)
-    given = parser.parse_args()
-    for name in given.samples.split(","):
-        made, shoot = scene(name, given.f0)
-        shoot = msgspec.structs.replace(
-            shoot,
-            width=given.width,
-            height=given.width * 2 // 3 // 2 * 2,
-            samples=given.rays,
-            exposures=given.exposures,
-        )
-        session = given.folder / f"{name}-{given.views}-{given.width}{'' if given.f0 == 1 else f'-f0-{given.f0:g}'}"
+    usual = {"views": 9, "width": 1500, "samples": ",".join(SAMPLES), "rays": 1, "exposures": 1, "f0": 1.0}
+    options = arguments(__doc__, "folder", polarization=("yes", "no"), **usual)
+    for name in options.samples.split(","):
+        made, shoot = scene(name, options.f0)
+        height = options.width * 2 // 3 // 2 * 2
+        how = {"width": options.width, "height": height, "samples": options.rays, "exposures": options.exposures}
+        suffix = "" if options.f0 == 1 else f"-f0-{options.f0:g}"
+        session = options.folder / f"{name}-{options.views}-{options.width}{suffix}"
         if not session.exists():
-            flat_views.write(session, made, shoot, given.views)
-        out = "material" if given.polarization == "yes" else "without"
-        options = [] if given.polarization == "yes" else ["--set", "material.gloss.fitting.polarization_error=1"]
-        began = time.process_time()
-        app(["-q", "material", str(session), "--out", str(session / out), *options], standalone_mode=False)
-        row = {key: round(value, 4) for key, value in errors(session, out).items()}
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-        print(
-            name, json.dumps({**row, "cpu_s": round(time.process_time() - began), "gb": round(memory, 2)}), flush=True
-        )
+            flat_views.write(session, made, msgspec.structs.replace(shoot, **how), options.views)
+        out = "material" if options.polarization == "yes" else "without"
+        more = [] if options.polarization == "yes" else ["--set", "material.gloss.fitting.polarization_error=1"]
+        words = ["-q", "material", str(session), "--out", str(session / out), *more]
+        _, seconds = timed(lambda words=words: app(words, standalone_mode=False))  # type: ignore[misc]
+        figures = {key: round(value, 4) for key, value in errors(session, out).items()}
+        figures |= {"cpu_s": round(seconds), "gb": round(peak_mb() / 1000, 2)}
+        print(name, json.dumps(figures), flush=True)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ the view that was left out, with a point light at its flash. Prints errors of S0
 of the photograph: median and 95th percentile over the sample without its outer 3 mm, of gray and of the worst color.
 """
 
-import argparse
 import shutil
 from functools import partial
 from pathlib import Path
@@ -23,15 +22,13 @@ from polcap.material.stokes_view import PosedStokes
 from polcap.material.texel_grid import TO_WORLD, TexelGrid
 from polcap.optics.projection import to_grid
 from tests.blender import session
+from tests.experiments import arguments
 
 SAMPLES, EDGE_M = 64, 0.003
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("session", type=Path)
-    parser.add_argument("--view", default="view08")
-    given = parser.parse_args()
+    given = arguments(__doc__, "session", view="view08")
     others = given.session.with_name(f"{given.session.name}-without-{given.view}")
     if not others.exists():
         shutil.copytree(given.session, others, ignore=shutil.ignore_patterns(given.view, "material", "without"))

@@ -14,8 +14,8 @@ import bench_material
 import cv2
 import msgspec
 import numpy as np
-from bench_captures import kept
-from make_mitsuba import scene, seen, shot
+from bench_captures import facet_share
+from make_mitsuba import scene, seen, shot, square_crop
 
 from polcap.image_values import Bools, Floats, View
 from polcap.optics import frames, fresnel
@@ -47,11 +47,8 @@ def path_traced(stokes: Any, of: Scene, view: View, x: Floats, y: Floats, *other
     """Stokes parameters (3, H, W, 3) of `render.stokes`, with pixels inside the sample's upper side by Mitsuba."""
     out: Floats = stokes(of, view, x, y, *others)
     mask = render.gbuffer(of, view, *x.shape).mask
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    top, left = int(rows[0]), int(columns[0])
-    size = max(int(rows[-1]) - top, int(columns[-1]) - left) + 1
-    light, inner = traced(of, View(view.focal, (view.center[0] - left, view.center[1] - top), 1.0), size)
-    inside = np.s_[top : top + size, left : left + size]
+    crop, size, inside = square_crop(mask, view, 0)
+    light, inner = traced(of, crop, size)
     height, width = mask[inside].shape
     at = inner[:height, :width] & mask[inside]
     out[:, *inside][:, at] = light[:, :height, :width][:, at]
@@ -72,7 +69,7 @@ def traced(of: Scene, view: View, size: int) -> tuple[Floats, Bools]:
         out[..., k] = np.mean([shot(mi, one, view, seed=3 * number + k) for number in range(PASSES)], axis=0)
     if of.law == "rough":
         rays = frames.rays(view, size, size)
-        out[1:] *= kept(truth["normal"], truth["roughness"] ** 2, truth["ior"], rays)[..., None]
+        out[1:] *= facet_share(truth["normal"], truth["roughness"] ** 2, truth["ior"], rays)[..., None]
     return out, cv2.erode(truth["mask"].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 

@@ -3,7 +3,7 @@
 python tests/benchmarks/bench_mesh.py FOLDER [--only NAME…] [--noise]     (POLCAP_DATA for the meshes)
 
 Renders normals, depth and true contours of 20 objects as a camera of 24 MP shows them and of 12 as one of 2 MP does
-(kept in FOLDER), integrates them by plain least squares and by the stage, and prints a row for each: CPU seconds,
+(stored in FOLDER), integrates them by plain least squares and by the stage, and prints a row for each: CPU seconds,
 depth error over the depth range after the best scale, pieces, slits (edges of the mesh inside a smooth surface, px
 from the nearest true contour more than 6) and the share of the true contours that are cut. With --noise normals are
 blurred, off by 5° in waves and noisy by 1°, as estimated ones are.
@@ -12,9 +12,6 @@ A link between pixels crosses a true contour where its depth step exceeds the le
 and goes on exceeding it between ever nearer rays.
 """
 
-import argparse
-import os
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,6 +27,7 @@ from polcap.stages import surface
 from polcap.stages.surface.occlusion import least_step
 from polcap.stages.surface.triangles import boundary_edges, measure_boundary
 from polcap.synth import render, scenes, trace
+from tests.experiments import arguments, data, head, plain_maps, rms, row, timed
 
 LARGE = (
     "vase 5", "vase 1", "vase 2", "clusters 0", "clusters 1", "clusters 2", "clusters 3", "clusters 4", "bumps 0",
@@ -41,7 +39,7 @@ SMALL = (
     "train/teapot 13", "train/frypan 14", "train/wingnut 15", "test/penguin 16",
 )  # fmt: skip
 SIDE = {"24MP": 1200, "2MP": 346}  # px of half the picture's height, about what an object of 16 cm fills
-BISECTIONS = 9  # a link's last step is one between rays 1/512 px apart
+BISECTIONS = 9  # the last step of a link is between rays 1/512 px from each other
 NEAR = 6  # px within which a cut belongs to a true contour
 
 
@@ -56,42 +54,30 @@ class Case:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--only", nargs="*")
-    parser.add_argument("--noise", action="store_true")
-    options = parser.parse_args()
+    options = arguments(__doc__, "folder", "--noise", only=[""])
     options.folder.mkdir(parents=True, exist_ok=True)
     names = [f"{size} {name}" for size, of in (("2MP", SMALL), ("24MP", LARGE)) for name in of]
-    print("| scene | MP | true pieces | plain: error | s | cut: error | s | pieces | slit px | contours cut |")
-    print("| --- " * 10 + "|")
+    figures = "plain: error", "s", "cut: error", "s", "pieces", "slit px", "contours cut"
+    print(head("scene", "MP", "true pieces", *figures))
     for name in names:
-        if options.only is None or any(part in name for part in options.only):
-            print(row(name, case(options.folder, name), options.noise), flush=True)
+        if any(part in name for part in options.only):
+            print(row(name, *measure(case(options.folder, name), options.noise)), flush=True)
 
 
-def row(name: str, of: Case, noise: bool) -> str:
+def measure(of: Case, noise: bool) -> list[float]:
+    """Figures of a scene's row."""
     maps = noisy(of.maps) if noise else of.maps
-    plain, plain_s = timed(maps, surface.SurfaceSettings(stiffness=0.0))
-    mesh, seconds = timed(maps, surface.SurfaceSettings())
-    slit, found = slits(mesh, of), cut_share(mesh, of)
-    return (
-        f"| {name} | {of.maps.mask.sum() / 1e6:.2f} | {true_pieces(of)} | {error(plain, of):.4f} | {plain_s:.1f} | "
-        f"{error(mesh, of):.4f} | {seconds:.1f} | {mesh.pieces} | {slit:.0f} | {found:.0%} |"
-    )
-
-
-def timed(maps: SurfaceMaps, settings: surface.SurfaceSettings) -> tuple[ReliefMesh, float]:
-    start = time.process_time()
-    mesh = surface.integrate(maps, None, settings)
-    return mesh, time.process_time() - start
+    plain, plain_s = timed(lambda: surface.integrate(maps, None, surface.SurfaceSettings(stiffness=0.0)))
+    mesh, seconds = timed(lambda: surface.integrate(maps, None, surface.SurfaceSettings()))
+    cut = mesh.pieces, slits(mesh, of), cut_share(mesh, of)
+    return [float(of.maps.mask.sum() / 1e6), true_pieces(of), error(plain, of), plain_s, error(mesh, of), seconds, *cut]
 
 
 def error(mesh: ReliefMesh, of: Case) -> float:
     """RMS after the best scale, over the depth range."""
     inside = of.maps.mask & np.isfinite(mesh.depth)
     ours, true = mesh.depth[inside].astype(np.float64), of.depth[inside].astype(np.float64)
-    return float(np.sqrt(np.mean((ours * (ours @ true) / (ours @ ours) - true) ** 2)) / np.ptp(true))
+    return rms(ours * (ours @ true) / (ours @ ours) - true) / float(np.ptp(true))
 
 
 def contours(of: Case) -> Bools:
@@ -105,7 +91,7 @@ def contours(of: Case) -> Bools:
 
 
 def true_pieces(of: Case) -> int:
-    """Parts that hold together by links that cross no true contour, specks apart (as the mesh counts its own)."""
+    """Number of parts joined by links that cross no true contour, without specks, as the mesh counts its own."""
     mask, (height, width) = of.maps.mask, of.maps.mask.shape
     number = np.arange(height * width).reshape(height, width)
     right, down = mask[:, :-1] & mask[:, 1:] & ~of.right, mask[:-1] & mask[1:] & ~of.down
@@ -162,35 +148,27 @@ def noisy(maps: SurfaceMaps) -> SurfaceMaps:
 
 
 def case(folder: Path, name: str) -> Case:
-    """Rendered, or as it was kept."""
+    """A scene, rendered once and stored in the folder."""
     file = folder / f"{name.replace(' ', '_').replace('/', '_')}.npz"
     if not file.exists():
         np.savez(file, allow_pickle=False, **rendered(name))
-    with np.load(file) as kept:
-        mask, normal = kept["mask"], kept["normal"]
-        flat = np.ones(mask.shape, dtype=np.float32)
-        maps = SurfaceMaps(
-            normal=normal,
-            diffuse=flat[..., None].repeat(3, axis=-1) / 2,
-            specular=flat[..., None].repeat(3, axis=-1) / 25,
-            roughness=flat / 2,
-            depth_prior=None,
-            confidence=5 * flat,
-            mask=mask,
-            view=View(float(kept["view"][0]), (float(kept["view"][1]), float(kept["view"][2])), 2.0),
-            estimator="truth",
-        )
-        return Case(maps, kept["depth"], kept["right"], kept["down"])
+    with np.load(file) as stored:
+        focal, x, y = (float(one) for one in stored["view"])
+        maps = plain_maps(stored["normal"], stored["mask"], View(focal, (x, y), 2.0), error_deg=5.0)
+        return Case(maps, stored["depth"], stored["right"], stored["down"])
+
+
+def scene_of(kind: str, seed: int) -> render.Scene:
+    """A random scene of a kind of object, or with a mesh such as test/mug."""
+    if "/" in kind:
+        return scenes.with_model(scenes.random_scene(seed, "vase"), data() / "meshes" / f"{kind}.npz", seed)
+    return scenes.random_scene(seed, kind)  # type: ignore[arg-type]
 
 
 def rendered(name: str) -> dict[str, Floats | Bools]:
     size, what, seed = name.split()
     half = SIDE[size] / 2
-    if "/" in what:
-        file = Path(os.environ["POLCAP_DATA"]) / "meshes" / f"{what}.npz"
-        scene = scenes.with_model(scenes.random_scene(int(seed), "vase"), file, int(seed))
-    else:
-        scene = scenes.random_scene(int(seed), what)  # type: ignore[arg-type]
+    scene = scene_of(what, int(seed))
     scene = msgspec.structs.replace(scene, position=(0.0, 0.0, scene.position[2]), chart=None)
     view = View(focal=half / 0.13, center=(half, half), scale=2.0)
     seen = render.gbuffer(scene, view, SIDE[size], SIDE[size])
@@ -207,7 +185,7 @@ def rendered(name: str) -> dict[str, Floats | Bools]:
 
 
 def true_links(scene: render.Scene, view: View, depth: Floats, mask: Bools, axis: int) -> Bools:
-    """Links along an axis whose depth step stays, however near the rays."""
+    """Links along an axis with a depth step that does not shrink between ever nearer rays."""
     least = least_step(mask, surface.SurfaceSettings().jump)
     log = view.focal * np.log(np.where(mask, depth, 1).astype(np.float64))
     both = (mask[:, :-1] & mask[:, 1:]) if axis else (mask[:-1] & mask[1:])

@@ -10,8 +10,6 @@ truth agree, for the stage and for plain least squares. Prints the rows as a Mar
 folder for what it takes to integrate again in other ways.
 """
 
-import argparse
-import json
 import os
 import shutil
 import time
@@ -21,18 +19,16 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from bench_mesh import Case, cut_share, error, slits, true_links, true_pieces
+from bench_mesh import Case, cut_share, error, scene_of, slits, true_links, true_pieces
 
-from polcap.config import Config
 from polcap.formats.capture import reader as captures
-from polcap.optics.frames import dot
-from polcap.pipeline import models
-from polcap.pipeline.cache import MemoryCache
-from polcap.pipeline.path import UserInput, distance_m, path
+from polcap.optics import frames
+from polcap.pipeline.path import distance_m
 from polcap.results import Results
 from polcap.stage_values import SurfaceMaps
 from polcap.stages import surface
-from polcap.synth import render, scenes, shooting
+from polcap.synth import render, shooting
+from tests.experiments import Rows, arguments, process, table
 
 SHOOTS = {
     "24MP": shooting.Shoot(width=4800, height=2880, focal_mm=75.0, samples=1, exposures=2),
@@ -50,28 +46,14 @@ COLUMNS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--only", nargs="*")
-    parser.add_argument("--first-seed", type=int, default=40)
-    options = parser.parse_args()
-    options.folder.mkdir(parents=True, exist_ok=True)
-    rows = options.folder / "rows.jsonl"
-    known = [json.loads(line) for line in rows.read_text().splitlines()] if rows.exists() else []
+    options = arguments(__doc__, "folder", only=[""], first_seed=40)
+    rows = Rows(options.folder / "rows.jsonl")
     for seed, (size, kind) in enumerate(((s, k) for s in SHOOTS for k in KINDS), options.first_seed):
         name = f"{size} {kind} {seed}"
-        if any(row["scene"] == name for row in known) or not any(part in name for part in options.only or [""]):
-            continue
-        known.append({"scene": name, **measured(options.folder / "capture", size, kind, seed)})
-        with rows.open("a") as file:
-            file.write(json.dumps(known[-1]) + "\n")
-        print(line(known[-1]), flush=True)
-    print("\n|", " | ".join(COLUMNS.values()), "|\n" + "| --- " * len(COLUMNS) + "|")
-    print("\n".join(map(line, known)))
-
-
-def line(row: dict[str, Any]) -> str:
-    return "| " + " | ".join(str(row[key]) for key in COLUMNS) + " |"
+        if (name,) not in rows.done("scene") and any(part in name for part in options.only):
+            rows.add({"scene": name, **measured(options.folder / "capture", size, kind, seed)})
+            print(rows.all[-1], flush=True)
+    print(table([[one[key] for key in COLUMNS] for one in rows.all], list(COLUMNS.values())))
 
 
 def measured(folder: Path, size: str, kind: str, seed: int) -> dict[str, Any]:
@@ -80,16 +62,14 @@ def measured(folder: Path, size: str, kind: str, seed: int) -> dict[str, Any]:
     shutil.rmtree(folder, ignore_errors=True)
     scene = scene_of(kind, seed)
     shooting.write(folder, scene, msgspec.structs.replace(SHOOTS[size], seed=seed))
-    network, mask_network = models.load_network(None, None), models.load_mask_network()
-    supplied = UserInput(network=network, mask_network=mask_network)
-    found = path(captures.read(folder, None), supplied, Config(), MemoryCache(), Results)
+    found = process(captures.read(folder, None), Results)
     maps, mesh, distance = found.maps, found.mesh, distance_m(found.color, found.radiance)
     plain = surface.integrate(maps, distance, surface.SurfaceSettings(stiffness=0.0))
     of, normal = truth(scene, maps)
     if keep := os.environ.get("POLCAP_KEEP_MAPS"):
         save(Path(keep) / f"{size}_{kind.replace('/', '_')}_{seed}.npz", maps, of)
     shutil.rmtree(folder)
-    angle = np.degrees(np.arccos(np.clip(dot(maps.normal, normal)[of.maps.mask], -1, 1)))
+    angle = frames.angle_deg(maps.normal, normal)[of.maps.mask]
     return {
         "pixels": round(float(maps.mask.sum()) / 1e6, 2),
         "normal_deg": round(float(angle.mean()), 2),
@@ -102,13 +82,6 @@ def measured(folder: Path, size: str, kind: str, seed: int) -> dict[str, Any]:
         "ours": round(error(mesh, of), 4),
         "seconds": round(time.process_time() - start),
     }
-
-
-def scene_of(kind: str, seed: int) -> render.Scene:
-    if "/" not in kind:
-        return scenes.random_scene(seed, kind)  # type: ignore[arg-type]
-    file = Path(os.environ["POLCAP_DATA"]) / "meshes" / f"{kind}.npz"
-    return scenes.with_model(scenes.random_scene(seed, "vase"), file, seed)
 
 
 def truth(scene: render.Scene, maps: SurfaceMaps) -> tuple[Case, Any]:

@@ -9,67 +9,48 @@ object [%] in connected regions of at least 0.1 % of it with normals turned by 1
 the tangential part of the normal points away from the true one, at true zenith angles above 20°.
 """
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from bench_captures import kept
+from bench_captures import facet_share
 from scipy import ndimage
 
-from polcap.chart_values import ColorCalibration
 from polcap.formats import onnx
 from polcap.image_values import Floats, View
 from polcap.optics import frames
-from polcap.pipeline import models
 from polcap.stage_values import SurfaceMaps
 from polcap.stages import cues, infer
 from polcap.training.camera_errors import CameraErrors, photograph
-from polcap.training.evaluation_protocol import Case, stokes_image
+from polcap.training.evaluation_protocol import Case, stokes_image, white
 from polcap.training.map_errors import Judge
+from tests.experiments import arguments, head, networks, row
 
 ROWS = (
-    "normal_mean",
-    "normal_median",
-    "normal_mean_core",
-    "diffuse",
-    "specular",
-    "roughness",
-    "depth",
-    "rendering",
+    "normal_mean", "normal_median", "normal_mean_core", "diffuse", "specular", "roughness", "depth", "rendering",
     "turned",
-)
+)  # fmt: skip
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--model", type=Path)
-    parser.add_argument("--analytic", action="store_true", help="also without a network")
-    parser.add_argument("--clean", action="store_true")
-    parser.add_argument("--rough", action="store_true")
-    options = parser.parse_args()
-    networks = {"network": models.load_network("network", options.model, "cpu", 2)}
-    if options.analytic:
-        networks["analytic"] = None
-    print("| scene | material | estimator |", " | ".join(ROWS), "|\n| --- | --- | --- |", " --- |" * len(ROWS))
+    options = arguments(__doc__, "folder", "--analytic", "--clean", "--rough", model=Path)
+    estimators = {name: networks(name, options.model)[0] for name in ("network", "analytic")[: 1 + options.analytic]}
+    print(head("scene", "material", "estimator", *ROWS))
     table: dict[tuple[str, str], list[list[float]]] = {}
     for number, file in enumerate(sorted(options.folder.glob("*.npz"))):
         case, material = read(file, options.clean, options.rough, seed=number)
         judge = Judge(case)
-        for name, network in networks.items():
+        for name, network in estimators.items():
             maps = infer.estimate(case.cues, network, onnx.run, infer.InferSettings())
             errors = judge.score(maps) | {"turned": turned_share(maps, case.truth)}
-            row = [errors.get(key, np.nan) for key in ROWS]
-            table.setdefault((material, name), []).append(row)
-            print(f"| {case.name} | {material} | {name} |", " | ".join(f"{x:.3g}" for x in row), "|", flush=True)
-    for name in networks:
-        table["all", name] = [row for (_, estimator), rows in table.items() if estimator == name for row in rows]
+            figures = [errors.get(key, np.nan) for key in ROWS]
+            for group in (material, "all"):
+                table.setdefault((group, name), []).append(figures)
+            print(row(case.name, material, name, *figures), flush=True)
     for (material, name), rows in table.items():
-        mean = " | ".join(f"{x:.3g}" for x in np.nanmean(rows, axis=0))
-        print(f"| mean of {len(rows)} | {material} | {name} |", mean, "|")
+        print(row(f"mean of {len(rows)}", material, name, *np.nanmean(rows, axis=0)))
 
 
 def turned_share(maps: SurfaceMaps, truth: SurfaceMaps) -> float:
@@ -89,7 +70,7 @@ def read(file: Path, clean: bool, rough: bool, seed: int) -> tuple[Case, str]:
     mask, about = made["mask"], json.loads(str(made["about"]))
     view = _view(made)
     rays = frames.rays(view, *mask.shape)
-    scene, diffuse, given, v = (
+    scene, diffuse, inside, v = (
         torch.from_numpy(np.asarray(value, order="C"))[None]
         for value in (scene_light(made, rough), made["diffuse"], mask, rays)
     )
@@ -98,21 +79,13 @@ def read(file: Path, clean: bool, rough: bool, seed: int) -> tuple[Case, str]:
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         errors = CameraErrors.none(1, one.device) if clean else CameraErrors.stated(1, one.device)
-        seen = photograph(scene[0][:, None], diffuse, given, v, torch.from_numpy(at), errors)
-    white = ColorCalibration(np.eye(3, dtype=np.float32), "profile")
-    measured = cues.compute(stokes_image(seen, at, mask, view), white)
+        seen = photograph(scene[0][:, None], diffuse, inside, v, torch.from_numpy(at), errors)
+    measured = cues.compute(stokes_image(seen, at, mask, view), white())
     depth = np.where(mask, (made["depth"] - made["middle"]) / made["unit"], 0).astype(np.float32)
     truth = SurfaceMaps(
-        normal=made["normal"],
-        diffuse=made["diffuse"],
-        specular=made["specular"],
-        roughness=made["roughness"],
-        depth_prior=depth,
-        confidence=np.zeros(mask.shape, np.float32),
-        mask=mask,
-        view=view,
-        estimator="truth",
-    )
+        made["normal"], made["diffuse"], made["specular"], made["roughness"], depth,
+        np.zeros(mask.shape, np.float32), mask, view, "truth",
+    )  # fmt: skip
     return Case(file.stem, measured, measured, measured, truth, depth), about["material"]
 
 
@@ -121,7 +94,7 @@ def scene_light(made: dict[str, Any], rough: bool = False) -> Floats:
     light = made["stokes"].copy()
     if rough or json.loads(str(made["about"]))["rough_law"]:
         rays = frames.rays(_view(made), *made["mask"].shape)
-        light[1:] *= kept(made["normal"], made["roughness"] ** 2, made["ior"], rays)[..., None]
+        light[1:] *= facet_share(made["normal"], made["roughness"] ** 2, made["ior"], rays)[..., None]
     return np.asarray(light)
 
 

@@ -9,7 +9,6 @@ closest points.
 """
 
 import json
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,6 +31,7 @@ from polcap.image_values import Floats
 from polcap.pipeline.cache import LazyCache, MemoryCache
 from polcap.pipeline.request import Request
 from polcap.synth import all_around, scenes
+from tests.experiments import data, row, true_pose
 
 PATTERN_M = 0.006  # size of the pattern
 ROUNDS, NEAR = 20, 0.9  # of the placing; share of the nearest points that it uses
@@ -52,15 +52,13 @@ def main(out: Path, mesh: str, views: int, step: int) -> None:
         turns = rotation_errors(pairs)
         residual = np.mean([one.residual_px for one in processed.poses.views.values()])
         away = 100 * distance(folder, results, processed.poses.metric, pairs)
-        print(
-            f"| {mesh}, {len(turns)} of {len(found.views)} views | {'board' if board != 'none' else 'features'} | "
-            f"{turns.mean():.2f}, {turns.max():.2f} | {residual:.2f} | {away:.2f} |"
-        )
+        used, by = f"{mesh}, {len(turns)} of {len(found.views)} views", "board" if board != "none" else "features"
+        print(row(used, by, f"{turns.mean():.2f}, {turns.max():.2f}", float(residual), away))
 
 
 def render(folder: Path, mesh: str, board: Any, views: int) -> None:
     """Views of 1500 × 1000 px of a mesh with two fine patterns."""
-    file = Path(os.environ["POLCAP_DATA"]) / "meshes" / "test" / f"{mesh}.npz"
+    file = data() / "meshes" / "test" / f"{mesh}.npz"
     scene = scenes.with_model(scenes.random_scene(0, "bumps"), file, 0)
     fine = zip(scene.coat.materials, ("veins", "noise"))
     materials = tuple(replace(one, size=PATTERN_M, pattern=pattern) for one, pattern in fine)
@@ -71,7 +69,7 @@ def render(folder: Path, mesh: str, board: Any, views: int) -> None:
 def true_poses(folder: Path, views: Sequence[FusionView]) -> list[tuple[Pose, Pose]]:
     """Found and true pose of each used view."""
     stated = json.loads((folder / "truth.json").read_text())["views"]
-    true = {one["name"]: Pose(np.array(one["rotation"]), np.array(one["translation"])) for one in stated}
+    true = {one["name"]: true_pose(one) for one in stated}
     return [(view.pose, true[view.name]) for view in views]
 
 

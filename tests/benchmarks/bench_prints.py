@@ -7,49 +7,39 @@ captures have a rough interface. FOLDER gets the captures, which are made once. 
 the estimated roughness inside the object, where the true one has none.
 """
 
-import argparse
 from pathlib import Path
 from typing import Literal
 
 import msgspec
 import numpy as np
 
-from polcap.config import Config
 from polcap.formats.capture import reader as captures
-from polcap.pipeline import models
-from polcap.pipeline.cache import MemoryCache
-from polcap.pipeline.path import UserInput, path
-from polcap.results import Results
+from polcap.optics import frames
+from polcap.results import ResultsUntilInfer
 from polcap.stage_values import SurfaceMaps
 from polcap.synth import shooting
 from polcap.synth.render import Scene
 from polcap.synth.scene_materials import Coat, Material
 from polcap.synth.scenes import random_scene
+from tests.experiments import arguments, head, networks, process, raw_pixels, rms, row
 
 ROWS = ("roughness", "estimated", "spread", "error", "F0 error", "normal mean")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--model", type=Path)
-    parser.add_argument("--captures", type=int, default=20)
-    parser.add_argument("--width", type=int, default=640, help="RAW px, 4:3")
-    options = parser.parse_args()
-    supplied = UserInput(
-        network=models.load_network(None, options.model, "cpu", 1), mask_network=models.load_mask_network(1)
-    )
-    print("| capture |", " | ".join(ROWS), "|\n| --- |", " --- |" * len(ROWS))
+    options = arguments(__doc__, "folder", model=Path, captures=20, width=640)
+    using = networks(model=options.model)
+    print(head("capture", *ROWS))
     rows = []
     for number in range(options.captures):
         scene, folder = printed(number), options.folder / f"{number:02d}"
         if not folder.exists():
             shoot = shooting.Shoot(seed=number, width=options.width, height=options.width * 3 // 4)
             shooting.write(folder, scene, shoot)
-        found = path(captures.read(folder), supplied, Config(), MemoryCache(), Results).maps
+        found = process(captures.read(folder), ResultsUntilInfer, using).maps
         rows.append(measure(folder, found, scene.coat.materials[0]))
-        print(f"| {folder.name} |", " | ".join(f"{x:.3g}" for x in rows[-1]), "|", flush=True)
-    print("| mean |", " | ".join(f"{x:.3g}" for x in np.mean(rows, axis=0)), "|")
+        print(row(folder.name, *rows[-1]), flush=True)
+    print(row("mean", *np.mean(rows, axis=0)))
 
 
 def printed(number: int) -> Scene:
@@ -68,17 +58,15 @@ def printed(number: int) -> Scene:
 
 def measure(folder: Path, maps: SurfaceMaps, material: Material) -> list[float]:
     """One capture's figures, in the order of ROWS."""
-    step, (x0, y0) = round(maps.view.scale), (round(at * maps.view.scale) for at in maps.view.origin)
-    height, width = maps.mask.shape
+    step, cut = raw_pixels(maps)
     with np.load(folder / "truth.npz") as file:
-        cut = np.s_[y0 : y0 + step * height : step, x0 : x0 + step * width : step]
-        normal, inside = file["normal"][cut].astype(np.float32), maps.mask & (file["mask"][cut] == 1)
+        normal, mask = (file[name][cut][::step, ::step].astype(np.float32) for name in ("normal", "mask"))
+    inside = maps.mask & (mask == 1)
     rough, f0 = maps.roughness[inside], maps.specular[inside].mean(axis=-1)
     true_f0 = ((material.ior - 1) / (material.ior + 1)) ** 2
-    angle = np.degrees(np.arccos(np.clip((normal * maps.normal).sum(-1)[inside], -1, 1)))
-    error = float(np.sqrt(np.mean((rough - material.roughness[0]) ** 2)))
-    f0_error = float(np.sqrt(np.mean((f0 - true_f0) ** 2)))
-    return [material.roughness[0], float(rough.mean()), float(rough.std()), error, f0_error, float(angle.mean())]
+    true_rough, angle = material.roughness[0], frames.angle_deg(normal, maps.normal)[inside]
+    means = float(rough.mean()), float(rough.std())
+    return [true_rough, *means, rms(rough - true_rough), rms(f0 - true_f0), float(angle.mean())]
 
 
 if __name__ == "__main__":

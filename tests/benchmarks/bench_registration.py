@@ -22,6 +22,7 @@ from polcap.optics.projection import transform_points
 from polcap.optics.registration import Pyramid, register, scaled
 from polcap.stages import align, hdr
 from tests import scenes
+from tests.experiments import data
 
 SIZE = (480, 600)
 MOTIONS = [  # reference px → px of the other frame
@@ -41,7 +42,7 @@ def main() -> None:
     if "POLCAP_DATA" not in os.environ:
         return
     print("shots of the rendered captures: error of the second and the third, px of the merged picture")
-    for file in sorted((Path(os.environ["POLCAP_DATA"]) / "rendered").glob("*.truth.json")):
+    for file in sorted((data() / "rendered").glob("*.truth.json")):
         print(f"{file.name.split('.')[0]:16s}", *(f"{error:.4f}" for error in _capture_errors(file)))
 
 

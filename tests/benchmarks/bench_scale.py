@@ -11,7 +11,6 @@ and a flash at the lens, and with the flash where the light's slope puts it; the
 depth; and how many 1σ of the stated doubt the third is.
 """
 
-import argparse
 from dataclasses import replace
 
 import cv2
@@ -31,6 +30,7 @@ from polcap.stages.whitebalance import WhitebalanceSettings
 from polcap.synth import color_checker, render
 from polcap.synth.render import Scene
 from polcap.synth.scenes import random_scene
+from tests.experiments import arguments, rms
 
 _VIEW = View(960.0, (319.5, 239.5), 2.0)  # 640 × 480 superpixels of 37° across
 _SAMPLES = 4  # rays per pixel side
@@ -39,12 +39,7 @@ _CAMERA = np.array([[0.28, 0.10, 0.07], [0.08, 0.71, 0.22], [0.02, 0.18, 0.66]])
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--captures", type=int, default=36)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--falloff", type=float, default=0.0)
-    parser.add_argument("--perfect-chart", action="store_true")
-    options = parser.parse_args()
+    options = arguments(__doc__, "--perfect-chart", captures=36, first=0, falloff=0.0)
     rows = []
     for number in range(options.first, options.first + options.captures):
         try:
@@ -58,9 +53,9 @@ def main() -> None:
     for name, off in zip(rules, found.T):
         median, most = np.percentile(np.abs(off), (50, 90))
         print(f"{name:20} median {median:5.2f} %, 90th percentile {most:5.2f} %, mean {off.mean():+5.2f} %")
-    print(f"errors in 1σ of the doubt: rms {np.sqrt(np.mean(found[:, 5] ** 2)):.2f}")
+    print(f"errors in 1σ of the doubt: rms {rms(found[:, 5]):.2f}")
     normal, flash, away = (float(column.mean()) for column in found.T[6:])
-    print(f"normal off by {normal:.2f}°, flash by {flash:.3f} distances; it stands {away:.3f} from the lens")
+    print(f"normal off by {normal:.2f}°, flash by {flash:.3f} distances, at {away:.3f} from the lens")
 
 
 def measure(number: int, falloff: float, printed: float) -> tuple[float, ...]:
@@ -83,7 +78,7 @@ def measure(number: int, falloff: float, printed: float) -> tuple[float, ...]:
     errors = [100 * (factor / true - 1) for factor in (*factors, bulge * factors[1], bulge * factors[2])]
     doubt = scale.sigma(stokes, color)
     assert doubt is not None
-    tilt = float(np.degrees(np.arccos(np.clip(color.light.normal @ scene.chart.axes[0], -1, 1))))
+    tilt = float(frames.angle_deg(color.light.normal, scene.chart.axes[0]))
     flash = np.array(scene.light[:2]) / -scene.chart.center[2]
     away = np.linalg.norm([color.light.flash[:2] - flash, flash], axis=1)
     return (*errors, errors[2] / 100 / doubt, tilt, *(float(a) for a in away))
@@ -126,14 +121,8 @@ def photograph(scene: Scene, falloff: float, printed: float, random: np.random.G
         )
     value = picture @ _CAMERA.T * (0.3 / picture.max())
     value = value + random.normal(size=value.shape) * np.sqrt(value / 30_000 + 1e-8)
-    return AngleStack(
-        value=value[None].astype(np.float32),
-        variance=np.full((1, *value.shape), 1e-8, np.float32),
-        quality=np.zeros((1, 480, 640), np.uint8),
-        angle=np.zeros(1),
-        view=_VIEW,
-        bracket=single_frames(1),
-    )
+    variance, quality = np.full((1, *value.shape), 1e-8, np.float32), np.zeros((1, 480, 640), np.uint8)
+    return AngleStack(value[None].astype(np.float32), variance, quality, np.zeros(1), _VIEW, single_frames(1))
 
 
 def truth(scene: Scene, object_: GBuffer, falloff: float) -> float:

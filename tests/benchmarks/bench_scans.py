@@ -11,9 +11,6 @@ References
 Cao, Santo, Shi, Okura & Matsushita, Bilateral normal integration, ECCV 2022.
 """
 
-import os
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -23,27 +20,26 @@ from scipy import sparse
 from scipy.sparse.linalg import cg
 
 from polcap.image_values import Floats, View
-from polcap.mesh_values import ReliefMesh
 from polcap.stage_values import SurfaceMaps
 from polcap.stages import surface
 from polcap.stages.surface.slope_equations import normal_field, slope_terms
+from tests.experiments import data, head, plain_maps, row, timed
 
+LEAST_SQUARES, POLCAP = surface.SurfaceSettings(stiffness=0.0), surface.SurfaceSettings()
 STIFFNESS = 2.0
 ITERATIONS, TOLERANCE = 150, 1e-4
 
 
 def main() -> None:
-    print("| object | least squares: mm | s | polcap: mm | s | bilateral: mm | s |\n" + "| --- " * 7 + "|")
-    for folder in sorted((Path(os.environ["POLCAP_DATA"]) / "real/scanned_normals").iterdir()):
+    print(head("object", "least squares: mm", "s", "polcap: mm", "s", "bilateral: mm", "s"))
+    for folder in sorted((data() / "real/scanned_normals").iterdir()):
         maps, truth = scan(folder)
-        plain, ours = surface.SurfaceSettings(stiffness=0.0), surface.SurfaceSettings()
-        works = (
-            partial(surface.integrate, maps, None, plain),
-            partial(surface.integrate, maps, None, ours),
-            partial(bilateral, maps),
-        )
-        figures = [timed_error(work, truth) for work in works]
-        print(f"| {folder.name} | " + " | ".join(f"{error:.3f} | {seconds:.2f}" for error, seconds in figures) + " |")
+        works = (partial(integrated, maps, settings) for settings in (LEAST_SQUARES, POLCAP))
+        cells: list[object] = []
+        for work in (*works, partial(bilateral, maps)):
+            depth, seconds = timed(work)
+            cells += [mean_error(depth, truth), seconds]
+        print(row(folder.name, *cells))
 
 
 def scan(folder: Path) -> tuple[SurfaceMaps, Floats]:
@@ -51,29 +47,15 @@ def scan(folder: Path) -> tuple[SurfaceMaps, Floats]:
     mask = np.asarray(cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE)) > 0
     normal = np.asarray(cv2.imread(str(folder / "normal_map.png"), cv2.IMREAD_UNCHANGED))[..., ::-1] / 65535 * 2 - 1
     camera = np.loadtxt(folder / "K.txt")
-    flat = np.ones(mask.shape, dtype=np.float32)
-    maps = SurfaceMaps(
-        normal=np.where(mask[..., None], normal, 0).astype(np.float32),
-        diffuse=flat[..., None].repeat(3, axis=-1) / 2,
-        specular=flat[..., None].repeat(3, axis=-1) / 25,
-        roughness=flat / 2,
-        depth_prior=None,
-        confidence=flat,
-        mask=mask,
-        view=View(float(camera[0, 0]), (float(camera[0, 2]), float(camera[1, 2])), 1.0),
-        estimator="scan",
-    )
+    view = View(float(camera[0, 0]), (float(camera[0, 2]), float(camera[1, 2])), 1.0)
+    maps = plain_maps(np.where(mask[..., None], normal, 0).astype(np.float32), mask, view, error_deg=1.0)
     with np.load(folder / "depth_gt.npz") as stored:
         return maps, np.where(mask, stored["depth_gt"].astype(np.float64), np.nan)
 
 
-def timed_error(work: Callable[[], ReliefMesh | Floats], truth: Floats) -> tuple[float, float]:
-    """Mean absolute error after the median scale [mm], and CPU seconds."""
-    start = time.process_time()
-    result = work()
-    seconds = time.process_time() - start
-    depth = result.depth if isinstance(result, ReliefMesh) else result
-    return mean_error(depth, truth), seconds
+def integrated(maps: SurfaceMaps, settings: surface.SurfaceSettings) -> Floats:
+    """Depth (H, W) by polcap."""
+    return surface.integrate(maps, None, settings).depth
 
 
 def mean_error(depth: Floats, truth: Floats) -> float:

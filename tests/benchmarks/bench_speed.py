@@ -6,7 +6,7 @@ Captures of 3 angles × 3 exposures are made below FOLDER where they are missing
 LibRaw's unpacking of the same files on two processes, one copy of the merged picture (a read and a write at
 memory bandwidth), the bare call of the network on the object's crop, and the encoding of the pictures of the
 result with the same libraries. Seconds are user + system time of the whole process tree, so that a busy machine
-is no slow one; ratios are what is compared. Writes speed.json and speed.md, and adds a line to
+is no slow one; the ratios are compared. Writes speed.json and speed.md, and adds a line to
 tests/benchmarks/speed_history.jsonl.
 """
 
@@ -17,6 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command sets it, be
 import argparse
 import json
 import platform
+import shutil
 import subprocess
 import sys
 import threading
@@ -59,12 +60,12 @@ class Bench:
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument("folder", type=Path)
-    options.add_argument("--megapixels", default="6,24")
-    options.add_argument("--out", type=Path, default=Path("speed.json"))
-    given = options.parse_args()
-    rows = [measure(given.folder, float(size)) for size in given.megapixels.split(",")]
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--megapixels", default="6,24")
+    parser.add_argument("--out", type=Path, default=Path("speed.json"))
+    options = parser.parse_args()
+    rows = [measure(options.folder, float(size)) for size in options.megapixels.split(",")]
     start = cpu_of([sys.executable, "-m", "polcap", "--help"])
     document = {
         "polcap": __version__,
@@ -72,8 +73,8 @@ def main() -> None:
         "help_cpu_s": round(start, 3),
         "sizes": [shown(row) for row in rows],
     }
-    given.out.write_text(json.dumps(document, indent=1) + "\n")
-    given.out.with_suffix(".md").write_text(table(rows, start))
+    options.out.write_text(json.dumps(document, indent=1) + "\n")
+    options.out.with_suffix(".md").write_text(table(rows, start))
     with HISTORY.open("a") as history:
         ratios = {f"{row.megapixels:g}": round(ratio(row), 2) for row in rows}
         history.write(json.dumps({"polcap": __version__, "time": time.strftime("%F"), "ratio": ratios}) + "\n")
@@ -84,10 +85,10 @@ def measure(folder: Path, megapixels: float) -> Bench:
     capture = made(folder, megapixels)
     out = folder / f"out{megapixels:g}"
     row = Bench(megapixels)
-    subprocess.run(["rm", "-rf", str(out)], check=True)
-    with watched(row):  # a run of its own: who looks at memory holds up who fetches it
+    shutil.rmtree(out, ignore_errors=True)
+    with watched(row):  # a run of its own: reading the memory delays the run
         processed(capture, out)
-    subprocess.run(["rm", "-rf", str(out)], check=True)
+    shutil.rmtree(out, ignore_errors=True)
     row.wall["cold"], row.cold = processed(capture, out)
     command = [sys.executable, "-m", "polcap", "process", str(capture), "--out", str(out)]
     row.again, row.warm = cpu_of(command), cpu_of(command)
@@ -241,7 +242,7 @@ def watched(row: Bench) -> Iterator[None]:
 
 
 def anonymous_mb() -> float:
-    """Proportional share of the memory that no file stands behind, MB."""
+    """Anonymous memory of the process tree, shared parts counted once, MB."""
     total = 0
     for place in tree():
         try:

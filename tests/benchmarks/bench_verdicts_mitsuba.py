@@ -9,37 +9,27 @@ verdict, the expected and the actual error of the normals (medians over the obje
 fail; then how often each gate spoke.
 """
 
-import argparse
 import shutil
-import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from bench_mitsuba import scene_light
-from bench_weaknesses import networks
 
-from polcap.chart_values import ChartRequest
-from polcap.config import Config
 from polcap.errors import InputError
-from polcap.formats.capture import reader as captures
 from polcap.image_values import Bools, Floats
-from polcap.pipeline import path
-from polcap.pipeline.cache import MemoryCache
+from polcap.optics import frames
 from polcap.quality import gates
-from polcap.quality.gate_values import Gate, full_size
-from polcap.results import Results
+from polcap.quality.gate_values import Gate
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Cluster
 from polcap.synth.forward_camera import SENSOR_WIDTH_MM
 from polcap.synth.render import Scene
 from polcap.synth.scenes import random_scene
 from polcap.synth.shooting import Shoot, Studio, Take
+from tests.experiments import arguments, judge, row
 
 WIDTH, HEIGHT, TIMES = 1152, 864, 2  # visible RAW px; RAW px per pixel of a scene
 DISTANCE = 0.7  # m
@@ -50,22 +40,18 @@ ANGLES = (0.0, 45.0, 90.0)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", type=Path)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--lamp", type=_numbers)
-    parser.add_argument("--turned", type=_numbers, default=np.array(ANGLES))
-    options = parser.parse_args()
+    options = arguments(__doc__, "scenes", "folder", lamp=str, turned="0,45,90")
+    lamp = _numbers(options.lamp) if options.lamp else None
     spoke: Counter[str] = Counter()
     for seed, file in enumerate(sorted(options.scenes.glob("*.npz"))):
         with np.load(file) as stored:
             scene = {name: stored[name] for name in stored.files}
         place = options.folder / file.stem
-        corner = photograph(place, scene, seed, options.lamp, options.turned)
+        corner = photograph(place, scene, seed, lamp, _numbers(options.turned))
         try:
             lines, error = judged(place, scene, corner)
         except InputError as refused:
-            print(f"| {file.stem} | refused | | | {refused} |", flush=True)
+            print(row(file.stem, "refused", "", "", refused), flush=True)
             continue
         finally:
             shutil.rmtree(place)
@@ -74,7 +60,7 @@ def main() -> None:
         spoke[gates.verdict(lines)] += 1
         expected = next(line.value for line in lines if line.name == "normal error")
         names = "; ".join(f"{line.name} {line.state} {line.value} ({line.cost_deg:.0f}°)" for line in said)
-        print(f"| {file.stem} | {gates.verdict(lines)} | {expected} | {error:.1f} | {names} |", flush=True)
+        print(row(file.stem, gates.verdict(lines), expected, error, names), flush=True)
     print(spoke.most_common())
 
 
@@ -145,10 +131,7 @@ def _enlarged(image: Floats | Bools, how: int) -> Floats:
 
 def judged(place: Path, scene: dict[str, Any], corner: tuple[int, int]) -> tuple[list[Gate], float]:
     """All gates of the capture, and the median error of its normals in degrees."""
-    capture = captures.read(place)
-    user = path.UserInput(ChartRequest("auto"), None, *networks())
-    found = path.path(capture, user, Config(), MemoryCache(), Results)
-    lines = gates.judge(full_size(found, capture.focal_doubt), Config().gates)
+    found, lines = judge(place)
     maps = found.maps
     rows, columns = np.nonzero(maps.mask)
     x = np.round((columns + maps.view.origin[0]) - corner[0] / TIMES).astype(int)
@@ -156,8 +139,7 @@ def judged(place: Path, scene: dict[str, Any], corner: tuple[int, int]) -> tuple
     height, width = scene["mask"].shape
     on = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     on[on] = scene["mask"][y[on], x[on]]
-    cosine = (maps.normal[rows[on], columns[on]] * scene["normal"][y[on], x[on]]).sum(-1)
-    return lines, float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1)))))
+    return lines, float(np.median(frames.angle_deg(maps.normal[rows[on], columns[on]], scene["normal"][y[on], x[on]])))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Fits `_WRONG`, `_REGION` and `_CELL` of `infer/shape/half_turns.py` (odds of a wrong azimuth side) on known normals.
 
-    python tests/benchmarks/fit_half_turns.py DATA SCENES … [--sixths 27] [--model ONNX]
+    python tests/benchmarks/fit_half_turns.py DATA --scenes FOLDER … [--sixths 27] [--model ONNX]
 
-SCENES are folders of `make_mitsuba.py`, of training meshes: black gloss and others; every third is seen under the
+The scenes are folders of `make_mitsuba.py`, of training meshes: black gloss and others; every third is seen under the
 rough law. Added to them are six pictures for each of --sixths: training meshes and materials in both protocols at 256².
 
 Cells of the network and of the inversion whose two sides differ by more than 10° give `_WRONG` and `_CELL`; every
@@ -11,13 +11,11 @@ to learn from. A region counts by what turning it changes of the mean normal err
 regions of its picture. Prints the three laws, and what the accepted regions gain and lose.
 """
 
-import argparse
 import tempfile
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
-import fit_expected_error
 import numpy as np
 from bench_mitsuba import read
 from numpy.typing import NDArray
@@ -27,30 +25,27 @@ from polcap.formats import onnx
 from polcap.image_values import Floats
 from polcap.optics import frames
 from polcap.optics.resize import area_mean
-from polcap.pipeline import models
 from polcap.stage_values import Cues, Network
 from polcap.stages.infer import analytic, learned, sizes_and_positions
 from polcap.stages.infer.shape import half_turns
 from polcap.training import evaluation_materials, evaluation_protocol, traced_views
 from polcap.training.evaluation_protocol import Case, Protocol
+from tests.experiments import arguments, networks
 
 MOST_DEG = 0.5  # that one region counts for
 CLEAR_DEG = 10.0  # cells whose two sides differ by less say nothing
 SHRINK = 1e-4  # weight of the squared coefficients
 SIZE = 256  # px, of the protocols' pictures
+MESHES = 6  # of the evaluation
+OTHER_SEEDS = 2028, 20281128  # of patterns and pictures: not the evaluation's
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("scenes", type=Path, nargs="+")
-    parser.add_argument("--sixths", type=int, default=27)
-    parser.add_argument("--model", type=Path)
-    options = parser.parse_args()
-    network = models.load_network("network", options.model, "cpu", 1)
+    options = arguments(__doc__, "data", scenes=[], sixths=27, model=Path)
+    network = networks("network", options.model)[0]
     assert network is not None
     network_cells, cells, grids = [], [], []
-    for case in chain(path_traced(options.scenes), pictures(options.data, options.sixths)):
+    for case in chain(path_traced([Path(one) for one in options.scenes]), pictures(options.data, options.sixths)):
         grid, terms, change = predicted(case, network)
         clear = np.abs(change) > CLEAR_DEG
         network_cells.append((terms[clear], change[clear] > 0, np.full(int(clear.sum()), 1 / max(int(clear.sum()), 1))))
@@ -80,14 +75,27 @@ def path_traced(folders: list[Path]) -> Iterator[Case]:
 
 def pictures(data: Path, sixths: int) -> Iterator[Case]:
     """Training meshes and materials as `polcap evaluate` draws its own, in either protocol by turns."""
-    evaluation_materials._SEED, evaluation_protocol._SEED = fit_expected_error.OTHER_SEEDS
+    evaluation_materials._SEED, evaluation_protocol._SEED = OTHER_SEEDS
     meshes = len(traced_views.training_meshes(data))
     for sixth in range(sixths):
         with tempfile.TemporaryDirectory() as folder:
-            fit_expected_error.linked(data, Path(folder), sixth, meshes)
+            linked(data, Path(folder), sixth, meshes)
             drawn = [Protocol(Path(folder), SIZE, which) for which in (2, 1)]
-            for number in range(fit_expected_error.MESHES):
-                yield drawn[number % 2].case(sixth * fit_expected_error.MESHES + number)
+            for number in range(MESHES):
+                yield drawn[number % 2].case(sixth * MESHES + number)
+
+
+def linked(data: Path, folder: Path, sixth: int, meshes: int) -> None:
+    """Link six training meshes and ten training materials where `Protocol` looks for the evaluation's."""
+    turn, place = divmod(sixth, meshes // MESHES)
+    own = np.random.default_rng(turn).permutation(meshes)[place * MESHES :][:MESHES]
+    files = traced_views.training_meshes(data)
+    sets = sorted(path.parent for path in (data / "materials" / "train").glob("*/albedo.jpg"))
+    worn = np.random.default_rng([sixth]).permutation(len(sets))[: evaluation_materials.TEXTURES]
+    for kind, chosen in (("meshes", [files[k] for k in own]), ("materials", [sets[k] for k in worn])):
+        (folder / kind / "test").mkdir(parents=True)
+        for path in chosen:
+            (folder / kind / "test" / path.name).symlink_to(path.resolve())
 
 
 def predicted(case: Case, network: Network) -> tuple[half_turns.Grid, Floats, Floats]:
@@ -130,8 +138,7 @@ def inverted(case: Case) -> tuple[Floats, NDArray[np.bool_], Floats]:
 def gain_of_turning(grid: half_turns.Grid, case: Case) -> Floats:
     """Error of each cell's normal less that of its half-turn, degrees (h, w); 0 outside."""
     local = frames.to_ray_frame(case.truth.normal, case.cues.rays) * case.truth.mask[..., None]
-    truth = area_mean(local.astype(np.float32), grid.mask.shape)
-    truth /= np.maximum(np.linalg.norm(truth, axis=-1, keepdims=True), 1e-6)
+    truth = frames.unit(area_mean(local.astype(np.float32), grid.mask.shape))
     lean = np.moveaxis(grid.lean, 0, -1)
     cosine = np.sqrt(np.maximum(1 - (lean**2).sum(axis=-1), 0)) * truth[..., 2]
     across = (lean * truth[..., :2]).sum(axis=-1)

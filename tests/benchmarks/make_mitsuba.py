@@ -12,9 +12,7 @@ The command writes one .npz per scene and skips existing ones. A scene is render
 DoLP, from two halves with independent seeds, is below 0.1 %, or 64 passes are done.
 """
 
-import argparse
 import json
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,11 +23,12 @@ import plastic
 import trimesh
 
 from polcap.formats import atomic, scene_files
-from polcap.image_values import Floats, View
+from polcap.image_values import Bools, Floats, View
 from polcap.optics import frames, fresnel
 from polcap.optics.mesh_tracer import Triangles
 from polcap.synth import scene_materials
 from polcap.training import traced_views
+from tests.experiments import arguments, data
 
 FACES = 100_000  # at least, after subdivision: each has one colour
 TEXELS = 1024  # side of the bitmap that holds the faces' colours
@@ -38,36 +37,33 @@ GOAL = 1e-3  # DoLP, 1σ: 95 % of the lit pixels are to lie within twice that
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--data", type=Path, default=os.environ.get("POLCAP_DATA"))
-    parser.add_argument("--scenes", type=int, default=12)
-    parser.add_argument("--size", type=int, default=256)
-    parser.add_argument("--depth", type=int, default=5, help="longest path; 2 is direct light only")
-    parser.add_argument("--meshes", choices=("test", "train", "withheld"), default="test")
-    parser.add_argument("--material", choices=("mixed", "kinds", *MATERIALS), default="mixed")
-    options = parser.parse_args()
+    options = arguments(
+        __doc__, "folder", data=Path, scenes=12, size=256, depth=5, meshes=("test", "train", "withheld"),
+        material=("mixed", "kinds", *MATERIALS),
+    )  # fmt: skip
+    source = options.data or data()
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_mono_polarized")
     mi.set_log_level(mi.LogLevel.Error)
-    withheld = [options.data / "meshes" / "train" / f"{name}.npz" for name in sorted(traced_views.WITHHELD)]
     meshes = {
-        "train": traced_views.training_meshes(options.data),
-        "test": sorted((options.data / "meshes" / "test").glob("*.npz")),
-        "withheld": withheld,
+        "train": traced_views.training_meshes(source),
+        "test": sorted((source / "meshes" / "test").glob("*.npz")),
+        "withheld": [source / "meshes" / "train" / f"{name}.npz" for name in sorted(traced_views.WITHHELD)],
     }[options.meshes]
-    sets = sorted(p.parent for p in (options.data / "materials" / "test").glob("*/albedo.jpg"))
+    sets = sorted(p.parent for p in (source / "materials" / "test").glob("*/albedo.jpg"))
     for index in range(options.scenes):
-        mesh = meshes[index % len(meshes)]
-        file = options.folder / f"{index:02d}_{mesh.stem}.npz"
+        file_of_mesh = meshes[index % len(meshes)]
+        file = options.folder / f"{index:02d}_{file_of_mesh.stem}.npz"
         if file.exists():
             continue
         random = np.random.default_rng([2026, index])
         texture = sets[index // 2 % len(sets)] if index % 2 else None
         name = list(MATERIALS)[index % len(MATERIALS)] if options.material == "kinds" else options.material
         began = time.monotonic()
-        made, about = build(mi, traced_views.read_mesh(mesh), name, texture, options.size, options.depth, random)
+        mesh = traced_views.read_mesh(file_of_mesh)
+        pose = traced_views.random_pose(mesh, options.size, random)
+        made, about = shoot(mi, mesh, pose, name, texture, options.size, options.depth, random)
         with atomic.path(file) as temporary:
             np.savez_compressed(temporary, allow_pickle=False, about=np.array(json.dumps(about)), **made)
         print(file.name, json.dumps(about), f"{time.monotonic() - began:.0f} s", flush=True)
@@ -100,21 +96,15 @@ MATERIALS = {
 }
 
 
-def build(
-    mi: Any, mesh: Triangles, name: str, texture: Path | None, size: int, depth: int, random: np.random.Generator
-) -> tuple[dict[str, Floats], dict[str, Any]]:
-    """Stokes parameters (3, H, W, 3) in the frame of each ray, truth maps, camera; and how it was made."""
-    pose = traced_views.random_pose(mesh, size, random)
-    return shoot(mi, mesh, pose, name, texture, size, depth, random)
-
-
 def shoot(
     mi: Any, mesh: Triangles, pose: tuple[Floats, Floats, View], name: str, texture: Path | None, size: int, depth: int,
     random: np.random.Generator, light: list[float] | None = None,
 ) -> tuple[dict[str, Floats], dict[str, Any]]:  # fmt: skip
-    """What `build` returns, of a mesh with a rotation and a translation (object to camera) before a camera.
+    """Stokes parameters (3, H, W, 3) in the frame of each ray, truth maps, camera; and how it was made.
 
-    `light` (3,) m: the flash in the camera frame; None: above the lens by 5 % of the distance.
+    `pose`: rotation and translation, object to camera, and the camera. `texture`: a folder, or None for solid noise.
+    `depth`: longest path; 2 is direct light only. `light` (3,) m: the flash in the camera frame; None: above the lens
+    by 5 % of the distance.
     """
     rotation, translation, view = pose
     corner, normal = subdivided(mesh)
@@ -150,15 +140,10 @@ def shoot(
         if passes % 2 == 0:
             error = dolp_error(halves, mask)
     about = {
-        "material": name,
-        "rough_law": bool(material and material.rough_law),
-        "texture": texture.name if texture else "noise",
-        "grades": coat["grades"],
-        "light": light,
-        "depth": depth,
-        "samples": passes * PASS,
-        "dolp_error": error,
-    }
+        "material": name, "rough_law": bool(material and material.rough_law),
+        "texture": texture.name if texture else "noise", "grades": coat["grades"], "light": light, "depth": depth,
+        "samples": passes * PASS, "dolp_error": error,
+    }  # fmt: skip
     camera = {"focal": view.focal, "center": view.center, "middle": middle, "unit": unit}
     stokes = (halves.sum(axis=0) / passes).astype(np.float32)
     return {"stokes": stokes, **truth, **{k: np.array(v) for k, v in camera.items()}}, about
@@ -260,6 +245,15 @@ def projected(picture: Floats, corner: Floats, scale: float) -> Floats:
     u, v = (np.take_along_axis(middle, ((axis + k) % 3)[:, None], 1)[:, 0] for k in (1, 2))
     column, row = (np.rint(np.abs((x + 1) % 4 - 2) * (picture.shape[-1] - 1) / 2).astype(int) for x in (u, v))
     return np.asarray(picture[:, row, column].T)
+
+
+def square_crop(mask: Bools, view: View, margin: int) -> tuple[View, int, tuple[slice, slice]]:
+    """The camera, the side [px] and the rows and columns of a square around a mask (H, W) with a margin [px]."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    top, left = int(rows[0]) - margin, int(columns[0]) - margin
+    size = max(int(rows[-1]) - top, int(columns[-1]) - left) + 1 + margin
+    crop = View(view.focal, (view.center[0] - left, view.center[1] - top), 1.0)
+    return crop, size, np.s_[top : top + size, left : left + size]
 
 
 def scene(

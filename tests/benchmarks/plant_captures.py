@@ -1,6 +1,6 @@
 """Simulates a good or faulty capture from a seed, with random angles, light, chart, object and polarization law.
 
-Kind "" is a good capture: ordinary jitter of light and angles, ordinary nudges. The truth (normals, mask) lies beside.
+Kind "" is a good capture: ordinary jitter of light and angles, ordinary nudges. The true normals are stored with it.
 """
 
 import tempfile
@@ -59,7 +59,7 @@ class Planned:
 
     studio: Studio
     look: str
-    chart: str  # beside, corner or none
+    chart: str  # near, corner or none
     actual: list[float]  # degrees
     names: list[float]
     shifts: Floats  # (K, 2) px
@@ -67,18 +67,13 @@ class Planned:
 
     @property
     def about(self) -> dict[str, Any]:
-        how = self.studio.shoot
-        law = self.studio.scene.law
+        """How it is shot, for a row of the benchmark."""
+        how, scene = self.studio.shoot, self.studio.scene
         return {
-            "angles": list(how.angles_deg),
-            "bracket": how.bracket,
-            "chart": self.chart,
-            "look": self.look,
-            "law": law if isinstance(law, str) else "smooth",
-            "object": Path(getattr(self.studio.scene.shape, "file", "")).stem,
-            "focal": round(how.focal_mm),
-            "width": how.width,
-        }
+            "angles": list(how.angles_deg), "bracket": how.bracket, "chart": self.chart, "look": self.look,
+            "law": scene.law if isinstance(scene.law, str) else "smooth",
+            "object": Path(getattr(scene.shape, "file", "")).stem, "focal": round(how.focal_mm), "width": how.width,
+        }  # fmt: skip
 
 
 def shoot(folder: Path, seed: int, kind: str, width: int, meshes: Path | None = None) -> dict[str, Any]:
@@ -116,23 +111,18 @@ def shoot(folder: Path, seed: int, kind: str, width: int, meshes: Path | None = 
 def _good(seed: int, kind: str, width: int, random: Random, meshes: Path | None) -> Planned:
     angles = _angles(seed, random)
     bracket: Literal["time", "flash", "iso", "aperture"] = ("time", "flash", "iso", "time", "aperture")[seed // 3 % 5]
+    jitter = 0.003 if bracket == "time" else 0.01  # steady lamps repeat better than flashes
     how = Shoot(
-        seed=seed,
-        width=width,
-        height=width * 3 // 8 * 2,
-        samples=1,
-        angles_deg=angles,
-        bracket=bracket,
-        gain_jitter=0.003 if bracket == "time" else 0.01,  # steady lamps repeat better than flashes
-        cfa=("RGGB", "BGGR", "GRBG", "GBRG")[seed // 2 % 4],
-    )
+        seed=seed, width=width, height=width * 3 // 8 * 2, samples=1, angles_deg=angles, bracket=bracket,
+        gain_jitter=jitter, cfa=("RGGB", "BGGR", "GRBG", "GBRG")[seed // 2 % 4],
+    )  # fmt: skip
     scene = random_scene(seed, ("bumps", "clusters", "vase")[int(random.integers(3))])
     look = LOOKS[int(random.integers(5))]
     if look != "as drawn":
         scene = msgspec.structs.replace(scene, coat=_dressed(scene.coat, look))
-    chart = ("beside", "beside", "corner", "none")[int(random.integers(4))]
+    chart = ("near", "near", "corner", "none")[int(random.integers(4))]
     if kind:  # other places of a chart are no fault that was planted
-        chart = "none" if kind in ("flash jitter, no chart", "no chart") else "beside"
+        chart = "none" if kind in ("flash jitter, no chart", "no chart") else "near"
     if chart == "none":
         scene = msgspec.structs.replace(scene, chart=None)
     elif chart == "corner":
@@ -168,8 +158,7 @@ def _other_object(scene: Scene, seed: int, meshes: Path) -> tuple[Scene, float]:
 
 
 def _angles(seed: int, random: Random) -> tuple[float, ...]:
-    """A usual set, or every fourth time 3 to 6 angles at random that a photographer might still set (whole degrees,
-    apart enough to solve for the Stokes parameters about as well as a usual set)."""
+    """A usual set; every fourth time 3 to 6 random whole degrees that determine the Stokes parameters about as well."""
     if seed % 4 < 3:
         return STANDARD_ANGLES[seed % 4]
     while True:

@@ -7,6 +7,7 @@ Captures have three angles, 640 × 480 RAW px, the chart next to the object, and
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -158,13 +159,12 @@ def _plant(plan: Plan, kind: str, random: Random) -> None:
         plan.shoot = replace(shoot, exposure_factor=12.0)
     elif kind == "one frame blurred":
         frame = int(random.integers(3))
-        plan.after = lambda light, k, e: (
-            gaussian_filter(light, 1.5, axes=(0, 1)) if (k, e) == (victim, frame) else light
-        )
+        blur = partial(gaussian_filter, sigma=1.5, axes=(0, 1))
+        plan.after = lambda light, k, e: blur(light) if (k, e) == (victim, frame) else light
     elif kind == "black level wrong by 2":
         plan.scene = replace(scene, backdrop_albedo=0.004)
         black = float(random.choice([-2, 2])) / (shoot.sensor.white - shoot.sensor.black)
-        middle = _middle(plan)
+        middle = float(Studio(plan.scene, plan.shoot).middle)
         plan.after = lambda light, k, e: np.maximum(light + black / (middle * shoot.step ** (e - 1)), 0)
     elif kind == "vignetting of wide apertures":
         plan.shoot = replace(shoot, bracket="aperture")
@@ -188,10 +188,6 @@ def _turned(scene: Scene, by_deg: Floats) -> Scene:
     turn = Rotation.from_rotvec(by_deg, degrees=True) * scene.turn
     x, y, z = (float(v) for v in turn.as_rotvec(degrees=True))
     return msgspec.structs.replace(scene, turn_deg=(x, y, z))
-
-
-def _middle(plan: Plan) -> float:
-    return float(Studio(plan.scene, plan.shoot).middle)
 
 
 def _lit(plan: Plan) -> Studio:
@@ -264,11 +260,6 @@ def _state_roles(folder: Path) -> None:
 def _write_truth(folder: Path, studio: Studio) -> None:
     buffer: Any = studio.buffer
     diffuse, specular, roughness, _ = scene_materials.evaluate(studio.scene.coat, buffer.position, buffer.facing)
-    np.savez_compressed(
-        folder / "truth.npz",
-        normal=buffer.normal.astype(np.float16),
-        mask=buffer.mask,
-        diffuse=diffuse.astype(np.float16),
-        specular=specular.astype(np.float16),
-        roughness=roughness.astype(np.float16),
-    )
+    maps = {"normal": buffer.normal, "diffuse": diffuse, "specular": specular, "roughness": roughness}
+    halves = {name: image.astype(np.float16) for name, image in maps.items()}
+    np.savez_compressed(folder / "truth.npz", allow_pickle=False, mask=buffer.mask, **halves)

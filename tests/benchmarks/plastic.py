@@ -10,13 +10,8 @@ from polcap.optics import frames
 
 def film(size: int) -> dict[str, Any]:
     """Square, each pixel the mean over its own area."""
-    return {
-        "type": "hdrfilm",
-        "width": size,
-        "height": size,
-        "rfilter": {"type": "box"},
-        "component_format": "float32",
-    }
+    box = {"type": "box"}
+    return {"type": "hdrfilm", "width": size, "height": size, "rfilter": box, "component_format": "float32"}
 
 
 def camera(mi: Any, view: View, size: int, sampler: str, samples: int) -> dict[str, Any]:
@@ -50,7 +45,7 @@ def plastic(alpha: float, ior: float, diffuse: Any, specular: Any) -> dict[str, 
 def in_ray_frame(image: Floats, view: View) -> Floats:
     """S0, S1, S2 … (H, W, ≥3) of `camera` -> (3, H, W) in the frame of each ray.
 
-    Mitsuba's S1, S2 stand on the horizontal across each ray (view × up), ours on the projected x axis.
+    Mitsuba's S1, S2 refer to the horizontal across each ray (view × up), polcap's to the projected x axis.
     """
     v = frames.rays(view, *image.shape[:2]).astype(float)
     e_x, e_y = frames.basis(v)

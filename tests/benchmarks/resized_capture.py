@@ -31,8 +31,8 @@ def make(capture: Path, out: Path, megapixels: float) -> None:
             place = temporary / file.relative_to(capture)
             place.parent.mkdir(parents=True, exist_ok=True)
             _frame(file, place, megapixels, np.random.default_rng(number))
-        for beside in capture.glob("truth.json"):
-            shutil.copy(beside, temporary / "not-to-scale.json")
+        for truth in capture.glob("truth.json"):
+            shutil.copy(truth, temporary / "not-to-scale.json")
 
 
 def _frame(source: Path, target: Path, megapixels: float, rng: np.random.Generator) -> None:
@@ -47,16 +47,12 @@ def _frame(source: Path, target: Path, megapixels: float, rng: np.random.Generat
     for y in (0, 1):
         for x in (0, 1):
             out[y::2, x::2] = _plane(counts[y::2, x::2], size, float(image.black[y, x]), image.white, grown, rng)
+    matrix = _SRGB_FROM_XYZ if stated is None else np.reshape(stated, (3, 3))
+    neutral = _DAYLIGHT if image.white_balance is None else 1 / image.white_balance
     dng_writer.write(
-        target,
-        out,
-        cfa=image.cfa,
-        black=image.black,
-        white=image.white,
-        exif=known.exif,
-        color_matrix=_SRGB_FROM_XYZ if stated is None else np.reshape(stated, (3, 3)),
-        as_shot_neutral=_DAYLIGHT if image.white_balance is None else 1 / image.white_balance,
-    )
+        target, out, cfa=image.cfa, black=image.black, white=image.white, exif=known.exif, color_matrix=matrix,
+        as_shot_neutral=neutral,
+    )  # fmt: skip
 
 
 def _plane(

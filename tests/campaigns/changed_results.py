@@ -27,8 +27,8 @@ from polcap.formats.maps import exr
 from polcap.pipeline import manifest
 from polcap.results import STAGES
 from tests.campaigns.mutations import mutated
-from tests.campaigns.rows import arguments, table
 from tests.campaigns.users_files import make_template, run
+from tests.experiments import Rows, arguments, table
 
 QUICK = ("--no-chart", "--estimator", "analytic")
 _OTHER: tuple[Any, ...] = (None, True, -1, 0, 1e300, "text", "\ud800", [], {}, [None], {"a": 1}, [[[]]], "9" * 5000)
@@ -224,7 +224,7 @@ def tried(template: Path, number: int, seed: int) -> dict[str, Any]:
 
 def main() -> None:
     """Run the campaign."""
-    stated = arguments(__doc__, changes=300, seed=0)
+    stated = arguments(__doc__, changes=300, seed=0, rows=Rows())
     with tempfile.TemporaryDirectory() as name:
         make_template(Path(name))
         complete(Path(name))

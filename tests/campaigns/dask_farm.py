@@ -29,14 +29,11 @@ from typing import Any
 import numpy as np
 
 from tests.campaigns import kill
-from tests.campaigns.rows import arguments, small_capture
-from tests.conftest import ROOT
+from tests.experiments import arguments, processor_s, small_capture
 
 _DISTINCT = 4  # captures that are shot; the others are copies
 _PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
 _SPAN_S = (1.0, 8.0)  # between two kills
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-ENVIRONMENT.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed polcap is compiled: no worker does so at its start
 OPTIONS = ("--estimator", "analytic", "--no-chart", "--threads", "1")
 Program = subprocess.Popen[bytes]
 
@@ -81,27 +78,19 @@ def shoot(root: Path, captures: int) -> None:
             shutil.copytree(root / f"capture{number % _DISTINCT:03d}", folder)
 
 
-def started(*command: str) -> Program:
-    """A Python module as a program."""
-    words = [sys.executable, "-m", *command]
-    return subprocess.Popen(words, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-
 def batch(root: Path, out: Path, *more: str) -> Program:
-    return started("polcap", "batch", str(root), "--out", str(out), *OPTIONS, *more)
+    return kill.start("polcap", "batch", str(root), "--out", str(out), *OPTIONS, *more)
 
 
 def timed(root: Path, out: Path, *more: str) -> dict[str, Any]:
     """Wall and CPU seconds of a batch with all its processes, and how it ended."""
-    before, start = os.times(), time.monotonic()
+    before, start = processor_s(), time.monotonic()
     code = batch(root, out, *more).wait()
     seconds = time.monotonic() - start
     with suppress(ChildProcessError):  # until all are gone that were left to this process
         while True:
             os.wait()
-    after = os.times()
-    spent = after.children_user + after.children_system - before.children_user - before.children_system
-    return {"wall_s": round(seconds, 1), "cpu_s": round(spent, 1), "exit": code}
+    return {"wall_s": round(seconds, 1), "cpu_s": round(processor_s() - before, 1), "exit": code}
 
 
 def capture_seconds(out: Path) -> float:
@@ -147,7 +136,7 @@ def started_scheduler() -> tuple[str, Program]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     where = ["--host", "127.0.0.1", "--port", str(port)]
-    program = started("dask", "scheduler", *where, "--no-dashboard", "--no-show")
+    program = kill.start("dask", "scheduler", *where, "--no-dashboard", "--no-show")
     for _ in range(600):
         with socket.socket() as asked:
             if asked.connect_ex(("127.0.0.1", port)) == 0:
@@ -158,7 +147,7 @@ def started_scheduler() -> tuple[str, Program]:
 
 def worker(address: str) -> Program:
     options = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--death-timeout", "300")
-    return started("dask", "worker", address, *options)
+    return kill.start("dask", "worker", address, *options)
 
 
 def around(base: Path, tiny: int) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from polcap.formats.maps import exr, png
 from polcap.formats.raw import file_checks, photo, probe
 from polcap.formats.raw import libraw as raw
 from tests.campaigns.mutations import Target, campaign
-from tests.campaigns.rows import arguments
+from tests.experiments import Rows, arguments
 from tests.formats import headers
 
 _BATCH = 25  # files that make a row
@@ -138,7 +138,7 @@ def _model(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    stated = arguments(__doc__, files=400, seed=0)
+    stated = arguments(__doc__, files=400, seed=0, rows=Rows())
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with tempfile.TemporaryDirectory() as place:
         kinds = targets(Path(place))

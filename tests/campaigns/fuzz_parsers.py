@@ -43,7 +43,7 @@ from polcap.rig.motor_grbl import GrblMotor, GrblSettings
 from polcap.rig.motor_line_protocol import LineMotor, LineSettings
 from polcap.stage_values import StokesImage
 from tests.campaigns.mutations import Target, campaign
-from tests.campaigns.rows import arguments
+from tests.experiments import Rows, arguments
 from tests.formats import headers
 from tests.rig import virtual
 
@@ -137,7 +137,7 @@ _MAPS = {
     "camera": {"focal_px": 900.0, "center_px": [15.5, 11.5], "focal_known": True},
 }  # fmt: skip
 _REPORT = {
-    "polcap": "0.9.0", "verdict": "pass",
+    "polcap": "0.9.0", "verdict": "pass", "versions": {"polcap": "0.9.0"},
     "figures": {"maps": {"normal_error_deg_median": 5.0, "estimator": "network 9"}},
     "capture": {"name": "vase", "camera": "Acme Z1", "notes": [], "shots": [
         {"angle_deg": 0.0, "frames": [{"file": "pol000/a.dng", "digest": "0f"}]}
@@ -221,5 +221,5 @@ PARSERS = {
 
 
 if __name__ == "__main__":
-    stated = arguments(__doc__, runs=100_000, seed=0)
+    stated = arguments(__doc__, runs=100_000, seed=0, rows=Rows())
     sys.exit(1 if campaign(PARSERS, stated.runs, stated.seed, stated.rows, _BATCH, time.process_time) else 0)

@@ -23,7 +23,7 @@ from polcap.stages import selfcal, whitebalance
 from polcap.stages.selfcal import angles, integrability, object_gains
 from tests import scenes
 from tests.campaigns import lit_objects
-from tests.campaigns.rows import arguments, table
+from tests.experiments import arguments, table
 
 JITTER = 0.02  # 1σ of a pop
 GOOD, BAD = 0.003, 0.006
@@ -31,7 +31,7 @@ BY_CHART = 0.0015
 
 
 def main() -> None:
-    stated = arguments(__doc__, "chart", "parts", objects=20, first_seed=0, angles="0,45,90")
+    stated = arguments(__doc__, "--chart", "--parts", objects=20, first_seed=0, angles="0,45,90")
     angle = np.radians([float(one) for one in stated.angles.split(",")])
     rows, errors, states = [], [], []
     for seed in range(stated.first_seed, stated.first_seed + stated.objects):

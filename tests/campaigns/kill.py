@@ -23,20 +23,22 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.campaigns.rows import Rows, arguments, processor_s, small_capture
+from polcap.formats import own_files
 from tests.conftest import ROOT
+from tests.experiments import Rows, arguments, processor_s, small_capture
 
 _CLOCK = {"seconds", "timings", "time"}  # keys of JSON that hold measured times
-_OWN = ("work/lock", "work/owner", "work/unchanged.json", "report.html")  # hold times, processes
+_OWN = ("work/lock", "work/owner", "work/unchanged.json", "report.html", own_files.RECORD)  # times, processes, order
 _POLL_S = 0.004  # between two checks whether the command writes
+_ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+_ENVIRONMENT.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed polcap is compiled: no worker does so at its start
 Step = tuple[str | Path, ...]
 
 
-def polcap(*arguments: object) -> subprocess.Popen[bytes]:
-    """The command, in a process of its own."""
-    command = [sys.executable, "-m", "polcap", *map(str, arguments)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+def start(*command: object) -> subprocess.Popen[bytes]:
+    """Run a Python module such as polcap in a process of its own."""
+    words = [sys.executable, "-m", *map(str, command)]
+    return subprocess.Popen(words, env=_ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -81,7 +83,7 @@ def spent_s(pid: int) -> float:
 def undisturbed(step: Step, out: Path) -> tuple[float, float]:
     """Processor time at which the command first writes, and ends, s."""
     before, first, last = _writes(out), None, 0.0
-    run = polcap(*step, out)
+    run = start("polcap", *step, out)
     while run.poll() is None:
         last = spent_s(run.pid)
         if first is None and _writes(out) != before:
@@ -93,7 +95,7 @@ def undisturbed(step: Step, out: Path) -> tuple[float, float]:
 
 def kill_amid(step: Step, out: Path, moment_s: float) -> bool:
     """Start the command and kill it once it took so much processor time; False if it ended before."""
-    run = polcap(*step, out)
+    run = start("polcap", *step, out)
     while run.poll() is None and spent_s(run.pid) < moment_s:
         time.sleep(_POLL_S)
     amid = run.poll() is None
@@ -137,7 +139,7 @@ def main(kills: int, seed: int, rows: Rows) -> int:
             for step, (first, last), wanted in zip(steps, spans, stages):
                 amid = kill_amid(step, out, random.uniform(first if number % 2 else 0.0, last))
                 broken = broken_names(out, *stages)
-                code = polcap(*step, out).wait()
+                code = start("polcap", *step, out).wait()
                 found = digests(out)
                 differ = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
                 row[str(step[0])] = {"amid": amid, "broken": broken, "code": code, "differ": differ}
@@ -160,5 +162,5 @@ def summary(rows: Rows) -> int:
 
 
 if __name__ == "__main__":
-    stated = arguments(__doc__, kills=30, seed=0)
+    stated = arguments(__doc__, kills=30, seed=0, rows=Rows())
     sys.exit(1 if main(stated.kills, stated.seed, stated.rows) else 0)

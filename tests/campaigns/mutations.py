@@ -15,7 +15,7 @@ from random import Random
 from typing import Any
 
 from polcap.errors import PolcapError
-from tests.campaigns.rows import Rows, processor_s, table
+from tests.experiments import Rows, processor_s, table
 
 _TOKENS = (
     b"nan", b"inf", b"-1", b"1e999", b"9" * 40, b"null", b"[[[[", b"{", b'"', b"\\", b"\n", b"\0", b"../", b"\x1b[2J",

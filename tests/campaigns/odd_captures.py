@@ -25,7 +25,7 @@ from polcap.formats.maps import maps_folder as maps
 from polcap.image_values import Floats
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput
-from tests.campaigns.rows import arguments, table
+from tests.experiments import arguments, table
 from tests.formats import headers
 
 BLACK, WHITE = 512, 16383

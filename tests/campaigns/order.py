@@ -15,13 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from polcap.chart_values import ColorCalibration
-from polcap.config import Config
 from polcap.errors import CaptureError, InputError
 from polcap.formats.capture import reader as captures
 from polcap.image_values import Floats
 from polcap.pipeline import models
-from polcap.pipeline.cache import MemoryCache
-from polcap.pipeline.path import UserInput, path
 from polcap.results import ResultsUntilMask
 from polcap.stage_values import Alignment, AngleStack, Equipment, ObjectMask
 from polcap.stages import selfcal
@@ -31,13 +28,13 @@ from polcap.synth import shooting
 from tests import scenes
 from tests.campaigns import lit_objects
 from tests.campaigns.ring import KINDS
-from tests.campaigns.rows import arguments, processor_s
+from tests.experiments import arguments, process, processor_s
 
 Case = tuple[str, AngleStack, Alignment, ObjectMask, ColorCalibration]  # name and inputs of `selfcal`
 
 
 def main() -> None:
-    stated = arguments(__doc__, "thin", "chart", "raw", objects=20, first_seed=0, angles="0,45,90")
+    stated = arguments(__doc__, "--thin", "--chart", "--raw", objects=20, first_seed=0, angles="0,45,90")
     degrees = tuple(float(one) for one in stated.angles.split(","))
     angle = np.radians(degrees)
     right, wrong = Counter[str](), Counter[str]()
@@ -65,10 +62,9 @@ def from_raw(seed: int, degrees: tuple[float, ...]) -> Case | None:
     shoot = shooting.Shoot(seed=seed, width=640, height=480, samples=1, angles_deg=degrees)
     with tempfile.TemporaryDirectory() as place:
         shooting.write(Path(place) / "capture", random_scenes.random_scene(seed, KINDS[seed % 3]), shoot)
-        supplied = UserInput(mask_network=models.load_mask_network(1))
         capture = captures.read(Path(place) / "capture")
         try:
-            results = path(capture, supplied, Config(), MemoryCache(), ResultsUntilMask)
+            results = process(capture, ResultsUntilMask, (None, models.load_mask_network(1)))
             return KINDS[seed % 3], results.radiance, results.alignment, results.object_, results.color
         except InputError as error:
             print(seed, "refused before:", error, flush=True)

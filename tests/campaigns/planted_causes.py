@@ -12,7 +12,6 @@ are not run again. --report prints the table of a file.
 import itertools
 import re
 import shutil
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -37,12 +36,13 @@ from polcap.quality.gate_values import Gate
 from polcap.stage_values import Network
 from polcap.synth import forward_camera, scenes
 from polcap.synth.shooting import Shoot, ShotPose, Studio, Take
-from tests.campaigns.rows import Rows, arguments, table
+from tests.experiments import Rows, arguments, table
 
 ANGLES = (0, 45, 90)
 KINDS: tuple[scenes.Kind, ...] = ("bumps", "clusters", "vase")
 Change = Callable[[Floats, int, int], Floats]  # light (H, W, 3) of frame e of shot k -> light
 Plant = Callable[["Shooting"], None]
+SHOWN = ("name", "right", "printed", "agree", "after", "finding", "first")
 
 
 @dataclass
@@ -96,16 +96,16 @@ def clipped(times: float, shot: int | None = None) -> Plant:
     return plant
 
 
-def frame_light(change: Callable[[Floats], Floats], shot: int, frame: int | None = None) -> Plant:
-    """Change the light of one shot, or of one of its frames."""
+def frame_light(change: Callable[[Floats], Floats], shot: int | None, frame: int | None = None) -> Plant:
+    """Change the light of one shot, of one of its frames, or of all shots."""
 
     def plant(to: Shooting) -> None:
-        to.lights.append(lambda light, k, e: change(light) if k == shot and frame in (None, e) else light)
+        to.lights.append(lambda light, k, e: change(light) if shot in (None, k) and frame in (None, e) else light)
 
     return plant
 
 
-def blurred(sigma: float, shot: int, frame: int | None = None) -> Plant:
+def blurred(sigma: float, shot: int | None, frame: int | None = None) -> Plant:
     return frame_light(lambda light: gaussian_filter(light, sigma, axes=(0, 1)), shot, frame)
 
 
@@ -273,13 +273,6 @@ def chart_in_mirror(to: Shooting) -> None:
     to.lights.append(lambda light, k, e: light * cover)
 
 
-def unsharp(sigma: float) -> Plant:
-    def plant(to: Shooting) -> None:
-        to.lights.append(lambda light, k, e: gaussian_filter(light, sigma, axes=(0, 1)))
-
-    return plant
-
-
 def dark(times: float) -> Plant:
     def plant(to: Shooting) -> None:
         to.times = times
@@ -322,7 +315,7 @@ CAUSES = {
     "frame 2 of 90° shaken": Cause(shaken(9, 2, 1), FILES + "|" + RETAKE),
     "45° blurred": Cause(blurred(3, 1), r"[Ff]ocus"),
     "0° blurred": Cause(blurred(3, 0), r"[Ff]ocus"),
-    "all blurred": Cause(unsharp(3), r"[Ff]ocus"),
+    "all blurred": Cause(blurred(3, None), r"[Ff]ocus"),
     **{f"frame {e} of {ANGLES[k]}° moved by {px} px": Cause(frame_moved(px, k, e), FILES + "|tripod|" + RETAKE, True)
        for k, e, px in ((1, 0, 4), (2, 2, 12), (0, 1, 90), (1, 2, 70))},
     **{f"{ANGLES[k]}° moved by {px} px": Cause(shot_moved(px, k), r"[Ll]ock the camera", px < 60)
@@ -391,24 +384,20 @@ def trial(
     shutil.rmtree(folder, ignore_errors=True)
     to.write(folder)
     seen, processed = judge(folder, networks), process(folder, networks)
-    first = seen["remedies"][0] if seen["remedies"] else ""
+    first = (seen["remedies"] or [""])[0]
     right = any(re.search(CAUSES[one].remedy, first) for one in planted) if first else False
     right = right or (seen["keep"] and all(CAUSES[one].harmless for one in planted))
     row = {"name": name, "seed": seed, "right": right, "printed": len(seen["remedies"]), "keep": seen["keep"],
            "process": processed["keep"], "agree": seen["keep"] == processed["keep"], "finding": seen["finding"],
            "error": seen["error"], "process_error": processed["error"], "first": first,
            "process_printed": len(processed["remedies"]),
-           "process_first": processed["remedies"][0] if processed["remedies"] else ""}  # fmt: skip
+           "process_first": (processed["remedies"] or [""])[0]}  # fmt: skip
     for _ in range(len(planted) + 1):  # each cause needs a round; heavy clipping may need two
         if not seen["keep"]:
             planted = follow(seen, folder, to, planted)
             seen = judge(folder, networks)
-    return {
-        **row,
-        "after": seen["keep"],
-        "after_finding": seen["finding"],
-        "after_first": (seen["remedies"] or [""])[0],
-    }
+    first = (seen["remedies"] or [""])[0]
+    return row | {"after": seen["keep"], "after_finding": seen["finding"], "after_first": first}
 
 
 def arranged(planted: list[str], seed: int, width: int) -> Shooting:
@@ -467,7 +456,7 @@ def follow(seen: dict[str, Any], folder: Path, to: Shooting, planted: list[str])
     A shot is taken again without the cause that the remedy is for, without any if it is for none of them, and with as
     much light as the others now have.
     """
-    first = seen["remedies"][0] if seen["remedies"] else ""
+    first = (seen["remedies"] or [""])[0]
     left = [one for one in planted if not re.search(CAUSES[one].remedy, first)]
     left = [] if left == planted else left
     clean = arranged(left, to.studio.shoot.seed, to.studio.shoot.width)
@@ -518,15 +507,11 @@ def main(folder: Path, rows: Rows, only: str, width: int) -> None:
         if name not in done and only in name:
             row = trial(name, folder / "capture", seed, width, networks)
             rows.add(row)
-            print(
-                {key: row[key] for key in ("name", "right", "printed", "agree", "after", "finding", "first")},
-                flush=True,
-            )
+            print({key: row[key] for key in SHOWN}, flush=True)
 
 
 if __name__ == "__main__":
-    stated = arguments(__doc__, "report", folder="/tmp/planted", only="", width=512)
+    stated = arguments(__doc__, "--report", folder="/tmp/planted", only="", width=512, rows=Rows())
     if not stated.report:
         main(Path(stated.folder), stated.rows, stated.only, stated.width)
     report(stated.rows)
-    sys.exit(0)

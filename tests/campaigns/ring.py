@@ -16,12 +16,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from polcap.config import Config
 from polcap.errors import InputError
 from polcap.formats.capture import reader as captures
 from polcap.pipeline import models
-from polcap.pipeline.cache import MemoryCache
-from polcap.pipeline.path import UserInput, path
 from polcap.results import ResultsUntilSelfcal
 from polcap.stage_values import RingZero
 from polcap.stages import selfcal
@@ -29,7 +26,7 @@ from polcap.synth import scenes as random_scenes
 from polcap.synth import shooting
 from tests import scenes
 from tests.campaigns import lit_objects
-from tests.campaigns.rows import arguments, processor_s
+from tests.experiments import Rows, arguments, process, processor_s
 
 _ANGLE = np.radians([0.0, 45.0, 90.0])
 _GAIN_ERROR = 0.001  # 1σ of a gain from a chart
@@ -40,7 +37,7 @@ KINDS: tuple[Literal["bumps", "clusters", "vase"], ...] = ("bumps", "clusters", 
 
 
 def main() -> None:
-    stated = arguments(__doc__, "no-chart", "raw", objects=50, turns=4, first_seed=0)
+    stated = arguments(__doc__, "--no-chart", "--raw", objects=50, turns=4, first_seed=0, rows=Rows())
     rows, done = stated.rows, stated.rows.done("seed", "turn_number", "raw")
     for seed in range(stated.first_seed, stated.first_seed + stated.objects):
         wanted = [t for t in range(stated.turns) if (seed, t, stated.raw) not in done]
@@ -84,9 +81,9 @@ def from_raw(seed: int, turn: float) -> dict[str, Any]:
         capture = captures.read(Path(place) / "capture")
         nominal = [min(_ANGLE, key=lambda a: _distance(shot.angle - math.radians(turn), a)) for shot in capture.shots]
         shots = tuple(replace(shot, angle=float(a)) for shot, a in zip(capture.shots, nominal))
-        supplied = UserInput(mask_network=models.load_mask_network(1))
         try:
-            results = path(replace(capture, shots=shots), supplied, Config(), MemoryCache(), ResultsUntilSelfcal)
+            using = None, models.load_mask_network(1)
+            results = process(replace(capture, shots=shots), ResultsUntilSelfcal, using)
             return error_of(results.selfcal.ring, kind)
         except InputError as error:
             return {"kind": kind, "refused": str(error)}

@@ -19,7 +19,7 @@ from polcap.errors import GateError
 from polcap.formats.capture import reader as captures
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.path import UserInput
-from tests.campaigns.rows import arguments, small_capture
+from tests.experiments import arguments, small_capture
 
 _SETTLED = 20  # captures after which memory should not grow
 

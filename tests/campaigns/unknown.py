@@ -18,14 +18,14 @@ from polcap.stage_values import Equipment
 from polcap.stages import selfcal
 from tests import scenes
 from tests.campaigns import lit_objects
-from tests.campaigns.rows import arguments, processor_s
+from tests.experiments import Rows, arguments, processor_s
 
 _GAIN_ERROR = 0.001
 _MOST_CONDITION = 6.0  # of the analyzers; 0°, 45°, 90° have 3.2
 
 
 def main() -> None:
-    stated = arguments(__doc__, objects=40, shots=5, first_seed=0)
+    stated = arguments(__doc__, objects=40, shots=5, first_seed=0, rows=Rows())
     rows, done = stated.rows, stated.rows.done("seed", "shots")
     for seed in range(stated.first_seed, stated.first_seed + stated.objects):
         if (seed, stated.shots) not in done:

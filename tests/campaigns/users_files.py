@@ -21,7 +21,7 @@ import numpy as np
 from polcap import cli
 from polcap.formats import own_files
 from polcap.synth import scenes, shooting
-from tests.campaigns.rows import arguments
+from tests.experiments import Rows, arguments
 
 _PLACES = (
     ".", "maps", "work", "asset", "work/01-hdr", "work/04-mask", "work/10-app", "asset/web", "asset/C_iiif",
@@ -149,7 +149,7 @@ def sequence(template: Path, seed: int) -> list[str]:
 
 def main() -> None:
     """Run the campaign."""
-    stated = arguments(__doc__, sequences=1000, seed=0)
+    stated = arguments(__doc__, sequences=1000, seed=0, rows=Rows())
     with tempfile.TemporaryDirectory() as name:
         make_template(Path(name))
         ended = stated.rows.done("seed")
