@@ -27,8 +27,9 @@ _GRAZING = 0.1  # cosine, as in `optics/body.py`
 _OUTLIER = 0.01  # of the ball's bright parts: least spread of the residuals
 _AROUND = 0.1  # radii of backdrop around the ball that are fitted
 _ROUNDS = 2  # of the weights
+# fitted numbers: the ball's move right, up and growth [radii]; the flash right, up [distances]; roughness
 _START = (0.0, 0.0, 0.0, 0.0, 0.05, 0.35)
-_LEAST = (-0.1, -0.1, -0.1, -1.5, -1.5, 0.08)  # of the fitted numbers
+_LEAST = (-0.1, -0.1, -0.1, -1.5, -1.5, 0.08)
 _MOST = (0.1, 0.1, 0.1, 1.5, 1.5, 1.0)
 
 
@@ -73,12 +74,12 @@ def fit(light: Floats, guess: Ball, view: View) -> BallLight:
     )
     value, weight = np.array(_START), np.where(picture.used, 1.0, 0.0)
     for _ in range(_ROUNDS):
-        weighted = partial(_weighted_rest, picture, weight)
+        weighted = partial(_weighted_residual, picture, weight)
         value = least_squares(weighted, value, bounds=(_LEAST, _MOST), x_scale=0.05, max_nfev=8).x
-        rest = _rest(picture, weight, value)
-        spread = max(robust.spread(rest[picture.used]), _OUTLIER)
-        weight = np.where(picture.used, np.sqrt(robust.biweight(rest, spread)), 0.0)
-    return BallLight(_moved(guess, value), value[3:5], robust.spread(rest[away < 0]))
+        residual = _residual(picture, weight, value)
+        spread = max(robust.spread(residual[picture.used]), _OUTLIER)
+        weight = np.where(picture.used, np.sqrt(robust.biweight(residual, spread)), 0.0)
+    return BallLight(_moved(guess, value), value[3:5], robust.spread(residual[away < 0]))
 
 
 def read_ring(stokes: Floats, ball: Ball, view: View, sound: Bools) -> RingReading:
@@ -116,13 +117,13 @@ def _reduced(light: Floats, view: View) -> tuple[Floats, View]:
     return area_mean(light, (height, width)), View(view.focal * factor, (x, y), view.scale / factor)
 
 
-def _weighted_rest(picture: _Picture, weight: Floats, value: Floats) -> Floats:
-    """`_rest` times the weight (H, W), for the pixels (N,) to fit."""
-    return (_rest(picture, weight, value) * weight)[picture.used]
+def _weighted_residual(picture: _Picture, weight: Floats, value: Floats) -> Floats:
+    """`_residual` times the weight (H, W), for the pixels (N,) to fit."""
+    return (_residual(picture, weight, value) * weight)[picture.used]
 
 
-def _rest(picture: _Picture, weight: Floats, value: Floats) -> Floats:
-    """S0 (H, W) minus its best fit with these numbers (6,): see `_moved`, flash right and up, roughness.
+def _residual(picture: _Picture, weight: Floats, value: Floats) -> Floats:
+    """S0 (H, W) minus its best fit with these numbers (6,), in the order of `_START`.
 
     Backdrop, mirrored light and the dependence of diffuse light on the zenith enter linearly.
     """
@@ -146,14 +147,14 @@ def _columns(picture: _Picture, value: Floats) -> list[Floats]:
     light = frames.to_ray_frame(to_light / np.sqrt(squared)[..., None], rays)
     body, gloss = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     parts = shade.stokes(local, body, gloss, roughness, _IOR, light, 1 / squared)[0]
-    seen = np.clip(0.5 - ball.outside(view, x, y) * _OVER, 0, 1)
+    seen = np.clip(0.5 - ball.outside(view, x, y) * _OVER, 0, 1)  # share of each sample that the ball covers
     sine2 = 1 - np.clip(local[..., 2], 0, 1) ** 2
     diffuse, mirrored = parts[..., 0] * seen, parts[..., 1] * seen
     falling = np.clip(frames.dot(local, light), 0, 1)
     rim = seen / squared * falling * sine2
     steep = rim * sine2 / np.clip(np.maximum(falling, local[..., 2]), _GRAZING, 1)
-    fine = [mirrored, 1 - seen, diffuse, diffuse * sine2, diffuse * sine2**2, rim, steep]
-    return [area_mean(gaussian_filter(part, _BLUR * _OVER), (height, width)) for part in fine]
+    columns = [mirrored, 1 - seen, diffuse, diffuse * sine2, diffuse * sine2**2, rim, steep]
+    return [area_mean(gaussian_filter(part, _BLUR * _OVER), (height, width)) for part in columns]
 
 
 def _moved(guess: Ball, value: Floats) -> Ball:

@@ -127,9 +127,9 @@ def _crossings(mask: Bools) -> Floats:
     """Points x, y (N, 2) [px] halfway between neighboring pixels inside and outside a mask (H, W)."""
     padded = np.pad(mask, 1)
     row, column = np.nonzero(padded[:, 1:] != padded[:, :-1])
-    beside = np.stack([column - 0.5, row - 1.0], axis=-1)
+    across = np.stack([column - 0.5, row - 1.0], axis=-1)
     row, column = np.nonzero(padded[1:] != padded[:-1])
-    return np.concatenate([beside, np.stack([column - 1.0, row - 0.5], axis=-1)])
+    return np.concatenate([across, np.stack([column - 1.0, row - 0.5], axis=-1)])
 
 
 def _fit_robustly(ray: Floats, focal: float) -> Ball:

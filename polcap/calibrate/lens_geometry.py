@@ -175,10 +175,7 @@ def _color_checker(image: SensorImage) -> BoardView | None:
         return None
     try:
         found = whitebalance.measure(
-            _as_stack(value, image),
-            shipped_data.colorchecker(),
-            ChartRequest("auto"),
-            WhitebalanceSettings(),
+            _as_stack(value, image), shipped_data.colorchecker(), ChartRequest("auto"), WhitebalanceSettings()
         )
     except ChartError:
         return None

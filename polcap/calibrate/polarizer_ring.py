@@ -53,8 +53,8 @@ def measure(turned: list[PolarizerShot]) -> Polarizer:
     axes = sorted({shot.axis_deg for shot in turned})
     curves = [_fit_axis([shot for shot in turned if shot.axis_deg == axis]) for axis in axes]
     known = _shows_sense(curves)
-    candidates = [(_zero(curves, sense), sense) for sense in ((1, -1) if known else (1,))]
-    (zero, sigma, _), sense = min(candidates, key=lambda candidate: candidate[0][2])
+    zeros = {sense: _zero(curves, sense) for sense in ((1, -1) if known else (1,))}
+    sense, (zero, sigma, _) = min(zeros.items(), key=lambda one: one[1][2])  # least difference between the axes
     weight = np.array([1 / np.maximum(curve.contrast_sigma, 1e-9) ** 2 for curve in curves])
     contrast = (weight * np.array([curve.contrast for curve in curves])).sum(0) / weight.sum(0)
     contrast_sigma = 1 / np.sqrt(weight.sum(0))

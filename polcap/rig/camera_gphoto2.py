@@ -51,7 +51,7 @@ class Gphoto2Camera:
     polarizes_flash = False
 
     def __init__(self, which: str, log: Log, timeout_s: float = 30.0) -> None:
-        """`timeout_s` limits release and transfer, without the exposure. Raises HardwareError, SettingError."""
+        """`timeout_s` limits release and transfer, not counting the exposure. Raises HardwareError, SettingError."""
         self._gp = _gphoto2()
         self._log = log
         self._which = which

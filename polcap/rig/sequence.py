@@ -33,12 +33,7 @@ _SPARE = 1.2  # free disk space over the size of the frames
 
 
 def shoot(
-    folder: Path,
-    order: CaptureOrder,
-    *,
-    resume: bool = False,
-    tries: int = 2,
-    report: Report = lambda line: None,
+    folder: Path, order: CaptureOrder, *, resume: bool = False, tries: int = 2, report: Report = lambda line: None
 ) -> dict[str, Any]:
     """Shoot a capture into `folder`, or with `resume` the frames that it lacks; returns a summary.
 
@@ -119,9 +114,8 @@ class CaptureLoop:
                     continue
             elif not self.check.pending:
                 return
-            self.check.collect(
-                block=True
-            )  # at the end, and before a person turns the ring, who should not turn it back
+            # at the end; also before a person turns the ring, who would have to turn it back for a rejected frame
+            self.check.collect(block=True)
 
     def _take(self, slot: Slot, missing: list[Slot]) -> None:
         """Turn the ring if needed, take a frame, submit it to the check. Raises SettingError: exposures repeat."""

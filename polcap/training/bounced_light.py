@@ -165,8 +165,9 @@ def mirrored_surroundings(
     turn = u(0, 2 * pi)
     down = torch.cat([torch.cos(turn), torch.sin(turn), 0 * turn], dim=1)  # the ground's normal is −down
     low = (pixels.place * down[own]).sum(dim=1)  # the object lies on the ground
-    ground = torch.full((count,), -9.0, device=device).scatter_reduce(0, own, low, "amax") + 9 * (u(0, 1)[:, 0] > 0.6)
-    behind = 1.35 + 1.5 * u(0, 1)[:, 0] ** 2
+    lowest = torch.full((count,), -9.0, device=device).scatter_reduce(0, own, low, "amax")
+    ground = lowest + 9 * (u(0, 1)[:, 0] > 0.6)  # depth below the lens; 9 more is as good as none
+    behind = 1.35 + 1.5 * u(0, 1)[:, 0] ** 2  # distance of the backdrop from the lens
 
     half = frames.from_ray_frame(normal, pixels.v)
     direction = 2 * normal[:, 2:] * half - pixels.v

@@ -65,24 +65,12 @@ class CameraErrors:
     @staticmethod
     def none(count: int, device: torch.device) -> "CameraErrors":
         """Parameters of a camera without errors, except for a trace of shot noise."""
-
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(shape, device=device)
-
+        zero, one = torch.zeros(count, device=device), torch.ones(count, device=device)
         return CameraErrors(
-            full_well=zeros(3, count) + 1e9,
-            bracket=zeros(count) + 1e3,
-            read_noise=zeros(count),
-            black=zeros(3, 3, count),
-            rows=zeros(count),
-            gain=zeros(3, count) + 1,
-            angle=zeros(3, count),
-            shift=zeros(3, count, 2),
-            blur=zeros(count),
-            depolarization=zeros(count) + 1,
-            ambient=zeros(count),
-            noise_belief=zeros(count) + 1,
-        )
+            full_well=1e9 * one.expand(3, -1), bracket=1e3 * one, read_noise=zero, black=zero.expand(3, 3, -1),
+            rows=zero, gain=one.expand(3, -1), angle=zero.expand(3, -1), shift=torch.zeros(3, count, 2, device=device),
+            blur=zero, depolarization=one, ambient=zero, noise_belief=one,
+        )  # fmt: skip
 
     @staticmethod
     def stated(count: int, device: torch.device) -> "CameraErrors":

@@ -21,13 +21,14 @@ import torch
 
 from polcap.formats import atomic, onnx, text_file
 from polcap.formats.maps import png
+from polcap.optics import frames
 from polcap.pipeline import models
 from polcap.stage_values import Cues, Network, SurfaceMaps
 from polcap.stages import cues, infer
 from polcap.training import evaluation_baselines, evaluation_page, evaluation_protocol
 from polcap.training.evaluation_baselines import Estimator, Means
 from polcap.training.evaluation_protocol import Protocol
-from polcap.training.map_errors import MAPS, Judge, angle, deciles
+from polcap.training.map_errors import MAPS, Judge, deciles
 from polcap.training.progress import Report, silent
 from polcap.training.scores import Score
 
@@ -169,7 +170,7 @@ def evaluate_picture(options: EvaluationOptions, means: Means, number: int) -> R
         scores[name] = judge.score(estimate) | (judge.integrated(estimate) if name in _INTEGRATED else {})
     seconds["scoring all"] = time.monotonic() - before
     some = np.random.default_rng(number).permutation(int(mask.sum()))[:_SAMPLE]
-    errors = maps[OURS].confidence, angle(maps[OURS], case)
+    errors = maps[OURS].confidence, frames.angle_deg(maps[OURS].normal, case.truth.normal)
     f0 = case.truth.specular[mask].astype(np.float64)
     return {
         "picture": number, "name": case.name, "scores": scores, "seconds": seconds,

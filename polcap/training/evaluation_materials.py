@@ -104,7 +104,7 @@ def _sampled(image: Floats, u: Floats, v: Floats) -> Floats:
     side = 2**14  # remap is limited to pictures under 2^15 px a side
     wide = (len(u) // side + 1) * side
     x, y = (np.pad(a, (0, wide - len(u))).astype(np.float32).reshape(-1, side) for a in (u, v))
-    # and to four channels
+    # and to pictures of at most four channels, so the six are sampled in two halves
     halves = (np.ascontiguousarray(image[..., part]) for part in (slice(0, 3), slice(3, 6)))
     parts = [cv2.remap(half, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for half in halves]
     return np.concatenate([p.reshape(wide, 3)[: len(u)] for p in parts], axis=1)

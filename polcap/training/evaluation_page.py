@@ -7,12 +7,13 @@ import cv2
 import numpy as np
 
 from polcap.image_values import Bools, Floats
+from polcap.optics import frames
 from polcap.report import stage_pictures as pictures
 from polcap.report.stage_pictures import Picture
 from polcap.stage_values import SurfaceMaps
 from polcap.training import traced_views
 from polcap.training.evaluation_protocol import Case
-from polcap.training.map_errors import angle, render_intensity
+from polcap.training.map_errors import render_intensity
 from polcap.training.scores import LIMITS_DEG, grid
 
 # Deschaintre, Lin & Ghosh, CVPR 2021, tables 1 and 2, on the authors' own test set
@@ -123,7 +124,7 @@ def make_row(case: Case, maps: SurfaceMaps) -> Picture:
     centered = [d - d[mask].mean() for d in depth]
     span = float(np.abs(centered[0][mask]).max())
     relit = [_render(case, one, _LIGHT / np.linalg.norm(_LIGHT)) for one in both]
-    white = float(np.percentile(relit[0][mask], 99))
+    white, error = float(np.percentile(relit[0][mask], 99)), frames.angle_deg(maps.normal, case.truth.normal)
     columns = [
         [pictures.display(seen.radiance, 1.0), pictures.display(_render(case, maps, np.array([0.0, 0.0, 1.0])), 1.0)],
         [pictures.scale(seen.dolp, 0, 0.4, mask), pictures.hue(np.arctan2(s2, s1) / 2, mask)],
@@ -133,7 +134,7 @@ def make_row(case: Case, maps: SurfaceMaps) -> Picture:
         [pictures.scale(one.roughness, 0, 1, mask) for one in both],
         [pictures.scale(-d, -span, span, mask) for d in centered],
         [pictures.display(image, white) for image in relit],
-        [pictures.scale(e, 0, 30, mask) for e in (angle(maps, case), maps.confidence)],
+        [pictures.scale(e, 0, 30, mask) for e in (error, maps.confidence)],
     ]
     crop = _box(mask)
     tiles = [np.vstack([_tile(tile[crop]) for tile in column]) for column in columns]

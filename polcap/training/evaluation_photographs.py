@@ -91,7 +91,7 @@ def score(folder: Path, angles: list[str], name: str, network: Network | None) -
     inside, crop = mask[::by, ::by], np.s_[y0:y1, x0:x1]
     there = truth[::by, ::by][crop]
     error = np.full(inside.shape, np.nan)
-    error[crop] = np.where(maps.mask, np.degrees(np.arccos(np.clip((maps.normal * there).sum(-1), -1, 1))), np.nan)
+    error[crop] = np.where(maps.mask, frames.angle_deg(maps.normal, there), np.nan)
     covered = float(np.isfinite(error[inside]).mean())
     error = np.nan_to_num(error[inside], nan=_MISSED_DEG)
     figures = {"mean": float(error.mean()), "median": float(np.median(error))}

@@ -142,20 +142,15 @@ def _read(path: Path) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
     return np.asarray(cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
 
 
-def _arguments() -> tuple[Path, Path]:
-    """Source and data folder of the command line."""
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(
         prog="python -m polcap.training.import_data", description="Converts meshes and textures for polcap train."
     )
     parser.add_argument("source", type=Path, help="folder with meshes and texture folders")
     parser.add_argument("data", type=Path, help="data folder of polcap train")
     stated = parser.parse_args()
-    return stated.source, stated.data
-
-
-if __name__ == "__main__":
     try:
-        main(*_arguments(), lambda text: print(text, file=sys.stderr))
+        main(stated.source, stated.data, lambda text: print(text, file=sys.stderr))
     except PolcapError as error:
         print(f"polcap: error: {error}", file=sys.stderr)
         sys.exit(error.exit_code)

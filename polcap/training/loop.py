@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from polcap.errors import InputError
 from polcap.formats import atomic
@@ -175,16 +175,11 @@ def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path, re
 
 def make_optimizers(network: nn.Module, rate: float) -> list[torch.optim.Optimizer]:
     """The optimizers of a network: Muon for hidden layers; AdamW for first and last layers, biases and curves."""
-    hidden: list[Tensor] = []
-    outer: list[Tensor] = []
-    plain: list[Tensor] = []
-    for name, weight in network.named_parameters():
-        if weight.ndim <= 1 or "knots" in name:
-            plain.append(weight)
-        elif any(part in name for part in _OUTER_LAYERS):
-            outer.append(weight)
-        else:
-            hidden.append(weight)
+    named = list(network.named_parameters())
+    plain = [weight for name, weight in named if weight.ndim <= 1 or "knots" in name]
+    matrices = [(name, weight) for name, weight in named if weight.ndim > 1 and "knots" not in name]
+    outer = [weight for name, weight in matrices if any(part in name for part in _OUTER_LAYERS)]
+    hidden = [weight for name, weight in matrices if not any(part in name for part in _OUTER_LAYERS)]
     others = [{"params": outer, "weight_decay": 1e-2}, {"params": plain, "weight_decay": 0.0}]
     adamw = torch.optim.AdamW(others, _OUTER_RATE * rate, betas=(0.9, 0.98), fused=True)
     optimizers: list[torch.optim.Optimizer] = [Muon(hidden, rate), adamw]

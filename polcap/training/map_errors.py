@@ -41,8 +41,8 @@ class Judge:
         `depth_fitted` is the error after the best scale and shift. `diffuse_clipped` is the error where all exposures
         are saturated; it is absent for fewer than ten such pixels.
         """
-        case, mask, error = self.case, self.mask, angle(maps, self.case)
-        out = {}
+        case, mask = self.case, self.mask
+        error, out = frames.angle_deg(maps.normal, case.truth.normal), {}
         for suffix, inside in (("", mask), ("_core", self.core)):
             out[f"normal_mean{suffix}"] = float(error[inside].mean())
             out[f"normal_median{suffix}"] = float(np.median(error[inside]))
@@ -78,12 +78,6 @@ class Judge:
         """S0 (20, M, 3) rendered from maps under the 20 test lights, clipped to 0…1, the truth's 99th percentile."""
         images = [render_intensity(maps, self.case, self.rendered_mask, light) for light in render_lights()]
         return np.asarray(np.clip(np.stack(images) / self.white, 0, 1))
-
-
-def angle(maps: SurfaceMaps, case: Case) -> Floats:
-    """Angle [°] between estimated and true normal at each pixel, (H, W)."""
-    half = np.linalg.norm(maps.normal.astype(np.float64) - case.truth.normal, axis=-1) / 2
-    return np.asarray(np.degrees(2 * np.arcsin(np.clip(half, 0, 1))))
 
 
 def deciles(predicted: Floats, actual: Floats) -> list[dict[str, float]]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polcap.image_values import Floats
+from polcap.optics import frames
 
 _WAVES = 16  # plane waves in a random height field
 _LONGEST, _SHORTEST = 40.0, 4.0  # wavelengths, px
@@ -41,10 +42,8 @@ def random_slopes(position: Floats, px: float, rng: np.random.Generator) -> Floa
 
 def _waves(position: Floats, wavelength: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """A random relief of plane waves of similar length: height (M,) of standard deviation 1, and gradient (M, 3)."""
-    wave_vectors = rng.normal(size=(_WAVES, 3))
-    wave_vectors *= (2 * pi / wavelength * rng.uniform(0.5, 1.3, _WAVES) / np.linalg.norm(wave_vectors, axis=1))[
-        :, None
-    ]
+    direction = frames.unit(rng.normal(size=(_WAVES, 3)))
+    wave_vectors = 2 * pi / wavelength * rng.uniform(0.5, 1.3, (_WAVES, 1)) * direction
     phase: NDArray[np.float64] = position @ wave_vectors.T + rng.uniform(0, 2 * pi, _WAVES)
     scale = np.sqrt(2 / _WAVES)
     return np.asarray(scale * np.cos(phase).sum(1)), np.asarray(-scale * np.sin(phase) @ wave_vectors)

@@ -46,7 +46,8 @@ def main() -> None:
         both = {"before": errors(before.normal, case, network), "after": errors(after.normal, case, network)}
         rows.append(both)
         print(json.dumps({"picture": case.name, **both}), flush=True)
-        looks.append(_look(case, before.normal, after.normal))
+        if options.look:
+            looks.append(_look(case, before.normal, after.normal))
     for band in rows[0]["before"]:
         was, now = (float(np.mean([row[when][band] for row in rows])) for when in ("before", "after"))
         print(f"{band:>16}  {was:6.2f}°  {now:6.2f}°  {100 * (now / was - 1):+.1f} %")

@@ -9,6 +9,7 @@ import pytest
 from polcap.calibrate.ball_outline import Ball
 from polcap.cli import validate_command
 from polcap.formats.maps import result_maps
+from polcap.optics import frames
 from polcap.synth import scenes, shooting
 from tests.conftest import Command
 
@@ -28,8 +29,7 @@ def true_error_deg(capture: Path) -> float:
     maps, distance = result_maps.read(capture / "polcap"), float(np.linalg.norm(SCENE.position))
     true = Ball(np.array(SCENE.position) / distance, float(np.arcsin(SCENE.shape.radius / distance)))
     normal, shown = true.normals(maps.view, maps.mask.shape)
-    cosine = np.clip((normal * maps.normal).sum(-1), -1, 1)
-    return float(np.degrees(np.arccos(cosine))[shown & maps.mask].mean())
+    return float(frames.angle_deg(normal, maps.normal)[shown & maps.mask].mean())
 
 
 def test_a_ball_gives_the_accuracy_that_later_reports_quote(

@@ -106,25 +106,15 @@ class Grbl(Device):
     WORK_OFFSET = 7.0  # units
 
     def __init__(
-        self,
-        *,
-        homing: bool = True,
-        steps: float = 10.0,
-        degrees: float = 1.0,
-        mask: int = 1,
-        inches: bool = False,
+        self, *, homing: bool = True, steps: float = 10.0, degrees: float = 1.0, mask: int = 1, inches: bool = False,
         **planted: object,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """`degrees` per unit: where the unit is not a degree. `mask`: $10. `inches`: $13."""
         super().__init__(**planted)  # type: ignore[arg-type]
         self.settings = {
-            10: float(mask),
-            13: float(inches),
-            22: float(homing),
-            100: steps,
-            110: self.speed_deg_s * 60 / degrees,
+            10: float(mask), 13: float(inches), 22: float(homing), 100: steps, 110: self.speed_deg_s * 60 / degrees,
             130: 500.0,
-        }
+        }  # fmt: skip
         self.degrees = degrees
         self.state = "Alarm" if homing else "Idle"
         self._critical = False  # a limit switch was hit: only reset helps
@@ -173,9 +163,8 @@ class Grbl(Device):
         elif text in ("$H", "$SLP", "$X", "$$", ""):
             self.state = {"$SLP": "Sleep", "$X": "Idle"}.get(text, self.state)
             stored = [f"${number}={value:.3f}" for number, value in self.settings.items()]
-            for answer in {"$H": ["error:5"], "$X": ["[MSG:Caution: Unlocked]", "ok"], "$$": [*stored, "ok"]}.get(
-                text, ["ok"]
-            ):
+            answers = {"$H": ["error:5"], "$X": ["[MSG:Caution: Unlocked]", "ok"], "$$": [*stored, "ok"]}
+            for answer in answers.get(text, ["ok"]):
                 self.say(answer)
         elif text.startswith("$"):
             self.say("error:3")

@@ -39,15 +39,9 @@ class Device:
     END = b"\r\n"
 
     def __init__(
-        self,
-        *,
-        fault: str = "",
-        at: int = 1,
-        times: int = 1,
-        speed_deg_s: float = 2000.0,
-        start_deg: float = 37.0,
+        self, *, fault: str = "", at: int = 1, times: int = 1, speed_deg_s: float = 2000.0, start_deg: float = 37.0,
         real: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         assert not fault or fault in (*self.FAULTS, "late"), f"{fault} is none of {self.FAULTS}"
         self.fault, self.struck_moments = fault, range(at, at + times)
         self.speed_deg_s = speed_deg_s

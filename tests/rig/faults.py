@@ -180,9 +180,8 @@ def _check(folder: Path, pool: dict[Key, bytes]) -> None:
 
 if __name__ == "__main__":  # the process to kill: FOLDER PORT POOL [frame at which it kills itself]
     place, port, stored, *moment = sys.argv[1:]
-    killed = PoolCamera(
-        pickle.loads(Path(stored).read_bytes()), fault="kill" if moment else "", at=int([*moment, "1"][0])
-    )
+    frames = pickle.loads(Path(stored).read_bytes())
+    killed = PoolCamera(frames, fault="kill" if moment else "", at=int([*moment, "1"][0]))
     serial_port.ANSWER_S = 20.0  # the device is a thread of another process; a busy machine may delay it
     with mock.patch("polcap.rig.device_urls.open_camera", lambda name, log: killed):
         sequence.shoot(Path(place), msgspec.structs.replace(pools.ORDER, rotator=f"elliptec:{port}?{QUICK}"))

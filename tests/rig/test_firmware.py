@@ -14,9 +14,9 @@ from polcap.errors import HardwareError
 from polcap.rig import device_urls, motor_line_protocol, serial_port
 from polcap.rig.device_log import Log
 from polcap.rig.device_urls import open_rotator, probe
+from tests.conftest import ROOT
 
 pytestmark = pytest.mark.timeout(120)
-ROOT = Path(__file__).parents[2]
 STEPS_PER_DEGREE = 26.6667  # of the sketch
 
 

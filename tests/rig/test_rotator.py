@@ -56,10 +56,8 @@ def test_a_lost_or_damaged_answer_is_asked_for_again(kind: str, at: int, fault: 
 @pytest.mark.parametrize("at", [1, 6])
 def test_a_lasting_fault_is_one_error_and_no_wrong_angle(kind: str, fault: str, at: int) -> None:
     with KINDS[kind](fault=fault, at=at, times=ALWAYS) as device:
-        with (
-            pytest.raises(HardwareError, match=r"rotator|GRBL|ELL14") as raised,
-            closing(opened(kind, device)) as rotator,
-        ):
+        error = pytest.raises(HardwareError, match=r"rotator|GRBL|ELL14")
+        with error as raised, closing(opened(kind, device)) as rotator:
             shoot_round(device, rotator, (10.0, 45.0, 90.0, 0.0, 45.0, 90.0))
         assert "\n" not in str(raised.value)
         assert isinstance(raised.value, Unplugged) == (fault == "unplug")

@@ -16,6 +16,9 @@ from polcap.image_values import Floats
 from polcap.training import evaluation_materials, materials, random_shapes, traced_views
 from polcap.training.simulator import Simulator
 
+EXPORT_WARNINGS = pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore::UserWarning"
+)
 RECIPE = traced_views.ViewsRecipe(views=6, procedural=2, size=64, seed=5, per_shape=3, flat=2)
 
 

@@ -9,12 +9,10 @@ import pytest
 from polcap.errors import InputError
 from polcap.training import ablation_study, train, validation
 from polcap.training.variants import VARIANTS
-from tests.training.conftest import write_blob
+from tests.training.conftest import EXPORT_WARNINGS, write_blob
 from tests.training.test_main_network import TINY
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore::UserWarning"
-)
+pytestmark = EXPORT_WARNINGS
 
 
 @pytest.fixture

@@ -45,12 +45,9 @@ def _both(turn: Floats) -> tuple[Floats, Floats]:
     normal = frames.to_ray_frame(buffer.normal[mask], v).astype(float)
     material = (ALBEDO * ones, F0 * ones, np.full(len(ones), ROUGHNESS))
     _, flat = scene.first_hits(np.broadcast_to(-translation @ turn, v.shape), -v @ turn)
-    places = light_transport.SurfacePoints(
-        mask, buffer.position[mask].astype(float), flat, normal, v, *material, ior=1.5
-    )
-    indirect = light_transport.IndirectLight(
-        scene, places, pose, lambda place, facing: ALBEDO * np.ones((len(place), 3))
-    )
+    position = buffer.position[mask].astype(float)
+    places = light_transport.SurfacePoints(mask, position, flat, normal, v, *material, ior=1.5)
+    indirect = light_transport.IndirectLight(scene, places, pose, lambda place, _: ALBEDO * np.ones((len(place), 3)))
     traced = indirect.diffuse(np.random.default_rng(2)) + indirect.mirrored(np.random.default_rng(3))
 
     local = torch.from_numpy(normal).float()

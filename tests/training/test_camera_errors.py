@@ -42,13 +42,10 @@ def test_polarizer_angles_are_projected_on_oblique_rays() -> None:
     stokes[1], stokes[2] = (0.5 * f(2 * axis)[..., None] for f in (torch.cos, torch.sin))
     measured, _, _ = shoot(CameraErrors.none(B, CPU), stokes, diffuse, mask, rays)
     through_45 = (measured[0] + measured[2]) / 2
-    torch.testing.assert_close(
-        through_45, torch.full_like(through_45, 0.5), atol=2e-4, rtol=0
-    )  # 9σ of the remaining noise
+    assert (through_45 - 0.5).abs().max() < 2e-4  # 9σ of the remaining noise
 
 
 def test_noise_has_the_variance_it_states() -> None:
-    torch.manual_seed(0)
     images = scene()
     errors = replace(CameraErrors.none(B, CPU), full_well=torch.full((3, B), 2e4), read_noise=torch.full((B,), 5.0))
     errors = replace(errors, bracket=torch.full((B,), 3.0))
@@ -70,8 +67,8 @@ def test_shift_moves_a_ramp_by_its_length(axis: int) -> None:
     shift = torch.zeros(3, B, 2)
     shift[:, :, axis] = 0.1
     measured, _, _ = shoot(replace(none, shift=shift), stokes, *rest)
-    moved = measured[0].reshape(B, S, S, 3)[:, 8:-8, 8:-8] - stokes[0][:, 8:-8, 8:-8]
-    torch.testing.assert_close(moved, torch.full_like(moved, -0.001), atol=1e-4, rtol=0)
+    moved = (measured[0].reshape(B, S, S, 3) - stokes[0])[:, 8:-8, 8:-8]
+    assert (moved + 0.001).abs().max() < 1e-4
 
 
 def test_saturation_is_flagged_and_stays_finite() -> None:
@@ -84,7 +81,6 @@ def test_saturation_is_flagged_and_stays_finite() -> None:
 
 def test_noise_is_that_of_each_color() -> None:
     """A channel with a quarter of the electrons has twice the shot noise, and says so in its variance."""
-    torch.manual_seed(0)
     images = scene()
     well = torch.tensor([5e3, 2e4, 2e4])[:, None].expand(3, B)
     measured, covariance, _ = shoot(replace(CameraErrors.none(B, CPU), full_well=well), *images)
@@ -95,7 +91,6 @@ def test_noise_is_that_of_each_color() -> None:
 
 
 def test_black_level_moves_whole_shots_and_row_noise_whole_rows() -> None:
-    torch.manual_seed(0)
     images, none = scene(), CameraErrors.none(B, CPU)
     black = torch.zeros(3, 3, B)
     black[2, 0] = 0.01  # red of the shot at 90°

@@ -36,18 +36,15 @@ def decode(code: np.ndarray) -> np.ndarray:
 def test_photographs_are_those_of_one_stokes_vector(made: Path) -> None:
     inside = png.read(made / SAMPLE / "mask.png") > 0
     i0, i45, i90, i135 = (decode(numbers(made / SAMPLE, f"I{a:03d}"))[inside] for a in (0, 45, 90, 135))
-    np.testing.assert_allclose(
-        i45 + i135, i0 + i90, rtol=0.01, atol=1e-4
-    )  # off axis the axes of 45° and 135° are no longer perpendicular
+    # off axis the axes of 45° and 135° are no longer perpendicular
+    np.testing.assert_allclose(i45 + i135, i0 + i90, rtol=0.01, atol=1e-4)
     axis = (i0 - i90).sum(-1) + 1j * (i45 - i135).sum(-1)
     stokes = numbers(made / SAMPLE, "stokes")[inside] * 2 - 1
     s0 = (i0 + i90).sum(-1)
     strong = np.abs(axis) > 0.03 * np.maximum(s0, 0.01)
     assert strong.sum() > 100
     np.testing.assert_allclose(stokes[:, 0], 0, atol=1e-4)
-    np.testing.assert_allclose(
-        (stokes[:, 1] + 1j * stokes[:, 2])[strong], (axis[strong] / np.abs(axis[strong])), atol=0.02
-    )
+    assert np.abs((stokes[:, 1] + 1j * stokes[:, 2] - axis / np.abs(axis))[strong]).max() < 0.02
     normal = numbers(made / SAMPLE, "normal")[inside] * 2 - 1
     azimuth = np.angle(normal[:, 0] + 1j * normal[:, 1])
     off = np.abs(np.angle(axis * np.exp(-2j * azimuth)))[strong] / 2

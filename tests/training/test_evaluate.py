@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 from polcap.cli import app
 from polcap.errors import InputError
-from polcap.training import evaluate, evaluation_page, main_network, train
+from polcap.training import evaluate, evaluation_page, train
+from tests.training.test_main_network import TINY
 
 MODEL = Path(__file__).parents[2] / "calib" / "models" / "polcap.onnx"
-TINY = main_network.NetworkShape((8, 8, 8, 8, 8), (8, 8, 8, 8), (8, 8, 8, 8), (8, 8, 8, 8), (1, 1, 1, 1, 1))
 shipped = pytest.mark.skipif(not MODEL.exists(), reason="no model is shipped")
 
 
@@ -32,9 +32,8 @@ def test_the_command_evaluates_all_columns(test_data: Path, networks: Path, tmp_
     done = CliRunner().invoke(app, ["evaluate", str(MODEL), str(test_data), *options])
     assert done.exit_code == 0, done.output
     result = json.loads((tmp_path / "evaluation.json").read_text())
-    assert list(result["table"]) == [
-        "ours", "ours, noise-free", "analytic", "frontal", "silhouette", "mean of each map",
-    ]  # fmt: skip
+    names = ["ours", "ours, noise-free", "analytic", "frontal", "silhouette", "mean of each map"]
+    assert list(result["table"]) == names
     assert list(result["ablations"]) == ["ours", "rgb"]
     for figures in (*result["table"].values(), *result["ablations"].values()):
         assert {"normal_mean", "diffuse", "roughness", "specular", "rendering"} <= figures.keys()

@@ -27,12 +27,8 @@ def test_truth_scores_zero_and_all_within(case: Case) -> None:
 def test_known_errors_are_measured(case: Case) -> None:
     c, s = np.cos(np.radians(15)), np.sin(np.radians(15))
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    wrong = replace(
-        case.truth,
-        normal=case.truth.normal @ turn.T,
-        roughness=case.truth.roughness + 0.1,
-        depth_prior=2 * case.depth + 5,
-    )
+    truth, depth = case.truth, 2 * case.depth + 5
+    wrong = replace(truth, normal=truth.normal @ turn.T, roughness=truth.roughness + 0.1, depth_prior=depth)
     figures = Judge(case).score(wrong)
     zenith = np.sqrt(np.maximum(1 - case.truth.normal[case.truth.mask][:, 2] ** 2, 0))
     expected = np.degrees(2 * np.arcsin(zenith * np.sin(np.radians(7.5)))).mean()

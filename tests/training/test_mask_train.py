@@ -66,7 +66,6 @@ def test_the_network_learns_and_is_exported(tmp_path: Path, picture: mask_scenes
     file = tmp_path / "0.npy"
     held = mask_train.pack(picture)
     np.save(file, np.tile(held, (2, 2, 1)))
-    torch.manual_seed(0)
     run = mask_train.MaskTraining(3e-3, [file])
     losses = [run.advance([file] * 4, 0.0)["loss_whole"] for _ in range(40)]
     assert losses[-1] < 0.9 * losses[0]
@@ -79,9 +78,7 @@ def test_the_network_learns_and_is_exported(tmp_path: Path, picture: mask_scenes
 def test_loss_is_small_where_the_network_is_right_and_sure() -> None:
     truth = torch.zeros(1, 1, 16, 16)
     truth[..., 4:12, 4:12] = 1
-    assert (
-        mask_train.mask_loss(20 * (2 * truth - 1), truth) < 1e-3 < mask_train.mask_loss(torch.zeros_like(truth), truth)
-    )
+    assert mask_train.mask_loss(20 * (2 * truth - 1), truth) < 1e-3 < mask_train.mask_loss(0 * truth, truth)
 
 
 def test_an_inserted_object_is_part_of_the_truth(tmp_path: Path, picture: mask_scenes.MaskScene) -> None:

@@ -16,11 +16,10 @@ from polcap.formats import onnx
 from polcap.stages.cues import CHANNELS
 from polcap.training import main_network, onnx_export
 from tests.conftest import ROOT
+from tests.training.conftest import EXPORT_WARNINGS
 from tests.training.test_main_network import TINY
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore::UserWarning"
-)
+pytestmark = EXPORT_WARNINGS
 
 
 def settled(shape: main_network.NetworkShape) -> main_network.MainNetwork:

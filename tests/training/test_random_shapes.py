@@ -9,9 +9,8 @@ from polcap.training import random_shapes
 def test_branches_are_closed_and_face_outwards() -> None:
     """A surface whose faces turn outwards encloses a positive volume (the divergence theorem)."""
     for seed in range(4):
-        vertices, faces = random_shapes._branch(
-            np.array([0.0, 0.3, 0.1]), 0.04, 0.8, np.ones(3), np.random.default_rng(seed)
-        )
+        start, rng = np.array([0.0, 0.3, 0.1]), np.random.default_rng(seed)
+        vertices, faces = random_shapes._branch(start, 0.04, 0.8, np.ones(3), rng)
         a, b, c = (vertices[faces[:, k]] for k in range(3))
         volume = np.einsum("ni,ni->n", a, np.cross(b, c)).sum() / 6
         assert 0 < volume < np.pi * 0.06**2 * 2

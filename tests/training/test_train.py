@@ -11,12 +11,11 @@ from polcap.errors import InputError
 from polcap.training import loop, main_network, muon, onnx_export, train
 from polcap.training.simulator import Simulator
 from tests.conftest import ROOT
+from tests.training.conftest import EXPORT_WARNINGS
 from tests.training.test_main_network import TINY
 from tests.training.test_onnx_export import settled
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning", "ignore::UserWarning"
-)
+pytestmark = EXPORT_WARNINGS
 CPU = torch.device("cpu")
 
 
@@ -88,7 +87,6 @@ def test_the_shipped_model_can_start_training() -> None:
 
 
 def test_steps_on_one_batch_lower_its_loss(simulator: Simulator) -> None:
-    torch.manual_seed(0)
     run, batch = train.NetworkTraining(TINY, CPU, 3e-3, 2), simulator.draw_batch(4, 64)
     run.step = 200  # past the warm-up
     losses = [run.advance([batch, batch], 0.0)["loss"] for _ in range(25)]
