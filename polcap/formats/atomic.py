@@ -157,10 +157,7 @@ def _sync_all(folder: Path) -> None:
 
 
 def sync(target: Path) -> None:
-    """Force the content of a file, or the list of names in a folder, from memory onto the disk (fsync).
-
-    Does nothing on a drive without this function. Raises OSError: the disk is full or faulty.
-    """
+    """Force a file's content, or a folder's list of names, onto the disk (fsync) if its drive can. Raises OSError."""
     if os.name == "nt" and target.is_dir():  # Windows cannot sync a folder
         return
     try:

@@ -116,9 +116,7 @@ def _alike(*pairs: tuple[float | None, float | None]) -> bool:
 
 def _parts(found: Calibration) -> list[str]:
     """The measured parts of a calibration in words, such as the lens with its focal length."""
-    parts = []
-    if found.noise:
-        parts.append("noise at ISO " + ", ".join(f"{line.iso:g}" for line in found.noise))
+    parts = ["noise at ISO " + ", ".join(f"{line.iso:g}" for line in found.noise)] if found.noise else []
     if found.falloff is not None:
         parts.append("falloff of the lens")
     if (lens := found.geometry) is not None:

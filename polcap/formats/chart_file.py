@@ -33,10 +33,7 @@ Rows = list[list[str]]
 
 
 def read(path: Path) -> ChartReference:
-    """Colors of a measured ColorChecker Classic (24 patches), or of a measured SG, at least its block E2 to J5.
-
-    Raises ChartError: the file cannot be read, has no colors, or does not name the patches of one of these charts.
-    """
+    """Colors of a measured ColorChecker Classic, or of an SG, at least its block E2 to J5. Raises ChartError."""
     try:
         text = text_file.read_bytes(path, _MOST_BYTES).decode("utf-8-sig", errors="replace")
     except OSError as error:

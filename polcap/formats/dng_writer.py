@@ -72,56 +72,56 @@ def write(
 def _layout_tags(width: int, height: int) -> list[_Entry]:
     """TIFF tags for an image in one strip of 16 bits per pixel, without masked borders."""
     return [
-        (254, _LONG, 0),  # the full image
-        (256, _LONG, width),
-        (257, _LONG, height),
-        (258, _SHORT, 16),
-        (259, _SHORT, 1),  # uncompressed
-        (262, _SHORT, 32803),  # color filter array
-        (273, _LONG, 0),  # strip offset, set by the caller
-        (277, _SHORT, 1),
-        (278, _LONG, height),
-        (279, _LONG, 2 * width * height),
-        (284, _SHORT, 1),
-        (34665, _LONG, 0),  # offset of the Exif directory, set by the caller
-        (50706, _BYTE, bytes((1, 4, 0, 0))),
-        (50707, _BYTE, bytes((1, 1, 0, 0))),
-        (50710, _BYTE, bytes((0, 1, 2))),
-        (50711, _SHORT, 1),
-        (50713, _SHORT, (2, 2)),
-        (50718, _RATIONAL, (1, 1)),
-        (50719, _LONG, (0, 0)),
-        (50720, _LONG, (width, height)),
+        (254, _LONG, 0),  # NewSubfileType: the full image
+        (256, _LONG, width),  # ImageWidth
+        (257, _LONG, height),  # ImageLength
+        (258, _SHORT, 16),  # BitsPerSample
+        (259, _SHORT, 1),  # Compression: none
+        (262, _SHORT, 32803),  # PhotometricInterpretation: color filter array
+        (273, _LONG, 0),  # StripOffsets, set by the caller
+        (277, _SHORT, 1),  # SamplesPerPixel
+        (278, _LONG, height),  # RowsPerStrip
+        (279, _LONG, 2 * width * height),  # StripByteCounts
+        (284, _SHORT, 1),  # PlanarConfiguration
+        (34665, _LONG, 0),  # Exif directory, set by the caller
+        (50706, _BYTE, bytes((1, 4, 0, 0))),  # DNGVersion
+        (50707, _BYTE, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
+        (50710, _BYTE, bytes((0, 1, 2))),  # CFAPlaneColor
+        (50711, _SHORT, 1),  # CFALayout
+        (50713, _SHORT, (2, 2)),  # BlackLevelRepeatDim
+        (50718, _RATIONAL, (1, 1)),  # DefaultScale
+        (50719, _LONG, (0, 0)),  # DefaultCropOrigin
+        (50720, _LONG, (width, height)),  # DefaultCropSize
     ]
 
 
 def _camera_tags(exif: Exif) -> list[_Entry]:
     return [
-        (271, _ASCII, exif.make),
-        (272, _ASCII, exif.model),
-        (274, _SHORT, next(tag for tag, turn in UPRIGHT_DEG.items() if turn == exif.upright_deg)),
-        (305, _ASCII, "polcap"),
-        (306, _ASCII, _stamp(exif, "%Y:%m:%d %H:%M:%S")),
-        (50708, _ASCII, exif.camera or "unknown"),
+        (271, _ASCII, exif.make),  # Make
+        (272, _ASCII, exif.model),  # Model
+        (274, _SHORT, next(tag for tag, turn in UPRIGHT_DEG.items() if turn == exif.upright_deg)),  # Orientation
+        (305, _ASCII, "polcap"),  # Software
+        (306, _ASCII, _stamp(exif, "%Y:%m:%d %H:%M:%S")),  # DateTime
+        (50708, _ASCII, exif.camera or "unknown"),  # UniqueCameraModel
     ]
 
 
 def _exif_tags(exif: Exif) -> list[_Entry]:
     pitch = exif.pixel_pitch_um
     return [
-        (33434, _RATIONAL, exif.exposure_time),
-        (33437, _RATIONAL, exif.f_number),
-        (34855, _SHORT, exif.iso and round(exif.iso)),
-        (36864, _UNDEFINED, b"0231"),
-        (36867, _ASCII, _stamp(exif, "%Y:%m:%d %H:%M:%S")),
-        (37385, _SHORT, exif.flash_fired if exif.flash_fired is None else int(exif.flash_fired)),
-        (37386, _RATIONAL, exif.focal_length_mm),
-        (37521, _ASCII, (_stamp(exif, "%f") or "")[:3] or None),
-        (41486, _RATIONAL, pitch and 1e4 / pitch),
-        (41487, _RATIONAL, pitch and 1e4 / pitch),
-        (41488, _SHORT, pitch and _CENTIMETRE),
-        (41989, _SHORT, exif.focal_length_35mm and round(exif.focal_length_35mm)),
-        (42036, _ASCII, exif.lens),
+        (33434, _RATIONAL, exif.exposure_time),  # ExposureTime
+        (33437, _RATIONAL, exif.f_number),  # FNumber
+        (34855, _SHORT, exif.iso and round(exif.iso)),  # ISOSpeedRatings
+        (36864, _UNDEFINED, b"0231"),  # ExifVersion
+        (36867, _ASCII, _stamp(exif, "%Y:%m:%d %H:%M:%S")),  # DateTimeOriginal
+        (37385, _SHORT, exif.flash_fired if exif.flash_fired is None else int(exif.flash_fired)),  # Flash
+        (37386, _RATIONAL, exif.focal_length_mm),  # FocalLength
+        (37521, _ASCII, (_stamp(exif, "%f") or "")[:3] or None),  # SubSecTimeOriginal
+        (41486, _RATIONAL, pitch and 1e4 / pitch),  # FocalPlaneXResolution
+        (41487, _RATIONAL, pitch and 1e4 / pitch),  # FocalPlaneYResolution
+        (41488, _SHORT, pitch and _CENTIMETRE),  # FocalPlaneResolutionUnit
+        (41989, _SHORT, exif.focal_length_35mm and round(exif.focal_length_35mm)),  # FocalLengthIn35mmFilm
+        (42036, _ASCII, exif.lens),  # LensModel
     ]
 
 
@@ -130,10 +130,7 @@ def _stamp(exif: Exif, form: str) -> str | None:
 
 
 def _ifd(entries: list[_Entry], offset: int) -> bytes:
-    """Encode a TIFF directory placed at byte `offset`, followed by its long values.
-
-    Entries without a value are left out.
-    """
+    """Encode a TIFF directory at byte `offset`, followed by its long values; entries without a value are left out."""
     valued = sorted((entry for entry in entries if entry[2] is not None), key=itemgetter(0))
     encoded = [(tag, kind, *_encode(kind, value)) for tag, kind, value in valued]
     present = [entry for entry in encoded if entry[3] != b"\0" or entry[1] != _ASCII]

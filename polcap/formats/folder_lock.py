@@ -13,8 +13,7 @@ from polcap.formats import system_errors
 def acquire(lock: FileLock) -> AbstractContextManager[Any]:
     """Lock the file of a lock; returns a context manager that unlocks it.
 
-    Raises filelock.Timeout: another process has locked it.
-    StorageError: it cannot be written, or its drive has no locks.
+    Raises filelock.Timeout: another process has it. StorageError: it cannot be written, or its drive has no locks.
     """
     try:
         return lock.acquire()

@@ -25,7 +25,7 @@ _MAPPED = 1 << 16  # bytes; smaller files are read at once, as a map costs a pag
 
 
 def encode(value: Any, name: str, arrays: Arrays) -> Any:
-    """Convert a value to JSON data; its arrays are added to `arrays` under dotted names. TypeError: unknown type."""
+    """Convert a value to JSON data; its arrays are added to `arrays` under dotted names. Raises TypeError."""
     if isinstance(value, np.ndarray):
         if value.dtype.hasobject:
             raise TypeError(f"{name}: an array of Python objects cannot be stored")
@@ -49,10 +49,7 @@ def encode(value: Any, name: str, arrays: Arrays) -> Any:
 
 
 def decode(tree: Any, hint: Any, folder: Path) -> Any:
-    """Rebuild a value of type `hint` from JSON data that `encode` made; arrays are read from `folder`.
-
-    Raises StorageError: the tree is not of that type, or an array file cannot be read.
-    """
+    """Rebuild a value of type `hint` from JSON data of `encode`; arrays are read from `folder`. Raises StorageError."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         if tree is None and NoneType in inner:
@@ -124,12 +121,7 @@ def save(file: Path, array: NDArray[Any]) -> list[Any]:
 
 
 def load(file: Path) -> NDArray[Any]:
-    """Open an array of any shape from an .npy file: as a read-only memory map if large, else read into memory.
-
-    Large files too are read into memory if their drive has no memory maps.
-
-    Raises StorageError: the file is missing or no .npy.
-    """
+    """Open an .npy file: as a read-only memory map if it is large and its drive has maps. Raises StorageError."""
     try:
         if file.stat().st_size > _MAPPED:
             with suppress(OSError):

@@ -71,10 +71,7 @@ def digest(data: bytes) -> str:
 
 
 def run(network: Network, inputs: Floats) -> dict[str, Floats]:
-    """Run a network on input channels (1, N, H, W); returns maps by name, (1, n, H, W) each.
-
-    Raises ModelError: it fails on this input, does not end, returns something else, or its file has changed.
-    """
+    """Run a network on input channels (1, N, H, W); returns maps by name, (1, n, H, W) each. Raises ModelError."""
     session = _session(network.path, network.digest, network.device, network.threads)
     return run_session(session, Path(network.path), inputs)
 
@@ -174,7 +171,7 @@ def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
 
 
 def _check(path: Path, session: Any, encoding: str) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Names of the model's input channels, and its metadata. ModelError: these do not fit polcap or the input."""
+    """Names of the model's input channels, and its metadata. Raises ModelError."""
     try:
         metadata = {str(k): str(v) for k, v in session.get_modelmeta().custom_metadata_map.items()}
     except UnicodeError as error:

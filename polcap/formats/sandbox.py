@@ -136,10 +136,7 @@ class Sandbox:
             timer.cancel()
 
     def _answer(self, pipe: IO[bytes]) -> tuple[_Head, Arrays]:
-        """Read the child process's answer from the pipe: JSON, then arrays.
-
-        Raises ValueError, TypeError or RecursionError: the answer is too large or malformed, or an array not numeric.
-        """
+        """Read the child process's answer: JSON, then arrays. Raises ValueError, TypeError or RecursionError."""
         head = msgspec.convert(json.loads(_receive(pipe, _HEAD_BYTES)), _Head)
         if head.meta is None and head.error is None and head.bug is None:
             raise ValueError("it is empty")

@@ -49,9 +49,7 @@ def read_textures(folder: Path, side: int = 256) -> Floats:
     """Read a texture set: linear albedo (3), roughness, and relief slopes along columns and rows, (6, side, side).
 
     albedo.jpg (sRGB) and roughness.jpg are required; normal.jpg (tangent space, green down as in DirectX) or height.jpg
-    is optional.
-
-    Raises DecodeError: a picture is missing or cannot be read.
+    is optional. Raises DecodeError: a picture is missing or cannot be read.
     """
     albedo = _picture(folder / "albedo.jpg", side)[..., ::-1]
     linear = color.decode_srgb(albedo)

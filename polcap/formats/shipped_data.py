@@ -30,11 +30,9 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def data_path(name: str) -> Path:
-    """The path of a shipped file, e.g. "colorchecker/classic_srgb.toml".
+    """The path of a shipped file, e.g. "colorchecker/classic_srgb.toml". Raises StorageError.
 
     In a checkout it is in `calib/` next to the package, in an installed wheel in `polcap/_calib/`.
-
-    Raises StorageError: neither folder has it: the installation is incomplete.
     """
     for root in (_PACKAGE / "_calib", _PACKAGE.parent / "calib"):
         if (root / name).exists():

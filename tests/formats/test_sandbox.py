@@ -146,16 +146,13 @@ def test_a_malformed_answer_is_an_error_of_the_file(sandbox, text):
     assert pid(sandbox)
 
 
-def test_an_error_without_a_class_is_an_error_of_the_file(sandbox):
-    with pytest.raises(DecodeError, match=r"broken\.raw: no picture"):
-        sandbox.call(sandbox.module.answer, "broken.raw", text='{"error": "no picture"}')
-
-
-def test_an_error_of_the_function_keeps_its_class_and_its_child(sandbox):
+def test_an_error_of_the_function_keeps_its_class_if_any_and_its_child(sandbox):
     before = pid(sandbox)
     with pytest.raises(ChartError, match=r"^a\.raw: no chart$"):
         sandbox.call(sandbox.module.refuse, "a.raw")
     assert pid(sandbox) == before
+    with pytest.raises(DecodeError, match=r"broken\.raw: no picture"):
+        sandbox.call(sandbox.module.answer, "broken.raw", text='{"error": "no picture"}')
 
 
 def test_a_defect_of_our_own_is_a_bug_with_the_childs_traceback(sandbox):

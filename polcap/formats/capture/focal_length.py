@@ -26,7 +26,7 @@ class FocalLength(NamedTuple):
 
     @property
     def known(self) -> bool:
-        return self.doubt == (0.0, 0.0)
+        return self.doubt == _KNOWN
 
 
 class _Source(NamedTuple):

@@ -153,7 +153,7 @@ def numbered(folder: Path) -> list[str]:
 def _degrees_by_name(names: Iterable[str]) -> dict[str, float]:
     """Angle [degrees] by folder name: of pol000, pol045, …, else of numbers with °, deg or Grad, else of plain numbers.
 
-    Numbers with a unit may stand beside others: "01 Foto 0°", "02 Foto 45°". Plain numbers are the only difference of
+    Numbers with a unit may follow others: "01 Foto 0°", "02 Foto 45°". Plain numbers are the only difference of
     the names: 0, 45, 90; 角度0, 角度45, 角度90. There are at least three different axes below 180°, one of them 0°.
     """
     names = [name for name in names if name not in OURS and not foreign_files.is_ignored_folder(name)]
@@ -233,7 +233,7 @@ def degrees_of_cross(path: Path) -> float | None:
 
 
 def count_axes(angles_deg: Iterable[float]) -> int:
-    """Number of different polarizer axes among the angles; angles 180° apart are the same axis."""
+    """Number of different polarizer axes among the angles; angles that differ by 180° are the same axis."""
     axes = sorted(angle % 180 for angle in angles_deg)
     gaps = [b - a for a, b in pairwise([*axes, axes[0] + 180])] if axes else []
     return max(sum(gap >= SEPARATION_DEG for gap in gaps), 1 if axes else 0)

@@ -87,8 +87,7 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     whole = Path(os.path.abspath(folder))
     if folder_names.is_one_angle(whole):
         raise CaptureError(f"{folder}: holds one angle of a capture; give the folder of all, {whole.parent}")
-    groups = _by_name(pictures)
-    if groups:
+    if groups := _by_name(pictures):
         notes.append("angles read from the file names")
         shots = _select(folder, groups, angles_deg)
         files = tuple(bracket[0].path.name for _, bracket in shots)  # of brackets, the first frames
@@ -241,10 +240,7 @@ def _by_name(pictures: list[Source]) -> dict[float, list[Source]]:
 
 
 def _by_time(folder: Path, pictures: list[Source], angles_deg: Sequence[float]) -> tuple[Shots, str]:
-    """Split the pictures of a flat folder by time into K brackets of equal length, one per polarizer angle.
-
-    Also returns a note on the assumed order.
-    """
+    """Split the pictures of a flat folder by time into equal brackets, one per angle, with a note on the order."""
     count, shots = len(pictures), len(angles_deg)
     listed = ", ".join(f"{angle:g}" for angle in angles_deg)
     sort = "sort the frames into pol000, pol045, …, or list them in capture.toml"

@@ -16,10 +16,7 @@ _AT_ONCE = 2  # files read in parallel: as many child processes as decode them l
 
 
 def read(path: Path) -> Probe:
-    """Metadata of a photograph, or the kind of another file.
-
-    Raises CaptureError: the content is unknown, or a link leads nowhere. DecodeError: the file is damaged.
-    """
+    """Metadata of a photograph, or the kind of another file. Raises CaptureError or DecodeError."""
     if path.is_symlink() and not path.exists():
         raise CaptureError(
             f"{path}: is a link to {os.readlink(path)}, which is missing; restore that file, or remove the link"

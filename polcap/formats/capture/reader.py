@@ -83,7 +83,7 @@ def _read(folder: Path, angles_deg: tuple[float, ...] | None, clockwise: bool) -
     reference = shots[0].frames[0].exif
     calibration, calibration_notes = None, list[str]()
     if plan.layout != "sensor" and plan.shots[0][1][0].probe.kind == "raw":  # a polarizer on a ring, sensor counts
-        calibration, calibration_notes = _calibration(folder, reference, stated, clockwise)
+        calibration, calibration_notes = calibrations.choose(reference, stated.filter, stated.focal_length_mm)
     step = 2 if plan.layout == "sensor" else 1  # a plane of a sensor mosaic has half its sides
     size = (reference.width or 0) // step, (reference.height or 0) // step
     lens, principal = _lens(reference, stated, calibration, size)
@@ -104,7 +104,7 @@ def _read(folder: Path, angles_deg: tuple[float, ...] | None, clockwise: bool) -
         calibration=calibration,
         crossed=crossed,
         catalog=stated.catalog,
-        angles=_sense(plan.angles, clockwise, calibration),
+        angles=_sense(folder, plan, clockwise, calibration),
         lens_filter=stated.filter or "",
         accuracy=ball_accuracies.choose(reference, stated.filter),
     )
@@ -142,22 +142,14 @@ def _check_encodings(every: dict[Path, Source], stated: CaptureFile) -> None:
             )
 
 
-def _calibration(
-    folder: Path, exif: Exif, stated: CaptureFile, clockwise: bool
-) -> tuple[Calibration | None, list[str]]:
-    """The stored calibration for this camera, lens and filter, if any, and notes on its use."""
-    found, notes = calibrations.choose(exif, stated.filter, stated.focal_length_mm)
-    if clockwise and found is not None and found.polarizer is not None and found.polarizer.sense < 0:
-        raise CaptureError(f"{folder}: clockwise is stated, but the ring's calibration turns it already; leave it out")
-    return found, notes
-
-
-def _sense(angles: AngleStatement, clockwise: bool, calibration: Calibration | None) -> AngleStatement:
+def _sense(folder: Path, plan: layouts.Plan, clockwise: bool, calibration: Calibration | None) -> AngleStatement:
     """The statement of the angles, with the reason why they are counted clockwise, if they are."""
     ring = None if calibration is None else calibration.polarizer
-    if ring is not None and ring.sense < 0:
-        return replace(angles, clockwise="calibrated")
-    return replace(angles, clockwise="stated" if clockwise else "")
+    if ring is None or ring.sense > 0:
+        return replace(plan.angles, clockwise="stated" if clockwise else "")
+    if clockwise:
+        raise CaptureError(f"{folder}: clockwise is stated, but the ring's calibration turns it already; leave it out")
+    return replace(plan.angles, clockwise="calibrated")
 
 
 def _lens(
@@ -280,7 +272,7 @@ def _encoding(probe: Probe, stated: CaptureFile) -> list[str]:
 
 
 def _stated_exposure(source: Source) -> float | None:
-    """Relative exposure that capture.toml states, from the flash energy if it is given; None: not stated."""
+    """Relative exposure that capture.toml states, or that follows from a stated flash energy; None: not stated."""
     if source.flash_energy:
         fact = source.probe.exif
         return source.flash_energy * (fact.iso or 100.0) / 100.0 / (fact.f_number or 1.0) ** 2
@@ -303,10 +295,7 @@ def _sorted_alike(frames: Iterable[Frame]) -> tuple[Frame, ...]:
 
 
 def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
-    """Check the polarizer angles [°]; `who` begins the message.
-
-    Raises SettingError: they are no numbers. CaptureError: they are fewer than three polarizer axes.
-    """
+    """Check the polarizer angles [°]; `who` begins the message. Raises SettingError or CaptureError."""
     if not all(isinstance(angle, Real) for angle in angles_deg):  # from Python
         raise SettingError(f"--angles = {angles_deg!r:.60}: it holds no numbers; give degrees, such as (0, 45, 90)")
     count = folder_names.count_axes(angles_deg)

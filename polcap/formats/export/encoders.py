@@ -64,12 +64,9 @@ class TextureEncoder:
 
 
 def encode(texture: Texture, kind: Kind) -> bytes:
-    """Encode one texture as PNG, JPEG, WebP or KTX2.
+    """Encode one texture as PNG (8 or 16 bits per channel, as the texture), JPEG, WebP or KTX2 (8 bits).
 
-    JPEG, WebP and KTX2 have 8 bits per channel, PNG 8 or 16 as the texture.
-
-    Raises SettingError: JPEG for four channels, or the KTX2 encoder is missing or failed.
-    Raises StorageError: OpenCV cannot encode the picture as JPEG or WebP.
+    Raises SettingError: JPEG for four channels, or no working KTX2 encoder. StorageError: OpenCV cannot encode it.
     """
     if kind == "png":
         return png.encode(texture.pixels, texture.color)
@@ -127,9 +124,7 @@ def eight_bits(texture: Texture) -> NDArray[np.uint8]:
 def animate(path: Path, frames: Frames, seconds: float) -> list[Path]:
     """Write sRGB frames (H, W, 3) as path.webp, which repeats, and with FFmpeg as path.mp4; returns the files.
 
-    Both last `seconds`.
-
-    Raises StorageError: OpenCV was built without WebP, or FFmpeg fails.
+    Both last `seconds`. Raises StorageError: OpenCV was built without WebP, or FFmpeg fails.
     """
     files = [path.with_suffix(".webp")]
     moving = cv2.Animation()

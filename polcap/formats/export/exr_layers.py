@@ -40,18 +40,16 @@ MEANINGS = {
 
 @dataclass(frozen=True)
 class ColorSpace:
-    """A color space of the OpenColorIO configuration: name, interoperability identifier and primaries."""
+    """A color space of the OpenColorIO configuration."""
 
     name: str
-    interop_id: str | None  # Color Interop Forum's name, where the configuration has it
-    chromaticities: tuple[float, ...] | None  # (8,) xy of R, G, B and white
+    header: dict[str, exr.Attribute]  # of an EXR in it: Color Interop Forum's name; xy of R, G, B and white; if known
 
 
 def write(path: Path, maps: Path, color: str, header: Mapping[str, str]) -> None:
     """Write the folder maps/ of a result as layers of one EXR, with colors in the color space or role `color`.
 
-    Raises SettingError: there is no such space.
-    Raises DecodeError: a map is missing or damaged.
+    `header` are texts by key. Raises SettingError: there is no such space. DecodeError: a map is missing or damaged.
     """
     space = find_space(color)
     layers: dict[str, Floats] = {}
@@ -68,18 +66,10 @@ def write(path: Path, maps: Path, color: str, header: Mapping[str, str]) -> None
     layers |= {f"{name}.Y": cues[name] for name in ("dolp", "aolp")}
     layers["mask.Y"] = (png.read(maps / "mask.png") > 127).astype(np.float32)
     layers |= exr.read(maps / "stokes.exr")
-    exr.write(path, layers, _attributes(space, header), half=[name for name in layers if not name.startswith(_FLOAT)])
-
-
-def _attributes(space: ColorSpace, header: Mapping[str, str]) -> dict[str, exr.Attribute]:
-    """Header of the EXR: meanings of the layers, color space, provenance."""
-    attributes = exr.described({**header, **{f"layer {key}": meaning for key, meaning in MEANINGS.items()}})
-    attributes["polcap:colors"] = f"{', '.join(_COLORS)} in {space.name}"
-    if space.interop_id is not None:
-        attributes["colorInteropID"] = space.interop_id
-    if space.chromaticities is not None:
-        attributes["chromaticities"] = space.chromaticities
-    return attributes
+    texts = {**header, **{f"layer {key}": meaning for key, meaning in MEANINGS.items()}}
+    texts["colors"] = f"{', '.join(_COLORS)} in {space.name}"
+    half = [name for name in layers if not name.startswith(_FLOAT)]
+    exr.write(path, layers, exr.described(texts) | space.header, half=half)
 
 
 def find_space(wanted: str) -> ColorSpace:
@@ -94,12 +84,9 @@ def find_space(wanted: str) -> ColorSpace:
     if name not in config.getColorSpaceNames() or config.isData(name):
         known = ", ".join(sorted([*config.getRoles(), *config.getColorSpaceNames()]))
         raise SettingError(f"--color {wanted} is not a color space or role of {source}; it has {known}")
-    white = config.get_chromaticities(name)
-    return ColorSpace(
-        name=name,
-        interop_id=config.get_color_interop_id(name) or None,
-        chromaticities=tuple(float(x) for x in white) if white else None,
-    )
+    white, identifier = config.get_chromaticities(name), config.get_color_interop_id(name)
+    header: dict[str, exr.Attribute] = {"colorInteropID": identifier} if identifier else {}
+    return ColorSpace(name, header | ({"chromaticities": tuple(map(float, white))} if white else {}))
 
 
 def convert(rgb: Floats, space: ColorSpace) -> Floats:

@@ -59,8 +59,7 @@ class Blob:
     def accessor(self, array: NDArray[Any], view: int | None, *, bounds: bool = False) -> int:
         """Add an accessor, which describes an array (N, C) to readers; returns its index.
 
-        The data are in the buffer view `view`; None: an extension has them. `bounds` adds the least and greatest
-        values.
+        The data are in the buffer view `view`; None: in an extension. `bounds` adds the least and greatest values.
         """
         entry: dict[str, Any] = {} if view is None else {"bufferView": view}
         entry |= {
@@ -91,10 +90,7 @@ def require(geometry: Geometry) -> None:
 
 
 def add(blob: Blob, mesh: Mesh, origin: Floats, geometry: Geometry) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Add a mesh to a GLB, with `origin` (3,) as its origin; returns the primitive and the node's transform.
-
-    Raises SettingError: DracoPy is not installed.
-    """
+    """Add a mesh to a GLB with its origin at `origin` (3,); returns primitive and transform. Raises SettingError."""
     points = (mesh.vertices - origin).astype(np.float32)
     if geometry == "draco":
         return _draco(blob, mesh, points), {}

@@ -74,21 +74,19 @@ def manifest(pictures: Mapping[str, Texture], facts: Mapping[str, str], address:
     license_ = facts.get("license", "")
     named = license_.partition("://")[2].removeprefix("www.")
     stated = {key: facts[key] for key in _LABELS if facts.get(key)}
-    return {
+    notice = {"label": _text("Rights", "en"), "value": _text(facts["rights"])} if facts.get("rights") else None
+    keys: dict[str, Any] = {
         "@context": "http://iiif.io/api/presentation/3/context.json",
         "id": f"{address}/manifest.json",
         "type": "Manifest",
         "label": _text(facts.get("title") or facts["name"]),
-        **({"summary": _text(facts["description"])} if facts.get("description") else {}),
+        "summary": _text(facts["description"]) if facts.get("description") else None,
         "metadata": [{"label": _text(_LABELS[key], "en"), "value": _text(value)} for key, value in stated.items()],
-        **({"rights": addresses.of_web(f"http://{named}")} if named.startswith(_RIGHTS) else {}),
-        **(
-            {"requiredStatement": {"label": _text("Rights", "en"), "value": _text(facts["rights"])}}
-            if facts.get("rights")
-            else {}
-        ),
+        "rights": addresses.of_web(f"http://{named}") if named.startswith(_RIGHTS) else None,
+        "requiredStatement": notice,
         "items": [_canvas(name, picture, address) for name, picture in pictures.items()],
     }
+    return {key: value for key, value in keys.items() if value is not None}
 
 
 def _canvas(name: str, picture: Texture, address: str) -> dict[str, Any]:

@@ -5,6 +5,7 @@ References
 Ward, Measuring and modeling anisotropic reflection, SIGGRAPH 1992, eq. (4).
 """
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -35,7 +36,7 @@ def pictures(asset: Asset) -> dict[str, Texture]:
     rough = encoders.eight_bits(texture_set.roughness(asset))
     gloss = np.rint(255 - np.sqrt(255.0 * np.arange(256))).astype(np.uint8)[rough]  # 255 (1 - √(rough/255))
     made = {
-        "albedo": Texture(asset.base_color, True, "base color, sRGB-encoded Rec.709"),
+        "albedo": texture_set.base_color(asset),
         "specular": Texture(color.srgb_eight_bits(texture_set.reflectance(asset)), True, "F0, sRGB-encoded"),
         "normal": texture_set.object_normal(asset),
         "gloss": Texture(gloss, False, "gloss, linear: 1 - square root of the perceptual roughness"),
@@ -48,11 +49,6 @@ def pictures(asset: Asset) -> dict[str, Texture]:
         inside = coverage > 0
         return np.where(inside if whole.ndim == 2 else inside[..., None], whole, np.uint8(outside))
 
-    return {
-        name: Texture(
-            np.rot90(on_object(one, NO_NORMAL if name == "normal" else 0), asset.mesh.turned_deg // 90),
-            one.color,
-            one.meaning,
-        )
-        for name, one in made.items()
-    }
+    shown = {name: on_object(one, NO_NORMAL if name == "normal" else 0) for name, one in made.items()}
+    turns = asset.mesh.turned_deg // 90
+    return {name: replace(one, pixels=np.rot90(shown[name], turns)) for name, one in made.items()}

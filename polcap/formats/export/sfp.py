@@ -34,10 +34,7 @@ _README = (
 
 
 def write(folder: Path, maps: Path, comment: str = "") -> list[Path]:
-    """Write the folder from the folder maps/ of a result, with a `comment` in README.txt; returns the files.
-
-    Raises DecodeError: a map is missing or damaged.
-    """
+    """Write the folder from the folder maps/ of a result; `comment` goes into README.txt. Raises DecodeError."""
     found, stokes, cues = maps_folder.read(maps), result_maps.read_stokes(maps), result_maps.read_cues(maps)
     angle = np.radians(ANGLES_DEG)
     shots = np.einsum("ks,shwc->khwc", mueller.analyzer(angle), stokes.astype(np.float64))

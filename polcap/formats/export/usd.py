@@ -39,9 +39,7 @@ def require() -> None:
 def write(path: Path, asset: Asset, name: str, files: Mapping[Key, str], facts: Mapping[str, str]) -> None:
     """Write an asset as a USD layer (.usdc or .usda); its textures `files` are in the same folder.
 
-    `facts` go into the layer's custom data.
-
-    Raises SettingError: usd-core is not installed.
+    `facts` go into the layer's custom data. Raises SettingError: usd-core is not installed.
     """
     _export(_stage(asset, name, files, facts, phone=False), path)
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from polcap.errors import DecodeError, StorageError
+from polcap.errors import StorageError
 from polcap.formats import atomic, sandbox
-from polcap.formats.raw import file_bytes, file_kind, photo
+from polcap.formats.raw import file_kind, photo
 from polcap.image_values import Floats
 
 Attribute = str | int | float | tuple[float, ...]
@@ -23,8 +23,6 @@ def write(
     """Write named channels (H, W) ("R", "normal.x", "S0.R") as an EXR, ZIP-compressed; same input, same bytes.
 
     `half` makes all channels, or those named, 16 bits instead of 32; values beyond the range of half are clipped to it.
-
-    Raises StorageError: the file cannot be written.
     """
     import OpenImageIO as oiio
 
@@ -62,19 +60,11 @@ def described(texts: Mapping[str, str]) -> dict[str, Attribute]:
 
 
 def read(path: Path) -> dict[str, Floats]:
-    """Read the channels of an EXR by name, each (H, W) float32.
-
-    Raises DecodeError: the file is missing, cut short, not an OpenEXR file, or larger than any picture.
-    """
+    """Read the channels of an EXR by name, each (H, W) float32. Raises DecodeError."""
     return sandbox.call(decode, path)[1]
 
 
 def decode(path: str) -> sandbox.Answer:
     """Read an EXR in the child process; result and DecodeError as for `read`."""
-    data = file_bytes.load(path)
-    if not data.startswith(file_kind.EXR):
-        raise DecodeError(f"{path} is not an OpenEXR file; write it again")
-    with photo.opened(path, data) as file:
-        pixels = photo.every_channel(path, file)
-        names = file.spec().channelnames
+    names, pixels = photo.stored_channels(path, file_kind.EXR, "an OpenEXR file")
     return {}, {name: pixels[..., k] for k, name in enumerate(names)}

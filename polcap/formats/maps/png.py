@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polcap.errors import DecodeError, StorageError
+from polcap.errors import StorageError
 from polcap.formats import atomic, sandbox
-from polcap.formats.raw import file_bytes, file_kind, photo
+from polcap.formats.raw import file_kind, photo
 from polcap.image_values import Floats
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
@@ -33,8 +33,7 @@ def write(path: Path, array: Pixels, srgb: bool = False) -> None:
 def encode(array: Pixels, srgb: bool = False) -> bytes:
     """Encode an image (H, W[, C]), uint8 or uint16, as the bytes of a PNG; `srgb` states that it is sRGB color.
 
-    Raises TypeError: the values are neither uint8 nor uint16.
-    Raises StorageError: OpenCV cannot encode them.
+    Raises TypeError: the values are neither uint8 nor uint16. StorageError: OpenCV cannot encode them.
     """
     if array.dtype not in (np.uint8, np.uint16):
         raise TypeError(f"PNG holds uint8 or uint16, not {array.dtype}")
@@ -84,20 +83,13 @@ def indexed(level: NDArray[np.uint8], colors: NDArray[np.uint8]) -> bytes:
 
 
 def read(path: Path) -> Pixels:
-    """Read a PNG as an array (H, W) or (H, W, C), channels in RGB(A) order.
-
-    Raises DecodeError: the file is missing, cut short, not a PNG, or larger than any picture.
-    """
+    """Read a PNG as an array (H, W) or (H, W, C), channels in RGB(A) order. Raises DecodeError."""
     return sandbox.call(decode, path)[1]["pixels"]
 
 
 def decode(path: str) -> sandbox.Answer:
     """Read a PNG in the child process; result and DecodeError as for `read`."""
-    data = file_bytes.load(path)
-    if not data.startswith(file_kind.PNG):
-        raise DecodeError(f"{path} is not a PNG; write it again")
-    with photo.opened(path, data) as file:
-        pixels = photo.every_channel(path, file)
+    _, pixels = photo.stored_channels(path, file_kind.PNG, "a PNG")
     return {}, {"pixels": pixels[..., 0] if pixels.shape[2] < 3 else pixels}  # grey, its alpha left out
 
 

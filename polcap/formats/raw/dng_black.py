@@ -33,9 +33,8 @@ def uneven(structure: TiffStructure, sizes: Any, channels: int) -> Floats | None
     if levels.size != rows * columns * channels:
         return None
     pattern = levels.reshape(rows, columns, channels)
-    by_column, by_row = (
-        np.array(directory.get(tag, ()) or (0.0,)) for tag in (file_kind.BLACK_BY_COLUMN, file_kind.BLACK_BY_ROW)
-    )
+    by_column = np.array(directory.get(file_kind.BLACK_BY_COLUMN, ()) or (0.0,))
+    by_row = np.array(directory.get(file_kind.BLACK_BY_ROW, ()) or (0.0,))
     top, left = (int(edge) for edge in (*directory.get(file_kind.ACTIVE_AREA, ()), 0, 0)[:2])
     bayer = directory.get(file_kind.CFA_REPEAT) == (2, 2) and max(rows, columns) <= 2
     even = top % 2 == left % 2 == 0  # LibRaw counts the pattern from the corner of the whole sensor

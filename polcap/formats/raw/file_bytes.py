@@ -30,7 +30,7 @@ def digest(data: bytes) -> str:
 
 
 def load(path: str, expected: str | None = None) -> bytes:
-    """All bytes of a file. Raises DecodeError: it cannot be read, or has no longer the digest of the cache key."""
+    """All bytes of a file. Raises DecodeError: it cannot be read, or its digest is not the `expected` one."""
     with opened(path) as file:
         data = file.read()
     if expected is not None and digest(data) != expected:

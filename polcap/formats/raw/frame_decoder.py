@@ -11,11 +11,7 @@ from polcap.image_values import SensorImage
 
 
 def decode(frame: Frame) -> SensorImage:
-    """Decode the pixels of one photograph of a capture.
-
-    Raises DecodeError: the file is damaged, has changed since it was probed, or is in color where the sensor is
-    monochrome.
-    """
+    """Decode the pixels of one photograph of a capture. Raises DecodeError: it is damaged, or has changed since."""
     path, digest, reading = frame.path, _file_digest(frame), frame.reading
     if reading.cell is not None:
         return photo.read_mosaic(path, reading.cell, reading, digest)

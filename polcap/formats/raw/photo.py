@@ -57,9 +57,7 @@ def read_mosaic(
 ) -> SensorImage:
     """One angle of a polarization sensor's raw frame, (H/2, W/2, 3), linear: the pixels at `cell`, row and column.
 
-    `digest` is as in `read`.
-
-    Raises DecodeError: the frame is in color, or cannot be read.
+    `digest` is as in `read`. Raises DecodeError: the frame is in color, or cannot be read.
     """
     y, x = cell
     if reading.kind == "photo":
@@ -104,12 +102,10 @@ def describe(path: str, data: bytes) -> dict[str, Any]:
 def decode(
     path: str, digest: str | None = None, stated: Encoding | None = None, mosaic: bool = False
 ) -> sandbox.Answer:
-    """In the child process: the stored values of a picture (H, W, 1 or 3) in their stored type.
+    """In the child process: the stored values of a picture (H, W, 1 or 3) in their stored type. Raises DecodeError.
 
     `stated` replaces the encoding that the file states. `light_of_code` is the linear light 0…1 of each stored
     integer, if the picture is not linear; floating point is `decoded` already. `mosaic`: a gray picture may be one.
-
-    Raises DecodeError.
     """
     data = file_bytes.load(path, digest)
     with opened(path, data) as file:
@@ -133,9 +129,7 @@ def decode(
 
 
 def _is_float(spec: Any) -> bool:
-    import OpenImageIO as oiio
-
-    return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+    return str(spec.format) in ("half", "float", "double")
 
 
 def _top(pixels: NDArray[Any]) -> float:
@@ -163,7 +157,7 @@ def _values(path: str, file: Any) -> NDArray[Any]:
 
 def _display_window(path: str, file: Any) -> NDArray[Any]:
     """Pixels (H, W, C) of an EXR's display window; 0 where none is stored. Raises DecodeError."""
-    spec, pixels = file.spec(), every_channel(path, file)
+    spec, pixels = file.spec(), _every_channel(path, file)
     left, upper, right, lower = _display(spec)
     if (left, upper, right, lower) == (spec.x, spec.y, spec.x + spec.width, spec.y + spec.height):
         return pixels
@@ -177,7 +171,16 @@ def _display_window(path: str, file: Any) -> NDArray[Any]:
     return picture
 
 
-def every_channel(path: str, file: Any) -> NDArray[Any]:
+def stored_channels(path: str, signature: bytes, kind: str) -> tuple[list[str], NDArray[Any]]:
+    """Names and values (H, W, C) of all channels in a file that begins with `signature`. Raises DecodeError."""
+    data = file_bytes.load(path)
+    if not data.startswith(signature):
+        raise DecodeError(f"{path} is not {kind}; write it again")
+    with opened(path, data) as file:
+        return list(file.spec().channelnames), _every_channel(path, file)
+
+
+def _every_channel(path: str, file: Any) -> NDArray[Any]:
     """All channels (H, W, C) of an open file of OpenImageIO: float32, or integers of their stored type. DecodeError."""
     spec = file.spec()
     kind = "float" if _is_float(spec) else str(spec.format)
@@ -200,7 +203,7 @@ def reason(source: Any) -> str:
 
 @contextmanager
 def opened(path: str, data: bytes) -> Iterator[Any]:
-    """Context manager: bytes of a picture opened by OpenImageIO, which opens files by name only. DecodeError."""
+    """Context manager: bytes of a picture opened by OpenImageIO, which needs a file name. Raises DecodeError."""
     import OpenImageIO as oiio
 
     if data.startswith(file_kind.JPEG):

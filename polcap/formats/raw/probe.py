@@ -36,10 +36,8 @@ class Probe:
 def read(path: str | Path) -> Probe:
     """Kind, digest and metadata of a file, with its size in visible RAW pixels.
 
-    A file of unknown content that LibRaw can open is a RAW too.
-
-    Raises DecodeError: the file cannot be read, no decoder recognises it, it is cut short or of a form that polcap
-    refuses.
+    A file of unknown content that LibRaw can open is a RAW too. Raises DecodeError: the file cannot be read, no decoder
+    recognises it, it is cut short or of a form that polcap refuses.
     """
     answer, _ = sandbox.call(examine, path, limit_s=_LIMIT_S)
     found = msgspec.convert(answer["probe"], Probe)
@@ -61,10 +59,7 @@ def examine_kind(path: str) -> sandbox.Answer:
 
 
 def examine(path: str) -> sandbox.Answer:
-    """In the child process: probe a file as `read` does, and report whether only decoding can show that it is complete.
-
-    Raises DecodeError.
-    """
+    """In the child process: probe a file as `read` does, and report whether only decoding can show that it is whole."""
     with file_bytes.opened(path) as file:
         found = file_kind.kind(file, Path(path).suffix)
         if found == "other":

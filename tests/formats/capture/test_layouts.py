@@ -36,7 +36,7 @@ def test_sub_folders_state_the_angles(tmp_path):
 def test_angles_are_read_from_folder_names_that_differ_in_one_number(tmp_path, listed):
     (tmp_path / "notes 7").mkdir()
     understood = capture.read(each(tmp_path, listed))
-    assert understood.layout == "folders"
+    assert understood.layout == "folders" and folder_names.states_angles(listed)
     assert degrees(understood) == [float(re.sub(r"[^\d,]", "", name).replace(",", ".")) for name in listed]
     assert "not used: the folders notes 7" in understood.notes
     with pytest.raises(CaptureError, match="holds one angle of a capture"):
@@ -76,11 +76,7 @@ def test_file_names_with_a_unit_state_the_angles_of_brackets(tmp_path):
 def test_other_names_such_as_numbers_of_objects_get_a_suggestion_for_each_folder(tmp_path, listed, advice):
     with pytest.raises(CaptureError, match=f"but polcap looks for pol000.*{advice}"):
         capture.read(each(tmp_path, listed))
-
-
-def test_a_batch_distinguishes_angle_folders_from_numbered_captures():
-    assert folder_names.states_angles(("0 Grad", "45 Grad", "90 Grad"))
-    assert not folder_names.states_angles(("10", "20", "30"))
+    assert not folder_names.states_angles(listed)  # for a batch too, these are captures
 
 
 def test_angles_pick_from_those_stated_and_set_the_reference(tmp_path):
@@ -189,14 +185,10 @@ def test_the_frame_of_a_polarization_sensor_is_four_shots(tmp_path):
         capture.read(tmp_path, clockwise=True)
 
 
-def test_the_folder_of_one_angle_is_no_capture(tmp_path):
-    folders(tmp_path, times=(1 / 200, 1 / 50, 1 / 12))
-    with pytest.raises(CaptureError, match=f"holds one angle of a capture; give the folder of all, {tmp_path}"):
-        capture.read(tmp_path / "pol045")
-
-
-def test_a_folder_of_captures_is_named_as_such(tmp_path):
-    folders(tmp_path / "krug")
+def test_the_folders_of_one_angle_and_of_several_captures_are_no_capture(tmp_path):
+    folders(tmp_path / "krug", times=(1 / 200, 1 / 50, 1 / 12))
+    with pytest.raises(CaptureError, match=f"holds one angle of a capture; give the folder of all, {tmp_path}/krug"):
+        capture.read(tmp_path / "krug/pol045")
     with pytest.raises(CaptureError, match="sub-folders krug hold captures: give one of them, or run `polcap batch`"):
         capture.read(tmp_path)
 
@@ -262,17 +254,13 @@ def test_a_folder_of_jpegs_is_read_and_asks_for_raw(tmp_path):
 
 
 def test_a_flat_folder_that_does_not_divide_into_equal_brackets_is_refused(tmp_path):
+    """By the number of its frames, by the angles on the command line, or by the first frame that differs."""
+    flat(tmp_path, shots=2)
     with pytest.raises(CaptureError, match=r"4 frames do not make 3 equal brackets.*--angles"):
-        capture.read(flat(tmp_path, shots=2))
-
-
-def test_flat_folder_of_unequal_brackets_names_the_first_frame_that_differs(tmp_path):
+        capture.read(tmp_path)
     flat(tmp_path)
+    with pytest.raises(CaptureError, match="--angles states 0, 90, 180: 2 different"):
+        capture.read(tmp_path, (0.0, 90.0, 180.0))
     shoot(tmp_path / "IMG_0001.dng", 1 / 100, "00:03:00")
     with pytest.raises(CaptureError, match=r"IMG_0001\.dng: its exposure is 0\.5 times"):
         capture.read(tmp_path)
-
-
-def test_three_equal_angles_on_the_command_line_are_refused(tmp_path):
-    with pytest.raises(CaptureError, match="--angles states 0, 90, 180: 2 different"):
-        capture.read(flat(tmp_path), (0.0, 90.0, 180.0))

@@ -143,6 +143,11 @@ def zipped(folder):
     Path(packed).rename(folder)
 
 
+def move(old, new, function=shutil.move):
+    """Move or copy a file or a folder."""
+    return lambda folder: function(folder / old, folder / new)
+
+
 def rewrite(place, change):
     """Change the bytes of a photograph."""
     return lambda folder: (folder / place).write_bytes(change((folder / place).read_bytes()))
@@ -157,11 +162,8 @@ FRAME = "pol045/IMG_1.dng"
 TOO_FEW = "2 different polarizer angles where 3 are needed"
 FAULTS = {
     "missing angle": (lambda vase: shutil.rmtree(vase / "pol045"), rf"angles are 0, 90: {TOO_FEW}"),
-    "name of an angle": (
-        lambda vase: (vase / "pol045").rename(vase / "angle45"),
-        rf"angles are 0, 90: {TOO_FEW}; add the missing shot, or name angle45 as",
-    ),
-    "axes that coincide": (lambda vase: (vase / "pol045").rename(vase / "pol180"), TOO_FEW),
+    "name of an angle": (move("pol045", "angle45"), rf"angles are 0, 90: {TOO_FEW}; add the .*, or name angle45 as"),
+    "axes that coincide": (move("pol045", "pol180"), TOO_FEW),
     "empty angle": (lambda vase: empty(vase / "pol045"), "pol045: holds no photograph"),
     "empty folder": (empty, "holds no photograph that polcap reads; give the folder that holds the photographs"),
     "no folder": (shutil.rmtree, "no such folder"),
@@ -176,18 +178,12 @@ FAULTS = {
     "zoom": (remake("pol090/IMG_0.dng", focal=70), "was taken at 70 mm, not 60 mm"),
     "size": (remake("pol090/IMG_0.dng", size=(32, 64)), "has 64×32 px, not 48×32"),
     "bracket length": (lambda vase: (vase / "pol090/IMG_0.dng").unlink(), "pol090: 90° has 1 frames where 0° has 2"),
-    "bracket exposure": (
-        remake("pol090/IMG_0.dng", 1 / 25),
-        r"pol090/IMG_0\.dng: 1/25 s f/8\.0 ISO 200\.0 where 0° has 1/50 s",
-    ),
-    "duplicate": (
-        lambda vase: shutil.copy(vase / "pol000/IMG_0.dng", vase / "pol090/IMG_0.dng"),
-        "is the same photograph as",
-    ),
+    "bracket exposure": (remake("pol090/IMG_0.dng", 1 / 25), "IMG_0.dng: 1/25 s f/8.0 ISO 200.0 where 0° has 1/50 s"),
+    "duplicate": (move("pol000/IMG_0.dng", "pol090/IMG_0.dng", shutil.copy), "is the same photograph as"),
     "truncated": (rewrite(FRAME, lambda data: data[:-50]), rf"{FRAME}: its image data run past the end"),
     "zero bytes": (rewrite(FRAME, lambda data: b""), rf"{FRAME}: is empty"),
     "noise": (rewrite(FRAME, lambda data: np.random.default_rng(3).bytes(5000)), rf"{FRAME}: not a picture"),
-    "same angle twice": (lambda vase: shutil.copytree(vase / "pol045", vase / "pol45"), "45° is also in pol045"),
+    "same angle twice": (move("pol045", "pol45", shutil.copytree), "45° is also in pol045"),
 }
 
 

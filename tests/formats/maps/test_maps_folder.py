@@ -155,7 +155,7 @@ def test_the_covariance_of_the_stokes_parameters_comes_back(folder: Path, result
     assert np.array_equal(found, np.swapaxes(found, 0, 1))
 
 
-def test_stored_maps_come_back(folder: Path, result: Result) -> None:
+def test_stored_maps_come_back_with_expected_errors_or_without(folder: Path, result: Result, tmp_path: Path) -> None:
     of, mesh, *_ = result
     stored = maps.read(folder)
     assert stored.metric and stored.view == of.view and stored.estimator == "truth"
@@ -163,6 +163,12 @@ def test_stored_maps_come_back(folder: Path, result: Result) -> None:
     assert np.array_equal(stored.normal[of.mask], of.normal[of.mask])
     assert np.array_equal(stored.depth, mesh.depth, equal_nan=True)
     assert np.allclose(stored.diffuse[of.mask], of.diffuse[of.mask], rtol=1e-3)
+    assert stored.diffuse_error is not None and stored.roughness_error is not None
+    assert np.allclose(stored.diffuse_error[of.mask], 0.04, rtol=1e-3)
+    assert np.allclose(stored.roughness_error[of.mask], 0.08, rtol=1e-3)
+    write(tmp_path / "maps", replace(of, diffuse_error=None, roughness_error=None), *result[1:])
+    without = maps.read(tmp_path / "maps")
+    assert without.diffuse_error is None and without.roughness_error is None
 
 
 def test_values_outside_the_range_of_half_floats_are_rounded_or_clipped(folder: Path, result: Result) -> None:
@@ -183,37 +189,25 @@ def test_the_mesh_of_the_stored_maps_is_that_of_the_stage(folder: Path, result: 
         assert np.array_equal(value, getattr(again, name), equal_nan=isinstance(value, np.ndarray)), name
 
 
-def test_expected_errors_of_the_material_come_back_and_a_result_without_them_is_read(
-    folder: Path, result: Result, tmp_path: Path
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("maps.json", None, "cannot be read"),
+        ("maps.json", b"{}", "process again"),
+        ("mask.png", None, r"mask\.png is missing; make the result again"),
+        ("mask.png", png.encode(np.zeros((3, 3), np.uint8)), r"mask\.png is not 160 × 120"),
+        ("normal.exr", None, r"normal\.exr is missing; make the result again"),
+    ],
+)
+def test_a_missing_or_damaged_file_is_one_line(
+    folder: Path, tmp_path: Path, name: str, content: bytes | None, words: str
 ) -> None:
-    of, mesh, stokes, cue = result
-    stored = maps.read(folder)
-    assert stored.diffuse_error is not None and stored.roughness_error is not None
-    assert np.allclose(stored.diffuse_error[of.mask], 0.04, rtol=1e-3)
-    assert np.allclose(stored.roughness_error[of.mask], 0.08, rtol=1e-3)
-    write(tmp_path / "maps", replace(of, diffuse_error=None, roughness_error=None), mesh, stokes, cue)
-    without = maps.read(tmp_path / "maps")
-    assert without.diffuse_error is None and without.roughness_error is None
-
-
-def test_a_missing_map_is_named_with_a_remedy(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder, tmp_path / "maps")
-    for name in ("normal.exr", "mask.png"):
-        (tmp_path / "maps" / name).unlink()
-        with pytest.raises(DecodeError, match=rf"{name} is missing; make the result again"):
-            maps.read(tmp_path / "maps")
-
-
-def test_damaged_folder_is_one_line(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(DecodeError, match="cannot be read"):
-        maps.read(tmp_path)
-    (tmp_path / "maps.json").write_text("{}")
-    with pytest.raises(DecodeError, match="process again"):
-        maps.read(tmp_path)
-    (tmp_path / "maps.json").write_bytes((folder / "maps.json").read_bytes())
-    png.write(tmp_path / "mask.png", np.zeros((3, 3), dtype=np.uint8))
-    with pytest.raises(DecodeError, match=r"mask\.png is not 160 × 120"):
-        maps.read(tmp_path)
+    (tmp_path / "maps" / name).unlink()
+    if content is not None:
+        (tmp_path / "maps" / name).write_bytes(content)
+    with pytest.raises(DecodeError, match=words):
+        maps.read(tmp_path / "maps")
 
 
 @pytest.mark.parametrize("name", ["capture/polcap/maps", "capture/polcap", "capture"])

@@ -32,23 +32,19 @@ def save(path, pixels, names=None, **attributes):
     return path
 
 
-@pytest.mark.parametrize("name", ["a.tif", "a.png"])
-def test_sixteen_bits_are_linear_counts(tmp_path, name):
-    image = photo.read(save(tmp_path / name, SIXTEEN))
-    np.testing.assert_array_equal(image.value, SIXTEEN)
-    assert (image.white, image.black.tolist(), image.cfa, image.lossy) == (65535, [[0]], None, False)
-
-
-def test_half_float_exr_is_linear_of_white_one(tmp_path):
-    pixels = np.linspace(0, 2, 24 * 32 * 3).reshape(24, 32, 3).astype(np.float16)
-    image = photo.read(save(tmp_path / "a.exr", pixels))
-    np.testing.assert_array_equal(image.value, pixels.astype(np.float32))
-    assert (image.white, image.lossy) == (1, False)
-
-
-def test_grey_fills_all_channels(tmp_path):
-    image = photo.read(save(tmp_path / "a.tif", SIXTEEN[..., 0]))
-    np.testing.assert_array_equal(image.value, np.stack([SIXTEEN[..., 0]] * 3, -1))
+@pytest.mark.parametrize(
+    ("name", "pixels", "white"),
+    [
+        ("a.tif", SIXTEEN, 65535),
+        ("a.png", SIXTEEN, 65535),
+        ("gray.tif", SIXTEEN[..., 0], 65535),
+        ("half.exr", np.linspace(0, 2, 24 * 32 * 3).reshape(24, 32, 3).astype(np.float16), 1),
+    ],
+)
+def test_sixteen_bits_and_floats_are_linear_and_gray_fills_all_channels(tmp_path, name, pixels, white):
+    image = photo.read(save(tmp_path / name, pixels))
+    np.testing.assert_array_equal(image.value, np.broadcast_to(np.atleast_3d(pixels), (24, 32, 3)).astype(np.float32))
+    assert (image.white, image.black.tolist(), image.cfa, image.lossy) == (white, [[0]], None, False)
 
 
 def test_eight_bits_are_srgb_with_a_loss(tmp_path):
