@@ -121,7 +121,7 @@ def save(file: Path, array: NDArray[Any]) -> list[Any]:
 
 
 def load(file: Path) -> NDArray[Any]:
-    """Open an .npy file: as a read-only memory map if it is large and its drive has maps. Raises StorageError."""
+    """Open an array of any shape: as a read-only memory map if large and its drive has maps. Raises StorageError."""
     try:
         if file.stat().st_size > _MAPPED:
             with suppress(OSError):

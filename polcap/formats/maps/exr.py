@@ -23,6 +23,7 @@ def write(
     """Write named channels (H, W) ("R", "normal.x", "S0.R") as an EXR, ZIP-compressed; same input, same bytes.
 
     `half` makes all channels, or those named, 16 bits instead of 32; values beyond the range of half are clipped to it.
+    Raises StorageError.
     """
     import OpenImageIO as oiio
 

@@ -59,7 +59,10 @@ def examine_kind(path: str) -> sandbox.Answer:
 
 
 def examine(path: str) -> sandbox.Answer:
-    """In the child process: probe a file as `read` does, and report whether only decoding can show that it is whole."""
+    """In the child process: probe a file as `read` does. Raises DecodeError.
+
+    The answer is "doubtful" if only decoding can show whether the file is complete.
+    """
     with file_bytes.opened(path) as file:
         found = file_kind.kind(file, Path(path).suffix)
         if found == "other":
