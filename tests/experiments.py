@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from msgspec.structs import replace
 
 from polcap.capture_values import Capture
 from polcap.chart_values import ChartRequest
@@ -26,6 +27,7 @@ from polcap.quality.gate_values import Gate, full_size
 from polcap.results import R, Results
 from polcap.stage_values import Network, SurfaceMaps
 from polcap.synth import scenes, shooting
+from polcap.synth.render import Scene
 
 T = TypeVar("T")
 Networks = tuple[Network | None, Network | None]  # of the normals, of the mask
@@ -118,6 +120,12 @@ def small_capture(folder: Path, seed: int = 0) -> None:
     shooting.write(folder, scenes.random_scene(seed, "bumps"), shoot)
 
 
+def with_materials(scene: Scene, **changes: Any) -> Scene:
+    """A scene with these fields of all its materials changed."""
+    changed = tuple(replace(one, **changes) for one in scene.coat.materials)
+    return replace(scene, coat=replace(scene.coat, materials=changed))
+
+
 @cache
 def networks(estimator: Any = None, model: Path | None = None) -> Networks:
     """The networks of normals and mask on one thread, shipped ones unless a model is named."""
@@ -147,6 +155,11 @@ def raw_pixels(maps: SurfaceMaps) -> tuple[int, tuple[slice, slice]]:
 def rms(error: Floats) -> float:
     """Root of the mean square."""
     return float(np.sqrt(np.mean(np.square(error))))
+
+
+def overlap(one: Bools, other: Bools) -> float:
+    """Intersection over union (IoU) of two masks."""
+    return float((one & other).sum() / max((one | other).sum(), 1))
 
 
 def plain_maps(normal: Floats, mask: Bools, view: View, error_deg: float) -> SurfaceMaps:

@@ -151,6 +151,7 @@ def _columns(picture: _Picture, value: Floats) -> list[Floats]:
     sine2 = 1 - np.clip(local[..., 2], 0, 1) ** 2
     diffuse, mirrored = parts[..., 0] * seen, parts[..., 1] * seen
     falling = np.clip(frames.dot(local, light), 0, 1)
+    # rough surfaces look flatter than Lambert's, so they send more light near the outline (`body.flattening`)
     rim = seen / squared * falling * sine2
     steep = rim * sine2 / np.clip(np.maximum(falling, local[..., 2]), _GRAZING, 1)
     columns = [mirrored, 1 - seen, diffuse, diffuse * sine2, diffuse * sine2**2, rim, steep]

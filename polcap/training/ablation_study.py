@@ -24,7 +24,7 @@ def main(
 ) -> Path:
     """Train each variant into out/NAME on the same traced views, evaluate all on `count` pictures of `size` px.
 
-    Returns the page out/evaluation.md. `report` is called with lines of text; the first states the cost.
+    Returns the page out/evaluation.md. The first line of the report states the cost.
 
     Raises InputError: as in `train.main`; or the options choose a variant or a model to start with.
     """

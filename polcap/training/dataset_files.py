@@ -52,10 +52,7 @@ class DatasetRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def main(out: Path, count: int, recipe: DatasetRecipe, report: Report = silent) -> int:
-    """Make the samples 0…count − 1 that the folder lacks; returns the number of new samples.
-
-    `report` is called with a line of text per new sample.
-    """
+    """Make the samples 0…count − 1 that the folder lacks; returns the number of new samples."""
     library, files = _open_library(recipe.material), _list_meshes(recipe.mesh)
     _describe(out, recipe)
     made = 0

@@ -56,10 +56,7 @@ class EvaluationOptions:
 
 
 def main(options: EvaluationOptions, report: Report = silent) -> dict[str, Score]:
-    """Evaluate model and baselines; returns mean scores, writes evaluation.json, evaluation.md and panel.png.
-
-    `report` is called with a line of text per picture.
-    """
+    """Evaluate model and baselines; returns mean scores, writes evaluation.json, evaluation.md and panel.png."""
     torch.set_num_threads(1)
     network = models.open_network(options.model)
     protocol = Protocol(options.data, options.size, options.protocol)

@@ -38,8 +38,6 @@ _MIN_DOLP, _MIN_TILT = 0.03, 0.3  # for the comparison of AoLP and azimuth; tilt
 def main(folder: Path, model: Path, out: Path, report: Report = silent) -> dict[str, Score]:
     """Evaluate every photograph set with and without the network; writes real.json and real.md to `out`.
 
-    `report` is called with a line of text per set.
-
     Raises InputError: the folder does not have this layout.
     """
     names, angles = _list_pictures(folder)

@@ -142,10 +142,7 @@ class PictureTraining(Trainee):
 
 
 def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path, report: Report = silent) -> None:
-    """Train a network until the budget is spent. Writes last.pt, metrics.csv and watch.csv to `out`.
-
-    `report` is called with a line of text after the first step and every ten seconds.
-    """
+    """Train a network until the budget is spent. Writes last.pt, metrics.csv and watch.csv to `out`."""
     saved = validated = trainee.elapsed
     reported = -math.inf
     before, losses = time.monotonic(), []

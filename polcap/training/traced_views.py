@@ -60,8 +60,6 @@ def open_cache(
 ) -> dict[str, NDArray[Any]]:
     """Open a cache of traced views; trace the views first if the folder has no complete cache.
 
-    `report` is called with lines of text: size and number of the views before tracing, then progress.
-
     Returns the arrays of ARRAYS (N, S, S, ·) as memory maps, and camera (N, 16): focal length, center x, y [px]; middle
     depth [m]; depth unit [m]; rotation from object to camera (9); flash to the right of the lens and above it [middle
     depths]. index.json is written last, so that an interrupted cache is recognized, and continued.

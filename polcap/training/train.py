@@ -78,8 +78,6 @@ PRESETS = {
 def main(options: TrainingOptions, report: Report = silent) -> Path:
     """Train and return the path of model.onnx; its folder also gets last.pt, metrics.csv, watch.csv and watch.png.
 
-    `report` is called with lines of text about the progress.
-
     Raises InputError: an option is unknown, or contradicts another one or the content of `out`; or there are no test
     meshes.
     """

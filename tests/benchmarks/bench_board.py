@@ -10,7 +10,7 @@ and eraser. Views that are not yet processed are processed as far as `align`.
 
 import json
 import sys
-import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ from polcap.results import ResultsUntilAlign
 from polcap.stage_values import AngleStack
 from polcap.stages import mask
 from polcap.stages.mask import MaskSettings
+from tests.experiments import overlap, timed
 
 _AROUND = 0.03 * np.array([[1, 1, 0], [-1, 1, 0], [0, 1, 1], [0, 2, 0], [0, 3, -1]], float)  # m, points of the object
 
@@ -42,11 +43,12 @@ def aligned(folder: Path) -> ResultsUntilAlign:
     return run.reopen(out, ResultsUntilAlign)[0]
 
 
-def overlap(radiance: AngleStack, results: ResultsUntilAlign, true: Bools) -> float:
-    found = mask.segment(
-        radiance, results.alignment, results.color, None, models.load_mask_network(1), onnx.run, MaskSettings()
-    ).mask
-    return float((found & true).sum() / (found | true).sum())
+def mask_overlap(radiance: AngleStack, results: ResultsUntilAlign, true: Bools) -> float:
+    """Overlap (IoU) of the object's mask with the true one."""
+    network, settings = models.load_mask_network(1), MaskSettings()
+    return overlap(
+        mask.segment(radiance, results.alignment, results.color, None, network, onnx.run, settings).mask, true
+    )
 
 
 def corners_of(results: ResultsUntilAlign) -> BoardCorners:
@@ -66,9 +68,7 @@ def main(session: Path) -> None:
     for one in truth["views"]:
         name = one["name"]
         results[name] = aligned(session / name)
-        start = time.process_time()
-        seen[name] = corners_of(results[name])
-        seconds[name] = time.process_time() - start
+        seen[name], seconds[name] = timed(partial(corners_of, results[name]))
     solved = poses.solve(seen, reader.read(session / truth["views"][0]["name"]))
     print(f"focal length {solved.camera.focal_px:.1f} ± {solved.camera.focal_sigma_px:.1f} px, true {camera.focal:.1f}")
     print("view corners error_px residual_px turn_deg object_px IoU_plain IoU_erased detect_s erase_s")
@@ -79,18 +79,16 @@ def main(session: Path) -> None:
         true_px = projection.project(camera, _AROUND @ turn.T + shift)
         moved = solved.camera.project(view.pose, _AROUND) - true_px
         cosine = (np.trace(view.pose.rotation @ turn.T) - 1) / 2
-        start = time.process_time()
-        erased = board_eraser.erase(
-            result.radiance, result.alignment, result.color, PosedBoard(corners.board, solved.camera, view.pose)
-        )
-        spent = time.process_time() - start
+        board = PosedBoard(corners.board, solved.camera, view.pose)
+        erase = partial(board_eraser.erase, result.radiance, result.alignment, result.color, board)
+        erased, spent = timed(erase)
         with np.load(session / name / "truth.npz") as maps:
             full = maps["mask"]
         true = full.reshape(full.shape[0] // 2, 2, -1, 2).mean(axis=(1, 3)) > 0.5
         print(
             f"{name} {len(corners.number)} {rms(error):.3f} {view.residual_px:.3f} "
             f"{np.degrees(np.arccos(min(cosine, 1.0))):.3f} {rms(moved):.3f} "
-            f"{overlap(result.radiance, result, true):.3f} {overlap(erased, result, true):.3f} "
+            f"{mask_overlap(result.radiance, result, true):.3f} {mask_overlap(erased, result, true):.3f} "
             f"{seconds[name]:.2f} {spent:.2f}"
         )
 

@@ -14,14 +14,13 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
-from msgspec import structs
 
 from polcap.formats.capture import reader as captures
 from polcap.image_values import Quality
 from polcap.optics.resize import block_means
 from polcap.results import ResultsUntilInfer
 from polcap.synth import scenes, shooting
-from tests.experiments import Networks, arguments, head, networks, process, row
+from tests.experiments import Networks, arguments, head, networks, process, row, with_materials
 
 ESTIMATORS = (None, "network", "analytic")
 NAMES = ("clipped", "without", "with", "gloss without", "gloss with", "elsewhere without", "elsewhere with")
@@ -47,8 +46,7 @@ def measure(place: Path, seed: int, width: int, using: Networks, chart: str) -> 
     shoot = shooting.Shoot(seed=seed, width=width, height=width * 3 // 4, samples=1, cross=True, exposure_factor=2.0)
     scene = scenes.random_scene(seed, kinds[seed % len(kinds)])
     gloss = (0.15, 0.2, 0.25)[seed // 3 % 3]
-    worn = tuple(structs.replace(one, roughness=(gloss, gloss)) for one in scene.coat.materials)
-    shooting.write(place / "capture", structs.replace(scene, coat=structs.replace(scene.coat, materials=worn)), shoot)
+    shooting.write(place / "capture", with_materials(scene, roughness=(gloss, gloss)), shoot)
     capture = captures.read(place / "capture", None)
     both = [process(one, ResultsUntilInfer, using, chart) for one in (replace(capture, crossed=None), capture)]
     without, with_it = (found.maps for found in both)

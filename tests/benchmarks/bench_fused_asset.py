@@ -139,9 +139,9 @@ def after(first: Pose, second: Pose) -> Pose:
 
 
 def textures(results: FusionResults) -> list[Floats]:
-    """Normal, albedo, F0 and roughness of all N texels, (N, 3) or (N, 1)."""
+    """Normal, albedo, F0 and roughness of all N texels, (N, 3) or (N,)."""
     maps, covered = results.maps, results.atlas.covered
-    return [maps.normal[covered], maps.diffuse[covered], maps.specular[covered], maps.roughness[covered][:, None]]
+    return [maps.normal[covered], maps.diffuse[covered], maps.specular[covered], maps.roughness[covered]]
 
 
 def material(surface: Triangles, truth: dict[str, Any], point: Floats) -> list[Floats]:
@@ -155,15 +155,14 @@ def material(surface: Triangles, truth: dict[str, Any], point: Floats) -> list[F
         return np.asarray(np.einsum("sk,fkc->fsc", share, parts).reshape(len(share) * len(surface.faces), -1))
 
     nearest = cKDTree(sampled(surface.vertices)).query(point)[1]
-    return [
-        sampled(part)[nearest] for part in (normals, *(truth[name] for name in ("diffuse", "specular", "roughness")))
-    ]
+    parts = normals, *(truth[name] for name in ("diffuse", "specular", "roughness"))
+    return [sampled(part)[nearest] for part in parts]
 
 
 def mean_errors(found: Sequence[Floats], true: Sequence[Floats]) -> Floats:
     """Mean errors (4,) of normals [°], luminance of albedo and of F0, and roughness."""
     albedo, f0 = (np.abs(color.luminance(found[k]) - color.luminance(true[k])).mean() for k in (1, 2))
-    return np.array([mean_angle_deg(found[0], true[0]), albedo, f0, np.abs(found[3] - true[3]).mean()])
+    return np.array([mean_angle_deg(found[0], true[0]), albedo, f0, np.abs(found[3] - true[3][:, 0]).mean()])
 
 
 def texel_distance(surface: Triangles, source: FusionResults) -> float:

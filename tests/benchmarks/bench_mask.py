@@ -26,7 +26,7 @@ from polcap.stages import mask
 from polcap.stages.mask.mask_channels import ENCODING
 from polcap.training import mask_scenes, mask_views, materials, traced_views
 from polcap.training.mask_views import ViewKind
-from tests.experiments import arguments, data
+from tests.experiments import arguments, data, overlap
 
 SIZE = (360, 480)
 NEAR, FAR = (0.0, 0.12), (0.3, 0.7)  # flash from the lens [object distances]
@@ -121,11 +121,6 @@ def found(case: Case, network: Network | None) -> ObjectMask | None:
         return mask.segment(case.radiance, case.alignment, case.color, None, network, onnx.run, mask.MaskSettings())
     except ObjectError:
         return None
-
-
-def overlap(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
-    """Intersection over union."""
-    return float((one & other).sum() / max((one | other).sum(), 1))
 
 
 def picture(case: Case, object_: ObjectMask | None) -> Floats:

@@ -9,7 +9,6 @@ decoding, in all processes, and less LibRaw's unpacking. hdrmerge (with QT_QPA_P
 align_image_stack are of Debian's hdrmerge and hugin-tools.
 """
 
-import argparse
 import json
 import shutil
 import sys
@@ -35,7 +34,8 @@ from polcap.image_values import Floats, View
 from polcap.stage_values import Alignment, AngleStack, ObjectMask, SelfCalibration, SurfaceMaps
 from polcap.stages import align, hdr, stokes, surface, whitebalance
 from polcap.stages.whitebalance import WhitebalanceSettings
-from tests import scenes
+from tests import experiments, scenes
+from tests.experiments import arguments, plain_maps, rms
 
 _FULL = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])  # binned px → RAW px
 _ECC = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
@@ -53,25 +53,21 @@ class Row:
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument("folder", type=Path)
-    options.add_argument("--megapixels", type=float, default=6)
-    options.add_argument("--out", type=Path, default=Path("peers.json"))
-    given = options.parse_args()
+    options = arguments(__doc__, "folder", megapixels=6.0, out=Path("peers.json"))
     cv2.setNumThreads(1)
-    folder = bench_speed.made(given.folder, given.megapixels)
+    folder = bench_speed.made(options.folder, options.megapixels)
     capture = captures.read(folder)
     stack = hdr.merge(capture, frame_decoder.decode, hdr.HdrSettings())
     rows = []
     for row in chain(solving(stack), charting(stack), registering(stack, folder), merging(capture), integrating()):
         print(table([row]), file=sys.stderr)
         rows.append(row)
-    given.out.write_text(json.dumps([vars(row) for row in rows], indent=1) + "\n")
+    options.out.write_text(json.dumps([vars(row) for row in rows], indent=1) + "\n")
     print(table(rows))
 
 
 def merging(capture: Capture) -> Iterator[Row]:
-    """One bracket, files to radiance; decoding apart ours is this process alone, theirs all less LibRaw's unpacking."""
+    """One bracket, files to radiance; without decoding: polcap's own process; the peer less LibRaw's unpacking."""
     shot = capture.shots[0]
     one = replace(capture, shots=(shot,))
     files = [frame.path for frame in shot.frames]
@@ -81,7 +77,7 @@ def merging(capture: Capture) -> Iterator[Row]:
         theirs = work()
         if theirs is not None:
             yield Row("merge of a bracket", peer, ours, theirs)
-            yield Row("merge, decoding apart", peer, here, theirs - unpacking)
+            yield Row("merge without decoding", peer, here, theirs - unpacking)
 
 
 def _merges(capture: Capture, times: int = 10) -> tuple[float, float]:
@@ -229,7 +225,8 @@ def integrating() -> Iterator[Row]:
     cost = least(theirs, times=1)
     ours = least(lambda: surface.integrate(maps, None, surface.SurfaceSettings()))
     own = surface.integrate(maps, None, surface.SurfaceSettings()).depth
-    errors = [_spread(np.log(depth[maps.mask] / true[maps.mask])) for depth in (own, found[0])]
+    ratios = [np.log(depth[maps.mask] / true[maps.mask]) for depth in (own, found[0])]
+    errors = [rms(ratio - np.median(ratio)) for ratio in ratios]
     note = f"error {errors[0]:.4f}, theirs {errors[1]:.4f}; ours with the mesh"
     yield Row("depth of 192² from normals", "dbini-torch", ours, cost, note)
 
@@ -250,12 +247,7 @@ def _balls(side: int) -> tuple[SurfaceMaps, Floats]:
         depth[nearer] = at[nearer]
         normal[nearer] = (((ray * at[..., None]) - center) / radius)[nearer]
     mask = np.isfinite(depth)
-    flat, grey = np.full((side, side), 3.0, np.float32), np.zeros((side, side, 3), np.float32)
-    return SurfaceMaps(normal.astype(np.float32), grey, grey, flat, None, flat, mask, view, "truth"), depth
-
-
-def _spread(error: Floats) -> float:
-    return float(np.sqrt(np.mean((error - np.median(error)) ** 2)))
+    return plain_maps(normal.astype(np.float32), mask, view, error_deg=3.0), depth
 
 
 def _error(found: Floats, true: Floats, size: tuple[int, ...]) -> float:
@@ -285,11 +277,9 @@ def least(work: Callable[[], Any], times: int = 3) -> float:
 
 def table(rows: list[Row]) -> str:
     """Markdown."""
-    lines = ["| step | peer | polcap, CPU s | peer, CPU s | times as fast | |", "|" + " --- |" * 6]
-    for row in rows:
-        figures = f"{row.ours:.3f} | {row.theirs:.3f} | {row.theirs / row.ours:.2f}"
-        lines.append(f"| {row.step} | {row.peer} | {figures} | {row.note} |")
-    return "\n".join([*lines, f"\nPython {sys.version.split()[0]}, OpenCV {cv2.__version__}\n"])
+    names = ("step", "peer", "polcap, CPU s", "peer, CPU s", "times as fast", "")
+    cells = [(one.step, one.peer, one.ours, one.theirs, one.theirs / one.ours, one.note) for one in rows]
+    return f"{experiments.table(cells, names)}\n\nPython {sys.version.split()[0]}, OpenCV {cv2.__version__}\n"
 
 
 if __name__ == "__main__":

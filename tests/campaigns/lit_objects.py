@@ -16,6 +16,7 @@ from polcap.stage_values import AngleStack, Equipment, ObjectMask, single_frames
 from polcap.synth.scenes import random_scene
 from polcap.synth.shooting import Shoot, Studio
 from tests import scenes
+from tests.experiments import with_materials
 
 FINISHES = ("textured", "glossy", "matt", "white patch", "clipped")
 _NOISE = 0.004  # 1σ at S0 = 1, growing with its root: that of a bracket's merged pixel
@@ -44,8 +45,7 @@ def lit(seed: int, thin: bool = False, chart: bool = False) -> Lit:
         scene = msgspec.structs.replace(scene, chart=None, position=(0.0, 0.0, scene.position[2]))
     rough = {"glossy": 0.2, "clipped": 0.25, "matt": 0.8}.get(finish)
     if rough is not None:
-        worn = tuple(msgspec.structs.replace(one, roughness=(rough, rough)) for one in scene.coat.materials)
-        scene = msgspec.structs.replace(scene, coat=msgspec.structs.replace(scene.coat, materials=worn))
+        scene = with_materials(scene, roughness=(rough, rough))
     law = "rough" if seed % 2 else "smooth"
     size = (640, 480, 60.0) if chart else (320, 240, 70.0)
     shoot = Shoot(width=size[0], height=size[1], focal_mm=size[2], samples=1)

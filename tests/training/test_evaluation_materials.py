@@ -8,22 +8,23 @@ import pytest
 from polcap.image_values import Floats
 from polcap.training import evaluation_materials
 
+Library = list[evaluation_materials.TestMaterial]
+Places = tuple[Floats, Floats]  # positions and directions (M, 3)
+
 
 @pytest.fixture(scope="module")
-def library(test_data: Path) -> list[evaluation_materials.TestMaterial]:
+def library(test_data: Path) -> Library:
     return evaluation_materials.test_materials(test_data / "materials" / "test")
 
 
 @pytest.fixture(scope="module")
-def places() -> tuple[Floats, Floats]:
+def places() -> Places:
     rng = np.random.default_rng(0)
     facing = rng.normal(size=(3000, 3))
     return rng.uniform(-0.5, 0.5, (3000, 3)), facing / np.linalg.norm(facing, axis=1, keepdims=True)
 
 
-def test_materials_are_those_of_the_protocol(
-    library: list[evaluation_materials.TestMaterial], places: tuple[Floats, Floats]
-) -> None:
+def test_materials_are_those_of_the_protocol(library: Library, places: Places) -> None:
     assert len(library) == 30 and len({m.name for m in library}) == 30
     samples = [material.at(*places) for material in library]
     assert np.std([sample.specular for sample in samples]) > 0.04
@@ -34,9 +35,7 @@ def test_materials_are_those_of_the_protocol(
         assert sample.specular.min() > 0.015 and sample.specular.max() < 0.41
 
 
-def test_a_materials_maps_follow_one_pattern(
-    library: list[evaluation_materials.TestMaterial], places: tuple[Floats, Floats]
-) -> None:
+def test_a_materials_maps_follow_one_pattern(library: Library, places: Places) -> None:
     related = 0
     for material in library[evaluation_materials.TEXTURES :]:
         sample = material.at(*places)
@@ -45,17 +44,13 @@ def test_a_materials_maps_follow_one_pattern(
     assert related >= 15
 
 
-def test_slopes_of_materials_are_bounded(
-    library: list[evaluation_materials.TestMaterial], places: tuple[Floats, Floats]
-) -> None:
+def test_slopes_of_materials_are_bounded(library: Library, places: Places) -> None:
     for material in library[evaluation_materials.TEXTURES :]:
         steep = np.linalg.norm(material.slope(*places), axis=1)
         assert 0 < np.sqrt(np.mean(steep**2)) < 0.4 and steep.max() < 0.61, material.name
 
 
-def test_without_texture_sets_the_patterns_remain(
-    library: list[evaluation_materials.TestMaterial], tmp_path: Path, places: tuple[Floats, Floats]
-) -> None:
+def test_without_texture_sets_the_patterns_remain(library: Library, tmp_path: Path, places: Places) -> None:
     alone = evaluation_materials.test_materials(tmp_path)
     assert [material.name for material in alone] == [one.name for one in library[evaluation_materials.TEXTURES :]]
     assert np.array_equal(alone[3].at(*places).diffuse, library[evaluation_materials.TEXTURES + 3].at(*places).diffuse)
