@@ -1,6 +1,6 @@
 """The cues: the paper's sphere figure, and one code for NumPy and torch."""
 
-import dataclasses
+from dataclasses import fields, replace
 from types import SimpleNamespace
 from typing import Literal
 
@@ -13,13 +13,24 @@ from polcap.optics import body, fresnel
 from polcap.stages import cues, stokes
 from tests import scenes
 
+CHART = replace(scenes.no_color(), source="chart")
+
+
+def solve(**scene):
+    """Stokes parameters of the ball."""
+    shots, settings = scenes.stack(**scene), stokes.StokesSettings()
+    return stokes.solve(shots, scenes.still(), scenes.equal(), scenes.ball_object(), settings)
+
+
+@pytest.fixture(scope="module")
+def solved():
+    return solve()
+
 
 @pytest.fixture(scope="module")
 def ball():
     """Cues of a plain ball, as the pipeline makes them."""
-    radiance = scenes.stack(textured=False)
-    solved = stokes.solve(radiance, scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
-    return cues.compute(solved, scenes.no_color())
+    return cues.compute(solve(textured=False), scenes.no_color())
 
 
 def test_the_normalised_stokes_map_of_a_sphere_turns_twice_around_it(ball):
@@ -57,11 +68,9 @@ def test_diffuse_color_is_the_fitted_least_intensity(ball):
     assert np.allclose(ball.diffuse_color[inside], expected, atol=1e-3)
 
 
-def test_albedo_of_a_ball_is_within_the_error_of_the_chart_s_depth():
+def test_albedo_of_a_ball_is_within_the_error_of_the_chart_s_depth(solved):
     """Inverse squares over the visible half, seen and lit along the axis; the chart anywhere next to the ball."""
-    solved = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
-    color = dataclasses.replace(scenes.no_color(), source="chart")
-    doubt = cues.scale.sigma(solved, color)
+    doubt = cues.scale.sigma(solved, CHART)
     assert cues.scale.sigma(solved, scenes.no_color()) is None
     radius = np.sqrt(solved.mask.sum() / np.pi) / solved.view.focal
     ahead = radius * np.sqrt(np.linspace(0, 1, 1001))  # cos θ of places that are spread evenly over the disc
@@ -80,13 +89,13 @@ def test_radiance_of_a_frontal_patch_is_its_albedo(ball):
 
 def test_torch_and_numpy_give_the_same_channels(ball):
     torch = pytest.importorskip("torch", reason="torch comes with the [train] extra")
-    fields = {f.name: getattr(ball, f.name) for f in dataclasses.fields(ball) if f.name != "view"}
-    fields = {name: value for name, value in fields.items() if value is not None}  # what a crossed shot would tell
+    values = {f.name: getattr(ball, f.name) for f in fields(ball) if f.name != "view"}
+    values = {name: value for name, value in values.items() if value is not None}  # None without a crossed shot
     batch = SimpleNamespace(
         **{
             name: torch.as_tensor(np.asarray(value))[:, None] if name in ("ratio", "normalized_stokes")
             else torch.as_tensor(np.asarray(value))[None]
-            for name, value in fields.items()
+            for name, value in values.items()
         }
     )  # fmt: skip
     found = cues.channels(batch)
@@ -114,12 +123,9 @@ def test_channels_hold_the_values_of_their_names(ball):
 
 
 @pytest.mark.parametrize("source", ["camera", "none"])
-def test_without_a_chart_the_object_alone_sets_the_scale(source: Literal["camera", "none"]) -> None:
-    solved = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
+def test_without_a_chart_the_object_alone_sets_the_scale(solved, source: Literal["camera", "none"]) -> None:
     light = np.where(solved.mask[..., None], solved.stokes, 7 * solved.stokes.max()).astype(np.float32)
-    found = cues.compute(
-        dataclasses.replace(solved, stokes=light), dataclasses.replace(scenes.no_color(), source=source)
-    )
+    found = cues.compute(replace(solved, stokes=light), replace(scenes.no_color(), source=source))
     assert np.percentile(found.radiance[found.mask], 99) == pytest.approx(0.8, rel=1e-5)
 
 
@@ -128,62 +134,51 @@ def test_nothing_outside_the_mask_reaches_the_network(ball):
 
 
 def test_clipping_reaches_the_network(ball):
-    clipped = dataclasses.replace(ball, quality=np.full_like(ball.quality, Quality.CLIPPED))
+    clipped = replace(ball, quality=np.full_like(ball.quality, Quality.CLIPPED))
     channel = cues.channels(clipped)[cues.CHANNELS.index("clipped")]
     assert (channel[ball.mask] == 1).all()
 
 
 @pytest.mark.parametrize("size", [0.05, 0.1, 0.2])
-def test_the_chart_is_level_with_the_middle_of_the_object(size: float):
+def test_the_chart_is_level_with_the_middle_of_the_object(solved, size: float):
     """Irradiance of the chart by that of the visible surface lies between those of a cone and of a ball.
 
     size: radius over distance; inverse-square law, both solids as deep as half their width.
     """
-    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
-    focal = float(np.sqrt(found.mask.sum() / np.pi)) / size
-    stokes_ = dataclasses.replace(found, view=dataclasses.replace(found.view, focal=focal))
-    free, charted = (
-        cues.compute(stokes_, dataclasses.replace(scenes.no_color(), source=source)) for source in ("profile", "chart")
-    )
-    factor = float(np.median(charted.radiance[found.mask] / free.radiance[found.mask]))
+    focal = float(np.sqrt(solved.mask.sum() / np.pi)) / size
+    sized = replace(solved, view=replace(solved.view, focal=focal))
+    free, charted = (cues.compute(sized, color) for color in (scenes.no_color(), CHART))
+    factor = float(np.median(charted.radiance[solved.mask] / free.radiance[solved.mask]))
     r = np.sqrt((np.arange(1000) + 0.5) / 1000)  # evenly over the disc
     cone, ball = (1 / np.mean(1 / (1 - size * height) ** 2) for height in (1 - r, np.sqrt(1 - r * r)))
     assert ball < factor < cone
 
 
-def test_a_profile_with_its_charts_light_has_the_charts_scale():
+def test_a_profile_with_its_charts_light_has_the_charts_scale(solved):
     """The views of one session share chart, flash and camera: albedo must not depend on which view shows the chart."""
-    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     light = ChartLight(np.array([0.1, 0.0, -1.0]), np.array([0.0, 0.0, 1.0]), np.zeros(3), np.zeros((5, 5)))
-    shown, shared = (
-        cues.compute(found, dataclasses.replace(scenes.no_color(), source=source, light=light))
-        for source in ("chart", "profile")
-    )
+    shown, shared = (cues.compute(solved, replace(color, light=light)) for color in (CHART, scenes.no_color()))
     assert np.array_equal(shown.radiance, shared.radiance)
     assert shown.scale_sigma == shared.scale_sigma is not None
 
 
 @pytest.mark.parametrize(("turn", "offset"), [(0.0, 0.0), (0.4, 0.0), (0.0, 0.15)])
-def test_a_turned_or_offset_chart_gets_less_light_than_the_object(turn: float, offset: float):
+def test_a_turned_or_offset_chart_gets_less_light_than_the_object(solved, turn: float, offset: float):
     """n·l / d² of a chart under a flash at the lens: cos of its turn, or cos³ of the angle to the axis."""
-    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
     white, normal = np.array([offset, 0.0, -1.0]), np.array([np.sin(turn), 0.0, np.cos(turn)])
     light = ChartLight(white, normal, np.zeros(3), np.zeros((5, 5)))
-    facing = cues.scale.factor(found, dataclasses.replace(scenes.no_color(), source="chart"))
-    factor = cues.scale.factor(found, dataclasses.replace(scenes.no_color(), source="chart", light=light))
-    assert factor / facing == pytest.approx(np.cos(turn) * np.cos(np.arctan(offset)) ** 3, rel=1e-6)
+    factor = cues.scale.factor(solved, replace(CHART, light=light)) / cues.scale.factor(solved, CHART)
+    assert factor == pytest.approx(np.cos(turn) * np.cos(np.arctan(offset)) ** 3, rel=1e-6)
 
 
-def test_the_scale_follows_a_flash_at_the_chart_s_side_and_its_doubt_widens_the_scale_s():
+def test_the_scale_follows_a_flash_at_the_chart_s_side_and_its_doubt_widens_the_scale_s(solved):
     """The object is on the axis: a flash nearer to the chart lights that more, by its distances squared."""
-    found = stokes.solve(scenes.stack(), scenes.still(), scenes.equal(), scenes.ball_object(), stokes.StokesSettings())
-    row, column = (axis.mean() for axis in np.nonzero(found.mask))
-    found = dataclasses.replace(found, view=dataclasses.replace(found.view, center=(column, row)))
+    row, column = (axis.mean() for axis in np.nonzero(solved.mask))
+    found = replace(solved, view=replace(solved.view, center=(column, row)))
     white, flash = np.array([0.2, 0.0, -1.0]), np.array([0.1, 0.0, 0.0])
-    color = dataclasses.replace(scenes.no_color(), source="chart")
     facing = np.array([0.0, 0.0, 1.0])
     at_lens, off_axis, doubtful = (
-        dataclasses.replace(color, light=ChartLight(white, facing, at, spread))
+        replace(CHART, light=ChartLight(white, facing, at, spread))
         for at, spread in ((0 * flash, np.zeros((5, 5))), (flash, np.zeros((5, 5))), (flash, 0.01 * np.eye(5)))
     )
     ahead = 1 - np.sqrt(found.mask.sum() / np.pi) / found.view.focal / 2

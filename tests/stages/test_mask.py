@@ -1,6 +1,6 @@
 """The object's mask."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,17 +29,25 @@ def segment(radiance, color, user=None, model=None):
     return mask.segment(radiance, scenes.still(), color, user, model, run, mask.MaskSettings())
 
 
+def reduced(radiance, alignment=None, box=(0, 0, scenes.WIDTH, scenes.HEIGHT), longest=160):
+    """The network's input picture, without a chart."""
+    chart = np.zeros((scenes.HEIGHT, scenes.WIDTH), np.uint8)
+    return mask_network.reduced_picture(radiance, alignment or scenes.still(), scenes.no_color(), chart, box, longest)
+
+
+def overlap(one, other):
+    return (one & other).sum() / (one | other).sum()
+
+
 def chart_color():
     corners = np.array([[223, 29], [301, 29], [301, 201], [223, 201]], float)
-    return dataclasses.replace(scenes.no_color(), place=ChartPlace(np.zeros((24, 4, 2)), corners), source="chart")
+    return replace(scenes.no_color(), place=ChartPlace(np.zeros((24, 4, 2)), corners), source="chart")
 
 
 @pytest.mark.parametrize("model", [None, network()])
 def test_the_ball_is_found_and_the_chart_is_not_the_object(model):
     found = segment(scenes.stack(noise=0.004), chart_color(), model=model)
-    true = scenes.ball_object().mask
-    overlap = (found.mask & true).sum() / (found.mask | true).sum()
-    assert overlap > 0.97
+    assert overlap(found.mask, scenes.ball_object().mask) > 0.97
     assert not found.mask[:, 230:].any()
     assert found.crop[0] < 36 and found.crop[2] > 204
     assert (found.doubt is None) == (model is None)
@@ -78,35 +86,24 @@ def test_answers_that_depend_on_the_side_cancel():
 
 def test_channels_do_not_depend_on_exposure():
     """Radiance and reflectance in any unit give the same channels."""
-    chart = np.zeros((scenes.HEIGHT, scenes.WIDTH), np.uint8)
-    box = (0, 0, scenes.WIDTH, scenes.HEIGHT)
-    made = []
-    for scale in (0.5, 0.05):
-        radiance = scenes.stack(scale=scale)
-        picture = mask_network.reduced_picture(radiance, scenes.still(), scenes.no_color(0.5), chart, box, 160)
-        made.append(mask_channels.encode(picture, mask_channels.brightness(picture.color)))
-    np.testing.assert_allclose(made[0], made[1], atol=2e-5)
+    pictures = (reduced(scenes.stack(scale=scale)) for scale in (0.5, 0.05))
+    one, other = (mask_channels.encode(picture, mask_channels.brightness(picture.color)) for picture in pictures)
+    np.testing.assert_allclose(one, other, atol=2e-5)
 
 
 @pytest.mark.parametrize("shot", range(3))
 def test_channels_do_not_depend_on_the_flash_energy_of_a_shot(shot):
-    radiance, box = scenes.stack(), (0, 0, 320, 240)
+    radiance = scenes.stack()
     energy = np.where(np.arange(3) == shot, 0.7, 1.0).astype(np.float32)[:, None, None, None]
-    chart = np.zeros((240, 320), np.uint8)
-    one, other = (
-        mask_network.reduced_picture(shown, scenes.still(), scenes.no_color(), chart, box, 160).stokes
-        for shown in (radiance, dataclasses.replace(radiance, value=radiance.value * energy))
-    )
+    one, other = (reduced(replace(radiance, value=value)).stokes for value in (radiance.value, radiance.value * energy))
     bright = one[0] > 0.1 * one[0].max()
     np.testing.assert_allclose((other[1:] / other[0])[:, bright], (one[1:] / one[0])[:, bright], atol=0.03)
 
 
 def test_a_black_shot_leaves_the_channels_finite():
-    radiance, chart, box = scenes.stack(), np.zeros((240, 320), np.uint8), (0, 0, 320, 240)
+    radiance = scenes.stack()
     value = radiance.value * np.array([1, 1, 0], np.float32)[:, None, None, None]
-    dark = dataclasses.replace(radiance, value=value)
-    picture = mask_network.reduced_picture(dark, scenes.still(), scenes.no_color(), chart, box, 160)
-    assert np.isfinite(picture.stokes).all()
+    assert np.isfinite(reduced(replace(radiance, value=value)).stokes).all()
 
 
 def test_channels_hold_the_polarization_of_the_aligned_shots():
@@ -114,10 +111,8 @@ def test_channels_hold_the_polarization_of_the_aligned_shots():
     moved = np.tile(np.eye(3), (3, 1, 1))
     moved[1, 0, 2], moved[2, 1, 2] = 3.0, -2.0
     radiance = scenes.stack(list(moved), textured=False)
-    alignment = dataclasses.replace(scenes.still(), transform=moved)
-    chart = np.zeros((scenes.HEIGHT, scenes.WIDTH), np.uint8)
-    box = (40, 30, 200, 210)
-    picture = mask_network.reduced_picture(radiance, alignment, scenes.no_color(), chart, box, 1000)
+    alignment = replace(scenes.still(), transform=moved)
+    picture = reduced(radiance, alignment=alignment, box=(40, 30, 200, 210), longest=1000)
     y, x = np.mgrid[30:210, 40:200].astype(float)
     true, inside = scenes.stokes(x, y, textured=False)
     inner = inside & (np.hypot(x - scenes.CENTER[0], y - scenes.CENTER[1]) < 78)
@@ -149,8 +144,7 @@ def test_colors_decide_where_probabilities_are_open():
     found = graph_cut.sharpen(
         picture.astype(np.float32), chance > 0.5, np.zeros(true.shape, np.uint8), chance.astype(np.float32)
     )
-    assert (found & true).sum() / (found | true).sum() > 0.97
-    assert ((chance > 0.5) & true).sum() / ((chance > 0.5) | true).sum() < 0.6
+    assert overlap(found, true) > 0.97 and overlap(chance > 0.5, true) < 0.6
 
 
 def test_colors_are_not_followed_against_the_network():
@@ -190,7 +184,7 @@ def test_a_mask_of_another_size_is_refused():
 
 def test_an_empty_picture_is_refused():
     radiance = scenes.stack()
-    dark = dataclasses.replace(radiance, value=np.full_like(radiance.value, 0.002))
+    dark = replace(radiance, value=np.full_like(radiance.value, 0.002))
     with pytest.raises(ObjectError, match="no object differs"):
         segment(dark, chart_color())
     nothing = network(lambda inputs: {"logit": np.full((1, 1, *inputs.shape[2:]), -9.0)})
@@ -213,7 +207,7 @@ def test_expected_error_is_one_minus_the_mean_overlap():
     rng = np.random.default_rng(0)
     chance = rng.beta(0.3, 0.3, (200, 200))
     found = chance > 0.5
-    overlaps = [((t := rng.random(chance.shape) < chance) & found).sum() / (t | found).sum() for _ in range(20)]
+    overlaps = [overlap(rng.random(chance.shape) < chance, found) for _ in range(20)]
     assert 1 - regions.expected_error(found, chance) == pytest.approx(np.mean(overlaps), abs=0.005)
 
 

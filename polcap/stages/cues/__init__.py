@@ -6,6 +6,8 @@ no cv2, no torch. Pixel axes are (..., H, W).
 
 from typing import Any
 
+import numpy as np
+
 from polcap.chart_values import ColorCalibration
 from polcap.image_values import Quality
 from polcap.optics import frames, fresnel
@@ -35,13 +37,9 @@ def compute(stokes: StokesImage, color: ColorCalibration, other_orders: tuple[Ot
     ratio. The visible surface of the object is nearer to the flash than the chart, and gets more light: `scale`
     corrects for it. A capture without a chart has no absolute scale: its 99th percentile of radiance becomes 0.8.
     """
-    import numpy as np
-
     ratio, sigma, dolp, normalized = polarization(stokes.stokes, stokes.covariance)
     radiance = np.asarray(stokes.stokes[0] @ color.matrix.T, dtype=np.float32)
-    factor = 1.0
-    if scale.is_known(color):
-        factor = scale.factor(stokes, color)
+    factor = scale.factor(stokes, color) if scale.is_known(color) else 1.0
     if color.source in ("camera", "none") and stokes.mask.any():
         factor = 0.8 / max(float(np.percentile(radiance[stokes.mask], 99)), 1e-9)
     radiance = radiance * np.float32(factor)
@@ -112,10 +110,8 @@ def channels(cues: Any) -> Any:
     on each pixel map ((B, H, W), (B, H, W, 3), (2, B, H, W)).
     """
     xp = array_namespace(cues.radiance)
-    dtype = cues.radiance.dtype
-    inside = xp.astype(cues.mask, dtype) if hasattr(xp, "astype") else cues.mask.to(dtype)
+    ones = xp.ones_like(cues.dolp)
     clipped = (cues.quality & int(Quality.CLIPPED)) > 0
-    clipped = xp.astype(clipped, dtype) if hasattr(xp, "astype") else clipped.to(dtype)
     log = xp.log(xp.clip(cues.radiance, 0.0, 50.0) + FLOOR)
     tilt = zenith(cues.dolp)
     maps = [
@@ -124,6 +120,6 @@ def channels(cues: Any) -> Any:
         tilt * cues.normalized_stokes[0], tilt * cues.normalized_stokes[1],
         cues.normalized_stokes[0], cues.normalized_stokes[1],
         zenith(xp.clip(cues.ratio_sigma, 0.0, 0.2)),
-        inside, clipped, cues.rays[..., 0], cues.rays[..., 1],
+        ones, clipped * ones, cues.rays[..., 0], cues.rays[..., 1],
     ]  # fmt: skip
-    return xp.stack([inside * m for m in maps], axis=-3)
+    return xp.stack([cues.mask * m for m in maps], axis=-3)

@@ -69,7 +69,7 @@ def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float)
     size.
     """
     source = _BracketSignals(bracket, lines, read)
-    still = source.still
+    still = source.reference_signals
     one = np.ones(still.shape[0], np.float32)
     if not bracket.others and source.ambient is None:
         source.learn(bracket.reference, noise.sample_frame(still))
@@ -131,14 +131,14 @@ class _BracketSignals:
         self.ambient = ambient_light(bracket, lines, read)
 
     @cached_property
-    def still(self) -> Signals:
+    def reference_signals(self) -> Signals:
         """Signals of the reference frame."""
         return self.signals(self.reference)
 
     @cached_property
-    def still_pyramid(self) -> Pyramid:
+    def reference_pyramid(self) -> Pyramid:
         """Brightness pyramid of the reference frame."""
-        return brightness_pyramid(self.still)
+        return brightness_pyramid(self.reference_signals)
 
     def signals(self, e: int) -> Signals:
         """Signals of frame e of the bracket, with its ambient light subtracted."""
@@ -173,21 +173,21 @@ class _BracketSignals:
 
 def _compare_frame(source: _BracketSignals, e: int, limit_px: float) -> RegisteredFrame:
     """Measure motion, exposure ratio, noise and misfit of frame e relative to the reference frame."""
-    still, reference = source.still, source.reference
+    reference = source.reference_signals
     name = f"{Path(source.frames[e].path).name}, frame {e + 1} of {source.name},"
     found, gain = source.signals(e), None
-    check_size(name, found.shape, still.shape)
-    motion = measure_motion(name, source.still_pyramid, brightness_pyramid(found), limit_px / source.raw_px)
-    learn = source.ambient is None and not source.settled(e, reference)
+    check_size(name, found.shape, reference.shape)
+    motion = measure_motion(name, source.reference_pyramid, brightness_pyramid(found), limit_px / source.raw_px)
+    learn = source.ambient is None and not source.settled(e, source.reference)
     if motion is not None:  # before resampling, the scene's detail does not cancel between the frames
         if learn:
             source.learn(e, noise.sample_frame(found))
-            source.learn(reference, noise.sample_frame(still))
+            source.learn(source.reference, noise.sample_frame(reference))
         found, gain = resample(found, motion)
-    tiles = exposure.common_tiles(still, found)
-    ratio = exposure.of_frame(name, tiles, source.frames[e], source.frames[reference])
+    tiles = exposure.common_tiles(reference, found)
+    ratio = exposure.of_frame(name, tiles, source.frames[e], source.frames[source.reference])
     if motion is None and learn:
-        for number, samples in zip((reference, e), noise.sample_pair(still, found, ratio)):
+        for number, samples in zip((source.reference, e), noise.sample_pair(reference, found, ratio)):
             source.learn(number, samples)
     frame = RegisteredFrame(
         signals=found,
@@ -196,12 +196,12 @@ def _compare_frame(source: _BracketSignals, e: int, limit_px: float) -> Register
         misfit=np.zeros_like(ratio),
         motion=motion,
         gain=gain,
-        vignetting=exposure.vignetting(still, found, ratio),
+        vignetting=exposure.vignetting(reference, found, ratio),
         curvature=exposure.curvature(*tiles),
-        flicker=exposure.flicker(still, found),
+        flicker=exposure.flicker(reference, found),
     )
-    lines = source.line(reference), frame.noise
-    return replace(frame, misfit=noise.misfit(still, found, ratio, lines, frame.mean_gain))
+    lines = source.line(source.reference), frame.noise
+    return replace(frame, misfit=noise.misfit(reference, found, ratio, lines, frame.mean_gain))
 
 
 def brightness_pyramid(frame: Signals) -> Pyramid:

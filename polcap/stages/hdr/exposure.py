@@ -115,8 +115,8 @@ def _lines(a: Floats, b: Floats) -> Floats:
         for _ in range(10):
             matrix = np.stack([a[:, c] * weight, weight], axis=1)
             found[:, c] = np.linalg.lstsq(matrix, b[:, c] * weight, rcond=None)[0]
-            rest = (b[:, c] - found[0, c] * a[:, c] - found[1, c]) * sure
-            weight = sure * np.sqrt(biweight(rest, spread(rest)))
+            residual = (b[:, c] - found[0, c] * a[:, c] - found[1, c]) * sure
+            weight = sure * np.sqrt(biweight(residual, spread(residual)))
     found[0] = np.maximum(found[0], 1e-9)
     return found
 
@@ -144,8 +144,8 @@ def vignetting(reference: Signals, other: Signals, ratio: Floats) -> Floats | No
     weight = np.ones(len(change))
     for _ in range(6):  # tiles where something moved lose their weight
         found = np.linalg.lstsq(basis * weight[:, None], change * weight, rcond=None)[0]
-        rest = np.abs(change - basis @ found)
-        weight = np.sqrt(1 / (1 + (rest / (2 * MAD_TO_SIGMA * np.median(rest) + 1e-4)) ** 2))
+        residual = np.abs(change - basis @ found)
+        weight = np.sqrt(1 / (1 + (residual / (2 * MAD_TO_SIGMA * np.median(residual) + 1e-4)) ** 2))
     if np.abs(basis @ found).max() < _LEAST_VIGNETTING:
         return None
     y, x = np.mgrid[:height, :width].astype(np.float32)
@@ -236,9 +236,9 @@ def _stripe_power(change: Floats) -> tuple[float, float]:
     sigma = MAD_TO_SIGMA * np.nanmedian(np.abs(change - median[:, None]), axis=1)
     variance = (MEDIAN_SE * sigma) ** 2 / np.isfinite(change).sum(axis=1)  # of a median
     row = np.arange(len(median))
-    rest = median - np.polyval(np.polyfit(row, median, 2), row)  # apertures differ in vignetting
+    residual = median - np.polyval(np.polyfit(row, median, 2), row)  # apertures differ in vignetting
     noise = float(np.mean(variance))
-    return float(np.mean(rest**2)) - noise, noise * float(np.sqrt(2 / len(rest)))
+    return float(np.mean(residual**2)) - noise, noise * float(np.sqrt(2 / len(residual)))
 
 
 def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:
@@ -261,5 +261,5 @@ def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:
         if keep.sum() < _LEAST_TILES / 2:
             return None
         r = float(b[keep].sum() / a[keep].sum())
-    rest = b[keep] - r * a[keep]
-    return r, float(np.sqrt(np.sum(rest**2)) / b[keep].sum())
+    residual = b[keep] - r * a[keep]
+    return r, float(np.sqrt(np.sum(residual**2)) / b[keep].sum())

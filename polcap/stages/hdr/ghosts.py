@@ -120,20 +120,20 @@ def first_estimate(parts: list[tuple[RegisteredFrame, Bools]], otherwise: Signal
         everywhere = clear.all() and any(np.ndim(serve) == 0 for serve in serves)
         stand_in = None if everywhere else otherwise.rows(rows)
         for c in range(len(out)):
-            number = np.zeros(clear.shape, np.float32)
+            total = np.zeros(clear.shape, np.float32)
             exposure: Floats | np.float32 = np.float32(0)
             floor: Floats | np.float32 = np.float32(0)
             for (frame, _), value, serve in zip(parts, values, serves):
                 electrons = 1 / frame.noise.slope[c]
-                number += value[c] * (serve * electrons)
+                total += value[c] * (serve * electrons)
                 exposure = exposure + serve * (electrons * frame.ratio[c])
                 floor = floor + serve * (electrons**2 * frame.noise.floor[c])
-            number /= np.maximum(exposure, np.float32(1e-20))
+            total /= np.maximum(exposure, np.float32(1e-20))
             if stand_in is not None:
                 served = (exposure > 0) & clear
-                number = np.where(served, number, stand_in[c])
+                total = np.where(served, total, stand_in[c])
                 exposure = np.where(served, exposure, np.float32(1e15))
-            out[c, target] = _wiener(number, exposure, floor)[inner]
+            out[c, target] = _wiener(total, exposure, floor)[inner]
 
     halo = 2 * (_WINDOW // 2)  # windows of distances from means of windows
     parallel.results(partial(estimate, *block) for block in blocks(out.shape[1], halo))

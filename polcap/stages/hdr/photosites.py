@@ -34,13 +34,13 @@ def _add(image: SensorImage, frame: WeightedFrame, signal: Floats, exposure: Flo
     if image.cfa is None:
         return
     width = signal.shape[1]
-    serves = np.repeat(frame.serves[rows], 2, axis=1).astype(np.float32)
+    used = np.repeat(frame.used[rows], 2, axis=1).astype(np.float32)
     scale = np.float32(image.white - float(image.black.mean()))
     for i in (0, 1):  # rows of one phase of the color filter array
         places = slice(2 * rows.start + i, 2 * rows.stop, 2)
         black = np.tile(np.broadcast_to(image.black, (2, 2))[i].astype(np.float32), width // 2)
         part = image.value[places, :width] - black
-        part *= serves
+        part *= used
         part /= scale
         signal[places] += part
-        exposure[places] += serves * np.tile(frame.frame.ratio[image.cfa[i]], width // 2)
+        exposure[places] += used * np.tile(frame.frame.ratio[image.cfa[i]], width // 2)

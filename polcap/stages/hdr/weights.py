@@ -37,9 +37,9 @@ class WeightedFrame:
     """One frame of a bracket on the grid of the merge, with its ambient light."""
 
     frame: RegisteredFrame
-    serves: Bools  # (H, W) pixels for which the frame is used
+    used: Bools  # (H, W) pixels for which the frame is used
     ambient: np.float32  # exposure to ambient light, relative to the reference frame
-    last: bool  # no frame is darker: used up to saturation
+    is_darkest: bool  # no frame is darker: used up to saturation
     cfa: Bits | None  # of an interpolated mosaic; None: binned
     least: np.float32  # weight where the frame is not used
 
@@ -52,7 +52,7 @@ class WeightedBracket:
     estimate: Floats  # (C, H, W) the smoothed first estimate
     ghost: Bools  # (H, W)
     ambient: AmbientLight | None
-    served: Bools  # (H, W) pixels with at least one usable frame
+    served: Bools  # (H, W) pixels with an unclipped frame
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -86,7 +86,7 @@ class WeightedBracket:
         w / ratio, so that signals need not be converted to radiance.
         """
         estimate = self.estimate[:, rows]
-        number, weights, variance, shares = (np.zeros_like(estimate) for _ in range(4))  # shares: of ambient light
+        total, weights, variance, shares = (np.zeros_like(estimate) for _ in range(4))  # shares: of ambient light
         steep = _edges(self.estimate, rows) if any(one.frame.misfit.any() for one in self.frames) else None
         for one in self.frames:
             sample, trust = one.frame.signals.rows(rows), self._trust(one, estimate, rows)
@@ -96,25 +96,25 @@ class WeightedBracket:
                 if self.ambient is not None:
                     plane = plane - one.ambient * self.ambient.value[c, rows]
                     cv2.scaleAdd(weight, float(one.ambient), shares[c], shares[c])
-                cv2.accumulateProduct(weight, plane, number[c])
+                cv2.accumulateProduct(weight, plane, total[c])
                 cv2.scaleAdd(weight, ratio, weights[c], weights[c])
                 weight *= trust
                 cv2.scaleAdd(weight, ratio, variance[c], variance[c])
-        number /= weights
+        total /= weights
         variance /= weights
         variance /= weights
         if self.ambient is not None:
             variance += (shares / weights) ** 2 * self.ambient.variance[:, rows]
-        return number, variance
+        return total, variance
 
     def _trust(self, one: WeightedFrame, estimate: Floats, rows: slice) -> Floats | np.float32:
         """Factor on a frame's weight, (h, W) or one number: it falls smoothly from 1 to almost 0 near saturation.
 
         So weights have no step. Where the frame is not used, the factor is almost 0 too.
         """
-        serves = one.serves[rows]
-        trust: Floats | np.float32 = np.float32(1) if serves.all() else np.maximum(serves, one.least)
-        if one.last:
+        used = one.used[rows]
+        trust: Floats | np.float32 = np.float32(1) if used.all() else np.maximum(used, one.least)
+        if one.is_darkest:
             return trust
         peak = np.maximum.reduce([plane * ratio for plane, ratio in zip(estimate, one.frame.ratio)])
         if self.ambient is not None:
@@ -156,19 +156,19 @@ def prepare(
         frame = compared.frames[e]
         if full or ambient is not None:
             frame = _read_again(bracket.shot.frames[e], frame, read, full)
-        last, usable = bright[e] < _AS_DARK * bright[darkest], frame.signals.usable
-        serves = usable if frame.motion is not None or not last else np.ones_like(usable)
+        is_darkest, usable = bright[e] < _AS_DARK * bright[darkest], frame.signals.usable
+        used = usable if frame.motion is not None or not is_darkest else np.ones_like(usable)
         if e == bracket.reference:
-            anchored = serves
+            anchored = used
         else:
-            serves = serves & (~ghost | (~anchored & (e == darkest)))
-        served = served | (serves & usable)
+            used = used & (~ghost | (~anchored & (e == darkest)))
+        served = served | (used & usable)
         frames.append(
             WeightedFrame(
                 frame=frame,
-                serves=serves,
+                used=used,
                 ambient=np.float32(exposure.of_ambient(bracket.shot.frames[e], reference)),
-                last=last,
+                is_darkest=is_darkest,
                 cfa=read(bracket.shot.frames[e]).cfa if full else None,
                 least=np.float32(_SOME if e == bracket.reference else 0),
             )

@@ -13,10 +13,10 @@ from polcap.chart_values import ColorCalibration
 from polcap.image_values import Bits, Floats
 from polcap.optics import mueller
 from polcap.optics.resize import area_mean
-from polcap.optics.warp import warp
+from polcap.optics.warp import Box, warp
 from polcap.stage_values import Alignment, AngleStack, Network, RunNetwork
 from polcap.stages.mask.mask_channels import SIZE_MULTIPLE, ReducedPicture, brightness, encode, mirror
-from polcap.stages.mask.regions import Box, box_around
+from polcap.stages.mask.regions import box_around
 
 _CLOSE_UP_PX = 256  # greatest longer side of a close-up
 _CLOSE_UPS = 2  # passes over the part with the object; the second adds parts that the first estimate lacked
@@ -28,9 +28,8 @@ _MIRRORS = ((), (0,), (1,), (0, 1))  # axes of the mirror images that are averag
 
 
 def object_probability(
-    radiance: AngleStack, alignment: Alignment, color: ColorCalibration, chart: Bits, network: Network,
-    run: RunNetwork,
-) -> Floats:  # fmt: skip
+    radiance: AngleStack, alignment: Alignment, color: ColorCalibration, chart: Bits, network: Network, run: RunNetwork
+) -> Floats:
     """Probability (H, W) 0…1 that a pixel of the reference shot is the object; `chart` (H, W) is 1 on the chart."""
     height, width = chart.shape
     whole = (0, 0, width, height)

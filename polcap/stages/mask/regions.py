@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 
 from polcap.image_values import Bits, Bools, Floats
-
-Box = tuple[int, int, int, int]  # x0, y0, x1, y1 px, end exclusive
+from polcap.optics.warp import Box
 
 _SPECK = 0.01  # of the largest region; smaller regions are specks
 _INSIDE = 0.5  # probability above which a pixel belongs to the object
@@ -89,7 +88,10 @@ def nth_part(mask: Bools, number: int) -> Bools:
 
 
 def box_around(mask: Bools, margin: float, least: int) -> Box | None:
-    """Bounding box of a mask (H, W); `margin` is a share of its longer side, at least `least` px. None if empty."""
+    """Bounding box x0, y0, x1, y1 (end exclusive) of a mask (H, W), with a margin; None for an empty mask.
+
+    `margin` is a share of the box's longer side, and `least` px or more.
+    """
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(rows):
         return None

@@ -39,8 +39,9 @@ from polcap.stages.selfcal import (
 from polcap.stages.selfcal.grey_patches import GreyPatches
 from polcap.stages.selfcal.object_gains import GainEstimate, ObjectShots
 
-_PRIOR = {"flash": 0.03, "steady": 0.01, "unknown": 0.03}  # prior 1σ of a shot's light; makers
-# state 0.5–2 % from flash to flash for studio flashes at full recycling, and under 1 % for LED and HMI lamps
+# Prior 1σ of a shot's light, relative. Makers state 0.5–2 % from flash to flash for studio flashes at full recycling,
+# and under 1 % for LED and HMI lamps.
+_PRIOR = {"flash": 0.03, "steady": 0.01, "unknown": 0.03}
 _LEAST_PRIOR = 0.001  # least prior 1σ, also of a calibrated flash
 _SURPRISE = 3.0  # two measurements contradict each other if they differ by more than this many σ
 _FLAT_ERROR = 0.05  # error of the gains by facing pixels of an object with flat faces (8 path-traced captures)
@@ -55,8 +56,7 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of the stage `selfcal`, the section `selfcal` of a settings file."""
 
     unknown_angles: Annotated[
-        bool,
-        Meta(description="ignore the stated angles and find them, from four or more shots with a chart"),
+        bool, Meta(description="ignore the stated angles and find them, from four or more shots with a chart")
     ] = False
     max_unknown_sigma_deg: Annotated[
         float, Meta(gt=0, le=20, description="greatest 1σ of found angles; more ends the run [degrees]")
@@ -96,11 +96,7 @@ class SelfcalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @stage(version=20)
 def solve(
-    radiance: AngleStack,
-    alignment: Alignment,
-    object_: ObjectMask,
-    color: ColorCalibration,
-    settings: SelfcalSettings,
+    radiance: AngleStack, alignment: Alignment, object_: ObjectMask, color: ColorCalibration, settings: SelfcalSettings
 ) -> SelfCalibration:
     """Self-calibrate: gains (K, 3) of all shots and channels, and checked and corrected polarizer angles (K,).
 
@@ -113,7 +109,7 @@ def solve(
     facing = object_gains.facing(shots.light, shots.inside, radiance.angle)
     gain, sigma, _ = _best_gains(radiance, greys, facing)  # without the angles, because these are not checked yet
     first = GainEstimate(gain.mean(1), sigma.mean(1))
-    even = replace(shots, light=shots.light / first.gain[:, None, None])
+    even = replace(shots, light=shots.light / first.gain[:, None, None])  # as under equal light
     rim = angles.rim(even)
     one_exposure = radiance.equipment.light == "one exposure"
     well_known = greys is not None or one_exposure
@@ -133,13 +129,10 @@ def solve(
     angle = angle + ring.correction
 
     with_gains = replace(rim, light=rim.light * first.gain[:, None])
-    by_angles = parallel.results(
-        [
-            partial(object_gains.closure, shots.light, shots.inside, angle),
-            partial(object_gains.outline, with_gains, angle),
-            partial(integrability.gains, shots.light, shots.inside, angle, facing.gain),
-        ]
-    )
+    by_closure = partial(object_gains.closure, shots.light, shots.inside, angle)
+    by_outline = partial(object_gains.outline, with_gains, angle)
+    by_slopes = partial(integrability.gains, shots.light, shots.inside, angle, facing.gain)
+    by_angles = parallel.results([by_closure, by_outline, by_slopes])
     if not np.isfinite(by_angles[-1].sigma).all():  # flat faces: most pixels may share a polarization
         facing = replace(facing, sigma=np.hypot(facing.sigma, np.where(facing.sigma > 0, _FLAT_ERROR, 0)))
     gains = _gains(radiance, greys, object_gains.combined([*by_angles, facing]))

@@ -167,13 +167,14 @@ def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma:
     fits = []
     for k, shot in enumerate(np.eye(shots)):
         turns = np.concatenate([[0.0], _FAR, -_FAR])
-        left = [_median_residual(light, angle + turn * shot) for turn in turns]
+        residual = [_median_residual(light, angle + turn * shot) for turn in turns]
         fit = _fit_turn(k, 0.0, light, angle, part, prior)
-        if min(left) < _MOST_LEFT * left[0]:
-            far = _fit_turn(k, turns[np.argmin(left)], light, angle, part, prior)
-            fit = replace(min(fit, far, key=lambda one: one.left), stated=fit.stated)
+        if min(residual) < _MOST_LEFT * residual[0]:
+            far = _fit_turn(k, turns[np.argmin(residual)], light, angle, part, prior)
+            best = min(fit, far, key=lambda one: one.misfit)
+            fit = replace(best, misfit_as_stated=fit.misfit_as_stated)
         fits.append(fit)
-    gained = [fit.stated - fit.left for fit in fits]
+    gained = [fit.misfit_as_stated - fit.misfit for fit in fits]
     alike = [k for k in range(shots) if gained[k] >= _ALIKE * max(gained)]
     alike.sort(key=lambda k: -abs(fits[k].turn))  # a small turn of one shot can be a large one of another
     found = fits[alike[0]]
@@ -182,7 +183,7 @@ def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma:
     sensitivity = np.linalg.norm(_complement(angle), axis=0) * change
     by_angles = _ANGLE_ERROR * float(np.linalg.norm(sensitivity) / max(sensitivity[alike[0]], 1e-9))
     sigma = float(np.hypot(found.sigma, by_angles))
-    if gained[alike[0]] < _LEAST_GAIN * found.stated or abs(found.turn) < _LEAST_SIGMAS * sigma:
+    if gained[alike[0]] < _LEAST_GAIN * found.misfit_as_stated or abs(found.turn) < _LEAST_SIGMAS * sigma:
         return TurnedShot()
     return TurnedShot(tuple(alike), found.turn, sigma)
 
@@ -193,8 +194,8 @@ class _TurnFit:
 
     turn: float  # rad
     sigma: float  # rad
-    stated: float  # misfit with the stated angles and fitted gains
-    left: float  # misfit with the turn too
+    misfit_as_stated: float  # with the stated angles and fitted gains
+    misfit: float  # with the turn too
 
 
 def _median_residual(light: Floats, angle: Floats) -> float:

@@ -24,12 +24,7 @@ _LEAST_PX = 100
 
 
 def measure(
-    radiance: AngleStack,
-    alignment: Alignment,
-    color: ColorCalibration,
-    shots: ObjectShots,
-    gain: Floats,
-    angle: Floats,
+    radiance: AngleStack, alignment: Alignment, color: ColorCalibration, shots: ObjectShots, gain: Floats, angle: Floats
 ) -> Floats | None:
     """Factor (3,) from the light of the cross-polarized shot to S0; None without such a shot or enough pixels."""
     if radiance.crossed is None or alignment.crossed is None:

@@ -89,14 +89,18 @@ def register(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) ->
 
 def unknown(shots: int) -> GainEstimate:
     """Gains of the shots when nothing is known: 1, with infinite 1σ."""
-    return GainEstimate(np.ones(shots), np.where(np.arange(shots) > 0, np.inf, 0.0))
+    return _relative_to_first(np.ones(shots), np.full(shots, np.inf))
+
+
+def _relative_to_first(gain: Floats, sigma: Floats) -> GainEstimate:
+    """Estimate of gains (K,) that refer to the first shot, which therefore has a 1σ of 0."""
+    return GainEstimate(gain, np.where(np.arange(len(gain)) > 0, sigma, 0.0))
 
 
 def combined(estimates: list[GainEstimate]) -> GainEstimate:
     """Weighted mean of several estimates of the shots' gains; unknown gains do not count."""
     mean, sigma = weighted_mean(*(np.stack([getattr(one, name) for one in estimates]) for name in ("gain", "sigma")))
-    known = np.isfinite(sigma)
-    return GainEstimate(np.where(known, mean, 1.0), np.where(np.arange(len(sigma)) > 0, sigma, 0.0))
+    return _relative_to_first(np.where(np.isfinite(sigma), mean, 1.0), sigma)
 
 
 def weighted_mean(value: Floats, sigma: Floats) -> tuple[Floats, Floats]:
@@ -116,7 +120,6 @@ def with_prior(measured: GainEstimate, prior: float) -> GainEstimate:
 
     A gain far from 1 with a large error is replaced by 1, with its distance from 1 as the error.
     """
-    later = np.arange(len(measured.gain)) > 0
     sigma = np.where(np.isfinite(measured.sigma), measured.sigma, 1e6)
     distance = np.abs(measured.gain - 1)
     surprising = distance > _SURPRISE * np.hypot(sigma, prior)
@@ -126,7 +129,7 @@ def with_prior(measured: GainEstimate, prior: float) -> GainEstimate:
     gain = np.where(surprising, np.where(certain, measured.gain, 1.0), mean)
     doubtful = np.where(certain, sigma, np.maximum(distance, prior))
     error = np.where(surprising, doubtful, 1 / np.sqrt(weight + before))
-    return GainEstimate(np.where(later, gain, 1.0), np.where(later, error, 0.0))
+    return _relative_to_first(np.append(1.0, gain[1:]), error)
 
 
 def closure(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
@@ -199,7 +202,7 @@ def facing(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
     scatter = np.std(climbs[best][1:], axis=0)
     one_sided = _ONE_SIDED * _one_sided(ratio / gain[:, None], angle)
     sigma = np.sqrt(peaks**2 + scatter**2 + one_sided**2 + _FACING_ERROR**2)
-    return GainEstimate(gain, np.where(np.arange(shots) > 0, sigma, 0.0))
+    return _relative_to_first(gain, sigma)
 
 
 def _one_sided(ratio: Floats, angle: Floats) -> float:
@@ -259,8 +262,7 @@ def _null_vector(
         turned = angle + _ANGLE_ERROR * (np.arange(len(angle)) == k)
         variance = variance + (_least(_squares(equations(turned), weight)) - h) ** 2
     h = np.clip(h, 0.05, 20)
-    sigma = np.hypot(np.sqrt(variance) / h**2, floor)
-    return GainEstimate(1 / h, np.where(np.arange(len(h)) > 0, sigma, 0.0))
+    return _relative_to_first(1 / h, np.hypot(np.sqrt(variance) / h**2, floor))
 
 
 def _squares(rows: Floats, weight: Floats) -> Floats:

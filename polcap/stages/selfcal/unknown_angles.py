@@ -39,22 +39,22 @@ def find_angles(band: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> tupl
     equally well. It is π/2 if nothing is known.
     """
     shots = len(cells)
-    around, part = _by_direction(band)
-    lit = around.min(axis=1) > 0
+    rim, phi = _by_direction(band)
+    lit = rim.min(axis=1) > 0
     if lit.sum() < _LEAST_BINS or cells.shape[1] < 10 * shots:
         return np.zeros(shots), np.pi / 2
-    around, part = around[lit], part[lit]
+    rim, phi = rim[lit], phi[lit]
     inside = _condensed(cells)
     random = np.random.default_rng(outline.SECTORS)
-    ends = [_solve(around, part, inside, random.uniform(0, np.pi, shots), _COARSE) for _ in range(_STARTS)]
-    ends = [_solve(around, part, inside, start, _FINE) for _, start in sorted(ends, key=lambda end: end[0])[:_POLISHED]]
+    ends = [_solve(rim, phi, inside, random.uniform(0, np.pi, shots), _COARSE) for _ in range(_STARTS)]
+    ends = [_solve(rim, phi, inside, start, _FINE) for _, start in sorted(ends, key=lambda end: end[0])[:_POLISHED]]
     cost, angle = min(ends, key=lambda end: end[0])
     elsewhere = max(float(np.abs(_difference(other, angle)).max()) for left, other in ends if left < _AS_GOOD * cost)
-    side = np.arange(len(part)) * _SIDES // len(part)
+    side = np.arange(len(phi)) * _SIDES // len(phi)
     place = np.argsort(np.argsort(row, kind="stable")) * _SIDES // len(row)
-    by_side = [_solve(around[side != s], part[side != s], inside, angle, _FINE)[1] for s in range(_SIDES)]
-    by_place = [_solve(around, part, _condensed(cells[:, place != s]), angle, _FINE)[1] for s in range(_SIDES)]
-    by_law = [_difference(_solve(around, part, inside, angle, _FINE, law)[1], angle) for law in _OTHER_LAWS]
+    by_side = [_solve(rim[side != s], phi[side != s], inside, angle, _FINE)[1] for s in range(_SIDES)]
+    by_place = [_solve(rim, phi, _condensed(cells[:, place != s]), angle, _FINE)[1] for s in range(_SIDES)]
+    by_law = [_difference(_solve(rim, phi, inside, angle, _FINE, law)[1], angle) for law in _OTHER_LAWS]
     variance = np.mean(np.square(by_law), axis=0)  # (K,)
     for without in (by_side, by_place):
         variance = variance + jackknife(np.array([_difference(one, angle) for one in without]), about=0.0) ** 2
@@ -62,7 +62,7 @@ def find_angles(band: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> tupl
 
 
 def _by_direction(band: OutlineBand) -> tuple[Floats, Floats]:
-    """Light of the outline averaged in bins of its direction, (B, K), and the mean directions (B,) rad."""
+    """Light of the outline averaged in bins of its azimuth, (B, K), and the mean azimuth φ (B,) rad of each."""
     number = np.floor(band.azimuth / (2 * np.pi) * _BINS).astype(int) % _BINS
     light = np.stack([np.bincount(number, shot, _BINS) for shot in band.light], axis=1).astype(np.float64)
     weight = band.light.sum(axis=0)
@@ -83,26 +83,28 @@ def _condensed(cells: Floats) -> Floats:
 
 
 def _solve(
-    around: Floats, part: Floats, inside: Floats, start: Floats, until: float, law: float = _LAW
+    rim: Floats, phi: Floats, inside: Floats, start: Floats, until: float, law: float = _LAW
 ) -> tuple[float, Floats]:
-    """Fit polarizer angles (K,) from a start; returns misfit and angles.
+    """Fit polarizer angles (K,) from a start to the light (B, K) of the rim at azimuths phi (B,) and of the inside.
+
+    Returns the misfit and the angles. `until` is the relative change of the misfit that ends the fit.
 
     Two solutions that differ by 90° fit equally well; the result is that of diffuse reflection.
     """
-    relative = around / around.mean(axis=1, keepdims=True)
+    relative = rim / rim.mean(axis=1, keepdims=True)
     from scipy.optimize import least_squares  # here: the import takes 0.3 s
 
-    end = least_squares(_residual, start, args=(relative, part, inside, law), method="lm", ftol=until, max_nfev=150)
-    along = np.cos(2 * (part[:, None] - end.x))
+    end = least_squares(_residual, start, args=(relative, phi, inside, law), method="lm", ftol=until, max_nfev=150)
+    along = np.cos(2 * (phi[:, None] - end.x))
     along -= along.mean(axis=1, keepdims=True)
     angle = end.x if float((along * relative).sum()) > 0 else end.x + np.pi / 2
     return float(end.cost), np.asarray(angle)
 
 
-def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats, law: float) -> Floats:
+def _residual(angle: Floats, relative: Floats, phi: Floats, inside: Floats, law: float) -> Floats:
     """Residuals for polarizer angles, over their 1σ: outline from the span of 1 and cos 2(φ − θ), inside from A(θ)."""
     ones = np.ones(len(angle)) / np.sqrt(len(angle))
-    wave = np.cos(2 * (part[:, None] - angle))
+    wave = np.cos(2 * (phi[:, None] - angle))
     wave = wave - (wave @ ones)[:, None] * ones
     wave = wave / np.maximum(np.linalg.norm(wave, axis=1, keepdims=True), 1e-9)
     left = relative - (relative @ ones)[:, None] * ones
@@ -110,9 +112,9 @@ def _residual(angle: Floats, relative: Floats, part: Floats, inside: Floats, law
     rows = np.stack([np.ones_like(angle), np.cos(2 * angle), np.sin(2 * angle)], axis=1)
     basis, _ = np.linalg.qr(rows)
     out = inside - basis @ (basis.T @ inside)
-    return np.concatenate([left.ravel() / law / np.sqrt(len(part)), out.ravel() / _INSIDE])
+    return np.concatenate([left.ravel() / law / np.sqrt(len(phi)), out.ravel() / _INSIDE])
 
 
 def _difference(a: Floats, b: Floats) -> Floats:
-    """Angle from axis b to axis a, −π/2…π/2 rad; axes have no direction."""
+    """Angle from axis b to axis a, −π/2…π/2 rad; axes have no sense."""
     return np.asarray((a - b + np.pi / 2) % np.pi - np.pi / 2)

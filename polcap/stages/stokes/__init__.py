@@ -4,7 +4,7 @@ Gains, registration, the photosite offsets of a mosaic's colors and the lens's d
 else, so every pixel is resampled once. The result is the picture of a pinhole camera.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import cv2
@@ -13,9 +13,9 @@ import numpy as np
 from msgspec import Meta
 
 from polcap.errors import CaptureError
-from polcap.image_values import Bits, Bools, Distortion, Floats, MaskedImage, Quality, View
+from polcap.image_values import Bits, Bools, Distortion, Floats, MaskedImage, Quality
 from polcap.optics import crossing, distortion, frames, fresnel, mueller
-from polcap.optics.warp import covered, warp
+from polcap.optics.warp import Box, covered, warp
 from polcap.stage_values import Alignment, AngleStack, ObjectMask, SelfCalibration, StokesImage
 from polcap.stages import stage
 from polcap.stages.stokes.reference_detail import reference_detail
@@ -28,15 +28,12 @@ _LEAST_ROWS, _BLOCK = 64, 200_000  # rows and pixels of a block: its planes fit 
 _LEAST_VARIANCE = np.float32(1e-14)
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # Stokes indices of a covariance's six rows
 
-Box = tuple[int, int, int, int]  # x0, y0, x1, y1 merged px of the reference shot
-
 
 class StokesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of the stage `stokes`, the section `stokes` of a settings file."""
 
     greatest_ior: Annotated[
-        float,
-        Meta(ge=1.2, le=3, description="greatest refractive index; a DoLP beyond it is flagged"),
+        float, Meta(ge=1.2, le=3, description="greatest refractive index; a DoLP beyond it is flagged")
     ] = 1.8
     undistort: Annotated[
         bool, Meta(description="correct the distortion of a calibrated lens while the shots are resampled")
@@ -82,12 +79,10 @@ def solve(
         covariance=covariance,
         quality=quality,
         mask=np.array(mask),
-        view=View(
-            focal=view.focal,
+        view=replace(
+            view,
             center=(view.center[0] - x0, view.center[1] - y0),
-            scale=view.scale,
             origin=(view.origin[0] + x0, view.origin[1] + y0),
-            known=view.known,
         ),
         residual=residual,
         body=_body(shots, alignment.crossed, calibration.crossed, stokes, quality, crop),
@@ -121,7 +116,8 @@ def _solve_in_blocks(
 ) -> tuple[Floats, Floats, Bits, Floats | None]:
     """Solve the Stokes parameters (3, h, w, 3) of the crop, block by block to limit memory.
 
-    Also returns covariance (6, h, w, 3), quality (h, w) and, for K > 3, residual (h, w).
+    `crop` is in merged px of the reference shot. Also returns covariance (6, h, w, 3), quality (h, w) and, for K > 3,
+    residual (h, w).
     """
     x0, y0, x1, y1 = crop
     size, count = (y1 - y0, x1 - x0), len(analyzers)
@@ -134,15 +130,15 @@ def _solve_in_blocks(
     for top in range(y0, y1, block):
         rows = slice(top - y0, min(top + block, y1) - y0)
         value, variance, flagged = _register(shots, flags, (x0, top, x1, rows.stop + y0))
-        solved, doubt = stokes[:, rows], covariance[:, rows]
-        solve_(analyzers, value, variance, solved, doubt)
+        solved, solved_covariance = stokes[:, rows], covariance[:, rows]
+        solve_(analyzers, value, variance, solved, solved_covariance)
         if residual is not None:
             fitted = np.einsum("kj,jhwc->khwc", analyzers, solved)
             difference = np.abs(value - fitted).sum(3).mean(0)
             residual[rows] = difference / np.maximum(solved[0].sum(2), 1e-9)
         if shots.radiance.equipment.extinction is not None:
-            _correct_extinction(solved, doubt, shots.radiance.equipment.extinction)
-        quality[rows] = _with_solution_flags(solved, doubt, flagged, settings)
+            _correct_extinction(solved, solved_covariance, shots.radiance.equipment.extinction)
+        quality[rows] = _with_solution_flags(solved, solved_covariance, flagged, settings)
     return stokes, covariance, quality, residual
 
 
@@ -224,15 +220,17 @@ def _resampled(shots: _Shots, picture: Floats, transform: Floats, box: Box) -> F
     return np.asarray(cv2.merge(planes))
 
 
-def _exact(analyzers: Floats, value: Floats, variance: Floats, solved: Floats, doubt: Floats) -> None:
+def _exact(analyzers: Floats, value: Floats, variance: Floats, stokes: Floats, covariance: Floats) -> None:
     """Solve Stokes parameters from three angles exactly: s = A⁻¹ I, with covariance A⁻¹ diag(var) A⁻ᵀ."""
     inverse = np.linalg.inv(analyzers)  # (3, K)
     squares = np.stack([inverse[i] * inverse[j] for i, j in _PAIRS])  # (6, K)
-    np.matmul(inverse.astype(np.float32), value.reshape(3, -1), out=solved.reshape(3, -1))
-    np.matmul(squares.astype(np.float32), variance.reshape(3, -1), out=doubt.reshape(6, -1))
+    np.matmul(inverse.astype(np.float32), value.reshape(3, -1), out=stokes.reshape(3, -1))
+    np.matmul(squares.astype(np.float32), variance.reshape(3, -1), out=covariance.reshape(6, -1))
 
 
-def _weighted_least_squares(analyzers: Floats, value: Floats, variance: Floats, solved: Floats, doubt: Floats) -> None:
+def _weighted_least_squares(
+    analyzers: Floats, value: Floats, variance: Floats, stokes: Floats, covariance: Floats
+) -> None:
     """Solve Stokes parameters (3, h, w, C) and covariance (6, h, w, C) from shots and variances (K, h, w, C)."""
     w = 1.0 / variance.astype(np.float64).reshape(len(value), -1)
     products = np.stack([analyzers[:, i] * analyzers[:, j] for i, j in _PAIRS])
@@ -241,10 +239,10 @@ def _weighted_least_squares(analyzers: Floats, value: Floats, variance: Floats, 
     c00, c01, c02 = m11 * m22 - m12**2, m02 * m12 - m01 * m22, m01 * m12 - m02 * m11
     determinant = m00 * c00 + m01 * c01 + m02 * c02
     c11, c12, c22 = m00 * m22 - m02**2, m01 * m02 - m00 * m12, m00 * m11 - m01**2
-    covariance = np.stack([c00, c01, c02, c11, c12, c22]) / determinant
-    i00, i01, i02, i11, i12, i22 = covariance
-    doubt[:] = covariance.reshape(doubt.shape)
-    for plane, (a, b, c) in zip(solved, ((i00, i01, i02), (i01, i11, i12), (i02, i12, i22))):
+    inverse = np.stack([c00, c01, c02, c11, c12, c22]) / determinant
+    i00, i01, i02, i11, i12, i22 = inverse
+    covariance[:] = inverse.reshape(covariance.shape)
+    for plane, (a, b, c) in zip(stokes, ((i00, i01, i02), (i01, i11, i12), (i02, i12, i22))):
         plane[:] = (a * right[0] + b * right[1] + c * right[2]).reshape(plane.shape)
 
 

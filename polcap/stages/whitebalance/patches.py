@@ -67,21 +67,21 @@ def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
     Raises ChartError: fewer than 12 patches are usable.
     """
     seen, use = samples.color, samples.use
-    used = int((use == PatchUse.USED).sum())
-    if used < _LEAST:
+    usable = use == PatchUse.USED
+    if usable.sum() < _LEAST:
         clipped, uneven = (int((use == reason).sum()) for reason in (PatchUse.CLIPPED, PatchUse.UNEVEN))
         why = (
-            f"{24 - used} of the chart's 24 patches cannot be used ({clipped} over-exposed, "
+            f"{24 - usable.sum()} of the chart's 24 patches cannot be used ({clipped} over-exposed, "
             f"{uneven} partly hidden or in shade), more than the {24 - _LEAST} allowed"
         )
         raise ChartError(f"{why}; add a shorter exposure to the bracket, or show the whole chart", why)
-    error = color_matrix.trimmed_residuals(seen, reference.rec709, position(), use == PatchUse.USED)
-    odd = error > max(_LEAST_ODD, _ODD * float(np.median(error[use == PatchUse.USED])))
-    use = np.where((use == PatchUse.USED) & odd, PatchUse.ODD, use).astype(np.uint8)
-    if (use == PatchUse.USED).sum() < _LEAST:  # no matrix fits most patches: use all
-        use = np.where(use == PatchUse.ODD, PatchUse.USED, use).astype(np.uint8)
-    found = color_matrix.fit_matrix(seen, reference.rec709, position(), use == PatchUse.USED)
-    every = np.where(use == PatchUse.ODD, np.minimum(error, _MOST_COUNTED), found.delta_e)
+    error = color_matrix.trimmed_residuals(seen, reference.rec709, position(), usable)
+    odd = usable & (error > max(_LEAST_ODD, _ODD * float(np.median(error[usable]))))
+    if (usable & ~odd).sum() < _LEAST:  # no matrix fits most patches: use all
+        odd[:] = False
+    use = np.where(odd, PatchUse.ODD, use).astype(np.uint8)
+    found = color_matrix.fit_matrix(seen, reference.rec709, position(), usable & ~odd)
+    every = np.where(odd, np.minimum(error, _MOST_COUNTED), found.delta_e)
     return ChartFit(found, use, float(np.nanmean(every)), seen)
 
 
@@ -133,7 +133,7 @@ def sample(value: Floats, quality: Bits, place: Placement, share: float, at: Flo
     centers, as in `Placement.quads`.
     """
     quads = place.quads(share, at)
-    color_, uneven = np.zeros((len(quads), 3)), np.zeros(len(quads))
+    color, uneven = np.zeros((len(quads), 3)), np.zeros(len(quads))
     use = np.zeros(len(quads), np.uint8)
     for index, quad in enumerate(quads):
         x, y = pixels_inside(quad, value.shape).T
@@ -143,13 +143,13 @@ def sample(value: Floats, quality: Bits, place: Placement, share: float, at: Flo
         inside = value[y, x].astype(np.float64)
         pixels = np.sort(inside, axis=0)
         trim = len(pixels) // 10
-        color_[index] = 2 * pixels[trim : len(pixels) - trim].mean(axis=0)
+        color[index] = 2 * pixels[trim : len(pixels) - trim].mean(axis=0)
         uneven[index] = 2 * _between_quarters(inside, x - x.mean(), y - y.mean())
         if np.mean((quality[y, x] & Quality.CLIPPED) > 0) > _CLIPPED:
             use[index] = PatchUse.CLIPPED
-    light = color_.sum(axis=1)
+    light = color.sum(axis=1)
     too_uneven = uneven > _UNEVEN * light + _UNEVEN_WHITE * light.max()
-    return PatchSamples(color_, np.where((use == PatchUse.USED) & too_uneven, PatchUse.UNEVEN, use).astype(np.uint8))
+    return PatchSamples(color, np.where((use == PatchUse.USED) & too_uneven, PatchUse.UNEVEN, use).astype(np.uint8))
 
 
 def left_out(use: Bits) -> str:
@@ -160,11 +160,8 @@ def left_out(use: Bits) -> str:
         PatchUse.UNEVEN: "partly hidden or in shade",
         PatchUse.ODD: "hidden, in shade or shining",
     }
-    parts = []
-    for reason, word in words.items():
-        which = [str(patch + 1) for patch in np.flatnonzero(use == reason)]
-        if which:
-            parts.append(f"{', '.join(which)} {word}")
+    numbers = {word: ", ".join(str(patch + 1) for patch in np.flatnonzero(use == one)) for one, word in words.items()}
+    parts = [f"{patches} {word}" for word, patches in numbers.items() if patches]
     return f"left out, of patches 1 to 24: {'; '.join(parts)}" if parts else ""
 
 

@@ -1,6 +1,7 @@
 """Shots of smooth surfaces z(x, y), for the laws of their slopes; self-calibration of the scene of `tests.scenes`."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,11 @@ def inside(light: Floats) -> Bools:
     used = np.zeros(light.shape[1:], bool)
     used[4:-4, 4:-4] = True
     return used
+
+
+def misstated(actual: Floats, stated: Floats, noise: float = 0.002) -> AngleStack:
+    """Shots of the scene at angles (K,) rad that differ from the stated ones."""
+    return replace(scenes.stack(noise=noise, angles=actual), angle=stated)
 
 
 def solve(

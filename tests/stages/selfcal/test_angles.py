@@ -15,7 +15,7 @@ from polcap.stages import stokes
 from polcap.stages.selfcal import angles as angles_
 from polcap.stages.selfcal import unknown_angles
 from tests import scenes
-from tests.stages.selfcal.shapes import solve
+from tests.stages.selfcal.shapes import misstated, solve
 
 FOUR = np.radians([0.0, 45.0, 90.0, 135.0])
 
@@ -72,10 +72,9 @@ def test_an_outline_without_information_supports_no_order(sectors, margin):
 @pytest.mark.parametrize("margin", [0.0, 0.2])
 def test_an_order_that_fits_as_well_is_named(margin):
     """All angles stated 90° on are those of another order, counted the other way: the outline fits both alike."""
-    radiance = scenes.stack(noise=0.002)
-    assert solve(radiance, order_margin=margin).outline.rival is None
-    turned = replace(radiance, angle=radiance.angle + np.pi / 2)
-    assert solve(turned, order_margin=margin).outline.rival is not None
+    for turn, has_rival in ((0.0, False), (np.pi / 2, True)):
+        found = solve(misstated(scenes.ANGLES, scenes.ANGLES + turn), order_margin=margin)
+        assert (found.outline.rival is not None) == has_rival
 
 
 @pytest.mark.parametrize(("degrees", "count"), [((0, 45, 90), 11), ((0, 45, 90, 135), 7), ((0, 40, 90, 135), 3)])
@@ -95,8 +94,8 @@ def test_orders_that_the_outline_does_not_exclude_explain_the_same_light(degrees
 
 @pytest.mark.parametrize("victim", [1, 2])
 def test_one_of_four_angles_that_is_wrong_is_found(victim):
-    turned = scenes.stack(noise=0.002, angles=FOUR + np.radians(15.0) * (np.arange(4) == victim))
-    found = solve(replace(turned, angle=FOUR), correct_ring=False).turned
+    turned = FOUR + np.radians(15.0) * (np.arange(4) == victim)
+    found = solve(misstated(turned, FOUR), correct_ring=False).turned
     assert victim in found.shots
     assert abs(np.degrees(found.angle)) == pytest.approx(15, abs=3 * np.degrees(found.sigma) + 1)
     assert solve(scenes.stack(noise=0.002, angles=FOUR)).turned.shots == ()
@@ -105,8 +104,7 @@ def test_one_of_four_angles_that_is_wrong_is_found(victim):
 @pytest.mark.parametrize("victim", [1, 2, 3])
 def test_of_four_shots_the_one_before_which_the_ring_was_not_turned_is_found(victim):
     actual = np.where(np.arange(4) == victim, FOUR - np.radians(45.0), FOUR)
-    radiance = replace(scenes.stack(noise=0.002, angles=actual), angle=FOUR)
-    found = solve(radiance, check_order=False).turned
+    found = solve(misstated(actual, FOUR), check_order=False).turned
     assert {victim, victim - 1} & set(found.shots)  # both have the same angle: either may be the wrong one
     assert abs(np.degrees(found.angle)) > 25
 
@@ -114,20 +112,18 @@ def test_of_four_shots_the_one_before_which_the_ring_was_not_turned_is_found(vic
 def test_small_errors_of_all_angles_are_no_great_turn_of_the_least_sensitive_one():
     stated = np.radians([24.0, 72.0, 90.0, 109.0])
     by_hand = stated + np.radians([-0.2, -1.0, -1.1, 0.6])
-    radiance = replace(scenes.stack(noise=0.002, angles=by_hand), angle=stated)
-    assert solve(radiance, correct_ring=False).turned.shots == ()
+    assert solve(misstated(by_hand, stated), correct_ring=False).turned.shots == ()
 
 
 def test_of_shots_that_explain_the_residual_alike_the_most_turned_counts():
     """Crossed analyzers explain the same residual, by different turns where the other angles lie unevenly."""
     stated = np.radians([81.0, 108.0, 126.0, 171.0])
-    radiance = scenes.stack(noise=0.002, angles=stated + np.radians([0, 0, 0, 15.0]))
-    found = solve(replace(radiance, angle=stated), correct_ring=False).turned
+    found = solve(misstated(stated + np.radians([0, 0, 0, 15.0]), stated), correct_ring=False).turned
     assert found.shots[0] == 3 and np.degrees(found.angle) == pytest.approx(15, abs=5)
 
 
 TRUE = np.radians([12.0, 51.0, 83.0, 118.0, 160.0])
-UNNOTED = replace(scenes.stack(angles=TRUE), angle=np.radians(np.arange(5.0)), equipment=Equipment("one exposure"))
+UNNOTED = replace(misstated(TRUE, np.radians(np.arange(5.0)), noise=0.0), equipment=Equipment("one exposure"))
 
 
 def test_five_angles_of_a_ball_are_found():

@@ -10,7 +10,7 @@ from polcap.stage_values import Equipment, RingZero
 from polcap.stages import selfcal, stokes
 from polcap.stages.selfcal import ring_zero
 from tests import scenes
-from tests.stages.selfcal.shapes import ANGLES, SHAPES, inside, shots, solve
+from tests.stages.selfcal.shapes import ANGLES, SHAPES, inside, misstated, shots, solve
 
 DEG = np.radians(1.0)
 
@@ -57,15 +57,15 @@ def test_two_measurements_are_averaged_by_their_errors_or_doubted() -> None:
 
 @pytest.mark.parametrize("turn", [7.0, -2.5])
 def test_a_ring_whose_zero_is_off_is_found_and_corrected(turn):
-    radiance = scenes.stack(noise=0.002, angles=ANGLES + turn * DEG)
-    misset = replace(radiance, angle=ANGLES)
+    misset = misstated(ANGLES + turn * DEG, ANGLES)
     found = solve(misset)
     assert within(found.ring, turn * DEG) and found.ring.sigma < 0.7 * DEG
     assert found.ring.correction == found.ring.offset
     assert found.angle == pytest.approx(ANGLES + found.ring.offset)
-    right = stokes.solve(radiance, scenes.still(), scenes.equal(radiance.angle), scenes.ball_object(),
-                         stokes.StokesSettings())  # fmt: skip
-    corrected = stokes.solve(misset, scenes.still(), found, scenes.ball_object(), stokes.StokesSettings())
+    right, corrected = (
+        stokes.solve(misset, scenes.still(), calibration, scenes.ball_object(), stokes.StokesSettings())
+        for calibration in (scenes.equal(ANGLES + turn * DEG), found)
+    )
     s1, s2 = (right.stokes - corrected.stokes)[1:].sum(-1)[:, right.mask]
     polarized = np.hypot(*right.stokes[1:].sum(-1)[:, right.mask])
     assert np.hypot(s1, s2).sum() < 2 * DEG * polarized.sum()
@@ -92,8 +92,7 @@ def test_a_ring_set_right_is_not_corrected():
 
 
 def test_a_turn_is_corrected_only_where_asked_and_certain():
-    radiance = scenes.stack(noise=0.002, angles=ANGLES + 3 * DEG)
-    misset = replace(radiance, angle=ANGLES)
+    misset = misstated(ANGLES + 3 * DEG, ANGLES)
     assert solve(misset, correct_ring=False).ring.correction == 0
     assert solve(replace(misset, equipment=Equipment("one exposure"))).ring.correction == 0
     cut = replace(scenes.ball_object(), border=0.1)  # no closed outline: the slopes alone give the turn

@@ -34,6 +34,18 @@ def plain() -> tuple[Floats, Floats]:
     return photograph(place), place
 
 
+def chart_coordinates(place: Floats) -> Floats:
+    """Coordinates u, v (2, H, W) of the picture's pixels on the chart: 0…6 × 0…4."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
+    return np.moveaxis(transform_points(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
+
+
+def corners(place: Floats, off: Floats | float = 0.0, patch: float = 0.87) -> ChartRequest:
+    """The outer corners of a chart as the user states them in RAW px, with an error [binned px]."""
+    at = chart.Placement(place, patch).corners() + off
+    return ChartRequest("corners", corners=2 * at + 0.5)  # binned px (i, j) ↔ RAW px (2i + ½, 2j + ½)
+
+
 def centers_off(color: ColorCalibration, homography: Floats) -> Floats:
     """Distance of each found patch center from the true one (24,), px."""
     assert color.place is not None
@@ -121,8 +133,7 @@ def test_matrix_ignores_exposure_and_the_place_does_too():
 
 def test_sloping_light_and_glare_are_taken_out_of_the_matrix():
     image, place = plain()
-    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
-    u, v = np.moveaxis(transform_points(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
+    u, v = chart_coordinates(place)
     light = 1 + 0.03 * (u - 0.5) - 0.02 * (v - 3.5)
     veil = 0.02 * CAMERA.sum(axis=1) / 2
     color = measure(image * light[..., None] + veil)
@@ -143,25 +154,21 @@ def test_overexposed_patches_are_left_out():
 
 def test_a_chart_burnt_out_asks_for_a_shorter_exposure():
     image, place = plain()
-    corners = 2 * chart.from_centers(transform_points(place, chart.centers())).corners() + 0.5
     with pytest.raises(ChartError, match=r"over-exposed.*shorter exposure"):
-        measure(stack(image, clip=0.02), ChartRequest("corners", corners=corners))
+        measure(stack(image, clip=0.02), corners(place))
 
 
-def painted(place: Floats, columns: slice, rows: slice, color: Floats | float) -> Floats:
+def painted(columns: slice, rows: slice, color: Floats | float) -> Floats:
     """`plain()`, with something over these columns and rows of the chart: (u, v) 0…6 × 0…4."""
-    image, _ = plain()
-    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
-    u, v = np.moveaxis(transform_points(np.linalg.inv(place), np.stack([x, y], axis=-1)), -1, 0)
+    image, place = plain()
+    u, v = chart_coordinates(place)
     over = (u > columns.start) & (u < columns.stop) & (v > rows.start) & (v < rows.stop)
     return np.where(over[..., None], color if np.ndim(color) else color * image, image)
 
 
 def test_hidden_patches_are_left_out_and_named():
     """A thumb over three patches and half a fourth."""
-    place = plain()[1]
-    image = painted(place, slice(4.2, 7), slice(0, 1.9), CAMERA @ np.array([0.45, 0.25, 0.17]) / 2)
-    color = measure(image)
+    color = measure(painted(slice(4.2, 7), slice(0, 1.9), CAMERA @ np.array([0.45, 0.25, 0.17]) / 2))
     assert color.patches.use is not None and color.patches.predicted is not None
     assert set(np.flatnonzero(color.patches.use)) >= {5, 10, 11} and (color.patches.use > 0).sum() <= 5
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.02)
@@ -170,9 +177,7 @@ def test_hidden_patches_are_left_out_and_named():
 
 
 def test_patches_in_shade_are_left_out():
-    place = plain()[1]
-    image = painted(place, slice(4.5, 7), slice(-1, 5), 0.5)  # the last column, and an edge across the one before
-    color = measure(image)
+    color = measure(painted(slice(4.5, 7), slice(-1, 5), 0.5))  # the last column, and an edge across the one before
     assert color.patches.use is not None
     assert (color.patches.use[[4, 5, 10, 11, 16, 17, 22, 23]] > 0).sum() >= 6
     assert (color.patches.use.reshape(4, 6)[:, :4] == 0).all()
@@ -181,10 +186,7 @@ def test_patches_in_shade_are_left_out():
 
 def test_block_of_an_sg_chart_is_read_at_its_corners():
     sg, place = shipped_data.colorchecker("sg"), pose(24, 8, (260, 170))
-    image = photograph(place, sg.rec709)
-    exact = chart.Placement(place, 0.87).corners()
-    request = ChartRequest("corners", corners=2 * exact + 0.5)
-    color = measure(image, request, sg, chart="sg")
+    color = measure(photograph(place, sg.rec709), corners(place), sg, chart="sg")
     assert color.matrix @ CAMERA == pytest.approx(np.eye(3), abs=0.03)
     assert np.nanmean(color.patches.delta_e) < 1
     assert color.patches.surroundings is not None and np.isnan(color.patches.surroundings).all()  # only a table
@@ -207,8 +209,9 @@ def sg_picture(spread: float = 0.0, patch: float = 0.9, seed: int = 7) -> Floats
 
 def sg_corners(whole: bool, patch: float = 0.9) -> ChartRequest:
     """RAW px of the outer corners of the whole SG, or of its block."""
-    gap = (1 - patch) / 2
-    left, top, right, bottom = (gap - 4, gap - 1, 10 - gap, 9 - gap) if whole else (gap, gap, 6 - gap, 4 - gap)
+    if not whole:
+        return corners(SG_PLACE, patch=patch)
+    left, top, right, bottom = -3.5 - patch / 2, -0.5 - patch / 2, 9.5 + patch / 2, 8.5 + patch / 2
     at = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
     return ChartRequest("corners", corners=2 * transform_points(SG_PLACE, at) + 0.5)
 
@@ -251,9 +254,7 @@ def test_more_patches_make_the_matrix_better() -> None:
 
 def test_hidden_patches_of_an_sg_are_left_out() -> None:
     picture = sg_picture()
-    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
-    u = transform_points(np.linalg.inv(SG_PLACE), np.stack([x, y], axis=-1).astype(float))[..., 0]
-    picture[u < -2] = CAMERA @ [0.35, 0.2, 0.15] / 2  # a hand on the first two columns
+    picture[chart_coordinates(SG_PLACE)[0] < -2] = CAMERA @ [0.35, 0.2, 0.15] / 2  # a hand on the first two columns
     color = measure(picture, sg_corners(whole=True), SG, chart="sg")
     used = np.isfinite(color.patches.surroundings)
     hidden = SG.surroundings.center[:, 0] < -2
@@ -281,25 +282,20 @@ def test_a_picture_without_a_usable_chart_is_refused_with_the_reason(name: str):
 
 def test_manual_corners_in_raw_pixels_are_drawn_to_the_chart():
     image, place = plain()
-    exact = chart.Placement(place, 0.87).corners()
-    rough = exact + np.array([[3.0, -2], [-3, 2], [2, 3], [-2, -3]])  # an unsteady hand
-    request = ChartRequest("corners", corners=2 * rough + 0.5)  # binned px (i, j) ↔ RAW px (2i + ½, 2j + ½)
-    color = measure(image, request)
+    color = measure(image, corners(place, off=np.array([[3.0, -2], [-3, 2], [2, 3], [-2, -3]])))  # an unsteady hand
     assert color.source == "corners" and np.isnan(color.cost)
     assert centers_off(color, place).max() < 0.1
-    assert color.place.corners == pytest.approx(exact, abs=0.15)
+    assert color.place.corners == pytest.approx(chart.Placement(place, 0.87).corners(), abs=0.15)
 
 
 def test_corners_from_the_wrong_end_are_named():
     image, place = plain()
-    corners = 2 * chart.Placement(place, 0.87).corners() + 0.5
     with pytest.raises(ChartError, match="upside down"):
-        request = ChartRequest("corners", corners=np.roll(corners, 2, axis=0))
-        measure(image, request)
+        measure(image, corners(place @ [[-1.0, 0, 6], [0, -1.0, 4], [0, 0, 1]]))
 
 
 @pytest.mark.parametrize(
-    ("corners", "message"),
+    ("stated", "message"),
     [
         (None, "four outer corners of the patches"),
         ([[10, 10], [10, 200], [300, 200], [300, 10]], "clockwise"),
@@ -308,8 +304,8 @@ def test_corners_from_the_wrong_end_are_named():
         ([[10, 10], [310, 10], [310, 210], [10, 210]], "do not show a ColorChecker Classic"),
     ],
 )
-def test_impossible_corners_are_one_clear_line(corners, message):
-    request = ChartRequest("corners", corners=None if corners is None else np.array(corners, float))
+def test_impossible_corners_are_one_clear_line(stated, message):
+    request = ChartRequest("corners", corners=None if stated is None else np.array(stated, float))
     with pytest.raises(ChartError, match=message):
         measure(plain()[0], request)
 
