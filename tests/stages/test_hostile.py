@@ -18,7 +18,15 @@ from tests import scenes
 
 HEIGHT, WIDTH = 36, 48
 LOOKS = ("noise", "constant", "zero", "disc", "stripes", "one pixel", "ramp", "negative")
-FLAWS = ("none", "all clipped", "half clipped", "all dark", "all ghosts", "ball clipped")
+DISC = np.hypot(*np.mgrid[-18 : HEIGHT - 18, -22 : WIDTH - 22]) ** 2 < 150
+FLAWS: dict[str, tuple[int, Any]] = {  # quality bit, and the pixels where it is set
+    "none": (0, ...),
+    "all clipped": (Quality.CLIPPED, ...),
+    "half clipped": (Quality.CLIPPED, np.s_[:, :, ::2]),
+    "all dark": (Quality.DARK, ...),
+    "all ghosts": (Quality.GHOST, ...),
+    "ball clipped": (Quality.CLIPPED, np.s_[:, DISC]),
+}
 MASKS = ("found", "whole", "one pixel", "line", "two specks", "disc")
 
 
@@ -28,13 +36,12 @@ def hostile(seed: int) -> tuple[AngleStack, np.ndarray | None]:
     shots = int(random.integers(3, 7))
     angle = np.sort(random.uniform(0, np.pi, shots)) if random.integers(2) else np.arange(shots) * np.pi / shots
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(float)
-    disc = (x - 22) ** 2 + (y - 18) ** 2 < 150
     look = LOOKS[random.integers(len(LOOKS))]
     light = {
         "noise": random.uniform(0, 1, (HEIGHT, WIDTH)),
         "constant": np.full((HEIGHT, WIDTH), 0.5),
         "zero": np.zeros((HEIGHT, WIDTH)),
-        "disc": 0.01 + 0.5 * disc,
+        "disc": 0.01 + 0.5 * DISC,
         "stripes": 0.5 + 0.5 * np.sin(x),
         "one pixel": 1.0 * ((x == 20) & (y == 20)),
         "ramp": x / WIDTH,
@@ -44,24 +51,15 @@ def hostile(seed: int) -> tuple[AngleStack, np.ndarray | None]:
     value = (light * wave[:, None, None])[..., None] * random.uniform(0.3, 1, 3)
     value = value + random.choice([0, 1e-3]) * random.normal(size=value.shape)
     quality = np.zeros(value.shape[:3], np.uint8)
-    flaw = FLAWS[random.integers(len(FLAWS))]
-    if flaw == "all clipped":
-        quality[:] = Quality.CLIPPED
-    elif flaw == "half clipped":
-        quality[:, :, ::2] = Quality.CLIPPED
-    elif flaw == "all dark":
-        quality[:] = Quality.DARK
-    elif flaw == "all ghosts":
-        quality[:] = Quality.GHOST
-    elif flaw == "ball clipped":
-        quality[:, disc] = Quality.CLIPPED
+    flaw, where = FLAWS[list(FLAWS)[random.integers(len(FLAWS))]]
+    quality[where] = flaw
     drawn = {
         "found": None,
         "whole": np.ones((HEIGHT, WIDTH), bool),
         "one pixel": (x == 20) & (y == 20),
         "line": y == 18,
         "two specks": ((x < 4) & (y < 4)) | ((x > 40) & (y > 30)),
-        "disc": disc,
+        "disc": DISC,
     }[MASKS[random.integers(len(MASKS))]]
     ones = np.ones((shots, 2, 3)) * np.array([1.0, random.uniform(1, 5)])[:, None]
     stack = AngleStack(

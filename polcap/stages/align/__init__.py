@@ -51,10 +51,11 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: AlignSetti
 
     Raises AlignmentError, which names the shot: it moved too far, or shows another scene.
     """
-    if radiance.offset_px is not None:
-        return _of_mosaic(radiance.offset_px)
     shots = len(radiance.angle)
     transform, residual, correlation = np.tile(np.eye(3), (shots, 1, 1)), np.zeros(shots), np.ones(shots)
+    if radiance.offset_px is not None:  # all shots are cut from one frame of a polarization sensor
+        transform[:, :2, 2] = -radiance.offset_px
+        return Alignment(transform, residual, correlation)
     crossed: Floats | None = None if radiance.crossed is None else np.eye(3)
     if settings.model == "none":
         return Alignment(transform, residual, correlation, crossed)
@@ -67,13 +68,6 @@ def register(radiance: AngleStack, color: ColorCalibration, settings: AlignSetti
         name = "the cross-polarized shot"
         crossed, _, _ = _register_shot(name, radiance.crossed.picture, reference, step, settings)
     return Alignment(transform, residual, correlation, crossed)
-
-
-def _of_mosaic(offset_px: Floats) -> Alignment:
-    """Alignment of shots that are cut from one frame of a polarization sensor: their offsets (K, 2) px are known."""
-    transform = np.tile(np.eye(3), (len(offset_px), 1, 1))
-    transform[:, :2, 2] = -offset_px
-    return Alignment(transform, np.zeros(len(offset_px)), np.ones(len(offset_px)))
 
 
 def _detail(shot: MaskedImage, step: int, settings: AlignSettings) -> Pyramid:

@@ -69,24 +69,24 @@ def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float)
     size.
     """
     source = _BracketSignals(bracket, lines, read)
-    still = source.reference_signals
-    one = np.ones(still.shape[0], np.float32)
+    reference = source.reference_signals
+    one = np.ones(reference.shape[0], np.float32)
     if not bracket.others and source.ambient is None:
-        source.learn(bracket.reference, noise.sample_frame(still))
-    ghost = np.zeros(still.usable.shape, bool)
+        source.learn(bracket.reference, noise.sample_frame(reference))
+    ghost = np.zeros(reference.usable.shape, bool)
     frames, parts = {}, []
     anchor: Anchor | None = None
     for e in bracket.others:
         frames[e] = _compare_frame(source, e, limit_px)
-        anchor = anchor or Anchor(RegisteredFrame(still, one, source.line(bracket.reference), 0 * one))
+        anchor = anchor or Anchor(RegisteredFrame(reference, one, source.line(bracket.reference), 0 * one))
         new = anchor.ghosts(frames[e])
         parts.append((frames[e], frames[e].signals.usable & ~new))
         ghost |= new
         if e == bracket.order[0]:
             anchor = replace(anchor, darkest=frames[e])
-    frames[bracket.reference] = RegisteredFrame(still, one, source.line(bracket.reference), 0 * one)
-    parts.append((frames[bracket.reference], still.usable))
-    estimate = first_estimate(parts, anchor or still, ghost)
+    frames[bracket.reference] = RegisteredFrame(reference, one, source.line(bracket.reference), 0 * one)
+    parts.append((frames[bracket.reference], reference.usable))
+    estimate = first_estimate(parts, anchor or Anchor(frames[bracket.reference]), ghost)
     return ComparedBracket(
         frames=[replace(frames[e], noise=source.sensor_line(e)) for e in range(len(frames))],
         ghost=ghost,

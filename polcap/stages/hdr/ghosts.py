@@ -104,7 +104,7 @@ class Anchor:
         return dilate(erode(found, 1), _WINDOW // 2 + 2)
 
 
-def first_estimate(parts: list[tuple[RegisteredFrame, Bools]], otherwise: Signals | Anchor, ghost: Bools) -> Floats:
+def first_estimate(parts: list[tuple[RegisteredFrame, Bools]], otherwise: Anchor, ghost: Bools) -> Floats:
     """First estimate of a bracket's radiance, X₀ = Σ Y/a / Σ e/a, (C, H, W), after a local Wiener filter.
 
     `parts` are frames, each with the pixels (H, W) for which it is used. `otherwise` is used where no frame is, and at

@@ -281,11 +281,10 @@ def _from_camera(radiance: AngleStack) -> ColorCalibration:
     """Color calibration without a chart: matrix or white balance from the camera's metadata, else the identity."""
     sensor = radiance.sensor
     if sensor.camera_matrix is not None:
-        matrix = np.asarray(sensor.camera_matrix, np.float64)
-    else:
-        matrix = np.diag(np.ones(3) if sensor.white_balance is None else np.asarray(sensor.white_balance, np.float64))
-    known = sensor.camera_matrix is not None or sensor.white_balance is not None
-    return ColorCalibration(matrix=matrix / 2, source="camera" if known else "none")
+        return ColorCalibration(np.asarray(sensor.camera_matrix, np.float64) / 2, "camera")
+    if sensor.white_balance is not None:
+        return ColorCalibration(np.diag(np.asarray(sensor.white_balance, np.float64)) / 2, "camera")
+    return ColorCalibration(np.eye(3) / 2, "none")
 
 
 def _scale(place: Placement, view: View, width_m: float | None) -> float | None:

@@ -99,9 +99,7 @@ def from_sg_corners(points: Floats) -> Placement:
 
     The block begins at column 5 of 14 and row 2 of 10.
     """
-    gap = (1 - USUAL_PATCH) / 2
-    left, top, right, bottom = gap - 4, gap - 1, 10 - gap, 9 - gap
-    return Placement(_homography(np.array([[left, top], [right, top], [right, bottom], [left, bottom]]), points))
+    return Placement(_homography(_outer(USUAL_PATCH, 14, 10) - [4, 1], points))
 
 
 def is_view(homography: Floats) -> bool:
@@ -222,10 +220,10 @@ def _colors(value: Floats, cover: Floats, cell: NDArray[np.intp]) -> tuple[Float
     return np.array([np.median(inside, axis=0) if len(inside) else card for inside in full]), card
 
 
-def _outer(patch: float) -> Floats:
-    """Outer corners (4, 2) of the chart's corner patches in chart coordinates, dark skin first, clockwise."""
+def _outer(patch: float, columns: int = COLUMNS, rows: int = ROWS) -> Floats:
+    """Outer corners (4, 2) of a chart's corner patches in chart coordinates, the first patch first, clockwise."""
     gap = (1 - patch) / 2
-    return np.array([[gap, gap], [COLUMNS - gap, gap], [COLUMNS - gap, ROWS - gap], [gap, ROWS - gap]])
+    return np.array([[gap, gap], [columns - gap, gap], [columns - gap, rows - gap], [gap, rows - gap]])
 
 
 def _homography(source: Floats, target: Floats) -> Floats:

@@ -27,8 +27,8 @@ def decode(frame):
     return frame.load()
 
 
-def merge(captured, settings):
-    return hdr.merge(captured, decode, settings)
+def merge(captured, **settings):
+    return hdr.merge(captured, decode, hdr.HdrSettings(**settings))
 
 
 def ramp(height, width, low=20.0, high=1.2e5, ripple=0.2):

@@ -10,7 +10,6 @@ from polcap.errors import CaptureError
 from polcap.image_values import Quality
 from polcap.optics.registration import squared_gradient
 from polcap.optics.robust import MAD_TO_SIGMA
-from polcap.stages import hdr
 from polcap.stages.hdr import noise
 from polcap.stages.hdr.bracket import Bracket, compare
 from polcap.stages.hdr.planes import Reader, signals
@@ -62,8 +61,8 @@ def test_hand_held_bracket_is_registered(hand):
         frame(photograph(1, rng), iso=100.0),
         frame(photograph(4, rng, turned(-hand[1], hand[0], hand[2] / 2)), iso=100.0),
     ]
-    stack = merge(capture(frames), hdr.HdrSettings())
-    still = merge(capture([frames[1]]), hdr.HdrSettings())
+    stack = merge(capture(frames))
+    still = merge(capture([frames[1]]))
     np.testing.assert_allclose(stack.bracket.exposure_ratio[0, :, 1], [0.25, 1, 4], rtol=1e-3)
     assert stack.bracket.ghost_fraction[0] < 1e-3
     y, x = np.mgrid[:640, :800]
@@ -82,7 +81,7 @@ def test_tripod_bracket_is_not_resampled():
     """Noise of neighbours stays independent: resampling would correlate it."""
     rng = np.random.default_rng(9)
     frames = [frame(photograph(e, rng), iso=100.0) for e in (0.25, 1, 4)]
-    stack = merge(capture(frames), hdr.HdrSettings())
+    stack = merge(capture(frames))
     y, x = np.mgrid[:640:2, :800:2]
     error = stack.value[0, ..., 0] - electrons_to_signal(scene(x, y)[..., 0])
     z = error / np.sqrt(stack.variance[0, ..., 0])
@@ -94,7 +93,7 @@ def test_too_much_motion_is_refused():
     rng = np.random.default_rng(7)
     frames = [frame(photograph(1, rng), iso=100.0), frame(photograph(2, rng, turned(9, 9, 0)), iso=100.0)]
     with pytest.raises(CaptureError, match=r"frame \d of shot 0°, moved by .*; check this file.* hdr.max_motion_px"):
-        merge(capture(frames), hdr.HdrSettings(max_motion_px=4))
+        merge(capture(frames), max_motion_px=4)
 
 
 @needs_data
@@ -108,7 +107,7 @@ def test_hand_held_nikon_bracket():
     folder = Path(DATA) / "real" / "raw_bracket"
     times = {"sample2.dng": 1 / 640, "sample1.dng": 1 / 160, "sample3.dng": 1 / 40}
     frames = [raw_file(folder / n, iso=200.0, exposure_time=t, f_number=6.3) for n, t in times.items()]
-    stack = merge(capture(frames), hdr.HdrSettings())
+    stack = merge(capture(frames))
     ratio = stack.bracket.exposure_ratio[0].mean(axis=1)
     assert ratio[1] / ratio[0] == pytest.approx(3.96, rel=0.01)
     assert ratio[2] / ratio[1] == pytest.approx(4.21, rel=0.01)

@@ -28,7 +28,7 @@ def test_first_estimate_is_unbiased_smooth_and_keeps_edges():
     scene[:, 150:] = 0.2
     everywhere = np.ones(scene.shape[:2], bool)
     parts = [(exposed(shoot(rng, scene, exposure), exposure), everywhere) for exposure in (0.25, 1, 4)]
-    x = np.moveaxis(ghosts.first_estimate(parts, exposed(scene).signals, ~everywhere), 0, -1)
+    x = np.moveaxis(ghosts.first_estimate(parts, ghosts.Anchor(exposed(scene)), ~everywhere), 0, -1)
     for part in (np.s_[:, 10:140], np.s_[:, 160:290]):
         assert abs(x[part].mean() / scene[part].mean() - 1) < 2e-3
         assert (x[part] - scene[part]).std() < 0.4 * np.sqrt(scene[part].mean() / WELL / 5.25)
@@ -37,7 +37,7 @@ def test_first_estimate_is_unbiased_smooth_and_keeps_edges():
 
 def test_unserved_pixels_take_the_other_value():
     nowhere = np.zeros((20, 20), bool)
-    other = exposed(np.full((20, 20, 3), 7)).signals
+    other = ghosts.Anchor(exposed(np.full((20, 20, 3), 7)))
     np.testing.assert_allclose(ghosts.first_estimate([(exposed(np.ones((20, 20, 3))), nowhere)], other, nowhere), 7)
 
 

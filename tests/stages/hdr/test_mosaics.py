@@ -32,7 +32,7 @@ from tests.stages.hdr.brackets import (
 
 def test_view_is_that_of_the_binned_grid():
     frames, _, _ = bracket(ramp(192, 288), [(1, 100)])
-    view = merge(capture(frames), hdr.HdrSettings()).view
+    view = merge(capture(frames)).view
     assert (view.scale, view.focal, view.center) == (2, 500, (50.0, 40.0))
 
 
@@ -41,7 +41,7 @@ def test_full_size_keeps_bias_and_variance_honest():
     light = (400 * np.exp(x / 160) * (1 + 0.1 * np.sin(y / 40)))[..., None] * np.array([0.6, 1.0, 0.7])
     rng, mosaic = np.random.default_rng(5), through_filter(light)
     frames = [frame(record(mosaic * e, rng), iso=100.0) for e in (0.25, 1, 4)]
-    stack = merge(capture(frames), hdr.HdrSettings(demosaic="full"))
+    stack = merge(capture(frames), demosaic="full")
     assert stack.value.shape == (1, 512, 640, 3)
     assert (stack.view.scale, stack.view.focal, stack.view.center) == (1, 1000, (100.5, 80.5))
     inner = np.s_[4:-4, 4:-4]
@@ -60,7 +60,7 @@ def test_photosites_of_the_first_shot_are_merged_without_the_frame_that_moved():
     light = through_filter(light[..., None] * np.array([0.6, 1.0, 0.7]))
     exposed = ((0.25, 0), (1, 0), (4, 8))  # exposure, and px by which the frame moved
     frames = [frame(record(np.roll(light, moved, 1) * e, rng), iso=100.0) for e, moved in exposed]
-    stack = merge(capture(frames, frames), hdr.HdrSettings())
+    stack = merge(capture(frames, frames))
     assert np.array_equal(stack.mosaic.cfa, RGGB) and stack.mosaic.value.shape == light.shape
     exposure = 1.25  # of the two frames that did not move
     variance = (light * exposure + 2 * (READ**2 + GAIN**2 / 12)) / exposure**2
@@ -102,7 +102,7 @@ def test_monochrome_channel_becomes_three_with_three_times_the_variance():
         gray = np.clip(np.round(rng.poisson(light * exposure) / GAIN + BLACK), 0, WHITE).astype(np.uint16)
         return SensorImage(np.repeat(gray[..., None], 3, 2), np.full((1, 1), BLACK), WHITE, None)
 
-    stack = merge(capture([frame(shoot(e), iso=100.0) for e in (0.5, 1, 2)]), hdr.HdrSettings())
+    stack = merge(capture([frame(shoot(e), iso=100.0) for e in (0.5, 1, 2)]))
     assert stack.value.shape == (1, 300, 400, 3)
     assert (stack.view.scale, stack.view.center) == (1, (100.5, 80.5))
     total = stack.value[0].mean(axis=2) - electrons_to_signal(light)
@@ -123,7 +123,7 @@ def test_wholly_clipped_frame_has_the_channels_of_the_others(channels, order):
         frame(SensorImage(value, np.zeros((1, 1)), 1.0, None), exposure_time=e) for value, e in zip(pictures, order)
     ]
     assert (frames[order.index(80)].load().value == 1).all()
-    stack = merge(capture(frames), hdr.HdrSettings())
+    stack = merge(capture(frames))
     assert stack.value.shape == (1, 90, 120, 3) and np.isfinite(stack.value).all()
 
 
@@ -134,6 +134,6 @@ def test_three_channel_frames_pass_unbinned_and_lossy_is_reported():
         frame(SensorImage(rng.poisson(light * e).astype(np.float32) / 2e4, np.zeros((1, 1)), 1.0, None, lossy=e == 1))
         for e in (0.5, 1, 2)
     ]
-    stack = merge(capture(frames), hdr.HdrSettings())
+    stack = merge(capture(frames))
     assert stack.value.shape == (1, 200, 300, 3) and stack.sensor.lossy
     check_errors(stack, light / 2e4)
