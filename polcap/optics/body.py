@@ -80,9 +80,10 @@ def flattening(cos_i: Any, cos_o: Any, between: Any, alpha: Any) -> Any:
     angle from light to camera, alpha (...,) the GGX α 0…1.
     """
     xp = array_namespace(cos_o)
-    strength = _interpolate(xp, xp.asarray(_strengths(), dtype=cos_o.dtype, device=device(cos_o)), alpha, _ALPHAS)
-    greater = xp.where(cos_i > cos_o, cos_i, cos_o)
-    greater = xp.clip(greater, _GRAZING, None)
+    strengths = xp.asarray(_strengths(), dtype=cos_o.dtype, device=device(cos_o))
+    at, share = _step(xp, alpha, _ALPHAS)
+    strength = strengths[at] * (1 - share) + strengths[at + 1] * share
+    greater = xp.clip(xp.where(cos_i > cos_o, cos_i, cos_o), _GRAZING, None)
     return 1 + strength * xp.clip(between - cos_i * cos_o, 0.0, None) / (greater * (1 + greater))
 
 
@@ -91,8 +92,9 @@ def _interpolate_table(c: Any, alpha: Any, ior: Any) -> tuple[Any, Any, Any]:
     xp = array_namespace(c)
     table = xp.asarray(_table().reshape(-1, 3), dtype=c.dtype, device=device(c))
     zero = 0 * c
-    steps = [_step(xp, zero + x, nodes) for x, nodes in ((ior, _INDICES), (alpha, _ALPHAS), (c, _COSINES))]
-    (ni, nf), (ai, af), (ci, cf) = steps
+    (ni, nf), (ai, af), (ci, cf) = (
+        _step(xp, zero + x, nodes) for x, nodes in ((ior, _INDICES), (alpha, _ALPHAS), (c, _COSINES))
+    )
     out: Any = 0.0
     for n, wn in ((ni, 1 - nf), (ni + 1, nf)):
         for a, wa in ((ai, 1 - af), (ai + 1, af)):
@@ -100,12 +102,6 @@ def _interpolate_table(c: Any, alpha: Any, ior: Any) -> tuple[Any, Any, Any]:
             weight = wn * wa
             out = out + (weight * (1 - cf))[..., None] * table[row] + (weight * cf)[..., None] * table[row + 1]
     return out[..., 0], out[..., 1], out[..., 2]
-
-
-def _interpolate(xp: Any, values: Any, x: Any, nodes: Floats) -> Any:
-    """Linear interpolation between values at evenly spaced nodes."""
-    at, share = _step(xp, x, nodes)
-    return values[at] * (1 - share) + values[at + 1] * share
 
 
 def _step(xp: Any, x: Any, nodes: Floats) -> tuple[Any, Any]:

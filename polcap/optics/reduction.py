@@ -1,6 +1,7 @@
 """Reduces maps of an object to fewer pixels; every mean is taken over the object's pixels only."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -28,19 +29,13 @@ class ObjectReduction:
 
     def maps(self, maps: SurfaceMaps) -> SurfaceMaps:
         """Reduce all maps of a result; the network's coarse depth is left out."""
-        return replace(
-            maps,
-            normal=frames.unit(self.mean(maps.normal)),
-            diffuse=self.mean(maps.diffuse),
-            specular=self.mean(maps.specular),
-            roughness=self.mean(maps.roughness),
-            confidence=self.mean(maps.confidence),
-            diffuse_error=None if maps.diffuse_error is None else self.mean(maps.diffuse_error),
-            roughness_error=None if maps.roughness_error is None else self.mean(maps.roughness_error),
-            depth_prior=None,
-            mask=self.share > 0.5,
-            view=scaled_view(maps.view, self.factor),
-        )
+        names = ("normal", "diffuse", "specular", "roughness", "confidence", "diffuse_error", "roughness_error")
+        reduced: dict[str, Any] = {
+            name: self.mean(image) for name in names if (image := getattr(maps, name)) is not None
+        }
+        reduced["normal"] = frames.unit(reduced["normal"])
+        view = scaled_view(maps.view, self.factor)
+        return replace(maps, **reduced, view=view, mask=self.share > 0.5, depth_prior=None)
 
 
 def scaled_view(view: View, factor: float) -> View:

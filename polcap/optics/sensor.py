@@ -61,18 +61,17 @@ def monochrome(image: SensorImage) -> bool:
     return alike and bool(np.ptp(v[..., 0]) > 0)
 
 
-def usable(image: SensorImage, clip: float, full: bool = False) -> Bools:
-    """Mask (H, W) of pixels of `signal` without a clipped photosite in them or in their eight neighbors.
-
-    Raw counts of whole superpixels are compared, so all colors of a pixel are treated alike. One clipped photosite
-    excludes its surroundings, so pixels near the limit are not selected by their noise.
-    `clip` is as in `clip_count`.
-    """
-    return below(image, clip_count(image, clip), full)
+def usable(image: SensorImage, clip: float) -> Bools:
+    """Mask (H, W) of binned pixels of `signal` without a clipped photosite; `clip` is as in `clip_count`."""
+    return below(image, clip_count(image, clip))
 
 
 def below(image: SensorImage, level: float, full: bool = False) -> Bools:
-    """Mask (H, W) of pixels of `signal` without a count of `level` or more in them or in their eight neighbors."""
+    """Mask (H, W) of pixels of `signal` without a count of `level` or more in them or in their eight neighbors.
+
+    Raw counts of whole superpixels are compared, so all colors of a pixel are treated alike. Such a count excludes its
+    surroundings, so pixels near the limit are not selected by their noise.
+    """
     value = image.value
     over = _at_least(value, level)
     if image.cfa is None:

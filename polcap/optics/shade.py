@@ -61,15 +61,15 @@ def stokes(
 
     alpha = roughness * roughness
     if law is bodies.SMOOTH:
-        in_plus, _ = fresnel.transmission(cos_i, ior)
+        in_plus, in_minus = fresnel.transmission(cos_i, ior)
         out_plus, out_minus = fresnel.transmission(cos_o, ior)
     else:
-        in_plus, _ = bodies.leaving(cos_i, law.rough * alpha, ior)
+        in_plus, in_minus = bodies.leaving(cos_i, law.rough * alpha, ior, law.local)
         out_plus, out_minus = bodies.leaving(cos_o, law.rough * alpha, ior, law.local)
         in_plus = in_plus * (1 + law.local * (bodies.flattening(cos_i, cos_o, to_light[..., 2], law.rough * alpha) - 1))
         out_minus = out_minus * law.dolp_factor
-    if axis is not None:
-        in_plus = in_plus + _entering(normal, to_light, axis, alpha, ior, law)
+    if axis is not None:  # Δ from the axis to the plane of normal and light
+        in_plus = in_plus + in_minus * (2 * frames.dot(normal, axis) ** 2 / (1 - cos_i**2 + 1e-12) - 1)  # T₋ cos 2Δ
     body = irradiance * cos_i * in_plus
 
     ray = xp.zeros_like(to_light)
@@ -88,25 +88,12 @@ def stokes(
     if axis is not None:
         mirrored = _reflected(to_light, axis, cos_d, ior)
     leaving = out_plus, out_minus * diffuse_cos, out_minus * diffuse_sin
-    parts = list(zip(leaving, mirrored))
     return xp.stack(
         [
             xp.where(lit[..., None], diffuse * (body * d)[..., None] + specular * (facets * s)[..., None], 0.0)
-            for d, s in parts
+            for d, s in zip(leaving, mirrored)
         ]
     )
-
-
-def _entering(normal: Any, to_light: Any, axis: Any, alpha: Any, ior: Any, law: bodies.Law) -> Any:
-    """Change T₋ cos 2Δ (...,) of the entering transmittance T₊ for light polarized along `axis`, Δ from the azimuth."""
-    xp = array_namespace(normal)
-    cos_i = xp.clip(frames.dot(normal, to_light), _LEAST_COSINE, 1.0)
-    if law is bodies.SMOOTH:
-        _, minus = fresnel.transmission(cos_i, ior)
-    else:
-        _, minus = bodies.leaving(cos_i, law.rough * alpha, ior, law.local)
-    along = frames.dot(normal, axis)
-    return minus * (2 * along**2 / (1 - cos_i**2 + 1e-12) - 1)
 
 
 def _reflected(to_light: Any, axis: Any, cos_d: Any, ior: Any) -> tuple[Any, Any, Any]:

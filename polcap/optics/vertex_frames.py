@@ -7,7 +7,7 @@ from polcap.optics.frames import cross, dot, unit
 
 
 def vertex_frames(vertices: Floats, uv: Floats, faces: Faces) -> tuple[Floats, Floats]:
-    """Normals (V, 3) and tangents (V, 4) of mesh vertices; see the functions below."""
+    """Normals (V, 3) and tangents (V, 4) of mesh vertices, as of `vertex_normals` and `vertex_tangents`."""
     normals = vertex_normals(vertices, faces)
     return normals, vertex_tangents(vertices, uv, faces, normals)
 

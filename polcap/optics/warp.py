@@ -57,8 +57,7 @@ def warp(
     across = np.arange(float(x0), x1)
     for first in range(y0, y1, _ROWS):
         down = np.arange(float(first), min(first + _ROWS, y1))[:, None]
-        x, y = (across, down) if lens is None else distortion.distort(lens, across, down)
-        u, v = coordinates(transform, x, y)
+        u, v = _source(transform, lens, across, down)
         block = out[:, first - y0 : first - y0 + len(down)]
         if order == 3:
             taps = Taps(u - left, v - top, part.shape[:2])
@@ -122,17 +121,19 @@ def _mix(a: Floats, b: Floats, share: Floats) -> Floats:
     return b
 
 
-def source_box(shape: tuple[int, ...], transform: Floats, box: Box, lens: Distortion | None = None) -> Box:
+def _source(transform: Floats, lens: Distortion | None, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Positions in the image of pixels x, y of the output; shapes broadcast."""
+    return coordinates(transform, *((x, y) if lens is None else distortion.distort(lens, x, y)))
+
+
+def source_box(shape: tuple[int, ...], transform: Floats, box: Box, lens: Distortion | None) -> Box:
     """Box of an image of `shape` (H, W) that a warp over `box` reads."""
     x0, y0, x1, y1 = box
-    x: Floats = np.array([x0, x1, x0, x1]) - 0.5
-    y: Floats = np.array([y0, y0, y1, y1]) - 0.5
-    if lens is not None:  # the sides become curves
-        across, down = np.linspace(x0 - 0.5, x1 - 0.5, 65), np.linspace(y0 - 0.5, y1 - 0.5, 65)
-        x = np.concatenate([across, across, np.full(65, across[0]), np.full(65, across[-1])])
-        y = np.concatenate([np.full(65, down[0]), np.full(65, down[-1]), down, down])
-        x, y = distortion.distort(lens, x, y)
-    x, y = coordinates(transform, x, y)
+    # points along the sides, which a lens bends
+    across, down = np.linspace(x0 - 0.5, x1 - 0.5, 65), np.linspace(y0 - 0.5, y1 - 0.5, 65)
+    x = np.concatenate([across, across, np.full(65, across[0]), np.full(65, across[-1])])
+    y = np.concatenate([np.full(65, down[0]), np.full(65, down[-1]), down, down])
+    x, y = _source(transform, lens, x, y)
     margin = _REACH + _EDGE + 2
     left, top = int(np.floor(x.min())) - margin, int(np.floor(y.min())) - margin
     right, bottom = int(np.ceil(x.max())) + margin, int(np.ceil(y.max())) + margin
@@ -150,6 +151,6 @@ def covered(
     """
     x0, y0, x1, y1 = box
     x, y = np.arange(float(x0), x1), np.arange(float(y0), y1)[:, None]
-    u, v = coordinates(transform, *((x, y) if lens is None else distortion.distort(lens, x, y)))
+    u, v = _source(transform, lens, x, y)
     across, down = (u >= margin) & (u <= shape[1] - 1 - margin), (v >= margin) & (v <= shape[0] - 1 - margin)
     return np.asarray(across & down)

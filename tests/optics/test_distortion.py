@@ -1,5 +1,6 @@
 """A lens's distortion is the textbook's, its inverse undoes it, and pictures are resampled once through it."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -19,7 +20,6 @@ def test_barrel_pulls_corners_in_as_brown_says():
 
 
 def test_as_opencv_projects():
-    cv2 = pytest.importorskip("cv2")
     point = np.array([[0.3, -0.2, 1.0], [-0.5, 0.4, 1.2]])
     camera = np.array([[500.0, 0, 150], [0, 500, 100], [0, 0, 1]])
     expected = cv2.projectPoints(point, np.zeros(3), np.zeros(3), camera, np.array([-0.2, 0.05, 0, 0]))[0].reshape(2, 2)
