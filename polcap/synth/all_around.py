@@ -30,7 +30,7 @@ from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Model
 from polcap.synth.laid_board import LaidBoard
 from polcap.synth.render import Scene
-from polcap.synth.shooting import Shoot, Studio
+from polcap.synth.shooting import Shoot
 
 Poses = list[tuple[Rotation, Floats]]  # turn and position [m] of the board in the camera frame
 CONVENTIONS = (
@@ -96,27 +96,18 @@ def write(
         scene = msgspec.structs.replace(scene, shape=sized)
     mesh = surface(scene)
     sets = [ObjectPose(mesh, Rotation.identity())] + [ObjectPose(mesh, _LAID)] * bool(shoot.laid)
-    named = [
-        (f"set{letter}/" * bool(shoot.laid) + folder_names.view_name(k), placed, *pose)
-        for letter, placed, count in zip("AB", sets, (views, shoot.laid))
-        for k, pose in enumerate(_poses(shoot, count, placed.middle))
-    ]
-    frames = shoot.exposures * (len(shoot.angles_deg) + shoot.cross)  # of a view
-    exposure = None
+    scenes: dict[str, Scene] = {}
+    poses: dict[str, tuple[Rotation, Floats]] = {}
+    for letter, placed, count in zip("AB", sets, (views, shoot.laid)):
+        for k, pose in enumerate(_poses(shoot, count, placed.middle)):
+            name = f"set{letter}/" * bool(shoot.laid) + folder_names.view_name(k)
+            view = _view(scene, shoot, *pose, placed)
+            scenes[name] = msgspec.structs.replace(view, chart=None) if scenes else view
+            poses[name] = pose
     with atomic.new_folder(folder) as place:
-        for k, (name, placed, turn, position) in enumerate(named):
-            view = _view(scene, shoot, turn, position, placed)
-
-            def report(written: int, _: int, before: int = k * frames) -> None:
-                if frame_written is not None:
-                    frame_written(before + written, len(named) * frames)
-
-            view = view if k == 0 else msgspec.structs.replace(view, chart=None)
-            studio = Studio(view, msgspec.structs.replace(shoot, seed=shoot.seed + 1000 * k), exposure)
-            exposure = studio.middle
-            shooting.write_capture(place / name, studio, report)
+        shooting.write_views(place, scenes, shoot, [1.0] * len(scenes), frame_written)
         _write_surface(place / "truth.npz", scene, mesh, sets[0].lift)
-        _write_poses(place / "truth.json", scene, shoot, {name: (turn, at) for name, _, turn, at in named}, sets)
+        _write_poses(place / "truth.json", scene, shoot, poses, sets)
 
 
 def surface(scene: Scene) -> Triangles:

@@ -27,7 +27,7 @@ from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Slab
 from polcap.synth.laid_board import LaidBoard
 from polcap.synth.render import Scene
-from polcap.synth.shooting import Shoot, Studio
+from polcap.synth.shooting import Shoot
 
 _BOARD: Literal["A4"] = "A4"
 _CHART = (0.084, 0.003, 0.0)  # m, world, middle of the chart: on the right of the ring, over the page's edge
@@ -72,29 +72,18 @@ def write(
     """
     forward_camera.require_empty(folder)
     slab = Slab(shoot.side_m, shoot.thickness_m, shoot.relief_m, shoot.feature_m, shoot.seed, shoot.height_map)
-    frames = shoot.exposures * (len(shoot.angles_deg) + shoot.cross)
     power = np.random.default_rng([shoot.seed, 0xF1A5]).normal(1.0, shoot.flash_jitter, views)
-    exposure, poses = None, _poses(shoot, views)
+    poses = _poses(shoot, views)
+    scenes = {
+        folder_names.view_name(k): _view(scene, slab, shoot, *pose, with_chart=k == 0) for k, pose in enumerate(poses)
+    }
+    # the unit of a scene is the light at the board's middle, not the flash
+    distance = np.linalg.norm([np.array(scene.light) - position for _, position in poses], axis=1)  # m, to the flash
+    energies = [float(one) for one in power * (distance[0] / distance) ** 2]
     with atomic.new_folder(folder) as place:
-        for k, pose in enumerate(poses):
-
-            def report(written: int, _: int, before: int = k * frames) -> None:
-                if frame_written is not None:
-                    frame_written(before + written, views * frames)
-
-            one = msgspec.structs.replace(shoot, seed=shoot.seed + 1000 * k)
-            studio = Studio(_view(scene, slab, shoot, *pose, with_chart=k == 0), one, exposure)
-            exposure = studio.middle
-            studio.middle *= float(power[k] * _closer(scene, poses[0], pose))
-            shooting.write_capture(place / folder_names.view_name(k), studio, report)
+        shooting.write_views(place, scenes, shoot, energies, frame_written)
         _write_maps(place / "truth.npz", scene, slab)
         _write_poses(place / "truth.json", scene, shoot, poses, power)
-
-
-def _closer(scene: Scene, first: tuple[Rotation, Floats], pose: tuple[Rotation, Floats]) -> float:
-    """Factor by which a scene is too bright in a pose: its unit is the light at the board's middle, not the flash."""
-    light = np.array(scene.light)
-    return float(np.sum((light - first[1]) ** 2) / np.sum((light - pose[1]) ** 2))
 
 
 def _poses(shoot: FlatShoot, views: int) -> Poses:

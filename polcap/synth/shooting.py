@@ -8,7 +8,7 @@
     FOLDER/truth.npz               true maps on the pixels of the first angle
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timedelta
 from math import sqrt
@@ -61,8 +61,7 @@ class Shoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     angles_deg: Annotated[
         tuple[Angle, ...],
         Meta(
-            min_length=1,
-            description="stated polarizer angles, 0 to 360, counter-clockwise; write -45 as 135 [degrees]",
+            min_length=1, description="stated polarizer angles, 0 to 360, counter-clockwise; write -45 as 135 [degrees]"
         ),
     ] = (0.0, 45.0, 90.0)
     exposures: Annotated[int, Meta(ge=1, le=9, description="frames of a bracket")] = 3
@@ -114,6 +113,30 @@ def write(folder: Path, scene: Scene, shoot: Shoot, frame_written: Callable[[int
     """
     forward_camera.require_empty(folder)
     write_capture(folder, Studio(scene, shoot), frame_written)
+
+
+def write_views(
+    folder: Path,
+    scenes: Mapping[str, Scene],
+    shoot: Shoot,
+    energies: Sequence[float],
+    frame_written: Callable[[int, int], None] | None,
+) -> None:
+    """Write a capture of each scene into the subfolder of its name; all have the exposure of the first.
+
+    `energies` are factors on the light of each scene; `frame_written` is as in `write`, over all captures.
+    """
+    frames, middle = shoot.exposures * (len(shoot.angles_deg) + shoot.cross), None
+    for k, (name, scene) in enumerate(scenes.items()):
+
+        def report(written: int, _: int, before: int = k * frames) -> None:
+            if frame_written is not None:
+                frame_written(before + written, len(scenes) * frames)
+
+        studio = Studio(scene, msgspec.structs.replace(shoot, seed=shoot.seed + 1000 * k), middle)
+        middle = studio.middle
+        studio.middle *= energies[k]
+        write_capture(folder / name, studio, report)
 
 
 def write_capture(folder: Path, studio: "Studio", frame_written: Callable[[int, int], None] | None = None) -> None:
@@ -203,7 +226,8 @@ class Studio:
         v = frames.rays_at(shoot.view, *_reference_px(shoot, back, x, y))
         axis = frames.axis_on_ray(np.radians(pose.actual_deg - pose.rot_deg), v)
         weights = mueller.analyzer(axis, shoot.extinction_ratio).astype(np.float32)  # (H, W, 3)
-        return np.asarray(_blur(shoot, np.einsum("hws,shwc->hwc", weights, stokes)) @ self.to_camera.T)
+        light = gaussian_filter(np.einsum("hws,shwc->hwc", weights, stokes), shoot.blur_px, axes=(0, 1))
+        return np.asarray(light @ self.to_camera.T)
 
     def photograph(self, path: Path, radiance: Floats, take: Take) -> dict[str, Any]:
         """Write one DNG of `radiance` (H, W, 3); returns its exposure for truth.json."""
@@ -267,11 +291,6 @@ def _reference_px(shoot: Shoot, back: Floats, x: Floats, y: Floats) -> tuple[Flo
     return projection.coordinates(back, *forward_camera.undistort(shoot.view, shoot.distortion, x, y))
 
 
-def _blur(shoot: Shoot, image: Floats) -> Floats:
-    """Apply the blur of the simulated lens to an image (..., H, W, C)."""
-    return np.asarray(gaussian_filter(image, shoot.blur_px, axes=(-3, -2))) if shoot.blur_px else image
-
-
 def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) -> float:
     """Automatic exposure of the middle frame of a bracket, for s0 (H, W, 3) in camera channels.
 
@@ -289,19 +308,15 @@ def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) ->
     return shoot.exposure_factor * min(0.35 / level, 0.95 / peak * shoot.step ** (shoot.exposures // 2))
 
 
-def _equivalent(shoot: Shoot) -> float:
-    """Full-frame equivalent of the focal length, mm: by equal diagonals, also for a sensor that is not 3:2."""
-    diagonal = SENSOR_WIDTH_MM * np.hypot(1, shoot.height / shoot.width)
-    return float(shoot.focal_mm * np.hypot(36, 24) / diagonal)
-
-
 def _exposure(shoot: Shoot, take: Take, middle: float) -> tuple[Exif, float, float]:
     """EXIF data of a simulated photograph, the light it receives, and its amplification."""
     stops, number = take.stops, take.shot * shoot.exposures + take.frame
+    diagonal_mm = SENSOR_WIDTH_MM * np.hypot(1, shoot.height / shoot.width)
+    equivalent_mm = float(shoot.focal_mm * np.hypot(36, 24) / diagonal_mm)  # the same angle of view on full frame
     taken = datetime(2026, 3, 14, 12) + timedelta(seconds=4.25 * number + 20 * (number // shoot.exposures))
     exif = Exif(
         make="Polcap", model="Synthetic", lens=f"Synthetic {shoot.focal_mm:g}mm", exposure_time=1 / 160, f_number=11.0,
-        iso=100.0, focal_length_mm=shoot.focal_mm, focal_length_35mm=_equivalent(shoot),
+        iso=100.0, focal_length_mm=shoot.focal_mm, focal_length_35mm=equivalent_mm,
         pixel_pitch_um=1000 * SENSOR_WIDTH_MM / shoot.width, taken=taken.isoformat(timespec="milliseconds"),
         flash_fired=shoot.bracket != "time" and take.lit,
     )  # fmt: skip
@@ -339,10 +354,10 @@ def _write_truth(place: Path, studio: Studio, files: list[dict[str, Any]]) -> No
     if any(shoot.distortion):  # the true maps are those of a pinhole camera
         reference = _light(scene, msgspec.structs.replace(shoot, distortion=(0.0, 0.0)), buffer, np.eye(3))
     diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, buffer.position, buffer.facing)
-    inside = buffer.mask[..., None]
+    inside, blurred = buffer.mask[..., None], gaussian_filter(reference, shoot.blur_px, axes=(1, 2))
     maps = {
         "normal": buffer.normal, "diffuse": diffuse * inside, "specular": specular * inside,
-        "roughness": roughness * buffer.mask, "ior": ior * buffer.mask, "S": _blur(shoot, reference) / white * inside,
+        "roughness": roughness * buffer.mask, "ior": ior * buffer.mask, "S": blurred / white * inside,
     }  # fmt: skip
     halves: dict[str, Any] = {name: value.astype(np.float16) for name, value in maps.items()}
     with atomic.path(place / "truth.npz") as temporary:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from polcap.optics import frames
 from polcap.synth import trace
 from polcap.synth.distance_fields import Bumps, Cluster, Shape, Vase
 from polcap.synth.scenes import random_scene
@@ -20,10 +21,8 @@ SHAPES: dict[str, Shape] = {
 def rays(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Rays from a sphere of 0.3 m to points near the middle."""
     random = np.random.default_rng(seed)
-    origin = random.normal(size=(count, 3))
-    origin *= 0.3 / np.linalg.norm(origin, axis=-1, keepdims=True)
-    direction = random.uniform(-0.06, 0.06, (count, 3)) - origin
-    return origin, direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    origin = 0.3 * frames.unit(random.normal(size=(count, 3)))
+    return origin, frames.unit(random.uniform(-0.06, 0.06, (count, 3)) - origin)
 
 
 def surface(shape: Shape, seed: int, count: int) -> np.ndarray:
@@ -37,10 +36,8 @@ def test_a_step_of_the_stated_distance_never_enters_the_shape(name: str) -> None
     shape = SHAPES[name]
     points = surface(shape, 0, 3000)
     assert len(points) > 600 and np.linalg.norm(points, axis=-1).max() <= shape.radius
-    outside = (
-        points[:400]
-        + np.random.default_rng(1).normal(size=(400, 3)) * np.repeat([0.003, 0.02, 0.08, 0.2], 100)[:, None]
-    )
+    reach = np.repeat([0.003, 0.02, 0.08, 0.2], 100)[:, None]
+    outside = points[:400] + np.random.default_rng(1).normal(size=(400, 3)) * reach
     promised = shape.distance(outside)
     nearest = np.linalg.norm(outside[:, None] - points[None], axis=-1).min(axis=1)
     assert (promised <= nearest + 1e-6)[promised > 0].all()
@@ -49,21 +46,21 @@ def test_a_step_of_the_stated_distance_never_enters_the_shape(name: str) -> None
 @pytest.mark.parametrize("name", SHAPES)
 def test_rays_end_on_the_front_of_the_surface(name: str) -> None:
     shape = SHAPES[name]
-    v = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 60), np.linspace(-0.1, 0.1, 60), [1.0]), axis=-1).reshape(-1, 3)
-    v /= np.linalg.norm(v, axis=-1, keepdims=True)
+    side = np.linspace(-0.1, 0.1, 60)
+    v = frames.unit(np.stack(np.meshgrid(side, side, [1.0]), axis=-1).reshape(-1, 3))
     hits = trace.trace(shape, (0.0, 0.0, -0.8), Rotation.from_rotvec([20, 30, 0], degrees=True), v)
     assert len(hits.index) > 300
     assert np.abs(shape.distance(hits.local)).max() < 2e-6
     np.testing.assert_allclose(np.linalg.norm(hits.normal, axis=-1), 1.0, rtol=1e-9)
-    facing = np.einsum("ni,ni->n", hits.normal, v[hits.index])
-    assert facing.min() > -0.02  # a ray that grazes within 1 µm may hit just behind the outline
+    assert (
+        frames.dot(hits.normal, v[hits.index]).min() > -0.02
+    )  # a ray that grazes within 1 µm may hit just behind the outline
     np.testing.assert_allclose(hits.point, -v[hits.index] * hits.distance[:, None], atol=1e-12)
 
 
 def test_sphere_hits_solve_the_quadratic_equation() -> None:
     ball, middle = Cluster(((0, 0, 0, 0.06),)), np.array([0.05, -0.02, -0.7])
-    v = -np.array([[0.05, -0.02, -0.7], [0.08, 0.0, -0.7], [0.2, 0.2, -0.7]])
-    v /= np.linalg.norm(v, axis=-1, keepdims=True)
+    v = frames.unit(-np.array([[0.05, -0.02, -0.7], [0.08, 0.0, -0.7], [0.2, 0.2, -0.7]]))
     hits = trace.trace(ball, tuple(middle), Rotation.from_rotvec([0.0, 40, 0], degrees=True), v)
     b = -(v @ middle)
     root = b**2 - middle @ middle + 0.06**2

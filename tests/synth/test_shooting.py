@@ -14,7 +14,8 @@ from polcap.capture_values import Exif
 from polcap.errors import CaptureError, SettingError
 from polcap.formats import shipped_data
 from polcap.formats.capture import focal_length
-from polcap.optics import projection
+from polcap.optics import frames, projection
+from polcap.optics.projection import transform_points
 from polcap.synth import color_checker, render, shooting
 from polcap.synth.color_checker import Chart
 from polcap.synth.distance_fields import Cluster
@@ -68,9 +69,7 @@ def test_files_hold_the_stokes_parameters_of_the_truth(still: Any) -> None:
     pictures, truth, maps = still
     i0, i45, i90, i135 = (p[0::2, 1::2] for p in pictures)
     s0, s1, s2 = i0 + i90, i0 - i90, i45 - i135
-    np.testing.assert_allclose(
-        i45 + i135, s0, rtol=2e-3, atol=1e-3
-    )  # off axis the axes of 45° and 135° are no longer perpendicular
+    np.testing.assert_allclose(i45 + i135, s0, rtol=2e-3, atol=1e-3)  # off axis 45° and 135° are not perpendicular
     green = np.array(truth["camera_matrix_from_linear_srgb"])[1]
     t0, t1, t2 = (maps["S"].astype(float) @ green)[:, 0::2, 1::2]
     inside = maps["mask"][0::2, 1::2] & (maps["normal"][0::2, 1::2, 2] > 0.3)
@@ -92,10 +91,8 @@ def test_white_patch_has_its_reflectance(still: Any) -> None:
         part = s0[int(np.ceil(y0)) : int(y1), int(np.ceil(x0)) : int(x1)]
         rows, columns = np.indices(part.shape)
         green = part[(rows + int(np.ceil(y0)) + columns + int(np.ceil(x0))) % 2 == 1]
-        assert green.mean() / scale == pytest.approx(
-            reference[patch] * (far[18] / far[patch]) ** 3,
-            rel=0.003,  # cos θ / r²
-        )
+        expected = reference[patch] * (far[18] / far[patch]) ** 3  # cos θ / r²
+        assert green.mean() / scale == pytest.approx(expected, rel=0.003)
 
 
 def test_ball_is_where_the_projection_puts_it(still: Any) -> None:
@@ -103,8 +100,7 @@ def test_ball_is_where_the_projection_puts_it(still: Any) -> None:
     middle, radius, f = np.array(BALL.position), 0.08, truth["focal_px"]
     y, x = np.mgrid[:216, :288]
     cx, cy = truth["principal_px"]
-    v = np.stack([(cx - x) / f, (y - cy) / f, np.ones(x.shape)], axis=-1)
-    v /= np.linalg.norm(v, axis=-1, keepdims=True)
+    v = frames.unit(np.stack([(cx - x) / f, (y - cy) / f, np.ones(x.shape)], axis=-1))
     b = -(v @ middle)
     root = b**2 - middle @ middle + radius**2
     np.testing.assert_array_equal(maps["mask"], root > 0)
@@ -132,18 +128,15 @@ def test_transform_maps_the_chart_to_its_place_in_a_shot(tmp_path: Path) -> None
         tmp_path / "c", scene, replace(STILL, width=576, height=432, nudge_px=12.0, nudge_deg=1.0, seed=6)
     )
     quads = np.array(truth["chart"]["patch_corners_px"])[[18, 19, 20, 15, 5, 10]]
-    found = []  # (K, 6, 2)
-    for picture, file in zip(pictures, truth["files"]):
-        matrix = np.array(file["transform"])
-        found.append([centroid(picture, moved(matrix, quad)) for quad in quads])
-    for file, here in zip(truth["files"][1:], found[1:]):
-        off = np.array(here) - moved(np.array(file["transform"]), np.array(found[0]))
-        assert np.linalg.norm(np.array(here) - found[0], axis=-1).min() > 1  # px: there is something to find
+    matrices = [np.array(file["transform"]) for file in truth["files"]]
+    found = [
+        np.array([centroid(picture, transform_points(matrix, quad)) for quad in quads])
+        for picture, matrix in zip(pictures, matrices)
+    ]
+    for matrix, here in zip(matrices[1:], found[1:]):
+        assert np.linalg.norm(here - found[0], axis=-1).min() > 1  # px: there is something to find
+        off = here - transform_points(matrix, found[0])
         np.testing.assert_allclose(off.mean(axis=0), 0, atol=0.07)  # px: one centroid is good to 0.15
-
-
-def moved(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points @ matrix[:2, :2].T + matrix[:2, 2]
 
 
 def test_positive_roll_turns_the_picture_counter_clockwise_and_shift_is_right_and_down() -> None:
