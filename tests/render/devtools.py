@@ -3,17 +3,31 @@
 import base64
 import json
 import os
+import shutil
 import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
-from tests.render import browser
+import pytest
 
+MODULES = Path(__file__).parents[1] / "gltf" / "node_modules"
+BROWSERS = ("chromium", "chromium-browser", "chromium-headless-shell", "google-chrome")
 LIMIT_S = 400
+
+
+def find() -> str:
+    """The browser's path; skips the test where there is none."""
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        pytest.skip("needs a Chromium")
+    return browser
 
 
 class Page:
@@ -100,7 +114,7 @@ class Page:
 def opened() -> Iterator[Page]:
     """A tab without network, WebGL by software; the test is skipped where there is no Chromium."""
     command = [
-        browser.find(), "--headless", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
+        find(), "--headless", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
         "--enable-unsafe-swiftshader", "--no-first-run", "--remote-debugging-pipe", "--hide-scrollbars",
     ]  # fmt: skip
     to_browser, from_browser = os.pipe(), os.pipe()
@@ -123,6 +137,45 @@ def opened() -> Iterator[Page]:
             page.call("Network.emulateNetworkConditions", **offline)
             yield page
         finally:
-            browser.end(process)
+            process.terminate()
+            try:
+                process.wait(timeout=60)  # on a busy machine it takes its time
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
             os.close(to_browser[1])
             os.close(from_browser[0])
+
+
+@contextmanager
+def visited(address: str) -> Iterator[Page]:
+    """A page of a server of this machine."""
+    with opened() as page:
+        page.call(
+            "Network.emulateNetworkConditions",
+            offline=False, latency=0, downloadThroughput=-1, uploadThroughput=-1,
+        )  # fmt: skip
+        page.call("Emulation.setDeviceMetricsOverride", width=900, height=600, deviceScaleFactor=1, mobile=False)
+        page.call("Page.navigate", url=address)
+        yield page
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """The address of a folder on a web server of its own, which also has /node_modules."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Handler, directory=str(folder)))
+    Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    def translate_path(self, path: str) -> str:
+        if path.startswith("/node_modules/"):
+            return str(MODULES / path.removeprefix("/node_modules/").split("?")[0])
+        return super().translate_path(path)
+
+    def log_message(self, *_: object) -> None:
+        pass

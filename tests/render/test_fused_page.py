@@ -11,6 +11,7 @@ import pytest
 import trimesh
 
 from polcap.fusion import fused_page
+from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps
 from polcap.mesh_values import Mesh
 from tests.render import devtools
@@ -47,7 +48,8 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "polcap": "0", "capture": {"name": "ball", "camera": ""}, "verdict": "pass", "gates": [],
         "figures": {"mesh": mesh, "views": {"view01": {**view, "residual": None, "verdict": "pass"}}, "left_out": {}},
     }  # fmt: skip
-    results: Any = SimpleNamespace(atlas=SimpleNamespace(mesh=ball()), maps=textures())
+    maps, none = textures(), np.zeros((0, 3))
+    results: Any = SimpleNamespace(atlas=Atlas(ball(), maps.mask, none, none, margin=1), maps=maps)
     fused_page.write(folder, about, results)
     return folder / "report.html"
 

@@ -1,12 +1,7 @@
 """The IIIF folder in a browser: a deep-zoom viewer finds every tile, and the page moves the light with the pointer."""
 
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
 
 import cv2
 import numpy as np
@@ -16,9 +11,10 @@ from polcap.formats.export import iiif, openlime_page, relightable_layer
 from polcap.optics import color, shade
 from polcap.stages import asset
 from tests import surfaces
-from tests.render import browser, devtools
+from tests.render import devtools
+from tests.render.devtools import served, visited
 
-VIEWER = browser.MODULES / "openseadragon" / "build" / "openseadragon" / "openseadragon.min.js"
+VIEWER = devtools.MODULES / "openseadragon" / "build" / "openseadragon" / "openseadragon.min.js"
 TILES = """<!doctype html><meta charset="utf-8"><div id="view" style="width:900px;height:600px"></div>
 <script src="openseadragon.min.js"></script><script>
 const viewer = OpenSeadragon({ id: 'view', tileSources: 'albedo/info.json', showNavigationControl: false });
@@ -27,35 +23,6 @@ viewer.addHandler('tile-loaded', (event) => seen.add(event.tile.getUrl()));
 viewer.addHandler('tile-load-failed', (event) => failed.push(event.tile.getUrl()));
 viewer.addHandler('open', () => viewer.viewport.zoomTo(viewer.viewport.imageToViewportZoom(1)));
 </script>"""
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
-        pass
-
-
-@contextmanager
-def served(folder: Path) -> Iterator[str]:
-    """The address of a folder on a web server of its own."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder)))
-    Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}"
-    finally:
-        server.shutdown()
-
-
-@contextmanager
-def visited(address: str) -> Iterator[devtools.Page]:
-    """A page of a server of this machine."""
-    with devtools.opened() as page:
-        page.call(
-            "Network.emulateNetworkConditions",
-            offline=False, latency=0, downloadThroughput=-1, uploadThroughput=-1,
-        )  # fmt: skip
-        page.call("Emulation.setDeviceMetricsOverride", width=900, height=600, deviceScaleFactor=1, mobile=False)
-        page.call("Page.navigate", url=address)
-        yield page
 
 
 def write(folder: Path, address: str, scale: int = 1) -> None:

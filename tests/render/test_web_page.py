@@ -10,9 +10,9 @@ import pytest
 from polcap.errors import SettingError
 from polcap.formats.export import gltf, web_page
 from tests import surfaces
-from tests.render import browser, devtools
+from tests.render import devtools
 
-SCRIPT = browser.MODULES / "@google" / "model-viewer" / "dist" / "model-viewer.min.js"
+SCRIPT = devtools.MODULES / "@google" / "model-viewer" / "dist" / "model-viewer.min.js"
 
 
 def test_page_shows_the_object_without_network_or_complaint(tmp_path: Path) -> None:
