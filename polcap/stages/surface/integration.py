@@ -37,7 +37,7 @@ _SURE = 1 / 16  # least weight of a normal that can show an occluding contour: a
 _OPEN = 0.3  # least share of the gap that opens where a part is separate
 _CUT_ROUNDS = 2  # of removing cuts
 _AROUND = 10  # px from a cut within which the residual is compared
-_STRAIN, _STRAIN_RATIO = 1.0, 1.4  # excess of the residual that condemns a cut: σ² per link, and a factor; both
+_WORSE, _WORSE_RATIO = 1.0, 1.4  # by this much more residual a cut is removed: σ² per link, and a factor; both
 
 
 def log_depth(field: NormalField, stiffness: float, iterations: int, tolerance: float, jump: float) -> Floats:
@@ -121,18 +121,18 @@ def remove_useless_cuts(level: PyramidLevel) -> None:
 
 
 def _useless_cuts(level: PyramidLevel, found: OcclusionMap, uncut: PyramidLevel) -> Bools:
-    """Mask (N,) of pixels near cuts where the slope residuals (`strain`) are larger than without any cut."""
+    """Mask (N,) of pixels near cuts around which the slope residuals are larger than without any cut."""
     mask, p = level.field.mask, level.grid.p
     cut = level.grid.links(found.right, found.down)
     contour = label_contours(found.near(0))
     count = np.bincount(contour[mask][p], cut, minlength=int(contour.max()) + 1)
     useless = np.zeros(mask.shape, dtype=bool)
-    strains = (uncut.strain(), level.strain())
+    residuals = (uncut.slope_residuals(), level.slope_residuals())
     for number in np.flatnonzero(count[1:]) + 1:
         at = contour == number
         around = dilate(at, _AROUND)[mask][p] & ~dilate(at, 1)[mask][p]
-        without, with_cut = (strain[around & ~cut].sum() / count[number] for strain in strains)
-        if with_cut > max(without + _STRAIN, _STRAIN_RATIO * without):
+        without, with_cut = (of[around & ~cut].sum() / count[number] for of in residuals)
+        if with_cut > max(without + _WORSE, _WORSE_RATIO * without):
             useless |= dilate(at, REACH)
     return np.asarray(useless[mask])
 

@@ -131,20 +131,16 @@ class PyramidLevel:
         Only pixels near the cuts of that grid (n,) choose between neighbors.
         """
         block = block_numbers(self.field.mask)
-        self.z = self._interpolated(coarse, block)
+        # inside a 2×2 block z follows the slopes of its pixels
+        row, column = self.grid.row % 2 - 0.5, self.grid.column % 2 - 0.5
+        tilt = (column * self.side[0] + row * self.side[1]) / np.maximum(self.facing, 0.1)
+        self.z = np.asarray(2 * coarse[block] + tilt)
         self.chords = self.precise
         self.choosing = self.cuttable = near_cuts[block] & (self.stiffness > 0)
         for _ in range(_FINER_SOLVES if self.choosing.any() else 1):
             matrix, right, _ = self.equations(self.stiffness, self.field.pull)
             self.solver = TwoGrid(matrix, block, solver)
             self.z, _ = conjugate_gradients(matrix, right, self.z, self.solver, _PRECISION, 20)
-
-    def _interpolated(self, coarse: Floats, block: NDArray[np.intp]) -> Floats:
-        """Interpolate z (N,) from the coarse solution; inside a 2×2 block it follows the slopes of its pixels."""
-        steep = np.maximum(self.facing, 0.1)
-        row, column = self.grid.row % 2 - 0.5, self.grid.column % 2 - 0.5
-        tilt = (column * self.side[0] + row * self.side[1]) / steep
-        return np.asarray(2 * coarse[block] + tilt)
 
     def without_cuts(self) -> "PyramidLevel":
         """A copy of this grid solved by plain least squares, without cuts."""
@@ -178,7 +174,7 @@ class PyramidLevel:
         right, down = (self.grid.image(slope, 0.0) for slope in self.slope)
         return occlusion.depth_steps(self.grid.image(self.z, 0.0), (right, down), self.field.mask, self.least_step)
 
-    def strain(self) -> Floats:
+    def slope_residuals(self) -> Floats:
         """Squared slope residual of each link (L,), in units of the variance of the median normal."""
         change = self.z[self.grid.q] - self.z[self.grid.p]
         return np.asarray(self.weight * (change - self.step) ** 2 / self.field.sigma**2)
@@ -213,7 +209,8 @@ class PyramidLevel:
         stiffness and σ the sigmoid (Cao et al.). Returns the energy of these links; 0 for chords, which do not need it.
         """
         facing, grid = self.facing, self.grid
-        chosen, both = self._choosing_links(part)
+        ends = self.choosing[grid.p[part]].astype(int) + self.choosing[grid.q[part]]  # choosing ends of each link
+        chosen, both = np.flatnonzero(ends) + (part.start or 0), ends[ends > 0] == 2
         p, q, step = grid.p[chosen], grid.q[chosen], change[chosen]
         ahead, behind = np.zeros(grid.size), np.zeros(grid.size)  # m ∂z on either side; 0 past the mask
         first, second = facing[p], facing[q]
@@ -234,12 +231,6 @@ class PyramidLevel:
         weight[at] = (forward * first + backward * second)[both]
         flux[at] = (forward * side[p] + backward * side[q])[both]
         return energy
-
-    def _choosing_links(self, part: slice) -> tuple[NDArray[np.intp], Bools]:
-        """Numbers of the links along one axis with a choosing end, and a mask of those with two choosing ends."""
-        p, q = self.choosing[self.grid.p[part]], self.choosing[self.grid.q[part]]
-        chosen = np.flatnonzero(p | q)
-        return chosen + (part.start or 0), (p & q)[chosen]
 
 
 def _sigmoid(x: Floats) -> Floats:

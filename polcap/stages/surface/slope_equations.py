@@ -9,6 +9,7 @@ from polcap.image_values import Bools, Floats, View
 from polcap.optics.frames import dot
 from polcap.optics.outline import disc_radius
 from polcap.optics.projection import ray_slopes
+from polcap.optics.reduction import scaled_view
 from polcap.stage_values import SurfaceMaps
 
 _LEAST_SIGMA_DEG = 1.0  # expected errors below count as this
@@ -89,10 +90,9 @@ def halve(field: NormalField) -> NormalField:
     weight = np.bincount(block, field.weight)
     normal: Floats = np.stack([np.bincount(block, field.normal[:, k] * field.weight) for k in range(3)], axis=-1)
     normal /= np.maximum(dot(normal, normal) ** 0.5, 1e-12)[:, None]
-    x, y = field.view.center
     return NormalField(
         mask=_any_of_blocks(field.mask),
-        view=View(field.view.focal / 2, ((x - 0.5) / 2, (y - 0.5) / 2), field.view.scale * 2),
+        view=scaled_view(field.view, 0.5),
         normal=normal,
         weight=weight / count,
         sigma=field.sigma,

@@ -97,8 +97,8 @@ def light_odds(lean: Floats, inside: Bools, flash: FlashPicture, mask: Bools) ->
     """
     shape = inside.shape
     light = np.log(np.maximum([weighted_area_mean(c, mask, shape) for c in np.moveaxis(flash.radiance, -1, 0)], 1e-3))
-    rays = [area_mean(c.astype(np.float32), shape) for c in np.moveaxis(flash.rays, -1, 0)]
-    place = -np.stack(rays[:2]) / rays[2]  # (2, h, w) tangents of the picture angles, x right, y up
+    x, y, z = (area_mean(c.astype(np.float32), shape) for c in np.moveaxis(flash.rays, -1, 0))
+    place = -np.stack([x, y]) / z  # (2, h, w) tangents of the picture angles, x right, y up
     sine = np.hypot(*lean)
     axis = lean / np.maximum(sine, 1e-6)
     odds = np.zeros(shape)
@@ -107,15 +107,15 @@ def light_odds(lean: Floats, inside: Bools, flash: FlashPicture, mask: Bools) ->
         plane = erode(face, 1)  # without the mixed light of edges
         if plane.sum() < _FEWEST_CELLS:
             continue
-        double = ((axis[0] + 1j * axis[1]) ** 2 * sine)[plane].sum()
-        common = np.array([np.sqrt(double).real, np.sqrt(double).imag]) / max(np.sqrt(abs(double)), 1e-9)
+        azimuth = np.angle(((axis[0] + 1j * axis[1]) ** 2 * sine)[plane].sum()) / 2  # mean of axes, by double angles
+        common = np.array([np.cos(azimuth), np.sin(azimuth)])
         gradient, covariance = _light_gradient(light[:, plane].T, place[:, plane].T, _tiles(plane))
         along = abs(gradient @ common) > _ALONG * np.hypot(*gradient)
         if along and np.hypot(*gradient) < _STEEPEST and _spread_deg(lean[:, plane], common) < _SPREAD_DEG:
-            across = axis[:, face]
-            variance = np.einsum("in,ij,jn->n", across, covariance, across) + _FLASH_GRADIENT**2
-            sure = gradient @ across / np.sqrt(variance)
-            odds[face] = 1.6 * sure + 0.07 * sure**3  # ln Φ / (1 − Φ), Page 1977
+            lean_axis = axis[:, face]
+            variance = np.einsum("in,ij,jn->n", lean_axis, covariance, lean_axis) + _FLASH_GRADIENT**2
+            rise = gradient @ lean_axis / np.sqrt(variance)  # of the light towards the lean, σ
+            odds[face] = 1.6 * rise + 0.07 * rise**3  # ln Φ / (1 − Φ), Page 1977
     return np.clip(odds, -_MOST_ODDS, _MOST_ODDS)
 
 
