@@ -13,13 +13,6 @@ from polcap.optics import color
 from polcap.optics.colour_science import colour
 
 
-def test_srgb_curve_meets_the_standards_values():
-    assert color.decode_srgb(np.array([0.0, 10 / 255, 119 / 255, 1.0])) == pytest.approx(
-        [0.0, 0.003035, 0.184475, 1.0], abs=1e-6
-    )  # IEC 61966-2-1: 10 on the straight part, 119 a mid grey of 18.4 %
-    assert color.encode_srgb(np.array([0.0031308])) == pytest.approx([0.04045], abs=1e-5)
-
-
 def test_srgb_curve_is_inverted_negative_values_too():
     linear = np.linspace(-0.5, 4, 1001)
     assert color.decode_srgb(color.encode_srgb(linear)) == pytest.approx(linear, rel=1e-4, abs=2e-7)
@@ -29,11 +22,6 @@ def test_srgb_curve_serves_torch():
     torch = pytest.importorskip("torch")
     value = torch.tensor([-0.2, 0.0, 0.002, 0.4, 1.0], dtype=torch.float64)
     assert color.encode_srgb(value).numpy() == pytest.approx(color.encode_srgb(value.numpy()))
-
-
-def test_white_of_rec709_is_d65():
-    xyz = color.REC709_TO_XYZ @ np.ones(3)
-    assert xyz[:2] / xyz.sum() == pytest.approx([0.3127, 0.3290], abs=1e-4)
 
 
 def test_curve_and_matrix_are_those_of_colour_science():

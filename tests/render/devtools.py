@@ -15,6 +15,8 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 MODULES = Path(__file__).parents[1] / "gltf" / "node_modules"
@@ -78,10 +80,13 @@ class Page:
             assert time.monotonic() < limit, (condition, self.complaints)
             time.sleep(0.05)
 
-    def screenshot(self, file: Path) -> None:
-        """The whole page, not only what the window shows."""
-        shot = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True)
-        file.write_bytes(base64.b64decode(shot["data"]))
+    def screenshot(self) -> np.ndarray:
+        """The whole page, not only what the window shows, (H, W, 3) 0…255."""
+        return _decoded(self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True)["data"])
+
+    def canvas(self, name: str) -> np.ndarray:
+        """The pixels of a canvas as it is drawn now, (H, W, 3) 0…255."""
+        return _decoded(self.evaluate(f"({name}.draw(), {name}.canvas.toDataURL().split(',')[1])"))
 
     def pdf(self) -> bytes:
         return base64.b64decode(self.call("Page.printToPDF", printBackground=True)["data"])
@@ -108,6 +113,11 @@ class Page:
             self.complaints.append(str(about["entry"]["text"]))
         elif method == "Network.requestWillBeSent":
             self.asked.append(str(about["request"]["url"])[:80])
+
+
+def _decoded(png: str) -> np.ndarray:
+    data = np.frombuffer(base64.b64decode(png), np.uint8)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))[..., ::-1].astype(float)
 
 
 @contextmanager
