@@ -13,17 +13,11 @@ VALID = re.compile(r"https?://[A-Za-z0-9._~%!$&'()*+,;=:@\[\]-]*(/([A-Za-z0-9._~
 @pytest.mark.parametrize(
     "text",
     [
-        "https://example.org/my files",
-        "https://example.org/pot #3",
-        "https://example.org/50 %/vase?",
-        "https://museum.example/Gefäße/Öl",
-        'http://localhost:8000/a"b<c>`{d}|^\\e',
-        "http://[::1]:8000/x[1]",
-        "https://müller.example/",
-        "https://example.org",
-        "https://user@example.org/a/b+c;d=e",
+        "https://example.org/my files", "https://example.org/pot #3", "https://example.org/50 %/vase?",
+        "https://museum.example/Gefäße/Öl", 'http://localhost:8000/a"b<c>`{d}|^\\e', "http://[::1]:8000/x[1]",
+        "https://müller.example/", "https://example.org", "https://user@example.org/a/b+c;d=e",
     ],
-)
+)  # fmt: skip
 def test_a_web_address_is_valid_and_encoded_once(text: str) -> None:
     encoded = addresses.of_web(text)
     assert VALID.fullmatch(encoded), encoded

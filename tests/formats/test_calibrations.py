@@ -9,7 +9,7 @@ import pytest
 from polcap.calibration_values import Calibration, Falloff, FlashEnergy, LensGeometry, Levels, NoiseLine, Polarizer
 from polcap.capture_values import Exif
 from polcap.errors import CaptureError
-from polcap.formats import calibrations
+from polcap.formats import atomic, calibrations
 from polcap.formats.capture import reader as capture
 
 EXAMPLE = Path(__file__).parents[1] / "capture"
@@ -79,8 +79,7 @@ def test_falloff_of_another_aperture_is_left_out(users):
 
 @pytest.mark.parametrize("text", [b"x = ", b"made = 3", b"", b"made = '\xff'"])
 def test_a_foreign_file_is_one_clear_line(users, text):
-    users.mkdir()
-    (users / "a.toml").write_bytes(text)
+    atomic.write(users / "a.toml", text)
     with pytest.raises(CaptureError, match="not a polcap calibration"):
         calibrations.choose(EXIF, None, None)
 

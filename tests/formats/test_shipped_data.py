@@ -42,24 +42,18 @@ def test_chart_by_the_makers_srgb_values():
     assert colors[[0, 17, 18, 23]].tolist() == [[115, 82, 68], [8, 133, 161], [243, 243, 242], [52, 52, 52]]
 
 
-def test_the_classic_knows_its_other_editions():
+def test_the_classic_knows_its_other_editions_and_is_as_wide_as_six_square_patches_by_four():
     found = shipped_data.colorchecker()
     assert len(found.editions) == 2 and len({found.name, *(other.name for other in found.editions)}) == 3
     assert all(other.patches == found.patches and not other.editions for other in found.editions)
-
-
-def test_chart_is_as_wide_as_six_square_patches_by_four():
-    width, height = shipped_data.colorchecker().size_m
+    width, height = found.size_m
     assert width / height == pytest.approx((5 + 0.874) / (3 + 0.874), rel=0.01)
 
 
-def test_data_of_a_checkout_is_found_and_missing_data_named():
+def test_data_of_a_checkout_or_of_the_package_is_found_and_missing_data_named(tmp_path, monkeypatch):
     assert shipped_data.data_path("colorchecker/classic_srgb.toml").is_file()
     with pytest.raises(StorageError, match=r"cameras/none\.toml"):
         shipped_data.data_path("cameras/none.toml")
-
-
-def test_installed_data_is_found_in_the_package(tmp_path, monkeypatch):
     (tmp_path / "polcap" / "_calib").mkdir(parents=True)
     (tmp_path / "polcap" / "_calib" / "x.toml").write_text("")
     monkeypatch.setattr(shipped_data, "_PACKAGE", tmp_path / "polcap")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
 if TYPE_CHECKING:  # the command line needs the names before NumPy is imported
@@ -35,6 +35,10 @@ class ExportPreset:
     textures: Mapping[str, str] = field(default_factory=dict)  # PNG files next to the asset: `texture_set.TEXTURES`
 
 
+_OF_FILMS = ExportPreset(
+    "", ("usd", "materialx"), bits=16, shared="exr", extras=("displacement",),
+    textures={"{}_displacement": "displacement"},
+)  # fmt: skip
 PRESETS: Mapping[str, ExportPreset] = {
     "blender": ExportPreset(
         description="File > Import > glTF, or polcap's extension for camera, flash and photograph; normals +Y",
@@ -87,21 +91,13 @@ PRESETS: Mapping[str, ExportPreset] = {
             "{}_ambientocclusion": "occlusion",
         },
     ),
-    "maya": ExportPreset(
-        formats=("usd", "materialx"),
+    "maya": replace(
+        _OF_FILMS,
         description="File > Import > USD, or LookdevX for the MaterialX document; linear EXR textures; normals +Y",
-        bits=16,
-        shared="exr",
-        extras=("displacement",),
-        textures={"{}_displacement": "displacement"},
     ),
-    "houdini": ExportPreset(
-        formats=("usd", "materialx"),
+    "houdini": replace(
+        _OF_FILMS,
         description="Sublayer or Reference LOP for Karma and other renderers; linear EXR textures; normals +Y",
-        bits=16,
-        shared="exr",
-        extras=("displacement",),
-        textures={"{}_displacement": "displacement"},
     ),
     "archive": ExportPreset(
         formats=("gltf", "obj", "usd", "materialx", "exr"),

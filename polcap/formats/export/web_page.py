@@ -1,8 +1,12 @@
-"""Writes a web page that shows a GLB with model-viewer; both are in the page, so it works without a network."""
+"""Writes a web page that shows a GLB with model-viewer, from the template `web_page.html`.
+
+Both are in the page, which may load nothing else; so it works without the Internet.
+"""
 
 import base64
 from collections.abc import Mapping
 from html import escape
+from importlib.resources import files
 from pathlib import Path
 from string import Template
 
@@ -10,28 +14,6 @@ from polcap.errors import SettingError
 from polcap.formats import atomic, text_file
 
 _SHOWN = ("object_number", "date", "institution", "creator", "rights", "license")
-# the page may load nothing but its own parts
-_PAGE = Template(
-    """<!doctype html>
-<html lang="en">
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval';
- style-src 'unsafe-inline'; img-src data: blob:; connect-src data: blob:; worker-src blob:">
-<meta name="description" content="$description">
-<title>$title</title>
-<style>
-html, body { margin: 0; height: 100%; font: 14px sans-serif; background: #eee; }
-model-viewer { width: 100%; height: 100%; }
-p { position: absolute; left: 12px; bottom: 4px; margin: 0; color: #333; pointer-events: none; }
-</style>
-<model-viewer src="data:model/gltf-binary;base64,$glb" alt="$title" camera-controls touch-action="pan-y"
- tone-mapping="neutral" shadow-intensity="1"></model-viewer>
-<p>$caption</p>
-<script type="module">$script</script>
-</html>
-"""
-)
 
 
 def texts(facts: Mapping[str, str]) -> dict[str, str]:
@@ -57,7 +39,6 @@ def write(path: Path, glb: Path, script: str, facts: Mapping[str, str]) -> None:
 
     `facts` are fields of `CatalogEntry` and the capture's `name`; the page shows them.
     """
-    page = _PAGE.substitute(
-        texts(facts), glb=base64.b64encode(glb.read_bytes()).decode(), script=script.replace("</script", "<\\/script")
-    )
-    atomic.write(path, page)
+    page = Template(files("polcap.formats.export").joinpath("web_page.html").read_text("utf-8"))
+    content, script = base64.b64encode(glb.read_bytes()).decode(), script.replace("</script", "<\\/script")
+    atomic.write(path, page.substitute(texts(facts), glb=content, script=script))

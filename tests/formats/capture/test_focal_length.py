@@ -8,10 +8,7 @@ import pytest
 from polcap.capture_values import Exif
 from polcap.formats.capture import focal_length
 
-
-def test_sensor_table_makes_a_stated_focal_length_known() -> None:
-    found = focal_length.find(Exif(model="NIKON D90", focal_length_mm=50.0, width=4310, height=2868), None, None)
-    assert found.known and found.px == pytest.approx(50 / 23.6 * 4310)
+D90 = Exif(model="NIKON D90", focal_length_mm=50.0, width=4310, height=2868)
 
 
 @pytest.mark.parametrize(("width", "height"), [(6000, 4000), (4000, 3000), (3000, 4000)])
@@ -21,14 +18,15 @@ def test_an_equivalent_has_the_diagonal_of_full_frame(width: int, height: int) -
     assert 2 * math.degrees(math.atan(math.hypot(width, height) / 2 / found.px)) == pytest.approx(46.79, abs=0.01)
 
 
-def test_a_stated_focal_length_that_contradicts_exif_is_not_known() -> None:
-    exif = Exif(model="NIKON D90", focal_length_mm=50.0, width=4310, height=2868)
-    found = focal_length.find(exif, 24.0, None)
+def test_the_sensor_table_makes_a_focal_length_known_unless_exif_contradicts_the_stated_one() -> None:
+    known = focal_length.find(D90, None, None)
+    assert known.known and known.px == pytest.approx(50 / 23.6 * 4310)
+    found = focal_length.find(D90, 24.0, None)
     shorter, longer = found.doubt  # EXIF states a longer one
     assert shorter == 0.0 and longer == pytest.approx(math.log(50 / 24))
     assert not found.known and "50 mm" in found.note
     assert found.px == pytest.approx(24 / 23.6 * 4310)  # the user's statement is used
-    assert focal_length.find(exif, 51.0, None).known
+    assert focal_length.find(D90, 51.0, None).known
 
 
 CROPPED = Exif(model="Canon EOS 6D Mark II", focal_length_mm=40.0, width=4000, height=2667)  # a table width of 35.9 mm
@@ -59,15 +57,12 @@ def test_sources_that_contradict_each_other_leave_a_doubt(
     assert not found.known and " but " in found.note
 
 
-def test_sources_that_differ_by_less_than_a_tenth_agree() -> None:
+def test_sources_that_differ_by_less_than_a_tenth_and_a_confirmed_statement_are_known() -> None:
+    """The most precise source is used, or the user's, who has decided between two sources of the file."""
     found = focal_length.find(replace(CROPPED, pixel_pitch_um=35e3 / 4000, focal_length_35mm=41.0), None, None)
-    assert found.known and found.px == pytest.approx(40 / 35.0 * 4000)  # the most precise of them
-
-
-def test_a_statement_that_a_source_confirms_is_known() -> None:
-    """The user has decided between two sources of the file."""
-    found = focal_length.find(replace(CROPPED, pixel_pitch_um=PITCH_UM), None, 36.0)
-    assert found.known and found.px == pytest.approx(40 / 36 * 4000) and "24.0 mm" in found.note
+    assert found.known and found.px == pytest.approx(40 / 35.0 * 4000)
+    decided = focal_length.find(replace(CROPPED, pixel_pitch_um=PITCH_UM), None, 36.0)
+    assert decided.known and decided.px == pytest.approx(40 / 36 * 4000) and "24.0 mm" in decided.note
 
 
 def test_doubts_on_focal_length_and_sensor_add_up() -> None:

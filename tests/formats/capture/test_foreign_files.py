@@ -17,6 +17,7 @@ Form = Literal["NFC", "NFD"]
 BINARY = b"\0\1\2\377"
 SILENT = {
     **dict.fromkeys(["IMG_0.acr", "IMG_0.vrd", "IMG_0.DR4", "IMG_0.dng.dop", "ZbThumbnail.info", "Thumbs.db"], BINARY),
+    "._IMG_0.dng": BINARY,
     "desktop.ini": "\ufeff[.ShellClassInfo]".encode("utf-16-le"),
     "Icon\r": b"",
     "IMG_0.xmp": b"",
@@ -62,7 +63,7 @@ def test_folders_of_other_programs_are_not_even_named(tmp_path: Path, name: str)
 
 @pytest.mark.parametrize("damaged", ["pol000/IMG_5.dng", "pol000/IMG_5.NEF", "pol000/IMG_5.cr3", "c.tif"])
 def test_a_damaged_photograph_is_an_error(tmp_path: Path, damaged: str) -> None:
-    _ = pictures(tmp_path, ["a.png", "b.png"]) if damaged == "c.tif" else folders(tmp_path)
+    pictures(tmp_path, ["a.png", "b.png"]) if damaged == "c.tif" else folders(tmp_path)
     (tmp_path / damaged).write_bytes(BINARY)
     with pytest.raises(InputError, match=damaged):
         reader.read(tmp_path)
