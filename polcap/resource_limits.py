@@ -21,31 +21,31 @@ _BYTES = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
 
 def set_limits(threads: int, gigabytes: float) -> None:
-    """Limit the threads and the memory [GB] of this process; 0: no limit. Raises SettingError as `check_memory`."""
-    set_threads(threads)
-    set_memory(gigabytes)
+    """Limit the threads and the private memory [GB] of this process; 0: no limit.
 
+    Called before any numerical library starts its own threads. An allocation beyond the limit fails.
 
-def set_threads(count: int) -> None:
-    """Set the number of threads before any numerical library starts its own; 0 leaves it to them.
-
-    Raises SettingError: the number is negative.
+    Raises SettingError: the number of threads is negative, or as `check_memory`.
     """
-    if count < 0:
-        raise SettingError(f"--threads {count}: give a number of threads, or 0 for all")
-    if count:
+    if threads < 0:
+        raise SettingError(f"--threads {threads}: give a number of threads, or 0 for all")
+    check_memory(gigabytes)
+    if threads:
         for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-            os.environ[name] = str(count)
+            os.environ[name] = str(threads)
         import cv2
 
-        cv2.setNumThreads(count)
+        cv2.setNumThreads(threads)
+    if gigabytes:
+        resource = _resource(gigabytes)
+        size, most = int(gigabytes * 1e9), resource.getrlimit(resource.RLIMIT_DATA)[1]
+        if most != resource.RLIM_INFINITY:  # the administrator's limit is not raised
+            size = min(size, most)
+        resource.setrlimit(resource.RLIMIT_DATA, (size, most))
 
 
 def check_memory(gigabytes: float) -> None:
-    """Check that `set_memory` can set this limit.
-
-    Raises SettingError: it is not a valid amount, less than any capture needs, or the system has no such limit.
-    """
+    """Raise a SettingError for a limit that no system accepts, that is too low for any capture, or unknown here."""
     if not 0 <= gigabytes <= _MOST_GB:
         raise SettingError(f"--memory {gigabytes:g}: give a number of GB up to {_MOST_GB:g}, or leave it out")
     if 0 < gigabytes < _LEAST_GB:
@@ -55,21 +55,6 @@ def check_memory(gigabytes: float) -> None:
         )
     if gigabytes:
         _resource(gigabytes)
-
-
-def set_memory(gigabytes: float) -> None:
-    """Limit the private memory of the process, so that larger allocations fail; 0 sets no limit.
-
-    Raises SettingError: see `check_memory`.
-    """
-    check_memory(gigabytes)
-    if not gigabytes:
-        return
-    resource = _resource(gigabytes)
-    size, most = int(gigabytes * 1e9), resource.getrlimit(resource.RLIMIT_DATA)[1]
-    if most != resource.RLIM_INFINITY:  # the administrator's limit is not raised
-        size = min(size, most)
-    resource.setrlimit(resource.RLIMIT_DATA, (size, most))
 
 
 def _resource(gigabytes: float) -> Any:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 _LONGEST = 600  # characters of a message
 _FRAMES_S = 5.0  # between two lines about frames, where there is no terminal to write over
 _verbosity = 0  # -1 with --quiet, 1 with --verbose
+_debug = False  # with --debug
 _log_file: TextIO | None = None  # with --log
 _outputs: dict[str, "_Output"] = {}  # stdout and --log: the exit code states whether they are complete
 _Level = Literal["INFO", "WARNING", "ERROR"]
@@ -95,10 +96,10 @@ def final_code(code: int) -> int:
     return code
 
 
-def set_verbosity(quiet: bool, verbose: bool) -> None:
-    """Print no progress, or a line per frame and stage in place of a bar."""
-    global _verbosity
-    _verbosity = -1 if quiet else int(verbose)
+def set_verbosity(quiet: bool, verbose: bool, debug: bool) -> None:
+    """Print no progress, or a line per frame and stage in place of a bar; with `debug`, tracebacks of errors."""
+    global _verbosity, _debug
+    _verbosity, _debug = -1 if quiet else int(verbose), debug
 
 
 def is_verbose() -> bool:
@@ -149,18 +150,18 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
     """Report a command's error in one line on stderr and by its exit code."""
 
     @functools.wraps(command)
-    def run(context: typer.Context, *args: Any, **kwargs: Any) -> None:
+    def run(*args: Any, **kwargs: Any) -> None:
         try:
-            command(context, *args, **kwargs)
+            command(*args, **kwargs)
             return
         except (typer.Exit, typer.Abort):
             raise
         except (Exception, KeyboardInterrupt) as error:
-            if context.obj and isinstance(error, Exception):  # --debug
+            if _debug and isinstance(error, Exception):
                 print_message("".join(traceback.format_exception(error)).rstrip())
-            text, code = _explain(error, context.obj, kwargs.get("resume") is False)
+            text, code = _explain(error, kwargs.get("resume") is False)
             print_message(f"polcap: {text}", "ERROR")
-            if code == 1 and not context.obj:
+            if code == 1 and not _debug:
                 log("".join(traceback.format_exception(error)), "ERROR")
             if not (isinstance(error, KeyboardInterrupt) and kwargs.get("watch")):  # Ctrl-C is its normal end
                 print_error_document(kwargs, error, text.removeprefix("error: "), code)
@@ -169,7 +170,7 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def _explain(error: BaseException, debug: bool, resumable: bool) -> tuple[str, int]:
+def _explain(error: BaseException, resumable: bool) -> tuple[str, int]:
     """Message and exit code for an error of a command."""
     if isinstance(error, KeyboardInterrupt):
         return f"interrupted; run the same command again{' with --resume' if resumable else ''} to go on", 130
@@ -181,7 +182,7 @@ def _explain(error: BaseException, debug: bool, resumable: bool) -> tuple[str, i
         name = f"{error.filename}: " if error.filename else ""
         reason = f"{name}{error.strerror or line(error)}; check the path and its permissions"
         return f"error: {reason}", SettingError.exit_code
-    remedy = "with the lines above" if debug else "run with --debug and"
+    remedy = "with the lines above" if _debug else "run with --debug and"
     return f"bug: {type(error).__name__}: {line(error)}; {remedy} report it", 1
 
 

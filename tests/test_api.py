@@ -16,7 +16,7 @@ from polcap.api import Result
 from polcap.errors import PolcapError, SettingError
 from polcap.formats.maps import result_maps as maps
 from polcap.image_values import MaskedImage
-from polcap.pipeline import models, request
+from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
 from polcap.results import ResultsUntilMask
 
@@ -59,7 +59,7 @@ def test_python_takes_the_network_as_the_command_line_does(monkeypatch: pytest.M
         raise polcap.PolcapError("far enough")
 
     monkeypatch.setattr(models, "load_network", load)
-    request._networks.cache_clear()  # an earlier test of this process may have opened the networks
+    models.load_networks.cache_clear()  # an earlier test of this process may have opened the networks
     with pytest.raises(polcap.PolcapError, match="far enough"):
         polcap.process("nowhere")
     assert asked == [(None, None, "cpu", 0)]  # what `polcap process` without flags asks for
@@ -151,10 +151,7 @@ def test_errors_name_the_argument_and_not_the_flag(result: Path, options: dict[s
     ("options", "words"),
     [
         ({"threads": -1}, "^threads -1: give a number of threads, or 0 for all"),
-        (
-            {"angles_deg": "0,45,90"},
-            r"^angles_deg = '0,45,90': it holds no numbers; give degrees",
-        ),
+        ({"angles_deg": "0,45,90"}, r"^angles_deg = '0,45,90': it holds no numbers; give degrees"),
         ({"angles_deg": ("0", "45", "90")}, "it holds no numbers"),
     ],
 )

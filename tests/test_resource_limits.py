@@ -18,7 +18,7 @@ from tests.conftest import Command
 @pytest.mark.parametrize("gigabytes", [float("inf"), float("nan"), 1e300, -1.0])
 def test_what_is_no_amount_of_memory_is_refused(gigabytes: float) -> None:
     with pytest.raises(SettingError, match="--memory"):
-        resource_limits.set_memory(gigabytes)
+        resource_limits.set_limits(0, gigabytes)
 
 
 def test_less_than_any_capture_needs_is_refused_with_what_it_takes() -> None:

@@ -131,9 +131,9 @@ def test_frames_are_reported_every_five_seconds_with_the_time_left(
     for done in (1, 2, 3, 4):
         steps.frame(done, 9)
     assert capsys.readouterr().err.splitlines() == ["2 of 9 frames, 21 s left", "4 of 9 frames, 15 s left"]
-    terminal.set_verbosity(quiet=False, verbose=True)
+    terminal.set_verbosity(quiet=False, verbose=True, debug=False)
     steps.frame(5, 9)
-    terminal.set_verbosity(quiet=False, verbose=False)
+    terminal.set_verbosity(quiet=False, verbose=False, debug=False)
     assert capsys.readouterr().err.startswith("5 of 9 frames")
 
 

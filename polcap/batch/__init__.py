@@ -159,15 +159,10 @@ def _process(
     if plan.scheduler is not None:
         from polcap.batch import cluster
 
-        return cluster.run(wanted, request, plan.scheduler, plan.workers, plan.retries, print_line)
-    return _in_processes(wanted, request, plan.workers, plan.retries)
-
-
-def _in_processes(wanted: Sequence[Unit], request: Request, workers: int, retries: int) -> Iterator[UnitRecord]:
-    """Process captures in several child processes; yields records in the order in which captures end."""
-    limits = Limits(request.threads, request.memory_gb)
+        yield from cluster.run(wanted, request, plan.scheduler, plan.workers, plan.retries, print_line)
+        return
     before = {unit: units.read_record(unit) for unit in wanted}
-    with ProcessPool(workers, retries, limits) as pool:
+    with ProcessPool(plan.workers, plan.retries, Limits(request.threads, request.memory_gb)) as pool:
         for unit, outcome in pool.run(partial(_process_unit, request), wanted):
             if isinstance(outcome, Died):
                 message = _DIED.format(attempts=outcome.attempts)

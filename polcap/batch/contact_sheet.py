@@ -13,20 +13,9 @@ from polcap.batch.unit import FINISHED, FOLDER, WORDS, Unit, UnitRecord
 from polcap.formats import addresses, atomic
 
 _COLUMNS = (
-    "name",
-    "title",
-    "object_number",
-    "creator",
-    "rights",
-    "state",
-    "verdict",
-    "expected_error_deg",
-    "seconds",
-    "attempts",
-    "asset",
-    "report",
-    "says",
-)
+    "name", "title", "object_number", "creator", "rights", "state", "verdict", "expected_error_deg", "seconds",
+    "attempts", "asset", "report", "says",
+)  # fmt: skip
 _FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # first characters of cells that spreadsheets compute
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><meta name="color-scheme" content="light dark"><title>{{ folder }}</title><style>

@@ -126,7 +126,6 @@ def _version(asked: bool) -> None:
 
 @app.callback()
 def common_options(
-    context: typer.Context,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of a failure.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress, only data and errors.")] = False,
     verbose: Annotated[
@@ -140,8 +139,7 @@ def common_options(
         bool, typer.Option("--version", is_eager=True, callback=_version, help="Print the version and end.")
     ] = False,
 ) -> None:
-    context.obj = debug
-    terminal.set_verbosity(quiet, verbose)
+    terminal.set_verbosity(quiet, verbose, debug)
     try:
         terminal.open_log(log)
     except OSError as error:

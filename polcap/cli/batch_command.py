@@ -51,8 +51,8 @@ def batch(
     resource_limits.check_memory(memory)
     if model is not None or estimator == "network":  # refuse an unusable model before any capture is processed
         models.load_network(estimator, model, "cpu", 1)  # the GPU may be in other machines
-    given = {**context.params, "model": None if model is None else model.resolve()}
-    request = options.request(given, settings.load(config, assignments or ()))
+    stated = {**context.params, "model": None if model is None else model.resolve()}
+    request = options.request(stated, settings.load(config, assignments or ()))
     part = shards.from_environment(os.environ) if shard is None else shards.parse(shard)
     plan = batches.BatchPlan(part, scheduler, workers, retries, keep_going)
     summary = batches.run(root, out, request, plan, terminal.print_progress)

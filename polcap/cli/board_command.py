@@ -4,14 +4,13 @@ import os
 from pathlib import Path
 from typing import Annotated, Literal
 
-from typer import Argument, Context, Option
+from typer import Argument, Option
 
 from polcap import terminal
 from polcap.cli.options import Json
 
 
 def board(
-    context: Context,
     folder: Annotated[Path, Argument(help="Folder to write into.")] = Path(),
     size: Annotated[
         Literal["A4", "A3", "A2"], Option(case_sensitive=False, help="Paper; the object stands on 96, 136 or 192 mm.")

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from typer import Argument, Context, Option
+from typer import Argument, Option
 
 from polcap import terminal
 from polcap.cli import options
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    context: Context,
     folder: Annotated[Path, Argument(help="Folder with some of dark/, flat/, bracket/, flash/, polarizer/, lens/.")],
     lens_filter: Annotated[str, Option("--filter", metavar="NAME", help="The polarizer's name.")] = "",
     axis: Annotated[

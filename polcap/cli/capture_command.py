@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Argument, Context, Exit, Option
+from typer import Argument, Exit, Option
 
 from polcap import terminal
 from polcap.cli import options
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 
 def capture(
-    context: Context,
     folder: Annotated[Path, Argument(help="Folder for the photographs: a new one, or with --resume a begun one.")],
     rotator: Annotated[
         str | None, Option(metavar="URL", help="elliptec:PORT, grbl:PORT, line:PORT, manual or simulated.")

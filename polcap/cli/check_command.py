@@ -8,7 +8,6 @@ from polcap.errors import GateError
 
 
 def check(
-    context: typer.Context,
     capture: options.CaptureFolder,
     config: options.ConfigFile = None,
     assignments: options.Assignments = None,
@@ -24,10 +23,11 @@ def check(
     from polcap import config as settings
     from polcap.formats.capture import reader as captures
     from polcap.pipeline import check as checks
+    from polcap.pipeline import models
 
     chosen, request = settings.load(config, assignments or ()), options.chart_request(chart, no_chart)
     with ThreadPoolExecutor(1) as pool:  # networks are opened while photographs are read
-        opening = pool.submit(checks.shipped_networks)
+        opening = pool.submit(models.load_networks)
         found = captures.read(capture, options.angles_deg(angles), clockwise)
         verdict = checks.inspect(found, chosen, request, opening.result)
     for note in found.notes:

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-from typer import Argument, Context, Exit, Option, confirm
+from typer import Argument, Exit, Option, confirm
 
 from polcap import terminal
 from polcap.cli.options import Json
@@ -13,7 +13,6 @@ from polcap.errors import SettingError
 
 
 def doctor(
-    context: Context,
     ask_ports: Annotated[
         bool | None,
         Option("--ports/--no-ports", help="Write to the serial ports to find motors; by default you are asked."),

@@ -36,9 +36,9 @@ def fuse(
     """Join several captures of one object into a closed asset. Run again, it goes on where it was stopped."""
     from polcap.pipeline import unchanged
 
-    given = {**context.params, "config": config, "model": model}  # paths, not text
+    stated = {**context.params, "config": config, "model": model}  # paths, not text
     target = out or folder / own_folders.FUSED
-    asked = options.request_digest(given, folder, target)
+    asked = options.request_digest(stated, folder, target)
     if options.print_finished(target, asked, json, open_):
         return
     from polcap import config as settings
@@ -49,10 +49,9 @@ def fuse(
     resource_limits.set_limits(threads, memory)
     if missing := [name for name in _NEEDED if find_spec(name) is None]:
         raise SettingError(f"polcap fuse needs {', '.join(missing)}: pip install 'polcap[fusion]'")
-    stated = settings.fill(SessionConfig, settings.read(config), assignments or [])
-    request = options.request(given, stated.of_views)
-    steps = terminal.Steps()
-    session_input = SessionInput(folder, stated, request, workers)
-    about = fuse_run.fuse(session_input, target, terminal.print_progress, steps.stage)
+    chosen = settings.fill(SessionConfig, settings.read(config), assignments or [])
+    request = options.request(stated, chosen.of_views)
+    session_input = SessionInput(folder, chosen, request, workers)
+    about = fuse_run.fuse(session_input, target, terminal.print_progress, terminal.Steps().stage)
     unchanged.remember(target, asked, files=request.files())
     terminal.print_result(about, target, json, open_)

@@ -57,14 +57,13 @@ def material(
     from polcap.material.material_path import MaterialConfig
 
     resource_limits.set_limits(threads, memory)
-    stated = settings.fill(MaterialConfig, settings.read(config), assignments or [])
-    given = {**context.params, "estimator": "analytic"}  # no network is needed up to the Stokes parameters
-    request = options.request(given, stated.of_views)
-    steps = terminal.Steps()
-    session_input = SessionInput(folder, stated, request, workers)
+    chosen = settings.fill(MaterialConfig, settings.read(config), assignments or [])
+    stated = {**context.params, "estimator": "analytic"}  # no network is needed up to the Stokes parameters
+    request = options.request(stated, chosen.of_views)
+    session_input = SessionInput(folder, chosen, request, workers)
     about = material_run.measure(
         session_input, target, _region(region), None if texel is None else texel / 1000, tile,
-        terminal.print_progress, steps.stage,
+        terminal.print_progress, terminal.Steps().stage,
     )  # fmt: skip
     unchanged.remember(target, asked, files=request.files())
     terminal.print_result(about, target, json, open_)

@@ -163,18 +163,15 @@ def request(stated: Mapping[str, Any], config: "Config") -> "Request":
     """
     from polcap.pipeline.request import Request
 
+    same = ("estimator", "model", "device", "clockwise", "threads")  # names of options and of fields
     mask = stated.get("mask")
     return Request(
         config=config,
         chart=chart_request(stated["chart"], stated["no_chart"]),
         mask=None if mask is None else user_mask(mask),
-        estimator=stated.get("estimator"),
-        model=stated.get("model"),
-        device=stated.get("device", "cpu"),
         angles_deg=angles_deg(stated["angles"]),
-        clockwise=stated.get("clockwise", False),
-        threads=stated.get("threads", 0),
         memory_gb=stated.get("memory", 0.0),
+        **{name: stated[name] for name in same if name in stated},
     )
 
 

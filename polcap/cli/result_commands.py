@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
-from typer import Argument, Context, Option
+from typer import Argument, Option
 
 from polcap import terminal
 from polcap.cli import options
@@ -15,7 +15,6 @@ from polcap.results import STAGES
 
 
 def show(
-    context: Context,
     result: Result,
     stage: Annotated[str | None, Argument(help=f"One of {', '.join(STAGES)}.")] = None,
     all_: Annotated[bool, Option("--all", help="Every stage.")] = False,
@@ -41,7 +40,7 @@ def show(
     terminal.print_written(drawn, json)
 
 
-def status(context: Context, result: Result, json: Json = False) -> None:
+def status(result: Result, json: Json = False) -> None:
     """List the stored stages of a result folder, or the progress of a batch."""
     from polcap.pipeline import manifest
 
@@ -66,7 +65,6 @@ def status(context: Context, result: Result, json: Json = False) -> None:
 
 
 def report(
-    context: Context,
     result: Result,
     compare: Annotated[
         Path | None, Option(metavar="OTHER", help="Another result folder.", callback=options.result_folder)
@@ -120,7 +118,6 @@ def _compare(results: tuple[Path, Path], out: Path, json: bool, open_: bool) -> 
 
 
 def clean(
-    context: Context,
     result: Annotated[
         Path, Argument(help="Result folder, its capture, or the folder of a batch.", callback=options.result_folder)
     ],

@@ -4,7 +4,7 @@ import textwrap
 from json import dumps as to_json
 from typing import TYPE_CHECKING, Annotated
 
-from typer import Argument, Context
+from typer import Argument
 
 from polcap import terminal
 from polcap.cli.options import Json
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 
 def settings(
-    context: Context,
     stage: Annotated[
         str | None, Argument(metavar="[STAGE]", help="Only this stage, such as hdr, gates or fusion; or synth.")
     ] = None,

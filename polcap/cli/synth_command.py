@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from typer import Argument, Context, Option
+from typer import Argument, Option
 
 from polcap import terminal
 from polcap.cli import options
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 
 def synth(
-    context: Context,
     folder: Annotated[Path, Argument(help="Folder to make; must be new or empty.")],
     scene: Annotated[Literal["bumps", "clusters", "vase", "ball"], choice("Kind of object.")] = "bumps",
     seed: Annotated[int, Option(min=0, help="Of shape, material, light and noise.")] = 0,

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from typer import Argument, Context, Option
+from typer import Argument, Option
 
 from polcap import terminal
 from polcap.cli import options
@@ -12,7 +12,6 @@ from polcap.errors import SettingError
 
 
 def train(
-    context: Context,
     data: Annotated[Path, Argument(help="Folder with meshes/ and materials/.")],
     out: Annotated[Path, Option("--out", "-o", help="Checkpoints and metrics.")] = Path("runs/train"),
     preset: Annotated[Literal["cpu", "gpu"], choice("Size of the network and of a batch.")] = "cpu",
@@ -56,7 +55,6 @@ def train(
 
 
 def evaluate(
-    context: Context,
     model: Annotated[Path, Argument(help="ONNX model.")],
     data: Annotated[Path | None, Argument(help="Folder with meshes/ and materials/.")] = None,
     out: Annotated[Path, Option("--out", "-o", help="Tables and pictures; a stopped evaluation goes on.")] = Path(

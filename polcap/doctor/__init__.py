@@ -18,7 +18,7 @@ import numpy as np
 from polcap import __version__
 from polcap.capture_values import Exif
 from polcap.errors import PolcapError
-from polcap.formats import dng_writer, onnx, shipped_data
+from polcap.formats import dng_writer, onnx
 from polcap.formats.raw import libraw
 from polcap.pipeline import models
 
@@ -50,7 +50,7 @@ def examine(rig: Rig, folder: Path) -> tuple[Finding, ...]:
     import cv2
 
     about = f"{__version__}, Python {sys.version.split()[0]}, numpy {np.__version__}, OpenCV {cv2.__version__}"
-    model = next(reversed(shipped_data.model_files("polcap")), None)
+    model = models.newest("polcap")
     return (
         Finding("polcap", "ok", about),
         _decoder(),
@@ -131,7 +131,6 @@ def _providers(model: Path) -> Iterator[Finding]:
 
 
 def _disk(folder: Path) -> Finding:
-    """Check the free space of the disk."""
     free = shutil.disk_usage(folder).free / 1e9
     message = f"{free:.1f} GB free at {folder}"
     if free >= _ENOUGH_GB:

@@ -54,7 +54,7 @@ class DeferredResult(StageResult[T]):
     """Result whose value is made when it is first needed."""
 
     def __init__(self, key: str, make: Callable[[], T]) -> None:
-        vars(self).update(key=key, make=make)
+        vars(self).update(key=key, make=make)  # a frozen dataclass
 
     @cached_property
     def value(self) -> T:
@@ -87,11 +87,9 @@ class MemoryCache:
     def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
         """The result of a stage, from the cache or computed. Inputs are other results, plain values or functions.
 
-        Raises StageReached: this was the stage at which the path was to stop.
+        Raises StageReached: this was the stage at which the path was to stop. StorageError: as `ArchiveCache`.
         """
-        about = _about(stage, inputs, config)
-        self._forced = self._forced or stage.name == self._force
-        self.results[stage.name] = StageResult(about["key"], self._value(stage, inputs, config, about))
+        self.results[stage.name] = self._result(stage, inputs, config)
         if stage.name == self.until:
             raise StageReached(stage.name)
         return self.results[stage.name]
@@ -119,10 +117,15 @@ class MemoryCache:
                 raise
             raise resource_limits.shortfall(error, self.stage, pixels) from error
 
+    def _result(self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None) -> StageResult[T]:
+        about = _about(stage, inputs, config)
+        self._forced = self._forced or stage.name == self._force
+        return StageResult(about["key"], self._value(stage, inputs, config, about))
+
     def _value(
         self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None, about: dict[str, Any]
     ) -> Any:
-        """The result of a stage, read from the cache or computed."""
+        """The value of a stage's result, read from the cache or computed."""
         value = None if self._forced else self._find(stage, about["key"])
         if value is not None:
             if stage.keep:
@@ -186,11 +189,9 @@ class StageCache(MemoryCache):
 class LazyCache(StageCache):
     """Stage cache that reads or computes a result when its value is first needed: not before a stored result."""
 
-    def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
-        """The result of a stage, not yet read or computed."""
+    def _result(self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None) -> StageResult[T]:
         about = _about(stage, inputs, config)
-        self.results[stage.name] = DeferredResult(about["key"], partial(self._value, stage, inputs, config, about))
-        return self.results[stage.name]
+        return DeferredResult(about["key"], partial(self._value, stage, inputs, config, about))
 
     def derive(self, function: Callable[..., T], *inputs: Any) -> StageResult[T]:
         """A value derived from stage results, not yet computed; its key has the function's name."""
@@ -219,15 +220,12 @@ class ArchiveCache(StageCache):
     """Cache of an earlier run whose photographs are missing, so that the keys of the first stages cannot be computed.
 
     A stored result is used if it was made from the results of the stages before it, with these settings and versions.
+    A StorageError names a result that was not, is missing or damaged. A result that is never stored is computed.
     """
 
-    def run(self, stage: Stage[..., T], *inputs: Any, config: msgspec.Struct | None = None) -> StageResult[T]:
-        """The stored result of a stage; a result that is never stored is computed.
-
-        Raises StorageError: the result is missing, damaged, or not made from the results of the stages before it.
-        """
+    def _result(self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None) -> StageResult[T]:
         if not stage.keep:
-            return super().run(stage, *inputs, config=config)
+            return super()._result(stage, inputs, config)
         place = self.place(stage)
         about, value = read_manifest(place), read(place, stage)
         # "": an input that is no stage's result, whose key cannot be known here
@@ -238,10 +236,7 @@ class ArchiveCache(StageCache):
             raise StorageError(
                 f"{place} is of another run than the stages before it, or of another polcap; run `polcap process` again"
             )
-        self.results[stage.name] = StageResult(about["key"], value)
-        if stage.name == self.until:
-            raise StageReached(stage.name)
-        return self.results[stage.name]
+        return StageResult(about["key"], value)
 
     def derive(self, function: Callable[..., T], *inputs: Any) -> StageResult[T]:
         """As in other caches; without a key if an input is missing, such as the user's mask."""

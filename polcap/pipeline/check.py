@@ -44,16 +44,11 @@ class Verdict(msgspec.Struct, frozen=True):
     needs: str = ""  # the option without which `polcap process` ends with an error
 
 
-def shipped_networks() -> tuple[Network | None, Network | None]:
-    """Open the shipped networks of the normal estimator and of the mask; None for a missing one."""
-    return models.load_network(None, None), models.load_mask_network()
-
-
 def inspect(
     capture: Capture,
     config: Config,
     chart: ChartRequest = AUTO,
-    networks: Callable[[], tuple[Network | None, Network | None]] = shipped_networks,
+    networks: Callable[[], tuple[Network | None, Network | None]] = models.load_networks,
 ) -> Verdict:
     """Judge a capture for `polcap check`, by the same gates as `process`.
 
@@ -71,8 +66,7 @@ def inspect(
         finally:
             pool.shutdown(cancel_futures=True)
     bad = [line for line in lines if line.state == "fail"]
-    one_exposure = capture.layout == "sensor"  # a frame holds all angles
-    blamed = set() if one_exposure else {name for line in bad for name in line.shots}
+    blamed = {name for line in bad for name in line.shots if capture.layout != "sensor"}  # its frame holds all angles
     shots = tuple(shot.name for shot in capture.shots if shot.name in blamed)
     missing = any(line.name == "chart" and line.state == "warn" for line in lines)
     seconds = round(perf_counter() - start, 2)

@@ -1,6 +1,7 @@
 """Opens the network files of the path: the model that the user names, else the shipped ones."""
 
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -12,6 +13,14 @@ from polcap.stages.infer import fine
 from polcap.stages.mask import mask_channels
 
 Estimator = Literal["network", "analytic"]
+
+
+@lru_cache(maxsize=1)
+def load_networks(
+    estimator: Estimator | None = None, model: Path | None = None, device: Device = "cpu", threads: int = 0
+) -> tuple[Network | None, Network | None]:
+    """Open the networks of the estimator and of the mask, once per process. Raises as `load_network`."""
+    return load_network(estimator, model, device, threads), load_mask_network(threads)
 
 
 def load_network(
@@ -34,7 +43,7 @@ def load_network(
         if model is not None:
             raise SettingError("--model and --estimator analytic exclude each other; leave one out")
         return None
-    named = model or _newest("polcap")
+    named = model or newest("polcap")
     if named is None:
         if estimator == "network" or device == "cuda":
             raise ModelError("this polcap ships no model; name one with --model, or use --estimator analytic")
@@ -45,7 +54,7 @@ def load_network(
 def open_network(path: Path, device: Device = "cpu", threads: int = 0) -> Network:
     """Open an estimator's network. The shipped one comes with its refinement network, which was trained for it only."""
     network = onnx.load(path, device, threads)
-    own, relief = _newest("polcap"), _newest("fine")
+    own, relief = newest("polcap"), newest("fine")
     if own is None or relief is None or (path != own and network.digest != onnx.digest(own.read_bytes())):
         return network
     return replace(network, fine=onnx.load(relief, device, threads, fine.ENCODING))
@@ -53,10 +62,10 @@ def open_network(path: Path, device: Device = "cpu", threads: int = 0) -> Networ
 
 def load_mask_network(threads: int = 0) -> Network | None:
     """Open the shipped network that segments the object; None if none is shipped."""
-    found = _newest("mask")
+    found = newest("mask")
     return onnx.load(found, "cpu", threads, mask_channels.ENCODING) if found else None
 
 
-def _newest(name: str) -> Path | None:
-    """Path of the newest shipped model whose file name begins with `name`."""
+def newest(name: str) -> Path | None:
+    """Path of the newest shipped model with a file name that begins with `name`; None if none is shipped."""
     return max(shipped_data.model_files(name), default=None)

@@ -2,7 +2,6 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 from polcap.capture_values import Capture
@@ -13,7 +12,6 @@ from polcap.image_values import Bools, Device
 from polcap.pipeline import models, unchanged
 from polcap.pipeline.cache import fingerprint
 from polcap.pipeline.path import AUTO, UserInput
-from polcap.stage_values import Network
 
 
 @dataclass(frozen=True)
@@ -33,7 +31,7 @@ class Request:
 
     def supplied(self) -> UserInput:
         """The inputs of the path, with opened networks. Raises ModelError or SettingError: as `models.load_network`."""
-        network, mask_network = _networks(self.estimator, self.model, self.device, self.threads)
+        network, mask_network = models.load_networks(self.estimator, self.model, self.device, self.threads)
         return UserInput(self.chart, self.mask, network, mask_network)
 
     def read(self, folder: Path) -> Capture:
@@ -60,11 +58,3 @@ class Request:
         """Files that the settings name: the measured colors of the chart."""
         named = Path(self.config.whitebalance.chart)
         return [named] if named.is_file() else []
-
-
-@lru_cache(maxsize=1)
-def _networks(
-    estimator: models.Estimator | None, model: Path | None, device: Device, threads: int
-) -> tuple[Network | None, Network | None]:
-    """The networks of the estimator and of the mask, opened once per process."""
-    return models.load_network(estimator, model, device, threads), models.load_mask_network(threads)

@@ -22,7 +22,6 @@ from polcap.formats.export import encoders, provenance
 from polcap.formats.maps import maps_folder, png
 from polcap.formats.raw import frame_decoder
 from polcap.image_values import SensorImage
-from polcap.mesh_values import ReliefMesh
 from polcap.pipeline import (
     asset_export,
     detail_levels,
@@ -127,26 +126,19 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
     )
     parallel.both(
         partial(report.write, out, about, results),
-        partial(_write_asset, out, about, config, results.mesh),
+        lambda: asset_export.write(out, about, ExportRequest(), detail_levels.read(out / "maps", config, results.mesh)),
     )
+    profile = out / color_profile.NAME
     if results.color.source in ("chart", "corners"):
-        color_profile.write(out / color_profile.NAME, results.color)
-    elif results.color.source != "profile" and (
-        own := own_files.owner(out / color_profile.NAME)
-    ):  # a profile may be this file
-        own.remove(out / color_profile.NAME)
+        color_profile.write(profile, results.color)
+    elif results.color.source != "profile" and (own := own_files.owner(profile)):  # --chart may name this file
+        own.remove(profile)
     return about
-
-
-def _write_asset(out: Path, about: dict[str, Any], config: Config, mesh: ReliefMesh) -> None:
-    """Write the asset of a finished path, from the files in maps/ and their mesh."""
-    asset_export.write(out, about, ExportRequest(), detail_levels.read(out / "maps", config, mesh))
 
 
 def decode_with_progress(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
     """A decode function that reports progress by `frame_read`: numbers of decoded and of all photographs."""
-    brackets = capture.all_shots
-    total, number = sum(len(shot.frames) for shot in brackets), count(1)
+    total, number = sum(len(shot.frames) for shot in capture.all_shots), count(1)
 
     def decode(frame: Frame) -> SensorImage:
         image = frame_decoder.decode(frame)

@@ -77,13 +77,12 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
     step = half * times
     x, y = (to_grid(at, step) for at in capture.principal_px)
     width, height = (side // step for side in capture.size_px)
-    calibration = capture.calibration and replace(capture.calibration, noise=())  # it is of pixels, not of means
     small = replace(
         capture,
         focal_px=capture.focal_px / step,
         principal_px=(x, y),
         size_px=(width, height),
-        calibration=calibration,
+        calibration=capture.calibration and replace(capture.calibration, noise=()),  # it is of pixels, not of means
     )
     return SmallCapture(small, step, half, reduced)
 

@@ -81,7 +81,7 @@ def remember(out: Path, asked: str | None, table: str = "", files: Iterable[Path
 
 @contextmanager
 def preserved(out: Path) -> Iterator[None]:
-    """Context manager: what polcap changes in a locked result meanwhile leaves it up to date, if it was before."""
+    """Context manager: a locked result that is up to date still is after polcap has changed files in it."""
     known: dict[str, Any] = {}
     with suppress(OSError, ValueError, TypeError, KeyError):
         known = text_file.read_json(out / "work" / _FILE)

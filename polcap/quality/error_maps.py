@@ -93,7 +93,7 @@ def _diffuse_error(found: Evidence[ResultsUntilInfer]) -> Floats:
     """1σ of the diffuse albedo (H, W), mean of the channels, if chart and object had the same light."""
     maps, clipped = found.results.maps, _flagged(found, Quality.CLIPPED)
     albedo = np.maximum(maps.diffuse.mean(axis=-1), _DARKEST)
-    error = _ALBEDO[_is_analytic(maps)] * np.sqrt(albedo * np.minimum(maps.confidence, _MOST_DEG))
+    error = _ALBEDO[maps.estimator == "analytic"] * np.sqrt(albedo * np.minimum(maps.confidence, _MOST_DEG))
     if clipped.any():
         hidden = _ALBEDO_CLIPPED * clipped.sum() / maps.mask.sum()
         error = np.hypot(error, hidden * _share_around(clipped, maps.mask) * albedo)
@@ -104,10 +104,6 @@ def _roughness_error(maps: SurfaceMaps) -> Floats:
     """1σ of the roughness (H, W): that of the network's materials, or of the inversion."""
     error = _ROUGHNESS_OF_INVERSION if maps.roughness_error is None else maps.roughness_error
     return np.where(maps.mask, error, 0).astype(np.float32)
-
-
-def _is_analytic(maps: SurfaceMaps) -> bool:
-    return maps.estimator == "analytic"
 
 
 def _flagged(found: Evidence[ResultsUntilInfer], bit: Quality) -> Bools:

@@ -12,16 +12,7 @@ from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
 from polcap.optics.resize import block_means
 from polcap.quality import flatness, rim
-from polcap.quality.gate_values import (
-    MOST_DEG,
-    Evidence,
-    Gate,
-    State,
-    at_most,
-    lit,
-    sentence,
-    worded,
-)
+from polcap.quality.gate_values import MOST_DEG, Evidence, Gate, State, at_most, lit, sentence, worded
 from polcap.quality.limits import GateLimits
 from polcap.quality.rerendering import explains
 from polcap.quality.shot_order import is_confirmed

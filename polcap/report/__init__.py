@@ -99,14 +99,8 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
 
 
 def _frame_facts(frame: Frame, capture: Capture) -> dict[str, Any]:
-    exif = frame.exif
-    return {
-        "file": capture.file_name(frame),
-        "exposure_time": exif.exposure_time,
-        "iso": exif.iso,
-        "f_number": exif.f_number,
-        "digest": frame.digest,
-    }
+    stated = {name: getattr(frame.exif, name) for name in ("exposure_time", "iso", "f_number")}
+    return {"file": capture.file_name(frame), **stated, "digest": frame.digest}
 
 
 def judge(facts: Mapping[str, Any], results: Results, config: Config) -> tuple[list[Gate], Results]:
@@ -125,12 +119,13 @@ def document(
     """Assemble the content of report.json: facts of the run, figures, gates, computing time of each stage [s]."""
     measured = {**figures.measured(results), "rerendering": figures.rerendering(results, config.infer.ior)}
     chart = config.whitebalance.chart
+    expected = [gate.value for gate in judged if gate.name == "normal error" and isinstance(gate.value, float)]
     measured["chart"]["reference_sha256"] = chart_colors.digest(chart)
     return {
         "polcap": __version__,
         "versions": facts["versions"],
         "verdict": gates.verdict(judged),
-        "expected_error_deg": _expected_error_deg(judged),
+        "expected_error_deg": next(iter(expected), None),
         "capture": facts["capture"],
         "gates": msgspec.to_builtins(judged),
         "figures": measured,
@@ -163,12 +158,6 @@ def session_document(
         "gates": msgspec.to_builtins(judged),
         **others,
     }
-
-
-def _expected_error_deg(judged: Sequence[Gate]) -> float | None:
-    """Median of the expected error of the normals [°]; None where it was not measured."""
-    found = [gate.value for gate in judged if gate.name == "normal error" and isinstance(gate.value, float)]
-    return found[0] if found else None
 
 
 def model_facts(network: Network | None) -> dict[str, str] | None:

@@ -53,7 +53,7 @@ def render(points: TexturedPoints, ray: Floats, to_light: Floats, up: Floats, io
 
 def light(maps: SurfaceMaps, ior: float) -> list[Picture]:
     """Frames of the object lit by a distant light that moves once around the optical axis."""
-    sized = _Sized(maps, _SIDE)
+    sized = _ResizedMaps(maps, _SIDE)
     points, ray = sized.points(), frames.rays(sized.view, *sized.shape).astype(np.float32)
     drawn = []
     for turn in np.linspace(0, 2 * np.pi, FRAMES, endpoint=False):
@@ -65,7 +65,7 @@ def light(maps: SurfaceMaps, ior: float) -> list[Picture]:
 
 def turntable(maps: SurfaceMaps, mesh: ReliefMesh, ior: float) -> list[Picture]:
     """Frames of the surface rotated to both sides and back, under a fixed light near the camera."""
-    sized = _Sized(replace(maps, mask=maps.mask & np.isfinite(mesh.depth)), _SIDE)
+    sized = _ResizedMaps(replace(maps, mask=maps.mask & np.isfinite(mesh.depth)), _SIDE)
     surface, inside = sized.points(), sized.coverage > 0.5
     row, column = np.mgrid[: sized.shape[0], : sized.shape[1]].astype(np.float32)
     points = projection.back_project(sized.view, column, row) * sized.fit(mesh.depth)[..., None]  # (H, W, 3)
@@ -83,7 +83,7 @@ def turntable(maps: SurfaceMaps, mesh: ReliefMesh, ior: float) -> list[Picture]:
     return _to_srgb(drawn)
 
 
-class _Sized:
+class _ResizedMaps:
     """Maps of one view at the size of the base color, but with at most `longest` px a side.
 
     Values continue beyond the outline, whose pixels the object covers by `coverage` (H, W).

@@ -280,7 +280,7 @@ def _materials(roughness: Floats, both: Bools) -> NDArray[np.intp]:
 
 
 def _usual(name: str, value: Floats) -> float:
-    """The difference that is usual in a pair: the quarter that changed least is not of a change."""
+    """Usual difference in a pair, by its 25th percentile: at least a quarter of the object has not changed."""
     quarter = float(np.quantile(np.abs(value), 0.25)) if value.size else 0.0
     return min(_OVER_QUARTER * quarter, _LARGEST_DOUBT[name])
 

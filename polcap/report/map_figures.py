@@ -95,17 +95,17 @@ def _difference_note(rms: float | None, outliers: float | None) -> str:
 
 def scalar(name: str, title: str, note: str, value: Floats, inside: Bools, key: ColorKey) -> MapFigure:
     """Figure of a map with one number per pixel."""
-    probe = {name: getattr(key, name) for name in ("low", "high", "power", "palette", "unit", "digits")}
+    of_key = {name: getattr(key, name) for name in ("low", "high", "power", "palette", "unit", "digits")}
     palette = keys.colors(key.palette)
     near = dilate(inside, _BORDER_PX)
     image = html.indexed(key.level(fill_outward(value[..., None], inside)[..., 0], near), palette)
+    ticks = tuple((key.place(tick), f"{number(tick, 3)}{key.unit}") for tick in key.ticks)
+    colors = palette[:: keys.LEVELS // 17]
     if key.palette == "wheel":  # once around in 180°
         steps = [round(2 * k / _WHEEL_STEPS % 1 * keys.LEVELS) % keys.LEVELS for k in range(_WHEEL_STEPS)]
-        colors = css_colors(palette[steps])
-        return MapFigure(name, title, note, image, {"kind": "scalar", **probe}, colors, outline=matte(inside))
-    ticks = tuple((key.place(tick), f"{number(tick, 3)}{key.unit}") for tick in key.ticks)
-    bar = css_colors(palette[:: keys.LEVELS // 17])
-    return MapFigure(name, title, note, image, {"kind": "scalar", **probe}, bar, ticks, outline=matte(inside))
+        colors, ticks = palette[steps], ()
+    probe = {"kind": "scalar", **of_key}
+    return MapFigure(name, title, note, image, probe, css_colors(colors), ticks, outline=matte(inside))
 
 
 def normal(name: str, title: str, vectors: Floats, inside: Bools) -> MapFigure:

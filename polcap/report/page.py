@@ -105,7 +105,6 @@ def archived(text: str, about: Mapping[str, Any]) -> str:
 
 
 def _template(name: str) -> "Template":
-    """One of the HTML templates."""
     import jinja2  # not needed by most commands
 
     loader = jinja2.FileSystemLoader(Path(__file__).parent / "templates")
@@ -162,7 +161,7 @@ def gate_row(gate: Mapping[str, Any]) -> dict[str, str]:
 def _gate_number(gate: Mapping[str, Any], name: str) -> str:
     """Value or limit of a quality gate, with its unit."""
     value, unit = gate[name], gate.get("unit", "")
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
+    if isinstance(value, (int, float)):
         if unit == "1":
             value, unit = 100 * value, "%"
         shown = labels.number(value)

@@ -29,7 +29,7 @@ from polcap.errors import InputError
 from polcap.formats.capture import reader as captures
 from polcap.formats.raw import libraw, probe
 from polcap.image_values import Floats
-from polcap.pipeline import check, run
+from polcap.pipeline import check, models, run
 from polcap.pipeline.path import UserInput
 from polcap.quality.advice import advice
 from polcap.quality.gate_values import Gate
@@ -500,7 +500,7 @@ def report(rows: Rows) -> None:
 
 def main(folder: Path, rows: Rows, only: str, width: int) -> None:
     """Run all rows that the file lacks."""
-    networks = check.shipped_networks()
+    networks = models.load_networks()
     names = [*CAUSES, *(" + ".join(pair) for pair in PAIRS)]
     done = {name for (name,) in rows.done("name")}
     for name, seed in zip(names, itertools.cycle(range(1, 7))):

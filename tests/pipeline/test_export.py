@@ -61,15 +61,10 @@ def test_validator_finds_no_error_and_no_warning(exported: Path, preset: str) ->
 
 
 FACTS = {
-    "title": "Krug Ω",
-    "creator": "Frieda <F.>",
-    "rights": "© Museum",
-    "license": "https://creativecommons.org/licenses/by/4.0/",
-    "object_number": "1897.12",
-    "date": "um 1720",
-    "institution": "Haus Nord",
+    "title": "Krug Ω", "creator": "Frieda <F.>", "rights": "© Museum", "object_number": "1897.12",
+    "license": "https://creativecommons.org/licenses/by/4.0/", "date": "um 1720", "institution": "Haus Nord",
     "description": "Glasiert, mit Deckel",
-}
+}  # fmt: skip
 _UNNAMED = re.compile(  # files whose format has no place for facts, or that belong to a file which states them
     r".*\.stl|.*_sfp/(K\.txt|sfp\.mat|.*\.png)|.*_iiif/\w+/(info\.json|full/max/0/default\.jpg)|"
     r"archive/(color\.toml|manifest-sha256\.txt|maps/.*\.(exr|png))"
@@ -210,10 +205,7 @@ def test_a_wrong_name_makes_no_copy(tiny_result: Path, polcap: Command, tmp_path
         (["--obj", "--page", ROOT / "README.md"], "README.md is not model-viewer"),
         (["--iiif", "museum.example/7"], "--iiif museum.example/7 is no web address"),
         (["--iiif", "http://museum.example/7", "--texture-size", "512"], "leave out --texture-size"),
-        (
-            ["--iiif", "http://museum.example/7", "--preset", "unity"],
-            "and presets for engines",
-        ),
+        (["--iiif", "http://museum.example/7", "--preset", "unity"], "and presets for engines"),
         (["--exr", "--color", "ACEScq"], "--color ACEScq is not a color space or role"),
     ],
 )
@@ -365,11 +357,8 @@ def test_a_later_export_of_the_glb_removes_levels_that_polcap_wrote(own: Path) -
     pipeline.export(own, ExportRequest(formats=("obj",)))
     assert (asset / "capture_lod2.glb").exists() and len(levels.rows(own)) == 5
     pipeline.export(own, ExportRequest(formats=("gltf",), lod=1))
-    assert sorted(file.name for file in asset.glob("*_lod*")) == [
-        "capture_lod1.glb",
-        "capture_lod9.glb",
-        "mine_lod2.glb",
-    ]
+    left = sorted(file.name for file in asset.glob("*_lod*"))
+    assert left == ["capture_lod1.glb", "capture_lod9.glb", "mine_lod2.glb"]
     assert (asset / "web" / "capture_lod1.glb").exists() and len(levels.rows(own)) == 4
     pipeline.export(own, ExportRequest(formats=("gltf",)))
     assert not (asset / "capture_lod1.glb").exists() and len(levels.rows(own)) == 2

@@ -41,9 +41,7 @@ def test_without_findings_the_error_is_the_estimators_own(good: Seen) -> None:
     assert np.allclose(error[good.results.maps.mask], OWN) and not error[~good.results.maps.mask].any()
 
 
-def test_a_cost_without_a_place_counts_on_the_whole_object_and_costs_add_in_squares(
-    good: Seen,
-) -> None:
+def test_a_cost_without_a_place_counts_on_the_whole_object_and_costs_add_in_squares(good: Seen) -> None:
     error = errors(good, *(Gate(name, "warn", None, None, "", cost_deg=6.0) for name in ("gains", "source")))
     assert np.allclose(error[good.results.maps.mask], np.sqrt(OWN**2 + 2 * 6**2))
 
@@ -94,9 +92,7 @@ def test_exposures_that_differ_cost_in_these_pixels(good: Seen) -> None:
     assert np.allclose(error[square], np.hypot(OWN, 5)) and np.allclose(error[good.results.maps.mask & ~square], OWN)
 
 
-def test_an_assumed_focal_length_costs_more_away_from_the_middle_of_the_picture(
-    good: Seen,
-) -> None:
+def test_an_assumed_focal_length_costs_more_away_from_the_middle_of_the_picture(good: Seen) -> None:
     view, mask = good.results.maps.view, good.results.maps.mask
     error = errors(changed(good, focal_doubt=(-0.7, 0.7)), Gate("focal length", "warn", None, None, "", cost_deg=9.0))
     y, x = np.nonzero(mask)
