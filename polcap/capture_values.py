@@ -45,7 +45,7 @@ class Exif:
         """Exposure by the camera settings [s · ISO/100 / f-number²]; not valid under flash."""
         if self.exposure_time is None:
             return None
-        aperture = self.f_number if self.f_number else 1.0  # a lens without electronics reports 0
+        aperture = self.f_number or 1.0  # a lens without electronics reports 0
         return self.exposure_time * (self.iso or 100.0) / 100.0 / aperture**2
 
 

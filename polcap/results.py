@@ -86,7 +86,7 @@ class Results(ResultsUntilInfer):
 R = TypeVar("R", bound=FirstResults)
 FIELDS: dict[str, str] = {one.metadata["stage"]: one.name for one in fields(Results) if one.metadata}  # by stage
 STAGES = (*FIELDS, "asset")  # maps/ and mesh -> glTF textures and factors: `pipeline/asset_export.py`
-_KINDS: tuple[type[FirstResults], ...] = Results.__mro__[-2::-1]  # FirstResults … Results; the index is the number of stages
+_KINDS: tuple[type[FirstResults], ...] = Results.__mro__[-2::-1]  # by number of stages: FirstResults first
 
 
 def collect(values: Mapping[str, Any], keys: Mapping[str, str]) -> FirstResults:

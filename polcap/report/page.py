@@ -179,13 +179,12 @@ def _maps(about: Mapping[str, Any], results: Results) -> tuple[dict[str, Any], d
     bright = page_data.exposure(small)
     view, size = small.maps.view, small.maps.mask.shape[1::-1]
     photograph = page_data.photograph(results.radiance, results.color, view, size)
-    figures = about["figures"].get("rerendering") or rendered.residuals(small.maps.mask)
     drawn = {
         "photograph": html.jpeg(srgb_eight_bits(bright * photograph)),
         "flashed": html.jpeg(srgb_eight_bits(bright * rendered.scale * rendered.flashed)),
         "agreement": light_agreement(rendered),
         "maps": map_figures.of_result(small, results.mesh.metric),
-        "differences": map_figures.differences(small, rendered, figures),
+        "differences": map_figures.differences(small, rendered, about["figures"]["rerendering"]),
     }
     return drawn, {
         "size": list(size),
