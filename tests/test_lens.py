@@ -67,6 +67,4 @@ def test_stokes_are_those_of_a_pinhole(shot, tmp_path, monkeypatch):
         scale = np.median(found[both] / true[both])
         error[name] = float(np.abs(found / scale - true)[both].mean() / true[both].mean())
     assert overlap["pinhole"] > 0.93 > overlap["as seen"] + 0.03
-    assert (
-        error["pinhole"] < 0.06 and error["pinhole"] < 0.4 * error["as seen"]
-    )  # sums of unlike channels differ a little
+    assert error["pinhole"] < min(0.06, 0.4 * error["as seen"])  # sums of unlike channels differ a little

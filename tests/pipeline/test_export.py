@@ -164,10 +164,8 @@ def test_sidecar_knows_photographs_settings_and_files(exported: Path) -> None:
     assert recorded["versions"]["polcap"] == about["polcap"] and "numpy" in recorded["versions"]
     files = {file.name for file in (exported / "asset" / "archive").iterdir()}
     assert files - {"capture.provenance.json", "manifest-sha256.txt", "maps"} <= set(recorded["files"])
-    packet = document((exported / "asset/archive/capture.glb").read_bytes())["extensions"]["KHR_xmp_json_ld"][
-        "packets"
-    ][0]
-    assert json.loads(packet["polcap:settings"]) == about["settings"]
+    metadata = document((exported / "asset/archive/capture.glb").read_bytes())["extensions"]["KHR_xmp_json_ld"]
+    assert json.loads(metadata["packets"][0]["polcap:settings"]) == about["settings"]
 
 
 def test_exporting_again_gives_the_bytes_that_process_wrote(tiny: Path, tiny_result: Path, polcap: Command) -> None:
@@ -217,9 +215,8 @@ def test_what_does_not_exist_is_one_line(tiny_result: Path, polcap: Command, fla
 def test_relightable_layer_has_the_facts_of_the_catalog_and_is_in_the_sidecar(
     tiny_result: Path, polcap: Command
 ) -> None:
-    done = polcap(
-        "export", tiny_result, "--iiif", "http://localhost:8000/", "--about", "title=Vase", "--about", "creator=A. B."
-    )
+    facts = ("--about", "title=Vase", "--about", "creator=A. B.")
+    done = polcap("export", tiny_result, "--iiif", "http://localhost:8000/", *facts)
     assert done.returncode == 0, done.stderr
     manifest = json.loads((tiny_result / "asset/C_iiif/manifest.json").read_text())
     assert manifest["id"] == "http://localhost:8000/manifest.json" and manifest["label"] == {"none": ["Vase"]}
@@ -374,9 +371,8 @@ def test_the_report_lists_the_levels(own: Path) -> None:
 
 
 def test_exports_of_earlier_maps_are_named(own: Path, polcap: Command) -> None:
-    assert (
-        polcap("export", own, "--preset", "unreal", "--triangles", 99999, "--lod", 2, "--texture-size", 64).stderr == ""
-    )
+    first = polcap("export", own, "--preset", "unreal", "--triangles", 99999, "--lod", 2, "--texture-size", 64)
+    assert first.stderr == ""
     polcap("export", own, "--sfp")
     asset, about = own / "asset", json.loads((own / "report.json").read_text())
     assert asset_export.find_outdated(own, asset_export.sidecars(own), about["keys"]) == []
@@ -440,15 +436,14 @@ def test_an_archive_checks_itself_after_two_exports_and_a_copy(
     tiny_result: Path, polcap: Command, tmp_path: Path
 ) -> None:
     pytest.importorskip("pxr", reason="needs usd-core")
-    first = polcap(
-        "export", tiny_result, "--preset", "archive", "--about", "title=Vase", "--iiif", "https://museum.example/7"
-    )
+    to_archive = ("export", tiny_result, "--preset", "archive", "--about", "title=Vase")
+    first = polcap(*to_archive, "--iiif", "https://museum.example/7")
     assert first.returncode == 0, first.stderr
     names = check_sums(tiny_result / "asset/archive")
     assert {"maps/normal.exr", "maps/maps.json", "report.html", "report.json", "C.glb"} <= set(names)
     assert "C_iiif/manifest.json" in names and len([name for name in names if name.endswith("default.jpg")]) > 8
     assert ("color.toml" in names) == (tiny_result / "color.toml").exists()
-    second = polcap("export", tiny_result, "--preset", "archive", "--extra", "occlusion", "--about", "title=Vase")
+    second = polcap(*to_archive, "--extra", "occlusion")
     assert second.returncode == 0 and second.stderr == ""
     shutil.copytree(tiny_result / "asset/archive", tmp_path / "elsewhere")
     again = polcap("export", tmp_path / "elsewhere", "--out", tmp_path / "new", "--ply")

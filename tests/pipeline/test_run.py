@@ -238,9 +238,8 @@ def test_an_output_that_cannot_be_written_is_one_clear_line(
     monkeypatch.setattr(f"polcap.{part}", refuse)
     done = polcap("process", tiny / "C", "--out", tiny_result, *TINY, "--force", "asset")
     assert done.returncode == StorageError.exit_code
-    assert [line for line in done.stderr.splitlines() if "cannot write" in line] == [
-        "polcap: error: cannot write it: the disk is full"
-    ]
+    refused = [line for line in done.stderr.splitlines() if "cannot write" in line]
+    assert refused == ["polcap: error: cannot write it: the disk is full"]
     assert partial(tiny_result) == []
     without_exports = {"maps/maps.json": b""}  # it notes none then
     assert product(tiny_result) | without_exports == before | without_exports
