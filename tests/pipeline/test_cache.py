@@ -1,5 +1,6 @@
 """The promises of the stage cache, on toy stages."""
 
+import json
 import os
 import shutil
 import signal
@@ -331,6 +332,16 @@ def test_an_edited_manifest_is_noticed_and_computed_again(tmp_path: Path, old: s
     calls.clear()
     assert path(StageCache(tmp_path)).double.value.shift == (3.0, 0.0)
     assert calls == ["double", "passing"]
+
+
+@pytest.mark.parametrize("seconds", ["long", None, -1, {"a": 1}])
+def test_a_stage_whose_seconds_are_no_number_is_computed_again(tmp_path: Path, seconds: Any) -> None:
+    path(StageCache(tmp_path))
+    file = tmp_path / "work" / "01-double" / "manifest.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "seconds": seconds}))
+    assert [about["stage"] for about in contents(tmp_path)] == ["total"]  # for `polcap status`
+    path(StageCache(tmp_path))
+    assert calls == ["double", "passing", "total", "double", "passing"]
 
 
 @pytest.mark.parametrize(

@@ -34,16 +34,6 @@ def change(file: Path, edit: Callable[[Any], Any], sealed: bool = False) -> None
     file.write_text(json.dumps(about), encoding="utf-8")
 
 
-@pytest.mark.parametrize("seconds", ["long", None, -1, {"a": 1}])
-def test_a_stage_whose_seconds_are_no_number_is_computed_again(root: Path, polcap: Command, seconds: Any) -> None:
-    result = root / "C" / "polcap"
-    change(result / "work" / "03-align" / "manifest.json", lambda about: {**about, "seconds": seconds})
-    assert polcap("status", result).returncode == 0 and "align" not in polcap("status", result).stdout
-    done = polcap("report", result)
-    assert done.returncode == 2 and "03-align" in done.stderr and "run `polcap process`" in done.stderr
-    assert polcap("process", root / "C", *TINY).returncode in (0, 3) and polcap("report", result).returncode in (0, 3)
-
-
 def test_a_stage_with_another_number_of_inputs_is_of_another_polcap(root: Path, polcap: Command) -> None:
     result = root / "C" / "polcap"
     manifest = result / "work" / "05-selfcal" / "manifest.json"
