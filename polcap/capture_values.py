@@ -139,7 +139,7 @@ class Capture:
     size_px: tuple[int, int]  # width, height, visible RAW pixels
     chart_frames: tuple[Frame, ...] = ()
     notes: tuple[str, ...] = field(default=(), metadata=NOT_IN_KEY)  # on how the folder was read, one line each
-    focal_doubt: tuple[float, float] = field(default=(0.0, 0.0), metadata=NOT_IN_KEY)  # ln of bounds / focal_px
+    focal_doubt: tuple[float, float] = field(default=(0.0, 0.0), metadata=NOT_IN_KEY)  # ln of least, largest / focal_px
     calibration: Calibration | None = None  # of this camera, lens and filter, if measured
     crossed: Shot | None = None  # under a polarized flash; its angle is that of the lens's polarizer
     catalog: CatalogEntry = field(default=CatalogEntry(), metadata=NOT_IN_KEY)
