@@ -161,7 +161,7 @@ def _ambient_shared(shots: tuple[Shot, ...]) -> bool:
 
 
 def _stated_ratios(shots: tuple[Shot, ...], reference: int) -> Floats:
-    """Exposures (K, E) of all frames by their metadata, relative to frame `reference` of their shot."""
+    """Exposures (K, E) of all frames by their metadata, relative to the frame of index `reference` in their shot."""
     return np.array([[exposure.stated(frame, shot.frames[reference]) for frame in shot.frames] for shot in shots])
 
 

@@ -41,15 +41,15 @@ def measure(
     across = crossing.polarization_along(s1, s2, radiance.crossed.angle)
     inside = shots.mask & (shots.quality == 0) & sound
     share = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), _BLUR_PX)
-    whole, crossed = (
+    uncrossed, crossed = (
         cv2.GaussianBlur((part * inside[..., None]).astype(np.float32), (0, 0), _BLUR_PX)
         for part in (s0 - across**2 / np.maximum(s0, 1e-9), picture)
     )
-    some = inside & (share > 0.5) & (crossed.min(-1) > 0) & (whole.min(-1) > 0)
+    some = inside & (share > 0.5) & (crossed.min(-1) > 0) & (uncrossed.min(-1) > 0)
     bright = some & (crossed.sum(-1) > 0.2 * np.median(crossed.sum(-1)[some])) if some.any() else some
     if bright.sum() < _LEAST_PX:
         return None
-    ratio = np.log(whole[bright] / crossed[bright])  # (N, 3)
+    ratio = np.log(uncrossed[bright] / crossed[bright])  # (N, 3)
     return np.asarray(np.exp(np.median(ratio[_closest(ratio.mean(-1))], axis=0)))
 
 

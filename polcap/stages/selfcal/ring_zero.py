@@ -75,21 +75,22 @@ def by_outline(
     s0, s1, s2 = np.linalg.pinv(mueller.analyzer(angle)) @ smooth[:, inside & sound]
     seen = inside & sound
     lit = s0 > 0
-    seen[seen] = lit
+    seen[seen] = lit  # (H, W); its N pixels are those of the arrays below
     if not lit.any():
         return UNKNOWN
-    polarization = (s1[lit] + 1j * s2[lit]) / s0[lit]  # (N,), as everything below
+    polarization = (s1[lit] + 1j * s2[lit]) / s0[lit]  # (N,)
     strength = np.abs(polarization)
     weight = np.minimum(strength, outline.DOLP_CAP)
-    slope = np.sqrt(polarization / np.maximum(strength, 1e-9)) * weight  # along it or against it: half the angle
+    slope = np.sqrt(polarization / np.maximum(strength, 1e-9)) * weight  # half the angle; its sign is unknown
     outward = [_outward(mask, sigma) for sigma in (_RIM_PX, *(d * radius for d in _DEEPER))]
     outward.append(_outward(np.minimum(depth, _PLATEAU * radius), 2.0))
-    rim, *deeper = (_turn(slope, way[seen]) for way in outward)
+    rim, *deeper = (_turn(slope, gradient[seen]) for gradient in outward)  # rad
     scatter = float(np.sqrt(np.mean([(other - rim) ** 2 for other in deeper])))
     at_rim = outward[0][seen]
     length = np.abs(at_rim)
-    hidden = float(np.abs(outward[0][inside & ~seen]).sum())
+    hidden = float(np.abs(outward[0][inside & ~seen]).sum())  # share of the outline without light or with defects
     hidden /= max(hidden + float(length.sum()), 1e-9)
+    # 0 for an outline with all directions alike, whose turn does not depend on the gains
     lopsided = abs(complex((np.conj(at_rim) ** 2 / np.maximum(length, 1e-30)).sum()))
     lopsided /= max(float(length @ weight), 1e-9)
     sector = outline.sectors(seen)
