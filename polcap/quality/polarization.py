@@ -31,8 +31,8 @@ _WEAK_DOLP = 0.05  # of an outline: above, no shape counts as flattened
 _DIMMED = 0.9  # of the mean light: below, an outline turns away
 _MOST_ILL_POSED = 0.15  # of the object; gloss with shadows and thin parts reaches .12 (docs/benchmarks/gates.md)
 # agreement of the re-rendering from which a finding is false (docs/benchmarks/gates.md): of wax .30, under light from
-# around .48, without a polarizer .04
-_BODY_EXPLAINED, _UNPOLARIZED_EXPLAINED = 0.5, 0.1
+# around .27, without a polarizer .04
+_BODY_EXPLAINED, _UNPOLARIZED_EXPLAINED = 0.33, 0.1
 _ROUGH = 0.5  # roughness from which facets alone leave little polarization
 # What a finding adds to the expected error of the normals, by captures with known normals: docs/benchmarks/gates.md
 _UNPOLARIZED_DEG = 11.0
