@@ -34,9 +34,8 @@ class Comparison:
 @stage(version=2)
 def compare(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps) -> Comparison:
     """Compare each view with the fused mesh and its textures."""
-    return Comparison(
-        tuple(_agreement(view, one, atlas, maps) for view, one in zip(views, visible_texels(views, atlas)))
-    )
+    visible = visible_texels(views, atlas)
+    return Comparison(tuple(_agreement(view, texels, atlas, maps) for view, texels in zip(views, visible)))
 
 
 def _agreement(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: AtlasMaps) -> ViewAgreement:
@@ -53,7 +52,7 @@ def _agreement(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: Atl
 
 
 def render(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: AtlasMaps) -> Floats:
-    """S0 (M, 3) of the texels that a view sees, under its light; 1 on a white plane at the object's distance."""
+    """S0 (M, 3) of the texels that a view sees under a flash at the lens; 1: white plane at the object's distance."""
     rotation, translation = view.pose.rotation, view.pose.translation
     point = view.pose.to_camera(atlas.position[visible.texel])
     to_lens = frames.unit(-point)
@@ -62,8 +61,8 @@ def render(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: AtlasMa
         for part in (maps.normal, maps.diffuse, maps.specular, maps.roughness)
     )
     far = float(np.linalg.norm(rotation @ atlas.position.mean(axis=0) + translation))
-    light = irradiance(point, view.light[:2], 0.0) * far**2
-    to_light = frames.to_ray_frame(frames.unit(view.light - point), to_lens)
+    light = irradiance(point, np.zeros(2), 0.0) * far**2
+    to_light = frames.to_ray_frame(to_lens, to_lens)
     local = frames.to_ray_frame(normal @ rotation.T, to_lens)
     one, rough = np.ones(len(point)), np.maximum(roughness, 0.05)
     return np.asarray(shade.stokes(local, diffuse, specular, rough, _INDEX * one, to_light, light)[0])

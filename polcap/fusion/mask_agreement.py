@@ -54,13 +54,12 @@ class AgreedMasks:
 def agree(views: tuple[Silhouette, ...]) -> AgreedMasks:
     """Compare the masks of each set of views. The largest part of each stays; remains of the board are smaller.
 
-    Raises CaptureError: more than a third of the views of a set contradict the others, fewer than three are left, or
-    the masks have too little in common.
+    Raises CaptureError: as `compare_set`.
     """
     used, left_out = list[Silhouette](), dict[str, str]()
     for folder in dict.fromkeys(set_of_view(view.name) for view in views):
-        agreed, contradicting = compare_set([view for view in views if set_of_view(view.name) == folder])
-        used, left_out = used + agreed, left_out | contradicting
+        agreeing, reasons = compare_set([view for view in views if set_of_view(view.name) == folder])
+        used, left_out = used + agreeing, left_out | reasons
     masks = tuple(regions.nth_part(view.mask, 1) for view in used)
     return AgreedMasks(tuple(view.name for view in used), masks, left_out)
 
@@ -74,7 +73,7 @@ def compare_set(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str
     points, step = grid_around(views)
     used = _close_gaps(views, points, step)
     left_out: dict[str, str] = {}
-    inside = np.stack([view.inside(points, step) for view in used])  # (N, P)
+    inside = np.stack([view.shows(points, step) for view in used])  # (N, P)
     while True:
         shares = _uncovered(used, points[inside.all(axis=0)], step)
         worst, share = _find_contradicting(used, inside, points, step, shares)
@@ -97,7 +96,7 @@ def compare_set(views: Sequence[Silhouette]) -> tuple[list[Silhouette], dict[str
 
 def _close_gaps(views: Sequence[Silhouette], points: Floats, step: float) -> list[Silhouette]:
     """The views with slits and small holes of their masks closed where all other masks have a point in common."""
-    inside = np.stack([view.inside(points, step) for view in views])
+    inside = np.stack([view.shows(points, step) for view in views])
     votes = inside.sum(axis=0)
     out = []
     for view, own in zip(views, inside, strict=True):
@@ -105,8 +104,8 @@ def _close_gaps(views: Sequence[Silhouette], points: Floats, step: float) -> lis
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         framed = np.pad(view.mask.astype(np.uint8), reach)
         closed = fill_holes(cv2.morphologyEx(framed, cv2.MORPH_CLOSE, disc)[reach:-reach, reach:-reach], _HOLE)
-        solid = view.near(points[votes - own == len(views) - 1], step)
-        out.append(replace(view, mask=view.mask | closed & solid))
+        hull_of_others = points[votes - own == len(views) - 1]
+        out.append(replace(view, mask=view.mask | closed & view.covered(hull_of_others, step)))
     return out
 
 
@@ -122,7 +121,7 @@ def _uncovered(views: Sequence[Silhouette], hull: Floats, step: float) -> Floats
     """Share (N,) of each view's mask that the hull's points (P, 3) do not cover, on a grid as coarse as the hull's."""
     shares = []
     for view in views:
-        mask, covered = view.covered(hull, step)
+        mask, covered = view.coarse(hull, step)
         shares.append(float((mask & ~covered).sum() / max(mask.sum(), 1)))
     return np.array(shares)
 
@@ -151,5 +150,5 @@ def _trim(views: Sequence[Silhouette], hull: Floats, step: float) -> list[Silhou
     fine, half = halve(hull, step)
     fine = fine[fine[:, 1] > -half]  # the board is y = 0
     for view in views:
-        fine = fine[view.inside(fine, half)]
-    return [replace(view, mask=view.mask & view.near(fine, half)) for view in views]
+        fine = fine[view.shows(fine, half)]
+    return [replace(view, mask=view.mask & view.covered(fine, half)) for view in views]

@@ -118,7 +118,7 @@ def _collect_samples(
         point = view.pose.to_camera(atlas.position[texel])
         local = frames.to_ray_frame(normal[texel] @ view.pose.rotation.T, frames.unit(-point))
         distance = float(np.linalg.norm(view.pose.rotation @ middle + view.pose.translation))
-        light = irradiance(point, view.light[:2], 0.0) * (distance * (view.white_distance or 1)) ** 2
+        light = irradiance(point, np.zeros(2), 0.0) * (distance * (view.white_distance or 1)) ** 2
         radiance = color.luminance(texels.sample(view.s0))[use] / light
         parts.append((radiance, albedo[texel], local, point, texels.weight[use], texel))
     radiance, base, local, point, weight, texel = (np.concatenate(column) for column in zip(*parts))

@@ -37,32 +37,30 @@ class Silhouette:
         """Size in the mask of a step [m] at the board's distance, px."""
         return step * self.camera.focal_px / self.distance
 
-    def inside(self, points: Floats, step: float) -> Bools:
-        """Points (P,) whose cells of size `step` [m] touch the mask; outside the picture there is no object."""
-        reach = max(round(0.9 * self.cell_px(step)), 1)
+    def shows(self, points: Floats, step: float) -> Bools:
+        """Whether cells of size `step` [m] around points (P, 3) touch the mask; no object is outside the picture."""
+        reach = max(round(0.9 * self.cell_px(step)), 1)  # half the diagonal of a cell, about
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-        framed = np.pad(self.mask.astype(np.uint8), reach + 1)
-        grown = cv2.dilate(framed, disc)
+        grown = cv2.dilate(np.pad(self.mask.astype(np.uint8), reach + 1), disc)
         x, y = np.rint(self.camera.project(self.pose, points) + reach + 1).astype(int).T
         height, width = grown.shape
         within = (x >= 0) & (y >= 0) & (x < width) & (y < height)
         return np.asarray(within & (grown[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] > 0))
 
-    def covered(self, points: Floats, step: float) -> tuple[Bools, Bools]:
-        """Mask (h, w) reduced to pixels as wide as a cell, and the pixels (h, w) that points (P, 3) cover."""
-        coarse = max(self.cell_px(step), 1.0)
-        height, width = (int(np.ceil(side / coarse)) for side in self.mask.shape)
+    def coarse(self, points: Floats, step: float) -> tuple[Bools, Bools]:
+        """Mask (h, w) reduced to pixels as wide as a cell, and those of these pixels that points (P, 3) cover."""
+        cell_px = max(self.cell_px(step), 1.0)
+        height, width = (int(np.ceil(side / cell_px)) for side in self.mask.shape)
         mask = area_mean(self.mask, (height, width)) > 0.5
-        x, y = np.rint((self.camera.project(self.pose, points) + 0.5) / coarse - 0.5).astype(int).T
+        x, y = np.rint((self.camera.project(self.pose, points) + 0.5) / cell_px - 0.5).astype(int).T
         within = (x >= 0) & (y >= 0) & (x < width) & (y < height)
         covered = np.zeros((height, width), np.uint8)
         covered[y[within], x[within]] = 1
         return mask, cv2.dilate(covered, np.ones((3, 3), np.uint8)) > 0
 
-    def near(self, points: Floats, step: float) -> Bools:
-        """Pixels (H, W) of the picture that the points cover."""
-        height, width = self.mask.shape
-        covered = self.covered(points, step)[1].astype(np.uint8)
+    def covered(self, points: Floats, step: float) -> Bools:
+        """Pixels (H, W) of the mask that the points cover."""
+        covered, (height, width) = self.coarse(points, step)[1].astype(np.uint8), self.mask.shape
         return np.asarray(cv2.resize(covered, (width, height), interpolation=cv2.INTER_NEAREST) > 0)
 
 
@@ -71,9 +69,9 @@ def grid_around(views: Sequence[Silhouette]) -> tuple[Floats, float]:
     reach = max(_extent(view) for view in views)
     low, high = np.array([-reach, -0.2 * reach, -reach]), np.array([reach, 2 * reach, reach])
     points, step = _grid(low, high, _COARSE)
-    seen = np.mean([view.inside(points, step) for view in views], axis=0)
-    there = points[seen >= max(0.5, 0.8 * seen.max())]
-    return _grid(there.min(axis=0) - step, there.max(axis=0) + step, _GRID)
+    share = np.mean([view.shows(points, step) for view in views], axis=0)
+    object_ = points[share >= max(0.5, 0.8 * share.max())]  # single masks may lack a part
+    return _grid(object_.min(axis=0) - step, object_.max(axis=0) + step, _GRID)
 
 
 def _grid(low: Floats, high: Floats, count: int) -> tuple[Floats, float]:

@@ -38,14 +38,13 @@ class FusionView:
     name: str
     pose: Pose
     view: View  # pinhole camera of the maps' grid
-    light: Floats  # (3,) position of the flash in the camera frame, m
     mask: Bools  # (H, W)
     normal: Floats  # (H, W, 3) unit, camera frame
     sigma_deg: Floats  # (H, W) expected error of the normals
     diffuse: Floats  # (H, W, 3) albedo, linear Rec.709
     specular: Floats  # (H, W, 3) F0
     roughness: Floats  # (H, W) perceptual
-    s0: Floats | None = None  # (H, W, 3) white-balanced radiance under the flash; for highlights and residuals
+    s0: Floats | None = None  # (H, W, 3) white-balanced radiance under the flash at the lens
     white_distance: float | None = None  # where a white plane has S0 = 1, over the object's distance; None: unknown
     metric: bool = True  # the pose is in metres; else its unit is the distance of the lens
 

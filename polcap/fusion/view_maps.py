@@ -1,7 +1,5 @@
 """Maps of a processed view as the fusion needs them: free of lens distortion, for the camera of the whole session."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 
@@ -29,24 +27,21 @@ def fusion_view(
     lens = Distortion(view.focal, view.center, camera.k1, camera.k2)
     source_x, source_y = (x, y) if undistorted else distortion.distort(lens, x, y)
     normal = _turn_normals(maps.normal, maps.view, view, (source_x, source_y))
-    found = FusionView(
-        name=name,
-        pose=pose,
-        view=view,
-        light=np.zeros(3),
-        mask=np.asarray(maps.mask),
-        normal=normal,
-        sigma_deg=np.asarray(maps.confidence, np.float32),
-        diffuse=np.asarray(maps.diffuse, np.float32),
-        specular=np.asarray(maps.specular, np.float32),
-        roughness=np.asarray(maps.roughness, np.float32),
-        s0=np.asarray(results.cues.radiance, np.float32),
-        white_distance=scale.surface_distance(maps.mask, maps.view) if scale.is_known(results.color) else None,
-        metric=metric,
+    mask, s0 = np.asarray(maps.mask), np.asarray(results.cues.radiance, np.float32)
+    others = [np.asarray(one, np.float32) for one in (maps.confidence, maps.diffuse, maps.specular, maps.roughness)]
+    if max(np.abs(source_x - x).max(), np.abs(source_y - y).max()) >= _LEAST_SHIFT_PX:
+        source = source_x.astype(np.float32), source_y.astype(np.float32)
+
+        def resample(image: Floats) -> Floats:
+            return np.asarray(cv2.remap(image, *source, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+        mask = cv2.remap(mask.astype(np.float32), *source, cv2.INTER_LINEAR) > 0.5
+        normal, s0, others = frames.unit(resample(normal)), resample(s0), [resample(one) for one in others]
+    white_distance = scale.surface_distance(maps.mask, maps.view) if scale.is_known(results.color) else None
+    sigma_deg, diffuse, specular, roughness = others
+    return FusionView(
+        name, pose, view, mask, normal, sigma_deg, diffuse, specular, roughness, s0, white_distance, metric
     )
-    if max(np.abs(source_x - x).max(), np.abs(source_y - y).max()) < _LEAST_SHIFT_PX:
-        return found
-    return _resample(found, source_x.astype(np.float32), source_y.astype(np.float32))
 
 
 def on_grid(camera: SessionCamera, grid: View) -> View:
@@ -61,26 +56,7 @@ def _turn_normals(normal: Floats, before: View, after: View, source: tuple[Float
     The normal of a pixel turns with the pixel's ray.
     """
     height, width = normal.shape[:2]
-    lens_x, lens_y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
-    moved = lens_x - (source[0] - lens_x), lens_y - (source[1] - lens_y)  # pinhole pixel that appears at each pixel
+    x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+    pinhole = x - (source[0] - x), y - (source[1] - y)  # pixel of the undistorted picture that appears at each pixel
     local = frames.to_ray_frame(np.asarray(normal, np.float64), frames.rays(before, height, width))
-    return np.asarray(frames.from_ray_frame(local, frames.rays_at(after, *moved)), np.float32)
-
-
-def _resample(view: FusionView, x: Floats, y: Floats) -> FusionView:
-    """The view with pixels from the places x, y (H, W)."""
-
-    def linear(image: Floats) -> Floats:
-        return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-
-    mask = cv2.remap(view.mask.astype(np.float32), x, y, cv2.INTER_LINEAR) > 0.5
-    return replace(
-        view,
-        mask=mask,
-        normal=frames.unit(linear(view.normal)),
-        sigma_deg=linear(view.sigma_deg),
-        diffuse=linear(view.diffuse),
-        specular=linear(view.specular),
-        roughness=linear(view.roughness),
-        s0=None if view.s0 is None else linear(view.s0),
-    )
+    return np.asarray(frames.from_ray_frame(local, frames.rays_at(after, *pinhole)), np.float32)

@@ -13,7 +13,7 @@ from polcap.optics.board import SQUARES, Board
 from polcap.stages import stage
 
 _REACH_PX, _STEPS = 4.0, 33  # of the profile across an edge, at most
-_BESIDE = 0.11  # squares from an edge, up to which both sides are even
+_EVEN = 0.11  # squares from an edge, up to which both sides are even
 _MOST_OVER, _MOST_RATIO = 0.5, 1.6  # largest blur of a view: px above that of the median view, and times it
 
 
@@ -35,8 +35,8 @@ def measure(views: tuple[PosedStokes, ...], board: Board) -> BoardSight:
 def left_out(names: tuple[str, ...], sight: BoardSight) -> dict[str, str]:
     """Reasons for the views with too little paper, and for those much less sharp than the others, by name."""
     blur = sight.blur
-    known = [one for one in blur if np.isfinite(one)]
-    middle = float(np.median(known)) if known else float("inf")
+    finite = [one for one in blur if np.isfinite(one)]
+    middle = float(np.median(finite)) if finite else float("inf")
     limit = max(middle + _MOST_OVER, _MOST_RATIO * middle)
     few = {
         name: f"{count} points of the board's paper are usable, {flash_light.LEAST_POINTS} are needed; show the whole "
@@ -59,22 +59,22 @@ def _blur(view: PosedStokes, board: Board) -> float:
     step = 1e-4  # m
     ends = [np.stack(view.pixels(edge + sign * step * across), axis=-1) for sign in (-1, 1)]
     scale = np.linalg.norm(ends[1] - ends[0], axis=-1) / (2 * step)  # px per m
-    reach = min(_REACH_PX, _BESIDE * board.square_m * float(np.quantile(scale, 0.1)))
+    reach = min(_REACH_PX, _EVEN * board.square_m * float(np.quantile(scale, 0.1)))
     t = np.linspace(-reach, reach, _STEPS)
     place = edge[:, None] + across[:, None] * (t / scale[:, None])[..., None]
     x, y = (a.astype(np.float32) for a in view.pixels(place))
     height, width = view.stokes.mask.shape
     inside = ((x > 0) & (y > 0) & (x < width - 1) & (y < height - 1)).all(axis=1)
-    if inside.sum() == 0:
+    if not inside.any():
         return float("nan")
     gray = np.asarray(view.stokes.stokes[0] @ flash_light.gray(view.matrix), np.float32)
     profile = cv2.remap(gray, x[inside], y[inside], cv2.INTER_LINEAR)
     low, high = profile[:, :4].mean(axis=1), profile[:, -4:].mean(axis=1)
     contrast = high - low
     clear = contrast > 0.5 * np.median(contrast)  # the chart hides some
-    rise = np.diff(((profile - low[:, None]) / np.maximum(contrast, 1e-6)[:, None])[clear].mean(axis=0))
-    at, weight = (t[1:] + t[:-1]) / 2, np.maximum(rise, 0)
-    middle = float((weight * at).sum() / weight.sum())
+    edge_profile = ((profile - low[:, None]) / np.maximum(contrast, 1e-6)[:, None])[clear].mean(axis=0)
+    at, weight = (t[1:] + t[:-1]) / 2, np.maximum(np.diff(edge_profile), 0)
+    middle = (weight * at).sum() / weight.sum()
     return float(np.sqrt((weight * (at - middle) ** 2).sum() / weight.sum()))
 
 

@@ -20,9 +20,9 @@ from scipy.sparse.linalg import spsolve
 from polcap.image_values import ArrayValue, Floats
 from polcap.material import flash_light, texel_grid, texel_stokes
 from polcap.material.stokes_view import PosedStokes
-from polcap.material.texel_fit import SLOPES, FitSettings, Measurements, TexelEstimate, TexelPrior, fit, start
+from polcap.material.texel_fit import SLOPES, FitSettings, TexelEstimate, TexelPrior, fit, start
 from polcap.material.texel_grid import FlashLight, TexelGrid
-from polcap.material.texel_stokes import TexelStokes, resample
+from polcap.material.texel_stokes import TexelStokes, measurements, resample
 from polcap.optics import body
 from polcap.stages import stage
 
@@ -59,18 +59,16 @@ def solve(views: tuple[PosedStokes, ...], light: FlashLight, grid: TexelGrid, se
     """Height on the fine grid, interpolated from coarse texels."""
     step = max(1, round(max(grid.size) / _COARSE))
     coarse = grid.coarser(step)
-    middle = _plane(views, grid, step)
-    height = np.full(coarse.size[::-1], middle)
+    height = np.full(coarse.size[::-1], _find_plane(views, grid, step))
     for number in range(_ROUNDS):
         fine = _enlarge(height, grid, step)
         seen = resample(views, light, grid, fine, step)
         estimate = _fit(seen, views, light, coarse, height)
-        delta = coarse.texel
-        raised = resample(views, light, grid, fine + delta, step)
-        update, weight = _parallax(seen, raised, estimate, delta, settings)
-        stereo = height + np.clip(update, -_MOST_STEP * delta, _MOST_STEP * delta)
+        raised = resample(views, light, grid, fine + coarse.texel, step)
+        change, weight = _parallax(seen, raised, estimate, coarse.texel, settings)
+        stereo = height + np.clip(change, -_MOST_STEP * coarse.texel, _MOST_STEP * coarse.texel)
         slope = estimate.value[:, SLOPES].reshape(*height.shape, 2)
-        reach = np.inf if number == 0 else CROSSOVER / step  # slopes of misplaced views are wrong
+        reach = None if number == 0 else CROSSOVER / step  # slopes of misplaced views are wrong
         height = _join(stereo, weight, slope, coarse.texel, reach)
     sigma = 1 / np.sqrt(np.maximum(weight, 1e-30))
     return CoarseRelief(_enlarge(height, grid, step), _enlarge(np.minimum(sigma, 1.0), grid, step))
@@ -86,7 +84,7 @@ def _enlarge(image: Floats, grid: TexelGrid, step: int) -> Floats:
     return np.asarray(cv2.remap(smooth, across, down, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
 
 
-def _plane(views: tuple[PosedStokes, ...], grid: TexelGrid, step: int) -> float:
+def _find_plane(views: tuple[PosedStokes, ...], grid: TexelGrid, step: int) -> float:
     """Mean height [m] over the board on which the textures of all views agree best."""
     coarse = grid.coarser(step)
     pictures = [_picture(view, step) for view in views]
@@ -96,13 +94,13 @@ def _plane(views: tuple[PosedStokes, ...], grid: TexelGrid, step: int) -> float:
         detail = np.stack([_detail(view, one, point) for view, one in zip(views, pictures, strict=True)])
         return float(np.median((detail - np.median(detail, axis=0)) ** 2, axis=0).mean() + 1e-12)
 
-    spacing = coarse.texel
-    trial = np.arange(_LOWEST_M, _THICKEST_M + spacing, spacing)
-    cost = np.array([disagreement(height) for height in trial])
-    best = int(np.clip(cost.argmin(), 1, len(trial) - 2))
-    low, mid, high = cost[best - 1 : best + 2]
-    bend = low - 2 * mid + high
-    return float(trial[best] + spacing * (np.clip((low - high) / (2 * bend), -1, 1) if bend > 0 else 0.0))
+    heights = np.arange(_LOWEST_M, _THICKEST_M + coarse.texel, coarse.texel)
+    cost = np.array([disagreement(height) for height in heights])
+    best = int(np.clip(cost.argmin(), 1, len(heights) - 2))
+    before, least, after = cost[best - 1 : best + 2]
+    bend = before - 2 * least + after
+    vertex = np.clip((before - after) / (2 * bend), -1, 1) if bend > 0 else 0.0  # of a parabola, in steps
+    return float(heights[best] + coarse.texel * vertex)
 
 
 def _picture(view: PosedStokes, step: int) -> Floats:
@@ -131,52 +129,43 @@ def _fit(
     return fit(data, geometry, prior, first, body.SMOOTH, FitSettings())
 
 
-def measurements(seen: TexelStokes, views: Sequence[PosedStokes]) -> Measurements:
-    """The data of all texels, in one row."""
-    parts = (seen.radiance, seen.polarized, seen.noise)
-    radiance, polarized, noise = (one.reshape(len(one), -1, one.shape[-1]) for one in parts)
-    return Measurements(radiance, polarized, noise, flash_light.gray_of_colors(views[0].matrix))
-
-
 def _parallax(
-    seen: TexelStokes, raised: TexelStokes, estimate: TexelEstimate, delta: float, settings: ReliefSettings
+    seen: TexelStokes, raised: TexelStokes, estimate: TexelEstimate, lift: float, settings: ReliefSettings
 ) -> tuple[Floats, Floats]:
-    """Change (H, W) [m] of the height that makes all views agree, and its inverse variance."""
-    shape = seen.noise.shape[1:3]
+    """Change (H, W) [m] of the height that makes all views agree, and its inverse variance.
+
+    `raised` are the views at heights that are greater by `lift` [m]: they give the derivative of the radiance.
+    """
     known = np.isfinite(seen.noise[..., 0]) & np.isfinite(raised.noise[..., 0])
     here, above = (one.radiance.mean(axis=-1) for one in (seen, raised))
-    model = estimate.model.reshape(-1, *shape)
+    model = estimate.model.reshape(here.shape)
     level = np.maximum(model, 1e-3)
-    slope = np.where(known, (above - here) / level / delta, 0)
-    count = np.maximum(known.sum(axis=0), 1)
-    slope = np.where(known, slope - slope.sum(axis=0) / count, 0)  # albedo absorbs what is common to the views
+    derivative = np.where(known, (above - here) / level / lift, 0)
+    common = derivative.sum(axis=0) / np.maximum(known.sum(axis=0), 1)  # to all views: a change of the albedo
+    derivative = np.where(known, derivative - common, 0)
     error = np.where(known, np.clip((model - here) / level, -0.5, 0.5), 0)
-    sums = [cv2.GaussianBlur((slope * part).sum(axis=0), (0, 0), _WINDOW) for part in (error, slope)]
-    area = 4 * np.pi * _WINDOW**2
-    weight = sums[1] * area / settings.parallax_error**2
-    return np.asarray(sums[0] / np.maximum(sums[1], 1e-12)), np.asarray(weight)
+    right, square = (cv2.GaussianBlur((derivative * part).sum(axis=0), (0, 0), _WINDOW) for part in (error, derivative))
+    weight = square * (4 * np.pi * _WINDOW**2) / settings.parallax_error**2
+    return np.asarray(right / np.maximum(square, 1e-12)), np.asarray(weight)
 
 
-def _join(stereo: Floats, weight: Floats, slope: Floats, texel: float, reach: float) -> Floats:
+def _join(stereo: Floats, weight: Floats, slope: Floats, texel: float, reach: float | None) -> Floats:
     """Height (H, W) [m] by least squares: near `stereo` by its inverse variance, with slopes (H, W, 2).
 
-    Over less than about `reach` texels the slopes alone give the height.
+    Over less than about `reach` texels the slopes alone give the height; None: by the variances everywhere.
     """
-    height, width = stereo.shape
-    number = np.arange(height * width).reshape(height, width)
-    across = number[:, :-1].ravel(), number[:, 1:].ravel()
-    up = number[1:].ravel(), number[:-1].ravel()  # rows run down
-    rise = np.concatenate(
-        [(slope[:, :-1, 0] + slope[:, 1:, 0]).ravel(), (slope[1:, :, 1] + slope[:-1, :, 1]).ravel()]
-    ) * (texel / 2)
-    first, second = (np.concatenate(ends) for ends in zip(across, up, strict=True))
+    number = np.arange(stereo.size).reshape(stereo.shape)
+    first = np.concatenate([number[:, :-1].ravel(), number[1:].ravel()])  # rows run down, slopes up
+    second = np.concatenate([number[:, 1:].ravel(), number[:-1].ravel()])
+    across, up = slope[:, :-1, 0] + slope[:, 1:, 0], slope[1:, :, 1] + slope[:-1, :, 1]
+    rise = np.concatenate([across.ravel(), up.ravel()]) * (texel / 2)  # from the first to the second texel
     count = len(first)
-    rows = np.repeat(np.arange(count), 2)
-    columns = np.stack([first, second], axis=-1).ravel()
-    links: Any = sparse.csr_matrix((np.tile([-1.0, 1.0], count), (rows, columns)), (count, number.size))
-    tie = 1 / (_SLOPE_ERROR * texel) ** 2
-    own = weight.ravel() / (2 * np.pi * _WINDOW**2) + tie * 1e-8  # windows overlap
-    own = np.minimum(own, tie / reach**2) if np.isfinite(reach) else own
-    system = tie * (links.T @ links) + sparse.diags(own)
-    right = tie * (links.T @ rise) + own * stereo.ravel()
-    return np.asarray(spsolve(system.tocsc(), right)).reshape(height, width)
+    ends = np.repeat(np.arange(count), 2), np.stack([first, second], axis=-1).ravel()
+    differences: Any = sparse.csr_matrix((np.tile([-1.0, 1.0], count), ends), (count, number.size))
+    slope_weight = 1 / (_SLOPE_ERROR * texel) ** 2
+    own = weight.ravel() / (2 * np.pi * _WINDOW**2) + slope_weight * 1e-8  # windows overlap
+    if reach is not None:
+        own = np.minimum(own, slope_weight / reach**2)
+    system = slope_weight * (differences.T @ differences) + sparse.diags(own)
+    right = slope_weight * (differences.T @ rise) + own * stereo.ravel()
+    return np.asarray(spsolve(system.tocsc(), right)).reshape(stereo.shape)

@@ -35,10 +35,11 @@ _ROUNDS, _OUTLIER = 3, 4.0  # of the fit; robust standard deviations
 _SCATTER = 0.02  # of paper about Lambert's law
 _USABLE = ~np.uint8(Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST | Quality.DARK)
 PAPER = 0.8  # albedo of matt paper, for sessions without a chart
-_SHARE_SIGMA = 0.1  # of the highlight: F0 over the paper's albedo
+_SHARE_SIGMA = 0.1  # of s: F0 over the paper's albedo
 _GLOSS = (0.2, 0.4, 0.7)  # roughness tried first
-_LOW, _HIGH = [-0.5, -0.5, -0.5, 0.0, 0.08], [0.5, 0.5, 0.5, 0.3, 1.0]  # of the flash's place, s and roughness
-_STEP = [0.01, 0.01, 0.01, 0.01, 0.05]  # of the same, scales of the search
+_PLACE, _SHARE, _ROUGHNESS = slice(0, 3), 3, 4  # of the flash [m], s, and of the highlight in a law (5,) of the paper
+_LOW, _HIGH = [-0.5, -0.5, -0.5, 0.0, 0.08], [0.5, 0.5, 0.5, 0.3, 1.0]  # of a law
+_STEP = [0.01, 0.01, 0.01, 0.01, 0.05]  # scales of the search for a law
 
 
 @dataclass(frozen=True)
@@ -56,26 +57,26 @@ def measure(views: tuple[PosedStokes, ...], chart: ChartInView | None, board: Bo
     Each view must show `LEAST_POINTS` points of the paper or more.
     """
     samples = [paper(view, board) for view in views]
-    keep = [np.ones(len(one.radiance), bool) for one in samples]
-    trials = [np.array([0.0, 0.0, 0.0, 0.02, rough]) for rough in _GLOSS]  # place [m], share and roughness of the gloss
+    used = [np.ones(len(one.radiance), bool) for one in samples]
+    starts = [np.array([0.0, 0.0, 0.0, 0.02, rough]) for rough in _GLOSS]
     for _ in range(_ROUNDS):
-        law = _fit(samples, keep, trials)
-        trials, error = [law], [_log_error(one, law) for one in samples]
-        middle = [float(np.median(e[used])) for e, used in zip(error, keep, strict=True)]
-        spread = 1.48 * np.median(np.abs(np.concatenate([e - m for e, m in zip(error, middle, strict=True)])))
-        keep = [np.abs(e - m) < _OUTLIER * spread for e, m in zip(error, middle, strict=True)]
-    level = np.exp([float(e[used].mean()) for e, used in zip(error, keep, strict=True)])  # c_k
-    rest = np.concatenate([(e - np.log(c))[used] for e, c, used in zip(error, level, keep, strict=True)])
-    place, shine = law[:3], max(float(_highlight(one, law).max()) for one in samples)
-    albedo = PAPER if chart is None else float(level[chart.view] * _chart_irradiance(views[chart.view], chart, place))
-    matrix = np.stack([_shot_matrix(view, one, k) for view, one, k in zip(views, samples, keep, strict=True)])
+        law = _fit(samples, used, starts)
+        starts, errors = [law], [_log_error(one, law) for one in samples]
+        errors = [error - float(np.median(error[use])) for error, use in zip(errors, used, strict=True)]
+        spread = 1.48 * np.median(np.abs(np.concatenate(errors)))
+        used = [np.abs(error) < _OUTLIER * spread for error in errors]
+    logs = [_log_error(one, law)[use] for one, use in zip(samples, used, strict=True)]
+    energy = np.exp([float(log.mean()) for log in logs])  # c_k
+    rest = np.concatenate([log - np.log(c) for log, c in zip(logs, energy, strict=True)])
+    place = law[_PLACE]
+    albedo = PAPER if chart is None else float(energy[chart.view] * _chart_irradiance(views[chart.view], chart, place))
     return FlashLight(
         place=place,
-        gain=level / albedo,
-        shot_matrix=matrix,
+        gain=energy / albedo,
+        shot_matrix=np.stack([_shot_matrix(*one) for one in zip(views, samples, used, strict=True)]),
         sigma=float(rest.std()),
         paper=albedo,
-        shine=shine,
+        shine=max(float(_highlight(one, law).max()) for one in samples),
     )
 
 
@@ -135,18 +136,18 @@ def _paper_points(board: Board, margin: float) -> Floats:
 
 def _log_error(samples: PaperSamples, law: Floats) -> Floats:
     """ln (M,) of the radiance over its law, without c_k."""
-    light = _irradiance(samples.point, samples.normal, law[:3]) * (1 + _highlight(samples, law))
+    light = _irradiance(samples.point, samples.normal, law[_PLACE]) * (1 + _highlight(samples, law))
     return np.asarray(np.log(samples.radiance / light))
 
 
 def _highlight(samples: PaperSamples, law: Floats) -> Floats:
-    """Highlight s L (M,) over the diffuse light, for the flash's place, s and the roughness in `law` (5,)."""
-    to_light, ray = frames.unit(law[:3] - samples.point), frames.unit(-samples.point)
+    """Highlight s L (M,) over the diffuse light."""
+    to_light, ray = frames.unit(law[_PLACE] - samples.point), frames.unit(-samples.point)
     half = frames.unit(to_light + ray)
     cos_i, cos_o, cos_h = (np.clip(one @ samples.normal, 1e-3, 1.0) for one in (to_light, ray, half))
-    alpha = law[4] ** 2
+    alpha = law[_ROUGHNESS] ** 2
     facets = np.pi * brdf.ggx_distribution(cos_h, alpha) * brdf.smith_masking(cos_i, cos_o, alpha)
-    return np.asarray(law[3] * facets / (4 * cos_i * cos_o))
+    return np.asarray(law[_SHARE] * facets / (4 * cos_i * cos_o))
 
 
 def _irradiance(point: Floats, normal: Floats, place: Floats) -> Floats:
@@ -156,17 +157,18 @@ def _irradiance(point: Floats, normal: Floats, place: Floats) -> Floats:
     return np.asarray(np.maximum(towards @ normal, 1e-6) / squared**1.5)
 
 
-def _fit(samples: Sequence[PaperSamples], keep: Sequence[Bools], starts: Sequence[Floats]) -> Floats:
-    """Place [m] of the flash, share and roughness of the paper's highlight (5,), with the least scatter."""
-    some = [
-        one.take(np.flatnonzero(k)[:: max(1, int(k.sum()) // _FITTED)]) for one, k in zip(samples, keep, strict=True)
-    ]
+def _fit(samples: Sequence[PaperSamples], used: Sequence[Bools], starts: Sequence[Floats]) -> Floats:
+    """Law (5,) of the paper with the least scatter."""
+    some = []
+    for one, use in zip(samples, used, strict=True):
+        index = np.flatnonzero(use)
+        some.append(one.take(index[:: max(1, len(index) // _FITTED)]))
 
     def residuals(law: Floats) -> Floats:
-        parts = [_log_error(one, law) for one in some]
+        errors = [_log_error(one, law) for one in some]
         # each view counts as LEAST_POINTS points
-        scatter = [(part - np.median(part)) / _SCATTER / np.sqrt(len(part) / LEAST_POINTS) for part in parts]
-        return np.concatenate([*scatter, law[:3] / _FLASH_SIGMA_M, law[3:4] / _SHARE_SIGMA])
+        scatter = [(error - np.median(error)) / _SCATTER / np.sqrt(len(error) / LEAST_POINTS) for error in errors]
+        return np.concatenate([*scatter, law[_PLACE] / _FLASH_SIGMA_M, [law[_SHARE] / _SHARE_SIGMA]])
 
     found = [least_squares(residuals, start, bounds=(_LOW, _HIGH), loss="soft_l1", x_scale=_STEP) for start in starts]
     return np.asarray(min(found, key=lambda one: float(one.cost)).x)
@@ -183,11 +185,11 @@ def _chart_irradiance(view: PosedStokes, chart: ChartInView, place: Floats) -> f
     return float(_irradiance(point, normal, place))
 
 
-def _shot_matrix(view: PosedStokes, samples: PaperSamples, keep: Floats) -> Floats:
+def _shot_matrix(view: PosedStokes, samples: PaperSamples, used: Bools) -> Floats:
     """Matrices (3, 3, 3), by channel, that make the paper's S1 and S2 zero."""
     analyzers = mueller.analyzer(np.asarray(view.angle, np.float64))
-    back, out = np.linalg.pinv(analyzers), []
-    for q, u in np.median(samples.ratio[np.asarray(keep, bool)], axis=0).T:
-        gain = analyzers @ [1, q, u] * 2
-        out.append(back @ (analyzers / gain[:, None]))
+    from_shots, out = np.linalg.pinv(analyzers), []
+    for q, u in np.median(samples.ratio[used], axis=0).T:  # S1/S0 and S2/S0 of a channel
+        gain = analyzers @ [1, q, u] * 2  # of each shot
+        out.append(from_shots @ (analyzers / gain[:, None]))
     return np.stack(out)

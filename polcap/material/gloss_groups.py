@@ -15,11 +15,11 @@ from msgspec import Meta
 from polcap.errors import CaptureError
 from polcap.image_values import ArrayValue, Floats
 from polcap.material import texel_fit, texel_grid
-from polcap.material.coarse_relief import CoarseRelief, measurements
+from polcap.material.coarse_relief import CoarseRelief
 from polcap.material.stokes_view import PosedStokes
 from polcap.material.texel_fit import LEAST_VIEWS, FitSettings, Measurements, TexelEstimate, TexelPrior
 from polcap.material.texel_grid import FlashLight, TexelGrid, TexelViews
-from polcap.material.texel_stokes import TexelStokes
+from polcap.material.texel_stokes import TexelStokes, measurements
 from polcap.optics import body, clusters, color
 from polcap.stages import stage
 
@@ -89,8 +89,8 @@ def find(
     Raises CaptureError: fewer than `LEAST_VIEWS` views show the sample.
     """
     step = max(1, round(max(grid.size) / _SIDE))
-    at = (slice(step // 2, None, step),) * 2
-    some = TexelStokes(*(part[:, *at] for part in (seen.radiance, seen.polarized, seen.noise)))
+    sampled = (slice(step // 2, None, step),) * 2  # rows, columns
+    some = TexelStokes(*(part[:, *sampled] for part in (seen.radiance, seen.polarized, seen.noise)))
     data = measurements(some, views)
     known = np.flatnonzero(np.isfinite(data.noise[..., 0]).sum(axis=0) >= LEAST_VIEWS)
     if len(known) < _LEAST_SAMPLES:
@@ -98,15 +98,13 @@ def find(
             f"{len(known)} of {data.radiance.shape[1]} sampled texels are seen by {LEAST_VIEWS} views or more, "
             f"{_LEAST_SAMPLES} are needed; expose darker, or name the sample's part with --region"
         )
-    point = grid.points(relief.height)[at].reshape(-1, 3)[known]
+    point = grid.points(relief.height)[sampled].reshape(-1, 3)[known]
     geometry = texel_grid.geometry(point, [view.pose for view in views], light)
     data = data.take(known)
-    first = TexelPrior.alike((0.45, _F0), (0.2, 0.01), len(known))
-    begin = texel_fit.start(data, geometry, first, body.SMOOTH)
-    albedo = texel_fit.fit(data, geometry, first, begin, body.SMOOTH, settings.fitting, rounds=4).value[
-        :, texel_fit.ALBEDO
-    ]
-    return group(data, geometry, albedo, settings)
+    prior = TexelPrior.alike((0.45, _F0), (0.2, 0.01), len(known))
+    first = texel_fit.start(data, geometry, prior, body.SMOOTH)
+    fitted = texel_fit.fit(data, geometry, prior, first, body.SMOOTH, settings.fitting, rounds=4)
+    return group(data, geometry, fitted.value[:, texel_fit.ALBEDO], settings)
 
 
 def group(data: Measurements, views: TexelViews, albedo: Floats, settings: GlossSettings) -> GlossGroups:
@@ -116,50 +114,52 @@ def group(data: Measurements, views: TexelViews, albedo: Floats, settings: Gloss
     member = clusters.soft_share(encoded, center, spread).argmax(axis=1)
     found: dict[str, tuple[float, Floats, Floats]] = {}
     for name, law in LAWS.items():
-        gloss = np.tile([0.45, _F0], (len(center), 1))
+        gloss = np.tile([0.45, _F0], (len(center), 1))  # of groups with too few texels
         sigma = np.tile([0.2, _F0_SIGMA], (len(center), 1))
         cost = 0.0
         for k in range(len(center)):
             mine = np.flatnonzero(member == k)
-            mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), _SAMPLES)).astype(int)] if len(mine) else mine
             if len(mine) >= _LEAST_SAMPLES:
-                gloss[k], sigma[k], misfit = _shared(data.take(mine), views.take(mine), law, fitting)
-                cost += misfit * (member == k).sum()
+                some = mine[np.linspace(0, len(mine) - 1, min(len(mine), _SAMPLES)).astype(int)]
+                gloss[k], sigma[k], misfit = _fit_shared(data.take(some), views.take(some), law, fitting)
+                cost += misfit * len(mine)
         found[name] = cost, gloss, sigma
     law_name: Literal["smooth", "rough"] = "smooth" if found["smooth"][0] <= found["rough"][0] else "rough"
     _, gloss, sigma = found[law_name]
     return GlossGroups(center, spread, gloss[:, 0], gloss[:, 1], sigma, law_name)
 
 
-def _shared(data: Measurements, views: TexelViews, law: body.Law, fitting: FitSettings) -> tuple[Floats, Floats, float]:
+def _fit_shared(
+    data: Measurements, views: TexelViews, law: body.Law, fitting: FitSettings
+) -> tuple[Floats, Floats, float]:
     """Roughness and F0 (2,) that all texels share, their 1σ (2,), and the mean cost of a texel."""
     few = slice(None, None, max(1, data.radiance.shape[1] // _TRIED))
     some, seen = data.take(few), views.take(few)
-    tried = [np.inf, *(_at(some, seen, np.array([rough, _F0]), law, fitting)[0] for rough in _ROUGHNESS), np.inf]
-    starts = [rough for rough, (a, b, c) in zip(_ROUGHNESS, zip(tried, tried[1:], tried[2:])) if b < min(a, c)]
-    found = [_descend(data, views, np.array([rough, _F0]), law, fitting) for rough in starts]
-    return min(found, key=lambda one: one[2])
+    starts = [np.array([rough, _F0]) for rough in _ROUGHNESS]
+    costs = [np.inf, *(_fit_texels(some, seen, gloss, law, fitting)[0] for gloss in starts), np.inf]
+    minima = [k for k in range(len(starts)) if costs[k + 1] < min(costs[k], costs[k + 2])]
+    return min((_descend(data, views, starts[k], law, fitting) for k in minima), key=lambda found: found[2])
 
 
 def _descend(
     data: Measurements, views: TexelViews, gloss: Floats, law: body.Law, fitting: FitSettings
 ) -> tuple[Floats, Floats, float]:
     """The nearest shared gloss (2,) of least cost, its 1σ (2,), and the mean cost of a texel."""
-    cost, estimate = _at(data, views, gloss, law, fitting)
+    cost, estimate = _fit_texels(data, views, gloss, law, fitting)
     for _ in range(_ROUNDS):
         step, _ = _newton(estimate, gloss)
         for share in (1.0, 0.3):
             trial = np.clip(gloss + share * step, [0.06, 0.01], [1.0, 0.15])
-            found, there = _at(data, views, trial, law, fitting, estimate.value)
-            if found < cost:
-                gloss, cost, estimate = trial, found, there
+            trial_cost, trial_estimate = _fit_texels(data, views, trial, law, fitting, estimate.value)
+            if trial_cost < cost:
+                gloss, cost, estimate = trial, trial_cost, trial_estimate
                 break
         else:
             break
     return gloss, _newton(estimate, gloss)[1], cost
 
 
-def _at(
+def _fit_texels(
     data: Measurements,
     views: TexelViews,
     gloss: Floats,
@@ -167,19 +167,21 @@ def _at(
     fitting: FitSettings,
     first: Floats | None = None,
 ) -> tuple[float, TexelEstimate]:
-    """Mean cost of texels that all have one gloss (2,), with its prior, and their estimates."""  # fmt: skip
+    """Estimates of texels that all have one gloss (2,), and their mean cost with the prior of F0."""
     prior = TexelPrior.alike(gloss, _TIGHT, data.radiance.shape[1])
     if first is None:
-        begin = texel_fit.start(data, views, prior, law)
+        first = texel_fit.start(data, views, prior, law)
     else:
-        begin = np.concatenate([first[:, texel_fit.SLOPES], prior.mean, first[:, texel_fit.ALBEDO]], axis=-1)
-    estimate = texel_fit.fit(data, views, prior, begin, law, fitting, rounds=5)
-    away = (gloss[1] - _F0) / _F0_SIGMA
-    return float(estimate.cost.mean()) + away**2 / _INDEPENDENT, estimate
+        first = np.concatenate([first[:, texel_fit.SLOPES], prior.mean, first[:, texel_fit.ALBEDO]], axis=-1)
+    estimate = texel_fit.fit(data, views, prior, first, law, fitting, rounds=5)
+    return float(estimate.cost.mean()) + ((gloss[1] - _F0) / _F0_SIGMA) ** 2 / _INDEPENDENT, estimate
 
 
 def _newton(estimate: TexelEstimate, gloss: Floats) -> tuple[Floats, Floats]:
-    """Step (2,) of the shared gloss, and its 1σ (2,): Schur complements of the texels' equations, without priors."""
+    """Newton step (2,) of the shared gloss, and its 1σ (2,).
+
+    Slopes and albedo are eliminated from the equations of each texel, without its priors (Schur complement).
+    """
     data = estimate.information.astype(np.float64)
     data[:, (2, 3), (2, 3)] -= _TIGHT.astype(float) ** -2
     own, others = np.array([2, 3]), np.array([0, 1, 4, 5, 6])
@@ -190,5 +192,5 @@ def _newton(estimate: TexelEstimate, gloss: Floats) -> tuple[Floats, Floats]:
     pull = (estimate.value[:, texel_fit.GLOSS] - gloss) / _TIGHT.astype(float) ** 2
     total = _INDEPENDENT * schur.mean(axis=0) + np.diag([1e-6, _F0_SIGMA**-2])
     right = _INDEPENDENT * pull.mean(axis=0) + np.array([0, (_F0 - gloss[1]) / _F0_SIGMA**2])
-    inverse = np.linalg.inv(total)
-    return np.asarray(inverse @ right), np.sqrt(np.diag(inverse))
+    covariance = np.linalg.inv(total)
+    return np.asarray(covariance @ right), np.sqrt(np.diag(covariance))

@@ -125,18 +125,18 @@ def without_print(slope: Floats, albedo: Floats) -> tuple[Floats, Floats]:
 def integrate(slope: Floats, sigma: Floats, coarse: Floats, texel: float) -> Floats:
     """Height (H, W) [m] with slopes (H, W, 2) to the right and up, of doubt (H, W), near the height `coarse` (H, W).
 
-    Over long ranges the coarse height decides.
+    Over long ranges the coarse height decides. The unknown is the height over it.
     """
     height, width = coarse.shape
     weight = np.minimum((np.median(sigma) / np.maximum(sigma, 1e-9)) ** 2, _MOST_WEIGHT)
     weights = np.minimum(weight[:, 1:], weight[:, :-1]), np.minimum(weight[1:], weight[:-1])
-    rises = (
-        (slope[:, :-1, 0] + slope[:, 1:, 0]) * (texel / 2) - np.diff(coarse, axis=1),  # between neighbors
+    rises = (  # between neighbors, over those of the coarse height
+        (slope[:, :-1, 0] + slope[:, 1:, 0]) * (texel / 2) - np.diff(coarse, axis=1),
         -(slope[:-1, :, 1] + slope[1:, :, 1]) * (texel / 2) - np.diff(coarse, axis=0),
     )
     tie = CROSSOVER**-2
-    waves = [2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in (height, width)]
-    laplacian = waves[0][:, None] + waves[1][None]
+    rows, columns = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in (height, width))
+    laplacian = rows[:, None] + columns  # of cosine waves
 
     def divergence(across: Floats, down: Floats) -> Floats:
         total = np.zeros((height, width))
@@ -152,12 +152,11 @@ def integrate(slope: Floats, sigma: Floats, coarse: Floats, texel: float) -> Flo
         return np.asarray((divergence(*steps) + tie * rise).ravel())
 
     def equal_doubts(flat: Floats) -> Floats:
-        return np.asarray(
-            idctn(dctn(flat.reshape(height, width), norm="ortho") / (laplacian + tie), norm="ortho")
-        ).ravel()
+        waves = dctn(flat.reshape(height, width), norm="ortho") / (laplacian + tie)
+        return np.asarray(idctn(waves, norm="ortho")).ravel()
 
-    count = height * width
-    matrix, inverse = (LinearOperator((count, count), matvec=one) for one in (equation, equal_doubts))
+    shape = (height * width,) * 2
+    matrix, inverse = (LinearOperator(shape, matvec=one) for one in (equation, equal_doubts))
     right = divergence(weights[0] * rises[0], weights[1] * rises[1]).ravel()
     found, _ = cg(matrix, right, rtol=_TOLERANCE, maxiter=_MOST_STEPS, M=inverse)
     return np.asarray(coarse + found.reshape(height, width))
@@ -166,18 +165,18 @@ def integrate(slope: Floats, sigma: Floats, coarse: Floats, texel: float) -> Flo
 def ambient_occlusion(height: Floats, normal: Floats, texel: float) -> Floats:
     """Share (H, W) of a uniform sky, weighted by the cosine, that the relief leaves visible, from its horizons."""
     rows, columns = height.shape
-    smooth = np.asarray(height, np.float32)
+    relief = np.asarray(height, np.float32)
     farthest = max(2.0, _FARTHEST * max(rows, columns))
     distances = np.unique(np.rint(_GROWTH ** np.arange(np.log(farthest) / np.log(_GROWTH) + 1)).astype(int))
     share = np.zeros((rows, columns), np.float32)
     for angle in 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
         tangent = -(normal[..., 0] * np.cos(angle) + normal[..., 1] * np.sin(angle)) / normal[..., 2]
-        horizon = tangent.astype(np.float32)
+        horizon = tangent.astype(np.float32)  # slope of the line of sight, at first that of the surface
         for distance in distances:
             matrix = np.array([[1, 0, distance * np.cos(angle)], [0, 1, -distance * np.sin(angle)]], np.float32)
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            there = cv2.warpAffine(smooth, matrix, (columns, rows), flags=flags, borderMode=cv2.BORDER_REFLECT)
-            np.maximum(horizon, (there - smooth) / (distance * texel), out=horizon)
+            there = cv2.warpAffine(relief, matrix, (columns, rows), flags=flags, borderMode=cv2.BORDER_REFLECT)
+            np.maximum(horizon, (there - relief) / (distance * texel), out=horizon)
         sine = horizon / np.sqrt(1 + horizon**2) - tangent / np.sqrt(1 + tangent**2)
         share += (1 - np.clip(sine, 0, 1) ** 2) / _DIRECTIONS
     return np.asarray(np.clip(share, 0, 1))

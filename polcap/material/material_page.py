@@ -24,15 +24,13 @@ _LIGHT = np.array([-0.45, 0.35, 0.82], np.float32)  # first direction; from the 
 def write(folder: Path, about: Mapping[str, Any], source: MaterialSource) -> None:
     """Write report.json and report.html into a result folder. Raises StorageError."""
     atomic.write_json(folder / "report.json", about)
-    small = _reduced(source.maps)
-    inside = np.ones(small["roughness"].shape[:2], bool)
-    figures = about["figures"]
-    lit = _lit(small)
+    small, figures = _reduce(source.maps), about["figures"]
+    lit = _render(small)
     bright = 0.9 / max(float(np.quantile(lit, 0.995)), 1e-6)
-    height, width = small["roughness"].shape[:2]
+    height, width = small["roughness"].shape
     content = {
         "lit": html.jpeg(color.srgb_eight_bits(bright * lit)),
-        "maps": _figures(small, inside),
+        "maps": _figures(small),
         "rows": [_row(row) for row in figures["views"].values()],
         "left_out": list(figures["left_out"].items()),
         "size": _size(figures["maps"]),
@@ -44,7 +42,7 @@ def write(folder: Path, about: Mapping[str, Any], source: MaterialSource) -> Non
     page.write_report("material.html", folder, about, content, {"view": view})
 
 
-def _reduced(maps: MaterialMaps) -> dict[str, Floats]:
+def _reduce(maps: MaterialMaps) -> dict[str, Floats]:
     """The maps at most `_LONGEST` texels a side."""
     height, width = maps.seen.shape
     scale = min(1.0, _LONGEST / max(height, width))
@@ -57,7 +55,7 @@ def _reduced(maps: MaterialMaps) -> dict[str, Floats]:
     return {**found, "normal": frames.unit(found["normal"])}
 
 
-def _lit(small: Mapping[str, Floats]) -> Floats:
+def _render(small: Mapping[str, Floats]) -> Floats:
     """S0 (H, W, 3) of the sample seen from above under a lamp at the side, linear Rec.709."""
     light = np.broadcast_to(_LIGHT / np.linalg.norm(_LIGHT), small["normal"].shape)
     seen = shade.stokes(
@@ -66,11 +64,13 @@ def _lit(small: Mapping[str, Floats]) -> Floats:
     return np.asarray(seen[0])
 
 
-def _figures(small: Mapping[str, Floats], inside: Any) -> list[map_figures.MapFigure]:
+def _figures(small: Mapping[str, Floats]) -> list[map_figures.MapFigure]:
     """Figures of all maps."""
+    inside = np.ones(small["roughness"].shape, bool)
     micron = 1e6 * small["height"]
     low, high = (float(q) for q in np.quantile(micron, (0.001, 0.999)))
-    span = ColorKey(low, max(high, low + 1e-3), " µm", tuple(np.linspace(low, max(high, low + 1e-3), 4)), digits=0)
+    high = max(high, low + 1e-3)
+    span = ColorKey(low, high, " µm", tuple(np.linspace(low, high, 4)), digits=0)
     doubt = ColorKey(0, 5, "°", (0, 1, 2, 3, 5), "inferno", digits=2)
     rough_doubt = ColorKey(0, 0.2, "", (0, 0.05, 0.1, 0.2), "inferno", digits=3)
     return [

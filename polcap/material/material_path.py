@@ -70,7 +70,7 @@ def path(
     """Run the stages in order.
 
     Raises CaptureError: too little of board or sample is visible.
-    """  # fmt: skip
+    """
     light = cache.run(flash_light.measure, views, chart, board)
     relief = cache.run(coarse_relief.solve, views, light, grid, config=settings.relief)
     seen = cache.run(rectification.rectify, views, light, relief, grid)

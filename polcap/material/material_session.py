@@ -4,14 +4,14 @@ Views and steps are those of `polcap fuse` (`fusion/session_views.py`, `fusion/v
 used is left out, with the reason.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from polcap.chart_values import ColorCalibration
 from polcap.errors import SettingError
-from polcap.fusion import each_view, session, view_path
+from polcap.fusion import each_view, view_path
+from polcap.fusion import session as sessions
 from polcap.fusion.each_view import Notify
 from polcap.fusion.poses import SessionPoses
 from polcap.fusion.session_views import Session, SessionInput
@@ -48,7 +48,7 @@ class FlatSession:
 
 
 def process(
-    found: Session,
+    session: Session,
     session_input: SessionInput[MaterialConfig],
     region: Region | None,
     texel: float | None,
@@ -59,31 +59,30 @@ def process(
 
     Raises CaptureError: too few views can be used. ChartError: no view shows the chart. SettingError: the region or
     the texel does not fit the board.
-    """  # fmt: skip
-    found = found.with_inputs(lambda view: replace(view, config=stokes_view.of_flat_views(view.config)))
-    charted = session.with_colors(found, notify)
+    """
+    session = session.with_inputs(lambda view: replace(view, config=stokes_view.of_flat_views(view.config)))
+    session = sessions.with_colors(session, notify)
     with each_view.step_runner(session_input, notify) as run_step:
-        charted, boards = run_step("exposures and board", view_path.find_board, charted)
-        charted, solved = session.pose_by_board(charted, boards, cache)
+        session, boards = run_step("exposures and board", view_path.find_board, session)
+        session, solved = sessions.pose_by_board(session, boards, cache)
         board = solved.board
         assert board is not None
-        masked = charted.with_inputs(lambda view: _with_mask(view, solved, board))
+        masked = session.with_inputs(lambda view: _with_mask(view, solved, board))
         masked, keys = run_step("Stokes parameters", stokes_view.solve, masked)
-    every = {name: _posed(view, solved, keys[name], cache) for name, view in masked.views.items()}
-    sight = cache.run(board_focus.measure, together(list(every.values())), board).value
-    masked = masked.without(board_focus.left_out(tuple(every), sight))
-    posed = [every[name] for name in masked.views]
-    names = tuple(masked.views)
+    posed = {name: _posed(view, solved, keys[name], cache) for name, view in masked.views.items()}
+    sight = cache.run(board_focus.measure, together(list(posed.values())), board).value
+    used = masked.without(board_focus.left_out(tuple(posed), sight))
+    names = tuple(used.views)
     return FlatSession(
-        views=together(posed),
+        views=together([posed[name] for name in names]),
         names=names,
         poses=solved,
-        chart=_chart(masked, charted),
+        chart=_find_chart([session.views[name] for name in names]),
         board=board,
-        grid=sample_grid(solved, names, board, posed, region, texel),
-        left_out=masked.left_out,
-        tilt_deg={name: _tilt_deg(solved, name) for name in names},
-        blur_px={name: blur for name, blur in zip(every, sight.blur, strict=True) if name in names},
+        grid=make_grid(solved, board, [posed[name] for name in names], names, region, texel),
+        left_out=used.left_out,
+        tilt_deg={name: _tilt_deg(solved.views[name].pose) for name in names},
+        blur_px={name: blur for name, blur in zip(posed, sight.blur, strict=True) if name in names},
     )
 
 
@@ -107,34 +106,33 @@ def posed_stokes(name: str, results: ResultsUntilStokes, solved: SessionPoses, p
     )
 
 
-def _chart(found: Session, charted: Session) -> ChartInView | None:
+def _find_chart(views: Sequence[SessionView]) -> ChartInView | None:
     """The view that shows the chart, if there is one."""
-    for number, view in enumerate(found.views.values()):
+    for number, view in enumerate(views):
         if view.supplied.chart.mode in ("auto", "corners"):
-            color: ColorCalibration = view_path.find_chart(charted.views[view.name])
+            color = view_path.find_chart(view)
             if color.place is not None:
                 return ChartInView(number, color)
     return None
 
 
-def _tilt_deg(solved: SessionPoses, name: str) -> float:
+def _tilt_deg(pose: Pose) -> float:
     """Angle between the page's normal and the direction to the lens [degrees]."""
-    towards = solved.views[name].pose.center
-    return float(np.degrees(np.arccos(towards[1] / np.linalg.norm(towards))))
+    return float(np.degrees(np.arccos(pose.center[1] / np.linalg.norm(pose.center))))
 
 
-def sample_grid(
+def make_grid(
     solved: SessionPoses,
-    names: tuple[str, ...],
     board: Board,
-    views: list[StageResult[PosedStokes]],
+    views: Sequence[StageResult[PosedStokes]],
+    names: Sequence[str],
     region: Region | None,
     texel: float | None,
 ) -> TexelGrid:
     """Grid of the sample: by default over the board's middle, with texels as large as the nearest view's pixels.
 
     Raises SettingError: the region reaches beyond the board, or has too many texels.
-    """  # fmt: skip
+    """
     half = (SQUARES / 2 - RING) * board.square_m - _MARGIN_M
     left, lower, right, upper = region or (-half, -half, half, half)
     most = board.page_m[0] / 2

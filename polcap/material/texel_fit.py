@@ -2,7 +2,7 @@
 
 The light at the camera is E (ρ_d D(n) + F0 S(n, roughness)), with the diffuse and the specular law of `optics/shade.py`
 and the irradiance E. Unknown are two slopes, roughness, F0 and three albedos. Data are S0 of three colors, S1 and S2 in
-every view. Roughness and F0 have priors: those of the texel's material. Levenberg-Marquardt steps are taken for many
+every view. Priors of roughness and F0 are those of the texel's material. Levenberg-Marquardt steps are taken for many
 texels at once; a view that contradicts the others, as in a shadow, gets less weight (Cauchy).
 """
 
@@ -78,12 +78,14 @@ class TexelPrior(ArrayValue):
 
 @dataclass(frozen=True, repr=False)
 class TexelEstimate(ArrayValue):
-    """Estimates at N texels."""
+    """Values of N texels, and the least-squares problem linearized there."""
 
     value: Floats  # (N, 7)
     information: Floats  # (N, 7, 7) of data and priors
     by_kind: Floats  # (2, N, 7, 7) information of S0, and of S1 and S2
+    gradient: Floats  # (N, 7) descent of `total`
     cost: Floats  # (N,) of the data, robust
+    total: Floats  # (N,) of data and priors
     error: Floats  # (K, N, 5) measured minus modelled, in standard deviations; 0 where not measured
     model: Floats  # (K, N) modelled S0, gray
 
@@ -91,6 +93,12 @@ class TexelEstimate(ArrayValue):
     def normal(self) -> Floats:
         """Unit normals (N, 3) in the plane's frame."""
         return normals(self.value)
+
+    def replace_texels(self, index: Indices, other: "TexelEstimate", chosen: Bools) -> None:
+        """Overwrite the texels at `index` by the chosen ones of another estimate."""
+        for name, array in vars(self).items():
+            along = (slice(None),) if name in ("by_kind", "error", "model") else ()
+            array[*along, index] = getattr(other, name)[*along, chosen]
 
 
 def normals(value: Floats) -> Floats:
@@ -101,25 +109,19 @@ def normals(value: Floats) -> Floats:
 def responses(slope: Floats, roughness: Floats, views: TexelViews, law: body.Law) -> Floats:
     """Stokes parameters (3, K, N, 2) of a texel of albedo 1 and F0 0, and of albedo 0 and F0 1."""
     normal = (views.normal_to_ray @ normals(slope)[:, :, None])[..., 0]
-    count = normal.shape[:2]
-    unit_diffuse, unit_specular = (np.array(v, np.float32) for v in ((1, 0), (0, 1)))
-    rough = np.broadcast_to(roughness, count)
-    ior = np.full((1, 1), IOR, np.float32)
-    return np.asarray(
-        shade.stokes(normal, unit_diffuse, unit_specular, rough, ior, views.to_light, views.irradiance, law)
-    )
+    albedo, f0 = (np.array(v, np.float32) for v in ((1, 0), (0, 1)))
+    rough, ior = np.broadcast_to(roughness, normal.shape[:2]), np.full((1, 1), IOR, np.float32)
+    return np.asarray(shade.stokes(normal, albedo, f0, rough, ior, views.to_light, views.irradiance, law))
 
 
 def start(data: Measurements, views: TexelViews, prior: TexelPrior, law: body.Law) -> Floats:
     """First values (N, 7): flat texels with the prior's gloss, and the albedo of the median view."""
-    count = data.radiance.shape[1]
-    flat = np.zeros((count, 2), np.float32)
-    one = responses(flat, prior.mean[:, 0], views, law)[0]
-    rest = (data.radiance - (one[..., 1] * prior.mean[:, 1])[..., None]) / np.maximum(one[..., :1], 1e-6)
+    flat = np.zeros((data.radiance.shape[1], 2), np.float32)
+    diffuse, specular = np.moveaxis(responses(flat, prior.mean[:, 0], views, law)[0], -1, 0)
+    albedo = (data.radiance - (specular * prior.mean[:, 1])[..., None]) / np.maximum(diffuse, 1e-6)[..., None]
     known = np.isfinite(data.noise[..., :1])
-    albedo = np.nan_to_num(np.nanmedian(np.where(known, rest, np.nan), axis=0), nan=0.2)
-    value = np.concatenate([flat, prior.mean, albedo], axis=-1).astype(np.float32)
-    return np.clip(value, _LOW, _HIGH)
+    albedo = np.nan_to_num(np.nanmedian(np.where(known, albedo, np.nan), axis=0), nan=0.2)
+    return np.clip(np.concatenate([flat, prior.mean, albedo], axis=-1).astype(np.float32), _LOW, _HIGH)
 
 
 def fit(
@@ -131,12 +133,12 @@ def fit(
     settings: FitSettings,
     rounds: int = _ROUNDS,
 ) -> TexelEstimate:
-    """Estimate all unknowns of N texels from first values (N, 7)."""  # fmt: skip
+    """Estimate all unknowns of N texels from first values (N, 7)."""
     sigma = _sigma(data, settings)
     best = _linearize(data, views, prior, value.copy(), law, sigma)
     damping = np.full(len(value), _DAMPING, np.float32)
     eye = np.eye(UNKNOWNS, dtype=np.float32)
-    active = np.arange(len(value))
+    active = np.arange(len(value))  # texels that are not finished
     for _ in range(rounds):
         information, gradient, first = best.information[active], best.gradient[active], best.value[active]
         diagonal = np.einsum("nii->ni", information)
@@ -147,31 +149,12 @@ def fit(
         active, second = active[going], second[going]
         if len(active) == 0:
             break
-        trial = _linearize(
-            data.take(active), views.take(active), prior.take(active), second, law, sigma[:, active]
-        )  # fmt: skip
+        some = data.take(active), views.take(active), prior.take(active)
+        trial = _linearize(*some, second, law, sigma[:, active])
         better = trial.total < best.total[active]
         damping[active] = np.clip(np.where(better, damping[active] / 4, damping[active] * 8), 1e-6, 1e4)
-        best.put(active[better], trial, better)
-    return TexelEstimate(best.value, best.information, best.by_kind, best.cost, best.error, best.model)
-
-
-@dataclass(frozen=True)
-class _Linearized:
-    value: Floats  # (N, 7)
-    information: Floats  # (N, 7, 7)
-    by_kind: Floats  # (2, N, 7, 7)
-    gradient: Floats  # (N, 7) descent
-    cost: Floats  # (N,) data
-    total: Floats  # (N,) with priors
-    error: Floats  # (K, N, 5)
-    model: Floats  # (K, N)
-
-    def put(self, index: Indices, other: "_Linearized", where: Bools) -> None:
-        """Replace the texels at `index` by the chosen ones of another linearization."""
-        for name, array in vars(self).items():
-            along = (slice(None),) if name in ("by_kind", "error", "model") else ()
-            array[*along, index] = getattr(other, name)[*along, where]
+        best.replace_texels(active[better], trial, better)
+    return best
 
 
 def _sigma(data: Measurements, settings: FitSettings) -> Floats:
@@ -204,35 +187,33 @@ def misfit(data: Measurements, found: TexelEstimate, settings: FitSettings) -> t
 
 def _linearize(
     data: Measurements, views: TexelViews, prior: TexelPrior, value: Floats, law: body.Law, sigma: Floats
-) -> _Linearized:
+) -> TexelEstimate:
     """Errors and normal equations at values (N, 7)."""
-    slope, rough = value[:, SLOPES], value[:, ROUGHNESS]
-    base = responses(slope, rough, views, law)
+    slope, rough, f0, albedo = value[:, SLOPES], value[:, ROUGHNESS], value[:, F0], value[:, ALBEDO]
+    gray = data.gray.astype(np.float32)
+    gray_albedo = albedo @ gray
+
+    def light(response: Floats) -> Floats:  # (K, N, 5)
+        s0, polarized = response[0], response[1:]
+        colors = s0[..., :1] * albedo + (s0[..., 1] * f0)[..., None]
+        s1_s2 = polarized[..., 0] * gray_albedo + polarized[..., 1] * f0
+        return np.concatenate([colors, np.moveaxis(s1_s2, 0, -1)], axis=-1)
+
+    response = responses(slope, rough, views, law)
     across, up = _STEP[0] * np.array([[1, 0], [0, 1]], np.float32)
-    moved = [
-        responses(slope + across, rough, views, law),
-        responses(slope + up, rough, views, law),
-        responses(slope, rough + _STEP[2], views, law),
-    ]
-    f0, albedo = value[:, F0], value[:, ALBEDO]
-    level = albedo @ data.gray.astype(np.float32)
-
-    def light(one: Floats) -> Floats:  # (K, N, 5)
-        colors = one[0, ..., :1] * albedo + (one[0, ..., 1] * f0)[..., None]
-        return np.concatenate([colors, np.moveaxis(one[1:, ..., 0] * level + one[1:, ..., 1] * f0, 0, -1)], axis=-1)
-
-    model, measured = light(base), np.concatenate([data.radiance, data.polarized], axis=-1)
+    changed = (slope + across, rough), (slope + up, rough), (slope, rough + _STEP[2])
+    model, measured = light(response), np.concatenate([data.radiance, data.polarized], axis=-1)
     jacobian = np.empty((*model.shape, UNKNOWNS), np.float32)
-    for k, (one, step) in enumerate(zip(moved, _STEP, strict=True)):
-        jacobian[..., k] = (light(one) - model) / step
-    jacobian[..., :3, F0] = base[0, ..., 1:]
-    jacobian[..., 3:, F0] = np.moveaxis(base[1:, ..., 1], 0, -1)
-    jacobian[..., :3, ALBEDO] = base[0, ..., 0, None, None] * np.eye(3, dtype=np.float32)
-    jacobian[..., 3:, ALBEDO] = np.moveaxis(base[1:, ..., 0], 0, -1)[..., None] * data.gray.astype(np.float32)
+    for k, (values, step) in enumerate(zip(changed, _STEP, strict=True)):
+        jacobian[..., k] = (light(responses(*values, views, law)) - model) / step
+    jacobian[..., :3, F0] = response[0, ..., 1:]
+    jacobian[..., 3:, F0] = np.moveaxis(response[1:, ..., 1], 0, -1)
+    jacobian[..., :3, ALBEDO] = response[0, ..., 0, None, None] * np.eye(3, dtype=np.float32)
+    jacobian[..., 3:, ALBEDO] = np.moveaxis(response[1:, ..., 0], 0, -1)[..., None] * gray
     known = np.isfinite(sigma)
     weight = np.where(known, 1 / sigma, 0).astype(np.float32)
     error = np.where(known, measured - model, 0) * weight
-    rms2 = (error**2).sum(axis=-1) / 5
+    mean_square = (error**2).sum(axis=-1) / 5
     root = np.sqrt(_robust_weight(error))[..., None]
     jacobian *= (weight * root)[..., None]
     by_kind, gradient = np.empty((len(KINDS), len(value), UNKNOWNS, UNKNOWNS), np.float32), np.zeros_like(value)
@@ -243,13 +224,12 @@ def _linearize(
         part[:] = transposed @ rows
         gradient += (transposed @ left)[..., 0]
     information = by_kind.sum(axis=0)
-    cost = 5 * _CAUCHY**2 * np.log1p(rms2 / _CAUCHY**2).sum(axis=0)
+    cost = 5 * _CAUCHY**2 * np.log1p(mean_square / _CAUCHY**2).sum(axis=0)
     pull, tie = _priors(prior, value)
     information[:, range(4), range(4)] += tie
     gradient[:, :4] += pull * tie
     total = cost + (pull**2 * tie).sum(axis=-1)
-    gray = model[..., :3] @ data.gray.astype(np.float32)
-    return _Linearized(value, information, by_kind, gradient, cost, total, error, gray)
+    return TexelEstimate(value, information, by_kind, gradient, cost, total, error, model[..., :3] @ gray)
 
 
 def _robust_weight(error: Floats) -> Floats:

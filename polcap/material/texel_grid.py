@@ -61,11 +61,6 @@ class TexelViews:
         """The geometry at some of the points."""
         return TexelViews(self.normal_to_ray[:, index], self.to_light[:, index], self.irradiance[:, index])
 
-    def of_views(self, which: Sequence[int]) -> "TexelViews":
-        """The geometry of some of the views."""
-        at = list(which)
-        return TexelViews(self.normal_to_ray[at], self.to_light[at], self.irradiance[at])
-
 
 def geometry(point: Floats, poses: Sequence[Pose], light: FlashLight) -> TexelViews:
     """Directions and irradiance at world points (N, 3) [m] in all views."""

@@ -7,21 +7,12 @@ import numpy as np
 
 from polcap.image_values import ArrayValue, Bools, Floats
 from polcap.material import texel_fit, texel_grid
-from polcap.material.coarse_relief import CoarseRelief, measurements
+from polcap.material.coarse_relief import CoarseRelief
 from polcap.material.gloss_groups import LAWS, GlossGroups, GlossSettings
 from polcap.material.stokes_view import PosedStokes
-from polcap.material.texel_fit import (
-    ALBEDO,
-    GLOSS,
-    KINDS,
-    LEAST_VIEWS,
-    UNKNOWNS,
-    Measurements,
-    TexelEstimate,
-    TexelPrior,
-)
+from polcap.material.texel_fit import KINDS, LEAST_VIEWS, UNKNOWNS, Measurements, TexelEstimate, TexelPrior
 from polcap.material.texel_grid import FlashLight, TexelGrid, TexelViews
-from polcap.material.texel_stokes import TexelStokes
+from polcap.material.texel_stokes import TexelStokes, measurements
 from polcap.stages import stage
 
 _TILE = 16_000  # texels
@@ -51,13 +42,13 @@ def estimate(
     gloss: GlossGroups,
     settings: GlossSettings,
 ) -> TexelMaps:
-    """Fit all texels of the sample."""  # fmt: skip
+    """Fit all texels of the sample."""
     width, height = grid.size
     value = np.zeros((height, width, UNKNOWNS), np.float32)
     variance = np.zeros((height, width, len(KINDS) + 1, UNKNOWNS), np.float32)
     squares, freedom = np.zeros((2, height, width, len(KINDS)), np.float32)
     residual = np.zeros((len(views), height, width), np.float16)
-    square: Floats = np.zeros((len(views), 2))  # sum of squared errors, number
+    error_squares, error_count = np.zeros((2, len(views)))
     point, poses = grid.points(relief.height), [view.pose for view in views]
     rows = max(1, _TILE // width)
     for top in range(0, height, rows):
@@ -69,7 +60,8 @@ def estimate(
         for target, part in zip((value, variance, squares, freedom), parts, strict=True):
             target[strip] = part.reshape(target[strip].shape)
         known = np.isfinite(data.noise[..., 0])
-        square += np.stack([(found.error**2).sum(axis=(1, 2)), 5.0 * known.sum(axis=1)], axis=-1)
+        error_squares += (found.error**2).sum(axis=(1, 2))
+        error_count += 5 * known.sum(axis=1)
         error = np.abs(data.radiance @ data.gray - found.model) / np.maximum(found.model, 1e-3)
         residual[:, strip] = np.where(known, error, np.nan).reshape(residual[:, strip].shape)
     measured = np.isfinite(seen.noise[..., 0]).sum(axis=0) >= LEAST_VIEWS
@@ -81,7 +73,7 @@ def estimate(
         value=value,
         sigma=np.sqrt(variance.sum(axis=2)),
         seen=measured,
-        misfit=np.sqrt(square[:, 0] / np.maximum(square[:, 1], 1)),
+        misfit=np.sqrt(error_squares / np.maximum(error_count, 1)),
         residual=middle,
     )
 
@@ -96,11 +88,11 @@ def _fit(
     law = LAWS[gloss.law]
     radiance = np.median(np.where(np.isfinite(data.noise[..., :1]), data.radiance, 0), axis=0)
     flat = texel_fit.start(data, geometry, gloss.prior(np.clip(radiance, 0, 1), settings), law)
-    prior = gloss.prior(flat[:, ALBEDO], settings)
+    prior = gloss.prior(flat[:, texel_fit.ALBEDO], settings)
     few = texel_fit.fit(data, geometry, prior, flat, law, settings.fitting, _FIRST_ROUNDS).value
-    prior = gloss.prior(few[:, ALBEDO], settings)
+    prior = gloss.prior(few[:, texel_fit.ALBEDO], settings)
     found = texel_fit.fit(data, geometry, prior, few, law, settings.fitting)
-    return found, variances(found, prior, gloss.sigma_of(few[:, ALBEDO]))
+    return found, variances(found, prior, gloss.sigma_of(few[:, texel_fit.ALBEDO]))
 
 
 def variances(found: TexelEstimate, prior: TexelPrior, shared: Floats) -> Floats:
@@ -109,7 +101,7 @@ def variances(found: TexelEstimate, prior: TexelPrior, shared: Floats) -> Floats
     The 1σ `shared` (N, 2) of the gloss of the texels' material belongs to the priors.
     """
     covariance = np.linalg.inv(found.information.astype(np.float64))
-    response = covariance[:, :, GLOSS] / prior.sigma[:, None, :] ** 2  # to a change of the prior's mean
+    response = covariance[:, :, texel_fit.GLOSS] / prior.sigma[:, None, :] ** 2  # to a change of the prior's mean
     data = np.einsum("knij,nij->nki", covariance @ found.by_kind, covariance)
     priors = np.maximum(np.einsum("nii->ni", covariance) - data.sum(axis=1), 0)
     priors += np.square(response * shared[:, None, :]).sum(axis=-1)

@@ -1,5 +1,6 @@
 """Resampling of the views on the texels of the sample's plane, at given heights."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -8,6 +9,7 @@ import numpy as np
 from polcap.image_values import ArrayValue, Floats, Quality
 from polcap.material import flash_light
 from polcap.material.stokes_view import PosedStokes
+from polcap.material.texel_fit import Measurements
 from polcap.material.texel_grid import FlashLight, TexelGrid
 from polcap.optics.resize import block_means
 from polcap.optics.warp import Spline, Taps
@@ -29,6 +31,13 @@ class TexelStokes(ArrayValue):
     def rows(self, index: slice) -> "TexelStokes":
         """Some rows of the texels."""
         return TexelStokes(self.radiance[:, index], self.polarized[:, index], self.noise[:, index])
+
+
+def measurements(seen: TexelStokes, views: Sequence[PosedStokes]) -> Measurements:
+    """The data of all texels, in one row."""
+    parts = (seen.radiance, seen.polarized, seen.noise)
+    radiance, polarized, noise = (one.reshape(len(one), -1, one.shape[-1]) for one in parts)
+    return Measurements(radiance, polarized, noise, flash_light.gray_of_colors(views[0].matrix))
 
 
 def resample(

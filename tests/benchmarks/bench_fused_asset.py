@@ -81,7 +81,7 @@ def errors(folder: Path) -> Errors:
     for view, visible in zip(views, baking.visible_texels(views, results.atlas)):
         good = visible.weight > LEAST_SEEN
         normal = frames.unit(visible.sample(view.normal)) @ view.pose.rotation
-        own = [normal, *(visible.sample(part) for part in (view.diffuse, view.specular, view.roughness))]
+        own = [normal, *(visible.sample(part) for part in (view.diffuse, view.specular, view.roughness[..., None]))]
         texel = visible.texel[good]
         single.append(mean_errors([part[good] for part in own], [part[texel] for part in true]))
         baked.append(mean_errors([part[texel] for part in textures(results)], [part[texel] for part in true]))

@@ -8,40 +8,30 @@ import pytest
 from polcap.fusion import atlas as atlases
 from polcap.fusion import baking, comparison, fused_page
 from polcap.fusion.atlas import Atlas
-from polcap.fusion.baking import BakingSettings
+from polcap.fusion.baking import AtlasMaps, BakingSettings
 from polcap.fusion.values import ClosedMesh
-from polcap.image_values import Floats
+from polcap.optics.frames import angle_deg
 from polcap.stages import asset
 from tests.fusion import ellipsoid
 
 RING = ellipsoid.views(8)
 
 
-@pytest.fixture(scope="module")
-def atlas() -> Atlas:
-    return atlases.chart(ellipsoid.mesh(), 256, 6)
-
-
-def degrees(one: Floats, two: Floats) -> Floats:
-    return np.degrees(np.arccos(np.clip(np.sum(one * two, axis=-1), -1, 1)))
-
-
-def test_maps_without_errors_are_baked_as_they_are(atlas: Atlas) -> None:
-    made = baking.bake(RING, atlas, BakingSettings())
-    seen = made.seen[atlas.covered]
+def test_maps_without_errors_are_baked_as_they_are(atlas: Atlas, baked: AtlasMaps) -> None:
+    seen = baked.seen[atlas.covered]
     assert seen.mean() > 0.8
-    assert degrees(made.normal[atlas.covered], ellipsoid.normals(atlas.position))[seen].mean() < 0.5
-    error = made.diffuse[atlas.covered] - ellipsoid.albedo(atlas.position)
+    assert angle_deg(baked.normal[atlas.covered], ellipsoid.normals(atlas.position))[seen].mean() < 0.5
+    error = baked.diffuse[atlas.covered] - ellipsoid.albedo(atlas.position)
     assert np.abs(error[seen]).mean() < 0.01
-    assert made.roughness[made.seen] == pytest.approx(0.4, abs=1e-4)
+    assert baked.roughness[baked.seen] == pytest.approx(0.4, abs=1e-4)
 
 
 def test_views_with_independent_errors_outvote_each_other(atlas: Atlas) -> None:
     views = tuple(ellipsoid.tilted(view, 8.0, seed) for seed, view in enumerate(RING))
     made = baking.bake(views, atlas, BakingSettings(mesh_sigma_deg=90))  # the mesh, which is the truth, has no vote
-    single = degrees(views[0].normal, RING[0].normal)[RING[0].mask].mean()
+    single = angle_deg(views[0].normal, RING[0].normal)[RING[0].mask].mean()
     seen = made.seen[atlas.covered]
-    error = degrees(made.normal[atlas.covered], ellipsoid.normals(atlas.position))[seen].mean()
+    error = angle_deg(made.normal[atlas.covered], ellipsoid.normals(atlas.position))[seen].mean()
     assert error < 0.8 * single  # a texel is seen by two to three of them
 
 
@@ -50,8 +40,8 @@ def test_a_half_turn_in_one_view_is_outvoted(atlas: Atlas) -> None:
     views = (replace(RING[0], normal=wrong.astype(np.float32)), *RING[1:])
     made = baking.bake(views, atlas, BakingSettings(mesh_sigma_deg=90))
     seen = made.seen[atlas.covered]
-    error = degrees(made.normal[atlas.covered], ellipsoid.normals(atlas.position))[seen]
-    assert np.median(error) < 2 and degrees(wrong, RING[0].normal)[RING[0].mask].mean() > 30
+    error = angle_deg(made.normal[atlas.covered], ellipsoid.normals(atlas.position))[seen]
+    assert np.median(error) < 2 and angle_deg(wrong, RING[0].normal)[RING[0].mask].mean() > 30
 
 
 def test_a_part_behind_another_takes_nothing_from_the_view() -> None:
@@ -82,18 +72,17 @@ def test_texels_between_the_charts_have_the_nearest_values(atlas: Atlas) -> None
     assert not maps.seen[~maps.mask].any()
 
 
-def test_the_asset_stage_turns_the_atlas_into_tangent_space(atlas: Atlas) -> None:
+def test_the_asset_stage_turns_the_atlas_into_tangent_space(atlas: Atlas, baked: AtlasMaps) -> None:
     """Textures of the closed mesh come from the same code as those of a single view."""
-    made = baking.bake(RING, atlas, BakingSettings())
-    found = asset.build(made, atlas.mesh, asset.AssetSettings())
+    found = asset.build(baked, atlas.mesh, asset.AssetSettings())
     local = found.normal[atlas.covered] / 127.5 - 1
     assert np.degrees(np.arccos(np.clip(local[..., 2], -1, 1))).mean() < 1.5  # the mesh has the true normals
     assert found.specular_factor[0] == pytest.approx(1.0, rel=1e-3)
 
 
-def test_a_view_without_a_photograph_has_no_residual_and_a_row_in_the_report(atlas: Atlas) -> None:
+def test_a_view_without_a_photograph_has_no_residual_and_a_row_in_the_report(atlas: Atlas, baked: AtlasMaps) -> None:
     bare = replace(RING[0], s0=None)
-    (found,) = comparison.compare((bare,), atlas, baking.bake(RING, atlas, BakingSettings())).views
+    (found,) = comparison.compare((bare,), atlas, baked).views
     assert found.residual is None and found.normal_deg < 1
     row = {
         "name": "view01", "corners": 30, "reprojection_px": 0.1, "pose_sigma_deg": 0.1,

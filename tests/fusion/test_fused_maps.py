@@ -11,8 +11,9 @@ from polcap.errors import DecodeError, ObjectError, SettingError
 from polcap.formats.export import gltf, texture_set
 from polcap.formats.maps import maps_folder, result_maps
 from polcap.fusion import atlas as atlases
-from polcap.fusion import baking, closed_mesh, filling, fuse_run, fused_maps
-from polcap.fusion.baking import BakingSettings
+from polcap.fusion import closed_mesh, filling, fuse_run, fused_maps
+from polcap.fusion.atlas import Atlas
+from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.closed_mesh import is_closed
 from polcap.fusion.fused_maps import FusedSource
 from polcap.fusion.values import ClosedMesh
@@ -23,11 +24,8 @@ from tests.fusion import ellipsoid
 
 
 @pytest.fixture(scope="module")
-def source() -> FusedSource:
-    atlas = atlases.chart(ellipsoid.mesh(), 256, 6)
-    return FusedSource(
-        atlas, filling.fill(baking.bake(ellipsoid.views(8), atlas, BakingSettings()), atlas), AssetSettings()
-    )
+def source(atlas: Atlas, baked: AtlasMaps) -> FusedSource:
+    return FusedSource(atlas, filling.fill(baked, atlas), AssetSettings())
 
 
 def test_maps_and_mesh_come_back_as_written(source: FusedSource, tmp_path: Path) -> None:
@@ -54,7 +52,7 @@ def test_a_coarser_level_that_cannot_be_charted_is_reduced_further(
     whole, level = (one.asset.mesh for one in detail_levels.levels(source, ExportRequest(lod=1)))
     charted, calls = atlases.chart, list[int]()
 
-    def failing(mesh: ClosedMesh, side: int, margin: int, metric: bool) -> atlases.Atlas:
+    def failing(mesh: ClosedMesh, side: int, margin: int, metric: bool) -> Atlas:
         calls.append(len(mesh.faces))
         if len(calls) == 1:
             raise ObjectError("no texture atlas")

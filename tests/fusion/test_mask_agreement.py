@@ -39,71 +39,77 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def views() -> list[Silhouette]:
+def whole() -> list[Silhouette]:
     return [view(k) for k in range(COUNT)]
 
 
-def test_masks_of_one_object_agree_and_stay_as_they_are(views: list[Silhouette]) -> None:
+@pytest.fixture
+def views(whole: list[Silhouette]) -> list[Silhouette]:
+    """The same, with masks that a test may change."""
+    return [replace(one, mask=one.mask.copy()) for one in whole]
+
+
+def compare_all(views: list[Silhouette]) -> list[Bools]:
+    """The masks after a comparison that leaves no view out."""
     used, left_out = mask_agreement.compare_set(views)
     assert not left_out
-    assert all(overlap(found.mask, right.mask) > 0.99 for right, found in zip(views, used, strict=True))
+    return [one.mask for one in used]
+
+
+def rows(mask: Bools) -> np.ndarray:
+    return np.flatnonzero(mask.any(axis=1))
+
+
+def remove_head(mask: Bools) -> None:
+    mask[: rows(mask)[len(rows(mask)) // 3]] = False
+
+
+def test_masks_of_one_object_agree_and_stay_as_they_are(whole: list[Silhouette]) -> None:
+    assert all(overlap(found, right.mask) > 0.99 for right, found in zip(whole, compare_all(whole), strict=True))
 
 
 def test_outlines_that_err_by_two_pixels_agree(views: list[Silhouette]) -> None:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
-    wrong = [
-        replace(one, mask=(cv2.erode if k % 2 else cv2.dilate)(one.mask.astype(np.uint8), disc) > 0)
-        for k, one in enumerate(views)
-    ]
-    assert not mask_agreement.compare_set(wrong)[1]
+    for k, one in enumerate(views):
+        one.mask[:] = (cv2.erode if k % 2 else cv2.dilate)(one.mask.astype(np.uint8), disc)
+    compare_all(views)
 
 
-def test_pieces_of_the_board_are_removed_from_the_masks_that_hold_them(views: list[Silhouette]) -> None:
-    wrong = list(views)
-    for k, box in ((2, np.s_[-160:-90, 150:330]), (5, np.s_[-200:-60, 380:600])):
-        mask = views[k].mask.copy()
-        mask[box] = True
-        wrong[k] = replace(views[k], mask=mask)
-    used, left_out = mask_agreement.compare_set(wrong)
-    assert not left_out
-    for right, found in zip(views, used, strict=True):
-        assert overlap(found.mask, right.mask) > 0.97, found.name
+def test_pieces_of_the_board_are_removed_from_the_masks_that_hold_them(
+    whole: list[Silhouette], views: list[Silhouette]
+) -> None:
+    views[2].mask[-160:-90, 150:330] = True
+    views[5].mask[-200:-60, 380:600] = True
+    for right, found in zip(whole, compare_all(views), strict=True):
+        assert overlap(found, right.mask) > 0.97, right.name
 
 
-def test_a_slit_of_one_mask_is_closed(views: list[Silhouette]) -> None:
-    mask = views[3].mask.copy()
-    rows = np.flatnonzero(mask.any(axis=1))
-    mask[rows[len(rows) // 2] : rows[len(rows) // 2] + 4] = False
-    used, left_out = mask_agreement.compare_set([*views[:3], replace(views[3], mask=mask), *views[4:]])
-    assert not left_out
-    assert overlap(used[3].mask, views[3].mask) > 0.99
+def test_a_slit_of_one_mask_is_closed(whole: list[Silhouette], views: list[Silhouette]) -> None:
+    middle = rows(views[3].mask)[len(rows(views[3].mask)) // 2]
+    views[3].mask[middle : middle + 4] = False
+    assert overlap(compare_all(views)[3], whole[3].mask) > 0.99
 
 
-def test_a_small_hole_of_one_mask_is_filled(views: list[Silhouette]) -> None:
-    mask = views[3].mask.copy()
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    side = round(np.sqrt(0.008 * mask.sum()))
-    top, left = rows[len(rows) * 2 // 3], columns[len(columns) // 2]
-    mask[top : top + side, left : left + side] = False
-    used, left_out = mask_agreement.compare_set([*views[:3], replace(views[3], mask=mask), *views[4:]])
-    assert not left_out
-    assert used[3].mask[top : top + side, left : left + side].all()
-    assert all(overlap(one.mask, whole.mask) > 0.99 for one, whole in zip(used, views))
+def test_a_small_hole_of_one_mask_is_filled(whole: list[Silhouette], views: list[Silhouette]) -> None:
+    high, wide = (np.flatnonzero(whole[3].mask.any(axis=axis)) for axis in (1, 0))
+    side = round(np.sqrt(0.008 * whole[3].mask.sum()))
+    top, left = high[len(high) * 2 // 3], wide[len(wide) // 2]
+    hole = np.s_[top : top + side, left : left + side]
+    views[3].mask[hole] = False
+    masks = compare_all(views)
+    assert masks[3][hole].all()
+    assert all(overlap(mask, right.mask) > 0.99 for mask, right in zip(masks, whole))
 
 
 def test_a_mask_that_lacks_a_part_of_the_object_is_left_out(views: list[Silhouette]) -> None:
-    mask = views[5].mask.copy()
-    rows = np.flatnonzero(mask.any(axis=1))
-    mask[: rows[len(rows) // 3]] = False  # the head
-    _, left_out = mask_agreement.compare_set([*views[:5], replace(views[5], mask=mask), *views[6:]])
-    assert list(left_out) == ["view06"]
+    remove_head(views[5].mask)
+    assert list(mask_agreement.compare_set(views)[1]) == ["view06"]
 
 
 def test_two_masks_that_lack_the_same_part_do_not_outvote_whole_ones() -> None:
     twelve = [view(k, count=12) for k in range(12)]
     for k in (2, 7):
-        rows = np.flatnonzero(twelve[k].mask.any(axis=1))
-        twelve[k].mask[: rows[len(rows) // 3]] = False
+        remove_head(twelve[k].mask)
     assert sorted(mask_agreement.compare_set(twelve)[1]) == ["view03", "view08"]
 
 
@@ -117,15 +123,12 @@ def test_a_view_in_which_the_object_had_slid_is_left_out(
 
 
 def test_pieces_of_the_board_at_the_object_in_two_masks_leave_no_view_out(views: list[Silhouette]) -> None:
-    wrong = list(views)
     for k, height in ((1, 0.28), (5, -0.22)):  # of the piece under the mask's middle, of its height
-        mask = views[k].mask.copy()
-        rows = np.flatnonzero(mask.any(axis=1))
-        middle = int(np.nonzero(mask)[0].mean() + height * np.ptp(rows))
+        mask = views[k].mask
+        middle = int(np.nonzero(mask)[0].mean() + height * np.ptp(rows(mask)))
         edge = np.flatnonzero(mask[middle]).max()
         mask[middle - 9 : middle + 9, edge : edge + 28] = True
-        wrong[k] = replace(views[k], mask=mask)
-    assert not mask_agreement.compare_set(wrong)[1]
+    compare_all(views)
 
 
 def test_an_object_that_slid_halfway_is_refused(views: list[Silhouette]) -> None:

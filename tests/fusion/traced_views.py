@@ -45,10 +45,8 @@ def stand(vertices: Floats, faces: NDArray[np.integer], turn: Rotation | None = 
 def ring(body: Body, count: int, elevation_deg: float = 25.0, tip: Rotation | None = None) -> list[Pose]:
     """Poses (count) of a camera that looks at the object from a ring around it, first turned over by `tip`."""
     tip = tip or Rotation.identity()
-    poses = []
-    for azimuth in np.arange(count) * (360 / count):
-        poses.append(look_at(body, Rotation.from_euler("XY", [elevation_deg, -azimuth], degrees=True) * tip))
-    return poses
+    turns = (Rotation.from_euler("XY", [elevation_deg, -360 * k / count], degrees=True) for k in range(count))
+    return [look_at(body, turn * tip) for turn in turns]
 
 
 def all_around(body: Body, count: int) -> list[Pose]:
@@ -60,10 +58,9 @@ def all_around(body: Body, count: int) -> list[Pose]:
 def into_the_opening(body: Body, count: int) -> list[Pose]:
     """Half of the poses on a ring about a standing vessel; half look into it after it is laid on its side."""
     laid = count // 2
-    tip, poses = Rotation.from_euler("x", 90, degrees=True), []
-    for azimuth in np.linspace(-40, 40, laid):
-        poses.append(look_at(body, Rotation.from_euler("XY", [15, -azimuth], degrees=True) * tip))
-    return ring(body, count - laid) + poses
+    tip = Rotation.from_euler("x", 90, degrees=True)
+    turns = (Rotation.from_euler("XY", [15, azimuth], degrees=True) for azimuth in np.linspace(40, -40, laid))
+    return ring(body, count - laid) + [look_at(body, turn * tip) for turn in turns]
 
 
 def look_at(body: Body, turn: Rotation) -> Pose:
@@ -80,7 +77,7 @@ def capture(body: Body, pose: Pose, pixels: int = 384, name: str = "") -> Fusion
     albedo = np.where(mask[..., None], solid_texture(seen.position / body.size), 0).astype(np.float32)
     flat = np.ones_like(albedo)
     return FusionView(
-        name, pose, view, np.zeros(3), mask, seen.normal, np.full(mask.shape, 1, np.float32), albedo, flat * 0.04,
+        name, pose, view, mask, seen.normal, np.full(mask.shape, 1, np.float32), albedo, flat * 0.04,
         flat[..., 0] * 0.4,
     )  # fmt: skip
 
@@ -110,7 +107,7 @@ def with_errors(body: Body, of: FusionView, rng: np.random.Generator, normals: f
     tilt = [np.radians(BLOB_DEG * normals) * blobs(rng, (height, width), width / 12) for _ in range(2)]
     local = frames.unit(local + np.stack([*tilt, np.zeros((height, width))], axis=-1))
     normal = frames.from_ray_frame(frames.lifted(local), v)
-    error = np.degrees(np.arccos(np.clip(frames.dot(normal, of.normal), -1, 1)))
+    error = frames.angle_deg(normal, of.normal)
     expected = cv2.GaussianBlur(np.where(of.mask, error, 8).astype(np.float32), (0, 0), width / 10) + 1
     albedo = of.diffuse * (1 + 0.05 * blobs(rng, (height, width), width / 12))[..., None]
     return replace(
@@ -137,8 +134,7 @@ def blobs(rng: np.random.Generator, shape: tuple[int, int], radius: float) -> Fl
 
 def mean_error_deg(a: FusionView, b: FusionView) -> float:
     """Mean angle between the normals of two views of the same pixels."""
-    cosine = frames.dot(a.normal, b.normal)[a.mask & b.mask]
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
+    return float(frames.angle_deg(a.normal, b.normal)[a.mask & b.mask].mean())
 
 
 def solid(mesh: ClosedMesh) -> trimesh.Trimesh:

@@ -32,15 +32,21 @@ def views(count: int, seed: int = 0) -> TexelViews:
 def measured(truth: Floats, seen: TexelViews, law: body.Law = body.SMOOTH, seed: int = 0) -> Measurements:
     """Photographs of texels with these values (N, 7), with errors of radiance and polarization."""
     random = np.random.default_rng([seed, 2])
-    one = texel_fit.responses(truth[:, :2], truth[:, 2], seen, law)
+    response = texel_fit.responses(truth[:, :2], truth[:, 2], seen, law)
     f0, level = truth[:, 3], truth[:, 4:] @ GRAY
-    radiance = one[0, ..., :1] * truth[:, 4:] + (one[0, ..., 1] * f0)[..., None]
-    polarized = np.moveaxis(one[1:, ..., 0] * level + one[1:, ..., 1] * f0, 0, -1)
+    radiance = response[0, ..., :1] * truth[:, 4:] + (response[0, ..., 1] * f0)[..., None]
+    polarized = np.moveaxis(response[1:, ..., 0] * level + response[1:, ..., 1] * f0, 0, -1)
     s0 = radiance @ GRAY
     radiance *= 1 + RADIANCE_ERROR * random.normal(size=s0.shape)[..., None]
     polarized = polarized + POLARIZATION_ERROR * s0[..., None] * random.normal(size=polarized.shape)
     noise = np.full((*s0.shape, 2), 1e-5)
     return Measurements(radiance.astype(np.float32), polarized.astype(np.float32), noise.astype(np.float32), GRAY)
+
+
+def first_views(count: int, data: Measurements, seen: TexelViews) -> tuple[Measurements, TexelViews]:
+    """Data and geometry of the first views."""
+    measured = Measurements(data.radiance[:count], data.polarized[:count], data.noise[:count], data.gray)
+    return measured, TexelViews(seen.normal_to_ray[:count], seen.to_light[:count], seen.irradiance[:count])
 
 
 def materials(count: int, seed: int = 0) -> Floats:
