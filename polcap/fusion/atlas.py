@@ -149,7 +149,9 @@ def _cut_charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArr
 def _pixel_m(mesh: ClosedMesh, views: tuple[FusionView, ...]) -> float:
     """Side of a pixel of the views' maps at the object [m]."""
     middle = mesh.vertices.mean(axis=0)
-    return float(np.median([-(one.pose.rotation @ middle + one.pose.translation)[2] / one.view.focal for one in views]))
+    return float(
+        np.median([-(one.pose.rotation @ middle + one.pose.translation)[2] / one.camera.focal for one in views])
+    )
 
 
 def _area(mesh: ClosedMesh | Mesh) -> float:

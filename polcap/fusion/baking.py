@@ -143,15 +143,15 @@ def visible_texels(views: Sequence[FusionView], atlas: Atlas) -> list[VisibleTex
 def _visible(view: FusionView, atlas: Atlas, tracer: Tracer) -> VisibleTexels:
     """The texels that face the view, in front of the rest of the mesh and inside the picture."""
     height, width = view.mask.shape
-    surface = tracer.trace(view.pose.rotation, view.pose.translation, view.view, height, width)
+    surface = tracer.trace(view.pose.rotation, view.pose.translation, view.camera, height, width)
     point = view.pose.to_camera(atlas.position)
     cosine = frames.dot(atlas.normal @ view.pose.rotation.T, frames.unit(-point))
-    pixel = project(view.view, point)
+    pixel = project(view.camera, point)
     column, row = np.rint(pixel).astype(int).T
     inside = (cosine > _LEAST_COSINE) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     texel = np.flatnonzero(inside & (point[:, 2] < 0))
     row, column, cosine = row[texel], column[texel], cosine[texel]
-    slack = _BEHIND / view.view.focal / cosine
+    slack = _BEHIND / view.camera.focal / cosine
     in_front = -point[texel, 2] <= surface.depth[row, column] * (1 + slack)  # false where the surface is missed
     fade = _distance_from_edges(view, surface.depth)[row, column]
     weight = np.where(in_front, cosine**2 * fade, 0)
@@ -168,7 +168,7 @@ def _visible(view: FusionView, atlas: Atlas, tracer: Tracer) -> VisibleTexels:
 
 def _distance_from_edges(view: FusionView, depth: Floats) -> Floats:
     """Smooth step (H, W) from 0 at the outline and at edges of parts that hide others to 1."""
-    step = _EDGE / view.view.focal * np.where(np.isfinite(depth), depth, 0)
+    step = _EDGE / view.camera.focal * np.where(np.isfinite(depth), depth, 0)
     filled = np.where(np.isfinite(depth), depth, np.inf)
     inside = view.mask & np.isfinite(depth)
     with np.errstate(invalid="ignore"):

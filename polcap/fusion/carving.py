@@ -41,11 +41,11 @@ _ALBEDO = 0.12  # 1σ of the relative difference of two views' albedos
 _FACING = 0.2  # least cosine at which another view can have measured a normal
 _AGREEING = 3  # views, of which the mean agreement is the score of a depth
 _WINDOW = 5  # px of the sweep over which scores are averaged
-_LEAST_SCORE = 0.45
+_LEAST_SCORE = 0.45  # of a depth
 _SUPPORT = 3.0  # steps within which another view confirms a depth
-_TRUNCATION = 2.5  # steps
+_TRUNCATION = 2.5  # steps; larger distances from a view's surface count as much
 _SOLID = 0.1  # weight of a vote for solid at every point, so that points without depths stay
-_SMOOTHING = 1.0  # steps, 1σ
+_SMOOTHING = 1.0  # steps, 1σ of the Gaussian over the mean distances
 _WALL = 1.5  # steps; thickness that stays behind a wall: surface through which no view looks
 _OPEN = 0.2  # a vertex with a larger share of vertices around it through which views look is no wall
 
@@ -56,7 +56,6 @@ class HollowDepths:
 
     view: SmallView  # on the grid of the sweep
     depth: Floats  # (H, W) m along the optical axis; NaN where none is known
-    score: Floats  # (H, W) 0…1
 
 
 def carve(hull: DistanceGrid, surface: FittedSurface, views: Sequence[SmallView]) -> DistanceGrid:
@@ -94,7 +93,7 @@ def _sweep(number: int, views: Sequence[SmallView], trace: Tracer, doubtful: Boo
     view = _coarsen(views[number], step)
     height, width = view.outline.shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    ray = back_project(view.view, x, y) @ view.pose.rotation  # (H, W, 3) world, at depth 1
+    ray = back_project(view.camera, x, y) @ view.pose.rotation  # (H, W, 3) world, at depth 1
     met = trace.meet(np.broadcast_to(view.pose.center, (height * width, 3)), ray.reshape(-1, 3))
     behind = np.zeros(height * width, bool)
     behind[met.index] = doubtful[trace.mesh.faces[met.face]].mean(axis=1) > 0.5
@@ -108,9 +107,8 @@ def _sweep(number: int, views: Sequence[SmallView], trace: Tracer, doubtful: Boo
         layer[pixel[inside]] = _agreement(point[inside], pixel[inside], view, [*views[:number], *views[number + 1 :]])
     share = np.maximum(cv2.blur(behind.reshape(height, width).astype(np.float32), (_WINDOW, _WINDOW)), 1e-6)
     score = np.stack([cv2.blur(layer, (_WINDOW, _WINDOW)) / share for layer in score])
-    best = score.argmax(axis=0)
-    top = np.where(behind.reshape(height, width), score.max(axis=0), 0)
-    return HollowDepths(view, np.where(top > _LEAST_SCORE, planes[best], np.nan), top)
+    good = behind.reshape(height, width) & (score.max(axis=0) > _LEAST_SCORE)
+    return HollowDepths(view, np.where(good, planes[score.argmax(axis=0)], np.nan))
 
 
 def _agreement(point: Floats, pixel: NDArray[np.intp], view: SmallView, others: Sequence[SmallView]) -> Floats:
@@ -119,23 +117,23 @@ def _agreement(point: Floats, pixel: NDArray[np.intp], view: SmallView, others: 
     found = np.zeros((len(others), len(point)), np.float32)
     for row, other in zip(found, others):
         facing = np.flatnonzero(dot(normal, other.towards(point)) > _FACING)
-        at = other.pixels(point[facing])
-        angle2 = 2 - 2 * dot(unit(sample(other.normal, at)), normal[facing])
+        at, own_albedo = other.pixels(point[facing]), albedo[facing]
+        squared_angle = 2 - 2 * dot(unit(sample(other.normal, at)), normal[facing])  # rad², by the chord
         seen = sample(other.diffuse, at)
-        relative = np.abs(seen - albedo[facing]).sum(axis=-1) / np.maximum(
-            (seen + albedo[facing]).sum(axis=-1) / 2, 1e-6
-        )
-        row[facing] = np.exp(-angle2 / (2 * np.radians(_NORMAL_DEG) ** 2) - relative**2 / (2 * _ALBEDO**2))
+        mean = np.maximum((seen + own_albedo).sum(axis=-1) / 2, 1e-6)
+        relative = np.abs(seen - own_albedo).sum(axis=-1) / mean
+        row[facing] = np.exp(-squared_angle / (2 * np.radians(_NORMAL_DEG) ** 2) - relative**2 / (2 * _ALBEDO**2))
     return np.asarray(np.sort(found, axis=0)[-_AGREEING:].mean(axis=0))
 
 
 def _coarsen(of: SmallView, step: float) -> SmallView:
     """The view with about one pixel to a grid step."""
     far = float(np.linalg.norm(of.pose.translation))
-    every = max(1, round(step * of.view.focal / far))
-    view = replace(of.view, focal=of.view.focal / every, center=(of.view.center[0] / every, of.view.center[1] / every))
+    every = max(1, round(step * of.camera.focal / far))
+    x, y = of.camera.center
+    camera = replace(of.camera, focal=of.camera.focal / every, center=(x / every, y / every))
     normal, diffuse = (np.ascontiguousarray(image[::every, ::every]) for image in (of.normal, of.diffuse))
-    return replace(of, view=view, outline=of.outline[::every, ::every], normal=normal, diffuse=diffuse)
+    return replace(of, camera=camera, outline=of.outline[::every, ::every], normal=normal, diffuse=diffuse)
 
 
 def _confirm(depths: Sequence[HollowDepths], step: float) -> list[HollowDepths]:
@@ -143,14 +141,12 @@ def _confirm(depths: Sequence[HollowDepths], step: float) -> list[HollowDepths]:
     confirmed = []
     for one in depths:
         rows, columns = np.nonzero(np.isfinite(one.depth))
-        ray = back_project(one.view.view, columns.astype(float), rows.astype(float)) @ one.view.pose.rotation
+        ray = back_project(one.view.camera, columns.astype(float), rows.astype(float)) @ one.view.pose.rotation
         point = one.view.pose.center + one.depth[rows, columns, None] * ray
-        support = np.zeros(len(point), int)
-        for other in depths:
-            if other is not one:
-                support += np.abs(_depth_beyond(other, point)) < _SUPPORT * step
-        depth = np.full_like(one.depth, np.nan)
-        depth[rows, columns] = np.where(support > 0, one.depth[rows, columns], np.nan)
+        others = [other for other in depths if other is not one]
+        near = np.any([np.abs(_depth_beyond(other, point)) < _SUPPORT * step for other in others], axis=0)
+        depth = one.depth.copy()
+        depth[rows[~near], columns[~near]] = np.nan
         confirmed.append(replace(one, depth=depth))
     return confirmed
 

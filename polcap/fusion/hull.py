@@ -83,14 +83,14 @@ def _shared_space(views: Sequence[SmallView]) -> tuple[Floats, float]:
     matrix, right = np.zeros((3, 3)), np.zeros(3)  # of the normal equations
     for view in views:
         height, width = view.outline.shape
-        x, y = ((width - 1) / 2 - view.view.center[0], view.view.center[1] - (height - 1) / 2)
-        ray = np.array([x, y, -view.view.focal]) @ view.pose.rotation
+        x, y = ((width - 1) / 2 - view.camera.center[0], view.camera.center[1] - (height - 1) / 2)
+        ray = np.array([x, y, -view.camera.focal]) @ view.pose.rotation
         across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)  # projects onto the plane across the ray
         matrix += across
         right += across @ view.pose.center
     middle = np.linalg.lstsq(matrix, right)[0]
     distance = [np.linalg.norm(middle - view.pose.center) for view in views]
-    slope = [np.hypot(*view.outline.shape) / 2 / view.view.focal for view in views]  # of the picture's corners
+    slope = [np.hypot(*view.outline.shape) / 2 / view.camera.focal for view in views]  # of the picture's corners
     return middle, float(np.max(np.multiply(distance, slope)))
 
 

@@ -167,7 +167,7 @@ def _find_rims(
         distance = view.distance(vertices)
         near = np.flatnonzero((distance > -_RIM_DEPTH * step) & (target.weight > 0))
         pixel, rim_normal = view.nearest_rim(vertices[near])
-        side = step * view.view.focal / np.linalg.norm(view.pose.center - vertices.mean(axis=0))
+        side = step * view.camera.focal / np.linalg.norm(view.pose.center - vertices.mean(axis=0))
         piece = np.unique(np.round(pixel / side), axis=0, return_inverse=True)[1].ravel()
         outermost = np.full(piece.max(initial=0) + 1, -np.inf)
         np.maximum.at(outermost, piece, distance[near])

@@ -29,7 +29,7 @@ class SmallView:
     """One view on its own small grid, cropped to the object; images are float32."""
 
     pose: Pose
-    view: View
+    camera: View
     outline: Floats  # (H, W) signed distance from the silhouette's border, px, negative inside
     slope: Floats  # (H, W, 2) gradient of `outline` along x and y
     normal: Floats  # (H, W, 3) unit, world frame; 0 outside
@@ -39,15 +39,15 @@ class SmallView:
     def distance(self, point: Floats) -> Floats:
         """Signed distances (N,) m of world points (N, 3) from the cone of the silhouette, negative inside."""
         at = point @ self.pose.rotation.T.astype(point.dtype) + self.pose.translation.astype(point.dtype)
-        pixel = project(self.view, at)
+        pixel = project(self.camera, at)
         height, width = self.outline.shape
         inside = np.clip(pixel, 0, np.array([width - 1, height - 1], pixel.dtype))
         px = sample(self.outline, inside) + np.hypot(*(pixel - inside).T)
-        return np.asarray(px * -at[:, 2] / self.view.focal)
+        return np.asarray(px * -at[:, 2] / self.camera.focal)
 
     def pixels(self, point: Floats) -> Floats:
         """Pixels x, y (N, 2) of world points (N, 3)."""
-        return project(self.view, self.pose.to_camera(point))
+        return project(self.camera, self.pose.to_camera(point))
 
     def towards(self, point: Floats) -> Floats:
         """Unit vectors (N, 3) from world points (N, 3) to the lens."""
@@ -81,15 +81,15 @@ def _reduce(of: FusionView) -> SmallView:
     mask = of.mask[box]
     shape = tuple(max(1, round(side / step)) for side in mask.shape)
     scale = np.array(mask.shape[::-1]) / shape[::-1]  # px of the map per small px, x and y, equal within 1/SIDE
-    x, y = ((np.array(of.view.center) - (left, top)) + 0.5) / scale - 0.5
-    view = View(of.view.focal / float(scale.mean()), (float(x), float(y)), of.view.scale * float(scale.mean()))
+    x, y = ((np.array(of.camera.center) - (left, top)) + 0.5) / scale - 0.5
+    camera = View(of.camera.focal / float(scale.mean()), (float(x), float(y)), of.camera.scale * float(scale.mean()))
     normal = weighted_area_mean(of.normal[box], mask, shape) @ of.pose.rotation
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     outline = area_mean(_signed_distance(mask), shape) / np.float32(scale.mean())
     certainty = np.where(mask, 1 / np.maximum(of.sigma_deg[box], _LEAST_SIGMA) ** 2, 0).astype(np.float32)
     return SmallView(
         pose=of.pose,
-        view=view,
+        camera=camera,
         outline=outline,
         slope=np.stack([np.gradient(outline, axis=axis) for axis in (1, 0)], axis=-1),
         normal=(normal / np.maximum(length, 1e-9)).astype(np.float32),

@@ -37,7 +37,7 @@ class FusionView:
 
     name: str
     pose: Pose
-    view: View  # pinhole camera of the maps' grid
+    camera: View  # pinhole camera of the maps' grid
     mask: Bools  # (H, W)
     normal: Floats  # (H, W, 3) unit, camera frame
     sigma_deg: Floats  # (H, W) expected error of the normals

@@ -38,13 +38,13 @@ def test_texels_lie_on_the_surface_with_its_normals(atlas: Atlas) -> None:
 def test_a_texel_is_no_larger_than_a_pixel_of_the_maps() -> None:
     views = ellipsoid.views(1)
     found = atlases.unwrap(ellipsoid.mesh(), views, AtlasSettings())
-    pixel = ellipsoid.DISTANCE / views[0].view.focal
+    pixel = ellipsoid.DISTANCE / views[0].camera.focal
     assert 0.2 < found.texel / pixel <= 1.05
 
 
 def test_a_dense_mesh_is_reduced_to_what_the_maps_resolve() -> None:
     views, dense = ellipsoid.views(1), ellipsoid.mesh()
-    views = tuple(replace(one, view=replace(one.view, focal=one.view.focal / 4)) for one in views)
+    views = tuple(replace(one, camera=replace(one.camera, focal=one.camera.focal / 4)) for one in views)
     found = atlases.unwrap(dense, views, AtlasSettings())
     assert 1900 < len(found.mesh.faces) < len(dense.faces)
 

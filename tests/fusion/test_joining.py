@@ -43,7 +43,7 @@ def views(body: Body, shift: np.ndarray | None, rng: np.random.Generator) -> lis
     for pose in ring(body, COUNT):
         view = capture(body, pose, 160)
         if shift is not None:
-            position = body.tracer.trace(pose.rotation, pose.translation, view.view, 160, 160).position
+            position = body.tracer.trace(pose.rotation, pose.translation, view.camera, 160, 160).position
             own = TIP.inv().apply((position - shift).reshape(-1, 3)).reshape(position.shape)
             albedo = np.where(view.mask[..., None], solid_texture(own / body.size), 0).astype(np.float32)
             view = replace(view, diffuse=albedo)

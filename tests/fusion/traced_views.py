@@ -96,7 +96,7 @@ def solid_texture(position: Floats) -> Floats:
 def with_errors(body: Body, of: FusionView, rng: np.random.Generator, normals: float = 1.0) -> FusionView:
     """The view with normals, albedo and pose wrong as those of real captures; `normals` scales the first."""
     height, width = of.mask.shape
-    v = frames.rays(of.view, height, width)
+    v = frames.rays(of.camera, height, width)
     local = frames.to_ray_frame(of.normal, v)  # x, y across the ray, z along it
     zenith = np.arccos(np.clip(local[..., 2], -1, 1))
     azimuth = np.arctan2(local[..., 1], local[..., 0])
