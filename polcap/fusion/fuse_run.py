@@ -108,7 +108,6 @@ def _verdict(about: Mapping[str, Any]) -> str:
 def _gates(
     processed: ProcessedSession, seen: SeenSurface, figures: Mapping[str, Any], limits: FusedGateLimits
 ) -> Iterator[Gate]:
-    """All gates of a fused object."""
     views = figures["views"]
     yield fused_object.views(list(processed.reports), processed.left_out, limits)
     by_board = processed.poses.board is not None

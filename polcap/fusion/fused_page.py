@@ -74,7 +74,6 @@ def _size(mesh: Mapping[str, Any]) -> str:
 
 
 def _row(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """The figures of one view as texts."""
     return (
         row["name"],
         str(row["corners"]),

@@ -65,7 +65,6 @@ def _render(small: Mapping[str, Floats]) -> Floats:
 
 
 def _figures(small: Mapping[str, Floats]) -> list[map_figures.MapFigure]:
-    """Figures of all maps."""
     inside = np.ones(small["roughness"].shape, bool)
     micron = 1e6 * small["height"]
     low, high = (float(q) for q in np.quantile(micron, (0.001, 0.999)))
@@ -97,7 +96,6 @@ def _size(maps: Mapping[str, Any]) -> str:
 
 
 def _row(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """The figures of one view as texts."""
     return (
         row["name"],
         f"{row['tilt_deg']:.0f}°",

@@ -102,7 +102,6 @@ def _view_figures(flat: FlatSession, results: MaterialResults, k: int) -> dict[s
 def _gates(
     flat: FlatSession, results: MaterialResults, views: Mapping[str, Any], config: MaterialConfig
 ) -> Iterator[Gate]:
-    """All gates of a flat sample."""
     limits = config.material.gates
     yield flat_sample.views(flat.names, flat.left_out, limits)
     yield flat_sample.tilts(flat.tilt_deg, limits)
