@@ -100,17 +100,11 @@ def expose(radiance: Floats, sensor: Sensor, amplification: float, random: np.ra
 def write_dng(
     path: Path, counts: NDArray[np.uint16], sensor: Sensor, cfa: Bits, color_matrix: Sequence[float], exif: Exif
 ) -> None:
-    """Write the counts of one simulated photograph as a DNG."""
+    matrix, neutral = np.reshape(color_matrix, (3, 3)), rec709_to_camera(color_matrix).sum(axis=1)
     dng_writer.write(
-        path,
-        counts,
-        cfa=cfa,
-        black=sensor.black,
-        white=sensor.white,
-        exif=exif,
-        color_matrix=np.reshape(color_matrix, (3, 3)),
-        as_shot_neutral=rec709_to_camera(color_matrix).sum(axis=1),
-    )
+        path, counts, cfa=cfa, black=sensor.black, white=sensor.white, exif=exif, color_matrix=matrix,
+        as_shot_neutral=neutral,
+    )  # fmt: skip
 
 
 def require_empty(folder: Path) -> None:

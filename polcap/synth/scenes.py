@@ -70,7 +70,6 @@ def _bumps(random: np.random.Generator) -> Shape:
 
 
 def _cluster(random: np.random.Generator) -> Shape:
-    """Overlapping balls."""
     balls = [np.array([0, 0, 0, random.uniform(0.034, 0.044)])]
     while len(balls) < 4 + random.integers(0, 5):
         radius = random.uniform(0.02, 0.036)
@@ -87,7 +86,6 @@ def _ball(random: np.random.Generator) -> Shape:
 
 
 def _vase(random: np.random.Generator) -> Shape:
-    """A body of revolution with lobes."""
     foot, belly, neck, lip = random.uniform((0.024, 0.05, 0.02, 0.026), (0.036, 0.064, 0.03, 0.04))
     at = random.uniform(0.35, 0.55)
     profile = ((0.0, foot), (at, belly), (0.84, neck), (1.0, lip))

@@ -337,7 +337,6 @@ def _exposure(shoot: Shoot, take: Take, middle: float) -> tuple[Exif, float, flo
 
 
 def _write_truth(place: Path, studio: Studio, files: list[dict[str, Any]]) -> None:
-    """Write truth.json and the true maps."""
     scene, shoot, buffer, reference = studio.scene, studio.shoot, studio.buffer, studio.reference
     view, white = shoot.view, render.white_level(scene)
     chart = scene.chart and {

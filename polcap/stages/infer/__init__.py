@@ -53,8 +53,7 @@ class InferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     ior: Annotated[float, Meta(ge=1.2, le=2.5, description="refractive index assumed by the analytic estimator")] = 1.5
     symmetries: Annotated[
-        Literal[1, 2, 4, 8],
-        Meta(description="number of turned and mirrored positions that the network sees"),
+        Literal[1, 2, 4, 8], Meta(description="number of turned and mirrored positions that the network sees")
     ] = 4
     fine: Annotated[bool, Meta(description="a second network adds relief finer than the pixels of the first")] = True
 
