@@ -94,7 +94,7 @@ def triangulate(depth: Floats, maps: SurfaceMaps, metric: bool, settings: Surfac
     Raises ObjectError: no triangle fits into the mask.
     """
     height, width = maps.mask.shape
-    mask = np.asarray(maps.mask & np.isfinite(depth), dtype=bool)
+    mask = maps.mask & np.isfinite(depth)
     step = max(1, int(np.ceil(np.sqrt(mask.sum() / settings.max_vertices))))
     z = maps.view.focal * np.log(np.where(mask, depth, 1.0))
     field = normal_field(replace(maps, mask=mask), np.radians(settings.steepest_deg), 0.0)

@@ -183,14 +183,9 @@ def add_back(front: ReliefMesh, back: Back) -> ReliefMesh:
     normals = np.broadcast_to([0.0, 0.0, -1.0], front.normals.shape) if back == "closed" else front.normals
     tangents = np.broadcast_to([1.0, 0.0, 0.0, 1.0], front.tangents.shape)
     used, renumbered = np.unique(np.concatenate([faces, *added]), return_inverse=True)
-    return replace(
-        front,
-        vertices=np.concatenate([front.vertices, behind])[used],
-        normals=np.concatenate([front.normals, normals])[used],
-        uv=np.concatenate([front.uv, front.uv])[used],
-        tangents=np.concatenate([front.tangents, tangents])[used],
-        faces=renumbered.reshape(-1, 3).astype(np.int32),
-    )
+    backs = {"vertices": behind, "normals": normals, "uv": front.uv, "tangents": tangents}
+    both = {name: np.concatenate([getattr(front, name), value])[used] for name, value in backs.items()}
+    return replace(front, **both, faces=renumbered.reshape(-1, 3).astype(np.int32))
 
 
 def to_float32(mesh: ReliefMesh) -> ReliefMesh:
