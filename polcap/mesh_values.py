@@ -23,7 +23,6 @@ class Mesh(ArrayValue):
     cut_px: float = 0.0  # length of the cuts inside the mask, one side, px of the maps
     raggedness: float = 0.0  # length of the boundary over its smoothed length, minus 1; before smoothing
     frame: Literal["camera", "board"] = "camera"
-    turned_deg: int = 0  # counter-clockwise from that frame, about its z axis
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -48,6 +47,7 @@ class Asset(ArrayValue):
     curvature: TexturePixels | None = None  # (H, W) ½ flat, above convex, below concave
     object_normal: TexturePixels | None = None  # (H, W, 3) camera frame, n * 0.5 + 0.5
     albedo_sigma: float | None = None  # as in `SurfaceMaps`
+    turned_deg: int = 0  # of mesh and object normals from the mesh's frame, counter-clockwise about z; 0 to 270
 
     @property
     def has_occlusion(self) -> bool:

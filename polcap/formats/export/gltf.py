@@ -136,7 +136,7 @@ def _extras(asset: Asset, origin: Floats) -> dict[str, Any]:
         "unit": "metre" if mesh.metric else "relative",
         "albedo": maps_folder.albedo_scale(asset.albedo_sigma),
         f"origin_in_{mesh.frame}": origin.tolist(),
-        "turned_deg": mesh.turned_deg,
+        "turned_deg": asset.turned_deg,
         "pieces": mesh.pieces,
         "cuts": mesh.cuts,
         "cut_px": mesh.cut_px,

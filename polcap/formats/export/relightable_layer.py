@@ -50,5 +50,5 @@ def pictures(asset: Asset) -> dict[str, Texture]:
         return np.where(inside if whole.ndim == 2 else inside[..., None], whole, np.uint8(outside))
 
     shown = {name: on_object(one, NO_NORMAL if name == "normal" else 0) for name, one in made.items()}
-    turns = asset.mesh.turned_deg // 90
+    turns = asset.turned_deg // 90
     return {name: replace(one, pixels=np.rot90(shown[name], turns)) for name, one in made.items()}

@@ -145,7 +145,7 @@ def turn(asset: Asset, angle_deg: int) -> Asset:
     space = asset.object_normal
     if space is not None:
         space = _as(space, (2 * (space / np.iinfo(space.dtype).max) - 1) @ rotation.T / 2 + 0.5)
-    return replace(asset, mesh=replace(mesh, **kinds, turned_deg=mesh.turned_deg + angle_deg), object_normal=space)
+    return replace(asset, mesh=replace(mesh, **kinds), object_normal=space, turned_deg=asset.turned_deg + angle_deg)
 
 
 def curvature(maps: SurfaceMaps) -> Floats:
