@@ -30,7 +30,7 @@ _LEAST_SPREAD = 1e-6  # of the squares of the normals' x and y in the mean: a pl
 
 @dataclass(frozen=True)
 class AlbedoSlope:
-    """Change of ln albedo per unit of the normal's lateral part: at least this, within two standard deviations."""
+    """Change of ln albedo per unit of the normal's x and y, towards the brighter side: a lower limit, two σ below."""
 
     amount: float  # the smaller one of the whole object and of its parts; 0 without a lamp at the side
     azimuth: float  # rad, of the brighter side, from image x towards image up

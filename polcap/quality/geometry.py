@@ -25,9 +25,9 @@ from polcap.stages.align import object_motion
 from polcap.stages.whitebalance import chart_in_mask
 
 _LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ
-_DEGREES_PER_PUSH = 200.0  # error of the normals per movement by the object's radius
-_SIGMAS, _FALSE_PUSH = 3.0, 0.003  # of a push; 1σ that polarization imitates, of the object's radius
-_DEGREES_PER_TURN = 600.0  # error of the normals per turn's shift of the surface, of the radius
+_DEGREES_PER_SHIFT = 200.0  # error of the normals per shift by the object's radius
+_SIGMAS, _FALSE_SHIFT = 3.0, 0.003  # of a shift; 1σ that polarization imitates, of the object's radius
+_DEGREES_PER_TURN = 600.0  # error of the normals per shift of the surface by a turn, over the radius
 _FALSE_TURN_DEG = 0.2  # 1σ of a turn that polarization imitates
 _SHARP_PX, _DEGREES_PER_BLUR_PX = 1.2, 2.5  # greatest blur of sharp edges; error of the normals per px beyond it
 _SMOOTH_OUTLINE = 1.1  # of the limit: smooth balls reach .96 of it, objects out of focus from 1.13 (10 objects)
@@ -135,9 +135,9 @@ def _check_files(found: Evidence[ResultsUntilHdr], odd: Bools) -> str:
 
 
 def _judge_shift(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
-    """Gate on a shift of the object against its surroundings, beyond its error.
+    """Gate on a shift of the object against its surroundings, with its error σ. Infinite: a shot of another object.
 
-    It warns from a share of the object's radius on, and fails beyond a limit in px.
+    It warns above 3 σ and a share of the object's radius. It fails if the shift less 3 σ exceeds a limit in px.
     """
     names, measured, limit = found.names, _measure_shift(found), limits.max_object_shift_px
     radius = max(outline.disc_radius(found.results.object_.mask) * found.grid_px, 1.0)
@@ -146,7 +146,7 @@ def _judge_shift(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     sure = length - _SIGMAS * sigma
     least = limits.min_object_shift * radius
     true = np.sqrt(np.maximum(length**2 - sigma**2, 0))
-    cost = _DEGREES_PER_PUSH * float(true.max()) / radius
+    cost = _DEGREES_PER_SHIFT * float(true.max()) / radius
     k = int(np.argmax(sure))
     figure = round(float(length[k]), 3)
     message = f"The object moved by {figure:.1f} ± {sigma[k]:.1f} px against its surroundings in {names[k]}"
@@ -154,7 +154,7 @@ def _judge_shift(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     message += ", or the chart did" if charted else ""
     remedy = _HOLD_BOTH_STILL if charted else _HOLD_STILL
     bad = bad_shots(names, sure > limit)
-    moved = bad_shots(names, length > np.maximum(_SIGMAS * np.hypot(sigma, _FALSE_PUSH * radius), least))
+    moved = bad_shots(names, length > np.maximum(_SIGMAS * np.hypot(sigma, _FALSE_SHIFT * radius), least))
     if (unlike := np.isinf(length)).any():
         odd = _odd(unlike)
         other = bad_shots(names, odd)

@@ -119,7 +119,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         PositiveShare, Meta(description="allowed polarization common to the brightest parts that face the camera [1]")
     ] = 0.004
     max_albedo_slope: Annotated[
-        Positive, Meta(description="allowed growth of ln albedo towards one side, per lateral part of the normal [1]")
+        Positive, Meta(description="allowed change of ln albedo per unit of the normal's x and y, towards one side [1]")
     ] = 0.15
     max_room_dolp: Annotated[
         PositiveShare, Meta(description="allowed polarization of the surroundings, common to all of them [1]")
@@ -159,11 +159,11 @@ class FusedGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     min_views: Annotated[int, Meta(ge=3, le=999, description="least number of views without a warning")] = 8
     max_corner_px: Annotated[
-        Positive, Meta(description="allowed rms distance of board corners from the pose; usually 0.1 to 0.2 [RAW px]")
+        Positive, Meta(description="allowed rms reprojection error of board corners; usually 0.1 to 0.2 [RAW px]")
     ] = 0.5
     max_feature_px: Annotated[
         Positive,
-        Meta(description="without a board: allowed rms distance of features from the pose; usually 0.6 to 1 [RAW px]"),
+        Meta(description="without a board: allowed rms reprojection error of features; usually 0.6 to 1 [RAW px]"),
     ] = 2.0
     max_normal_deg: Annotated[
         float,
@@ -184,7 +184,7 @@ class MaterialGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
     min_views: Annotated[int, Meta(ge=3, le=999, description="least number of views without a warning")] = 5
     max_corner_px: Annotated[
-        Positive, Meta(description="allowed rms distance of board corners from the pose; usually 0.1 to 0.2 [RAW px]")
+        Positive, Meta(description="allowed rms reprojection error of board corners; usually 0.1 to 0.2 [RAW px]")
     ] = 0.5
     max_paper_shine: Annotated[
         Positive, Meta(description="allowed highlight of the board's paper over its diffuse light [1]")

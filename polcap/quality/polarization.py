@@ -26,7 +26,7 @@ _SURE = 2.5  # σ between sectors of the outline: least significance of a turn
 _CERTAIN = 0.8  # of the limit of the misfit: above, also good captures fit a turn (docs/benchmarks/gates.md)
 _CLEAR = 0.8  # least concentration of the AoLP about the outline, to estimate a common turn
 _ALONG = -0.3  # below: the AoLP is along the contour
-_DARK = 0.1  # albedo below which a glossy object shows mostly reflections of itself
+_DARK = 0.1  # albedo below which a glossy object shows mostly reflections of its own parts
 _WEAK_DOLP = 0.05  # of an outline: above, no shape counts as flattened
 _DIMMED = 0.9  # of the mean light: below, an outline turns away
 _MOST_ILL_POSED = 0.15  # of the object; gloss with shadows and thin parts reaches .12 (docs/benchmarks/gates.md)
@@ -264,7 +264,7 @@ def _light_of_body(body: rim.RimFigures, found: Evidence[ResultsUntilInfer], lim
     remedy = "Darken the room, keep the flash next to the lens, and photograph an ambient frame"
     zenith, roughness, albedo = _medians(found.results.maps)
     confirmed = is_confirmed(found.results.maps.order)
-    if body.along < _ALONG and not (confirmed and albedo < _DARK):  # dark gloss reflects itself
+    if body.along < _ALONG and not (confirmed and albedo < _DARK):  # dark gloss reflects its own parts
         return _along_contour(body.along, albedo, f"{remedy}; {_across(found)}")
     if found.explained > _BODY_EXPLAINED:
         message = f"The outline is polarized by {100 * body.dolp:.1f} %, as the shape explains"
@@ -296,9 +296,9 @@ def _light_of_body(body: rim.RimFigures, found: Evidence[ResultsUntilInfer], lim
 
 
 def _along_contour(along: float, albedo: float, remedy: str) -> Gate:
-    """Gate "body" of an outline polarized along the contour: usual for dark gloss, a fault for brighter objects."""
+    """Gate "body" for an outline polarized along its contour: a warning on dark objects, a failure on brighter ones."""
     dark = albedo < _DARK
-    reflects = "itself (dark gloss)" if dark else "light from around (metal)"
+    reflects = "its own parts (dark gloss)" if dark else "light from around (metal)"
     message = (
         f"The outline is polarized along the contour: the object reflects {reflects}, or all angles are off by 90°; "
         "the pictures cannot tell which"

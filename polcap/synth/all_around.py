@@ -152,7 +152,7 @@ def _view(scene: Scene, shoot: AroundShoot, turn: Rotation, position: Floats, pl
 
 
 def _write_surface(file: Path, scene: Scene, mesh: Triangles, lift: float) -> None:
-    """Write vertices, faces and material of the true surface."""
+    """Write vertices, faces and material of the true surface, raised by `lift` [m] into the world frame."""
     diffuse, specular, roughness, ior = scene_materials.evaluate(scene.coat, mesh.vertices, mesh.vertex_normals())
     values = {
         "vertices": mesh.vertices + np.array([0.0, lift, 0.0]), "diffuse": diffuse, "specular": specular,

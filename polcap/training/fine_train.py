@@ -135,7 +135,7 @@ def load_example(file: Path) -> NDArray[np.float16]:
     picture = np.load(file)
     channels = picture[:_COUNT].astype(np.float32)
     truth, known = picture[_COUNT : _COUNT + 3].astype(np.float32), picture[-1] > 0
-    shrink = float(np.exp(channels[-1].max()))
+    shrink = float(np.exp(channels[-1].max()))  # from the channel `log_shrink`, constant in the mask
     relief = fine.high_pass(np.moveaxis(truth - channels[_NORMAL : _NORMAL + 3], 0, -1), known, shrink)
     return np.concatenate([picture[:_COUNT], np.moveaxis(relief, -1, 0), known[None]]).astype(np.float16)
 

@@ -1,6 +1,6 @@
 """Detects motion of the object relative to its surroundings, which one transform of the whole picture would hide.
 
-If the object was pushed while chart and backdrop stayed, one transform fits both by a false zoom and roll. So object
+If the object moved while chart and backdrop stayed, one transform fits both by a false zoom and roll. So object
 and surroundings are registered separately, and the two motions are compared in the middle of the object.
 """
 
@@ -31,8 +31,8 @@ _SAME_PX = 0.5  # two starts that differ by less lead to one place
 class ObjectShift:
     """Shift of the object's middle, outline included, relative to chart and backdrop in each shot.
 
-    An infinite shift is another object, NaN is too little detail. The error is large for a chart in a corner, which
-    hardly tells where the object's middle should be.
+    Infinite: the shot shows another object; NaN: too little detail. The error is large if a chart in a corner is all of
+    the surroundings, because its registration is uncertain at the object's middle.
     """
 
     length: Floats  # (K,) merged px
@@ -42,12 +42,12 @@ class ObjectShift:
 def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> ObjectShift:
     """Register object and surroundings of each shot separately, and compare the two motions."""
     shots = len(radiance.angle)
-    pushed = ObjectShift(*np.zeros((2, shots)))
+    shift = ObjectShift(*np.zeros((2, shots)))
     if radiance.offset_px is not None:  # shots cut from one mosaic
-        return pushed
-    pushed.length[1:] = np.nan
+        return shift
+    shift.length[1:] = np.nan
     if not object_.mask.any():
-        return pushed
+        return shift
     step = averaging_step(object_.mask.shape, _MOST_PIXELS)
     reference = detail(radiance.shot(0), _DETAIL_PX, step)[0]
     small = area_mean(object_.mask.astype(np.uint8), reference.picture.shape)
@@ -59,17 +59,17 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
         start = registration.scaled(alignment.transform[k], 1 / step)
         (whole, of_object), (outer, around) = (_registered(region, shot, start) for region in regions)
         if around > _SURE_CORRELATION and of_object < _OTHER_CORRELATION:
-            pushed.length[k] = np.inf
+            shift.length[k] = np.inf
         elif min(of_object, around) > _SURE_CORRELATION:
             places = [transform_points(found.matrix, middle) for found in (whole, outer)]
             per_axis = np.hypot(whole.sigma_at(middle), outer.sigma_at(middle))
-            pushed.length[k] = step * np.hypot(*(places[0] - places[1]))
-            pushed.sigma[k] = step * _ERROR_SCALE * np.sqrt(2) * per_axis * _student(min(whole.tiles, outer.tiles))
-    return pushed
+            shift.length[k] = step * np.hypot(*(places[0] - places[1]))
+            shift.sigma[k] = step * _ERROR_SCALE * np.sqrt(2) * per_axis * _student(min(whole.tiles, outer.tiles))
+    return shift
 
 
 def _student(tiles: int) -> float:
-    """Factor on an error that so few tiles state themselves, so that three times it is as rare as 3σ (Student's t)."""
+    """Factor on a 1σ estimated from few tiles, so that errors above three times it are as rare as 3σ (Student's t)."""
     from scipy.special import ndtr, stdtrit  # here: the import takes 0.2 s
 
     return float(stdtrit(max(2 * tiles - _PARAMETERS, 1), ndtr(3.0)) / 3)

@@ -55,7 +55,7 @@ def of_frame(name: str, tiles: tuple[Floats, Floats], frame: Frame, reference: F
 
 
 def of_tiles(a: Floats, b: Floats) -> Floats | None:
-    """Measure the exposure ratio b / a (C,) of two frames from tiles (T, C) of `common_tiles`; None for too few.
+    """Measure the exposure ratio b / a (C,) of two frames from `common_tiles` (T, C); None for too few bright ones.
 
     It is the quotient of sums over tiles: the maximum-likelihood estimate for Poisson counts, without the bias of a
     mean of quotients or of logarithms. Tiles that disagree, because something moved, are left out. A channel with an
@@ -159,7 +159,7 @@ def _quadratic(x: Floats, y: Floats) -> Floats:
 
 
 def of_unlit(a: Floats, b: Floats, stated: float) -> float | None:
-    """Exposure ratio of a frame that got no light, from tiles (T, C); None if it got some, or was to get little."""
+    """Exposure ratio b / a of an unlit frame b, from tiles (T, C); None if b has light, or was set to get little."""
     a, b = a.sum(axis=1), b.sum(axis=1)
     seen = stated * a > _DIM
     if seen.sum() < _LEAST_TILES or b[seen].sum() > _UNLIT * stated * a[seen].sum():

@@ -4,9 +4,9 @@
 2. The network predicts normals, material, depth and error; half-turns of whole regions are corrected.
 3. The analytic inversion gives normals of each pixel. Their detail replaces that of the network where noise is low.
 4. The refinement network adds relief.
-5. The coarse part of the normals becomes that of one surface where there is one.
+5. The coarse part of the normals becomes that of one surface, except at depth steps.
 6. Planar faces lose the variation that the expected error explains.
-7. The picture over the shading of the normals, times a smooth factor of the network, is the albedo.
+7. The albedo is the picture, divided by the shading of the normals, times a smooth factor from the network.
 8. Pixels of one material get one roughness, with one expected error, and one F0.
 """
 

@@ -32,9 +32,9 @@ _DAMPING = 1e-9  # of the mean diagonal element
 
 
 def make_integrable(normal: Floats, error: Floats, mask: Bools, rays: Floats) -> Floats:
-    """Change the coarse part of unit normals (H, W, 3) to those of one surface, where the mask (H, W) has one.
+    """Replace the coarse part of unit normals (H, W, 3) by that of one surface, except at depth steps.
 
-    `error` (H, W) is their expected error [degrees]; `rays` (H, W, 3) are the view rays.
+    `error` (H, W) is their expected error [degrees]; `mask` (H, W) is the object's; `rays` (H, W, 3) are the view rays.
     """
     shrink = max(1.0, max(mask.shape) / _LONGEST)
     shape = tuple(max(8, round(side / shrink)) for side in mask.shape)
