@@ -187,6 +187,14 @@ def test_a_hostile_report_is_one_line(polcap: Command, copy: Path, text: str) ->
     refused(polcap("report", copy, "--compare", copy), "report.json")
 
 
+@pytest.mark.parametrize("turn", [45, "90", None])
+def test_a_turn_in_a_report_that_is_no_quarter_is_one_line(polcap: Command, copy: Path, turn: object) -> None:
+    about = json.loads((copy / "report.json").read_text("utf-8"))
+    about["capture"]["upright_deg"] = turn
+    (copy / "report.json").write_text(json.dumps(about), "utf-8")
+    refused(polcap("export", copy, "--ply"), "report.json")
+
+
 @pytest.mark.parametrize("name", ["run.json", "01-hdr/manifest.json", "07-cues/manifest.json"])
 def test_an_edited_cache_is_one_line(polcap: Command, copy: Path, name: str) -> None:
     file = copy / "work" / name

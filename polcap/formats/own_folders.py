@@ -47,5 +47,8 @@ def ball_accuracies() -> Path:
 
 
 def toml_files(folder: Path) -> list[Path]:
-    """TOML files of a folder by name; none if there is no folder. Hidden files are of macOS, or of a killed run."""
-    return sorted(path for path in folder.glob("[!.]*.toml") if path.is_file())
+    """TOML files of a folder by name; none if it cannot be opened. Hidden files are of macOS, or of a killed run."""
+    try:
+        return sorted(path for path in folder.glob("[!.]*.toml") if path.is_file())
+    except OSError:
+        return []

@@ -49,6 +49,7 @@ class _CaptureFacts(msgspec.Struct, frozen=True):
     ball: BallAccuracy | None = None
     catalog: dict[str, str] = {}
     focal_doubt: tuple[float, float] = (0.0, 0.0)
+    upright_deg: Literal[0, 90, 180, 270] = 0
 
 
 class RunFacts(msgspec.Struct, frozen=True):

@@ -1,6 +1,7 @@
 """Blender loads GLB, OBJ and USD: what it samples is what the maps say, upright and of the right size."""
 
 import importlib.util
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from polcap.formats.export import encoders, gltf, obj, texture_set, usd
 from polcap.formats.export.glb_geometry import Geometry
 from polcap.image_values import Floats
 from polcap.mesh_values import ReliefMesh
+from polcap.pipeline import run as pipeline
+from polcap.pipeline.export_request import ExportRequest
 from polcap.stage_values import SurfaceMaps
 from tests import surfaces
 from tests.blender import session
@@ -110,8 +113,13 @@ runpy.run_path(str(tool), run_name="__main__")
     assert "Success" in session.run(script, ROOT / "examples" / "blender" / "polcap_result")
 
 
-def test_extension_sets_up_camera_flash_and_photograph(result: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("upright_deg", [0, 90])
+def test_extension_sets_up_camera_flash_and_photograph(copy: Path, tmp_path: Path, upright_deg: int) -> None:
     """The bundled result through its own camera: the rendered outline falls onto the mask."""
+    about = json.loads((copy / "report.json").read_text())
+    about["capture"]["upright_deg"] = upright_deg
+    (copy / "report.json").write_text(json.dumps(about))
+    pipeline.export(copy, ExportRequest())
     script = tmp_path / "load.py"
     script.write_text(
         f"""
@@ -137,12 +145,12 @@ polcap_result.unregister()
     )
     import cv2
 
-    said = session.run(script, result / "maps" / "maps.json", tmp_path / "seen.png")
+    said = session.run(script, copy / "maps" / "maps.json", tmp_path / "seen.png")
     assert "scale is relative" in said
-    seen, mask = (cv2.imread(str(file), -1) for file in (tmp_path / "seen.png", result / "maps" / "mask.png"))
+    seen, mask = (cv2.imread(str(file), -1) for file in (tmp_path / "seen.png", copy / "maps" / "mask.png"))
     assert seen is not None and mask is not None and seen.shape[:2] == mask.shape
     assert ((seen[..., 3] > 127) != (mask > 127)).sum() < 0.03 * (mask > 127).sum()
-    photograph = cv2.imread(str(result / "maps" / "photograph.png")).astype(float)
+    photograph = cv2.imread(str(copy / "maps" / "photograph.png")).astype(float)
     inside = cv2.erode(mask, np.ones((9, 9))) > 127
     gain = [np.median(seen[..., k][inside]) / np.median(photograph[..., k][inside]) for k in range(3)]
     assert np.allclose(gain, 1, atol=0.1)  # the flash is as bright as the one of the photograph

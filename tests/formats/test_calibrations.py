@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from polcap.calibration_values import Calibration, Falloff, FlashEnergy, LensGeometry, Levels, NoiseLine, Polarizer
 from polcap.capture_values import Exif
 from polcap.errors import CaptureError
-from polcap.formats import atomic, calibrations
+from polcap.formats import atomic, ball_accuracies, calibrations
 from polcap.formats.capture import reader as capture
 
 EXAMPLE = Path(__file__).parents[1] / "capture"
@@ -75,6 +76,14 @@ def test_falloff_of_another_aperture_is_left_out(users):
     found, notes = calibrations.choose(dataclasses.replace(EXIF, f_number=4.0), None, None)
     assert (found.falloff, found.polarizer) == (None, RING)
     assert "another aperture" in notes[-1]
+
+
+def test_a_folder_that_cannot_be_opened_holds_no_calibration(users, monkeypatch):
+    """Such as that of another account whose home folder the environment names."""
+    calibrations.write(users, KNOWN)
+    monkeypatch.setattr(Path, "glob", Mock(side_effect=PermissionError))
+    assert calibrations.choose(EXIF, None, None) == (None, [])
+    assert ball_accuracies.choose(EXIF, None) is None
 
 
 @pytest.mark.parametrize("text", [b"x = ", b"made = 3", b"", b"made = '\xff'"])

@@ -7,7 +7,7 @@ expected error of the normals is an AOV of the material, and a switch in the sid
 
 import json
 import struct
-from math import pi
+from math import pi, radians
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +42,14 @@ class Result:
         """The object's median depth, in its unit: where the light of the photographs is 1."""
         return float(self.said["depth"]["median"])
 
-    def origin(self) -> Vector:
-        """Where the GLB's origin lies in the frame of the camera (x right, y up, z toward it)."""
+    def pose(self) -> Matrix:
+        """The camera's frame (x right, y up, z toward it) in Blender's; polcap turns assets of upright cameras."""
         with self.glb.open("rb") as file:
             _, _, _, length, _ = struct.unpack("<4sIIII", file.read(20))
             document = json.loads(file.read(length))
-        return Vector(document["asset"]["extras"]["origin_in_camera"])
+        extras = document["asset"]["extras"]
+        turn = Matrix.Rotation(radians(extras.get("turned_deg", 0)), 4, "Z")
+        return TO_BLENDER.to_4x4() @ Matrix.Translation(-Vector(extras["origin_in_camera"])) @ turn
 
 
 class IMPORT_SCENE_OT_polcap(bpy.types.Operator, ImportHelper):  # type: ignore[misc]
@@ -68,15 +70,15 @@ class IMPORT_SCENE_OT_polcap(bpy.types.Operator, ImportHelper):  # type: ignore[
     def execute(self, context: Any) -> set[str]:
         try:
             result = Result(Path(self.filepath))
-            middle = TO_BLENDER @ -result.origin()
+            pose = result.pose()
         except (OSError, ValueError, KeyError, struct.error) as error:
             self.report({"ERROR"}, f"no result of polcap: {error}")
             return {"CANCELLED"}
         before = set(bpy.data.objects)
         bpy.ops.import_scene.gltf(filepath=str(result.glb))
         added = [one for one in bpy.data.objects if one not in before and one.type == "MESH"]
-        camera = add_camera(context, result, middle)
-        add_flash(context, result, middle)
+        camera = add_camera(context, result, pose)
+        add_flash(context, result, pose.translation)
         for one in added:
             one["polcap_unit"] = result.said["depth"]["unit"]
             add_confidence(one.data.materials[0], result)
@@ -89,7 +91,7 @@ class IMPORT_SCENE_OT_polcap(bpy.types.Operator, ImportHelper):  # type: ignore[
         return {"FINISHED"}
 
 
-def add_camera(context: Any, result: Result, at: Vector) -> Any:
+def add_camera(context: Any, result: Result, pose: Matrix) -> Any:
     """The photograph's camera over the crop: focal length, shifted centre, backdrop."""
     said, (width, height) = result.said["camera"], result.said["size"]
     camera = bpy.data.cameras.new("polcap camera")
@@ -105,7 +107,7 @@ def add_camera(context: Any, result: Result, at: Vector) -> Any:
         backdrop.display_depth, backdrop.alpha = "BACK", 1.0
         camera.show_background_images = True
     placed = bpy.data.objects.new("polcap camera", camera)
-    placed.matrix_world = Matrix.Translation(at) @ TO_BLENDER.to_4x4()
+    placed.matrix_world = pose
     context.scene.collection.objects.link(placed)
     return placed
 
