@@ -73,8 +73,9 @@ def order_of_shots(
 
 def _likelier(object_: ObjectMask, seen: flatness.Flatness | None, explained: float | None) -> float:
     """Factor between expected errors that decides on an order: larger where good captures reach more."""
+    if seen is not None and seen.flat:
+        return _LIKELIER_FLAT
     likelier = _LIKELIER if object_.mask.sum() > _SMALL_PX else _LIKELIER_SMALL
-    likelier = _LIKELIER_FLAT if seen is not None and seen.flat else likelier
     unexplained = explained is not None and explained < _ORDER_UNEXPLAINED
     return min(likelier, _LIKELIER_UNEXPLAINED) if unexplained else likelier
 
