@@ -60,9 +60,14 @@ class Flatness:
         return self.aligned > _ALIGNED
 
     @property
+    def unpolarized(self) -> bool:
+        """Whether most of the outline is hardly polarized, as that of a plane that faces the camera."""
+        return self.rim_dolp < _FACING_DOLP
+
+    @property
     def flat(self) -> bool:
         """Whether the object is one plane, except for its relief."""
-        one_plane = self.rim_dolp < _FACING_DOLP or self.common > _ONE_PLANE or self.aligned > _ONE_NORMAL
+        one_plane = self.unpolarized or self.common > _ONE_PLANE or self.aligned > _ONE_NORMAL
         return self.sharp_edged and self.one_normal and one_plane
 
 

@@ -17,7 +17,7 @@ _LIKELIER = 1.1  # factor between expected errors that decides on an order (docs
 _LIKELIER_SMALL, _SMALL_PX = 1.5, 5000  # the same for objects of fewer pixels, of which good ones reach 1.2
 _LIKELIER_FLAT = 1.8  # the same for flat objects: good ones reach 1.5, wrong orders 2.2
 _LIKELIER_UNEXPLAINED, _ORDER_UNEXPLAINED = 1.3, 0.3  # the same where maps explain less polarization: good ones 1.2
-_BOX_CONTOUR, _BOX_DEG, _BOX_EXPLAINED = 0.35, 8.0, 0.6  # two good boxes: factors 1.6 and 2.1, .76 and .69 explained
+_BOX_CONTOUR, _BOX_EXPLAINED = 0.35, 0.6  # three good boxes: factors 1.6, 2.1 and 2.3; .76, .69 and .68 explained
 _ORDER_EXPLAINED = 0.4  # part of the polarization from which maps confirm an order: wrong ones up to .26
 
 
@@ -73,16 +73,16 @@ def order_of_shots(
 
 def _likelier(object_: ObjectMask, seen: flatness.Flatness | None, explained: float | None) -> float:
     """Factor between expected errors that decides on an order: larger where good captures reach more."""
-    if seen is not None and seen.flat:
-        return _LIKELIER_FLAT
     likelier = _LIKELIER if object_.mask.sum() > _SMALL_PX else _LIKELIER_SMALL
-    unexplained = explained is not None and explained < _ORDER_UNEXPLAINED
+    likelier = _LIKELIER_FLAT if seen is not None and seen.flat else likelier
+    faces = seen is not None and seen.unpolarized  # the facing plane has little polarization to explain
+    unexplained = explained is not None and explained < _ORDER_UNEXPLAINED and not faces
     return min(likelier, _LIKELIER_UNEXPLAINED) if unexplained else likelier
 
 
 def _hides_order(seen: flatness.Flatness | None) -> bool:
-    """Whether an object is flat, or has hardly any occluding contour and normals with small expected errors."""
-    return seen is not None and (seen.flat or (seen.contour < _BOX_CONTOUR and seen.expected_deg < _BOX_DEG))
+    """Whether an object is flat, or has hardly any occluding contour."""
+    return seen is not None and (seen.flat or seen.contour < _BOX_CONTOUR)
 
 
 def _undecided(other: str, outline: OutlineCheck, radiance: AngleStack) -> Gate:
