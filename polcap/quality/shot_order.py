@@ -62,6 +62,8 @@ def order_of_shots(
     message = f"The outline supports the stated order (fit {outline.concentration:.2f} of 1)"
     if is_confirmed(test):
         message = f"In any other order, the network expects errors that are at least {test.ratio:.1f} times as large"
+    elif edges and test is not None and test.ratio < 1 / _LIKELIER_UNEXPLAINED and _is_unexplained(seen, explained):
+        return _undecided(_order_text(test.rival, names), outline, radiance)
     elif edges:
         return Gate("order", "not measured", None, "as stated", "Flat faces show no order of the angles", unit="")
     elif outline.rival is not None and (explained or 0.0) > _ORDER_EXPLAINED and (test is None or test.ratio >= 1):
@@ -73,11 +75,16 @@ def order_of_shots(
 
 def _likelier(object_: ObjectMask, seen: flatness.Flatness | None, explained: float | None) -> float:
     """Factor between expected errors that decides on an order: larger where good captures reach more."""
+    if seen is not None and seen.flat:
+        return _LIKELIER_FLAT
     likelier = _LIKELIER if object_.mask.sum() > _SMALL_PX else _LIKELIER_SMALL
-    likelier = _LIKELIER_FLAT if seen is not None and seen.flat else likelier
-    faces = seen is not None and seen.unpolarized  # the facing plane has little polarization to explain
-    unexplained = explained is not None and explained < _ORDER_UNEXPLAINED and not faces
-    return min(likelier, _LIKELIER_UNEXPLAINED) if unexplained else likelier
+    return min(likelier, _LIKELIER_UNEXPLAINED) if _is_unexplained(seen, explained) else likelier
+
+
+def _is_unexplained(seen: flatness.Flatness | None, explained: float | None) -> bool:
+    """Whether maps explain little of the polarization; a facing plane has little to explain."""
+    faces = seen is not None and seen.unpolarized
+    return explained is not None and explained < _ORDER_UNEXPLAINED and not faces
 
 
 def _hides_order(seen: flatness.Flatness | None) -> bool:
