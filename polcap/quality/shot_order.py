@@ -43,7 +43,7 @@ def order_of_shots(
     An outline that is the edge of flat faces decides nothing. Where another order is as good, the stated one counts if
     its maps explain the photographs and the network does not expect smaller errors in another one. The network's test
     sees one small picture, and misjudges boxes and planes: maps that explain much of the polarization (`explained`, 1
-    is all) leave its finding undecided, maps that explain little confirm it.
+    is all) leave its finding undecided. Maps that explain little confirm it, or on flat faces leave it undecided.
     """
     statement, names, better = radiance.equipment.angles, shot_names(radiance), None
     edges = seen is not None and seen.sharp_edged
