@@ -28,6 +28,7 @@ from polcap.pipeline.export_request import ExportRequest
 from polcap.report import levels
 from tests.conftest import ROOT, Command, python, shell
 from tests.formats.export.test_gltf import NODE, document
+from tests.stages.hdr import brackets
 
 
 @pytest.fixture(scope="module")
@@ -509,6 +510,12 @@ def test_an_asset_of_a_turned_camera_stands_upright(own: Path, orientation: int,
     assert upright.vertex_normals[:, 1] == pytest.approx(lying.vertex_normals[:, :2] @ up, abs=1e-4)
     assert upright.vertices[:, 2] == pytest.approx(lying.vertices[:, 2], abs=1e-6)
     assert np.array_equal(upright.visual.uv, lying.visual.uv)
+
+
+def test_photographs_that_state_different_orientations_turn_nothing() -> None:
+    upright, lying = (brackets.frame(None, upright_deg=turn) for turn in (90, 0))
+    assert brackets.capture([upright, upright], [upright, upright]).upright_deg == 90
+    assert brackets.capture([upright, upright], [upright, lying]).upright_deg == 0
 
 
 def test_cavities_are_the_concave_part_of_the_curvature(tiny_result: Path) -> None:
