@@ -94,7 +94,7 @@ def test_the_command_prints_every_quantity(found):
 def test_command_writes_a_dated_file_where_process_looks(folder, found, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("POLCAP_CALIB", str(tmp_path / "calib"))
     monkeypatch.setattr(calibrate, "measure", lambda *_: found)
-    calibrate_command.calibrate(None, folder, json=True)
+    calibrate_command.calibrate(folder, json=True)
     answer = json.loads(capsys.readouterr().out)
     assert Path(answer["file"]).parent == tmp_path / "calib"
     assert calibrations.read(Path(answer["file"])).camera == found.camera
