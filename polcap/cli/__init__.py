@@ -82,8 +82,9 @@ def _one_line(error: TyperException) -> str:
     text = text.rstrip(".").replace("Value error, ", "")
     if "unexpected extra argument" in text:
         text += "; put a path with spaces in quotes"
-    context, option = getattr(error, "ctx", None), getattr(error, "option_name", None)
-    if option and context is not None and any("--set" in known.opts for known in context.command.params):
+    context = getattr(error, "ctx", None)
+    if "such option" in text and context is not None and any("--set" in known.opts for known in context.command.params):
+        option = str(getattr(error, "option_name", ""))
         keys = keys_named(option, str(context.info_name))
         text = f"no such option: {option}; it is a setting: --set {keys[0]}=…" if len(keys) == 1 else text
     asked = "polcap" if context is None or context.parent is None else f"polcap {context.info_name}"
