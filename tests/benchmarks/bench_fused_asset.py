@@ -81,7 +81,7 @@ def errors(folder: Path) -> Errors:
     for view, visible in zip(views, baking.visible_texels(views, results.atlas)):
         good = visible.weight > LEAST_SEEN
         normal = frames.unit(visible.sample(view.normal)) @ view.pose.rotation
-        own = [normal, *(visible.sample(part) for part in (view.diffuse, view.specular, view.roughness[..., None]))]
+        own = [normal, *(visible.sample(part) for part in (view.diffuse, view.specular, view.roughness))]
         texel = visible.texel[good]
         single.append(mean_errors([part[good] for part in own], [part[texel] for part in true]))
         baked.append(mean_errors([part[texel] for part in textures(results)], [part[texel] for part in true]))
@@ -162,7 +162,7 @@ def material(surface: Triangles, truth: dict[str, Any], point: Floats) -> list[F
 def mean_errors(found: Sequence[Floats], true: Sequence[Floats]) -> Floats:
     """Mean errors (4,) of normals [°], luminance of albedo and of F0, and roughness."""
     albedo, f0 = (np.abs(color.luminance(found[k]) - color.luminance(true[k])).mean() for k in (1, 2))
-    return np.array([mean_angle_deg(found[0], true[0]), albedo, f0, np.abs(found[3] - true[3][:, 0]).mean()])
+    return np.array([mean_angle_deg(found[0], true[0]), albedo, f0, np.abs(found[3].ravel() - true[3].ravel()).mean()])
 
 
 def texel_distance(surface: Triangles, source: FusionResults) -> float:
