@@ -176,6 +176,7 @@ def _maps(about: Mapping[str, Any], results: Results) -> tuple[dict[str, Any], d
     maps, ior = results.maps, float(about["settings"]["infer"]["ior"])
     small = page_data.reduce(maps, results.mesh, results.cues, results.radiance.angle, _LONGEST)
     rendered = rerender(small, ior)
+    figures = about["figures"].get("rerendering") or rendered.residuals(small.maps.mask)  # an older report has none
     bright = page_data.exposure(small)
     view, size = small.maps.view, small.maps.mask.shape[1::-1]
     photograph = page_data.photograph(results.radiance, results.color, view, size)
@@ -184,7 +185,7 @@ def _maps(about: Mapping[str, Any], results: Results) -> tuple[dict[str, Any], d
         "flashed": html.jpeg(srgb_eight_bits(bright * rendered.scale * rendered.flashed)),
         "agreement": light_agreement(rendered),
         "maps": map_figures.of_result(small, results.mesh.metric),
-        "differences": map_figures.differences(small, rendered, about["figures"]["rerendering"]),
+        "differences": map_figures.differences(small, rendered, figures),
     }
     return drawn, {
         "size": list(size),

@@ -25,7 +25,7 @@ from polcap.synth.render import Scene
 from polcap.synth.shooting import Shoot
 
 SHOOT = Shoot(width=768, height=576, exposures=2, samples=1)
-OBJECTS = {"bumps": 5, "vase": 3}  # kind and seed
+OBJECTS: dict[scenes.Kind, int] = {"bumps": 5, "vase": 3}  # kind and seed
 MOVE_M, ORBIT_DEG = np.array([0.012, -0.008, 0.03]), 4.0
 FOCAL_MM = 75.0
 _evaluate, _relief = scene_materials.evaluate, scene_materials.add_relief
@@ -122,7 +122,7 @@ def result(folder: Path, scene: Scene, shoot: Shoot, change: str, base: Scene) -
 def main(folder: Path) -> None:
     """Make the pairs, compare them, and print what was found."""
     for number, (kind, seed) in enumerate(OBJECTS.items()):
-        scene = scenes.random_scene(seed, kind)  # type: ignore[arg-type]
+        scene = scenes.random_scene(seed, kind)
         before = result(folder / kind / "before", scene, SHOOT, "", scene)
         for name, (other, shoot, change) in pairs(scene, number == 0).items():
             after = result(folder / kind / name, other, shoot, change, scene)

@@ -7,6 +7,7 @@ Most samples have an F0 near the mean of its prior, so that its errors are small
 """
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,7 @@ def main() -> None:
         out = "material" if options.polarization == "yes" else "without"
         more = [] if options.polarization == "yes" else ["--set", "material.gloss.fitting.polarization_error=1"]
         words = ["-q", "material", str(session), "--out", str(session / out), *more]
-        _, seconds = timed(lambda words=words: app(words, standalone_mode=False))  # type: ignore[misc]
+        _, seconds = timed(partial(app, words, standalone_mode=False))
         figures = {key: round(value, 4) for key, value in errors(session, out).items()}
         figures |= {"cpu_s": round(seconds), "gb": round(peak_mb() / 1000, 2)}
         print(name, json.dumps(figures), flush=True)

@@ -14,6 +14,7 @@ and goes on exceeding it between ever nearer rays.
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import cv2
 import msgspec
@@ -162,7 +163,7 @@ def scene_of(kind: str, seed: int) -> render.Scene:
     """A random scene of a kind of object, or with a mesh such as test/mug."""
     if "/" in kind:
         return scenes.with_model(scenes.random_scene(seed, "vase"), data() / "meshes" / f"{kind}.npz", seed)
-    return scenes.random_scene(seed, kind)  # type: ignore[arg-type]
+    return scenes.random_scene(seed, cast(scenes.Kind, kind))
 
 
 def rendered(name: str) -> dict[str, Floats | Bools]:

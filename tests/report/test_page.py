@@ -50,6 +50,13 @@ def test_an_empty_list_is_shown_as_none() -> None:
     assert labels.text("chart.unused", [1, 2]) == "1, 2"
 
 
+def test_a_report_without_figures_of_the_rerendering_is_drawn(result: Path, tmp_path: Path) -> None:
+    about = report.read(result)
+    del about["figures"]["rerendering"]
+    page.write(tmp_path, about, pipeline.reopen(result, Results)[0])
+    assert "45° shot" in (tmp_path / "report.html").read_text()
+
+
 def test_any_name_is_text_and_no_markup_and_the_link_leads_to_the_asset(result: Path, tmp_path: Path) -> None:
     about = report.read(result)
     about["capture"]["name"] = "<i>jug #3 50% Öl"
