@@ -222,7 +222,7 @@ class StokesImage(ArrayValue):
     view: View  # of the crop
     residual: Floats | None  # (H, W) |measured − fitted| / S0 where K > 3
     body: MaskedImage | None = None  # S0 of the diffuse reflection only, from a crossed shot
-    detail: Floats | None = None  # (2H, 2W) float16, ln of the light of RAW pixels over these pixels, enlarged
+    detail: Floats | None = None  # (2H, 2W) float16, ln(light at RAW pixels / enlarged light of this grid)
 
 
 @dataclass(frozen=True, repr=False)
@@ -243,7 +243,7 @@ class Cues(ArrayValue):
     body: Floats | None = None  # (H, W, 3) radiance of the diffuse reflection only, from a crossed shot
     body_known: Bools | None = None  # (H, W) where the crossed shot is valid
     other_orders: tuple[OtherOrder, ...] = ()
-    detail: Floats | None = None  # (2H, 2W) float16, ln of the light of RAW pixels over these pixels, enlarged
+    detail: Floats | None = None  # (2H, 2W) float16, ln(light at RAW pixels / enlarged light of this grid)
 
 
 @dataclass(frozen=True)
@@ -277,7 +277,7 @@ class SurfaceMaps(ArrayValue):
     view: View
     estimator: str
     albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown, albedos are relative
-    detail: Floats | None = None  # (2H, 2W) float16, ln of the albedo of RAW pixels over `diffuse`, enlarged
-    order: OrderTest | None = None  # None without a network, or without other orders
-    diffuse_error: Floats | None = None  # (H, W) 1σ of the mean of its channels; None until the gates judged
-    roughness_error: Floats | None = None  # (H, W) 1σ of `roughness`; of the inversion None until the gates judged
+    detail: Floats | None = None  # (2H, 2W) float16, ln(albedo at RAW pixels / enlarged `diffuse`)
+    order: OrderTest | None = None  # None without a network, or if the outline excludes all other orders
+    diffuse_error: Floats | None = None  # (H, W) 1σ of the mean of its channels; the gates set it
+    roughness_error: Floats | None = None  # (H, W) 1σ of `roughness`; without a network the gates set it

@@ -24,7 +24,7 @@ from polcap.optics.vertex_frames import area_vectors, vertex_normals, vertex_tan
 from polcap.stages import stage
 
 _FILLED = 0.4  # share of the texture that charts cover, about; uvunwrap reaches .4 to .63
-_TRIANGLE = 4  # map pixels to a triangle of the mesh; docs/benchmarks/fusion.md
+_TRIANGLE = 4  # map pixels to a triangle of the mesh; docs/benchmarks/fusion-choices.md
 _FEWEST = 2000  # triangles
 _SHARES = (1.0, 0.9, 0.8)  # of the triangles, in turn until the mesh can be charted
 _SIDES = (512, 4096)  # px, least and greatest side of a texture whose size is not set
@@ -34,7 +34,9 @@ class AtlasSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of the stage `atlas` of the fusion."""
 
     size: Annotated[int, Meta(ge=0, le=8192, description="side of the textures; 0: a texel is one map pixel [px]")] = 0
-    margin: Annotated[int, Meta(ge=1, le=32, description="distance of UV charts, filled from their borders [px]")] = 6
+    margin: Annotated[
+        int, Meta(ge=1, le=32, description="gap between UV charts, filled with their border colors [px]")
+    ] = 6
 
 
 @dataclass(frozen=True)

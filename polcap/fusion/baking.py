@@ -207,7 +207,7 @@ def _bake_normals(
 def _mesh_sigma_deg(differences: Sequence[Floats]) -> float:
     """Error of the mesh's smooth normals: twice the median angle between them and those of the views.
 
-    Twice, because the mesh was fitted to these normals; docs/benchmarks/fusion.md.
+    Twice, because the mesh was fitted to these normals; docs/benchmarks/fusion-choices.md.
     """
     angle = np.concatenate([np.linalg.norm(one[::8], axis=-1) for one in differences])
     return float(max(2 * np.degrees(np.median(angle)), _FLOOR_DEG))

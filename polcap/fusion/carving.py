@@ -32,7 +32,7 @@ from polcap.optics.mesh_tracer import Tracer
 from polcap.optics.projection import back_project
 from polcap.optics.vertex_frames import vertex_normals
 
-_DOUBT = 0.4  # share of the views' weight that contradicts the mean normal; this and below: docs/benchmarks/fusion.md
+_DOUBT = 0.4  # share of the views' weight against the mean normal; from here on: docs/benchmarks/fusion-choices.md
 _PASSES = 6  # of averaging over neighbors
 _LEAST_PART = 0.01  # share of the vertices on a doubtful part of the surface; smaller parts are no hollows
 _PLANES = 1.5  # steps between the sweep's planes

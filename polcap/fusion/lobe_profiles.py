@@ -11,7 +11,7 @@ from polcap.image_values import Bools, Floats
 from polcap.optics import frames, shade
 
 ALPHAS = np.geomspace(0.01, 1.0, 49)
-# the numbers below: docs/benchmarks/fusion.md, "Gloss from the highlights of all views"
+# the numbers below: docs/benchmarks/fusion-choices.md, "Textures and gloss"
 _BIN_DEG, _LARGEST_DEG = 3.0, 60.0  # half-angles; beyond, errors of the normals change the mean radiance
 _LEAST_IN_BIN, _LEAST_BINS = 10, 8
 _OUTLIERS = 0.02  # share of the darkest and of the brightest samples of a bin, which are left out

@@ -53,7 +53,7 @@ _SAMPLES = 6000  # of a material, at most
 _LEAST_SAMPLES = 300  # of a material, below which its maps are left as they are
 _LEAST_SHARE = 0.02  # of the weight in the view that sees most of a material, for a view's maps to count
 _LEAST_COSINE = 0.3  # between normal and view: flatter views show errors of the normals
-# the numbers below: docs/benchmarks/fusion.md, "Gloss from the highlights of all views"
+# the numbers below: docs/benchmarks/fusion-choices.md, "Textures and gloss"
 _GAIN_SIGMA, _LAW_SIGMA = 0.15, 0.1  # of g and c
 _OWN_F0_SIGMA = 0.004  # of a material's F0 about the F0 of all
 _BROAD_ALPHA, _BROAD_POWER = 0.35, 4  # beyond, a highlight is so like the shading that F0 stays near that of the maps

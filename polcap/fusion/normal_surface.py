@@ -29,7 +29,7 @@ from polcap.optics.frames import dot, unit
 from polcap.optics.mesh_tracer import Tracer, Triangles
 from polcap.optics.vertex_frames import area_vectors, vertex_normals
 
-# the numbers: docs/benchmarks/fusion.md; steps are those of the hull's grid
+# the numbers: docs/benchmarks/fusion-choices.md; steps are those of the hull's grid
 _LIFT = 0.3  # steps off the surface, where rays towards the lenses start
 _FACING = 0.1  # least cosine between a vertex's normal and the direction to a lens that sees it
 _CAUCHY = np.radians(12.0)  # rad; a view that differs by as much from the mean counts half

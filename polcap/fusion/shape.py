@@ -14,7 +14,7 @@ from polcap.fusion.small_views import reduce_views
 from polcap.fusion.values import ClosedMesh, FusionView
 from polcap.stages import stage
 
-_ROUNDS = 20  # of the surface's fit; docs/benchmarks/fusion.md
+_ROUNDS = 20  # of the surface's fit; docs/benchmarks/fusion-choices.md
 _FIRST_ROUNDS = 6  # before hollows are searched: on the bare hull views disagree at flat hollows, too
 
 

@@ -87,7 +87,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Meta(
             gt=0,
             lt=1,
-            description="misfit of the outline with a turn over that without, from which no turn is reported [1]",
+            description="a turn is reported if it lowers the outline's misfit below this share [1]",
         ),
     ] = 0.68
     min_outline_dolp: Annotated[Share, Meta(description="least allowed median polarization of the outline [1]")] = 0.03

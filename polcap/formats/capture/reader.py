@@ -38,7 +38,7 @@ def read(folder: str | Path, angles_deg: tuple[float, ...] | None = None, clockw
     the reference. `clockwise`: the stated angles are counted clockwise in the picture.
 
     Raises CaptureError: the photographs do not form a capture; the message names the file, the reason and the remedy.
-    Raises DecodeError: a file is cut short, or no decoder recognises it.
+    Raises DecodeError: a file is cut short, or no decoder recognizes it.
     """
     folder = Path(folder)
     missing = unfinished.missing_frames(folder)

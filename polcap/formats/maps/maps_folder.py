@@ -107,7 +107,7 @@ class ResultMaps(SurfaceMaps):
     """All maps of a result, with its depth."""
 
     depth: Floats  # (H, W) along the optical axis, growing away from the camera; NaN outside the mask
-    metric: bool  # depth is in metres; otherwise in a unit of its own
+    metric: bool  # depth is in metres; otherwise its median is 1
 
 
 def write(folder: Path, results: Results) -> None:

@@ -37,7 +37,7 @@ def read(path: str | Path) -> Probe:
     """Kind, digest and metadata of a file, with its size in visible RAW pixels.
 
     A file of unknown content that LibRaw can open is a RAW too. Raises DecodeError: the file cannot be read, no decoder
-    recognises it, it is cut short or of a form that polcap refuses.
+    recognizes it, it is cut short or of a form that polcap refuses.
     """
     answer, _ = sandbox.call(examine, path, limit_s=_LIMIT_S)
     found = msgspec.convert(answer["probe"], Probe)
