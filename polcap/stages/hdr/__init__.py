@@ -53,7 +53,7 @@ class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.98
     demosaic: Annotated[
         Literal["superpixel", "full"],
-        Meta(description="a pixel per 2×2 quad (X-Trans 3×3), or Bayer interpolated to full size"),
+        Meta(description="superpixel: a pixel per 2×2 quad (X-Trans 3×3); full: Bayer interpolated to the RAW's size"),
     ] = "superpixel"
     max_motion_px: Annotated[
         float, Meta(ge=0.0, le=500.0, description="a bracket that moved more is refused [visible RAW px]")

@@ -34,7 +34,7 @@ class MaskSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     margin: Annotated[
         float, Meta(ge=0, le=1, description="border added around the object's box [share of its longer side]")
     ] = 0.04
-    min_area: Annotated[float, Meta(gt=0, le=1, description="least part of the picture that an object covers")] = 0.002
+    min_area: Annotated[float, Meta(gt=0, le=1, description="least share of the picture that an object covers")] = 0.002
     part: Annotated[int, Meta(ge=0, le=9, description="process this part of the mask, 1 being the largest; 0: all")] = 0
     chart_margin: Annotated[
         float,
