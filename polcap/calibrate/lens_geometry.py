@@ -36,6 +36,7 @@ _SAMPLES = 31  # across a patch and half of its gaps, to measure the center
 _LEAST_CONTRAST = 2.0  # patch over card
 _CARD = 0.06  # share of the window at each side that shows the card: a patch has 0.88 of the pitch
 _ITERATIONS = 6  # the window moves to the center found
+_NORMAL = 1.4  # focal length over the picture's width of a normal lens, as a first guess
 _ALIKE = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
 
 
@@ -126,7 +127,7 @@ def _bundle_adjustment(
     Returns rms residual [px], camera matrix (3, 3), distortion k₁ k₂ …, and 1σ of fx fy cx cy k₁ k₂ ….
     """
     width, height = size
-    guess = np.array([[1.4 * width, 0, (width - 1) / 2], [0, 1.4 * width, (height - 1) / 2], [0, 0, 1]])
+    guess = np.array([[_NORMAL * width, 0, (width - 1) / 2], [0, _NORMAL * width, (height - 1) / 2], [0, 0, 1]])
     answer: Any = cv2.calibrateCameraExtended(
         [one.flat for one in boards],
         [one.seen for one in boards],
@@ -219,14 +220,14 @@ def _patch_center(light: Floats, place: Floats, center: Floats) -> Floats | None
 
 
 def _as_stack(value: Floats, image: SensorImage) -> AngleStack:
-    """Wrap one picture (H, W, 3) as the input type of the chart detection in `stages/whitebalance`."""
+    """Wrap one picture (H, W, 3) to find a chart by `stages/whitebalance`; variance and lens have no effect there."""
     height, width = value.shape[:2]
     return AngleStack(
         value=value[None],
         variance=np.full((1, height, width, 3), 1e-6, np.float32),
         quality=np.zeros((1, height, width), np.uint8),
         angle=np.zeros(1),
-        view=View(1.4 * width, ((width - 1) / 2, (height - 1) / 2), float(image.superpixel)),
+        view=View(_NORMAL * width, ((width - 1) / 2, (height - 1) / 2), float(image.superpixel)),
         bracket=single_frames(1),
         sensor=ColorSensor(image.camera_matrix, image.white_balance),
     )

@@ -103,17 +103,17 @@ def detect(radiance: AngleStack, color: ColorCalibration) -> BoardSearch:
 
 
 def _find_markers(picture: Floats) -> list[tuple[int, Floats]]:
-    """Numbers of all markers in a linear picture, with their corners (4, 2) px."""
-    bright = max(float(np.quantile(picture, 0.98)), 1e-6)
-    gray = np.asarray(255 * np.clip(picture / bright, 0, 1) ** (1 / 2.2), np.uint8)
-    zoom = _DETECTOR_PX / max(gray.shape)
-    how = cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC
-    sized = cv2.resize(gray, None, fx=zoom, fy=zoom, interpolation=how)
-    quads, numbers, _ = cv2.aruco.ArucoDetector(boards.dictionary()).detectMarkers(sized)
+    """Numbers of all markers in a linear picture, with their corners (4, 2) px; OpenCV searches a gray 8-bit copy."""
+    white = max(float(np.quantile(picture, 0.98)), 1e-6)  # highlights are brighter
+    encoded = np.asarray(255 * np.clip(picture / white, 0, 1) ** (1 / 2.2), np.uint8)  # with a display's gamma
+    zoom = _DETECTOR_PX / max(encoded.shape)
+    method = cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC
+    resized = cv2.resize(encoded, None, fx=zoom, fy=zoom, interpolation=method)
+    quads, numbers, _ = cv2.aruco.ArucoDetector(boards.dictionary()).detectMarkers(resized)
     if numbers is None:
         return []
-    found = np.asarray(quads, np.float64).reshape(-1, 4, 2)
-    return list(zip(np.ravel(numbers).tolist(), (found + 0.5) / zoom - 0.5, strict=True))
+    corners = (np.asarray(quads, np.float64).reshape(-1, 4, 2) + 0.5) / zoom - 0.5  # pixel centers are whole numbers
+    return list(zip(np.ravel(numbers).tolist(), corners, strict=True))
 
 
 def _choose_board(markers: list[tuple[int, Floats]]) -> tuple[Board | None, int]:

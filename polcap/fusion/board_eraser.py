@@ -86,24 +86,24 @@ def erase(radiance: AngleStack, alignment: Alignment, color: ColorCalibration, p
 
 
 def _project(radiance: AngleStack, posed: PosedBoard) -> _Print:
-    """Share of paper in each pixel of the merged picture, through the pose of the board."""
+    """Place and share of paper of each pixel of the merged picture, through the pose of the board."""
     board = posed.board
     height, width = radiance.value.shape[1:3]
     scale = radiance.view.scale
     y, x = (from_grid(axis, scale) for axis in np.mgrid[:height, :width].astype(np.float64))
     place = _on_board(posed.camera, posed.pose, x, y)
-    near = np.abs(place).max(axis=-1) <= board.page_m[0] / 2
-    down, across = (np.gradient(place, axis=axis)[near] for axis in (0, 1))  # m on the board per pixel
+    on_page = np.abs(place).max(axis=-1) <= board.page_m[0] / 2
+    down, across = (np.gradient(place, axis=axis)[on_page] for axis in (0, 1))  # m on the board per pixel
     steps = _SITE_PX * ((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5)
     sites = np.zeros((3, 2)) if radiance.sensor.site_px is None else radiance.sensor.site_px
     paper: Floats = np.zeros((height, width, 3))
-    for channel, (dx, dy) in enumerate(sites):
+    for channel, (site_x, site_y) in enumerate(sites):
         total = sum(
-            ~boards.is_ink(board, *(place[near] + (dx + right) * across + (dy + low) * down).T)
-            for right, low in itertools.product(steps, steps)
+            ~boards.is_ink(board, *(place[on_page] + (site_x + dx) * across + (site_y + dy) * down).T)
+            for dx, dy in itertools.product(steps, steps)
         )
-        paper[near, channel] = total / _SAMPLES**2
-    slope = np.hypot(np.gradient(paper, axis=0), np.gradient(paper, axis=1))
+        paper[on_page, channel] = total / _SAMPLES**2
+    slope = np.hypot(np.gradient(paper, axis=0), np.gradient(paper, axis=1))  # per pixel
     return _Print(2 * place / board.side_m, paper, _SHIFT_PX * maximum_filter(slope, (3, 3, 1)))
 
 

@@ -170,8 +170,9 @@ def _first_motion(
 ) -> tuple[NDArray[np.intp], _Motion]:
     """The largest group of views that matches connect, and their motion, from normals alone.
 
-    The rotations between views are turns about one axis. A tree of the pairs with most matches gives a first turn of
-    each view, least squares of all pairs the final one.
+    1. Matching normals give the rotation between two views: a turn about an axis that all pairs share.
+    2. A tree of the pairs with most matches gives a first turn of each view.
+    3. Least squares over all pairs gives the turns.
     """
     found: dict[_Pair, tuple[Rotation, int]] = {}
     for (one, other), match in pairs.items():
@@ -180,29 +181,30 @@ def _first_motion(
             found[one, other] = rotation, agreeing
     if not found:
         return np.zeros(0, np.intp), _Motion(Rotation.identity(), np.zeros(_TURNS))
-    (i, j), (rotations, counts) = np.array(list(found)).T, zip(*found.values())
+    (i, j), (rotations, counts) = np.array(list(found)).T, zip(*found.values())  # of each pair (P,)
     between, count = Rotation.concatenate(rotations), np.array(counts)
     vector, quaternion = between.as_rotvec(), between.as_quat()
-    axis = unit(np.sum(vector * (np.sign(vector[:, 1]) * count)[:, None], axis=0))
-    step = 2 * np.arctan2(quaternion[:, :3] @ axis, quaternion[:, 3])  # [rad] about the axis
-    distance, signed = np.zeros((2, len(features), len(features)))
-    distance[i, j], signed[i, j], signed[j, i] = 1 / count, step, -step
-    _, group = csgraph.connected_components(distance, directed=False)
+    axis = unit(np.sum(vector * (np.sign(vector[:, 1]) * count)[:, None], axis=0))  # upwards
+    step = 2 * np.arctan2(quaternion[:, :3] @ axis, quaternion[:, 3])  # [rad] turn about the axis, without tilt
+    cost, steps = np.zeros((2, len(features), len(features)))
+    cost[i, j], steps[i, j], steps[j, i] = 1 / count, step, -step
+    _, group = csgraph.connected_components(cost, directed=False)
     views = np.flatnonzero(group == np.argmax(np.bincount(group)))
-    order, before = csgraph.breadth_first_order(csgraph.minimum_spanning_tree(distance), views[0], directed=False)
+    order, parent = csgraph.breadth_first_order(csgraph.minimum_spanning_tree(cost), views[0], directed=False)
     turn: Floats = np.zeros(len(features))
     for k in order[1:]:
-        turn[k] = turn[before[k]] + signed[before[k], k]
+        turn[k] = turn[parent[k]] + steps[parent[k], k]
 
     def residuals(turn: Floats) -> Floats:
-        angle = turn[j] - turn[i] - step
-        error = (angle - 2 * np.pi * np.rint(angle / (2 * np.pi))) * np.sqrt(count) / _NORMAL_SIGMA
-        return np.append(error, turn[views[0]])  # of the first view: 0
+        gap = turn[j] - turn[i] - step
+        error = (gap - 2 * np.pi * np.rint(gap / (2 * np.pi))) * np.sqrt(count) / _NORMAL_SIGMA
+        return np.append(error, turn[views[0]])  # the first view is at turn 0
 
     turn = least_squares(residuals, turn, loss="cauchy").x[views]
     middle = np.concatenate([features[k].ray for k in views.tolist()]).mean(axis=0)
     base = Rotation.align_vectors([axis], [[0.0, 1.0, 0.0]])[0]
-    return views, _Motion(base, np.concatenate([[0.0, 0.0], middle, [0.0], turn, np.zeros(2 * len(views))]))
+    tilt, focal, shifts = np.zeros(2), np.zeros(1), np.zeros(2 * len(views))
+    return views, _Motion(base, np.concatenate([tilt, middle, focal, turn, shifts]))
 
 
 def _rotation(before: Floats, after: Floats) -> tuple[Rotation, int]:

@@ -30,7 +30,7 @@ class Request:
     memory_gb: float = 0.0  # 0: no limit
 
     def supplied(self) -> UserInput:
-        """The inputs of the path, with opened networks. Raises ModelError or SettingError: as `models.load_network`."""
+        """The user's inputs, with opened networks. Raises ModelError or SettingError: as `models.load_network`."""
         network, mask_network = models.load_networks(self.estimator, self.model, self.device, self.threads)
         return UserInput(self.chart, self.mask, network, mask_network)
 
@@ -39,7 +39,7 @@ class Request:
         return reader.read(folder, self.angles_deg, self.clockwise)
 
     def open(self, folder: Path) -> tuple[Capture, UserInput]:
-        """The capture in a folder and the inputs of its path. Networks are opened while photographs are read.
+        """The capture in a folder, and the user's inputs; networks are opened while photographs are read.
 
         Raises InputError: a photograph, the chart or a model cannot be used.
         """

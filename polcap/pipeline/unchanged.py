@@ -119,15 +119,15 @@ def _holds(known: dict[str, Stat], out: Path) -> bool:
     return all(found.get(name) == stat for name, stat in known.items())
 
 
-def _stats(folder: Path, except_: str = "", ignored: tuple[str, ...] = (own_folders.BATCH,)) -> dict[str, Stat]:
-    """Size and times of every file below a folder, except in the folder `except_` and in those of a name in `ignored`.
+def _stats(folder: Path, result: str = "", ignored: tuple[str, ...] = (own_folders.BATCH,)) -> dict[str, Stat]:
+    """Stats of every file below a folder, but for those in the folder of path `result` or in one named in `ignored`.
 
     Raises OSError: a folder is a link, which is not followed.
     """
     found: dict[str, Stat] = {}
     for place, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if name not in ("__pycache__", *ignored)]
-        folders[:] = [name for name in folders if os.path.realpath(os.path.join(place, name)) != except_]
+        folders[:] = [name for name in folders if os.path.realpath(os.path.join(place, name)) != result]
         if any(os.path.islink(os.path.join(place, name)) for name in folders):
             raise OSError(f"{place}: a folder is a link")
         paths = [os.path.join(place, name) for name in files]

@@ -117,7 +117,7 @@ def lit(image: StokesImage) -> Bools:
     inside = image.mask & (image.quality & int(Quality.CLIPPED) == 0)
     s0, s1, s2 = frames.total(image.stokes)
     least = _LIT * float(np.median(s0[inside])) if inside.any() else 0.0
-    return np.asarray(inside & (np.maximum(s0, np.hypot(s1, s2)) > least))
+    return np.asarray(inside & (np.maximum(s0, np.hypot(s1, s2)) > least))  # S0 is small where shots contradict
 
 
 def shot_names(radiance: AngleStack) -> list[str]:
@@ -151,10 +151,8 @@ def at_most(
 
 def compared(change: float, other: str) -> str:
     """Relative change of light in words, such as 3.0 % brighter than the others."""
-    text = f"{100 * abs(change):.1f}"
-    return (
-        f"as bright as {other}" if text == "0.0" else f"{text} % {'darker' if change < 0 else 'brighter'} than {other}"
-    )
+    text, relation = f"{100 * abs(change):.1f}", "darker" if change < 0 else "brighter"
+    return f"as bright as {other}" if text == "0.0" else f"{text} % {relation} than {other}"
 
 
 def worded(figure: float, text: str, zero: str) -> str:

@@ -121,26 +121,26 @@ def crossed(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Iterator
         yield Gate("crossed", "warn", None, limit, message, "Put a ColorChecker next to the object, or expose more")
         return
     seen = _compare_crossed(found.results.stokes)
-    share = 100 * seen.mirrored
     text = "{:.1f} % of the object's light is mirrored at its surface; it is removed from the albedo"
-    message = worded(share, text, "No light is mirrored at the object's surface")
-    if seen.left > _STILL_CLIPPED and seen.clipped > _FEW:
-        message = f"{100 * seen.left:.0f} % of the clipped highlights are also clipped in the cross-polarized shot"
-        yield Gate("crossed", "warn", round(seen.left, 3), _STILL_CLIPPED, message, remedy)
+    message = worded(100 * seen.specular, text, "No light is mirrored at the object's surface")
+    if seen.still_clipped > _STILL_CLIPPED and seen.clipped_px > _FEW:
+        share = 100 * seen.still_clipped
+        message = f"{share:.0f} % of the clipped highlights are also clipped in the cross-polarized shot"
+        yield Gate("crossed", "warn", round(seen.still_clipped, 3), _STILL_CLIPPED, message, remedy)
         return
-    if seen.over > limit:
-        message = f"{100 * seen.over:.0f} % of the object is brighter in the cross-polarized shot than is possible"
-    yield at_most("crossed", seen.over, limit, message, remedy, beyond="warn")
+    if seen.brighter > limit:
+        message = f"{100 * seen.brighter:.0f} % of the object is brighter in the cross-polarized shot than is possible"
+    yield at_most("crossed", seen.brighter, limit, message, remedy, beyond="warn")
 
 
 @dataclass(frozen=True)
 class CrossedFigures:
     """Comparison of the cross-polarized shot with S0."""
 
-    left: float  # share of the clipped highlights of S0 that are clipped in the crossed shot too
-    clipped: int  # number of clipped pixels of S0
-    over: float  # share of pixels that are brighter in the crossed shot than in S0, which is not possible
-    mirrored: float  # share of the object's light that the crossed filter removes: specular reflection
+    still_clipped: float  # share of the clipped highlights of S0 that are clipped in the crossed shot too
+    clipped_px: int  # number of clipped pixels of S0
+    brighter: float  # share of pixels that are brighter in the crossed shot than in S0, all light: not possible
+    specular: float  # share of the object's light that the crossed filter removes: specular reflection
 
 
 def _compare_crossed(image: StokesImage) -> CrossedFigures:
@@ -150,13 +150,13 @@ def _compare_crossed(image: StokesImage) -> CrossedFigures:
     sound = known & ((image.quality & int(Quality.CLIPPED)) == 0)
     total, body = image.stokes[0].sum(-1), image.body.value.sum(-1)
     clipped = image.mask & ((image.quality & int(Quality.CLIPPED)) > 0)
-    left = float((clipped & ~known).sum() / max(clipped.sum(), 1))
+    still_clipped = float((clipped & ~known).sum() / max(clipped.sum(), 1))
     weight = sound.astype(np.float32)
     smooth, whole = (cv2.GaussianBlur(part * weight, (0, 0), _EDGE_PX) for part in (body, total))
     inner = erode(sound, 2)
-    over = float((smooth > _BRIGHTER * whole)[inner].mean()) if inner.any() else 1.0
-    mirrored = float(np.maximum(total - body, 0)[sound].sum() / max(float(total[sound].sum()), 1e-9))
-    return CrossedFigures(left, int(clipped.sum()), over, mirrored)
+    brighter = float((smooth > _BRIGHTER * whole)[inner].mean()) if inner.any() else 1.0
+    specular = float(np.maximum(total - body, 0)[sound].sum() / max(float(total[sound].sum()), 1e-9))
+    return CrossedFigures(still_clipped, int(clipped.sum()), brighter, specular)
 
 
 def ambient(found: Evidence[ResultsUntilHdr], limits: GateLimits) -> Gate:
@@ -280,10 +280,8 @@ def _judge_highlights(found: Evidence[ResultsUntilInfer], limits: GateLimits) ->
     text = "The brightest parts that face the camera share a polarization of {:.1f} % or more"
     message = worded(100 * share, text, "The brightest parts that face the camera share no polarization")
     if share > limit:
-        message += (
-            ": light from the sides (two flashes, softboxes, a window), or light that changed across the picture "
-        )
-        message += "between shots (the flash moved, the lamp drifted); it bends normals and roughness"
+        message += ": light from the sides (two flashes, softboxes, a window), or light that changed across the "
+        message += "picture between shots (the flash moved, the lamp drifted); it bends normals and roughness"
     cost = float(_DEGREES_PER_ROOT_OF_HIGHLIGHT_DOLP * np.sqrt(max(np.nan_to_num(share) - _FALSE_HIGHLIGHT_DOLP, 0.0)))
     gate = at_most("lighting", share, limit, message, _ONE_FLASH, beyond=grade(cost))
     return msgspec.structs.replace(gate, cost_deg=round(cost, 1))

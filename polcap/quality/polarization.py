@@ -178,43 +178,34 @@ def _own_error_deg(maps: SurfaceMaps) -> float:
 
 
 def _angles(
-    found: rim.AngleError,
-    body: rim.RimFigures,
-    angle: Floats,
-    evidence: Evidence[ResultsUntilSelfcal],
-    limits: GateLimits,
+    turn: rim.AngleError, body: rim.RimFigures, angle: Floats, found: Evidence[ResultsUntilSelfcal], limits: GateLimits
 ) -> Gate:
-    """Gate on polarizer angles: it fails if one shot or all shots have a wrong angle, beyond the estimate's error."""
-    limit, selfcal, names = limits.max_turn_deg, evidence.results.selfcal, evidence.names
-    statement = evidence.results.radiance.equipment.angles
-    known = selfcal.gains.source in ("grey patches", "one exposure")
-    common = -float(np.degrees(body.turned))  # an AoLP too small is an angle stated too small
-    if (
-        abs(common) > limit + 3 * np.degrees(body.turned_sigma)
-        and body.concentration > _CLEAR
-        and abs(abs(common) - 90) > 25  # reflections are polarized across the contour; see "body"
-    ):
-        message = f"All angles look turned by {common:+.0f}° ± {np.degrees(body.turned_sigma):.0f}°"
+    """Gate on polarizer angles (K,) rad: on a turn of all angles, then on one of a single shot, beyond their errors."""
+    limit, names, statement = limits.max_turn_deg, found.names, found.results.radiance.equipment.angles
+    # true minus stated angle: an angle stated too small makes the AoLP too small
+    common, sigma = -float(np.degrees(body.turned)), np.degrees(body.turned_sigma)
+    reflects = abs(abs(common) - 90) <= 25  # reflections are polarized across the contour; see "body"
+    if abs(common) > limit + 3 * sigma and body.concentration > _CLEAR and not reflects:
+        message = f"All angles look turned by {common:+.0f}° ± {sigma:.0f}°"
         remedy = sentence(angle_advice.turn(statement, angle, -body.turned))
         return Gate("angles", "fail", round(common, 1), limit, message, remedy, abs(common), unit="°")
-    fit = limits.max_turn_fit * (1.0 if known else 0.75)  # guessed gains look like turns
-    if found.misfit >= fit or found.sigmas < _SURE or found.shot is None:
+    known = found.results.selfcal.gains.source in ("grey patches", "one exposure")
+    most_misfit = limits.max_turn_fit * (1.0 if known else 0.75)  # guessed gains look like turns
+    if turn.misfit >= most_misfit or turn.sigmas < _SURE or turn.shot is None:
         return Gate("angles", "pass", 0.0, limit, "No other angle fits the outline clearly better", unit="°")
-    degrees = float(np.degrees(found.angle))
-    gap = np.degrees(angle[found.shot] + found.angle - angle)
+    degrees, remedy = float(np.degrees(turn.angle)), sentence(angle_advice.retake(statement))
+    gap = np.degrees(angle[turn.shot] + turn.angle - angle)  # between the true angle of this shot and the others
     same = np.abs((gap + 90) % 180 - 90) < _SAME_DEG
-    same[found.shot] = False
+    same[turn.shot] = False
     cost = abs(degrees) / 2
     if same.any():  # the pictures do not show which of the two is wrong
-        shots = tuple(names[k] for k in sorted((found.shot, int(np.argmax(same)))))
+        shots = tuple(names[k] for k in sorted((turn.shot, int(np.argmax(same)))))
         message = f"{' and '.join(shots)} look equal, as if the polarizer was not turned between them"
-        remedy = sentence(angle_advice.retake(statement))
         return Gate("angles", "fail", round(degrees, 1), limit, message, remedy, cost, shots, "°")
-    times = 1 / found.misfit
-    message = f"The {names[found.shot]} shot looks turned by {degrees:+.0f}°: the outline fits {times:.1f} times better"
-    remedy = sentence(angle_advice.retake(statement))
-    state: State = "fail" if found.misfit < _CERTAIN * fit else "warn"
-    return Gate("angles", state, round(degrees, 1), limit, message, remedy, cost, (names[found.shot],), "°")
+    times, name = 1 / turn.misfit, names[turn.shot]
+    message = f"The {name} shot looks turned by {degrees:+.0f}°: the outline fits {times:.1f} times better"
+    state: State = "fail" if turn.misfit < _CERTAIN * most_misfit else "warn"
+    return Gate("angles", state, round(degrees, 1), limit, message, remedy, cost, (name,), "°")
 
 
 def _with_ring(gate: Gate, body: rim.RimFigures, found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate:
@@ -227,11 +218,9 @@ def _with_ring(gate: Gate, body: rim.RimFigures, found: Evidence[ResultsUntilSel
     if selfcal.found_sigma is not None and gate.state == "pass":
         doubt, ring = float(np.degrees(selfcal.found_sigma)), np.degrees(selfcal.angle) % 180
         message = f"The angles were estimated: {', '.join(f'{one:.1f}°' for one in ring)} (± {doubt:.1f}°)"
-        remedy = (
-            sentence(angle_advice.check_statement(statement))
-            if statement.place == "cells"
-            else "Note the ring's mark of every shot"
-        )
+        remedy = "Note the ring's mark of every shot"
+        if statement.place == "cells":
+            remedy = sentence(angle_advice.check_statement(statement))
         return Gate("angles", "warn", "found", "noted", message, remedy, doubt, unit="")
     turn, doubt = np.degrees([selfcal.ring.offset, selfcal.ring.sigma])
     applied = selfcal.ring.correction != 0

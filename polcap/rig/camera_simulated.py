@@ -41,7 +41,7 @@ class SimulatedCamera:
         self._log = log
         self._studio: Studio | None = None
         self._rendered: dict[tuple[float, bool], Floats] = {}  # by angle and by whether the flash has its filter
-        self._taken: Counter[tuple[int, int, bool]] = Counter()
+        self._taken: Counter[tuple[int, int, bool]] = Counter()  # photographs by shot, frame and flash
         self._next = (0, 0, 0.0)  # shot, frame, true angle in degrees
         self._crossed = False  # the flash's filter is on
         self.frame_bytes = 2 * self._shoot.width * self._shoot.height
@@ -64,13 +64,13 @@ class SimulatedCamera:
         self._next = shot + _NUMBER_OF_ROLE[role], step, wanted if RING.true_deg is None else RING.true_deg
 
     def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
+        """Photograph the prepared frame; its light is rendered once for all exposures at one angle."""
         self._studio = self._studio or Studio(random_scene(self._shoot.seed, self._shoot.scene), self._shoot)
         shot, step, angle = self._next
         if (angle, self._crossed) not in self._rendered:
             self._rendered = {(angle, self._crossed): self._studio.through(angle, self._crossed)}
         is_flash = exposure.time_s is None or exposure.flash is not None
-        time_s = exposure.time_s or FLASH_SYNC_S
-        dials = Dials(time_s, exposure.f_number or 11.0, exposure.iso or 100.0, is_flash)
+        dials = Dials(exposure.time_s or FLASH_SYNC_S, exposure.f_number or 11.0, exposure.iso or 100.0, is_flash)
         take = Take(shot, step, exposure_factor(exposure), self._taken[shot, step, flash], flash, dials)
         self._taken[shot, step, flash] += 1
         self._log.write("camera", ">", f"{exposure}, {'lit' if flash else 'dark'}, polarizer at {angle:.4f}°")

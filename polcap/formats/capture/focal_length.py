@@ -94,9 +94,9 @@ def _sources(exif: Exif, stated_mm: float | None, stated_width_mm: float | None)
 
 
 def _most_plausible(sources: list[_Source]) -> FocalLength:
-    """Focal length by the user's statement, else by the source with which most others agree."""
+    """Focal length by the user's statement, else by the source that most others agree with (the most precise)."""
     best = max(sources, key=lambda one: (one.stated, sum(one.agrees(other) for other in sources), one.trust))
-    chosen = next(one for one in sources if one.agrees(best))
+    chosen = next(one for one in sources if one.agrees(best))  # `sources` begin with the most precise
     others = [one for one in sources if not one.agrees(chosen)]
     if not others:
         return FocalLength(chosen.px, _KNOWN, chosen.text)

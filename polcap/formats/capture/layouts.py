@@ -25,7 +25,7 @@ from polcap.formats.raw.probe import Probe
 
 DEFAULT_DEG = (0.0, 45.0, 90.0)
 _COUNTER = 9999  # greatest file number of a camera
-_JUMP_S = 600.0  # between two frames: the clock was set, or the photographer had a long break
+_BREAK_S = 600.0  # between two frames: the clock was set, or the photographer had a long break
 _LOSSY_SUFFIXES = {".heic", ".heif", ".hif", ".avif", ".webp"}  # of phones and small cameras; not decoded
 
 
@@ -276,24 +276,24 @@ def shutter(time: float | None) -> str:
 
 
 def _in_order(pictures: list[Source], size: int) -> tuple[list[Source], str]:
-    """Pictures in the order of their exposure, by clock or by number, and a phrase on the source.
+    """Pictures in the order in which they were taken, by EXIF time or by number, and a phrase on the source.
 
-    Where both make different brackets of `size` frames, the one decides that makes equal brackets. If both do, it is
-    the clock, unless it jumped.
+    Times decide, unless they contradict the numbers: then the order that makes equal brackets of `size` frames decides;
+    if both do, the times, unless there is a long break between two of them.
     """
     by_number, times = _by_number(pictures), {source.probe.exif.taken for source in pictures}
     if "" in times or len(times) == 1:
         return by_number, "by name"
-    by_clock = sorted(by_number, key=lambda one: one.probe.exif.taken)
-    if len({NUMBER.sub("#", source.path.stem) for source in pictures}) > 1 or all(
-        set(map(id, by_clock[at : at + size])) == set(map(id, by_number[at : at + size]))
-        for at in range(0, len(pictures), size)
-    ):
-        return by_clock, "by their EXIF times"
-    fits_clock, fits_number = (_first_unequal(order, size) is None for order in (by_clock, by_number))
-    if fits_number and (not fits_clock or _jumped(by_clock)):
+    by_time = sorted(by_number, key=lambda one: one.probe.exif.taken)
+    one_series = len({NUMBER.sub("#", source.path.stem) for source in pictures}) == 1  # names differ in numbers only
+    starts = range(0, len(pictures), size)  # of the brackets, whose frames are compared as sets
+    time_sets, number_sets = ([set(map(id, order[k : k + size])) for k in starts] for order in (by_time, by_number))
+    if not one_series or time_sets == number_sets:
+        return by_time, "by their EXIF times"
+    equal_by_time, equal_by_number = (_first_unequal(order, size) is None for order in (by_time, by_number))
+    if equal_by_number and (not equal_by_time or _has_break(by_time)):
         return by_number, "by the numbers in their names (their EXIF times contradict: was the clock set?)"
-    return by_clock, "by their EXIF times (the numbers in their names contradict: were they renamed?)"
+    return by_time, "by their EXIF times (the numbers in their names contradict: were they renamed?)"
 
 
 def _by_number(pictures: list[Source]) -> list[Source]:
@@ -311,9 +311,9 @@ def _first_unequal(order: Sequence[Source], size: int) -> int | None:
     return next((at for at, value in enumerate(exposure) if not same_exposure(value, exposure[at % size])), None)
 
 
-def _jumped(by_clock: Sequence[Source]) -> bool:
-    times = [datetime.fromisoformat(source.probe.exif.taken) for source in by_clock]
-    return any((after - before).total_seconds() > _JUMP_S for before, after in pairwise(times))
+def _has_break(by_time: Sequence[Source]) -> bool:
+    times = [datetime.fromisoformat(source.probe.exif.taken) for source in by_time]
+    return any((after - before).total_seconds() > _BREAK_S for before, after in pairwise(times))
 
 
 def _select(folder: Path, groups: dict[float, list[Source]], angles_deg: _Order) -> Shots:

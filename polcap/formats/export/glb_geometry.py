@@ -117,7 +117,7 @@ def _integers(value: Floats, kind: str) -> NDArray[Any]:
 
 
 def _draco(blob: Blob, mesh: Mesh, points: Floats) -> dict[str, Any]:
-    """Compress a mesh with Draco; accessors describe the arrays that a decoder returns."""
+    """Compress a mesh with Draco; returns the glTF primitive, whose accessors describe the decoded arrays."""
     require("draco")
     import DracoPy
 
@@ -132,23 +132,23 @@ def _draco(blob: Blob, mesh: Mesh, points: Floats) -> dict[str, Any]:
     )
     decoded = DracoPy.decode(data)  # Draco may drop vertices
     count = len(decoded.points)
-    arrays: dict[str, Any] = {
+    arrays: dict[str, Any] = {  # only types, shapes and bounds are used: the data are in the extension
         "POSITION": decoded.points.astype(np.float32),
         "NORMAL": np.empty((count, 3), np.float32),
         "TANGENT": np.empty((count, 4), np.int8),
         "TEXCOORD_0": np.empty((count, 2), np.float32),
     }
-    number = {one["attribute_type"]: one["unique_id"] for one in decoded.attributes}
-    identifiers = {name: number[kind] for name, kind in _DRACO_ATTRIBUTES.items()}
-    view = blob.view(_signed(data, identifiers["TANGENT"]))
+    by_type = {attribute["attribute_type"]: attribute["unique_id"] for attribute in decoded.attributes}
+    identifiers = {name: by_type[kind] for name, kind in _DRACO_ATTRIBUTES.items()}
+    view = blob.view(_with_signed_tangents(data, identifiers["TANGENT"]))
     return {
-        "attributes": {name: blob.accessor(a, None, bounds=name == "POSITION") for name, a in arrays.items()},
+        "attributes": {name: blob.accessor(one, None, bounds=name == "POSITION") for name, one in arrays.items()},
         "indices": blob.accessor(np.empty((decoded.faces.size, 1), np.uint32), None),
         "extensions": {"KHR_draco_mesh_compression": {"bufferView": view, "attributes": identifiers}},
     }
 
 
-def _signed(data: bytes, identifier: int) -> bytes:
+def _with_signed_tangents(data: bytes, identifier: int) -> bytes:
     """The Draco stream with its attribute of four unsigned bytes declared as signed, which DracoPy cannot write.
 
     The stream declares an attribute by type, data type, number of components, normalized and identifier. The values

@@ -229,26 +229,25 @@ def _icc_curve(tag: bytes) -> Curve:
 
 
 def _exr(spec: Any) -> Iterator[_Statement]:
-    """Statements of an EXR's attributes; without any it is linear, of Rec.709 (OpenEXR, standard attributes)."""
-    stated = spec.getattribute("chromaticities")
-    matrix = None if stated is None else _from_primaries(stated)
+    """Statements of an EXR: its attributes that name a color space; else its chromaticities, with linear values."""
+    chromaticities = spec.getattribute("chromaticities")
+    matrix = None if chromaticities is None else _from_primaries(chromaticities)
     named = False
     for attribute in spec.extra_attribs:
         name = re.split("[:/.]", attribute.name)[-1].replace("_", "").lower()
         if name not in _EXR_NAMES or not isinstance(attribute.value, str):
             continue
-        text = attribute.value.lower()
-        if _OTHER_CURVES.search(text):
+        space = attribute.value.lower()
+        if _OTHER_CURVES.search(space):
             raise _UnusableError(f"its attribute {attribute.name} states {attribute.value}; write linear values")
-        curve = _named_curve(text)
-        if curve is None:
+        if (curve := _named_curve(space)) is None:
             continue
-        xy = next((xy for names, xy in _NAMED_PRIMARIES.items() if re.search(names, text)), None)
-        if stated is not None and xy is not None and np.abs(np.subtract(xy, stated)).max() > _UNEQUAL:
+        xy = next((xy for names, xy in _NAMED_PRIMARIES.items() if re.search(names, space)), None)
+        if chromaticities is not None and xy is not None and np.abs(np.subtract(xy, chromaticities)).max() > _UNEQUAL:
             raise _UnusableError(f"its attribute {attribute.name} contradicts its chromaticities; {_STATE}")
         named = True
         yield _Statement(f"attribute {attribute.name}", curve, matrix if xy is None else _from_primaries(xy))
-    if matrix is not None and not named:
+    if matrix is not None and not named:  # with neither, it is linear Rec.709 (OpenEXR, standard attributes)
         yield _Statement("chromaticities", _linear, matrix)
 
 
