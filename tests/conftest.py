@@ -1,6 +1,7 @@
 """Fixtures of several tests: a small capture, the `polcap` command, and one finished run of the two."""
 
 import os
+import runpy
 import shutil
 import signal
 import subprocess
@@ -99,6 +100,18 @@ def polcap(capsys: pytest.CaptureFixture[str]) -> Command:
         with pytest.raises(SystemExit) as ended:
             cli.app([*map(str, arguments)])
         return Done(ended.value.code or 0, *capsys.readouterr())  # type: ignore[arg-type]
+
+    return run
+
+
+@pytest.fixture
+def run_example(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+    """Run a program of examples/ in this process; returns what it printed."""
+
+    def run(name: str, *arguments: object) -> str:
+        monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+        runpy.run_path(str(ROOT / "examples" / name))
+        return capsys.readouterr().out
 
     return run
 
