@@ -20,6 +20,9 @@ FUNCTIONS = """
     from polcap.errors import ChartError
     from polcap.formats import sandbox
 
+    if "SHORT_GRACE" in os.environ:
+        sandbox._GRACE_S = 0.2
+
     def ramp(path, count=12):
         print("a library chatters on stdout")
         return {"path": path, "pid": os.getpid()}, {
@@ -168,9 +171,10 @@ def test_a_child_in_a_loop_ends_when_its_parent_was_killed(sandbox, tmp_path, lo
         "import sys; sys.path.insert(0, sys.argv[1]); import misbehaving\n"
         "from polcap.formats.sandbox import Sandbox\n"
         "w = Sandbox(); print(w.call(misbehaving.ramp, 'a')[0]['pid'], flush=True)\n"
-        f"w.call(misbehaving.{loop}, 'b', limit_s=2)"
+        f"w.call(misbehaving.{loop}, 'b', limit_s=0.6)"
     )
-    parent = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)
+    command, environment = [sys.executable, "-c", code, str(tmp_path)], {**os.environ, "SHORT_GRACE": ""}
+    parent = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment)
     child = int(parent.stdout.readline())
     time.sleep(0.3)  # it is in the loop
     parent.kill()

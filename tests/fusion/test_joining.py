@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from polcap.errors import CaptureError
-from polcap.fusion import joining
+from polcap.fusion import joining, shape
 from polcap.fusion.joining import JoinedSet
 from polcap.fusion.values import FusionView
 from polcap.optics.mesh_tracer import Tracer, smooth
@@ -17,6 +17,7 @@ from tests.fusion.traced_views import Body, capture, ring, solid_texture, stand,
 
 trimesh = pytest.importorskip("trimesh")
 COUNT = 8  # views of a set
+COARSE = ((joining, "_GRID", 60), (joining, "_TURNS", 300), (shape, "_FIRST_ROUNDS", 2), (shape, "_ROUNDS", 6))
 TIP = Rotation.from_euler("yxz", [40, 87, 5], degrees=True)
 
 
@@ -72,8 +73,8 @@ def session() -> Session:
     sets = [views(body, None, rng), views(other, shift, rng), views(stand(torus.vertices, torus.faces), None, rng)]
     made = sum((named(one, f"set{letter}") for one, letter in zip(sets, "ABC")), ())
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in (("_GRID", 60), ("_TURNS", 1000)):
-            patch.setattr(joining, name, value)
+        for module, name, value in COARSE:
+            patch.setattr(module, name, value)
         return Session(body, shift, made, joining.join(made))
 
 
