@@ -95,22 +95,21 @@ def test_results_and_values_have_a_short_repr(tmp_path: Path, example: Path) -> 
     )
 
 
-def test_check_export_and_reopen_take_strings(result: Path, example: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "capture"  # whose result is in polcap/
-    shutil.copytree(result, copy / "polcap")
-    assert polcap.check(str(example)).keep
+def test_check_export_and_reopen_take_strings(tiny: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(tiny / "C", tmp_path / "C"))  # its result is in polcap/
+    assert polcap.check(str(copy)).capture == "C"
     files = polcap.export(str(copy), "godot", extras="cavity", texture_size=64, catalog={"title": "Vase"})
-    assert {"capture.glb", "capture_orm.png", "capture_cavity.png"} <= {file.name for file in files}
+    assert {"C.glb", "C_orm.png", "C_cavity.png"} <= {file.name for file in files}
     assert pipeline.reopen(str(copy), ResultsUntilMask)[0].object_.mask.any()
 
 
 def test_the_python_of_the_reference_pages_runs(
-    result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("CAPTURE", "capture"):
-        shutil.copytree(result, tmp_path / name / "polcap")
+        shutil.copytree(tiny / "C", tmp_path / name)
     monkeypatch.chdir(tmp_path)
-    about = json.loads((result / "report.json").read_text(encoding="utf-8"))
+    about = json.loads((tiny / "C" / "polcap" / "report.json").read_text(encoding="utf-8"))
     monkeypatch.setattr(polcap, "process", lambda folder: Result(Path(folder) / "polcap", about), raising=False)
     programs = 0
     for page in (Path(__file__).parents[1] / "docs" / "reference").glob("*.md"):
@@ -141,9 +140,9 @@ def test_the_python_of_the_reference_pages_runs(
         ({"formats": "fbx"}, "^formats fbx: there is no such format"),
     ],
 )
-def test_errors_name_the_argument_and_not_the_flag(result: Path, options: dict[str, Any], words: str) -> None:
+def test_errors_name_the_argument_and_not_the_flag(tiny: Path, options: dict[str, Any], words: str) -> None:
     with pytest.raises(SettingError, match=words) as caught:
-        polcap.export(result, **options)
+        polcap.export(tiny / "C", **options)
     assert "--texture" not in str(caught.value) and "--color" not in str(caught.value)
 
 
