@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
@@ -22,21 +23,22 @@ from polcap.formats.export import encoders
 from polcap.formats.export.presets import EXTRAS, FORMATS, PRESETS
 from polcap.formats.maps import png
 from polcap.formats.raw.exif import UPRIGHT_DEG
-from polcap.pipeline import asset_export
+from polcap.pipeline import asset_export, detail_levels
 from polcap.pipeline import run as pipeline
 from polcap.pipeline.export_request import ExportRequest
 from polcap.report import levels
-from tests.conftest import ROOT, Command, python, shell
+from polcap.synth import scenes, shooting
+from tests.conftest import ROOT, TINY, Command, shell
 from tests.formats.export.test_gltf import NODE, document
 from tests.stages.hdr import brackets
 
 
 @pytest.fixture(scope="module")
-def exported(result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The small capture's result with every preset exported."""
+def exported(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny capture's result with every preset exported."""
     pytest.importorskip("pxr", reason="needs usd-core")
     copy = tmp_path_factory.mktemp("export") / "copy"
-    shutil.copytree(result, copy, ignore=shutil.ignore_patterns("work"))
+    shutil.copytree(tiny / "C" / "polcap", copy, ignore=shutil.ignore_patterns("work"))
     for preset in PRESETS:
         pipeline.export(copy, ExportRequest(preset=preset))
     return copy
@@ -93,10 +95,10 @@ def _stated(file: Path) -> str:
     return json.dumps(json.loads(text), ensure_ascii=False) if kind == ".json" else text
 
 
-def test_every_file_states_all_facts_for_catalogs(own: Path, tmp_path: Path) -> None:
+def test_every_file_states_all_facts_for_catalogs(tiny_result: Path, tmp_path: Path) -> None:
     pytest.importorskip("pxr", reason="needs usd-core")
     (tmp_path / "viewer.js").write_text("// model-viewer")
-    formats = tuple(one for one in FORMATS if one != "iiif")
+    own, formats = tiny_result, tuple(one for one in FORMATS if one != "iiif")
     plain = ExportRequest(formats=formats, extras=("occlusion",), triangles=2000, catalog=FACTS, iiif="http://a.b")
     pipeline.export(
         own,
@@ -110,7 +112,7 @@ def test_every_file_states_all_facts_for_catalogs(own: Path, tmp_path: Path) -> 
     assert {Path(name).suffix for name in named} == {
         ".glb", ".obj", ".mtl", ".ply", ".usdc", ".usdz", ".mtlx", ".exr", ".png", ".html", ".json", ".txt",
     }  # fmt: skip
-    assert {"archive/maps/maps.json", "capture_iiif/manifest.json", "archive/report.html"} < named
+    assert {"archive/maps/maps.json", "C_iiif/manifest.json", "archive/report.html"} < named
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -136,9 +138,9 @@ def test_maps_json_and_report_json_agree_and_state_units(exported: Path) -> None
 
 def test_unreal_gets_green_down_and_unity_smoothness(exported: Path) -> None:
     assets = exported / "asset"
-    down, up = (png.read(assets / name) for name in ("unreal/T_capture_N.png", "unity/capture_Normal.png"))
+    down, up = (png.read(assets / name) for name in ("unreal/T_C_N.png", "unity/C_Normal.png"))
     assert np.array_equal(down[..., 1], 255 - up[..., 1]) and np.array_equal(down[..., ::2], up[..., ::2])
-    packed, mask = (png.read(assets / name) for name in ("unreal/T_capture_ORM.png", "unity/capture_MaskMap.png"))
+    packed, mask = (png.read(assets / name) for name in ("unreal/T_C_ORM.png", "unity/C_MaskMap.png"))
     assert np.array_equal(mask[..., 3], 255 - packed[..., 1]) and mask[..., 0].max() == 0
 
 
@@ -156,7 +158,7 @@ def test_archived_textures_have_16_bits(exported: Path) -> None:
 
 
 def test_sidecar_knows_photographs_settings_and_files(exported: Path) -> None:
-    recorded = json.loads((exported / "asset" / "archive" / "capture.provenance.json").read_text())
+    recorded = json.loads((exported / "asset" / "archive" / "C.provenance.json").read_text())
     about = json.loads((exported / "report.json").read_text())
     assert [one["sha256"] for one in recorded["photographs"]] == [
         frame["digest"] for shot in about["capture"]["shots"] for frame in shot["frames"]
@@ -164,8 +166,8 @@ def test_sidecar_knows_photographs_settings_and_files(exported: Path) -> None:
     assert recorded["settings"] == about["settings"] and recorded["stages"] == about["keys"]
     assert recorded["versions"]["polcap"] == about["polcap"] and "numpy" in recorded["versions"]
     files = {file.name for file in (exported / "asset" / "archive").iterdir()}
-    assert files - {"capture.provenance.json", "manifest-sha256.txt", "maps"} <= set(recorded["files"])
-    metadata = document((exported / "asset/archive/capture.glb").read_bytes())["extensions"]["KHR_xmp_json_ld"]
+    assert files - {"C.provenance.json", "manifest-sha256.txt", "maps"} <= set(recorded["files"])
+    metadata = document((exported / "asset/archive/C.glb").read_bytes())["extensions"]["KHR_xmp_json_ld"]
     assert json.loads(metadata["packets"][0]["polcap:settings"]) == about["settings"]
 
 
@@ -269,10 +271,8 @@ def test_encoder_on_the_path_makes_ktx2_textures(
     assert sorted("--assign_oetf srgb" in call for call in calls) == [False, False, True, True]  # data, colours
 
 
-def test_the_example_of_presets_runs(own: Path) -> None:
-    done = python(ROOT / "examples" / "export_presets.py", own)
-    assert done.returncode == 0, done.stderr
-    assert "T_capture_N.png: tangent-space normal n * 0.5 + 0.5, -Y" in done.stdout
+def test_the_example_of_presets_runs(tiny_result: Path, run_example: Callable[..., str]) -> None:
+    assert "T_C_N.png: tangent-space normal n * 0.5 + 0.5, -Y" in run_example("export_presets.py", tiny_result)
 
 
 def test_usd_without_its_package_is_one_line_with_the_remedy(
@@ -283,12 +283,15 @@ def test_usd_without_its_package_is_one_line_with_the_remedy(
     assert done.returncode == 2 and "pip install 'polcap[usd]'" in done.stderr and done.stderr.count("\n") == 1
 
 
-def test_number_of_threads_changes_no_byte(result: Path, example: Path, tmp_path: Path) -> None:
-    """The result was made on one thread; the network's own threads are tested in tests/stages/test_golden.py."""
-    done = shell("process", example, "--out", tmp_path, "--estimator", "analytic", "--threads", 2)
-    assert done.returncode == 0, done.stderr
+def test_number_of_threads_changes_no_byte(polcap: Command, tmp_path: Path) -> None:
+    """Of the run in this process one thread; the network's own threads are tested in tests/stages/test_golden.py."""
+    capture, one, two = (tmp_path / name for name in ("C", "one", "two"))
+    shoot = shooting.Shoot(seed=1, width=320, height=240, samples=1, exposures=2)
+    shooting.write(capture, scenes.random_scene(1, "bumps"), shoot)
+    assert polcap("process", capture, "--out", one, *TINY).returncode in (0, 3)
+    assert shell("process", capture, "--out", two, *TINY, "--threads", 2).returncode in (0, 3)
     found = []
-    for out in (result, tmp_path):
+    for out in (one, two):
         found.append({file.name: file.read_bytes() for part in ("maps", "asset") for file in (out / part).iterdir()})
         found[-1] |= {str(file.relative_to(out)): file.read_bytes() for file in (out / "work").rglob("*.npy")}
     assert [name for name in found[0] if found[0][name] != found[1][name]] == [] and found[0].keys() == found[1].keys()
@@ -303,12 +306,13 @@ def test_textures_for_engines_have_powers_of_two(exported: Path, preset: str) ->
 
 
 def test_a_preset_for_an_engine_has_20_000_triangles_unless_stated(own: Path, polcap: Command) -> None:
-    done = polcap("export", own, "--preset", "unity")
+    done = polcap("export", own, "--preset", "unity", "--texture-size", 64)
     count = json.loads((own / "maps" / "maps.json").read_text())["exports"]["asset/unity"]["mesh"]["triangles"]
     assert 19_000 < count <= 20_000
     said = f"asset/unity has {count:,} triangles; 99 % of the full mesh are within 0."
     assert said in done.stderr and "--triangles N changes" in done.stderr
-    assert polcap("export", own, "--preset", "unity", "--triangles", 1_000_000).stderr == ""
+    all_triangles = ("--triangles", 1_000_000, "--texture-size", 64)
+    assert polcap("export", own, "--preset", "unity", *all_triangles).stderr == ""
     assert trimesh.load(own / "asset/unity/capture.glb", force="mesh").faces.shape[0] > 100_000
 
 
@@ -347,32 +351,40 @@ def test_a_level_off_by_over_one_percent_of_the_size_is_not_written(own: Path, p
         assert np.abs(level.bounds - written[0].bounds).max() <= 0.0101 * size
 
 
-def test_a_later_export_of_the_glb_removes_levels_that_polcap_wrote(own: Path) -> None:
-    asset = own / "asset"
+@pytest.fixture
+def leveled(tiny_result: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the tiny result, of which levels of any error are written."""
+    monkeypatch.setattr(detail_levels, "_LARGEST_DEVIATION", 1.0)
+    return tiny_result
+
+
+def test_a_later_export_of_the_glb_removes_levels_that_polcap_wrote(leveled: Path) -> None:
+    own, asset = leveled, leveled / "asset"
     pipeline.export(own, ExportRequest(formats=("gltf",), lod=2), ExportRequest(preset="web", lod=1))
     (asset / "mine_lod2.glb").write_bytes(b"of the user")
-    (asset / "capture_lod9.glb").write_bytes(b"of the user")
+    (asset / "C_lod9.glb").write_bytes(b"of the user")
     pipeline.export(own, ExportRequest(formats=("obj",)))
-    assert (asset / "capture_lod2.glb").exists() and len(levels.rows(own)) == 5
+    assert (asset / "C_lod2.glb").exists() and len(levels.rows(own)) == 5
     pipeline.export(own, ExportRequest(formats=("gltf",), lod=1))
     left = sorted(file.name for file in asset.glob("*_lod*"))
-    assert left == ["capture_lod1.glb", "capture_lod9.glb", "mine_lod2.glb"]
-    assert (asset / "web" / "capture_lod1.glb").exists() and len(levels.rows(own)) == 4
+    assert left == ["C_lod1.glb", "C_lod9.glb", "mine_lod2.glb"]
+    assert (asset / "web" / "C_lod1.glb").exists() and len(levels.rows(own)) == 4
     pipeline.export(own, ExportRequest(formats=("gltf",)))
-    assert not (asset / "capture_lod1.glb").exists() and len(levels.rows(own)) == 2
-    listed = json.loads((asset / "capture.provenance.json").read_text())["files"]
+    assert not (asset / "C_lod1.glb").exists() and len(levels.rows(own)) == 2
+    listed = json.loads((asset / "C.provenance.json").read_text())["files"]
     assert all((asset / name).exists() for name in listed)
 
 
-def test_the_report_lists_the_levels(own: Path) -> None:
-    pipeline.export(own, ExportRequest(formats=("gltf",), lod=1))
-    rows = levels.rows(own)
-    assert [row[0] for row in rows] == ["asset/capture.glb", "asset/capture_lod1.glb"]
+def test_the_report_lists_the_levels(leveled: Path) -> None:
+    pipeline.export(leveled, ExportRequest(formats=("gltf",), lod=1))
+    rows = levels.rows(leveled)
+    assert [row[0] for row in rows] == ["asset/C.glb", "asset/C_lod1.glb"]
     assert rows[1][4].endswith(" px") and rows[1][2].endswith(" MB")
 
 
-def test_exports_of_earlier_maps_are_named(own: Path, polcap: Command) -> None:
-    first = polcap("export", own, "--preset", "unreal", "--triangles", 99999, "--lod", 2, "--texture-size", 64)
+def test_exports_of_earlier_maps_are_named(leveled: Path, polcap: Command) -> None:
+    own = leveled
+    first = polcap("export", own, "--preset", "unreal", "--triangles", 999, "--lod", 2, "--texture-size", 32)
     assert first.stderr == ""
     polcap("export", own, "--sfp")
     asset, about = own / "asset", json.loads((own / "report.json").read_text())
@@ -382,21 +394,21 @@ def test_exports_of_earlier_maps_are_named(own: Path, polcap: Command) -> None:
     maps = json.loads((own / "maps" / "maps.json").read_text())
     (own / "maps" / "maps.json").write_text(json.dumps({**maps, "keys": about["keys"]}))
     old = asset_export.find_outdated(own, asset_export.sidecars(own), about["keys"])
-    assert {asset / "capture.glb", asset / "capture_sfp", asset / "unreal"} < set(old) and asset not in old
+    assert {asset / "C.glb", asset / "C_sfp", asset / "unreal"} < set(old) and asset not in old
     (asset / "mine.png").write_bytes(b"of the user")
     again = polcap("export", own, "--gltf", "--texture-size", 64)
-    named = "asset/capture.mtl, asset/capture.obj, asset/capture_basecolor.png, asset/capture_normal.exr, "
+    named = "asset/C.mtl, asset/C.obj, asset/C_basecolor.png, asset/C_normal.exr, "
     assert again.returncode == 0 and named in again.stderr and "mine.png" not in again.stderr
     found = asset_export.find_outdated(own, asset_export.sidecars(own), about["keys"])
-    assert asset / "capture_sfp" in found and asset / "unreal" in found
+    assert asset / "C_sfp" in found and asset / "unreal" in found
 
 
-def test_presets_of_one_command_each_get_their_folder(own: Path, polcap: Command) -> None:
-    assert polcap("export", own, "--preset", "web", "--preset", "unreal", "--triangles", 3000).returncode == 0
-    stated = json.loads((own / "maps" / "maps.json").read_text())["exports"]
+def test_presets_of_one_command_each_get_their_folder(tiny_result: Path, polcap: Command) -> None:
+    assert polcap("export", tiny_result, "--preset", "web", "--preset", "unreal", "--triangles", 300).returncode == 0
+    stated = json.loads((tiny_result / "maps" / "maps.json").read_text())["exports"]
     for preset in ("web", "unreal"):
-        assert stated[f"asset/{preset}"]["mesh"]["triangles"] == pytest.approx(3000, rel=0.01)
-    assert "KHR_mesh_quantization" in document((own / "asset/web/capture.glb").read_bytes())["extensionsRequired"]
+        assert stated[f"asset/{preset}"]["mesh"]["triangles"] == pytest.approx(300, rel=0.01)
+    assert "KHR_mesh_quantization" in document((tiny_result / "asset/web/C.glb").read_bytes())["extensionsRequired"]
 
 
 def check_sums(archive: Path) -> list[str]:
@@ -499,8 +511,9 @@ def test_extra_textures_and_sixteen_bits(tiny_result: Path, polcap: Command) -> 
 
 
 @pytest.mark.parametrize(("orientation", "up"), [(6, (-1, 0)), (8, (1, 0)), (3, (0, -1))])
-def test_an_asset_of_a_turned_camera_stands_upright(own: Path, orientation: int, up: tuple[int, int]) -> None:
+def test_an_asset_of_a_turned_camera_stands_upright(tiny_result: Path, orientation: int, up: tuple[int, int]) -> None:
     """EXIF 2.3: with Orientation 6 the left side of the stored picture is the top; `up` points to it."""
+    own = tiny_result
     lying = trimesh.load(pipeline.export(own, ExportRequest())[0], force="mesh", process=False)
     about = json.loads((own / "report.json").read_text())
     about["capture"]["upright_deg"] = UPRIGHT_DEG[orientation]
