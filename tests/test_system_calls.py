@@ -20,7 +20,7 @@ import pytest
 
 from tests.conftest import ROOT, slow
 
-WATCH_S = 12.0  # onnxruntime 1.32 looks up its host's address 9 s after it is loaded
+WATCH_S = 10.0  # onnxruntime 1.32 looks up its host's address 9 s after it is loaded
 MINUTE_S = 60.0  # of a process that has loaded it
 HOMES = ("writable", "unset", "unwritable")
 CALLS = "open,openat,openat2,creat,mkdir,mkdirat,mknod,mknodat,truncate,rename,renameat,renameat2"
@@ -39,7 +39,20 @@ class Trace(NamedTuple):
 
 def traced(command: list[str], log: Path) -> list[str]:
     """The command line that runs a command and logs its calls and those of its children."""
-    return ["strace", "-f", "-y", "-qq", "-s", "4096", "-e", f"trace=%network,{CALLS}", "-o", str(log), *command]
+    return [
+        "strace",
+        "-f",
+        "--seccomp-bpf",
+        "-y",
+        "-qq",
+        "-s",
+        "4096",
+        "-e",
+        f"trace=%network,{CALLS}",
+        "-o",
+        str(log),
+        *command,
+    ]
 
 
 def read(log: Path, folder: Path) -> Trace:
@@ -62,7 +75,7 @@ def read(log: Path, folder: Path) -> Trace:
 def _cannot_trace() -> str:
     if not shutil.which("strace"):
         return "no strace"
-    done = subprocess.run(["strace", "-f", "-o", "/dev/null", "true"], capture_output=True, text=True)
+    done = subprocess.run(traced(["true"], Path(os.devnull)), capture_output=True, text=True)
     return done.stderr.strip() if done.returncode else ""
 
 
@@ -111,29 +124,6 @@ def test_a_request_and_a_file_of_a_child_are_seen(tmp_path: Path, environment: d
     assert outside(seen.written, tmp_path / "other") == [tmp_path / "made", tmp_path / "made" / "id"]
 
 
-def test_process_asks_no_network_and_writes_only_its_result(
-    tiny: Path, tmp_path: Path, temporary: Path, environment: dict[str, str]
-) -> None:
-    out = tmp_path / "out"
-    seen = run_polcap(["process", str(tiny / "C"), "--no-chart", "--out", str(out)], tmp_path, environment)
-    assert seen.sockets == []
-    assert any(path.parent == out for path in seen.written)
-    assert outside(seen.written, out, temporary) == []
-
-
-def test_workers_of_a_batch_ask_no_network_and_write_only_their_results(
-    tiny: Path, tmp_path: Path, temporary: Path, environment: dict[str, str]
-) -> None:
-    """They get a copy of their parent's environment, in which nothing has imported onnxruntime."""
-    captures, out = tmp_path / "captures", tmp_path / "out"
-    shutil.copytree(tiny / "C", captures / "one", ignore=shutil.ignore_patterns("polcap"))
-    environment["HOME"] = str(tmp_path / "home")
-    seen = run_polcap(["batch", str(captures), "--no-chart", "--out", str(out)], tmp_path, environment)
-    assert seen.sockets == []
-    assert any(path.name == "report.json" for path in out.rglob("*"))
-    assert outside(seen.written, out, temporary) == []
-
-
 def start_watching(capture: Path, folder: Path, home: str, environment: dict[str, str]) -> subprocess.Popen[str]:
     """`process --watch`, which also follows the settings file set.toml, with a kind of home folder."""
     if home == "writable":
@@ -152,11 +142,16 @@ def start_watching(capture: Path, folder: Path, home: str, environment: dict[str
     )  # fmt: skip
 
 
-@pytest.fixture
-def watching(tiny: Path, tmp_path: Path, environment: dict[str, str]) -> Iterator[dict[Path, subprocess.Popen[str]]]:
+Watching = dict[Path, subprocess.Popen[str]]
+
+
+@pytest.fixture(params=[("unset",)])
+def watching(
+    request: pytest.FixtureRequest, tiny: Path, tmp_path: Path, environment: dict[str, str]
+) -> Iterator[Watching]:
     """One process for each kind of home folder, all at the same time, by their folders."""
     running = {}
-    for home in HOMES:
+    for home in request.param:
         (folder := tmp_path / home).mkdir()
         running[folder] = start_watching(tiny / "C", folder, home, environment)
     yield running
@@ -165,18 +160,30 @@ def watching(tiny: Path, tmp_path: Path, environment: dict[str, str]) -> Iterato
             os.killpg(process.pid, signal.SIGKILL)
 
 
-def test_watch_asks_no_network_and_writes_only_its_result(
-    temporary: Path, watching: dict[Path, subprocess.Popen[str]]
+def test_commands_ask_no_network_and_write_only_their_results(
+    tiny: Path, tmp_path: Path, temporary: Path, environment: dict[str, str], watching: Watching
 ) -> None:
+    """`process` and `batch` run while `process --watch` waits.
+
+    The workers of a batch get a copy of their parent's environment, in which nothing has imported onnxruntime.
+    """
     _read_until_watching(watching)
-    time.sleep(WATCH_S)
+    end = time.monotonic() + WATCH_S
+    (tmp_path / "file").touch()
+    shutil.copytree(tiny / "C", tmp_path / "captures" / "C", ignore=shutil.ignore_patterns("polcap"))
+    for command, source, home in (("process", tiny / "C", "file"), ("batch", tmp_path / "captures", "home")):
+        out = tmp_path / command
+        arguments = [command, str(source), "--no-chart", "--out", str(out)]
+        _require_only_results(
+            run_polcap(arguments, tmp_path, environment | {"HOME": str(tmp_path / home)}), out, temporary
+        )
+    time.sleep(max(0.0, end - time.monotonic()))
     _require_silence(watching, temporary)
 
 
 @slow
-def test_a_minute_of_watch_asks_no_network_and_writes_only_its_result(
-    temporary: Path, watching: dict[Path, subprocess.Popen[str]]
-) -> None:
+@pytest.mark.parametrize("watching", [HOMES], indirect=True)
+def test_a_minute_of_watch_asks_no_network_and_writes_only_its_result(temporary: Path, watching: Watching) -> None:
     _read_until_watching(watching)
     for folder in watching:
         (folder / "set.toml").write_text("[surface]\nback = 'skirt'\n")
@@ -185,18 +192,21 @@ def test_a_minute_of_watch_asks_no_network_and_writes_only_its_result(
     _require_silence(watching, temporary)
 
 
+def _require_only_results(seen: Trace, out: Path, temporary: Path) -> None:
+    assert seen.sockets == []
+    assert any(path.name == "report.json" for path in seen.written)
+    assert outside(seen.written, out, temporary) == []
+
+
 def _require_silence(watching: dict[Path, subprocess.Popen[str]], temporary: Path) -> None:
     """End the processes and check what they asked of the system."""
     for folder, process in watching.items():
         os.killpg(process.pid, signal.SIGINT)
         assert process.wait(60) == 130
-        seen = read(folder / "log", folder)
-        assert seen.sockets == []
-        assert any(path.parent == folder / "out" for path in seen.written)
-        assert outside(seen.written, folder / "out", temporary) == []
+        _require_only_results(read(folder / "log", folder), folder / "out", temporary)
 
 
-def _read_until_watching(watching: dict[Path, subprocess.Popen[str]]) -> None:
+def _read_until_watching(watching: Watching) -> None:
     """Wait until every process has processed the capture."""
     for process in watching.values():
         assert process.stderr is not None
