@@ -85,9 +85,9 @@ def _enlarge(image: Floats, grid: TexelGrid, step: int) -> Floats:
 
 
 def _find_plane(views: tuple[PosedStokes, ...], grid: TexelGrid, step: int) -> float:
-    """Mean height [m] over the board on which the textures of all views agree best."""
+    """Height [m] of the plane over the board on which the textures of all views agree best."""
     coarse = grid.coarser(step)
-    pictures = [_picture(view, step) for view in views]
+    pictures = [_log_picture(view, step) for view in views]
 
     def disagreement(height: float) -> float:
         point = coarse.points(np.full(coarse.size[::-1], height))
@@ -103,7 +103,7 @@ def _find_plane(views: tuple[PosedStokes, ...], grid: TexelGrid, step: int) -> f
     return float(heights[best] + coarse.texel * vertex)
 
 
-def _picture(view: PosedStokes, step: int) -> Floats:
+def _log_picture(view: PosedStokes, step: int) -> Floats:
     """ln S0 (H, W), gray, of a view, in means of about a coarse texel; NaN where not measured."""
     gray = np.asarray(view.stokes.stokes[0] @ flash_light.gray(view.matrix), np.float32)
     log = np.log(cv2.blur(np.maximum(gray, 1e-3), (step, step)))
@@ -145,7 +145,7 @@ def _parallax(
     derivative = np.where(known, derivative - common, 0)
     error = np.where(known, np.clip((model - here) / level, -0.5, 0.5), 0)
     right, square = (cv2.GaussianBlur((derivative * part).sum(axis=0), (0, 0), _WINDOW) for part in (error, derivative))
-    weight = square * (4 * np.pi * _WINDOW**2) / settings.parallax_error**2
+    weight = square * (4 * np.pi * _WINDOW**2) / settings.parallax_error**2  # the window averages 4πσ² texels
     return np.asarray(right / np.maximum(square, 1e-12)), np.asarray(weight)
 
 

@@ -178,19 +178,20 @@ def _fit_texels(
 
 
 def _newton(estimate: TexelEstimate, gloss: Floats) -> tuple[Floats, Floats]:
-    """Newton step (2,) of the shared gloss, and its 1σ (2,).
+    """Newton step (2,) of the shared gloss, and its 1σ (2,), from texels that were fitted with it.
 
-    Slopes and albedo are eliminated from the equations of each texel, without its priors (Schur complement).
+    With the information of a texel's data in blocks of gloss (g) and of the other unknowns (u), that on the gloss alone
+    is I_gg − I_gu I_uu⁻¹ I_ug (Schur complement). The gradient is the pull of the prior that held the texel's gloss: in
+    the texel's optimum the two are in balance. F0 has a prior for the group, roughness almost none.
     """
-    data = estimate.information.astype(np.float64)
-    data[:, (2, 3), (2, 3)] -= _TIGHT.astype(float) ** -2
-    own, others = np.array([2, 3]), np.array([0, 1, 4, 5, 6])
-    cross = data[:, own[:, None], others]
-    inner = np.linalg.inv(data[:, others[:, None], others] + 1e-6 * np.eye(5))
-    schur = data[:, own[:, None], own] - cross @ inner @ np.swapaxes(cross, 1, 2)
-    # at the texels' optimum the prior's pull equals the data's gradient
-    pull = (estimate.value[:, texel_fit.GLOSS] - gloss) / _TIGHT.astype(float) ** 2
-    total = _INDEPENDENT * schur.mean(axis=0) + np.diag([1e-6, _F0_SIGMA**-2])
-    right = _INDEPENDENT * pull.mean(axis=0) + np.array([0, (_F0 - gloss[1]) / _F0_SIGMA**2])
+    g, u = np.r_[texel_fit.GLOSS], np.r_[texel_fit.SLOPES, texel_fit.ALBEDO]
+    information = estimate.information.astype(np.float64)  # (N, 7, 7)
+    information[:, g, g] -= _TIGHT.astype(float) ** -2  # that of the prior
+    cross = information[:, g[:, None], u]
+    inverse = np.linalg.inv(information[:, u[:, None], u] + 1e-6 * np.eye(len(u)))
+    of_gloss = information[:, g[:, None], g] - cross @ inverse @ np.swapaxes(cross, 1, 2)
+    gradient = (estimate.value[:, texel_fit.GLOSS] - gloss) / _TIGHT.astype(float) ** 2
+    total = _INDEPENDENT * of_gloss.mean(axis=0) + np.diag([1e-6, _F0_SIGMA**-2])
+    right = _INDEPENDENT * gradient.mean(axis=0) + np.array([0, (_F0 - gloss[1]) / _F0_SIGMA**2])
     covariance = np.linalg.inv(total)
     return np.asarray(covariance @ right), np.sqrt(np.diag(covariance))

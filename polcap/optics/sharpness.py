@@ -27,7 +27,7 @@ _LEAST_TILES = 4
 _LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise would count as detail
 _SURE = 0.999  # quantile of Student's t beyond which a loss of detail is significant
 _BEYOND = 0.1  # least log of a loss of detail beyond that of a shift
-_PHASES = 4.0  # effective number of rows with edges in a tile; fewer share one place within a pixel
+_PHASES = 4.0  # effective number of rows with edges in a tile; fewer may share one place within a pixel
 _DETAIL = -0.5  # largest log of fine over coarse energy of a tile with detail; noise has 0
 
 
@@ -139,14 +139,15 @@ def _fineness(tiles: Floats) -> Floats:
 
 
 def _phase_loss(tiles: Floats) -> Floats:
-    """Fineness (4, T) that sharp tiles lose by a shift of half a pixel; 0 if their edges lie at many places in a pixel.
+    """Fineness (4, T) that sharp tiles would lose if the camera moved by half a pixel.
 
-    An edge along the pixel rows is sharpest between two rows: there a shift of the camera looks like blur.
+    An edge along the rows is sharpest between two rows, and moved by half a pixel it looks blurred. Tiles with edges in
+    many rows (or columns) lose nothing, because these lie at all places within a pixel.
     """
     moved = tiles.copy()
     for axis in (1, 2):  # rows, columns
-        energy = (np.diff(tiles, axis=axis) ** 2).mean(axis=3 - axis)  # (T, n − 1)
-        few = energy.sum(axis=1) ** 2 < _PHASES * (energy**2).sum(axis=1)
+        energy = (np.diff(tiles, axis=axis) ** 2).mean(axis=3 - axis)  # (T, n − 1) of the edges between two rows
+        few = energy.sum(axis=1) ** 2 < _PHASES * (energy**2).sum(axis=1)  # (Σ e)² / Σ e²: number of rows with edges
         lines = np.moveaxis(moved, axis, 1)  # a view
         lines[few, 1:] = (lines[few, 1:] + lines[few, :-1]) / 2
     return _fineness(tiles) - _fineness(moved)

@@ -43,28 +43,28 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
     """Register object and surroundings of each shot separately, and compare the two motions."""
     shots = len(radiance.angle)
     shift = ObjectShift(*np.zeros((2, shots)))
-    if radiance.offset_px is not None:  # shots cut from one mosaic
+    if radiance.offset_px is not None:  # shots cut from one mosaic: nothing moves between them
         return shift
-    shift.length[1:] = np.nan
+    shift.length[1:] = np.nan  # where nothing is measured below
     if not object_.mask.any():
         return shift
     step = averaging_step(object_.mask.shape, _MOST_PIXELS)
     reference = detail(radiance.shot(0), _DETAIL_PX, step)[0]
     small = area_mean(object_.mask.astype(np.uint8), reference.picture.shape)
     near = dilate(small > 0, _RIM_PX)
-    regions = [Pyramid(reference.picture, reference.usable & region) for region in (near, ~near)]
+    regions = [Pyramid(reference.picture, reference.usable & region) for region in (near, ~near)]  # inner, outer
     middle = np.argwhere(small).mean(axis=0)[::-1] if small.any() else np.array(small.shape[::-1]) / 2
     for k in range(1, shots):
         shot = detail(radiance.shot(k), _DETAIL_PX, step)
         start = registration.scaled(alignment.transform[k], 1 / step)
-        (whole, of_object), (outer, around) = (_registered(region, shot, start) for region in regions)
-        if around > _SURE_CORRELATION and of_object < _OTHER_CORRELATION:
-            shift.length[k] = np.inf
-        elif min(of_object, around) > _SURE_CORRELATION:
-            places = [transform_points(found.matrix, middle) for found in (whole, outer)]
-            per_axis = np.hypot(whole.sigma_at(middle), outer.sigma_at(middle))
+        (inner, inner_match), (outer, outer_match) = (_register(region, shot, start) for region in regions)
+        if outer_match > _SURE_CORRELATION and inner_match < _OTHER_CORRELATION:
+            shift.length[k] = np.inf  # another object
+        elif min(inner_match, outer_match) > _SURE_CORRELATION:
+            places = [transform_points(found.matrix, middle) for found in (inner, outer)]
+            per_axis = np.hypot(inner.sigma_at(middle), outer.sigma_at(middle))
             shift.length[k] = step * np.hypot(*(places[0] - places[1]))
-            shift.sigma[k] = step * _ERROR_SCALE * np.sqrt(2) * per_axis * _student(min(whole.tiles, outer.tiles))
+            shift.sigma[k] = step * _ERROR_SCALE * np.sqrt(2) * per_axis * _student(min(inner.tiles, outer.tiles))
     return shift
 
 
@@ -75,7 +75,7 @@ def _student(tiles: int) -> float:
     return float(stdtrit(max(2 * tiles - _PARAMETERS, 1), ndtr(3.0)) / 3)
 
 
-def _registered(region: Pyramid, shot: Pyramid, start: Floats) -> tuple[Registration, float]:
+def _register(region: Pyramid, shot: Pyramid, start: Floats) -> tuple[Registration, float]:
     """Register one region of the picture; returns its motion and the correlation.
 
     The search starts from the motion `start` of the whole picture, and from no motion; the better result is returned.

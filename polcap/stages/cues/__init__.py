@@ -104,7 +104,7 @@ def zenith(dolp: Any) -> Any:
 
 
 def channels(cues: Any) -> Any:
-    """Network input channels (..., N, H, W) float32 from cues, in the order of CHANNELS; 0 outside the mask.
+    """Network input channels (..., N, H, W) float32 by the formulas of CHANNELS, limited; 0 outside the mask.
 
     `cues` has the fields of `Cues`; in training these are torch tensors, with a leading batch axis
     on each pixel map ((B, H, W), (B, H, W, 3), (2, B, H, W)).
@@ -113,11 +113,11 @@ def channels(cues: Any) -> Any:
     ones = xp.ones_like(cues.dolp)
     clipped = (cues.quality & int(Quality.CLIPPED)) > 0
     log = xp.log(xp.clip(cues.radiance, 0.0, 50.0) + FLOOR)
-    tilt = zenith(cues.dolp)
+    angle = zenith(cues.dolp)
     maps = [
         log[..., 0], log[..., 1], log[..., 2],
         xp.clip(10 * cues.ratio[0], -5.0, 5.0), xp.clip(10 * cues.ratio[1], -5.0, 5.0),
-        tilt * cues.normalized_stokes[0], tilt * cues.normalized_stokes[1],
+        angle * cues.normalized_stokes[0], angle * cues.normalized_stokes[1],
         cues.normalized_stokes[0], cues.normalized_stokes[1],
         zenith(xp.clip(cues.ratio_sigma, 0.0, 0.2)),
         ones, clipped * ones, cues.rays[..., 0], cues.rays[..., 1],

@@ -85,38 +85,39 @@ def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack
 
 def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     """Merge shot after shot into one stack; the first shot gives the order of brightness, black level and noise."""
-    shots, count, first = capture.all_shots, len(capture.shots), capture.shots[0]
+    shots, count, first = capture.all_shots, len(capture.shots), capture.shots[0]  # a crossed shot is the last of all
     order = _by_brightness(first, read)
     image = _read_reference(first.frames[middle(order)], read, settings)
     sensor, view, side = _sensor(capture, image, settings), _view(capture, image, settings), image.superpixel
     full = settings.demosaic == "full" and image.cfa is not None
-    bayer = image.cfa if sensor.site_px is not None and side == 2 else None  # binned
+    bayer = image.cfa if sensor.site_px is not None and side == 2 else None  # of a binned mosaic
     stack = _empty(len(shots), *(size // side * (side if full else 1) for size in image.value.shape[:2]))
     pictures = [MaskedImage(*shot) for shot in zip(stack.value, stack.variance, stack.quality)]
     del image  # so that the reader can free the frame
     read.black = black_error(Bracket(first, order), read)
     places = sharpness.places(read(middle(first.frames)), settings.clip)  # of the same frame as in `check`
     lines = noise.Lines(() if capture.calibration is None else capture.calibration.noise)
-    figures, ambient_share, tiles = [], [], []  # of each shot
+    ratio, curvature, flicker, ambient_share, tiles = [], [], [], [], []  # of each shot but the crossed one
     for k, shot in enumerate(shots):
-        # the crossed shot is merged on the scale of its own middle frame: its flash has another energy
-        bracket = Bracket(shot, _by_brightness(shot, read) if k == count else order)
+        is_crossed = k == count  # then merged on the scale of its own middle frame: its flash has another energy
+        bracket = Bracket(shot, _by_brightness(shot, read) if is_crossed else order)
         compared = compare(bracket, lines, read, settings.max_motion_px)
         weighted = weights.prepare(bracket, compared, lines, read, full)
         if k == 0:
             shape = weighted.shape
             mosaic = None if bayer is None else photosites.merge(bracket, weighted, bayer, read)
-        check_size("the cross-polarized shot" if k == count else f"shot {shot.name}", weighted.shape, shape)
+        check_size("the cross-polarized shot" if is_crossed else f"shot {shot.name}", weighted.shape, shape)
         weighted.merge_into(pictures[k])
-        if k < count:
+        if not is_crossed:
             _check_ambient(compared.ambient_share, shot)
             ambient_share.append(compared.ambient_share)
-            figures.append([(frame.ratio, frame.curvature, frame.flicker) for frame in compared.frames])
+            ratio.append([frame.ratio for frame in compared.frames])
+            curvature.append([frame.curvature for frame in compared.frames])
+            flicker.append([frame.flicker for frame in compared.frames])
             tiles.append([sharpness.take(read(frame), places, settings.clip) for frame in shot.frames])
-        del weighted, compared
+        del weighted, compared  # memory, before the next shot
         read.forget((*shot.frames, *shot.ambient))
         lines.settle()
-    ratio, curvature, flicker = (np.array([[one[i] for one in shot] for shot in figures], np.float64) for i in range(3))
     if settings.falloff and capture.calibration is not None and capture.calibration.falloff is not None:
         for picture in pictures:
             weights.divide_by_falloff(picture, view, capture.size_px, capture.calibration.falloff)
@@ -127,10 +128,10 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         angle=capture.angle,
         view=view,
         bracket=BracketMeasurement(
-            exposure_ratio=np.repeat(ratio, 3 // shape[0], axis=2),
+            exposure_ratio=np.repeat(np.array(ratio, np.float64), 3 // shape[0], axis=2),  # for three channels
             exif_ratio=_stated_ratios(capture.shots, middle(order)),
-            curvature=curvature,
-            flicker=flicker,
+            curvature=np.array(curvature, np.float64),
+            flicker=np.array(flicker, np.float64),
             ghost_fraction=np.array([np.mean((quality & Quality.GHOST) > 0) for quality in stack.quality[:count]]),
             ambient_share=np.array(ambient_share),
             blur_px=sharpness.frames_blur(tiles, side),

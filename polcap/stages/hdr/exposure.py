@@ -91,7 +91,7 @@ def black_error(tiles: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]
     line, and its slope r (N,) is the exposure ratio, NaN for too few tiles. The error is 0 where it is below 1e-4, or
     where the frames disagree.
     """
-    lines = [_lines(a, b) if len(a) >= _LEAST_TILES else np.full((2, a.shape[1]), np.nan) for a, b in tiles]
+    lines = [_fit_lines(a, b) if len(a) >= _LEAST_TILES else np.full((2, a.shape[1]), np.nan) for a, b in tiles]
     ratio = np.array([slope.mean() for slope, _ in lines])
     known = [offset / (1 - slope) for slope, offset in lines if (np.abs(np.log(slope)) > np.log(_BLACK_STEP)).all()]
     if not known:
@@ -102,23 +102,23 @@ def black_error(tiles: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]
     return np.where((np.abs(error) > _LEAST_BLACK) & agree, error, 0.0), ratio
 
 
-def _lines(a: Floats, b: Floats) -> Floats:
-    """Slopes and intercepts (2, C) of b over a, (T, C) each, by iterated least squares.
+def _fit_lines(a: Floats, b: Floats) -> Floats:
+    """Slope and intercept (2, C) of b over a by robust least squares, for each channel of T tiles (T, C).
 
-    Tiles where something moved count less.
+    Tiles where something moved get less weight, in ten iterations.
     """
     shot, relative, dark = _TILE_NOISE
-    found = np.empty((2, a.shape[1]))
+    line = np.empty((2, a.shape[1]))
     for c in range(a.shape[1]):
-        sure = 1 / np.sqrt(shot * np.maximum(b[:, c], 0) + (relative * b[:, c]) ** 2 + dark**2)
-        weight = sure
+        accuracy = 1 / np.sqrt(shot * np.maximum(b[:, c], 0) + (relative * b[:, c]) ** 2 + dark**2)  # 1/σ
+        weight = accuracy
         for _ in range(10):
             matrix = np.stack([a[:, c] * weight, weight], axis=1)
-            found[:, c] = np.linalg.lstsq(matrix, b[:, c] * weight, rcond=None)[0]
-            residual = (b[:, c] - found[0, c] * a[:, c] - found[1, c]) * sure
-            weight = sure * np.sqrt(biweight(residual, spread(residual)))
-    found[0] = np.maximum(found[0], 1e-9)
-    return found
+            line[:, c] = np.linalg.lstsq(matrix, b[:, c] * weight, rcond=None)[0]
+            residual = (b[:, c] - line[0, c] * a[:, c] - line[1, c]) * accuracy  # in σ
+            weight = accuracy * np.sqrt(biweight(residual, spread(residual)))
+    line[0] = np.maximum(line[0], 1e-9)  # its logarithm is needed
+    return line
 
 
 def scales_as_stated(ratio: float, frame: Frame, reference: Frame) -> bool:

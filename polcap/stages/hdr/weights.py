@@ -203,16 +203,16 @@ def _twice(picture: Floats) -> Floats:
 
 
 def divide_by_falloff(image: MaskedImage, view: View, size_px: tuple[int, int], light: Falloff) -> None:
-    """Divide merged radiance (H, W, 3) by the lens's relative illumination, and its variance by the square, in place.
+    """Divide radiance (H, W, 3) by a lens's falloff 1 + a r² + b r⁴ + c r⁶, and variance by its square, in place.
 
     `view` is the camera of the picture; `size_px` the width and height of the visible RAW, where r = 1 in the corners.
     """
-    coefficient = np.broadcast_to(np.array(light.coefficient), (3, 3))
-    half = np.hypot(*size_px) / 2 / view.scale  # px of this grid
+    coefficient = np.broadcast_to(np.array(light.coefficient), (3, 3))  # also of a monochrome sensor
+    radius = np.hypot(*size_px) / 2 / view.scale  # r = 1, in px of this grid
     height, width = image.quality.shape
-    x2 = ((np.arange(width) - view.center[0]) / half) ** 2
+    x2 = ((np.arange(width) - view.center[0]) / radius) ** 2
     for rows, _, _ in blocks(height):
-        y2 = ((np.arange(rows.start, rows.stop) - view.center[1]) / half) ** 2
+        y2 = ((np.arange(rows.start, rows.stop) - view.center[1]) / radius) ** 2
         r2 = (y2[:, None] + x2)[..., None]
         gain = (1 + r2 * (coefficient[:, 0] + r2 * (coefficient[:, 1] + r2 * coefficient[:, 2]))).astype(np.float32)
         image.value[rows] /= gain

@@ -102,10 +102,10 @@ def estimate_coarse(
 
 
 def _compare_orders(cues: Cues, network: Network, run: RunNetwork) -> OrderTest | None:
-    """Compare the orders of the shots by the mean error that the network expects, in a small picture.
+    """The other order of the shots in which the network expects the least mean error, over that in the stated order.
 
-    Under a wrong order the polarization fits no shape with this outline and shading, so the network expects
-    errors that are 1.1 to 3 times as large.
+    Under a wrong order the polarization fits no shape with this outline and shading, so the network expects larger
+    errors (decision 33), in a small picture too. None: there is no other order, or no pixel.
     """
     if not cues.other_orders:
         return None

@@ -85,7 +85,7 @@ def solve(
             origin=(view.origin[0] + x0, view.origin[1] + y0),
         ),
         residual=residual,
-        body=_body(shots, alignment.crossed, calibration.crossed, stokes, quality, crop),
+        body=_diffuse_reflection(shots, alignment.crossed, calibration.crossed, stokes, quality, crop),
         detail=None if radiance.mosaic is None else reference_detail(radiance.mosaic, crop, lens),
     )
 
@@ -142,21 +142,21 @@ def _solve_in_blocks(
     return stokes, covariance, quality, residual
 
 
-def _body(
-    shots: _Shots, transform: Floats | None, factor: Floats | None, stokes: Floats, seen: Bits, crop: Box
+def _diffuse_reflection(
+    shots: _Shots, transform: Floats | None, factor: Floats | None, stokes: Floats, quality: Bits, crop: Box
 ) -> MaskedImage | None:
-    """Diffuse reflection S0 (h, w, 3) from the cross-polarized shot, registered and multiplied by its factor (3,)."""
+    """Diffuse reflection S0 (h, w, 3) by `optics/crossing`, from the registered crossed shot times its factor (3,)."""
     crossed = shots.radiance.crossed
     if crossed is None or transform is None or factor is None:
         return None
     picture, factor = crossed.picture, factor.astype(np.float32)
-    clipped = (seen & np.uint8(Quality.CLIPPED)) > 0  # S1, S2 are unknown there, and small: highlights face the camera
-    across = np.where(clipped[..., None], 0, crossing.polarization_along(stokes[1], stokes[2], crossed.angle))
-    value = crossing.diffuse_light(_resampled(shots, picture.value, transform, crop) * factor, across)
+    clipped = (quality & np.uint8(Quality.CLIPPED)) > 0  # p is unknown there, and small: highlights face the camera
+    p = np.where(clipped[..., None], 0, crossing.polarization_along(stokes[1], stokes[2], crossed.angle))
+    value = crossing.diffuse_light(_resampled(shots, picture.value, transform, crop) * factor, p)
     variance = np.maximum(warp(picture.variance, transform, crop, 1, shots.lens), _LEAST_VARIANCE) * factor**2
     height, width = picture.quality.shape
-    quality = _defects(_flagged(picture.quality), (height, width), transform, crop, shots.lens)
-    return MaskedImage(value.astype(np.float32), variance, quality)
+    defects = _defects(_flagged(picture.quality), (height, width), transform, crop, shots.lens)
+    return MaskedImage(value.astype(np.float32), variance, defects)
 
 
 def _flagged(quality: Bits) -> list[tuple[Quality, Bits]]:
@@ -247,12 +247,12 @@ def _weighted_least_squares(
 
 
 def _correct_extinction(stokes: Floats, covariance: Floats, extinction: Floats) -> None:
-    """Correct the polarizer's finite extinction: divide S1 and S2 by (E − 1)/(E + 1), E (C,), in place."""
-    ratio = np.asarray(extinction, np.float64)
-    contrast = (1 - 1 / ratio) / (1 + 1 / ratio)
-    up = (1 / np.stack([np.ones_like(contrast), contrast, contrast])).astype(np.float32)  # (3, C)
-    stokes *= up[:, None, None]
-    covariance *= np.stack([up[i] * up[j] for i, j in _PAIRS])[:, None, None]
+    """Correct a finite extinction ratio E (C,) of the polarizer: divide S1 and S2 by (E − 1)/(E + 1), in place."""
+    leak = 1 / np.asarray(extinction, np.float64)  # 1/E, finite for an ideal polarizer too
+    contrast = (1 - leak) / (1 + leak)
+    factor = (1 / np.stack([np.ones_like(contrast), contrast, contrast])).astype(np.float32)  # (3, C)
+    stokes *= factor[:, None, None]
+    covariance *= np.stack([factor[i] * factor[j] for i, j in _PAIRS])[:, None, None]
 
 
 def _with_solution_flags(stokes: Floats, covariance: Floats, quality: Bits, settings: StokesSettings) -> Bits:

@@ -138,14 +138,14 @@ def _useless_cuts(level: PyramidLevel, found: OcclusionMap, uncut: PyramidLevel)
 
 
 def join_contacts(level: PyramidLevel) -> None:
-    """Remove cuts between parts of the surface that touch."""
+    """Remove cuts between parts that touch: many links across the cut have the same small depth step (`occlusion`)."""
     found = level.occlusions()
     if not found.any() or not level.choosing.any():
         return
     grid, separate = level.grid, level.grid.links(found.right, found.down)
     separate[level.contours.link] = True
-    step, ends = level.z[grid.q] - level.z[grid.p], (level.slope_at(grid.p), level.slope_at(grid.q))
-    excess = step - np.clip(step, np.minimum(*ends), np.maximum(*ends))
+    step, slopes = level.z[grid.q] - level.z[grid.p], (level.slope_at(grid.p), level.slope_at(grid.q))
+    excess = step - np.clip(step, np.minimum(*slopes), np.maximum(*slopes))  # beyond the slopes at both ends
     touch = occlusion.contact_links(grid, separate, excess, disc_radius(level.field.mask))
     if not touch.any():
         return
