@@ -144,6 +144,7 @@ def ball_object() -> ObjectMask:
     return ObjectMask(inside, (30, 28, 212, 210), "user")
 
 
+@functools.lru_cache(maxsize=8)
 def seen(noise: float = 0.0, textured: bool = True) -> Cues:
     """Cues of the ball, whose shots do not move."""
     radiance, settings = stack(noise=noise, textured=textured), stokes_stage.StokesSettings()

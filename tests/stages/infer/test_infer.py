@@ -44,16 +44,18 @@ def errors_deg(maps, cues_) -> np.ndarray:
     return frames.angle_deg(maps.normal, frames.from_ray_frame(local, cues_.rays))[mask & maps.mask]
 
 
-@pytest.mark.parametrize(("albedo", "doubled"), [(0.5, False), (0.95, False), (1.4, True)])
+@pytest.mark.parametrize(("albedo", "doubled"), [(0.95, False), (1.4, True)])
 def test_white_things_are_no_evidence_of_a_chart_with_less_light(
     albedo: float, doubled: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The chart got half of the light only where more comes back than from the whitest surface; highlights are none."""
-    monkeypatch.setattr(learned, "estimate", lambda found, *_, **__: analytic.estimate(found, 1.5))
     found = seen(noise=0.002, textured=False)
     local, _ = scenes.truth()
     highlight = 3.0 * (local[..., 2:] > 0.95)
     lit = replace(found, scale_sigma=0.1, radiance=albedo / 0.5 * found.radiance + highlight)
+    maps = analytic.estimate(lit, 1.5)
+    for estimator in (analytic, learned):
+        monkeypatch.setattr(estimator, "estimate", lambda *_, **__: maps)
     expected = np.sqrt(0.1**2 + 0.05**2 + np.log(2) ** 2 * (1.0 if doubled else 0.01))
     for model in (None, object()):
         assert estimate(lit, model).albedo_sigma == pytest.approx(expected, abs=0.06)
@@ -95,9 +97,10 @@ def test_albedo_goes_on_into_saturated_highlights(known: bool):
     radiance[bright], quality[bright] = 4.0, quality[bright] | Quality.CLIPPED
     burnt = replace(found, radiance=radiance, quality=quality)
     for estimator in (None, network()):
-        albedo, whole = (estimate(c, estimator).diffuse for c in (burnt, found))
+        albedo = estimate(burnt, estimator).diffuse
         assert np.isfinite(albedo).all()
         if known:  # this network returns 0.3, the inversion about 0.5
+            whole = estimate(found, estimator).diffuse
             assert np.abs(albedo - whole)[bright].mean() < 0.03, estimator
 
 
@@ -166,12 +169,14 @@ SINGLE = np.array([[1.05, 0.95], [0.95, 0.95]])
 
 
 @pytest.mark.parametrize("pattern", [GRID, SINGLE], ids=["checkered", "single pixels"])
-@pytest.mark.parametrize("name", ["diffuse", "roughness", "specular"])
-def test_a_grid_of_the_network_does_not_reach_its_maps(name, pattern):
+def test_a_grid_of_the_network_does_not_reach_its_maps(pattern):
     found = seen(noise=1e-4, textured=False)
-    part = getattr(estimate(found, gridded(pattern, name)), name)[middle(found)]
-    means = [part[y::2, x::2].mean() for y in (0, 1) for x in (0, 1)]
-    assert np.ptp(means) / np.mean(means) < 2e-3
+    names = ("diffuse", "roughness", "specular")
+    maps = estimate(found, gridded(pattern, *names))
+    for name in names:
+        part = getattr(maps, name)[middle(found)]
+        means = [part[y::2, x::2].mean() for y in (0, 1) for x in (0, 1)]
+        assert np.ptp(means) / np.mean(means) < 2e-3, name
 
 
 def test_relief_that_the_network_does_not_see_leaves_the_albedo(monkeypatch):
@@ -307,8 +312,8 @@ def test_the_shipped_network_expects_larger_errors_in_a_wrong_order(swapped: boo
     assert order is not None
     if swapped:
         assert order.ratio < 0.8 and order.rival == exchanged.order
-    else:
-        assert order.ratio > 1.2
+        return
+    assert order.ratio > 1.2
     assert estimate(found).order is None  # the inversion expects nothing
     thread = np.zeros_like(found.mask)
     thread[:, found.mask.shape[1] // 2] = found.mask[:, found.mask.shape[1] // 2]
