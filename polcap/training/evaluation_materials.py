@@ -22,7 +22,7 @@ _MAX_SLOPE = 0.6  # of the relief
 _ORDINARY, _STRONG = (0.030, 0.052), (0.06, 0.26)  # protocol 1: F0 of every second material, and of the others
 _COMMON, _RARE = (0.034, 0.055), (0.06, 0.18)  # protocol 2: F0 of four of five materials, and of the fifth
 
-Field = Callable[[Floats], tuple[Floats, Floats]]  # (M, 3) -> tone 0…1, depth of grooves 0…1; (M,) each
+ToneAndGroove = Callable[[Floats], tuple[Floats, Floats]]  # (M, 3) -> tone 0…1, depth of grooves 0…1; (M,) each
 
 
 @dataclass(frozen=True)
@@ -169,12 +169,12 @@ def _waves(rng: np.random.Generator, low: float, high: float, count: int = 10) -
     return lambda p: np.sin(p @ wave_vectors + phase) @ weight
 
 
-def _step(x: Floats, low: float, high: float) -> Floats:
+def _smooth_step(x: Floats, low: float, high: float) -> Floats:
     t = np.clip((x - low) / (high - low), 0, 1)
     return np.asarray(t * t * (3 - 2 * t))
 
 
-def _wood(rng: np.random.Generator) -> Field:
+def _wood(rng: np.random.Generator) -> ToneAndGroove:
     """Growth rings with fibers."""
     rings, bend = rng.uniform(8, 20), _waves(rng, 0.7, 4)
     grain, off = _waves(rng, 12, 40), rng.uniform(-0.5, 0.5, 2)
@@ -182,14 +182,14 @@ def _wood(rng: np.random.Generator) -> Field:
     def field(p: Floats) -> tuple[Floats, Floats]:
         radius = np.hypot(p[:, 0] + off[0], p[:, 1] + off[1]) * rings + 0.35 * bend(p)
         part = np.mod(radius, 1)
-        late = part**2 * (1 - _step(part, 0.9, 1.0))
+        late = part**2 * (1 - _smooth_step(part, 0.9, 1.0))
         fibre = 0.5 + 0.5 * np.tanh(grain(p * [1, 1, 0.06]))
         return np.clip(0.75 * late / 0.8 + 0.25 * fibre, 0, 1), 0.3 * late + 0.2 * fibre
 
     return field
 
 
-def _marble(rng: np.random.Generator) -> Field:
+def _marble(rng: np.random.Generator) -> ToneAndGroove:
     """Veins that swirl."""
     cycles, swirl, width = rng.uniform(2, 5), _waves(rng, 1, 9, 14), rng.uniform(0.1, 0.35)
     cloud = _waves(rng, 0.8, 4)
@@ -207,55 +207,55 @@ def _scattered(rng: np.random.Generator, side: int) -> Floats:
     return (cells + rng.uniform(0.05, 0.95, cells.shape)) / side * 2 - 1
 
 
-def _cells(rng: np.random.Generator) -> Field:
+def _cells(rng: np.random.Generator) -> ToneAndGroove:
     """Voronoi cells of one shade each, with joints."""
-    points = _scattered(rng, int(rng.integers(10, 22)))
+    side = int(rng.integers(10, 22))
+    points, joint = _scattered(rng, side), 0.12 * 2 / side
     tree, shade = cKDTree(points), rng.uniform(0, 1, len(points))
-    joint = 0.12 * 2 / round(len(points) ** (1 / 3))
 
     def field(p: Floats) -> tuple[Floats, Floats]:
         distance, which = (np.asarray(found) for found in tree.query(p, k=2))
-        return shade[which[:, 0]], 1 - _step(distance[:, 1] - distance[:, 0], 0, 3 * joint)
+        return shade[which[:, 0]], 1 - _smooth_step(distance[:, 1] - distance[:, 0], 0, 3 * joint)
 
     return field
 
 
-def _stripes(rng: np.random.Generator) -> Field:
+def _stripes(rng: np.random.Generator) -> ToneAndGroove:
     """Wavy stripes of two shades."""
     count, share, bend = rng.uniform(5, 16), rng.uniform(0.25, 0.75), _waves(rng, 0.7, 2)
 
     def field(p: Floats) -> tuple[Floats, Floats]:
         part = np.abs(np.mod(p[:, 0] * count + 0.15 * bend(p), 1) * 2 - 1)  # 0…1…0 over a stripe
-        return _step(part, share - 0.06, share + 0.06), np.exp(-(((part - share) / 0.08) ** 2))
+        return _smooth_step(part, share - 0.06, share + 0.06), np.exp(-(((part - share) / 0.08) ** 2))
 
     return field
 
 
-def _checks(rng: np.random.Generator) -> Field:
+def _checks(rng: np.random.Generator) -> ToneAndGroove:
     """Cubes of two shades, with joints."""
     count, joint = rng.uniform(4, 10), rng.uniform(0.02, 0.08)
 
     def field(p: Floats) -> tuple[Floats, Floats]:
-        part = p * count
-        edge = np.abs(part - np.round(part)).min(axis=1)
-        return np.floor(part).sum(axis=1) % 2, 1 - _step(edge, 0, 2 * joint)
+        scaled = p * count
+        edge = np.abs(scaled - np.round(scaled)).min(axis=1)  # distance to the nearest face, in cubes
+        return np.floor(scaled).sum(axis=1) % 2, 1 - _smooth_step(edge, 0, 2 * joint)
 
     return field
 
 
-def _dots(rng: np.random.Generator) -> Field:
+def _dots(rng: np.random.Generator) -> ToneAndGroove:
     """Balls of another shade at scattered points."""
     side = int(rng.integers(14, 30))
-    tree, share = cKDTree(_scattered(rng, side)), rng.uniform(0.3, 0.5)
+    tree, radius = cKDTree(_scattered(rng, side)), rng.uniform(0.3, 0.5)  # in cells of the grid of points
 
     def field(p: Floats) -> tuple[Floats, Floats]:
-        near = np.asarray(tree.query(p)[0]) * side / 2
-        return 1 - _step(near, share - 0.06, share), np.clip(1 - near / share, 0, 1) ** 2
+        distance = np.asarray(tree.query(p)[0]) * side / 2
+        return 1 - _smooth_step(distance, radius - 0.06, radius), np.clip(1 - distance / radius, 0, 1) ** 2
 
     return field
 
 
-def _brushed(rng: np.random.Generator) -> Field:
+def _brushed(rng: np.random.Generator) -> ToneAndGroove:
     """Fine lines along one axis."""
     lines, cloud = _waves(rng, 8, 40, 24), _waves(rng, 1, 4)
 
@@ -266,7 +266,7 @@ def _brushed(rng: np.random.Generator) -> Field:
     return field
 
 
-_FAMILIES: dict[str, Callable[[np.random.Generator], Field]] = {
+_FAMILIES: dict[str, Callable[[np.random.Generator], ToneAndGroove]] = {
     "wood": _wood, "marble": _marble, "cells": _cells, "stripes": _stripes, "checks": _checks, "dots": _dots,
     "brushed": _brushed,
 }  # fmt: skip

@@ -38,7 +38,7 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
 
     def __init__(self, coarse: int, fine: int, outputs: int) -> None:
         super().__init__()
-        self.sort = nn.Conv2d(coarse, _GROUPS, 1)
+        self.sort = nn.Conv2d(coarse, _GROUPS, 1)  # scores of the groups for a region
         self.part = nn.Sequential(nn.Conv2d(fine + 6, 32, 1), nn.ReLU(), nn.Conv2d(32, _GROUPS, 1))
         self.read = nn.Sequential(nn.Linear(PROFILE, 96), nn.ReLU(), nn.Linear(96, outputs))
         nn.init.zeros_(self.part[-1].weight)
@@ -49,15 +49,14 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
 
         Coarse features (B, ·, H/2, W/2) assign regions, fine features (B, ·, H, W) pixels within a region.
         """
-        color = torch.log(seen.diffuse + 0.02)
-        weight = seen.usable + 1e-4
+        color = torch.log(seen.diffuse + 0.02)  # finite for black
+        weight = seen.usable + 1e-4  # not 0 everywhere
         deviation = color - (color * weight).sum(dim=(2, 3), keepdim=True) / weight.sum(dim=(2, 3), keepdim=True)
         region = F.interpolate(self.sort(coarse).float(), scale_factor=2.0, mode="bilinear", align_corners=False)
-        kind = self.part(torch.cat([fine, color.to(fine.dtype), deviation.to(fine.dtype)], dim=1)).float()
-        member = torch.softmax(region + kind, dim=1)
-        outputs = self.read(profile((member * seen.usable).flatten(2), seen.figures.flatten(2), seen.cosine.flatten(2)))
-        # (B, groups, outputs) and (B, groups, H·W)
-        return (outputs.transpose(1, 2) @ member.flatten(2)).unflatten(2, member.shape[2:])
+        pixel = self.part(torch.cat([fine, color.to(fine.dtype), deviation.to(fine.dtype)], dim=1)).float()
+        share = torch.softmax(region + pixel, dim=1)  # (B, groups, H, W) of each pixel in each group
+        gloss = self.read(profile((share * seen.usable).flatten(2), seen.figures.flatten(2), seen.cosine.flatten(2)))
+        return (gloss.transpose(1, 2) @ share.flatten(2)).unflatten(2, share.shape[2:])  # gloss: (B, groups, outputs)
 
 
 def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) -> Tensor:

@@ -29,6 +29,7 @@ MODES: dict[Mode, float] = {
     "pictured": 0.15,
 }  # fmt: skip
 _PITCH = 16  # px per patch in the picture of the chart
+_UNDETECTED = 1 / 14  # share of the charts
 
 
 @dataclass(frozen=True)
@@ -173,43 +174,43 @@ def _light(
 
 
 def _add_chart(image: Floats, mask: Bools, touching: float, rng: np.random.Generator) -> tuple[Bools, Floats | None]:
-    """Paint a ColorChecker next to or behind the object into a picture (H, W, 3).
+    """Paint a ColorChecker next to or behind the object into the Stokes parameters (3, H, W, 3) of a picture.
 
-    Returns its detected area (H, W) and corners (4, 2); one in fourteen counts as not detected: no area, None.
+    Returns its detected area (H, W) and corners (4, 2): no area and None where it has no place or is not detected.
     """
     height, width = mask.shape
-    frame = rng.uniform(0.15, 0.5)
-    picture, ratio = _chart_picture(frame), (4 + 2 * frame) / (6 + 2 * frame)
-    quad = _place_chart(mask, ratio, rng.random() < touching, rng)
+    frame = rng.uniform(0.15, 0.5)  # its width, in patches
+    picture, aspect = _chart_picture(frame), (4 + 2 * frame) / (6 + 2 * frame)  # 4 rows of 6 patches
+    quad = _place_chart(mask, aspect, rng.random() < touching, rng)
     if quad is None:
         return np.zeros(mask.shape, bool), None
     tall, wide = picture.shape[:2]
     source = np.array([[0, 0], [wide, 0], [wide, tall], [0, tall]], np.float32) - 0.5
     matrix = cv2.getPerspectiveTransform(source, quad.astype(np.float32))
-    laid = cv2.warpPerspective(picture, matrix, (width, height), flags=cv2.INTER_AREA)
+    color = cv2.warpPerspective(picture, matrix, (width, height), flags=cv2.INTER_AREA)
     cover = cv2.warpPerspective(np.ones((tall, wide), np.float32), matrix, (width, height)) * ~mask
     y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     light = rng.uniform(0.6, 1.4) * (1 + rng.normal(0, 0.08) * x + rng.normal(0, 0.08) * y)
     sheen = rng.uniform(0, 0.01)
-    image[0] += cover[..., None] * (light[..., None] * (laid + sheen) - image[0])
-    image[1:] *= 1 - cover[..., None]
+    image[0] += cover[..., None] * (light[..., None] * (color + sheen) - image[0])
+    image[1:] *= 1 - cover[..., None]  # the chart does not polarize
     inner = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * frame * _PITCH + source  # outer corners of the patches
     corners = cv2.perspectiveTransform(inner[None].astype(np.float32), matrix)[0]
-    corners += rng.normal(0, 0.004 * max(height, width), (4, 2)) * (rng.random() < 0.3)
-    if rng.random() < 1 / 14:
+    corners += rng.normal(0, 0.004 * max(height, width), (4, 2)) * (rng.random() < 0.3)  # error of the detection
+    if rng.random() < _UNDETECTED:
         return np.zeros(mask.shape, bool), None
     return _fill(corners, mask.shape), corners
 
 
-def _place_chart(mask: Bools, ratio: float, near: bool, rng: np.random.Generator) -> Floats | None:
-    """Corners (4, 2) of a free place for the chart, `near` the object or anywhere; None if 14 random tries fail."""
+def _place_chart(mask: Bools, aspect: float, near: bool, rng: np.random.Generator) -> Floats | None:
+    """Corners (4, 2) of a free place for the chart, `near` the object or anywhere; `aspect`: height over width."""
     size = np.array(mask.shape[::-1])
     found: list[tuple[float, Floats]] = []
     distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)
-    for _ in range(14):
+    for _ in range(14):  # random tries
         across = size.max() * rng.uniform(0.14, 0.36)
         turn = rng.normal(0, 0.08) + rng.choice([0, np.pi / 2, -np.pi / 2, np.pi], p=[0.7, 0.12, 0.12, 0.06])
-        half = np.array([[-1, -ratio], [1, -ratio], [1, ratio], [-1, ratio]]) * across / 2
+        half = np.array([[-1, -aspect], [1, -aspect], [1, aspect], [-1, aspect]]) * across / 2
         quad = half @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
         quad *= 1 + rng.normal(0, 0.02, (4, 2))
         quad += rng.uniform(0, 1, 2) * size

@@ -63,8 +63,8 @@ def make_pictures(out: Path, data: Path, count: int) -> None:
 
 
 def _make_group(files: list[Path], library: materials.MaterialLibrary, group: int) -> Iterator[Floats]:
-    """Simulated pictures of one object, or of two or three objects side by side."""
-    rng = np.random.default_rng([5, group])
+    """Simulated pictures of one object, or of two or three side by side, in a quarter of the groups."""
+    rng = np.random.default_rng([5, group])  # 5: an arbitrary seed
     torch.manual_seed(int(rng.integers(1 << 62)))
     if rng.random() < 0.75:
         mesh = _draw_mesh(files, rng)
@@ -110,14 +110,14 @@ def load_varied(file: Path, rng: np.random.Generator, other: Path | None = None)
         layers = np.where(inserted[..., None], more, layers)
     layers = _crop(layers, rng)
     stokes, mask, chart = layers[..., :_OBJECT], layers[..., _OBJECT], layers[..., _CHART] > 0.5
-    if not chart.any() and rng.random() < 0.3:
+    if not chart.any() and rng.random() < 0.3:  # other colors; those of a chart stay
         stokes = stokes[..., [*rng.permutation(3), 3, 4]]
-    if rng.random() < 0.5:
+    if rng.random() < 0.5:  # mirrored, which negates S2
         stokes, mask, chart = stokes[:, ::-1] * [1, 1, 1, 1, -1], mask[:, ::-1], chart[:, ::-1]
     if rng.random() < 0.1:  # camera upside down
         stokes, mask, chart = stokes[::-1] * [1, 1, 1, 1, -1], mask[::-1], chart[::-1]
     light = np.exp(rng.normal(0, 0.25)) * mask + np.exp(rng.normal(0, 0.25)) * (1 - mask)
-    light = light * (1 - chart) + chart
+    light = light * (1 - chart) + chart  # that of the chart is 1
     tint = np.exp(rng.normal(0, 0.1, (2, 3)))
     color = stokes[..., :3] * light[..., None] * np.where((mask > 0)[..., None], tint[0], tint[1])
     sums = np.stack([color.sum(-1), *(np.moveaxis(stokes[..., 3:], -1, 0) * light * rng.uniform(0.6, 1.1))])
@@ -159,19 +159,19 @@ class MaskTraining(loop.PictureTraining):
     def advance(self, batch: list[Path], progress: float) -> dict[str, float]:
         """One training step on picture files; returns the losses of both passes (whole picture, then parts)."""
         rng = self.random
-        others = [batch[n - 1] if rng.random() < _INSERTED else None for n in range(len(batch))]
-        examples = [load_varied(file, rng, other) for file, other in zip(batch, others)]
+        inserted = [batch[n - 1] if rng.random() < _INSERTED else None for n in range(len(batch))]
+        examples = [load_varied(file, rng, other) for file, other in zip(batch, inserted)]
         width = int(rng.choice(_FIRST_WIDTHS))
         truths = _stack([_reduce(truth, width) for _, truth in examples])
         logits = self.network(_stack_channels([_encode_reduced(picture, width) for picture, _ in examples]))
-        logits = logits[..., : truths.shape[2], :width]
+        logits = logits[..., : truths.shape[2], :width]  # without the padding of `_stack_channels`
         loss_whole = mask_loss(logits, truths)
         loss_whole.backward()
-        chances = torch.sigmoid(logits.detach())[:, 0].numpy()
-        parts = [_cut_part(*example, chance, rng) for example, chance in zip(examples[:_PARTS], chances)]
+        hints = torch.sigmoid(logits.detach())[:, 0].numpy()
+        parts = [_cut_part(*example, hint, rng) for example, hint in zip(examples[:_PARTS], hints)]
         channels = _stack_channels([channels for channels, _ in parts])
         if rng.random() < _REPEATED:
-            with torch.no_grad():
+            with torch.no_grad():  # the channel "chance" has the hint in −1…1
                 channels[:, CHANNELS.index("chance")] = 2 * torch.sigmoid(self.network(channels)[:, 0]) - 1
         loss_part = mask_loss(self.network(channels), _stack([truth for _, truth in parts]))
         loss_part.backward()

@@ -97,13 +97,15 @@ def draw_surface(
     object itself surrounds each pixel, 0…1.
     """
     count, device = len(turn), normal.device
+    # position and normal in the frame of the patterns
     frame, _ = torch.linalg.qr(torch.randn(count, 3, 3, device=device))  # from object to pattern
     aligned = (_u((count, 1, 1), device) < _ALIGNED).to(frame.dtype)
     frame = aligned * torch.eye(3, device=device) + (1 - aligned) * frame
-    inner = _rotate(frame, position, owner)
+    place = _rotate(frame, position, owner)
     facing = _rotate(frame @ turn.transpose(1, 2), normal, owner)
+    # noise that divides an object into materials, of the relief, and of printed patterns; some follow the shape
     regions, fine, printed = (
-        library.sample_noise(inner * _log_uniform((count, 1), low, high, device)[owner] + _u((count, 3), device)[owner])
+        library.sample_noise(place * _log_uniform((count, 1), low, high, device)[owner] + _u((count, 3), device)[owner])
         for low, high in ((0.5, 2.5), (2.0, 9.0), (4.0, 28.0))
     )
     outward = _rotate(turn.transpose(1, 2), normal, owner)
@@ -111,27 +113,29 @@ def draw_surface(
     of_shape = (_u((2, count), device) < _OF_SHAPE) * (0.5 + 2 * _u((2, count), device))  # of regions, of patterns
     regions[:, 0] += of_shape[0, owner] * form
     printed[:, 0] += of_shape[1, owner] * form
+    # material of each pixel: of the slots that its object uses, the one with the greatest noise
     used = 1 + torch.bucketize(_u((count,), device), torch.tensor([0.5, 0.85], device=device))  # mostly one or two
     active = torch.arange(_MATERIALS, device=device)[None] < used[:, None]
     slot = torch.where(active[owner], regions[:, :_MATERIALS], -9.0).argmax(dim=1)
+    row = owner * _MATERIALS + slot
     levels = _draw_levels(library, count, device)
-    chosen = owner * _MATERIALS + slot
-    own = {name: value.reshape(count * _MATERIALS, -1)[chosen].squeeze(-1) for name, value in levels.items()}
-
-    axis = facing.abs().argmax(dim=1)  # of the texture's projection
+    own = {name: value.reshape(count * _MATERIALS, -1)[row].squeeze(-1) for name, value in levels.items()}
+    # texture, projected along the nearest axis
+    axis = facing.abs().argmax(dim=1)
     across, up = ((axis + step) % 3 for step in (1, 2))
     scale = _log_uniform((count,), 0.4, 3.0, device)[owner]
-    u = inner.gather(1, across[:, None])[:, 0] * scale + own["shift"]
-    v = inner.gather(1, up[:, None])[:, 0] * scale
+    u = place.gather(1, across[:, None])[:, 0] * scale + own["shift"]
+    v = place.gather(1, up[:, None])[:, 0] * scale
     texture = own["texture"].long()
     picture = library.sample_textures(texture, u, v)
     lightness = (picture[:, :3].mean(dim=1) ** 0.45 - library.middle[texture]) / library.spread[texture]
-
+    # albedo and gloss
     pattern, diffuse = _albedo(own, fine, printed, picture, lightness)
     rough, specular = _reflection(own, fine, picture, pattern, diffuse)
     law = gloss.draw_laws(count, device, smooth_share).at(owner)
     fibers = torch.where(law.rough > 0, own["dolp_factor"] + own["dolp_step"] * pattern, 1.0)
-
+    law = Law(law.rough, law.local, law.dolp_factor * fibers)
+    # bumps, with the slopes of the noise or of the texture
     relief = fine[:, 4:7] * torch.where(own["raised"] > 0.5, 4 * pattern * (1 - pattern), 1.0)[:, None]
     slope = torch.zeros_like(facing).scatter(1, across[:, None], picture[:, 4:5])
     slope = slope.scatter(1, up[:, None], picture[:, 5:6])
@@ -139,7 +143,6 @@ def draw_surface(
     slope = _rotate(turn, _rotate(frame.transpose(1, 2), slope, owner), owner)
     along = (slope * normal).sum(dim=1, keepdim=True)
     bumped = F.normalize(normal + own["bump"][:, None] * (slope - along * normal), dim=1)
-    law = Law(law.rough, law.local, law.dolp_factor * fibers)
     return Surface(bumped, diffuse, specular, rough, own["ior"], law)
 
 

@@ -25,7 +25,7 @@ OPSET = 17
 UNSTATED = "NOASSERTION"  # SPDX name of a licence that nobody stated
 NATIVE_SIZE = 256  # px of the longer side in inference, which uses sizes around it; larger than in training
 _PREFIX, _HALF = "network.", ".half"  # of the names of stored weights
-_GREATEST_IR = 10  # read by onnxruntime 1.20 and later
+_NEWEST_FORMAT = 10  # version of the file format (ONNX: IR version); read by onnxruntime 1.20 and later
 
 
 def export_main(network: main_network.MainNetwork, path: Path, facts: Mapping[str, str]) -> None:
@@ -42,7 +42,7 @@ def export_main(network: main_network.MainNetwork, path: Path, facts: Mapping[st
 
 def export_network(network: nn.Module, path: Path, outputs: tuple[str, ...], metadata: Mapping[str, str]) -> None:
     """Export a network from channels (1, N, H, W) to named maps, with the metadata that `formats/onnx.py` requires."""
-    side = 2 * int(metadata["size_multiple"])
+    side = 2 * int(metadata["size_multiple"])  # of the picture by which the network is traced
     sample = torch.zeros(1, len(metadata["channels"].split(",")), side, side)
     with atomic.path(path) as temporary:
         torch.onnx.export(
@@ -53,8 +53,8 @@ def export_network(network: nn.Module, path: Path, outputs: tuple[str, ...], met
             training=torch.onnx.TrainingMode.TRAINING,  # evaluation would store equal weights only once
         )  # fmt: skip
         graph = onnx.load(str(temporary))
-        _halve(graph)
-        graph.ir_version = min(graph.ir_version, _GREATEST_IR)
+        _store_as_fp16(graph)
+        graph.ir_version = min(graph.ir_version, _NEWEST_FORMAT)
         helper.set_model_props(graph, dict(metadata))
         onnx.checker.check_model(graph)
         onnx.save(graph, str(temporary))
@@ -89,8 +89,8 @@ class _OrderedOutputs(nn.Module):  # type: ignore[misc]  # torch comes without t
         return tuple(maps[name] for name in main_network.OUTPUTS)
 
 
-def _halve(graph: Any) -> None:
-    """Store each large fp32 weight tensor of an ONNX graph as fp16 behind a Cast node."""
+def _store_as_fp16(graph: Any) -> None:
+    """Store each fp32 weight tensor of an ONNX graph as fp16 with a Cast node; small ones, which save little, stay."""
     casts = []
     for tensor in graph.graph.initializer:
         if tensor.data_type != TensorProto.FLOAT or np.prod(tensor.dims) < 256:

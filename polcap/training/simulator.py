@@ -86,19 +86,21 @@ class Simulator:
 
     def gather(self, pick: Indices, size: int, *, flip: bool) -> ViewBatch:
         """Read cached traced views by index, subsampled to size² pixels. With `flip`, they are mirrored at random."""
+        # rows y and columns x in the cached view, of the pixels of a subsampled and mirrored one
         full, area = self.size, size * size
         mirrored, change = _mirror(np.arange(area).reshape(size, size), flip)
-        order = mirrored.reshape(-1)  # thinned pixels in their mirrored places
-        where = np.floor((np.arange(size) + 0.5) * (full / size)).astype(np.int64)  # rows and columns that are used
-        y, x = where[order // size], where[order % size]
+        order = mirrored.reshape(-1)
+        sampled = np.floor((np.arange(size) + 0.5) * (full / size)).astype(np.int64)
+        y, x = sampled[order // size], sampled[order % size]
+        # the object's pixels: M indices into B·H·W, and their object, view, and row in the cache's arrays
         mask = self.views["mask"].reshape(-1, full * full)[pick][:, y * full + x]
         inside = np.flatnonzero(mask)
         owner, at = np.divmod(inside, area)
-        view = pick[owner]  # of each pixel
+        view = pick[owner]
+        rows = (view * full + y[at]) * full + x[at]
         met, (escaped, hidden) = np.full((len(at), bounced_light.RAYS), -1), np.zeros((2, len(at)), np.float32)
         if self.bounces:
             met, escaped, hidden = self._seen_pixels(view, y[at], x[at], order, mask, owner)
-        rows = (view * full + y[at]) * full + x[at]
 
         def tensor(array: NDArray[Any]) -> Tensor:
             return torch.from_numpy(array).to(self.device)
@@ -106,15 +108,15 @@ class Simulator:
         def read(name: str) -> Tensor:
             return tensor(self.views[name].take(rows, axis=0)).float()
 
-        camera, mirror, owners = tensor(self.camera[pick]), tensor(change), tensor(owner)
-        focal, middle, unit = camera[:, 0, None], camera[:, 3], camera[:, 4]
-        right, low = ((tensor(a).float() - camera[:, k : k + 1]) / focal for a, k in ((x, 1), (y, 2)))
-        rays = F.normalize(torch.stack([-right, low, torch.ones_like(low)], dim=-1), dim=-1) @ mirror.T
+        camera, mirror, owners = tensor(self.camera[pick]), tensor(change), tensor(owner)  # as in `open_cache`
+        focal, distance, unit = camera[:, 0, None], camera[:, 3], camera[:, 4]
+        right, down = ((tensor(a).float() - camera[:, k : k + 1]) / focal for a, k in ((x, 1), (y, 2)))
+        rays = F.normalize(torch.stack([-right, down, torch.ones_like(down)], dim=-1), dim=-1) @ mirror.T
         v, depth = rays.reshape(-1, 3)[tensor(inside)], read("depth")[:, 0]
-        far = 1 + depth * (unit / middle)[owners]
+        z = 1 + depth * (unit / distance)[owners]  # in units of the object's distance
         pixels = ObjectPixels(
             index=tensor(inside), owner=owners, v=v, normal=read("normal") @ mirror.T, position=read("position"),
-            place=-v * (far / v[:, 2])[:, None], depth=depth, lit=read("lit")[:, 0], met=tensor(met),
+            place=-v * (z / v[:, 2])[:, None], depth=depth, lit=read("lit")[:, 0], met=tensor(met),
             open=tensor(escaped), hidden=tensor(hidden),
         )  # fmt: skip
         return ViewBatch(

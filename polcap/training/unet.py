@@ -30,11 +30,12 @@ class UNet(nn.Module):  # type: ignore[misc]  # torch comes without types here
             self.deep = ResidualBlock(widths[-1])
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairwise(widths))
         self.joined = nn.ModuleList(ResidualBlock(width) for width in widths[:-1])
-        self.wide = nn.Conv2d(widths[0], 4 * upsampled, 1)
-        self.raw = nn.Conv2d(inputs + upsampled, full, 3, padding=1)
+        self.wide = nn.Conv2d(widths[0], 4 * upsampled, 1)  # from half to full resolution
+        self.raw = nn.Conv2d(inputs + upsampled, full, 3, padding=1)  # joins the input channels there
         self.out = nn.Conv2d(full, outputs, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Maps from channels: down the levels, up again with the features of each added, then to full resolution."""
         features = [self.levels[0](self.stem(F.pixel_unshuffle(x, 2)))]
         for down, level in zip(self.down, list(self.levels)[1:]):
             features.append(level(down(features[-1])))
@@ -43,8 +44,8 @@ class UNet(nn.Module):  # type: ignore[misc]  # torch comes without types here
             summary = torch.cat([deep.mean(dim=(2, 3)), deep.amax(dim=(2, 3))], dim=1)
             deep = self.deep(deep + self.context(summary)[:, :, None, None])
         for up, block, skip in reversed(list(zip(self.up, self.joined, features))):
-            wide = F.interpolate(up(deep), scale_factor=2.0, mode="bilinear", align_corners=False)
-            deep = block(wide + skip)
+            enlarged = F.interpolate(up(deep), scale_factor=2.0, mode="bilinear", align_corners=False)
+            deep = block(enlarged + skip)
         upsampled = F.pixel_shuffle(self.wide(deep), 2)
         return self.out(F.relu(self.raw(torch.cat([x, upsampled], dim=1))))
 
