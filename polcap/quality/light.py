@@ -139,7 +139,7 @@ class CrossedFigures:
 
     still_clipped: float  # share of the clipped highlights of S0 that are clipped in the crossed shot too
     clipped_px: int  # number of clipped pixels of S0
-    brighter: float  # share of pixels that are brighter in the crossed shot than in S0, all light: not possible
+    brighter: float  # share of pixels that are brighter in the crossed shot than in S0, although S0 is all light
     specular: float  # share of the object's light that the crossed filter removes: specular reflection
 
 

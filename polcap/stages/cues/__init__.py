@@ -104,7 +104,7 @@ def zenith(dolp: Any) -> Any:
 
 
 def channels(cues: Any) -> Any:
-    """Network input channels (..., N, H, W) float32 by the formulas of CHANNELS, limited; 0 outside the mask.
+    """Network input channels (..., N, H, W) float32 by the formulas of CHANNELS, without outliers; 0 outside the mask.
 
     `cues` has the fields of `Cues`; in training these are torch tensors, with a leading batch axis
     on each pixel map ((B, H, W), (B, H, W, 3), (2, B, H, W)).

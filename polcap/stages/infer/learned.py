@@ -102,7 +102,7 @@ def estimate_coarse(
 
 
 def _compare_orders(cues: Cues, network: Network, run: RunNetwork) -> OrderTest | None:
-    """The other order of the shots in which the network expects the least mean error, over that in the stated order.
+    """The other order of the shots with the least error that the network expects, and its ratio to the stated order's.
 
     Under a wrong order the polarization fits no shape with this outline and shading, so the network expects larger
     errors (decision 33), in a small picture too. None: there is no other order, or no pixel.
