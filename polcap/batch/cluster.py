@@ -12,6 +12,7 @@ from polcap.batch.unit import Unit, UnitRecord
 from polcap.errors import SettingError, package_for
 from polcap.pipeline.request import Request
 
+_ANSWER_S = 10.0  # within which a scheduler answers
 _SETTINGS = {
     "distributed.worker.profile.enabled": False,  # costs 6 % of a small capture's time
     "distributed.nanny.pre-spawn-environ": {  # without MALLOC_TRIM_THRESHOLD_, which slows down every large array
@@ -50,7 +51,7 @@ def run(
                     resources=resources,
                     dashboard_address="127.0.0.1:0",  # a host that is left out means all networks
                 )
-            client = distributed.Client(target, timeout="10s")
+            client = distributed.Client(target, timeout=_ANSWER_S)
         except (OSError, TimeoutError, ValueError) as error:
             raise SettingError(f"--scheduler {address}: no scheduler answers there ({error}); start one") from error
         try:

@@ -16,7 +16,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """obj0, deeper/obj1 and broken; never written to: give --out."""
     root = tmp_path_factory.mktemp("captures")
     for seed, name in enumerate(("obj0", "deeper/obj1")):
-        shoot = synthetic.Shoot(seed=seed, width=320, height=240, samples=1)
+        shoot = synthetic.Shoot(seed=seed, width=96, height=96, samples=1, exposures=1)
         synthetic.write(root / name, scenes.random_scene(seed, "bumps"), shoot)
     for angle in ("pol000", "pol045", "pol090"):
         (root / "broken" / angle).mkdir(parents=True)

@@ -191,8 +191,11 @@ def test_killed_worker_costs_nothing_but_time_under_a_temporary_folder_of_any_le
     assert again == (finished / "obj0/asset/obj0.glb").read_bytes()
 
 
-def test_scheduler_that_does_not_answer_is_named(captures: Path, tmp_path: Path, polcap: Command) -> None:
+def test_scheduler_that_does_not_answer_is_named(
+    captures: Path, tmp_path: Path, polcap: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("distributed")
+    monkeypatch.setattr(cluster, "_ANSWER_S", 0.3)
     done = polcap("batch", captures, "--out", tmp_path, *OPTIONS, "--scheduler", "tcp://127.0.0.1:9")
     assert done.returncode == 2 and "tcp://127.0.0.1:9: no scheduler answers there" in done.stderr
 

@@ -1,28 +1,25 @@
 """The whole chain on small views, `polcap synth --flat --views` and `polcap material`, against the truth."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import bench_material
 import pytest
 
-from tests.conftest import ROOT, Command
+from tests.conftest import ROOT, Command, made_once, python
 
 
 @pytest.fixture(scope="module")
-def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sample(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
     """Five small views of a flat sample, and its material, as the example makes them."""
-    folder = tmp_path_factory.mktemp("flat") / "sample"
-    done = subprocess.run(
-        [sys.executable, ROOT / "examples" / "flat_sample.py", folder],
-        env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0 and "texels of 1.1" in done.stdout, done.stderr
-    return folder
+
+    def make(folder: Path) -> None:
+        done = python(ROOT / "examples" / "flat_sample.py", folder)
+        assert done.returncode == 0 and "texels of 1.1" in done.stdout, done.stderr
+
+    made = made_once(tmp_path_factory, worker_id, "sample", make)
+    return Path(shutil.copytree(made, tmp_path_factory.mktemp("flat") / "sample"))  # of this worker alone
 
 
 def test_five_raw_views_become_a_material_that_is_like_the_true_one(sample: Path) -> None:
@@ -44,7 +41,7 @@ def test_maps_state_their_scale_and_light_is_found(sample: Path) -> None:
 
 
 def test_a_run_again_computes_nothing_and_exports_work(sample: Path, polcap: Command) -> None:
-    again = polcap("material", sample)
+    again = polcap("material", sample, "--set", "material.gloss.materials=3")
     assert again.returncode == 0
     assert "Nothing has changed" in again.stderr or "texel_maps    cached" in again.stderr
     assert (sample / "material" / "asset" / "unreal" / "T_sample_N.png").is_file()
@@ -58,9 +55,9 @@ def test_a_view_without_the_board_is_left_out_and_named(
     folder = tmp_path / "fewer"
     shutil.copytree(sample, folder)  # with the stages of the other views
     for file in (folder / "view03").glob("pol*/*.DNG"):
-        shutil.copy(next((example / "pol000").glob("*.DNG")), file)
-    done = polcap("material", folder)
-    assert done.returncode in (0, 2) and "view03" in done.stderr
+        shutil.copy(next((example / file.parent.name).glob("*.DNG")), file)
+    done = polcap("material", folder, "--region=-12,-12,12,12", "--set", "material.gloss.materials=1")  # quicker
+    assert done.returncode in (0, 2) and "view03: no board is visible" in done.stderr
 
 
 @pytest.mark.parametrize(
