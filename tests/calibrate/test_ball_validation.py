@@ -13,7 +13,7 @@ from polcap.optics import frames
 from polcap.synth import scenes, shooting
 from tests.conftest import Command
 
-SHOOT = shooting.Shoot(seed=4, width=640, height=480, exposures=2)
+SHOOT = shooting.Shoot(seed=4, width=480, height=360, samples=1, exposures=1)
 SCENE = scenes.random_scene(4, "ball")
 
 

@@ -63,7 +63,12 @@ FUNCTIONS = """
 
     def answer(path, text):
         send = sandbox._send
-        sandbox._send = lambda pipe, message: send(pipe, text.encode())
+
+        def send_once(pipe, message):
+            sandbox._send = send
+            send(pipe, text.encode())
+
+        sandbox._send = send_once
         return {}, {}
 
     def stopped(path):
@@ -77,15 +82,17 @@ class Misled(Sandbox):
     module: ModuleType
 
 
-@pytest.fixture
-def sandbox(tmp_path, monkeypatch):
-    (tmp_path / "misbehaving.py").write_text(textwrap.dedent(FUNCTIONS))
-    monkeypatch.syspath_prepend(tmp_path)
-    sandbox = Misled(timeout_s=300, memory_gib=1.5)
-    sandbox.module = importlib.import_module("misbehaving")
-    yield sandbox
-    sys.modules.pop("misbehaving")
-    sandbox.close()
+@pytest.fixture(scope="module")
+def sandbox(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("modules")
+    (folder / "misbehaving.py").write_text(textwrap.dedent(FUNCTIONS))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        sandbox = Misled(timeout_s=300, memory_gib=1.5)
+        sandbox.module = importlib.import_module("misbehaving")
+        yield sandbox
+        sys.modules.pop("misbehaving")
+        sandbox.close()
 
 
 def pid(sandbox):
@@ -114,6 +121,7 @@ def test_a_child_imports_no_modules_from_inside_a_package(sandbox, tmp_path, mon
     (package / "__init__.py").touch()
     (package / "typing.py").write_text("raise ImportError('not the typing of Python')")  # as OpenCV has one
     monkeypatch.setattr(sys, "path", [str(package), *sys.path])
+    sandbox.close()
     assert sandbox.call(sandbox.module.ramp, "next.raw")[0]["path"] == "next.raw"
 
 
@@ -166,14 +174,17 @@ def test_a_defect_of_our_own_is_a_bug_with_the_childs_traceback(sandbox):
 
 
 @pytest.mark.parametrize("loop", ["spin", "hang"])
-def test_a_child_in_a_loop_ends_when_its_parent_was_killed(sandbox, tmp_path, loop):
+def test_a_child_in_a_loop_ends_when_its_parent_was_killed(sandbox, loop):
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); import misbehaving\n"
         "from polcap.formats.sandbox import Sandbox\n"
         "w = Sandbox(); print(w.call(misbehaving.ramp, 'a')[0]['pid'], flush=True)\n"
         f"w.call(misbehaving.{loop}, 'b', limit_s=0.6)"
     )
-    command, environment = [sys.executable, "-c", code, str(tmp_path)], {**os.environ, "SHORT_GRACE": ""}
+    command, environment = (
+        [sys.executable, "-c", code, os.path.dirname(sandbox.module.__file__)],
+        {**os.environ, "SHORT_GRACE": ""},
+    )
     parent = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment)
     child = int(parent.stdout.readline())
     time.sleep(0.3)  # it is in the loop

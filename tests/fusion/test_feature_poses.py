@@ -28,7 +28,7 @@ SIDE = 400  # px
 VIEW = View(2600.0, ((SIDE - 1) / 2, (SIDE - 1) / 2), 1.0)
 DISTANCE = 0.7  # m
 SWAPPED = ShotOrder((1, 0))
-TURNS = {f"view{k + 1:02d}": board_views.pose(15 * k) for k in range(12)}
+TURNS = {f"view{k + 1:02d}": board_views.pose(15 * k) for k in range(8)}
 
 
 def maps(name: str, coat: Coat, seed: int = 0) -> Any:

@@ -14,7 +14,7 @@ from polcap.fusion.closed_mesh import is_closed
 from polcap.image_values import Floats
 from polcap.stages.asset import AssetSettings
 from polcap.synth import all_around, scenes
-from tests.conftest import shell, slow
+from tests.conftest import Command, shell, slow
 
 pytest.importorskip("embreex")
 
@@ -52,9 +52,9 @@ def width(vertices: Floats) -> float:
     return float(pdist(vertices[::11, [0, 2]]).max())
 
 
-def test_an_object_without_pattern_is_refused_with_the_remedy(tmp_path: Path) -> None:
+def test_an_object_without_pattern_is_refused_with_the_remedy(tmp_path: Path, polcap: Command) -> None:
     folder = session(tmp_path / "object", "plain", 4, width=180)
-    done = shell("fuse", folder, "--no-chart", "--estimator", "analytic")
+    done = polcap("fuse", folder, "--no-chart", "--estimator", "analytic")
     assert done.returncode == 2
     assert "no view shows a board" in done.stderr and "polcap board" in done.stderr
     assert not (folder / "fused" / "report.json").exists()

@@ -68,8 +68,8 @@ def ours(which: Scene) -> tuple[Floats, Floats]:
     return np.array(stokes), np.array(facing)
 
 
-def tessellated(mi: Any, shape: distance_fields.Bumps, at: trace.Vector, rings: int = 500) -> Any:
-    """The waved ellipsoid as triangles half a millimetre across, with its own normals at their corners."""
+def tessellated(mi: Any, shape: distance_fields.Bumps, at: trace.Vector, rings: int = 250) -> Any:
+    """The waved ellipsoid as triangles a millimetre across, with its own normals at their corners."""
     unit, faces = random_shapes._sphere(rings, 2 * rings)
     raised = np.sum([a * np.sin(unit @ [x, y, z] + phase) for a, x, y, z, phase in shape.waves], axis=0)
     point = unit * (1 + raised)[:, None] * shape.size
