@@ -34,18 +34,23 @@ def draw(
     inverse = np.linalg.inv(homography)
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
     table = 0.2 + 0.05 * np.sin(x / 17)[..., None] * np.cos(y / 23)[..., None] * np.array([1, 0.8, 0.5])
-    total = np.zeros((HEIGHT, WIDTH, 3))
+    edges = transform_points(homography, np.array([[0.0, 0], [columns, 0], [columns, rows], [0, rows]]))
+    x0, y0 = np.maximum(np.floor(edges.min(axis=0)).astype(int) - 9, 0)
+    x1, y1 = np.maximum(np.ceil(edges.max(axis=0)).astype(int) + 9, 0)
+    around = np.s_[y0:y1, x0:x1]  # the chart with the edge of its card
+    total = np.zeros_like(table[around])
     for dy in (np.arange(samples) + 0.5) / samples - 0.5:
         for dx in (np.arange(samples) + 0.5) / samples - 0.5:
-            at = transform_points(inverse, np.stack([x + dx, y + dy], axis=-1))
+            at = transform_points(inverse, np.stack([x[around] + dx, y[around] + dy], axis=-1))
             u, v = at[..., 0], at[..., 1]
             on = (u > -0.1) & (u < columns + 0.1) & (v > -0.1) & (v < rows + 0.1)
             column = np.clip(np.floor(u), 0, columns - 1).astype(int)
             row = np.clip(np.floor(v), 0, rows - 1).astype(int)
             inside = on & (abs(u - column - 0.5) < patch / 2) & (abs(v - row - 0.5) < patch / 2)
-            picture = np.where(on[..., None], card, table)
+            picture = np.where(on[..., None], card, table[around])
             total += np.where(inside[..., None], colors[row * columns + column], picture)
-    return total / samples**2
+    table[around] = total / samples**2
+    return table
 
 
 UNKNOWN = ColorSensor()
