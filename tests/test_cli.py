@@ -172,14 +172,19 @@ def test_open_shows_the_report_but_not_in_ci(
     assert shown == [(tiny_result / "report.html").as_uri()]
 
 
-def test_clean_removes_the_stage_cache_only(result: Path, copy: Path, polcap: Command, tmp_path: Path) -> None:
+def test_clean_removes_the_stage_cache_only(tiny: Path, tiny_result: Path, polcap: Command, tmp_path: Path) -> None:
+    copy = tiny_result
     (copy / "work" / "photograph.dng").touch()
     before = {file for file in copy.rglob("*") if file.is_file()}
     dry = json.loads(polcap("clean", copy, "--dry-run", "--json").stdout)
     assert {file for file in copy.rglob("*") if file.is_file()} == before
     done = json.loads(polcap("clean", copy, "--json").stdout)
     removed = before - {file for file in copy.rglob("*") if file.is_file()}
-    assert done["bytes"] == dry["bytes"] == sum((result / file.relative_to(copy)).stat().st_size for file in removed)
+    assert (
+        done["bytes"]
+        == dry["bytes"]
+        == sum((tiny / "C" / "polcap" / file.relative_to(copy)).stat().st_size for file in removed)
+    )
     assert all(file.is_relative_to(copy / "work") for file in removed)
     assert sorted(path.name for path in (copy / "work").iterdir()) == ["lock", "owner", "photograph.dng"]
     assert polcap("export", copy, "--obj").returncode == 0
@@ -198,8 +203,8 @@ def test_a_fused_object_is_refused_where_only_one_view_will_do(polcap: Command, 
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_every_stage_can_be_shown(copy: Path, stage: str) -> None:
-    picture = cv2.imread(str(pipeline.show(copy, [stage])[0]))
+def test_every_stage_can_be_shown(tiny_result: Path, stage: str) -> None:
+    picture = cv2.imread(str(pipeline.show(tiny_result, [stage])[0]))
     assert picture is not None and picture.std() > 5  # there is something to see
 
 
@@ -218,18 +223,18 @@ def test_show_draws_all_stages_or_moves_the_light(
 
 
 @pytest.mark.parametrize("options", [(), ("hdr", "--all"), ("--all", "--animate", "light")])
-def test_show_wants_one_thing(result: Path, polcap: Command, options: tuple[str, ...]) -> None:
-    done = polcap("show", result, *options)
+def test_show_wants_one_thing(tiny: Path, polcap: Command, options: tuple[str, ...]) -> None:
+    done = polcap("show", tiny / "C", *options)
     assert done.returncode == 2 and "give one of a stage" in done.stderr
 
 
-def test_export_needs_only_the_maps_and_prints_the_written_files(copy: Path, polcap: Command) -> None:
-    shutil.rmtree(copy / "work")
-    shutil.rmtree(copy / "asset")
-    done = polcap("export", copy, "--gltf")
-    written = [str(copy / "asset" / name) for name in ("capture.glb", "capture.provenance.json")]
+def test_export_needs_only_the_maps_and_prints_the_written_files(tiny_result: Path, polcap: Command) -> None:
+    shutil.rmtree(tiny_result / "work")
+    shutil.rmtree(tiny_result / "asset")
+    done = polcap("export", tiny_result, "--gltf")
+    written = [str(tiny_result / "asset" / name) for name in ("C.glb", "C.provenance.json")]
     assert done.stdout.split() == written, done.stderr
-    assert sorted(str(file) for file in (copy / "asset").iterdir()) == written
+    assert sorted(str(file) for file in (tiny_result / "asset").iterdir()) == written
 
 
 def test_status_and_report_print_json(tiny: Path, tiny_result: Path, polcap: Command) -> None:
@@ -246,7 +251,8 @@ def test_status_and_report_print_json(tiny: Path, tiny_result: Path, polcap: Com
     assert document["differences"] == []
 
 
-def test_a_folder_of_another_kind_is_exit_2(tmp_path: Path, polcap: Command, result: Path, example: Path) -> None:
+def test_a_folder_of_another_kind_is_exit_2(tmp_path: Path, polcap: Command, tiny: Path) -> None:
+    result = tiny / "C" / "polcap"
     cases = [((name, tmp_path), "") for name in ("status", "report", "export")] + [(("show", tmp_path, "hdr"), "")]
     cases += [(("status", tmp_path / "none"), "no such folder"), (("process", result), "it is a result of polcap")]
     shutil.copytree(result / "maps", tmp_path / "archive" / "maps")
@@ -254,14 +260,15 @@ def test_a_folder_of_another_kind_is_exit_2(tmp_path: Path, polcap: Command, res
     shutil.copy(tmp_path / "archive/maps/diffuse.exr", tmp_path / "archive" / "owl_layers.exr")
     for place in (result / "maps", result / "asset", tmp_path / "archive"):
         cases.append((("process", place, "--dry-run"), "a result of polcap or a part of one"))
-    cases += [(("process", next(example.rglob("*.DNG"))), "give the folder that holds all photographs")]
+    cases += [(("process", next(tiny.rglob("*.DNG"))), "give the folder that holds all photographs")]
     for command, words in cases:
         done = polcap(*command)
         assert done.returncode == 2 and done.stderr.count("\n") == 1 and words in done.stderr, done.stderr
     assert not (tmp_path / "work").exists()
 
 
-def test_a_capture_names_the_result_in_it(result: Path, polcap: Command, tmp_path: Path) -> None:
+def test_a_capture_names_the_result_in_it(tiny: Path, polcap: Command, tmp_path: Path) -> None:
+    result = tiny / "C" / "polcap"
     shutil.copytree(result, tmp_path / "capture" / "polcap")
     assert polcap("status", tmp_path / "capture").stdout == polcap("status", result).stdout
     assert polcap("show", tmp_path / "capture", "mask").stdout.startswith(str(tmp_path / "capture" / "polcap"))
@@ -278,30 +285,40 @@ def test_user_mask_replaces_the_search(copy: Path, example: Path, polcap: Comman
     assert results.object_.source == "user" and np.array_equal(results.object_.mask, drawn > 0)
 
 
-def test_a_run_that_ended_early_joins_no_old_result(copy: Path, example: Path, polcap: Command) -> None:
+def test_a_run_that_ended_early_joins_no_old_result(tiny: Path, tiny_result: Path, polcap: Command) -> None:
+    copy = tiny_result
     report = (copy / "report.json").read_bytes()
-    stopped = ("process", example, "--out", copy, "--estimator", "analytic", "--until", "mask")
+    stopped = ("process", tiny / "C", "--out", copy, *TINY, "--until", "mask")
     assert polcap(*stopped, "--set", "mask.margin=0.2").returncode == 0
-    for words in (("report", copy), ("show", copy, "selfcal"), ("show", copy, "--animate", "light")):
+    for words in (
+        ("report", copy),
+        ("show", copy, "selfcal"),
+        ("show", copy, "--animate", "light"),
+    ):
         done = polcap(*words)
         assert done.returncode == 2 and "of another run" in done.stderr, words
     assert polcap("show", copy, "mask").returncode == 0
     assert (copy / "report.json").read_bytes() == report
 
 
-def test_the_asset_is_the_last_stage_and_no_part_of_another_run(copy: Path, example: Path, polcap: Command) -> None:
-    command = ("process", example, "--out", copy, "--estimator", "analytic", "--until")
-    (copy / "asset" / "capture.glb").unlink()
-    assert polcap(*command, "asset").returncode == 0 and (copy / "asset" / "capture.glb").exists()
+def test_the_asset_is_the_last_stage_and_no_part_of_another_run(tiny: Path, tiny_result: Path, polcap: Command) -> None:
+    command = ("process", tiny / "C", "--out", tiny_result, *TINY, "--until")
+    (tiny_result / "asset" / "C.glb").unlink()
+    assert polcap(*command, "asset").returncode in (0, 3) and (tiny_result / "asset" / "C.glb").exists()
     assert polcap(*command, "surface", "--set", "surface.back=closed").returncode == 0
-    shown = polcap("show", copy, "asset")
+    shown = polcap("show", tiny_result, "asset")
     assert shown.returncode == 2 and "of two runs" in shown.stderr
 
 
-def test_maps_and_report_of_two_runs_are_not_exported(copy: Path, polcap: Command) -> None:
+def test_maps_and_report_of_two_runs_are_not_exported(tiny_result: Path, polcap: Command) -> None:
+    copy = tiny_result
     maps = json.loads((copy / "maps" / "maps.json").read_text())
     (copy / "maps" / "maps.json").write_text(json.dumps({**maps, "keys": {**maps["keys"], "mask": "other"}}))
-    for words in (("export", copy, "--obj"), ("report", copy), ("report", copy, "--compare", copy)):
+    for words in (
+        ("export", copy, "--obj"),
+        ("report", copy),
+        ("report", copy, "--compare", copy),
+    ):
         done = polcap(*words)
         assert done.returncode == 2 and "of two runs" in done.stderr, words
 

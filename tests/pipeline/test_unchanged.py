@@ -8,7 +8,7 @@ import pytest
 
 from polcap.formats import own_files
 from polcap.pipeline import unchanged
-from tests.conftest import Command, python
+from tests.conftest import TINY, Command, python
 
 OLD_NS = 1_000_000_000 * 10**9
 ASKED = {"angles": None}
@@ -102,22 +102,25 @@ def test_files_that_a_run_does_not_write_do_not_matter(capture: Path) -> None:
     assert unchanged.find(out, "asked") is not None
 
 
-def test_an_export_and_another_report_leave_a_result_up_to_date(copy: Path, polcap: Command) -> None:
+def test_an_export_and_another_report_leave_a_result_up_to_date(tiny_result: Path, polcap: Command) -> None:
+    copy = tiny_result
     unchanged.remember(copy, "asked")
     for first, *words in (["export", "--gltf", "--lod", "1"], ["report"], ["show", "mask"]):
-        assert polcap(first, copy, *words).returncode == 0
+        assert polcap(first, copy, *words).returncode in (0, 3)
         assert unchanged.find(copy, "asked") is not None
     (copy / "report.html").write_text("of the user")
     assert polcap("export", copy).returncode == 0
     assert unchanged.find(copy, "asked") is None
 
 
-def test_run_with_nothing_to_do_loads_no_library(copy: Path, example: Path, polcap: Command, tmp_path: Path) -> None:
-    capture = tmp_path / "capture"
-    shutil.copytree(example, capture)
+def test_run_with_nothing_to_do_loads_no_library(
+    tiny: Path, tiny_result: Path, polcap: Command, tmp_path: Path
+) -> None:
+    capture = tmp_path / "C"
+    shutil.copytree(tiny / "C", capture, ignore=shutil.ignore_patterns("polcap"))
     for file in capture.rglob("*.*"):
         os.utime(file, ns=(OLD_NS, OLD_NS))
-    options = ["process", str(capture), "--out", str(copy), "--estimator", "analytic"]
+    options = ["process", str(capture), "--out", str(tiny_result), *TINY]
     first = polcap(*options)
     heavy = ("numpy", "scipy", "cv2", "onnxruntime")
     code = f"import atexit, sys; from polcap import cli; sys.argv[1:] = {options}\n"
