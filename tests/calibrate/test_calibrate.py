@@ -1,8 +1,6 @@
 """`polcap calibrate` measures a simulated set-up truly, within the errors that it states."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -101,11 +99,9 @@ def test_command_writes_a_dated_file_where_process_looks(folder, found, tmp_path
     assert answer["calibration"]["polarizer"]["zero_deg"] == found.polarizer.zero_deg
 
 
-def test_example_runs(tmp_path):
-    script = Path(__file__).parents[2] / "examples" / "calibrate_set_up.py"
-    done = subprocess.run([sys.executable, script, tmp_path], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert "zero of the ring 2.5" in done.stdout or "zero of the ring 2.4" in done.stdout
+def test_example_runs(run_example, tmp_path):
+    printed = run_example("calibrate_set_up.py", tmp_path)
+    assert "zero of the ring 2.5" in printed or "zero of the ring 2.4" in printed
     assert list(tmp_path.glob("*.toml"))
 
 

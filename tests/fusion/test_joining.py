@@ -17,7 +17,7 @@ from tests.fusion.traced_views import Body, capture, ring, solid_texture, stand,
 
 trimesh = pytest.importorskip("trimesh")
 COUNT = 8  # views of a set
-COARSE = ((joining, "_GRID", 60), (joining, "_TURNS", 300), (shape, "_FIRST_ROUNDS", 2), (shape, "_ROUNDS", 6))
+COARSE = ((joining, "_GRID", 60), (joining, "_TURNS", 300), (shape, "_FIRST_ROUNDS", 1), (shape, "_ROUNDS", 3))
 TIP = Rotation.from_euler("yxz", [40, 87, 5], degrees=True)
 
 

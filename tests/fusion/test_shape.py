@@ -19,7 +19,7 @@ from polcap.fusion.values import ClosedMesh, FusionView
 from polcap.optics import frames
 from tests.fusion.traced_views import SIZE, Body, all_around, capture, into_the_opening, ring, solid, stand, with_errors
 
-GRID, PIXELS = 44, 96  # of the fused body, and of a view
+GRID, PIXELS = 40, 96  # of the fused body, and of a view
 
 
 def fuse(views: list[FusionView]) -> ClosedMesh:

@@ -1,7 +1,9 @@
 """The IIIF folder in a browser: a deep-zoom viewer finds every tile, and the page moves the light with the pointer."""
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -51,32 +53,38 @@ def test_a_deep_zoom_viewer_finds_every_tile(tmp_path: Path) -> None:
     assert any("/full/" in one or "/0,0,1280," in one for one in asked)  # and the coarsest
 
 
-def test_the_light_follows_the_pointer(tmp_path: Path) -> None:
-    shutil.copy(Path(__file__).parent / "openlime_stand_in.js", tmp_path / openlime_page.SCRIPT)
-    with served(tmp_path) as address:
-        write(tmp_path, address)
+class Visit(NamedTuple):
+    page: devtools.Page
+    first: np.ndarray  # the page under a frontal light, (H, W, 3) 0…255
+
+
+@pytest.fixture(scope="module")
+def visit(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Visit]:
+    folder = tmp_path_factory.mktemp("site")
+    shutil.copy(Path(__file__).parent / "openlime_stand_in.js", folder / openlime_page.SCRIPT)
+    with served(folder) as address:
+        write(folder, address)
         with visited(f"{address}/index.html") as page:
             page.wait("document.documentElement?.dataset.ready > 0")
-            pictures = [page.screenshot()[:560]]  # above the words
-            for x, y in ((240, 300), (660, 300), (450, 90)):
-                before = page.evaluate("Number(document.documentElement.dataset.ready)")
-                page.move(x, y)
-                page.wait(f"document.documentElement.dataset.ready > {before}")
-                pictures.append(page.screenshot()[:560])
-            assert page.evaluate("document.title") == "A <ball>"
-            assert page.complaints == []
+            yield Visit(page, page.screenshot())
+
+
+def test_the_light_follows_the_pointer(visit: Visit) -> None:
+    page, pictures = visit.page, [visit.first[:560]]  # above the words
+    for x, y in ((240, 300), (660, 300), (450, 90)):
+        before = page.evaluate("Number(document.documentElement.dataset.ready)")
+        page.move(x, y)
+        page.wait(f"document.documentElement.dataset.ready > {before}")
+        pictures.append(page.screenshot()[:560])
+    assert page.evaluate("document.title") == "A <ball>"
+    assert page.complaints == []
     column, row = (share(picture) for picture in (pictures[2] - pictures[1], pictures[3] - pictures[0]))
     assert column[0] < 0 < column[1] and row[2] > 0 > row[3]  # right is brighter, and then above
 
 
-def test_under_a_frontal_light_the_page_is_as_bright_as_the_photograph(tmp_path: Path) -> None:
+def test_under_a_frontal_light_the_page_is_as_bright_as_the_photograph(visit: Visit) -> None:
     """OpenLIME divides the albedo by π under a light of irradiance 1; S0 of the photograph is under one of π."""
-    shutil.copy(Path(__file__).parent / "openlime_stand_in.js", tmp_path / openlime_page.SCRIPT)
-    with served(tmp_path) as address:
-        write(tmp_path, address)
-        with visited(f"{address}/index.html") as page:
-            page.wait("document.documentElement?.dataset.ready > 0")
-            shown = cv2.resize(page.screenshot(), (surfaces.WIDTH, surfaces.HEIGHT))
+    shown = cv2.resize(visit.first, (surfaces.WIDTH, surfaces.HEIGHT))
     maps, front = surfaces.maps(roughness=0.5, specular=0.04), np.array([0.0, 0.0, 1.0])
     one = np.ones(maps.mask.shape)
     photograph = shade.stokes(
