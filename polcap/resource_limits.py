@@ -14,7 +14,7 @@ OUT_OF_MEMORY = (  # messages of OpenCV, pybind11, onnxruntime, threads, the loa
     "failed to map segment", "Cannot allocate memory",
 )  # fmt: skip
 # memory of a run: per RAW pixel, and fixed (measured, docs/explanations/scale.md)
-_GB_PER_PIXEL, _GB_FIXED = 60e-9, 0.3
+_GB_PER_PIXEL, _GB_FIXED = 55e-9, 0.55
 _ROOM = 1.1  # factor on the memory at which a request failed, because later requests may be larger
 _ASKED = re.compile(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)")  # numpy, OpenCV
 _BYTES = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}

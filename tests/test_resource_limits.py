@@ -69,4 +69,4 @@ def test_a_lack_of_memory_names_the_stage_what_it_would_take_and_the_remedy(
 def test_without_a_limit_the_remedy_is_another(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planes, "process_memory", lambda: (0, None))
     message = str(resource_limits.shortfall(MemoryError(), "surface", 24_000_000))
-    assert message.startswith("surface: out of memory; a capture of 24 MP takes about 1.8 GB in all: free that much")
+    assert message.startswith("surface: out of memory; a capture of 24 MP takes about 1.9 GB in all: free that much")

@@ -33,8 +33,8 @@ def session(folder: Path, pattern: str, views: int, width: int = 540) -> Path:
 
 @slow
 def test_views_without_a_board_become_a_closed_object_of_relative_size(tmp_path: Path) -> None:
-    folder = session(tmp_path / "object", "noise", 18)
-    done = shell("fuse", folder, "--no-chart", "--set", "fusion.shape.grid=60")
+    folder = session(tmp_path / "object", "noise", 18, width=400)
+    done = shell("fuse", folder, "--no-chart", "--set", "fusion.shape.grid=60", "--estimator", "analytic")
     assert done.returncode == 0, done.stderr
     about = json.loads((folder / "fused" / "report.json").read_text())
     assert len(about["figures"]["views"]) >= 15  # of 17

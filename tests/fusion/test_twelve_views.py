@@ -34,7 +34,7 @@ def synth(folder: Path, views: int) -> Path:
 @slow
 def test_twelve_raw_views_become_a_closed_object_that_is_like_the_true_one(tmp_path: Path) -> None:
     folder = synth(tmp_path / "object", 12)
-    done = shell("fuse", folder)
+    done = shell("fuse", folder, "--set", "fusion.shape.grid=90")
     assert done.returncode == 0, done.stderr
     about = json.loads((folder / "fused" / "report.json").read_text())
     assert len(about["figures"]["views"]) == 12 and not about["figures"]["left_out"]
@@ -78,7 +78,7 @@ def stats(folder: Path, pattern: str) -> dict[Path, int]:
 @slow
 def test_a_fusion_that_was_killed_twice_ends_as_one_that_was_not(tmp_path: Path) -> None:
     """And so does one of two views at a time as one of a single one."""
-    folder, coarse = synth(tmp_path / "object", 4), ("--set", "fusion.shape.grid=60")
+    folder, coarse = synth(tmp_path / "object", 4), ("--set", "fusion.shape.grid=60", "--estimator", "analytic")
     whole = tmp_path / "whole" / "object"
     shutil.copytree(folder, whole)
     assert shell("fuse", whole, *coarse).returncode == 0
