@@ -18,7 +18,7 @@ patches = shipped_data.colorchecker(settings.whitebalance.chart)
 
 radiance = hdr.merge(capture, frame_decoder.decode, settings.hdr)  # .value (K, H, W, 3): one picture per angle
 color = whitebalance.measure(radiance, patches, polcap.ChartRequest("auto"), settings.whitebalance)
-alignment = align.register(radiance, color, settings.align)
+alignment = align.register(radiance, settings.align)
 found = mask.segment(radiance, alignment, color, None, models.load_mask_network(), onnx.run, settings.mask)
 calibration = selfcal.solve(radiance, alignment, found, color, settings.selfcal)
 image = stokes.solve(radiance, alignment, calibration, found, settings.stokes)  # .stokes (3, H, W, 3)

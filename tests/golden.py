@@ -225,7 +225,7 @@ def goldens(inputs: Arrays, threads: int = 1) -> dict[str, Golden]:
             whitebalance.measure,
             lambda: whitebalance.measure(shots(), chart, chart_values.ChartRequest("auto"), config.whitebalance),
         ),
-        "align": Golden(align.register, lambda: align.register(shots(), color, config.align)),
+        "align": Golden(align.register, lambda: align.register(shots(), config.align)),
         "mask": Golden(
             mask.segment, lambda: mask.segment(shots(), registered, color, None, mask_network(), run, config.mask)
         ),
@@ -367,7 +367,7 @@ def make_inputs() -> Arrays:
     config, shots = Config(), radiance()
     chart = shipped_data.colorchecker(config.whitebalance.chart)
     color = whitebalance.measure(shots, chart, chart_values.ChartRequest("auto"), config.whitebalance)
-    registered = align.register(shots, color, config.align)
+    registered = align.register(shots, config.align)
     object_ = mask.segment(shots, registered, color, None, models.load_mask_network(1), onnx.run, config.mask)
     calibration = selfcal.solve(shots, registered, object_, color, config.selfcal)
     assert color.place is not None and color.light is not None

@@ -47,7 +47,7 @@ def _registered(reached: ResultsUntilWhitebalance, config: Config) -> ResultsUnt
     """The results with the motion of all shots, also of shots that moved too far or show another scene."""
     anything = msgspec.structs.replace(config.align, max_shift_px=500.0, min_correlation=0.0)
     try:
-        alignment = align.register(reached.radiance, reached.color, anything)
+        alignment = align.register(reached.radiance, anything)
     except AlignmentError:  # there is nothing to register
         return reached
     return ResultsUntilAlign(**vars(reached), alignment=alignment)

@@ -57,7 +57,7 @@ def run_stages(capture: Capture | None, supplied: UserInput, config: Config, cac
         colors = background.submit(shipped_data.colorchecker, config.whitebalance.chart)  # imports a large library
         radiance = cache.run(hdr.merge, capture, supplied.decode, config=config.hdr)
         color = cache.run(whitebalance.measure, radiance, colors.result(), supplied.chart, config=config.whitebalance)
-        alignment = cache.run(align.register, radiance, color, config=config.align)
+        alignment = cache.run(align.register, radiance, config=config.align)
         drawn = cache.derive(on_grid, supplied.mask, radiance)
         finder = supplied.mask_network
         object_ = cache.run(mask.segment, radiance, alignment, color, drawn, finder, onnx.run, config=config.mask)

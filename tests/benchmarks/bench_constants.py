@@ -123,7 +123,7 @@ def corners(results: Results) -> Floats:
     """Corners (K, 2, 4) px of the picture on the shots."""
     height, width = results.radiance.value.shape[1:3]
     corner = np.array([[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]], np.float64)
-    moved = align.register(results.radiance, results.color, Config().align).transform @ corner
+    moved = align.register(results.radiance, Config().align).transform @ corner
     return np.asarray(moved[:, :2] / moved[:, 2:])
 
 

@@ -120,9 +120,8 @@ def registering(stack: AngleStack, folder: Path) -> Iterator[Row]:
             found.append(np.vstack([motion, [0, 0, 1]]))
 
     theirs = least(ecc)
-    color = whitebalance.measure(stack, shipped_data.colorchecker(), ChartRequest("none"), WhitebalanceSettings())
-    ours = least(lambda: align.register(stack, color, align.AlignSettings()))
-    own = align.register(stack, color, align.AlignSettings()).transform[1:]
+    ours = least(lambda: align.register(stack, align.AlignSettings()))
+    own = align.register(stack, align.AlignSettings()).transform[1:]
     size = stack.value.shape[1:3]
     errors = [", ".join(f"{_error(m, t, size):.3f}" for m, t in zip(some, true[1:])) for some in (own, found)]
     yield Row("registration", "cv2.findTransformECC", ours, theirs, f"error {errors[0]} px, theirs {errors[1]} px")

@@ -21,7 +21,6 @@ from polcap.image_values import Floats
 from polcap.optics.projection import transform_points
 from polcap.optics.registration import Pyramid, register, scaled
 from polcap.stages import align, hdr
-from tests import scenes
 from tests.experiments import data
 
 SIZE = (480, 600)
@@ -75,7 +74,7 @@ def _scene(motion: Floats) -> Floats:
 def _capture_errors(file: Path) -> list[float]:
     capture = reader.read(file.with_name(file.name.removesuffix(".truth.json")), None)
     radiance = hdr.merge(capture, decode, Config().hdr)
-    found = align.register(radiance, scenes.no_color(), Config().align)
+    found = align.register(radiance, Config().align)
     frames = json.loads(file.read_text())["shots"]
     first = [frames[k * len(frames) // len(radiance.angle)] for k in range(1, len(radiance.angle))]
     true = [scaled(np.vstack([frame["affine_ref_to_shot"], [0, 0, 1]]), 1 / radiance.view.scale) for frame in first]

@@ -75,7 +75,7 @@ def run(radiance: AngleStack, drawn: np.ndarray | None) -> None:
     """Every stage after the merge, and the gates; a refusal by an InputError is allowed."""
     config, color = Config(), scenes.no_color()
     try:
-        alignment = align.register(radiance, color, config.align)
+        alignment = align.register(radiance, config.align)
         object_ = mask.segment(radiance, alignment, color, drawn, None, onnx.run, config.mask)
         calibration = selfcal.solve(radiance, alignment, object_, color, config.selfcal)
         image = stokes.solve(radiance, alignment, calibration, object_, config.stokes)

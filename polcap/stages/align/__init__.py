@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polcap.chart_values import ColorCalibration
 from polcap.errors import AlignmentError
 from polcap.image_values import Floats, MaskedImage, Quality
 from polcap.optics import registration
@@ -46,7 +45,7 @@ class AlignSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @stage(version=10)
-def register(radiance: AngleStack, color: ColorCalibration, settings: AlignSettings) -> Alignment:
+def register(radiance: AngleStack, settings: AlignSettings) -> Alignment:
     """Register every shot with the reference shot: transforms (K, 3, 3) from its merged px to those of each shot.
 
     Raises AlignmentError, which names the shot: it moved too far, or shows another scene.

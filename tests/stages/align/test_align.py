@@ -23,7 +23,7 @@ def pose(dx: float, dy: float, degrees: float) -> np.ndarray:
 
 
 def register(radiance, **settings):
-    return align.register(radiance, scenes.no_color(), align.AlignSettings(**settings))
+    return align.register(radiance, align.AlignSettings(**settings))
 
 
 def errors_px(found: np.ndarray, true: np.ndarray) -> np.ndarray:
