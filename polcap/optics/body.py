@@ -28,7 +28,7 @@ from polcap.optics.namespace import array_namespace
 _COSINES = np.linspace(0, 1, 49)
 _ALPHAS = np.linspace(0, 1, 21)
 _INDICES = np.linspace(1.3, 1.7, 3)
-_AROUND, _ALONG = 48, 96  # azimuths and slopes of the facets that are summed
+_AROUND, _ALONG = 48, 96  # numbers of azimuths and of slopes of the facets that are summed
 _LEAST_COSINE = 1e-4
 _GRAZING = 0.1  # cosine; at smaller ones the shading factor stays constant
 _SEEN = 0.25  # least cosine at which the shading is fitted: zenith angles up to 75°
@@ -122,14 +122,14 @@ def _table() -> Floats:
     out[..., 1:] = 1.0
     cosine = np.maximum(_COSINES, _LEAST_COSINE)
     for j, alpha in enumerate(_ALPHAS[1:], start=1):
-        c, turned, weight = facets(cosine, float(alpha))
+        c, cos_2phi, weight = facets(cosine, float(alpha))
         for i, ior in enumerate(_INDICES):
             plus, minus = fresnel.transmission(c, ior)
             smooth_plus, smooth_minus = fresnel.transmission(cosine, ior)
             mean = (weight * plus).sum(axis=1)
-            even = (weight * minus * turned).sum(axis=1) / mean
+            even = (weight * minus * cos_2phi).sum(axis=1) / mean
             weighted = weight * c * plus
-            local = (weighted * minus * turned).sum(axis=1) / (weighted * plus).sum(axis=1)
+            local = (weighted * minus * cos_2phi).sum(axis=1) / (weighted * plus).sum(axis=1)
             out[i, j, :, 0] = mean - smooth_plus
             # near the normal both DoLPs go to 0 as sin²θ: their ratio there is extrapolated
             ratio = np.stack([even, local], axis=1)[:-1] / (smooth_minus / smooth_plus)[:-1, None]
@@ -155,19 +155,19 @@ def _strengths() -> Floats:
 def facets(cosine: Floats, alpha: float) -> tuple[Floats, Floats, Floats]:
     """Visible facets of surfaces seen at cosines (N,): v·m, cos 2φ_m and weight, (N, M) each; weights sum to 1.
 
-    In slopes tan θ_m = α √u/(1 − s), u = 1 − (1 − s)², even steps of s and azimuth: a facet's projected area over
-    cos θ_m, cos θ + sin θ tan θ_m cos φ, times 1 − s stays finite where slopes do not.
+    Facets have even steps of azimuth and of s, with the slope tan θ_m = α √(1 − (1 − s)²)/(1 − s). Then the GGX density
+    of slopes is 2 (1 − s) ds. The weight is 1 − s times the projected area v·m/cos θ_m, finite where slopes are not.
     """
     s, around = np.meshgrid(
         (np.arange(_ALONG) + 0.5) / _ALONG, (np.arange(_AROUND) + 0.5) * np.pi / _AROUND, indexing="ij"
     )
     slope, turn = (alpha * np.sqrt(1 - (1 - s) ** 2) / (1 - s)).ravel(), around.ravel()
     upright = 1 / np.sqrt(1 + slope**2)
-    local = np.stack([slope * np.cos(turn), slope * np.sin(turn), np.ones_like(slope)]) * upright  # about the normal
+    facet = np.stack([slope * np.cos(turn), slope * np.sin(turn), np.ones_like(slope)]) * upright  # about the normal
     sine = np.sqrt(1 - cosine**2)
-    along = cosine[:, None] * local[2] + sine[:, None] * local[0]  # v·m
-    x = sine[:, None] * local[2] - cosine[:, None] * local[0]  # across the ray, towards the projected normal
-    y = local[1]
+    along = cosine[:, None] * facet[2] + sine[:, None] * facet[0]  # v·m
+    x = sine[:, None] * facet[2] - cosine[:, None] * facet[0]  # across the ray, towards the projected normal
+    y = facet[1]
     weight = np.maximum(along, 0) / upright * (1 - s).ravel()
     across = np.maximum(x * x + y * y, 1e-20)
     return np.clip(along, 1e-6, 1), (x * x - y * y) / across, weight / weight.sum(axis=1, keepdims=True)

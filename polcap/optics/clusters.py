@@ -6,21 +6,21 @@ import numpy as np
 from polcap.image_values import Floats
 
 _LEAST_SPREAD = 0.02
-_SOME = 40_000  # colors that are grouped, at most
+_MOST = 40_000  # colors that are grouped
 
 
 def color_clusters(encoded: Floats, count: int) -> tuple[Floats, float]:
     """Centers (G, C) of at most `count` groups of sRGB-encoded colors (N, C), and the spread within a group.
 
-    Other features than color count as much as their units make them.
+    Features other than color may be added; their scale is their weight.
     """
-    some = np.ascontiguousarray(encoded[:: max(1, len(encoded) // _SOME)], np.float32)
+    sample = np.ascontiguousarray(encoded[:: max(1, len(encoded) // _MOST)], np.float32)
     stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-4)
     cv2.setRNGSeed(0)
     compactness, _, center = cv2.kmeans(
-        some, min(count, len(some)), np.empty(0, np.int32), stop, 3, cv2.KMEANS_PP_CENTERS
+        sample, min(count, len(sample)), np.empty(0, np.int32), stop, 3, cv2.KMEANS_PP_CENTERS
     )
-    return np.asarray(center), max(float(np.sqrt(compactness / len(some))), _LEAST_SPREAD)
+    return np.asarray(center), max(float(np.sqrt(compactness / len(sample))), _LEAST_SPREAD)
 
 
 def soft_share(encoded: Floats, center: Floats, spread: float) -> Floats:

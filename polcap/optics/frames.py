@@ -87,8 +87,8 @@ def from_ray_frame(m: Any, v: Any) -> Any:
 def lifted(m: Any) -> Any:
     """Turn unit vectors (..., 3) in ray frames towards the camera: z becomes at least 0.02; unit length again."""
     xp = array_namespace(m)
-    up = xp.concat([m[..., :2], xp.clip(m[..., 2:], 0.02, None)], axis=-1)
-    return up / (dot(up, up) ** 0.5)[..., None]
+    raised = xp.concat([m[..., :2], xp.clip(m[..., 2:], 0.02, None)], axis=-1)
+    return raised / (dot(raised, raised) ** 0.5)[..., None]
 
 
 def tilted(normal: Any, slope: Any) -> Any:

@@ -21,9 +21,9 @@ def erode(mask: Bools, reach: int, *, from_border: bool = False) -> Bools:
 def masked_mean(image: Floats, inside: Bools, sigma: float) -> Floats:
     """Gaussian mean, 1σ = `sigma` px, of an image (H, W) or (H, W, C) over the pixels inside a mask (H, W)."""
     planar = image.ndim == 2
-    held = np.where(inside if planar else inside[..., None], image, 0).astype(np.float32)
+    masked = np.where(inside if planar else inside[..., None], image, 0).astype(np.float32)
     share = np.maximum(cv2.GaussianBlur(inside.astype(np.float32), (0, 0), sigma), np.float32(1e-6))
-    total = cv2.GaussianBlur(held, (0, 0), sigma).reshape(held.shape)
+    total = cv2.GaussianBlur(masked, (0, 0), sigma).reshape(masked.shape)
     return np.asarray(total / (share if planar else share[..., None]))
 
 

@@ -95,9 +95,9 @@ def phasor(band: OutlineBand, angle: Floats) -> tuple[NDArray[Any], Floats]:
     φ is the AoLP from polarizer angles (K,) rad, φ_contour the outward direction, w the DoLP up to DOLP_CAP. The sum is
     real and positive for diffuse reflection, which is polarized across the contour.
     """
-    along = polarization(band, angle)
-    weight = np.minimum(np.abs(along), DOLP_CAP)
-    relative = weight * along / np.maximum(np.abs(along), 1e-12) * np.exp(-2j * band.azimuth)
+    polarized = polarization(band, angle)
+    weight = np.minimum(np.abs(polarized), DOLP_CAP)
+    relative = weight * polarized / np.maximum(np.abs(polarized), 1e-12) * np.exp(-2j * band.azimuth)
     real, imaginary = (np.bincount(band.sector, part, SECTORS) for part in (relative.real, relative.imag))
     return real + 1j * imaginary, np.asarray(np.bincount(band.sector, weight, SECTORS), np.float64)
 

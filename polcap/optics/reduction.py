@@ -40,6 +40,6 @@ class ObjectReduction:
 
 def scaled_view(view: View, factor: float) -> View:
     """The camera of a picture in `factor` times its size."""
-    x, y = ((edge + 0.5) * factor - 0.5 for edge in view.center)
-    left, top = (edge * factor for edge in view.origin)
+    x, y = ((position + 0.5) * factor - 0.5 for position in view.center)
+    left, top = (position * factor for position in view.origin)
     return replace(view, focal=view.focal * factor, center=(x, y), scale=view.scale / factor, origin=(left, top))

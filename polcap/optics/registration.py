@@ -39,7 +39,7 @@ _REACH_PX = 2.0  # largest movement of a tile in one step
 _GAIN = 0.2, 5.0  # range of a tile's gain; beyond, the two tiles show different things
 _LEAST_TILES = 6
 _TILE_ERROR_PX = 0.02  # of interpolation and aliasing, in the richest tile
-_PRIOR_PX = 0.1  # 1σ of a parameter's change in one step, before the tiles are used
+_PRIOR_PX = 0.1  # prior 1σ of a parameter's change in one step
 _AGREE_PX = 0.3  # a tile with a smaller residual agrees with the motion; after a smaller step, no new tiles are tried
 _LEAST_AGREE = 0.4  # share of the matched tiles; if fewer agree, no motion is found
 _FAR_BETTER = 1.25  # factor by which more tiles must agree with a distant match: detail may repeat
@@ -155,19 +155,19 @@ def correlation(reference: Pyramid, other: Pyramid, matrix: Floats) -> float:
     a, b = reference[0], other[0]
     size, inverse = a.picture.shape[::-1], cv2.WARP_INVERSE_MAP
     seen = cv2.warpPerspective(b.usable.view(np.uint8), matrix, size, flags=inverse | cv2.INTER_NEAREST, borderValue=0)
-    both = a.usable & (seen > 0)
-    how = {"flags": inverse | cv2.INTER_CUBIC, "borderMode": cv2.BORDER_REPLICATE}
-    warped = cv2.warpPerspective(b.picture, matrix, size, **how)
-    if not both.any():
+    usable = a.usable & (seen > 0)
+    options = {"flags": inverse | cv2.INTER_CUBIC, "borderMode": cv2.BORDER_REPLICATE}
+    warped = cv2.warpPerspective(b.picture, matrix, size, **options)
+    if not usable.any():
         return 0.0
-    x, y = a.picture[both] - a.picture[both].mean(), warped[both] - warped[both].mean()
+    x, y = a.picture[usable] - a.picture[usable].mean(), warped[usable] - warped[usable].mean()
     return float(np.vdot(x, y) / np.sqrt(float(np.vdot(x, x)) * float(np.vdot(y, y)) + 1e-30))
 
 
 def scaled(matrix: Floats, step: float) -> Floats:
     """Convert a motion (3, 3) from a grid that is averaged down by `step` to the full grid; with 1/step, back."""
-    up = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2], [0, 0, 1.0]])
-    return np.asarray(up @ matrix @ np.linalg.inv(up))
+    to_full = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2], [0, 0, 1.0]])
+    return np.asarray(to_full @ matrix @ np.linalg.inv(to_full))
 
 
 def squared_gradient(picture: Floats) -> Floats:
@@ -183,7 +183,7 @@ def squared_gradient(picture: Floats) -> Floats:
 
 
 def _phase_correlation(reference: Level, other: Level) -> Floats:
-    """Whole-pixel shift between two pictures as a matrix (3, 3); the identity unless a shift fits clearly better."""
+    """Whole-pixel shift between two pictures, a matrix (3, 3); the identity unless its peak is 1.5 times that at 0."""
     a, b, both = reference.picture, other.picture, reference.usable & other.usable
     window = np.outer(np.hanning(a.shape[0]), np.hanning(a.shape[1]))
     if both.mean() < 0.05:
@@ -222,8 +222,8 @@ def _refine(
             matrix = matrix @ update
             points = matches.point
             step = transform_points(update, points) - points
-            rest, largest = matches.shift - step, float(np.abs(step).max())
-            agree = int(np.sum(np.hypot(rest[:, 0], rest[:, 1]) < _AGREE_PX))
+            residual, largest = matches.shift - step, float(np.abs(step).max())
+            agree = int(np.sum(np.hypot(residual[:, 0], residual[:, 1]) < _AGREE_PX))
             if largest < _SETTLED_PX * (4 if level else 1):
                 break
             if largest < _AGREE_PX:
@@ -268,11 +268,11 @@ def _match_some(reference: Level, other: Level, corner: Indices, matrix: Floats)
     usable = np.asarray(clear & _windows(reference.usable, corner, _TILE), np.float64)
     patch = _windows(reference.picture, corner - 1, _TILE + 2).astype(np.float64)
     taps = Taps(u.reshape(-1, _TILE), v.reshape(-1, _TILE), (height, width))
-    read = other.spline.at(taps).reshape(u.shape).astype(np.float64)
+    sampled = other.spline.at(taps).reshape(u.shape).astype(np.float64)
     gx = (patch[:, 1:-1, 2:] - patch[:, 1:-1, :-2]) / 2
     gy = (patch[:, 2:, 1:-1] - patch[:, :-2, 1:-1]) / 2
     weight = usable.reshape(count, 1, -1)
-    basis = np.stack([gx, gy, read, usable], axis=1).reshape(count, 4, -1) * weight
+    basis = np.stack([gx, gy, sampled, usable], axis=1).reshape(count, 4, -1) * weight
     normal = basis @ basis.transpose(0, 2, 1)  # unknowns: shift, gain, offset
     normal += (1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-30) * np.eye(4)
     target = patch[:, 1:-1, 1:-1].reshape(count, -1) * weight[:, 0]
@@ -289,17 +289,17 @@ def _match_some(reference: Level, other: Level, corner: Indices, matrix: Floats)
 def _without_noise(shift: Floats, normal: Floats, count: Floats, variance: Floats) -> tuple[Floats, Floats]:
     """Correct the shifts (T, 2) of tiles for noise of their gradients, which makes them too small.
 
-    `normal` (T, 4, 4) is the normal matrix of each tile; the noise adds half the `variance` (T,) of each of its `count`
-    (T,) pixels. Directions dominated by noise are left out. Also returns the information (T, 2, 2) of the shifts.
+    In the normal matrix (T, 4, 4) of each tile, noise adds half the `variance` (T,) of each of its `count` (T,) pixels.
+    Directions dominated by noise get the shift 0. Also returns the information (T, 2, 2) of the shifts.
     """
-    both = np.linalg.inv(np.linalg.inv(normal)[:, :2, :2])
-    power, axes = np.linalg.eigh(both)
+    of_shift = np.linalg.inv(np.linalg.inv(normal)[:, :2, :2])
+    power, axes = np.linalg.eigh(of_shift)
     scene = power - 0.5 * (count * variance)[:, None]
-    known = scene > 0.5 * power
+    clear = scene > 0.5 * power
     along = np.einsum("tik,ti->tk", axes, shift) * power / np.maximum(scene, 0.5 * power + 1e-300)
-    missing = np.einsum("tik,tk->ti", axes, np.where(known, along, 0))
-    information = np.einsum("tik,tk,tjk->tij", axes, np.where(known, scene, 0) / variance[:, None], axes)
-    return missing, information
+    corrected = np.einsum("tik,tk->ti", axes, np.where(clear, along, 0))
+    information = np.einsum("tik,tk,tjk->tij", axes, np.where(clear, scene, 0) / variance[:, None], axes)
+    return corrected, information
 
 
 def _windows(picture: NDArray[Any], corner: Indices, size: int) -> NDArray[Any]:
@@ -386,8 +386,8 @@ def _robust(design: Floats, shift: Floats, information: Floats) -> _RobustFit:
         normal, right = weighted @ design.reshape(-1, k), weighted @ shift.ravel()
         parameters = np.linalg.solve(normal + np.eye(k) / _PRIOR_PX**2, right)
         covariance = np.linalg.inv(normal + np.eye(k))
-        rest = shift - design @ parameters
-        chi2 = np.einsum("ti,tij,tj->t", rest, information, rest)
+        residual = shift - design @ parameters
+        chi2 = np.einsum("ti,tij,tj->t", residual, information, residual)
         scale = max(float(np.median(chi2)) / 1.386, 1e-6)  # χ² of two has median 1.386
-        weight = np.clip(1 - chi2 / (25 * scale), 0, None) ** 2
+        weight = np.clip(1 - chi2 / (25 * scale), 0, None) ** 2  # 0 beyond 5σ
     return _RobustFit(parameters, covariance, float(np.sum(weight * chi2)), weight)

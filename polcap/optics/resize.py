@@ -34,6 +34,11 @@ def weighted_area_mean(image: Floats, weight: NDArray[Any], shape: tuple[int, ..
     return np.asarray(total / np.maximum(area_mean(weight, shape), 1e-9)[..., *extra])
 
 
+def block_step(pixels: float, most: float) -> int:
+    """Side of the blocks to average so that at most `most` of so many pixels remain; 1 for fewer."""
+    return int(np.ceil(np.sqrt(max(pixels / most, 1))))
+
+
 def block_means(image: NDArray[Any], step: int) -> NDArray[Any]:
     """Means of step × step blocks of an image (H, W) or (H, W, C); incomplete blocks at the end are dropped."""
     height, width = (side // step for side in image.shape[:2])

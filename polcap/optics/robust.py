@@ -85,7 +85,7 @@ def fit_noise_line(
             return NoiseFit(np.nan, np.nan, np.full((2, 2), np.nan))
         inverse = np.linalg.inv(scaled) * scale[:, None] * scale
         found = inverse @ right
-        if found[1] < least_floor:
+        if found[1] < least_floor:  # the slope that fits best with the least floor
             found[0] += normal[0, 1] / normal[0, 0] * (found[1] - least_floor)
             found[1] = least_floor
         model = matrix @ found

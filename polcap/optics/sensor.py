@@ -106,7 +106,7 @@ def clip_count(image: SensorImage, clip: float) -> float:
 
 
 def saturation(image: SensorImage) -> float:
-    """The count at which pixels saturate: the stated white level, or the highest count where many pixels share it."""
+    """Count at which pixels saturate: white level, or the highest count (over .6 of it) if .1 % of pixels have it."""
     part = np.ascontiguousarray(image.value[::3, ::3])
     top = float(part.max())
     crowded = np.count_nonzero(part == top) > max(1e-3 * part.size, 20)

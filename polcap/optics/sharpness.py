@@ -21,14 +21,14 @@ from polcap.optics.tiles import spread_over_cells
 TILE = 32  # px of the binned frames
 _CELLS, _PER_CELL = (8, 12), 3  # rows and columns of cells in the picture; tiles chosen in each cell
 _FINE, _COARSE = 1, 4  # px, distances of the differences
-_WAYS = ((0, 1), (1, 0), (1, 1), (1, -1))
-_LADDER = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # px, 1σ
+_WAYS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows and columns: directions of the differences
+_BLURS_PX = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # 1σ: blurs with which the sharpest tiles are compared
 _LEAST_TILES = 4
 _LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise would count as detail
-_SURE = 0.999  # quantile of Student's t beyond which a loss of detail is significant
-_BEYOND = 0.1  # least log of a loss of detail beyond that of a shift
+_SIGNIFICANCE = 0.999  # quantile of Student's t beyond which a loss of detail is significant
+_LEAST_BEYOND_SHIFT = 0.1  # least loss of detail (ln) beyond that which a shift explains
 _PHASES = 4.0  # effective number of rows with edges in a tile; fewer may share one place within a pixel
-_DETAIL = -0.5  # largest log of fine over coarse energy of a tile with detail; noise has 0
+_DETAIL = -0.5  # largest ln of fine over coarse energy of a tile with detail; noise has 0
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Tiles:
 
 def places(image: SensorImage, clip: float) -> NDArray[np.int64]:
     """Choose the tiles to compare in one decoded photograph of a capture: corners (T, 2)."""
-    return choose_tiles(_whole_light(image), sensor.usable(image, clip))
+    return choose_tiles(_mean_light(image), sensor.usable(image, clip))
 
 
 def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
@@ -64,7 +64,7 @@ def take(image: SensorImage, corners: NDArray[np.int64], clip: float) -> Tiles:
     strip = replace(image, value=np.concatenate(around))  # tiles have whole CFA periods: the phase is unchanged
     shape = (len(corners), TILE + 2 * spare, TILE + 2 * spare)
     inner = np.s_[:, spare:-spare, spare:-spare]
-    light = _whole_light(strip).reshape(shape)[inner]
+    light = _mean_light(strip).reshape(shape)[inner]
     sound = sensor.below(strip, sensor.clip_count(image, clip)).reshape(shape)[inner].all((1, 2))
     return Tiles(light, sound & (light.mean((1, 2)) > _LEAST_LIGHT))
 
@@ -81,7 +81,7 @@ def frames_blur(shots: Sequence[Sequence[Tiles]], px: float) -> Floats:
     return np.asarray(px * np.stack(each, axis=1))
 
 
-def _whole_light(image: SensorImage) -> Floats:
+def _mean_light(image: SensorImage) -> Floats:
     """Mean light (H, W) of the photosites of each binned pixel."""
     if image.superpixel == 2:  # from the counts: ten times as fast as from channels
         black = float(image.black.mean())
@@ -107,30 +107,30 @@ def choose_tiles(light: Floats, usable: Bools) -> NDArray[np.int64]:
 def extra_blur(tiles: Floats, usable: Bools) -> Floats:
     """Extra Gaussian blur (K,) of each photograph, 1σ [px], relative to the sharpest one; NaN: not measurable.
 
-    tiles (K, T, n, n) are from K photographs of equal exposure, usable (K, T). A blur smaller than the scatter between
-    tiles counts as 0. The scatter is taken from the photograph with the least scatter, because blur itself adds some:
-    tiles with much detail lose more. So does a loss that a shift explains.
+    tiles (K, T, n, n) are from K photographs of equal exposure, usable (K, T). A loss of detail counts as 0 if it is
+    within the scatter between tiles, or if a shift explains it. Blur itself adds scatter, because tiles with much
+    detail lose more; so the least scatter of the photographs is taken.
     """
     from scipy.special import stdtrit  # here: the import takes 0.2 s
 
     fineness = np.stack([_fineness(shot) for shot in tiles])  # (K, 4, T)
-    every = usable.all(0) & (fineness.mean((0, 1)) < _DETAIL)
-    if every.sum() < _LEAST_TILES:
+    chosen = usable.all(0) & (fineness.mean((0, 1)) < _DETAIL)
+    if chosen.sum() < _LEAST_TILES:
         return np.full(len(tiles), np.nan)
-    fineness = fineness[..., every]
+    fineness = fineness[..., chosen]
     sharpest = int(np.argmax(np.median(fineness, axis=2).mean(1)))
-    each = fineness[sharpest] - fineness  # (K, 4, T)
-    lost = np.median(each, axis=2)  # (K, 4)
-    scatter = np.delete(each, sharpest, axis=0).std(axis=2, ddof=1).min(axis=0, initial=np.inf)  # (4,)
-    count = each.shape[2]
-    sure = stdtrit(count - 1, _SURE) * MEDIAN_SE * scatter / np.sqrt(count)
-    of_blur = np.median(each - _phase_loss(tiles[sharpest][every]), axis=2)
-    lost = np.where((lost > sure) & (of_blur > _BEYOND), lost, 0.0)
+    loss = fineness[sharpest] - fineness  # (K, 4, T)
+    lost = np.median(loss, axis=2)  # (K, 4)
+    scatter = np.delete(loss, sharpest, axis=0).std(axis=2, ddof=1).min(axis=0, initial=np.inf)  # (4,)
+    count = loss.shape[2]
+    significant = stdtrit(count - 1, _SIGNIFICANCE) * MEDIAN_SE * scatter / np.sqrt(count)
+    beyond_shift = np.median(loss - _phase_loss(tiles[sharpest][chosen]), axis=2)
+    lost = np.where((lost > significant) & (beyond_shift > _LEAST_BEYOND_SHIFT), lost, 0.0)
     if not lost.any():
         return np.zeros(len(tiles))
-    ladder = np.stack([_fineness(_blurred(tiles[sharpest][every], sigma)) for sigma in _LADDER])  # (L, 4, T)
-    fall = np.median(ladder[0] - ladder, axis=2)  # (L, 4), growing
-    return np.array([max(np.interp(lost[k, w], fall[:, w], _LADDER) for w in range(4)) for k in range(len(tiles))])
+    blurred = np.stack([_fineness(_blurred(tiles[sharpest][chosen], sigma)) for sigma in _BLURS_PX])  # (L, 4, T)
+    known = np.median(blurred[0] - blurred, axis=2)  # (L, 4), growing
+    return np.array([max(np.interp(lost[k, w], known[:, w], _BLURS_PX) for w in range(4)) for k in range(len(tiles))])
 
 
 def _fineness(tiles: Floats) -> Floats:

@@ -48,17 +48,17 @@ def rasterize(uv: Floats, faces: NDArray[np.int32], height: int, width: int) -> 
     corner, one, two, area = corner[facing], one[facing], two[facing], area[facing]
     first = np.ceil(corner.min(axis=1) - _SLACK).astype(np.int32)
     extent = np.floor(corner.max(axis=1) + _SLACK).astype(np.int32) - first
-    at = (first - corner[:, 0]).astype(np.float32)
+    offset = (first - corner[:, 0]).astype(np.float32)
     across, down = ((v / area[:, None]).astype(np.float32) for v in (one, two))
     # barycentric coordinates of the second and third corner at the first pixel; they are linear in the pixel
-    second = at[:, 0] * down[:, 1] - at[:, 1] * down[:, 0]
-    third = across[:, 0] * at[:, 1] - across[:, 1] * at[:, 0]
+    second = offset[:, 0] * down[:, 1] - offset[:, 1] * down[:, 0]
+    third = across[:, 0] * offset[:, 1] - across[:, 1] * offset[:, 0]
     owner = np.full(height * width, -1, np.int32)
     weights = np.empty((height * width, 2), np.float32)
     for y in range(int(extent[:, 1].max(initial=-1)) + 1):
-        tall = np.flatnonzero(extent[:, 1] >= y)
-        for x in range(int(extent[tall, 0].max(initial=-1)) + 1):
-            f = tall[extent[tall, 0] >= x]
+        reaching = np.flatnonzero(extent[:, 1] >= y)
+        for x in range(int(extent[reaching, 0].max(initial=-1)) + 1):
+            f = reaching[extent[reaching, 0] >= x]
             w1 = second[f] + (x * down[f, 1] - y * down[f, 0])
             w2 = third[f] + (y * across[f, 0] - x * across[f, 1])
             hit = (w1 > -_SLACK) & (w2 > -_SLACK) & (w1 + w2 < 1 + _SLACK)

@@ -23,8 +23,8 @@ Box = tuple[int, int, int, int]
 
 _POLE = np.sqrt(3.0) - 2.0  # of the filter from samples to the coefficients of a cubic spline
 _REACH = 8  # px; weights beyond are below |pole|⁸ = 2.6e-5, 1/100 of the noise of a good shot
-_CUT = _POLE ** np.abs(np.arange(-_REACH, _REACH + 1.0))
-_PREFILTER = (_CUT / _CUT.sum()).astype(np.float32)  # sum 1: a uniform image does not change
+_POWERS = _POLE ** np.abs(np.arange(-_REACH, _REACH + 1.0))
+_PREFILTER = (_POWERS / _POWERS.sum()).astype(np.float32)  # sum 1: a uniform image does not change
 _EDGE = 3  # px added around the image, for interpolation at its outermost pixels
 _ROWS = 64  # resampled at a time
 
@@ -82,17 +82,17 @@ class Taps:
 def _taps(at: Floats, last: int) -> tuple[Floats, Floats, Floats]:
     """The two look-ups of a cubic B-spline along one axis, and the weight of the second, float32."""
     at = np.clip(at, 0, last)
-    whole = np.floor(at)
-    f = (at - whole).astype(np.float32)
-    whole += _EDGE
+    before = np.floor(at)
+    f = (at - before).astype(np.float32)
+    before += _EDGE
     f2 = f * f
     f3 = f2 * f
     # of the four weights (1−f)³/6, (4−6f²+3f³)/6, …, f³/6, the first two form one look-up, the last two the other
     second = 1 + 3 * f + 3 * f2 - 2 * f3
     first = 6 - second
     return (
-        (whole - 1 + (4 - 6 * f2 + 3 * f3) / first).astype(np.float32),
-        (whole + 1 + f3 / second).astype(np.float32),
+        (before - 1 + (4 - 6 * f2 + 3 * f3) / first).astype(np.float32),
+        (before + 1 + f3 / second).astype(np.float32),
         second * np.float32(1 / 6),
     )
 
@@ -102,7 +102,7 @@ class Spline:
 
     def __init__(self, image: Floats) -> None:
         around = cv2.copyMakeBorder(image, _EDGE, _EDGE, _EDGE, _EDGE, cv2.BORDER_REPLICATE)
-        self._of = cv2.sepFilter2D(around, cv2.CV_32F, _PREFILTER, _PREFILTER, borderType=cv2.BORDER_REPLICATE)
+        self._coeffs = cv2.sepFilter2D(around, cv2.CV_32F, _PREFILTER, _PREFILTER, borderType=cv2.BORDER_REPLICATE)
 
     def at(self, taps: Taps) -> Floats:
         """Interpolated values (h, w) of the image at the positions of `taps`."""
@@ -110,7 +110,7 @@ class Spline:
         return _mix(upper, lower, taps.down)
 
     def _read(self, x: Floats, y: Floats) -> Floats:
-        return np.asarray(cv2.remap(self._of, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+        return np.asarray(cv2.remap(self._coeffs, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _mix(a: Floats, b: Floats, share: Floats) -> Floats:

@@ -7,7 +7,7 @@ import msgspec
 from polcap.quality.gate_values import Gate
 
 _MOST = 2
-_NOTABLE_DEG = 1.0  # error of the normals from which a warning comes before those that cost less
+_NOTABLE_DEG = 1.0  # error of the normals: warnings that cost less come last
 
 
 def advise(judged: Sequence[Gate]) -> list[Gate]:
@@ -19,8 +19,7 @@ def advise(judged: Sequence[Gate]) -> list[Gate]:
 def advice(judged: Sequence[Gate]) -> list[Gate]:
     """The gates of the remedies to follow first, at most two.
 
-    Where gates failed, theirs; otherwise, or where warnings are their cause, those of warnings. `judged` has causes
-    before consequences.
+    They are failed gates; if no failed gate has a remedy, they are warnings. `judged` has causes before consequences.
     """
     failed = [gate for gate in judged if gate.state == "fail" and gate.remedy]
     warned = sorted((gate for gate in judged if gate.state == "warn"), key=lambda gate: gate.cost_deg < _NOTABLE_DEG)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from polcap.image_values import Bools, Floats
 from polcap.optics.morphology import erode
-from polcap.optics.resize import block_means
+from polcap.optics.resize import block_means, block_step
 from polcap.optics.robust import jackknife, spread
 from polcap.stage_values import SurfaceMaps
 
@@ -22,9 +22,9 @@ _FACING = 0.35  # least z of a normal
 _DARKEST = 0.01  # albedo
 _CELL = 0.5  # side of a part, of the object's radius
 _LEAST_PIXELS, _LEAST_CELLS = 300, 6
-_CAUCHY = 2.0  # robust standard deviations
+_CAUCHY = 2.0  # robust standard deviations of the residuals: scale of the weights
 _ROUNDS = 8
-_SIGMAS = 2.0
+_SIGMAS = 2.0  # of the slope: how far its lower limit lies below it
 _LEAST_SPREAD = 1e-6  # of the squares of the normals' x and y in the mean: a plane has no slope to compare
 
 
@@ -39,7 +39,7 @@ class AlbedoSlope:
 def measure(maps: SurfaceMaps, usable: Bools) -> AlbedoSlope | None:
     """Measure how the albedo depends on the slope, in pixels `usable` (H, W); None for a small object."""
     chosen = maps.mask & usable
-    step = int(np.ceil(np.sqrt(max(chosen.sum() / _MOST_PIXELS, 1))))
+    step = block_step(chosen.sum(), _MOST_PIXELS)
     normal, albedo = (block_means(part, step) for part in (maps.normal, maps.diffuse.mean(axis=-1)))
     inside = erode(block_means(chosen.astype(np.float32), step) > 0.99, 1) & (normal[..., 2] > _FACING)
     y, x = np.nonzero(inside)
@@ -49,11 +49,11 @@ def measure(maps: SurfaceMaps, usable: Bools) -> AlbedoSlope | None:
         return None
     lean = normal[inside][:, :2].astype(np.float64)
     log = np.log(np.maximum(albedo[inside], _DARKEST)).astype(np.float64)
-    whole, error = _fit(lean, log, np.zeros_like(cell), cell)
-    towards = whole / max(float(np.linalg.norm(whole)), 1e-9)
-    parts, doubt = _fit(lean, log, cell, cell)
-    sure = (towards @ slope - _SIGMAS * np.hypot(*(towards * e)) for slope, e in ((whole, error), (parts, doubt)))
-    return AlbedoSlope(max(float(min(sure)), 0.0), float(np.arctan2(whole[1], whole[0])))
+    overall = _fit(lean, log, np.zeros_like(cell), cell)
+    slope, parts = overall[0], _fit(lean, log, cell, cell)
+    towards = slope / max(float(np.linalg.norm(slope)), 1e-9)
+    lower_limits = (towards @ value - _SIGMAS * np.hypot(*(towards * sigma)) for value, sigma in (overall, parts))
+    return AlbedoSlope(max(float(min(lower_limits)), 0.0), float(np.arctan2(slope[1], slope[0])))
 
 
 def _fit(lean: Floats, log: Floats, group: NDArray[Any], cell: NDArray[Any]) -> tuple[Floats, Floats]:
@@ -77,6 +77,6 @@ def _fit(lean: Floats, log: Floats, group: NDArray[Any], cell: NDArray[Any]) -> 
 
 def _centered(value: Floats, weight: Floats, group: NDArray[Any]) -> Floats:
     """Values (N, C) minus the weighted mean of their group."""
-    whole = np.maximum(np.bincount(group, weight), 1e-9)
-    mean = np.stack([np.bincount(group, weight * column) / whole for column in value.T], axis=1)
+    total = np.maximum(np.bincount(group, weight), 1e-9)
+    mean = np.stack([np.bincount(group, weight * column) / total for column in value.T], axis=1)
     return np.asarray(value - mean[group])

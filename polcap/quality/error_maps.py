@@ -1,8 +1,8 @@
 """Expected errors of each pixel: of the normals, of the albedo and of the roughness.
 
-That of the roughness is the estimator's own. That of a normal is the estimator's own error, and the costs of all gates.
-A finding of a gate costs the same on the whole object, unless it has a place in `_PLACES`: there its pixels have their
-own costs, also where they are too few for a finding.
+The error of the roughness is the estimator's own. To the error of a normal the costs of all gates are added. A finding
+of a gate costs the same on the whole object. Gates in `_PLACES` have a cost for each pixel instead, also if too few
+pixels have one for a finding.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -20,7 +20,7 @@ from polcap.results import ResultsUntilInfer
 from polcap.stage_values import SurfaceMaps
 
 _AROUND = 0.12  # 1σ over the object's radius: how far clipped pixels mislead the estimator
-_FINEST_PX = 4.0  # this distance on the reduced grid on which it is computed
+_FINEST_PX = 4.0  # the same distance, in pixels of the reduced grid of the computation
 # degrees by the share of clipped pixels around, most at the edge of a clipped part (docs/benchmarks/gates.md)
 _CLIPPED_AROUND = (0.0, 0.15, 0.3, 0.45, 0.6, 0.8, 1.0)
 _CLIPPED_DEG = (0.0, 5.0, 9.5, 22.0, 28.0, 25.0, 18.0)
@@ -29,14 +29,14 @@ _CLIPPED_PART = 0.3  # clipped part of the object with these costs; they grow wi
 _UNSTATED = {"sharpness": 0.7, "ill-posed": 0.0}
 # agreement of the re-rendering from which `body` is a false finding (docs/benchmarks/gates.md); of wax it is .22
 _CONFIRMED = 0.45
-_WHOLE = "re-rendering"  # its cost is the whole error, if the estimators state less
+_RERENDERING = "re-rendering"  # its cost is the whole error, if the estimators state less
 _GHOST_DEG = 5.0  # where the exposures of a shot differ
 # 1σ by 150 simulated captures and the 4 rendered ones (docs/benchmarks/albedo.md); (network, analytic)
 _ALBEDO = (0.04, 0.06)  # of the diffuse albedo, times the root of albedo times expected normal error [degrees]
 _DARKEST = 0.01  # albedo
 _MOST_DEG = 20.0  # normal error: a larger one does not change the albedo more
 _ALBEDO_CLIPPED = 3.0  # relative, times the clipped shares of the object and around: light that no shot shows
-_ROUGHNESS_OF_INVERSION = 0.17  # it assumes one
+_ROUGHNESS_OF_INVERSION = 0.17  # the inversion assumes one roughness
 
 
 def with_errors(found: Evidence[ResultsUntilInfer], judged: Iterable[Gate]) -> SurfaceMaps:
@@ -53,8 +53,8 @@ def expected_normal_error(found: Evidence[ResultsUntilInfer], judged: Iterable[G
     """Expected error of the normals (H, W), degrees: root of the squares of the estimator's own and all costs."""
     places = {name: cost(found) for name, cost in _PLACES.items()}
     costs = [(name, cost) for name, cost in unstated_costs(judged) if name not in places]
-    everywhere = sum(cost**2 for name, cost in costs if name != _WHOLE)
-    own = np.maximum(found.results.maps.confidence, sum(cost for name, cost in costs if name == _WHOLE))
+    everywhere = sum(cost**2 for name, cost in costs if name != _RERENDERING)
+    own = np.maximum(found.results.maps.confidence, sum(cost for name, cost in costs if name == _RERENDERING))
     squares = own**2 + everywhere + sum(cost**2 for cost in places.values())
     return np.where(found.results.maps.mask, np.minimum(np.sqrt(squares), MOST_DEG), 0).astype(np.float32)
 
@@ -62,7 +62,7 @@ def expected_normal_error(found: Evidence[ResultsUntilInfer], judged: Iterable[G
 def unstated_costs(judged: Iterable[Gate]) -> list[tuple[str, float]]:
     """Names of the gates with their costs [degrees], as far as the estimators do not state these themselves."""
     gates = list(judged)
-    agreement = (gate.value for gate in gates if gate.name == _WHOLE and gate.state == "pass")
+    agreement = (gate.value for gate in gates if gate.name == _RERENDERING and gate.state == "pass")
     confirmed = any(isinstance(value, float) and value > _CONFIRMED for value in agreement)
     parts = _UNSTATED | ({"body": 0.0} if confirmed else {})
     return [(gate.name, parts.get(gate.name, 1.0) * gate.cost_deg) for gate in gates]
@@ -86,7 +86,7 @@ def _of_focal_length(found: Evidence[ResultsUntilInfer]) -> Floats:
     """Cost (H, W) of an unknown focal length, in degrees: the tilt of the view ray."""
     if not any(found.focal_doubt):
         return np.zeros(1)
-    return geometry.lean(found.results.maps, *found.focal_doubt)
+    return geometry.ray_doubt_deg(found.results.maps, *found.focal_doubt)
 
 
 def _diffuse_error(found: Evidence[ResultsUntilInfer]) -> Floats:
@@ -115,8 +115,8 @@ def _share_around(chosen: Bools, inside: Bools) -> Floats:
     sigma = max(_AROUND * disc_radius(inside), 1e-3)
     shrink = min(1.0, _FINEST_PX / sigma)
     shape = tuple(max(1, round(side * shrink)) for side in inside.shape)
-    part, whole = (cv2.GaussianBlur(area_mean(one, shape), (0, 0), sigma * shrink) for one in (chosen, inside))
-    return np.asarray(cv2.resize(part / np.maximum(whole, 1e-6), inside.shape[::-1]))
+    part, total = (cv2.GaussianBlur(area_mean(one, shape), (0, 0), sigma * shrink) for one in (chosen, inside))
+    return np.asarray(cv2.resize(part / np.maximum(total, 1e-6), inside.shape[::-1]))
 
 
 _PLACES: Mapping[str, Callable[[Evidence[ResultsUntilInfer]], Floats]] = {

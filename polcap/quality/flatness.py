@@ -14,7 +14,7 @@ import numpy as np
 from polcap.image_values import Bools, Floats
 from polcap.optics import outline
 from polcap.optics.frames import total
-from polcap.optics.resize import block_means
+from polcap.optics.resize import block_means, block_step
 from polcap.quality.gate_values import MOST_DEG, Evidence, Gate
 from polcap.results import ResultsUntilInfer
 from polcap.stage_values import StokesImage, SurfaceMaps
@@ -22,7 +22,7 @@ from polcap.stage_values import StokesImage, SurfaceMaps
 _MOST_PIXELS = 1e4  # of the object; a larger picture is averaged down
 _RIM, _INNER = 0.08, (0.2, 0.4)  # bands along the outline, by depth over the object's radius
 _MIXED_PX, _LEAST_RIM_PX = 2.0, 4.0  # from the outline: mixed with the backdrop; least end of the outer band
-_FEW = 5  # px of a sector's band
+_FEW = 5  # least px of a sector's band
 _GROWTH, _LEAST_DOLP = 1.5, 0.04  # of the DoLP in a sector with an occluding contour
 _ROUNDED = 0.2  # share of such sectors: plates, coins and sheets up to .17, unless tilted; bodies from .25
 _ONE_PLANE = 0.5  # common part of the polarization: rounded objects up to .46; beyond, orders look alike
@@ -104,7 +104,7 @@ def judge(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
 
 def measure(image: StokesImage, maps: SurfaceMaps) -> Flatness | None:
     """Measure the flatness of an object; None if the object is too small."""
-    step = int(np.ceil(np.sqrt(max(image.mask.sum() / _MOST_PIXELS, 1))))
+    step = block_step(image.mask.sum(), _MOST_PIXELS)
     inside = block_means(image.mask.astype(np.float32), step) > 0.99
     s0, s1, s2 = (block_means(part, step) for part in total(image.stokes))
     polarized = (s1 + 1j * s2) / np.maximum(s0, 1e-9)

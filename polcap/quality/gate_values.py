@@ -173,5 +173,5 @@ def bad_shots(names: list[str], bad: Bools) -> tuple[str, ...]:
 
 
 def grade(cost_deg: float) -> State:
-    """State of a gate beyond its limit, by its cost in degrees of the normals."""
+    """State of a gate beyond its limit: it fails if it costs more than 15° of the normals."""
     return "fail" if cost_deg > 15 else "warn"

@@ -53,6 +53,7 @@ def _without_limits(judge: Callable[[Evidence[R]], _Judged]) -> Callable[[Eviden
     return lambda found, _limits: judge(found)
 
 
+# gates, by what is unknown if one of them fails
 _FILES = ("tone curve", "exposures")
 _LIT = ("clipping", "ambient", "flicker", "noise")  # no shot is measured
 _PAIRED = (*_LIT, "sharpness", "alignment")  # the shots cannot be compared
@@ -60,7 +61,7 @@ _EVEN = (*_PAIRED, "stillness", "gains", "energy")  # the light of the shots is 
 _POLARIZED = (*_EVEN, "angles", "polarized", "order")  # the Stokes parameters are wrong
 _ONE_LIGHT = (*_POLARIZED, "other light")  # the light is not the flash alone
 _SHAPED = (*_POLARIZED, "mask", "body", "other light", "lighting")  # the normals are wrong
-_ROUND: dict[str, tuple[str, ...]] = {"explained_by": ("flat",), "needs": ("contour",)}  # of a rounded object
+_ROUND: dict[str, tuple[str, ...]] = {"explained_by": ("flat",), "needs": ("contour",)}  # for a rounded object
 
 _STEPS = (
     Step(("source",), _without_limits(shot_exposure.source), ResultsUntilHdr),

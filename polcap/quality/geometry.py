@@ -26,7 +26,7 @@ from polcap.stages.whitebalance import chart_in_mask
 
 _LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ
 _DEGREES_PER_SHIFT = 200.0  # error of the normals per shift by the object's radius
-_SIGMAS, _FALSE_SHIFT = 3.0, 0.003  # of a shift; 1σ that polarization imitates, of the object's radius
+_SIGMAS, _FALSE_SHIFT = 3.0, 0.003  # least significance of a shift; 1σ that polarization imitates, over the radius
 _DEGREES_PER_TURN = 600.0  # error of the normals per shift of the surface by a turn, over the radius
 _FALSE_TURN_DEG = 0.2  # 1σ of a turn that polarization imitates
 _SHARP_PX, _DEGREES_PER_BLUR_PX = 1.2, 2.5  # greatest blur of sharp edges; error of the normals per px beyond it
@@ -44,7 +44,7 @@ _TEXTURE = (
 _SAMPLED_PX = 1.0  # doubt of the outline that pixels alone cause: most of a thin object lies next to its outline
 _HOLD_STILL = "Fix the object, do not touch it between shots, and take that shot again"
 _HOLD_BOTH_STILL = "Fix the object and the chart, do not touch them between shots, and take that shot again"
-_FOCAL_LENGTHS, _RADII = 9, 1000  # within the doubt; distances from the picture's center between which it interpolates
+_FOCAL_LENGTHS, _RADII = 9, 1000  # numbers of focal lengths in doubt, and of distances from the center in a table
 _INWARD = 0.5  # sine of the zenith from which a normal leans inward: the inside of a bowl leans less at its lip
 _INWARD_DEG = 25.0  # mean error of objects beyond the limit (docs/benchmarks/half-turns.md)
 
@@ -143,17 +143,17 @@ def _judge_shift(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     radius = max(outline.disc_radius(found.results.object_.mask) * found.grid_px, 1.0)
     length = np.nan_to_num(measured.length, posinf=np.inf) * found.grid_px
     sigma = measured.sigma * found.grid_px
-    sure = length - _SIGMAS * sigma
+    lower_limit = length - _SIGMAS * sigma
     least = limits.min_object_shift * radius
-    true = np.sqrt(np.maximum(length**2 - sigma**2, 0))
-    cost = _DEGREES_PER_SHIFT * float(true.max()) / radius
-    k = int(np.argmax(sure))
+    unbiased = np.sqrt(np.maximum(length**2 - sigma**2, 0))
+    cost = _DEGREES_PER_SHIFT * float(unbiased.max()) / radius
+    k = int(np.argmax(lower_limit))
     figure = round(float(length[k]), 3)
     message = f"The object moved by {figure:.1f} ± {sigma[k]:.1f} px against its surroundings in {names[k]}"
     charted = found.results.color.place is not None  # the surroundings that moved may be the chart
     message += ", or the chart did" if charted else ""
     remedy = _HOLD_BOTH_STILL if charted else _HOLD_STILL
-    bad = bad_shots(names, sure > limit)
+    bad = bad_shots(names, lower_limit > limit)
     moved = bad_shots(names, length > np.maximum(_SIGMAS * np.hypot(sigma, _FALSE_SHIFT * radius), least))
     if (unlike := np.isinf(length)).any():
         odd = _odd(unlike)
@@ -172,8 +172,8 @@ def _judge_turn(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     measured, names, limit = _measure_turn(found, limits), found.names, limits.max_object_turn_deg
     least = measured.degrees - 2 * np.hypot(measured.sigma, _FALSE_TURN_DEG)
     k = int(np.argmax(least))
-    true = np.sqrt(np.maximum(measured.shift**2 - measured.shift_sigma**2, 0))
-    figure, cost = round(float(measured.degrees[k]), 3), _DEGREES_PER_TURN * float(true.max())
+    unbiased = np.sqrt(np.maximum(measured.shift**2 - measured.shift_sigma**2, 0))
+    figure, cost = round(float(measured.degrees[k]), 3), _DEGREES_PER_TURN * float(unbiased.max())
     message = (
         f"The object turned by {figure:.1f}° ± {measured.sigma[k]:.1f}° in {names[k]}, as its visible detail shows"
     )
@@ -359,7 +359,7 @@ def focal_length(found: Evidence[ResultsUntilInfer]) -> Gate:
     least, most = found.focal_doubt
     if not most - least:
         return Gate("focal length", "pass", "known", "known", "The focal length is known", unit="")
-    cost = _lean(found.results.maps, least, most)
+    cost = _median_ray_doubt_deg(found.results.maps, least, most)
     times = np.exp(max(most, -least))
     message = f"The focal length is in doubt and may be wrong by a factor of {times:.1f}, which bends shape and depth"
     remedy = (
@@ -399,12 +399,12 @@ def _inward_share(maps: SurfaceMaps) -> float:
     return float((outwards < -_INWARD).mean()) if outwards.size else 0.0
 
 
-def _lean(maps: SurfaceMaps, least: float, most: float) -> float:
+def _median_ray_doubt_deg(maps: SurfaceMaps, least: float, most: float) -> float:
     """Change of a view ray's tilt [degrees] within the doubt of the focal length; median over the object."""
-    return float(np.median(lean(maps, least, most)[maps.mask])) if maps.mask.any() else 0.0
+    return float(np.median(ray_doubt_deg(maps, least, most)[maps.mask])) if maps.mask.any() else 0.0
 
 
-def lean(maps: SurfaceMaps, least: float, most: float) -> Floats:
+def ray_doubt_deg(maps: SurfaceMaps, least: float, most: float) -> Floats:
     """Root mean square change of each view ray's tilt (H, W) [degrees], if all focal lengths in doubt are as likely."""
     y, x = np.indices(maps.mask.shape)
     off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal

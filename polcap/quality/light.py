@@ -30,7 +30,7 @@ _TURNED = 0.35  # rad: the message states larger turns of a chart, which cost a 
 _BRIGHTER = 1.08  # times S0: the greatest that scale and registration explain; set by hand
 _EDGE_PX = 2.0  # 1σ of the blur before two shots are compared, so that misaligned edges of a print do not count
 _STILL_CLIPPED = 0.5  # share of highlights that a crossed filter should have stopped
-_FEW = 20  # px
+_FEW = 20  # px: fewer clipped ones are not judged
 _DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame for all angles: 1 to 2° at 15 %
 # of the room's light between two ambient frames: beyond, more than its polarization (60 %) causes
 _UNLIKE, _LEAST_AMBIENT, _DEGREES_PER_UNLIKE = 4.0, 0.02, 80.0  # ratio; share; 12° at .15
@@ -152,9 +152,9 @@ def _compare_crossed(image: StokesImage) -> CrossedFigures:
     clipped = image.mask & ((image.quality & int(Quality.CLIPPED)) > 0)
     still_clipped = float((clipped & ~known).sum() / max(clipped.sum(), 1))
     weight = sound.astype(np.float32)
-    smooth, whole = (cv2.GaussianBlur(part * weight, (0, 0), _EDGE_PX) for part in (body, total))
+    smooth_body, smooth_total = (cv2.GaussianBlur(part * weight, (0, 0), _EDGE_PX) for part in (body, total))
     inner = erode(sound, 2)
-    brighter = float((smooth > _BRIGHTER * whole)[inner].mean()) if inner.any() else 1.0
+    brighter = float((smooth_body > _BRIGHTER * smooth_total)[inner].mean()) if inner.any() else 1.0
     specular = float(np.maximum(total - body, 0)[sound].sum() / max(float(total[sound].sum()), 1e-9))
     return CrossedFigures(still_clipped, int(clipped.sum()), brighter, specular)
 
@@ -295,10 +295,10 @@ def _highlight_dolp(found: Evidence[ResultsUntilInfer]) -> float:
     pixels and that of the shots' gains.
     """
     maps, cues, selfcal = found.results.maps, found.results.cues, found.results.selfcal
-    both = maps.mask & cues.mask
-    both &= cues.quality & int(Quality.CLIPPED) == 0
-    towards = both & (dot(maps.normal, rays(maps.view, *maps.mask.shape)) > _TOWARDS_CAMERA)
-    if towards.sum() < max(_LEAST_TOWARDS * both.sum(), _LEAST_FACING):
+    inside = maps.mask & cues.mask
+    inside &= cues.quality & int(Quality.CLIPPED) == 0
+    towards = inside & (dot(maps.normal, rays(maps.view, *maps.mask.shape)) > _TOWARDS_CAMERA)
+    if towards.sum() < max(_LEAST_TOWARDS * inside.sum(), _LEAST_FACING):
         return float("nan")
     azimuth = np.arctan2(maps.normal[towards, 1], maps.normal[towards, 0])
     polarized = 1 - maps.normal[towards, 2] ** 2  # DoLP of small tilts, but for a factor

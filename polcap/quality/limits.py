@@ -83,12 +83,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, Meta(gt=0, le=45, description="allowed error of the ring's zero, with three angles [degrees]")
     ] = 3.0
     max_turn_fit: Annotated[
-        float,
-        Meta(
-            gt=0,
-            lt=1,
-            description="a turn is reported if it lowers the outline's misfit below this share [1]",
-        ),
+        float, Meta(gt=0, lt=1, description="a turn is reported if it lowers the outline's misfit below this share [1]")
     ] = 0.68
     min_outline_dolp: Annotated[Share, Meta(description="least allowed median polarization of the outline [1]")] = 0.03
     min_zenith_deg: Annotated[

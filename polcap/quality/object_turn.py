@@ -35,7 +35,7 @@ _LEAST_SHOT = 0.05  # of half the light: no shot of a dielectric is darker, exce
 _FLOOR = 0.01  # of the 99th percentile of the light, added before the logarithm
 _LEAST_PIXELS = 1000
 _PRIOR = np.array([1.0, 1.0, 0.03, 0.03, 0.03, 0.03])  # 1σ of shift [px], zoom [1], roll, tilts [rad]
-_CAUCHY = 2.0  # robust standard deviations
+_CAUCHY = 2.0  # robust standard deviations of the residuals: scale of the weights
 _STEPS = 5
 _FALSE_SHIFT_PX = 0.06  # 1σ of a shift that polarization imitates (docs/benchmarks/gates.md)
 _CELL = 12  # px: residuals of different cells are independent
@@ -96,8 +96,8 @@ def _relief(maps: SurfaceMaps | None, object_: ObjectMask, step: int) -> Floats:
         (x, y), (tall, wide) = (round(at) for at in maps.view.origin), maps.mask.shape
         prior = -outline.disc_radius(maps.mask) * maps.depth_prior
         height[y : y + tall, x : x + wide] = np.where(maps.mask, prior - prior[maps.mask].min(), 0)
-    whole = block_means(object_.mask, step) > 0.99
-    return np.where(whole, block_means(height, step) / step + 1, 0)
+    inside = block_means(object_.mask, step) > 0.99
+    return np.where(inside, block_means(height, step) / step + 1, 0)
 
 
 def _polarization(maps: SurfaceMaps | None, angle: Floats, shape: tuple[int, ...], step: int) -> Floats:

@@ -10,7 +10,7 @@ from polcap.formats.capture import angle_advice
 from polcap.image_values import Bools, Floats, Quality
 from polcap.optics import mueller
 from polcap.optics.frames import dot, rays, total
-from polcap.optics.resize import block_means
+from polcap.optics.resize import block_means, block_step
 from polcap.quality import flatness, rim
 from polcap.quality.gate_values import MOST_DEG, Evidence, Gate, State, at_most, lit, sentence, worded
 from polcap.quality.limits import GateLimits
@@ -22,7 +22,7 @@ from polcap.stage_values import StokesImage, SurfaceMaps
 _LEAST_RIM = 200  # pixels of outline, to estimate an angle
 _LEAST_DOLP = 0.01  # of the most polarized tenth of the outline; there the least index has ten times that
 _SAME_DEG = 5.0  # axes nearer than this are the same angle
-_SURE = 2.5  # σ between sectors of the outline: least significance of a turn
+_LEAST_SIGMAS = 2.5  # σ between sectors of the outline: least significance of a turn
 _CERTAIN = 0.8  # of the limit of the misfit: above, also good captures fit a turn (docs/benchmarks/gates.md)
 _CLEAR = 0.8  # least concentration of the AoLP about the outline, to estimate a common turn
 _ALONG = -0.3  # below: the AoLP is along the contour
@@ -48,7 +48,7 @@ _MOST_PIXELS = 6e5  # a larger picture is averaged down
 def polarized(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
     """Gate "polarized", only if no part of the outline is polarized.
 
-    It passes over a plane that faces the camera, of which maps explain the little that there is.
+    A plane that faces the camera is not judged if the maps explain its little polarization.
     """
     most = _most_dolp(found)
     if not most < _LEAST_DOLP:
@@ -191,7 +191,7 @@ def _angles(
         return Gate("angles", "fail", round(common, 1), limit, message, remedy, abs(common), unit="°")
     known = found.results.selfcal.gains.source in ("grey patches", "one exposure")
     most_misfit = limits.max_turn_fit * (1.0 if known else 0.75)  # guessed gains look like turns
-    if turn.misfit >= most_misfit or turn.sigmas < _SURE or turn.shot is None:
+    if turn.misfit >= most_misfit or turn.sigmas < _LEAST_SIGMAS or turn.shot is None:
         return Gate("angles", "pass", 0.0, limit, "No other angle fits the outline clearly better", unit="°")
     degrees, remedy = float(np.degrees(turn.angle)), sentence(angle_advice.retake(statement))
     gap = np.degrees(angle[turn.shot] + turn.angle - angle)  # between the true angle of this shot and the others
@@ -224,7 +224,7 @@ def _with_ring(gate: Gate, body: rim.RimFigures, found: Evidence[ResultsUntilSel
         return Gate("angles", "warn", "found", "noted", message, remedy, doubt, unit="")
     turn, doubt = np.degrees([selfcal.ring.offset, selfcal.ring.sigma])
     applied = selfcal.ring.correction != 0
-    noted = len(selfcal.angle) == 3 and abs(turn) > max(limits.max_ring_turn_deg, _SURE * doubt)
+    noted = len(selfcal.angle) == 3 and abs(turn) > max(limits.max_ring_turn_deg, _LEAST_SIGMAS * doubt)
     noted = noted and body.concentration > _CLEAR and abs(turn) < 45  # above: reflections, see "body"
     noted = noted and found.results.radiance.equipment.light != "one exposure"  # a sensor's angles are exact
     if gate.state != "pass" or not (applied or noted):
@@ -316,14 +316,9 @@ def _medians(maps: SurfaceMaps) -> tuple[float, float, float]:
 
 def _reduce(image: StokesImage, angle: Floats) -> tuple[Floats, Bools, Bools]:
     """Reduced pictures: light of the shots (K, h, w) from the Stokes parameters, object (h, w), valid pixels (h, w)."""
-    step = _step(image)
+    step = block_step(image.mask.size, _MOST_PIXELS)
     doubtful = Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST
     usable = (image.quality & int(doubtful)) == 0
     light = np.stack([block_means(part, step) for part in total(image.stokes)])
     mask, usable = (block_means(part.astype(np.float32), step) > 0.99 for part in (image.mask, usable))
     return np.einsum("kj,jhw->khw", mueller.analyzer(angle), light), mask, usable
-
-
-def _step(image: StokesImage) -> int:
-    """Pixels (one side) that are averaged to one of the reduced pictures."""
-    return int(np.ceil(np.sqrt(max(image.mask.size / _MOST_PIXELS, 1))))

@@ -11,6 +11,7 @@ import numpy as np
 from polcap.image_values import Bools, Floats, Quality
 from polcap.optics import frames, shade
 from polcap.optics.reduction import ObjectReduction
+from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.quality.limits import GateLimits
 from polcap.results import ResultsUntilInfer
 from polcap.stage_values import Cues, SurfaceMaps
@@ -69,16 +70,15 @@ class Rerendering:
     def residuals(self, inside: Bools) -> dict[str, list[float]]:
         """Difference of photograph and re-rendering at each angle: `rms` without outliers, and share of `outliers`.
 
-        Pixels `inside` (H, W) count. The rms is relative to white. An outlier differs by more than five standard
-        deviations, which the median of the absolute differences gives: a few pixels of a highlight do not carry the
-        figure.
+        Pixels `inside` (H, W) count. The rms is relative to white. An outlier differs by more than five robust standard
+        deviations: a few pixels of a highlight do not carry the figure.
         """
         found: dict[str, list[float]] = {"rms": [], "outliers": []}
         for measured, predicted in zip(self.measured, self.predicted):
             size = np.abs(measured - predicted)[inside]
-            far = size > _OUTLIER * max(1.4826 * float(np.median(size)), 1e-6) if size.size else size > 0
-            found["rms"].append(float(np.sqrt(np.mean(size[~far] ** 2))))
-            found["outliers"].append(float(far.mean()))
+            outlier = size > _OUTLIER * max(MAD_TO_SIGMA * float(np.median(size)), 1e-6) if size.size else size > 0
+            found["rms"].append(float(np.sqrt(np.mean(size[~outlier] ** 2))))
+            found["outliers"].append(float(outlier.mean()))
         return found
 
 
@@ -93,7 +93,8 @@ def rerender(small: ReducedResult, ior: float) -> Rerendering:
     white = max(float(np.quantile(light, WHITE_QUANTILE)), 1e-6) if light.size else 1.0
 
     shown = scale * lit
-    bright = (either := np.maximum(light, shown)) >= (np.quantile(either, _BRIGHTEST) if either.size else 0.0)
+    brighter = np.maximum(light, shown)
+    bright = brighter >= (np.quantile(brighter, _BRIGHTEST) if brighter.size else 0.0)
     measured, predicted = [], []
     for angle, shot in zip(small.angle, shots):
         measured.append(seen * (1 + small.ratio[0] * np.cos(2 * angle) + small.ratio[1] * np.sin(2 * angle)) / white)
@@ -130,13 +131,13 @@ def under_flash(maps: SurfaceMaps, angle: Floats, ior: float) -> tuple[Floats, F
 def _agreement(measured: Floats, rendered: Floats) -> float:
     """Agreement of two polarizations S1/S0, S2/S0 (2, N), −1…1; NaN without pixels.
 
-    For each pixel the smaller DoLP times the cosine between both, relative to the larger DoLP: 1 if both are equal, 0
-    for other directions or if one of them is unpolarized, −1 across.
+    The sum of the smaller DoLPs times the cosine between both, over the sum of the larger DoLPs: 1 if both are equal, 0
+    if one is unpolarized or they differ by 45°, −1 if they are across each other.
     """
     one, other = (np.linalg.norm(ratio, axis=0) for ratio in (measured, rendered))
     cosine = (measured * rendered).sum(axis=0) / np.maximum(one * other, 1e-9)
-    least, most = (np.minimum(bound(one, other), _MOST_DOLP) for bound in (np.minimum, np.maximum))
-    return float((least * cosine).sum() / most.sum()) if most.sum() > 0 else float("nan")
+    smaller, larger = np.minimum(np.minimum(one, other), _MOST_DOLP), np.minimum(np.maximum(one, other), _MOST_DOLP)
+    return float((smaller * cosine).sum() / larger.sum()) if larger.sum() > 0 else float("nan")
 
 
 def measure(results: ResultsUntilInfer) -> Rerendering:

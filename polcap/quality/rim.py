@@ -85,7 +85,7 @@ def off_border(band: Bools) -> Bools:
     return inner
 
 
-def fit_angle_error(at: Rim, angle: Floats, least: float) -> AngleError:
+def fit_angle_error(band: Rim, angle: Floats, least: float) -> AngleError:
     """Fit an angle error to the outline, of all shots or of at least `least` rad of one; angle (K,) rad as stated.
 
     An error of one shot imitates a smaller one of all, which fits worse.
@@ -94,48 +94,49 @@ def fit_angle_error(at: Rim, angle: Floats, least: float) -> AngleError:
     steps = np.sort([*-sizes, 0.0, *sizes])
 
     def misfit(shot: int | None, step: float) -> float:
-        return float(np.median(_misfit(at, angle + step * _turns(shot, angle)))) + 1e-9
+        return float(np.median(_misfit(band, angle + step * _pattern(shot, angle)))) + 1e-9
 
     shared, step = min((misfit(None, step), step) for step in steps)
     best = AngleError(None, float(step), 1.0, 0.0)
     for shot, step in itertools.product(range(len(angle)), steps[np.abs(steps) >= least]):
         if (ratio := misfit(shot, step) / shared) < best.misfit:
             best = AngleError(shot, float(step), ratio, 0.0)
-    return replace(best, sigmas=_sigmas(at, angle, np.sign(best.angle) * _turns(best.shot, angle)))
+    return replace(best, sigmas=_significance(band, angle, np.sign(best.angle) * _pattern(best.shot, angle)))
 
 
-def _turns(shot: int | None, angle: Floats) -> Floats:
+def _pattern(shot: int | None, angle: Floats) -> Floats:
     """Pattern (K,) of an angle error: 1 for the shot with the error, 0 for the others; None: 1 for all."""
     return np.ones(len(angle)) if shot is None else (np.arange(len(angle)) == shot).astype(float)
 
 
-def _misfit(at: Rim, angle: Floats) -> Floats:
+def _misfit(band: Rim, angle: Floats) -> Floats:
     """Residual (N,) of the shots' light along the outline after a fit of 1 and cos 2(θ − φ)."""
-    return np.asarray(np.linalg.norm(_unpolarized(at, angle), axis=0))
+    return np.asarray(np.linalg.norm(_unpolarized(band, angle), axis=0))
 
 
-def _unpolarized(at: Rim, angle: Floats) -> Floats:
+def _unpolarized(band: Rim, angle: Floats) -> Floats:
     """Light (K, N) of the shots along the outline that 1 and cos 2(θ − φ) do not explain."""
-    wave = np.cos(2 * (angle[:, None] - at.azimuth))
+    wave = np.cos(2 * (angle[:, None] - band.azimuth))
     wave = wave - wave.mean(0)
-    light = at.light - at.light.mean(0)
+    light = band.light - band.light.mean(0)
     share = (wave * light).sum(0) / np.maximum((wave * wave).sum(0), 1e-9)
     return np.asarray(light - share * wave)
 
 
-def _sigmas(at: Rim, angle: Floats, way: Floats) -> float:
+def _significance(band: Rim, angle: Floats, pattern: Floats) -> float:
     """Significance of an angle error: its linear estimate over the jackknife error of that estimate.
 
-    `way` (K,) is the pattern of the error over the shots (`_turns`) times its sign. The estimate keeps its sign, so
+    `pattern` (K,) is that of the error over the shots (`_pattern`), times its sign. The estimate keeps its sign, so
     errors of the outline, which differ in sign from sector to sector, cancel.
     """
-    away = 2 * (angle[:, None] - at.azimuth)
-    wave, slope, light = (part - part.mean(0) for part in (np.cos(away), -2 * np.sin(away) * way[:, None], at.light))
+    away = 2 * (angle[:, None] - band.azimuth)
+    parts = np.cos(away), -2 * np.sin(away) * pattern[:, None], band.light
+    wave, slope, light = (part - part.mean(0) for part in parts)  # slope: derivative of the wave by the error
     power = np.maximum((wave * wave).sum(0), 1e-9)
     share = (wave * light).sum(0) / power
     slope = slope - (wave * slope).sum(0) / power * wave
-    moment = np.bincount(at.sector, (slope * (light - share * wave)).sum(0))
-    weight = np.bincount(at.sector, (slope * slope).sum(0)) * float(np.median(share))
+    moment = np.bincount(band.sector, (slope * (light - share * wave)).sum(0))
+    weight = np.bincount(band.sector, (slope * slope).sum(0)) * float(np.median(share))
     used = np.flatnonzero(weight)
     if len(used) < _LEAST_SECTORS:
         return 0.0
@@ -143,10 +144,10 @@ def _sigmas(at: Rim, angle: Floats, way: Floats) -> float:
     return float(moment.sum() / weight.sum() / max(float(jackknife(without)), 1e-9))
 
 
-def summarize(at: Rim, angle: Floats) -> RimFigures:
+def summarize(band: Rim, angle: Floats) -> RimFigures:
     """Summarize polarization and brightness of the outline; angle (K,) rad."""
-    mean, turned_sigma = outline.mean_and_sigma(*outline.phasor(at, angle))
-    dolp = np.abs(outline.polarization(at, angle))
+    mean, turned_sigma = outline.mean_and_sigma(*outline.phasor(band, angle))
+    dolp = np.abs(outline.polarization(band, angle))
     return RimFigures(
         dolp=float(np.median(dolp)),
         dolp_most=float(np.quantile(dolp, 0.9)),
@@ -154,22 +155,22 @@ def summarize(at: Rim, angle: Floats) -> RimFigures:
         concentration=abs(mean),
         turned=float(np.angle(mean) / 2),
         turned_sigma=turned_sigma,
-        brightness=float(np.median(at.total)),
+        brightness=float(np.median(band.total)),
     )
 
 
-def side_light(at: Rim, angle: Floats) -> Floats:
+def side_light(band: Rim, angle: Floats) -> Floats:
     """Measure one-sided extra light in each shot (K,): amplitude of the first harmonic of its relative light in φ.
 
     Polarization changes opposite sides of a rounded outline equally. A lamp that was on during one shot does not.
     One side of a box may be polarized more than the other. Polarization along φ explains all of that, but leaves
     `_LAMP` or more of a lamp's light.
     """
-    phi = at.azimuth
+    phi = band.azimuth
     basis = np.stack([np.ones_like(phi), *(f(n * phi) for n in (1, 2) for f in (np.cos, np.sin))], axis=1)
 
     def uneven(light: Floats) -> Floats:
-        found = np.linalg.lstsq(basis, light.T, rcond=None)[0]  # (5, K)
-        return np.asarray(np.hypot(found[1], found[2]))
+        harmonics = np.linalg.lstsq(basis, light.T, rcond=None)[0]  # (5, K)
+        return np.asarray(np.hypot(harmonics[1], harmonics[2]))
 
-    return np.asarray(np.minimum(uneven(at.light), uneven(_unpolarized(at, angle)) / _LAMP))
+    return np.asarray(np.minimum(uneven(band.light), uneven(_unpolarized(band, angle)) / _LAMP))

@@ -24,17 +24,17 @@ from polcap.stage_values import AngleStack, StokesImage
 
 _EVEN_STEPS = (1.3, 20.0)  # from one exposure to the next: less is no bracket, more leaves a gap
 # frames of a bracket count as equal if the step in pixels is below the first and in metadata above the second
-_ALIKE, _PROMISED = 1.15, 1.4
+_EQUAL_STEP, _STATED_STEP = 1.15, 1.4
 _MISFIRE = 0.2  # change of one frame's light that fails; smaller ones are measured and corrected
 _CLIPPED_HIGHLIGHTS = 0.001  # of the object: from .002 on roughness errs by .06 more (docs/benchmarks/gates.md)
 _FULL = 0.95  # of the white level
 _MOST_CLIPPED = 0.9975  # from here on the pictures do not show how bright the object is
 _STOPS, _STOPS_PER_HALVING = 1.5, 0.75  # too bright; per halving of the unclipped share (docs/benchmarks/gates.md)
 _CLIPPED_PICTURE = 0.1  # of a picture in which no object was found; a bright backdrop may clip
-_WHOLE = 0.5  # share of the object that moving parts do not reach in every shot
-DEGREES_PER_NOISE = 300.0  # of the normals, per false degree of polarization
+_MOST_MOVING = 0.5  # share of the object; moving parts do not cover more in every shot
+DEGREES_PER_NOISE = 300.0  # of the normals, per unit of false DoLP
 _USUAL_CHANGE = 0.02  # of the light of a shot, 1σ; the polarization of flat faces looks like 8 to 12 %
-_EXPLAINED = 0.5  # agreement of the re-rendering: a can .84, with a chart that mirrors −.1 (three objects)
+_EXPLAINED = 0.5  # agreement of the re-rendering that confirms gains: a can .84, with a chart that mirrors −.1
 _GLOSS_PART = 0.3  # of the chart's gloss goes into gains taken from its light patches
 
 
@@ -45,11 +45,11 @@ def exposures(found: Evidence[ResultsUntilHdr]) -> Gate:
     if len(ratio) == 1:
         remedy = "Shoot a bracket: it holds highlights and shadows at once"
         return Gate("exposures", "warn", 1.0, None, "One exposure per shot", remedy, unit="×")
-    steps, promised, (least, most) = ratio[1:] / ratio[:-1], _promised_steps(radiance), _EVEN_STEPS
+    steps, stated, (least, most) = ratio[1:] / ratio[:-1], _stated_step(radiance), _EVEN_STEPS
     smallest, largest = float(steps.min()), float(steps.max())
     message = f"{len(ratio)} exposures per shot, {ratio[0]:.3g} to {ratio[-1]:.3g} times the reference"
-    if smallest < _ALIKE and promised > _PROMISED:
-        message = f"The frames of a bracket are equal, but the camera states steps of {promised:.2g} times"
+    if smallest < _EQUAL_STEP and stated > _STATED_STEP:
+        message = f"The frames of a bracket are equal, but the camera states steps of {stated:.2g} times"
         remedy = "Bracket by flash power, aperture or ISO: shutter time does not change a flash exposure"
         if radiance.equipment.light == "steady":
             remedy = f"Was a flash on? {remedy}"
@@ -64,7 +64,7 @@ def exposures(found: Evidence[ResultsUntilHdr]) -> Gate:
     return Gate("exposures", "warn", round(smallest, 3), least, message, remedy, unit="×")
 
 
-def _promised_steps(radiance: AngleStack) -> float:
+def _stated_step(radiance: AngleStack) -> float:
     """Smallest ratio of successive exposures of the bracket, by metadata; NaN without metadata."""
     stated = np.sort(radiance.bracket.exif_ratio[0])
     return float((stated[1:] / stated[:-1]).min()) if np.isfinite(stated).all() and len(stated) > 1 else float("nan")
@@ -160,7 +160,7 @@ def stillness(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
         bad_shots(found.names, fraction > limits.max_ghost),
         np.nan_to_num(found.blur_px) > limits.max_blur_px,
     )
-    if blurred.any() and limits.max_ghost < fraction[k] <= _WHOLE:
+    if blurred.any() and limits.max_ghost < fraction[k] <= _MOST_MOVING:
         return Gate("stillness", "not judged", None, None, "The gate 'sharpness' leaves nothing to judge here", unit="")
     if rescue := leave_out(found, np.asarray(blurred), limits):  # it shows something else, not less sharp
         remedy = f"{rescue}; or take the bracket again: a frame shows something else"
@@ -175,7 +175,7 @@ def _has_wrong_levels(radiance: AngleStack, ghost: Floats, limits: GateLimits) -
     bracket = radiance.bracket
     black = bool(bracket.black.error.any()) and not bracket.black.corrected
     curved = np.nanmax(np.abs(np.nan_to_num(bracket.curvature)), axis=1) > limits.max_tone_curvature
-    return black or bool((ghost > _WHOLE).all() or ((ghost > _WHOLE) & curved).any())
+    return black or bool((ghost > _MOST_MOVING).all() or ((ghost > _MOST_MOVING) & curved).any())
 
 
 def leave_out(found: Evidence[ResultsUntilHdr], bad: Bools, limits: GateLimits) -> str:
@@ -233,7 +233,7 @@ def gains(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Iterator[
     shot = measured.gain.mean(1)
     light = shot[:, None] * radiance.bracket.exposure_ratio.mean(2)  # (K, E)
     off = light / np.median(light, axis=0) - 1
-    each = np.median(off, axis=1)
+    each = np.median(off, axis=1)  # (K,) change of each shot's light
     limit = limits.max_gain_change
     brighter = each > limit  # it may show another lamp, which no gain corrects
     k = int(np.argmax(np.where(brighter.any() & ~brighter, 0, np.abs(each))))

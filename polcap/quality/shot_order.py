@@ -14,9 +14,9 @@ from polcap.results import ResultsUntilInfer, ResultsUntilSelfcal
 from polcap.stage_values import AngleStack, ObjectMask, OrderTest, OutlineCheck
 
 _LIKELIER = 1.1  # factor between expected errors that decides on an order (docs/benchmarks/gates.md)
-_LIKELIER_SMALL, _SMALL_PX = 1.5, 5000  # the same for objects of fewer pixels, of which good ones reach 1.2
-_LIKELIER_FLAT = 1.8  # the same for flat objects: good ones reach 1.5, wrong orders 2.2
-_LIKELIER_UNEXPLAINED, _ORDER_UNEXPLAINED = 1.3, 0.3  # the same where maps explain less polarization: good ones 1.2
+_LIKELIER_SMALL, _SMALL_PX = 1.5, 5000  # the same for objects of fewer pixels: good captures reach 1.2
+_LIKELIER_FLAT = 1.8  # the same for flat objects: good captures reach 1.5, wrong orders 2.2
+_LIKELIER_UNEXPLAINED, _ORDER_UNEXPLAINED = 1.3, 0.3  # the same if maps explain less than this: good captures 1.2
 _BOX_CONTOUR, _BOX_EXPLAINED = 0.35, 0.6  # three good boxes: factors 1.6, 2.1 and 2.3; .76, .69 and .68 explained
 _ORDER_EXPLAINED = 0.4  # part of the polarization from which maps confirm an order: wrong ones up to .26
 
@@ -95,8 +95,8 @@ def _hides_order(seen: flatness.Flatness | None) -> bool:
 def _undecided(other: str, outline: OutlineCheck, radiance: AngleStack) -> Gate:
     """Gate on an order of the shots that another one matches."""
     message = f"The order {other} fits as well as the stated one (fit of the outline {outline.concentration:.2f} of 1)"
-    surer = "a rounded object or a chart" + ("" if len(radiance.angle) > 3 else " or four angles")
-    remedy = sentence(f"{angle_advice.check_statement(radiance.equipment.angles)}; {surer} would decide")
+    decisive = "a rounded object or a chart" + ("" if len(radiance.angle) > 3 else " or four angles")
+    remedy = sentence(f"{angle_advice.check_statement(radiance.equipment.angles)}; {decisive} would decide")
     return Gate("order", "warn", "cannot tell", "as stated", message, remedy, unit="")
 
 

@@ -78,7 +78,7 @@ MEASURES = {  # the function that measures each figure
     "pushed": (geometry, "_measure_shift"), "turn": (geometry, "_measure_turn"),
     "edge_blur": (geometry, "_edge_blurs"),
     "rendered": (rerendering, "measure"), "own_error": (polarization, "_own_error_deg"),
-    "charted": (geometry, "_chart_share"), "lean": (geometry, "_lean"),
+    "charted": (geometry, "_chart_share"), "lean": (geometry, "_median_ray_doubt_deg"),
     "noise": (shot_exposure, "noise_dolp"), "crossed": (light, "_compare_crossed"),
     "ill_posed": (polarization, "_ill_posed"), "medians": (polarization, "_medians"),
     "outline": (polarization, "_outline"), "flatness": (flatness, "measure"), "most_dolp": (polarization, "_most_dolp"),

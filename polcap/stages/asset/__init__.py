@@ -27,7 +27,7 @@ from polcap.stages.asset.ambient_occlusion import ambient_occlusion
 
 Bits = Literal[8, 16]  # of a texture's channel
 _EXTRAS = ("displacement", "curvature", "object_normal")
-_CURVATURE_SIGMA_PX, _CURVATURE_RANGE = 1.0, 10.0  # 1σ of the smoothing; curvature of white, over the object's
+_CURVATURE_SIGMA_PX, _CURVATURE_RANGE = 1.0, 10.0  # 1σ of the smoothing; curvature of white, times object's radius
 _LEAST_Z = 0.05  # of a tangent-space normal, which must leave the surface (glTF: blue above one half)
 
 
@@ -73,16 +73,17 @@ def build(maps: TextureMaps, mesh: Mesh, settings: AssetSettings, bits: Bits = 8
     detail of the RAW pixels, the base color has twice their size (2H, 2W, 3).
     """
     specular = np.clip(maps.specular, 0.0, 1.0)
-    greatest = specular.max(axis=-1)
-    top = float(greatest[maps.mask].max(initial=0.0))
-    entry, _ = fresnel.transmission(np.float64(1.0), settings.ior)
+    f0 = specular.max(axis=-1)
+    most_f0 = float(f0[maps.mask].max(initial=0.0))
+    transmittance, _ = fresnel.transmission(np.float64(1.0), settings.ior)
     roughness, known = _integers(maps.roughness, bits), _without_outline(maps.mask)
-    full, detail = np.full_like(roughness, np.iinfo(roughness.dtype).max), maps.detail if settings.raw_pixels else None
-    base = maps.diffuse * np.float32(entry**2) / (1 - np.minimum(greatest, 0.99))[..., None]
+    full = np.full_like(roughness, np.iinfo(roughness.dtype).max)  # no occlusion
+    detail = maps.detail if settings.raw_pixels else None
+    base = maps.diffuse * np.float32(transmittance**2) / (1 - np.minimum(f0, 0.99))[..., None]
     base = fill_outward(base.astype(np.float32), known)
     others = [
         np.stack([full, roughness, np.zeros_like(roughness)], axis=-1),
-        _srgb(specular / max(top, 1e-9), bits),
+        _srgb(specular / max(most_f0, 1e-9), bits),
     ]
     filled = fill_outward(np.concatenate(others, axis=-1), known)
     packed, specular_color = (np.ascontiguousarray(filled[..., k : k + 3]) for k in (0, 3))
@@ -92,7 +93,7 @@ def build(maps: TextureMaps, mesh: Mesh, settings: AssetSettings, bits: Bits = 8
         occlusion_roughness_metallic=packed,
         normal=_integers(tangent_space(maps, mesh) / 2 + 0.5, bits),
         specular_color=specular_color,
-        specular_factor=(top / float(fresnel.normal_reflectance(settings.ior)),) * 3,
+        specular_factor=(most_f0 / float(fresnel.normal_reflectance(settings.ior)),) * 3,
         ior=settings.ior,
         albedo_sigma=maps.albedo_sigma,
     )
@@ -107,7 +108,7 @@ def _with_detail(albedo: Floats, detail: Floats, bits: Bits) -> TexturePixels:
 
 def with_mesh(asset: Asset, maps: TextureMaps, mesh: Mesh) -> Asset:
     """A copy of the asset with another mesh of the same maps, and the normal texture that fits this mesh."""
-    return replace(asset, mesh=mesh, normal=_as(asset.normal, tangent_space(maps, mesh) / 2 + 0.5))
+    return replace(asset, mesh=mesh, normal=_integers_like(asset.normal, tangent_space(maps, mesh) / 2 + 0.5))
 
 
 def with_extras(asset: Asset, maps: SurfaceMaps, depth: Floats, occlusion: bool) -> Asset:
@@ -120,13 +121,13 @@ def with_extras(asset: Asset, maps: SurfaceMaps, depth: Floats, occlusion: bool)
     filled = fill_outward(np.concatenate([height[..., None], maps.normal / 2 + 0.5], axis=-1), maps.mask)
     packed = asset.occlusion_roughness_metallic.copy()
     if occlusion:
-        packed[..., 0] = _as(packed, ambient_occlusion(maps, depth))
+        packed[..., 0] = _integers_like(packed, ambient_occlusion(maps, depth))
     return replace(
         asset,
         occlusion_roughness_metallic=packed,
         displacement=_integers(np.ascontiguousarray(filled[..., 0]), 16),
         curvature=_integers(curvature(maps), 16),
-        object_normal=_as(asset.normal, filled[..., 1:]),
+        object_normal=_integers_like(asset.normal, filled[..., 1:]),
     )
 
 
@@ -144,7 +145,7 @@ def turn(asset: Asset, angle_deg: int) -> Asset:
     kinds = {name: value.astype(getattr(mesh, name).dtype) for name, value in turned.items()}
     space = asset.object_normal
     if space is not None:
-        space = _as(space, (2 * (space / np.iinfo(space.dtype).max) - 1) @ rotation.T / 2 + 0.5)
+        space = _integers_like(space, (2 * (space / np.iinfo(space.dtype).max) - 1) @ rotation.T / 2 + 0.5)
     return replace(asset, mesh=replace(mesh, **kinds), object_normal=space, turned_deg=asset.turned_deg + angle_deg)
 
 
@@ -202,7 +203,7 @@ def _with_sizes(asset: Asset, shape: Callable[[TexturePixels], tuple[int, int]])
         if before is not None:
             value = _resize(before, shape(before)) / np.iinfo(before.dtype).max
             value = frames.unit(2 * value - 1) / 2 + 0.5 if name.endswith("normal") else value
-            textures[name] = _as(before, value)
+            textures[name] = _integers_like(before, value)
     return replace(asset, **textures)
 
 
@@ -225,11 +226,11 @@ def tangent_space(maps: TextureMaps, mesh: Mesh) -> Floats:
 
     A vector (x, y, z) means the normal x t + y b + z n, with tangent, bitangent and normal of the mesh at this pixel.
     """
-    at, covered = rasterize_frames(mesh, *maps.mask.shape)
-    at, covered = at[maps.mask[covered]], covered & maps.mask
-    # n and t are interpolated separately, so they are neither unit nor square to each other: solve, do not project
-    n, t = frames.unit(at[:, :3]), frames.unit(at[:, 3:6])
-    b = frames.cross(n, t) * np.where(at[:, 6:] < 0, np.float32(-1), np.float32(1))
+    frame, covered = rasterize_frames(mesh, *maps.mask.shape)
+    frame, covered = frame[maps.mask[covered]], covered & maps.mask
+    # n and t are interpolated separately, so they are neither unit nor orthogonal: solve, do not project
+    n, t = frames.unit(frame[:, :3]), frames.unit(frame[:, 3:6])
+    b = frames.cross(n, t) * np.where(frame[:, 6:] < 0, np.float32(-1), np.float32(1))
     m = maps.normal[covered]
     across = frames.cross(t, b)
     local = np.stack([frames.dot(m, v) for v in (frames.cross(b, n), frames.cross(n, t), across)], axis=-1)
@@ -246,8 +247,8 @@ def _integers(value: Floats, bits: Bits) -> TexturePixels:
     return np.asarray(np.rint(np.clip(value, 0.0, 1.0) * (2**bits - 1)), dtype=np.uint8 if bits == 8 else np.uint16)
 
 
-def _as(texture: TexturePixels, value: Floats) -> TexturePixels:
-    """Values 0…1 as integers of the type of a texture."""
+def _integers_like(texture: TexturePixels, value: Floats) -> TexturePixels:
+    """Values 0…1 as integers of the type of `texture`."""
     return _integers(value, 8 if texture.dtype == np.uint8 else 16)
 
 

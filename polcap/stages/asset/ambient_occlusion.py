@@ -13,7 +13,7 @@ from polcap.optics import frames
 from polcap.optics.projection import back_project
 from polcap.stage_values import SurfaceMaps
 
-_SIDE = 512  # px, at most, of the longer side at which it is computed: it varies slowly
+_SIDE = 512  # px: longest side at which occlusion is computed, because it varies slowly
 _DIRECTIONS = 16
 _GROWTH = 1.05  # ratio of successive distances
 
@@ -38,10 +38,10 @@ def ambient_occlusion(maps: SurfaceMaps, depth: Floats) -> Floats:
     for angle in 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
         along = normal[..., 0] * np.cos(angle) - normal[..., 1] * np.sin(angle)  # y runs up, rows run down
         tilt = np.arctan2(along, normal[..., 2])
-        rise = -np.sin(tilt)  # cosine of the angle between horizon and optical axis; the tangent plane's at least
+        rise = -np.sin(tilt)  # cosine from optical axis to horizon, at first the tangent plane's
         for distance in distances:
-            x, y = reach + round(distance * np.cos(angle)), reach + round(distance * np.sin(angle))
-            towards = around[y : y + mask.shape[0], x : x + mask.shape[1]] - point
+            left, top = reach + round(distance * np.cos(angle)), reach + round(distance * np.sin(angle))
+            towards = around[top : top + mask.shape[0], left : left + mask.shape[1]] - point
             rise = np.fmax(rise, towards[..., 2] / np.maximum(np.sqrt(frames.dot(towards, towards)), 1e-12))
         horizon = np.arccos(np.clip(rise, -1, 1))
         lit = np.cos(tilt) - np.cos(2 * horizon - tilt) + 2 * horizon * np.sin(tilt)

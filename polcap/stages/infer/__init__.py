@@ -30,13 +30,12 @@ from polcap.stages import stage
 from polcap.stages.infer import analytic, highlights, learned
 
 _MAPS_SIGMA = 0.05  # of the estimators' own albedos, with a correct scale (docs/benchmarks/gates.md)
-# A chart that gets half of the object's light doubles the albedo, often beyond that of white things. Limit of the
-# brightest parts (ln) and its width; one chart in a hundred is assumed to (docs/benchmarks/gates.md). Cosines of the
-# surfaces that are judged: they lean too far to show a highlight.
-_WHITE, _WHITE_SPREAD, _BRIGHTEST = -0.2, 0.04, 95  # percentile
-_LEANING = (0.5, 0.87)
-_HALF, _ODDS = log(2), 0.01
-_BAND = 2.0  # px, 1σ: shading in finer detail predicts the shading that is finer than a superpixel
+# a chart with half of the object's light doubles the albedo, often beyond that of white things (the same page)
+_WHITE, _WHITE_SPREAD = -0.2, 0.04  # ln of the greatest albedo of white things, and the width of this limit
+_BRIGHTEST = 95  # percentile of the albedos that is compared with the limit
+_LEANING = (0.5, 0.87)  # range of the cosines of the judged surfaces: they lean too far to show a highlight
+_LN_DOUBLED, _ODDS_OF_DOUBLED = log(2), 0.01  # error of the scale by such a chart; one in a hundred is assumed
+_BAND = 2.0  # px, 1σ: shading finer than this predicts the shading finer than a superpixel
 _DETAIL_AROUND = 4.0  # px, 1σ of the means of power, and of the albedo
 # factors on the power of each explanation of fine detail (docs/benchmarks/albedo.md)
 _SHADING = 4.0  # on that of the normals' shading
@@ -80,15 +79,14 @@ def _scale_error(cues: Cues, maps: SurfaceMaps, sigma: float) -> float:
     """Relative error (1σ) of the scale of all albedos: `sigma` of the chart's light, and the risk that it is doubled.
 
     A chart behind the object, or in a shadow, gets less light than the object. The only sign is an albedo above that of
-    white things. It must be above even if the scale errs by `sigma`, and even as S0 over the root of the shading, which
-    is at most the albedo.
+    white things. A lower limit of the albedo is compared: S0 over the root of the shading, less the error `sigma`.
     """
     cosine = frames.dot(maps.normal, cues.rays)
     leaning = cues.mask & (cues.quality == 0) & (cosine > _LEANING[0]) & (cosine < _LEANING[1])
-    light = cues.radiance[leaning].max(axis=-1) / np.sqrt(cosine[leaning])
-    least = log(max(float(np.percentile(light, _BRIGHTEST)), 1e-6)) - sigma if len(light) else -inf
-    odds = _ODDS * (1 + exp((least - _WHITE) / _WHITE_SPREAD))
-    return hypot(sigma, _MAPS_SIGMA, _HALF * sqrt(odds / (1 + odds)))
+    albedo = cues.radiance[leaning].max(axis=-1) / np.sqrt(cosine[leaning])
+    least = log(max(float(np.percentile(albedo, _BRIGHTEST)), 1e-6)) - sigma if len(albedo) else -inf
+    odds = _ODDS_OF_DOUBLED * (1 + exp((least - _WHITE) / _WHITE_SPREAD))
+    return hypot(sigma, _MAPS_SIGMA, _LN_DOUBLED * sqrt(odds / (1 + odds)))
 
 
 def _select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:
@@ -110,7 +108,7 @@ def _select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:
 
 
 def _power_of_shading(cues: Cues, maps: SurfaceMaps) -> Floats:
-    """Squared logarithm (H, W) of the fine shading that the normals show, and that their error may hide."""
+    """Squared logarithm (H, W) of the fine shading of the normals, plus that which their expected error may cause."""
     albedo = np.maximum(masked_mean(maps.diffuse.mean(axis=-1), cues.mask, _DETAIL_AROUND), _DARKEST)
     gloss, alpha = maps.specular.mean(axis=-1), np.maximum(maps.roughness**2, _DARKEST)
 
@@ -124,5 +122,5 @@ def _power_of_shading(cues: Cues, maps: SurfaceMaps) -> Floats:
     error = np.radians(maps.confidence)
     light = log_light(zenith)
     fine = light - masked_mean(light, cues.mask, _BAND)
-    doubt = (log_light(np.maximum(zenith - error, 0)) - log_light(zenith + error)) / 2
-    return np.asarray(_SHADING * fine**2 + _UNCERTAIN * doubt**2)
+    of_error = (log_light(np.maximum(zenith - error, 0)) - log_light(zenith + error)) / 2
+    return np.asarray(_SHADING * fine**2 + _UNCERTAIN * of_error**2)

@@ -63,11 +63,11 @@ def invert(cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -
     axis = ratio / np.sqrt(squared + 1e-12)
     if guide is None:
         phi = np.arctan2(axis[1], axis[0]) / 2
-        found = half_turns.resolve(_local(cos_zenith, phi, cues.rays), cues.mask)
+        found = half_turns.resolve(_normals_on_rays(cos_zenith, phi, cues.rays), cues.mask)
         phi, certainty = np.where(found.turned, phi + np.pi, phi), 1 - 2 * found.doubt
     else:
         phi, certainty = _azimuth_by_guide(axis, cues.rays, *guide)
-    normal = frames.from_ray_frame(_local(cos_zenith, phi, cues.rays), cues.rays)
+    normal = frames.from_ray_frame(_normals_on_rays(cos_zenith, phi, cues.rays), cues.rays)
     return np.asarray(normal), _expected_error(zenith, dolp, sigma, certainty, cues), cos_zenith
 
 
@@ -108,13 +108,13 @@ def _azimuth_by_guide(axis: Floats, rays: Floats, normal: Floats, sigma: Floats)
     from scipy.special import erf  # here: importing it costs .2 s of every start
 
     phi = np.arctan2(axis[1], axis[0]) / 2
-    turned = frames.axis_on_ray(phi, rays)
-    along = normal[..., 0] * np.cos(turned) + normal[..., 1] * np.sin(turned)
+    azimuth = frames.axis_on_ray(phi, rays)
+    agreement = normal[..., 0] * np.cos(azimuth) + normal[..., 1] * np.sin(azimuth)
     spread = np.radians(np.maximum(sigma, 1.0))
-    return np.where(along < 0, phi + np.pi, phi), np.asarray(erf(np.abs(along) / (np.sqrt(2) * spread)))
+    return np.where(agreement < 0, phi + np.pi, phi), np.asarray(erf(np.abs(agreement) / (np.sqrt(2) * spread)))
 
 
-def _local(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:
+def _normals_on_rays(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:
     """Unit normals (H, W, 3) in the frame of each ray, from cosines of the zenith and azimuths φ (H, W)."""
     x, y = frames.axis_across(phi, rays)
     share = np.sqrt(np.maximum(1 - cos_zenith**2, 0) / (x * x + y * y))
@@ -145,8 +145,8 @@ def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]
     opening removes, where the zenith is under 35°. The rest of the radiance, divided by cos θ T₊(θ) T₊(0), is the
     albedo. The cosine has a lower limit, because reflected room light brightens the outline.
     """
-    size = max(5, round(_HIGHLIGHT * np.sqrt(max(cues.mask.sum(), 1)))) | 1
-    radiance = highlights.fill(cues.radiance, cues) / cues.rays[..., 2:] ** 2
+    size = max(5, round(_HIGHLIGHT * np.sqrt(max(cues.mask.sum(), 1)))) | 1  # odd
+    radiance = highlights.fill(cues.radiance, cues) / cues.rays[..., 2:] ** 2  # off the axis the flash is farther
     darkest = cv2.GaussianBlur(radiance.min(-1), (0, 0), 1.0)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     opened = cv2.GaussianBlur(cv2.morphologyEx(darkest, cv2.MORPH_OPEN, kernel), (0, 0), size / 6)

@@ -15,11 +15,11 @@ lens, in units of a white plane that faces it, the mirrored light is
 and reaches this limit where the surface faces the lens. So the brightest highlight bounds the roughness from above.
 Mirrored light is what S0 has beyond the albedo, and therefore less certain on a bright material.
 
-If a material does not show both parts, those that may mirror the flash and those that cannot, a broad highlight looks
-like a bright albedo, and the network's roughness is joined with that of usual materials.
+A material must show parts that may mirror the flash, and parts that cannot. Otherwise a broad highlight looks like a
+bright albedo, and the network's roughness is combined with that of usual materials.
 
-**Expected error of the roughness.** Its error is common to a material, and greater where no highlight confirms the
-network, or a clipped one; and where the network also expects large errors of the normals.
+**Expected error of the roughness.** It is common to a material. It is greater if no highlight confirms the network, if
+the highlight is clipped, and if the network expects large errors of the normals.
 """
 
 from dataclasses import replace
@@ -34,26 +34,26 @@ from polcap.optics.morphology import dilate, masked_mean
 from polcap.optics.outline import disc_radius
 from polcap.stage_values import Cues, SurfaceMaps
 
-REACHED = 0.05  # least share of known pixels under a Gaussian for a mean
-# specular share of S0: below the first the estimator's albedo is used, above the second that of the crossed shot
-_GLOSS = (0.03, 0.1)
+LEAST_KNOWN = 0.05  # least weight of the known pixels under a filter, for a mean of them
+# specular share of S0: below the first the estimator's albedo counts, above the second that of the crossed shot
+_SPECULAR_SHARES = (0.03, 0.1)
 _AROUND = 0.05  # 1σ of the continuation, over the object's radius
 _LEAST_PX = 2.0
 _LEAST_COSINE = 0.2  # of the shading that divides
-_LEAST_MATTE = 1e-3  # share of matte pixels in a neighborhood
+_LEAST_MATTE = 1e-3  # least share of matte pixels in a neighborhood
 _FLOOR = 1e-3  # albedo
 
 _MOST_MATERIALS = 4
-_COLOR = 0.1  # weight of the encoded albedo, relative to the roughness
-_LIKE = 0.06  # rms distance from the mean of a material: a larger one asks for one more material
+_COLOR_WEIGHT = 0.1  # weight of the encoded albedo, relative to the roughness
+_MOST_SPREAD = 0.06  # rms distance from the mean of a material: a larger one asks for one more material
 _BLUR = 0.004  # 1σ over the object's radius, of S0 before the brightest pixel is taken
 _LEAST_BLUR_PX = 0.7
 _LEAST_HIGHLIGHT = 1e-6
-_BRIGHTEST = 3  # this pixel counts as the highlight, not the brightest
+_HIGHLIGHT_RANK = 3  # the third brightest pixel counts as the highlight
 _FACING_DEG = 35.0  # greatest zenith angle of a highlight
 _AWAY_DEG = (25.0, 60.0)  # zenith angles without highlight; what S0 has there beyond the albedo is its error
 _AWAY_QUANTILE = 0.99
-_FEWEST_PX, _FEWEST_AWAY = 50, 0.2  # pixels of each part, and share of the material's that cannot mirror the flash
+_FEWEST_PX, _FEWEST_AWAY = 50, 0.2  # least number of facing and of leaning pixels; least share of leaning ones
 # measured on path-traced pictures (docs/benchmarks/network.md)
 _ALBEDO_SIGMA = 0.2  # relative error of the albedo under a highlight
 _NETWORK_SIGMA = 0.08  # error of the network's roughness
@@ -76,7 +76,7 @@ def fill(image: Floats, cues: Cues) -> Floats:
     known = cues.mask & ~hole
     out = np.array(image, np.float32)
     if hole.any() and known.any():
-        around, far = mean_around(out, known, hole, blur=2.0, least=REACHED)
+        around, far = mean_around(out, known, hole, blur=2.0, least=LEAST_KNOWN)
         out[hole] = around[hole]
         out[far] = out[known].mean(axis=0)
     return out
@@ -104,9 +104,9 @@ def correct(maps: SurfaceMaps, cues: Cues, ior: float) -> SurfaceMaps:
     """Correct the albedo of maps (H, W, …) in highlights by the cross-polarized shot, `cues.body`, if there is one."""
     if cues.body is None or cues.body_known is None:
         return maps
-    low, high = _GLOSS
+    low, high = _SPECULAR_SHARES
     specular = np.clip(1 - cues.body.sum(-1) / np.maximum(cues.radiance.sum(-1), 1e-6), 0, 1)  # share of S0
-    share = np.clip((specular - low) / (high - low), 0, 1) * (cues.body_known & cues.mask)  # of the crossed shot
+    share = np.clip((specular - low) / (high - low), 0, 1) * (cues.body_known & cues.mask)  # of that shot
     share = cv2.GaussianBlur(share.astype(np.float32), (0, 0), 1.0) * cues.body_known
     cosine = np.clip(frames.dot(maps.normal, cues.rays), _LEAST_COSINE, 1)
     shading = cosine * fresnel.transmission(cosine, ior)[0] * fresnel.transmission(1.0, ior)[0]
@@ -128,9 +128,9 @@ def pool_gloss(maps: SurfaceMaps, cues: Cues) -> SurfaceMaps:
     if not maps.mask.any():
         return maps
     mask = maps.mask
-    alike = np.column_stack([_COLOR * color.encode_srgb(maps.diffuse[mask]), maps.roughness[mask]])
-    center, spread = _fewest_groups(alike.astype(np.float32))
-    share = clusters.soft_share(alike, center, spread)  # (N, K)
+    features = np.column_stack([_COLOR_WEIGHT * color.encode_srgb(maps.diffuse[mask]), maps.roughness[mask]])
+    center, spread = _fewest_groups(features.astype(np.float32))
+    share = clusters.soft_share(features, center, spread)  # (N, K)
     member = np.full(mask.shape, -1)
     member[mask] = share.argmax(axis=1)
     beyond = (cues.radiance - maps.diffuse).mean(axis=-1)  # than the albedo of a surface that faces the lens
@@ -143,47 +143,48 @@ def pool_gloss(maps: SurfaceMaps, cues: Cues) -> SurfaceMaps:
     clipped = (cues.quality & np.uint8(Quality.CLIPPED)) > 0
     for k in range(len(center)):
         of_material = member == k
-        seen = _highlight(of_material, zenith, mirrored, maps.diffuse)
-        if seen is None:
-            roughness[k], sigma[k] = _joined_with_usual(roughness[k], hypot(sigma[k], _SIGMA_UNCONFIRMED))
+        highlight = _highlight(of_material, zenith, mirrored, maps.diffuse)
+        if highlight is None:
+            roughness[k], sigma[k] = _combine_with_usual(roughness[k], hypot(sigma[k], _SIGMA_UNCONFIRMED))
             continue
-        roughness[k] = _bounded(float(roughness[k]), float(f0[k]), *seen)
-        if seen[0] <= seen[1] or (clipped & of_material & (zenith < _FACING_DEG)).sum() >= _BRIGHTEST:
+        light, error = highlight
+        roughness[k] = _lower_to_bound(float(roughness[k]), float(f0[k]), light, error)
+        if light <= error or (clipped & of_material & (zenith < _FACING_DEG)).sum() >= _HIGHLIGHT_RANK:
             sigma[k] = hypot(sigma[k], _SIGMA_UNCONFIRMED)
     pooled = np.zeros((3, *mask.shape), np.float32)
-    pooled[:, mask] = [share @ of_material for of_material in (f0, roughness, sigma)]
+    pooled[:, mask] = [share @ by_material for by_material in (f0, roughness, sigma)]
     specular = np.repeat(pooled[0][..., None], 3, axis=-1)
     return replace(maps, specular=specular, roughness=pooled[1], roughness_error=pooled[2])
 
 
-def _fewest_groups(alike: Floats) -> tuple[Floats, float]:
-    """Centers (K, 4) of the fewest groups whose pixels (N, 4) are alike, and the spread within a group."""
+def _fewest_groups(features: Floats) -> tuple[Floats, float]:
+    """Group pixels (N, 4): centers (K, 4) of the fewest groups with a small spread, at most 4, and that spread."""
     for count in range(1, _MOST_MATERIALS + 1):
-        center, spread = clusters.color_clusters(alike, count)
-        if spread < _LIKE:
+        center, spread = clusters.color_clusters(features, count)
+        if spread < _MOST_SPREAD:
             break
     return center, spread
 
 
-def _joined_with_usual(roughness: float, sigma: float) -> tuple[float, float]:
+def _combine_with_usual(roughness: float, sigma: float) -> tuple[float, float]:
     """Mean of a roughness with error `sigma` and that of usual materials, weighted by their errors, and its 1σ."""
     weight = _USUAL_SIGMA**2 / (_USUAL_SIGMA**2 + sigma**2)
     return _USUAL + weight * (roughness - _USUAL), sigma * sqrt(weight)
 
 
 def _highlight(of_material: Bools, zenith: Floats, mirrored: Floats, albedo: Floats) -> tuple[float, float] | None:
-    """Mirrored light of a material's highlight, and its 1σ; None if the material (H, W) may not show it."""
+    """Mirrored light of a material's highlight, and its 1σ; None if too few pixels face the lens or lean."""
     facing = of_material & (zenith < _FACING_DEG)
     away = of_material & (zenith > _AWAY_DEG[0]) & (zenith < _AWAY_DEG[1])
     if min(facing.sum(), away.sum()) < _FEWEST_PX or away.sum() < _FEWEST_AWAY * of_material.sum():
         return None
-    highlight = float(np.partition(mirrored[facing], -_BRIGHTEST)[-_BRIGHTEST])
+    highlight = float(np.partition(mirrored[facing], -_HIGHLIGHT_RANK)[-_HIGHLIGHT_RANK])
     error = hypot(np.quantile(mirrored[away], _AWAY_QUANTILE), _ALBEDO_SIGMA * albedo[facing].mean())
     return max(highlight, _LEAST_HIGHLIGHT), error
 
 
-def _bounded(roughness: float, f0: float, highlight: float, error: float) -> float:
-    """Roughness of a material, at most the bound from its highlight with this 1σ error."""
+def _lower_to_bound(roughness: float, f0: float, highlight: float, error: float) -> float:
+    """Lower a roughness towards the bound (F0 / 4 S)^¼ by the highlight S with 1σ `error`, weighted by both errors."""
     bound: float = (f0 / (4 * highlight)) ** 0.25
     sigma = bound * hypot(_BOUND_SIGMA, error / (4 * highlight))
     weight = _NETWORK_SIGMA**2 / (_NETWORK_SIGMA**2 + sigma**2)

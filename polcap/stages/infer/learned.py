@@ -22,15 +22,16 @@ from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.stage_values import Cues, Network, OrderTest, RunNetwork, SurfaceMaps
 from polcap.stages.cues import FLOOR
 from polcap.stages.infer import analytic, fine, highlights, sizes_and_positions
-from polcap.stages.infer.highlights import REACHED
+from polcap.stages.infer.highlights import LEAST_KNOWN
 from polcap.stages.infer.shape import half_turns, integrable_normals, planar_faces
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join, for the network's input holds the inversion
 # error = min(a·statedᵇ, c), degrees: maximum likelihood on simulated captures and on test pictures (decision 28)
 _CALIBRATION = (0.51, 1.19, 40.0)
 _SIZES = (1.5625, 0.875)  # of the network's pictures, over its native size: 400 and 224 px (decision 9)
-_OVERVIEWS, _OVERVIEW_POSITIONS = (0.5, 0.35), 2  # sizes of smaller pictures, evidence for the side of normals
-_TEST_SIZE = 0.35  # of the picture by which orders of the shots are compared
+# sizes of smaller pictures, over the native size, and positions of each: evidence for the side of normals
+_OVERVIEWS, _OVERVIEW_POSITIONS = (0.5, 0.35), 2
+_TEST_SIZE = 0.35  # size of the picture in which orders of the shots are compared, over the network's native size
 _GRAZING = 0.15  # least cosine of the shading; .1 and .2 leave the same error
 _BRIGHTEST = 2.0  # greatest S0 of diffuse reflection; white paper that faces the flash near the chart has 1
 
@@ -89,7 +90,7 @@ def estimate_coarse(
     doubt = half_turns.NetworkDoubt(small["sigma"], small.pop("opposed"), overview)
     small["normal"], small["doubt"] = _correct_half_turns(small["normal"], seen, doubt)
     small["factor"] = _log_factor(small["diffuse"] * _shading(small["normal"], seen.rays), seen)
-    without_grid = _masked_filter(small["roughness"], seen.mask, sizes_and_positions.BINOMIAL, REACHED)
+    without_grid = _masked_filter(small["roughness"], seen.mask, sizes_and_positions.BINOMIAL, LEAST_KNOWN)
     small["roughness"] = np.where(seen.mask, without_grid, small["roughness"])
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
     smooth = frames.unit(maps["normal"])
@@ -102,7 +103,7 @@ def estimate_coarse(
 
 
 def _compare_orders(cues: Cues, network: Network, run: RunNetwork) -> OrderTest | None:
-    """The other order of the shots with the least error that the network expects, and its ratio to the stated order's.
+    """The other order of the shots with the least expected error, and the ratio of this error to the stated order's.
 
     Under a wrong order the polarization fits no shape with this outline and shading, so the network expects larger
     errors (decision 33), in a small picture too. None: there is no other order, or no pixel.
@@ -158,7 +159,7 @@ def _reduce(cues: Cues, scale: float) -> Cues:
     small = max(16, round(height * scale)), max(16, round(width * scale))
     light = np.maximum(frames.total(cues.radiance), 1e-6) * cues.mask
     ratio = np.stack([weighted_area_mean(r, light, small) for r in cues.ratio])
-    averaging = min(1.0, scale * np.sqrt(width / small[1] * scale))  # noise of a mean over (1/scale)² pixels
+    averaging = min(1.0, scale * np.sqrt(width / small[1] * scale))  # ≈ scale: noise of a mean over (1/scale)² pixels
     sigma = weighted_area_mean(cues.ratio_sigma, light, small) * averaging
     mask = area_mean(cues.mask, small) > 0.5
     view = scaled_view(cues.view, scale)

@@ -17,7 +17,7 @@ from polcap.optics import frames
 from polcap.optics.morphology import erode
 from polcap.stage_values import Cues, Network, RunNetwork
 from polcap.stages.cues import CHANNELS, channels
-from polcap.stages.infer.highlights import REACHED
+from polcap.stages.infer.highlights import LEAST_KNOWN
 
 OUTPUTS = {"normal": 3, "depth": 1, "diffuse": 3, "specular": 3, "roughness": 1, "sigma": 1}  # channels of each map
 _POSITIONS = (  # quarter turns, mirrored; the first four have all turns
@@ -25,8 +25,8 @@ _POSITIONS = (  # quarter turns, mirrored; the first four have all turns
 )  # fmt: skip
 _STEPS = 5  # of the median's iteration
 _LEAST_ERROR = 0.5  # degrees
-_NEAR_PX = 16.0  # 1σ of the means of expected errors by which the sizes are weighted
-_POWER = 12  # of these errors in the weights
+_NEAR_PX = 16.0  # 1σ of the means of expected errors; the sizes are weighted by these means
+_POWER = 12  # the weights are these means to the power −12
 _CELLS = 2.0  # cells of the network's grid, 1σ, over which its pattern is constant
 BINOMIAL = np.array([0.25, 0.5, 0.25], np.float32)
 _NEAREST = 0.05  # least distance between unit vectors, about 3°: nearer ones weigh the same
@@ -76,9 +76,9 @@ def _mean(predictions: Sequence[dict[str, Floats]]) -> dict[str, Floats]:
 def _weights(errors: Sequence[Floats], mask: Bools) -> Floats:
     """Weights (K, H, W) of K sizes of the picture by their expected errors (H, W), averaged over the neighborhood."""
     inside = mask.astype(np.float32)
-    near = np.stack([cv2.GaussianBlur(error * inside, (0, 0), _NEAR_PX) for error in errors]) + _LEAST_ERROR
-    odds = (near / near.min(axis=0)) ** -_POWER
-    return np.asarray(odds / odds.sum(axis=0), np.float32)
+    around = np.stack([cv2.GaussianBlur(error * inside, (0, 0), _NEAR_PX) for error in errors]) + _LEAST_ERROR
+    weights = (around / around.min(axis=0)) ** -_POWER
+    return np.asarray(weights / weights.sum(axis=0), np.float32)
 
 
 def _predict_turned(
@@ -87,9 +87,9 @@ def _predict_turned(
     """Run the network on a rotated or mirrored picture (H, W, N), and transform its maps back."""
     turned = _turn_channels(_turn(picture, quarters, mirror), quarters, mirror)
     maps = run_network(np.moveaxis(turned, -1, 0), network, run, CHANNELS, OUTPUTS)
-    own = np.array(_turn(cues.rays, quarters, mirror))
-    own[..., :2] = _turn_vectors(own[..., :2], quarters, mirror)
-    maps["normal"] = np.array(frames.from_ray_frame(maps["normal"], own))
+    rays = np.array(_turn(cues.rays, quarters, mirror))
+    rays[..., :2] = _turn_vectors(rays[..., :2], quarters, mirror)
+    maps["normal"] = np.array(frames.from_ray_frame(maps["normal"], rays))
     for name, image in maps.items():
         back = np.rot90(image, -quarters)
         back = back[:, ::-1] if mirror else back
@@ -108,14 +108,14 @@ def _without_grid(normal: Floats, mask: Bools) -> Floats:
     For each of the four places in a 2×2 cell, the deviation that neighboring cells have in common is subtracted. Relief
     does not repeat with the cells, so it remains.
     """
-    whole = erode(mask, 1).astype(np.float32)
+    inside = erode(mask, 1).astype(np.float32)
     out = normal.astype(np.float32)
-    uneven = (out - cv2.sepFilter2D(out, -1, BINOMIAL, BINOMIAL)) * whole[..., None]
+    uneven = (out - cv2.sepFilter2D(out, -1, BINOMIAL, BINOMIAL)) * inside[..., None]
     for place in (np.s_[y::2, x::2] for y in (0, 1) for x in (0, 1)):
         common, share = (
-            cv2.GaussianBlur(np.ascontiguousarray(part[place]), (0, 0), _CELLS) for part in (uneven, whole)
+            cv2.GaussianBlur(np.ascontiguousarray(part[place]), (0, 0), _CELLS) for part in (uneven, inside)
         )
-        out[place] -= common / np.maximum(share, REACHED)[..., None] * mask[place][..., None]
+        out[place] -= common / np.maximum(share, LEAST_KNOWN)[..., None] * mask[place][..., None]
     return out
 
 

@@ -39,8 +39,8 @@ _MOST_MISFIT = 9.0  # of a pixel against the guide, σ²
 
 _TENTHS = 10
 _UNEVEN = 0.07  # 1σ of the logarithm of an even albedo's patches: shading is not known better
-_FLAT = 0.2  # α of a rough body; its shading is the unit of flatness
-_FLATTEST = 2.0  # in that unit: α = .4
+_FLAT = 0.2  # α of the rough body with the flatness 1
+_FLATTEST = 2.0  # greatest flatness: α = .4
 
 _OUTLINE_PX = 1.0  # from the outline: nearer, pixels mix with the backdrop
 _RINGS = (0.015, 0.05, 0.1, 0.16)  # distances from the outline between which the DoLP is read, in radii of the disc
@@ -71,7 +71,7 @@ class DiffuseLaws:
     prior: Floats  # (C,) logarithm
     dolp: Floats  # (C, Z), never falling
     shading: Floats  # (Z,) logarithm of S0 over albedo, of a smooth body
-    flatter: Floats  # (Z,) logarithm of a rough body's over it
+    flatter: Floats  # (Z,) logarithm of the shading of a rough body over that of a smooth one
 
 
 def estimate_zenith(dolp: Floats, cues: Cues, ior: float, guide: tuple[Floats, Floats] | None = None) -> ZenithEstimate:
@@ -109,11 +109,11 @@ def candidate_laws(ior: float) -> DiffuseLaws:
     rows = []
     for local, alpha in [(0.0, 0.0), *product((0.0, 1.0), _ALPHAS)]:
         plus, minus = body.leaving(cosine, alpha, ior, local)
-        for even, loss in product(_FACTORS, _EDGE_LOSSES):
-            smooth = alpha == 0 and even == 1 and loss == 0
-            prior = _DEPOLARIZED_LIKELIER * (1 - even) + (_SMOOTH_LIKELIER if smooth else 0.0)
-            left = even * (1 - loss * (1 - cosine**2))
-            rows.append((prior, np.maximum.accumulate(left * minus / plus)))
+        for factor, loss in product(_FACTORS, _EDGE_LOSSES):
+            smooth = alpha == 0 and factor == 1 and loss == 0
+            prior = _DEPOLARIZED_LIKELIER * (1 - factor) + (_SMOOTH_LIKELIER if smooth else 0.0)
+            remaining = factor * (1 - loss * (1 - cosine**2))
+            rows.append((prior, np.maximum.accumulate(remaining * minus / plus)))
     plus, _ = body.leaving(cosine, 0.0, ior)
     shading = np.log(np.maximum(cosine * plus * plus, 1e-4))
     flatter = np.log(body.flattening(cosine, cosine, np.ones_like(cosine), _FLAT + 0 * cosine))
@@ -148,22 +148,22 @@ def _even_albedo(angles: Floats, light: Floats, laws: DiffuseLaws) -> Floats:
 def _round_outline(dolp: Floats, cues: Cues, laws: DiffuseLaws) -> Floats:
     """Log likelihood (C,) of each diffuse law from the outline, where a round object has sin θ = 1 − x.
 
-    x is the distance from the outline over the radius of the ball. The median DoLP of each of a few rings inside the
-    outline is compared. The radius is fitted, near that of a disc with the object's area. If the outline is a sharp
-    edge, it favors no law.
+    x is the distance from the outline over the radius of a ball. The zenith of the ball is compared with that of the
+    median DoLP, in a few rings inside the outline. The radius is fitted, near that of a disc with the object's area. If
+    the outline is a sharp edge, it favors no law.
     """
     distance = cv2.distanceTransform(cues.mask.astype(np.uint8), cv2.DIST_L2, 5) - 0.5
     radius = disc_radius(cues.mask)
-    high, middle = [], []
+    dolps, distances = [], []
     for near, far in pairwise(np.maximum(np.array(_RINGS) * radius, _OUTLINE_PX)):
         ring = cues.mask & (distance > near) & (distance < far)
         if ring.sum() >= _PATCHES and far - near > 1:
-            high.append(np.median(dolp[ring]))
-            middle.append((near + far) / 2)
-    if len(middle) < 2:
+            dolps.append(np.median(dolp[ring]))
+            distances.append((near + far) / 2)
+    if len(distances) < 2:
         return np.zeros(len(laws.prior))
-    away = np.clip(np.array(middle) / (radius * _RADII[:, None]), 0, 1)  # (R, rings)
+    away = np.clip(np.array(distances) / (radius * _RADII[:, None]), 0, 1)  # (R, rings)
     ball = np.degrees(np.arccos(np.sqrt(away * (2 - away))))
-    found = np.degrees([np.interp(high, row, _ZENITHS) for row in laws.dolp])  # (C, rings)
-    misfit = (((found[:, None] - ball) / _OUTLINE_DEG) ** 2).sum(axis=-1) + (np.log(_RADII) / _RADIUS_SPREAD) ** 2
+    zeniths = np.degrees([np.interp(dolps, row, _ZENITHS) for row in laws.dolp])  # (C, rings)
+    misfit = (((zeniths[:, None] - ball) / _OUTLINE_DEG) ** 2).sum(axis=-1) + (np.log(_RADII) / _RADIUS_SPREAD) ** 2
     return np.asarray(np.log(np.exp(-misfit.min(axis=1) / 2) + _SHARP))

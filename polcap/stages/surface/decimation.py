@@ -51,7 +51,7 @@ def decimate(front: ReliefMesh, view: View, count: int, back: Back) -> Decimated
         raise ObjectError(f"a mesh of {count} triangles is under {_FEWEST}; ask for more triangles or fewer levels")
     reduced = _simplify(front, view, round(_FRONT[back] * count))
     folded = face_areas(reduced.uv, reduced.faces) <= 0  # by a collapse
-    reduced = _framed(front, view, reduced.vertices, reduced.faces[~folded])
+    reduced = _with_triangles(front, view, reduced.vertices, reduced.faces[~folded])
     if back != "open":
         around = _AROUND[back] * len(boundary_edges(reduced.faces))
         if len(reduced.faces) + around > count:
@@ -65,15 +65,15 @@ def _simplify(mesh: ReliefMesh, view: View, count: int) -> ReliefMesh:
     import fast_simplification  # here: its 0.25 s are for exports with levels of detail alone
 
     if count >= len(mesh.faces):
-        return _framed(mesh, view, mesh.vertices, mesh.faces)
+        return _with_triangles(mesh, view, mesh.vertices, mesh.faces)
     points, faces = fast_simplification.simplify(  # which takes no read-only arrays
         np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.int32), target_count=count
     )
-    return _framed(mesh, view, np.asarray(points), np.asarray(faces))
+    return _with_triangles(mesh, view, np.asarray(points), np.asarray(faces))
 
 
-def _framed(mesh: ReliefMesh, view: View, vertices: Floats, faces: Faces) -> ReliefMesh:
-    """The mesh with other triangles, texture coordinates by the camera's view, and new normals and tangents."""
+def _with_triangles(mesh: ReliefMesh, view: View, vertices: Floats, faces: Faces) -> ReliefMesh:
+    """A copy of the mesh with other triangles: computes texture coordinates by the camera's view, normals, tangents."""
     height, width = mesh.depth.shape
     used, renumbered = np.unique(faces, return_inverse=True)
     faces = renumbered.reshape(-1, 3).astype(np.int32)
@@ -90,16 +90,16 @@ def _framed(mesh: ReliefMesh, view: View, vertices: Floats, faces: Faces) -> Rel
     )
 
 
-def _distance(first: ReliefMesh, coarser: ReliefMesh) -> float:
+def _distance(full: ReliefMesh, coarser: ReliefMesh) -> float:
     """Distance of the full mesh's vertices to the nearest triangle's plane in a coarser mesh: 99th percentile."""
     from scipy.spatial import cKDTree  # here: importing it costs .1 s of every start
 
     corner = coarser.vertices[coarser.faces].astype(np.float64)  # (F, 3, 3)
-    share = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4], [0, 1, 1], [1, 0, 1], [1, 1, 0]], float)
-    sample = np.einsum("sk,fkc->fsc", share / share.sum(axis=1, keepdims=True), corner)
+    barycentric = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4], [0, 1, 1], [1, 0, 1], [1, 1, 0]], float)
+    samples = np.einsum("sk,fkc->fsc", barycentric / barycentric.sum(axis=1, keepdims=True), corner)
     normal = unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
-    every = max(1, len(first.vertices) // _MEASURED)
-    vertex: Floats = first.vertices[::every].astype(np.float64)
-    _, nearest = cKDTree(sample.reshape(-1, 3)).query(vertex)
-    distance = np.abs(np.sum((vertex - sample.reshape(-1, 3)[nearest]) * normal[nearest // len(share)], axis=-1))
+    every = max(1, len(full.vertices) // _MEASURED)
+    vertex: Floats = full.vertices[::every].astype(np.float64)
+    _, nearest = cKDTree(samples.reshape(-1, 3)).query(vertex)
+    distance = np.abs(np.sum((vertex - samples.reshape(-1, 3)[nearest]) * normal[nearest // len(barycentric)], axis=-1))
     return float(np.percentile(distance, 99))

@@ -33,7 +33,7 @@ from polcap.stages.surface.pyramid_level import GAP, REACH, ContourLinks, Pyrami
 from polcap.stages.surface.slope_equations import NormalField, halve
 
 _DECISION_PIXELS = 80_000  # most pixels of the grid that decides on cuts (docs/benchmarks/surface.md)
-_SURE = 1 / 16  # least weight of a normal that can show an occluding contour: an error of four times the median
+_LEAST_WEIGHT = 1 / 16  # least weight of a normal that can show an occluding contour: an error of four times the median
 _OPEN = 0.3  # least share of the gap that opens where a part is separate
 _CUT_ROUNDS = 2  # of removing cuts
 _AROUND = 10  # px from a cut within which the residual is compared
@@ -81,8 +81,8 @@ def decide(level: PyramidLevel, iterations: int, tolerance: float) -> None:
 
 def cut_contours(level: PyramidLevel) -> None:
     """Cut the surface at the occluding contours that the normals show: remove the slope terms of links across them."""
-    sure = level.field.weight > _SURE
-    lean = [np.where(sure, np.arctan2(side, np.maximum(level.facing, 1e-6)), np.nan) for side in level.side]
+    reliable = level.field.weight > _LEAST_WEIGHT
+    lean = [np.where(reliable, np.arctan2(side, np.maximum(level.facing, 1e-6)), np.nan) for side in level.side]
     found = occlusion.occluding_contours((level.grid.image(lean[0]), level.grid.image(lean[1])), level.field.mask)
     sign = level.grid.links(*found)
     link = np.flatnonzero(sign)

@@ -21,13 +21,13 @@ _COARSEST = 400  # unknowns that are solved directly
 _STRONG = 0.02  # least link, over √(a_ii a_jj), along which unknowns are aggregated
 _LEAST_COARSENING = 0.7  # the hierarchy ends where a coarser level would hold a greater share of the unknowns
 _SPECTRUM = 2.0  # D⁻¹A of a Laplacian with a shift has its eigenvalues in 0…2 (Gershgorin)
-_DAMPING = 4 / 3 / _SPECTRUM
+_DAMPING = 4 / 3 / _SPECTRUM  # Vaněk et al.
 
 
 class PixelGrid:
     """The N pixels of a mask (H, W) as a graph: pixels numbered row by row, and L links between neighbors.
 
-    Link l joins the pixels `p[l]` and `q[l]`. The links to the right come first; from number `turn` on, links go down.
+    Link l joins the pixels `p[l]` and `q[l]`. Links to the right come first; links from number `first_down` on go down.
     """
 
     def __init__(self, mask: Bools) -> None:
@@ -38,28 +38,28 @@ class PixelGrid:
         self.row, self.column = self.pixel.T
         self.size = len(self.pixel)  # N
         right, down = _links(number[:, :-1], number[:, 1:]), _links(number[:-1], number[1:])
-        self.turn = len(right[0])
+        self.first_down = len(right[0])
         self.p, self.q = (np.concatenate(ends) for ends in zip(right, down))
-        self._lay_out(right, down)
+        self._make_pattern(right, down)
 
-    def _lay_out(self, right: Any, down: Any) -> None:
+    def _make_pattern(self, right: Any, down: Any) -> None:
         """Compute the sparsity pattern of matrices on this grid: a pixel with its neighbors up, left, right, down."""
         size, count = self.size, len(self.p)
         place = np.full((size, 5), -1, dtype=np.int32)  # which link or pixel each stored value belongs to
         link = np.arange(count, dtype=np.int32)
-        place[self.q[self.turn :], 0] = link[self.turn :]
-        place[self.q[: self.turn], 1] = link[: self.turn]
+        place[self.q[self.first_down :], 0] = link[self.first_down :]
+        place[self.q[: self.first_down], 1] = link[: self.first_down]
         place[:, 2] = count + np.arange(size, dtype=np.int32)
-        place[self.p[: self.turn], 3] = link[: self.turn]
-        place[self.p[self.turn :], 4] = link[self.turn :]
+        place[self.p[: self.first_down], 3] = link[: self.first_down]
+        place[self.p[self.first_down :], 4] = link[self.first_down :]
         neighbor = np.zeros((size, 5), dtype=np.int32)
         neighbor[down[1], 0], neighbor[right[1], 1] = down[0], right[0]
         neighbor[:, 2] = np.arange(size, dtype=np.int32)
         neighbor[right[0], 3], neighbor[down[0], 4] = right[1], down[1]
-        there = place >= 0
-        self._place = place[there]
-        self._indices = neighbor[there]
-        self._starts = np.concatenate([[0], np.cumsum(there.sum(axis=1))]).astype(np.int32)
+        stored = place >= 0
+        self._place = place[stored]
+        self._indices = neighbor[stored]
+        self._starts = np.concatenate([[0], np.cumsum(stored.sum(axis=1))]).astype(np.int32)
 
     def laplacian(self, link: Floats, diagonal: Floats) -> Any:
         """Weighted Laplacian as a CSR matrix (N, N), from link weights (L,), plus a diagonal (N,)."""
@@ -163,10 +163,10 @@ class Multigrid:
         level = self.levels[depth]
         x = level.step * right
         x += level.prolong @ self._cycle(depth + 1, level.restrict @ (right - level.matrix @ x))
-        left = right - level.matrix @ x
-        left *= level.step
-        left += x
-        return np.asarray(left)
+        update = right - level.matrix @ x
+        update *= level.step
+        update += x
+        return np.asarray(update)
 
 
 def _aggregate(matrix: Any, cell: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -174,10 +174,10 @@ def _aggregate(matrix: Any, cell: NDArray[np.int64]) -> NDArray[np.int64]:
     links = matrix.tocoo()
     diagonal = matrix.diagonal()
     row, column = links.row, links.col
-    at = cell[:, 0] * (int(cell[:, 1].max()) + 1) + cell[:, 1]
-    together = at[row] == at[column]
-    together &= links.data**2 > _STRONG**2 * diagonal[row] * diagonal[column]
-    return connected_parts(row[together], column[together], len(cell))
+    cell_number = cell[:, 0] * (int(cell[:, 1].max()) + 1) + cell[:, 1]
+    joined = cell_number[row] == cell_number[column]
+    joined &= links.data**2 > _STRONG**2 * diagonal[row] * diagonal[column]
+    return connected_parts(row[joined], column[joined], len(cell))
 
 
 def _prolongation(matrix: Any, group: NDArray[np.int64], count: int) -> Any:
@@ -210,6 +210,6 @@ class TwoGrid:
         right = right.astype(np.float32)
         step = _DAMPING * self.inverse_diagonal
         x = step * right
-        left = np.asarray(np.bincount(self.block, right - self.matrix @ x, self.count), dtype=np.float64)
-        x = x + self.coarse(left).astype(np.float32)[self.block]
+        residual = np.asarray(np.bincount(self.block, right - self.matrix @ x, self.count), dtype=np.float64)
+        x = x + self.coarse(residual).astype(np.float32)[self.block]
         return np.asarray(x + step * (right - self.matrix @ x), dtype=np.float64)

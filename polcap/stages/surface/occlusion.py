@@ -37,11 +37,11 @@ _CONTOUR_LEAN = np.radians(75.0)  # of the nearer side, mean along the contour
 
 _LEAST_STEP_PX = 2.0  # smaller depth steps are no occlusions, however small the object is
 _PEAK = 2.0  # highest step of a contour, over the least step
-_RIM_PX = 2  # the nearer side's lean is the greatest within this distance, for normals are blurred
+_RIM_PX = 2  # px from a link within which the nearer side's lean is greatest, for normals are blurred
 _RIM_LEAN = 0.5  # rad, of the nearer side, mean along the contour
 
 _PART = 0.002  # of the object's pixels: smaller parts are specks
-_LEAST_PERCENTILE = 10.0  # of the steps along a border: the smallest step, without outliers
+_LEAST_PERCENTILE = 10.0  # of the steps along a border: counts as the smallest step
 _EQUAL = 0.04  # range of the steps along a contact
 _CONTACT_LENGTH = 0.43  # of a contact
 
@@ -81,6 +81,7 @@ def _contour_candidates(lean: Floats, mask: Bools, axis: int, sign: int) -> tupl
     last = (_REACH - 1, 0) if axis else (0, _REACH - 1)
     back, ahead = (last, (0, 0)) if sign > 0 else ((0, 0), last)
     box = np.ones(size, np.uint8)
+    # ±9 outside the mask: beyond any angle
     steepest = cv2.dilate(np.where(inside, away, -9).astype(np.float32), box, anchor=back, borderValue=-9)
     flattest = cv2.erode(np.where(inside, away, 9).astype(np.float32), box, anchor=ahead, borderValue=9)
     one, two = _ends(axis)
@@ -201,7 +202,7 @@ def _parts(grid: PixelGrid, together: Bools) -> NDArray[np.int64]:
 
 
 def _most_equal(step: Floats, width: float) -> tuple[float, int]:
-    """Most frequent small step: center and count of the fullest window of this width near the smallest steps (B,)."""
+    """Most frequent of the small steps (B,): center of the window of this width that holds most, and their number."""
     low = np.sort(step)
     count = np.searchsorted(low, low + width, side="right") - np.arange(len(low))
     count[low > np.percentile(low, _LEAST_PERCENTILE) + width] = 0

@@ -33,8 +33,8 @@ _PRECISE_DEG, _PRECISE_SOLVES = 2.0, 8  # median error of normals below which ch
 _PRECISION = 1e-3  # of each linear solution, relative
 _SLOW = 12  # iterations of a linear solution that call for a new hierarchy, which costs as much as 28
 _PROXIMITY = 1e-8  # pull towards the last estimate: fixes the offset of each separate part
-_LEAST_TRUST = 1e-9  # of a link's ends in it: keeps the equations solvable
-_BEND = 1 / 12  # variance of a step anywhere between its ends' slopes, over their difference squared
+_LEAST_TRUST = 1e-9  # of both ends in a link: keeps the equations solvable
+_BEND = 1 / 12  # variance of a uniform distribution of width 1: a step lies anywhere between its ends' slopes
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ContourLinks:
 
     link: NDArray[np.intp]  # (M,) numbers of the links
     gap: Floats  # (M,) expected depth behind the contour [px], positive where it grows to the right or down
-    step: Floats  # (M,) that and the slope of the nearer side [px]
+    step: Floats  # (M,) `gap` plus the slope of the nearer side [px]
 
     def select(self, at: Any) -> "ContourLinks":
         """The contour links at these indices or where this mask is true."""
@@ -74,8 +74,8 @@ class PyramidLevel:
         self.grid = grid = PixelGrid(field.mask)
         self.facing, right, down = slope_terms(field)
         self.side = (right, down)
-        p, q, turn = grid.p, grid.q, grid.turn
-        target = np.concatenate([right[p[:turn]] + right[q[:turn]], down[p[turn:]] + down[q[turn:]]]) / 2
+        p, q, n = grid.p, grid.q, grid.first_down
+        target = np.concatenate([right[p[:n]] + right[q[:n]], down[p[n:]] + down[q[n:]]]) / 2
         facing = (self.facing[p] + self.facing[q]) / 2
         steep = np.maximum(facing, LEAST_FACING)
         self.slope = right / np.maximum(self.facing, LEAST_FACING), down / np.maximum(self.facing, LEAST_FACING)
@@ -95,8 +95,8 @@ class PyramidLevel:
 
     def slope_at(self, ends: NDArray[np.intp]) -> Floats:
         """Slope (L,) along each link between pixels, from the normal at one of its ends."""
-        turn = self.grid.turn
-        return np.concatenate([self.slope[0][ends[:turn]], self.slope[1][ends[turn:]]])
+        first_down = self.grid.first_down
+        return np.concatenate([self.slope[0][ends[:first_down]], self.slope[1][ends[first_down:]]])
 
     def integrate_bilaterally(self, iterations: int, tolerance: float) -> None:
         """Solve z by bilateral integration: every pixel chooses between its neighbors along each axis.
@@ -189,11 +189,11 @@ class PyramidLevel:
         change = self.z[grid.q] - self.z[grid.p]
         energy = 0.0
         if self.choosing.any():
-            for part, side in zip((slice(None, grid.turn), slice(grid.turn, None)), self.side):
+            for part, side in zip((slice(None, grid.first_down), slice(grid.first_down, None)), self.side):
                 energy += self._weigh_neighbors(part, side, change, stiffness, weight, flux)
         certainty = (self.field.sigma / (GAP * disc_radius(self.field.mask))) ** 2 if self.chords else _GAP_WEIGHT
-        weight[self.contours.link] = little = certainty / max(len(self.contours.link), 1)
-        flux[self.contours.link] = little * self.contours.step
+        weight[self.contours.link] = of_gap = certainty / max(len(self.contours.link), 1)
+        flux[self.contours.link] = of_gap * self.contours.step
         diagonal, right = np.full(grid.size, _PROXIMITY), _PROXIMITY * self.z + grid.divergence(flux)
         if self.field.prior is not None:
             diagonal += pull
@@ -215,9 +215,8 @@ class PyramidLevel:
         ahead, behind = np.zeros(grid.size), np.zeros(grid.size)  # m ∂z on either side; 0 past the mask
         first, second = facing[p], facing[q]
         ahead[p], behind[q] = first * step, second * step
-        forward, backward = (
-            _sigmoid(stiffness * (a[e] ** 2 - b[e] ** 2)) for a, b, e in ((behind, ahead, p), (ahead, behind, q))
-        )
+        forward = _sigmoid(stiffness * (behind[p] ** 2 - ahead[p] ** 2))
+        backward = _sigmoid(stiffness * (ahead[q] ** 2 - behind[q] ** 2))
         at = chosen[both]
         if self.chords:  # a chord holds only where both ends belong to one sheet
             weight[at] *= np.maximum(4 * (forward * backward)[both], _LEAST_TRUST)

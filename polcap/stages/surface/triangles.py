@@ -17,9 +17,9 @@ Back = Literal["open", "skirt", "closed"]
 
 _SPECK = 0.002  # of the mesh's triangles: smaller pieces do not count
 _ROUNDS = 4  # of averaging along the boundary; about two grid steps either side
-_DEPTH_ROUNDS = 64  # the same of depth, 1σ of six steps: where the surface is edge-on its stairs are ten times as deep
+_DEPTH_ROUNDS = 64  # the same for depth, 1σ of six steps: at an edge-on surface, steps of depth are ten times as high
 _FARTHEST = 0.75  # grid steps that a vertex may move in the picture
-_LEAST_AREA = 0.1  # of a triangle after the move, over before: else its corners stay
+_LEAST_AREA = 0.1  # least area of a triangle after the move, over that before; otherwise its corners do not move
 _BEHIND = 0.02  # distance of the back behind the deepest vertex, over the greatest extent
 
 
@@ -66,10 +66,10 @@ def _unbroken_runs(links: Bools, step: int, axis: int) -> Bools:
     """Combine each `step` links along an axis to one grid side: true if none of them crosses an occlusion."""
     if step == 1:
         return links
-    whole = links.shape[axis] // step * step
-    runs = np.moveaxis(links, axis, -1)[..., :whole]
-    together = np.asarray(runs.reshape(*runs.shape[:-1], -1, step).all(axis=-1))
-    return np.moveaxis(together, -1, axis)
+    end = links.shape[axis] // step * step
+    runs = np.moveaxis(links, axis, -1)[..., :end]
+    unbroken = np.asarray(runs.reshape(*runs.shape[:-1], -1, step).all(axis=-1))
+    return np.moveaxis(unbroken, -1, axis)
 
 
 @dataclass(frozen=True)
@@ -154,10 +154,10 @@ def _average_along(values: Floats, edge: NDArray[np.int64], rounds: int) -> Floa
     mean = sparse.csr_matrix((1 / degree[ends[:, 0]], (row, column)), (len(used), len(used)))
     moving = degree[used] == 2
     out = values.copy()
-    on = values[used]
+    smooth = values[used]
     for _ in range(rounds):
-        on = np.where(moving[:, None], (on + mean @ on) / 2, on)
-    out[used] = on
+        smooth = np.where(moving[:, None], (smooth + mean @ smooth) / 2, smooth)
+    out[used] = smooth
     return out
 
 

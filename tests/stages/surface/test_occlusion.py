@@ -14,7 +14,7 @@ RADIUS = SIZE / np.sqrt(np.pi)
 def left_before_right(jump: Floats) -> tuple[PixelGrid, np.ndarray, Floats]:
     """A square cut down its middle, its left half before the right by `jump` (SIZE,) px."""
     grid = PixelGrid(np.ones((SIZE, SIZE), dtype=bool))
-    separate = (np.arange(len(grid.p)) < grid.turn) & (grid.column[grid.p] == SIZE // 2 - 1)
+    separate = (np.arange(len(grid.p)) < grid.first_down) & (grid.column[grid.p] == SIZE // 2 - 1)
     return grid, separate, np.where(separate, jump[grid.row[grid.p]], 0.0)
 
 

@@ -6,8 +6,8 @@ often on black gloss. The inversion does not determine the side at all. For both
 whole object: every cell of a coarse grid keeps n or turns it to n′. With t the part of n across the ray, of length
 sin θ, the energy is the sum of
 
-    outline      e, e: share of object ahead of t less that behind it. A closed surface leans towards its outline;
-                 where t runs along an outline (a neck that the mask cuts), e is 0
+    outline      share of object ahead of t less that behind it: a closed surface leans towards its outline. It is 0
+                 where t runs along the outline (a neck that the mask cuts)
     inside       −0.015 t·o, o the direction away from the object's inside: decides where nothing else does
     network      −0.16 L for turning, L the log odds that the network erred in this cell: where its positions disagree,
                  where it says the opposite of smaller pictures, in which it sees more of the object at once, and
@@ -41,16 +41,16 @@ from polcap.stages.infer.shape import planar_faces
 _OUTLINE, _INVERSION_OUTLINE, _INSIDE, _NETWORK = 1.0, 3.0, 0.015, 0.16  # weights of the terms; the neighbors' is 1
 _AHEAD = 1.5  # cells from a cell to the places ahead and behind
 _BLUR = 3.0  # cells, 1σ, of the depth inside the mask
-_INTEGER = 1000  # capacities per unit of energy: the flow is one of whole numbers
+_INTEGER = 1000  # capacities per unit of energy: SciPy's maximum flow takes integers
 # ln odds that the network's side of a cell is wrong: constant, share of its positions that disagree, correlation with
 # smaller pictures (both with the cells around), ln of its error in degrees; tests/benchmarks/fit_half_turns.py
 _WRONG = (-6.56, 4.51, -1.45, 1.67)
-_NEAR = 2.0  # cells, 1σ
+_NEAR = 2.0  # cells, 1σ of the means of the second and third term
 _REGION = (0.46, 0.68)  # ln odds that a region is turned: constant, mean ln odds of its cells; same benchmark
 # ln odds that a cell of the inversion is on the wrong side: constant, energy of turning it alone, ln of the share of
 # links around it that contradict each other, mean lean away from the inside around it; same benchmark
 _CELL = (2.94, -0.176, 1.04, -2.31)
-_AROUND = 8.0  # cells, 1σ
+_AROUND = 8.0  # cells, 1σ of the means of the third and fourth term
 
 
 @dataclass(frozen=True)
@@ -92,16 +92,16 @@ def resolve(
     if network is None:
         turned, terms = sides(grid)
         x, y = (_enlarged(part, mask.shape) for part in np.where(turned, -1, 1) * grid.lean)
-        doubt = _chance(terms @ np.array(_CELL))
+        doubt = _logistic(terms @ np.array(_CELL))
         return HalfTurns(x * normal[..., 0] + y * normal[..., 1] < 0, _enlarged(doubt, mask.shape))
     wrong = wrong_terms(grid, network, mask) @ np.array(_WRONG)
     region, odds = proposals(
         grid, wrong if flash is None else wrong + planar_faces.light_odds(grid.lean, grid.mask, flash, mask)
     )
-    chance = _chance(_REGION[0] + _REGION[1] * odds)
-    chance[0] = 0  # cells that the cut does not turn: the network's error covers them
-    doubt = np.minimum(chance, 1 - chance)[region]
-    return HalfTurns(_enlarged((chance > 0.5)[region], mask.shape) > 0.5, _enlarged(doubt, mask.shape))
+    probability = _logistic(_REGION[0] + _REGION[1] * odds)
+    probability[0] = 0  # cells that the cut does not turn: the network's error covers them
+    doubt = np.minimum(probability, 1 - probability)[region]
+    return HalfTurns(_enlarged((probability > 0.5)[region], mask.shape) > 0.5, _enlarged(doubt, mask.shape))
 
 
 def error_with_doubt(error: Floats, doubt: Floats, cos_zenith: Floats) -> Floats:
@@ -110,7 +110,7 @@ def error_with_doubt(error: Floats, doubt: Floats, cos_zenith: Floats) -> Floats
 
 
 def coarse(normal: Floats, mask: Bools) -> Grid:
-    """Average normals (H, W, 3) over the cells of a coarse grid: double azimuth, zenith, and the side of the mean."""
+    """Average normals (H, W, 3) over the cells of a coarse grid: axis of the azimuth, zenith, and side of the mean."""
     shape = planar_faces.grid_shape(mask.shape)
     x, y = normal[..., 0] * mask, normal[..., 1] * mask
     parts = (mask, x, y, x * x - y * y, 2 * x * y, np.hypot(x, y), np.maximum(normal[..., 2] * mask, 0))
@@ -133,39 +133,38 @@ def sides(grid: Grid) -> tuple[Bools, Floats]:
     turned = _cut(grid.mask, cost, first, second, alike)
     sign = np.where(turned, -1, 1)
     side = sign[grid.mask]
-    bound = alike * side[first] * side[second]  # negative: the two contradict each other
+    agreement = alike * side[first] * side[second]  # negative: the two cells contradict each other
 
-    def cells(of_link: Floats) -> Floats:
+    def sum_at_cells(of_link: Floats) -> Floats:
         out = np.zeros(grid.mask.shape)
         out[grid.mask] = sum(np.bincount(ends, of_link, len(side)) for ends in (first, second))
         return out
 
-    def around(image: Floats) -> Floats:
+    def mean_around(image: Floats) -> Floats:
         return np.asarray(cv2.GaussianBlur(image, (0, 0), _AROUND)) + 1e-9
 
-    energy = cells(bound)
+    energy = sum_at_cells(agreement)
     energy[grid.mask] += side * cost
-    contradiction = around(cells(np.maximum(-bound, 0))) / around(cells(np.abs(bound)))
-    lean = around(sign * outwards * grid.mask) / around(grid.mask.astype(float))
+    contradiction = mean_around(sum_at_cells(np.maximum(-agreement, 0))) / mean_around(sum_at_cells(np.abs(agreement)))
+    lean = mean_around(sign * outwards * grid.mask) / mean_around(grid.mask.astype(float))
     return turned, np.stack([np.ones(turned.shape), energy, np.log(contradiction + 0.01), lean], axis=-1)
 
 
 def wrong_terms(grid: Grid, network: NetworkDoubt, mask: Bools) -> Floats:
     """Evidence (h, w, 4) that the network's normals lean to the wrong side: the terms of the odds `_WRONG`.
 
-    They are 1; the share of its positions that disagree, near a cell; the agreement −1…1 with the lean in smaller
-    pictures; and ln of the expected error. `network` and `mask` have the size of the picture. Outline and neighbors are
-    not part of this evidence.
+    The terms are 1; the share of the network's positions that disagree, near a cell; the agreement −1…1 with the lean
+    in smaller pictures; and ln of the expected error. `network` and `mask` have the size of the picture.
     """
     images = (network.sigma, network.opposed, *network.overview)
     sigma, opposed, *overview = (weighted_area_mean(image, mask, grid.mask.shape) for image in images)
 
-    def near(image: Floats) -> Floats:
+    def mean(image: Floats) -> Floats:
         return np.asarray(cv2.GaussianBlur((image * grid.mask).astype(np.float32), (0, 0), _NEAR))
 
-    alike = near((grid.lean * overview).sum(axis=0)) / (near(np.hypot(*grid.lean) * np.hypot(*overview)) + 1e-3)
-    disagree = near(opposed) / (near(np.ones(grid.mask.shape)) + 1e-6)
-    return np.stack([np.ones(alike.shape), disagree, alike, np.log(np.maximum(sigma, 1))], axis=-1)
+    agreement = mean((grid.lean * overview).sum(axis=0)) / (mean(np.hypot(*grid.lean) * np.hypot(*overview)) + 1e-3)
+    disagree = mean(opposed) / (mean(np.ones(grid.mask.shape)) + 1e-6)
+    return np.stack([np.ones(agreement.shape), disagree, agreement, np.log(np.maximum(sigma, 1))], axis=-1)
 
 
 def proposals(grid: Grid, odds: Floats) -> tuple[NDArray[np.int32], Floats]:
@@ -181,7 +180,7 @@ def proposals(grid: Grid, odds: Floats) -> tuple[NDArray[np.int32], Floats]:
     return region.astype(np.int32), np.bincount(region.ravel(), odds.ravel(), count) / cells
 
 
-def _chance(odds: Floats) -> Floats:
+def _logistic(odds: Floats) -> Floats:
     """Probability from a logarithm of odds (logistic function)."""
     return np.asarray(1 / (1 + np.exp(-odds)))
 
@@ -238,8 +237,8 @@ def _cut(mask: Bools, cost: Floats, first: NDArray[np.intp], second: NDArray[np.
     """Minimize Σ cost · x + Σ alike · (x ≠ x′) over x = 0 or 1 of each cell; returns the cells (h, w) with x = 1.
 
     `cost` (N,) belongs to the mask's cells, `alike` (M,) to the links between its cells `first` and `second` (M,).
-    Cells that the cut leaves open have x = 0. Each cell has two nodes in the graph: the first is on the source's side
-    where x is 0, the second where x is 1.
+    Cells that the cut leaves open have x = 0. The graph has two nodes for each cell, `cell` and `count + cell`. The
+    first is on the source's side if x is 0, the second if x is 1.
     """
     from scipy import sparse  # here: importing it costs .3 s of every start
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
@@ -252,14 +251,17 @@ def _cut(mask: Bools, cost: Floats, first: NDArray[np.intp], second: NDArray[np.
     edges = [
         (np.full(count, source), costly, single),
         (costless, np.full(count, sink), single),
-        *((one, two, pair) for a, b in ((first, same), (first + count, other)) for one, two in ((a, b), (b, a))),
+        (first, same, pair),
+        (same, first, pair),
+        (first + count, other, pair),
+        (other, first + count, pair),
     ]
     start, end, capacity = (np.concatenate(column).astype(np.int32) for column in zip(*edges))
     graph = sparse.csr_array((np.abs(capacity), (start, end)), shape=(2 * count + 2, 2 * count + 2))
-    rest = sparse.csr_array(graph - maximum_flow(graph, source, sink).flow)
-    rest.eliminate_zeros()
+    residual = sparse.csr_array(graph - maximum_flow(graph, source, sink).flow)
+    residual.eliminate_zeros()
     reached = np.zeros(2 * count + 2, dtype=bool)
-    reached[breadth_first_order(rest, source, return_predecessors=False)] = True
+    reached[breadth_first_order(residual, source, return_predecessors=False)] = True
     turned = np.zeros(mask.shape, dtype=bool)
     turned[mask] = ~reached[:count] & reached[count : 2 * count]
     return turned

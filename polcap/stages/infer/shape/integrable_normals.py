@@ -49,10 +49,10 @@ def make_integrable(normal: Floats, error: Floats, mask: Bools, rays: Floats) ->
     coarse = frames.unit(weighted_area_mean(normal, mask, shape))
     sigma = np.radians(weighted_area_mean(np.clip(error, *_ERROR_DEG), mask, shape))[inside]
     towards = frames.unit(area_mean(rays, shape))
-    found, certain = _fit_surface(coarse, sigma, inside, towards)
+    found, fit_weight = _fit_surface(coarse, sigma, inside, towards)
     change = np.zeros(coarse.shape, np.float32)
     weight = np.zeros(shape, np.float32)
-    change[inside], weight[inside] = found - coarse[inside], certain
+    change[inside], weight[inside] = found - coarse[inside], fit_weight
     change *= cv2.erode(weight, np.ones((3, 3), np.uint8))[..., None] ** 2
     return frames.unit(normal + cv2.resize(change, mask.shape[::-1])) * mask[..., None]
 
@@ -75,12 +75,12 @@ def _fit_surface(normal: Floats, sigma: Floats, inside: Bools, rays: Floats) -> 
     rows, size = np.arange(len(n)), corner.max() + 1
 
     def difference(*weights: Floats | float) -> sparse.csr_matrix:
-        """Weighted sum of a cell's four corners."""
+        """Matrix (N, corners) of a weighted sum over each cell's four corners."""
         values = np.concatenate([np.broadcast_to(w, len(n)) for w in weights])
         return sparse.csr_matrix((values, (np.tile(rows, 4), corner.ravel())), (len(n), size))
 
     def derivative(angle: Floats | float) -> sparse.csr_matrix:
-        """Derivative of a function on the corners, in the direction `angle` (N,) rad from a towards b."""
+        """Matrix (N, corners) of the derivative in the direction `angle` (N,) rad from a towards b."""
         a, b = np.cos(angle), np.sin(angle)
         return difference((b - a) / 2, (b + a) / 2, (-b - a) / 2, (a - b) / 2)
 
@@ -94,8 +94,8 @@ def _fit_surface(normal: Floats, sigma: Floats, inside: Bools, rays: Floats) -> 
         ]
     ).tocsr()
     right = np.concatenate([np.zeros(len(n)), steepness / sigma_along, np.zeros(len(n))])
-    continuous = _weigh_curl(slope, sigma_along, inside)
-    weight = continuous
+    curl_weight = _weigh_curl(slope, sigma_along, inside)
+    weight = curl_weight
     for _ in range(_PASSES):
         weighted = equations.T @ sparse.diags(np.tile(weight, 3))
         matrix = (weighted @ equations).tocsc()
@@ -103,7 +103,7 @@ def _fit_surface(normal: Floats, sigma: Floats, inside: Bools, rays: Floats) -> 
         damped = matrix + damping * sparse.identity(size, format="csc")
         log_distance = splu(damped, **_SYMMETRIC).solve(weighted @ right)
         residual = (equations @ log_distance - right).reshape(3, -1)[:2]
-        weight = continuous / (1 + (residual**2).sum(axis=0) / _OUTLIER**2)
+        weight = curl_weight / (1 + (residual**2).sum(axis=0) / _OUTLIER**2)
     g_a, g_b = derivative(0.0) @ log_distance, derivative(np.pi / 2) @ log_distance
     # the surface's tangents along a and b, over ρ: the derivatives of −e^(ln ρ) rays
     found = np.cross(g_a[:, None] * towards + along_a, g_b[:, None] * towards + along_b)
@@ -111,16 +111,16 @@ def _fit_surface(normal: Floats, sigma: Floats, inside: Bools, rays: Floats) -> 
 
 
 def _weigh_curl(slope: Floats, sigma: Floats, inside: Bools) -> Floats:
-    """Weights (N,) of cells by the largest curl of the slopes (2, N) around their corners, over the error (N,)."""
+    """Weights 1/(1 + (c/_CURL)²) (N,) of cells: c is the largest curl of slopes (2, N) at a corner, over `sigma`."""
     a, b, error = (np.zeros(inside.shape) for _ in range(3))
     a[inside], b[inside], error[inside] = *slope, sigma
-    cells = np.ones((2, 2), np.uint8)
+    two = np.ones((2, 2), np.uint8)
     curl = np.zeros((inside.shape[0] + 1, inside.shape[1] + 1))
-    whole = cv2.erode(inside.astype(np.uint8), cells, borderValue=0)[1:, 1:] > 0  # all four cells around a corner
+    complete = cv2.erode(inside.astype(np.uint8), two, borderValue=0)[1:, 1:] > 0  # all four cells around a corner
     twice = np.diff(b, axis=1)[:-1] + np.diff(b, axis=1)[1:] + np.diff(a, axis=0)[:, :-1] + np.diff(a, axis=0)[:, 1:]
-    largest_error = cv2.dilate(error, cells)[1:, 1:]
-    curl[1:-1, 1:-1][whole] = (twice / 2 / np.maximum(largest_error, 1e-9))[whole]
-    return np.asarray(1 / (1 + (cv2.dilate(abs(curl), cells)[1:, 1:][inside] / _CURL) ** 2))
+    largest_error = cv2.dilate(error, two)[1:, 1:]
+    curl[1:-1, 1:-1][complete] = (twice / 2 / np.maximum(largest_error, 1e-9))[complete]
+    return np.asarray(1 / (1 + (cv2.dilate(abs(curl), two)[1:, 1:][inside] / _CURL) ** 2))
 
 
 def _corners(inside: Bools) -> NDArray[np.intp]:

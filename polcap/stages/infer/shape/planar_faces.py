@@ -67,15 +67,15 @@ def faces(normal: Floats, mask: Bools, *, half_turns: bool = False) -> Iterator[
 
     `half_turns`: the normals are in ray frames, and their azimuth is known up to 180°.
     """
-    flat = normal.reshape(-1, 3)
+    normals = normal.reshape(-1, 3)
     least = max(_FEWEST_CELLS, _SHARE * mask.sum())
     left = mask.copy()
     while left.sum() >= least:
         cells = np.flatnonzero(left)
-        candidates = flat[cells[:: max(1, len(cells) // _CANDIDATES)]].T
-        cosine = flat[cells] @ candidates
+        candidates = normals[cells[:: max(1, len(cells) // _CANDIDATES)]].T
+        cosine = normals[cells] @ candidates
         if half_turns:
-            cosine = np.maximum(cosine, (flat[cells] * [-1, -1, 1]) @ candidates)
+            cosine = np.maximum(cosine, (normals[cells] * [-1, -1, 1]) @ candidates)
         alike = cosine > np.cos(np.radians(_ALIKE_DEG))
         part = np.zeros(left.shape, np.uint8)
         part.flat[cells] = alike[:, alike.sum(axis=0).argmax()]
@@ -108,10 +108,10 @@ def light_odds(lean: Floats, inside: Bools, flash: FlashPicture, mask: Bools) ->
         if plane.sum() < _FEWEST_CELLS:
             continue
         azimuth = np.angle(((axis[0] + 1j * axis[1]) ** 2 * sine)[plane].sum()) / 2  # mean of axes, by double angles
-        common = np.array([np.cos(azimuth), np.sin(azimuth)])
+        mean_axis = np.array([np.cos(azimuth), np.sin(azimuth)])
         gradient, covariance = _light_gradient(light[:, plane].T, place[:, plane].T, _tiles(plane))
-        along = abs(gradient @ common) > _ALONG * np.hypot(*gradient)
-        if along and np.hypot(*gradient) < _STEEPEST and _spread_deg(lean[:, plane], common) < _SPREAD_DEG:
+        along = abs(gradient @ mean_axis) > _ALONG * np.hypot(*gradient)
+        if along and np.hypot(*gradient) < _STEEPEST and _spread_deg(lean[:, plane], mean_axis) < _SPREAD_DEG:
             lean_axis = axis[:, face]
             variance = np.einsum("in,ij,jn->n", lean_axis, covariance, lean_axis) + _FLASH_GRADIENT**2
             rise = gradient @ lean_axis / np.sqrt(variance)  # of the light towards the lean, σ
@@ -141,7 +141,7 @@ def flatten(normal: Floats, error: Floats, mask: Bools) -> Floats:
 def _continued(face: Bools, normal: Floats, mask: Bools) -> Bools:
     """Extend a face (h, w) by connected cells that are like its mean normal, also those of other faces.
 
-    A strip of a curved surface, between two other faces, varies little; with the cells around it, it varies as they do.
+    A strip of a curved surface between two other faces varies little; the cells around it show the curvature.
     """
     mean = frames.unit(np.median(normal[face], axis=0))
     alike = mask & (face | (frames.dot(normal, mean) > np.cos(np.radians(_ALIKE_DEG))))
@@ -152,7 +152,7 @@ def _continued(face: Bools, normal: Floats, mask: Bools) -> Bools:
 def _light_gradient(light: Floats, place: Floats, tile: NDArray[np.intp]) -> tuple[Floats, Floats]:
     """Gradient (2,) of the log light (N, 3) of a plane over its places (N, 2), beyond that of its colors.
 
-    Also returns its covariance (2, 2). Residuals in the same `tile` (N,) may be correlated.
+    Also returns its covariance (2, 2) by the sandwich estimator: residuals in the same `tile` (N,) may be correlated.
     """
     color = light[:, [0, 2]] - light[:, [1]]
     share = clusters.soft_share(color, *clusters.color_clusters(color, _COLORS))
