@@ -23,10 +23,10 @@ from polcap.optics.texture_rasterizer import rasterize
 from polcap.optics.vertex_frames import area_vectors, vertex_normals, vertex_tangents
 from polcap.stages import stage
 
-_FILLED = 0.4  # share of the texture that charts cover, about; uvunwrap reaches .4 to .63
+_FILLED = 0.4  # share of the texture that charts cover, about; uvunwrap reaches 0.4 to 0.63
 _TRIANGLE = 4  # map pixels to a triangle of the mesh; docs/benchmarks/fusion-choices.md
-_FEWEST = 2000  # triangles
-_SHARES = (1.0, 0.9, 0.8)  # of the triangles, in turn until the mesh can be charted
+_FEWEST = 2000  # triangles of the mesh
+_SHARES = (1.0, 0.9, 0.8)  # of the triangles, tried in turn until the mesh can be charted
 _SIDES = (512, 4096)  # px, least and greatest side of a texture whose size is not set
 
 
@@ -63,8 +63,8 @@ class Atlas:
 def unwrap(mesh: ClosedMesh, views: tuple[FusionView, ...], settings: AtlasSettings) -> Atlas:
     """Cut a closed mesh into charts, and pack them into a square texture.
 
-    The mesh is reduced to a triangle for four pixels of the views' maps: smaller ones would cut it into charts of a few
-    texels. Without a set size, the side is the least power of two whose texels are no larger than these pixels.
+    The mesh is reduced to a triangle for four pixels of the views' maps: with smaller triangles, charts would have only
+    a few texels. Without a set size, the side is the least power of two whose texels are no larger than these pixels.
 
     Raises SettingError, ObjectError: as `chart`, for the mesh and for coarser ones.
     """
@@ -129,7 +129,7 @@ def of_mesh(mesh: Mesh, side: int, margin: int) -> Atlas:
 
 
 def _cut_charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.int32]]:
-    """Texture coordinates (W, 2) with v down, the mesh's vertex of each (W,), and faces (F, 3) in their numbers."""
+    """Texture coordinates (W, 2) with v down, vertices of the mesh they belong to (W,), faces (F, 3) of coordinates."""
     with package_for("a texture atlas", "uvunwrap", "fusion"):
         import uvunwrap
     surface = uvunwrap.Mesh(mesh.vertices.astype(np.float32).ravel().tolist(), mesh.faces.ravel().tolist())

@@ -35,15 +35,15 @@ from polcap.stages import stage
 
 _LEAST_COSINE = 0.15  # between surface and view: beyond 81° a map pixel covers seven texels
 _FADE = 0.04  # of the object's diameter: distance from an edge over which a view's weight rises to 1
-_EDGE = 8.0  # depth step between pixels that counts as an edge, in pixels' widths; that of a slope of 83°
-_BEHIND = 3.0  # a texel this far behind the traced surface is hidden, in pixels' widths over the cosine
+_EDGE = 8.0  # depth step between neighboring pixels that counts as an edge, in widths of a pixel; a slope of 83° has it
+_BEHIND = 3.0  # distance behind the traced surface at which a texel is hidden, in widths of a pixel over the cosine
 _SHARPNESS = 4  # power of the weights for the fine band
-_OUTLIER_DEG = 12.0  # scale of Cauchy's weight of a normal
-_OUTLIER = 0.15  # the same of albedo, F0 and roughness, over the median
+_OUTLIER_DEG = 12.0  # scale of the Cauchy weights of normals
+_OUTLIER = 0.15  # the same of albedo, and of F0 with roughness, over the median of all samples
 _FLOOR_DEG = 2.0  # error of every normal, added to the expected one
 _ROUNDS = 3  # of reweighting
 _SEEN = 0.02  # least total weight of a seen texel; that of a view along the normal, far from any edge, is 1
-_MARGIN_PX = 2  # around the charts, which belongs to the mask
+_MARGIN_PX = 2  # width of the border around the charts that belongs to the mask
 # columns of a texel's values (N, 11)
 _NORMAL, DIFFUSE, SPECULAR, ROUGHNESS, WEIGHT = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10
 MATERIAL = slice(3, 10)
@@ -72,7 +72,7 @@ class AtlasMaps:
     mask: Bools  # (S, S) the charts, with a margin
     weight: Floats  # (S, S) total weight of the views; 1: one view along the normal, far from any edge
     albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown
-    detail: Floats | None = None  # none on an atlas
+    detail: Floats | None = None  # as `SurfaceMaps` has; an atlas has none
 
     @property
     def seen(self) -> Bools:
@@ -92,8 +92,8 @@ class VisibleTexels:
     texel: NDArray[np.intp]  # (M,) index among the atlas's N texels
     pixel: Floats  # (M, 2) x, y in the view's maps
     cosine: Floats  # (M,) between the mesh's normal and the view
-    weight: Floats  # (M,) 0…1, without the doubt of the maps
-    mesh_normal: Floats  # (H, W, 3) of the mesh at the view's pixels, camera frame; 0 where it is missed
+    weight: Floats  # (M,) 0…1, without the errors of the maps
+    mesh_normal: Floats  # (H, W, 3) of the mesh at the view's pixels, camera frame; 0 without a mesh there
 
     def sample(self, image: Floats) -> Floats:
         """Values (M,) or (M, C) of an image (H, W) or (H, W, C) of the view, interpolated linearly."""
@@ -109,7 +109,7 @@ def bake(views: tuple[FusionView, ...], atlas: Atlas, settings: BakingSettings) 
     albedo = _bake_albedo(views, visible, count, settings.smooth)
     gloss = [texels.sample(np.dstack([view.specular, view.roughness])) for texels, view in zip(visible, views)]
     weights = [texels.weight for texels in visible]
-    specular_roughness, _ = _robust_mean(gloss, weights, visible, count, _OUTLIER * _typical(gloss))
+    specular_roughness, _ = _robust_mean(gloss, weights, visible, count, _OUTLIER * _median_length(gloss))
     total = np.zeros(count)
     for texels in visible:
         total[texels.texel] += texels.weight
@@ -120,8 +120,8 @@ def bake(views: tuple[FusionView, ...], atlas: Atlas, settings: BakingSettings) 
 def on_atlas(atlas: Atlas, values: Floats) -> AtlasMaps:
     """Maps from the values (N, 11) of an atlas's texels.
 
-    Between the charts they have the values of the nearest texel, for reduced textures, and for charts so small that
-    they cover no texel's middle.
+    Texels between the charts get the values of the nearest covered texel. Reduced textures need them, and so do charts
+    so small that they cover no texel's middle.
     """
     image = np.zeros((*atlas.covered.shape, 11), np.float32)
     image[atlas.covered] = values
@@ -153,7 +153,7 @@ def _visible(view: FusionView, atlas: Atlas, tracer: Tracer) -> VisibleTexels:
     row, column, cosine = row[texel], column[texel], cosine[texel]
     slack = _BEHIND / view.camera.focal / cosine
     in_front = -point[texel, 2] <= surface.depth[row, column] * (1 + slack)  # false where the surface is missed
-    fade = _distance_from_edges(view, surface.depth)[row, column]
+    fade = _fade_at_edges(view, surface.depth)[row, column]
     weight = np.where(in_front, cosine**2 * fade, 0)
     seen = np.flatnonzero(weight > 0)
     texel = texel[seen]
@@ -166,16 +166,16 @@ def _visible(view: FusionView, atlas: Atlas, tracer: Tracer) -> VisibleTexels:
     )
 
 
-def _distance_from_edges(view: FusionView, depth: Floats) -> Floats:
-    """Smooth step (H, W) from 0 at the outline and at edges of parts that hide others to 1."""
-    step = _EDGE / view.camera.focal * np.where(np.isfinite(depth), depth, 0)
+def _fade_at_edges(view: FusionView, depth: Floats) -> Floats:
+    """Weight (H, W) that rises smoothly to 1 from 0 at the outline and at edges of parts that hide others."""
+    least = _EDGE / view.camera.focal * np.where(np.isfinite(depth), depth, 0)
     filled = np.where(np.isfinite(depth), depth, np.inf)
     inside = view.mask & np.isfinite(depth)
     with np.errstate(invalid="ignore"):
         for axis in (0, 1):
-            jump = np.abs(np.diff(filled, axis=axis)) > np.take(step, range(step.shape[axis] - 1), axis=axis)
+            jump = np.abs(np.diff(filled, axis=axis)) > np.take(least, range(least.shape[axis] - 1), axis=axis)
             pad = [(0, 1), (0, 0)] if axis == 0 else [(0, 0), (0, 1)]
-            inside &= ~(np.pad(jump, pad) | np.pad(jump, [side[::-1] for side in pad]))
+            inside &= ~(np.pad(jump, pad) | np.pad(jump, [side[::-1] for side in pad]))  # both pixels of a jump
     distance = cv2.distanceTransform(np.pad(inside, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
     share = np.clip(distance / (_FADE * diameter_px(view)), 0, 1)
     return np.asarray(share * share * (3 - 2 * share))
@@ -192,13 +192,13 @@ def _bake_normals(
     """Unit normals (N, 3) in the board frame: those of the mesh plus the mean differences of the views from it."""
     smooth, fine, weights = list[Floats](), list[Floats](), list[Floats]()
     for view, texels in zip(views, visible):
-        both = view.mask & (frames.dot(texels.mesh_normal, texels.mesh_normal) > 0.5)
+        both = view.mask & (frames.dot(texels.mesh_normal, texels.mesh_normal) > 0.5)  # view and mesh have a normal
         difference = np.where(both[..., None], view.normal - texels.mesh_normal, 0).astype(np.float32)
         low, high = _sample_bands(difference, both, texels, settings.smooth * diameter_px(view))
         smooth.append(low @ view.pose.rotation)
         fine.append(high @ view.pose.rotation)
         weights.append(texels.weight / (texels.sample(view.sigma_deg) ** 2 + _FLOOR_DEG**2))
-    prior = (settings.mesh_sigma_deg or _mesh_sigma_deg(smooth)) ** -2
+    prior = (settings.mesh_sigma_deg or _mesh_sigma_deg(smooth)) ** -2  # weight of the mesh: a difference of 0
     outlier = float(np.radians(_OUTLIER_DEG))
     means = _mean_bands(smooth, fine, weights, visible, len(atlas.position), outlier, prior)
     return frames.unit(atlas.normal + means[0] + means[1])
@@ -223,11 +223,11 @@ def _bake_albedo(
     ]
     smooth, fine = zip(*bands)
     weights = [texels.weight for texels in visible]
-    means = _mean_bands(smooth, fine, weights, visible, count, _OUTLIER * _typical(smooth))
+    means = _mean_bands(smooth, fine, weights, visible, count, _OUTLIER * _median_length(smooth))
     return np.maximum(means[0] + means[1], 0)
 
 
-def _typical(samples: Sequence[Floats]) -> float:
+def _median_length(samples: Sequence[Floats]) -> float:
     """Median length of the samples (M, C) of all views."""
     return float(np.median(np.concatenate([np.linalg.norm(one[::16], axis=-1) for one in samples])))
 
@@ -249,7 +249,7 @@ def _mean_bands(
     outlier: float,
     prior: float = 0.0,
 ) -> tuple[Floats, Floats]:
-    """Robust mean (N, 3) of the smooth bands of all views, and mean (N, 3) of the fine bands of the best ones."""
+    """Mean (N, 3) of all smooth bands by `_robust_mean`, and mean (N, 3) of the fine bands of the best views."""
     mean, weights = _robust_mean(smooth, weights, visible, count, outlier, prior)
     return mean, _weighted_mean(fine, [one**_SHARPNESS for one in weights], visible, count)
 

@@ -1,7 +1,7 @@
 """Corners of the board in the merged picture of a view, to a fraction of a pixel.
 
 OpenCV finds the markers. They give a homography from the board to the picture. Around each corner the print is drawn
-through it and registered to the picture in linear light; corners whose surroundings do not look as printed are hidden.
+through this homography and registered to the picture in linear light. Where both do not agree, the corner is hidden.
 """
 
 import itertools
@@ -23,12 +23,13 @@ from polcap.stages import stage
 
 _DETECTOR_PX = 2400  # longer side of the picture in which markers are searched
 _LEAST_MARKERS = 3  # of a board; fewer may be false
-_LEAST_CORNERS = 6  # a pose has six unknowns, and each corner two coordinates; the rest shows errors
+_RANSAC = 0.02  # threshold of the homography's fit, over the extent of the markers
+_LEAST_CORNERS = 6  # twelve coordinates for six unknowns of a pose; the surplus shows errors
 _WINDOW = 0.45  # half side of the print that is compared around a corner, squares
 _SAMPLES = 4  # of the print, per pixel side
 _BLUR_PX = 0.5  # 1σ of the lens and the photosites together
 _ROUNDS = 6  # of the registration
-_MOST_SHIFT = 0.15  # squares; from the homography's prediction, which neglects distortion
+_MOST_SHIFT, _MOST_SHIFT_PX = 0.15, 1.5  # squares or px, whichever is more; the homography neglects distortion
 _LEAST_CORRELATION = 0.85  # of picture and print around a corner
 _MOST_TWINS = 2  # markers seen twice: more are a second board
 
@@ -60,9 +61,9 @@ class BoardSearch:
 
 
 def gray_picture(radiance: AngleStack, color: ColorCalibration) -> tuple[Floats, float]:
-    """Picture (H, W) in which the board is gray, linear, and its RAW pixels per pixel.
+    """Linear gray picture (H, W), and the width of its pixels in RAW pixels.
 
-    These are the white-balanced photosites of the reference shot where it has them, else the mean of all shots.
+    Its values are the white-balanced photosites of the reference shot if known, else means of all shots and colors.
     """
     white = np.linalg.inv(np.asarray(color.matrix, np.float64)) @ np.ones(3)  # in camera channels
     if radiance.mosaic is None:
@@ -87,8 +88,8 @@ def detect(radiance: AngleStack, color: ColorCalibration) -> BoardSearch:
     known = np.asarray(boards.charuco(board).getIds()).ravel().tolist()
     plan = np.asarray(boards.charuco(board).getObjPoints())[..., :2]  # (M, 4, 2) m, from the top left
     pairs = [(plan[known.index(number)], quad) for number, quad in markers if number in known]
-    flat, seen = (np.concatenate(side).astype(np.float64) for side in zip(*pairs, strict=True))
-    homography, _ = cv2.findHomography(flat, seen, cv2.RANSAC, 0.02 * float(np.ptp(seen, axis=0).max()))
+    flat, measured = (np.concatenate(side).astype(np.float64) for side in zip(*pairs, strict=True))
+    homography, _ = cv2.findHomography(flat, measured, cv2.RANSAC, _RANSAC * float(np.ptp(measured, axis=0).max()))
     if homography is None:
         raise CaptureError("the board's markers contradict each other; show a flat board")
     number, world = boards.corners(board)
@@ -134,7 +135,7 @@ def _choose_board(markers: list[tuple[int, Floats]]) -> tuple[Board | None, int]
 def _locate(picture: Floats, homography: Floats, board: Board) -> Floats:
     """Corners (N, 2) px of the board; NaN where the print around a corner is not visible.
 
-    Around each corner the print is drawn through the homography, and moved until it fits (Gauss-Newton).
+    Around each corner the print is drawn through the homography, and shifted until it fits (Gauss-Newton).
     """
     _, world = boards.corners(board)
     out = np.full((len(world), 2), np.nan)
@@ -144,14 +145,14 @@ def _locate(picture: Floats, homography: Floats, board: Board) -> Floats:
         if min(x.min(), y.min()) < 0 or x.max() > picture.shape[1] - 1 or y.max() > picture.shape[0] - 1:
             continue
         shift, correlation = _register(picture, x, y, drawn)
-        square_px = np.array([np.ptp(x), np.ptp(y)]) / (2 * _WINDOW)
-        if correlation > _LEAST_CORRELATION and (np.abs(shift) < np.maximum(_MOST_SHIFT * square_px, 1.5)).all():
+        limit = np.maximum(_MOST_SHIFT * (np.array([np.ptp(x), np.ptp(y)]) / (2 * _WINDOW)), _MOST_SHIFT_PX)
+        if correlation > _LEAST_CORRELATION and (np.abs(shift) < limit).all():
             out[k] = transform_points(homography, flat) + shift
     return out
 
 
 def _draw(homography: Floats, flat: Floats, board: Board) -> tuple[Floats, Floats, Floats]:
-    """Pixels x, y (h, w) around a point (2,) [m] of the print, and the share of paper (h, w) that they should show."""
+    """Pixels x, y (h, w) around a point (2,) [m] from the print's top left, and the share of paper (h, w) there."""
     corners = _WINDOW * board.square_m * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
     around = transform_points(homography, flat + corners)
     low, high = np.floor(around.min(axis=0)), np.ceil(around.max(axis=0))
@@ -166,7 +167,7 @@ def _draw(homography: Floats, flat: Floats, board: Board) -> tuple[Floats, Float
 
 
 def _register(picture: Floats, x: Floats, y: Floats, drawn: Floats) -> tuple[Floats, float]:
-    """Shift (2,) px from the pixels x, y to where the picture looks as `drawn` (h, w), and their correlation.
+    """Shift (2,) px of the picture against the print `drawn` (h, w) at pixels x, y, and their correlation.
 
     Each round fits the shifted picture by a · drawn + b · gradient + c; then the shift is off by b / a.
     """
@@ -174,8 +175,8 @@ def _register(picture: Floats, x: Floats, y: Floats, drawn: Floats) -> tuple[Flo
     terms = np.stack([drawn, across, down, np.ones_like(drawn)], axis=-1).reshape(-1, 4)
     shift: Floats = np.zeros(2)
     for _ in range(_ROUNDS):
-        at = (x + shift[0]).astype(np.float32), (y + shift[1]).astype(np.float32)
-        seen = cv2.remap(picture, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()
+        pixel = (x + shift[0]).astype(np.float32), (y + shift[1]).astype(np.float32)
+        seen = cv2.remap(picture, *pixel, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()
         weight = np.linalg.lstsq(terms, seen, rcond=None)[0]
         if weight[0] <= 1e-6 * np.abs(seen).max():  # no print is here
             return shift, 0.0

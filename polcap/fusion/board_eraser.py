@@ -1,8 +1,8 @@
 """Erases the board's print from a view's picture, so that the object's mask is found as before a dark backdrop.
 
 The pose gives the places of paper and ink. Their brightness is fitted by smooth functions over the board. Pixels like
-the print then get the brightness of ink. Paper is printed in strips only, and a closing over their width returns
-parts of the object that are as bright as the paper behind them.
+the print then get the brightness of ink. Parts of the object that are as bright as the paper behind them are lost at
+first. Paper is printed in narrow strips only, so a closing over the width of a strip restores these parts.
 """
 
 import itertools
@@ -28,9 +28,9 @@ _SITE_PX = 0.8  # side of the area that a channel's photosites and the lens's bl
 _SHIFT_PX = 0.25  # error of the print's position in the picture
 _TOLERANCE = 0.2  # relative, of a channel's brightness against the print's
 _NOISE = 0.02  # of the paper's brightness: noise and scattered light
-_BEYOND = 1.02  # to which the paper may reach, in half widths of the page: its edge in the picture is not sharp
-_ROUNDS = 8  # of the fit without pixels of the object
-_SPECK = 0.25  # squares; smaller parts before the board are noise
+_BEYOND = 1.02  # half widths of the page within which pixels are erased: the paper's edge is not sharp
+_ROUNDS = 8  # of the fit of the brightness, each without pixels that deviate: those of the object
+_SPECK = 0.25  # area in squares; smaller parts in front of the board are noise
 _STRIP = 1 / boards.CELLS  # width of the strips of paper, in squares
 
 
@@ -79,7 +79,7 @@ def erase(radiance: AngleStack, alignment: Alignment, color: ColorCalibration, p
     light = _fit_light(picture, print_)
     erased = covered & ~_find_object(picture / light.tint, print_, light, _strip_px(print_, board))
     white = np.linalg.inv(np.asarray(color.matrix, np.float64)) @ light.tint
-    ink = (0.5 * light.ink * white).astype(np.float32)
+    ink = (0.5 * light.ink * white).astype(np.float32)  # a shot has half of S0
     value = np.where(erased[..., None], ink, radiance.value)
     quality = radiance.quality | np.where(erased, np.uint8(Quality.ERASED), np.uint8(0))
     return replace(radiance, value=value, quality=quality, mosaic=None)
@@ -108,7 +108,7 @@ def _project(radiance: AngleStack, posed: PosedBoard) -> _Print:
 
 
 def _on_board(camera: SessionCamera, pose: Pose, x: Floats, y: Floats) -> Floats:
-    """Points x, z (H, W, 2) [m] of the board's plane that RAW pixels show; far away above the plane's horizon."""
+    """Points x, z (H, W, 2) [m] of the board's plane that RAW pixels show; very distant ones above its horizon."""
     ray = back_project(camera.view, *distortion.undistort(camera.lens, x, y)) @ pose.rotation  # world frame
     start = pose.center
     down = np.where(ray[..., 1] < -1e-6, -ray[..., 1], np.nan)
@@ -129,10 +129,10 @@ def _fit_light(picture: Floats, print_: _Print) -> _PrintLight:
         use = error < max(3 * 1.48 * float(np.median(error)), 1e-9)
     everywhere = _quadratic(np.clip(print_.place, -1.5, 1.5))
     paper, ink = everywhere @ weight[:6], everywhere[..., :3] @ weight[6:]
-    usual = float(np.median(gray[use & (share > 0.8)])) if (use & (share > 0.8)).any() else float(gray.max())
-    white = picture[ring][use & (share > 0.6)]
-    tint = np.median(white, axis=0) if len(white) else np.ones(3)
-    paper, ink = np.maximum(paper, 0.1 * usual), np.maximum(ink, 1e-3 * usual)
+    level = float(np.median(gray[use & (share > 0.8)])) if (use & (share > 0.8)).any() else float(gray.max())
+    colors = picture[ring][use & (share > 0.6)]
+    tint = np.median(colors, axis=0) if len(colors) else np.ones(3)
+    paper, ink = np.maximum(paper, 0.1 * level), np.maximum(ink, 1e-3 * level)  # `level` is that of paper
     return _PrintLight(paper[..., None], ink[..., None], np.asarray(tint / tint.mean()))
 
 
@@ -155,10 +155,10 @@ def _find_object(picture: Floats, print_: _Print, light: _PrintLight, strip: tup
     """Pixels (H, W) that differ from the print, closed over the strips of paper, without lines and specks."""
     expected = print_.paper * (light.paper - light.ink) + light.ink
     limit = _TOLERANCE * expected + (print_.doubt + _NOISE) * light.paper
-    off = (np.abs(picture - expected) > limit).any(axis=-1)
+    differs = (np.abs(picture - expected) > limit).any(axis=-1)
     element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * (strip[0] // 2) + 1, 2 * (strip[1] // 2) + 1))
     pair = np.ones((2, 2), np.uint8)  # removes edges of the print; with one anchor for both, the result would shift
-    broad = cv2.dilate(cv2.erode(off.astype(np.uint8), pair, anchor=(0, 0)), pair, anchor=(1, 1))
+    broad = cv2.dilate(cv2.erode(differs.astype(np.uint8), pair, anchor=(0, 0)), pair, anchor=(1, 1))
     closed = cv2.morphologyEx(broad, cv2.MORPH_CLOSE, element)
     thick = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, label, stats, _ = cv2.connectedComponentsWithStats(thick)

@@ -32,9 +32,9 @@ from polcap.optics.mesh_tracer import Tracer
 from polcap.optics.projection import back_project
 from polcap.optics.vertex_frames import vertex_normals
 
-_DOUBT = 0.4  # share of the views' weight against the mean normal; from here on: docs/benchmarks/fusion-choices.md
+_DOUBT = 0.4  # share of the views' weight against the mean normal; all numbers: docs/benchmarks/fusion-choices.md
 _PASSES = 6  # of averaging over neighbors
-_LEAST_PART = 0.01  # share of the vertices on a doubtful part of the surface; smaller parts are no hollows
+_LEAST_PART = 0.01  # of all vertices; smaller doubtful parts of the surface are no hollows
 _PLANES = 1.5  # steps between the sweep's planes
 _NORMAL_DEG = 15.0  # 1σ of the angle between two views' normals of one point
 _ALBEDO = 0.12  # 1σ of the relative difference of two views' albedos
@@ -42,12 +42,12 @@ _FACING = 0.2  # least cosine at which another view can have measured a normal
 _AGREEING = 3  # views, of which the mean agreement is the score of a depth
 _WINDOW = 5  # px of the sweep over which scores are averaged
 _LEAST_SCORE = 0.45  # of a depth
-_SUPPORT = 3.0  # steps within which another view confirms a depth
-_TRUNCATION = 2.5  # steps; larger distances from a view's surface count as much
+_SUPPORT = 3.0  # steps; a depth of another view confirms a depth within this distance
+_TRUNCATION = 2.5  # steps; larger distances from a view's surface count as this one
 _SOLID = 0.1  # weight of a vote for solid at every point, so that points without depths stay
 _SMOOTHING = 1.0  # steps, 1σ of the Gaussian over the mean distances
-_WALL = 1.5  # steps; thickness that stays behind a wall: surface through which no view looks
-_OPEN = 0.2  # a vertex with a larger share of vertices around it through which views look is no wall
+_WALL = 1.5  # steps, thickness that stays behind a wall: surface behind which no view has a depth
+_OPEN = 0.2  # largest share, around a vertex of a wall, of vertices behind which views have a depth
 
 
 @dataclass(frozen=True)
@@ -95,9 +95,9 @@ def _sweep(number: int, views: Sequence[SmallView], trace: Tracer, doubtful: Boo
     y, x = np.mgrid[:height, :width].astype(np.float64)
     ray = back_project(view.camera, x, y) @ view.pose.rotation  # (H, W, 3) world, at depth 1
     met = trace.meet(np.broadcast_to(view.pose.center, (height * width, 3)), ray.reshape(-1, 3))
-    behind = np.zeros(height * width, bool)
-    behind[met.index] = doubtful[trace.mesh.faces[met.face]].mean(axis=1) > 0.5
-    pixel = np.flatnonzero(behind)
+    searched = np.zeros(height * width, bool)
+    searched[met.index] = doubtful[trace.mesh.faces[met.face]].mean(axis=1) > 0.5
+    pixel = np.flatnonzero(searched)
     corner_depths = -view.pose.to_camera(hull.grid.corners())[:, 2]
     planes = np.arange(corner_depths.min(), corner_depths.max(), _PLANES * step)
     score = np.zeros((len(planes), height, width), np.float32)
@@ -105,9 +105,9 @@ def _sweep(number: int, views: Sequence[SmallView], trace: Tracer, doubtful: Boo
         point = view.pose.center + depth * ray.reshape(-1, 3)[pixel]
         inside = hull.at(point) < 0
         layer[pixel[inside]] = _agreement(point[inside], pixel[inside], view, [*views[:number], *views[number + 1 :]])
-    share = np.maximum(cv2.blur(behind.reshape(height, width).astype(np.float32), (_WINDOW, _WINDOW)), 1e-6)
+    share = np.maximum(cv2.blur(searched.reshape(height, width).astype(np.float32), (_WINDOW, _WINDOW)), 1e-6)
     score = np.stack([cv2.blur(layer, (_WINDOW, _WINDOW)) / share for layer in score])
-    good = behind.reshape(height, width) & (score.max(axis=0) > _LEAST_SCORE)
+    good = searched.reshape(height, width) & (score.max(axis=0) > _LEAST_SCORE)
     return HollowDepths(view, np.where(good, planes[score.argmax(axis=0)], np.nan))
 
 
@@ -127,7 +127,7 @@ def _agreement(point: Floats, pixel: NDArray[np.intp], view: SmallView, others: 
 
 
 def _coarsen(of: SmallView, step: float) -> SmallView:
-    """The view with about one pixel to a grid step."""
+    """Every n-th pixel of the view, about one to a grid step."""
     far = float(np.linalg.norm(of.pose.translation))
     every = max(1, round(step * of.camera.focal / far))
     x, y = of.camera.center
@@ -137,7 +137,7 @@ def _coarsen(of: SmallView, step: float) -> SmallView:
 
 
 def _confirm(depths: Sequence[HollowDepths], step: float) -> list[HollowDepths]:
-    """Depths that at least one other view has at the same place."""
+    """The depths that a depth of at least one other view confirms."""
     confirmed = []
     for one in depths:
         rows, columns = np.nonzero(np.isfinite(one.depth))
@@ -179,7 +179,7 @@ def _mean_distance(hull: DistanceGrid, depths: Sequence[HollowDepths]) -> Floats
 
 
 def _find_walls(surface: FittedSurface, depths: Sequence[HollowDepths], step: float) -> Bools:
-    """Vertices (V,) through which no view looks at a depth behind them."""
+    """Vertices (V,) of walls: few vertices around are seen by a view that has a depth behind them."""
     mesh = surface.mesh
     seen = visible(mesh, vertex_normals(mesh.vertices, mesh.faces), [one.view for one in depths], step)
     beyond = np.stack([_depth_beyond(one, mesh.vertices) > _TRUNCATION * step for one in depths])

@@ -8,8 +8,8 @@ from polcap.errors import ObjectError
 from polcap.fusion.hull import DistanceGrid
 from polcap.fusion.values import ClosedMesh
 
-FEWEST = 16  # triangles of a level
-_SEPARATION = 1e-3  # of the way to the neighbors' middle, by which coincident vertices are moved
+FEWEST = 16  # triangles of a level of detail
+_SEPARATION = 1e-3  # share of the way to their neighbors' middle by which coincident vertices are moved
 
 
 def iso_surface(of: DistanceGrid) -> ClosedMesh:
@@ -21,7 +21,7 @@ def iso_surface(of: DistanceGrid) -> ClosedMesh:
 
 
 def is_closed(mesh: ClosedMesh) -> bool:
-    """Every edge belongs to two triangles that run along it in opposite directions."""
+    """Whether each edge belongs to two triangles that run along it in opposite directions."""
     faces, count = mesh.faces.astype(np.int64), len(mesh.vertices)
     first, last = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     there, back = np.sort(first * count + last), np.sort(last * count + first)  # one number for each directed edge
@@ -29,7 +29,7 @@ def is_closed(mesh: ClosedMesh) -> bool:
 
 
 def solid(mesh: ClosedMesh, floor: float | None = None) -> ClosedMesh:
-    """The mesh as manifold3d writes it: manifold, outward, its largest body alone, above the height `floor` [m].
+    """The largest body of a mesh, cut off below the height `floor` [m]; manifold, with outward faces, by manifold3d.
 
     Raises ObjectError: the mesh is not the border of a body.
     """

@@ -12,7 +12,7 @@ from polcap.optics import frames, shade
 from polcap.optics.point_light import irradiance
 from polcap.stages import stage
 
-_INDEX = 1.5
+_INDEX = 1.5  # refractive
 
 
 @dataclass(frozen=True)

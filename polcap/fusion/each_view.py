@@ -76,8 +76,8 @@ def _outcomes(
             yield name, error
 
 
-def _outcome(work: Callable[[SessionView], R], named: tuple[str, SessionView], _: int) -> R | Exception:
-    """Result of a view, or its error with a traceback for the process that raises it again."""
+def _outcome(work: Callable[[SessionView], R], named: tuple[str, SessionView], _attempt: int) -> R | Exception:
+    """Result of `work` on a named view, or its error, with a traceback for the process that raises it again."""
     try:
         return work(named[1])
     except Exception as error:

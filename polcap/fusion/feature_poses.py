@@ -31,22 +31,22 @@ from polcap.image_values import Bools, Floats
 from polcap.optics.frames import dot, unit
 from polcap.stages import stage
 
-_RATIO = 0.85  # of the distances of the nearest and the second descriptor
-_SAMPLES = 200  # pairs of matches that are tried as the turn between two views
+_RATIO = 0.85  # largest distance of the nearest descriptor over that of the second nearest
+_SAMPLES = 200  # pairs of matches, each of which gives a rotation between two views that is tried
 _AGREES = np.radians(15.0)  # between matching normals after the right turn; normals of single views err by 3 to 8°
-_LEAST_MATCHES = 12  # of two views, with agreeing normals, and a third of all
-_MOST_POINTS = 3000  # those that most views see are used: the time of the adjustment grows with them
+_LEAST_MATCHES = 12  # of two views, with agreeing normals; these must also be a third of all matches
+_MOST_POINTS = 3000  # in the adjustment, whose time grows with them: those that most views see
 _NORMAL_SIGMA = np.radians(5.0)  # 1σ of a normal, in the first turns
 _SCALES_PX = (12.0, 6.0, 3.0, 1.5, 1.0, 1.0)  # of the Cauchy weights, by round; the first turns err by some pixels
 _FAR = 3.0  # times the last of these; features beyond are wrong matches
 _SHIFT_SIGMA = 0.02  # 1σ of an object's motion on the table besides the turn, over the distance of the lens
 _HELD = 1e-4  # 1σ by which the origin's height and the first turn are held near 0: the features do not determine them
 _STEPS = 12  # of the adjustment in a round
-_WRONG = 0.01  # share of the features at the lower and at the upper end that may be wrong
-_BELOW = 0.15  # of the features' height, from the lowest of them to y = 0; the foot itself often shows none
+_WRONG = 0.01  # share of the lowest and of the highest features that may be wrong
+_BELOW = 0.15  # from the lowest feature down to y = 0, over the range of heights; the object's foot often shows none
 # places of the unknowns in `_Motion.value`
 _TILT = slice(0, 2)  # of the axis about x and z [rad]
-_AXIS_X, _AXIS_Y = 2, 3  # of the axis before the lens
+_AXIS_X, _AXIS_Y = 2, 3  # position of the axis in the camera frame, over its distance from the lens
 _FOCAL = 4  # ln of the change of the focal length
 _TURNS = 5  # first of the N turns [rad]; then N shifts along x of the table, and N along z
 _Pair = tuple[int, int]  # numbers of two views
@@ -64,10 +64,10 @@ class _FeatureTracks:
 
 @dataclass(frozen=True)
 class _Motion:
-    """Unknowns: the axis, its place before the lens, and the motion of each view on the table."""
+    """Axis and position of the turntable, focal length, and motion of each view on the table."""
 
-    base: Rotation  # world to camera at turn 0, about which the axis is corrected
-    value: Floats  # (5 + 3 N,) in the places above
+    base: Rotation  # world to camera at turn 0, before the correction `_TILT` of the axis
+    value: Floats  # (5 + 3 N,) unknowns, at the places above
 
     def poses(self) -> tuple[Floats, Floats]:
         """Rotations (N, 3, 3) and translations (N, 3), world to camera; the lens is 1 from the axis."""
@@ -92,7 +92,7 @@ class _AdjustedMotion:
     motion: _Motion
     sigma: Floats  # 1σ of the unknowns
     error: Floats  # (M, 2) slopes of the points minus those of their features
-    near: Bools  # (M,) features that are no wrong matches
+    inlier: Bools  # (M,) features that are no wrong matches
 
 
 @stage(version=1)
@@ -104,20 +104,20 @@ def solve(features: Mapping[str, ObjectFeatures], capture: Capture) -> SessionPo
 
     Raises CaptureError: fewer than three views have enough features in common.
     """
-    names, seen = list(features), list(features.values())
-    pairs = {(i, j): _match(seen[i], seen[j]) for i, j in combinations(range(len(names)), 2)}
-    views, start = _first_motion(seen, pairs)
+    names, found = list(features), list(features.values())
+    pairs = {(i, j): _match(found[i], found[j]) for i, j in combinations(range(len(names)), 2)}
+    views, start = _first_motion(found, pairs)
     if len(views) < LEAST_VIEWS:
         raise _too_few(0, len(names))
-    tracks, distance = _tracks(seen, pairs, start, views), seen[0].distance_m
+    tracks, distance = _tracks(found, pairs, start, views), found[0].distance_m
     doubt = max(*np.abs(capture.focal_doubt), 0.002 if capture.focal_known else 0.5)
-    found = _adjust(tracks, start, seen[0].focal, float(doubt))
-    posed = _pose_views(found, [names[k] for k in views], distance or 1.0, capture.focal_px)
+    adjusted = _adjust(tracks, start, found[0].focal, float(doubt))
+    posed = _pose_views(adjusted, [names[k] for k in views], distance or 1.0, capture.focal_px)
     if len(posed) < LEAST_VIEWS:
         raise _too_few(len(posed), len(names))
     reason = f"fewer than {_LEAST_MATCHES} features of the object match those of other views; turn it by 15° or less"
     left_out = {name: reason for name in names if name not in {one.name for one in posed}}
-    camera = _camera(capture, seen[0].bend, found)
+    camera = _camera(capture, found[0].bend, adjusted)
     return SessionPoses(camera, tuple(posed), left_out, metric=distance is not None)
 
 
@@ -139,13 +139,13 @@ def _camera(capture: Capture, bend: tuple[float, float], found: _AdjustedMotion)
 def _pose_views(found: _AdjustedMotion, names: Sequence[str], distance: float, focal_px: float) -> list[PosedView]:
     """Poses of the views with enough features; the lens is `distance` from the axis."""
     tracks, motion = found.tracks, found.motion
-    point = _points(tracks, motion, found.near.astype(float))[0]
-    height = point[tracks.point[found.near], 1]
+    point = _points(tracks, motion, found.inlier.astype(float))[0]
+    height = point[tracks.point[found.inlier], 1]
     foot = float(np.quantile(height, _WRONG) - _BELOW * np.ptp(np.quantile(height, [_WRONG, 1 - _WRONG])))
     turns, shifts = motion.poses()
     out = []
     for k, (name, turn, shift) in enumerate(zip(names, turns, shifts, strict=True)):
-        own = found.near & (tracks.view == k)
+        own = found.inlier & (tracks.view == k)
         if own.sum() >= _LEAST_MATCHES:
             residual = float(np.sqrt(2 * np.mean(found.error[own] ** 2))) * focal_px
             sigma = float(np.degrees(np.hypot(found.sigma[_TURNS + k], found.sigma[_TILT].max())))
@@ -208,7 +208,7 @@ def _first_motion(
 
 
 def _rotation(before: Floats, after: Floats) -> tuple[Rotation, int]:
-    """Rotation that most pairs of unit vectors (N, 3), before and after, agree with; and the number of these pairs."""
+    """Rotation with which most pairs of unit vectors (N, 3), before and after, agree (RANSAC); their number."""
     if len(before) < _LEAST_MATCHES:
         return Rotation.identity(), 0
     pick = np.random.default_rng(0).integers(len(before), size=(_SAMPLES, 2))
@@ -235,12 +235,12 @@ def _tracks(
     view = np.repeat(np.arange(len(features)), np.diff(start))
     turns = np.zeros((len(features), 3, 3))  # 0 for views that are not used
     turns[views] = first.poses()[0]
-    one, other = np.concatenate([start[list(pair)] + match for pair, match in pairs.items()]).T
+    one, other = np.concatenate([start[list(pair)] + match for pair, match in pairs.items()]).T  # numbers in all views
     world = np.einsum("nji,nj->ni", turns[view], normal)
     good = dot(world[one], world[other]) > np.cos(_AGREES)
     joined = coo_matrix((good[good], (one[good], other[good])), shape=(len(view),) * 2)
     _, track = csgraph.connected_components(joined, directed=False)
-    use = np.unique(np.stack([track, view]), axis=1, return_index=True)[1]
+    use = np.unique(np.stack([track, view]), axis=1, return_index=True)[1]  # one feature of a track in each view
     size = np.bincount(track[use])
     longest = np.argsort(-size, kind="stable")[:_MOST_POINTS]
     use = use[(size[track[use]] > 1) & np.isin(track[use], longest)]
@@ -250,7 +250,7 @@ def _tracks(
 def _adjust(tracks: _FeatureTracks, first: _Motion, focal_px: float, doubt: float) -> _AdjustedMotion:
     """The motion that fits the tracks best; `doubt` is the 1σ of the logarithm of the focal length."""
     count = (len(first.value) - _TURNS) // 3
-    prior = np.full(len(first.value), np.inf)
+    prior = np.full(len(first.value), np.inf)  # 1σ; infinite: none
     prior[_AXIS_Y], prior[_FOCAL], prior[_TURNS] = _HELD, doubt, _HELD
     prior[_TURNS + count :] = _SHIFT_SIGMA
     value, weight = first.value, np.ones(len(tracks.view))
@@ -265,10 +265,10 @@ def _adjust(tracks: _FeatureTracks, first: _Motion, focal_px: float, doubt: floa
         error = _errors(tracks, _Motion(first.base, value), weight)
         far = np.linalg.norm(error, axis=1) * focal_px / scale
         weight = 1 / np.sqrt(1 + far**2)
-    near, jacobian = far < _FAR, np.asarray(best.jac)
-    spread = float(np.sqrt(np.mean(error[near] ** 2))) * focal_px / scale
+    inlier, jacobian = far < _FAR, np.asarray(best.jac)
+    spread = float(np.sqrt(np.mean(error[inlier] ** 2))) * focal_px / scale
     sigma = spread * np.sqrt(np.abs(np.diag(np.linalg.pinv(jacobian.T @ jacobian))))
-    return _AdjustedMotion(tracks, _Motion(first.base, value), sigma, error, near)
+    return _AdjustedMotion(tracks, _Motion(first.base, value), sigma, error, inlier)
 
 
 def _points(tracks: _FeatureTracks, motion: _Motion, weight: Floats) -> tuple[Floats, Floats]:

@@ -18,14 +18,14 @@ from polcap.optics.texture_rasterizer import rasterize
 from polcap.stages import stage
 
 _STIFFNESS = 0.02  # λ, relative to the weight of a vertex that one view sees along the normal
-_FADE = 0.1  # weight of the views below which the filling shows
+_FADE = 0.1  # weight of the views below which the filled values are mixed in
 
 
 @stage(version=1)
 def fill(maps: AtlasMaps, atlas: Atlas) -> AtlasMaps:
     """Fill albedo, F0 and roughness where no view saw the surface; normals there are those of the mesh already."""
     points = rasterize(atlas.mesh.uv, atlas.mesh.faces, *atlas.covered.shape)
-    _, vertex = np.unique(atlas.mesh.vertices, axis=0, return_inverse=True)  # numbers without the charts' seams
+    _, vertex = np.unique(atlas.mesh.vertices, axis=0, return_inverse=True)  # copies at seams get one number
     vertex = vertex.reshape(-1)
     second, third = points.weights.T.astype(np.float64)
     corners = np.stack([1 - second - third, second, third], axis=-1)  # (N, 3) barycentric coordinates of the texels

@@ -33,7 +33,7 @@ from polcap.quality.limits import FusedGateLimits
 from polcap.report import animation
 
 OF_ONE_VIEW: tuple[Extra, ...] = ("displacement", "curvature", "cavity")  # extra textures that a fused object lacks
-_LODS = 2  # coarser levels, each with a quarter of the triangles
+_LODS = 2  # coarser levels of detail, each with a quarter of the triangles
 _SIDE = 480  # px of an animation's frame
 
 
@@ -144,7 +144,7 @@ def _write(out: Path, about: dict[str, Any], results: FusionResults, config: Ses
     source = fused_maps.read(out / "maps", config.asset)  # as stored, so that `polcap export` makes the same bytes
     levels = _LODS if source.triangles > closed_mesh.FEWEST * 4**_LODS else 0
     asset_export.write(out, about, ExportRequest(lod=levels), source)
-    turning = object_pictures.around(results.atlas, results.maps, object_pictures.FRAMES, _SIDE)
+    turning = object_pictures.draw_around(results.atlas, results.maps, object_pictures.FRAMES, _SIDE)
     encoders.animate(out / "asset" / "turntable", turning, animation.SECONDS)
     fused_page.write(out, about, results)
 

@@ -30,7 +30,7 @@ from polcap.stages.asset import AssetSettings
 from polcap.stages.surface import DecimatedMesh
 
 FORMAT = "polcap fused maps 1"
-_ARRAYS = {"vertices": 3, "normals": 3, "uv": 2, "tangents": 4, "faces": 3}  # columns
+_ARRAYS = {"vertices": 3, "normals": 3, "uv": 2, "tangents": 4, "faces": 3}  # columns of the arrays of mesh.npz
 _CHANNELS = {"normal": "RGB", "diffuse": "RGB", "specular": "RGB", "roughness": "Y", "weight": "Y"}
 _MEANINGS = {
     "normal": "unit vectors in the board's frame; float",
@@ -152,7 +152,7 @@ def _mesh_arrays(file: Path) -> dict[str, Any]:
 
 
 def weld(mesh: Mesh) -> ClosedMesh:
-    """The mesh without the seams of its charts: vertices at one position are one."""
+    """The mesh without the seams of its charts: vertices at the same position become one."""
     vertices, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces: NDArray[np.int32] = place.reshape(-1)[mesh.faces].astype(np.int32)
     return ClosedMesh(vertices, faces)
@@ -161,7 +161,7 @@ def weld(mesh: Mesh) -> ClosedMesh:
 def transfer(source: Atlas, maps: AtlasMaps, target: Atlas) -> AtlasMaps:
     """The maps of one atlas on the texels of another of the same object: means of the nearest texels."""
     distance, nearest = cKDTree(source.position).query(target.position, k=_NEIGHBORS)
-    share: Floats = 1 / (np.asarray(distance) + 0.1 * source.texel)
+    share: Floats = 1 / (np.asarray(distance) + 0.1 * source.texel)  # finite at distance 0
     share /= share.sum(axis=1, keepdims=True)
     mixed = np.einsum("nk,nkc->nc", share, maps.texels(source.covered)[nearest])
     return replace(on_atlas(target, mixed), albedo_sigma=maps.albedo_sigma)
@@ -172,12 +172,12 @@ def _asset(
 ) -> Asset:
     """The glTF asset of an atlas, with the extra textures that a closed mesh has."""
     built = asset.build(maps, atlas.mesh, settings, bits)
-    top, kind = np.iinfo(built.normal.dtype).max, built.normal.dtype
+    largest, kind = np.iinfo(built.normal.dtype).max, built.normal.dtype
     if "object-normal" in extras:
-        built = replace(built, object_normal=np.rint((maps.normal / 2 + 0.5) * top).astype(kind))
+        built = replace(built, object_normal=np.rint((maps.normal / 2 + 0.5) * largest).astype(kind))
     if "occlusion" in extras:
         packed = built.occlusion_roughness_metallic.copy()
-        packed[..., 0] = np.rint(ambient_occlusion(atlas) * top)
+        packed[..., 0] = np.rint(ambient_occlusion(atlas) * largest)
         built = replace(built, occlusion_roughness_metallic=packed)
     return built
 

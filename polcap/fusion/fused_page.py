@@ -15,8 +15,8 @@ from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.report import keys, labels, levels, map_figures, page
 from polcap.report.map_figures import MapFigure
 
-_SIDES = 8
-_SIDE = 360  # px of a picture
+_SIDES = 8  # from which the object is drawn
+_PICTURE_PX = 360
 _LONGEST = 1024  # px, side of a map
 _WHITE_QUANTILE = 0.995  # of the albedo; under the lamp it becomes nearly white
 
@@ -24,7 +24,7 @@ _WHITE_QUANTILE = 0.995  # of the albedo; under the lamp it becomes nearly white
 def write(folder: Path, about: Mapping[str, Any], results: FusionResults) -> None:
     """Write report.json and report.html into a result folder. Raises StorageError."""
     atomic.write_json(folder / "report.json", about)
-    drawn = object_pictures.around(results.atlas, results.maps, _SIDES, _SIDE)
+    drawn = object_pictures.draw_around(results.atlas, results.maps, _SIDES, _PICTURE_PX)
     figures, view = _atlas_figures(results.maps)
     content = {
         "sides": [(f"{k * 360 // _SIDES}°", html.jpeg(picture)) for k, picture in enumerate(drawn)],

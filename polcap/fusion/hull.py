@@ -20,10 +20,11 @@ from polcap.image_values import Bools, Floats
 _COARSE = 48  # steps of the grid that finds the object's box
 _MARGIN = 3  # steps around the object
 _NEAR = 3.5  # steps from the surface within which distances are exact; two points lie at most √3 steps apart
-_THIN = 2  # steps; handles and tunnels up to twice as thick are taken for false
-_LARGEST_CUT = 0.002  # of the body's volume; a larger thin part with loops is no handle, but a wall with holes
-_BELOW = 2  # steps below the board, to which the body may reach; at the end it is cut at the board
-_LOOSE = 0.01  # steps inside the surface, of points that touch others of the body by an edge alone
+_THIN = 2  # steps; handles and tunnels up to twice as thick count as false
+_LARGEST_CUT = 0.002  # of the body's volume; a larger thin part with loops is not a handle, but a wall with holes
+_BELOW = 2  # steps below the board, down to which the body may reach; `shape` cuts it at the board
+_CHANGED = 0.05  # steps between the surface and points that were added to the body or removed
+_LOOSE = 0.01  # steps inside the surface: distance given to points that touch others by an edge alone
 
 
 @dataclass(frozen=True)
@@ -73,9 +74,9 @@ def _object_grid(views: Sequence[SmallView], steps: int) -> VoxelGrid:
     if not len(inside):
         raise ObjectError("the silhouettes of the views have no point in common; check the poses and the masks")
     low, high = (coarse.origin + step * bound for bound in (inside.min(axis=0), inside.max(axis=0)))
-    side = float((high - low).max()) / steps
-    shape = np.ceil((high - low) / side).astype(int) + 1 + 2 * _MARGIN
-    return VoxelGrid(low - _MARGIN * side, side, (int(shape[0]), int(shape[1]), int(shape[2])))
+    spacing = float((high - low).max()) / steps
+    shape = np.ceil((high - low) / spacing).astype(int) + 1 + 2 * _MARGIN
+    return VoxelGrid(low - _MARGIN * spacing, spacing, (int(shape[0]), int(shape[1]), int(shape[2])))
 
 
 def _shared_space(views: Sequence[SmallView]) -> tuple[Floats, float]:
@@ -119,7 +120,7 @@ def plain_body(distance: Floats, step: float) -> Floats:
     body = ndimage.binary_fill_holes(_largest_part(distance < 0))
     body = _without_false_loops(body)
     body = ndimage.binary_fill_holes(_largest_part(body))
-    near = 0.05 * step  # where the body was changed, its surface is near the changed points
+    near = _CHANGED * step
     changed = np.where(body, np.minimum(distance, -near), np.maximum(distance, near))
     # marching cubes would join two cubes that share an edge alone, which `_euler` counts as separate
     changed[_touches_by_an_edge(body)] = -_LOOSE * step
@@ -127,7 +128,7 @@ def plain_body(distance: Floats, step: float) -> Floats:
 
 
 def _touches_by_an_edge(body: Bools) -> Bools:
-    """Points of a body that are joined to another by a cube's edge, but not by faces around this edge."""
+    """Points of a body whose cubes touch by an edge alone: the two other cubes at this edge are outside."""
     touching = np.zeros_like(body)
     for axes in ((0, 1), (0, 2), (1, 2)):
         corners = list(product(range(2), range(2)))
@@ -139,7 +140,7 @@ def _touches_by_an_edge(body: Bools) -> Bools:
 
 
 def _corner(array: Bools, axes: tuple[int, int], at: tuple[int, int]) -> Bools:
-    """View of one corner of all squares of neighboring points along two axes."""
+    """View of an array: one corner, `at` (0 or 1 along each axis), of all squares of neighboring points in two axes."""
     box = [slice(None)] * 3
     for axis, side in zip(axes, at, strict=True):
         box[axis] = slice(side, array.shape[axis] - 1 + side)

@@ -28,15 +28,15 @@ from polcap.optics.vertex_frames import vertex_normals
 from polcap.stages import stage
 
 _GRID = 80  # steps along a set's own mesh, which is for this registration alone
-_LEAST_SEEN = 0.3  # least sum of the cosines between normal and views of a point that counts as seen
+_LEAST_SEEN = 0.3  # least sum of the cosines between a point's normal and the views that see it
 _TURNS = 3000  # sampled: every turn is within about 15° of one of them
 _SHIFTS = 3  # tried with each turn
 _TRIED = 40  # best of these motions, which are refined
-_FEW, _MANY = 400, 8000  # points, in the search and in the last rounds
+_FEW, _MANY = 400, 8000  # points of the moved surface, in the search and in the last rounds
 _NORMAL = 0.4  # 1σ of the difference of two normals of one point
 _ALBEDO = 0.1  # the same of albedos
 _CLOSE = (0.06, 0.03, 0.015, 0.008, 0.004)  # 1σ of distances over the object's size, from the search to the last rounds
-_ROUNDS = 6  # with each of them
+_ROUNDS = 6  # of iterated closest points with each 1σ
 _FAR = 3.0  # σ; points that differ by more have no partner
 _ALONG = 0.1  # weight of distances along the surface over that of distances from it
 
@@ -55,8 +55,8 @@ class ObservedSurface:
         """Longest side of the points' box, m."""
         return float(np.ptp(self.point, axis=0).max())
 
-    def some(self, count: int, random: np.random.Generator) -> "ObservedSurface":
-        """About `count` of the points."""
+    def subsample(self, count: int, random: np.random.Generator) -> "ObservedSurface":
+        """`count` random points, or all if there are fewer."""
         index = random.choice(len(self.point), min(count, len(self.point)), replace=False)
         return ObservedSurface(self.point[index], self.normal[index], self.albedo[index], self.middle)
 
@@ -135,29 +135,29 @@ def observe_surface(views: Sequence[FusionView]) -> ObservedSurface:
     diffuse = np.stack([sample(view.diffuse, view.pixels(mesh.vertices)) for view in small])
     weight = visible(mesh, outward, small, step) * cosine  # (N, V)
     total = weight.sum(axis=0)
-    there = np.flatnonzero(total > _LEAST_SEEN)
-    albedo = np.einsum("nv,nvc->vc", weight[:, there], diffuse[:, there]) / total[there, None]
-    return ObservedSurface(mesh.vertices[there], outward[there], albedo, mesh.vertices.mean(axis=0))
+    seen = np.flatnonzero(total > _LEAST_SEEN)
+    albedo = np.einsum("nv,nvc->vc", weight[:, seen], diffuse[:, seen]) / total[seen, None]
+    return ObservedSurface(mesh.vertices[seen], outward[seen], albedo, mesh.vertices.mean(axis=0))
 
 
 def register(moving: ObservedSurface, fixed: ObservedSurface) -> tuple[Motion, float]:
     """The motion of one surface onto another, and the share of its points that then have a partner there."""
     random = np.random.default_rng(0)
-    few, coarse = moving.some(_FEW, random), fixed.some(10 * _FEW, random)
+    few, coarse = moving.subsample(_FEW, random), fixed.subsample(10 * _FEW, random)
     find_coarse = _partner_search(coarse, _CLOSE[1])
 
     def misfit(motion: Motion) -> float:
         return float(np.mean(np.minimum(find_coarse(motion.apply(few))[0], _FAR) ** 2))
 
     best = min((_refine(motion, few, coarse, _CLOSE[:2]) for motion in _search_turns(few, coarse)), key=misfit)
-    many = moving.some(_MANY, random)
+    many = moving.subsample(_MANY, random)
     motion = _refine(best, many, fixed, _CLOSE[1:])
     difference, _ = _partner_search(fixed, _CLOSE[2])(motion.apply(many))
     return motion, float(np.isfinite(difference).mean())
 
 
 def _search_turns(moving: ObservedSurface, fixed: ObservedSurface) -> list[Motion]:
-    """Motions by the best of many sampled turns, middle onto middle and then shifted, by points nearest in space."""
+    """The best motions: of many turns, each with middle on middle, and then shifted towards the nearest points."""
     tree, close = cKDTree(fixed.point), _CLOSE[0] * fixed.size
     features = fixed.features(close)
     found = []
@@ -190,22 +190,22 @@ def _partner_search(fixed: ObservedSurface, close: float) -> Callable[[ObservedS
 
 
 def _refine(motion: Motion, moving: ObservedSurface, fixed: ObservedSurface, closes: Sequence[float]) -> Motion:
-    """A motion improved by iterated closest points, with the 1σ of distances `closes` [sizes] in turn."""
+    """A motion after iterated closest points, with each 1σ of distances in `closes` [sizes of the object] in turn."""
     for close in closes:
         find = _partner_search(fixed, close)
         for _ in range(_ROUNDS):
             moved = motion.apply(moving)
             difference, index = find(moved)
-            there = np.isfinite(difference)
-            if there.sum() < 6:  # a motion has six unknowns
+            paired = np.isfinite(difference)
+            if paired.sum() < 6:  # a motion has six unknowns
                 return motion
-            partner, weight = index[there], 1 / (1 + difference[there] ** 2)
-            motion = _step_to_planes(motion, moved.point[there], fixed.point[partner], fixed.normal[partner], weight)
+            partner, weight = index[paired], 1 / (1 + difference[paired] ** 2)
+            motion = _step_to_planes(motion, moved.point[paired], fixed.point[partner], fixed.normal[partner], weight)
     return motion
 
 
 def _step_to_planes(motion: Motion, point: Floats, target: Floats, normal: Floats, weight: Floats) -> Motion:
-    """A motion, then a small motion that brings the points nearest to the planes of their targets (linearized)."""
+    """The motion, followed by a small one that brings points nearest to their targets' planes (least squares)."""
     middle = point.mean(axis=0)
     axes = [normal, *(np.broadcast_to(_ALONG * axis, normal.shape) for axis in np.eye(3))]
     rows = [np.concatenate([np.cross(point - middle, axis), axis], axis=1) * weight[:, None] for axis in axes]

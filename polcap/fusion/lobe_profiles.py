@@ -10,14 +10,14 @@ from scipy.optimize import minimize
 from polcap.image_values import Bools, Floats
 from polcap.optics import frames, shade
 
-ALPHAS = np.geomspace(0.01, 1.0, 49)
+ALPHAS = np.geomspace(0.01, 1.0, 49)  # GGX α of the lobes that are tried
 # the numbers below: docs/benchmarks/fusion-choices.md, "Textures and gloss"
 _BIN_DEG, _LARGEST_DEG = 3.0, 60.0  # half-angles; beyond, errors of the normals change the mean radiance
-_LEAST_IN_BIN, _LEAST_BINS = 10, 8
+_LEAST_IN_BIN, _LEAST_BINS = 10, 8  # samples of a bin, bins of a profile
 _OUTLIERS = 0.02  # share of the darkest and of the brightest samples of a bin, which are left out
 _RELATIVE = 0.03  # error of a bin's mean radiance, with `_PER_TANGENT`
-_PER_TANGENT = 0.05  # the same over the tangent of the zenith angle: radiance goes with the cosine
-_FLASH_BIN_DEG, _FLASH_SCATTER = 2.0, 0.2  # half-angle; relative scatter beyond which samples count less
+_PER_TANGENT = 0.05  # this error per tangent of the zenith angle: radiance goes with the cosine
+_FLASH_BIN_DEG, _FLASH_SCATTER = 2.0, 0.2  # of the half-angle; relative scatter from which samples count less
 _FARTHEST_FLASH = 0.15  # m from the lens
 _INDEX = 1.5  # refractive index of the diffuse law and of the Fresnel term
 
@@ -51,7 +51,7 @@ class LobeSamples:
 
     def diffuse(self, to_light: Floats) -> Floats:
         """Radiance (P,) of diffuse reflection."""
-        return self.albedo * self._shade(to_light, 1.0, 0.0, 0.5)
+        return self.albedo * self._shade(to_light, 1.0, 0.0, 0.5)  # roughness has no effect
 
     def specular(self, to_light: Floats, alpha: float) -> Floats:
         """Radiance (P,) of specular reflection for F0 = 1."""
@@ -78,14 +78,14 @@ class LobeProfile:
 
 
 def flash_place(samples: Sequence[LobeSamples]) -> Floats:
-    """Place (3,) of the flash in the camera frame for which radiance scatters least within bins of the half-angle."""
-    half = [one.take(slice(None, None, 2)) for one in samples]
-    if not half:
+    """Place (3,) of the flash beside the lens for which radiance scatters least in bins of the half-angle."""
+    every_second = [one.take(slice(None, None, 2)) for one in samples]
+    if not every_second:
         return np.zeros(3)
 
     def misfit(place: Floats) -> float:
         beyond = max(float(np.hypot(*place)) / _FARTHEST_FLASH - 1, 0)
-        return float(np.mean([_scatter(one, np.append(place, 0.0)) for one in half])) + 10 * beyond
+        return float(np.mean([_scatter(one, np.append(place, 0.0)) for one in every_second])) + 10 * beyond
 
     simplex = np.array([[0.0, 0.0], [0.03, 0.0], [0.0, 0.03]])
     best = minimize(misfit, np.zeros(2), method="Nelder-Mead",
@@ -97,7 +97,7 @@ def _scatter(samples: LobeSamples, flash: Floats) -> float:
     """Robust scatter of radiance over that of diffuse reflection, within bins of the half-angle."""
     to_light = samples.to_light(flash)
     diffuse = samples.diffuse(to_light)
-    ratio = np.clip(samples.radiance / np.maximum(diffuse, 1e-3), 0.3, 6)
+    ratio = np.clip(samples.radiance / np.maximum(diffuse, 1e-3), 0.3, 6)  # limits outliers
     bin_ = (samples.half_angle_deg(to_light) / _FLASH_BIN_DEG).astype(int)
     weight = samples.weight * (samples.normal[:, 2] > np.cos(np.radians(_LARGEST_DEG)))
     mean = np.bincount(bin_, weight * ratio) / np.maximum(np.bincount(bin_, weight), 1e-9)

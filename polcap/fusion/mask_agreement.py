@@ -33,12 +33,11 @@ COMPARED = "work/compared_masks"  # folder in the result of a session: the masks
 _SLIT = 0.05  # of the object's diameter in a view; wider gaps in a mask are gaps between the object's parts
 _HOLE = 0.01  # of a mask's area; larger holes may be holes of the object
 _MOST_UNCOVERED = 0.01  # of a mask's area; masks whose outlines err by one cell of the grid leave 0.000
-# Least sum of shares of masks by which a view counts as slid. If the object slid in one view, the hull of the others
-# covers a little more of several masks when this view is left out. The greatest of these gains is not counted, since
-# that mask may hold a piece of the board.
+# If the object slid in one view, the hull of the others covers a little more of several masks without this view. From
+# this sum of the gained shares on, a view counts as slid. The greatest gain is left out: its mask may hold some board.
 _SLIDE = 0.002
 _MOST_LEFT_OUT = 1 / 3  # of the views; where more contradict, nobody knows which are right
-_MOST_TRIMMED = 1 / 2  # of the views may be left out, or hold more than the object
+_MOST_TRIMMED = 1 / 2  # of the views: most that are left out or hold more than the object
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def _close_gaps(views: Sequence[Silhouette], points: Floats, step: float) -> lis
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         framed = np.pad(view.mask.astype(np.uint8), reach)
         closed = fill_holes(cv2.morphologyEx(framed, cv2.MORPH_CLOSE, disc)[reach:-reach, reach:-reach], _HOLE)
-        hull_of_others = points[votes - own == len(views) - 1]
+        hull_of_others = points[votes - own == len(views) - 1]  # inside all other masks
         out.append(replace(view, mask=view.mask | closed & view.covered(hull_of_others, step)))
     return out
 

@@ -47,11 +47,11 @@ from polcap.optics.point_light import irradiance
 from polcap.stages import stage
 
 _F0S = np.linspace(0.012, 0.09, 14)  # of all materials, tried first
-_F0_ERROR = 0.0003  # of the search between them
-_LEAST_F0, _LEAST_F0_SIGMA = 0.005, 0.0005  # an F0 that would be less is held there, with this 1σ
+_F0_ERROR = 0.0003  # at which the search between them ends
+_LEAST_F0, _LEAST_F0_SIGMA = 0.005, 0.0005  # an F0 that would be less gets this one as its prior, with this 1σ
 _SAMPLES = 6000  # of a material, at most
 _LEAST_SAMPLES = 300  # of a material, below which its maps are left as they are
-_LEAST_SHARE = 0.02  # of the weight in the view that sees most of a material, for a view's maps to count
+_LEAST_SHARE = 0.02  # of a view's maps that count: weight on a material, over that of the view that sees most of it
 _LEAST_COSINE = 0.3  # between normal and view: flatter views show errors of the normals
 # the numbers below: docs/benchmarks/fusion-choices.md, "Textures and gloss"
 _GAIN_SIGMA, _LAW_SIGMA = 0.15, 0.1  # of g and c
@@ -128,8 +128,8 @@ def _collect_samples(
         mine = np.flatnonzero((best[texel] == k) & (weight > 0))
         if len(mine) >= _LEAST_SAMPLES:
             mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), _SAMPLES)).astype(int)]
-            every = LobeSamples(radiance, base, local, point, weight, f0, max(roughness**2, ALPHAS[0]))
-            found[k] = every.take(mine)
+            samples = LobeSamples(radiance, base, local, point, weight, f0, max(roughness**2, ALPHAS[0]))
+            found[k] = samples.take(mine)
     return found
 
 
@@ -165,20 +165,20 @@ def _normal_sigma(
 def _fit_lobes(profiles: Mapping[int, LobeProfile], widening: float, settings: MaterialSettings) -> dict[int, Lobe]:
     """Lobes of the materials, with nearly the same F0; errors of the normals add `widening` to each α².
 
-    Errors of all materials are alike, so together they count as one: their misfits are averaged. A material whose law
-    is another adds little.
+    The materials share their errors, so together they count as one: their misfits are averaged. The logarithm limits
+    the misfit of a material that does not follow the law.
     """
     if not profiles:
         return {}
-    every = list(profiles.values())
-    weight = [one.weight for one in every]
-    f0_of_maps = float(np.average([one.f0 for one in every], weights=weight))
-    alpha_of_maps = float(np.average([one.alpha for one in every], weights=weight))
+    found = list(profiles.values())
+    weight = [one.weight for one in found]
+    f0_of_maps = float(np.average([one.f0 for one in found], weights=weight))
+    alpha_of_maps = float(np.average([one.alpha for one in found], weights=weight))
     sigma = settings.f0_sigma * min(1.0, (_BROAD_ALPHA / alpha_of_maps) ** _BROAD_POWER)
 
     def misfit(f0: float) -> float:
-        each = [_fit_lobe(one, f0, _OWN_F0_SIGMA, settings.roughness_sigma, widening).misfit for one in every]
-        robust = [len(one.radiance) * np.log1p(value / len(one.radiance)) for one, value in zip(every, each)]
+        each = [_fit_lobe(one, f0, _OWN_F0_SIGMA, settings.roughness_sigma, widening).misfit for one in found]
+        robust = [len(one.radiance) * np.log1p(value / len(one.radiance)) for one, value in zip(found, each)]
         return float(np.average(robust, weights=weight)) + ((f0 - f0_of_maps) / sigma) ** 2
 
     best = int(np.argmin([misfit(float(f0)) for f0 in _F0S]))
@@ -218,7 +218,7 @@ def _fit_lobe(profile: LobeProfile, f0: float, f0_sigma: float, roughness_sigma:
 
 
 def _amplitudes(terms: Floats, radiance: Floats, expected: Floats, sigma: Floats) -> Floats:
-    """F0, g and c (A, 3) by least squares around the expected values."""
+    """F0, g and c (A, 3) by least squares, with their expected values (A, 3) as priors of 1σ `sigma` (A, 3)."""
     tie = sigma**-2
     normal = np.einsum("abs,abt->ast", terms, terms) + tie[..., None] * np.eye(3)
     right = np.einsum("abt,b->at", terms, radiance) + tie * expected

@@ -37,12 +37,12 @@ _RIM_DEPTH = 3.0  # steps inside the silhouette where rims are searched
 _RIM_LAYER = 0.5  # steps; the rim is a vertex of the outermost layer of this thickness
 _RIM_SIGMA = np.radians(6.0)  # 1σ of the angle between a rim's mean normal and the silhouette's; weights fall with it
 _RIM_LIMIT = 3.0  # σ; vertices beyond are no rims
-_HOLLOW_WEIGHT = 0.5  # of the equation that holds a carved vertex
-_HOLLOW_DEPTH = 2.0  # steps inside the hull from where on the surface was carved
+_HOLLOW_WEIGHT = 0.5  # of the equation that holds a carved vertex at its place
+_HOLLOW_DEPTH = 2.0  # steps; vertices at least as far inside the hull were carved
 _FACET_POWER = 4  # of the cosine between a mesh's normal and the measured one, in the weight of the measured one
 _MOST_MOVE = 1.0  # steps that a vertex may move in a round; more would fold the surface
 _DAMPING = 0.02  # weight of the equations displacement = 0
-_SMOOTHNESS = 0.03  # weight of the equations displacement = that of the neighbor
+_SMOOTHNESS = 0.03  # weight of the equations displacement = displacement of the neighbor
 _PASSES = 5  # of smoothing in a round
 _RELAXATION = 0.5  # share of the way to the neighbors' middle, along the surface, where this has the measured normals
 
@@ -128,7 +128,7 @@ def tracer(mesh: ClosedMesh) -> Tracer:
 def _mean_normals(vertices: Floats, outward: Floats, seen: Bools, views: Sequence[SmallView]) -> SurfaceNormals:
     """Robust mean of the views' normals at each vertex, by expected error and by cosine to the ray.
 
-    It begins at the view with the least Cauchy loss of all others, so that views outvote wrong half-turns.
+    It begins at the normal with the least Cauchy loss against all views, so that a wrong half-turn is outvoted.
     """
     n = np.zeros((len(views), len(vertices), 3), np.float32)
     w = np.zeros((len(views), len(vertices)), np.float32)
@@ -159,8 +159,8 @@ def _find_rims(
 ) -> Anchors:
     """One vertex for each piece of each silhouette, a step long, with its way to the silhouette.
 
-    Of the outermost vertices at the piece it is the one with the mean normal nearest to the silhouette's. To pin all
-    of them would freeze the hull, because each of its vertices touches some silhouette's cone.
+    Of the outermost vertices at the piece, the vertex is chosen whose mean normal is nearest to the silhouette's. If
+    all were held, the surface would stay on the hull: each vertex of the hull touches the cone of some silhouette.
     """
     found = []
     for view in views:

@@ -53,8 +53,8 @@ def find(
     Raises CaptureError: the outline or the network contradicts the order of the polarizer angles, so the normals are
     wrong everywhere.
     """
-    seen = flatness.measure(stokes, maps)
-    order = shot_order.order_of_shots(radiance, object_, calibration.outline, maps.order, seen)
+    flat = flatness.measure(stokes, maps)
+    order = shot_order.order_of_shots(radiance, object_, calibration.outline, maps.order, flat)
     if order.state == "fail":
         raise CaptureError(f"{order.message}. {order.remedy}")
     lens = radiance.equipment.distortion

@@ -16,15 +16,15 @@ from polcap.report.animation import TexturedPoints
 from polcap.report.sheets import Picture
 
 FRAMES = 48  # of the turntable
-INDEX = 1.5
-_FILLED = 0.85  # of the picture's side, by the sphere around the object
-_DISTANCE = 5.0  # from the object's middle, in its radii
-_ELEVATION_DEG = 20.0
+INDEX = 1.5  # refractive
+_FILLED = 0.85  # diameter of the sphere around the object in the picture, over the picture's side
+_DISTANCE = 5.0  # of the camera from the object's middle, in radii of this sphere
+_ELEVATION_DEG = 20.0  # of the camera
 _LIGHT = np.array([-0.5, 0.7, 0.8])  # direction towards the light, camera frame
 _BACKGROUND = 0.012  # linear
 
 
-def around(atlas: Atlas, maps: AtlasMaps, count: int, side: int) -> list[Picture]:
+def draw_around(atlas: Atlas, maps: AtlasMaps, count: int, side: int) -> list[Picture]:
     """Pictures (side, side, 3) of the object from `count` directions around the vertical, in sRGB."""
     vertices, tracer = atlas.mesh.vertices, atlas.tracer()
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
@@ -63,6 +63,6 @@ def sample_textures(atlas: Atlas, maps: AtlasMaps, face: NDArray[np.integer], we
 
 
 def seen_picture(maps: AtlasMaps) -> Picture:
-    """The base color of the atlas, darkened where no view saw the surface."""
+    """The diffuse albedo of the atlas, darkened where no view saw the surface."""
     shown = maps.diffuse * np.where(maps.seen, 1.0, 0.3)[..., None]
     return np.asarray(cv2.resize(color.srgb_eight_bits(shown), (640, 640)))

@@ -33,7 +33,7 @@ _CORNER_SIGMA = 0.05  # px, 1σ of a corner; the robust loss begins at 3σ
 _OUTLIER = 5.0  # times the robust spread of all corners, at least `_LEAST_OUTLIER` px
 _LEAST_OUTLIER = 0.5  # px
 _LEAST_INLIERS = 0.75  # of a view's corners; where more are outliers, all are used
-_PRINCIPAL_SIGMA = 0.002  # of the picture's width: where lenses have their axis; weak, see above
+_PRINCIPAL_SIGMA = 0.002  # 1σ about the stated one, over the picture's width: where lenses have their axis
 _BEND_SIGMA = 0.3, 1.0  # of k₁ and k₂ where nothing else is known
 _CAMERA = 5  # unknowns of the camera: ln focal length, principal point, k₁, k₂
 _STEPS = np.array([1e-6, 1e-3, 1e-3, 1e-5, 1e-4, *[1e-6] * 6])  # of the derivatives: camera; rad and m of a view
@@ -143,7 +143,7 @@ def _adjust(seen: Mapping[str, BoardCorners], capture: Capture) -> tuple[Session
 
 
 def _select(corners: BoardCorners, near: Bools) -> BoardCorners:
-    """The corners (N,) that are near their measured places; all of them where these are too few."""
+    """The corners that `near` (N,) selects; all of them where these are too few."""
     if near.sum() < _LEAST_INLIERS * len(near):
         return corners
     return BoardCorners(corners.board, corners.number[near], corners.world[near], corners.measured_px[near])
@@ -190,7 +190,7 @@ def _residuals(boards: Sequence[BoardCorners], capture: Capture, unknown: Floats
 
 
 def _minimize(boards: Sequence[BoardCorners], capture: Capture, start: Floats) -> OptimizeResult:
-    """Least squares of all unknowns from `start`, with weak priors of the camera's."""
+    """Least squares of all unknowns from `start`, with weak priors of those of the camera."""
     width = capture.size_px[0]
     doubt = max(abs(capture.focal_doubt[0]), abs(capture.focal_doubt[1]), 0.05 if capture.focal_known else 0.5)
     prior = np.array([doubt, *[_PRINCIPAL_SIGMA * width] * 2, *_BEND_SIGMA])  # 1σ

@@ -1,7 +1,7 @@
 """Masks of the views and a grid of points: which points lie inside a mask, and which of its pixels they cover.
 
-This is for the masks' comparison, before there are maps: whole masks with the lens's distortion, on a grid of cells.
-The shape is made later from `SmallView` on the grid of `hull.py`, which holds signed distances without distortion.
+They serve the comparison of the masks, before there are maps: full masks with the lens's distortion, on a grid of
+cells. The shape is made later, from each `SmallView` on the grid of `hull.py`: signed distances without distortion.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ class Silhouette:
         return step * self.camera.focal_px / self.distance
 
     def shows(self, points: Floats, step: float) -> Bools:
-        """Whether cells of size `step` [m] around points (P, 3) touch the mask; no object is outside the picture."""
+        """Whether cells of size `step` [m] around points (P, 3) touch the mask; false outside the picture."""
         reach = max(round(0.9 * self.cell_px(step)), 1)  # half the diagonal of a cell, about
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         grown = cv2.dilate(np.pad(self.mask.astype(np.uint8), reach + 1), disc)
@@ -66,7 +66,7 @@ class Silhouette:
 
 def grid_around(views: Sequence[Silhouette]) -> tuple[Floats, float]:
     """Grid points (P, 3) [m] around the object, and their spacing [m]."""
-    reach = max(_extent(view) for view in views)
+    reach = max(_extent(view) for view in views)  # the object is within a box about the board's middle
     low, high = np.array([-reach, -0.2 * reach, -reach]), np.array([reach, 2 * reach, reach])
     points, step = _grid(low, high, _COARSE)
     share = np.mean([view.shows(points, step) for view in views], axis=0)
@@ -84,8 +84,8 @@ def _grid(low: Floats, high: Floats, count: int) -> tuple[Floats, float]:
 def _extent(view: Silhouette) -> float:
     """Longer side of a mask at the board's distance [m]."""
     row, column = np.nonzero(view.mask)
-    pixels = max(np.ptp(row), np.ptp(column)) if len(row) else 0
-    return float(pixels) * view.distance / view.camera.focal_px
+    side_px = max(np.ptp(row), np.ptp(column)) if len(row) else 0
+    return float(side_px) * view.distance / view.camera.focal_px
 
 
 def halve(points: Floats, step: float) -> tuple[Floats, float]:

@@ -1,7 +1,4 @@
-"""Views reduced to the resolution of the shape: silhouette distances and world normals, and their values at points.
-
-`Silhouette` is another value: the whole mask before there are maps, with the lens's distortion.
-"""
+"""Views reduced to the resolution of the shape: silhouette distances and world normals, and their values at points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +17,7 @@ from polcap.optics.resize import area_mean, weighted_area_mean
 
 SIDE = 420  # px of the object's box in a small view, at most: three to a step of the default grid
 _MARGIN = 3  # px around the box
-_LEAST_SIGMA = 1.0  # deg
+_LEAST_SIGMA = 1.0  # deg, least expected error of a normal
 _ROW = 1024  # points in a row of cv2.remap, which takes 32,767 at most
 
 
@@ -42,8 +39,8 @@ class SmallView:
         pixel = project(self.camera, at)
         height, width = self.outline.shape
         inside = np.clip(pixel, 0, np.array([width - 1, height - 1], pixel.dtype))
-        px = sample(self.outline, inside) + np.hypot(*(pixel - inside).T)
-        return np.asarray(px * -at[:, 2] / self.camera.focal)
+        distance_px = sample(self.outline, inside) + np.hypot(*(pixel - inside).T)  # plus the way to the picture
+        return np.asarray(distance_px * -at[:, 2] / self.camera.focal)
 
     def pixels(self, point: Floats) -> Floats:
         """Pixels x, y (N, 2) of world points (N, 3)."""
@@ -73,6 +70,7 @@ def reduce_views(views: Sequence[FusionView]) -> list[SmallView]:
 
 
 def _reduce(of: FusionView) -> SmallView:
+    """The view cropped to its object, with a margin, and reduced."""
     rows, columns = (np.flatnonzero(of.mask.any(axis=axis)) for axis in (1, 0))
     step = max(1.0, max(np.ptp(rows) + 1, np.ptp(columns) + 1) / SIDE)
     margin = int(np.ceil(_MARGIN * step))

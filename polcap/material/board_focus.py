@@ -12,9 +12,10 @@ from polcap.optics import board as boards
 from polcap.optics.board import SQUARES, Board
 from polcap.stages import stage
 
-_REACH_PX, _STEPS = 4.0, 33  # of the profile across an edge, at most
-_EVEN = 0.11  # squares from an edge, up to which both sides are even
-_MOST_OVER, _MOST_RATIO = 0.5, 1.6  # largest blur of a view: px above that of the median view, and times it
+_REACH_PX, _STEPS = 4.0, 33  # of the profile across an edge: largest distance from the edge, and samples
+_EVEN = 0.11  # squares; the profile goes no farther: up to there, each side of an edge has one color
+# a view is left out if its blur exceeds both: the median blur plus so many px, and so many times the median blur
+_MOST_OVER, _MOST_RATIO = 0.5, 1.6
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class BoardSight:
 @stage(version=2)
 def measure(views: tuple[PosedStokes, ...], board: Board) -> BoardSight:
     """Blur and usable points of the paper in each view."""
-    paper = tuple(len(flash_light.paper(view, board).radiance) for view in views)
+    paper = tuple(len(flash_light.sample_paper(view, board).radiance) for view in views)
     return BoardSight(tuple(_blur(view, board) for view in views), paper)
 
 
@@ -54,15 +55,15 @@ def left_out(names: tuple[str, ...], sight: BoardSight) -> dict[str, str]:
 
 
 def _blur(view: PosedStokes, board: Board) -> float:
-    """Standard deviation of the mean edge's derivative, px."""
+    """Blur of a view, 1σ [px]: that of the derivative of its mean edge profile; NaN where no edge is visible."""
     edge, across = _edges(board)
     step = 1e-4  # m
     ends = [np.stack(view.pixels(edge + sign * step * across), axis=-1) for sign in (-1, 1)]
     scale = np.linalg.norm(ends[1] - ends[0], axis=-1) / (2 * step)  # px per m
     reach = min(_REACH_PX, _EVEN * board.square_m * float(np.quantile(scale, 0.1)))
-    t = np.linspace(-reach, reach, _STEPS)
-    place = edge[:, None] + across[:, None] * (t / scale[:, None])[..., None]
-    x, y = (a.astype(np.float32) for a in view.pixels(place))
+    offset = np.linspace(-reach, reach, _STEPS)  # px across the edge, from ink to paper
+    point = edge[:, None] + across[:, None] * (offset / scale[:, None])[..., None]
+    x, y = (a.astype(np.float32) for a in view.pixels(point))
     height, width = view.stokes.mask.shape
     inside = ((x > 0) & (y > 0) & (x < width - 1) & (y < height - 1)).all(axis=1)
     if not inside.any():
@@ -71,21 +72,21 @@ def _blur(view: PosedStokes, board: Board) -> float:
     profile = cv2.remap(gray, x[inside], y[inside], cv2.INTER_LINEAR)
     low, high = profile[:, :4].mean(axis=1), profile[:, -4:].mean(axis=1)
     contrast = high - low
-    clear = contrast > 0.5 * np.median(contrast)  # the chart hides some
+    clear = contrast > 0.5 * np.median(contrast)  # edges that no chart hides
     edge_profile = ((profile - low[:, None]) / np.maximum(contrast, 1e-6)[:, None])[clear].mean(axis=0)
-    at, weight = (t[1:] + t[:-1]) / 2, np.maximum(np.diff(edge_profile), 0)
-    middle = (weight * at).sum() / weight.sum()
-    return float(np.sqrt((weight * (at - middle) ** 2).sum() / weight.sum()))
+    between, slope = (offset[1:] + offset[:-1]) / 2, np.maximum(np.diff(edge_profile), 0)
+    middle = (slope * between).sum() / slope.sum()
+    return float(np.sqrt((slope * (between - middle) ** 2).sum() / slope.sum()))
 
 
 def _edges(board: Board) -> tuple[Floats, Floats]:
     """World points (M, 3) [m] on edges of the squares, and unit vectors (M, 3) across them, from ink to paper."""
     line = (np.arange(1, SQUARES) - SQUARES / 2) * board.square_m
-    along = (np.arange(8 * SQUARES) / 8 + 1 / 16 - SQUARES / 2) * board.square_m
+    along = (np.arange(8 * SQUARES) / 8 + 1 / 16 - SQUARES / 2) * board.square_m  # eight points a square
     a, b = (one.ravel() for one in np.meshgrid(line, along))
     point = np.concatenate([np.stack([a, 0 * a, b], -1), np.stack([b, 0 * a, a], -1)])
     across = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], len(a), axis=0)
-    sides = [
+    sides = [  # whether ink: before the edge and behind it, at two distances each
         [boards.is_ink(board, *(point + share * board.square_m * across)[:, [0, 2]].T) for share in shares]
         for shares in ((-0.1, -0.02), (0.02, 0.1))
     ]

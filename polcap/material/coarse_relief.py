@@ -2,8 +2,8 @@
 
 1. The plane on which the textures of all views agree best gives the sample's thickness.
 2. Fits of coarse texels give normals, and the radiance that each view should show.
-3. Where a view shows the texture of a neighbor instead, the height is wrong: least squares over a window give it.
-4. Heights from normals and from parallax are joined, by the errors of both. Steps 2 to 4 are repeated.
+3. At a wrong height, a view shows the radiance of a neighboring texel; least squares over a window correct the height.
+4. Heights from normals and from parallax are joined, weighted by their errors. Steps 2 to 4 are repeated.
 """
 
 from collections.abc import Sequence
@@ -29,13 +29,14 @@ from polcap.stages import stage
 _COARSE = 160  # texels along the longer side, about
 _ROUNDS = 3
 _WINDOW = 2.5  # coarse texels, 1σ, over which parallax is summed
-_THICKEST_M, _LOWEST_M = 0.02, -0.002  # range of the plane
+_THICKEST_M, _LOWEST_M = 0.02, -0.002  # range in which the plane is searched
+_SHADING = 6.0  # coarse texels, 1σ of the smoothing that separates shading from texture
 _SLOPE_ERROR = 0.03  # 1σ of the coarse slopes
 # Heights from parallax err by 0.08 texels. Slopes err by 0.001, and their errors add up: heights from slopes are better
 # over waves of up to 500 texels = 2π · CROSSOVER
 CROSSOVER = 80.0  # texels
 _MOST_STEP = 1.5  # coarse texels of height, in a round
-_GLOSS, _GLOSS_SIGMA = (0.45, 0.042), (0.2, 0.012)  # roughness and F0 of common surfaces
+_GLOSS, _GLOSS_SIGMA = (0.45, 0.042), (0.2, 0.012)  # roughness and F0 of common surfaces: mean and 1σ of the prior
 
 
 @dataclass(frozen=True, repr=False)
@@ -62,13 +63,13 @@ def solve(views: tuple[PosedStokes, ...], light: FlashLight, grid: TexelGrid, se
     height = np.full(coarse.size[::-1], _find_plane(views, grid, step))
     for number in range(_ROUNDS):
         fine = _enlarge(height, grid, step)
-        seen = resample(views, light, grid, fine, step)
-        estimate = _fit(seen, views, light, coarse, height)
+        stokes = resample(views, light, grid, fine, step)
+        estimate = _fit(stokes, views, light, coarse, height)
         raised = resample(views, light, grid, fine + coarse.texel, step)
-        change, weight = _parallax(seen, raised, estimate, coarse.texel, settings)
+        change, weight = _parallax(stokes, raised, estimate, coarse.texel, settings)
         stereo = height + np.clip(change, -_MOST_STEP * coarse.texel, _MOST_STEP * coarse.texel)
         slope = estimate.value[:, SLOPES].reshape(*height.shape, 2)
-        reach = None if number == 0 else CROSSOVER / step  # slopes of misplaced views are wrong
+        reach = None if number == 0 else CROSSOVER / step  # at first, misplaced texels give wrong slopes
         height = _join(stereo, weight, slope, coarse.texel, reach)
     sigma = 1 / np.sqrt(np.maximum(weight, 1e-30))
     return CoarseRelief(_enlarge(height, grid, step), _enlarge(np.minimum(sigma, 1.0), grid, step))
@@ -80,8 +81,7 @@ def _enlarge(image: Floats, grid: TexelGrid, step: int) -> Floats:
     x = ((np.arange(width) + 0.5) / step - 0.5).astype(np.float32)
     y = ((np.arange(height) + 0.5) / step - 0.5).astype(np.float32)
     across, down = (np.ascontiguousarray(a) for a in np.broadcast_arrays(x[None], y[:, None]))
-    smooth = image.astype(np.float32)
-    return np.asarray(cv2.remap(smooth, across, down, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+    return np.asarray(cv2.remap(image.astype(np.float32), across, down, cv2.INTER_CUBIC, None, cv2.BORDER_REPLICATE))
 
 
 def _find_plane(views: tuple[PosedStokes, ...], grid: TexelGrid, step: int) -> float:
@@ -111,18 +111,18 @@ def _log_picture(view: PosedStokes, step: int) -> Floats:
 
 
 def _detail(view: PosedStokes, picture: Floats, point: Floats) -> Floats:
-    """Texture (H, W) of a view at world points (H, W, 3): its logarithm without coarse shading; 0: not measured."""
+    """Texture (H, W) of a `_log_picture` at world points (H, W, 3): ln S0 less its smoothed values; 0: not measured."""
     x, y = (a.astype(np.float32) for a in view.pixels(point))
     log = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
     log = np.nan_to_num(log, nan=0.0)
-    return np.asarray(log - cv2.GaussianBlur(log, (0, 0), 6.0))
+    return np.asarray(log - cv2.GaussianBlur(log, (0, 0), _SHADING))
 
 
 def _fit(
-    seen: TexelStokes, views: Sequence[PosedStokes], light: FlashLight, grid: TexelGrid, height: Floats
+    stokes: TexelStokes, views: Sequence[PosedStokes], light: FlashLight, grid: TexelGrid, height: Floats
 ) -> TexelEstimate:
-    """Fits of all coarse texels with a wide prior of their gloss."""
-    data = measurements(seen, views)
+    """Fit all coarse texels at heights (H, W) [m], with a wide prior of their gloss."""
+    data = measurements(stokes, views)
     geometry = texel_grid.geometry(grid.points(height).reshape(-1, 3), [view.pose for view in views], light)
     prior = TexelPrior.alike(_GLOSS, _GLOSS_SIGMA, data.radiance.shape[1])
     first = start(data, geometry, prior, body.SMOOTH)
@@ -130,18 +130,18 @@ def _fit(
 
 
 def _parallax(
-    seen: TexelStokes, raised: TexelStokes, estimate: TexelEstimate, lift: float, settings: ReliefSettings
+    stokes: TexelStokes, raised: TexelStokes, estimate: TexelEstimate, lift: float, settings: ReliefSettings
 ) -> tuple[Floats, Floats]:
     """Change (H, W) [m] of the height that makes all views agree, and its inverse variance.
 
-    `raised` are the views at heights that are greater by `lift` [m]: they give the derivative of the radiance.
+    `raised` are the views resampled at heights greater by `lift` [m]; they give the derivative of the radiance.
     """
-    known = np.isfinite(seen.noise[..., 0]) & np.isfinite(raised.noise[..., 0])
-    here, above = (one.radiance.mean(axis=-1) for one in (seen, raised))
+    known = np.isfinite(stokes.noise[..., 0]) & np.isfinite(raised.noise[..., 0])
+    here, above = (one.radiance.mean(axis=-1) for one in (stokes, raised))
     model = estimate.model.reshape(here.shape)
     level = np.maximum(model, 1e-3)
     derivative = np.where(known, (above - here) / level / lift, 0)
-    common = derivative.sum(axis=0) / np.maximum(known.sum(axis=0), 1)  # to all views: a change of the albedo
+    common = derivative.sum(axis=0) / np.maximum(known.sum(axis=0), 1)  # to all views: the albedo explains it
     derivative = np.where(known, derivative - common, 0)
     error = np.where(known, np.clip((model - here) / level, -0.5, 0.5), 0)
     right, square = (cv2.GaussianBlur((derivative * part).sum(axis=0), (0, 0), _WINDOW) for part in (error, derivative))
@@ -150,20 +150,20 @@ def _parallax(
 
 
 def _join(stereo: Floats, weight: Floats, slope: Floats, texel: float, reach: float | None) -> Floats:
-    """Height (H, W) [m] by least squares: near `stereo` by its inverse variance, with slopes (H, W, 2).
+    """Height (H, W) [m] by least squares, from heights `stereo` of inverse variance `weight`, and slopes (H, W, 2).
 
-    Over less than about `reach` texels the slopes alone give the height; None: by the variances everywhere.
+    `reach` limits the weight of `stereo`: the slopes decide over less than about `reach` texels; None: no limit.
     """
-    number = np.arange(stereo.size).reshape(stereo.shape)
-    first = np.concatenate([number[:, :-1].ravel(), number[1:].ravel()])  # rows run down, slopes up
-    second = np.concatenate([number[:, 1:].ravel(), number[:-1].ravel()])
+    index = np.arange(stereo.size).reshape(stereo.shape)
+    first = np.concatenate([index[:, :-1].ravel(), index[1:].ravel()])  # rows run down, slopes up
+    second = np.concatenate([index[:, 1:].ravel(), index[:-1].ravel()])
     across, up = slope[:, :-1, 0] + slope[:, 1:, 0], slope[1:, :, 1] + slope[:-1, :, 1]
     rise = np.concatenate([across.ravel(), up.ravel()]) * (texel / 2)  # from the first to the second texel
     count = len(first)
     ends = np.repeat(np.arange(count), 2), np.stack([first, second], axis=-1).ravel()
-    differences: Any = sparse.csr_matrix((np.tile([-1.0, 1.0], count), ends), (count, number.size))
+    differences: Any = sparse.csr_matrix((np.tile([-1.0, 1.0], count), ends), (count, index.size))
     slope_weight = 1 / (_SLOPE_ERROR * texel) ** 2
-    own = weight.ravel() / (2 * np.pi * _WINDOW**2) + slope_weight * 1e-8  # windows overlap
+    own = weight.ravel() / (2 * np.pi * _WINDOW**2) + slope_weight * 1e-8  # windows overlap, so a texel has a share
     if reach is not None:
         own = np.minimum(own, slope_weight / reach**2)
     system = slope_weight * (differences.T @ differences) + sparse.diags(own)

@@ -5,9 +5,9 @@ The paper around the sample is flat, evenly white and unpolarized. Its radiance 
     S0 = c_k cos θ / d² (1 + s L)
 
 with the distance d to the flash, the angle θ between the page's normal and the flash, and the highlight L of GGX
-facets, which is weak and broad on matt paper. The flash's place next to the lens, the share s of the highlight and its
-roughness are those that leave the least scatter; c_k are then means. Where S1 and S2 of the paper are not 0, the shots
-of a view had different energies, and a matrix corrects them.
+facets, which is weak and broad on matt paper. A robust fit of all views gives the flash's place next to the lens, the
+share s of the highlight and its roughness. The factor c_k is then a mean over the points of view k. Where S1 and S2 of
+the paper are not 0, the shots of a view had different energies, and a matrix corrects them.
 """
 
 from collections.abc import Sequence
@@ -27,18 +27,18 @@ from polcap.optics.projection import back_project, from_grid
 from polcap.stages import stage
 
 _STEP_M = 0.001  # between the points of the paper that are sampled
-_MARGIN_PX = 3.0  # between such a point and the print; demosaicing errs by 2 % nearer to it
-_FITTED = 800  # of the points of a view, about
+_MARGIN_PX = 3.0  # between such a point and the nearest ink; demosaicing errs by 2 % nearer to it
+_FITTED = 800  # points of a view in the fit, about
 LEAST_POINTS = 60  # of the paper, in a view
-_FLASH_SIGMA_M = 0.08  # distance of a flash from the lens
-_ROUNDS, _OUTLIER = 3, 4.0  # of the fit; robust standard deviations
-_SCATTER = 0.02  # of paper about Lambert's law
+_FLASH_SIGMA_M = 0.08  # 1σ of the flash's position about the lens, prior
+_ROUNDS, _OUTLIER = 3, 4.0  # of the fit; robust standard deviations, beyond which points are left out
+_SCATTER = 0.02  # relative 1σ of paper about Lambert's law
 _USABLE = ~np.uint8(Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST | Quality.DARK)
 PAPER = 0.8  # albedo of matt paper, for sessions without a chart
-_SHARE_SIGMA = 0.1  # of s: F0 over the paper's albedo
-_GLOSS = (0.2, 0.4, 0.7)  # roughness tried first
-_PLACE, _SHARE, _ROUGHNESS = slice(0, 3), 3, 4  # of the flash [m], s, and of the highlight in a law (5,) of the paper
-_LOW, _HIGH = [-0.5, -0.5, -0.5, 0.0, 0.08], [0.5, 0.5, 0.5, 0.3, 1.0]  # of a law
+_SHARE_SIGMA = 0.1  # 1σ of s about 0, prior; s is F0 over the paper's albedo
+_GLOSS = (0.2, 0.4, 0.7)  # roughness of the highlight, with which the search starts
+_PLACE, _SHARE, _ROUGHNESS = slice(0, 3), 3, 4  # in a law (5,) of the paper: flash [m], s, roughness of the highlight
+_LOW, _HIGH = [-0.5, -0.5, -0.5, 0.0, 0.08], [0.5, 0.5, 0.5, 0.3, 1.0]  # limits of a law
 _STEP = [0.01, 0.01, 0.01, 0.01, 0.05]  # scales of the search for a law
 
 
@@ -56,7 +56,7 @@ def measure(views: tuple[PosedStokes, ...], chart: ChartInView | None, board: Bo
 
     Each view must show `LEAST_POINTS` points of the paper or more.
     """
-    samples = [paper(view, board) for view in views]
+    samples = [sample_paper(view, board) for view in views]
     used = [np.ones(len(one.radiance), bool) for one in samples]
     starts = [np.array([0.0, 0.0, 0.0, 0.02, rough]) for rough in _GLOSS]
     for _ in range(_ROUNDS):
@@ -67,14 +67,14 @@ def measure(views: tuple[PosedStokes, ...], chart: ChartInView | None, board: Bo
         used = [np.abs(error) < _OUTLIER * spread for error in errors]
     logs = [_log_error(one, law)[use] for one, use in zip(samples, used, strict=True)]
     energy = np.exp([float(log.mean()) for log in logs])  # c_k
-    rest = np.concatenate([log - np.log(c) for log, c in zip(logs, energy, strict=True)])
+    residual = np.concatenate([log - np.log(c) for log, c in zip(logs, energy, strict=True)])
     place = law[_PLACE]
     albedo = PAPER if chart is None else float(energy[chart.view] * _chart_irradiance(views[chart.view], chart, place))
     return FlashLight(
         place=place,
         gain=energy / albedo,
         shot_matrix=np.stack([_shot_matrix(*one) for one in zip(views, samples, used, strict=True)]),
-        sigma=float(rest.std()),
+        sigma=float(residual.std()),
         paper=albedo,
         shine=max(float(_highlight(one, law).max()) for one in samples),
     )
@@ -94,8 +94,8 @@ class PaperSamples:
         return replace(self, point=self.point[index], radiance=self.radiance[index], ratio=self.ratio[index])
 
 
-def paper(view: PosedStokes, board: Board) -> PaperSamples:
-    """Samples of the paper in a view."""
+def sample_paper(view: PosedStokes, board: Board) -> PaperSamples:
+    """Samples of the paper in a view: pixels of usable quality, away from ink."""
     distance = float(np.linalg.norm(view.pose.translation))
     margin = _MARGIN_PX * distance * view.stokes.view.scale / view.camera.focal_px
     world = _paper_points(board, margin)
@@ -107,24 +107,23 @@ def paper(view: PosedStokes, board: Board) -> PaperSamples:
     good = ((view.stokes.quality[row, column] & ~_USABLE) == 0) & (stokes[0].min(axis=-1) > 0)
     stokes, world = stokes[:, good], world[inside][good]
     radiance = gray(view.matrix) @ stokes[0].T
-    return PaperSamples(
-        view.pose.to_camera(world), view.pose.rotation[:, 1], radiance, np.moveaxis(stokes[1:] / stokes[0], 0, 1)
-    )
+    ratio = np.moveaxis(stokes[1:] / stokes[0], 0, 1)
+    return PaperSamples(view.pose.to_camera(world), view.pose.rotation[:, 1], radiance, ratio)
 
 
 def gray(matrix: Floats) -> Floats:
-    """Weights (3,) of camera channels: their sum, scaled so that white is 1."""
+    """Equal weights (3,) of camera channels, with which white is 1; `matrix` converts them to linear Rec.709."""
     return np.full(3, 1 / np.linalg.inv(np.asarray(matrix, np.float64)).sum())
 
 
 def gray_of_colors(matrix: Floats) -> Floats:
-    """The same weights (3,) for colors in linear Rec.709."""
+    """Weights (3,) of colors in linear Rec.709 that give the same gray as `gray` gives of camera channels."""
     total = np.linalg.inv(np.asarray(matrix, np.float64)).sum(axis=0)
     return np.asarray(total / total.sum())
 
 
 def _paper_points(board: Board, margin: float) -> Floats:
-    """World points (M, 3) [m] of the page that are white up to `margin` [m] around."""
+    """World points (M, 3) [m] of the page with white paper all around, up to the distance `margin` [m]."""
     half = board.page_m[0] / 2 - margin
     axis = np.arange(-half, half, _STEP_M)
     x, z = (a.ravel() for a in np.meshgrid(axis, axis))
@@ -135,13 +134,13 @@ def _paper_points(board: Board, margin: float) -> Floats:
 
 
 def _log_error(samples: PaperSamples, law: Floats) -> Floats:
-    """ln (M,) of the radiance over its law, without c_k."""
+    """ln (M,) of the measured radiance over that of a law (5,) for c_k = 1."""
     light = _irradiance(samples.point, samples.normal, law[_PLACE]) * (1 + _highlight(samples, law))
     return np.asarray(np.log(samples.radiance / light))
 
 
 def _highlight(samples: PaperSamples, law: Floats) -> Floats:
-    """Highlight s L (M,) over the diffuse light."""
+    """Highlight s L (M,) of a law (5,), relative to the diffuse reflection."""
     to_light, ray = frames.unit(law[_PLACE] - samples.point), frames.unit(-samples.point)
     half = frames.unit(to_light + ray)
     cos_i, cos_o, cos_h = (np.clip(one @ samples.normal, 1e-3, 1.0) for one in (to_light, ray, half))
@@ -158,7 +157,7 @@ def _irradiance(point: Floats, normal: Floats, place: Floats) -> Floats:
 
 
 def _fit(samples: Sequence[PaperSamples], used: Sequence[Bools], starts: Sequence[Floats]) -> Floats:
-    """Law (5,) of the paper with the least scatter."""
+    """Law (5,) of the paper with the least scatter, searched from several `starts`."""
     some = []
     for one, use in zip(samples, used, strict=True):
         index = np.flatnonzero(use)
@@ -177,7 +176,7 @@ def _fit(samples: Sequence[PaperSamples], used: Sequence[Bools], starts: Sequenc
 def _chart_irradiance(view: PosedStokes, chart: ChartInView, place: Floats) -> float:
     """cos θ / d² at the chart's white patch, which lies on the board's plane."""
     assert chart.color.place is not None
-    patch = chart.color.place.quads[18].mean(axis=0)
+    patch = chart.color.place.quads[18].mean(axis=0)  # white
     raw = from_grid(patch, view.stokes.view.scale)
     x, y = distortion.undistort(view.camera.lens, *(np.array(a) for a in raw))
     ray, normal = back_project(view.camera.view, x, y), view.pose.rotation[:, 1]

@@ -1,8 +1,8 @@
 """Materials of the sample: groups of texels of like albedo, with the roughness and F0 that all of a group share.
 
-A narrow highlight is met by few texels in few views. So every group gets the gloss that fits many of its texels best:
-a few values of roughness are tried, and Newton steps on sums of the texels' normal equations start from each that fits
-better than its neighbors. The law of diffuse reflection, of a smooth or a rough interface, is the one that fits better.
+Only few texels show a narrow highlight, each in few views. So every group gets the gloss that fits many of its texels
+best: a few values of roughness are tried, and Newton steps on sums of the texels' normal equations start from each that
+fits better than its neighbors. Diffuse reflection has a smooth or a rough interface, whichever fits better.
 """
 
 from dataclasses import dataclass
@@ -23,14 +23,16 @@ from polcap.material.texel_stokes import TexelStokes, measurements
 from polcap.optics import body, clusters, color
 from polcap.stages import stage
 
-_ROUGHNESS = (0.1, 0.16, 0.25, 0.38, 0.55, 0.8)  # tried first
+_ROUGHNESS = (0.1, 0.16, 0.25, 0.38, 0.55, 0.8)  # of a group, tried first
 _SIDE = 70  # texels along the longer side of the sampled grid
-_SAMPLES, _TRIED = 400, 120  # texels of a group; with each of the roughnesses tried first
-_LEAST_SAMPLES = 40
-_ROUNDS = 4
+_SAMPLES, _TRIED = 400, 120  # most texels of a group in its fit; in the trial of each `_ROUGHNESS`, about
+_LEAST_SAMPLES = 40  # texels of a group that is fitted
+_ROUNDS = 4  # most Newton steps
 _INDEPENDENT = 6.0  # texels: a whole group counts as so many, because light, pose and law err alike in all of them
 _TIGHT = np.array([1e-3, 1e-4], np.float32)  # 1σ that ties roughness and F0 of a texel to those of its group
-_F0, _F0_SIGMA = 0.042, 0.008
+_F0, _F0_SIGMA = 0.042, 0.008  # prior of a group's F0
+_ROUGH, _ROUGH_SIGMA = 0.45, 0.2  # roughness of texels before a fit, and of groups without one
+_LOWEST, _HIGHEST = [0.06, 0.01], [1.0, 0.15]  # limits of a group's roughness and F0
 LAWS = {"smooth": body.SMOOTH, "rough": body.Law(rough=1.0)}
 
 
@@ -48,20 +50,20 @@ class GlossGroups(ArrayValue):
     """Materials of a sample."""
 
     center: Floats  # (G, 3) sRGB-encoded albedo
-    spread: float
+    spread: float  # rms distance of such albedos from their center
     roughness: Floats  # (G,)
     f0: Floats  # (G,)
     sigma: Floats  # (G, 2) 1σ of roughness and F0
     law: Literal["smooth", "rough"]
 
     def prior(self, albedo: Floats, settings: GlossSettings) -> TexelPrior:
-        """Expected gloss of texels of an albedo (N, 3)."""
+        """Expected gloss of texels with albedos (N, 3)."""
         mean = self._mix(albedo, np.stack([self.roughness, self.f0], axis=-1))
         sigma = np.tile(np.array([settings.roughness_sigma, settings.f0_sigma], np.float32), (len(mean), 1))
         return TexelPrior(mean, sigma)
 
     def sigma_of(self, albedo: Floats) -> Floats:
-        """1σ (N, 2) of the roughness and F0 that texels of an albedo (N, 3) share with their material."""
+        """1σ (N, 2) of the roughness and F0 that texels with albedos (N, 3) share with their material."""
         return self._mix(albedo, self.sigma)
 
     def _mix(self, albedo: Floats, value: Floats) -> Floats:
@@ -81,16 +83,16 @@ def find(
     light: FlashLight,
     relief: CoarseRelief,
     grid: TexelGrid,
-    seen: TexelStokes,
+    stokes: TexelStokes,
     settings: GlossSettings,
 ) -> GlossGroups:
-    """Group texels on an even grid by their first albedo, and fit the gloss of each group.
+    """Group texels on an even grid by the albedo of a first fit, and fit the gloss of each group.
 
     Raises CaptureError: fewer than `LEAST_VIEWS` views show the sample.
     """
     step = max(1, round(max(grid.size) / _SIDE))
     sampled = (slice(step // 2, None, step),) * 2  # rows, columns
-    some = TexelStokes(*(part[:, *sampled] for part in (seen.radiance, seen.polarized, seen.noise)))
+    some = TexelStokes(*(part[:, *sampled] for part in (stokes.radiance, stokes.polarized, stokes.noise)))
     data = measurements(some, views)
     known = np.flatnonzero(np.isfinite(data.noise[..., 0]).sum(axis=0) >= LEAST_VIEWS)
     if len(known) < _LEAST_SAMPLES:
@@ -101,7 +103,7 @@ def find(
     point = grid.points(relief.height)[sampled].reshape(-1, 3)[known]
     geometry = texel_grid.geometry(point, [view.pose for view in views], light)
     data = data.take(known)
-    prior = TexelPrior.alike((0.45, _F0), (0.2, 0.01), len(known))
+    prior = TexelPrior.alike((_ROUGH, _F0), (_ROUGH_SIGMA, 0.01), len(known))
     first = texel_fit.start(data, geometry, prior, body.SMOOTH)
     fitted = texel_fit.fit(data, geometry, prior, first, body.SMOOTH, settings.fitting, rounds=4)
     return group(data, geometry, fitted.value[:, texel_fit.ALBEDO], settings)
@@ -114,8 +116,8 @@ def group(data: Measurements, views: TexelViews, albedo: Floats, settings: Gloss
     member = clusters.soft_share(encoded, center, spread).argmax(axis=1)
     found: dict[str, tuple[float, Floats, Floats]] = {}
     for name, law in LAWS.items():
-        gloss = np.tile([0.45, _F0], (len(center), 1))  # of groups with too few texels
-        sigma = np.tile([0.2, _F0_SIGMA], (len(center), 1))
+        gloss = np.tile([_ROUGH, _F0], (len(center), 1))  # of groups with too few texels
+        sigma = np.tile([_ROUGH_SIGMA, _F0_SIGMA], (len(center), 1))
         cost = 0.0
         for k in range(len(center)):
             mine = np.flatnonzero(member == k)
@@ -134,9 +136,9 @@ def _fit_shared(
 ) -> tuple[Floats, Floats, float]:
     """Roughness and F0 (2,) that all texels share, their 1σ (2,), and the mean cost of a texel."""
     few = slice(None, None, max(1, data.radiance.shape[1] // _TRIED))
-    some, seen = data.take(few), views.take(few)
+    some, some_views = data.take(few), views.take(few)
     starts = [np.array([rough, _F0]) for rough in _ROUGHNESS]
-    costs = [np.inf, *(_fit_texels(some, seen, gloss, law, fitting)[0] for gloss in starts), np.inf]
+    costs = [np.inf, *(_fit_texels(some, some_views, gloss, law, fitting)[0] for gloss in starts), np.inf]
     minima = [k for k in range(len(starts)) if costs[k + 1] < min(costs[k], costs[k + 2])]
     return min((_descend(data, views, starts[k], law, fitting) for k in minima), key=lambda found: found[2])
 
@@ -144,12 +146,12 @@ def _fit_shared(
 def _descend(
     data: Measurements, views: TexelViews, gloss: Floats, law: body.Law, fitting: FitSettings
 ) -> tuple[Floats, Floats, float]:
-    """The nearest shared gloss (2,) of least cost, its 1σ (2,), and the mean cost of a texel."""
+    """Shared gloss (2,) after Newton steps from `gloss`, its 1σ (2,), and the mean cost of a texel."""
     cost, estimate = _fit_texels(data, views, gloss, law, fitting)
     for _ in range(_ROUNDS):
         step, _ = _newton(estimate, gloss)
-        for share in (1.0, 0.3):
-            trial = np.clip(gloss + share * step, [0.06, 0.01], [1.0, 0.15])
+        for share in (1.0, 0.3):  # a shorter step where the whole one is too long
+            trial = np.clip(gloss + share * step, _LOWEST, _HIGHEST)
             trial_cost, trial_estimate = _fit_texels(data, views, trial, law, fitting, estimate.value)
             if trial_cost < cost:
                 gloss, cost, estimate = trial, trial_cost, trial_estimate
@@ -180,9 +182,9 @@ def _fit_texels(
 def _newton(estimate: TexelEstimate, gloss: Floats) -> tuple[Floats, Floats]:
     """Newton step (2,) of the shared gloss, and its 1σ (2,), from texels that were fitted with it.
 
-    With the information of a texel's data in blocks of gloss (g) and of the other unknowns (u), that on the gloss alone
-    is I_gg − I_gu I_uu⁻¹ I_ug (Schur complement). The gradient is the pull of the prior that held the texel's gloss: in
-    the texel's optimum the two are in balance. F0 has a prior for the group, roughness almost none.
+    A texel's information matrix I has blocks of gloss (g) and of the other unknowns (u). The information on the gloss
+    alone is I_gg − I_gu I_uu⁻¹ I_ug (Schur complement). The gradient is that of the prior that tied the texel's gloss:
+    in the texel's optimum it balances that of the data. F0 has a prior for the group, roughness almost none.
     """
     g, u = np.r_[texel_fit.GLOSS], np.r_[texel_fit.SLOPES, texel_fit.ALBEDO]
     information = estimate.information.astype(np.float64)  # (N, 7, 7)

@@ -1,8 +1,8 @@
 """Metric height of each texel, integrated from its slopes, and low frequencies from parallax.
 
-Slopes give detail, but add up to large errors over many texels; parallax gives the coarse shape. Their least squares
-solution is a Poisson equation with a tie to the coarse height. It is solved by conjugate gradients, because every slope
-counts by its doubt; cosine transforms, which solve it for equal doubts, are the preconditioner.
+Slopes give detail, but their errors add up over many texels; parallax gives the coarse shape. Least squares of both are
+a Poisson equation with a term that holds the height near the coarse one. Each slope is weighted by its error, so the
+equation is solved by conjugate gradients; cosine transforms, which solve it for equal errors, are the preconditioner.
 
 References
 ----------
@@ -27,8 +27,8 @@ from polcap.stages import stage
 _DIRECTIONS, _GROWTH = 12, 1.25  # of the horizon's search; ratio of successive distances
 _FARTHEST = 0.1  # of the longer side
 _MISPLACED = 0.25  # texels, 1σ of a texel's place in a view
-_PRINT = 0.1  # texels, largest shift of a print; slopes that follow the albedo by more are relief
-_PRINT_LEFT = 0.02  # texels, 1σ of the shift that is left, as large as usual shifts because these differ by view
+_PRINT = 0.1  # texels, largest displacement e of a print; slopes that follow the albedo with a larger e are relief
+_PRINT_LEFT = 0.02  # texels, 1σ of the remaining displacement: that of a usual one, because it differs by view
 _SIDE, _WINDOW = 160, 1 / 9  # texels along the longer side of reduced maps; 1σ of a window over that side
 _MOST_WEIGHT = 4.0  # of a slope, over that of the median doubt
 _TOLERANCE, _MOST_STEPS = 1e-3, 60  # of the conjugate gradients; about 15 steps are needed
@@ -91,16 +91,16 @@ def build(found: TexelMaps, relief: CoarseRelief, grid: TexelGrid, albedo_sigma:
 
 
 def _albedo_doubt(albedo: Floats, sigma: Floats, scale: float) -> Floats:
-    """1σ (H, W) of the albedo (H, W, 3): of its texel (H, W), of its scale (relative), and of its place at edges."""
+    """1σ (H, W) of the albedo (H, W, 3): from the texels' `sigma`, the relative 1σ `scale` of all, misplaced edges."""
     gray = albedo.mean(axis=-1)
     down, across = np.gradient(gray)
     return np.asarray(np.sqrt(sigma**2 + (scale * gray) ** 2 + _MISPLACED**2 * (down**2 + across**2)), np.float32)
 
 
 def without_print(slope: Floats, albedo: Floats) -> tuple[Floats, Floats]:
-    """Slopes (H, W, 2) without the part that a shifted print causes, and 1σ (H, W) of the part that is left.
+    """Slopes (H, W, 2) without the part that a misplaced print causes, and 1σ (H, W) of the part that is left.
 
-    `albedo` (H, W) is ρ. If a view at the tilt θ shows the print e tan θ texels off, under a light at the lens this
+    `albedo` (H, W) is ρ. A view at the tilt θ may show the print e tan θ texels off. Under a light at the lens this
     looks like a slope of e d ln ρ/dx. So e is fitted to slopes and gradients of ln ρ in a window; it is about 0.02
     texels. A relief that follows the albedo, as a groove does, has a larger e and keeps its slopes.
     """
@@ -123,20 +123,20 @@ def without_print(slope: Floats, albedo: Floats) -> tuple[Floats, Floats]:
 
 
 def integrate(slope: Floats, sigma: Floats, coarse: Floats, texel: float) -> Floats:
-    """Height (H, W) [m] with slopes (H, W, 2) to the right and up, of doubt (H, W), near the height `coarse` (H, W).
+    """Height (H, W) [m] from slopes (H, W, 2) to the right and up, their 1σ (H, W), and the height `coarse` (H, W).
 
-    Over long ranges the coarse height decides. The unknown is the height over it.
+    Over more than about CROSSOVER texels `coarse` decides. The unknown of the equation is the height above `coarse`.
     """
     height, width = coarse.shape
     weight = np.minimum((np.median(sigma) / np.maximum(sigma, 1e-9)) ** 2, _MOST_WEIGHT)
     weights = np.minimum(weight[:, 1:], weight[:, :-1]), np.minimum(weight[1:], weight[:-1])
-    rises = (  # between neighbors, over those of the coarse height
+    rises = (  # between neighbors, less those of the coarse height
         (slope[:, :-1, 0] + slope[:, 1:, 0]) * (texel / 2) - np.diff(coarse, axis=1),
         -(slope[:-1, :, 1] + slope[1:, :, 1]) * (texel / 2) - np.diff(coarse, axis=0),
     )
     tie = CROSSOVER**-2
     rows, columns = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in (height, width))
-    laplacian = rows[:, None] + columns  # of cosine waves
+    laplacian = rows[:, None] + columns  # its eigenvalues, for cosine waves
 
     def divergence(across: Floats, down: Floats) -> Floats:
         total = np.zeros((height, width))

@@ -33,7 +33,7 @@ _MEANINGS = {
     "specular_sigma": ("Y", "1 sigma of F0"),
     "roughness_sigma": ("Y", "1 sigma of the roughness"),
 }
-_FLOAT = ("normal", "height")
+_FLOAT = ("normal", "height")  # 32 bit in EXR; the others have 16
 _Side = Annotated[int, Meta(ge=1, le=1 << 14)]
 
 
@@ -101,9 +101,8 @@ class MaterialSource:
         packed = built.occlusion_roughness_metallic.copy()
         packed[..., 0] = np.rint(self.maps.occlusion * np.iinfo(packed.dtype).max)
         share = (height - height.min()) / max(float(np.ptp(height)), 1e-12)
-        built = replace(
-            built, occlusion_roughness_metallic=packed, displacement=np.rint(65535 * share).astype(np.uint16)
-        )
+        displacement = np.rint(65535 * share).astype(np.uint16)
+        built = replace(built, occlusion_roughness_metallic=packed, displacement=displacement)
         return replace(built, object_normal=built.normal) if "object-normal" in extras else built
 
     def decimated(self, whole: Asset, triangles: int) -> DetailLevel:

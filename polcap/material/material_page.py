@@ -26,10 +26,10 @@ def write(folder: Path, about: Mapping[str, Any], source: MaterialSource) -> Non
     atomic.write_json(folder / "report.json", about)
     small, figures = _reduce(source.maps), about["figures"]
     lit = _render(small)
-    bright = 0.9 / max(float(np.quantile(lit, 0.995)), 1e-6)
+    exposure = 0.9 / max(float(np.quantile(lit, 0.995)), 1e-6)
     height, width = small["roughness"].shape
     content = {
-        "lit": html.jpeg(color.srgb_eight_bits(bright * lit)),
+        "lit": html.jpeg(color.srgb_eight_bits(exposure * lit)),
         "maps": _figures(small),
         "rows": [_row(row) for row in figures["views"].values()],
         "left_out": list(figures["left_out"].items()),
@@ -37,7 +37,7 @@ def write(folder: Path, about: Mapping[str, Any], source: MaterialSource) -> Non
     }
     view = {
         "size": [width, height], "center": [(width - 1) / 2, (height - 1) / 2], "focal": _DISTANCE * width,
-        "ior": IOR, "exposure": bright, "top": keys.F0.high, "light": _LIGHT.tolist(),
+        "ior": IOR, "exposure": exposure, "top": keys.F0.high, "light": _LIGHT.tolist(),
     }  # fmt: skip
     page.write_report("material.html", folder, about, content, {"view": view})
 
@@ -47,12 +47,12 @@ def _reduce(maps: MaterialMaps) -> dict[str, Floats]:
     height, width = maps.seen.shape
     scale = min(1.0, _LONGEST / max(height, width))
     shape = max(1, round(scale * height)), max(1, round(scale * width))
-    found = {
+    small = {
         name: area_mean(np.asarray(value, np.float32), shape)
         for name, value in vars(maps).items()
         if isinstance(value, np.ndarray)
     }
-    return {**found, "normal": frames.unit(found["normal"])}
+    return {**small, "normal": frames.unit(small["normal"])}
 
 
 def _render(small: Mapping[str, Floats]) -> Floats:

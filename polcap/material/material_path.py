@@ -23,7 +23,7 @@ from polcap.optics.board import Board
 from polcap.pipeline.cache import MemoryCache, StageResult
 from polcap.quality.limits import MaterialGateLimits
 
-_PAPER_SIGMA, _CHART_SIGMA = 0.1, 0.02  # relative 1σ: of the paper's albedo; of the light that reaches a chart
+_PAPER_SIGMA, _CHART_SIGMA = 0.1, 0.02  # relative 1σ of the paper's albedo, and of the light on a chart
 
 
 class SampleSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -73,9 +73,9 @@ def path(
     """
     light = cache.run(flash_light.measure, views, chart, board)
     relief = cache.run(coarse_relief.solve, views, light, grid, config=settings.relief)
-    seen = cache.run(rectification.rectify, views, light, relief, grid)
-    gloss = cache.run(gloss_groups.find, views, light, relief, grid, seen, config=settings.gloss)
-    fitted = cache.run(texel_maps.estimate, views, light, relief, grid, seen, gloss, config=settings.gloss)
+    stokes = cache.run(rectification.rectify, views, light, relief, grid)
+    gloss = cache.run(gloss_groups.find, views, light, relief, grid, stokes, config=settings.gloss)
+    fitted = cache.run(texel_maps.estimate, views, light, relief, grid, stokes, gloss, config=settings.gloss)
     maps = cache.run(height_map.build, fitted, relief, grid, cache.derive(albedo_sigma, chart))
     if tile:
         maps = cache.run(tiling.tile, maps)

@@ -28,8 +28,8 @@ from polcap.pipeline.cache import DeferredResult, LazyCache, StageResult, togeth
 from polcap.results import ResultsUntilStokes
 
 Region = tuple[float, float, float, float]  # m, left, lower, right, upper side, from the board's middle; y up the page
-_MARGIN_M = 0.0015  # inside the board's black middle
-_MOST_TEXELS = 8192  # along a side
+_MARGIN_M = 0.0015  # between the sample and the border of the board's black middle
+_LEAST_TEXELS, _MOST_TEXELS = 8, 8192  # along a side
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,14 @@ def process(
 
 
 def _with_mask(view: SessionView, solved: SessionPoses, board: Board) -> SessionView:
-    """The view with the part of its picture that shows the board as the mask."""
+    """The view with a mask in its input: the part of its picture that shows the board."""
     pose = solved.views[view.name].pose
     mask = stokes_view.board_mask(view.capture.size_px, solved.camera, pose, board)
     return replace(view, supplied=replace(view.supplied, mask=mask))
 
 
 def _posed(view: SessionView, solved: SessionPoses, key: str, cache: LazyCache) -> StageResult[PosedStokes]:
-    """Stokes parameters of a view with its pose, which are read when they are needed."""
+    """Stokes parameters of a view with its pose; they are read when they are needed."""
     results = DeferredResult(key, lambda: run.reopen(view.out, ResultsUntilStokes)[0])
     return cache.derive(posed_stokes, view.name, results, solved, solved.views[view.name].pose)
 
@@ -135,20 +135,20 @@ def make_grid(
     """
     half = (SQUARES / 2 - RING) * board.square_m - _MARGIN_M
     left, lower, right, upper = region or (-half, -half, half, half)
-    most = board.page_m[0] / 2
-    if not (-most <= left < right <= most and -most <= lower < upper <= most):
+    edge = board.page_m[0] / 2
+    if not (-edge <= left < right <= edge and -edge <= lower < upper <= edge):
         raise SettingError(
             f"--region {', '.join(f'{1000 * a:g}' for a in (left, lower, right, upper))} mm: x0 < x1 and y0 < y1 must "
-            f"lie within ±{1000 * most:g} mm, the board's page"
+            f"lie within ±{1000 * edge:g} mm, the board's page"
         )
     if texel is None:
         nearest = min(float(np.linalg.norm(solved.views[name].pose.translation)) for name in names)
         texel = float(f"{nearest * views[0].value.stokes.view.scale / solved.camera.focal_px:.3g}")
     size = tuple(int(side / texel) for side in (right - left, upper - lower))
-    if not 8 <= min(size) <= max(size) <= _MOST_TEXELS:
+    if not _LEAST_TEXELS <= min(size) <= max(size) <= _MOST_TEXELS:
         raise SettingError(
-            f"{size[0]} × {size[1]} texels of {1000 * texel:g} mm: 8 to {_MOST_TEXELS} along a side are possible; "
-            "change --texel or --region"
+            f"{size[0]} × {size[1]} texels of {1000 * texel:g} mm: {_LEAST_TEXELS} to {_MOST_TEXELS} along a side are "
+            "possible; change --texel or --region"
         )
     origin = ((left + right) / 2 - (size[0] - 1) / 2 * texel, -(lower + upper) / 2 - (size[1] - 1) / 2 * texel)
     return TexelGrid(origin, texel, (size[0], size[1]))

@@ -1,7 +1,6 @@
 """Stages of one view of a flat sample: the path of a single capture up to its Stokes parameters, without networks.
 
-The board is searched first. The poses then give the part of the picture that shows the board, which takes the place of
-the object's mask.
+The board is searched first. The poses then give the part of the picture that shows the board. It is used as the mask.
 """
 
 from collections.abc import Sequence
@@ -44,11 +43,10 @@ class PosedStokes:
 
 
 def of_flat_views(config: Config) -> Config:
-    """The settings of the views of a flat sample: its outline states no order of the angles, and no ring's zero."""
+    """The settings of the views of a flat sample: the outline gives no order and no zero of angles; no undistortion."""
     selfcal = msgspec.structs.replace(config.selfcal, check_order=False, correct_ring=False)
-    return msgspec.structs.replace(
-        config, selfcal=selfcal, stokes=msgspec.structs.replace(config.stokes, undistort=False)
-    )
+    stokes = msgspec.structs.replace(config.stokes, undistort=False)
+    return msgspec.structs.replace(config, selfcal=selfcal, stokes=stokes)
 
 
 def board_mask(size_px: Sequence[int], camera: SessionCamera, pose: Pose, board: Board) -> Bools:

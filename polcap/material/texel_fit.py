@@ -24,12 +24,12 @@ KINDS = slice(0, 3), slice(3, 5)  # places of S0 and of S1 and S2 in a view's da
 LEAST_VIEWS = 3
 _ROUNDS = 9
 _STEP = np.array([2e-3, 2e-3, 4e-3], np.float32)  # of the derivatives: slopes, roughness
-_LOW = np.array([-1.5, -1.5, 0.06, 0.004, 0.002, 0.002, 0.002], np.float32)
+_LOW = np.array([-1.5, -1.5, 0.06, 0.004, 0.002, 0.002, 0.002], np.float32)  # limits of the unknowns
 _HIGH = np.array([1.5, 1.5, 1.0, 0.25, 1.3, 1.3, 1.3], np.float32)
-_MOST_STEP = np.array([0.2, 0.2, 0.15, 0.02, 0.3, 0.3, 0.3], np.float32)
-_SLOPE_SIGMA = 0.5  # prior
+_MOST_STEP = np.array([0.2, 0.2, 0.15, 0.02, 0.3, 0.3, 0.3], np.float32)  # in a round
+_SLOPE_SIGMA = 0.5  # 1σ of slopes about 0, prior
 _CAUCHY = 2.0  # rms error of a view, in standard deviations, from which its weight falls
-_LEAST_DESCENT = 0.01  # of the sum of squared errors, by the next step of a texel that is not finished
+_LEAST_DESCENT = 0.01  # of the sum of squared errors; a texel whose next step promises less is finished
 _DAMPING = 1e-3  # at the start, relative to the diagonal
 
 
@@ -82,8 +82,8 @@ class TexelEstimate(ArrayValue):
 
     value: Floats  # (N, 7)
     information: Floats  # (N, 7, 7) of data and priors
-    by_kind: Floats  # (2, N, 7, 7) information of S0, and of S1 and S2
-    gradient: Floats  # (N, 7) descent of `total`
+    by_kind: Floats  # (2, N, 7, 7) information of S0 alone, and of S1 and S2
+    gradient: Floats  # (N, 7) half the negative gradient of `total`
     cost: Floats  # (N,) of the data, robust
     total: Floats  # (N,) of data and priors
     error: Floats  # (K, N, 5) measured minus modelled, in standard deviations; 0 where not measured
@@ -97,8 +97,8 @@ class TexelEstimate(ArrayValue):
     def replace_texels(self, index: Indices, other: "TexelEstimate", chosen: Bools) -> None:
         """Overwrite the texels at `index` by the chosen ones of another estimate."""
         for name, array in vars(self).items():
-            along = (slice(None),) if name in ("by_kind", "error", "model") else ()
-            array[*along, index] = getattr(other, name)[*along, chosen]
+            first = (slice(None),) if name in ("by_kind", "error", "model") else ()  # axis before that of the texels
+            array[*first, index] = getattr(other, name)[*first, chosen]
 
 
 def normals(value: Floats) -> Floats:
@@ -107,7 +107,7 @@ def normals(value: Floats) -> Floats:
 
 
 def responses(slope: Floats, roughness: Floats, views: TexelViews, law: body.Law) -> Floats:
-    """Stokes parameters (3, K, N, 2) of a texel of albedo 1 and F0 0, and of albedo 0 and F0 1."""
+    """Stokes parameters (3, K, N, 2) of texels in K views: diffuse reflection for albedo 1, gloss for F0 1."""
     normal = (views.normal_to_ray @ normals(slope)[:, :, None])[..., 0]
     albedo, f0 = (np.array(v, np.float32) for v in ((1, 0), (0, 1)))
     rough, ior = np.broadcast_to(roughness, normal.shape[:2]), np.full((1, 1), IOR, np.float32)
@@ -145,8 +145,8 @@ def fit(
         system = information + (damping[active, None] * diagonal + 1e-6)[:, :, None] * eye
         step = np.clip(np.linalg.solve(system, gradient[..., None])[..., 0], -_MOST_STEP, _MOST_STEP)
         second = np.clip(first + step, _LOW, _HIGH)
-        going = ((second - first) * gradient).sum(axis=-1) > _LEAST_DESCENT
-        active, second = active[going], second[going]
+        unfinished = ((second - first) * gradient).sum(axis=-1) > _LEAST_DESCENT
+        active, second = active[unfinished], second[unfinished]
         if len(active) == 0:
             break
         some = data.take(active), views.take(active), prior.take(active)
@@ -158,42 +158,42 @@ def fit(
 
 
 def _sigma(data: Measurements, settings: FitSettings) -> Floats:
-    """1σ (K, N, 5) of the data: noise, and errors in proportion to S0."""
+    """1σ (K, N, 5) of three colors, S1 and S2: noise, and errors in proportion to S0."""
     level = np.maximum(data.radiance, 0) @ data.gray
     # three colors share the errors of light and geometry, so each counts by a third
     colors = np.sqrt(3) * np.hypot(
         data.noise[..., :1], settings.radiance_error * np.maximum(data.radiance, 0.3 * level[..., None])
     )
     polarized = np.hypot(data.noise[..., 1], settings.polarization_error * level)
-    both = np.concatenate([colors, np.repeat(polarized[..., None], 2, axis=-1)], axis=-1)
-    return np.where(np.isfinite(both), np.maximum(both, 1e-6), np.inf).astype(np.float32)
+    sigma = np.concatenate([colors, np.repeat(polarized[..., None], 2, axis=-1)], axis=-1)
+    return np.where(np.isfinite(sigma), np.maximum(sigma, 1e-6), np.inf).astype(np.float32)
 
 
 def misfit(data: Measurements, found: TexelEstimate, settings: FitSettings) -> tuple[Floats, Floats]:
     """Sums of squared errors (N, 2) of S0 and of S1 and S2, in 1σ as stated, and their degrees of freedom (N, 2).
 
-    S0 is gray: its colors share the errors of light and geometry, and noise of color does not bend a normal.
+    S0 is gray: its colors share the errors of light and geometry, and noise of color hardly changes a normal.
     """
     known = np.isfinite(data.noise[..., 0])
     level = np.maximum(data.radiance, 0) @ data.gray
     stated = np.where(known, np.hypot(data.noise[..., 0], settings.radiance_error * level), np.inf)
     gray = np.where(known, data.radiance @ data.gray - found.model, 0) / np.maximum(stated, 1e-6)
     squares = np.stack([gray**2, (found.error[..., KINDS[1]] ** 2).sum(axis=-1)], axis=-1)
-    share = np.einsum("nij,knji->nk", np.linalg.inv(found.information.astype(np.float64)), found.by_kind)
-    fitted = np.maximum(share - [2, 0], 0)  # two unknowns of the albedo are of color, not gray
-    freedom = np.maximum(known.sum(axis=0)[:, None] * [1, 2] - fitted, 0)
+    used = np.einsum("nij,knji->nk", np.linalg.inv(found.information.astype(np.float64)), found.by_kind)
+    used = np.maximum(used - [2, 0], 0)  # unknowns that each kind of data determines; two of the albedo are not gray
+    freedom = np.maximum(known.sum(axis=0)[:, None] * [1, 2] - used, 0)
     return (_robust_weight(found.error)[..., None] * squares).sum(axis=0), freedom
 
 
 def _linearize(
     data: Measurements, views: TexelViews, prior: TexelPrior, value: Floats, law: body.Law, sigma: Floats
 ) -> TexelEstimate:
-    """Errors and normal equations at values (N, 7)."""
+    """Errors and normal equations at values (N, 7); derivatives of slopes and roughness are differences."""
     slope, rough, f0, albedo = value[:, SLOPES], value[:, ROUGHNESS], value[:, F0], value[:, ALBEDO]
     gray = data.gray.astype(np.float32)
     gray_albedo = albedo @ gray
 
-    def light(response: Floats) -> Floats:  # (K, N, 5)
+    def light(response: Floats) -> Floats:  # (K, N, 5): three colors of S0, gray S1 and S2
         s0, polarized = response[0], response[1:]
         colors = s0[..., :1] * albedo + (s0[..., 1] * f0)[..., None]
         s1_s2 = polarized[..., 0] * gray_albedo + polarized[..., 1] * f0

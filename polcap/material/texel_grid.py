@@ -46,7 +46,7 @@ class FlashLight:
     shot_matrix: Floats  # (K, 3, 3, 3) channel, corrected Stokes parameters from those of a view
     sigma: float  # relative, of the paper's radiance about the model
     paper: float  # albedo of the board's paper that the model implies
-    shine: float  # highlight of the paper over its diffuse light, at the brightest point
+    shine: float  # highlight of the paper over its diffuse reflection, at the brightest point
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,12 @@ def geometry(point: Floats, poses: Sequence[Pose], light: FlashLight) -> TexelVi
     """Directions and irradiance at world points (N, 3) [m] in all views."""
     rays, lights, levels = [], [], []
     for pose, gain in zip(poses, light.gain, strict=True):
-        seen = pose.to_camera(point)
-        v = frames.unit(-seen)
+        in_camera = pose.to_camera(point)
+        v = frames.unit(-in_camera)
         across, up = frames.basis(v)
         axes = np.stack([across, up, v], axis=-2)  # (N, 3, 3) in the camera frame
         rays.append((axes @ (pose.rotation @ TO_WORLD)).astype(np.float32))
-        towards = light.place - seen
+        towards = light.place - in_camera
         squared = frames.dot(towards, towards)
         lights.append(frames.to_ray_frame(towards / np.sqrt(squared)[:, None], v).astype(np.float32))
         levels.append((gain / squared).astype(np.float32))

@@ -17,7 +17,7 @@ from polcap.stages import stage
 
 _TILE = 16_000  # texels
 _AROUND = 3  # texels, 1σ, over which the misfit is averaged
-_STATED = 0.1  # degrees of freedom that stated errors count for; they decide where three views leave none
+_STATED = 0.1  # degrees of freedom with errors as stated, added everywhere: three views may leave no others
 _FIRST_ROUNDS = 3  # of the fits that give the albedo, by which the material is chosen
 
 
@@ -38,7 +38,7 @@ def estimate(
     light: FlashLight,
     relief: CoarseRelief,
     grid: TexelGrid,
-    seen: TexelStokes,
+    stokes: TexelStokes,
     gloss: GlossGroups,
     settings: GlossSettings,
 ) -> TexelMaps:
@@ -53,7 +53,7 @@ def estimate(
     rows = max(1, _TILE // width)
     for top in range(0, height, rows):
         strip = slice(top, min(top + rows, height))
-        data = measurements(seen.rows(strip), views)
+        data = measurements(stokes.rows(strip), views)
         geometry = texel_grid.geometry(point[strip].reshape(-1, 3), poses, light)
         found, own = _fit(data, geometry, gloss, settings)
         parts = (found.value, own, *texel_fit.misfit(data, found, settings.fitting))
@@ -64,26 +64,26 @@ def estimate(
         error_count += 5 * known.sum(axis=1)
         error = np.abs(data.radiance @ data.gray - found.model) / np.maximum(found.model, 1e-3)
         residual[:, strip] = np.where(known, error, np.nan).reshape(residual[:, strip].shape)
-    measured = np.isfinite(seen.noise[..., 0]).sum(axis=0) >= LEAST_VIEWS
+    measured = np.isfinite(stokes.noise[..., 0]).sum(axis=0) >= LEAST_VIEWS
     squares, freedom = (cv2.GaussianBlur(one, (0, 0), _AROUND) + _STATED for one in (squares, freedom))
     variance[:, :, : len(KINDS)] *= (squares / freedom)[..., None]
     with np.errstate(all="ignore"):
-        middle = np.nanmedian(residual[:, measured].astype(np.float32), axis=1)
+        median = np.nanmedian(residual[:, measured].astype(np.float32), axis=1)
     return TexelMaps(
         value=value,
         sigma=np.sqrt(variance.sum(axis=2)),
         seen=measured,
         misfit=np.sqrt(error_squares / np.maximum(error_count, 1)),
-        residual=middle,
+        residual=median,
     )
 
 
 def _fit(
     data: Measurements, geometry: TexelViews, gloss: GlossGroups, settings: GlossSettings
 ) -> tuple[TexelEstimate, Floats]:
-    """Estimates of N texels, and their variances as of `variances`. Priors are those of the materials, by the albedo.
+    """Estimates of N texels, and their `variances`. The albedo of a texel gives its material, and so its prior.
 
-    The albedo is better known at each step: median radiance of the views, fit of flat texels, fit of a few rounds.
+    The albedo becomes more exact with each step: median radiance of the views, flat texels, fit of a few rounds.
     """
     law = LAWS[gloss.law]
     radiance = np.median(np.where(np.isfinite(data.noise[..., :1]), data.radiance, 0), axis=0)
@@ -96,9 +96,9 @@ def _fit(
 
 
 def variances(found: TexelEstimate, prior: TexelPrior, shared: Floats) -> Floats:
-    """Variances (N, 3, 7) of texels by cause: S0, S1 and S2, both with errors as stated, and the priors.
+    """Variances (N, 3, 7) of texels by cause: stated errors of S0, stated errors of S1 and S2, and priors.
 
-    The 1σ `shared` (N, 2) of the gloss of the texels' material belongs to the priors.
+    The third contains the 1σ `shared` (N, 2) of the roughness and F0 of the texels' material.
     """
     covariance = np.linalg.inv(found.information.astype(np.float64))
     response = covariance[:, :, texel_fit.GLOSS] / prior.sigma[:, None, :] ** 2  # to a change of the prior's mean

@@ -15,7 +15,8 @@ from polcap.optics.resize import block_means
 from polcap.optics.warp import Spline, Taps
 
 _ROWS = 256  # of the grid at a time
-_BORDER = 12  # px around a strip's pixels, for the splines
+_BORDER = 12  # px around the pixels of a strip of the grid, for the splines
+_MOST_UNKNOWN = 0.01  # weight of unknown pixels in a texel, by linear interpolation
 UNKNOWN = np.uint8(Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST)
 _SPLINE_NOISE = 0.7  # standard deviation of a spline between pixels, over that of a pixel
 
@@ -33,9 +34,9 @@ class TexelStokes(ArrayValue):
         return TexelStokes(self.radiance[:, index], self.polarized[:, index], self.noise[:, index])
 
 
-def measurements(seen: TexelStokes, views: Sequence[PosedStokes]) -> Measurements:
+def measurements(stokes: TexelStokes, views: Sequence[PosedStokes]) -> Measurements:
     """The data of all texels, in one row."""
-    parts = (seen.radiance, seen.polarized, seen.noise)
+    parts = (stokes.radiance, stokes.polarized, stokes.noise)
     radiance, polarized, noise = (one.reshape(len(one), -1, one.shape[-1]) for one in parts)
     return Measurements(radiance, polarized, noise, flash_light.gray_of_colors(views[0].matrix))
 
@@ -74,22 +75,22 @@ def _sample(view: PosedStokes, shot_matrix: Floats, point: Floats) -> tuple[Floa
     radiance = np.einsum("ij,jhw->hwi", view.matrix, corrected[0])
     weights = flash_light.gray(view.matrix)
     polarized = np.einsum("c,schw->hws", weights, corrected[1:])
-    places = (x - left).astype(np.float32), (y - top).astype(np.float32)
+    pixels = (x - left).astype(np.float32), (y - top).astype(np.float32)
 
     def linear(plane: Floats) -> Floats:
-        return np.asarray(cv2.remap(np.ascontiguousarray(plane, np.float32), *places, cv2.INTER_LINEAR))
+        return np.asarray(cv2.remap(np.ascontiguousarray(plane, np.float32), *pixels, cv2.INTER_LINEAR))
 
     squares = (weights**2).astype(np.float32)
-    covariance = [view.stokes.covariance[k][box] @ squares for k in (0, 3, 5)]
+    covariance = [view.stokes.covariance[k][box] @ squares for k in (0, 3, 5)]  # variances
     s0, s1, s2 = (_SPLINE_NOISE**2 * linear(one) for one in covariance)
     noise = np.sqrt(np.maximum(np.stack([s0, (s1 + s2) / 2], axis=-1), 0))
-    bad = linear(np.asarray((view.stokes.quality[box] & UNKNOWN) > 0, np.float32)) > 0.01
+    bad = linear(np.asarray((view.stokes.quality[box] & UNKNOWN) > 0, np.float32)) > _MOST_UNKNOWN
     bad |= (x < 0) | (y < 0) | (x > width - 1) | (y > height - 1)
     noise[bad] = np.inf
     return radiance.astype(np.float32), polarized.astype(np.float32), noise
 
 
 def _span(at: Floats, size: int) -> tuple[int, int]:
-    """First and last pixel (exclusive) of a picture's side that positions need, with a border."""
+    """First and last pixel (exclusive) along a picture's side of `size` px around positions `at`, with a border."""
     first = int(np.clip(np.floor(at.min()) - _BORDER, 0, size - 2))
     return first, int(np.clip(np.ceil(at.max()) + _BORDER, first + 2, size))

@@ -1,8 +1,8 @@
 """Makes the maps of a material seamless: their edges are blended over a strip, and keep their contrast.
 
-The strip at the right and lower edge fades into the opposite one. A periodic pattern is first cut to a length at which
-both strips agree. A mean of two textures has less contrast than either, so their fine parts are divided by the standard
-deviation of the mean.
+The strip at the right and lower edge is blended into the opposite strip. A periodic pattern is first cut to a length at
+which both strips agree. A mean of two textures has less contrast than either, so its fine part is divided by its
+standard deviation.
 
 References
 ----------
@@ -21,14 +21,14 @@ from polcap.optics import frames
 from polcap.stages import stage
 
 _STRIP = 1 / 6  # of each side
-_PERIODIC = 0.5  # of the median difference of two strips, that of a periodic pattern at its best length
-_LINES = 64  # across the strips, that are compared
+_PERIODIC = 0.5  # largest difference of a periodic pattern's strips at the best length, over the median of all lengths
+_LINES = 64  # compared across the strips, about
 _CONTRAST = ("normal", "diffuse", "roughness", "height")  # maps with texture; the others are plain means
 
 
 @stage(version=2)
 def tile(maps: MaterialMaps) -> MaterialMaps:
-    """The maps, smaller by the strip, such that opposite edges continue each other."""
+    """The maps without the last strips, such that opposite edges continue each other."""
     changed: dict[str, Any] = {}
     level = replace(maps, height=_level(maps.height))
     texture = np.concatenate([maps.diffuse, maps.normal[..., :2]], axis=-1)
@@ -75,7 +75,7 @@ def _blend(value: Floats, axis: int, strip: int, contrast: bool) -> Floats:
     mixed = share * start + (1 - share) * end
     if contrast:
         fine, other = (one - cv2.GaussianBlur(one, (0, 0), strip / 4) for one in (start, end))
-        likeness = np.clip((fine * other).sum() / max(np.sqrt((fine**2).sum() * (other**2).sum()), 1e-12), 0, 1)
-        spread = np.sqrt(share**2 + (1 - share) ** 2 + 2 * likeness * share * (1 - share))
-        mixed += (share * fine + (1 - share) * other) * (1 / spread - 1)
+        correlation = np.clip((fine * other).sum() / max(np.sqrt((fine**2).sum() * (other**2).sum()), 1e-12), 0, 1)
+        sigma = np.sqrt(share**2 + (1 - share) ** 2 + 2 * correlation * share * (1 - share))
+        mixed += (share * fine + (1 - share) * other) * (1 / sigma - 1)
     return np.moveaxis(np.concatenate([mixed, image[strip : length - strip]]), 0, axis)

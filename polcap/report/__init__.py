@@ -26,7 +26,7 @@ from polcap.report import chart_colors, figures, labels, page
 from polcap.results import Results
 from polcap.stage_values import Network
 
-_PAGE_BYTES = 64 << 20  # that of the bundled capture has 3 MB
+_PAGE_BYTES = 64 << 20  # largest page that is read; the page of the bundled capture has 3 MB
 
 
 class _PhotographFacts(msgspec.Struct, frozen=True):
@@ -105,7 +105,7 @@ def _frame_facts(frame: Frame, capture: Capture) -> dict[str, Any]:
 
 
 def judge(facts: Mapping[str, Any], results: Results, config: Config) -> tuple[list[Gate], Results]:
-    """Judge a result by the gates, and give its maps the expected errors with the costs of all gates."""
+    """Judge a result by the gates, and give its maps expected errors that include the costs of all gates."""
     files = tuple(tuple(frame["file"] for frame in shot["frames"]) for shot in facts["capture"]["shots"])
     focal_doubt = tuple(facts["capture"].get("focal_doubt", (0.0, 0.0)))
     evidence = full_size(results, focal_doubt, config.align, files)
@@ -118,7 +118,7 @@ def document(
     facts: Mapping[str, Any], results: Results, judged: Sequence[Gate], config: Config, timings: Mapping[str, float]
 ) -> dict[str, Any]:
     """Assemble the content of report.json: facts of the run, figures, gates, computing time of each stage [s]."""
-    measured = {**figures.measured(results), "rerendering": figures.rerendering(results, config.infer.ior)}
+    measured = {**figures.measure(results), "rerendering": figures.rerendering(results, config.infer.ior)}
     chart = config.whitebalance.chart
     expected = [gate.value for gate in judged if gate.name == "normal error" and isinstance(gate.value, float)]
     measured["chart"]["reference_sha256"] = chart_colors.digest(chart)
@@ -176,10 +176,10 @@ def write(folder: Path, about: dict[str, Any], results: Results) -> None:
 
 
 def archive(out: Path, folder: Path, about: Mapping[str, Any], entry: Mapping[str, str]) -> list[Path]:
-    """Write report.json and report.html of the result `out` into an archive, with its catalog facts; returns both.
+    """Write report.json and report.html of the result `out` into an archive, with its catalog facts; returns the files.
 
-    `about` is the content of report.json, `entry` has the stated fields of `CatalogEntry`. A copy of an archive has no
-    page.
+    `about` is the content of report.json, `entry` has the stated fields of `CatalogEntry`. A result without a page gets
+    none.
 
     Raises StorageError: the page is a link or not that of this polcap, or cannot be read.
     """

@@ -17,13 +17,13 @@ from polcap.stage_values import SurfaceMaps
 Motion = Literal["light", "turntable"]
 FRAMES = 48
 SECONDS = 4.0
-SKY = 0.25  # light from everywhere, relative to the lamp
+SKY = 0.25  # light of the sky, relative to the lamp
 _SIDE = 720  # px, at most, of a frame's longer side
 _LIGHT_TILT = 0.75  # sine of the angle between the light's direction and the optical axis
 _TURNTABLE_LIGHT = np.array([-0.35, 0.45, 0.82])  # direction towards the light: left, above and in front
 _UP = np.array([0.0, 1.0, 0.0])  # camera frame
-_SWING = np.radians(35.0)  # to either side; a larger turn would show the unseen back
-_OVERSAMPLING = 2  # surface points per pixel and side, so that turning leaves no holes
+_SWING = np.radians(35.0)  # largest turn to either side; a larger one would show the unseen back
+_OVERSAMPLING = 2  # surface points per pixel side, so that turning leaves no holes
 _WHITE_QUANTILE = 0.995  # of the light; it becomes nearly white
 _BACKGROUND = 0.012  # linear
 
@@ -47,8 +47,8 @@ def render(points: TexturedPoints, ray: Floats, to_light: Floats, up: Floats, io
     facing = frames.lifted(frames.to_ray_frame(points.normal, ray))
     one, rough = np.ones(ray.shape[:-1], np.float32), np.maximum(points.roughness, np.float32(0.05))
     lit = shade.stokes(facing, points.diffuse, points.specular, rough, ior * one, lamp, one)[0]
-    above = 0.6 + 0.4 * (points.normal @ up.astype(np.float32))
-    return np.asarray(lit + SKY * (points.diffuse * above[..., None] + points.specular), np.float32)
+    sky = 0.6 + 0.4 * (points.normal @ up.astype(np.float32))  # brighter above
+    return np.asarray(lit + SKY * (points.diffuse * sky[..., None] + points.specular), np.float32)
 
 
 def light(maps: SurfaceMaps, ior: float) -> list[Picture]:
@@ -71,14 +71,14 @@ def turntable(maps: SurfaceMaps, mesh: ReliefMesh, ior: float) -> list[Picture]:
     points = projection.back_project(sized.view, column, row) * sized.fit(mesh.depth)[..., None]  # (H, W, 3)
     middle = (points[inside].min(axis=0) + points[inside].max(axis=0)) / 2
     fine = tuple(_OVERSAMPLING * side for side in sized.shape[::-1])
-    drawn_from = cv2.resize(sized.coverage, fine) > 0.5
+    fine_inside = cv2.resize(sized.coverage, fine) > 0.5
     drawn = []
     for angle in _SWING * np.sin(np.linspace(0, 2 * np.pi, FRAMES, endpoint=False)):
         turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]], np.float32)
         moved = ((points - middle) @ turn.T + middle).astype(np.float32)
         turned = surface._replace(normal=surface.normal @ turn.T)
         shaded = render(turned, frames.unit(-moved), _TURNTABLE_LIGHT, _UP, ior)
-        points_fine, shaded_fine = (np.asarray(cv2.resize(one, fine))[drawn_from] for one in (moved, shaded))
+        points_fine, shaded_fine = (np.asarray(cv2.resize(one, fine))[fine_inside] for one in (moved, shaded))
         drawn.append(_draw_points(points_fine, shaded_fine, sized.view, sized.shape))
     return _to_srgb(drawn)
 

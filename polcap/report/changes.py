@@ -1,11 +1,11 @@
 """Changes of an object between two results, on the pixels of the first one, and their size over the doubt.
 
-1. The second result is laid on the first by the cameras' rays: crops, scales and focal lengths may differ.
-2. Pictures of the maps under one lamp are registered by a similarity and a homography, then by a smooth flow, because
-   a camera that moved sees depth from another side. The normals are turned by the rotation that fits them best.
-3. Color, normal and roughness are subtracted. The doubt of a pixel is the difference that is usual in this pair, more
-   where the normals' expected error is larger. Two results share most of their errors, but not those of the
-   roughness of a material that only one of them divides. Regions that differ by more than `LIMIT` doubts are changes.
+1. The cameras' rays map the second result onto the first: crops, scales and focal lengths may differ.
+2. Pictures of the maps under one lamp are registered by a similarity and a homography. A smooth flow then corrects the
+   parallax of a camera that moved. The normals are turned by the rotation that fits them best.
+3. Color, normal and roughness are subtracted. The doubt of a pixel is the usual difference in this pair, increased
+   where the normals' expected error is larger. Two results share most of their errors, but not those of roughness
+   where one result divides a material of the other. Regions that differ by more than `LIMIT` doubts are changes.
 
 References
 ----------
@@ -29,22 +29,22 @@ from polcap.optics.registration import Pyramid, correlation, refine
 from polcap.stage_values import SurfaceMaps
 
 _LAMP = np.array([0.4, 0.5, 0.77], np.float32)  # direction of the lamp of the registered pictures
-_RIM_PX = 3  # at the outline, where pixels mix with the backdrop
+_RIM_PX = 3  # left out at the outline, where pixels mix with the backdrop
 _LEAST_CORRELATION = 0.7  # of the registered pictures
 _LARGEST_TURN_DEG = 45.0  # between the two cameras
-_LEAST_SHARE = 0.1  # of the first object, that both results show
-_FLOW_SHARE = 0.06  # 1σ of the smoothing of the flow, over the object's longer side
-_AVERAGED_PX = 1.0  # 1σ of the averaging of the maps, which leaves less of their noise
+_LEAST_SHARE = 0.1  # of the first object that both results show
+_FLOW_SHARE = 0.06  # 1σ of the smoothing of the flow, over the maps' longer side
+_AVERAGED_PX = 1.0  # 1σ of the averaging of the maps, which reduces their noise
 LIMIT = 3.0  # doubts
 _LEAST_AREA, _LEAST_PX = 0.0018, 9  # of a changed region: over the object's area, and pixels
 _OVER_QUARTER = 2.0  # usual difference over the 25th percentile
 _LEAST_DOUBT = {"color": 0.6, "roughness": 0.02}  # ΔE2000, 1
-_LARGEST_DOUBT = {"color": 2.5, "normal": 4.0, "roughness": 0.03}  # usual difference, so that a change of all is one
+_LARGEST_DOUBT = {"color": 2.5, "normal": 4.0, "roughness": 0.03}  # so that a change of the whole object is found
 _OF_EXPECTED = 0.3  # least doubt of normals, over the expected error of the pair: two results share most of it
 _GLOSS_STEP = 0.02  # of a histogram of roughness
-_LEAST_MATERIAL = 0.05  # of the compared pixels, in one step: borders mix two materials
-_MISREGISTRATION_PX = 0.4
-_PATTERN = 0.7, 2.0  # range of a pixel's doubt over the usual one
+_LEAST_MATERIAL = 0.05  # share of the compared pixels in a step of it that is a material, not a mixture at borders
+_MISREGISTRATION_PX = 0.4  # error of the registration
+_PATTERN = 0.7, 2.0  # least and largest doubt of a pixel over the usual one, by its expected error
 
 
 @dataclass(frozen=True)
@@ -83,13 +83,13 @@ class Changes:
 
 def measure(one: SurfaceMaps, other: SurfaceMaps) -> Changes:
     """Register the maps of a second result onto the maps of the first, and measure the differences."""
-    matrix = _motion(one, other)
-    at = _refined(one, other, matrix)
-    moved, both = _resampled(one, other, at)
+    matrix = _register(one, other)
+    position = _refine_by_flow(one, other, matrix)
+    moved, both = _resample(one, other, position)
     rotation = _rotation(one.normal[both], moved.normal[both])
     moved = replace(moved, normal=(moved.normal @ rotation.T).astype(np.float32))
-    agreement = _agreement(_lit(one), _lit(moved), both)
-    gain = _gain(one, moved, both)
+    agreement = _agreement(_light(one), _light(moved), both)
+    gain = _albedo_gain(one, moved, both)
     return Changes(
         other=moved,
         both=both,
@@ -98,7 +98,7 @@ def measure(one: SurfaceMaps, other: SurfaceMaps) -> Changes:
         turn_deg=float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))),
         gain=gain,
         differences=_differences(
-            _averaged(one, both), _averaged(replace(moved, diffuse=moved.diffuse * np.float32(gain)), both), both
+            _average(one, both), _average(replace(moved, diffuse=moved.diffuse * np.float32(gain)), both), both
         ),
     )
 
@@ -108,17 +108,17 @@ def shading(maps: SurfaceMaps) -> Floats:
     return np.asarray(0.2 + 0.8 * np.maximum(maps.normal @ _LAMP, 0))
 
 
-def _lit(maps: SurfaceMaps) -> Floats:
-    """Picture (H, W) of the maps under the lamp, square root for even noise."""
+def _light(maps: SurfaceMaps) -> Floats:
+    """Picture (H, W) of the maps under the lamp; its square root, in which noise is more even."""
     light = np.sqrt(np.maximum(maps.diffuse.mean(axis=-1), 0) * shading(maps))
     return np.asarray(np.where(maps.mask, light, 0), dtype=np.float32)
 
 
-def _motion(one: SurfaceMaps, other: SurfaceMaps) -> Floats:
+def _register(one: SurfaceMaps, other: SurfaceMaps) -> Floats:
     """Homography (3, 3) from pixels of the first maps to those of the second."""
-    first, second = (Pyramid(cv2.GaussianBlur(_lit(maps), (0, 0), 0.7), _inner(maps.mask)) for maps in (one, other))
+    first, second = (Pyramid(cv2.GaussianBlur(_light(maps), (0, 0), 0.7), _trim(maps.mask)) for maps in (one, other))
     rays = other.view.intrinsic @ np.linalg.inv(one.view.intrinsic)
-    starts = [rays, _by_extent(one.mask, other.mask)]
+    starts = [rays, _match_extent(one.mask, other.mask)]
     found = [refine(first, second, "similarity", start).matrix for start in starts]
 
     def fit(matrix: Floats) -> float:
@@ -135,40 +135,40 @@ def _overlap(one: Bools, other: Bools, matrix: Floats) -> float:
     return float((one & moved).sum() / max(min(one.sum(), moved.sum()), 1)) if moved.any() else 0.0
 
 
-def _inner(mask: Bools) -> Bools:
+def _trim(mask: Bools) -> Bools:
     return np.asarray(erode(mask, _RIM_PX, from_border=True))
 
 
-def _by_extent(one: Bools, other: Bools) -> Floats:
-    """The similarity (3, 3) that lays one outline on another by middle and area."""
+def _match_extent(one: Bools, other: Bools) -> Floats:
+    """The similarity (3, 3) that gives the first mask the middle and the area of the second."""
     scale = np.sqrt(other.sum() / max(one.sum(), 1))
     (y, x), (v, u) = (np.argwhere(mask).mean(axis=0) for mask in (one, other))
     return np.array([[scale, 0, u - scale * x], [0, scale, v - scale * y], [0, 0, 1]])
 
 
-def _refined(one: SurfaceMaps, other: SurfaceMaps, matrix: Floats) -> Floats:
+def _refine_by_flow(one: SurfaceMaps, other: SurfaceMaps, matrix: Floats) -> Floats:
     """Positions (H, W, 2) of the first maps' pixels in the second: the motion and a smooth flow."""
     height, width = one.mask.shape
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
     moved_grid: Any = cv2.perspectiveTransform(grid.reshape(1, -1, 2), matrix)
-    at: Floats = moved_grid.reshape(height, width, 2).astype(np.float32)
-    moved, both = _resampled(one, other, at)
-    pictures = [np.where(both, _lit(maps), 0) for maps in (one, moved)]
+    unrefined: Floats = moved_grid.reshape(height, width, 2).astype(np.float32)
+    moved, both = _resample(one, other, unrefined)
+    pictures = [np.where(both, _light(maps), 0) for maps in (one, moved)]
     top = max(float(picture.max()) for picture in pictures) or 1.0
     first, second = (np.rint(255 * picture / top).astype(np.uint8) for picture in pictures)
     flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, None)
     sigma = _FLOW_SHARE * max(height, width)
     weight = cv2.GaussianBlur(both.astype(np.float32), (0, 0), sigma)
     smooth = cv2.GaussianBlur(flow * both[..., None], (0, 0), sigma) / np.maximum(weight, 1e-3)[..., None]
-    shifted = at + smooth @ (matrix[:2, :2] / matrix[2, 2]).T.astype(np.float32)
-    better, inside = _resampled(one, other, shifted)
-    before, after = (_agreement(_lit(one), _lit(maps), both & inside) for maps in (moved, better))
-    return np.asarray(shifted if after > before else at)
+    shifted = unrefined + smooth @ (matrix[:2, :2] / matrix[2, 2]).T.astype(np.float32)
+    better, inside = _resample(one, other, shifted)
+    before, after = (_agreement(_light(one), _light(maps), both & inside) for maps in (moved, better))
+    return np.asarray(shifted if after > before else unrefined)
 
 
-def _resampled(one: SurfaceMaps, other: SurfaceMaps, at: Floats) -> tuple[SurfaceMaps, Bools]:
-    """The second maps at positions `at` (H, W, 2), and the pixels where both have the object."""
-    x, y = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
+def _resample(one: SurfaceMaps, other: SurfaceMaps, position: Floats) -> tuple[SurfaceMaps, Bools]:
+    """The second maps at positions (H, W, 2), and the pixels (H, W) where both have the object."""
+    x, y = np.ascontiguousarray(position[..., 0]), np.ascontiguousarray(position[..., 1])
 
     def sample(value: Floats) -> Floats:
         sampled: Any = cv2.remap(np.ascontiguousarray(value, np.float32), x, y, cv2.INTER_CUBIC)
@@ -179,8 +179,8 @@ def _resampled(one: SurfaceMaps, other: SurfaceMaps, at: Floats) -> tuple[Surfac
     layers = [other.normal, other.diffuse, other.specular, scalars]
     filled = fill_outward(np.concatenate(layers, axis=-1), other.mask)
     moved = np.concatenate([sample(filled[..., k : k + 3]) for k in (0, 3, 6)] + [sample(filled[..., 9:])], axis=-1)
-    seen = cv2.remap(_inner(other.mask).astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0
-    both = np.asarray(seen & _inner(one.mask))
+    seen = cv2.remap(_trim(other.mask).astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0
+    both = np.asarray(seen & _trim(one.mask))
     return (
         replace(
             other,
@@ -221,7 +221,7 @@ def _rotation(one: Floats, other: Floats) -> Floats:
     return rotation
 
 
-def _gain(one: SurfaceMaps, other: SurfaceMaps, both: Bools) -> float:
+def _albedo_gain(one: SurfaceMaps, other: SurfaceMaps, both: Bools) -> float:
     """Factor on the second albedo that makes the medians equal, where the doubt of the scales allows it; else 1."""
     if not both.any():
         return 1.0
@@ -248,16 +248,16 @@ def _differences(one: SurfaceMaps, other: SurfaceMaps, both: Bools) -> dict[str,
         value = np.where(both, distance(before, after), 0)
         steps = [np.abs(distance(before, np.roll(before, 1, axis))) * both for axis in (0, 1)]
         misplaced = _MISREGISTRATION_PX * np.hypot(steps[0], steps[1])
-        doubt = np.hypot(_usual(name, value[both]) * pattern, misplaced)
+        doubt = np.hypot(_usual_difference(name, value[both]) * pattern, misplaced)
         least = _OF_EXPECTED * expected if name == "normal" else _LEAST_DOUBT[name]
         if name == "roughness" and one.roughness_error is not None and other.roughness_error is not None:
             unshared = np.hypot(one.roughness_error, other.roughness_error)
-            least = np.where(_divided(one.roughness, other.roughness, both), unshared, least)
+            least = np.where(_find_divided(one.roughness, other.roughness, both), unshared, least)
         found[name] = _difference(value, np.maximum(doubt, least), both)
     return found
 
 
-def _divided(one: Floats, other: Floats, both: Bools) -> Bools:
+def _find_divided(one: Floats, other: Floats, both: Bools) -> Bools:
     """Pixels (H, W) of a material of one result that is two or more materials in the other, by their roughness."""
     if not both.any():
         return both
@@ -279,13 +279,13 @@ def _materials(roughness: Floats, both: Bools) -> NDArray[np.intp]:
     return np.asarray(np.searchsorted((places[1:] + places[:-1]) / 2, step))
 
 
-def _usual(name: str, value: Floats) -> float:
-    """Usual difference in a pair, by its 25th percentile: at least a quarter of the object has not changed."""
+def _usual_difference(name: str, value: Floats) -> float:
+    """Usual difference in a pair, by its 25th percentile: at least a quarter of the object is taken for unchanged."""
     quarter = float(np.quantile(np.abs(value), 0.25)) if value.size else 0.0
     return min(_OVER_QUARTER * quarter, _LARGEST_DOUBT[name])
 
 
-def _averaged(maps: SurfaceMaps, both: Bools) -> SurfaceMaps:
+def _average(maps: SurfaceMaps, both: Bools) -> SurfaceMaps:
     """The maps averaged over neighboring pixels of both objects."""
     weight = np.maximum(cv2.GaussianBlur(both.astype(np.float32), (0, 0), _AVERAGED_PX), 1e-3)
 

@@ -55,15 +55,15 @@ def _lab(rec709: Floats) -> Floats:
 
 def _differences(one: Floats, other: Floats) -> tuple[Floats, Floats, Floats]:
     """ΔL*, ΔC* and ΔH* (N,) of measured minus reference Lab (N, 3); ΔH* has the sign of the turn of the hue."""
-    chroma, known = (np.hypot(lab[:, 1], lab[:, 2]) for lab in (one, other))
-    along = known * chroma + one[:, 1] * other[:, 1] + one[:, 2] * other[:, 2]
+    chroma, reference_chroma = (np.hypot(lab[:, 1], lab[:, 2]) for lab in (one, other))
+    along = reference_chroma * chroma + one[:, 1] * other[:, 1] + one[:, 2] * other[:, 2]
     turn = one[:, 2] * other[:, 1] - one[:, 1] * other[:, 2]
     hue = turn * np.sqrt(2 / np.maximum(along, 1e-12))
-    return one[:, 0] - other[:, 0], chroma - known, hue
+    return one[:, 0] - other[:, 0], chroma - reference_chroma, hue
 
 
 def _rounded(value: Floats) -> Any:
-    """A number or a list of numbers with two digits; None where it is not finite."""
+    """A number or a list of numbers with two decimals; None where it is not finite."""
     values = np.round(np.atleast_1d(value), 2)
     rounded = [float(x) if np.isfinite(x) else None for x in values]
     return rounded if np.ndim(value) else rounded[0]

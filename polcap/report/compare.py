@@ -33,7 +33,7 @@ Row = tuple[str, Any, Any]  # name, value in the first result, value in the seco
 
 def rows(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Row]:
     """Figures and settings that differ between two reports, each named part.section.name with both values."""
-    first, second = _flat(one), _flat(other)
+    first, second = _flatten(one), _flatten(other)
     names = dict.fromkeys([*first, *second])
     return [(name, first.get(name), second.get(name)) for name in names if first.get(name) != second.get(name)]
 
@@ -111,7 +111,7 @@ def sentence(found: Changes) -> str:
 
 
 def _change(name: str, difference: changes.Difference) -> str:
-    """A changed quantity with its size and share."""
+    """Text on a changed quantity: median size of the change, and share of the object."""
     size = float(np.median(difference.value[difference.changed]))
     share = f"on {labels.number(100 * difference.share, 2)} %"
     if name == "roughness":
@@ -120,7 +120,7 @@ def _change(name: str, difference: changes.Difference) -> str:
 
 
 def _notes(found: Changes) -> list[str]:
-    """Sentences on how the second result was laid on the first."""
+    """Sentences on the registration of the second result onto the first."""
     notes = [f"{100 * found.share:.0f} % of the object is compared; the pictures correlate by {found.correlation:.2f}."]
     if found.turn_deg > 1:
         notes.append(f"The camera turned by {found.turn_deg:.1f}° about the object; the normals are turned back.")
@@ -134,9 +134,9 @@ def _table(found: Changes) -> list[tuple[str, ...]]:
     rows = []
     for name, one in found.differences.items():
         title, unit = _NAMES[name]
-        size, middle = (float(np.quantile(np.abs(one.value[found.both]), q)) for q in (0.99, 0.5))
+        large, middle = (float(np.quantile(np.abs(one.value[found.both]), q)) for q in (0.99, 0.5))
         doubt = float(np.median(one.doubt[found.both]))
-        numbers = (f"{labels.number(value, 2)}{unit}" for value in (middle, size, doubt))
+        numbers = (f"{labels.number(value, 2)}{unit}" for value in (middle, large, doubt))
         rows.append((title, *numbers, f"{labels.number(100 * one.share, 2)} %"))
     return rows
 
@@ -172,7 +172,7 @@ def _figures(names: tuple[str, str], first: SurfaceMaps, found: Changes) -> list
     return sections
 
 
-def _flat(about: Mapping[str, Any]) -> dict[str, Any]:
+def _flatten(about: Mapping[str, Any]) -> dict[str, Any]:
     """Figures and settings of a report in one dictionary by full name (part.section.name)."""
     return {
         f"{part}.{section}.{name}": value

@@ -18,9 +18,9 @@ _COMPARED_PX = 512  # longest side on which photographs and their re-rendering a
 _FLAGS = (Quality.CLIPPED, Quality.DARK, Quality.ILL_POSED, Quality.METAL, Quality.GHOST)
 
 
-def measured(results: Results) -> dict[str, dict[str, Any]]:
+def measure(results: Results) -> dict[str, dict[str, Any]]:
     """All figures of a result by subject, for report.json; `labels.LABELS` describes each of them."""
-    bracket, moved, gains = results.radiance.bracket, results.alignment, results.selfcal.gains
+    bracket, alignment, gains = results.radiance.bracket, results.alignment, results.selfcal.gains
     ring, outline = results.selfcal.ring, results.selfcal.outline
     return {
         "merge": {
@@ -31,10 +31,10 @@ def measured(results: Results) -> dict[str, dict[str, Any]]:
         },
         "chart": _colors(results.color, results.maps.albedo_sigma),
         "alignment": {
-            "shift_px": _plain(moved.transform[:, :2, 2], 3),
-            "turn_deg": _plain(np.degrees(np.arctan2(moved.transform[:, 1, 0], moved.transform[:, 0, 0])), 4),
-            "residual_px": _plain(moved.residual_px, 4),
-            "correlation": _plain(moved.correlation, 4),
+            "shift_px": _plain(alignment.transform[:, :2, 2], 3),
+            "turn_deg": _plain(np.degrees(np.arctan2(alignment.transform[:, 1, 0], alignment.transform[:, 0, 0])), 4),
+            "residual_px": _plain(alignment.residual_px, 4),
+            "correlation": _plain(alignment.correlation, 4),
         },
         "gains": {
             "source": gains.source,

@@ -15,7 +15,7 @@ from polcap.image_values import Bools, Floats
 
 Palette = Literal["inferno", "viridis", "wheel", "balance"]
 LEVELS = 255
-_STEPS = np.linspace(0, 1, LEVELS)
+_SHARES = np.linspace(0, 1, LEVELS)  # of the levels
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def colors(palette: Palette) -> NDArray[np.uint8]:
         rgb: Any = cv2.cvtColor(hsv[None].astype(np.float32), cv2.COLOR_HSV2RGB)[0]
     elif palette == "balance":  # blue, gray at zero, red
         ends = np.array([[0.10, 0.42, 0.90], [0.55, 0.55, 0.55], [0.95, 0.35, 0.10]])
-        rgb = np.stack([np.interp(_STEPS, [0, 0.5, 1], ends[:, channel]) for channel in range(3)], axis=-1)
+        rgb = np.stack([np.interp(_SHARES, [0, 0.5, 1], ends[:, channel]) for channel in range(3)], axis=-1)
     else:
         ramp = np.arange(256, dtype=np.uint8)[None]
         kind = cv2.COLORMAP_INFERNO if palette == "inferno" else cv2.COLORMAP_VIRIDIS

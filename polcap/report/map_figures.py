@@ -19,8 +19,9 @@ from polcap.report.keys import ColorKey
 from polcap.report.labels import number
 from polcap.report.page_data import PageMaps
 
-_BORDER_PX = 4  # colors continue beyond the outline, because textures are interpolated
-_WHEEL_STEPS = 72
+_BORDER_PX = 4  # colors continue so far beyond the outline, because textures are interpolated
+_WHEEL_STEPS = 72  # colors of a color wheel
+_PROBED = ("low", "high", "power", "palette", "unit", "digits")  # fields of a color key for probe.js
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def _difference_note(rms: float | None, outliers: float | None) -> str:
 
 def scalar(name: str, title: str, note: str, value: Floats, inside: Bools, key: ColorKey) -> MapFigure:
     """Figure of a map with one number per pixel."""
-    of_key = {name: getattr(key, name) for name in ("low", "high", "power", "palette", "unit", "digits")}
+    probe = {"kind": "scalar", **{part: getattr(key, part) for part in _PROBED}}
     palette = keys.colors(key.palette)
     near = dilate(inside, _BORDER_PX)
     image = html.indexed(key.level(fill_outward(value[..., None], inside)[..., 0], near), palette)
@@ -104,7 +105,6 @@ def scalar(name: str, title: str, note: str, value: Floats, inside: Bools, key: 
     if key.palette == "wheel":  # once around in 180°
         steps = [round(2 * k / _WHEEL_STEPS % 1 * keys.LEVELS) % keys.LEVELS for k in range(_WHEEL_STEPS)]
         colors, ticks = palette[steps], ()
-    probe = {"kind": "scalar", **of_key}
     return MapFigure(name, title, note, image, probe, css_colors(colors), ticks, outline=matte(inside))
 
 

@@ -32,8 +32,8 @@ _HEADLINE = {
     "warn": "Good to use, but check an assumption",
     "fail": "Check the result before you use it",
 }
-_SAME_LIGHT = (0.77, 1.3)  # ratio of highlights that agree, set by hand
-_SIMILAR = 0.15  # relative difference of pictures that agree, set by hand
+_SAME_LIGHT = (0.77, 1.3)  # range of the ratio of highlights that agree, set by hand
+_SIMILAR = 0.15  # largest relative difference of pictures that agree, set by hand
 _ORDER = ("fail", "warn", "pass", "not measured", "not judged")  # of the gates in their table
 
 
@@ -90,9 +90,9 @@ def render(
 
 
 def archived(text: str, about: Mapping[str, Any]) -> str:
-    """A report's page as it lies in an archive: with the catalog facts of `about`, and with the GLB next to it.
+    """The text of a report's page for an archive: with the catalog facts of `about`, and a link to the GLB next to it.
 
-    Two templates write these parts between comments with their names. Raises ValueError: the page has no such part.
+    Two templates make these parts, which stand between comments with their names. Raises ValueError: a part is missing.
     """
     parts = {"catalog": {"catalog": catalog(about)}, "glb_link": {"asset": f"{about['capture']['name']}.glb"}}
     for name, content in parts.items():

@@ -30,13 +30,13 @@ def reduce(maps: SurfaceMaps, mesh: ReliefMesh, cues: Cues, angle: Floats, longe
     """Reduce the maps of a result to at most `longest` pixels a side; means are taken over the object only."""
     small = rerendering.reduce(maps, cues, angle, longest)
     reduction = ObjectReduction(np.asarray(maps.mask & cues.mask, bool), longest)
-    axis = [reduction.mean(part) for part in cues.normalized_stokes]
-    where_depth = ObjectReduction(reduction.inside & np.isfinite(mesh.depth), longest)
+    cosine, sine = (reduction.mean(part) for part in cues.normalized_stokes)  # of twice the AoLP
+    of_depth = ObjectReduction(reduction.inside & np.isfinite(mesh.depth), longest)
     return PageMaps(
         **vars(small),
-        depth=np.where((where_depth.share > 0.5) & small.maps.mask, where_depth.mean(mesh.depth), np.nan),
+        depth=np.where((of_depth.share > 0.5) & small.maps.mask, of_depth.mean(mesh.depth), np.nan),
         dolp=reduction.mean(cues.dolp),
-        aolp=np.degrees(np.arctan2(axis[1], axis[0]) / 2) % 180,
+        aolp=np.degrees(np.arctan2(sine, cosine) / 2) % 180,
     )
 
 
@@ -72,7 +72,7 @@ def patches(radiance: AngleStack, found: ColorCalibration) -> Floats | None:
         if inside.size:
             cv2.fillConvexPoly(inside, corners - low, 1)
         if inside.any():
-            camera[index] = 2 * np.median(part[inside > 0], axis=0)
+            camera[index] = 2 * np.median(part[inside > 0], axis=0)  # a shot has half of S0
     row, column = np.divmod(np.arange(24), 6)
     offset = np.stack([column - column[_WHITE_PATCH], row - row[_WHITE_PATCH]], axis=-1)
     falloff, glare = ((0.0, 0.0), 0.0) if found.patches is None else (found.patches.falloff, found.patches.glare)

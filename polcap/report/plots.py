@@ -13,7 +13,7 @@ from polcap.report.labels import number
 from polcap.report.map_figures import css_colors
 from polcap.stage_values import Alignment, Gains
 
-_CHANNELS = {"red": "#e0434c", "green": "#2f9e4d", "blue": "#3f78e0"}  # on light and dark
+_CHANNELS = {"red": "#e0434c", "green": "#2f9e4d", "blue": "#3f78e0"}  # legible on light and dark pages
 _BLUE = _CHANNELS["blue"]
 
 
@@ -45,13 +45,13 @@ def exposures(measured: list[list[float]], stated: list[list[float | None]], nam
     known = np.log2([value for rows in (measured, stated) for row in rows for value in row if value])
     low, high = np.floor(known.min() - 0.3), np.ceil(known.max() + 0.3)
     rows: list[tuple[str, list[Mark]]] = []
-    for name, values, claims in zip(names, measured, stated):
+    for name, values, stated_values in zip(names, measured, stated):
         marks: list[Mark] = []
         rows.append((name, marks))
-        for frame, (value, claim) in enumerate(zip(values, claims), 1):
-            if claim:
-                title = f"{name}, frame {frame}: stated {number(claim)} ×"
-                marks.append(Mark((np.log2(claim) - low) / (high - low), title, "ring"))
+        for frame, (value, by_camera) in enumerate(zip(values, stated_values), 1):
+            if by_camera:
+                title = f"{name}, frame {frame}: stated {number(by_camera)} ×"
+                marks.append(Mark((np.log2(by_camera) - low) / (high - low), title, "ring"))
             if value:
                 title = f"{name}, frame {frame}: {number(value)} ×"
                 marks.append(Mark((np.log2(value) - low) / (high - low), title))
@@ -66,8 +66,8 @@ def gains(found: Gains, names: Sequence[str]) -> RowPlot:
 
     Crosses are the same gains measured on the object itself.
     """
-    far = np.concatenate([(found.gain - 1).ravel(), np.nan_to_num(found.anchor - 1).ravel()])
-    span = max(0.005, 1.15 * float(np.abs(far).max()))
+    changes = np.concatenate([(found.gain - 1).ravel(), np.nan_to_num(found.anchor - 1).ravel()])
+    span = max(0.005, 1.15 * float(np.abs(changes).max()))
     rows: list[tuple[str, list[Mark]]] = []
     for name, gain, sigma, anchor in zip(names, found.gain, found.sigma, found.anchor):
         marks: list[Mark] = []
@@ -113,8 +113,8 @@ def shifts(found: Alignment, names: Sequence[str]) -> dict[str, Any]:
 
 def chart(reference: ChartReference, measured: Floats, fit: PatchColors, figures: Mapping[str, Any]) -> dict[str, Any]:
     """Plot of the 24 chart patches: the reference color, the photographed one (24, 3), linear Rec.709, and ΔE."""
-    whose = "your measured" if figures["reference_sha256"] else "the maker's"
-    note = f"outside: {whose} color; inside: the photographed color; below: ΔE2000, mean "
+    source = "your measured" if figures["reference_sha256"] else "the maker's"
+    note = f"outside: {source} color; inside: the photographed color; below: ΔE2000, mean "
     note += f"{number(figures['delta_e_mean'], 2)}, 90th percentile {number(figures['delta_e_90'], 2)}"
     if figures["predicted_mean"] is not None:
         note += f" ({number(figures['predicted_mean'], 2)} when each patch is left out of the fit)"

@@ -30,7 +30,7 @@ _RED = (230, 40, 30)
 
 def of_stage(results: FirstResults, stage: str) -> Picture:
     """Picture of the result of a stage that the path has reached, for people to check."""
-    paint: dict[str, Callable[[Any], Picture | list[Tile]]] = {
+    draw: dict[str, Callable[[Any], Picture | list[Tile]]] = {
         "hdr": lambda found: _merged(found.radiance),
         "whitebalance": lambda found: chart(found.radiance, found.color),
         "align": lambda found: registered(found.radiance, found.alignment),
@@ -41,14 +41,14 @@ def of_stage(results: FirstResults, stage: str) -> Picture:
         "infer": lambda found: _maps(found.maps),
         "surface": lambda found: _surface(found.mesh, found.maps),
     }
-    drawn = paint[stage](results)
+    drawn = draw[stage](results)
     return sheet(drawn) if isinstance(drawn, list) else drawn
 
 
 def stopped(results: ResultsUntilHdr, colors: ChartReference | None) -> Picture:
     """Picture of the shots of a path that an error ended: red where all exposures are clipped.
 
-    With `colors`, of the chart that was not found, the first shot shows the patches of all that resembles it.
+    `colors` are those of a chart that was not found; then the first shot shows the patches of all its candidates.
     """
     radiance, tiles = results.radiance, []
     for k, degrees in enumerate(np.degrees(radiance.angle)):
@@ -75,8 +75,8 @@ def reference(radiance: AngleStack, color: ColorCalibration, widest: int | None 
 def chart(radiance: AngleStack, color: ColorCalibration, widest: int | None = None) -> Picture:
     """Picture of the reference shot with the outlines of the detected chart patches."""
     picture = reference(radiance, color, widest)
-    times = max(1, round(2 * WIDTH / picture.shape[1]))
-    picture = np.asarray(picture.repeat(times, 0).repeat(times, 1), np.uint8)
+    copies = max(1, round(2 * WIDTH / picture.shape[1]))  # of each pixel, along both sides
+    picture = np.asarray(picture.repeat(copies, 0).repeat(copies, 1), np.uint8)
     zoom = picture.shape[1] / radiance.value.shape[2]
     if color.place is not None:
         outlines = [(quad, (0, 255, 0)) for quad in color.place.quads] + [(color.place.corners, (255, 255, 0))]

@@ -38,7 +38,7 @@ CONVENTIONS = (
     "camera: x right, y up, z towards the camera; camera point = rotation @ world point + translation; "
     "pixels are those of a pinhole with focal_px and principal_px, before the lens"
 )
-_LAID = Rotation.from_euler("yxz", [40, 87, 5], degrees=True)  # of the object that is laid on its side
+_LAID = Rotation.from_euler("yxz", [40, 87, 5], degrees=True)  # turn of an object that is laid on its side
 _GRID = 96  # points along a side of the grid on which a shape's surface is found
 
 
@@ -85,10 +85,7 @@ def write(
     """Write captures of `scene`'s object from `views` sides into a new folder; the same arguments give the same bytes.
 
     The object is on the board, its y axis up; position and turn of `scene` are not used. All views have the exposure
-    of the first. `frame_written` is called with the number of photographs written so far and in all.
-
-    Raises CaptureError: the folder holds something already. StorageError: the folder cannot be written; then it is
-    removed.
+    of the first. `frame_written` and errors are as for `shooting.write`.
     """
     forward_camera.require_empty(folder)
     if isinstance(scene.shape, Model):
@@ -128,7 +125,8 @@ def surface(scene: Scene) -> Triangles:
 def _poses(shoot: AroundShoot, views: int, target: Floats) -> Poses:
     """Turn and position [m] of the board in the camera frame of each view; the lens aims at `target` (3,)."""
     random = np.random.default_rng([shoot.seed, 0x7A61E])
-    off = shoot.off_axis_m * np.array([np.cos(angle := random.uniform(0, 2 * np.pi)), 0.0, np.sin(angle)])
+    angle = random.uniform(0, 2 * np.pi)
+    off = shoot.off_axis_m * np.array([np.cos(angle), 0.0, np.sin(angle)])  # of the board's middle from the axis
     tilt = Rotation.from_euler("x", shoot.elevation_deg, degrees=True)
     out: Poses = []
     for k in range(views):
@@ -143,7 +141,9 @@ def _view(scene: Scene, shoot: AroundShoot, turn: Rotation, position: Floats, pl
     vector = tuple(turn.as_rotvec(degrees=True).tolist())
     own = tuple((turn * placed.turn).as_rotvec(degrees=True).tolist())
     place = tuple((turn.apply([0.0, placed.lift, 0.0]) + position).tolist())
-    right = 0.5 * forward_camera.SENSOR_WIDTH_MM / shoot.focal_mm * shoot.distance_m - 0.053
+    right = (
+        0.5 * forward_camera.SENSOR_WIDTH_MM / shoot.focal_mm * shoot.distance_m - 0.053
+    )  # m from the picture's edge
     chart = Chart(center=(right, 0.085 * shoot.distance_m, -shoot.distance_m))
     laid = UNSET if shoot.board == "none" else LaidBoard(tuple(position.tolist()), vector, shoot.board)
     return msgspec.structs.replace(
@@ -158,9 +158,9 @@ def _write_surface(file: Path, scene: Scene, mesh: Triangles, lift: float) -> No
         "vertices": mesh.vertices + np.array([0.0, lift, 0.0]), "diffuse": diffuse, "specular": specular,
         "roughness": roughness, "ior": ior,
     }  # fmt: skip
-    single: dict[str, Any] = {name: value.astype(np.float32) for name, value in values.items()}
+    arrays: dict[str, Any] = {name: value.astype(np.float32) for name, value in values.items()}
     with atomic.path(file) as temporary:
-        np.savez_compressed(temporary, faces=mesh.faces, **single)
+        np.savez_compressed(temporary, faces=mesh.faces, **arrays)
 
 
 def _write_poses(

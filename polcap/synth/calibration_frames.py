@@ -26,8 +26,9 @@ Extinction = Annotated[float, Meta(ge=1)]  # largest over smallest transmittance
 _TINT = np.array([0.8, 1.0, 0.7])  # of the light, in camera channels
 _SAMPLES = 3  # rays per pixel side
 _COLUMNS, _ROWS = 10, 7  # squares of the checkerboard
-_WALL, _PAPER, _INK = 0.18, 0.85, 0.04  # albedos: of the wall behind, of the checkerboard
-_MOST_TILT_DEG = 35.0
+_WALL, _PAPER, _INK = 0.18, 0.85, 0.04  # albedos of the wall behind and of the checkerboard
+_MOST_TILT_DEG = 35.0  # of a board
+_FILLED = 0.6  # width of a board over that of the picture, at distance 1
 
 
 class CalibrationShoot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -136,7 +137,7 @@ def _surface(shoot: CalibrationShoot) -> Floats:
     x, y = x - (shoot.width - 1) / 2, y - (shoot.height - 1) / 2
     half = np.hypot(shoot.width, shoot.height) / 2
     r2 = (x**2 + y**2) / half**2
-    vignette = 1 + sum(a * r2 ** (k + 1) for k, a in enumerate(shoot.falloff))
+    vignette = 1 + sum(factor * r2**power for power, factor in enumerate(shoot.falloff, 1))
     uneven = 1 + shoot.slope[0] * x / half + shoot.slope[1] * y / half
     return np.asarray((vignette * uneven)[..., None] * _TINT)
 
@@ -146,7 +147,7 @@ def _boards(shoot: CalibrationShoot) -> Iterator[Floats]:
     width, height, view, kind = shoot.width, shoot.height, shoot.view, shoot.board
     random = np.random.default_rng([shoot.seed, 9])
     across = width / view.focal  # of the picture, at distance 1
-    pitch = 0.6 * across / (6 if kind == "chart" else _COLUMNS)
+    pitch = _FILLED * across / (6 if kind == "chart" else _COLUMNS)
     for _ in range(shoot.boards):
         turn = random.uniform(-1, 1, 3) * (_MOST_TILT_DEG, _MOST_TILT_DEG, 15)
         share = random.uniform(-1, 1, 2) * (0.2, 0.16)

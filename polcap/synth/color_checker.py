@@ -47,7 +47,7 @@ def intersect(chart: Chart, v: Floats) -> tuple[NDArray[np.integer], Floats, Flo
     """Intersect rays v (P, 3) with the chart: indices (N,) of the rays that hit it, lengths (N,) [m], albedo (N, 3)."""
     center = np.array(chart.center)
     near = np.flatnonzero(-(v @ center) > np.linalg.norm(center) * np.cos(5 * chart.pitch / np.linalg.norm(center)))
-    distance, column, row = meet_plane(chart, v[near])
+    distance, column, row = meet_plane(chart, v[near])  # rays within five pitches of the chart's middle
     on = (np.abs(column) < 3 + _FRAME) & (np.abs(row) < 2 + _FRAME) & (distance > 0)
     column, row = column[on] + _MIDDLE[0], row[on] + _MIDDLE[1]
     patch = (column >= 0) & (row >= 0) & (column % 1 < _PATCH) & (row % 1 < _PATCH) & (column < 6) & (row < 4)

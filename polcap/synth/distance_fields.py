@@ -1,7 +1,8 @@
 """Shapes as distance fields for sphere tracing; each in its own frame, in metres.
 
-`distance(p)`, (..., 3) → (...,), is 0 on the surface; outside it is positive and at most the true distance. `radius` is
-that of a sphere about the origin that contains the shape.
+`distance(p)`, (..., 3) → (...,), is 0 on the surface; outside it is positive and at most the true distance. For this,
+a height over the surface is divided by √(1 + its steepest slope²). A sphere of `radius` about the origin contains the
+shape.
 
 References
 ----------
@@ -65,22 +66,22 @@ class Vase(msgspec.Struct, frozen=True, tag="vase", forbid_unknown_fields=True):
 
     @property
     def radius(self) -> float:
-        curve, _ = _turned(self.profile)
+        curve, _ = _wall(self.profile)
         widest = float(curve(np.linspace(0, 1, 257)).max()) * (1 + self.depth)
         return hypot(self.height / 2, widest) + sum(abs(wave[0]) for wave in self.waves)
 
     def distance(self, p: Floats) -> Floats:
-        curve, steepest = _turned(self.profile)
+        curve, steepest = _wall(self.profile)
         across = np.maximum(np.hypot(p[..., 0], p[..., 2]), 1e-9)
         wall = curve(np.clip(p[..., 1] / self.height + 0.5, 0, 1))
         lobes = 1.0 + self.depth * np.cos(self.lobes * np.arctan2(p[..., 0], p[..., 2]))
-        raised = sum(abs(a) * hypot(x, y, z) for a, x, y, z, _ in self.waves)
-        around = self.depth * self.lobes / (1 - self.depth)
-        slope = hypot(steepest / self.height * (1 + self.depth), around) + raised
+        of_waves = sum(abs(a) * hypot(x, y, z) for a, x, y, z, _ in self.waves)  # slopes, at most
+        of_lobes = self.depth * self.lobes / (1 - self.depth)
+        slope = hypot(steepest / self.height * (1 + self.depth), of_lobes) + of_waves
         side = (across - wall * lobes - _waves(self.waves, p)) / hypot(1, slope)
-        end, over = np.abs(p[..., 1]) - self.height / 2, 0.06 * self.height
-        near = np.maximum(over - np.abs(side - end), 0.0) / over
-        return np.asarray(np.maximum(side, end) + near * near * (over / 4))  # the rim is rounded over `over` metres
+        end, width = np.abs(p[..., 1]) - self.height / 2, 0.06 * self.height
+        near = np.maximum(width - np.abs(side - end), 0.0) / width
+        return np.asarray(np.maximum(side, end) + near * near * (width / 4))  # the rim is rounded over this width
 
 
 class Model(msgspec.Struct, frozen=True, tag="model", forbid_unknown_fields=True):
@@ -145,7 +146,7 @@ def _heights(slab: Slab) -> tuple[Floats, float]:
 
 
 @lru_cache
-def _turned(profile: tuple[tuple[float, float], ...]) -> tuple[CubicSpline, float]:
+def _wall(profile: tuple[tuple[float, float], ...]) -> tuple[CubicSpline, float]:
     """Radius of a vase's wall as a spline over height 0…1, and the wall's steepest slope [m per height]."""
     at, radius = np.array(profile).T
     curve = CubicSpline(at, radius, bc_type="natural")

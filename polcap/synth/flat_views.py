@@ -32,7 +32,7 @@ from polcap.synth.shooting import Shoot
 _BOARD: Literal["A4"] = "A4"
 _CHART = (0.084, 0.003, 0.0)  # m, world, middle of the chart: on the right of the ring, over the page's edge
 _CHART_TURN = Rotation.from_matrix([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # its columns run to the left, it faces up
-_FEW = 5  # views, up to which all oblique ones have one tilt
+_FEW = 5  # views; up to this number, all oblique views have the same tilt
 _TEXELS = 1024  # along a side of the true maps
 
 
@@ -64,11 +64,7 @@ def write(
 ) -> None:
     """Write captures of a flat sample with the coat of `scene` into a new folder; same arguments give the same bytes.
 
-    Shape, position and turn of `scene` are not used. `frame_written` is called with the number of photographs written
-    so far and in all.
-
-    Raises CaptureError: the folder holds something already. StorageError: the folder cannot be written; then it is
-    removed.
+    Shape, position and turn of `scene` are not used. `frame_written` and errors are as for `shooting.write`.
     """
     forward_camera.require_empty(folder)
     slab = Slab(shoot.side_m, shoot.thickness_m, shoot.relief_m, shoot.feature_m, shoot.seed, shoot.height_map)
@@ -91,7 +87,7 @@ def _poses(shoot: FlatShoot, views: int) -> Poses:
     random = np.random.default_rng([shoot.seed, 0xF1A7])
     near, far = shoot.tilts_deg
     count = views - 1
-    inner = 0 if views <= _FEW else (count + 1) // 2
+    inner = 0 if views <= _FEW else (count + 1) // 2  # views at the smaller tilt
     tilts = [near] * inner + [far if inner else (near + far) / 2] * (count - inner)
     turns = [360 * k / max(inner, 1) for k in range(inner)]
     turns += [360 * (k + 0.5) / (count - inner) for k in range(count - inner)]
@@ -105,17 +101,17 @@ def _poses(shoot: FlatShoot, views: int) -> Poses:
 
 def _view(scene: Scene, slab: Slab, shoot: FlatShoot, turn: Rotation, position: Floats, with_chart: bool) -> Scene:
     """The scene of one view: sample, board and chart before the camera."""
-    vector, at = tuple(turn.as_rotvec(degrees=True).tolist()), tuple(position.tolist())
+    vector, place = tuple(turn.as_rotvec(degrees=True).tolist()), tuple(position.tolist())
     middle = turn.apply(_CHART) + position
     chart = Chart(tuple(middle.tolist()), tuple((turn * _CHART_TURN).as_rotvec(degrees=True).tolist()))
     return msgspec.structs.replace(
-        scene, shape=slab, turn_deg=vector, position=at, chart=chart if with_chart else None,
-        board=LaidBoard(at, vector, _BOARD, shoot.board_roughness or msgspec.UNSET), cast_shadows=True, shadows=True,
+        scene, shape=slab, turn_deg=vector, position=place, chart=chart if with_chart else None,
+        board=LaidBoard(place, vector, _BOARD, shoot.board_roughness or msgspec.UNSET), cast_shadows=True, shadows=True,
     )  # fmt: skip
 
 
 def _write_maps(file: Path, scene: Scene, slab: Slab) -> None:
-    """True maps at the middles of _TEXELS² texels: normals in the frame x right, y up the page, z out of it."""
+    """Write the true maps at the middles of _TEXELS² texels; normals: x right, y up the page, z out of it."""
     axis = ((np.arange(_TEXELS) + 0.5) / _TEXELS - 0.5) * slab.side
     x, z = np.meshgrid(axis, axis)
     point = np.stack([x, slab.thickness + slab.height(x, z), z], axis=-1)
@@ -126,9 +122,9 @@ def _write_maps(file: Path, scene: Scene, slab: Slab) -> None:
         "normal": np.stack([bent[..., 0], -bent[..., 2], bent[..., 1]], axis=-1), "diffuse": diffuse,
         "specular": specular, "roughness": roughness, "ior": ior, "height": slab.height(x, z),
     }  # fmt: skip
-    single: dict[str, Any] = {name: value.astype(np.float32) for name, value in values.items()}
+    arrays: dict[str, Any] = {name: value.astype(np.float32) for name, value in values.items()}
     with atomic.path(file) as temporary:
-        np.savez_compressed(temporary, **single)
+        np.savez_compressed(temporary, **arrays)
 
 
 def _write_poses(file: Path, scene: Scene, shoot: FlatShoot, poses: Poses, power: Floats) -> None:

@@ -23,7 +23,7 @@ from polcap.optics.color import REC709_TO_XYZ
 
 SENSOR_WIDTH_MM = 36.0
 Bend = Annotated[float, Meta(ge=-1, le=1)]  # k₁ or k₂ of the lens
-_RADII = 20001  # in the table of a lens
+_RADII = 20001  # radii in the table of a lens
 COLOR_MATRIX = (0.87, -0.27, -0.075, -0.44, 1.23, 0.235, -0.09, 0.19, 0.69)  # XYZ → camera, row by row
 
 

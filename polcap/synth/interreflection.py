@@ -1,6 +1,6 @@
 """Interreflection between the parts of a mesh: flash light that reaches a place by one diffuse bounce elsewhere.
 
-`flash_light` and `diffuse_light` are the law of this bounce. Synthetic captures gather it at the vertices (`received`):
+`flash_light` and `diffuse_light` are the law of this bounce. Synthetic captures gather it at the vertices (`gather`):
 all shots use the same interpolated values, so sampling noise adds no false polarization. The evaluation's pictures
 gather it per pixel, also in specular reflection (`training/light_transport.py`). Both neglect further bounces and the
 slight polarization of this light. Training has another simulation, `training/bounced_light.py`. It computes light with
@@ -46,7 +46,7 @@ def diffuse_light(
     return np.asarray(albedo * (irradiance * cos_i * into * out)[:, None])
 
 
-def received(tracer: Tracer, lit: DiffuseLight, camera: Floats, ior: float) -> Floats:
+def gather(tracer: Tracer, lit: DiffuseLight, camera: Floats, ior: float) -> Floats:
     """Interreflected light that enters the surface at each vertex, (V, 3), relative to the light from a white plane.
 
     `lit(point, normal, towards)` computes the diffusely reflected S0 (N, 3) of points under the flash, in the direction
@@ -63,7 +63,7 @@ def received(tracer: Tracer, lit: DiffuseLight, camera: Floats, ior: float) -> F
     total: Floats = np.zeros(normal.shape)
     for k in range(_RAYS):
         cosine = np.sqrt(1 - (k + 0.5) / _RAYS)
-        angle = turn + k * np.pi * (3 - np.sqrt(5))
+        angle = turn + k * np.pi * (3 - np.sqrt(5))  # golden angle
         across = np.cos(angle)[:, None] * e_x + np.sin(angle)[:, None] * e_y
         direction = cosine * normal + np.sqrt(1 - cosine**2) * across
         hit = tracer.meet(mesh.vertices + LIFT * tracer.size * normal, direction)
@@ -71,10 +71,10 @@ def received(tracer: Tracer, lit: DiffuseLight, camera: Floats, ior: float) -> F
         facing = np.where(np.sum(hit.normal * back, axis=1, keepdims=True) < 0, -hit.normal, hit.normal)
         entered, _ = fresnel.transmission(np.float64(cosine), ior)
         total[hit.index] += entered * lit(hit.position, facing, back)
-    return _smoothed(total / _RAYS, tracer)
+    return _smooth(total / _RAYS, tracer)
 
 
-def _smoothed(value: Floats, tracer: Tracer) -> Floats:
+def _smooth(value: Floats, tracer: Tracer) -> Floats:
     """Values (V, 3) at vertices, averaged over the triangles around, `_SMOOTH` times."""
     faces = tracer.mesh.faces
     count = np.maximum(np.bincount(faces.ravel(), minlength=len(value)), 1)[:, None]

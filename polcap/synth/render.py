@@ -84,7 +84,7 @@ class ObjectBuffer(GBuffer):
 def gbuffer(scene: Scene, view: View, height: int, width: int) -> ObjectBuffer:
     """G-buffer of a scene's object at the center of each pixel."""
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    unlit = structs.replace(scene, cast_shadows=False)  # their light is not needed
+    unlit = structs.replace(scene, cast_shadows=False)  # the light on chart, board and backdrop is not needed
     hits, _ = _visible(unlit, frames.rays_at(view, x, y).reshape(-1, 3))
     facing, bent = _normals(scene, hits)
     depth = mesh_tracer.scatter(-hits.point[:, 2], hits.index, x.shape, np.nan)
@@ -104,7 +104,7 @@ def white_level(scene: Scene) -> float:
     """S0 of an ideal white surface at the chart's white patch; 1 without a chart."""
     if scene.chart is None:
         return 1.0
-    point = charts.patches(scene.chart)[18].mean(axis=0, keepdims=True)
+    point = charts.patches(scene.chart)[18].mean(axis=0, keepdims=True)  # the white patch
     return float(_irradiance(scene, point, scene.chart.axes[0])[0])
 
 
@@ -115,7 +115,7 @@ def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits
     out = np.zeros((3, len(v), 3))
     out[0] = wall[:, None]
     hits = trace.trace(scene.shape, scene.position, scene.turn, v, start)
-    for normal, roughness, (at, reach, albedo) in _flat_things(scene, v):
+    for normal, roughness, (at, reach, albedo) in _flat_objects(scene, v):
         nearer = reach < distance[at]
         at, reach, albedo = at[nearer], reach[nearer], albedo[nearer]
         distance[at] = reach
@@ -125,7 +125,7 @@ def _visible(scene: Scene, v: Floats, start: Floats | None = None) -> tuple[Hits
     return hits.take(np.flatnonzero(hits.distance < distance[hits.index])), out
 
 
-def _flat_things(scene: Scene, v: Floats) -> Iterator[tuple[Floats, float, tuple[Indices, Floats, Floats]]]:
+def _flat_objects(scene: Scene, v: Floats) -> Iterator[tuple[Floats, float, tuple[Indices, Floats, Floats]]]:
     """Normals and roughness (0: matt) of chart and board, and the rays on them: indices, lengths [m] and albedo."""
     if scene.chart is not None:
         yield scene.chart.axes[0], 0.0, charts.intersect(scene.chart, v)
@@ -211,4 +211,4 @@ def _bounced(scene: Scene) -> Floats:
         return interreflection.diffuse_light(light, normal, towards, diffuse, ior)
 
     ior = scene.coat.materials[0].ior
-    return np.asarray(interreflection.received(tracer, lit, lens, ior)[tracer.mesh.faces])
+    return np.asarray(interreflection.gather(tracer, lit, lens, ior)[tracer.mesh.faces])

@@ -75,7 +75,7 @@ def solid_noise(p: Floats, seed: int) -> Floats:
             k = direction / np.linalg.norm(direction) * (2.0 * 1.7**octave * random.uniform(0.8, 1.25))
             phase = p[..., 0] * k[0] + p[..., 1] * k[1] + p[..., 2] * k[2] + random.uniform(0, 6.3)
             total += 0.7**octave * np.sin(phase.astype(np.float32))
-    return np.asarray(total / np.sqrt(2.5 * sum(0.49**octave for octave in range(3))))
+    return np.asarray(total / np.sqrt(2.5 * sum(0.49**octave for octave in range(3))))  # five waves of variance ½ each
 
 
 def _choose(coat: Coat, position: Floats, parts: list[Floats]) -> Floats:
@@ -118,14 +118,14 @@ def _project(material: Material, position: Floats, facing: Floats) -> tuple[Floa
     texture = _texture(str(material.texture))
     axis = np.abs(facing).argmax(axis=-1)[..., None]
     across = np.concatenate([np.take_along_axis(position, (axis + k) % 3, axis=-1) for k in (1, 2)], axis=-1)
-    turned = np.mod(across / material.size, 2)
-    at = np.where(turned < 1, turned, 2 - turned) * (_TEXELS - 1)
+    along = np.mod(across / material.size, 2)  # 0…2: there and mirrored back
+    at = np.where(along < 1, along, 2 - along) * (_TEXELS - 1)
     corner = np.minimum(at.astype(np.intp), _TEXELS - 2)
     column, row = corner[..., 0], corner[..., 1]
     u, v = (at - corner)[..., :1], (at - corner)[..., 1:]
     upper = texture[row, column] * (1 - u) + texture[row, column + 1] * u
     lower = texture[row + 1, column] * (1 - u) + texture[row + 1, column + 1] * u
-    return upper * (1 - v) + lower * v, axis, np.where(turned < 1, 1.0, -1.0)
+    return upper * (1 - v) + lower * v, axis, np.where(along < 1, 1.0, -1.0)
 
 
 @lru_cache(maxsize=4)

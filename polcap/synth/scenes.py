@@ -57,10 +57,10 @@ def with_model(scene: Scene, file: Path, seed: int) -> Scene:
 def with_textures(scene: Scene, folder: Path) -> Scene:
     """A copy of the scene with a texture set as its only material."""
     material = scene.coat.materials[0]
-    laid = msgspec.structs.replace(
+    textured = msgspec.structs.replace(
         material, first=(1.0, 1.0, 1.0), second=(1.0, 1.0, 1.0), size=0.1, roughness=(0.0, 1.0), texture=str(folder)
     )
-    return msgspec.structs.replace(scene, coat=Coat((laid,)))
+    return msgspec.structs.replace(scene, coat=Coat((textured,)))
 
 
 def _bumps(random: np.random.Generator) -> Shape:
@@ -99,7 +99,7 @@ def _vase(random: np.random.Generator) -> Shape:
 
 
 def _random_waves(random: np.random.Generator, count: int, amplitude: float, number: float) -> tuple[Wave, ...]:
-    """Sine waves of random direction, with about `number` rad per metre."""
+    """Sine waves of random direction, with about this amplitude and wave number [rad/unit]."""
     waves = []
     for _ in range(count):
         direction = random.normal(size=3)

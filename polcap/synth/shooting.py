@@ -153,8 +153,8 @@ def write_capture(folder: Path, studio: "Studio", frame_written: Callable[[int, 
             matrix = transform(shoot, pose.shift_px, pose.rot_deg).tolist()
             for frame in range(shoot.exposures):
                 name = f"{kind}{folder_names.degrees(angle)}/IMG_{shot * shoot.exposures + frame + 1:04d}.DNG"
-                stops = float(shoot.step ** (frame - shoot.exposures // 2))
-                taken = studio.photograph(place / name, radiance, Take(shot, frame, stops))
+                factor = float(shoot.step ** (frame - shoot.exposures // 2))
+                taken = studio.photograph(place / name, radiance, Take(shot, frame, factor))
                 files.append({"file": name, "nominal_deg": angle, **asdict(pose), "transform": matrix, **taken})
                 if frame_written is not None:
                     frame_written(len(files), len(shots) * shoot.exposures)
@@ -176,7 +176,7 @@ class Take:
 
     shot: int
     frame: int  # within the bracket
-    stops: float  # exposure relative to the middle frame, as a factor
+    factor: float  # exposure over that of the middle frame
     again: int = 0  # number of earlier photographs of this frame
     lit: bool = True  # False: the light is off
     dials: "Dials | None" = None  # None: as the bracket of `Shoot`
@@ -310,7 +310,7 @@ def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) ->
 
 def _exposure(shoot: Shoot, take: Take, middle: float) -> tuple[Exif, float, float]:
     """EXIF data of a simulated photograph, the light it receives, and its amplification."""
-    stops, number = take.stops, take.shot * shoot.exposures + take.frame
+    factor, number = take.factor, take.shot * shoot.exposures + take.frame
     diagonal_mm = SENSOR_WIDTH_MM * np.hypot(1, shoot.height / shoot.width)
     equivalent_mm = float(shoot.focal_mm * np.hypot(36, 24) / diagonal_mm)  # the same angle of view on full frame
     taken = datetime(2026, 3, 14, 12) + timedelta(seconds=4.25 * number + 20 * (number // shoot.exposures))
@@ -324,19 +324,20 @@ def _exposure(shoot: Shoot, take: Take, middle: float) -> tuple[Exif, float, flo
         dials, amplification = take.dials, take.dials.iso / 100.0
         exif = replace(exif, exposure_time=dials.time_s, f_number=dials.f_number, iso=dials.iso)
         exif = replace(exif, flash_fired=dials.flash and take.lit)
-        return exif, middle * stops / amplification, amplification
+        return exif, middle * factor / amplification, amplification
     if shoot.bracket == "iso":
         amplification = shoot.step**take.frame
         light = middle / shoot.step ** (shoot.exposures // 2)
         return replace(exif, iso=100.0 * amplification), light, amplification
     if shoot.bracket == "time":
-        exif = replace(exif, exposure_time=MIDDLE_S * stops)
+        exif = replace(exif, exposure_time=MIDDLE_S * factor)
     elif shoot.bracket == "aperture":
-        exif = replace(exif, f_number=round(11.0 / sqrt(stops), 1))
-    return exif, middle * stops, 1.0
+        exif = replace(exif, f_number=round(11.0 / sqrt(factor), 1))
+    return exif, middle * factor, 1.0
 
 
 def _write_truth(place: Path, studio: Studio, files: list[dict[str, Any]]) -> None:
+    """Write truth.json and truth.npz of a capture."""
     scene, shoot, buffer, reference = studio.scene, studio.shoot, studio.buffer, studio.reference
     view, white = shoot.view, render.white_level(scene)
     chart = scene.chart and {

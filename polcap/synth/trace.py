@@ -21,7 +21,7 @@ from polcap.synth.distance_fields import Model, Shape
 Vector = tuple[float, float, float]
 _TOLERANCE = 1e-6  # m, distance at which a ray has arrived
 _STEPS = 300  # most steps of a ray
-_GRAZING = 1e-4  # m, the same after the last step, for rays along the surface
+_GRAZING = 1e-4  # m, the same at the last step, for rays along the surface
 LIFT = 5e-4  # m above the surface, where a shadow ray starts
 
 
@@ -59,7 +59,7 @@ def trace(shape: Shape | Model, position: Vector, turn: Rotation, v: Floats, sta
     The search begins at the distance `start` (P,) [m], in front of the surface; infinite: the ray misses.
     """
     to_middle = -(v @ np.array(position))
-    near = to_middle**2 > np.dot(position, position) - shape.radius**2
+    near = to_middle**2 > np.dot(position, position) - shape.radius**2  # of the rays, to the shape's sphere
     if start is not None:
         near &= np.isfinite(start)
     candidates = np.flatnonzero(near)
@@ -94,20 +94,20 @@ def in_shadow(shape: Shape | Model, position: Vector, turn: Rotation, point: Flo
 def _march(shape: Shape, origin: Floats, direction: Floats, start: Floats | float) -> tuple[Indices, Floats]:
     """Sphere tracing: indices of the rays (P, 3) that hit the shape, and their lengths [m]."""
     middle = -np.einsum("pi,pi->p", origin, direction)
-    missed = np.einsum("pi,pi->p", origin, origin) - middle**2
-    half = np.sqrt(np.maximum(shape.radius**2 - missed, 0.0))
+    gap2 = np.einsum("pi,pi->p", origin, origin) - middle**2  # squared distance of the ray from the origin
+    half = np.sqrt(np.maximum(shape.radius**2 - gap2, 0.0))  # length of the ray in the shape's sphere
     alive = np.flatnonzero((half > 0) & (middle + half > 0))
     travelled = np.maximum(middle - half, start)[alive]
     end = (middle + half)[alive]
     arrived_index, arrived_at = [alive[:0]], [travelled[:0]]
-    for left in reversed(range(_STEPS)):
+    for steps_left in reversed(range(_STEPS)):
         step = shape.distance(origin[alive] + direction[alive] * travelled[:, None])
         travelled = travelled + step
-        there = np.abs(step) < (_TOLERANCE if left else _GRAZING)
-        arrived_index.append(alive[there])
-        arrived_at.append(travelled[there])
-        going = ~there & (travelled < end)
-        alive, travelled, end = alive[going], travelled[going], end[going]
+        arrived = np.abs(step) < (_TOLERANCE if steps_left else _GRAZING)
+        arrived_index.append(alive[arrived])
+        arrived_at.append(travelled[arrived])
+        moving = ~arrived & (travelled < end)
+        alive, travelled, end = alive[moving], travelled[moving], end[moving]
         if not len(alive):
             break
     index = np.concatenate(arrived_index)

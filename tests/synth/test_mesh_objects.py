@@ -71,7 +71,7 @@ def test_every_point_of_a_hemispherical_bowl_receives_the_light_of_half_a_sphere
         return np.ones((len(point), 3))
 
     inside = np.unique(bowl[whole.vertices[bowl][..., 2].max(axis=1) < -0.03])
-    found = interreflection.received(tracer, shining, np.array([0.0, 0.0, 0.01]), 1.0)[inside, 0]
+    found = interreflection.gather(tracer, shining, np.array([0.0, 0.0, 0.01]), 1.0)[inside, 0]
     assert abs(found.mean() - 0.5) < 0.01
     assert np.abs(found - 0.5).max() < 0.1  # 48 rays each
 
