@@ -36,7 +36,7 @@ def undistort(lens: Distortion, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def folds(lens: Distortion, width: float, height: float) -> bool:
-    """Whether a distortion is impossible: two rays fall on one pixel within a picture of this size [px]."""
+    """Whether a distortion is impossible: two rays fall on one pixel, within 1.3 times this picture's size [px]."""
     x, y = (max(c, side - c) for c, side in zip(lens.center, (width, height)))
     far = np.hypot(x, y) / lens.focal
     r2 = np.linspace(0, 1.3 * far, 64) ** 2

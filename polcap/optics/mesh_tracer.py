@@ -164,7 +164,7 @@ class Tracer:
 def face_camera(normal: Floats, v: Floats) -> Floats:
     """Turn normals (N, 3) towards the camera, along rays v (N, 3).
 
-    Normals that face away are flipped. Normals that smoothing turned slightly away are tilted back.
+    Normals that face away (cosine under −0.3) are flipped. Normals that smoothing turned slightly away are tilted back.
     """
     facing = np.sum(normal * v, axis=-1, keepdims=True)
     normal = np.where(facing < -0.3, -normal, normal)

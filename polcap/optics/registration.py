@@ -134,9 +134,9 @@ def register(reference: Pyramid, other: Pyramid, model: Model = "simplest") -> R
     still, _ = _refine(reference, other, model, 0, 0, np.eye(3))
     start = _phase_correlation(reference[coarsest], other[coarsest])
     if start[:2, 2].any():
-        near, agree = _refine(reference, other, model, coarsest, 0, np.eye(3))
-        far, more = _refine(reference, other, model, coarsest, 0, start)
-        return far if more > _FAR_BETTER * agree else near
+        near, near_tiles = _refine(reference, other, model, coarsest, 0, np.eye(3))
+        far, far_tiles = _refine(reference, other, model, coarsest, 0, start)
+        return far if far_tiles > _FAR_BETTER * near_tiles else near
     coarse, _ = _refine(reference, other, model, coarsest, coarsest, np.eye(3))
     if min(still.tiles, coarse.tiles) and max(still.shift_px, coarse.shift_px * 2**coarsest) < _STILL_PX:
         return still
@@ -254,8 +254,8 @@ def _match(reference: Level, other: Level, corner: Indices, matrix: Floats) -> _
 def _match_some(reference: Level, other: Level, corner: Indices, matrix: Floats) -> tuple[Indices, Floats, Floats]:
     """Match some tiles: corners, shifts and information of the tiles that match."""
     height, width = other.picture.shape
-    each = np.arange(float(_TILE))
-    u, v = coordinates(matrix, corner[:, 1, None, None] + each, corner[:, 0, None, None] + each[:, None])
+    offset = np.arange(float(_TILE))
+    u, v = coordinates(matrix, corner[:, 1, None, None] + offset, corner[:, 0, None, None] + offset[:, None])
     inside = (u.min((1, 2)) >= _MARGIN) & (u.max((1, 2)) < width - 1 - _MARGIN)
     inside &= (v.min((1, 2)) >= _MARGIN) & (v.max((1, 2)) < height - 1 - _MARGIN) & (corner.min(axis=1) >= 1)
     corner, u, v = corner[inside], u[inside], v[inside]

@@ -21,7 +21,7 @@ from polcap.optics.tiles import spread_over_cells
 TILE = 32  # px of the binned frames
 _CELLS, _PER_CELL = (8, 12), 3  # rows and columns of cells in the picture; tiles chosen in each cell
 _FINE, _COARSE = 1, 4  # px, distances of the differences
-_WAYS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows and columns: directions of the differences
+_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows and columns: directions of the differences
 _BLURS_PX = (0.0, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # 1σ: blurs with which the sharpest tiles are compared
 _LEAST_TILES = 4
 _LEAST_LIGHT = 0.01  # of the sensor's range; in darker tiles noise would count as detail
@@ -135,7 +135,7 @@ def extra_blur(tiles: Floats, usable: Bools) -> Floats:
 
 def _fineness(tiles: Floats) -> Floats:
     """Logarithm (4, T) of fine over coarse detail of tiles, in four directions; blur lowers it."""
-    return np.stack([np.log(_energy(tiles, way, _FINE) / _energy(tiles, way, _COARSE)) for way in _WAYS])
+    return np.stack([np.log(_energy(tiles, axis, _FINE) / _energy(tiles, axis, _COARSE)) for axis in _DIRECTIONS])
 
 
 def _phase_loss(tiles: Floats) -> Floats:
@@ -153,10 +153,10 @@ def _phase_loss(tiles: Floats) -> Floats:
     return _fineness(tiles) - _fineness(moved)
 
 
-def _energy(tiles: Floats, way: tuple[int, int], lag: int) -> Floats:
+def _energy(tiles: Floats, direction: tuple[int, int], lag: int) -> Floats:
     """Mean squared difference (T,) of pixels `lag` px apart in a direction, as a measure of detail."""
-    down, across = way[0] * lag, abs(way[1]) * lag
-    flipped = tiles[:, :, ::-1] if way[1] < 0 else tiles
+    down, across = direction[0] * lag, abs(direction[1]) * lag
+    flipped = tiles[:, :, ::-1] if direction[1] < 0 else tiles
     n = tiles.shape[-1]
     difference = flipped[:, down:, across:] - flipped[:, : n - down, : n - across]
     return np.asarray((difference**2).mean((1, 2)) + 1e-12)

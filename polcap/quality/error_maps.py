@@ -25,7 +25,7 @@ _FINEST_PX = 4.0  # the same distance, in pixels of the reduced grid of the comp
 _CLIPPED_AROUND = (0.0, 0.15, 0.3, 0.45, 0.6, 0.8, 1.0)
 _CLIPPED_DEG = (0.0, 5.0, 9.5, 22.0, 28.0, 25.0, 18.0)
 _CLIPPED_PART = 0.3  # clipped part of the object with these costs; they grow with its root, as a highlight's width
-# part of a cost that the estimators do not state themselves, where the polarization contradicts itself
+# part of a cost that is not in the estimators' own error: they expect larger errors where polarization is contradictory
 _UNSTATED = {"sharpness": 0.7, "ill-posed": 0.0}
 # agreement of the re-rendering from which `body` is a false finding (docs/benchmarks/gates.md); of wax it is .22
 _CONFIRMED = 0.45

@@ -73,11 +73,11 @@ class Flatness:
 
 def judge(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
     """Gates "flat" and "contour": whether the object is one plane, and whether its outline is an occluding contour."""
-    seen = measure(found.results.stokes, found.results.maps)
-    if seen is None:
+    shape = measure(found.results.stokes, found.results.maps)
+    if shape is None:
         yield Gate("flat", "not measured", None, _ONE_PLANE, "The object is too small")
         return
-    if seen.flat and seen.expected_deg > _KNOWN_DEG:
+    if shape.flat and shape.expected_deg > _KNOWN_DEG:
         message = (
             "The object is flat: a surface that faces camera and flash is hardly polarized, so one picture shows "
             "neither its relief nor its gloss"
@@ -85,14 +85,14 @@ def judge(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
         if found.results.radiance.crossed is not None:
             message += "; the cross-polarized shot shows its color without highlights"
         remedy = "Photograph it from five to nine sides for `polcap material`, which measures both"
-        if seen.facing > _TILTED:
+        if shape.facing > _TILTED:
             remedy += "; a single picture shows more of it where it is tilted by 30°"
-        yield Gate("flat", "warn", round(seen.common, 3), _ONE_PLANE, message, remedy)
+        yield Gate("flat", "warn", round(shape.common, 3), _ONE_PLANE, message, remedy)
     else:
-        message = "The object is flat, and its polarization shows its tilt" if seen.flat else "The object is not flat"
-        yield Gate("flat", "pass", round(seen.common, 3), _ONE_PLANE, message)
-    value = round(seen.contour, 3)
-    if seen.sharp_edged:
+        message = "The object is flat, and its polarization shows its tilt" if shape.flat else "The object is not flat"
+        yield Gate("flat", "pass", round(shape.common, 3), _ONE_PLANE, message)
+    value = round(shape.contour, 3)
+    if shape.sharp_edged:
         message = (
             "The outline is the edge of flat faces: its polarization shows neither the angles' order nor the light"
         )

@@ -407,8 +407,8 @@ def _median_ray_doubt_deg(maps: SurfaceMaps, least: float, most: float) -> float
 def ray_doubt_deg(maps: SurfaceMaps, least: float, most: float) -> Floats:
     """Root mean square change of each view ray's tilt (H, W) [degrees], if all focal lengths in doubt are as likely."""
     y, x = np.indices(maps.mask.shape)
-    off = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
+    radius = np.hypot(x - maps.view.center[0], y - maps.view.center[1]) / maps.view.focal
     doubts = least + (most - least) * (np.arange(_FOCAL_LENGTHS) + 0.5) / _FOCAL_LENGTHS
-    table = np.linspace(0, off.max(), _RADII)
+    table = np.linspace(0, radius.max(), _RADII)
     changes = np.arctan(table * np.exp(-doubts[:, None])) - np.arctan(table)
-    return np.asarray(np.interp(off, table, np.degrees(np.sqrt((changes**2).mean(0)))))
+    return np.asarray(np.interp(radius, table, np.degrees(np.sqrt((changes**2).mean(0)))))

@@ -32,8 +32,8 @@ _EDGE_PX = 2.0  # 1σ of the blur before two shots are compared, so that misalig
 _STILL_CLIPPED = 0.5  # share of highlights that a crossed filter should have stopped
 _FEW = 20  # px: fewer clipped ones are not judged
 _DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame for all angles: 1 to 2° at 15 %
-# of the room's light between two ambient frames: beyond, more than its polarization (60 %) causes
-_UNLIKE, _LEAST_AMBIENT, _DEGREES_PER_UNLIKE = 4.0, 0.02, 80.0  # ratio; share; 12° at .15
+# ratio of the room's light in two ambient frames that a polarization of 60 % causes; least share; 12° at a gap of .15
+_UNLIKE, _LEAST_AMBIENT, _DEGREES_PER_UNLIKE = 4.0, 0.02, 80.0
 _DEGREES_PER_FLICKER = 400.0  # of the normals: 4.3 and 7.3° at 1.2 and 3.6 % of the light (docs/benchmarks/gates.md)
 _LEAST_ALBEDO = 0.02  # sum of the channels
 _TOWARDS_CAMERA = float(np.cos(np.radians(30)))  # cosine; lamps 45° to the side are mirrored at 22°
@@ -192,14 +192,14 @@ def _unlike_ambient(found: Evidence[ResultsUntilHdr]) -> Gate | None:
     The room's polarization alone changes its light through the polarizer by less.
     """
     share = np.maximum(found.results.radiance.bracket.ambient_share, 1e-6)
-    level = np.log(share / np.maximum(1 - share, 1e-6))
+    level = np.log(share / np.maximum(1 - share, 1e-6))  # room light over flash light
     if not np.nanmax(share) > _LEAST_AMBIENT or not np.ptp(level) > np.log(_UNLIKE):
         return None
-    off = level - np.median(level)
-    k = int(np.argmax(np.abs(off)))
+    deviation = level - np.median(level)
+    k = int(np.argmax(np.abs(deviation)))
     name, gap = found.names[k], float(abs(share[k] - np.median(share)))
     amount, cause = "less", "the lens was covered, or it was exposed less than stated"
-    if off[k] > 0:
+    if deviation[k] > 0:
         amount, cause = "more", "it contains flash light"
     message = f"The ambient frame of the {name} shot has {amount} light than the others: {cause}"
     remedy = "Take that ambient frame again, without the flash and with the settings of the others"
@@ -253,17 +253,17 @@ def side_light(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
     gate = _judge_highlights(found, limits)
     if gate.state in ("warn", "fail"):
         return gate
-    seen, limit = _albedo_slope(found), limits.max_albedo_slope
-    if seen is None or seen.amount <= limit:
+    slope, limit = _albedo_slope(found), limits.max_albedo_slope
+    if slope is None or slope.amount <= limit:
         return gate
-    times = np.exp(2 * np.sin(_LEANING) * seen.amount) - 1
+    times = np.exp(2 * np.sin(_LEANING) * slope.amount) - 1
     message = (
-        f"Parts that lean to the {_SIDES[round(seen.azimuth / (np.pi / 4)) % len(_SIDES)]} are {100 * times:.0f} % "
+        f"Parts that lean to the {_SIDES[round(slope.azimuth / (np.pi / 4)) % len(_SIDES)]} are {100 * times:.0f} % "
         "brighter than under a flash at the lens: a lamp or window there, which bends normals and albedo (or the "
         "object is brighter there)"
     )
-    cost = float(np.hypot(gate.cost_deg, _LAMP_DEG + _DEGREES_PER_ALBEDO_SLOPE * seen.amount))
-    return at_most("lighting", seen.amount, limit, message, _ONE_FLASH, cost_deg=cost, beyond="warn")
+    cost = float(np.hypot(gate.cost_deg, _LAMP_DEG + _DEGREES_PER_ALBEDO_SLOPE * slope.amount))
+    return at_most("lighting", slope.amount, limit, message, _ONE_FLASH, cost_deg=cost, beyond="warn")
 
 
 def _albedo_slope(found: Evidence[ResultsUntilInfer]) -> albedo_slope.AlbedoSlope | None:

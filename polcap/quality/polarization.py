@@ -72,23 +72,23 @@ def _most_dolp(found: Evidence[ResultsUntilStokes]) -> float:
 def of_outline(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Iterator[Gate]:
     """Gates on angles, material and other light, judged by the polarization along the object's outline."""
     angle, limit = found.results.selfcal.angle - found.results.selfcal.ring.correction, limits.max_turn_deg
-    seen = _outline(found, limit, angle)
-    if seen is None:
+    figures = _outline(found, limit, angle)
+    if figures is None:
         yield Gate("angles", "not measured", None, limit, "The outline is too short", unit="°")
         return
-    body = seen.body
+    body = figures.body
     if body.dolp > 1:
         message = "The shots contradict each other: they are not of one object under one light"
         remedy = sentence(angle_advice.check_statement(found.results.radiance.equipment.angles))
         yield Gate("body", "fail", None, None, message, remedy, MOST_DEG)
         return
-    of_shots = _angles(seen.turn, body, angle, found, limits)
+    of_shots = _angles(figures.turn, body, angle, found, limits)
     closed = found.results.object_.border <= limits.max_mask_border
     if of_shots.state == "fail" and not closed:  # a part of an outline can fit a turned shot by chance
         of_shots = msgspec.structs.replace(of_shots, state="warn")
     yield _with_ring(of_shots, body, found, limits)
     yield _light_of_body(body, found, limits)
-    side = seen.side
+    side = figures.side
     if found.results.radiance.equipment.light == "one exposure":
         yield Gate("other light", "pass", 0.0, limits.max_side_light, "All angles come from one exposure")
         return
@@ -100,7 +100,7 @@ def of_outline(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Iterat
     text = f"The {found.names[k]} shot is {{:.1f}} % brighter on one side than the others"
     message = worded(100 * float(side[k]), text, "No shot is brighter on one side than the others")
     remedy = "Darken the room and take that shot again: another light was on"
-    yield at_most("other light", float(side[k]), limits.max_side_light, message, remedy, (found.names[k],), 10)
+    yield at_most("other light", float(side[k]), limits.max_side_light, message, remedy, (found.names[k],), cost_deg=10)
 
 
 @dataclass(frozen=True)
@@ -168,8 +168,8 @@ def explained_by_maps(found: Evidence[ResultsUntilInfer], limits: GateLimits) ->
 
 def _is_plane(found: Evidence[ResultsUntilInfer]) -> bool:
     """Whether the object is about one plane, which may be hardly polarized: a rounded object is, unless it is wax."""
-    seen = flatness.measure(found.results.stokes, found.results.maps)
-    return seen is not None and seen.one_normal
+    figures = flatness.measure(found.results.stokes, found.results.maps)
+    return figures is not None and figures.one_normal
 
 
 def _own_error_deg(maps: SurfaceMaps) -> float:

@@ -21,7 +21,7 @@ WHITE_QUANTILE = 0.995  # of the object's light; it becomes white
 _BRIGHTEST = 0.99  # quantile of the light from which a pixel is a highlight
 _JUDGED_PX = 256  # longest side on which the gate compares
 _OUTLIER = 5  # standard deviations of the differences
-_MOST_DOLP = 0.1  # more has no more weight: that of noise and of reflections
+_MOST_DOLP = 0.1  # greater ones count as this: noise and reflections
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Rerendering:
     flashed: Floats  # (H, W, 3) S0 of the maps under that flash, linear Rec.709
     scale: float  # brightness of the photographs over that of the re-rendering, median of the pixels
     agreement: float = float("nan")  # of the polarizations, see `_agreement`
-    difference: float = 0.0  # of both lights S0, relative, median of the pixels
+    difference: float = 0.0  # relative, of S0 of the photographs and the re-rendering: median of the pixels
     significance: float = float("inf")  # DoLP of the photographs' median pixel over its 1σ
     highlights: float = 1.0  # S0 of the photographs over that of the re-rendering, where either is brightest
 
@@ -87,8 +87,8 @@ def rerender(small: ReducedResult, ior: float) -> Rerendering:
     maps = small.maps
     stokes, shots = under_flash(maps, np.array([*small.angle, 0.0, np.pi / 4]), ior)
     s0 = frames.total(stokes[0]) / 3 * maps.mask
-    seen = frames.total(small.radiance) / 3 * maps.mask
-    light, lit = seen[maps.mask], s0[maps.mask]
+    photo = frames.total(small.radiance) / 3 * maps.mask
+    light, lit = photo[maps.mask], s0[maps.mask]
     scale = float(np.median(light[lit > 0] / lit[lit > 0])) if (lit > 0).any() else 1.0
     white = max(float(np.quantile(light, WHITE_QUANTILE)), 1e-6) if light.size else 1.0
 
@@ -97,7 +97,7 @@ def rerender(small: ReducedResult, ior: float) -> Rerendering:
     bright = brighter >= (np.quantile(brighter, _BRIGHTEST) if brighter.size else 0.0)
     measured, predicted = [], []
     for angle, shot in zip(small.angle, shots):
-        measured.append(seen * (1 + small.ratio[0] * np.cos(2 * angle) + small.ratio[1] * np.sin(2 * angle)) / white)
+        measured.append(photo * (1 + small.ratio[0] * np.cos(2 * angle) + small.ratio[1] * np.sin(2 * angle)) / white)
         predicted.append(scale * shot * s0 / white)
     rendered = shots[-2:] - 1
     return Rerendering(

@@ -126,6 +126,7 @@ def _unpolarized(band: Rim, angle: Floats) -> Floats:
 def _significance(band: Rim, angle: Floats, pattern: Floats) -> float:
     """Significance of an angle error: its linear estimate over the jackknife error of that estimate.
 
+    The estimate is Σ s r / (m Σ s²), r the residual, m the median amplitude of the wave, s `slope` without the wave.
     `pattern` (K,) is that of the error over the shots (`_pattern`), times its sign. The estimate keeps its sign, so
     errors of the outline, which differ in sign from sector to sector, cancel.
     """

@@ -95,10 +95,10 @@ def _exposure_power(radiance: AngleStack) -> float:
     """Power law between measured and stated exposures: slope of their logarithms; 1 without metadata or steps."""
     ratio = radiance.bracket.exif_ratio[0]
     stated: Floats = np.log(ratio) if np.isfinite(ratio).all() else np.zeros(1)
-    seen = np.log(np.maximum(np.median(radiance.bracket.exposure_ratio.mean(2), axis=0), 1e-6))  # of most shots
-    if np.ptp(stated) < 0.5 or np.ptp(seen) < 0.3:
+    measured = np.log(np.maximum(np.median(radiance.bracket.exposure_ratio.mean(2), axis=0), 1e-6))  # of most shots
+    if np.ptp(stated) < 0.5 or np.ptp(measured) < 0.3:
         return 1.0
-    return float(np.polyfit(stated, seen, 1)[0])
+    return float(np.polyfit(stated, measured, 1)[0])
 
 
 def source(found: Evidence[ResultsUntilHdr]) -> Gate:
@@ -167,7 +167,7 @@ def stillness(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
     if _has_wrong_levels(found.results.radiance, fraction, limits):
         message += ": their black level, white level or encoding is not as stated"
         remedy, bad = _levels_remedy(found), ()
-    return at_most("stillness", float(fraction[k]), limits.max_ghost, message, remedy, bad, 5)
+    return at_most("stillness", float(fraction[k]), limits.max_ghost, message, remedy, bad, cost_deg=5)
 
 
 def _has_wrong_levels(radiance: AngleStack, ghost: Floats, limits: GateLimits) -> bool:
@@ -232,8 +232,8 @@ def gains(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Iterator[
     measured, radiance, names = found.results.selfcal.gains, found.results.radiance, found.names
     shot = measured.gain.mean(1)
     light = shot[:, None] * radiance.bracket.exposure_ratio.mean(2)  # (K, E)
-    off = light / np.median(light, axis=0) - 1
-    each = np.median(off, axis=1)  # (K,) change of each shot's light
+    relative = light / np.median(light, axis=0) - 1
+    each = np.median(relative, axis=1)  # (K,) change of each shot's light
     limit = limits.max_gain_change
     brighter = each > limit  # it may show another lamp, which no gain corrects
     k = int(np.argmax(np.where(brighter.any() & ~brighter, 0, np.abs(each))))
@@ -246,7 +246,7 @@ def gains(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Iterator[
     state: State = "fail" if brighter.any() else "warn"
     yield at_most("gains", float(abs(each[k])), limit, message, remedy, bad, 3 if each[k] > 0 else 0, beyond=state)
     yield gain_doubt(found, limits)
-    drift = off - each[:, None]
+    drift = relative - each[:, None]
     k, e = (int(i) for i in np.unravel_index(int(np.argmax(np.abs(drift))), drift.shape))
     limit = limits.max_energy_drift
     change = float(drift[k, e])
@@ -313,5 +313,5 @@ def _has_sharp_edges(found: Evidence[ResultsUntilSelfcal]) -> bool:
     """Whether sharp edges of flat faces make the outline: then its polarization does not show the shots' light."""
     if not reaches(found, ResultsUntilInfer):
         return False
-    seen = flatness.measure(found.results.stokes, found.results.maps)
-    return seen is not None and seen.sharp_edged
+    figures = flatness.measure(found.results.stokes, found.results.maps)
+    return figures is not None and figures.sharp_edged

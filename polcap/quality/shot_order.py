@@ -23,11 +23,11 @@ _ORDER_EXPLAINED = 0.4  # part of the polarization from which maps confirm an or
 
 def order(found: Evidence[ResultsUntilSelfcal]) -> Gate:
     """Gate on the order and sense of the polarizer angles."""
-    results, test, seen, explained = found.results, None, None, None
+    results, test, shape, explained = found.results, None, None, None
     if reaches(found, ResultsUntilInfer):
         test, explained = found.results.maps.order, found.explained
-        seen = flatness.measure(found.results.stokes, found.results.maps)
-    return order_of_shots(results.radiance, results.object_, results.selfcal.outline, test, seen, explained)
+        shape = flatness.measure(found.results.stokes, found.results.maps)
+    return order_of_shots(results.radiance, results.object_, results.selfcal.outline, test, shape, explained)
 
 
 def order_of_shots(
@@ -35,24 +35,24 @@ def order_of_shots(
     object_: ObjectMask,
     outline: OutlineCheck,
     test: OrderTest | None,
-    seen: flatness.Flatness | None,
+    shape: flatness.Flatness | None,
     explained: float | None = None,
 ) -> Gate:
     """Gate on the order of shots, by the polarization along the outline and the test of the network.
 
     An outline that is the edge of flat faces decides nothing. Where another order is as good, the stated one counts if
     its maps explain the photographs and the network does not expect smaller errors in another one. The network's test
-    sees one small picture, and misjudges boxes and planes: maps that explain much of the polarization (`explained`, 1
-    is all) leave its finding undecided. Maps that explain little confirm it, or on flat faces leave it undecided.
+    sees one small picture, and misjudges boxes and planes. If maps explain much of their polarization (`explained`, 1
+    is all), its finding is undecided. If maps explain little, it counts; on flat faces it is undecided.
     """
     statement, names, better = radiance.equipment.angles, shot_names(radiance), None
-    edges = seen is not None and seen.sharp_edged
-    likelier = _likelier(object_, seen, explained)
+    edges = shape is not None and shape.sharp_edged
+    likelier = _likelier(object_, shape, explained)
     if not outline.as_stated and not edges:
         better, because = outline.best, "The outline fits"
     elif test is not None and test.ratio < 1 / likelier:
         better, because = test.rival, f"The network expects {1 / test.ratio:.1f} times smaller errors for"
-    if better is not None and outline.as_stated and _hides_order(seen) and (explained or 0.0) > _BOX_EXPLAINED:
+    if better is not None and outline.as_stated and _hides_order(shape) and (explained or 0.0) > _BOX_EXPLAINED:
         return _undecided(_order_text(better, names), outline, radiance)
     if better is not None:
         message = f"{because} the order {_order_text(better, names)} rather than the stated one"
@@ -62,7 +62,7 @@ def order_of_shots(
     message = f"The outline supports the stated order (fit {outline.concentration:.2f} of 1)"
     if is_confirmed(test):
         message = f"In any other order, the network expects errors that are at least {test.ratio:.1f} times as large"
-    elif edges and test is not None and test.ratio < 1 / _LIKELIER_UNEXPLAINED and _is_unexplained(seen, explained):
+    elif edges and test is not None and test.ratio < 1 / _LIKELIER_UNEXPLAINED and _is_unexplained(shape, explained):
         return _undecided(_order_text(test.rival, names), outline, radiance)
     elif edges:
         return Gate("order", "not measured", None, "as stated", "Flat faces show no order of the angles", unit="")
@@ -73,23 +73,23 @@ def order_of_shots(
     return Gate("order", "pass", "as stated", "as stated", message, unit="")
 
 
-def _likelier(object_: ObjectMask, seen: flatness.Flatness | None, explained: float | None) -> float:
+def _likelier(object_: ObjectMask, shape: flatness.Flatness | None, explained: float | None) -> float:
     """Factor between expected errors that decides on an order: larger where good captures reach more."""
-    if seen is not None and seen.flat:
+    if shape is not None and shape.flat:
         return _LIKELIER_FLAT
     likelier = _LIKELIER if object_.mask.sum() > _SMALL_PX else _LIKELIER_SMALL
-    return min(likelier, _LIKELIER_UNEXPLAINED) if _is_unexplained(seen, explained) else likelier
+    return min(likelier, _LIKELIER_UNEXPLAINED) if _is_unexplained(shape, explained) else likelier
 
 
-def _is_unexplained(seen: flatness.Flatness | None, explained: float | None) -> bool:
+def _is_unexplained(shape: flatness.Flatness | None, explained: float | None) -> bool:
     """Whether maps explain little of the polarization; a facing plane has little to explain."""
-    faces = seen is not None and seen.unpolarized
+    faces = shape is not None and shape.unpolarized
     return explained is not None and explained < _ORDER_UNEXPLAINED and not faces
 
 
-def _hides_order(seen: flatness.Flatness | None) -> bool:
+def _hides_order(shape: flatness.Flatness | None) -> bool:
     """Whether an object is flat, or has hardly any occluding contour."""
-    return seen is not None and (seen.flat or seen.contour < _BOX_CONTOUR)
+    return shape is not None and (shape.flat or shape.contour < _BOX_CONTOUR)
 
 
 def _undecided(other: str, outline: OutlineCheck, radiance: AngleStack) -> Gate:

@@ -142,11 +142,11 @@ def turn(asset: Asset, angle_deg: int) -> Asset:
     mesh, rotation = asset.mesh, np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
     tangents = np.concatenate([mesh.tangents[:, :3] @ rotation.T, mesh.tangents[:, 3:]], axis=1)
     turned = {"vertices": mesh.vertices @ rotation.T, "normals": mesh.normals @ rotation.T, "tangents": tangents}
-    kinds = {name: value.astype(getattr(mesh, name).dtype) for name, value in turned.items()}
-    space = asset.object_normal
-    if space is not None:
-        space = _integers_like(space, (2 * (space / np.iinfo(space.dtype).max) - 1) @ rotation.T / 2 + 0.5)
-    return replace(asset, mesh=replace(mesh, **kinds), object_normal=space, turned_deg=asset.turned_deg + angle_deg)
+    fields = {name: value.astype(getattr(mesh, name).dtype) for name, value in turned.items()}
+    normal = asset.object_normal
+    if normal is not None:
+        normal = _integers_like(normal, (2 * (normal / np.iinfo(normal.dtype).max) - 1) @ rotation.T / 2 + 0.5)
+    return replace(asset, mesh=replace(mesh, **fields), object_normal=normal, turned_deg=asset.turned_deg + angle_deg)
 
 
 def curvature(maps: SurfaceMaps) -> Floats:

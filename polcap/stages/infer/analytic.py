@@ -150,7 +150,7 @@ def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]
     darkest = cv2.GaussianBlur(radiance.min(-1), (0, 0), 1.0)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     opened = cv2.GaussianBlur(cv2.morphologyEx(darkest, cv2.MORPH_OPEN, kernel), (0, 0), size / 6)
-    facing = np.clip((cos_zenith - np.cos(np.radians(35))) / 0.1, 0, 1)
+    facing = np.clip((cos_zenith - np.cos(np.radians(35))) / 0.1, 0, 1)  # soft limit
     highlight = np.maximum(darkest - opened, 0) * facing * cues.mask
     plus, _ = fresnel.transmission(np.maximum(cos_zenith, _LEAST_COSINE), ior)
     shading = np.maximum(cos_zenith, _LEAST_COSINE) * plus * fresnel.transmission(1.0, ior)[0]
@@ -165,7 +165,7 @@ def _gloss(highlight: Floats, cos_zenith: Floats, cues: Cues) -> tuple[float, fl
     """
     roughness, f0 = 0.5, 0.04
     usable = cues.mask & ((cues.quality & Quality.CLIPPED) == 0) & (cos_zenith > np.cos(np.radians(45)))
-    if usable.sum() < 200 or np.quantile(highlight[usable], 0.99) < 0.02:
+    if usable.sum() < 200 or np.quantile(highlight[usable], 0.99) < 0.02:  # no clear highlight
         return roughness, f0
     edges = np.cos(np.radians(np.arange(45, -1, -3)))
     seen = usable & (cos_zenith < 1)  # where it is 1, the DoLP is below its noise
@@ -174,7 +174,7 @@ def _gloss(highlight: Floats, cos_zenith: Floats, cues: Cues) -> tuple[float, fl
     c = (edges[:-1] + edges[1:]) / 2
     weight = np.sqrt(count)
     best = np.inf
-    for candidate in np.linspace(0.15, 0.8, 27):
+    for candidate in np.linspace(0.15, 0.8, 27):  # roughness
         alpha = candidate**2
         lobe = np.pi * brdf.ggx_distribution(c, alpha) * brdf.smith_masking(c, c, alpha) / (4 * c)
         scale = float((weight * lobe * light).sum() / (weight * lobe**2).sum())

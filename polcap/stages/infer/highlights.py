@@ -63,8 +63,8 @@ _SIGMA = 0.06
 _SIGMA_PER_DEGREE = 0.006  # of the material's mean expected normal error
 _SIGMA_UNCONFIRMED = 0.15  # without a highlight, or with a clipped one
 _USUAL, _USUAL_SIGMA = 0.5, 0.2  # mean roughness of 47 materials, and its standard deviation
-# F0 of common surfaces by the predicted one; the network learned from more coatings and gems than people own:
-# median F0 of training surfaces, if a twentieth of them has more than .06
+# median F0 of training surfaces by the predicted F0, if a twentieth of them has more than .06: the network learned from
+# more coatings and gems than people own
 _PREDICTED_F0 = (0.03, 0.04, 0.05, 0.06, 0.08, 0.105, 0.16, 1.0)
 _MEDIAN_F0 = (0.039, 0.0415, 0.0425, 0.0435, 0.046, 0.0556, 0.16, 1.0)
 
@@ -90,14 +90,14 @@ def mean_around(image: Floats, known: Bools, wanted: Bools, blur: float, least: 
     """
     weight = known.astype(np.float32)
     weighted = (image * weight[..., None]).astype(np.float32)
-    out, left = np.zeros_like(weighted), wanted.copy()
-    while left.any() and blur < 2 * max(known.shape):
+    out, missing = np.zeros_like(weighted), wanted.copy()
+    while missing.any() and blur < 2 * max(known.shape):
         share = cv2.GaussianBlur(weight, (0, 0), blur)
         mean = cv2.GaussianBlur(weighted, (0, 0), blur) / np.maximum(share, 1e-9)[..., None]
-        reached = left & (share > least)
+        reached = missing & (share > least)
         out[reached] = mean[reached]
-        left, blur = left & ~reached, 2 * blur
-    return out, left
+        missing, blur = missing & ~reached, 2 * blur
+    return out, missing
 
 
 def correct(maps: SurfaceMaps, cues: Cues, ior: float) -> SurfaceMaps:

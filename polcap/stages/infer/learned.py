@@ -83,15 +83,15 @@ def estimate_coarse(
     size = cues.mask.shape[::-1]
     scale = int(network.metadata["native_size"]) / max(size)
     largest, *others = sorted({min(1.0, factor * scale) for factor in _SIZES}, reverse=True)
-    seen = _reduce(_limit_radiance(cues), largest)
-    pictures = [seen, *(_reduce(seen, other / largest) for other in others)]
+    reduced = _reduce(_limit_radiance(cues), largest)
+    pictures = [reduced, *(_reduce(reduced, other / largest) for other in others)]
     small = sizes_and_positions.predict(pictures, network, run, symmetries)
-    overview = _overview(seen, min(scale, 1.0) / largest, network, run)
+    overview = _overview(reduced, min(scale, 1.0) / largest, network, run)
     doubt = half_turns.NetworkDoubt(small["sigma"], small.pop("opposed"), overview)
-    small["normal"], small["doubt"] = _correct_half_turns(small["normal"], seen, doubt)
-    small["factor"] = _log_factor(small["diffuse"] * _shading(small["normal"], seen.rays), seen)
-    without_grid = _masked_filter(small["roughness"], seen.mask, sizes_and_positions.BINOMIAL, LEAST_KNOWN)
-    small["roughness"] = np.where(seen.mask, without_grid, small["roughness"])
+    small["normal"], small["doubt"] = _correct_half_turns(small["normal"], reduced, doubt)
+    small["factor"] = _log_factor(small["diffuse"] * _shading(small["normal"], reduced.rays), reduced)
+    without_grid = _masked_filter(small["roughness"], reduced.mask, sizes_and_positions.BINOMIAL, LEAST_KNOWN)
+    small["roughness"] = np.where(reduced.mask, without_grid, small["roughness"])
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
     smooth = frames.unit(maps["normal"])
     guide = np.asarray(frames.to_ray_frame(smooth, cues.rays)), maps["sigma"]
@@ -115,13 +115,13 @@ def _compare_orders(cues: Cues, network: Network, run: RunNetwork) -> OrderTest 
     if not low.mask.any():  # thinner than a pixel of the small picture
         return None
 
-    def error(matrix: Floats) -> float:
+    def mean_error(matrix: Floats) -> float:
         predicted = sizes_and_positions.predict([_transformed(low, matrix)], network, run, 1)
         return float(predicted["sigma"][low.mask].mean())
 
-    errors = [error(other.matrix) for other in cues.other_orders]
+    errors = [mean_error(other.matrix) for other in cues.other_orders]
     least = int(np.argmin(errors))
-    return OrderTest(cues.other_orders[least].order, errors[least] / error(np.eye(3)))
+    return OrderTest(cues.other_orders[least].order, errors[least] / mean_error(np.eye(3)))
 
 
 def _transformed(cues: Cues, matrix: Floats) -> Cues:
@@ -175,38 +175,38 @@ def _reduce(cues: Cues, scale: float) -> Cues:
     )
 
 
-def _overview(seen: Cues, scale: float, network: Network, run: RunNetwork) -> Floats:
-    """Mean lean (2, H, W) across the ray of the normals that the network predicts from pictures smaller than `seen`.
+def _overview(reduced: Cues, scale: float, network: Network, run: RunNetwork) -> Floats:
+    """Mean lean (2, H, W) across the ray of the normals that the network predicts from pictures smaller than `reduced`.
 
     The fewer the pixels, the more of the object the network takes in at once. One position alone is not reliable.
     """
-    lean = np.zeros((2, *seen.mask.shape), np.float32)
+    lean = np.zeros((2, *reduced.mask.shape), np.float32)
     for size in _OVERVIEWS:
-        low = _reduce(seen, size * scale)
+        low = _reduce(reduced, size * scale)
         normal = sizes_and_positions.predict([low], network, run, _OVERVIEW_POSITIONS)["normal"]
         local = frames.to_ray_frame(frames.unit(normal), low.rays)[..., :2] * low.mask[..., None]
-        lean += np.moveaxis(cv2.resize(local.astype(np.float32), seen.mask.shape[::-1]), -1, 0) / len(_OVERVIEWS)
+        lean += np.moveaxis(cv2.resize(local.astype(np.float32), reduced.mask.shape[::-1]), -1, 0) / len(_OVERVIEWS)
     return lean
 
 
-def _correct_half_turns(normal: Floats, seen: Cues, doubt: half_turns.NetworkDoubt) -> tuple[Floats, Floats]:
+def _correct_half_turns(normal: Floats, reduced: Cues, doubt: half_turns.NetworkDoubt) -> tuple[Floats, Floats]:
     """Turn regions of the network's normals (H, W, 3) that lean to the wrong side of the ray (180° ambiguity).
 
     Also returns the probability (H, W) that the chosen side is wrong.
     """
-    flash = planar_faces.FlashPicture(seen.radiance, seen.rays)
-    found = half_turns.resolve(frames.to_ray_frame(frames.unit(normal), seen.rays), seen.mask, doubt, flash)
-    opposite = 2 * frames.dot(normal, seen.rays)[..., None] * seen.rays - normal
+    flash = planar_faces.FlashPicture(reduced.radiance, reduced.rays)
+    found = half_turns.resolve(frames.to_ray_frame(frames.unit(normal), reduced.rays), reduced.mask, doubt, flash)
+    opposite = 2 * frames.dot(normal, reduced.rays)[..., None] * reduced.rays - normal
     return np.where(found.turned[..., None], opposite, normal).astype(np.float32), found.doubt
 
 
-def _log_factor(light: Floats, seen: Cues) -> Floats:
+def _log_factor(light: Floats, reduced: Cues) -> Floats:
     """Logarithm of predicted light (albedo times shading) over S0, (H, W, 3), without the 2 px grid artifact.
 
     Outside the object and in clipped highlights it is continued from the pixels around, for the enlargement.
     """
-    known = seen.mask & ((seen.quality & Quality.CLIPPED) == 0)
-    factor = np.log((light + FLOOR) / (np.maximum(seen.radiance, 0) + FLOOR))
+    known = reduced.mask & ((reduced.quality & Quality.CLIPPED) == 0)
+    factor = np.log((light + FLOOR) / (np.maximum(reduced.radiance, 0) + FLOOR))
     near, far = (
         _masked_filter(factor, known, kernel, 1e-3, cv2.BORDER_CONSTANT)
         for kernel in (sizes_and_positions.BINOMIAL, cv2.getGaussianKernel(9, 2).astype(np.float32))

@@ -139,14 +139,14 @@ def depth_steps(z: Floats, slope: tuple[Floats, Floats], mask: Bools, least: flo
     if count < 2:
         nothing = np.zeros(mask.shape, dtype=bool)
         return OcclusionMap(nothing[:, 1:], nothing[1:], nothing)
-    on = label > 0
+    high = label > 0
     peak = np.zeros(count, dtype=np.float32)
-    np.maximum.at(peak, label[on], highest[on])
-    long = np.bincount(label[on], minlength=count) >= max(_LEAST_LENGTH * disc_radius(mask), 3)
-    on &= (long & (peak > _PEAK * least))[label]
-    rim = _nearer_lean(on, beyond, slope, least) > _RIM_LEAN
-    right, down = ((np.abs(excess) > least) & (on & rim)[_ends(axis)[0]] for axis, excess in zip((1, 0), beyond))
-    return OcclusionMap(right, down, on & ~rim)
+    np.maximum.at(peak, label[high], highest[high])
+    long = np.bincount(label[high], minlength=count) >= max(_LEAST_LENGTH * disc_radius(mask), 3)
+    high &= (long & (peak > _PEAK * least))[label]
+    rim = _nearer_lean(high, beyond, slope, least) > _RIM_LEAN
+    right, down = ((np.abs(excess) > least) & (high & rim)[_ends(axis)[0]] for axis, excess in zip((1, 0), beyond))
+    return OcclusionMap(right, down, high & ~rim)
 
 
 def _excess(z: Floats, slope: Floats, mask: Bools, axis: int) -> Floats:
@@ -157,16 +157,16 @@ def _excess(z: Floats, slope: Floats, mask: Bools, axis: int) -> Floats:
     return np.where(mask[first] & mask[second], step - np.clip(step, low, high), 0).astype(np.float32)
 
 
-def _nearer_lean(on: Bools, beyond: tuple[Floats, ...], slope: tuple[Floats, Floats], least: float) -> Floats:
+def _nearer_lean(high: Bools, beyond: tuple[Floats, ...], slope: tuple[Floats, Floats], least: float) -> Floats:
     """Slope angle (H, W) [rad] at which the nearer side of depth steps falls towards the farther side, local mean."""
-    total, links = np.zeros(on.shape, dtype=np.float32), np.full(on.shape, 1e-6, dtype=np.float32)
+    total, links = np.zeros(high.shape, dtype=np.float32), np.full(high.shape, 1e-6, dtype=np.float32)
     for axis, excess, of in zip((1, 0), beyond, slope):
         first, second = _ends(axis)
         size = (1, _RIM_PX + 1) if axis else (_RIM_PX + 1, 1)
         begin = (_RIM_PX, 0) if axis else (0, _RIM_PX)
         backward = cv2.dilate(of.astype(np.float32), np.ones(size, np.uint8), anchor=begin)
         forward = cv2.dilate(-of.astype(np.float32), np.ones(size, np.uint8), anchor=(0, 0))
-        at = (np.abs(excess) > least) & on[first]
+        at = (np.abs(excess) > least) & high[first]
         total[first][at] += np.arctan(np.where(excess[at] > 0, backward[first][at], forward[second][at]))
         links[first] += at
     total, links = (cv2.GaussianBlur(values, (0, 0), _SMOOTHING_PX) for values in (total, links))

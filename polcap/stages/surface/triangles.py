@@ -47,9 +47,9 @@ def grid_triangles(z: Floats, links: tuple[Bools, Bools], step: int) -> tuple[ND
     left, right, top, bottom = along[:, :-1], along[:, 1:], across[:-1], across[1:]
     with_falling = (left & bottom, right & top)  # the diagonal a–c
     with_rising = (left & top, bottom & right)
-    gain = np.add(*(t.astype(int) for t in with_falling)) - np.add(*(t.astype(int) for t in with_rising))
+    surplus = np.add(*(t.astype(int) for t in with_falling)) - np.add(*(t.astype(int) for t in with_rising))
     flatter = np.abs(height[:-1, :-1] - height[1:, 1:]) <= np.abs(height[1:, :-1] - height[:-1, 1:])
-    fall = (gain > 0) | ((gain == 0) & flatter)
+    fall = (surplus > 0) | ((surplus == 0) & flatter)
     triangles = (
         (with_falling[0] & fall, (a, b, c)),
         (with_falling[1] & fall, (a, c, d)),

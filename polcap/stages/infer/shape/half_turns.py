@@ -248,13 +248,11 @@ def _cut(mask: Bools, cost: Floats, first: NDArray[np.intp], second: NDArray[np.
     single, pair = np.rint(_INTEGER * cost).astype(int), np.rint(_INTEGER * alike).astype(int)
     costly, costless = cell + count * (single < 0), cell + count * (single >= 0)  # nodes
     same, other = second + count * (pair < 0), second + count * (pair >= 0)
+    pairs = (first, same), (same, first), (first + count, other), (other, first + count)
     edges = [
         (np.full(count, source), costly, single),
         (costless, np.full(count, sink), single),
-        (first, same, pair),
-        (same, first, pair),
-        (first + count, other, pair),
-        (other, first + count, pair),
+        *((one, two, pair) for one, two in pairs),
     ]
     start, end, capacity = (np.concatenate(column).astype(np.int32) for column in zip(*edges))
     graph = sparse.csr_array((np.abs(capacity), (start, end)), shape=(2 * count + 2, 2 * count + 2))

@@ -69,23 +69,23 @@ def faces(normal: Floats, mask: Bools, *, half_turns: bool = False) -> Iterator[
     """
     normals = normal.reshape(-1, 3)
     least = max(_FEWEST_CELLS, _SHARE * mask.sum())
-    left = mask.copy()
-    while left.sum() >= least:
-        cells = np.flatnonzero(left)
+    remaining = mask.copy()
+    while remaining.sum() >= least:
+        cells = np.flatnonzero(remaining)
         candidates = normals[cells[:: max(1, len(cells) // _CANDIDATES)]].T
         cosine = normals[cells] @ candidates
         if half_turns:
             cosine = np.maximum(cosine, (normals[cells] * [-1, -1, 1]) @ candidates)
-        alike = cosine > np.cos(np.radians(_ALIKE_DEG))
-        part = np.zeros(left.shape, np.uint8)
-        part.flat[cells] = alike[:, alike.sum(axis=0).argmax()]
+        similar = cosine > np.cos(np.radians(_ALIKE_DEG))
+        part = np.zeros(remaining.shape, np.uint8)
+        part.flat[cells] = similar[:, similar.sum(axis=0).argmax()]
         if not part.any():  # means of opposite normals are like none, not even themselves
             return
         _, label, statistics, _ = cv2.connectedComponentsWithStats(part, connectivity=4)
         largest = 1 + int(statistics[1:, cv2.CC_STAT_AREA].argmax())
         if statistics[largest, cv2.CC_STAT_AREA] < least:
             return
-        left &= label != largest
+        remaining &= label != largest
         yield label == largest
 
 
