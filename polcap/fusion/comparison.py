@@ -6,13 +6,11 @@ import numpy as np
 
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps, VisibleTexels, visible_texels
-from polcap.fusion.values import FusionView
+from polcap.fusion.values import IOR, FusionView
 from polcap.image_values import Floats
 from polcap.optics import frames, shade
 from polcap.optics.point_light import irradiance
 from polcap.stages import stage
-
-_INDEX = 1.5  # refractive
 
 
 @dataclass(frozen=True)
@@ -65,4 +63,4 @@ def render(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: AtlasMa
     to_light = frames.to_ray_frame(to_lens, to_lens)
     local = frames.to_ray_frame(normal @ rotation.T, to_lens)
     one, rough = np.ones(len(point)), np.maximum(roughness, 0.05)
-    return np.asarray(shade.stokes(local, diffuse, specular, rough, _INDEX * one, to_light, light)[0])
+    return np.asarray(shade.stokes(local, diffuse, specular, rough, IOR * one, to_light, light)[0])

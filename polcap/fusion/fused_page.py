@@ -10,6 +10,7 @@ from polcap.formats import atomic, html
 from polcap.fusion import object_pictures
 from polcap.fusion.baking import AtlasMaps
 from polcap.fusion.fusion_path import FusionResults
+from polcap.fusion.values import IOR
 from polcap.optics import frames
 from polcap.optics.resize import area_mean, weighted_area_mean
 from polcap.report import keys, labels, levels, map_figures, page
@@ -59,7 +60,7 @@ def _atlas_figures(maps: AtlasMaps) -> tuple[list[MapFigure], dict[str, Any]]:
         "size": [side, side],
         "center": [side / 2, side / 2],
         "focal": float(side),
-        "ior": object_pictures.INDEX,
+        "ior": IOR,
         "exposure": 0.9 / max(bright, 1e-3),
         "top": keys.F0.high,
     }

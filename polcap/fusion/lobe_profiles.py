@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from polcap.fusion.values import IOR
 from polcap.image_values import Bools, Floats
 from polcap.optics import frames, shade
 
@@ -19,7 +20,6 @@ _RELATIVE = 0.03  # error of a bin's mean radiance, with `_PER_TANGENT`
 _PER_TANGENT = 0.05  # this error per tangent of the zenith angle: radiance goes with the cosine
 _FLASH_BIN_DEG, _FLASH_SCATTER = 2.0, 0.2  # of the half-angle; relative scatter from which samples count less
 _FARTHEST_FLASH = 0.15  # m from the lens
-_INDEX = 1.5  # refractive index of the diffuse law and of the Fresnel term
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class LobeSamples:
     def _shade(self, to_light: Floats, albedo: float, f0: float, roughness: float) -> Floats:
         """S0 (P,) of a gray material under unit light."""
         one = np.ones(len(to_light))
-        material = albedo * one[:, None], f0 * one[:, None], roughness * one, _INDEX * one
+        material = albedo * one[:, None], f0 * one[:, None], roughness * one, IOR * one
         return np.asarray(shade.stokes(self.normal, *material, to_light, one)[0][:, 0])
 
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from polcap.fusion.atlas import Atlas
 from polcap.fusion.baking import AtlasMaps
-from polcap.fusion.values import Pose
+from polcap.fusion.values import IOR, Pose
 from polcap.image_values import Floats, View
 from polcap.optics import color, frames
 from polcap.optics.mesh_tracer import Tracer
@@ -16,7 +16,6 @@ from polcap.report.animation import TexturedPoints
 from polcap.report.sheets import Picture
 
 FRAMES = 48  # of the turntable
-INDEX = 1.5  # refractive
 _FILLED = 0.85  # diameter of the sphere around the object in the picture, over the picture's side
 _DISTANCE = 5.0  # of the camera from the object's middle, in radii of this sphere
 _ELEVATION_DEG = 20.0  # of the camera
@@ -46,7 +45,7 @@ def render(atlas: Atlas, maps: AtlasMaps, tracer: Tracer, pose: Pose, view: View
     points = sample_textures(atlas, maps, met.face, met.weight)
     points = points._replace(normal=points.normal @ pose.rotation.T)  # in the camera frame
     out = np.full((side * side, 3), _BACKGROUND, np.float32)
-    out[met.index] = animation.render(points, v[met.index], _LIGHT, pose.rotation[:, 1], INDEX)
+    out[met.index] = animation.render(points, v[met.index], _LIGHT, pose.rotation[:, 1], IOR)
     return out.reshape(side, side, 3)
 
 

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from polcap.image_values import Bools, Floats, View
 
+IOR = 1.5  # refractive index that the fusion assumes for diffuse reflection and Fresnel's terms
+
 
 @dataclass(frozen=True)
 class Pose:

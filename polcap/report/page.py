@@ -92,7 +92,7 @@ def render(
 def archived(text: str, about: Mapping[str, Any]) -> str:
     """The text of a report's page for an archive: with the catalog facts of `about`, and a link to the GLB next to it.
 
-    Two templates make these parts, which stand between comments with their names. Raises ValueError: a part is missing.
+    Two templates make these parts, each between two comments with its name. Raises ValueError: a part is missing.
     """
     parts = {"catalog": {"catalog": catalog(about)}, "glb_link": {"asset": f"{about['capture']['name']}.glb"}}
     for name, content in parts.items():

@@ -141,10 +141,8 @@ def _view(scene: Scene, shoot: AroundShoot, turn: Rotation, position: Floats, pl
     vector = tuple(turn.as_rotvec(degrees=True).tolist())
     own = tuple((turn * placed.turn).as_rotvec(degrees=True).tolist())
     place = tuple((turn.apply([0.0, placed.lift, 0.0]) + position).tolist())
-    right = (
-        0.5 * forward_camera.SENSOR_WIDTH_MM / shoot.focal_mm * shoot.distance_m - 0.053
-    )  # m from the picture's edge
-    chart = Chart(center=(right, 0.085 * shoot.distance_m, -shoot.distance_m))
+    edge = 0.5 * forward_camera.SENSOR_WIDTH_MM / shoot.focal_mm * shoot.distance_m  # m, of the picture
+    chart = Chart(center=(edge - 0.053, 0.085 * shoot.distance_m, -shoot.distance_m))
     laid = UNSET if shoot.board == "none" else LaidBoard(tuple(position.tolist()), vector, shoot.board)
     return msgspec.structs.replace(
         scene, turn_deg=own, position=place, chart=chart, board=laid, cast_shadows=True, shadows=True

@@ -95,7 +95,7 @@ def _march(shape: Shape, origin: Floats, direction: Floats, start: Floats | floa
     """Sphere tracing: indices of the rays (P, 3) that hit the shape, and their lengths [m]."""
     middle = -np.einsum("pi,pi->p", origin, direction)
     gap2 = np.einsum("pi,pi->p", origin, origin) - middle**2  # squared distance of the ray from the origin
-    half = np.sqrt(np.maximum(shape.radius**2 - gap2, 0.0))  # length of the ray in the shape's sphere
+    half = np.sqrt(np.maximum(shape.radius**2 - gap2, 0.0))  # half the ray's length in the shape's sphere
     alive = np.flatnonzero((half > 0) & (middle + half > 0))
     travelled = np.maximum(middle - half, start)[alive]
     end = (middle + half)[alive]
