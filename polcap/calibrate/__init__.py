@@ -5,7 +5,7 @@
     FOLDER/dark/                     the cap on the lens
     FOLDER/flat/                     an evenly lit white surface, out of focus, at least twice at every exposure
     FOLDER/bracket/                  exposures of any still scene, or such folders: noise at an ISO that flat/ lacks
-    FOLDER/flash/                    the same thing many times, by the flash
+    FOLDER/flash/                    one still scene many times, by the flash
     FOLDER/lens/                     a checkerboard or a ColorChecker, tilted to all sides, in all parts of the picture
     FOLDER/polarizer/axis000/pol000/ polarized light of a known axis (a second polarizer on a lamp, a screen)
                     /pol015/ …       through the filter at every angle of its ring; a second axis gives the sense
@@ -61,10 +61,10 @@ def measure(
     dark, flat, flash, boards = (
         photographs_in(folders[name]) if name in folders else [] for name in ("dark", "flat", "flash", "lens")
     )
-    turned = _polarizer_shots(folders["polarizer"], axis_deg) if "polarizer" in folders else []
+    ring_shots = _polarizer_shots(folders["polarizer"], axis_deg) if "polarizer" in folders else []
     brackets = bracket_noise.brackets(folders["bracket"]) if "bracket" in folders else []
     photographs = [*dark, *flat, *(shot for bracket in brackets for shot in bracket), *flash, *boards]
-    photographs += [shot.photograph for shot in turned]
+    photographs += [shot.photograph for shot in ring_shots]
     _check_one_camera(photographs)
     exif = photographs[0].exif
     return Calibration(
@@ -77,7 +77,7 @@ def measure(
         linearity=linearity.measure(flat),
         falloff=lens_falloff.measure(flat) if flat else None,
         geometry=lens_geometry.measure(boards, squares) if boards else None,
-        polarizer=polarizer_ring.measure(turned) if turned else None,
+        polarizer=polarizer_ring.measure(ring_shots) if ring_shots else None,
         flash=flash_energy.measure(flash) if flash else None,
     )
 

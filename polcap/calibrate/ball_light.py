@@ -20,13 +20,13 @@ from polcap.optics.resize import area_mean
 
 MOST_MISFIT = 0.02  # of S0 about the fit to a ball of one color
 _LONGEST = 112  # px of the picture to which the ball is fitted
-_OVER = 2  # samples per pixel side
+_SAMPLES = 2  # per pixel side
 _BLUR = 0.4  # px, 1σ of lens and resampling
 _IOR = 1.5
 _GRAZING = 0.1  # cosine, as in `optics/body.py`
-_OUTLIER = 0.01  # of the ball's bright parts: least spread of the residuals
-_AROUND = 0.1  # radii of backdrop around the ball that are fitted
-_ROUNDS = 2  # of the weights
+_LEAST_SPREAD = 0.01  # of the residuals, relative to the ball's bright parts
+_AROUND = 0.1  # width of the backdrop around the ball that is fitted [radii]
+_ROUNDS = 2  # of the fit, each with new weights
 # fitted numbers: the ball's move right, up and growth [radii]; the flash right, up [distances]; roughness
 _START = (0.0, 0.0, 0.0, 0.0, 0.05, 0.35)
 _LEAST = (-0.1, -0.1, -0.1, -1.5, -1.5, 0.08)
@@ -65,10 +65,10 @@ def fit(light: Floats, guess: Ball, view: View) -> BallLight:
     """Fit the places of ball and flash to S0 (H, W) of the crop of `view`, from the ball that the mask shows."""
     small, grid = _reduced(light.astype(np.float64), view)
     y, x = np.mgrid[: small.shape[0], : small.shape[1]].astype(np.float64)
-    away = guess.outside(grid, x, y)
+    distance = guess.outside(grid, x, y)
     picture = _Picture(
-        light=small / np.percentile(small[away < 0], 90),
-        used=away < max(_AROUND * guess.radius_px(grid), 2.0),
+        light=small / np.percentile(small[distance < 0], 90),
+        used=distance < max(_AROUND * guess.radius_px(grid), 2.0),
         guess=guess,
         view=grid,
     )
@@ -77,9 +77,9 @@ def fit(light: Floats, guess: Ball, view: View) -> BallLight:
         weighted = partial(_weighted_residual, picture, weight)
         value = least_squares(weighted, value, bounds=(_LEAST, _MOST), x_scale=0.05, max_nfev=8).x
         residual = _residual(picture, weight, value)
-        spread = max(robust.spread(residual[picture.used]), _OUTLIER)
+        spread = max(robust.spread(residual[picture.used]), _LEAST_SPREAD)
         weight = np.where(picture.used, np.sqrt(robust.biweight(residual, spread)), 0.0)
-    return BallLight(_moved(guess, value), value[3:5], robust.spread(residual[away < 0]))
+    return BallLight(_moved(guess, value), value[3:5], robust.spread(residual[distance < 0]))
 
 
 def read_ring(stokes: Floats, ball: Ball, view: View, sound: Bools) -> RingReading:
@@ -123,22 +123,22 @@ def _weighted_residual(picture: _Picture, weight: Floats, value: Floats) -> Floa
 
 
 def _residual(picture: _Picture, weight: Floats, value: Floats) -> Floats:
-    """S0 (H, W) minus its best fit with these numbers (6,), in the order of `_START`.
+    """S0 (H, W) minus its best fit for the numbers `value` (6,), in the order of `_START`.
 
     Backdrop, mirrored light and the dependence of diffuse light on the zenith enter linearly.
     """
     column = np.stack(_columns(picture, value))
-    used, scale = picture.used, weight[picture.used]
-    found = np.linalg.lstsq((column[:, used] * scale).T, picture.light[used] * scale, rcond=None)[0]
-    return np.asarray(picture.light - np.einsum("khw,k->hw", column, found))
+    used, used_weight = picture.used, weight[picture.used]
+    amount = np.linalg.lstsq((column[:, used] * used_weight).T, picture.light[used] * used_weight, rcond=None)[0]
+    return np.asarray(picture.light - np.einsum("khw,k->hw", column, amount))
 
 
 def _columns(picture: _Picture, value: Floats) -> list[Floats]:
     """Pictures (H, W) whose sum is S0: mirrored light, backdrop, diffuse light by several laws of the zenith."""
     (height, width), view = picture.light.shape, picture.view
     ball, flash, roughness = _moved(picture.guess, value), np.append(value[3:5], 0.0), float(value[5])
-    side = (np.arange(_OVER) + 0.5) / _OVER - 0.5
-    x, y = np.meshgrid(*((np.arange(n)[:, None] + side).ravel() for n in (width, height)))
+    offset = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+    x, y = np.meshgrid(*((np.arange(n)[:, None] + offset).ravel() for n in (width, height)))
     rays = frames.rays_at(view, x, y)
     point, normal = ball.points(rays)
     to_light = flash - point
@@ -147,15 +147,15 @@ def _columns(picture: _Picture, value: Floats) -> list[Floats]:
     light = frames.to_ray_frame(to_light / np.sqrt(squared)[..., None], rays)
     body, gloss = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     parts = shade.stokes(local, body, gloss, roughness, _IOR, light, 1 / squared)[0]
-    seen = np.clip(0.5 - ball.outside(view, x, y) * _OVER, 0, 1)  # share of each sample that the ball covers
+    seen = np.clip(0.5 - ball.outside(view, x, y) * _SAMPLES, 0, 1)  # share of each sample that the ball covers
     sine2 = 1 - np.clip(local[..., 2], 0, 1) ** 2
     diffuse, mirrored = parts[..., 0] * seen, parts[..., 1] * seen
-    falling = np.clip(frames.dot(local, light), 0, 1)
+    incidence = np.clip(frames.dot(local, light), 0, 1)
     # rough surfaces look flatter than Lambert's, so they send more light near the outline (`body.flattening`)
-    rim = seen / squared * falling * sine2
-    steep = rim * sine2 / np.clip(np.maximum(falling, local[..., 2]), _GRAZING, 1)
+    rim = seen / squared * incidence * sine2
+    steep = rim * sine2 / np.clip(np.maximum(incidence, local[..., 2]), _GRAZING, 1)
     columns = [mirrored, 1 - seen, diffuse, diffuse * sine2, diffuse * sine2**2, rim, steep]
-    return [area_mean(gaussian_filter(part, _BLUR * _OVER), (height, width)) for part in columns]
+    return [area_mean(gaussian_filter(part, _BLUR * _SAMPLES), (height, width)) for part in columns]
 
 
 def _moved(guess: Ball, value: Floats) -> Ball:

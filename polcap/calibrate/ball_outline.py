@@ -15,13 +15,13 @@ from polcap.image_values import Bools, Floats, View
 from polcap.optics import frames, robust
 
 LEAST_RADIUS_PX = 24.0  # of a ball on the maps; an error of half a pixel of its outline is one degree at 45°
-_TRIALS = 300  # triples of outline points; one without a stand is among them, unless it covers half of the outline
+_TRIALS = 300  # triples of outline points; some have no point of a stand, unless it covers half of the outline
 _ROUNDS = 10  # of the biweight
-_ON_OUTLINE = 0.02  # radii from the ball's outline, and at least 1.5 px: a stand or a second ball lies beyond
+_ON_OUTLINE = 0.02  # radii, and at least 1.5 px: points of the mask's outline that are nearer are the ball's
 _LEAST_SHARE = 0.7  # of the outline that must lie on that of a ball
-_LEAST_MISFIT_PX, _MISFIT = 0.8, 0.008  # spread of the outline about a ball's: px, and radii; an egg has more
+_MOST_MISFIT_PX, _MOST_MISFIT = 0.8, 0.008  # spread of the outline about a ball's, px and radii; an egg has more
 _SECOND_BALL = 0.1  # area of the mask's second largest part over that of its largest
-_CENTERED = np.array([0.0, 0.0, -1.0])
+_AHEAD = np.array([0.0, 0.0, -1.0])  # direction of the optical axis
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ class Ball:
         along = -frames.dot(rays, self.direction)
         across = -rays - along[..., None] * self.direction
         sine = np.sqrt(frames.dot(across, across))
-        least = np.minimum(1.0, self.radius / np.maximum(sine, 1e-12))  # a ray that misses is turned to the outline
-        inside = self.direction * np.sqrt(np.maximum(1 - (least * sine) ** 2, 0))[..., None] + across * least[..., None]
+        scale = np.minimum(1.0, self.radius / np.maximum(sine, 1e-12))  # a ray that misses is turned to the outline
+        inside = self.direction * np.sqrt(np.maximum(1 - (scale * sine) ** 2, 0))[..., None] + across * scale[..., None]
         along = frames.dot(inside, self.direction)
-        reach = along - np.sqrt(np.maximum(along**2 - np.cos(self.angular_radius) ** 2, 0))
-        point = reach[..., None] * inside
+        depth = along - np.sqrt(np.maximum(along**2 - np.cos(self.angular_radius) ** 2, 0))
+        point = depth[..., None] * inside
         return point, np.asarray((point - self.direction) / self.radius)
 
     def normals(self, view: View, shape: tuple[int, int]) -> tuple[Floats, Bools]:
@@ -95,18 +95,18 @@ def fit(mask: Bools, view: View, at_border: bool) -> BallOutline:
             "move closer, or use a longer lens"
         )
     ball = _fit_robustly(-frames.rays_at(view, point[:, 0], point[:, 1]), view.focal)
-    away = ball.outside(view, point[:, 0], point[:, 1])
-    near = np.abs(away) <= max(_ON_OUTLINE * radius_px, 1.5)
-    misfit, share = robust.spread(away[near]) if near.any() else np.inf, float(near.mean())
-    most = max(_LEAST_MISFIT_PX, _MISFIT * radius_px)
+    distance = ball.outside(view, point[:, 0], point[:, 1])
+    on_ball = np.abs(distance) <= max(_ON_OUTLINE * radius_px, 1.5)
+    misfit, share = robust.spread(distance[on_ball]) if on_ball.any() else np.inf, float(on_ball.mean())
+    limit = max(_MOST_MISFIT_PX, _MOST_MISFIT * radius_px)
     if share < _LEAST_SHARE:
         raise ObjectError(
             f"{100 * share:.0f} % of the object's outline lies on that of a ball, less than {100 * _LEAST_SHARE:.0f} %;"
             " use a ball on a small ring, apart from other objects, or paint its mask (`polcap process --mask`)"
         )
-    if misfit > most:
+    if misfit > limit:
         raise ObjectError(
-            f"the object's outline differs by {misfit:.1f} px from that of a ball, more than {most:.1f} px; "
+            f"the object's outline differs by {misfit:.1f} px from that of a ball, more than {limit:.1f} px; "
             "use a true ball, or paint its mask (`polcap process --mask`)"
         )
     return BallOutline(ball, float(misfit), share)
@@ -135,18 +135,18 @@ def _crossings(mask: Bools) -> Floats:
 def _fit_robustly(ray: Floats, focal: float) -> Ball:
     """Ball whose outline rays (N, 3), camera to scene, touch: least median of squares, then Tukey's biweight."""
     random = np.random.default_rng(0)
-    best, least = _ball(ray, np.ones(len(ray))), np.inf
+    ball, least_median = _ball(ray, np.ones(len(ray))), np.inf
     for triple in random.integers(len(ray), size=(_TRIALS, 3)):
         if abs(np.linalg.det(ray[triple])) < 1e-12:
             continue
-        tried = _ball(ray[triple], np.ones(3))
-        middle = float(np.median(np.abs(_away(tried, ray))))
-        if middle < least:
-            best, least = tried, middle
+        candidate = _ball(ray[triple], np.ones(3))
+        median = float(np.median(np.abs(_angle_beyond(candidate, ray))))
+        if median < least_median:
+            ball, least_median = candidate, median
     for _ in range(_ROUNDS):
-        away = _away(best, ray)
-        best = _ball(ray, robust.biweight(away, max(robust.spread(away), 0.3 / focal)))
-    return best
+        angle = _angle_beyond(ball, ray)
+        ball = _ball(ray, robust.biweight(angle, max(robust.spread(angle), 0.3 / focal)))
+    return ball
 
 
 def _ball(ray: Floats, weight: Floats) -> Ball:
@@ -154,10 +154,10 @@ def _ball(ray: Floats, weight: Floats) -> Ball:
     w = np.linalg.lstsq(ray * weight[:, None], weight, rcond=None)[0]
     length = float(np.linalg.norm(w))
     if length <= 1:  # no cone: the rays lie in a plane
-        return Ball(_CENTERED, 1e-6)
+        return Ball(_AHEAD, 1e-6)
     return Ball(w / length, float(np.arccos(1 / length)))
 
 
-def _away(ball: Ball, ray: Floats) -> Floats:
+def _angle_beyond(ball: Ball, ray: Floats) -> Floats:
     """Angle [rad] (N,) of rays beyond a ball's outline."""
     return np.arccos(np.clip(ray @ ball.direction, -1, 1)) - ball.angular_radius

@@ -44,6 +44,7 @@ def write(folder: Path, name: str, found: MeasuredBall, texts: list[str]) -> Non
 
 
 def _tables(found: BallReport) -> list[tuple[str, list[tuple[str, ...]]]]:
+    """Tables of the errors by zenith angle and by expected error: title and rows."""
     return [
         ("Zenith angle", [_row(one, "") for one in found.by_zenith]),
         ("Expected error", [_row(one, ".1f") for one in found.by_expected]),
@@ -58,4 +59,5 @@ def _row(one: ErrorClass, form: str) -> tuple[str, ...]:
 
 
 def _picture(normal: Floats, inside: Any) -> Any:
+    """Picture (H, W, 3) uint8 of a normal map (H, W, 3), black outside the ball."""
     return np.asarray(np.round((normal / 2 + 0.5) * 255 * inside[..., None]), np.uint8)

@@ -25,10 +25,10 @@ from polcap.image_values import ArrayValue, Bools, Floats
 from polcap.optics import frames
 
 _ZENITHS = (0, 15, 30, 45, 60, 75, 90)  # degrees, limits of the classes
-_TENTHS = 10  # classes of the expected error
-_LEAST_RING_DEG, _RING_SIGMAS = 1.0, 2.5  # smaller zero errors are no fault
-_FAR_FLASH = 0.12  # distances of the object: 7°
-_UNLIKE = 1.5  # factor between measured and expected error
+_CLASSES = 10  # of the expected error, with equal numbers of pixels
+_LEAST_RING_DEG, _RING_SIGMAS = 1.0, 2.5  # degrees, and 1σ; smaller zero errors give no warning
+_FAR_FLASH = 0.12  # from the lens [distances of the object], 7°; more gives a warning
+_UNLIKE = 1.5  # measured over expected error; more gives a warning
 _NO_LOSS = 0.99  # contrast beyond which the DoLP shows no loss in the polarizer
 
 
@@ -53,10 +53,10 @@ class BallShape(msgspec.Struct, frozen=True):
 
 
 class FlashPlace(msgspec.Struct, frozen=True):
-    """Place of the flash, right of the lens and above it; None: not measured, as with a print on the ball."""
+    """Place of the flash, to the right of the lens and above; None: not measured, as with a print on the ball."""
 
     distances: tuple[float, float] | None  # of the ball from the lens
-    mm: tuple[float, float] | None  # None: or no length is known
+    mm: tuple[float, float] | None  # None also if the ball's diameter is unknown
 
 
 class PolarizerReading(msgspec.Struct, frozen=True):
@@ -64,7 +64,7 @@ class PolarizerReading(msgspec.Struct, frozen=True):
 
     zero_deg: float  # true minus stated angle of all shots
     sigma_deg: float
-    applied_deg: float  # part of it that the run has corrected
+    applied_deg: float  # part of `zero_deg` that the run has corrected
     dolp_ratio: float  # DoLP over that of a smooth ball of index 1.5, median
     least_extinction: float | None  # a weaker polarizer would show a lower DoLP; None: the DoLP shows no loss
 
@@ -109,12 +109,12 @@ def measure(result: Path, diameter_mm: float | None = None) -> MeasuredBall:
     inside = maps.mask & shown
     error = frames.angle_deg(maps.normal.astype(np.float64), truth)
     zenith = frames.angle_deg(truth, frames.rays(maps.view, *maps.mask.shape))
-    every = error[inside], maps.confidence[inside]
-    limits = np.quantile(every[1], np.linspace(0, 1, _TENTHS + 1))
+    errors = error[inside], maps.confidence[inside]
+    limits = np.quantile(errors[1], np.linspace(0, 1, _CLASSES + 1))
     found = BallReport(
-        normals=_class(*every, 0, 180, np.ones(len(every[0]), bool)),
-        by_zenith=_classes(*every, zenith[inside], _ZENITHS),
-        by_expected=_classes(*every, every[1], limits),
+        normals=_class(*errors, 0, 180, np.ones(len(errors[0]), bool)),
+        by_zenith=_classes(*errors, zenith[inside], _ZENITHS),
+        by_expected=_classes(*errors, errors[1], limits),
         ball=BallShape(
             radius_px=_rounded(light.ball.radius_px(maps.view)),
             misfit_px=_rounded(seen.misfit_px),
@@ -172,6 +172,7 @@ def _classes(error: Floats, expected: Floats, by: Floats, limits: Any) -> tuple[
 
 
 def _class(error: Floats, expected: Floats, least: float, most: float, chosen: Bools) -> ErrorClass:
+    """Errors of the `chosen` pixels (N,), a class with the limits `least` and `most`."""
     mean, median, stated = error[chosen].mean(), np.median(error[chosen]), expected[chosen].mean()
     return ErrorClass(_rounded(least), _rounded(most), int(chosen.sum()), *map(_rounded, (mean, median, stated)))
 

@@ -28,8 +28,8 @@ from polcap.stages.hdr.planes import Signals
 
 _PARTS = 16  # of the picture, for the jackknife
 _LEAST_TILES = 80
-_MOST_PX = 1.5e6  # per pair; twice the pixels of a merge
-_LEAST_RATIO = 1.2  # of two exposures; closer ones are pairs for `flat/`
+_MOST_PX = 1.5e6  # measured pixels of a pair; a merge uses half of them
+_LEAST_RATIO = 1.2  # of two exposures; closer ones are not used
 _MOST_SHIFT_PX = 40.0  # more: the frames show different scenes
 
 
@@ -92,15 +92,15 @@ def measure(brackets: list[list[Photograph]]) -> tuple[NoiseLine, ...]:
 
 def _pair(a: Signals, b: Signals) -> BracketTiles | None:
     """Measure signal and variance in tiles of two frames, darker `a` and brighter `b`; None for similar exposures."""
-    found = exposure.of_tiles(*exposure.common_tiles(a, b))
-    if found is None or not np.all(np.maximum(found, 1 / found) > _LEAST_RATIO):
+    ratio = exposure.of_tiles(*exposure.common_tiles(a, b))
+    if ratio is None or not np.all(np.maximum(ratio, 1 / ratio) > _LEAST_RATIO):
         return None
-    r = found.astype(np.float32)[:, None, None]
+    r = ratio.astype(np.float32)[:, None, None]
     weight = 1 / (1 + r * r)
 
     def maps(one: Floats, two: Floats) -> tuple[Floats, ...]:
-        level, rough = noise.inner(two + r * r * one), noise.roughness(two - r * one)
-        return level * weight, rough**2 * weight, noise.squared_differences(two) * weight
+        level, differences = noise.inner(two + r * r * one), noise.second_differences(two - r * one)
+        return level * weight, differences**2 * weight, noise.squared_gradients(two) * weight
 
     level, variance, edges = noise.tile_columns((a, b), maps, _MOST_PX)
     part = np.arange(len(level)) * _PARTS // max(len(level), 1)

@@ -14,7 +14,7 @@ from polcap.formats.raw import libraw as raw
 from polcap.image_values import Floats, SensorImage
 from polcap.optics import sensor
 
-CLIP = 0.95  # of the saturated count; nothing is measured above
+CLIP = 0.95  # of the saturated count; pixels above are not used
 _MOST_CLIPPED = 0.01  # share of a picture's middle
 _ANGLE = re.compile(r"(\d{1,3}(?:\.\d+)?)")
 

@@ -6,7 +6,7 @@ from polcap.calibrate.calibration_photographs import Photograph, by_setting, exp
 from polcap.calibration_values import FlashEnergy
 from polcap.errors import CaptureError
 
-_LEAST = 4  # pops
+_LEAST = 4  # flashes
 
 
 def measure(photographs: list[Photograph]) -> FlashEnergy:
@@ -22,7 +22,7 @@ def measure(photographs: list[Photograph]) -> FlashEnergy:
         )
     light = [float(exposed_center(one).mean()) for one in group]
     energy = np.array(light) / np.mean(light)
-    order = np.arange(len(energy)) - (len(energy) - 1) / 2
+    order = np.arange(len(energy)) - (len(energy) - 1) / 2  # about the middle
     drift = float(order @ energy / (order @ order))
     spread = float(np.std(energy - drift * order, ddof=2))
     return FlashEnergy(

@@ -12,8 +12,8 @@ from polcap.image_values import Floats
 from polcap.optics import sensor
 from polcap.optics.resize import area_mean
 
-_CELLS = 48  # along the longer side
-_FAINT = 0.02  # of white; below, noise and the error of black matter
+_CELLS = 48  # means of the picture, along its longer side
+_FAINT = 0.02  # of white; darker frames show noise and the error of the black level
 
 
 def measure(flat: list[Photograph]) -> Falloff:
@@ -43,7 +43,7 @@ def measure(flat: list[Photograph]) -> Falloff:
 
 
 def _fit(picture: Floats) -> tuple[Floats, Floats]:
-    """Fit the falloff of a flat frame: coefficients (C, 3) and their 1σ."""
+    """Fit the falloff to a flat frame (H, W, C): coefficients (C, 3) and their 1σ (C, 3)."""
     h, w = picture.shape[:2]
     width, height = (max(4, round(_CELLS * side / max(h, w))) for side in (w, h))
     cells = area_mean(np.asarray(picture, np.float32), (height, width)).reshape(height * width, -1)

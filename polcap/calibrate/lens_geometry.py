@@ -27,17 +27,17 @@ from polcap.stage_values import AngleStack, ColorSensor, single_frames
 from polcap.stages import whitebalance
 from polcap.stages.whitebalance import WhitebalanceSettings, chart
 
-_LEAST_BOARDS = 6  # three tilts determine a pinhole; the others show its error
-_MOST_FOCAL_SIGMA = 0.01  # relative; beyond, EXIF is better
-_MOST_RESIDUAL = 1.5  # RAW px rms; a flat, sharp board leaves a tenth
-_MOST_PRINCIPAL_SIGMA = 0.004  # of the width; beyond, the principal point is the picture's middle
+_LEAST_BOARDS = 6  # three tilts determine a pinhole camera; more show the error
+_MOST_FOCAL_SIGMA = 0.01  # relative; with more, EXIF is better
+_MOST_RESIDUAL = 1.5  # RAW px rms; a flat, sharp board has a tenth of it
+_MOST_PRINCIPAL_SIGMA = 0.004  # of the width; with more, the principal point is the picture's middle
 _WINDOW, _MOST_WINDOW_PX = 0.3, 6  # half side of a corner's search window: share of a square; at most, px
 _SAMPLES = 31  # across a patch and half of its gaps, to measure the center
 _LEAST_CONTRAST = 2.0  # patch over card
 _CARD = 0.06  # share of the window at each side that shows the card: a patch has 0.88 of the pitch
 _ITERATIONS = 6  # the window moves to the center found
 _NORMAL = 1.4  # focal length over the picture's width of a normal lens, as a first guess
-_ALIKE = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
+_MODEL = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ def measure(photographs: list[Photograph], squares: tuple[int, int]) -> LensGeom
     size: tuple[int, int] | None = None
     for one in photographs:
         image = one.image()
-        here = image.value.shape[1], image.value.shape[0]
-        size = size or here
-        if here != size:
+        shape = image.value.shape[1], image.value.shape[0]
+        size = size or shape
+        if shape != size:
             raise CaptureError(f"{one.path}: has another size than {photographs[0].path.name}; keep one camera setting")
         found = _checkerboard(image, squares) or _color_checker(image)
         boards += [] if found is None else [found]
@@ -77,20 +77,20 @@ def measure(photographs: list[Photograph], squares: tuple[int, int]) -> LensGeom
 
 def _fit_lens(boards: list[BoardView], size: tuple[int, int], first: Photograph, folder: str) -> LensGeometry:
     """Fit focal length, distortion and, if they determine it, principal point. Raises CaptureError: too uncertain."""
-    pinhole = _bundle_adjustment(boards, size, _ALIKE | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2)[0]
-    residual, camera, bend, sigma = _bundle_adjustment(boards, size, _ALIKE)
-    free = float(np.hypot(sigma[2], sigma[3])) < _MOST_PRINCIPAL_SIGMA * size[0]
-    if not free:
-        residual, camera, bend, sigma = _bundle_adjustment(boards, size, _ALIKE | cv2.CALIB_FIX_PRINCIPAL_POINT)
-    px = float(camera[0, 0])
+    pinhole = _bundle_adjustment(boards, size, _MODEL | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2)[0]
+    residual, camera, coefficients, sigma = _bundle_adjustment(boards, size, _MODEL)
+    principal_known = float(np.hypot(sigma[2], sigma[3])) < _MOST_PRINCIPAL_SIGMA * size[0]
+    if not principal_known:
+        residual, camera, coefficients, sigma = _bundle_adjustment(boards, size, _MODEL | cv2.CALIB_FIX_PRINCIPAL_POINT)
+    focal = float(camera[0, 0])
     focal_sigma = float(max(sigma[:2]))  # one of the two, where their ratio is fixed
-    if not focal_sigma < _MOST_FOCAL_SIGMA * px:
+    if not focal_sigma < _MOST_FOCAL_SIGMA * focal:
         raise CaptureError(
-            f"{folder}: the focal length is known to {100 * focal_sigma / px:.1f} %, the limit is "
+            f"{folder}: the focal length is known to {100 * focal_sigma / focal:.1f} %, the limit is "
             f"{100 * _MOST_FOCAL_SIGMA:g} %; photograph the board tilted by 30° and more to all sides, "
             "in all corners of the picture"
         )
-    lens = Distortion(px, (float(camera[0, 2]), float(camera[1, 2])), float(bend[0]), float(bend[1]))
+    lens = Distortion(focal, (float(camera[0, 2]), float(camera[1, 2])), float(coefficients[0]), float(coefficients[1]))
     if distortion.folds(lens, *size):
         raise CaptureError(
             f"{folder}: the fitted distortion folds the picture's corners over; photograph the board in all corners, "
@@ -105,7 +105,7 @@ def _fit_lens(boards: list[BoardView], size: tuple[int, int], first: Photograph,
         focal_px=lens.focal,
         focal_sigma_px=focal_sigma,
         principal_px=lens.center,
-        principal_sigma_px=float(np.hypot(sigma[2], sigma[3])) if free else 0.0,
+        principal_sigma_px=float(np.hypot(sigma[2], sigma[3])) if principal_known else 0.0,
         k1=lens.k1,
         k1_sigma=float(sigma[4]),
         k2=lens.k2,
@@ -128,7 +128,7 @@ def _bundle_adjustment(
     """
     width, height = size
     guess = np.array([[_NORMAL * width, 0, (width - 1) / 2], [0, _NORMAL * width, (height - 1) / 2], [0, 0, 1]])
-    answer: Any = cv2.calibrateCameraExtended(
+    result: Any = cv2.calibrateCameraExtended(
         [one.flat for one in boards],
         [one.seen for one in boards],
         size,
@@ -137,8 +137,8 @@ def _bundle_adjustment(
         flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS,
         criteria=(cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10),
     )
-    rms, camera, bend, _, _, sigma = answer[:6]
-    return float(rms), np.asarray(camera), np.asarray(bend).ravel(), np.asarray(sigma).ravel()
+    rms, camera, coefficients, _, _, sigma = result[:6]
+    return float(rms), np.asarray(camera), np.asarray(coefficients).ravel(), np.asarray(sigma).ravel()
 
 
 def _checkerboard(image: SensorImage, squares: tuple[int, int]) -> BoardView | None:
@@ -182,16 +182,16 @@ def _color_checker(image: SensorImage) -> BoardView | None:
         return None
     if found.place is None:
         return None
-    place, at, seen = chart.from_corners(found.place.corners).homography, [], []
+    place, flat, seen = chart.from_corners(found.place.corners).homography, [], []
     light = np.asarray(value.sum(axis=-1), np.float32)
     for center in chart.centers():
         point = _patch_center(light, place, center)
         if point is not None:
-            at.append([*center, 0.0])
+            flat.append([*center, 0.0])
             seen.append(point)
     if len(seen) < len(chart.centers()) / 2:
         return None
-    return BoardView(np.array(at, np.float32), _on_raw(np.array(seen), image), "ColorChecker")
+    return BoardView(np.array(flat, np.float32), _on_raw(np.array(seen), image), "ColorChecker")
 
 
 def _patch_center(light: Floats, place: Floats, center: Floats) -> Floats | None:
@@ -201,12 +201,12 @@ def _patch_center(light: Floats, place: Floats, center: Floats) -> Floats | None
     the homography from chart coordinates to px. The center is the centroid of the light above the card's, computed in
     chart coordinates, so that tilt does not move it.
     """
-    step = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
-    far = np.maximum(np.abs(step)[:, None], np.abs(step))
-    card_at, patch_at, counted = far > 0.5 - _CARD, far < 0.25, far < 0.5 - _CARD / 2
+    offset = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+    distance = np.maximum(np.abs(offset)[:, None], np.abs(offset))
+    card_at, patch_at, counted = distance > 0.5 - _CARD, distance < 0.25, distance < 0.5 - _CARD / 2
     at = np.array(center)
     for _ in range(_ITERATIONS):
-        grid = np.stack(np.meshgrid(at[0] + step, at[1] + step), axis=-1)
+        grid = np.stack(np.meshgrid(at[0] + offset, at[1] + offset), axis=-1)
         px = transform_points(place, grid).astype(np.float32)
         if px.min() < 0 or (px.max(axis=(0, 1)) > np.array(light.shape[::-1]) - 1).any():
             return None
@@ -214,8 +214,8 @@ def _patch_center(light: Floats, place: Floats, center: Floats) -> Floats | None
         card, patch = float(np.median(window[card_at])), float(np.median(window[patch_at]))
         if patch < _LEAST_CONTRAST * max(card, 1e-6):
             return None
-        over = np.where(counted, np.clip((window - card) / (patch - card), 0, 1), 0)
-        at = np.array([(over * grid[..., k]).sum() / over.sum() for k in (0, 1)])
+        light_above = np.where(counted, np.clip((window - card) / (patch - card), 0, 1), 0)
+        at = np.array([(light_above * grid[..., k]).sum() / light_above.sum() for k in (0, 1)])
     return np.asarray(transform_points(place, at))
 
 

@@ -6,7 +6,7 @@ from scipy import stats
 from polcap.calibrate.calibration_photographs import Photograph, by_setting, center
 from polcap.calibration_values import Linearity
 
-_LEAST = 0.02  # of white; below, the error of black matters more than a curve
+_LEAST = 0.02  # of white; darker signals show the error of the black level more than a curve
 
 
 def measure(flat: list[Photograph]) -> Linearity | None:
@@ -22,12 +22,12 @@ def measure(flat: list[Photograph]) -> Linearity | None:
             signal = float(mean.mean())
             if clipped == 0 and signal > _LEAST and time > 0:
                 groups.setdefault((iso, aperture), []).append((time, signal))
-    best = max(groups.values(), key=lambda group: len({time for time, _ in group}), default=[])
-    times = sorted({time for time, _ in best})
+    longest_series = max(groups.values(), key=lambda group: len({time for time, _ in group}), default=[])
+    times = sorted({time for time, _ in longest_series})
     if len(times) < 3:
         return None
     exposure = np.array(times)
-    light = np.array([np.mean([value for at, value in best if at == time]) for time in times])
+    light = np.array([np.mean([signal for at, signal in longest_series if at == time]) for time in times])
     gain = float(np.exp(np.mean(np.log(light / exposure))))
     deviation = light / (gain * exposure) - 1
     line = stats.linregress(np.log(exposure), np.log(light))

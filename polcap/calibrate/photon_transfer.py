@@ -18,7 +18,7 @@ from polcap.errors import CaptureError
 from polcap.image_values import Bools, Floats, SensorImage
 from polcap.optics import robust, sensor
 
-_TILE = 16  # px; within a tile the lens's falloff changes nothing
+_TILE = 16  # px; over a tile the lens's falloff is negligible
 _LEAST_RANGE = 2.0  # brightest over darkest tile: a line needs two ends
 
 
@@ -62,13 +62,13 @@ def _tiles(a: Floats, b: Floats, usable: Bools, ratio: float) -> tuple[Floats, F
     rows, columns = a.shape[0] // _TILE, a.shape[1] // _TILE
     shape = rows, _TILE, columns, _TILE
     cut = slice(rows * _TILE), slice(columns * _TILE)
-    whole = usable[cut].reshape(shape).all(axis=(1, 3)).ravel()
+    usable_tiles = usable[cut].reshape(shape).all(axis=(1, 3)).ravel()
     weight = 1 / (1 + ratio**2)
     level = ((b + ratio**2 * a)[cut] * weight).reshape(*shape, -1).mean(axis=(1, 3), dtype=np.float64)
     difference = (b - ratio * a)[cut].astype(np.float64).reshape(*shape, -1)
     variance = difference.var(axis=(1, 3), ddof=1) * weight
     channels = a.shape[-1]
-    return level.reshape(-1, channels)[whole], variance.reshape(-1, channels)[whole]
+    return level.reshape(-1, channels)[usable_tiles], variance.reshape(-1, channels)[usable_tiles]
 
 
 def photosites(image: SensorImage, channels: int) -> Floats:
@@ -79,12 +79,12 @@ def photosites(image: SensorImage, channels: int) -> Floats:
     return np.asarray(count * image.superpixel**2 / image.cfa.size)
 
 
-def _line(iso: float, points: list[tuple[Floats, Floats, Floats]], where: Photograph) -> NoiseLine:
+def _line(iso: float, points: list[tuple[Floats, Floats, Floats]], frame: Photograph) -> NoiseLine:
     """Noise line of an ISO from all pairs of its frames. Raises CaptureError: all are of one brightness."""
     level, variance = (np.concatenate([point[i] for point in points]) for i in (0, 1))
     if len(level) < 4 or level.max() < _LEAST_RANGE * max(float(level.min()), 1e-3):
         raise CaptureError(
-            f"{where.path.parent}: flat frames at ISO {iso:g} are all of one brightness or clipped; take pairs from "
+            f"{frame.path.parent}: flat frames at ISO {iso:g} are all of one brightness or clipped; take pairs from "
             "a tenth to nine tenths of white, or dark ones too"
         )
     fits = [
@@ -104,16 +104,16 @@ def noise_line(
     Its electron numbers are those of one photosite.
     """
     electrons = 1 / (slope[0] * sites)
-    height = np.maximum(floor[0], 0.0)
-    read = np.sqrt(height * sites) * electrons
+    variance = np.maximum(floor[0], 0.0)
+    read_noise = np.sqrt(variance * sites) * electrons
     return NoiseLine(
         iso=iso,
         slope=tuple(slope[0].tolist()),
         slope_sigma=tuple(slope[1].tolist()),
-        floor=tuple(height.tolist()),
+        floor=tuple(variance.tolist()),
         floor_sigma=tuple(floor[1].tolist()),
         electrons_at_white=tuple(electrons.tolist()),
-        read_noise_electrons=tuple(read.tolist()),
-        read_noise_sigma=tuple((np.sqrt(height + floor[1]) * np.sqrt(sites) * electrons - read).tolist()),
+        read_noise_electrons=tuple(read_noise.tolist()),
+        read_noise_sigma=tuple((np.sqrt(variance + floor[1]) * np.sqrt(sites) * electrons - read_noise).tolist()),
         source=source,
     )

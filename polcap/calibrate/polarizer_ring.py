@@ -19,8 +19,8 @@ from polcap.errors import CaptureError
 from polcap.image_values import Floats
 
 _LEAST = 5  # angles of the ring, for three unknowns and a scatter
-_LAMP = 1e-3  # 1σ of a steady lamp from frame to frame, relative
-_RING_DEG = 0.1  # 1σ of a ring's angle; lamp and ring only weight the frames, the error comes from their scatter
+_LAMP = 1e-3  # relative 1σ of a steady lamp from frame to frame
+_RING_DEG = 0.1  # 1σ of a ring's angle; lamp and ring give the weights of frames, their scatter gives the error
 _SPAN_DEG = 90.0  # least range of ring angles
 _LEAST_DIFFERENCE_DEG = 10.0  # between two axes, and between their mirror images, to find the sense
 
@@ -72,14 +72,14 @@ def measure(turned: list[PolarizerShot]) -> Polarizer:
 
 def _fit_axis(shots: list[PolarizerShot]) -> _MalusFit:
     """Fit a Malus curve to the light of one axis. Raises CaptureError: exposures, angles or contrast do not suffice."""
-    where = shots[0].photograph.path.parent.parent
+    folder = shots[0].photograph.path.parent.parent
     if len({shot.photograph.setting for shot in shots}) > 1:
-        raise CaptureError(f"{where}: frames of unequal exposure; take all angles of the ring with one setting")
+        raise CaptureError(f"{folder}: frames of unequal exposure; take all angles of the ring with one setting")
     ring = np.radians([shot.ring_deg for shot in shots])
     angles = np.unique(np.round(np.degrees(ring) % 180, 2))
     if len(angles) < _LEAST or np.ptp(angles) < _SPAN_DEG:
         raise CaptureError(
-            f"{where}: {len(angles)} angles of the ring over {np.ptp(angles):.0f}°; take {_LEAST} or more over 180°, "
+            f"{folder}: {len(angles)} angles of the ring over {np.ptp(angles):.0f}°; take {_LEAST} or more over 180°, "
             "best every 15°"
         )
     light = [exposed_center(shot.photograph) for shot in shots]
@@ -88,18 +88,18 @@ def _fit_axis(shots: list[PolarizerShot]) -> _MalusFit:
     length = np.hypot(wave[:, 1], wave[:, 2])
     contrast = length / wave[:, 0]
     if contrast.max() < 0.2:
-        raise CaptureError(f"{where}: the light hardly changes with the ring ({contrast.max():.2f}); is it polarized?")
-    toward = np.stack([-contrast, wave[:, 1] / length, wave[:, 2] / length], axis=1) / wave[:, :1]
-    across = np.stack([0 * length, -wave[:, 2], wave[:, 1]], axis=1) / (2 * length**2)[:, None]
-    spread = np.sqrt(np.einsum("ci,cij,cj->c", toward, covariance, toward))
-    turn = np.sqrt(np.einsum("ci,cij,cj->c", across, covariance, across))
-    phase = np.arctan2((wave[:, 2] / turn**2).sum(), (wave[:, 1] / turn**2).sum()) / 2
-    # the ring's scatter is the same in all channels: an average would not lower it
-    return _MalusFit(shots[0].axis_deg, float(np.degrees(phase)), float(np.degrees(turn.min())), contrast, spread)
+        raise CaptureError(f"{folder}: the light hardly changes with the ring ({contrast.max():.2f}); is it polarized?")
+    contrast_by_wave = np.stack([-contrast, wave[:, 1] / length, wave[:, 2] / length], axis=1) / wave[:, :1]
+    phase_by_wave = np.stack([0 * length, -wave[:, 2], wave[:, 1]], axis=1) / (2 * length**2)[:, None]
+    sigma = np.sqrt(np.einsum("ci,cij,cj->c", contrast_by_wave, covariance, contrast_by_wave))
+    phase_sigma = np.sqrt(np.einsum("ci,cij,cj->c", phase_by_wave, covariance, phase_by_wave))
+    phase = np.arctan2((wave[:, 2] / phase_sigma**2).sum(), (wave[:, 1] / phase_sigma**2).sum()) / 2
+    # all channels share the error of the ring's angles, so their average has no smaller one
+    return _MalusFit(shots[0].axis_deg, float(np.degrees(phase)), float(np.degrees(phase_sigma.min())), contrast, sigma)
 
 
 def _fit_wave(ring: Floats, light: Floats) -> tuple[Floats, Floats]:
-    """Fit a Malus curve: (3,) a, a c cos 2φ, a c sin 2φ and their covariance, scaled to the scatter of the frames."""
+    """Fit a Malus curve: (3,) a, a c cos 2φ, a c sin 2φ and their covariance (3, 3) by the scatter of the frames."""
     matrix = np.stack([np.ones_like(ring), np.cos(2 * ring), np.sin(2 * ring)], axis=1)
     weight = np.ones_like(light)
     for _ in range(6):
@@ -108,9 +108,9 @@ def _fit_wave(ring: Floats, light: Floats) -> tuple[Floats, Floats]:
         slope = 2 * (wave[2] * np.cos(2 * ring) - wave[1] * np.sin(2 * ring))
         variance = (_LAMP * matrix @ wave) ** 2 + (np.radians(_RING_DEG) * slope) ** 2
         weight = 1 / np.maximum(variance, (1e-5 * wave[0]) ** 2)
-    scatter = light - matrix @ wave
-    reduced = float(np.sum(weight * scatter**2)) / max(len(light) - 3, 1)
-    return wave, np.linalg.inv(normal) * max(reduced, 0.1)
+    residual = light - matrix @ wave
+    chi2 = float(np.sum(weight * residual**2)) / max(len(light) - 3, 1)
+    return wave, np.linalg.inv(normal) * max(chi2, 0.1)
 
 
 def _shows_sense(curves: list[_MalusFit]) -> bool:

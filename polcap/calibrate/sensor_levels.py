@@ -8,7 +8,7 @@ from polcap.errors import CaptureError
 from polcap.image_values import SensorImage
 from polcap.optics import sensor
 
-_DARK = 0.05  # of white; a frame above is not dark
+_DARK = 0.05  # of white; a frame with more light is not dark
 
 
 def measure(dark: list[Photograph], bright: list[Photograph]) -> Levels:
@@ -32,16 +32,17 @@ def measure(dark: list[Photograph], bright: list[Photograph]) -> Levels:
         noise.append([float(phase.std(dtype=np.float64)) / np.sqrt(phase.size) for phase in phases])
     black = np.mean(means, axis=0)
     sigma = np.hypot(np.mean(noise, axis=0), np.std(means, axis=0, ddof=1) if len(means) > 1 else 0.0)
-    found = [(sensor.saturation(image), image.white) for image in (one.image() for one in bright) if _clips(image)]
+    saturated = [(sensor.saturation(image), image.white) for image in (one.image() for one in bright) if _clips(image)]
     return Levels(
         black=tuple(black.tolist()),
         black_sigma=tuple((sigma / np.sqrt(len(means))).tolist()),
         black_stated=tuple(stated.tolist()),
-        white=min((level for level, _ in found), default=None),
+        white=min((level for level, _ in saturated), default=None),
         white_stated=float(image.white),
     )
 
 
 def _clips(image: SensorImage) -> bool:
-    top = image.value.max()
-    return bool(np.mean(image.value == top) > 1e-3 and top > 0.6 * image.white)
+    """Whether a photograph is saturated: more than 0.1 % of its counts are equal to the greatest, which is high."""
+    greatest = image.value.max()
+    return bool(np.mean(image.value == greatest) > 1e-3 and greatest > 0.6 * image.white)

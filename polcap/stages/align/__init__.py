@@ -20,10 +20,10 @@ from polcap.stage_values import Alignment, AngleStack
 from polcap.stages import stage
 from polcap.stages.align.detail import averaging_step, detail, edge_strength, shows_detail
 
-_SURE_CORRELATION = 0.6  # of detail, from which edges need not be compared
+_GOOD_CORRELATION = 0.6  # of detail; above it edges need not be compared
 _MOST_PIXELS = 0.5e6  # a larger picture is averaged down first: it has detail to spare
-_OVEREXPOSED, _TOO_DARK = 0.2, 3.0  # share of a picture; signal over noise of its median pixel
-_FLOOR_PX = 0.02  # error that aliasing leaves whatever the noise: that of tests/capture is .026 and .025 (decision 19)
+_OVEREXPOSED, _TOO_DARK = 0.2, 3.0  # clipped share of a picture; signal over noise of its median pixel
+_FLOOR_PX = 0.02  # error by aliasing, with any noise; the shots of tests/capture have .026 and .025 (decision 19)
 
 
 class AlignSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -71,16 +71,16 @@ def register(radiance: AngleStack, settings: AlignSettings) -> Alignment:
 
 def _detail(shot: MaskedImage, step: int, settings: AlignSettings) -> Pyramid:
     """Fine detail of a shot, averaged over `step` × `step` px."""
-    return detail(shot, settings.detail_px / np.sqrt(step), step)  # detail lies between the pixels of either grid
+    return detail(shot, settings.detail_px / np.sqrt(step), step)  # between this width in px and in averaged px
 
 
 def _no_detail(name: str, picture: MaskedImage) -> AlignmentError:
     """Error of a shot that shares no detail with the first one, with the likely cause."""
-    clipped = float(((picture.quality & int(Quality.CLIPPED)) > 0).mean())
+    clipped_share = float(((picture.quality & int(Quality.CLIPPED)) > 0).mean())
     signal = float(np.median(picture.value / np.sqrt(np.maximum(picture.variance, 1e-12))))
     cause, remedy = "even all over", "put something with texture next to the object"
-    if clipped > _OVEREXPOSED:
-        cause, remedy = f"{clipped:.0%} of it is over-exposed", "shoot with less light, or add a darker exposure"
+    if clipped_share > _OVEREXPOSED:
+        cause, remedy = f"{clipped_share:.0%} of it is over-exposed", "shoot with less light, or add a darker exposure"
     elif signal < _TOO_DARK:
         cause, remedy = "it is too dark", "use more light or a longer exposure"
     return AlignmentError(
@@ -99,8 +99,8 @@ def _register_shot(
     shot = _detail(picture, step, settings)
     if not (shows_detail(reference) and shows_detail(shot)):
         raise _no_detail(name, picture)
-    found, correlation = _best_match(reference, shot, settings)
-    transform = registration.scaled(found.matrix, step)
+    motion, correlation = _best_match(reference, shot, settings)
+    transform = registration.scaled(motion.matrix, step)
     corners = picture_corners(step * reference.shape[1], step * reference.shape[0])
     shift = np.abs(transform_points(transform, corners) - corners).max()
     if not np.isfinite(shift) or correlation < settings.min_correlation:
@@ -114,21 +114,21 @@ def _register_shot(
             f"{name} moved by {shift:.1f} px, more than align.max_shift_px = {settings.max_shift_px:g}; "
             "reshoot, or raise it"
         )
-    return transform, step * float(np.hypot(found.sigma_px, _FLOOR_PX)), correlation
+    return transform, step * float(np.hypot(motion.sigma_px, _FLOOR_PX)), correlation
 
 
 def _best_match(reference: Pyramid, shot: Pyramid, settings: AlignSettings) -> tuple[registration.Registration, float]:
     """Find the motion under which two shots correlate best, in their detail or in the strength of their edges.
 
-    Strong polarization may change which side of an edge is brighter, but not where the edge is. Also returns the
-    correlation.
+    Strong polarization may change which side of an edge is brighter, but not where the edge is. Returns the motion and
+    the correlation.
     """
     assert settings.model != "none"
     found = registration.register(reference, shot, settings.model)
     correlation = registration.correlation(reference, shot, found.matrix)
-    if correlation > _SURE_CORRELATION:
+    if correlation > _GOOD_CORRELATION:
         return found, correlation
     edges = edge_strength(reference), edge_strength(shot)
     by_edges = registration.register(*edges, settings.model)
-    of_edges = registration.correlation(*edges, by_edges.matrix)
-    return (by_edges, of_edges) if of_edges > correlation else (found, correlation)
+    edge_correlation = registration.correlation(*edges, by_edges.matrix)
+    return (by_edges, edge_correlation) if edge_correlation > correlation else (found, correlation)

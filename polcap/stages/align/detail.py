@@ -9,12 +9,12 @@ from polcap.optics.morphology import dilate
 from polcap.optics.registration import Pyramid, squared_gradient
 from polcap.optics.resize import block_means
 
-_BLUR_PX = 0.7  # both shots need one resolution; interpolation changes it
-_FLOOR = 0.01  # of the 99th percentile: keeps the logarithm of a dark background from amplifying its noise
-_HOT = 1.2  # times the brightest of its eight neighbors: a brighter pixel is hot, and moves with the sensor
+_BLUR_PX = 0.7  # blur of both shots; hides the blur that interpolation adds to one of them
+_FLOOR = 0.01  # of the 99th percentile; added before the logarithm, which would amplify the noise of a dark backdrop
+_HOT = 1.2  # greatest value over that of the brightest neighbor; more is a hot pixel, which moves with the sensor
 _NEIGHBORS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 _TYPICAL_DETAIL = 0.02  # relative; where noise exceeds it, detail is weighted down
-_LEAST_PIXELS = 30
+_LEAST_PIXELS = 30  # usable ones
 
 
 def averaging_step(shape: tuple[int, ...], most_pixels: float) -> int:
@@ -33,8 +33,8 @@ def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
     height, width = total.shape
     variance = frames.total(shot.variance[: height * step : step, : width * step : step])  # it changes slowly
     sigma = np.sqrt(variance) / np.float32(step)
-    some = (slice(None, None, 5),) * 2  # enough for a percentile
-    floor = max(float(np.percentile(total[some], 99)) * _FLOOR, 2 * float(np.median(sigma[some])), 1e-9)
+    sample = (slice(None, None, 5),) * 2  # every fifth pixel suffices for a percentile
+    floor = max(float(np.percentile(total[sample], 99)) * _FLOOR, 2 * float(np.median(sigma[sample])), 1e-9)
     level = np.maximum(total, 0)
     level += np.float32(floor)
     log = np.asarray(cv2.log(level))
@@ -47,19 +47,19 @@ def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
 
 def fine_detail(log: Floats, detail_px: float) -> Floats:
     """A picture (H, W) minus its Gaussian mean of 1σ = `detail_px`, slightly smoothed."""
-    reach = 2 * int(np.ceil(3 * detail_px)) + 1
+    size = 2 * int(np.ceil(3 * detail_px)) + 1
     fine = np.asarray(cv2.GaussianBlur(log, (0, 0), _BLUR_PX))
-    fine -= cv2.GaussianBlur(log, (reach, reach), detail_px)
+    fine -= cv2.GaussianBlur(log, (size, size), detail_px)
     return fine
 
 
 def edge_strength(shot: Pyramid) -> Pyramid:
-    """Strength of the edges in a shot, independent of which side is brighter: root of the gradient's length."""
+    """Strength of the edges in a shot, whichever side is brighter: square root of the gradient's length."""
     strength = np.sqrt(cv2.GaussianBlur(np.sqrt(squared_gradient(shot[0].picture)), (0, 0), 1.0))
     return Pyramid(np.asarray(strength), shot[0].usable)
 
 
 def shows_detail(shot: Pyramid) -> bool:
     """Whether a picture has enough detail to be registered."""
-    seen = shot[0].picture[shot[0].usable]
-    return len(seen) > _LEAST_PIXELS and bool(np.ptp(seen) > 0)
+    value = shot[0].picture[shot[0].usable]
+    return len(value) > _LEAST_PIXELS and bool(np.ptp(value) > 0)

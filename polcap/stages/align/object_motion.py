@@ -19,12 +19,12 @@ from polcap.stages.align.detail import averaging_step, detail
 
 _DETAIL_PX = 4.0  # as `align.detail_px`
 _MOST_PIXELS = 0.8e6  # a larger picture is averaged down first
-_RIM_PX = 6  # around the object, which its outline needs
-_SURE_CORRELATION = 0.6  # of detail: from here on a region was found in the shot
-_OTHER_CORRELATION = 0.4  # of the object: below, it is another or too far away; noise has less
+_RIM_PX = 6  # width of backdrop around the object's region, so that the region includes the outline
+_FOUND_CORRELATION = 0.6  # of detail; a region with more was found in the shot
+_OTHER_CORRELATION = 0.4  # of the object; with less it is another object, or too far away. Noise has less
 _ERROR_SCALE = 1.1  # actual error of the shift over that of the tiles, in 152 still shots (docs/benchmarks/gates.md)
-_PARAMETERS = 4  # of a similarity; a tile measures two
-_SAME_PX = 0.5  # two starts that differ by less lead to one place
+_PARAMETERS = 4  # of a similarity; each tile gives two measurements
+_SAME_PX = 0.5  # two starts of a registration that differ by less give the same result
 
 
 @dataclass(frozen=True)
@@ -45,40 +45,40 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
     shift = ObjectShift(*np.zeros((2, shots)))
     if radiance.offset_px is not None:  # shots cut from one mosaic: nothing moves between them
         return shift
-    shift.length[1:] = np.nan  # where nothing is measured below
+    shift.length[1:] = np.nan  # until measured
     if not object_.mask.any():
         return shift
     step = averaging_step(object_.mask.shape, _MOST_PIXELS)
     reference = detail(radiance.shot(0), _DETAIL_PX, step)[0]
     small = area_mean(object_.mask.astype(np.uint8), reference.picture.shape)
-    near = dilate(small > 0, _RIM_PX)
-    regions = [Pyramid(reference.picture, reference.usable & region) for region in (near, ~near)]  # inner, outer
+    around = dilate(small > 0, _RIM_PX)
+    regions = [Pyramid(reference.picture, reference.usable & region) for region in (around, ~around)]
     middle = np.argwhere(small).mean(axis=0)[::-1] if small.any() else np.array(small.shape[::-1]) / 2
     for k in range(1, shots):
         shot = detail(radiance.shot(k), _DETAIL_PX, step)
         start = registration.scaled(alignment.transform[k], 1 / step)
         (inner, inner_match), (outer, outer_match) = (_register(region, shot, start) for region in regions)
-        if outer_match > _SURE_CORRELATION and inner_match < _OTHER_CORRELATION:
+        if outer_match > _FOUND_CORRELATION and inner_match < _OTHER_CORRELATION:
             shift.length[k] = np.inf  # another object
-        elif min(inner_match, outer_match) > _SURE_CORRELATION:
-            places = [transform_points(found.matrix, middle) for found in (inner, outer)]
+        elif min(inner_match, outer_match) > _FOUND_CORRELATION:
+            positions = [transform_points(found.matrix, middle) for found in (inner, outer)]
             per_axis = np.hypot(inner.sigma_at(middle), outer.sigma_at(middle))
-            shift.length[k] = step * np.hypot(*(places[0] - places[1]))
+            shift.length[k] = step * np.hypot(*(positions[0] - positions[1]))
             shift.sigma[k] = step * _ERROR_SCALE * np.sqrt(2) * per_axis * _student(min(inner.tiles, outer.tiles))
     return shift
 
 
 def _student(tiles: int) -> float:
-    """Factor on a 1σ estimated from few tiles, so that errors above three times it are as rare as 3σ (Student's t)."""
+    """Factor on a 1σ from few tiles after which errors above 3σ are as rare as in a normal law, by Student's t."""
     from scipy.special import ndtr, stdtrit  # here: the import takes 0.2 s
 
     return float(stdtrit(max(2 * tiles - _PARAMETERS, 1), ndtr(3.0)) / 3)
 
 
 def _register(region: Pyramid, shot: Pyramid, start: Floats) -> tuple[Registration, float]:
-    """Register one region of the picture; returns its motion and the correlation.
+    """Register one region of the picture: its motion and the correlation.
 
-    The search starts from the motion `start` of the whole picture, and from no motion; the better result is returned.
+    The search starts from no motion and from the motion `start` (3, 3) of the whole picture. The better result counts.
     """
     found = [registration.register(region, shot, "similarity")]
     corners = picture_corners(region.shape[1], region.shape[0])

@@ -33,9 +33,9 @@ FLOOR = 0.02  # added to a radiance before its logarithm, in the channels and in
 def compute(stokes: StokesImage, color: ColorCalibration, other_orders: tuple[OtherOrder, ...] = ()) -> Cues:
     """Compute all cues (radiance, DoLP, AoLP, diffuse color…) of a crop (H, W) from its Stokes parameters.
 
-    The color matrix is applied to S0 only. DoLP and AoLP are computed in camera channels, which are summed before any
-    ratio. The visible surface of the object is nearer to the flash than the chart, and gets more light: `scale`
-    corrects for it. A capture without a chart has no absolute scale: its 99th percentile of radiance becomes 0.8.
+    The color matrix is applied to S0 only. DoLP and AoLP are computed from the sums of the camera channels. The visible
+    surface of the object is nearer to the flash than the chart, and gets more light: `scale` corrects for it. A capture
+    without a chart has no absolute scale: its 99th percentile of radiance becomes 0.8.
     """
     ratio, sigma, dolp, normalized = polarization(stokes.stokes, stokes.covariance)
     radiance = np.asarray(stokes.stokes[0] @ color.matrix.T, dtype=np.float32)

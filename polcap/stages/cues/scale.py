@@ -20,7 +20,7 @@ _BULGE = 0.5  # radii; mean distance of the visible surface in front of the cent
 _BULGE_SPREAD = 0.4  # radii; its 1σ over 204 views of training meshes and random shapes (decision 8)
 _CHART_SPREAD = 0.3  # radii: 1σ of the depth of a chart next to the middle of the object
 _LARGEST_RADIUS = 0.5  # of an object, over its distance; for larger ones the far-field law does not hold
-_STEP = 1e-4
+_STEP = 1e-4  # of the chart's light, for derivatives
 
 
 def is_known(color: ColorCalibration) -> bool:
@@ -29,19 +29,19 @@ def is_known(color: ColorCalibration) -> bool:
 
 
 def surface_distance(mask: Bools, view: View) -> float:
-    """Distance of the visible surface over that of the object's middle, with which the chart is level; mask (H, W)."""
+    """Distance of the visible surface over that of the object's middle and of the chart beside it; mask (H, W)."""
     return 1 - _BULGE * _radius(mask, view)
 
 
 def factor(stokes: StokesImage, color: ColorCalibration) -> float:
-    """Factor on radiance after which a white plane that faces the flash has 1, on the axis at the object's distance.
+    """Factor that scales the radiance of a white plane to 1, if it faces the flash at the object's place on the axis.
 
     The light still falls off over the object, with distance and to the sides, as in the training pictures.
     """
-    ahead = surface_distance(stokes.mask, stokes.view)
+    distance = surface_distance(stokes.mask, stokes.view)
     if color.light is None:
-        return ahead**2
-    return float(np.exp(_log_factor(color.light, _middle(stokes, ahead))))
+        return distance**2
+    return float(np.exp(_log_factor(color.light, _middle(stokes, distance))))
 
 
 def sigma(stokes: StokesImage, color: ColorCalibration) -> float | None:
@@ -53,23 +53,23 @@ def sigma(stokes: StokesImage, color: ColorCalibration) -> float | None:
     if not is_known(color):
         return None
     radius = _radius(stokes.mask, stokes.view)
-    ahead = surface_distance(stokes.mask, stokes.view)
-    depth = 2 * radius * hypot(_BULGE_SPREAD, _CHART_SPREAD) / ahead
+    distance = surface_distance(stokes.mask, stokes.view)
+    depth = 2 * radius * hypot(_BULGE_SPREAD, _CHART_SPREAD) / distance
     if color.light is None:
         return depth
-    light, middle = color.light, _middle(stokes, ahead)
-    here = _log_factor(light, middle)
-    slope = np.array([_log_factor(_changed(light, step), middle) - here for step in _STEP * np.eye(5)]) / _STEP
+    light, middle = color.light, _middle(stokes, distance)
+    log_factor = _log_factor(light, middle)
+    slope = np.array([_log_factor(_changed(light, step), middle) - log_factor for step in _STEP * np.eye(5)]) / _STEP
     return hypot(depth, light.uneven, sqrt(slope @ light.covariance @ slope))
 
 
 def _log_factor(light: ChartLight, middle: Floats) -> float:
     """Logarithm of chart irradiance over object irradiance, relative to the same ratio for a flash at the lens."""
     flash, power = light.flash[:2], float(light.flash[2])
-    chart = point_light.irradiance(light.white, flash, power, light.normal)
-    object_ = point_light.irradiance(middle, flash, power)
-    alone = point_light.irradiance(middle, np.zeros(2), 0.0)
-    return log(max(float(chart), 1e-6) * float(alone) / float(object_)) + 2 * log(-middle[2])
+    at_chart = point_light.irradiance(light.white, flash, power, light.normal)
+    at_object = point_light.irradiance(middle, flash, power)
+    lens_flash = point_light.irradiance(middle, np.zeros(2), 0.0)
+    return log(max(float(at_chart), 1e-6) * float(lens_flash) / float(at_object)) + 2 * log(-middle[2])
 
 
 def _changed(light: ChartLight, step: Floats) -> ChartLight:

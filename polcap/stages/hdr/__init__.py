@@ -35,7 +35,7 @@ from polcap.stages.hdr import exposure, noise, photosites, planes, weights
 from polcap.stages.hdr.bracket import Bracket, black_error, compare
 from polcap.stages.hdr.planes import Reader, check_size
 
-_ALL_AMBIENT = 0.9  # share of ambient light beyond which nothing of the flash is left
+_ALL_AMBIENT = 0.9  # ambient share of a shot's light; with more, nothing of the flash is left
 _LEAST_PX = 48  # least side of a merged picture: noise and motion are measured in tiles
 
 
@@ -95,7 +95,7 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     pictures = [MaskedImage(*shot) for shot in zip(stack.value, stack.variance, stack.quality)]
     del image  # so that the reader can free the frame
     read.black = black_error(Bracket(first, order), read)
-    places = sharpness.places(read(middle(first.frames)), settings.clip)  # of the same frame as in `check`
+    places = sharpness.places(read(middle(first.frames)), settings.clip)  # of the frame that `polcap check` uses
     lines = noise.Lines(() if capture.calibration is None else capture.calibration.noise)
     ratio, curvature, flicker, ambient_share, tiles = [], [], [], [], []  # of each shot but the crossed one
     for k, shot in enumerate(shots):
@@ -213,7 +213,7 @@ def _sensor(capture: Capture, image: SensorImage, settings: HdrSettings) -> Colo
 def _view(capture: Capture, image: SensorImage, settings: HdrSettings) -> View:
     """The pinhole camera (`View`) of the merged picture; its pixel (0, 0) is the center of a superpixel."""
     scale = 1.0 if settings.demosaic == "full" else float(image.superpixel)
-    x, y = (to_grid(at, scale) for at in capture.principal_px)
+    x, y = (to_grid(px, scale) for px in capture.principal_px)
     return View(capture.focal_px / scale, (x, y), scale, known=capture.focal_known)
 
 

@@ -21,9 +21,9 @@ from polcap.stages.hdr.ghosts import Anchor, RegisteredFrame, first_estimate
 from polcap.stages.hdr.planes import Reader, Signals, blocks, check_size, in_memory, planar, resample
 
 _SMOOTH = cv2.getGaussianKernel(7, 0.8, cv2.CV_32F)
-# Frames that moved less than either of these are not resampled: px, and standard deviations of the measured motion.
+# A frame that moved less than one of these is not resampled: px, and standard deviations of the measured motion.
 _STILL_PX, _MOTION_SIGMAS = 0.05, 3.0
-_ANY_CAUSE = 1e-3  # of the sensor's range: light up to here is subtracted even if it is no error of the black level
+_ALWAYS_CORRECTED = 1e-3  # of the sensor's range; a smaller error of the black level is corrected, even if it is light
 
 
 @dataclass(frozen=True)
@@ -70,21 +70,21 @@ def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float)
     """
     source = _BracketSignals(bracket, lines, read)
     reference = source.reference_signals
-    one = np.ones(reference.shape[0], np.float32)
+    ones = np.ones(reference.shape[0], np.float32)
     if not bracket.others and source.ambient is None:
         source.learn(bracket.reference, noise.sample_frame(reference))
     ghost = np.zeros(reference.usable.shape, bool)
     frames, parts = {}, []
-    anchor: Anchor | None = None
+    anchor: Anchor | None = None  # made after the first comparison, which measures the noise
     for e in bracket.others:
         frames[e] = _compare_frame(source, e, limit_px)
-        anchor = anchor or Anchor(RegisteredFrame(reference, one, source.line(bracket.reference), 0 * one))
-        new = anchor.ghosts(frames[e])
-        parts.append((frames[e], frames[e].signals.usable & ~new))
-        ghost |= new
+        anchor = anchor or Anchor(RegisteredFrame(reference, ones, source.line(bracket.reference), 0 * ones))
+        frame_ghost = anchor.ghosts(frames[e])
+        parts.append((frames[e], frames[e].signals.usable & ~frame_ghost))
+        ghost |= frame_ghost
         if e == bracket.order[0]:
             anchor = replace(anchor, darkest=frames[e])
-    frames[bracket.reference] = RegisteredFrame(reference, one, source.line(bracket.reference), 0 * one)
+    frames[bracket.reference] = RegisteredFrame(reference, ones, source.line(bracket.reference), 0 * ones)
     parts.append((frames[bracket.reference], reference.usable))
     estimate = first_estimate(parts, anchor or Anchor(frames[bracket.reference]), ghost)
     return ComparedBracket(
@@ -98,22 +98,22 @@ def compare(bracket: Bracket, lines: noise.Lines, read: Reader, limit_px: float)
 def black_error(bracket: Bracket, read: Reader) -> BlackError:
     """Measure the error of the stated black level in the frames of a bracket, and decide whether to correct it.
 
-    Light that does not scale with the exposure, such as a room's under a flash, looks the same. So an error above .1 %
+    Light that does not scale with the exposure, such as a room's under a flash, looks the same. So an error above 0.1 %
     of the range is corrected only where the exposures follow the camera settings.
     """
     frames = bracket.shot.frames
     if bracket.shot.ambient:  # subtracting them corrects such an error for frames of their exposure
         return BlackError(np.zeros(1))
     reference, others = frames[bracket.reference], [frames[e] for e in bracket.others]
-    still, tiles = exposure.tiles(read.signals(reference)), []
+    reference_tiles, tiles = exposure.tiles(read.signals(reference)), []
     for frame in others:
-        found = exposure.tiles(read.signals(frame))
-        if found[0].shape != still[0].shape:
+        frame_tiles = exposure.tiles(read.signals(frame))
+        if frame_tiles[0].shape != reference_tiles[0].shape:
             return BlackError(np.zeros(1))  # `compare` refuses the frame
-        tiles.append(exposure.in_common(still, found))
+        tiles.append(exposure.in_common(reference_tiles, frame_tiles))
     error, ratio = exposure.black_error(tiles)
     steady = all(exposure.scales_as_stated(one, frame, reference) for one, frame in zip(ratio.tolist(), others))
-    return BlackError(error, bool(error.any()) and (steady or bool(np.abs(error).max() < _ANY_CAUSE)))
+    return BlackError(error, bool(error.any()) and (steady or bool(np.abs(error).max() < _ALWAYS_CORRECTED)))
 
 
 class _BracketSignals:
@@ -124,10 +124,10 @@ class _BracketSignals:
         self._lines, self._read = lines, read
         self.name = f"shot {bracket.shot.name}"
         self._iso = [frame.exif.iso or f"frame {e}" for e, frame in enumerate(self.frames)]
-        still = read(self.frames[self.reference])
-        self.raw_px = still.superpixel  # RAW px per px
-        self._radiance = sensor.is_radiance(still)
-        self._rounding = sensor.rounding_variance(still) / 2  # variance of binned green, the mean of two photosites
+        image = read(self.frames[self.reference])
+        self.raw_px = image.superpixel  # RAW px per px
+        self._radiance = sensor.is_radiance(image)
+        self._rounding = sensor.rounding_variance(image) / 2  # of binned green, the mean of two photosites
         self.ambient = ambient_light(bracket, lines, read)
 
     @cached_property
@@ -165,9 +165,11 @@ class _BracketSignals:
         return all(self._lines.knows(self._iso[e]) for e in frames)
 
     def learn(self, e: int, samples: noise.Samples) -> None:
+        """Add noise samples of frame e to those of its ISO."""
         self._lines.learn(self._iso[e], samples)
 
     def _ambient_exposure(self, e: int) -> np.float32:
+        """Exposure of frame e to ambient light, relative to the reference frame."""
         return np.float32(exposure.of_ambient(self.frames[e], self.frames[self.reference]))
 
 
@@ -212,17 +214,17 @@ def brightness_pyramid(frame: Signals) -> Pyramid:
         total = sum(frame.rows(rows))
         smooth = np.asarray(cv2.sepFilter2D(total, -1, _SMOOTH, _SMOOTH))[inner]
         np.maximum(smooth, 0, out=smooth)
-        smooth += np.float32(1e-4)
+        smooth += np.float32(1e-4)  # limits the slope of the root
         np.sqrt(smooth, out=out[target])
     return Pyramid(out, frame.usable)
 
 
-def measure_motion(name: str, still: Pyramid, other: Pyramid, limit_px: float) -> Floats | None:
-    """Measure the motion of a frame relative to the reference frame: (3, 3), reference px → frame px; None: no motion.
+def measure_motion(name: str, reference: Pyramid, frame: Pyramid, limit_px: float) -> Floats | None:
+    """Measure the motion of a frame by two pyramids: (3, 3), reference px → frame px; None: no motion.
 
     Raises CaptureError: the frame `name` moved by more than `limit_px` px of the pyramids.
     """
-    found = register(still, other)
+    found = register(reference, frame)
     if found.shift_px > limit_px:
         raise CaptureError(
             f"{name} moved by {found.shift_px:.0f} px against the bracket's reference frame, more than {limit_px:.0f}, "
@@ -242,27 +244,27 @@ def ambient_light(bracket: Bracket, lines: noise.Lines, read: Reader, full: bool
     shot, reference = bracket.shot, bracket.shot.frames[bracket.reference]
     if not shot.ambient:
         return None
-    share = [exposure.of_ambient(frame, reference) for frame in shot.ambient]
+    exposures = [exposure.of_ambient(frame, reference) for frame in shot.ambient]
     value = planar(sensor.signal(read(shot.ambient[0]), full))
     for frame in shot.ambient[1:]:
-        part = planar(sensor.signal(read(frame), full))
-        check_size(f"an ambient frame of shot {shot.name}", part.shape, value.shape)
-        value += part
-    value /= np.float32(sum(share))
+        signal = planar(sensor.signal(read(frame), full))
+        check_size(f"an ambient frame of shot {shot.name}", signal.shape, value.shape)
+        value += signal
+    value /= np.float32(sum(exposures))  # (C, H, W), at the exposure of the reference frame
     variance = np.zeros_like(value)
-    for frame, one in zip(shot.ambient, share):
+    for frame, ratio in zip(shot.ambient, exposures):
         image = read(frame)
         iso = frame.exif.iso or "ambient"
         if not lines.knows(iso):
             lines.learn(iso, noise.sample_frame(read.signals(frame)))
         line = lines.line(iso, sensor.rounding_variance(image) / 2, sensor.is_radiance(image))
-        level = np.stack([cv2.blur(plane, (5, 5)) for plane in value]) * np.float32(one)
-        variance += noise.of_pixels(level, line, image.cfa if full else None) / np.float32(sum(share) ** 2)
+        level = np.stack([cv2.blur(plane, (5, 5)) for plane in value]) * np.float32(ratio)
+        variance += noise.of_pixels(level, line, image.cfa if full else None) / np.float32(sum(exposures) ** 2)
     return AmbientLight(value, variance)
 
 
 def _ambient_share(ambient: AmbientLight, flash: Floats) -> float:
     """Share of ambient light in all light, in the brighter half of the picture; `flash` (C, H, W) is flash light."""
-    without, lit = (picture[:, ::4, ::4].sum(0) for picture in (ambient.value, flash))
-    bright = lit + without >= np.median(lit + without)
-    return float(without[bright].sum() / max(float((lit + without)[bright].sum()), 1e-9))
+    room, lit = (picture[:, ::4, ::4].sum(0) for picture in (ambient.value, flash))
+    bright = lit + room >= np.median(lit + room)
+    return float(room[bright].sum() / max(float((lit + room)[bright].sum()), 1e-9))

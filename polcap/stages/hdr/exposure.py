@@ -11,22 +11,22 @@ from polcap.optics.resize import block_means
 from polcap.optics.robust import MAD_TO_SIGMA, MEDIAN_SE, biweight, spread
 from polcap.stages.hdr.planes import Signals, tile_means
 
-# For the tone curve: brightness in the sensor's range, bins of brightness, and their least span in ln (one stop).
+# For `curvature`: signals that are used, bins of brightness, and the least range of ln brightness (0.7: one stop).
 _TONE_RANGE, _TONE_BINS, _TONE_SPAN = (0.01, 0.9), 8, 0.7
 TILE = 16  # px
 _LEAST_TILES = 30
-_SURE, _LEAST_SURE = 0.01, 0.03  # largest relative 1σ of a ratio: of one channel, of all channels together
-_LEAST_VIGNETTING = 0.01  # smaller changes of the ratio over the picture are left to the limit of ghosts
+_MOST_SIGMA, _MOST_SIGMA_OF_SUM = 0.01, 0.03  # relative 1σ of a ratio: of one channel, of all channels together
+_LEAST_VIGNETTING = 0.01  # smaller changes of the ratio over the picture are below the limit for ghosts
 _DIM, _DIMMEST = 4e-3, 4e-4  # of the sensor's range: darker tiles suffer from errors of the black level
-# The black level: least step of the exposure; error of the sensor's range that matters; share and range by which
-# frames may differ. Good captures reach 2e-5 (docs/benchmarks/gates.md)
+# For the black level: least ratio of two exposures; least error that is corrected [sensor's range]; difference between
+# frames, relative and absolute, up to which they agree. Good captures reach 2e-5 (docs/benchmarks/gates.md).
 _BLACK_STEP, _LEAST_BLACK, _BLACK_AGREES = 1.3, 1e-4, (0.1, 5e-5)
-_AS_STATED = 1.3  # factor between measured and stated exposure below which steady light follows too
-# To measure flicker: tiles along a column of the picture; least size [px]; least lit rows and tiles of a row
+_AS_STATED = 1.3  # largest factor between the measured exposure and that of the settings
+# For flicker: tiles along a column of the picture; their least side [px]; least lit rows; least lit tiles of a row
 _FLICKER_ROWS, _LEAST_FLICKER_TILE, _LEAST_ROWS, _LEAST_IN_ROW = 60, 4, 12, 4
-_SHADOW = 0.01  # of the expected light: rows with less count as this
-_UNLIT, _LEAST_RATIO = 0.01, 1e-4  # of the stated exposure: less is none; for a frame without light
-_TILE_NOISE = (1e-7, 0.005, 3e-6)  # of a tile's mean: variance per signal, relative error, error of a black tile
+_LEAST_LIGHT = 0.01  # of the expected light; tiles with less count as this
+_UNLIT, _LEAST_RATIO = 0.01, 1e-4  # share of the stated light below which a frame is unlit; least ratio of such a frame
+_TILE_NOISE = (1e-7, 0.005, 3e-6)  # of a tile's mean: variance per signal, relative 1σ, 1σ of a black tile
 
 
 def of_frame(name: str, tiles: tuple[Floats, Floats], frame: Frame, reference: Frame) -> Floats:
@@ -62,10 +62,10 @@ def of_tiles(a: Floats, b: Floats) -> Floats | None:
     error above 1 % gets the ratio of all channels together.
     """
     found = [_quotient(a[:, c], b[:, c]) for c in range(a.shape[1])]
-    sums = _quotient(a.sum(axis=1), b.sum(axis=1))
-    if sums is None or sums[1] > _LEAST_SURE:
+    of_sum = _quotient(a.sum(axis=1), b.sum(axis=1))
+    if of_sum is None or of_sum[1] > _MOST_SIGMA_OF_SUM:
         return None
-    return np.array([one[0] if one is not None and one[1] < _SURE else sums[0] for one in found])
+    return np.array([one[0] if one is not None and one[1] < _MOST_SIGMA else of_sum[0] for one in found])
 
 
 def common_tiles(reference: Signals, other: Signals) -> tuple[Floats, Floats]:
@@ -134,8 +134,8 @@ def vignetting(reference: Signals, other: Signals, ratio: Floats) -> Floats | No
     """
     _, height, width = reference.shape
     a, b = tile_means(reference, TILE).sum(-1), (tile_means(other, TILE) / ratio).sum(-1)
-    clear = block_means((reference.usable & other.usable).astype(np.float32), TILE) > 0.999
-    bright = clear & (a > 3 * _DIM) & (b > 3 * _DIM)
+    usable = block_means((reference.usable & other.usable).astype(np.float32), TILE) > 0.999
+    bright = usable & (a > 3 * _DIM) & (b > 3 * _DIM)
     if bright.sum() < 2 * _LEAST_TILES:
         return None
     row, column = np.nonzero(bright)
@@ -145,12 +145,12 @@ def vignetting(reference: Signals, other: Signals, ratio: Floats) -> Floats | No
     for _ in range(6):  # tiles where something moved lose their weight
         found = np.linalg.lstsq(basis * weight[:, None], change * weight, rcond=None)[0]
         residual = np.abs(change - basis @ found)
-        weight = np.sqrt(1 / (1 + (residual / (2 * MAD_TO_SIGMA * np.median(residual) + 1e-4)) ** 2))
+        weight = np.sqrt(1 / (1 + (residual / (2 * MAD_TO_SIGMA * np.median(residual) + 1e-4)) ** 2))  # Cauchy's, at 2σ
     if np.abs(basis @ found).max() < _LEAST_VIGNETTING:
         return None
     y, x = np.mgrid[:height, :width].astype(np.float32)
-    flat = _quadratic((x.ravel() + 0.5) / (a.shape[1] * TILE), (y.ravel() + 0.5) / (a.shape[0] * TILE)) @ found
-    return np.asarray(np.exp(flat).reshape(height, width), np.float32)
+    logarithm = _quadratic((x.ravel() + 0.5) / (a.shape[1] * TILE), (y.ravel() + 0.5) / (a.shape[0] * TILE)) @ found
+    return np.asarray(np.exp(logarithm).reshape(height, width), np.float32)
 
 
 def _quadratic(x: Floats, y: Floats) -> Floats:
@@ -159,12 +159,12 @@ def _quadratic(x: Floats, y: Floats) -> Floats:
 
 
 def of_unlit(a: Floats, b: Floats, stated: float) -> float | None:
-    """Exposure ratio b / a of an unlit frame b, from tiles (T, C); None if b has light, or was set to get little."""
+    """Exposure ratio b / a of an unlit frame b, from tiles (T, C); None if b has light, or by `stated` too little."""
     a, b = a.sum(axis=1), b.sum(axis=1)
-    seen = stated * a > _DIM
-    if seen.sum() < _LEAST_TILES or b[seen].sum() > _UNLIT * stated * a[seen].sum():
+    bright = stated * a > _DIM
+    if bright.sum() < _LEAST_TILES or b[bright].sum() > _UNLIT * stated * a[bright].sum():
         return None
-    return max(float(b[seen].sum() / a[seen].sum()), _LEAST_RATIO)
+    return max(float(b[bright].sum() / a[bright].sum()), _LEAST_RATIO)
 
 
 def stated(frame: Frame, reference: Frame) -> float:
@@ -208,9 +208,9 @@ def curvature(a: Floats, b: Floats) -> float:
 def flicker(reference: Signals, other: Signals) -> float:
     """Measure flickering light: RMS change of two frames' exposure ratio from row to row, relative; NaN if unknown.
 
-    A shutter exposes a picture row after row, so flicker makes stripes of rows. Anything else that changes the ratio
-    (a room's light, motion, an error of the black level) changes it along the rows, too. So the power of the means of
-    columns is subtracted from that of the rows, and so is twice the error of the difference, by noise.
+    A shutter exposes a picture row after row, so flicker changes the ratio from row to row only. Other causes (a room's
+    light, motion, an error of the black level) change it from column to column as well. So the variance of the column
+    medians is subtracted from that of the row medians. So is twice the 1σ of their difference.
     """
     size = min(max(reference.shape[1] // _FLICKER_ROWS, _LEAST_FLICKER_TILE), TILE)
     (a, inside), (b, other_inside) = tiles(reference, size), tiles(other, size)
@@ -219,16 +219,13 @@ def flicker(reference: Signals, other: Signals) -> float:
     expected = a * (np.median(b[lit] / a[lit]) if lit.any() else 0)
     lit &= expected > 3 * _DIM
     change = np.full(a.shape, np.nan)
-    change[lit] = np.log(np.maximum(b[lit] / expected[lit], _SHADOW))  # a shutter may hide rows from the flash
-    (rows, sigma), (columns, other_sigma) = _stripe_power(change), _stripe_power(change.T)
+    change[lit] = np.log(np.maximum(b[lit] / expected[lit], _LEAST_LIGHT))  # a shutter may hide rows from the flash
+    (rows, sigma), (columns, other_sigma) = _variance_of_rows(change), _variance_of_rows(change.T)
     return float(np.sqrt(max(rows - columns - 2 * np.hypot(sigma, other_sigma), 0.0)))
 
 
-def _stripe_power(change: Floats) -> tuple[float, float]:
-    """Power of the medians of the rows of `change`, less a parabola and their own errors, and its 1σ by these errors.
-
-    NaN: too few rows.
-    """
+def _variance_of_rows(change: Floats) -> tuple[float, float]:
+    """Variance of the row medians of `change` about a parabola, less their noise, and its 1σ; NaN for too few rows."""
     change = change[np.isfinite(change).sum(axis=1) >= _LEAST_IN_ROW]
     if len(change) < _LEAST_ROWS:
         return float("nan"), float("nan")
@@ -253,13 +250,13 @@ def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:
     order = np.argsort(b / a)
     weight = np.cumsum(a[order])
     r = float((b / a)[order][np.searchsorted(weight, weight[-1] / 2)])  # weighted median
-    keep = np.ones(len(a), bool)
+    agree = np.ones(len(a), bool)
     for _ in range(6):
         error = (b - r * a) / np.sqrt(b)  # uniform noise if there is photon noise only
         scale = MAD_TO_SIGMA * float(np.median(np.abs(error)))
-        keep = np.abs(error) <= 4 * scale + 0.003 * np.sqrt(b)
-        if keep.sum() < _LEAST_TILES / 2:
+        agree = np.abs(error) <= 4 * scale + 0.003 * np.sqrt(b)  # 4σ and 0.3 %
+        if agree.sum() < _LEAST_TILES / 2:
             return None
-        r = float(b[keep].sum() / a[keep].sum())
-    residual = b[keep] - r * a[keep]
-    return r, float(np.sqrt(np.sum(residual**2)) / b[keep].sum())
+        r = float(b[agree].sum() / a[agree].sum())
+    residual = b[agree] - r * a[agree]
+    return r, float(np.sqrt(np.sum(residual**2)) / b[agree].sum())

@@ -19,12 +19,12 @@ from polcap.stages.hdr.noise import Noise
 from polcap.stages.hdr.planes import Signals, blocks
 
 _WINDOW = 5  # px, side of the window for comparison and smoothing
-_EVEN = np.full(_WINDOW, 1 / _WINDOW, np.float32)
+_EVEN = np.full(_WINDOW, 1 / _WINDOW, np.float32)  # kernel of a mean
 # A window is a ghost if its frames differ by more than the sum of these four:
 _SIGMA = 6.0  # standard deviations of noise
 _MISFIT = 3.0  # standard deviations of the registration error at edges
 _SHARE = 0.02  # of the radiance: flare differs by as much between exposures
-_BLACK = 2e-4  # of the sensor's range, at each frame's exposure: error of the black level, 3 of 15,000 counts
+_BLACK = 2e-4  # error of the black level in each frame [sensor's range]: 3 of 15,000 counts
 _CORRELATED = 1.5  # variance of a window's mean over that of independent pixels: neighbors share some noise
 
 
@@ -57,22 +57,22 @@ class Anchor:
     @property
     def known(self) -> Bools:
         """Mask (H, W) of pixels where the anchor has a usable frame."""
-        own = self.reference.signals.usable
-        return own if self.darkest is None else own | self.darkest.signals.usable
+        usable = self.reference.signals.usable
+        return usable if self.darkest is None else usable | self.darkest.signals.usable
 
     def rows(self, rows: slice) -> Floats:
         """Radiance (C, h, W) of some rows: of the reference frame, of the darkest frame where the reference clips."""
-        value, own = self.reference.signals.rows(rows), self.reference.signals.usable[rows]
-        if self.darkest is None or own.all():
+        value, usable = self.reference.signals.rows(rows), self.reference.signals.usable[rows]
+        if self.darkest is None or usable.all():
             return value
-        return np.where(own, value, self.darkest.signals.rows(rows) / self.darkest.ratio[:, None, None])
+        return np.where(usable, value, self.darkest.signals.rows(rows) / self.darkest.ratio[:, None, None])
 
     def variance(self, level: Floats, channel: int, rows: slice) -> Floats:
         """Noise variance (h, W) of the anchor in some rows of a channel, for an expected radiance `level` (h, W)."""
-        variance, own = self.reference.noise.of_channel(channel, level), self.reference.signals.usable[rows]
-        if self.darkest is None or own.all():
+        variance, usable = self.reference.noise.of_channel(channel, level), self.reference.signals.usable[rows]
+        if self.darkest is None or usable.all():
             return variance
-        return np.where(own, variance, self.darkest.noise.of_radiance(self.darkest.ratio).of_channel(channel, level))
+        return np.where(usable, variance, self.darkest.noise.of_radiance(self.darkest.ratio).of_channel(channel, level))
 
     def ghosts(self, frame: RegisteredFrame) -> Bools:
         """Ghost mask (H, W): pixels around which a frame differs by more than noise, registration error and flare.
@@ -85,7 +85,7 @@ class Anchor:
 
         def compare(rows: slice, inner: slice, target: slice) -> None:
             anchor, value = self.rows(rows), frame.signals.rows(rows)
-            off = np.zeros(anchor.shape[1:], bool)
+            differs = np.zeros(anchor.shape[1:], bool)
             for c in range(len(anchor)):
                 level = box(anchor[c])
                 own = self.variance(level, c, rows)
@@ -97,42 +97,42 @@ class Anchor:
                 scaled = box(value[c]) / frame.ratio[c]
                 if frame.vignetting is not None:
                     scaled /= frame.vignetting[rows]
-                off |= np.abs(scaled - level) > limit
-            found[target] = (off & erode(known[rows], _WINDOW // 2))[inner]
+                differs |= np.abs(scaled - level) > limit
+            found[target] = (differs & erode(known[rows], _WINDOW // 2))[inner]
 
         parallel.results(partial(compare, *block) for block in blocks(height, _WINDOW // 2 + 1))
         return dilate(erode(found, 1), _WINDOW // 2 + 2)
 
 
-def first_estimate(parts: list[tuple[RegisteredFrame, Bools]], otherwise: Anchor, ghost: Bools) -> Floats:
+def first_estimate(parts: list[tuple[RegisteredFrame, Bools]], fallback: Anchor, ghost: Bools) -> Floats:
     """First estimate of a bracket's radiance, X₀ = Σ Y/a / Σ e/a, (C, H, W), after a local Wiener filter.
 
-    `parts` are frames, each with the pixels (H, W) for which it is used. `otherwise` is used where no frame is, and at
+    `parts` are frames, each with the pixels (H, W) for which it is used. `fallback` is used where no frame is, and at
     ghosts. The filter (Lee, IEEE PAMI 1980) moves each pixel towards the mean of its window, by the share of the
-    window's variance that noise explains; it assumes 1.5 times the noise variance.
+    window's variance that 1.5 times the noise variance explains.
     """
     out = np.empty(parts[0][0].signals.shape, np.float32)
 
     def estimate(rows: slice, inner: slice, target: slice) -> None:
         values = [frame.signals.rows(rows) for frame, _ in parts]
-        serves = [_weight(serve[rows]) for _, serve in parts]
+        masks = [_weight(used[rows]) for _, used in parts]
         clear = ~ghost[rows]
-        everywhere = clear.all() and any(np.ndim(serve) == 0 for serve in serves)
-        stand_in = None if everywhere else otherwise.rows(rows)
+        everywhere = clear.all() and any(np.ndim(used) == 0 for used in masks)
+        substitute = None if everywhere else fallback.rows(rows)
         for c in range(len(out)):
             total = np.zeros(clear.shape, np.float32)
             exposure: Floats | np.float32 = np.float32(0)
             floor: Floats | np.float32 = np.float32(0)
-            for (frame, _), value, serve in zip(parts, values, serves):
+            for (frame, _), value, used in zip(parts, values, masks):
                 electrons = 1 / frame.noise.slope[c]
-                total += value[c] * (serve * electrons)
-                exposure = exposure + serve * (electrons * frame.ratio[c])
-                floor = floor + serve * (electrons**2 * frame.noise.floor[c])
+                total += value[c] * (used * electrons)
+                exposure = exposure + used * (electrons * frame.ratio[c])
+                floor = floor + used * (electrons**2 * frame.noise.floor[c])
             total /= np.maximum(exposure, np.float32(1e-20))
-            if stand_in is not None:
-                served = (exposure > 0) & clear
-                total = np.where(served, total, stand_in[c])
-                exposure = np.where(served, exposure, np.float32(1e15))
+            if substitute is not None:
+                measured = (exposure > 0) & clear
+                total = np.where(measured, total, substitute[c])
+                exposure = np.where(measured, exposure, np.float32(1e15))  # no noise, so no filter
             out[c, target] = _wiener(total, exposure, floor)[inner]
 
     halo = 2 * (_WINDOW // 2)  # windows of distances from means of windows
@@ -140,9 +140,9 @@ def first_estimate(parts: list[tuple[RegisteredFrame, Bools]], otherwise: Anchor
     return out
 
 
-def _weight(serves: Bools) -> Floats | np.float32:
+def _weight(used: Bools) -> Floats | np.float32:
     """Weight (h, w) of a frame: 1 in pixels where it is used, else 0; the number 1 if it is used everywhere."""
-    return np.float32(1) if serves.all() else serves.astype(np.float32)
+    return np.float32(1) if used.all() else used.astype(np.float32)
 
 
 def _wiener(x: Floats, electrons: Floats | np.float32, floor: Floats | np.float32) -> Floats:

@@ -25,10 +25,10 @@ from polcap.stages.hdr.planes import Signals
 
 TILE = 16  # px; about 68 independent second differences, which give a tile's variance to 17 %
 FREEDOM = TILE * TILE / 3.78  # 3.78 = Σ ρ² over the autocorrelation of [1, −2, 1] ⊗ [1, −2, 1]
-_SECOND = np.array([1, -2, 1]) / 6**0.5
+_KERNEL = np.array([1, -2, 1]) / 6**0.5
 _LEAST_TILES = 40
 _TYPICAL_ELECTRONS, _TYPICAL_READ = 20000.0, 4.0  # at ISO 100; e⁻
-_SANE_ELECTRONS = (100.0, 1e6)  # range of a plausible full well
+_PLAUSIBLE_ELECTRONS = (100.0, 1e6)  # range of a full well, e⁻
 
 
 @dataclass(frozen=True)
@@ -76,21 +76,21 @@ class Samples:
 
     signal: Floats  # (T, C)
     variance: Floats  # (T, C)
-    flat: bool  # the variance includes detail of the scene: only the smallest variances count
+    with_detail: bool  # the variance includes detail of the scene, so only the smallest variances count
 
 
-def roughness(picture: Floats) -> Floats:
-    """High-pass filter a picture to measure its noise: (C, H, W) → (C, H−2, W−2).
+def second_differences(picture: Floats) -> Floats:
+    """Second differences of a picture along both axes, to measure its noise: (C, H, W) → (C, H−2, W−2).
 
     The filter [1, −2, 1] ⊗ [1, −2, 1] / 6 is 0 on ramps, and does not change the variance of white noise.
     """
-    return np.stack([np.asarray(cv2.sepFilter2D(plane, -1, _SECOND, _SECOND))[1:-1, 1:-1] for plane in picture])
+    return np.stack([np.asarray(cv2.sepFilter2D(plane, -1, _KERNEL, _KERNEL))[1:-1, 1:-1] for plane in picture])
 
 
 def strips(height: int, width: int, most: float = 0.75e6) -> list[slice]:
     """Choose evenly spaced strips of rows in which noise is measured, at most about `most` px in all.
 
-    A strip is as high as a tile plus the 2 px that `roughness` needs.
+    A strip is as high as a tile plus the 2 px that `second_differences` needs.
     """
     rows = max((height - 2) // TILE, 0)
     wanted = max(1, min(rows, int(most / (TILE * max(width, 1)))))
@@ -108,15 +108,15 @@ def tile_columns(
     usable = np.logical_and.reduce([frame.usable for frame in frames])
     columns = []
     for rows in strips(usable.shape[0], usable.shape[1], most):
-        whole = _usable_tiles(usable[rows])
-        columns.append([_tiles(values, whole) for values in maps(*(frame.rows(rows) for frame in frames))])
+        usable_tiles = _usable_tiles(usable[rows])
+        columns.append([_tiles(values, usable_tiles) for values in maps(*(frame.rows(rows) for frame in frames))])
     return [np.concatenate(column) for column in zip(*columns, strict=True)]
 
 
 def sample_frame(picture: Signals) -> Samples:
     """Sample signal and noise variance in tiles of a single frame."""
-    signal, variance = tile_columns((picture,), lambda part: (inner(part), roughness(part) ** 2))
-    return Samples(signal, variance, flat=True)
+    signal, variance = tile_columns((picture,), lambda part: (inner(part), second_differences(part) ** 2))
+    return Samples(signal, variance, with_detail=True)
 
 
 def sample_pair(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples, Samples]:
@@ -128,12 +128,12 @@ def sample_pair(first: Signals, second: Signals, ratio: Floats) -> tuple[Samples
     r = np.asarray(ratio, np.float32)
 
     def maps(one: Floats, two: Floats) -> tuple[Floats, ...]:
-        h1, h2 = roughness(one), roughness(two)
+        h1, h2 = second_differences(one), second_differences(two)
         difference = h2 - r[:, None, None] * h1
         return inner(one), h1 * difference, inner(two), h2 * difference
 
     signal1, product1, signal2, product2 = tile_columns((first, second), maps)
-    return Samples(signal1, product1 / -r, flat=False), Samples(signal2, product2, flat=False)
+    return Samples(signal1, product1 / -r, with_detail=False), Samples(signal2, product2, with_detail=False)
 
 
 def inner(picture: Floats) -> Floats:
@@ -141,7 +141,7 @@ def inner(picture: Floats) -> Floats:
     return picture[:, 1:-1, 1:-1]
 
 
-def squared_differences(picture: Floats) -> Floats:
+def squared_gradients(picture: Floats) -> Floats:
     """Squared gradient (C, h−2, w−2) of a picture (C, h, w) by central differences, per px²."""
     return inner(np.stack([squared_gradient(plane) for plane in picture]))
 
@@ -149,10 +149,10 @@ def squared_differences(picture: Floats) -> Floats:
 def fit(samples: list[Samples], iso: float | None, least_floor: float, radiance: bool = False) -> Noise:
     """Fit the noise line of each channel to the tiles of all frames of one ISO.
 
-    Tiles are binned by signal. Each bin is represented by the median of its variances; for `flat` samples by the 15 %
-    quantile, converted to the mean by the χ² law. A typical sensor is assumed if there are too few usable tiles or the
-    line is implausible. `least_floor` is the variance from rounding to whole counts. `radiance`: its scale is
-    arbitrary, so the brightest tile takes the place of the sensor's white.
+    Tiles are binned by signal. Each bin is represented by the median of its variances; for samples `with_detail` by the
+    15 % quantile, converted to the mean by the χ² law. A typical sensor is assumed if there are too few usable tiles or
+    the line is implausible. `least_floor` is the variance from rounding to whole counts. `radiance`: the signals are
+    radiance on an arbitrary scale, so the brightest tile takes the place of the sensor's white.
     """
     white = np.ones(samples[0].signal.shape[1])
     if radiance:
@@ -172,16 +172,16 @@ def misfit(first: Signals, second: Signals, ratio: Floats, lines: tuple[Noise, N
 
     def maps(a: Floats, b: Floats) -> tuple[Floats, ...]:
         difference = inner(b) * (1 / r)[:, None, None] - inner(a)
-        return inner(a), difference, difference**2, squared_differences(a)
+        return inner(a), difference, difference**2, squared_gradients(a)
 
     level, offset, square, edge = tile_columns((first, second), maps)
     own = lines[0].variance(level)
     expected = own + lines[1].variance(level * r) / r**2 * gain
     columns = zip(expected.T, (square - offset**2).T, (edge - own).T)
-    return np.array([_per_edge(*column) for column in columns], np.float32)
+    return np.array([_fit_misfit(*column) for column in columns], np.float32)
 
 
-def _per_edge(expected: Floats, seen: Floats, edge: Floats) -> float:
+def _fit_misfit(expected: Floats, seen: Floats, edge: Floats) -> float:
     """Fit k in seen = expected + k · edge (tile variances) by relative least squares, without the worst 3 %."""
     good = np.isfinite(seen) & (edge > 0.5 * expected)
     if good.sum() < _LEAST_TILES:
@@ -191,8 +191,8 @@ def _per_edge(expected: Floats, seen: Floats, edge: Floats) -> float:
     for _ in range(8):
         model = expected + k * edge
         z = excess / model
-        inner = z <= np.quantile(z, 0.97)
-        x, y = (edge / model)[inner], z[inner]
+        used = z <= np.quantile(z, 0.97)
+        x, y = (edge / model)[used], z[used]  # y = k x
         k = max(float(np.sum(x * y) / np.sum(x * x)), 0.0)
         sigma = float(np.sqrt(np.sum((x * (y - k * x)) ** 2)) / np.sum(x * x))
     return k if k > 3 * sigma else 0.0
@@ -215,7 +215,7 @@ class Lines:
             self._known.pop(iso, None)
 
     def line(self, iso: object, least_floor: float, radiance: bool = False) -> Noise:
-        """Noise line at an ISO; a key that is not a number means an unknown ISO. Other arguments are those of `fit`."""
+        """Noise line at an ISO; a key that is no number is an unknown ISO. The other arguments are those of `fit`."""
         if iso not in self._known:
             number = float(iso) if isinstance(iso, int | float) else None
             self._known[iso] = fit(self._samples[iso], number, least_floor, radiance)
@@ -243,26 +243,26 @@ def _line(samples: list[Samples], channel: int, iso: float | None, least: float,
         signal, variance = sample.signal[good, channel], sample.variance[good, channel]
         order = np.argsort(signal.round(6), kind="stable")  # equal on every processor
         for chosen in np.array_split(order, np.clip(len(order) // 25, 2, 32)):
-            bins.append((signal[chosen], variance[chosen], sample.flat))
+            bins.append((signal[chosen], variance[chosen], sample.with_detail))
     if not bins:
         return typical
     level, number = np.array([(signal.mean(), len(signal)) for signal, _, _ in bins]).T
     slope, floor = typical
     for _ in range(3):  # the signal varies within a bin, so each tile is compared with the present line
-        quotient = np.array([_quotient(v / (slope * np.maximum(s, 0) + floor), flat) for s, v, flat in bins])
-        seen = np.maximum(quotient * (slope * np.maximum(level, 0) + floor), least)
-        fit = fit_noise_line(level, seen, FREEDOM * number, least=least, least_floor=least, outliers=True)
-        if not white / _SANE_ELECTRONS[1] < fit.slope < white / _SANE_ELECTRONS[0]:  # NaN if all signals are equal
+        relative = np.array([_mean_of_bin(v / (slope * np.maximum(s, 0) + floor), detail) for s, v, detail in bins])
+        seen = np.maximum(relative * (slope * np.maximum(level, 0) + floor), least)
+        found = fit_noise_line(level, seen, FREEDOM * number, least=least, least_floor=least, outliers=True)
+        if not white / _PLAUSIBLE_ELECTRONS[1] < found.slope < white / _PLAUSIBLE_ELECTRONS[0]:  # or NaN
             return typical
-        slope, floor = fit.slope, fit.floor
+        slope, floor = found.slope, found.floor
     return slope, floor
 
 
-def _quotient(relative: Floats, flat: bool) -> float:
-    """Mean of a bin's relative tile variances (n,): median, or from the 15 % quantile for `flat` samples."""
-    if not flat:
+def _mean_of_bin(relative: Floats, with_detail: bool) -> float:
+    """Mean of a bin's tile variances (n,), over the line's: median, or by the 15 % quantile for tiles `with_detail`."""
+    if not with_detail:
         return float(np.median(relative))
-    spread = 2 / (9 * FREEDOM)  # of a χ² law by Wilson and Hilferty
+    spread = 2 / (9 * FREEDOM)  # χ² law by Wilson and Hilferty; 1.0364σ below the mean is the 15 % quantile
     return float(np.quantile(relative, 0.15) / (1 - spread - 1.0364 * spread**0.5) ** 3)
 
 
@@ -274,8 +274,8 @@ def _usable_tiles(usable: Bools) -> Bools:
     return np.asarray(before[first + TILE + 2] == before[first])
 
 
-def _tiles(values: Floats, whole: Bools) -> Floats:
-    """Means (T, C) over the tiles of a strip (C, h, w) of `strips`; NaN for tiles that are not `whole` (T,)."""
-    count = len(whole)
+def _tiles(values: Floats, usable_tiles: Bools) -> Floats:
+    """Means (T, C) over the tiles of a strip (C, h, w) of `strips`; NaN for tiles not among the `usable_tiles` (T,)."""
+    count = len(usable_tiles)
     mean = np.stack([area_mean(plane[:TILE, : count * TILE], (1, count))[0] for plane in values], axis=-1)
-    return np.where(whole[:, None], mean.astype(np.float64), np.nan)
+    return np.where(usable_tiles[:, None], mean.astype(np.float64), np.nan)

@@ -36,11 +36,11 @@ def _add(image: SensorImage, frame: WeightedFrame, signal: Floats, exposure: Flo
     width = signal.shape[1]
     used = np.repeat(frame.used[rows], 2, axis=1).astype(np.float32)
     scale = np.float32(image.white - float(image.black.mean()))
-    for i in (0, 1):  # rows of one phase of the color filter array
-        places = slice(2 * rows.start + i, 2 * rows.stop, 2)
+    for i in (0, 1):  # rows of photosites of the color filter array's row i
+        sites = slice(2 * rows.start + i, 2 * rows.stop, 2)
         black = np.tile(np.broadcast_to(image.black, (2, 2))[i].astype(np.float32), width // 2)
-        part = image.value[places, :width] - black
-        part *= used
-        part /= scale
-        signal[places] += part
-        exposure[places] += used * np.tile(frame.frame.ratio[image.cfa[i]], width // 2)
+        counts = image.value[sites, :width] - black
+        counts *= used
+        counts /= scale
+        signal[sites] += counts
+        exposure[sites] += used * np.tile(frame.frame.ratio[image.cfa[i]], width // 2)

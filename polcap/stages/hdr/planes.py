@@ -23,10 +23,10 @@ from polcap.optics.projection import coordinates
 from polcap.optics.resize import block_means
 from polcap.stage_values import BlackError
 
-_ROWS = 64  # of a block: one channel of a 24 MP picture then fits a core's cache
-_AHEAD = 2  # frames decoded ahead of the merge; each thread waits for a decoding process
-_PLANES_BYTES = 400_000_000  # most for a shot's signals; with more they are computed again for every pass
-_HELD_BYTES = 1_100_000_000  # most for decoded frames; others are decoded again when needed
+_ROWS = 64  # of a block; one channel of such a block of a 24 MP picture fits a core's cache
+_AHEAD = 2  # frames decoded ahead of the merge, in as many threads; each waits for a decoding process
+_PLANES_BYTES = 400_000_000  # limit for a shot's signals; beyond, they are computed again for every pass
+_HELD_BYTES = 1_100_000_000  # limit for decoded frames; others are decoded again when needed
 _WORK_BYTES = 60  # per pixel, for the first estimate, registration, masks and blocks
 _MOSAIC_BYTES = 8  # per pixel: four photosites of the first shot, half floats
 _FRACTIONS = 32  # steps per pixel in the table of cv2's Lanczos kernel
@@ -102,11 +102,11 @@ def resample(signals: Signals, matrix: Floats) -> tuple[Signals, Floats]:
     """
     _, h, w = signals.shape
     inverse = cv2.WARP_INVERSE_MAP
-    how = {"flags": inverse | cv2.INTER_LANCZOS4, "borderMode": cv2.BORDER_REPLICATE}
-    value = np.stack([cv2.warpPerspective(plane, matrix, (w, h), **how) for plane in signals.rows(slice(None))])
-    # unusable if a clipped pixel or the border is within the main lobes of the kernel
+    options = {"flags": inverse | cv2.INTER_LANCZOS4, "borderMode": cv2.BORDER_REPLICATE}
+    value = np.stack([cv2.warpPerspective(plane, matrix, (w, h), **options) for plane in signals.rows(slice(None))])
+    # a pixel is usable if no clipped pixel and no border is within the main lobes of the kernel
     inner = cv2.erode(signals.usable.view(np.uint8) * 255, np.ones((5, 5), np.uint8), borderValue=0)
-    seen = cv2.warpPerspective(inner, matrix, (w, h), flags=inverse | cv2.INTER_LINEAR, borderValue=0) == 255
+    usable = cv2.warpPerspective(inner, matrix, (w, h), flags=inverse | cv2.INTER_LINEAR, borderValue=0) == 255
     gain = np.empty((h, w), np.float32)
     table = _kernel_gain()
     x = np.arange(w, dtype=np.float32)
@@ -115,7 +115,7 @@ def resample(signals: Signals, matrix: Floats) -> tuple[Signals, Floats]:
         px, py = coordinates(matrix, x, y)
         gain[rows] = table[((px - np.floor(px)) * _FRACTIONS + 0.5).astype(np.int8)]
         gain[rows] *= table[((py - np.floor(py)) * _FRACTIONS + 0.5).astype(np.int8)]
-    return in_memory(value, seen, signals.clip), gain
+    return in_memory(value, usable, signals.clip), gain
 
 
 @lru_cache(maxsize=1)
@@ -124,8 +124,8 @@ def _kernel_gain() -> Floats:
     impulse = np.zeros((17, 33), np.float32)
     impulse[:, 16] = 1
     x = np.arange(33, dtype=np.float32)[None] + np.arange(33, dtype=np.float32)[:, None] / 32
-    row = cv2.remap(impulse, x, np.full_like(x, 8), cv2.INTER_LANCZOS4)
-    return np.asarray(np.sum(row.astype(np.float64) ** 2, axis=1), np.float32)
+    weights = cv2.remap(impulse, x, np.full_like(x, 8), cv2.INTER_LANCZOS4)  # row i: at the fraction i/32
+    return np.asarray(np.sum(weights.astype(np.float64) ** 2, axis=1), np.float32)
 
 
 @dataclass(frozen=True)
@@ -143,21 +143,21 @@ def plan_memory(shots: int, frames: int, pixels: int, frame_bytes: int) -> Memor
 
     Raises SettingError: the merge needs more than the limit.
     """
-    taken, limit = process_memory()
+    used, limit = process_memory()
     if limit is None:
         return MemoryPlan(_PLANES_BYTES // frames)
-    sample = np.dtype(np.float32).itemsize
-    stack = pixels * (shots * (6 * sample + 1) + _MOSAIC_BYTES)
+    number = np.dtype(np.float32).itemsize  # bytes; a pixel has 3 values, 3 variances and a byte of quality
+    stack = pixels * (shots * (6 * number + 1) + _MOSAIC_BYTES)
     one_shot = frames * (frame_bytes + pixels) + pixels * _WORK_BYTES
-    left = limit - taken - stack - one_shot
-    if left < 0:
+    remaining = limit - used - stack - one_shot
+    if remaining < 0:
         raise SettingError(
             f"--memory {limit / 1e9:.3g}: merging {shots} × {frames} frames of {pixels / 1e6:.3g} million pixels "
-            f"needs {(limit - left) / 1e9:.2f} GB at least; raise it, or leave it out"
+            f"needs {(limit - remaining) / 1e9:.2f} GB at least; raise it, or leave it out"
         )
-    planes = 3 * sample * pixels * frames
-    held = min(_PLANES_BYTES, left) if planes <= left else 0
-    return MemoryPlan(held // frames, min(_HELD_BYTES, left - min(planes, held)))
+    planes = 3 * number * pixels * frames
+    held = min(_PLANES_BYTES, remaining) if planes <= remaining else 0
+    return MemoryPlan(held // frames, min(_HELD_BYTES, remaining - min(planes, held)))
 
 
 def process_memory() -> tuple[int, int | None]:
@@ -166,11 +166,11 @@ def process_memory() -> tuple[int, int | None]:
         import resource
 
         with open("/proc/self/statm", encoding="ascii") as file:
-            taken = int(file.read().split()[5]) * resource.getpagesize()
+            used = int(file.read().split()[5]) * resource.getpagesize()
     except (ImportError, OSError):  # another system
         return 0, None
     limit = resource.getrlimit(resource.RLIMIT_DATA)[0]
-    return taken, None if limit == resource.RLIM_INFINITY else limit
+    return used, None if limit == resource.RLIM_INFINITY else limit
 
 
 class Reader:
@@ -226,9 +226,9 @@ class Reader:
         """Stop decoding in advance."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
-    def _look_ahead(self, now: Frame | None, room: int) -> None:
-        """Start to decode the next frames in advance, as many as fit in memory."""
-        self._coming = deque(frame for frame in self._coming if frame is not now)
+    def _look_ahead(self, current: Frame | None, room: int) -> None:
+        """Start to decode the next frames but `current`, as many as fit into memory for `room` frames."""
+        self._coming = deque(frame for frame in self._coming if frame is not current)
         while self._coming and len(self._decoding) < _AHEAD and len(self._held) + len(self._decoding) < room:
             following = self._coming.popleft()
             if id(following) not in self._held:

@@ -1,11 +1,8 @@
 """Weighted mean of a bracket's frames: radiance, its variance and quality.
 
 X = Σ w (Y/e) / Σ w with w = e² / (a e X₀ + b), where e is the frame's exposure, a and b its noise line, and X₀ the
-smoothed first estimate. Weights fall towards saturation, and are 0 where a frame is clipped or a ghost.
-
-References
-----------
-Granados et al., Optimal HDR reconstruction with linear digital cameras, CVPR 2010.
+smoothed first estimate (Granados et al., as in `hdr`). Weights fall towards saturation, and are 0 where a frame is
+clipped or a ghost.
 """
 
 from dataclasses import dataclass, replace
@@ -24,11 +21,11 @@ from polcap.stages.hdr.bracket import AmbientLight, Bracket, ComparedBracket, am
 from polcap.stages.hdr.ghosts import RegisteredFrame
 from polcap.stages.hdr.planes import Reader, blocks, resample
 
-_FALL = 0.05  # [signal] range below clipping in which a frame's weight falls from 1 to _LEAST
+_FALL = 0.05  # range of signal below clipping in which the factor on a frame's weight falls from 1 to `_LEAST`
 _LEAST = 1e-3
 _BLOCK_PX = 64_000  # px of a block and channel: all planes of a block then fit a core's cache
-_SOME = 1e-9  # weight of the reference frame where no frame is usable, so that every pixel has a value
-_AS_DARK = 1.02  # a frame at most this factor brighter than the darkest counts as darkest too
+_FALLBACK = 1e-9  # weight of the reference frame where it is not used, so that every pixel has a value
+_AS_DARK = 1.02  # exposure over that of the darkest frame up to which a frame counts as darkest too
 _DARK_SIGMAS = np.float32(2)  # pixels below this many standard deviations are flagged DARK
 
 
@@ -39,7 +36,7 @@ class WeightedFrame:
     frame: RegisteredFrame
     used: Bools  # (H, W) pixels for which the frame is used
     ambient: np.float32  # exposure to ambient light, relative to the reference frame
-    is_darkest: bool  # no frame is darker: used up to saturation
+    is_darkest: bool  # its weight does not fall near saturation, because no frame is darker
     cfa: Bits | None  # of an interpolated mosaic; None: binned
     least: np.float32  # weight where the frame is not used
 
@@ -52,7 +49,7 @@ class WeightedBracket:
     estimate: Floats  # (C, H, W) the smoothed first estimate
     ghost: Bools  # (H, W)
     ambient: AmbientLight | None
-    served: Bools  # (H, W) pixels with an unclipped frame
+    unclipped: Bools  # (H, W) pixels with an unclipped frame
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -69,8 +66,8 @@ class WeightedBracket:
 
     def _block(self, out: MaskedImage, rows: slice) -> None:
         """Write value, variance and quality of some rows to `out`."""
-        value, variance = self._rows(rows)
-        quality = _flagged(~self.served[rows], Quality.CLIPPED)
+        value, variance = self._weighted_mean(rows)
+        quality = _flagged(~self.unclipped[rows], Quality.CLIPPED)
         quality |= _flagged(self.ghost[rows], Quality.GHOST)
         quality |= _flagged(value.sum(axis=0) < _DARK_SIGMAS * np.sqrt(variance.sum(axis=0)), Quality.DARK)
         out.quality[rows] = quality
@@ -79,23 +76,23 @@ class WeightedBracket:
         cv2.merge(list(value), out.value[rows])
         cv2.merge(list(variance), out.variance[rows])
 
-    def _rows(self, rows: slice) -> tuple[Floats, Floats]:
+    def _weighted_mean(self, rows: slice) -> tuple[Floats, Floats]:
         """Weighted mean of the frames and its variance in some rows, (C, h, W).
 
         With weights w = trust / v and v the variance of a frame's radiance, Σ w² v = Σ trust · w. The sums use
         w / ratio, so that signals need not be converted to radiance.
         """
         estimate = self.estimate[:, rows]
-        total, weights, variance, shares = (np.zeros_like(estimate) for _ in range(4))  # shares: of ambient light
-        steep = _edges(self.estimate, rows) if any(one.frame.misfit.any() for one in self.frames) else None
+        total, weights, variance, ambient_exposure = (np.zeros_like(estimate) for _ in range(4))
+        edges = _edges(self.estimate, rows) if any(one.frame.misfit.any() for one in self.frames) else None
         for one in self.frames:
             sample, trust = one.frame.signals.rows(rows), self._trust(one, estimate, rows)
-            for c, weight in enumerate(self._noise(one, rows, np.maximum(estimate, 0), steep)):
+            for c, weight in enumerate(self._noise(one, rows, np.maximum(estimate, 0), edges)):
                 ratio, plane = float(one.frame.ratio[c]), sample[c]
                 np.divide(trust, weight, out=weight)
                 if self.ambient is not None:
                     plane = plane - one.ambient * self.ambient.value[c, rows]
-                    cv2.scaleAdd(weight, float(one.ambient), shares[c], shares[c])
+                    cv2.scaleAdd(weight, float(one.ambient), ambient_exposure[c], ambient_exposure[c])
                 cv2.accumulateProduct(weight, plane, total[c])
                 cv2.scaleAdd(weight, ratio, weights[c], weights[c])
                 weight *= trust
@@ -104,7 +101,7 @@ class WeightedBracket:
         variance /= weights
         variance /= weights
         if self.ambient is not None:
-            variance += (shares / weights) ** 2 * self.ambient.variance[:, rows]
+            variance += (ambient_exposure / weights) ** 2 * self.ambient.variance[:, rows]
         return total, variance
 
     def _trust(self, one: WeightedFrame, estimate: Floats, rows: slice) -> Floats | np.float32:
@@ -122,19 +119,19 @@ class WeightedBracket:
         ramp = (np.float32(one.frame.signals.clip) - peak) * np.float32(1 / _FALL)
         return np.asarray(trust * np.clip(ramp, np.float32(_LEAST), 1))
 
-    def _noise(self, one: WeightedFrame, rows: slice, light: Floats, steep: Floats | None) -> Floats:
-        """Expected noise variance of a frame's radiance `light` (C, h, W), times its exposure ratio."""
+    def _noise(self, one: WeightedFrame, rows: slice, radiance: Floats, edges: Floats | None) -> Floats:
+        """Noise variance of a frame at the expected `radiance` (C, h, W), times its exposure ratio."""
         frame, ratio = one.frame, one.frame.ratio[:, None, None]
         if self.ambient is not None:
-            light = light + one.ambient / ratio * np.maximum(self.ambient.value[:, rows], 0)
-        out = noise.of_pixels(light * ratio, frame.noise, one.cfa)
-        out /= ratio
+            radiance = radiance + one.ambient / ratio * np.maximum(self.ambient.value[:, rows], 0)
+        variance = noise.of_pixels(radiance * ratio, frame.noise, one.cfa)
+        variance /= ratio
         if frame.gain is not None:
-            out *= frame.gain[rows]
-        if steep is not None:  # registration errors and aliasing, at edges
-            for c, plane in enumerate(out):
-                cv2.scaleAdd(steep[c], float(frame.misfit[c] * frame.ratio[c]), plane, plane)
-        return out
+            variance *= frame.gain[rows]
+        if edges is not None:  # squared gradients: registration errors and aliasing add variance
+            for c, plane in enumerate(variance):
+                cv2.scaleAdd(edges[c], float(frame.misfit[c] * frame.ratio[c]), plane, plane)
+        return variance
 
 
 def prepare(
@@ -148,21 +145,21 @@ def prepare(
     ghost, estimate = compared.ghost, compared.estimate
     if full:
         ghost, estimate = np.repeat(np.repeat(ghost, 2, axis=0), 2, axis=1), _twice(estimate)
-    bright = [float(frame.ratio.mean()) for frame in compared.frames]
-    darkest, reference = int(np.argmin(bright)), bracket.shot.frames[bracket.reference]
-    served = anchored = np.zeros(ghost.shape, bool)
+    exposures = [float(frame.ratio.mean()) for frame in compared.frames]
+    darkest, reference = int(np.argmin(exposures)), bracket.shot.frames[bracket.reference]
+    unclipped = by_reference = np.zeros(ghost.shape, bool)
     frames = []
     for e in [bracket.reference, *bracket.others]:
         frame = compared.frames[e]
         if full or ambient is not None:
             frame = _read_again(bracket.shot.frames[e], frame, read, full)
-        is_darkest, usable = bright[e] < _AS_DARK * bright[darkest], frame.signals.usable
+        is_darkest, usable = exposures[e] < _AS_DARK * exposures[darkest], frame.signals.usable
         used = usable if frame.motion is not None or not is_darkest else np.ones_like(usable)
         if e == bracket.reference:
-            anchored = used
+            by_reference = used
         else:
-            used = used & (~ghost | (~anchored & (e == darkest)))
-        served = served | (used & usable)
+            used = used & (~ghost | (~by_reference & (e == darkest)))
+        unclipped = unclipped | (used & usable)
         frames.append(
             WeightedFrame(
                 frame=frame,
@@ -170,18 +167,18 @@ def prepare(
                 ambient=np.float32(exposure.of_ambient(bracket.shot.frames[e], reference)),
                 is_darkest=is_darkest,
                 cfa=read(bracket.shot.frames[e]).cfa if full else None,
-                least=np.float32(_SOME if e == bracket.reference else 0),
+                least=np.float32(_FALLBACK if e == bracket.reference else 0),
             )
         )
-    return WeightedBracket(frames, estimate, ghost, ambient, served)
+    return WeightedBracket(frames, estimate, ghost, ambient, unclipped)
 
 
 def _read_again(source: Frame, frame: RegisteredFrame, read: Reader, full: bool) -> RegisteredFrame:
-    """Read a frame again for the merge, with its ambient light; `full`: on the grid of the photosites."""
+    """Read a frame again without subtracting ambient light; `full`: on the grid of the photosites."""
     signals, gain = read.signals(source, full), None
     if frame.motion is not None:
         signals, gain = resample(signals, scaled(frame.motion, 2) if full else frame.motion)
-    return replace(frame, signals=signals, gain=gain, misfit=frame.misfit * (4 if full else 1))
+    return replace(frame, signals=signals, gain=gain, misfit=frame.misfit * (4 if full else 1))  # px²
 
 
 def _flagged(where: Bools, flag: Quality) -> Bits:
@@ -202,18 +199,18 @@ def _twice(picture: Floats) -> Floats:
     return np.stack([cv2.resize(plane, (2 * w, 2 * h)) for plane in picture])
 
 
-def divide_by_falloff(image: MaskedImage, view: View, size_px: tuple[int, int], light: Falloff) -> None:
+def divide_by_falloff(image: MaskedImage, view: View, size_px: tuple[int, int], falloff: Falloff) -> None:
     """Divide radiance (H, W, 3) by a lens's falloff 1 + a r² + b r⁴ + c r⁶, and variance by its square, in place.
 
     `view` is the camera of the picture; `size_px` the width and height of the visible RAW, where r = 1 in the corners.
     """
-    coefficient = np.broadcast_to(np.array(light.coefficient), (3, 3))  # also of a monochrome sensor
+    coefficient = np.broadcast_to(np.array(falloff.coefficient), (3, 3))  # a monochrome sensor has one row
     radius = np.hypot(*size_px) / 2 / view.scale  # r = 1, in px of this grid
     height, width = image.quality.shape
     x2 = ((np.arange(width) - view.center[0]) / radius) ** 2
     for rows, _, _ in blocks(height):
         y2 = ((np.arange(rows.start, rows.stop) - view.center[1]) / radius) ** 2
         r2 = (y2[:, None] + x2)[..., None]
-        gain = (1 + r2 * (coefficient[:, 0] + r2 * (coefficient[:, 1] + r2 * coefficient[:, 2]))).astype(np.float32)
-        image.value[rows] /= gain
-        image.variance[rows] /= gain**2
+        factor = (1 + r2 * (coefficient[:, 0] + r2 * (coefficient[:, 1] + r2 * coefficient[:, 2]))).astype(np.float32)
+        image.value[rows] /= factor
+        image.variance[rows] /= factor**2

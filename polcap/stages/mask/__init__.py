@@ -98,8 +98,8 @@ def _by_probability(picture: Floats, probability: Floats, zone: Bits, patches: B
     """
     mask = regions.likely_regions(probability)
     if mask.any():
-        colored = regions.clean(graph_cut.sharpen(picture, mask, patches, probability), probability)
-        mask = regions.choose(colored, mask, probability)
+        by_color = regions.clean(graph_cut.sharpen(picture, mask, patches, probability), probability)
+        mask = regions.choose(by_color, mask, probability)
     else:
         with contextlib.suppress(ObjectError):
             mask = backdrop.find_object(picture, zone, min_area)

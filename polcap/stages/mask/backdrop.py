@@ -14,11 +14,11 @@ from polcap.stages.mask.regions import fill_holes
 STOPS = 10  # range of radiance, below the bright parts, that is distinguished
 _BRIGHT = 95  # percentile of the picture's radiance that counts as 1
 _BORDER = 20  # shorter side of the picture over the width of its border
-_BRIGHTER = (0.8, 1.6)  # stops above the backdrop that mark an object: least and most, by the backdrop's spread
+_BRIGHTER = (0.8, 1.6)  # stops above the backdrop that mark an object: 4σ of the backdrop, within these limits
 _OTHER_CHROMA = 0.15  # |Δr| + |Δg| + |Δb|, for r + g + b = 1, that marks another color
 _SOFT_STOPS, _SOFT_CHROMA = 0.4, 0.04  # widths of the transition from backdrop to object
 
-_HOLE = 0.01  # of the mask; smaller holes are dark texture
+_HOLE = 0.01  # share of the mask; smaller holes are dark texture
 _PART = 1 / 20  # of the largest region; smaller regions are not the object (an object may be in pieces)
 _ALONG_EDGE = 0.1  # share of a region's outline along the picture's edge; with more it is a wall or a table
 
@@ -43,12 +43,12 @@ def probability(color: Floats, chart: Bools) -> Floats:
     border &= ~chart
     if not border.any():
         return np.full_like(log, 0.5)
-    level = float(np.percentile(log[border], 40))  # the object may touch the border
+    level = float(np.percentile(log[border], 40))  # of the backdrop; the object may touch the border
     spread = 1.5 * float(np.median(level - log[border & (log <= level)]))
     chroma = color / (color.sum(-1, keepdims=True) + 1e-3 * bright)
-    other = np.abs(chroma - np.median(chroma[border], axis=0)).sum(-1)
+    difference = np.abs(chroma - np.median(chroma[border], axis=0)).sum(-1)
     brighter = (log - level - np.clip(4 * spread, *_BRIGHTER)) / _SOFT_STOPS
-    colored = np.where(log > level, (other - _OTHER_CHROMA) / _SOFT_CHROMA, -8)
+    colored = np.where(log > level, (difference - _OTHER_CHROMA) / _SOFT_CHROMA, -8)
     found = 1 / (1 + np.exp(-np.clip(np.maximum(brighter, colored), -8, 8)))
     return np.where(chart, 0, found).astype(np.float32)
 

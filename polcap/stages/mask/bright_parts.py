@@ -11,8 +11,8 @@ from polcap.optics.morphology import dilate
 from polcap.stages.mask.regions import box_around
 
 _REACH = 0.3  # of the mask's longer side: parts are searched as far from it
-_BRIGHT = 4.0  # times the backdrop; docs/benchmarks/fusion-choices.md
-_BEYOND = 4  # px from the mask that a part must reach; nearer pixels are left to `mask_border`
+_BRIGHT = 4.0  # times the backdrop; a brighter pixel is the object's (docs/benchmarks/fusion-choices.md)
+_BEYOND = 4  # px; an added part extends farther from the mask. Nearer pixels are left to `mask_border`
 
 
 def add(picture: Floats, mask: Bools, board: Bools) -> Bools:

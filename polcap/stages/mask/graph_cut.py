@@ -14,7 +14,7 @@ from polcap.optics.resize import area_mean
 _WORK_PIXELS = 3e5  # approximate size of the reduced picture that is cut
 _REACH = 0.006  # of the picture's longer side: largest movement of the outline
 _ROUNDS = 3  # of GrabCut
-_SURE = 0.996  # probability of object or backdrop; above it colors are not considered (decision 15)
+_CERTAIN = 0.996  # probability of object or backdrop above which colors are not considered (decision 15)
 
 
 def sharpen(picture: Floats, mask: Bools, chart: Bits, probability: Floats) -> Bools:
@@ -42,16 +42,16 @@ def cut(picture: Floats, seed: Bits, outside: Bools, probability: Floats | None 
     display = (255 * (tone - tone.min()) / (np.ptp(tone) + 1e-9)).astype(np.uint8)
     reach = max(3, round(_REACH * max(seed.shape)))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    sure, possible = cv2.erode(seed, kernel), cv2.dilate(seed, kernel)
+    certain, possible = cv2.erode(seed, kernel), cv2.dilate(seed, kernel)
     if probability is not None:
-        sure[probability < _SURE] = 0
-        possible[probability > 1 - _SURE] = 1
+        certain[probability < _CERTAIN] = 0
+        possible[probability > 1 - _CERTAIN] = 1
     labels = np.full(seed.shape, cv2.GC_BGD, np.uint8)
     labels[possible > 0] = cv2.GC_PR_BGD
     labels[seed > 0] = cv2.GC_PR_FGD
-    labels[sure > 0] = cv2.GC_FGD
+    labels[certain > 0] = cv2.GC_FGD
     labels[outside] = cv2.GC_BGD
-    if sure.any() and (labels == cv2.GC_BGD).any():
+    if certain.any() and (labels == cv2.GC_BGD).any():
         cv2.setRNGSeed(1)
         cv2.grabCut(display, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), _ROUNDS, cv2.GC_INIT_WITH_MASK)
     found = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.uint8)

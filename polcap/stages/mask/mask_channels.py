@@ -15,7 +15,8 @@ from polcap.stages.mask.backdrop import STOPS, brightness
 __all__ = ["CHANNELS", "ENCODING", "SIZE_MULTIPLE", "ReducedPicture", "brightness", "encode", "grid", "mirror"]
 
 ENCODING = "mask 1"  # changed with every formula below
-CHANNELS = ("log", "red", "blue", "s1", "s2", "dolp", "chart", "looked", "chance", "x", "y")  # names in the model files
+# names in the model files; "looked": an estimate of the network is given, "chance": the estimated probability
+CHANNELS = ("log", "red", "blue", "s1", "s2", "dolp", "chart", "looked", "chance", "x", "y")
 SIZE_MULTIPLE = 16  # the network's height and width are multiples of this
 
 
@@ -45,8 +46,8 @@ def encode(picture: ReducedPicture, bright: float, estimate: Floats | None = Non
     color = np.maximum(picture.color, 0) / bright
     red, green, blue = np.moveaxis(np.log2(color + 2 * floor), -1, 0)
     s0, s1, s2 = picture.stokes
-    level = np.maximum(s0, 0) + 2 * floor * _bright_s0(picture, bright)
-    s1, s2 = (np.clip(2 * s / level, -1, 1) for s in (s1, s2))
+    s0_level = np.maximum(s0, 0) + 2 * floor * _bright_s0(picture, bright)
+    s1, s2 = (np.clip(2 * s / s0_level, -1, 1) for s in (s1, s2))
     by_network = np.zeros_like(s0) if estimate is None else np.ones_like(s0)
     if estimate is None:
         estimate = backdrop.probability(picture.color, picture.chart)

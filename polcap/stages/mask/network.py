@@ -20,10 +20,10 @@ from polcap.stages.mask.regions import box_around
 
 _CLOSE_UP_PX = 256  # greatest longer side of a close-up
 _CLOSE_UPS = 2  # passes over the part with the object; the second adds parts that the first estimate lacked
-_ROOM = 0.12  # margin around that part, of its longer side
+_MARGIN = 0.12  # around that part, of its longer side
 _LIKELY = 0.3  # least probability of pixels that a close-up must include
-_LEAST_GAIN = 0.02  # a darker shot shows nothing but its noise
-_POLARIZED = 0.08  # change of a shot's light that polarized surroundings may cause; from .25 on masks were wrong
+_LEAST_GAIN = 0.02  # of a shot; a darker one shows its noise only
+_POLARIZED = 0.08  # a gain nearer to 1 may be polarized surroundings; errors from 0.25 on made masks wrong
 _MIRRORS = ((), (0,), (1,), (0, 1))  # axes of the mirror images that are averaged (decision 15)
 
 
@@ -37,7 +37,7 @@ def object_probability(
     bright = brightness(picture.color)
     out = cv2.resize(_run(network, run, encode(picture, bright)), (width, height))
     for _ in range(_CLOSE_UPS):
-        box = box_around(out > _LIKELY, _ROOM, least=8)
+        box = box_around(out > _LIKELY, _MARGIN, least=8)
         if box is None:
             break
         x0, y0, x1, y1 = box
@@ -80,9 +80,9 @@ def reduced_picture(
 
 
 def _coarse_gains(radiance: AngleStack) -> Floats:
-    """Gains (K,) of the shots, median over the brighter half of the picture; 1 where there is none.
+    """Gains (K,) of the shots, median over the brighter half of the picture.
 
-    Small changes may be polarization. A black shot has no gain, nor have angles of one exposure.
+    The gain is 1 if the change may be polarization, for a black shot, and for all angles of one exposure.
     """
     if radiance.offset_px is not None:
         return np.ones(len(radiance.value))
@@ -101,7 +101,7 @@ def _run(network: Network, run: RunNetwork, channels: Floats) -> Floats:
 def _logit(network: Network, run: RunNetwork, channels: Floats, axes: tuple[int, ...]) -> Floats:
     """The mask network's logit (H, W) for the picture mirrored along these axes, mirrored back."""
     height, width = channels.shape[1:]
-    more = [(0, -n % SIZE_MULTIPLE) for n in (height, width)]
-    shown = np.pad(mirror(channels, axes), [(0, 0), *more], mode="edge")
-    logit = run(network, shown[None])["logit"][0, 0, :height, :width]
+    padding = [(0, -n % SIZE_MULTIPLE) for n in (height, width)]
+    padded = np.pad(mirror(channels, axes), [(0, 0), *padding], mode="edge")
+    logit = run(network, padded[None])["logit"][0, 0, :height, :width]
     return np.flip(np.clip(logit, -30, 30), axes)

@@ -8,10 +8,10 @@ from polcap.optics.warp import Box
 
 _SPECK = 0.01  # of the largest region; smaller regions are specks
 _INSIDE = 0.5  # probability above which a pixel belongs to the object
-_LIKELY = 0.3  # least maximum probability of a region; otherwise it is backdrop of the object's color
+_LIKELY = 0.3  # a region without a pixel of more probability is backdrop of the object's color
 _PINHOLE = 1e-3  # of the mask; smaller holes are dark texture
-_OPENING = 0.15  # largest mean probability of an open hole; with more it is a shadowed part of the object
-_LEEWAY = 1.7  # largest expected error of the mask by colors, over that of the network's mask (decision 15)
+_OPENING = 0.15  # largest mean probability of a hole that stays open; others are shadowed parts of the object
+_MOST_ERROR = 1.7  # expected error of the mask by colors, over that of the network's mask (decision 15)
 
 
 def likely_regions(probability: Floats) -> Bools:
@@ -26,13 +26,13 @@ def clean(mask: Bools, probability: Floats) -> Bools:
     return fill_holes(_without_specks(likely[labels]), _PINHOLE)
 
 
-def choose(colored: Bools, learned: Bools, probability: Floats) -> Bools:
+def choose(by_color: Bools, by_network: Bools, probability: Floats) -> Bools:
     """Choose between two masks (H, W): by colors, or the network's if its probabilities contradict the colors.
 
     The outline by colors is sharper, but wrong where object and backdrop have the same color, such as white on white.
     """
-    allowed = _LEEWAY * expected_error(learned, probability)
-    return colored if expected_error(colored, probability) <= allowed else learned
+    allowed = _MOST_ERROR * expected_error(by_network, probability)
+    return by_color if expected_error(by_color, probability) <= allowed else by_network
 
 
 def _without_specks(mask: Bools) -> Bits:
@@ -44,14 +44,14 @@ def _without_specks(mask: Bools) -> Bits:
     return np.asarray(large[labels], np.uint8)
 
 
-def fill_holes(mask: Bits, least: float, probability: Floats | None = None) -> Bools:
-    """Fill holes of a mask (H, W) that are smaller than a share `least` of it, or of high mean probability (H, W).
+def fill_holes(mask: Bits, least_share: float, probability: Floats | None = None) -> Bools:
+    """Fill holes of a mask (H, W) that are smaller than `least_share` of it, or of high mean probability (H, W).
 
     Holes at the picture's edge stay open.
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
     area = stats[:, cv2.CC_STAT_AREA].astype(float)
-    fill = area < least * mask.sum()
+    fill = area < least_share * mask.sum()
     if probability is not None:
         total = np.bincount(labels.reshape(-1), weights=probability.reshape(-1), minlength=count)
         fill |= total / np.maximum(area, 1) > _OPENING
@@ -74,10 +74,10 @@ def measure_shape(mask: Bools) -> tuple[float, float, float]:
     area = mask.sum()
     _, _, parts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     largest = parts[1:, cv2.CC_STAT_AREA].max()
-    lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    whole = cv2.drawContours(np.zeros(mask.shape, np.uint8), lines, -1, 1, cv2.FILLED)
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    filled = cv2.drawContours(np.zeros(mask.shape, np.uint8), contours, -1, 1, cv2.FILLED)
     edge = np.concatenate([mask[[0, -1]].ravel(), mask[1:-1, [0, -1]].ravel()])
-    return float(1 - largest / area), float((whole.sum() - area) / area), float(edge.mean())
+    return float(1 - largest / area), float((filled.sum() - area) / area), float(edge.mean())
 
 
 def nth_part(mask: Bools, number: int) -> Bools:

@@ -43,12 +43,12 @@ from polcap.stages.selfcal.object_gains import GainEstimate, ObjectShots
 # and under 1 % for LED and HMI lamps.
 _PRIOR = {"flash": 0.03, "steady": 0.01, "unknown": 0.03}
 _LEAST_PRIOR = 0.001  # least prior 1σ, also of a calibrated flash
-_SURPRISE = 3.0  # two measurements contradict each other if they differ by more than this many σ
+_CONTRADICTION = 3.0  # σ; two measurements that differ by more contradict each other
 _FLAT_ERROR = 0.05  # error of the gains by facing pixels of an object with flat faces (8 path-traced captures)
 _REMOUNTED = np.radians(0.3)  # 1σ of the zero after a filter is screwed on again (play of the thread); assumed
-# Least score of another order, with measured and with estimated gains, which turn AoLPs too. Set by hand; none of 32
-# simulated captures in the right order was refused (tests/benchmarks/bench_verdicts.py).
-_SOLID_ORDER, _GUESSED_ORDER = 0.25, 0.45
+# Least score of another order with measured gains, and with gains from the object, whose errors turn AoLPs. Set by
+# hand; none of 32 simulated captures in the right order was refused (tests/benchmarks/bench_verdicts.py).
+_LEAST_SCORE, _LEAST_SCORE_BY_OBJECT = 0.25, 0.45
 _MOST_GAIN = 0.005  # largest 1σ of a shot's light with which unknown angles can be found
 
 
@@ -109,21 +109,21 @@ def solve(
     facing = object_gains.facing(shots.light, shots.inside, radiance.angle)
     gain, sigma, _ = _best_gains(radiance, greys, facing)  # without the angles, because these are not checked yet
     first = GainEstimate(gain.mean(1), sigma.mean(1))
-    even = replace(shots, light=shots.light / first.gain[:, None, None])  # as under equal light
-    rim = angles.rim(even)
+    equalized = replace(shots, light=shots.light / first.gain[:, None, None])  # as under equal light
+    rim = angles.rim(equalized)
     one_exposure = radiance.equipment.light == "one exposure"
     well_known = greys is not None or one_exposure
 
     angle, found_sigma = radiance.angle, None
     if settings.unknown_angles:
-        angle, found_sigma = _find_angles(rim, even, float(first.sigma.max()) if well_known else np.inf, settings)
+        angle, found_sigma = _find_angles(rim, equalized, float(first.sigma.max()) if well_known else np.inf, settings)
         facing = object_gains.facing(shots.light, shots.inside, angle)
-    least_score = _SOLID_ORDER if well_known else _GUESSED_ORDER
+    least_score = _LEAST_SCORE if well_known else _LEAST_SCORE_BY_OBJECT
     order = angles.check_order(rim, angle, settings.order_margin, least_score)
     if settings.check_order and not order.check.as_stated:
         raise CaptureError(_wrong_order(order, angle, radiance.equipment.angles))
 
-    ring = _ring(even, angle, first, object_.border > 0)
+    ring = _ring(equalized, angle, first, object_.border > 0)
     if found_sigma is not None or not one_exposure:  # the angles of a polarization mosaic are exact
         ring = corrected(ring, radiance.equipment.ring_sigma if found_sigma is None else found_sigma, settings)
     angle = angle + ring.correction
@@ -141,7 +141,7 @@ def solve(
         angle=angle,
         outline=order.check,
         ring=ring,
-        turned=angles.turned_shot(*object_gains.cells(even.light, even.inside), angle, first.sigma),
+        turned=angles.turned_shot(*object_gains.cells(equalized.light, equalized.inside), angle, first.sigma),
         found_sigma=found_sigma,
         crossed=crossed_light.measure(radiance, alignment, color, shots, gains.gain, angle),
         other_orders=angles.other_orders(order.check, angle),
@@ -172,7 +172,7 @@ def _gains(radiance: AngleStack, greys: GreyPatches | None, anchor: GainEstimate
         sigma=sigma,
         anchor=np.repeat(anchor.gain[:, None], 3, axis=1),
         source=source,
-        disagreement=float(np.max(np.where(np.isfinite(both), difference - _SURPRISE * both, 0), initial=0)),
+        disagreement=float(np.max(np.where(np.isfinite(both), difference - _CONTRADICTION * both, 0), initial=0)),
         grey_slope=float("nan") if greys is None else greys.slope,
         chart_gloss=0.0 if greys is None else greys.gloss,
     )
@@ -186,28 +186,28 @@ def _prior(radiance: AngleStack) -> float:
 
 
 def _find_angles(
-    band: OutlineBand, even: ObjectShots, gain_sigma: float, settings: SelfcalSettings
+    band: OutlineBand, equalized: ObjectShots, gain_sigma: float, settings: SelfcalSettings
 ) -> tuple[Floats, float]:
     """Find unknown polarizer angles (K,) and their 1σ, rad, from shots divided by their gains."""
-    shots = len(even.light)
-    otherwise = "or use the stated angles: --set selfcal.unknown_angles=false"
+    shots = len(equalized.light)
+    remedy = "or use the stated angles: --set selfcal.unknown_angles=false"
     if shots < 4:
         raise CaptureError(
-            f"{shots} shots at unknown angles: at least four are needed, five are better; take more, {otherwise}"
+            f"{shots} shots at unknown angles: at least four are needed, five are better; take more, {remedy}"
         )
     if gain_sigma > _MOST_GAIN:
         known = f"known to only {100 * gain_sigma:.1f} %" if np.isfinite(gain_sigma) else "not known without a chart"
         raise CaptureError(
             f"the flash energy of the shots is {known}; to find unknown angles, {100 * _MOST_GAIN:g} % is needed: "
-            f"put a color chart next to the object, {otherwise}"
+            f"put a color chart next to the object, {remedy}"
         )
-    found, sigma = unknown_angles.find_angles(band, *object_gains.cells(even.light, even.inside))
+    found, sigma = unknown_angles.find_angles(band, *object_gains.cells(equalized.light, equalized.inside))
     sigma_deg = float(np.degrees(sigma))
     if sigma_deg > settings.max_unknown_sigma_deg:
         raise CaptureError(
             f"the error of the polarizer angles found is {sigma_deg:.1f}° (1σ), more than "
             f"selfcal.max_unknown_sigma_deg = {settings.max_unknown_sigma_deg:g}; take five or more shots spread over "
-            f"180°, of a rounded object inside the picture, {otherwise}"
+            f"180°, of a rounded object inside the picture, {remedy}"
         )
     return found, sigma
 
@@ -225,13 +225,13 @@ def _wrong_order(found: angles.OrderFit, angle: Floats, statement: AngleStatemen
     )
 
 
-def _ring(even: ObjectShots, angle: Floats, gains: GainEstimate, leaves_picture: bool) -> RingZero:
+def _ring(equalized: ObjectShots, angle: Floats, gains: GainEstimate, leaves_picture: bool) -> RingZero:
     """Measure the zero error of the polarizer's ring by the object's outline and slopes; nothing is corrected."""
     gain_sigma = float(gains.sigma.max())
-    total = frames.total(even.value) / gains.gain[:, None, None]
+    total = frames.total(equalized.value) / gains.gain[:, None, None]
     return ring_zero.combined(
-        ring_zero.by_outline(total, even.quality == 0, even.mask, angle, gain_sigma, leaves_picture),
-        ring_zero.by_slopes(even.light, even.inside, angle, gain_sigma),
+        ring_zero.by_outline(total, equalized.quality == 0, equalized.mask, angle, gain_sigma, leaves_picture),
+        ring_zero.by_slopes(equalized.light, equalized.inside, angle, gain_sigma),
     )
 
 
@@ -244,16 +244,16 @@ def corrected(ring: RingZero, calibrated: float | None, settings: SelfcalSetting
     """
     uncertain = ring.sigma > np.radians(settings.max_ring_sigma_deg)
     if calibrated is not None:
-        before = float(np.hypot(calibrated, _REMOUNTED))
+        prior_sigma = float(np.hypot(calibrated, _REMOUNTED))
         if not settings.correct_ring or uncertain:
-            return RingZero(0.0, min(before, ring.sigma))
-        if abs(ring.offset) <= _SURPRISE * np.hypot(before, ring.sigma):
-            share = before**2 / (before**2 + ring.sigma**2)
+            return RingZero(0.0, min(prior_sigma, ring.sigma))
+        if abs(ring.offset) <= _CONTRADICTION * np.hypot(prior_sigma, ring.sigma):
+            share = prior_sigma**2 / (prior_sigma**2 + ring.sigma**2)
             return RingZero(share * ring.offset, float(np.sqrt(share) * ring.sigma), share * ring.offset)
-    certain = (
+    correctable = (
         settings.correct_ring
         and abs(ring.offset) > settings.ring_sigmas * ring.sigma
         and abs(ring.offset) <= np.radians(settings.max_ring_turn_deg)
         and not uncertain
     )
-    return replace(ring, correction=ring.offset if certain else 0.0)
+    return replace(ring, correction=ring.offset if correctable else 0.0)

@@ -27,20 +27,20 @@ from polcap.stages.selfcal.object_gains import ObjectShots
 # Order and sense.
 _EDGE_PX = 3  # from the picture's edge; nearer pixels are not on the object's contour
 _MOST_PERMUTED = 4  # shots; with more, only exchanges of two shots and the reversal are tried
-_CLOSES = 3.0  # factor of misfit (K > 3) with which an order is excluded, or accepted; set by hand
-_AHEAD = 2.0  # σ; another order is excluded if the stated one is better by more
-_BETTER = 3.0  # σ by which another order must be better to be accepted
-_CONCLUSIVE = 0.75  # score above which an outline without a rival decides (docs/benchmarks/gates.md)
+_CLOSES = 3.0  # factor of misfit, for K > 3, with which an order is excluded or accepted; set by hand
+_EXCLUDED = 2.0  # σ; another order is excluded if the stated one is better by more
+_ACCEPTED = 3.0  # σ by which another order must be better to be accepted
+_CONCLUSIVE = 0.75  # score above which an outline without a rival order decides (docs/benchmarks/gates.md)
 _EQUAL = 0.02  # largest difference of equal analyzers
-_LEAST_RIVAL = 0.25  # least score of an order that may be true too; set by hand
+_LEAST_RIVAL = 0.25  # least score of a rival: another order that may be true too; set by hand
 _ROUGH = 0.01  # largest relative misfit by gains and interpolation: a flash repeats within 1 %
 # One turned shot.
 _PARTS = 12  # of the object; their scatter gives the error
 _LEAST_CELLS = 60
-_LEAST_GAIN = 0.5  # least reduction of the misfit by a turn; 15° gives 0.8 or more, right angles < 0.3
-_LEAST_SIGMAS = 3.5  # least turn, in its σ
+_LEAST_REDUCTION = 0.5  # of the misfit by a turn; a shot turned by 15° has 0.8 or more, right angles less than 0.3
+_LEAST_SIGMAS = 3.5  # σ; least turn
 _ALIKE = 0.9  # of the best shot's reduction of the misfit; shots above cannot be distinguished
-_FAR = np.radians(np.arange(20.0, 91.0, 5.0))  # large turns, beyond the linear fit: a ring that was not turned at all
+_FAR = np.radians(np.arange(20.0, 91.0, 5.0))  # turns beyond the linear fit: a ring that was not turned
 _MOST_LEFT = 0.25  # largest residual after a large turn, over that with the stated angles
 _ANGLE_ERROR = np.radians(0.5)  # 1σ of each angle, set by hand or motor
 
@@ -77,22 +77,22 @@ def check_order(band: OutlineBand, angle: Floats, margin: float, least_score: fl
     total, weight = outline.phasor(band, angle)
     mean, _ = outline.mean_and_sigma(total, weight)
     along = (total * np.exp(-1j * np.angle(mean))).real
-    here = _misfit(band, angle)
+    stated_misfit = _misfit(band, angle)
     best, best_score = stated, abs(mean)
-    rival, nearest = None, -np.inf
+    rival, rival_lead = None, -np.inf
     for order, turned in hypotheses(angle).items():
         misfit = _misfit(band, turned)
-        if order == stated or misfit > _CLOSES * here:
+        if order == stated or misfit > _CLOSES * stated_misfit:
             continue
-        closes_alone = _CLOSES * misfit < here and here > _ROUGH  # more than three shots agree in this order only
-        other, others = outline.phasor(band, turned)
-        score = float(other.sum().real / max(others.sum(), 1e-9))
-        sigma = _sigma_of_difference(other.real, others, along, weight)
+        only_this_closes = _CLOSES * misfit < stated_misfit and stated_misfit > _ROUGH  # for K > 3
+        phasor, phasor_weight = outline.phasor(band, turned)
+        score = float(phasor.sum().real / max(phasor_weight.sum(), 1e-9))
+        sigma = _sigma_of_difference(phasor.real, phasor_weight, along, weight)
         lead = score - abs(mean)
-        if score > _LEAST_RIVAL and not closes_alone and lead > max(nearest, -_AHEAD * sigma):
-            rival, nearest = order, lead
-        needed = 0.0 if closes_alone else max(margin, _BETTER * sigma)
-        if score > max(best_score, least_score) and lead > needed:
+        if score > _LEAST_RIVAL and not only_this_closes and lead > max(rival_lead, -_EXCLUDED * sigma):
+            rival, rival_lead = order, lead
+        least_lead = 0.0 if only_this_closes else max(margin, _ACCEPTED * sigma)
+        if score > max(best_score, least_score) and lead > least_lead:
             best, best_score = order, score
     return OrderFit(OutlineCheck(best, abs(mean), rival, mean.real), best_score)
 
@@ -124,7 +124,7 @@ def hypotheses(angle: Floats) -> dict[ShotOrder, Floats]:
         for mirrored in (False, True):
             turned = angle[list(order)] * (-1 if mirrored else 1)
             weights = mueller.analyzer(turned)
-            if all(np.abs(weights - mueller.analyzer(known)).max() > _EQUAL for known in found.values()):
+            if all(np.abs(weights - mueller.analyzer(other)).max() > _EQUAL for other in found.values()):
                 found[ShotOrder(order, mirrored)] = turned
     return found
 
@@ -174,8 +174,8 @@ def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma:
             best = min(fit, far, key=lambda one: one.misfit)
             fit = replace(best, misfit_as_stated=fit.misfit_as_stated)
         fits.append(fit)
-    gained = [fit.misfit_as_stated - fit.misfit for fit in fits]
-    alike = [k for k in range(shots) if gained[k] >= _ALIKE * max(gained)]
+    reduction = [fit.misfit_as_stated - fit.misfit for fit in fits]
+    alike = [k for k in range(shots) if reduction[k] >= _ALIKE * max(reduction)]
     alike.sort(key=lambda k: -abs(fits[k].turn))  # a small turn of one shot can be a large one of another
     found = fits[alike[0]]
     # An error of one angle has the effect of a larger error of an angle to which the residual is less sensitive.
@@ -183,7 +183,7 @@ def turned_shot(light: Floats, row: NDArray[np.int_], angle: Floats, gain_sigma:
     sensitivity = np.linalg.norm(_complement(angle), axis=0) * change
     by_angles = _ANGLE_ERROR * float(np.linalg.norm(sensitivity) / max(sensitivity[alike[0]], 1e-9))
     sigma = float(np.hypot(found.sigma, by_angles))
-    if gained[alike[0]] < _LEAST_GAIN * found.misfit_as_stated or abs(found.turn) < _LEAST_SIGMAS * sigma:
+    if reduction[alike[0]] < _LEAST_REDUCTION * found.misfit_as_stated or abs(found.turn) < _LEAST_SIGMAS * sigma:
         return TurnedShot()
     return TurnedShot(tuple(alike), found.turn, sigma)
 
@@ -217,10 +217,10 @@ def _change_per_rad(light: Floats, angle: Floats) -> Floats:
 def _fit_turn(k: int, start: float, light: Floats, angle: Floats, part: NDArray[np.intp], prior: Floats) -> _TurnFit:
     """Fit the angle error of shot k [rad], and the gains, from a start, by least squares with biweights."""
     angle = angle + start * np.eye(len(angle))[k]
-    free = _complement(angle)
-    residual = free @ light  # (K − 3, P)
-    by_turn = free[:, k, None] * _change_per_rad(light, angle)[k]
-    columns = np.concatenate([free[:, None] * light.T, by_turn[..., None]], axis=2)  # (K − 3, P, K + 1)
+    complement = _complement(angle)
+    residual = complement @ light  # (K − 3, P)
+    by_turn = complement[:, k, None] * _change_per_rad(light, angle)[k]
+    columns = np.concatenate([complement[:, None] * light.T, by_turn[..., None]], axis=2)  # (K − 3, P, K + 1)
     weight: Floats = np.ones(residual.shape[1])
     ridge = 1e-12 * np.eye(columns.shape[2])
 
@@ -234,8 +234,8 @@ def _fit_turn(k: int, start: float, light: Floats, angle: Floats, part: NDArray[
         noise = float((weight * (residual**2).sum(0)).sum() / max(weight.sum(), 1e-9))
         square, right = equations(weight, noise)
         found, used = np.linalg.solve(square, right), weight
-        off = np.linalg.norm(residual - columns @ found, axis=0)
-        weight = biweight(off, spread(off))
+        distance = np.linalg.norm(residual - columns @ found, axis=0)
+        weight = biweight(distance, spread(distance))
     total = float((weight * (residual**2).sum(0)).sum())
     stated = total - float(right[:-1] @ np.linalg.solve(square[:-1, :-1], right[:-1]))
     without = [np.linalg.solve(*equations(used * (part != p), noise))[-1] for p in np.unique(part)]

@@ -19,8 +19,8 @@ from polcap.stages.selfcal import grey_patches
 from polcap.stages.selfcal.object_gains import ObjectShots
 
 _BLUR_PX = 2.0  # 1σ; averages noise before the ratio
-_SHORTEST = 0.25  # share of the pixels, with the most similar ratios: they have hardly any gloss
-_LEAST_PX = 100
+_MODE_SHARE = 0.25  # share of the pixels, with the most similar ratios: they have hardly any gloss
+_LEAST_PX = 100  # pixels for the mode
 
 
 def measure(
@@ -40,13 +40,13 @@ def measure(
     s0, s1, s2 = np.einsum("jk,khwc->jhwc", solve, shots.value / gain[:, None, None])
     across = crossing.polarization_along(s1, s2, radiance.crossed.angle)
     inside = shots.mask & (shots.quality == 0) & sound
-    share = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), _BLUR_PX)
+    weight = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), _BLUR_PX)
     uncrossed, crossed = (
         cv2.GaussianBlur((part * inside[..., None]).astype(np.float32), (0, 0), _BLUR_PX)
         for part in (s0 - across**2 / np.maximum(s0, 1e-9), picture)
     )
-    some = inside & (share > 0.5) & (crossed.min(-1) > 0) & (uncrossed.min(-1) > 0)
-    bright = some & (crossed.sum(-1) > 0.2 * np.median(crossed.sum(-1)[some])) if some.any() else some
+    lit = inside & (weight > 0.5) & (crossed.min(-1) > 0) & (uncrossed.min(-1) > 0)
+    bright = lit & (crossed.sum(-1) > 0.2 * np.median(crossed.sum(-1)[lit])) if lit.any() else lit
     if bright.sum() < _LEAST_PX:
         return None
     ratio = np.log(uncrossed[bright] / crossed[bright])  # (N, 3)
@@ -54,9 +54,9 @@ def measure(
 
 
 def _closest(ratio: Floats) -> NDArray[np.intp]:
-    """Indices of the ratios (N,) in the shortest interval that contains the share `_SHORTEST` of them (their mode)."""
+    """Indices of the ratios (N,) in the shortest interval that contains `_MODE_SHARE` of them (their mode)."""
     order = np.argsort(ratio)
-    count = max(int(_SHORTEST * len(ratio)), 2)
+    count = max(int(_MODE_SHARE * len(ratio)), 2)
     width = ratio[order[count - 1 :]] - ratio[order[: len(ratio) - count + 1]]
     first = int(np.argmin(width))
     return np.asarray(order[first : first + count])

@@ -18,10 +18,10 @@ from polcap.stage_values import Alignment, AngleStack
 _GREYS = (18, 19, 20, 21, 22, 23)  # white to black
 _LIGHT = 4  # number of light patches, used for the gains; the two dark ones reflect 9 and 3 % and are mostly noise
 _REFLECTANCE = np.array([0.900, 0.591, 0.362, 0.198])  # of the light patches, from the chart's maker
-_SCATTER = 0.001  # between patches, by print, registration and falloff; measured gains err by 0.0009 (decision 6)
-_MOST_SCATTER = 0.2  # the same, relative: a chart that moved by half a patch has .7
-_LEAST_PX, _MARGIN_PX = 9, 0.5  # of a patch
-_SURE = 4.0  # least significance of gloss, σ
+_SCATTER = 0.001  # relative 1σ of a patch by print, registration and falloff; gains err by 0.0009 (decision 6)
+_MOST_SCATTER = 0.2  # greatest relative scatter between patches; a chart that moved by half a patch has 0.7
+_LEAST_PX, _MARGIN_PX = 9, 0.5  # pixels of a patch; width of its edge that is left out
+_SIGMAS = 4.0  # σ; smaller gloss is not significant
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,13 @@ def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration)
     light = usable & (np.arange(len(_GREYS)) < _LIGHT)
     if not light.any():
         return None
-    pooled, noise = mean[:, light].sum(1), variance[:, light].sum(1)
-    gain = pooled / pooled[0]
-    photon = gain * np.sqrt(noise / pooled**2 + (noise / pooled**2)[0])
-    each = mean[:, light] / mean[:1, light]  # (K, P, 3)
-    if (each.std(1) > _MOST_SCATTER * each.mean(1)).any():
+    total, noise = mean[:, light].sum(1), variance[:, light].sum(1)
+    gain = total / total[0]
+    photon = gain * np.sqrt(noise / total**2 + (noise / total**2)[0])
+    ratio = mean[:, light] / mean[:1, light]  # (K, P, 3)
+    if (ratio.std(1) > _MOST_SCATTER * ratio.mean(1)).any():
         return None
-    sigma = np.hypot(photon, each.std(1) / np.sqrt(light.sum()))
+    sigma = np.hypot(photon, ratio.std(1) / np.sqrt(light.sum()))
     sigma[0] = 0
     gain, sigma = _one_for_all_channels(gain, sigma)
     reflectance = np.log(_REFLECTANCE[light[:_LIGHT]])
@@ -102,7 +102,7 @@ def _gloss(light: Floats, variance: Floats) -> float:
     for k in range(1, len(light)):
         line, covariance = np.polyfit(inverse, ratio[k], 1, w=1 / sigma[k], cov="unscaled")
         misfit = float((((ratio[k] - np.polyval(line, inverse)) / sigma[k]) ** 2).sum()) / (light.shape[1] - 2)
-        worst = max(worst, abs(line[0]) - _SURE * np.sqrt(covariance[0, 0] * max(1.0, misfit)))
+        worst = max(worst, abs(line[0]) - _SIGMAS * np.sqrt(covariance[0, 0] * max(1.0, misfit)))
     return float(worst)
 
 

@@ -30,22 +30,22 @@ from polcap.optics.morphology import erode
 from polcap.optics.robust import biweight, jackknife, spread
 from polcap.stages.selfcal.object_gains import GainEstimate, unknown
 
-_SHOTS = 3
+_SHOTS = 3  # for which gains are computed
 _SIDE = 110.0  # px; larger objects are averaged down to this root of their area, to average noise
 BLUR = 2.0  # px of the reduced picture, 1σ of the Gaussian that the derivative uses
-_LEAST = 300  # pixels of the reduced object
+_LEAST = 300  # pixels of the reduced object, away from its edge
 _IOR = 1.5
 _STEEPEST = 0.25  # largest DoLP that is used: 64° for index 1.5
-_NEAR = (0.6, 0.6, 0.6, 0.3, 0.3, *[0.15] * 8)  # largest |w| of the pixels used in each step; decreasing
-_NOISE = 0.012  # of w, 1σ
-_LAW = 0.3  # of w, relative: highlights and other indices
-_SLOPE_NOISE = 0.15  # of w_ζ, relative to its median
-_STEP = 1e-4
-_MOST_STEP = 0.03  # largest step
+_LARGEST = (0.6, 0.6, 0.6, 0.3, 0.3, *[0.15] * 8)  # largest |w| of the pixels used, in each step
+_NOISE = 0.012  # of w, 1σ by noise
+_MODEL = 0.3  # of w, relative 1σ by highlights and other refractive indices
+_SLOPE_NOISE = 0.15  # of w_ζ, 1σ relative to the median
+_STEP = 1e-4  # of the unknowns, for derivatives
+_MOST_STEP = 0.03  # largest change of an unknown in one step
 COHERENT = 0.25  # least share of w_ζ² w* that is positive for diffuse reflection
 _PARTS = 4  # to a side of the object, left out one at a time
-_ERROR = 0.0013  # least error, from simulated objects (decision 6)
-_TIMES = 2.0  # error over the scatter of the parts (decision 6)
+_LEAST_SIGMA = 0.0013  # of a gain, from simulated objects (decision 6)
+_SIGMA_FACTOR = 2.0  # 1σ over the scatter of the parts (decision 6)
 
 
 def gains(light: Floats, usable: Bools, angle: Floats, start: Floats) -> GainEstimate:
@@ -59,20 +59,20 @@ def gains(light: Floats, usable: Bools, angle: Floats, start: Floats) -> GainEst
     if slopes is None:
         return unknown(shots)
     unknowns: Floats = np.append(start[1:] / start[0], 0.0)
-    for near in _NEAR:  # least squares by biweight, over ever smaller w
-        found = linearize(slopes, unknowns, near)
-        if near < _NEAR[0]:
+    for largest in _LARGEST:  # least squares by biweight, over ever smaller w
+        found = linearize(slopes, unknowns, largest)
+        if largest < _LARGEST[0]:
             step = found.step(found.weight)
         else:  # far from the solution the turn would absorb the error of the gains
             step = np.append(replace(found, rows=found.rows[:, :-1]).step(found.weight), 0.0)
         unknowns = unknowns + np.clip(step, -_MOST_STEP, _MOST_STEP)
-        if near == _NEAR[-1] and np.abs(step).max() < _STEP / 10:
+        if largest == _LARGEST[-1] and np.abs(step).max() < _STEP / 10:
             break
     if found.coherence < COHERENT:
         return unknown(shots)
     part = part_of(slopes.inside)
     scatter = jackknife(np.stack([found.step(found.weight * (part != p)) for p in np.unique(part)]))
-    sigma = np.hypot(_TIMES * scatter[:-1], _ERROR) / found.coherence
+    sigma = np.hypot(_SIGMA_FACTOR * scatter[:-1], _LEAST_SIGMA) / found.coherence
     return GainEstimate(np.append(1.0, unknowns[:-1]), np.append(0.0, sigma))
 
 
@@ -136,21 +136,21 @@ def reduced_slopes(light: Floats, usable: Bools, angle: Floats) -> SlopeField | 
     height, width = (size // block * block for size in usable.shape)
     shape = (height // block, block, width // block, block)
     means = light[:, :height, :width].reshape(len(light), *shape).mean((2, 4), dtype=np.float64)
-    whole = usable[:height, :width].reshape(shape).all((1, 3)) & (means > 0).all(0)
-    inside = erode(whole, int(2 * BLUR))
+    usable_blocks = usable[:height, :width].reshape(shape).all((1, 3)) & (means > 0).all(0)
+    inside = erode(usable_blocks, int(2 * BLUR))
     return SlopeField(means, inside, angle) if inside.sum() >= _LEAST else None
 
 
-def linearize(slopes: SlopeField, unknowns: Floats, near: float) -> Equations:
-    """Linearize Im(w_ζ² w*) = 0 about gains and angle error `unknowns` (K,), for pixels with |w| < near."""
+def linearize(slopes: SlopeField, unknowns: Floats, largest: float) -> Equations:
+    """Linearize Im(w_ζ² w*) = 0 about gains and angle error `unknowns` (K,), for pixels with |w| < `largest`."""
     product, w, slope = slopes.at(unknowns)
     length, size = np.abs(slope), np.abs(w)
-    scale = 1e-12 + np.hypot(2 * length * size * _SLOPE_NOISE * np.median(length), length**2 * (_NOISE + _LAW * size))
+    scale = 1e-12 + np.hypot(2 * length * size * _SLOPE_NOISE * np.median(length), length**2 * (_NOISE + _MODEL * size))
     residual = product.imag / scale
     rows = [(slopes.at(unknowns + _STEP * one)[0].imag / scale - residual) / _STEP for one in np.eye(len(unknowns))]
-    counted = size < near
-    sigma = spread(residual[counted]) if counted.any() else 1.0
-    return Equations(residual, np.stack(rows, axis=1), biweight(residual, sigma) * counted, product / scale)
+    used = size < largest
+    sigma = spread(residual[used]) if used.any() else 1.0
+    return Equations(residual, np.stack(rows, axis=1), biweight(residual, sigma) * used, product / scale)
 
 
 def part_of(inside: Bools) -> NDArray[np.int_]:
@@ -164,10 +164,10 @@ def _derivative(w: NDArray[Any]) -> NDArray[Any]:
     """Complex derivative ½(∂x − i∂y) w of a map, x right, y up, by the derivative of a Gaussian."""
     at = np.arange(-int(2 * BLUR), int(2 * BLUR) + 1)
     bell = cv2.getGaussianKernel(len(at), BLUR)[:, 0]
-    rise = at * bell / (at**2 * bell).sum()
+    slope = at * bell / (at**2 * bell).sum()
     parts = w.view(np.float64).reshape(*w.shape, 2)
     across, down = (
-        cv2.sepFilter2D(parts, -1, *kernels).view(np.complex128)[..., 0] for kernels in ((rise, bell), (bell, rise))
+        cv2.sepFilter2D(parts, -1, *kernels).view(np.complex128)[..., 0] for kernels in ((slope, bell), (bell, slope))
     )
     return np.asarray((across + 1j * down) / 2)  # rows run down
 

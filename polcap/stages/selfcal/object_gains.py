@@ -43,13 +43,13 @@ _PARTS = 12  # of the object, left out one at a time: gives 1σ to 20 %
 _ANGLE_ERROR = np.radians(0.5)  # 1σ of each angle, half a degree, the step of the ring's scale; assumed
 _LEAST_RIM, _MOST_RIM = 200, 20_000  # pixels of the outline
 _FACING_ERROR = 0.003  # least error by facing pixels, from simulated objects (decision 6)
-_ONE_SIDED = 0.02  # the error if all slopes are on one side of the facing pixels (decision 6)
-_RING = (0.006, 0.02)  # DoLP of the slopes that are tested for that
+_ONE_SIDED = 0.02  # error by facing pixels if all slopes around them point to one side (decision 6)
+_RING = (0.006, 0.02)  # DoLP of the slopes around facing pixels that are tested for that
 _OUTLINE_ERROR = 0.002  # least error by the outline
 _OUTLINE_TIMES = 3.0  # error by the outline over the scatter of its parts: neighbors have common errors (decision 6)
 _CLOSURE_ERROR = 0.001  # least error by closure, from registration; assumed. The angles add more (decision 20)
-_SURPRISE = 3.0  # σ; gains farther from the prior are not averaged with it
-_CERTAIN = 10.0  # σ of its own error; such a gain is applied if it is farther from 1: the flash failed
+_SURPRISE = 3.0  # σ; gains farther from 1 are not averaged with the prior
+_CERTAIN = 10.0  # σ of the measured gain alone; a surprising gain farther from 1 is applied: the flash failed
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class GainEstimate:
 
 @dataclass(frozen=True)
 class ObjectShots:
-    """All shots on the crop around the object, registered by linear interpolation, which suffices for means."""
+    """All shots on the crop around the object, registered by linear interpolation."""
 
     value: Floats  # (K, h, w, 3)
     light: Floats  # (K, h, w) sum over channels, blurred by 2 px
@@ -123,12 +123,12 @@ def with_prior(measured: GainEstimate, prior: float) -> GainEstimate:
     sigma = np.where(np.isfinite(measured.sigma), measured.sigma, 1e6)
     distance = np.abs(measured.gain - 1)
     surprising = distance > _SURPRISE * np.hypot(sigma, prior)
-    weight, before = 1 / np.maximum(sigma, 1e-6) ** 2, 1 / prior**2
-    mean = (weight * measured.gain + before) / (weight + before)
+    weight, prior_weight = 1 / np.maximum(sigma, 1e-6) ** 2, 1 / prior**2
+    mean = (weight * measured.gain + prior_weight) / (weight + prior_weight)
     certain = distance > _CERTAIN * sigma
     gain = np.where(surprising, np.where(certain, measured.gain, 1.0), mean)
     doubtful = np.where(certain, sigma, np.maximum(distance, prior))
-    error = np.where(surprising, doubtful, 1 / np.sqrt(weight + before))
+    error = np.where(surprising, doubtful, 1 / np.sqrt(weight + prior_weight))
     return _relative_to_first(np.append(1.0, gain[1:]), error)
 
 
@@ -197,8 +197,8 @@ def facing(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
     height = np.exp(-distance / (2 * _PEAK_WIDTH**2)).mean(1)
     best = int(np.argmax(height))
     gain = climbs[best][-1]
-    odds = (height / max(float(height[best]), 1e-12)) ** 4
-    peaks = np.sqrt((odds[:, None] * (np.stack([path[-1] for path in climbs]) - gain) ** 2).sum(0) / odds.sum())
+    weight = (height / max(float(height[best]), 1e-12)) ** 4  # lower peaks hardly count
+    peaks = np.sqrt((weight[:, None] * (np.stack([path[-1] for path in climbs]) - gain) ** 2).sum(0) / weight.sum())
     scatter = np.std(climbs[best][1:], axis=0)
     one_sided = _ONE_SIDED * _one_sided(ratio / gain[:, None], angle)
     sigma = np.sqrt(peaks**2 + scatter**2 + one_sided**2 + _FACING_ERROR**2)
@@ -210,23 +210,23 @@ def _one_sided(ratio: Floats, angle: Floats) -> float:
     s0, s1, s2 = np.linalg.pinv(mueller.analyzer(angle)) @ ratio
     polarization = (s1 + 1j * s2) / np.maximum(s0, 1e-9)
     strength = np.abs(polarization)
-    some = polarization[(strength > _RING[0]) & (strength < _RING[1])]
-    return float(abs(np.mean(some / np.abs(some)))) if some.size else 1.0
+    ring = polarization[(strength > _RING[0]) & (strength < _RING[1])]
+    return float(abs(np.mean(ring / np.abs(ring)))) if ring.size else 1.0
 
 
 def _climb(ratio: Floats, start: Floats) -> list[Floats]:
     """Mean shift over shot ratios (K, N) from a start (K,): the end point for each kernel width."""
-    at, found = start, []
+    position, ends = start, []
     for width in _KERNELS:
         for _ in range(50):
-            distance = ratio - at[:, None]
+            distance = ratio - position[:, None]
             weight = np.exp(np.einsum("kn,kn->n", distance, distance) / (-2 * width**2))
             step = distance @ weight / max(float(weight.sum()), 1e-9)
-            at = at + step
+            position = position + step
             if np.abs(step).max() < 1e-5:
                 break
-        found.append(at)
-    return found
+        ends.append(position)
+    return ends
 
 
 def cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
@@ -234,10 +234,10 @@ def cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
     height, width = (size // _CELL_PX for size in usable.shape)
     cut = np.s_[..., : height * _CELL_PX, : width * _CELL_PX]
     shape = (height, _CELL_PX, width, _CELL_PX)
-    whole = usable[cut].reshape(shape).all((1, 3))
-    means = light[cut].reshape(len(light), *shape).mean((2, 4))[:, whole]
+    inside = usable[cut].reshape(shape).all((1, 3))
+    means = light[cut].reshape(len(light), *shape).mean((2, 4))[:, inside]
     bright = (means > 0).all(0)
-    return means[:, bright], np.nonzero(whole)[0][bright]
+    return means[:, bright], np.nonzero(inside)[0][bright]
 
 
 def _null_vector(

@@ -30,19 +30,19 @@ UNKNOWN = RingZero(0.0, np.pi / 2)
 
 # By the outline.
 _RIM_PX = 3.0  # 1σ of the mask's blur for the outermost contours
-_FINE_PX = 8.0  # 1σ of a blur in px of the coarser grid on which it is computed
-_DEEPER = (0.1, 0.2)  # further blurs, in radii of the object
-_PLATEAU = 0.3  # radii; the last band has contours of the depth up to this
+_GRID_SIGMA = 8.0  # 1σ of a blur, in px of the coarser grid on which it is computed
+_DEEPER = (0.1, 0.2)  # 1σ of blurs with contours deeper inside, in radii of the object
+_PLATEAU = 0.3  # radii; the last contours are those of the depth, up to this depth
 _SMOOTH_PX = 1.0  # of the light, inside the object only
-_LEAST_DEPTH_PX = 1.5  # nearer, a pixel is partly backdrop
+_LEAST_DEPTH_PX = 1.5  # of a pixel that is used; nearer ones are partly backdrop
 _SPREAD_TO_SIGMA = 2.0  # error of the outermost result over its rms difference from the deeper ones (decision 26)
 _FLOOR = np.radians(0.25)  # least error (decision 26)
-_LEAST_RIM_PX = 200
-_TURNS = 4  # iterations
-_SHAPES = 1.6  # rms of error over estimated 1σ on 29 path-traced objects (docs/benchmarks/gains-and-angles.md)
+_LEAST_RIM_PX = 200  # pixels of the rim
+_ITERATIONS = 4  # of `_turn`
+_SIGMA_FACTOR = 1.6  # rms of error over estimated 1σ, of 29 path-traced objects (docs/benchmarks/gains-and-angles.md)
 # By the slopes.
 _STEEPEST = 9.0  # largest tan²θ of the pixels used
-_ROUNDS = 12
+_ROUNDS = 12  # at most
 _SETTLED = 1e-5  # a smaller step ends the rounds
 _MOST_STEP = 0.1  # largest step, rad or relative gain
 _CORRELATED = 2 * np.pi * integrability.BLUR**2  # px with common noise
@@ -52,28 +52,28 @@ _SLOPES_FLOOR = np.radians(0.1)  # least 1σ (decision 26)
 def combined(one: RingZero, other: RingZero) -> RingZero:
     """Weighted mean of two measurements of a ring's zero; if they contradict, its error grows with the difference."""
     offset, sigma = weighted_mean(np.array([one.offset, other.offset]), np.array([one.sigma, other.sigma]))
-    return RingZero(float(offset), min(_SHAPES * float(sigma), np.pi / 2))
+    return RingZero(float(offset), min(_SIGMA_FACTOR * float(sigma), np.pi / 2))
 
 
 def by_outline(
-    light: Floats, sound: Bools, mask: Bools, angle: Floats, gain_sigma: float, leaves_picture: bool
+    light: Floats, usable: Bools, mask: Bools, angle: Floats, gain_sigma: float, leaves_picture: bool
 ) -> RingZero:
     """Error of the polarizer ring's zero, from the outline of registered shots (K, H, W) without their gains.
 
-    sound (H, W) are the pixels without defects, angle (K,) rad the stated angles, gain_sigma the relative 1σ of the
+    usable (H, W) are the pixels without defects, angle (K,) rad the stated angles, gain_sigma the relative 1σ of the
     gains. If the object leaves the picture there is no closed curve, and the result is UNKNOWN.
     """
     margin = int(np.ceil(4 * _RIM_PX))
     light = np.pad(light, ((0, 0), (margin, margin), (margin, margin)))
-    sound, mask = np.pad(sound, margin), np.pad(mask, margin)
+    usable, mask = np.pad(usable, margin), np.pad(mask, margin)
     depth = outline.depth(mask)
     inside = depth > _LEAST_DEPTH_PX
     radius = outline.disc_radius(mask)
     if leaves_picture or int((mask & (depth < 2 * _RIM_PX)).sum()) < _LEAST_RIM_PX:
         return UNKNOWN
-    smooth = np.stack([masked_mean(shot, mask & sound, _SMOOTH_PX) for shot in light])
-    s0, s1, s2 = np.linalg.pinv(mueller.analyzer(angle)) @ smooth[:, inside & sound]
-    seen = inside & sound
+    smooth = np.stack([masked_mean(shot, mask & usable, _SMOOTH_PX) for shot in light])
+    s0, s1, s2 = np.linalg.pinv(mueller.analyzer(angle)) @ smooth[:, inside & usable]
+    seen = inside & usable
     lit = s0 > 0
     seen[seen] = lit  # (H, W); its N pixels are those of the arrays below
     if not lit.any():
@@ -81,7 +81,7 @@ def by_outline(
     polarization = (s1[lit] + 1j * s2[lit]) / s0[lit]  # (N,)
     strength = np.abs(polarization)
     weight = np.minimum(strength, outline.DOLP_CAP)
-    slope = np.sqrt(polarization / np.maximum(strength, 1e-9)) * weight  # half the angle; its sign is unknown
+    slope = np.sqrt(polarization / np.maximum(strength, 1e-9)) * weight  # along the AoLP, of unknown sign
     outward = [_outward(mask, sigma) for sigma in (_RIM_PX, *(d * radius for d in _DEEPER))]
     outward.append(_outward(np.minimum(depth, _PLATEAU * radius), 2.0))
     rim, *deeper = (_turn(slope, gradient[seen]) for gradient in outward)  # rad
@@ -90,23 +90,20 @@ def by_outline(
     length = np.abs(at_rim)
     hidden = float(np.abs(outward[0][inside & ~seen]).sum())  # share of the outline without light or with defects
     hidden /= max(hidden + float(length.sum()), 1e-9)
-    # 0 for an outline with all directions alike, whose turn does not depend on the gains
-    lopsided = abs(complex((np.conj(at_rim) ** 2 / np.maximum(length, 1e-30)).sum()))
-    lopsided /= max(float(length @ weight), 1e-9)
+    # 0 for an outline with all directions alike: then the gains do not change its turn
+    uneven = abs(complex((np.conj(at_rim) ** 2 / np.maximum(length, 1e-30)).sum()))
+    uneven /= max(float(length @ weight), 1e-9)
     sector = outline.sectors(seen)
     by_part = [_turn(slope[sector == part], at_rim[sector == part]) for part in np.unique(sector)]
     variance = (
-        _FLOOR**2
-        + (_SPREAD_TO_SIGMA * scatter) ** 2
-        + (hidden * np.std(by_part)) ** 2
-        + (gain_sigma * lopsided / 2) ** 2
+        _FLOOR**2 + (_SPREAD_TO_SIGMA * scatter) ** 2 + (hidden * np.std(by_part)) ** 2 + (gain_sigma * uneven / 2) ** 2
     )
     return RingZero(-rim, min(float(np.sqrt(variance)), np.pi / 2))
 
 
 def _outward(inside: Floats | Bools, sigma: float) -> Complexes:
     """Outward gradient (H, W), as x + iy, y up, of a mask blurred by `sigma` px; a large blur uses a coarser grid."""
-    step = max(1, int(sigma / _FINE_PX))
+    step = max(1, int(sigma / _GRID_SIGMA))
     height, width = inside.shape
     small = area_mean(inside.astype(np.float32), (-(-height // step), -(-width // step)))
     direction, slope = outline.outward(small, sigma / step)
@@ -116,19 +113,19 @@ def _outward(inside: Floats | Bools, sigma: float) -> Complexes:
 
 def _turn(slope: Complexes, outward: Complexes) -> float:
     """Mean angle [rad] from the outward direction to the slopes from polarization, with their signs outward."""
-    across = slope * np.conj(outward)
-    real, imaginary = np.ascontiguousarray(across.real), np.ascontiguousarray(across.imag)
+    product = slope * np.conj(outward)
+    real, imaginary = np.ascontiguousarray(product.real), np.ascontiguousarray(product.imag)
     turn = 0.0
-    for _ in range(_TURNS):
-        way = np.copysign(1.0, real * np.cos(turn) + imaginary * np.sin(turn))
-        turn = float(np.arctan2(imaginary @ way, real @ way))
+    for _ in range(_ITERATIONS):
+        sign = np.copysign(1.0, real * np.cos(turn) + imaginary * np.sin(turn))
+        turn = float(np.arctan2(imaginary @ sign, real @ sign))
     return turn
 
 
 def by_slopes(light: Floats, usable: Bools, angle: Floats, gain_sigma: float) -> RingZero:
     """Error of the polarizer ring's zero, from slopes inside registered shots (K, H, W) without their gains.
 
-    usable (H, W) are the object's sound pixels, angle (K,) rad as stated, gain_sigma 1σ of the gains, relative.
+    usable (H, W) are the object's pixels without defects, angle (K,) rad as stated, gain_sigma 1σ of gains, relative.
     """
     slopes = integrability.reduced_slopes(light, usable, angle)
     if slopes is None:

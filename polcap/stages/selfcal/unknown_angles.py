@@ -19,11 +19,11 @@ from polcap.optics.robust import jackknife
 _BINS = 36  # of φ, 10° each
 _LEAST_BINS = 24  # bins with light; fewer do not determine turn and sense
 _STARTS = 20  # random starts, the same every time
-_COARSE, _FINE = 1e-3, 1e-7  # relative change of the misfit that ends a search: from all starts, from the best ones
-_POLISHED = 4  # number of best starts
-_AS_GOOD = 1.3  # of the least misfit; solutions up to here are possible too
-_LAW = 0.012  # relative 1σ of the outline's light from ideal diffuse reflection
-_OTHER_LAWS = (0.004, 0.03)  # the range of this 1σ: parts of an outline differ by up to 3 %
+_COARSE, _FINE = 1e-3, 1e-7  # relative change of the misfit that ends a fit: from all starts, from the best ones
+_BEST = 4  # number of best starts
+_AS_GOOD = 1.3  # of the least misfit; solutions with no more misfit are possible too
+_OUTLINE = 0.012  # relative 1σ of the outline's light from ideal diffuse reflection
+_OTHER_OUTLINES = (0.004, 0.03)  # the range of this 1σ: parts of an outline differ by up to 3 %
 _SIDES = 8  # parts of the outline and of the inside, left out one at a time
 _INSIDE = 0.0001  # relative 1σ inside, by interpolation and gains
 _FLOOR = np.radians(0.3)  # least 1σ (200 simulated cases)
@@ -46,19 +46,19 @@ def find_angles(band: OutlineBand, cells: Floats, row: NDArray[np.int_]) -> tupl
     rim, phi = rim[lit], phi[lit]
     inside = _condensed(cells)
     random = np.random.default_rng(outline.SECTORS)
-    ends = [_solve(rim, phi, inside, random.uniform(0, np.pi, shots), _COARSE) for _ in range(_STARTS)]
-    ends = [_solve(rim, phi, inside, start, _FINE) for _, start in sorted(ends, key=lambda end: end[0])[:_POLISHED]]
-    cost, angle = min(ends, key=lambda end: end[0])
-    elsewhere = max(float(np.abs(_difference(other, angle)).max()) for left, other in ends if left < _AS_GOOD * cost)
+    fits = [_solve(rim, phi, inside, random.uniform(0, np.pi, shots), _COARSE) for _ in range(_STARTS)]
+    fits = [_solve(rim, phi, inside, start, _FINE) for _, start in sorted(fits, key=lambda fit: fit[0])[:_BEST]]
+    least, angle = min(fits, key=lambda fit: fit[0])
+    ambiguity = max(float(np.abs(_difference(one, angle)).max()) for misfit, one in fits if misfit < _AS_GOOD * least)
     side = np.arange(len(phi)) * _SIDES // len(phi)
-    place = np.argsort(np.argsort(row, kind="stable")) * _SIDES // len(row)
+    part = np.argsort(np.argsort(row, kind="stable")) * _SIDES // len(row)
     by_side = [_solve(rim[side != s], phi[side != s], inside, angle, _FINE)[1] for s in range(_SIDES)]
-    by_place = [_solve(rim, phi, _condensed(cells[:, place != s]), angle, _FINE)[1] for s in range(_SIDES)]
-    by_law = [_difference(_solve(rim, phi, inside, angle, _FINE, law)[1], angle) for law in _OTHER_LAWS]
-    variance = np.mean(np.square(by_law), axis=0)  # (K,)
-    for without in (by_side, by_place):
+    by_part = [_solve(rim, phi, _condensed(cells[:, part != s]), angle, _FINE)[1] for s in range(_SIDES)]
+    by_sigma = [_difference(_solve(rim, phi, inside, angle, _FINE, sigma)[1], angle) for sigma in _OTHER_OUTLINES]
+    variance = np.mean(np.square(by_sigma), axis=0)  # (K,)
+    for without in (by_side, by_part):
         variance = variance + jackknife(np.array([_difference(one, angle) for one in without]), about=0.0) ** 2
-    return angle % np.pi, min(float(np.sqrt(_FLOOR**2 + variance.max() + elsewhere**2)), np.pi / 2)
+    return angle % np.pi, min(float(np.sqrt(_FLOOR**2 + variance.max() + ambiguity**2)), np.pi / 2)
 
 
 def _by_direction(band: OutlineBand) -> tuple[Floats, Floats]:
@@ -83,25 +83,26 @@ def _condensed(cells: Floats) -> Floats:
 
 
 def _solve(
-    rim: Floats, phi: Floats, inside: Floats, start: Floats, until: float, law: float = _LAW
+    rim: Floats, phi: Floats, inside: Floats, start: Floats, tolerance: float, outline_sigma: float = _OUTLINE
 ) -> tuple[float, Floats]:
     """Fit polarizer angles (K,) from a start to the light (B, K) of the rim at azimuths phi (B,) and of the inside.
 
-    Returns the misfit and the angles. `until` is the relative change of the misfit that ends the fit.
+    Returns the misfit and the angles. `tolerance` is the relative change of the misfit that ends the fit.
 
     Two solutions that differ by 90° fit equally well; the result is that of diffuse reflection.
     """
     relative = rim / rim.mean(axis=1, keepdims=True)
     from scipy.optimize import least_squares  # here: the import takes 0.3 s
 
-    end = least_squares(_residual, start, args=(relative, phi, inside, law), method="lm", ftol=until, max_nfev=150)
-    along = np.cos(2 * (phi[:, None] - end.x))
+    args = relative, phi, inside, outline_sigma
+    fit = least_squares(_residual, start, args=args, method="lm", ftol=tolerance, max_nfev=150)
+    along = np.cos(2 * (phi[:, None] - fit.x))
     along -= along.mean(axis=1, keepdims=True)
-    angle = end.x if float((along * relative).sum()) > 0 else end.x + np.pi / 2
-    return float(end.cost), np.asarray(angle)
+    angle = fit.x if float((along * relative).sum()) > 0 else fit.x + np.pi / 2
+    return float(fit.cost), np.asarray(angle)
 
 
-def _residual(angle: Floats, relative: Floats, phi: Floats, inside: Floats, law: float) -> Floats:
+def _residual(angle: Floats, relative: Floats, phi: Floats, inside: Floats, outline_sigma: float) -> Floats:
     """Residuals for polarizer angles, over their 1σ: outline from the span of 1 and cos 2(φ − θ), inside from A(θ)."""
     ones = np.ones(len(angle)) / np.sqrt(len(angle))
     wave = np.cos(2 * (phi[:, None] - angle))
@@ -112,7 +113,7 @@ def _residual(angle: Floats, relative: Floats, phi: Floats, inside: Floats, law:
     rows = np.stack([np.ones_like(angle), np.cos(2 * angle), np.sin(2 * angle)], axis=1)
     basis, _ = np.linalg.qr(rows)
     out = inside - basis @ (basis.T @ inside)
-    return np.concatenate([left.ravel() / law / np.sqrt(len(phi)), out.ravel() / _INSIDE])
+    return np.concatenate([left.ravel() / outline_sigma / np.sqrt(len(phi)), out.ravel() / _INSIDE])
 
 
 def _difference(a: Floats, b: Floats) -> Floats:

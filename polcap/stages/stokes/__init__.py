@@ -20,12 +20,12 @@ from polcap.stage_values import Alignment, AngleStack, ObjectMask, SelfCalibrati
 from polcap.stages import stage
 from polcap.stages.stokes.reference_detail import reference_detail
 
-_MOST_CONDITION = 50.0  # that of three angles in steps of 12°: S1 has 26 times a shot's noise; 0, 45, 90° have 2.4
+_MOST_CONDITION = 50.0  # of angles in steps of 12°: S1 then has 26 times a shot's noise; 0, 45, 90° have 2.4
 # A pixel is metal if red and blue have this DoLP and their AoLPs differ by this angle, at this many σ. Set by hand,
 # above the effects of noise and registration on a dielectric; not measured on metals.
 _METAL_DOLP, _METAL_DEG, _METAL_SIGMA = 0.05, 10.0, 5.0
 _LEAST_ROWS, _BLOCK = 64, 200_000  # rows and pixels of a block: its planes fit the cache, with few rows resampled twice
-_LEAST_VARIANCE = np.float32(1e-14)
+_LEAST_VARIANCE = np.float32(1e-14)  # so that weights are finite
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # Stokes indices of a covariance's six rows
 
 
@@ -187,18 +187,18 @@ def _register(shots: _Shots, flags: list[list[tuple[Quality, Bits]]], box: Box) 
     values, variances = (np.empty((len(shots.transform), *size, 3), np.float32) for _ in range(2))
     quality: Bits = np.zeros(size, np.uint8)
     height, width = radiance.quality.shape[1:]
-    mosaic, part = radiance.offset_px is not None, shots.transform[:, :2, 2] % 1
-    # of the variance, by linear interpolation; one for all shots: the sharpest would get the least weight
-    share = np.prod(part**2 + (1 - part) ** 2, axis=1).mean() if mosaic else 1.0
+    mosaic, offset = radiance.offset_px is not None, shots.transform[:, :2, 2] % 1
+    # share of the variance after linear interpolation; the mean of all shots, or the sharpest had the least weight
+    variance_share = np.prod(offset**2 + (1 - offset) ** 2, axis=1).mean() if mosaic else 1.0
     for k, transform in enumerate(shots.transform):
         gain = np.tile(shots.gain[k].astype(np.float32), size[1])
         if mosaic:  # mean of 2 or 4 neighbors, as usual for a mosaic: splines ring at edges of so coarse a grid
-            shot = warp(radiance.value[k], transform, box, 1, lens)
+            resampled = warp(radiance.value[k], transform, box, 1, lens)
         else:
-            shot = _resampled(shots, radiance.value[k], transform, box)
+            resampled = _resampled(shots, radiance.value[k], transform, box)
         variance = np.maximum(warp(radiance.variance[k], transform, box, 1, lens), _LEAST_VARIANCE)
-        np.divide(_rows(shot), gain, out=_rows(values[k]))
-        np.multiply(_rows(variance), np.float32(share) / gain**2, out=_rows(variances[k]))
+        np.divide(_rows(resampled), gain, out=_rows(values[k]))
+        np.multiply(_rows(variance), np.float32(variance_share) / gain**2, out=_rows(variances[k]))
         quality |= _defects(flags[k], (height, width), transform, box, lens)
     return values, variances, quality
 
@@ -234,7 +234,7 @@ def _weighted_least_squares(
     """Solve Stokes parameters (3, h, w, C) and covariance (6, h, w, C) from shots and variances (K, h, w, C)."""
     w = 1.0 / variance.astype(np.float64).reshape(len(value), -1)
     products = np.stack([analyzers[:, i] * analyzers[:, j] for i, j in _PAIRS])
-    m00, m01, m02, m11, m12, m22 = products @ w  # the symmetric AᵀWA of every pixel
+    m00, m01, m02, m11, m12, m22 = products @ w  # the symmetric AᵀWA of every pixel; below, c are its cofactors
     right = analyzers.T @ (w * value.reshape(len(value), -1))
     c00, c01, c02 = m11 * m22 - m12**2, m02 * m12 - m01 * m22, m01 * m12 - m02 * m11
     determinant = m00 * c00 + m01 * c01 + m02 * c02
@@ -275,11 +275,11 @@ def _metal(stokes: Floats, covariance: Floats) -> Bools:
     refractive index changes with wavelength, and the AoLP with it.
     """
     (x0, y0, square0, noise0), (x1, y1, square1, noise1) = (_polarization(stokes, covariance, c) for c in (0, 2))
-    enough = np.minimum(square0, square1) > np.float32(_METAL_DOLP**2)
-    most = np.float32(np.sin(2 * np.radians(_METAL_DEG))) * np.sqrt(square0) * np.sqrt(square1)
-    excess = np.abs(x0 * y1 - y0 * x1) - most
+    polarized = np.minimum(square0, square1) > np.float32(_METAL_DOLP**2)
+    limit = np.float32(np.sin(2 * np.radians(_METAL_DEG))) * np.sqrt(square0) * np.sqrt(square1)
+    excess = np.abs(x0 * y1 - y0 * x1) - limit
     noise = np.sqrt(noise0 * square1 + noise1 * square0)
-    return np.asarray(enough & (excess > np.float32(_METAL_SIGMA) * noise))
+    return np.asarray(polarized & (excess > np.float32(_METAL_SIGMA) * noise))
 
 
 def _polarization(stokes: Floats, covariance: Floats, channel: int) -> tuple[Floats, Floats, Floats, Floats]:

@@ -12,17 +12,16 @@ from polcap.optics.warp import Box, source_box, warp
 
 _ROWS = 64  # superpixels of a block
 _HALO = 3  # superpixels around a block: demosaicing reaches 3 photosites, the enlargement one superpixel
-_MOST = 1.0  # greatest logarithm; larger ones are dots of demosaicing in dark colors (docs/benchmarks/albedo.md)
-_LEAST = np.float32(1e-6)  # light
+_MOST_DETAIL = 1.0  # larger values are dots of demosaicing in dark colors (docs/benchmarks/albedo.md)
+_LEAST_LIGHT = np.float32(1e-6)  # so that ratios are finite
 
 
 def reference_detail(mosaic: Mosaic, crop: Box, lens: Distortion | None = None) -> Floats:
     """Fine detail of the reference shot: logarithm of the light of each RAW pixel over that of the superpixels.
 
-    The result is (2h, 2w) float16; the superpixels are enlarged linearly before the division.
-
-    Light is the sum of the demosaiced colors. `crop` (w × h) is in superpixels of the pinhole camera, and `lens` the
-    distortion on that grid. Shading, gains and falloff are the same in both, so only fine detail remains.
+    The result is (2h, 2w) float16. Light is the sum of the demosaiced colors; that of the superpixels is enlarged
+    linearly. `crop` (w × h) is in superpixels of the pinhole camera, and `lens` the distortion on that grid. Shading,
+    gains and falloff are the same in both, so only fine detail remains.
     """
     x0, y0, x1, y1 = crop
     out = np.empty((2 * (y1 - y0), 2 * (x1 - x0)), np.float16)
@@ -31,9 +30,9 @@ def reference_detail(mosaic: Mosaic, crop: Box, lens: Distortion | None = None) 
         light = _light(mosaic, (x0 - _HALO, top - _HALO, x1 + _HALO, bottom + _HALO), lens)
         height, width = light.shape
         coarse = cv2.resize(block_means(light, 2), (width, height))
-        ratio = np.maximum(light, _LEAST) / np.maximum(coarse, _LEAST)
+        ratio = np.maximum(light, _LEAST_LIGHT) / np.maximum(coarse, _LEAST_LIGHT)
         inner = np.s_[2 * _HALO : -2 * _HALO]
-        out[2 * (top - y0) : 2 * (bottom - y0)] = np.clip(np.log(ratio[inner, inner]), -_MOST, _MOST)
+        out[2 * (top - y0) : 2 * (bottom - y0)] = np.clip(np.log(ratio[inner, inner]), -_MOST_DETAIL, _MOST_DETAIL)
     return out
 
 
@@ -50,7 +49,7 @@ def _light(mosaic: Mosaic, box: Box, lens: Distortion | None) -> Floats:
     height, width = (side // 2 for side in mosaic.value.shape)
     x0, y0, x1, y1 = box
     left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1, width), min(y1, height)
-    part = mosaic.value[2 * top : 2 * bottom, 2 * left : 2 * right].astype(np.float32)
-    light = demosaic.interpolate(part, mosaic.cfa).sum(axis=-1)
+    photosites = mosaic.value[2 * top : 2 * bottom, 2 * left : 2 * right].astype(np.float32)
+    light = demosaic.interpolate(photosites, mosaic.cfa).sum(axis=-1)
     edges = 2 * (top - y0), 2 * (y1 - bottom), 2 * (left - x0), 2 * (x1 - right)
     return np.asarray(cv2.copyMakeBorder(light, *edges, cv2.BORDER_REPLICATE))

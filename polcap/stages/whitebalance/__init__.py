@@ -31,8 +31,8 @@ from polcap.stages.whitebalance.patches import ChartFit, PatchSamples
 
 _LEAST_PITCH_PX = 8.0  # with less, a patch has too few pixels
 _CLEARLY_BETTER = 0.5  # residual with another edition of the chart over that with the stated one: 15 charts had ≥ 0.93
-_SMALL_PART = 0.05  # of the variance, for edges of small patches: there colors decide
-_MOST_MOVED = 0.35  # patches; largest refinement of corners from the user
+_EDGES = 0.05  # a candidate with fitting colors may explain this much less: edges cover much of small patches
+_MOST_MOVED = 0.35  # largest refinement of corners from the user [pitch]
 _REMEDY = "give its corners with --chart x0,y0,…,x3,y3, a profile with --chart FILE, or --no-chart"
 
 
@@ -85,7 +85,7 @@ def measure(
     finder = _ChartFinder(radiance, reference, settings)
     found = finder.at_corners(request.corners) if request.mode == "corners" else finder.search()
     edition = finder.edition(found)
-    seen = found.seen if edition is reference else replace(finder, reference=edition).find(found.place).seen
+    seen = found.colors if edition is reference else replace(finder, reference=edition).find(found.place).colors
     fit, predicted = seen.fit, patches.cross_validate(seen, edition)
     if edition.surroundings is not None:
         around = finder.sample(found.place, edition.surroundings.center)
@@ -110,11 +110,11 @@ def measure(
 
 
 @dataclass(frozen=True)
-class _Find:
+class _LocatedChart:
     """A located chart with its fitted colors."""
 
     place: Placement
-    seen: ChartFit
+    colors: ChartFit
     cost: float = float("nan")  # the detector's; NaN at corners from the user
 
 
@@ -126,55 +126,55 @@ class _ChartFinder:
     reference: ChartReference
     settings: WhitebalanceSettings
 
-    def search(self) -> _Find:
+    def search(self) -> _LocatedChart:
         """Search the chart: the first candidate with a small color residual, else the best one. Raises ChartError."""
         settings, picture = self.settings, self.radiance.value[0]
-        finds: list[_Find] = []
-        cheapest, small_px = np.inf, 0.0
-        exposed: ChartError | None = None
+        found: list[_LocatedChart] = []
+        least_cost, largest_px = np.inf, 0.0
+        overexposed: ChartError | None = None
         for centers, cost in chart_search.candidates(picture, self.reference.is_block):
-            cheapest = min(cheapest, cost)
+            least_cost = min(least_cost, cost)
             start = chart.from_centers(centers)
             if cost > settings.max_cost or not chart.is_view(start.homography):
                 continue
             place = chart.refine(picture, start)
-            explained = place.explained >= settings.min_explained
-            if not _plausible(place, settings.min_explained - _SMALL_PART):
-                small_px = max(small_px, place.pitch_px) if explained else small_px
+            well_explained = place.explained >= settings.min_explained
+            if not _plausible(place, settings.min_explained - _EDGES):
+                largest_px = max(largest_px, place.pitch_px) if well_explained else largest_px
                 continue
             try:
-                find = self._find_either_way_up(place, cost)
+                one = self._oriented(place, cost)
             except ChartError as error:
-                exposed = error
+                overexposed = error
                 continue
-            if explained or find.seen.error <= settings.max_delta_e / 3:
-                finds.append(find)
-            if any(find.seen.error <= settings.max_delta_e / 2 for find in finds):  # else a later one may be better
+            if well_explained or one.colors.error <= settings.max_delta_e / 3:
+                found.append(one)
+            if any(one.colors.error <= settings.max_delta_e / 2 for one in found):  # else a later one may be better
                 break
-        best = min(finds, key=lambda find: find.seen.error, default=None)
-        if best is not None and best.seen.error <= settings.max_delta_e:
+        best = min(found, key=lambda one: one.colors.error, default=None)
+        if best is not None and best.colors.error <= settings.max_delta_e:
             return best
-        if exposed is not None:
-            raise exposed
+        if overexposed is not None:
+            raise overexposed
         scale = self.radiance.view.scale
         if best is not None:
-            why = f"best mean residual ΔE {best.seen.error:.1f}, whitebalance.max_delta_e = {settings.max_delta_e:g}"
-        elif 0 < small_px < _LEAST_PITCH_PX:
+            why = f"best mean residual ΔE {best.colors.error:.1f}, whitebalance.max_delta_e = {settings.max_delta_e:g}"
+        elif 0 < largest_px < _LEAST_PITCH_PX:
             why = (
-                f"its patches are spaced by {small_px * scale:.0f} RAW px, at least {_LEAST_PITCH_PX * scale:.0f} are "
-                "needed: show it larger"
+                f"its patches are spaced by {largest_px * scale:.0f} RAW px, at least {_LEAST_PITCH_PX * scale:.0f} "
+                "are needed: show it larger"
             )
-        elif cheapest == np.inf:
+        elif least_cost == np.inf:
             why = "the detector found nothing like it"
-        elif cheapest > settings.max_cost:
-            why = f"best detector cost {cheapest:.3f}, limit whitebalance.max_cost = {settings.max_cost:g}"
+        elif least_cost > settings.max_cost:
+            why = f"best detector cost {least_cost:.3f}, limit whitebalance.max_cost = {settings.max_cost:g}"
         else:
-            why = f"the best candidate (cost {cheapest:.3f}) does not show 6 × 4 patches on a dark card"
+            why = f"the best candidate (cost {least_cost:.3f}) does not show 6 × 4 patches on a dark card"
         name = "ColorChecker SG" if self.reference.is_block else "ColorChecker Classic"
         raise ChartError(f"no {name} in the reference shot, at any scale or exposure ({why}); {_REMEDY}", why)
 
-    def _find_either_way_up(self, place: Placement, cost: float) -> _Find:
-        """The chart at a place, read either way up; of a ColorChecker SG its block. Raises ChartError."""
+    def _oriented(self, place: Placement, cost: float) -> _LocatedChart:
+        """The chart at a place, in the orientation of the better colors; of an SG its block. Raises ChartError."""
         ways = [place, place.turned()]  # the detector may see it upside down
         if self.reference.is_block:
             block = chart.refine(self.radiance.value[0], self._sg_block(place))
@@ -187,30 +187,30 @@ class _ChartFinder:
         Any 6 × 4 patches of an SG look like its block to the detector, and may be upside down. Raises ChartError.
         """
         column, row = (grid.ravel() for grid in np.meshgrid(np.arange(-4, 10), np.arange(-5, 9)))
-        seen = self.sample(place, np.stack([column, row], axis=-1) + 0.5)
+        around = self.sample(place, np.stack([column, row], axis=-1) + 0.5)
         ways = []
         for right, down in itertools.product(range(-4, 5), range(-5, 6)):
             inside = (column >= right) & (column < right + chart.COLUMNS) & (row >= down) & (row < down + chart.ROWS)
-            block, samples = place.shifted(right, down), seen.select(inside)
-            if down < 2:  # the block is in rows 2 to 5 of ten
+            block, samples = place.shifted(right, down), around.select(inside)
+            if down < 2:  # upright: the block starts in row 2 of ten
                 ways.append((block, samples))
-            if down > -2:
+            if down > -2:  # upside down
                 ways.append((block.turned(), samples.turned()))
         return self._best(ways).place
 
-    def _best(self, ways: Iterable[tuple[Placement, PatchSamples]]) -> _Find:
-        """The chart at the place with the smallest color residual. Raises ChartError: too few patches at each place."""
-        finds, failed = list[_Find](), ChartError("")
+    def _best(self, ways: Iterable[tuple[Placement, PatchSamples]]) -> _LocatedChart:
+        """The chart with the smallest color residual of some `ways` to place it. Raises ChartError: too few patches."""
+        finds, failed = list[_LocatedChart](), ChartError("")
         for place, samples in ways:
             try:
-                finds.append(_Find(place, patches.fit(samples, self.reference)))
+                finds.append(_LocatedChart(place, patches.fit(samples, self.reference)))
             except ChartError as error:
                 failed = error
         if not finds:
             raise failed
-        return min(finds, key=lambda find: find.seen.error)
+        return min(finds, key=lambda find: find.colors.error)
 
-    def at_corners(self, corners_px: Floats | None) -> _Find:
+    def at_corners(self, corners_px: Floats | None) -> _LocatedChart:
         """Locate the chart at corners (4, 2) RAW px from the user, refined in the picture where that is plausible.
 
         Raises ChartError: there are not four corners; they are not clockwise, outside the picture, or too close
@@ -241,23 +241,23 @@ class _ChartFinder:
         refined = chart.refine(self.radiance.value[0], start)
         moved = float(np.abs(refined.corners() - start.corners()).max()) / start.pitch_px
         find = self.find(refined if _plausible(refined, self.settings.min_explained) and moved < _MOST_MOVED else start)
-        if find.seen.error > self.settings.max_delta_e:
-            upside_down = self.find(find.place.turned()).seen.error <= self.settings.max_delta_e
+        if find.colors.error > self.settings.max_delta_e:
+            upside_down = self.find(find.place.turned()).colors.error <= self.settings.max_delta_e
             remedy = "the chart is upside down: start from the opposite corner" if upside_down else "check them"
             raise ChartError(
-                f"{stated} do not show a ColorChecker Classic: mean color residual ΔE {find.seen.error:.1f}, "
+                f"{stated} do not show a ColorChecker Classic: mean color residual ΔE {find.colors.error:.1f}, "
                 f"limit whitebalance.max_delta_e = {self.settings.max_delta_e:g}; {remedy}"
             )
         return find
 
-    def find(self, place: Placement) -> _Find:
+    def find(self, place: Placement) -> _LocatedChart:
         """Sample and fit the chart's colors at a place. Raises ChartError: too few patches are usable."""
-        return _Find(place, patches.fit(self.sample(place), self.reference))
+        return _LocatedChart(place, patches.fit(self.sample(place), self.reference))
 
     def _error(self, place: Placement) -> float:
         """Color residual of the chart at a place; infinite if too few patches are usable."""
         try:
-            return self.find(place).seen.error
+            return self.find(place).colors.error
         except ChartError:
             return np.inf
 
@@ -265,15 +265,16 @@ class _ChartFinder:
         """Sample the patches of the chart, or those with centers `at` (N, 2) in chart coordinates."""
         return patches.sample(self.radiance.value[0], self.radiance.quality[0], place, self.settings.patch_share, at)
 
-    def edition(self, found: _Find) -> ChartReference:
+    def edition(self, found: _LocatedChart) -> ChartReference:
         """Choose the edition of the chart (by year of manufacture) with the colors that fit best."""
         editions = (self.reference, *self.reference.editions)
-        residuals = [patches.residual(found.seen, edition) for edition in editions]
+        residuals = [patches.residual(found.colors, edition) for edition in editions]
         least = int(np.argmin(residuals))
         return editions[least] if residuals[least] < _CLEARLY_BETTER * residuals[0] else self.reference
 
 
 def _plausible(place: Placement, min_explained: float) -> bool:
+    """Whether a place is a possible view of a chart, with large patches that explain enough of the variance."""
     return chart.is_view(place.homography) and place.pitch_px >= _LEAST_PITCH_PX and place.explained >= min_explained
 
 

@@ -24,9 +24,9 @@ from polcap.optics.robust import spread
 
 ROWS, COLUMNS = 4, 6
 USUAL_PATCH = 0.88  # side of a patch / pitch
-_LEAST_PATCH, _GREATEST_PATCH = 0.6, 0.97
+_LEAST_PATCH, _GREATEST_PATCH = 0.6, 0.97  # limits of the fit
 _GREATEST_BLUR = 0.12  # 1σ of edges [pitch]
-_START_BLUR = 0.04
+_START_BLUR = 0.04  # [pitch]
 _PIXEL_BLUR_PX = 0.29  # 1/√12, 1σ of a pixel's width: edges cannot be sharper
 _GAMMA = 2.2
 _DARKEST = 1e-3  # of white; darker values are set to this
@@ -34,9 +34,9 @@ _MARGIN = 0.045  # width of card around the outer patches that is compared [pitc
 _AROUND = 0.3  # width around the chart in which pixels are fitted [pitch]
 _LEAST_PX = 24 * 16  # pixels of a chart that is fitted
 _WORK_PITCH_PX = 32.0  # a chart with more pixels per patch is averaged down before it is fitted
-_STEPS = 12
+_ITERATIONS = 12  # at most
 _STEP = 1e-6  # of the unknowns, for derivatives
-_SQUARE = np.array([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1]])
+_SQUARE = np.array([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1]])  # corners, clockwise in the picture
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def is_view(homography: Floats) -> bool:
 
 
 def refine(picture: Floats, start: Placement) -> Placement:
-    """Refine the location of a chart, right to a third of a patch, in a linear picture (H, W, 3).
+    """Refine the location of a chart in a linear picture (H, W, 3); `start` may err by a third of a patch.
 
     A chart with more than 32 pixels per patch is averaged down first.
     """
@@ -155,17 +155,17 @@ def _fit(image: Floats, start: Placement) -> Placement:
     Light mixes linearly at an edge; residuals are computed after a gamma of 2.2, so that dark patches count too.
     """
     middle, pitch = transform_points(start.homography, np.array([COLUMNS / 2, ROWS / 2])), start.pitch_px
-    frame = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, pitch]]) / pitch  # px → units of the pitch
-    ring = np.array([COLUMNS, ROWS]) / 2 * (1 + _SQUARE) + _AROUND * _SQUARE
-    at = pixels_inside(transform_points(start.homography, ring), image.shape)
+    to_pitches = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, pitch]]) / pitch  # px → units of the pitch
+    rectangle = np.array([COLUMNS, ROWS]) / 2 * (1 + _SQUARE) + _AROUND * _SQUARE
+    at = pixels_inside(transform_points(start.homography, rectangle), image.shape)
     value = np.maximum(image[at[:, 1], at[:, 0]], _DARKEST)  # (N, 3)
-    point = frame @ np.column_stack([at, np.ones(len(at))]).T
-    inverse = np.linalg.inv(frame @ start.homography)
+    point = to_pitches @ np.column_stack([at, np.ones(len(at))]).T
+    inverse = np.linalg.inv(to_pitches @ start.homography)
     unknowns = np.array([*(inverse / inverse[2, 2]).ravel()[:8], start.patch, _START_BLUR])
     low = [*[-np.inf] * 8, _LEAST_PATCH, min(_PIXEL_BLUR_PX / pitch, _GREATEST_BLUR)]
     high = [*[np.inf] * 8, _GREATEST_PATCH, _GREATEST_BLUR]
     explained = 0.0
-    for step in range(_STEPS):
+    for iteration in range(_ITERATIONS):
         cover, cell, used = _cover(point, unknowns)
         if used.sum() < _LEAST_PX:
             return start
@@ -174,22 +174,22 @@ def _fit(image: Floats, start: Placement) -> Placement:
         contrast = colors[cell] - card
         linear = np.maximum(contrast * cover[:, None] + card, _DARKEST)
         drawn = linear ** (1 / _GAMMA)
-        contrast = contrast * drawn / linear / _GAMMA  # derivative of the drawn value by the cover
+        by_cover = contrast * drawn / linear / _GAMMA  # derivative of the drawn value by the cover
         seen = seen ** (1 / _GAMMA)
         residual = seen - drawn
-        by_cover = [(_cover(point[:, used], unknowns + h)[0] - cover) / _STEP for h in _STEP * np.eye(10)]
-        weight = np.minimum(1, 2.5 * spread(residual) / (np.abs(residual) + 1e-12)) * contrast  # Huber
-        normal = np.asarray(by_cover) * (weight * contrast).sum(axis=1) @ np.transpose(by_cover)
+        jacobian = [(_cover(point[:, used], unknowns + h)[0] - cover) / _STEP for h in _STEP * np.eye(10)]
+        weight = np.minimum(1, 2.5 * spread(residual) / (np.abs(residual) + 1e-12)) * by_cover  # Huber
+        normal = np.asarray(jacobian) * (weight * by_cover).sum(axis=1) @ np.transpose(jacobian)
         if not np.trace(normal) > 0:  # a uniform picture
             return start
         damping = 1e-3 * np.diag(normal) + 1e-9 * np.trace(normal)
-        change = np.linalg.solve(normal + np.diag(damping), by_cover @ (weight * residual).sum(axis=1))
+        change = np.linalg.solve(normal + np.diag(damping), jacobian @ (weight * residual).sum(axis=1))
         unknowns = np.clip(unknowns + change, low, high)
         variance = float(np.mean((seen - np.median(seen, axis=0)) ** 2))
         explained = 1 - float(np.mean(np.minimum(residual**2, 0.25))) / max(variance, 1e-9)
-        if step > 3 and np.abs(change[:8]).max() < 1e-5:
+        if iteration > 3 and np.abs(change[:8]).max() < 1e-5:
             break
-    homography = np.linalg.inv(np.append(unknowns[:8], 1.0).reshape(3, 3) @ frame)
+    homography = np.linalg.inv(np.append(unknowns[:8], 1.0).reshape(3, 3) @ to_pitches)
     return Placement(homography / homography[2, 2], float(unknowns[8]), explained)
 
 
@@ -202,15 +202,15 @@ def _cover(point: Floats, unknowns: Floats) -> tuple[Floats, NDArray[np.intp], B
     from scipy.special import ndtr  # here: the import takes 0.2 s
 
     patch, blur = unknowns[8:]
-    place = np.append(unknowns[:8], 1.0).reshape(3, 3) @ point
+    projected = np.append(unknowns[:8], 1.0).reshape(3, 3) @ point
     with np.errstate(divide="ignore", invalid="ignore"):
-        uv = place[:2] / place[2]
-    edge, last = (1 - patch) / 2 - _MARGIN, np.array([[COLUMNS], [ROWS]])
-    used = ((uv > edge) & (uv < last - edge)).all(axis=0) & (place[2] > 0)
+        uv = projected[:2] / projected[2]
+    margin, last = (1 - patch) / 2 - _MARGIN, np.array([[COLUMNS], [ROWS]])
+    on_chart = ((uv > margin) & (uv < last - margin)).all(axis=0) & (projected[2] > 0)
     index = np.clip(np.nan_to_num(np.floor(uv)), 0, last - 1)
     from_center = uv - index - 0.5
     sides = ndtr((from_center + patch / 2) / blur) - ndtr((from_center - patch / 2) / blur)
-    return sides[0] * sides[1], (index[1] * COLUMNS + index[0]).astype(np.intp), used
+    return sides[0] * sides[1], (index[1] * COLUMNS + index[0]).astype(np.intp), on_chart
 
 
 def _colors(value: Floats, cover: Floats, cell: NDArray[np.intp]) -> tuple[Floats, Floats]:

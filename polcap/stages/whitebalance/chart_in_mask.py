@@ -9,21 +9,21 @@ from polcap.image_values import Bools
 from polcap.stage_values import AngleStack
 from polcap.stages.whitebalance import chart, patches
 
-_LEAST_SHARE = 0.05  # of the mask; smaller parts do little harm
+_LEAST_SHARE = 0.05  # of the mask; smaller parts are not tested
 _LEAST_PITCH_PX = 6.0  # smaller patches cannot be distinguished from texture
-_FILLED = 0.9  # least share of its bounding rectangle that a card fills
+_FILLED = 0.9  # least share of its bounding rectangle that a card covers
 _ASPECT = (1.15, 1.8)  # range of aspect ratios of a card with 6 × 4 patches, also when tilted
-_EXPLAINED = 0.75  # least share of variance that 24 flat patches explain; 17 of 106 textures have it too
-_DELTA_E = 15.0  # largest mean ΔE of its colors, as `whitebalance.max_delta_e`; these textures have 20 and more
+_EXPLAINED = 0.75  # least share of variance that 24 flat patches explain; 17 of 106 textures reach it
+_DELTA_E = 15.0  # largest mean ΔE of a chart, as `whitebalance.max_delta_e`; these 17 textures have 20 and more
 _PATCH_SHARE = 0.6  # sampled share of a patch's side
 
 
 def share(radiance: AngleStack, mask: Bools, reference: ChartReference) -> float:
     """Share of the mask (H, W) that shows a ColorChecker in the first shot; 0 without one."""
-    count, label, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    count, label, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     total = max(int(mask.sum()), 1)
-    parts = [n for n in range(1, count) if about[n, cv2.CC_STAT_AREA] > _LEAST_SHARE * total]
-    return sum(int(about[n, cv2.CC_STAT_AREA]) for n in parts if _is_chart(radiance, label == n, reference)) / total
+    parts = [n for n in range(1, count) if stats[n, cv2.CC_STAT_AREA] > _LEAST_SHARE * total]
+    return sum(int(stats[n, cv2.CC_STAT_AREA]) for n in parts if _is_chart(radiance, label == n, reference)) / total
 
 
 def _is_chart(radiance: AngleStack, part: Bools, reference: ChartReference) -> bool:
@@ -41,10 +41,10 @@ def _is_chart(radiance: AngleStack, part: Bools, reference: ChartReference) -> b
     place = chart.refine(radiance.value[0], chart.from_corners(box, patch=1.0))
     if place.explained < _EXPLAINED or not chart.is_view(place.homography):
         return False
-    seen = patches.sample(radiance.value[0], radiance.quality[0], place, _PATCH_SHARE)
-    for way in (seen, seen.turned()):
+    upright = patches.sample(radiance.value[0], radiance.quality[0], place, _PATCH_SHARE)
+    for samples in (upright, upright.turned()):
         try:
-            if patches.fit(way, reference).error < _DELTA_E:
+            if patches.fit(samples, reference).error < _DELTA_E:
                 return True
         except ChartError:  # too few of its patches are usable
             continue

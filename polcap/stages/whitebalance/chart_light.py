@@ -24,18 +24,18 @@ from polcap.stages.whitebalance.chart import Placement
 # 1σ before the measurement: flash right of the lens, above the lens [chart distances], power of the falloff. A hot shoe
 # is 0.1 to 0.15 m above the lens, objects at about 1 m; cos⁴ is a lens's natural falloff, cos⁰ a corrected one.
 _PRIOR = np.array([0.1, 0.1, 2.0])
-# 1σ of the chart's tilt by its outline [rad]: corners are right to 0.2 % of the chart, lenses distort by 1 %. Then
-# relative 1σ of a focal length that is a guess; the tilt has the same relative error.
+# 1σ of the chart's tilt by its outline [rad]: corners are right to 0.2 % of the chart, lenses distort by 1 %. And
+# relative 1σ of a guessed focal length; the tilt has the same relative error.
 _TURN_SIGMA, _FOCAL_SPREAD = 0.03, 0.3
 _FARTHEST = 0.3  # largest distance of the flash from the lens [chart distances]
 _LIGHT_PER_DELTA_E = 0.02  # relative error of Y per ΔE2000; about half of a ΔE is lightness
-_LEAST_PATCH_ERROR = 0.005
+_LEAST_PATCH_ERROR = 0.005  # least relative error of Y
 # A slope that the flash does not cause: 1σ before the measurement [per patch], and the error of the level per unit of
 # it [patches]. On 40 charts lit by a lamp of their own or darkened by vignetting the level was off by 3 to 10 patches.
-_OTHER_SLOPE, _OTHER_REACH = 0.012, 6.0
-_STEP = 1e-4
-_ROUNDS = 4
-_STRAIGHT = np.linalg.pinv(
+_OTHER_SLOPE, _OTHER_LEVEL = 0.012, 6.0
+_STEP = 1e-4  # of the unknowns, for derivatives
+_ROUNDS = 4  # of Gauss–Newton
+_PLANE_FIT = np.linalg.pinv(
     np.column_stack([np.ones(24), patches.position()])
 )  # (3, 24) maps the light of patches to level and slope
 
@@ -47,32 +47,34 @@ def measure(place: Placement, view: View, slope: Floats, delta_e: float) -> Char
     delta_e, the mean residual of the patches, determines its error.
     """
     outlined = _ChartPlane(*_plane(place, view))
-    aslant = np.hypot(*outlined.normal[:2]) / outlined.normal[2]  # tangent of the tilt from the image plane
-    turn = _TURN_SIGMA if view.known else float(np.hypot(_TURN_SIGMA, _FOCAL_SPREAD * min(aslant, 1.0)))
-    prior = np.diag(1 / np.array([*_PRIOR, turn, turn, _OTHER_SLOPE, _OTHER_SLOPE]) ** 2)
-    error = max(_LEAST_PATCH_ERROR, _LIGHT_PER_DELTA_E * delta_e)
-    known = np.linalg.inv(error**2 * (_STRAIGHT @ _STRAIGHT.T)[1:, 1:])
+    tilt = np.hypot(*outlined.normal[:2]) / outlined.normal[2]  # tangent of the tilt from the image plane
+    turn_sigma = _TURN_SIGMA if view.known else float(np.hypot(_TURN_SIGMA, _FOCAL_SPREAD * min(tilt, 1.0)))
+    prior_precision = np.diag(1 / np.array([*_PRIOR, turn_sigma, turn_sigma, _OTHER_SLOPE, _OTHER_SLOPE]) ** 2)
+    patch_error = max(_LEAST_PATCH_ERROR, _LIGHT_PER_DELTA_E * delta_e)
+    precision = np.linalg.inv(patch_error**2 * (_PLANE_FIT @ _PLANE_FIT.T)[1:, 1:])
 
     state = np.zeros(7)  # flash (2,), falloff, turn (2,), other slope (2,)
     for _ in range(_ROUNDS):
-        here = _slope(outlined, state)
-        by_state = np.stack([(_slope(outlined, state + step) - here) / _STEP for step in _STEP * np.eye(7)], axis=1)
-        covariance = np.linalg.inv(prior + by_state.T @ known @ by_state)
-        state = covariance @ by_state.T @ known @ (slope - here + by_state @ state)
+        model = _slope(outlined, state)
+        by_state = np.stack([(_slope(outlined, state + step) - model) / _STEP for step in _STEP * np.eye(7)], axis=1)
+        covariance = np.linalg.inv(prior_precision + by_state.T @ precision @ by_state)
+        state = covariance @ by_state.T @ precision @ (slope - model + by_state @ state)
         state[:2] = np.clip(state[:2], -_FARTHEST, _FARTHEST)
     found = outlined.turned(state[3:5])
-    uneven = float(_OTHER_REACH * np.hypot(*state[5:]))
+    uneven = float(_OTHER_LEVEL * np.hypot(*state[5:]))
     return ChartLight(found.point[patches.WHITE], found.normal, state[:3], covariance[:5, :5], uneven)
 
 
 @dataclass(frozen=True)
 class _ChartPlane:
+    """Place and direction of a chart."""
+
     point: Floats  # (24, 3) patch centers in the camera frame, in units of the distance of the chart's center
     normal: Floats  # (3,)
 
     def turned(self, turn: Floats) -> "_ChartPlane":
         """The chart's plane after a small rotation (2,) about x and y [rad] through its center."""
-        from scipy.spatial.transform import Rotation  # here: importing it costs .2 s of every start
+        from scipy.spatial.transform import Rotation  # here: the import takes 0.2 s
 
         rotation, middle = Rotation.from_rotvec([*turn, 0.0]), self.point.mean(axis=0)
         return _ChartPlane(middle + rotation.apply(self.point - middle), rotation.apply(self.normal))
@@ -85,7 +87,7 @@ def _slope(outlined: _ChartPlane, state: Floats) -> Floats:
     falloff, turn (2,) [rad], and the slope (2,) that the flash does not cause [per patch].
     """
     plane = outlined.turned(state[3:5])
-    level, *slope = _STRAIGHT @ point_light.irradiance(plane.point, state[:2], state[2], plane.normal)
+    level, *slope = _PLANE_FIT @ point_light.irradiance(plane.point, state[:2], state[2], plane.normal)
     return np.asarray(np.array(slope) / level + state[5:])
 
 

@@ -11,15 +11,15 @@ from polcap.image_values import Floats
 from polcap.optics.projection import transform_points
 from polcap.stages.whitebalance.chart import resize, scaling, white
 
-_TILE_PX, _TILE_STEP_PX = 900, 600
+_TILE_PX, _TILE_STEP_PX = 900, 600  # side of a tile, and distance of two
 _CANDIDATES = 3  # per picture, because the detector may prefer a texture to the chart
 
 
 def candidates(value: Floats, of_sg: bool = False) -> Iterator[tuple[Floats, float]]:
     """Possible charts in a picture (H, W, 3): patch centers (24, 2) px and detector cost of each.
 
-    With `of_sg` they are any 24 patches of a ColorChecker SG: in some pictures OpenCV finds the whole chart, in others
-    only what looks like a Classic.
+    With `of_sg` they may be any 6 × 4 patches of a ColorChecker SG: OpenCV finds the whole chart, or takes a part of it
+    for a Classic.
     """
     detector: Any = cv2.mcc.CCheckerDetector.create()
     kinds = (cv2.mcc.SG140, cv2.mcc.MCC24) if of_sg else (cv2.mcc.MCC24,)
@@ -43,17 +43,17 @@ def _pictures(value: Floats) -> Iterator[tuple[NDArray[np.uint8], Floats]]:
     height, width = value.shape[:2]
     longest, balanced = max(height, width), white(value)
     grey = np.full(3, balanced.max())
-    exposures = {  # (white, gain) by the picture's longer side, px
+    exposures = {  # (white, gain) of the pictures, by their longer side, px
         1000: [(balanced, 1.0), (balanced, 2.5), (balanced, 0.3), (grey, 1.0), (grey, 2.5), (grey, 0.3)],
         600: [(balanced, 1.0)],
         1600: [(balanced, 1.0), (balanced, 2.5)],
         2400: [(balanced, 1.0)] if longest <= 2400 else [],
     }
-    for side, ways in exposures.items():
-        if side > 4.5 * longest:
+    for side, levels in exposures.items():
+        if side > 4.5 * longest:  # enlarged too much
             continue
         small = resize(value, side / longest)
-        for level, gain in ways:
+        for level, gain in levels:
             yield _eight_bits(small, level / gain), scaling(small.shape, value.shape)
     if longest > 2400:
         for y in range(0, max(height - _TILE_PX, 0) + _TILE_STEP_PX, _TILE_STEP_PX):

@@ -7,7 +7,7 @@ import numpy as np
 from polcap.image_values import Bools, Floats
 from polcap.optics.color import delta_e, luminance
 
-_ROUNDS = 20  # of reweighting the patches
+_ROUNDS = 20  # of the fit, each with new weights of the patches
 _TRIES = 60  # random starts of the least trimmed squares
 _RIDGE = 1e-12  # added to the scaled normal equations, so that too few colors raise no error
 
@@ -72,16 +72,16 @@ def trimmed_residuals(color: Floats, reference: Floats, position: Floats, usable
     Rousseeuw & Van Driessen, Computing LTS Regression for Large Data Sets, 2006.
     """
     color = color / (float(np.mean(color[usable])) + 1e-12)
-    base, random, system = _base(reference), np.random.default_rng(24), _ChartEquations(color, reference, position)
-    able = np.flatnonzero(usable)
-    most = max(9, round(0.6 * len(able)))
+    base, random, system = _weights(reference), np.random.default_rng(24), _ChartEquations(color, reference, position)
+    usable_patches = np.flatnonzero(usable)
+    count = max(9, round(0.6 * len(usable_patches)))
     chosen = np.zeros((_TRIES, len(base)), bool)
     for row in chosen:
-        row[random.choice(able, 9, replace=False)] = True
+        row[random.choice(usable_patches, 9, replace=False)] = True
     for _ in range(3):  # each step lowers the sum (Rousseeuw's C-step)
         corrected = _reflectance(color, position, *system.solve(base * chosen))
         error = np.linalg.norm(base[:, None] * (corrected - reference), axis=-1)
-        order = able[np.argsort(error[:, able], axis=1)[:, :most]]
+        order = usable_patches[np.argsort(error[:, usable_patches], axis=1)[:, :count]]
         chosen = np.zeros_like(chosen)
         np.put_along_axis(chosen, order, True, axis=1)
     best = int(np.argmin(np.sum(error**2, axis=1, where=chosen)))
@@ -94,7 +94,7 @@ def _fit_weighted(color: Floats, reference: Floats, position: Floats, usable: Bo
     Returns matrix M (…, 3, 3), light slope e (…, 2) and glare b (…,) of `fit_matrix`.
     """
     exposure = float(np.mean(color[usable.reshape(-1, len(color)).any(axis=0)])) + 1e-12
-    color, base = color / exposure, np.where(usable, _base(reference), 0.0)
+    color, base = color / exposure, np.where(usable, _weights(reference), 0.0)
     system, weight = _ChartEquations(color, reference, position), base
     for _ in range(_ROUNDS):
         matrix, slope, glare = system.solve(weight)
@@ -118,8 +118,8 @@ def _reflectance(color: Floats, position: Floats, matrix: Floats, slope: Floats,
     return np.asarray((color @ np.swapaxes(matrix, -1, -2) - np.asarray(glare)[..., None, None]) / level[..., None])
 
 
-def _base(reference: Floats) -> Floats:
-    """Weights (N,) of chart patches in the matrix fit: the slope of L*, doubled for neutral patches."""
+def _weights(reference: Floats) -> Floats:
+    """Weights (N,) of chart patches in the matrix fit: 1/Y^⅔, the slope of L*, doubled for neutral patches."""
     chroma = reference.max(axis=1) - reference.min(axis=1)
     return np.asarray((1 + (chroma < 0.1 * reference.max(axis=1))) / np.maximum(luminance(reference), 0.02) ** (2 / 3))
 

@@ -17,12 +17,12 @@ from polcap.stages.whitebalance import chart, color_matrix
 from polcap.stages.whitebalance.chart import Placement
 
 WHITE = 18  # index of the white patch, the first of six greys
-_LEAST = 12  # patches; the fit has 12 unknowns and three equations per patch
+_LEAST = 12  # usable patches; the fit has 12 unknowns and three equations per patch
 _CLIPPED = 0.02  # share of a patch's pixels that may be clipped
-_UNEVEN, _UNEVEN_WHITE = 0.15, 0.01  # largest difference of a patch's quarter: of the patch, plus of the white patch
+_UNEVEN, _UNEVEN_WHITE = 0.15, 0.01  # largest difference of a patch's quarter: a share of the patch plus one of white
 _ODD, _LEAST_ODD = 6.0, 4.0  # an outlier has more than this many times the median ΔE, and at least this ΔE
 _LEAST_SURROUNDINGS = 0.5  # share of the patches around a block that must agree with it
-_MOST_COUNTED = 30.0  # largest ΔE of an excluded patch in the mean that decides whether it is a chart
+_MOST_COUNTED = 30.0  # an outlier's larger ΔE counts as this in `ChartFit.error`
 
 
 class PatchUse(IntEnum):
@@ -41,7 +41,7 @@ class ChartFit:
 
     fit: color_matrix.MatrixFit
     use: Bits  # (24,) PatchUse
-    error: float  # mean ΔE2000 of all unclipped patches, excluded ones too: decides whether it is a chart
+    error: float  # mean ΔE2000 of the used patches and the outliers; decides whether this is a chart
     color: Floats  # (24, 3) S0 of the patches, camera channels
 
 
@@ -80,9 +80,9 @@ def fit(samples: PatchSamples, reference: ChartReference) -> ChartFit:
     if (usable & ~odd).sum() < _LEAST:  # no matrix fits most patches: use all
         odd[:] = False
     use = np.where(odd, PatchUse.ODD, use).astype(np.uint8)
-    found = color_matrix.fit_matrix(seen, reference.rec709, position(), usable & ~odd)
-    every = np.where(odd, np.minimum(error, _MOST_COUNTED), found.delta_e)
-    return ChartFit(found, use, float(np.nanmean(every)), seen)
+    matrix_fit = color_matrix.fit_matrix(seen, reference.rec709, position(), usable & ~odd)
+    delta_e = np.where(odd, np.minimum(error, _MOST_COUNTED), matrix_fit.delta_e)
+    return ChartFit(matrix_fit, use, float(np.nanmean(delta_e)), seen)
 
 
 def cross_validate(found: ChartFit, reference: ChartReference) -> Floats | None:
@@ -92,10 +92,7 @@ def cross_validate(found: ChartFit, reference: ChartReference) -> Floats | None:
 
 
 def residual(found: ChartFit, reference: ChartReference) -> float:
-    """Mean ΔE2000 of the patches in use, after a color matrix is fitted to the colors of `reference`.
-
-    It compares editions of the chart.
-    """
+    """Mean ΔE2000 of the patches in use, after a fit to the colors of `reference`, an edition of the chart."""
     used = found.use == PatchUse.USED
     return float(np.nanmean(color_matrix.fit_matrix(found.color, reference.rec709, position(), used).delta_e))
 
@@ -118,8 +115,8 @@ def fit_with_surroundings(
     assert others is not None
     at = others.center - chart.centers()[WHITE]
     error = color_matrix.residuals(found.fit, around.color, others.rec709, at)
-    most = max(_LEAST_ODD, _ODD * float(np.nanmedian(found.fit.delta_e)))
-    agree = (around.use == PatchUse.USED) & (error < most)
+    limit = max(_LEAST_ODD, _ODD * float(np.nanmedian(found.fit.delta_e)))
+    agree = (around.use == PatchUse.USED) & (error < limit)
     agree &= agree.mean() >= _LEAST_SURROUNDINGS
     seen, known = np.vstack([found.color, around.color]), np.vstack([reference.rec709, others.rec709])
     arguments = (seen, known, np.vstack([position(), at]), np.concatenate([found.use == PatchUse.USED, agree]))

@@ -25,9 +25,9 @@ def found(samples, iso=100.0):
 def test_roughness_keeps_white_noise_and_is_blind_to_ramps():
     rng = np.random.default_rng(0)
     white = rng.normal(size=(1, 400, 400))
-    assert noise.roughness(white).var() == pytest.approx(1, rel=0.03)
+    assert noise.second_differences(white).var() == pytest.approx(1, rel=0.03)
     y, x = np.mgrid[:20, :30].astype(float)
-    np.testing.assert_allclose(noise.roughness((3 * x - 2 * y + x * y)[None]), 0, atol=1e-10)
+    np.testing.assert_allclose(noise.second_differences((3 * x - 2 * y + x * y)[None]), 0, atol=1e-10)
 
 
 def test_pairs_find_both_gains_under_strong_texture():
@@ -112,7 +112,7 @@ def test_lines_are_learnt_once_per_iso():
 def test_calibrated_noise_is_not_learnt_again():
     line = NoiseLine(100.0, (1e-4,), (0.0,), (2e-8,), (0.0,), (1e4,), (1.4,))
     lines = noise.Lines([line])
-    rich = noise.Samples(np.full((500, 1), 0.3), np.full((500, 1), 1.0), flat=False)
+    rich = noise.Samples(np.full((500, 1), 0.3), np.full((500, 1), 1.0), with_detail=False)
     lines.learn(100.0, rich)
     assert lines.knows(100.0)
     assert lines.line(100.0, 0.0).slope == pytest.approx([1e-4])
