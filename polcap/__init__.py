@@ -57,8 +57,8 @@ def __getattr__(name: str) -> Any:
     """Import a public name from its module."""
     if name not in __all__:
         raise AttributeError(f"module 'polcap' has no attribute {name!r}")
-    module, there = _HOME[name]
-    return getattr(import_module(module), there)
+    module, attribute = _HOME[name]
+    return getattr(import_module(module), attribute)
 
 
 def __dir__() -> list[str]:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from polcap.fusion.fusion_path import SessionConfig
 
 _FLAG = re.compile(r"--([a-z]+(?:-[a-z]+)*)")
-_ARGUMENTS = {"angles": "angles_deg", "set": "config", "about": "catalog", "extra": "extras", "no-chart": "chart"}
+_ARGUMENT_OF = {"angles": "angles_deg", "set": "config", "about": "catalog", "extra": "extras", "no-chart": "chart"}
 _Arguments = ParamSpec("_Arguments")
 _Returned = TypeVar("_Returned")
 _Name = TypeVar("_Name", bound=str)
@@ -43,7 +43,7 @@ def _in_python(function: Callable[_Arguments, _Returned]) -> Callable[_Arguments
     names = inspect.signature(function).parameters
 
     def argument(flag: re.Match[str]) -> str:
-        name = _ARGUMENTS.get(flag[1], flag[1].replace("-", "_"))
+        name = _ARGUMENT_OF.get(flag[1], flag[1].replace("-", "_"))
         return name if name in names else flag[0]
 
     @wraps(function)
@@ -204,19 +204,19 @@ def export(
     result
         Result folder of `process` or `fuse`, its `Result`, or the folder of the capture or the views.
     preset
-        Program, such as "unreal"; it brings its formats. All are in `docs/how-to/export.md`.
+        Target program, such as "unreal", with its formats; `docs/how-to/export.md` lists all.
     out
-        New result folder for the files, with a copy of the maps; for an archive, which stays as it is.
+        New result folder for the files and a copy of the maps. An archive needs one, because it stays as it is.
     formats
         Without a preset: of gltf, obj, ply, stl, usd, usdz, materialx, exr, iiif, sfp; by default gltf and obj.
     images, geometry
         Inside the GLB: "png", "jpeg", "webp" or "ktx2"; "float", "quantized" or "draco".
     triangles, texture_size
-        Most triangles, by default those of the preset or all; px of the longer side of the textures.
+        Largest number of triangles, by default the preset's or that of the full mesh; longer side of the textures, px.
     color
         Color space or OCIO role of the colors in the layered EXR.
     bits
-        Of a texture's channel in PNG.
+        Bits per channel of PNG textures.
     extras
         Further textures: "displacement", "occlusion", "object-normal", …
     page
@@ -286,7 +286,7 @@ def fuse(
 
     `out` is by default `folder`/fused; `workers` views are processed at a time. `config` is a
     `polcap.fusion.fusion_path.SessionConfig`, the settings of the views and of the fusion. `notify` is called with
-    lines of text. The other arguments are those of `process`. Run again, it goes on where it was stopped.
+    lines of text. The other arguments are those of `process`. A repeated call continues an interrupted one.
 
     Raises
     ------

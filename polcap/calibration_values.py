@@ -14,7 +14,7 @@ class NoiseLine:
     floor_sigma: tuple[float, ...]
     electrons_at_white: tuple[float, ...]  # (C,) of one photosite
     read_noise_electrons: tuple[float, ...]  # (C,) 1σ of one photosite
-    read_noise_sigma: tuple[float, ...] = ()  # (C,) e⁻, 1σ upwards
+    read_noise_sigma: tuple[float, ...] = ()  # (C,) e⁻, 1σ error towards larger values
     source: str = "flat frames"  # or "bracket"
 
 
@@ -48,8 +48,8 @@ class Falloff:
     coefficient: tuple[tuple[float, float, float], ...]  # (C, 3)
     sigma: tuple[tuple[float, float, float], ...]
     corner: tuple[float, ...]  # (C,) light in the corners relative to the middle
-    f_number: float | None = None  # of the photographs; the falloff is valid for these two
-    focal_length_mm: float | None = None
+    f_number: float | None = None  # of the photographs; the falloff is valid only there
+    focal_length_mm: float | None = None  # likewise
 
 
 @dataclass(frozen=True)

@@ -85,9 +85,9 @@ class Shot:
     """All photographs of one polarizer angle: a bracket of exposures, and ambient frames."""
 
     angle: float  # rad, from image x towards image up
-    frames: tuple[Frame, ...]  # (E,) by stated exposure, else by name; an index has one exposure in every shot
+    frames: tuple[Frame, ...]  # (E,) sorted by stated exposure, else by name; e is the same exposure in all shots
     ambient: tuple[Frame, ...] = ()  # flash off, same settings
-    place_px: tuple[float, float] = (0.0, 0.0)  # x, y of its pixel (0, 0) in a polarization sensor's mosaic
+    place_px: tuple[float, float] = (0.0, 0.0)  # x, y of its pixel (0, 0) on the grid of a sensor's 2×2 cells [cells]
 
     @property
     def name(self) -> str:
@@ -145,14 +145,14 @@ class Capture:
     catalog: CatalogEntry = field(default=CatalogEntry(), metadata=NOT_IN_KEY)
     angles: AngleStatement = AngleStatement()
     lens_filter: str = field(default="", metadata=NOT_IN_KEY)  # the polarizer's name, from capture.toml
-    accuracy: BallAccuracy | None = field(default=None, metadata=NOT_IN_KEY)  # of these, on a ball; None: not validated
+    accuracy: BallAccuracy | None = field(default=None, metadata=NOT_IN_KEY)  # with this equipment; None: not validated
 
     def __repr__(self) -> str:
         shots = ", ".join(f"{shot.name}: {len(shot.frames)}" for shot in self.shots)
         return f"Capture({self.name!r}, {self.layout}, frames {shots}; {self.size_px[0]} × {self.size_px[1]} px)"
 
     def file_name(self, frame: Frame) -> str:
-        """A photograph's file as the user finds it in the capture's folder."""
+        """Path of a photograph's file, relative to the capture's folder if the file is in it."""
         path = Path(frame.path)
         return (path.relative_to(self.folder) if path.is_relative_to(self.folder) else path).as_posix()
 
@@ -170,13 +170,13 @@ class Capture:
     @property
     def angle(self) -> Floats:
         """Polarizer axes (K,) rad of the shots: as stated, or corrected by the ring's calibration."""
-        return self._turned(np.array([shot.angle for shot in self.shots]))
+        return self._calibrated(np.array([shot.angle for shot in self.shots]))
 
     @property
     def crossed_angle(self) -> float:
         """Polarizer axis [rad] of the cross-polarized shot; NaN without one."""
-        return float("nan") if self.crossed is None else float(self._turned(np.array(self.crossed.angle)))
+        return float("nan") if self.crossed is None else float(self._calibrated(np.array(self.crossed.angle)))
 
-    def _turned(self, stated: Floats) -> Floats:
+    def _calibrated(self, stated: Floats) -> Floats:
         ring = self.calibration.polarizer if self.calibration is not None else None
         return stated if ring is None else ring.sense * stated + np.radians(ring.zero_deg)

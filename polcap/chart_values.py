@@ -35,9 +35,9 @@ class ChartLight:
 
     white: Floats  # (3,) position of the white patch, camera frame
     normal: Floats  # (3,) unit, towards the camera
-    flash: Floats  # (3,) position right of and above the lens; exponent of the cosine of its angular falloff
-    covariance: Floats  # (5, 5) of these three and of the chart's rotations about x and y [rad]
-    uneven: float = 0.0  # relative 1σ of the light's level from a slope of the light that the flash does not cause
+    flash: Floats  # (3,) right of the lens, above the lens; last the exponent n of its angular falloff cosⁿ
+    covariance: Floats  # (5, 5) of the values of `flash`, and of the chart's rotations about x and y [rad]
+    uneven: float = 0.0  # relative 1σ of the light's level, because of a slope that the flash does not explain
 
     @property
     def tilt(self) -> float:

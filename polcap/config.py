@@ -49,7 +49,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def of_views(self) -> "Config":
-        """The settings of each view, without the sections of several views together."""
+        """The settings of a single view: a subclass's sections for several views are left out."""
         return msgspec.convert(self, Config, from_attributes=True)
 
 
@@ -83,25 +83,25 @@ def fill(kind: type[S], stated: Mapping[str, Any], assignments: Sequence[str]) -
 
     Raises SettingError: a key is unknown, of the wrong type or out of its range.
     """
-    known = {setting.key: setting for setting in settings(kind)}
+    setting_of = {setting.key: setting for setting in settings(kind)}
     values = dict(_by_key(stated))
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         if not equals:
-            raise SettingError(f"--set {assignment}: give a value, as in {next(iter(known))}=VALUE")
+            raise SettingError(f"--set {assignment}: give a value, as in {next(iter(setting_of))}=VALUE")
         values |= _by_key({key.strip(): _parse(text.strip())})
     _check_plain(values)
     table: dict[str, Any] = {}
     for key, value in values.items():
-        _check_known(key, value, known)
+        _check_known(key, value, setting_of)
         *sections, name = key.split(".")
         functools.reduce(lambda inner, section: inner.setdefault(section, {}), sections, table)[name] = value
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
         fault = text_file.fault(error, table, kind)
-        about = next((one.description for key, one in known.items() if re.match(rf"{key}\b", fault)), "")
-        raise SettingError(f"{fault} ({about})" if about else fault) from error
+        meaning = next((one.description for key, one in setting_of.items() if re.match(rf"{key}\b", fault)), "")
+        raise SettingError(f"{fault} ({meaning})" if meaning else fault) from error
     except UnicodeError as error:
         raise SettingError("--set: a value is not UTF-8 text; write it in ASCII") from error
 
@@ -125,15 +125,15 @@ def settings(kind: type[msgspec.Struct] = Config, prefix: str = "") -> Iterator[
         if isinstance(type_, type) and issubclass(type_, msgspec.Struct):
             yield from settings(type_, f"{key}.")
             continue
-        arms = [hint] if get_origin(hint) is Annotated else [*get_args(hint)] or [hint]  # of a union with None
-        metas = [extra for arm in arms for extra in get_args(arm)[1:] if isinstance(extra, Meta)]
+        members = [hint] if get_origin(hint) is Annotated else [*get_args(hint)] or [hint]  # of a union with None
+        metas = [extra for member in members for extra in get_args(member)[1:] if isinstance(extra, Meta)]
         choices = get_origin(type_) is Literal
-        word = str(type_).replace("typing.", "") if choices else (*get_args(type_), type_)[0].__name__
+        type_name = str(type_).replace("typing.", "") if choices else (*get_args(type_), type_)[0].__name__
         description = "".join(meta.description or "" for meta in metas)
-        yield Setting(key, word, field.default, ", ".join(filter(None, map(_limits, metas))), description)
+        yield Setting(key, type_name, field.default, ", ".join(filter(None, map(_limits, metas))), description)
 
 
-def _limits(meta: Meta) -> str:
+def _limits(meta: Meta) -> str:  # such as ≥ 0, ≤ 1
     signs = {"gt": "> ", "ge": "≥ ", "lt": "< ", "le": "≤ ", "multiple_of": "multiple of "}
     return ", ".join(f"{sign}{getattr(meta, name)}" for name, sign in signs.items() if getattr(meta, name) is not None)
 
@@ -149,9 +149,9 @@ def _by_key(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
 
 def _parse(text: str) -> Any:
     """Parse a setting's value as TOML; also words without quotes, lists without brackets (0,60,120) and .5 for 0.5."""
-    for written in (text, f"[{text}]" if "," in text else text, _BARE_POINT.sub("0.", text)):
+    for candidate in (text, f"[{text}]" if "," in text else text, _BARE_POINT.sub("0.", text)):
         try:
-            return tomllib.loads(f"value = {written}")["value"]
+            return tomllib.loads(f"value = {candidate}")["value"]
         except (ValueError, RecursionError):
             continue
     return text
@@ -169,7 +169,7 @@ def _check_known(key: str, value: Any, known: dict[str, Setting]) -> None:
     """Raise SettingError for an unknown key, with the most similar one."""
     if key in known or (value == {} and any(name.startswith(f"{key}.") for name in known)):
         return
-    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    similar = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
     sections = dict.fromkeys(name.partition(".")[0] for name in known)
-    hint = f"; did you mean {near[0]}?" if near else f"; there are {', '.join(sections)}"
+    hint = f"; did you mean {similar[0]}?" if similar else f"; there are {', '.join(sections)}"
     raise SettingError(f"{key} = {value!r}: there is no such setting{hint}")

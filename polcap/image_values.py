@@ -52,7 +52,7 @@ class SensorImage(ArrayValue):
     """One decoded frame, linear, black level not subtracted."""
 
     value: Floats | NDArray[np.uint16]  # (H, W) mosaic, or (H, W, 3) without a mosaic; counts
-    black: Floats  # per phase of the mosaic, same shape as `cfa`; without one (1, C); or (1, 1); counts
+    black: Floats  # shape of `cfa`, by place in the mosaic; (1, C) without one; (1, 1): one for all; counts
     white: float  # counts at which the sensor saturates
     cfa: Bits | None  # (2, 2), X-Trans (6, 6), of 0 R, 1 G, 2 B; None without a mosaic
     camera_matrix: Floats | None = None  # (3, 3) camera RGB → linear Rec.709 at the camera's white balance

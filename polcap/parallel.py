@@ -12,16 +12,16 @@ T = TypeVar("T")
 
 def threads() -> int:
     """Number of threads to use: OMP_NUM_THREADS, which `--threads` sets, or the cores that this process may use."""
-    asked = os.environ.get("OMP_NUM_THREADS", "")
-    if asked.isascii() and asked.isdecimal() and int(asked):
-        return int(asked)
+    stated = os.environ.get("OMP_NUM_THREADS", "")
+    if stated.isascii() and stated.isdecimal() and int(stated):
+        return int(stated)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def results(functions: Iterable[Callable[[], T]], most: int | None = None) -> list[T]:
     """Results of the calls in their order, from at most `most` threads; raises the first error in this order.
 
-    A single thread is the caller's. After an error or Ctrl-C, no further call starts.
+    With one thread, the calls run in the caller's. After an error or Ctrl-C, no further call starts.
     """
     calls = list(functions)
     workers = min(len(calls), threads() if most is None else most)

@@ -42,10 +42,10 @@ class _Child:
     """A child process that executes one call at a time."""
 
     def __init__(self, limits: Limits) -> None:
-        self._pipe, there = _SPAWN.Pipe()
-        self._process = _SPAWN.Process(target=_serve, args=(there, limits))
+        self._pipe, child_end = _SPAWN.Pipe()
+        self._process = _SPAWN.Process(target=_serve, args=(child_end, limits))
         self._process.start()
-        there.close()
+        child_end.close()
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Wait for the result of a function; None if the process died."""
@@ -83,12 +83,12 @@ class ProcessPool:
     def run(self, function: Callable[[T, int], R], tasks: Sequence[T]) -> Iterator[tuple[T, R | Died]]:
         """Call `function` on each task and the number of the attempt; yields tasks and outcomes as they end.
 
-        The function is found by its name, and never returns None. If its process dies, a task is begun again, up to
-        `retries` times.
+        The function must be importable by its name, and must not return None. If its process dies, a task is begun
+        again, up to `retries` times.
         """
-        begun = {self._threads.submit(self._call, function, task): task for task in tasks}
-        for future in as_completed(begun):
-            yield begun[future], future.result()
+        task_of_call = {self._threads.submit(self._call, function, task): task for task in tasks}
+        for future in as_completed(task_of_call):
+            yield task_of_call[future], future.result()
 
     def _call(self, function: Callable[[T, int], R], task: T) -> R | Died:
         """Call a function in an idle child process, or in a new one; in a thread of the pool."""

@@ -16,7 +16,7 @@ OUT_OF_MEMORY = (  # messages of OpenCV, pybind11, onnxruntime, threads, the loa
 # memory of a run: per RAW pixel, and fixed (measured, docs/explanations/scale.md)
 _GB_PER_PIXEL, _GB_FIXED = 55e-9, 0.55
 _ROOM = 1.1  # factor on the memory at which a request failed, because later requests may be larger
-_ASKED = re.compile(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)")  # numpy, OpenCV
+_REQUESTED = re.compile(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)")  # numpy, OpenCV
 _BYTES = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
 
@@ -38,10 +38,10 @@ def set_limits(threads: int, gigabytes: float) -> None:
         cv2.setNumThreads(threads)
     if gigabytes:
         resource = _resource(gigabytes)
-        size, most = int(gigabytes * 1e9), resource.getrlimit(resource.RLIMIT_DATA)[1]
-        if most != resource.RLIM_INFINITY:  # the administrator's limit is not raised
-            size = min(size, most)
-        resource.setrlimit(resource.RLIMIT_DATA, (size, most))
+        size, maximum = int(gigabytes * 1e9), resource.getrlimit(resource.RLIMIT_DATA)[1]
+        if maximum != resource.RLIM_INFINITY:  # the administrator's limit is not raised
+            size = min(size, maximum)
+        resource.setrlimit(resource.RLIMIT_DATA, (size, maximum))
 
 
 def check_memory(gigabytes: float) -> None:
@@ -81,15 +81,15 @@ def shortfall(error: BaseException, stage: str, pixels: int) -> SettingError:
     """
     from polcap.stages.hdr import planes
 
-    taken, limit = planes.process_memory()
-    asked = _ASKED.search(str(error))
-    more = float(asked[1]) * _BYTES[asked[2]] if asked else 0.0
-    whole = max(_GB_PER_PIXEL * pixels + _GB_FIXED, _ROOM * (taken + more) / 1e9, _LEAST_GB)
-    enough = math.ceil(10 * whole) / 10
+    used, limit = planes.process_memory()
+    request = _REQUESTED.search(str(error))
+    extra = float(request[1]) * _BYTES[request[2]] if request else 0.0
+    needed_gb = max(_GB_PER_PIXEL * pixels + _GB_FIXED, _ROOM * (used + extra) / 1e9, _LEAST_GB)
+    rounded_gb = math.ceil(10 * needed_gb) / 10
     message = f"{stage}: out of memory"
-    if taken:
-        message += f" with {taken / 1e9:.2f} GB used" + (f" and {more / 1e9:.2g} GB more requested" if more else "")
-    message += f"; a capture of {pixels / 1e6:.3g} MP takes about {enough:.1f} GB in all"
+    if used:
+        message += f" with {used / 1e9:.2f} GB used" + (f" and {extra / 1e9:.2g} GB more requested" if extra else "")
+    message += f"; a capture of {pixels / 1e6:.3g} MP takes about {rounded_gb:.1f} GB in all"
     if limit is None:
         return SettingError(f"{message}: free that much, process fewer captures at a time, or use a larger machine")
     return SettingError(f"{message}: raise --memory from {limit / 1e9:.3g} to that, or leave it out")

@@ -44,9 +44,9 @@ class _Output(io.FileIO):
     def write(self, data: Any, /) -> int:
         """Write bytes; after the first failure, everything is discarded."""
         try:
-            begun = 0
-            while begun < len(data):  # a signal may end a write early
-                begun += super().write(data[begun:]) or 0
+            written = 0
+            while written < len(data):  # a signal may end a write early
+                written += super().write(data[written:]) or 0
             return len(data)
         except OSError as error:
             if error.errno != errno.EPIPE:  # the reader wanted no more
@@ -58,9 +58,9 @@ class _Output(io.FileIO):
 
 
 def _text(output: _Output, encoding: str = "utf-8") -> TextIO:
-    """Text stream of an output; names of files may hold bytes that are no text.
+    """Text stream of an output; characters that it cannot encode, as in some names of files, are escaped.
 
-    Without a buffer, which would write its text again after Ctrl-C in a write.
+    It has no buffer: after Ctrl-C in a write, a buffer would write its text again.
     """
     return io.TextIOWrapper(output, encoding, errors="backslashreplace", line_buffering=True)
 
@@ -68,8 +68,8 @@ def _text(output: _Output, encoding: str = "utf-8") -> TextIO:
 def open_streams() -> None:
     """Prepare stdin, stdout and stderr for the whole run: a closed or full stream stops no work.
 
-    A closed stream becomes the null device: otherwise the next opened file would get its number, and all that is
-    printed.
+    A closed stream becomes the null device: otherwise the next opened file would get its number, and would receive the
+    output.
     """
     while (null := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
@@ -103,7 +103,7 @@ def set_verbosity(quiet: bool, verbose: bool, debug: bool) -> None:
 
 
 def is_verbose() -> bool:
-    """Whether --verbose asks for everything."""
+    """Whether --verbose was given."""
     return _verbosity > 0
 
 
@@ -134,8 +134,8 @@ def _open_at_once(path: str, flags: int) -> int:
 
 def _is_log(file: "Path") -> bool:
     """Whether a file is empty, or begins with a message of `log`."""
-    with file.open("rb") as begun:
-        first = begun.readline(_LONGEST)
+    with file.open("rb") as stream:
+        first = stream.readline(_LONGEST)
     return not first or b" INFO    polcap " in first
 
 
@@ -171,7 +171,7 @@ def reported(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _explain(error: BaseException, resumable: bool) -> tuple[str, int]:
-    """Message and exit code for an error of a command."""
+    """Message and exit code for an error of a command; `resumable`: it has an option --resume, which is not given."""
     if isinstance(error, KeyboardInterrupt):
         return f"interrupted; run the same command again{' with --resume' if resumable else ''} to go on", 130
     if isinstance(error, PolcapError):
@@ -193,7 +193,7 @@ def print_error_document(options: dict[str, Any], error: BaseException, text: st
 
 
 def line(error: BaseException) -> str:
-    """Text of an error on one line of at most 600 characters."""
+    """Text of an error on one line; a long text is cut in the middle to about 600 characters."""
     text = one_line(error)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 100]} … {text[-100:]}"
 
@@ -288,8 +288,8 @@ class Steps:
 
     def _frames_text(self, done: int, total: int, now: float) -> str:
         seconds = (now - self._begun) / done * (total - done)
-        left = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
-        return f"{done} of {total} frames, {left} left"
+        remaining = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+        return f"{done} of {total} frames, {remaining} left"
 
 
 class Bar(Steps):

@@ -59,9 +59,9 @@ def _search(root: Path) -> list[Candidate]:
 
 def _units(root: Path, out: Path | None, found: Sequence[Candidate]) -> list[Unit]:
     """The captures among the candidates, each once, sorted by name. Raises CaptureError: there is none."""
-    folders = sorted((each.folder for each in found if not each.reason), key=Path.is_symlink, reverse=True)
-    once = {os.path.realpath(folder): folder for folder in folders}  # a folder before links to it
-    captures = [_unit(root, folder, out) for folder in once.values()]
+    folders = sorted((one.folder for one in found if not one.reason), key=Path.is_symlink, reverse=True)
+    by_real_path = {os.path.realpath(folder): folder for folder in folders}  # a folder before links to it
+    captures = [_unit(root, folder, out) for folder in by_real_path.values()]
     if not captures:
         reasons = "; ".join(f"{candidate.folder}: {candidate.reason}" for candidate in found)
         nothing = "no folders pol000, pol045, …, no capture.toml, no photographs (views of a fused object do not count)"
@@ -125,10 +125,10 @@ def _run(
     print_line: Callable[[str], None],
 ) -> dict[str, Any]:
     """Process the unfinished captures of this shard and write the summary files."""
-    mine, batch_folder = plan.shard.of(found), Path(found[0].batch_folder)
-    records = {unit: record for unit in mine if (record := units.find_finished(unit, request)) is not None}
-    wanted = [unit for unit in mine if unit not in records]
-    print_line(f"{len(found)} captures, shard {plan.shard}: {len(mine)}, finished before: {len(records)}")
+    in_shard, batch_folder = plan.shard.of(found), Path(found[0].batch_folder)
+    records = {unit: record for unit in in_shard if (record := units.find_finished(unit, request)) is not None}
+    wanted = [unit for unit in in_shard if unit not in records]
+    print_line(f"{len(found)} captures, shard {plan.shard}: {len(in_shard)}, finished before: {len(records)}")
     for candidate in candidates:
         if candidate.reason:
             print_line(f"no capture in {candidate.folder}: {candidate.reason}")
@@ -141,15 +141,15 @@ def _run(
     start = time.monotonic()
     for done, record in enumerate(_process(wanted, request, plan, print_line) if wanted else (), 1):
         records[by_name[record.name]] = record
-        left = timedelta(seconds=round((time.monotonic() - start) / done * (len(wanted) - done)))
+        remaining = timedelta(seconds=round((time.monotonic() - start) / done * (len(wanted) - done)))
         message = f": {record.message}" if record.message else ""
         state = f"{done}/{len(wanted)} {record.name} {units.WORDS[record.state]} {record.seconds:.1f} s"
-        print_line(f"{state}, {left} left{message}")
+        print_line(f"{state}, {remaining} left{message}")
         if record.state not in FINISHED and not plan.keep_going:
             print_line("stopped at the first failure; --keep-going processes the others")
             break
     contact_sheet.write(batch_folder, found, [records.get(unit) or units.read_record(unit) for unit in found])
-    return contact_sheet.summary([records.get(unit, UnitRecord(unit.name)) for unit in mine])
+    return contact_sheet.summary([records.get(unit, UnitRecord(unit.name)) for unit in in_shard])
 
 
 def _process(

@@ -44,21 +44,21 @@ def search(folder: Path, linked: bool = False) -> list[Candidate]:
     stated = any(path.name == capture_toml.NAME for path in listed)
     if stated or folder_names.states_angles(path.name for path in inside):
         return [Candidate(folder)]
-    below = [] if linked else [found for path in inside for found in search(path, path.is_symlink())]
+    below = [] if linked else [candidate for path in inside for candidate in search(path, path.is_symlink())]
     kinds = [photograph_files.kind(path) for path in listed if not path.is_dir()]
     here = Candidate(folder, Rank.RAW if "raw" in kinds else Rank.PICTURES, kinds.count("raw") or kinds.count("photo"))
     return _chosen(here, below, any(map(_is_fused, inside)))
 
 
 def _chosen(here: Candidate, below: list[Candidate], fused: bool) -> list[Candidate]:
-    """Candidates of a folder and of those below it.
+    """The candidates to keep of a folder and of those below it.
 
     Photographs above captures document a session. Pictures below a capture are developed from it, and a few
     photographs there are rejected ones.
     """
     if here.photographs >= _LEAST and all(found.rank <= here.rank for found in below):
-        same = [found for found in below if found.rank == here.rank and found.photographs >= _LEAST]
-        return [here, *same]
+        equals = [found for found in below if found.rank == here.rank and found.photographs >= _LEAST]
+        return [here, *equals]
     alone = not fused and not any(found.photographs for found in below)
     return [here, *below] if here.photographs and alone else below
 

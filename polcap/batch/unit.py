@@ -78,7 +78,7 @@ class UnitRecord(msgspec.Struct, frozen=True):
 def run(unit: Unit, request: Request, attempt: int = 1) -> UnitRecord:
     """Process one capture of a batch. Errors are not raised, but written into the record.
 
-    Dask calls it again if the worker died after the capture was finished: the record of that stays.
+    Dask calls it again if a worker dies after it has finished a capture; then the finished record is returned.
     """
     if (finished := find_finished(unit, request)) is not None:
         return finished
@@ -168,7 +168,7 @@ def write_record(unit: Unit, record: UnitRecord) -> None:
 def record_crash(unit: Unit, before: UnitRecord, message: str, attempt: int) -> UnitRecord:
     """Write and return a record for a capture after the process that handled it died.
 
-    If the process had finished the capture first, its record stays; `before` is the record from before it began.
+    If the process finished the capture before it died, its record stays; `before` is the record before it began.
     """
     record = read_record(unit)
     if record.state in FINISHED and record != before:

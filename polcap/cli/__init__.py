@@ -1,9 +1,8 @@
 """The command line: one module per command.
 
-stdout carries data only; progress and messages go to stderr. Exit codes: 0 done, 2 the input or a
-setting is at fault, 3 the asset was written but a gate failed, 4 hardware, 130 interrupted (run again
-to go on), 1 a bug. Heavy imports happen inside the commands, so that `--help` answers at once. `options` declares the
-options of several commands.
+stdout carries data only; progress and messages go to stderr. Exit codes: 0 done, 2 the input or a setting is at fault,
+3 the asset was written but a gate failed, 4 hardware, 130 interrupted (run again to go on), 1 a bug. Heavy imports
+happen inside the commands, so that `--help` answers at once. `options` declares the options of several commands.
 """
 
 import os
@@ -65,7 +64,7 @@ class OneLineErrors(TyperGroup):
 
 def _common_first(words: Sequence[str]) -> list[str]:
     """Reorder the words of a command line: options that all commands share are moved in front of the command."""
-    if words[-1:] == ["--log"]:  # without its file: the parser names that
+    if words[-1:] == ["--log"]:  # its file is missing, which the parser reports
         return ["--log"]
     common, others = list[str](), list[str]()
     for before, word in zip(["", *words], words):

@@ -55,12 +55,12 @@ def lines(found: "Calibration") -> list[str]:
     """A calibration's measurements as lines of text."""
     rows = [" · ".join(part for part in (found.camera, found.lens, found.filter) if part)]
     for line in found.noise:
-        doubt = 100 * max(sigma / slope for sigma, slope in zip(line.slope_sigma, line.slope, strict=True))
+        relative_sigma = 100 * max(sigma / slope for sigma, slope in zip(line.slope_sigma, line.slope, strict=True))
         electrons, read = _join_numbers(line.electrons_at_white, ".0f"), _join_numbers(line.read_noise_electrons, ".1f")
         if line.read_noise_sigma:
             read += f" ± {max(line.read_noise_sigma):.1f}"
         source = "a bracket" if line.source == "bracket" else line.source
-        text = f"{electrons} e⁻ at white ± {doubt:.1f} %, read noise {read} e⁻, from {source}"
+        text = f"{electrons} e⁻ at white ± {relative_sigma:.1f} %, read noise {read} e⁻, from {source}"
         rows.append(f"noise      ISO {line.iso:g}: {text}")
     if (levels := found.levels) is not None:
         black, stated = _join_numbers(levels.black, ".2f"), _join_numbers(levels.black_stated, "g")
@@ -81,8 +81,8 @@ def lines(found: "Calibration") -> list[str]:
     if (ring := found.polarizer) is not None:
         sense = "counter-clockwise" if ring.sense > 0 else "clockwise"
         sense = f"counts {sense}" if ring.sense_known else "sense unknown: photograph light of a second axis"
-        doubt = max(sigma / ratio for sigma, ratio in zip(ring.extinction_sigma, ring.extinction, strict=True))
-        extinction = f"extinction {_join_numbers(ring.extinction, '.0f')} ± {100 * doubt:.0f} %"
+        relative_sigma = max(sigma / ratio for sigma, ratio in zip(ring.extinction_sigma, ring.extinction, strict=True))
+        extinction = f"extinction {_join_numbers(ring.extinction, '.0f')} ± {100 * relative_sigma:.0f} %"
         rows.append(f"polarizer  zero {ring.zero_deg:+.2f}° ± {ring.zero_sigma_deg:.2f}°, {sense}, {extinction}")
     if (flash := found.flash) is not None:
         drift = f"drift {100 * flash.drift_per_pop:+.3f} % ± {100 * flash.drift_sigma:.3f} % a pop"

@@ -122,11 +122,11 @@ def _warn_of_upsampling(result: Path, size: int) -> None:
     from polcap.formats import text_file
     from polcap.fusion import fused_maps
 
-    held = max(text_file.read_json(result / "maps" / "maps.json").get("size", [size]))
-    if size > held:
+    map_px = max(text_file.read_json(result / "maps" / "maps.json").get("size", [size]))
+    if size > map_px:
         setting = "fusion.atlas.size" if fused_maps.is_fused(result) else "hdr.demosaic=full"
         terminal.print_message(
-            f"polcap: textures of {size} px are {size / held:.2g} times as wide as the maps ({held} px); "
+            f"polcap: textures of {size} px are {size / map_px:.2g} times as wide as the maps ({map_px} px); "
             f"for more detail use --set {setting}, or photograph from nearer",
             "WARNING",
         )

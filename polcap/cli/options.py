@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 else:
     Stage = Literal[STAGES]
 
-_NAMED = 5  # outdated exports that a warning lists
+_LISTED = 5  # files that a warning lists
 # options without effect on the bytes of a result
 _NO_EFFECT = ("capture", "folder", "out", "json", "dry_run", "watch", "open_", "workers", "threads", "memory")
 
@@ -110,7 +110,7 @@ def warn_of_outdated_exports(out: Path, records: Sequence[Path]) -> None:
 
     old = asset_export.find_outdated(out, records, text_file.read_json(out / "report.json").get("keys", {}))
     if old:
-        named = ", ".join([path.relative_to(out).as_posix() for path in old[:_NAMED]] + ["…"] * (len(old) > _NAMED))
+        named = ", ".join([path.relative_to(out).as_posix() for path in old[:_LISTED]] + ["…"] * (len(old) > _LISTED))
         why = "exported earlier, under another name or with other maps, settings or facts"
         text = f"{named} in {out}: {why}; export again, or remove"
         terminal.print_message(f"polcap: warning: {text}", "WARNING")
@@ -122,7 +122,7 @@ def warn_of_altered_archive(folder: Path) -> None:
     from polcap.formats.export import archive
 
     if changed := archive.altered(folder):
-        named = ", ".join(changed[:_NAMED] + ["…"] * (len(changed) > _NAMED))
+        named = ", ".join(changed[:_LISTED] + ["…"] * (len(changed) > _LISTED))
         text = f"{named} in {folder}: missing, or not as in {own_folders.MANIFEST}; take another copy of the archive"
         terminal.print_message(f"polcap: warning: {text}", "WARNING")
 
@@ -163,7 +163,7 @@ def request(stated: Mapping[str, Any], config: "Config") -> "Request":
     """
     from polcap.pipeline.request import Request
 
-    same = ("estimator", "model", "device", "clockwise", "threads")  # names of options and of fields
+    shared = ("estimator", "model", "device", "clockwise", "threads")  # names of options and of fields
     mask = stated.get("mask")
     return Request(
         config=config,
@@ -171,7 +171,7 @@ def request(stated: Mapping[str, Any], config: "Config") -> "Request":
         mask=None if mask is None else user_mask(mask),
         angles_deg=angles_deg(stated["angles"]),
         memory_gb=stated.get("memory", 0.0),
-        **{name: stated[name] for name in same if name in stated},
+        **{name: stated[name] for name in shared if name in stated},
     )
 
 

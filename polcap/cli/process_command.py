@@ -50,15 +50,15 @@ def process(
     if options.print_finished(target, asked, json, open_):
         return
     resource_limits.set_limits(threads, memory)  # before the libraries start threads
-    once = partial(_plan, stated, target) if dry_run else partial(_process, stated, target, asked)
+    run_once = partial(_plan, stated, target) if dry_run else partial(_process, stated, target, asked)
     if watch:
-        _at_every_change(capture, target, config, once)
+        _at_every_change(capture, target, config, run_once)
     else:
-        once()
+        run_once()
 
 
-def _at_every_change(capture: Path, target: Path, config: Path | None, once: Callable[[], None]) -> None:
-    """Call `once` now and after each change of the capture folder or the settings file; print its errors.
+def _at_every_change(capture: Path, target: Path, config: Path | None, run_once: Callable[[], None]) -> None:
+    """Call `run_once` now and after each change of the capture folder or the settings file; print its errors.
 
     Raises SettingError if there is no such folder, or the settings are wrong from the start.
     """
@@ -70,7 +70,7 @@ def _at_every_change(capture: Path, target: Path, config: Path | None, once: Cal
     settings.load(config, ())
     for _ in arrivals.settled(capture, target, edited=[] if config is None else [config]):
         try:
-            once()
+            run_once()
         except (InputError, GateError, OSError) as error:  # a frame may have gone while it was read
             terminal.print_message(f"polcap: {terminal.line(error)}")
         terminal.print_progress(f"watching {capture}; Ctrl-C ends")

@@ -100,11 +100,11 @@ def _compare(results: tuple[Path, Path], out: Path, json: bool, open_: bool) -> 
 
     for result in results:
         options.warn_of_altered_archive(result)
-    abouts = reports.read(results[0]), reports.read(results[1])
+    contents = reports.read(results[0]), reports.read(results[1])
     file = out / "compare.html"
     with result_folder.opened(out):
-        sentence, table = pairs.write(file, results, abouts)
-    rows = pairs.rows(*abouts)
+        sentence, table = pairs.write(file, results, contents)
+    rows = pairs.rows(*contents)
     if json:
         named = [dict(zip(("quantity", *pairs.HEAD[1:]), row)) for row in table]
         differing = [{"name": name, "here": here, "there": there} for name, here, there in rows]
@@ -152,7 +152,7 @@ def _check_single(result: Path, command: str) -> None:
 
 
 def _results(named: Path) -> Iterator[Path]:
-    """The result folder that was named, or the finished and begun results of a batch that lie in its folder."""
+    """The result folder that was named, or the results of a batch, finished or begun, inside its folder."""
     if not (named / own_folders.BATCH).is_dir() or (named / "work").is_dir():
         yield named
         return

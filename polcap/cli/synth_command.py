@@ -51,9 +51,9 @@ def synth(
     """Render a capture of an object that does not exist, with its truth."""
     from polcap import config as settings
 
-    made = folder
+    output = folder
     if dataset is not None:
-        corpus, made = options.training("dataset_files"), folder / "dataset.json"
+        corpus, output = options.training("dataset_files"), folder / "dataset.json"
         named = {"seed": seed, "mesh": str(mesh or ""), "material": str(material or ""), "law": law}
         recipe = settings.fill(corpus.DatasetRecipe, named, assignments or ())
         corpus.main(folder, dataset, recipe, terminal.print_progress)
@@ -80,7 +80,7 @@ def synth(
         changes |= {"cast_shadows": True} if cast_shadow else {}
         changes |= {"interreflection": True} if interreflection else {}
         _render(folder, replace(chosen, **changes), seed, assignments or (), views, flat)
-    terminal.print_written([made], json)
+    terminal.print_written([output], json)
 
 
 def _render(folder: Path, scene: "Scene", seed: int, assignments: Sequence[str], views: int | None, flat: bool) -> None:

@@ -84,8 +84,8 @@ def evaluate(
         options.training("evaluation_photographs").main(real, model, out, terminal.print_progress)
         terminal.print_data(str(out / "real.md"))
         return
-    judge, fixed = options.training("evaluate"), options.training("evaluation_protocol")
-    usual = (fixed.QUICK_COUNT, fixed.QUICK_SIZE) if quick else (fixed.COUNT, fixed.SIZE)
-    stated = judge.EvaluationOptions(model, data, out, ablations, count or usual[0], size or usual[1], protocol)
-    judge.main(stated, terminal.print_progress)
+    evaluation, defaults = options.training("evaluate"), options.training("evaluation_protocol")
+    usual = (defaults.QUICK_COUNT, defaults.QUICK_SIZE) if quick else (defaults.COUNT, defaults.SIZE)
+    stated = evaluation.EvaluationOptions(model, data, out, ablations, count or usual[0], size or usual[1], protocol)
+    evaluation.main(stated, terminal.print_progress)
     terminal.print_data(str(out / "evaluation.md"))

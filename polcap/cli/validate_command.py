@@ -51,18 +51,18 @@ def validate(
         about = pipeline.process_once(found, supplied, request.config, result)
         terminal.print_progress(f"verdict {about['verdict']}; {result / 'report.html'}")
     measured, about = ball_validation.measure(result, diameter), read(result)
-    figures, facts, unsure = measured.figures, about["capture"], _reason_against_record(about)
+    figures, facts, reason = measured.figures, about["capture"], _reason_against_record(about)
     texts = ball_validation.lines(figures)
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    record = None if unsure else ball_accuracies.write(ball_validation.accuracy(figures, facts, made))
+    record = None if reason else ball_accuracies.write(ball_validation.accuracy(figures, facts, made))
     with result_folder.opened(result):
         ball_page.write(result, facts["name"], measured, texts)
         atomic.write_json(result / "ball.json", figures)
     terminal.print_progress("\n".join(texts))
     for text in figures.warnings:
         terminal.print_message(f"polcap: warning: {text}", "WARNING")
-    if unsure:
-        terminal.print_message(f"polcap: warning: later reports will not state this accuracy: {unsure}", "WARNING")
+    if reason:
+        terminal.print_message(f"polcap: warning: later reports will not state this accuracy: {reason}", "WARNING")
     page = str(result / "ball.html")
     written = {"page": page, "record": None if record is None else str(record)}
     terminal.print_data({**msgspec.to_builtins(figures), **written} if json else page)

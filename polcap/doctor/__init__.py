@@ -49,10 +49,10 @@ def examine(rig: Rig, folder: Path) -> tuple[Finding, ...]:
     """Check everything on this machine; the disk is that of `folder`."""
     import cv2
 
-    about = f"{__version__}, Python {sys.version.split()[0]}, numpy {np.__version__}, OpenCV {cv2.__version__}"
+    versions = f"{__version__}, Python {sys.version.split()[0]}, numpy {np.__version__}, OpenCV {cv2.__version__}"
     model = models.newest("polcap")
     return (
-        Finding("polcap", "ok", about),
+        Finding("polcap", "ok", versions),
         _decoder(),
         _model(model),
         *(_providers(model) if model else ()),
@@ -105,12 +105,12 @@ def _model(file: Path | None) -> Finding:
         return Finding("model", "warning", "this polcap has no network", remedy)
     try:
         network = models.open_network(file)
-        small = [one for one in (network.fine, models.load_mask_network()) if one is not None]
+        others = [one for one in (network.fine, models.load_mask_network()) if one is not None]
     except PolcapError as error:
         return Finding("model", "fault", str(error), "install polcap again, or use --estimator analytic")
     release = network.metadata.get("version", network.digest[:8])
-    about = f"{file.name}, version {release}, {file.stat().st_size / 1e6:.1f} MB, loads, and {len(small)} smaller ones"
-    return Finding("model", "ok", about)
+    facts = f"{file.name}, version {release}, {file.stat().st_size / 1e6:.1f} MB, loads, and {len(others)} smaller ones"
+    return Finding("model", "ok", facts)
 
 
 def _providers(model: Path) -> Iterator[Finding]:

@@ -1,7 +1,4 @@
-"""`polcap doctor FILE`: checks whether polcap can use a photograph.
-
-Reports kind, metadata, mosaic pattern and levels.
-"""
+"""`polcap doctor FILE`: checks whether polcap can use a photograph: kind, metadata, mosaic pattern and levels."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -83,12 +80,12 @@ def _pixels(image: SensorImage, exif: Exif) -> Iterator[Finding]:
         message = f"{size} decoded, but {exif.width}×{exif.height} are stated"
         yield Finding("size", "warning", message, "send this report in")
     black, white = float(image.black.mean()), image.white
-    least, most = float(image.value.min()), float(image.value.max())
+    darkest, brightest = float(image.value.min()), float(image.value.max())
     clipped = sensor.clipped_share(image, _CLIP)
-    message = f"black {black:g}, white {white:g}; counts {least:g} … {most:g}, {100 * clipped:.2f} % clipped"
-    if most > 1.001 * white or white <= black:
+    message = f"black {black:g}, white {white:g}; counts {darkest:g} … {brightest:g}, {100 * clipped:.2f} % clipped"
+    if brightest > 1.001 * white or white <= black:
         yield Finding("levels", "warning", message, "the white level does not fit the counts: send this report in")
-    elif clipped > 0.5 or most <= black:
+    elif clipped > 0.5 or brightest <= black:
         yield Finding("levels", "warning", message, "nothing can be measured: change the exposure")
     else:
         yield Finding("levels", "ok", message)

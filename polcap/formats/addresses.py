@@ -5,7 +5,7 @@ import re
 from urllib.parse import quote, urlsplit
 
 _PATH = "/:@!$&'()*+,;=~%"  # characters of a path that stay, with those of an address that is encoded already
-_STRAY = re.compile(r"%(?![0-9A-Fa-f]{2})")
+_STRAY = re.compile(r"%(?![0-9A-Fa-f]{2})")  # a % that begins no encoded character
 
 
 def of_file(relative: str) -> str:

@@ -28,12 +28,12 @@ def write(found: BallAccuracy) -> Path:
 def choose(exif: Exif, lens_filter: str | None) -> BallAccuracy | None:
     """The newest stored measurement of this camera, lens and polarizing filter, or None. Raises CaptureError."""
     files = own_folders.toml_files(own_folders.ball_accuracies())
-    wanted = exif.camera, exif.lens, lens_filter or ""
-    fitting = [found for found in map(_read, files) if _rig(found.camera, found.lens, found.filter) == _rig(*wanted)]
+    rig = exif.camera, exif.lens, lens_filter or ""
+    fitting = [found for found in map(_read, files) if _nfc(found.camera, found.lens, found.filter) == _nfc(*rig)]
     return max(fitting, key=lambda found: found.made) if exif.camera and fitting else None
 
 
-def _rig(*names: str) -> list[str]:
+def _nfc(*names: str) -> list[str]:
     return [normalize("NFC", name) for name in names]
 
 

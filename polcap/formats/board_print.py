@@ -20,6 +20,7 @@ RULER_MM = 100
 _POINT_MM = 25.4 / 72
 _TEXT_MM = 3.2  # height of the letters' body
 _FREE_MM = 4.0  # between board, ruler and text
+_MARKS_MM = 10.0, 7.0, 4.0  # length of the ruler's marks: every 10 mm, 5 mm and 1 mm
 
 Box = tuple[float, float, float, float]  # left, top, width, height, mm
 
@@ -88,8 +89,8 @@ def _pdf_file(objects: list[str]) -> bytes:
         starts.append(len(out))
         out += f"{number} 0 obj\n{body}\nendobj\n".encode("latin-1")
     table = "".join(f"{start:010d} 00000 n \n" for start in starts)
-    count, where = len(objects) + 1, len(out)
-    tail = f"trailer\n<< /Size {count} /Root 1 0 R >>\nstartxref\n{where}\n%%EOF\n"
+    count, table_start = len(objects) + 1, len(out)
+    tail = f"trailer\n<< /Size {count} /Root 1 0 R >>\nstartxref\n{table_start}\n%%EOF\n"
     return out + f"xref\n0 {count}\n0000000000 65535 f \n{table}{tail}".encode("latin-1")
 
 
@@ -109,16 +110,17 @@ def _page(board: Board) -> _Page:
         f"Check: the ruler is {RULER_MM} mm long, the board {side:g} mm wide.",
         "Glue it onto a flat plate, cut along its outer edge, and stand the object in the black middle.",
     ]
-    first = top + 10 + _FREE_MM + _TEXT_MM
+    first = top + _MARKS_MM[0] + _FREE_MM + _TEXT_MM
     lines = [(margin, first + 1.5 * _TEXT_MM * k, text) for k, text in enumerate(texts)]
     return _Page(width, height, boxes, _ruler(margin, top), lines)
 
 
 def _ruler(left: float, top: float) -> list[Box]:
     """Marks at every millimetre; the outer edges of the first and the last are `RULER_MM` from each other."""
-    thick = 0.2
+    thick = 0.2  # mm
+    long, middle, short = _MARKS_MM
     marks = [
-        (left + k * (RULER_MM - thick) / RULER_MM, top, thick, 10.0 if k % 10 == 0 else 7.0 if k % 5 == 0 else 4.0)
+        (left + k * (RULER_MM - thick) / RULER_MM, top, thick, long if k % 10 == 0 else middle if k % 5 == 0 else short)
         for k in range(RULER_MM + 1)
     ]
     return [(left, top, float(RULER_MM), thick), *marks]
@@ -126,14 +128,14 @@ def _ruler(left: float, top: float) -> list[Box]:
 
 def _rectangles(black: Bools) -> list[tuple[int, int, int, int]]:
     """Rectangles (row, column, rows, columns) that cover the black cells once; equal runs of rows are joined."""
-    open_: dict[tuple[int, int], int] = {}  # first and end column of a run, and the row where it begins
-    done = []
+    begun: dict[tuple[int, int], int] = {}  # first and end column of a run, and the row where it begins
+    finished = []
     for row, cells in enumerate([*black, np.zeros(black.shape[1], bool)]):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], cells, [0]])))
         runs = {(int(first), int(last)) for first, last in edges.reshape(-1, 2)}
-        for run in [run for run in open_ if run not in runs]:
-            start = open_.pop(run)
-            done.append((start, run[0], row - start, run[1] - run[0]))
-        for run in runs - open_.keys():
-            open_[run] = row
-    return sorted(done)
+        for run in [run for run in begun if run not in runs]:
+            start = begun.pop(run)
+            finished.append((start, run[0], row - start, run[1] - run[0]))
+        for run in runs - begun.keys():
+            begun[run] = row
+    return sorted(finished)

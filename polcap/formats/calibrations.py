@@ -137,7 +137,7 @@ def _impossible_parts(found: Calibration) -> list[str]:
             and 0 < min(line.slope) <= max(line.slope) < 1 and 0 <= min(line.floor) <= max(line.floor) < 1
             for line in found.noise
         ),
-        "falloff": not light or (len(light.coefficient) in _CHANNELS and all(map(_lights_corners, light.coefficient))),
+        "falloff": not light or (len(light.coefficient) in _CHANNELS and all(map(_leaves_light, light.coefficient))),
         "geometry": not lens or _possible_lens(lens),
         "polarizer": not ring or (
             len(ring.extinction) in _CHANNELS and min(ring.extinction) > 1 and ring.sense in (-1, 1)
@@ -152,10 +152,10 @@ def _possible_lens(lens: LensGeometry) -> bool:
     """Whether a lens calibration is plausible: principal point inside the picture, distortion without folds."""
     inside = all(0 < c < side <= _MAX_SIDE for c, side in zip(lens.principal_px, lens.size_px))
     small = lens.focal_px >= 1 and max(abs(lens.k1), abs(lens.k2)) <= _MAX_DISTORTION
-    known = Distortion(lens.focal_px, lens.principal_px, lens.k1, lens.k2)
-    return inside and small and not distortion.folds(known, *lens.size_px)
+    measured = Distortion(lens.focal_px, lens.principal_px, lens.k1, lens.k2)
+    return inside and small and not distortion.folds(measured, *lens.size_px)
 
 
-def _lights_corners(law: tuple[float, float, float]) -> bool:
-    """Whether the lens falloff 1 + a r² + b r⁴ + c r⁶ stays positive up to the corners of the picture."""
-    return bool(np.min(np.polyval([*reversed(law), 1], np.linspace(0, 1, 17))) > _LEAST_LIGHT)
+def _leaves_light(coefficients: tuple[float, float, float]) -> bool:
+    """Whether the lens falloff 1 + a r² + b r⁴ + c r⁶ is above `_LEAST_LIGHT` in the whole picture (17 radii)."""
+    return bool(np.min(np.polyval([*reversed(coefficients), 1], np.linspace(0, 1, 17))) > _LEAST_LIGHT)

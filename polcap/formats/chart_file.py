@@ -26,7 +26,7 @@ _BY_ROW = [f"{row}{column}" for row in "ABCD" for column in range(1, 7)]  # name
 _BY_COLUMN = [f"{column}{row}" for row in range(1, 5) for column in "ABCDEF"]
 _PATCH = re.compile(r"([A-Na-n])0*(\d{1,2})")
 _BAND = re.compile(r"[A-Z_ ]*?(\d{3})(?:\.0+)?\s*(?:NM)?")  # SPEC_400, nm400, SPECTRAL_NM_400, R_400nm, 400
-_LEAST_BANDS = 16
+_LEAST_BANDS = 16  # columns of wavelengths that make a spectrum
 _NANOMETERS = range(300, 831)
 
 Rows = list[list[str]]
@@ -41,7 +41,7 @@ def read(path: Path) -> ChartReference:
     try:
         columns, rows = _cgats(text) if "BEGIN_DATA" in text else _csv(text)
         rec709 = _colors(columns, rows)
-        named = _named(columns, rows)
+        named = _rows_by_patch(columns, rows)
         order, is_block = _order(named, len(rows))
     except ValueError as error:
         raise ChartError(f"whitebalance.chart = {path}: {error}") from None
@@ -58,7 +58,7 @@ def surroundings(rec709: Floats) -> SurroundingPatches:
     return SurroundingPatches(rec709, np.array(center))
 
 
-def adapted(xyz: Floats, white_xy: Sequence[float]) -> Floats:
+def to_rec709(xyz: Floats, white_xy: Sequence[float]) -> Floats:
     """Convert XYZ (N, 3), Y = 1 for white, under a white of chromaticity `white_xy` to linear Rec.709 (Bradford)."""
     from polcap.optics.colour_science import colour
 
@@ -87,27 +87,27 @@ def _csv(text: str) -> tuple[list[str], Rows]:
 
 def _table(columns: list[str], rows: Rows) -> tuple[list[str], Rows]:
     """Columns in capitals, and rows. Raises ValueError: a row has another number of values."""
-    odd = next((number for number, row in enumerate(rows, 1) if len(row) != len(columns)), None)
-    if odd is not None:
-        raise ValueError(f"row {odd} has {len(rows[odd - 1])} values for {len(columns)} columns; correct it")
+    wrong = next((number for number, row in enumerate(rows, 1) if len(row) != len(columns)), None)
+    if wrong is not None:
+        raise ValueError(f"row {wrong} has {len(rows[wrong - 1])} values for {len(columns)} columns; correct it")
     return [column.strip().upper().replace("*", "") for column in columns], rows
 
 
 def _colors(columns: list[str], rows: Rows) -> Floats:
     """Linear Rec.709 (N, 3) of all rows: from spectra if there are any, otherwise from XYZ or Lab."""
-    bands = {int(match[1]): at for at, name in enumerate(columns) if (match := _BAND.fullmatch(name))}
+    bands = {int(match[1]): column for column, name in enumerate(columns) if (match := _BAND.fullmatch(name))}
     bands = {band: bands[band] for band in sorted(bands) if band in _NANOMETERS}
     if len(bands) >= _LEAST_BANDS:
         return _from_spectra(list(bands), _numbers(rows, list(bands.values())))
-    places = {re.sub(r"^(?:CIE_?)?(?:LAB|XYZ)?_", "", name): at for at, name in enumerate(columns)}
-    d50 = (0.3457, 0.3585)
-    if {"X", "Y", "Z"} <= places.keys():
-        xyz = _numbers(rows, [places[name] for name in "XYZ"])
-        return adapted(xyz / (100.0 if xyz.max() > 1.5 else 1.0), d50)
-    if {"L", "A", "B"} <= places.keys():
+    column_of = {re.sub(r"^(?:CIE_?)?(?:LAB|XYZ)?_", "", name): column for column, name in enumerate(columns)}
+    d50_xy = (0.3457, 0.3585)  # chromaticity
+    if {"X", "Y", "Z"} <= column_of.keys():
+        xyz = _numbers(rows, [column_of[name] for name in "XYZ"])
+        return to_rec709(xyz / (100.0 if xyz.max() > 1.5 else 1.0), d50_xy)  # above 1.5: Y = 100 for white
+    if {"L", "A", "B"} <= column_of.keys():
         from polcap.optics.colour_science import colour
 
-        return adapted(colour.Lab_to_XYZ(_numbers(rows, [places[name] for name in "LAB"]), d50), d50)
+        return to_rec709(colour.Lab_to_XYZ(_numbers(rows, [column_of[name] for name in "LAB"]), d50_xy), d50_xy)
     raise ValueError(f"no columns L, a, b or X, Y, Z, or of {_LEAST_BANDS} wavelengths or more; name them so")
 
 
@@ -132,7 +132,7 @@ def _numbers(rows: Rows, places: list[int]) -> Floats:
     return found
 
 
-def _named(columns: list[str], rows: Rows) -> dict[str, int]:
+def _rows_by_patch(columns: list[str], rows: Rows) -> dict[str, int]:
     """Row of each patch by its name, such as A1; empty if no column has such names."""
     for at in range(len(columns)):
         found = [_PATCH.fullmatch(row[at].strip()) for row in rows]

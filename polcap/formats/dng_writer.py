@@ -117,7 +117,7 @@ def _exif_tags(exif: Exif) -> list[_Entry]:
         (37385, _SHORT, exif.flash_fired if exif.flash_fired is None else int(exif.flash_fired)),  # Flash
         (37386, _RATIONAL, exif.focal_length_mm),  # FocalLength
         (37521, _ASCII, (_stamp(exif, "%f") or "")[:3] or None),  # SubSecTimeOriginal
-        (41486, _RATIONAL, pitch and 1e4 / pitch),  # FocalPlaneXResolution
+        (41486, _RATIONAL, pitch and 1e4 / pitch),  # FocalPlaneXResolution, px per cm
         (41487, _RATIONAL, pitch and 1e4 / pitch),  # FocalPlaneYResolution
         (41488, _SHORT, pitch and _CENTIMETRE),  # FocalPlaneResolutionUnit
         (41989, _SHORT, exif.focal_length_35mm and round(exif.focal_length_35mm)),  # FocalLengthIn35mmFilm
@@ -133,14 +133,14 @@ def _ifd(entries: list[_Entry], offset: int) -> bytes:
     """Encode a TIFF directory at byte `offset`, followed by its long values; entries without a value are left out."""
     valued = sorted((entry for entry in entries if entry[2] is not None), key=itemgetter(0))
     encoded = [(tag, kind, *_encode(kind, value)) for tag, kind, value in valued]
-    present = [entry for entry in encoded if entry[3] != b"\0" or entry[1] != _ASCII]
-    behind = offset + 2 + 12 * len(present) + 4
+    present = [entry for entry in encoded if entry[3] != b"\0" or entry[1] != _ASCII]  # without empty texts
+    values_start = offset + 2 + 12 * len(present) + 4
     head, tail = struct.pack("<H", len(present)), b""
     for tag, kind, count, data in present:
         if len(data) <= 4:
             place = data.ljust(4, b"\0")
         else:
-            place = struct.pack("<I", behind + len(tail))
+            place = struct.pack("<I", values_start + len(tail))
             tail += data + b"\0" * (len(data) % 2)
         head += struct.pack("<HHI", tag, kind, count) + place
     return head + b"\0\0\0\0" + tail

@@ -17,7 +17,7 @@ def acquire(lock: FileLock) -> AbstractContextManager[Any]:
     """
     try:
         return lock.acquire()
-    except Timeout:
+    except Timeout:  # an OSError too
         raise
     except OSError as error:
         raise system_errors.cannot_write(Path(lock.lock_file), error) from error

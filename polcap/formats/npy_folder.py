@@ -96,7 +96,7 @@ def _scalar(tree: Any, hint: Any, folder: Path) -> Any:
 
 
 def _array_file(tree: Any, folder: Path) -> Path:
-    """File of an array that a manifest names. Raises StorageError: the name is none of a file in this folder."""
+    """File of an array that a manifest names. Raises StorageError: it names no file in this folder."""
     name = tree.get("array") if isinstance(tree, dict) else None
     _expect(isinstance(name, str) and Path(name).name == name, tree, "an array's file", folder)
     return folder / str(name)
@@ -110,14 +110,14 @@ def _expect(holds: bool, tree: Any, wanted: str, folder: Path) -> None:
 def save(file: Path, array: NDArray[Any]) -> list[Any]:
     """Write an array of any shape as an .npy file; returns the file's size and SHA-256 digest, as `checksum` does."""
     array = np.asarray(array, order="C")
-    head = io.BytesIO()
-    np.lib.format.write_array_header_2_0(head, np.lib.format.header_data_from_array_1_0(array))
-    summed, size = sha256(), 0
+    header = io.BytesIO()
+    np.lib.format.write_array_header_2_0(header, np.lib.format.header_data_from_array_1_0(array))
+    digest, size = sha256(), 0
     with file.open("wb") as stream:
-        for part in (head.getbuffer(), array.reshape(-1).view(np.uint8).data if array.size else b""):
-            summed.update(part)
+        for part in (header.getbuffer(), array.reshape(-1).view(np.uint8).data if array.size else b""):
+            digest.update(part)
             size += stream.write(part)
-    return [size, summed.hexdigest()]
+    return [size, digest.hexdigest()]
 
 
 def load(file: Path) -> NDArray[Any]:

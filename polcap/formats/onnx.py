@@ -52,17 +52,17 @@ def load(path: str | Path, device: Device = "cpu", threads: int = 0, encoding: s
     encoding, or there is no such device.
     """
     path = Path(path)
-    known = digest(_bytes(path))
-    if known not in {digest(file.read_bytes()) for file in shipped_data.model_files()}:
+    file_digest = digest(_bytes(path))
+    if file_digest not in {digest(file.read_bytes()) for file in shipped_data.model_files()}:
         try:
-            sandbox.call(trial, path, limit_s=_TRIAL_S, expected=known, encoding=encoding)
+            sandbox.call(trial, path, limit_s=_TRIAL_S, expected=file_digest, encoding=encoding)
         except DecodeError as error:
             raise ModelError(f"a trial run of the model failed: {error}") from error
-    session = _session(str(path), known, device, threads)
+    session = _session(str(path), file_digest, device, threads)
     channels, metadata = _check(path, session, encoding)
     # two runs on one thread each end sooner than one after the other on two threads
     at_once = min(threads or parallel.threads(), _AT_ONCE) if session.get_providers()[0] == CPU else 1
-    return Network(known, channels, metadata, None, str(path), device, threads, at_once)
+    return Network(file_digest, channels, metadata, None, str(path), device, threads, at_once)
 
 
 def digest(data: bytes) -> str:
@@ -214,5 +214,5 @@ def _onnxruntime() -> Any:
 def _failures() -> tuple[type[Exception], ...]:
     """The exception types that onnxruntime raises; they have no common base class."""
     state = vars(_onnxruntime().capi.onnxruntime_pybind11_state)
-    own = [kind for kind in state.values() if isinstance(kind, type) and issubclass(kind, Exception)]
-    return (*own, ValueError, RuntimeError)
+    raised = [kind for kind in state.values() if isinstance(kind, type) and issubclass(kind, Exception)]
+    return (*raised, ValueError, RuntimeError)

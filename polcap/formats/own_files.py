@@ -124,7 +124,7 @@ def claim(folder: Path, uses: Iterable[str]) -> None:
 
 @contextmanager
 def opened(folder: Path) -> Iterator[OwnFiles]:
-    """Context manager: files that are written into the folder are checked against its record, and recorded."""
+    """Context manager: files that `atomic` writes into the folder are checked against its record, and recorded."""
     own = OwnFiles(folder)
     before = _opened.get(str(own.folder))
     own = _opened[str(own.folder)] = before or own

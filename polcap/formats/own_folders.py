@@ -33,7 +33,7 @@ def calibrations() -> Path:
     """Path of the folder with the user's calibrations; it may not exist."""
     if stated := os.environ.get("POLCAP_CALIB"):
         return Path(stated)
-    home = Path(os.path.expanduser("~"))  # unlike Path.home(), raises for no account
+    home = Path(os.path.expanduser("~"))  # no error without a home, unlike Path.home()
     if sys.platform == "win32":
         return Path(os.environ.get("APPDATA", home / "AppData" / "Roaming")) / "polcap" / "calib"
     if sys.platform == "darwin":
@@ -47,7 +47,7 @@ def ball_accuracies() -> Path:
 
 
 def toml_files(folder: Path) -> list[Path]:
-    """TOML files of a folder by name; none if it cannot be opened. Hidden files are of macOS, or of a killed run."""
+    """TOML files of a folder by name, without hidden ones of macOS or a killed run; none if it cannot be opened."""
     try:
         return sorted(path for path in folder.glob("[!.]*.toml") if path.is_file())
     except OSError:

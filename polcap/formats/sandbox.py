@@ -57,10 +57,7 @@ class _Head(msgspec.Struct):
 
 
 class ChildBug(RuntimeError):
-    """Error for a defect in polcap's code that runs in the child process; exit code 1.
-
-    Its note is the child's traceback.
-    """
+    """Error for a defect in polcap's code that runs in the child process; its note is the child's traceback."""
 
 
 class Sandbox:
@@ -141,13 +138,13 @@ class Sandbox:
         if head.meta is None and head.error is None and head.bug is None:
             raise ValueError("it is empty")
         arrays: Arrays = {}
-        left = int(self.memory_gib * 2**30)
+        allowed = int(self.memory_gib * 2**30)
         for name, dtype, shape in head.arrays:
             kind = np.dtype(dtype)
             size = kind.itemsize * int(np.prod(shape, dtype=object))
-            if kind.kind not in "biuf" or size > left:
+            if kind.kind not in "biuf" or size > allowed:
                 raise ValueError(f"{name} is {dtype} of {shape}")
-            left -= size
+            allowed -= size
             arrays[name] = np.empty(shape, kind)
             content = arrays[name].reshape(-1).view(np.uint8)
             if cast(Any, pipe).readinto(content.data) < content.size:  # it fills the array, or the pipe is at its end
@@ -199,19 +196,19 @@ class Sandbox:
 
 
 _idle: list[Sandbox] = []
-_hold = threading.Lock()
+_idle_lock = threading.Lock()
 if hasattr(os, "register_at_fork"):  # a fork must not share the pipes
     os.register_at_fork(after_in_child=_idle.clear)
 
 
 def call(function: Function, path: str | os.PathLike[str], **options: Any) -> Answer:
     """Run a function on an untrusted file in an idle child process, or in a new one, as `Sandbox.call` does."""
-    with _hold:
+    with _idle_lock:
         sandbox = _idle.pop() if _idle else Sandbox()
     try:
         return sandbox.call(function, path, **options)
     finally:
-        with _hold:
+        with _idle_lock:
             _idle.append(sandbox)
 
 
@@ -263,8 +260,8 @@ def _run(module: str, name: str, path: str, options: dict[str, Any], memory_gib:
     except errors.InputError as error:
         return {"error": str(error), "kind": type(error).__name__}, {}
     except MemoryError:
-        much = f"{path}: decoding needs more than {memory_gib:g} GiB of memory; the file is damaged or far too large"
-        return {"error": much, "kind": "DecodeError"}, {}
+        message = f"{path}: decoding needs more than {memory_gib:g} GiB of memory; the file is damaged or far too large"
+        return {"error": message, "kind": "DecodeError"}, {}
     except Exception as error:
         return {"bug": f"{type(error).__name__}: {error}", "traceback": traceback.format_exc()}, {}
     return {"meta": meta, "arrays": [(name, array.dtype.str, array.shape) for name, array in arrays.items()]}, arrays

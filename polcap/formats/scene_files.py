@@ -23,7 +23,7 @@ def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int64]]:
     if not path.is_file():
         raise DecodeError(f"{path}: no such file; give a mesh as PLY, OBJ, STL or GLB")
     try:
-        vertices, faces = _compact(path) if path.suffix == ".npz" else _any(path)
+        vertices, faces = _read_quantized(path) if path.suffix == ".npz" else _read_by_trimesh(path)
     except OSError as error:
         raise DecodeError(f"cannot read {path}: {error.strerror or error}; check the path") from error
     except Exception as error:  # each of trimesh's readers raises errors of its own
@@ -33,12 +33,12 @@ def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int64]]:
     return vertices, faces
 
 
-def _compact(path: Path) -> tuple[Floats, NDArray[np.int64]]:
+def _read_quantized(path: Path) -> tuple[Floats, NDArray[np.int64]]:
     with np.load(path) as data:
         return data["vq"].astype(np.float64) / 65535 * data["vscale"] + data["vmin"], data["faces"].astype(np.int64)
 
 
-def _any(path: Path) -> tuple[Floats, NDArray[np.int64]]:
+def _read_by_trimesh(path: Path) -> tuple[Floats, NDArray[np.int64]]:
     import trimesh
 
     found = trimesh.load(path, force="mesh", process=False)
@@ -56,12 +56,12 @@ def read_textures(folder: Path, side: int = 256) -> Floats:
     rough = _picture(folder / "roughness.jpg", side).mean(axis=-1)
     slope: Floats = np.zeros((side, side, 2), dtype=np.float32)
     if (folder / "normal.jpg").exists():
-        n = _picture(folder / "normal.jpg", side)[..., ::-1] * 2 - 1
-        slope = -n[..., :2] / np.maximum(n[..., 2:], 0.3)
+        normal = _picture(folder / "normal.jpg", side)[..., ::-1] * 2 - 1
+        slope = -normal[..., :2] / np.maximum(normal[..., 2:], 0.3)
     elif (folder / "height.jpg").exists():
         height = _picture(folder / "height.jpg", side).mean(axis=-1)  # white is a 32nd of the side high
         slope = np.stack([np.roll(height, -1, a) - np.roll(height, 1, a) for a in (1, 0)], axis=-1) * side / 64
-    maps = np.concatenate([linear, rough[..., None], np.clip(slope, -2, 2)], axis=-1)
+    maps = np.concatenate([linear, rough[..., None], np.clip(slope, -2, 2)], axis=-1)  # steeper slopes are clipped
     return np.ascontiguousarray(maps.transpose(2, 0, 1), dtype=np.float32)
 
 
@@ -71,8 +71,8 @@ def read_height(path: Path, side: int) -> Floats:
     if image is None:
         raise DecodeError(f"{path} is missing or not a picture; give a height map as PNG, white is high")
     gray = image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
-    how = cv2.INTER_AREA if min(image.shape) >= side else cv2.INTER_CUBIC
-    return np.asarray(cv2.resize(gray, (side, side), interpolation=how))
+    method = cv2.INTER_AREA if min(image.shape) >= side else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(gray, (side, side), interpolation=method))
 
 
 def _picture(path: Path, side: int) -> Floats:

@@ -68,8 +68,8 @@ def colorchecker(kind: str = "classic") -> ChartReference:
     table = colour.CCS_COLOURCHECKERS[_TABLES[kind]]
     keys = chart_file.SG_BLOCK if kind == "sg" else tuple(table.data)
 
-    def colors(of: tuple[str, ...]) -> Floats:
-        return chart_file.adapted(colour.xyY_to_XYZ([table.data[key] for key in of]), table.illuminant)
+    def colors(patches: tuple[str, ...]) -> Floats:
+        return chart_file.to_rec709(colour.xyY_to_XYZ([table.data[key] for key in patches]), table.illuminant)
 
     return ChartReference(
         name=_NAMES[kind],

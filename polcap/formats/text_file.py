@@ -114,15 +114,15 @@ def check_plain(value: Any, finite: bool = True, name: str = "") -> None:
             check_plain(key)
             check_plain(item, finite, f"{name}.{key}" if name else str(key))
     if isinstance(value, list):
-        for at, item in enumerate(value):
-            check_plain(item, finite, f"{name}[{at}]")
+        for index, item in enumerate(value):
+            check_plain(item, finite, f"{name}[{index}]")
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
     """The most similar known name as a question, or all of them where none is similar."""
     choices = list(known)
-    near = difflib.get_close_matches(name.lower(), choices, n=1, cutoff=0.5)
-    return f"did you mean {near[0]}?" if near else f"there are {', '.join(choices)}"
+    similar = difflib.get_close_matches(name.lower(), choices, n=1, cutoff=0.5)
+    return f"did you mean {similar[0]}?" if similar else f"there are {', '.join(choices)}"
 
 
 def fault(error: msgspec.ValidationError, data: Any, kind: type[msgspec.Struct]) -> str:
@@ -130,13 +130,13 @@ def fault(error: msgspec.ValidationError, data: Any, kind: type[msgspec.Struct])
     message, _, path = str(error).partition(" - at `$")
     value, form = data, inspect.type_info(kind)
     for name, place in _STEP.findall(path):
-        value, form = value[int(place) if place else name], _inner(form, name)
+        value, form = value[int(place) if place else name], _element_type(form, name)
     where = path.strip("`.")
     if unknown := _UNKNOWN.fullmatch(message):
-        known = [field.encode_name for field in _of(form, inspect.StructType).fields]
+        known = [field.encode_name for field in _require(form, inspect.StructType).fields]
         return f"{f'{where}.' if where else ''}{unknown[1]}: there is no such key; {suggestion(unknown[1], known)}"
     if message.startswith("Invalid enum value"):
-        message = f"not one of {', '.join(map(str, _of(form, inspect.LiteralType).values))}"
+        message = f"not one of {', '.join(map(str, _require(form, inspect.LiteralType).values))}"
     elif "matching regex" in message:
         message = "no such choice"
     elif message.startswith("Expected `str`"):
@@ -147,23 +147,23 @@ def fault(error: msgspec.ValidationError, data: Any, kind: type[msgspec.Struct])
     return f"{where} = {value!r}: {text}"
 
 
-def _inner(form: inspect.Type, name: str) -> inspect.Type:
+def _element_type(form: inspect.Type, name: str) -> inspect.Type:
     """msgspec's type description of a table's key or of a list's element."""
     if name:
-        return next(field.type for field in _of(form, inspect.StructType).fields if field.encode_name == name)
+        return next(field.type for field in _require(form, inspect.StructType).fields if field.encode_name == name)
     for kind in (inspect.VarTupleType, inspect.ListType):
-        if (found := _found(form, kind)) is not None:
+        if (found := _member(form, kind)) is not None:
             return found.item_type
     return inspect.AnyType()  # a list of fixed length: of numbers only
 
 
-def _of(form: inspect.Type, kind: type[_Type]) -> _Type:
-    found = _found(form, kind)
+def _require(form: inspect.Type, kind: type[_Type]) -> _Type:
+    found = _member(form, kind)
     assert found is not None, f"{form} is no {kind.__name__}"
     return found
 
 
-def _found(form: inspect.Type, kind: type[_Type]) -> _Type | None:
+def _member(form: inspect.Type, kind: type[_Type]) -> _Type | None:
     """The member of a union type description that is of class `kind`, or the type itself; None if there is none."""
     members = form.types if isinstance(form, inspect.UnionType) else (form,)
     for member in members:

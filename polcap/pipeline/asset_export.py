@@ -1,7 +1,7 @@
 """Exports the asset of a result in the formats of a preset, with a record of its provenance.
 
-`process` and `polcap export` build the asset from the files in maps/. So the same result gives the
-same bytes, with any number of threads.
+`process` and `polcap export` build the asset from the files in maps/. So the same result gives the same bytes, with any
+number of threads.
 """
 
 import glob
@@ -56,7 +56,7 @@ _SHARING = {"obj", "usd", "materialx"}  # formats that share texture files
 
 
 def key(keys: Mapping[str, str], settings: AssetSettings) -> str:
-    """Key of the asset of a result with these cache keys, to recognize exports of other maps or settings."""
+    """Key of the asset of a result with these cache keys; exports of other maps or settings have another one."""
     return digest([asset.build.versions, msgspec.to_builtins(settings), keys["infer"], keys["surface"]])
 
 
@@ -92,10 +92,10 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     if found[0].asset.mesh.frame == "camera":  # one view
         turn_deg = about["capture"].get("upright_deg", 0)
         found = [replace(level, asset=asset.turn(level.asset, turn_deg)) for level in found]
-    preset, whole = effective(wanted), found[0].asset
+    preset, content = effective(wanted), found[0].asset
     name = atomic.safe_name(str(about["capture"].get("name")))  # files stay in the folder, whatever name the report has
-    files = _files(out / "asset" / (wanted.preset or ""), name, whole, preset, record)
-    loose = _loose_textures(preset, wanted.extras, whole, obj.stem(name), files.shared)
+    files = _files(out / "asset" / (wanted.preset or ""), name, content, preset, record)
+    loose = _loose_textures(preset, wanted.extras, content, obj.stem(name), files.shared)
     coarser = {files.path(f"_lod{k}.glb"): level for k, level in enumerate(found[1:], 1)}
     writers = _writers(files, out / "maps", wanted)
     tasks = [writers[one] for one in preset.formats]
@@ -112,7 +112,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     description = {
         "for": preset.description,
         "unit": files.facts["unit"],
-        "glb": {f"{files.stem}_{key}": text for key, text in _embedded(whole, preset).items()},
+        "glb": {f"{files.stem}_{key}": text for key, text in _embedded(content, preset).items()},
         "mesh": _size(found[0]),
         **({"lods": notes} if writes_glb else {}),
         "textures": {file: texture.meaning for file, texture in sorted(loose.items())},
@@ -129,36 +129,36 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     return [*written, sidecar]
 
 
-def _files(folder: Path, name: str, whole: Asset, preset: ExportPreset, record: Mapping[str, Any]) -> _Files:
+def _files(folder: Path, name: str, content: Asset, preset: ExportPreset, record: Mapping[str, Any]) -> _Files:
     """The files of an export of the object `name`, with its `record` of provenance."""
     entry = {key: record[key] for key in CatalogEntry.__struct_fields__ if record.get(key)}
     stem = preset.name.format(obj.stem(name) if preset.textures else name)
-    unit = "m" if whole.mesh.metric else "relative"
+    unit = "m" if content.mesh.metric else "relative"
     head = f"polcap; unit of length: {unit}; normals +Y (OpenGL); made from: {stem}.provenance.json"
     return _Files(
         folder=folder,
         stem=stem,
-        asset=whole,
+        asset=content,
         shared={key: f"{obj.stem(stem)}_{key}.{preset.shared}" for key in texture_set.LOOSE},
         facts={"unit": unit, "normals": "+Y (OpenGL)", **provenance.words(record)},
         entry=entry,
         comment="\n".join([head, *(f"{key}: {' '.join(text.split())}" for key, text in entry.items())]),
-        glb=gltf.GlbOptions(preset.images, preset.geometry, gltf.center(whole.mesh.vertices)),
+        glb=gltf.GlbOptions(preset.images, preset.geometry, gltf.center(content.mesh.vertices)),
         encoder=TextureEncoder(),
     )
 
 
 def _writers(files: _Files, maps: Path, wanted: ExportRequest) -> dict[Format, _Writer]:
     """The function that writes each format; `maps` is the folder maps/ of the result."""
-    whole, stem, shared, facts, comment = files.asset, files.stem, files.shared, files.facts, files.comment
+    content, stem, shared, facts, comment = files.asset, files.stem, files.shared, files.facts, files.comment
     return {
-        "gltf": partial(_write_glb, files, files.path(".glb"), whole),
-        "obj": partial(obj.write, files.path(".obj"), whole, stem, shared, comment, files.entry),
-        "ply": partial(_write_one, ply_stl.write, files.path(".ply"), whole, comment),
-        "stl": partial(_write_one, ply_stl.write, files.path(".stl"), whole),
-        "usd": partial(_write_one, usd.write, files.path(".usdc"), whole, stem, shared, facts),
+        "gltf": partial(_write_glb, files, files.path(".glb"), content),
+        "obj": partial(obj.write, files.path(".obj"), content, stem, shared, comment, files.entry),
+        "ply": partial(_write_one, ply_stl.write, files.path(".ply"), content, comment),
+        "stl": partial(_write_one, ply_stl.write, files.path(".stl"), content),
+        "usd": partial(_write_one, usd.write, files.path(".usdc"), content, stem, shared, facts),
         "usdz": partial(_write_usdz, files),
-        "materialx": partial(_write_one, materialx.write, files.path(".mtlx"), whole, shared, comment),
+        "materialx": partial(_write_one, materialx.write, files.path(".mtlx"), content, shared, comment),
         "exr": partial(_write_one, exr_layers.write, files.path("_layers.exr"), maps, wanted.color, facts),
         "sfp": partial(sfp.write, files.path("_sfp"), maps, comment),
         "iiif": partial(_write_iiif, files, wanted.iiif or ""),
@@ -197,7 +197,7 @@ def copy(result: Path, out: Path) -> None:
 
 
 def _loose_textures(
-    preset: ExportPreset, extras: Sequence[Extra], whole: Asset, stem: str, shared: Mapping[Key, str]
+    preset: ExportPreset, extras: Sequence[Extra], content: Asset, stem: str, shared: Mapping[Key, str]
 ) -> dict[str, Texture]:
     """Texture files of a preset, of --extra, and those that OBJ, USD and MaterialX share, by file name.
 
@@ -205,11 +205,11 @@ def _loose_textures(
     """
     names = {f"{pattern.format(stem)}.png": name for pattern, name in preset.textures.items()}
     names |= {f"{stem}_{key.replace('-', '')}.png": key.replace("-", "_") for key in extras}
-    of_relief = {"displacement": whole.displacement, "curvature": whole.curvature, "cavity": whole.curvature}
-    held = {file: name for file, name in names.items() if name not in of_relief or of_relief[name] is not None}
-    found = {file: texture_set.TEXTURES[name](whole) for file, name in held.items()}
+    of_relief = {"displacement": content.displacement, "curvature": content.curvature, "cavity": content.curvature}
+    available = {file: name for file, name in names.items() if name not in of_relief or of_relief[name] is not None}
+    found = {file: texture_set.TEXTURES[name](content) for file, name in available.items()}
     if _SHARING.intersection(preset.formats):
-        made = {file: texture_set.LOOSE[key](whole) for key, file in shared.items()}
+        made = {file: texture_set.LOOSE[key](content) for key, file in shared.items()}
         found |= {file: texture_set.linear(one) for file, one in made.items()} if preset.shared == "exr" else made
     return found
 
@@ -222,20 +222,20 @@ def sidecars(out: Path) -> list[Path]:
 def find_outdated(out: Path, records: Sequence[Path], keys: Mapping[str, str]) -> list[Path]:
     """Exports of other maps than those of the result `out` with these cache keys: folders of presets, and files.
 
-    `records` are sidecars. A folder has one; a file of polcap that it does not list was exported with another record.
+    `records` are sidecars, one of each folder. A file of polcap that it does not list had another record.
     """
-    old, parts, own = list[Path](), dict[Path, None](), own_files.OwnFiles(out)
+    outdated, unlisted, own = list[Path](), dict[Path, None](), own_files.OwnFiles(out)
     for sidecar in records:
         about, folder = provenance.read(sidecar), sidecar.parent
         if about.get("stages") != keys:
             listed = dict.fromkeys(folder / Path(name).parts[0] for name in about.get("files", ()))
-            old += [folder] if folder.name in PRESETS else [path for path in listed if path.exists()]
+            outdated += [folder] if folder.name in PRESETS else [path for path in listed if path.exists()]
             continue
         for file in own.below(folder):
             name = file.relative_to(os.path.abspath(folder))
             if file.suffix in _SUFFIXES and name.as_posix() not in about["files"] and name.parts[0] not in PRESETS:
-                parts[folder / name.parts[0]] = None
-    return [*old, *parts]
+                unlisted[folder / name.parts[0]] = None
+    return [*outdated, *unlisted]
 
 
 def _write_one(write_file: Callable[..., None], file: Path, *arguments: Any) -> list[Path]:
@@ -285,8 +285,8 @@ def _write_texture(files: _Files, file: Path, texture: Texture) -> list[Path]:
 
 def _keywords(entry: Mapping[str, str]) -> dict[str, str]:
     """Facts for catalogs by keyword of a PNG's texts; its Description is that of the texture."""
-    known = {"title": "Title", "creator": "Author", "rights": "Copyright", "description": "Object"}
-    return {known.get(key, key.capitalize().replace("_", " ")): text for key, text in entry.items()}
+    keyword_of = {"title": "Title", "creator": "Author", "rights": "Copyright", "description": "Object"}
+    return {keyword_of.get(key, key.capitalize().replace("_", " ")): text for key, text in entry.items()}
 
 
 def _embedded(content: Asset, preset: ExportPreset) -> dict[str, str]:

@@ -131,7 +131,7 @@ class MemoryCache:
             if stage.keep:
                 self.progress(stage.name, 0.0, True)
             return value
-        values = [value_of(one) for one in inputs]  # in a lazy cache, this runs the stages before
+        values = [value_of(one) for one in inputs]  # in a `LazyCache`, this runs the earlier stages
         self.begin(stage.name)
         value = stage(*values, *(() if config is None else (config,)))
         value = self._store(stage, value, about, time.perf_counter() - self._began)
@@ -187,7 +187,7 @@ class StageCache(MemoryCache):
 
 
 class LazyCache(StageCache):
-    """Stage cache that reads or computes a result when its value is first needed: not before a stored result."""
+    """Stage cache that reads or computes a result only when its value is needed: not for stored results."""
 
     def _result(self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None) -> StageResult[T]:
         about = _about(stage, inputs, config)
@@ -305,9 +305,9 @@ def key_of(value: Any) -> str:
 def fingerprint(value: Any) -> Any:
     """Convert an input to plain data for a cache key: equal for two inputs that give the same results."""
     if isinstance(value, np.ndarray):
-        solid = np.ascontiguousarray(value)
-        summed = sha256(solid.data.cast("B") if solid.size else b"")
-        return [str(solid.dtype), list(solid.shape), summed.hexdigest()]
+        contiguous = np.ascontiguousarray(value)
+        content_digest = sha256(contiguous.data.cast("B") if contiguous.size else b"")
+        return [str(contiguous.dtype), list(contiguous.shape), content_digest.hexdigest()]
     if is_dataclass(value) and not isinstance(value, type):
         names = [one.name for one in fields(value) if one.metadata.get("in_key", True)]
         return [type(value).__name__, {name: fingerprint(getattr(value, name)) for name in names}]

@@ -65,12 +65,12 @@ def inspect(
             lines = tuple(_judge(capture, small, supplied, config))
         finally:
             pool.shutdown(cancel_futures=True)
-    bad = [line for line in lines if line.state == "fail"]
-    blamed = {name for line in bad for name in line.shots if capture.layout != "sensor"}  # its frame holds all angles
+    fails = [line for line in lines if line.state == "fail"]
+    blamed = {name for line in fails for name in line.shots if capture.layout != "sensor"}  # its frame holds all angles
     shots = tuple(shot.name for shot in capture.shots if shot.name in blamed)
     missing = any(line.name == "chart" and line.state == "warn" for line in lines)
     seconds = round(perf_counter() - start, 2)
-    return Verdict(not bad, shots, lines, capture.name, seconds, "--no-chart" if missing else "")
+    return Verdict(not fails, shots, lines, capture.name, seconds, "--no-chart" if missing else "")
 
 
 def _judge(capture: Capture, small: SmallCapture, supplied: UserInput, config: Config) -> list[Gate]:
@@ -127,13 +127,13 @@ def _colors_at_full_size(capture: Capture, config: Config) -> ColorCalibration:
 
 def _settings(config: Config, step: int) -> Config:
     """Settings of the path for the reduced pictures, without the stages' own limits: the gates judge instead."""
-    changed = msgspec.structs.replace
-    return changed(
+    with_values = msgspec.structs.replace
+    return with_values(
         config,
-        hdr=changed(config.hdr, max_motion_px=max(config.hdr.max_motion_px / step, 1.0)),
-        align=changed(config.align, max_shift_px=500.0, min_correlation=0.0),
-        selfcal=changed(config.selfcal, check_order=False),
-        infer=changed(config.infer, symmetries=min(config.infer.symmetries, _SYMMETRIES), fine=False),
+        hdr=with_values(config.hdr, max_motion_px=max(config.hdr.max_motion_px / step, 1.0)),
+        align=with_values(config.align, max_shift_px=500.0, min_correlation=0.0),
+        selfcal=with_values(config.selfcal, check_order=False),
+        infer=with_values(config.infer, symmetries=min(config.infer.symmetries, _SYMMETRIES), fine=False),
     )
 
 

@@ -28,7 +28,7 @@ class ExportSource(Protocol):
         """The asset with the full mesh, textures of 8 or 16 bits, and extra textures."""
 
     def decimated(self, whole: Asset, triangles: int) -> "DetailLevel":
-        """The asset with about so many triangles."""
+        """The asset `whole` with its mesh decimated to about this number of triangles."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class ReliefSource:
         return asset.with_extras(built, maps, maps.depth, "occlusion" in extras) if extras else built
 
     def decimated(self, whole: Asset, triangles: int) -> "DetailLevel":
-        """The asset with about so many triangles."""
+        """The asset `whole` with its mesh decimated to about this number of triangles."""
         maps = self.maps
         coarse = surface.decimate(self._front, maps.view, triangles, self.config.surface.back)
         return DetailLevel(asset.with_mesh(whole, maps, coarse.mesh), coarse)
@@ -71,7 +71,7 @@ class DetailLevel:
 
     asset: Asset
     decimated: surface.DecimatedMesh | None = None
-    texel: float = 1.0  # of the normal texture, in map pixels
+    texel: float = 1.0  # side of a texel of the normal texture, map px
 
     @property
     def error(self) -> float:
@@ -120,8 +120,8 @@ def levels(source: ExportSource, wanted: ExportRequest) -> list[DetailLevel]:
 
 def _deviation(coarse: Mesh, full: Mesh, error: float) -> float:
     """Distance of a decimated mesh from the full one, or the change of its bounding box if larger, over the size."""
-    moved = [np.abs(edge(coarse.vertices, axis=0) - edge(full.vertices, axis=0)).max() for edge in (np.min, np.max)]
-    return float(max(error, *moved) / _extent(full))
+    shifts = [np.abs(edge(coarse.vertices, axis=0) - edge(full.vertices, axis=0)).max() for edge in (np.min, np.max)]
+    return float(max(error, *shifts) / _extent(full))
 
 
 def _extent(mesh: Mesh) -> float:
@@ -130,7 +130,7 @@ def _extent(mesh: Mesh) -> float:
 
 
 def _with_texels(level: DetailLevel, size: int | None, powers: bool, factor: int) -> DetailLevel:
-    """The level with textures of `size` px, powers of two near their own size, or their own size, over `factor`."""
+    """The level with textures of `size` px, of powers of two, or of their own size, each divided by `factor`."""
     built = level.asset
     if size is not None:
         resized = asset.resize_textures(built, max(size // factor, 1))

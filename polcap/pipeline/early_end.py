@@ -23,7 +23,7 @@ _OF_PIXELS = (CaptureError, ChartError, AlignmentError, ObjectError)  # the pict
 def explain(error: InputError, cache: StageCache, capture: Capture, config: Config) -> InputError | None:
     """The error with the cause that gates find in the stages so far, and a picture of the shots if they show the cause.
 
-    None without pixels.
+    None if the pixels do not explain this error, or no stage has read them.
     """
     reached = results_so_far(cache)
     if not isinstance(error, _OF_PIXELS) or not isinstance(reached, ResultsUntilHdr):
@@ -45,9 +45,9 @@ def explain(error: InputError, cache: StageCache, capture: Capture, config: Conf
 
 def _registered(reached: ResultsUntilWhitebalance, config: Config) -> ResultsUntilWhitebalance:
     """The results with the motion of all shots, also of shots that moved too far or show another scene."""
-    anything = msgspec.structs.replace(config.align, max_shift_px=500.0, min_correlation=0.0)
+    unlimited = msgspec.structs.replace(config.align, max_shift_px=500.0, min_correlation=0.0)
     try:
-        alignment = align.register(reached.radiance, anything)
+        alignment = align.register(reached.radiance, unlimited)
     except AlignmentError:  # there is nothing to register
         return reached
     return ResultsUntilAlign(**vars(reached), alignment=alignment)

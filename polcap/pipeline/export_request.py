@@ -14,7 +14,7 @@ from polcap.formats.export.glb_geometry import Geometry
 from polcap.formats.export.presets import EXTRAS, FORMATS, PRESETS, ExportPreset, Format
 from polcap.formats.export.texture_set import Extra
 
-_NEEDED: tuple[Extra, ...] = ("object-normal",)  # by the format `iiif`
+_OF_IIIF: tuple[Extra, ...] = ("object-normal",)  # textures that the format `iiif` needs
 
 
 @dataclass(frozen=True)
@@ -121,5 +121,5 @@ def effective(wanted: ExportRequest) -> ExportPreset:
         triangles=wanted.triangles or preset.triangles,
         bits=wanted.bits or preset.bits,
         formats=formats,
-        extras=(*preset.extras, *wanted.extras, *(_NEEDED if "iiif" in formats else ())),
+        extras=(*preset.extras, *wanted.extras, *(_OF_IIIF if "iiif" in formats else ())),
     )

@@ -54,10 +54,10 @@ def load_network(
 def open_network(path: Path, device: Device = "cpu", threads: int = 0) -> Network:
     """Open an estimator's network. The shipped one comes with its refinement network, which was trained for it only."""
     network = onnx.load(path, device, threads)
-    own, relief = newest("polcap"), newest("fine")
-    if own is None or relief is None or (path != own and network.digest != onnx.digest(own.read_bytes())):
+    shipped, refiner = newest("polcap"), newest("fine")
+    if shipped is None or refiner is None or (path != shipped and network.digest != onnx.digest(shipped.read_bytes())):
         return network
-    return replace(network, fine=onnx.load(relief, device, threads, fine.ENCODING))
+    return replace(network, fine=onnx.load(refiner, device, threads, fine.ENCODING))
 
 
 def load_mask_network(threads: int = 0) -> Network | None:

@@ -59,8 +59,8 @@ def run_stages(capture: Capture | None, supplied: UserInput, config: Config, cac
         color = cache.run(whitebalance.measure, radiance, colors.result(), supplied.chart, config=config.whitebalance)
         alignment = cache.run(align.register, radiance, config=config.align)
         drawn = cache.derive(on_grid, supplied.mask, radiance)
-        finder = supplied.mask_network
-        object_ = cache.run(mask.segment, radiance, alignment, color, drawn, finder, onnx.run, config=config.mask)
+        mask_network = supplied.mask_network
+        object_ = cache.run(mask.segment, radiance, alignment, color, drawn, mask_network, onnx.run, config=config.mask)
         calibration = cache.run(selfcal.solve, radiance, alignment, object_, color, config=config.selfcal)
         stokes_ = cache.run(stokes.solve, radiance, alignment, calibration, object_, config=config.stokes)
         cues_ = cache.run(cues.compute, stokes_, color, cache.derive(other_orders, calibration))

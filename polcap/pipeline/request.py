@@ -50,9 +50,9 @@ class Request:
 
     def digest(self, folder: Path, out: Path) -> str | None:
         """Digest of the request and its files for `unchanged`; None: these do not determine the result."""
-        stated = replace(self, model=None, threads=0, memory_gb=0.0)  # they do not change the result, but for the model
-        models_ = [] if self.model is None else [self.model]
-        return unchanged.request([fingerprint(stated), str(self.model)], folder, out, [*models_, *self.files()])
+        stated = replace(self, model=None, threads=0, memory_gb=0.0)  # without limits; the model is added below
+        model_files = [] if self.model is None else [self.model]
+        return unchanged.request([fingerprint(stated), str(self.model)], folder, out, [*model_files, *self.files()])
 
     def files(self) -> list[Path]:
         """Files that the settings name: the measured colors of the chart."""

@@ -71,9 +71,9 @@ def _remove_temporary(out: Path) -> None:
     presets = [] if asset.is_symlink() or not asset.is_dir() else [path for path in asset.iterdir() if path.is_dir()]
     for place in (out, out / "work", out / "maps", asset, *presets):
         if place == out or not place.is_symlink():
-            for left in place.glob(".*.part*"):
-                if atomic.is_temporary(left.name):
-                    atomic.discard(left)
+            for file in place.glob(".*.part*"):
+                if atomic.is_temporary(file.name):
+                    atomic.discard(file)
 
 
 def clean(out: Path, dry_run: bool = False) -> int:

@@ -15,15 +15,15 @@ def check(out: Path, photographs: Path) -> None:
 
     Raises SettingError: `out` contains the capture, lies among its shots, is a link out of it, or as `check_free`.
     """
-    here, there = _real(out), Path(os.path.realpath(photographs))
-    if here == there:
+    target, capture = _real(out), Path(os.path.realpath(photographs))
+    if target == capture:
         raise SettingError(f"--out {out} is the capture itself; choose a folder of its own")
-    if there.is_relative_to(here):
+    if capture.is_relative_to(target):
         raise SettingError(f"--out {out} contains the capture {photographs}; choose a folder of its own")
-    if out.is_symlink() and here.parent != there and Path(os.path.realpath(out.parent)) == there:
+    if out.is_symlink() and target.parent != capture and Path(os.path.realpath(out.parent)) == capture:
         raise SettingError(f"--out {out} is a link; name the folder that it leads to")
-    inside = here.relative_to(there).parts[:1] if here.is_relative_to(there) else ()
-    if any(name in folder_names.angle_folder_names(there) or folder_names.is_angle_folder(name) for name in inside):
+    inside = target.relative_to(capture).parts[:1] if target.is_relative_to(capture) else ()
+    if any(name in folder_names.angle_folder_names(capture) or folder_names.is_angle_folder(name) for name in inside):
         raise SettingError(f"--out {out} lies among the capture's shots; choose {photographs / own_folders.OUTPUT}")
     check_free(out)
 
@@ -31,18 +31,18 @@ def check(out: Path, photographs: Path) -> None:
 def check_free(out: Path) -> None:
     """Refuse a folder for files of polcap that holds photographs or lies among those of a capture.
 
-    Raises SettingError: it is one of these, or its name is none that OpenEXR can have.
+    Raises SettingError: it is one of these, or OpenEXR cannot open a file of its name.
     """
-    here = _real(out)
-    if any(map(_holds_shots, (here, *here.parents))):
+    target = _real(out)
+    if any(map(_holds_shots, (target, *target.parents))):
         raise SettingError(f"--out {out} lies among the capture's shots; choose another folder")
-    held = folder_names.children(here) if here.is_dir() and not own_files.is_claimed(out) else []
-    if photograph := next((path for path in held if path.is_file() and probe.kind(path) == "raw"), None):
+    files = folder_names.children(target) if target.is_dir() and not own_files.is_claimed(out) else []
+    if photograph := next((path for path in files if path.is_file() and probe.kind(path) == "raw"), None):
         raise SettingError(f"--out {out} holds photographs ({photograph.name}); choose a folder of its own")
 
 
 def _real(out: Path) -> Path:
-    """The folder without links. Raises SettingError: its name is no text for files."""
+    """The folder without links. Raises SettingError: its name is not UTF-8, or holds a NUL character."""
     try:
         os.fspath(out).encode()
     except UnicodeEncodeError:

@@ -32,10 +32,7 @@ def no_cache(out: Path) -> StorageError:
 
 
 def read(out: Path) -> dict[str, Any]:
-    """Read work/run.json of a result folder.
-
-    Raises StorageError: there is none, or it is damaged.
-    """
+    """Read work/run.json of a result folder. Raises StorageError: there is none, or it is damaged."""
     file = out / "work" / "run.json"
     try:
         about: dict[str, Any] = text_file.read_json(file)

@@ -70,21 +70,21 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
     """
     first = middle(capture.shots[0].frames)
     meta, arrays = frame_decoder.apply(first, reduce_first, clip=clip, most_pixels=_MOST_PIXELS)
-    times, half, corners = int(meta["times"]), int(meta["superpixel"]), arrays["corners"].tolist()
+    times, merged_px, corners = int(meta["times"]), int(meta["superpixel"]), arrays["corners"].tolist()
     reduced = {first: pool.submit(_build_frame, meta, arrays)}
     for frame in (frame for shot in capture.all_shots for frame in (*shot.frames, *shot.ambient) if frame != first):
         reduced[frame] = pool.submit(_decode_reduced, frame, clip, times, corners)
-    step = half * times
-    x, y = (to_grid(at, step) for at in capture.principal_px)
+    step = merged_px * times
+    x, y = (to_grid(coordinate, step) for coordinate in capture.principal_px)
     width, height = (side // step for side in capture.size_px)
     small = replace(
         capture,
         focal_px=capture.focal_px / step,
         principal_px=(x, y),
         size_px=(width, height),
-        calibration=capture.calibration and replace(capture.calibration, noise=()),  # it is of pixels, not of means
+        calibration=capture.calibration and replace(capture.calibration, noise=()),  # noise of pixels, not of means
     )
-    return SmallCapture(small, step, half, reduced)
+    return SmallCapture(small, step, merged_px, reduced)
 
 
 def _decode_reduced(frame: Frame, clip: float, times: int, corners: list[list[int]]) -> ReducedFrame:

@@ -57,12 +57,12 @@ def request_of_run(stated: Any) -> str:
 def find(out: Path, asked: str | None) -> Finished | None:
     """The earlier run with this request digest, if nothing in its result folder has changed since; else None."""
     try:
-        known = text_file.read_json(out / "work" / _FILE)
-        if asked is None or known["request"] != asked or not _holds(known["result"], out):
+        record = text_file.read_json(out / "work" / _FILE)
+        if asked is None or record["request"] != asked or not _holds(record["result"], out):
             return None
-        if any(_stat(file) != stat for file, stat in known["files"].items()):
+        if any(_stat(file) != stat for file, stat in record["files"].items()):
             return None
-        return Finished(str(known["table"]), text_file.read_json(out / "report.json"))
+        return Finished(str(record["table"]), text_file.read_json(out / "report.json"))
     except (OSError, ValueError, TypeError, KeyError):
         return None
 
@@ -81,16 +81,16 @@ def remember(out: Path, asked: str | None, table: str = "", files: Iterable[Path
 
 @contextmanager
 def preserved(out: Path) -> Iterator[None]:
-    """Context manager: a locked result that is up to date still is after polcap has changed files in it."""
-    known: dict[str, Any] = {}
+    """Context manager: if a locked result is up to date, it still counts as such after polcap has changed its files."""
+    record: dict[str, Any] = {}
     with suppress(OSError, ValueError, TypeError, KeyError):
-        known = text_file.read_json(out / "work" / _FILE)
-        if not _holds(known["result"], out):
-            known = {}
+        record = text_file.read_json(out / "work" / _FILE)
+        if not _holds(record["result"], out):
+            record = {}
     yield
-    if known:
+    if record:
         with own_files.opened(out):
-            atomic.write_json(out / "work" / _FILE, {**known, "result": _result(out)}, synced=False)
+            atomic.write_json(out / "work" / _FILE, {**record, "result": _result(out)}, synced=False)
 
 
 @cache
@@ -113,10 +113,10 @@ def _is_of_run(parts: tuple[str, ...]) -> bool:
     return parts[0] in _PARTS or (parts[0] == "work" and (len(parts) > 2 or parts[1] == "run.json"))
 
 
-def _holds(known: dict[str, Stat], out: Path) -> bool:
-    """Whether all files of a result are as known; files that others added do not matter."""
+def _holds(expected: dict[str, Stat], out: Path) -> bool:
+    """Whether all files of a result still have the `expected` stats; files that others added do not matter."""
     found = _result(out)
-    return all(found.get(name) == stat for name, stat in known.items())
+    return all(found.get(name) == stat for name, stat in expected.items())
 
 
 def _stats(folder: Path, result: str = "", ignored: tuple[str, ...] = (own_folders.BATCH,)) -> dict[str, Stat]:
@@ -136,5 +136,5 @@ def _stats(folder: Path, result: str = "", ignored: tuple[str, ...] = (own_folde
 
 
 def _stat(file: str | Path) -> Stat:
-    about = os.stat(file)
-    return [about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino]
+    status = os.stat(file)
+    return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]

@@ -21,7 +21,7 @@ class BackgroundCheck:
     """Thread that saves each photograph, then accepts or rejects it, in the order of taking."""
 
     def __init__(self, record: CaptureRecord, tries: int, log: Log) -> None:
-        self.small: dict[str, Floats] = {}  # accepted frames of this run by slot, small and grey
+        self.small: dict[str, Floats] = {}  # small gray pictures (h, w) of this run's accepted frames, by slot
         self._record = record
         self._tries = tries
         self._log = log
@@ -72,8 +72,8 @@ class BackgroundCheck:
         if reason is not None:
             self._reject(slot.name, file, read_deg, reason)
             return
-        of_slot = slot.role, slot.angle_deg, slot.step
-        frame = AcceptedFrame(name, *of_slot, read_deg, photograph.exposure, slot.flash, photograph.name, facts)
+        place = slot.role, slot.angle_deg, slot.step
+        frame = AcceptedFrame(name, *place, read_deg, photograph.exposure, slot.flash, photograph.name, facts)
         self._record.accept(slot, frame)
         self.small[slot.name] = small
         for earlier, other in same_exposure.items():  # an early frame may be the blurred one

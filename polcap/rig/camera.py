@@ -8,7 +8,7 @@ from polcap.capture_values import Role
 from polcap.formats.raw import file_kind
 from polcap.rig.exposure_bracket import Exposure
 
-_MAKERS = {"nikon": ".nef", "sony": ".arw", "pentax": ".pef", "ricoh": ".pef", "samsung": ".srw", "canon": ".cr2"}
+_SUFFIXES = {"nikon": ".nef", "sony": ".arw", "pentax": ".pef", "ricoh": ".pef", "samsung": ".srw", "canon": ".cr2"}
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class CameraFile:
             if file_kind.structure(self.data).dng:
                 return ".dng"
             head = self.data[:4096].lower()
-            return next((suffix for maker, suffix in _MAKERS.items() if maker.encode() in head), ".tif")
+            return next((suffix for maker, suffix in _SUFFIXES.items() if maker.encode() in head), ".tif")
         return Path(self.name).suffix.lower() or ".raw"
 
 
@@ -38,9 +38,9 @@ class Camera(Protocol):
     """Protocol that every camera driver implements."""
 
     model: str
-    frame_bytes: int  # about; to check the free disk space
-    switches_flash: bool  # can take a frame without flash by itself
-    polarizes_flash: bool  # can put the flash's filter on by itself
+    frame_bytes: int  # approximate size of a file, to check the free disk space
+    switches_flash: bool  # switches the flash off without a person
+    polarizes_flash: bool  # puts the filter on the flash without a person
 
     def bracket(self, flash: bool) -> tuple[Exposure, ...]:
         """Default exposures of the camera; they differ in ISO under a flash, which the shutter does not change."""

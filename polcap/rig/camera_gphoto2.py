@@ -21,7 +21,7 @@ from polcap.rig.exposure_bracket import Exposure, bracket_by_iso, bracket_by_shu
 
 T = TypeVar("T")
 
-_WIDGETS = {  # names of Exposure's fields, and the power of the value that is proportional to light
+_WIDGETS = {  # by field of Exposure: names of the setting, and the power of its value that is proportional to light
     "time_s": (("shutterspeed", "shutterspeed2"), 1.0),
     "f_number": (("aperture", "f-number"), 2.0),
     "iso": (("iso",), 1.0),
@@ -95,12 +95,12 @@ class Gphoto2Camera:
 
     def _shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
         """Set exposure and flash, and take one photograph."""
-        done = {field: self._set(field, getattr(exposure, field)) for field in _WIDGETS}
+        set_values = {field: self._set(field, getattr(exposure, field)) for field in _WIDGETS}
         if self._flash_off is not None and self._flash_on is not None:
             self._choose(_FLASH_MODE, self._flash_on if flash else self._flash_off)
-        seconds = done["time_s"] or exposure.time_s or 0.0
+        seconds = set_values["time_s"] or exposure.time_s or 0.0
         data, name = self._ask("capture", self._capture, seconds)
-        return CameraFile(data, name, Exposure(**done))
+        return CameraFile(data, name, Exposure(**set_values))
 
     def _connect(self) -> Any:
         """Connect to the one camera that fits. Raises HardwareError: there is none; SettingError: there are several."""

@@ -17,7 +17,7 @@ from polcap.synth.scenes import Kind, random_scene
 from polcap.synth.shooting import MIDDLE_S, Dials, Shoot, Studio, Take
 
 FLASH_SYNC_S = 1 / 160  # shutter time under the flash
-_NUMBER_OF_ROLE = {"shot": 0, "repeat": 1000, "ambient": 2000, "chart": 3000, "cross": 4000}
+_FIRST_NUMBER = {"shot": 0, "repeat": 1000, "ambient": 2000, "chart": 3000, "cross": 4000}  # of the shots of a role
 
 
 class SimulatedCameraSettings(Shoot, frozen=True, forbid_unknown_fields=True):
@@ -61,7 +61,7 @@ class SimulatedCamera:
         wanted = 0.0 if angle_deg is None else angle_deg
         shot = angles.index(wanted) if wanted in angles else len(angles) + round(10 * wanted) % 900
         self._crossed = role == "cross"
-        self._next = shot + _NUMBER_OF_ROLE[role], step, wanted if RING.true_deg is None else RING.true_deg
+        self._next = shot + _FIRST_NUMBER[role], step, wanted if RING.true_deg is None else RING.true_deg
 
     def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
         """Photograph the prepared frame; its light is rendered once for all exposures at one angle."""

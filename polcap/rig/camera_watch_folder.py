@@ -71,16 +71,16 @@ class WatchFolderCamera:
     def prepare(self, angle_deg: float | None, role: Role, step: int) -> None:
         """Skip the files that arrived, or began to arrive, at the angle before."""
         if angle_deg != self._angle:
-            begun = self._new()
+            arriving = self._new()
             end = time.monotonic() + _SETTLE_S
-            while not all(map(self._is_stable, begun.items())) and time.monotonic() < end:
+            while not all(map(self._is_stable, arriving.items())) and time.monotonic() < end:
                 time.sleep(_POLL_S)
-                begun = {file: version for file, version in self._versions().items() if file in begun}
-            for file in sorted({*begun, *self._refused, *(file for file, _ in self._arrived)}):
+                arriving = {file: version for file, version in self._versions().items() if file in arriving}
+            for file in sorted({*arriving, *self._refused, *(file for file, _ in self._arrived)}):
                 self._log.write("camera", "!", f"{file.name}: taken before the polarizer turned; not used")
                 with suppress(OSError):  # removed: it is the program's
                     self._known.add(file_bytes.digest(file.read_bytes()))
-            self._read |= begun
+            self._read |= arriving
             self._arrived.clear()
             self._refused.clear()
         self._angle = angle_deg

@@ -115,15 +115,15 @@ class CaptureRecord:
             return name
 
     def reject_other_angle(self, slot: Slot, read_deg: float) -> list[str]:
-        """When the ring returns to a begun bracket: reject the bracket's frames if they were taken at another angle."""
-        begun = {name: frame for name, frame in self.accepted().items() if _bracket(frame) == _bracket(slot)}
-        read = [frame.read_deg for frame in begun.values() if frame.read_deg is not None]
+        """Reject the frames of a begun bracket to which the ring has returned, if they were taken at another angle."""
+        bracket = {name: frame for name, frame in self.accepted().items() if _bracket(frame) == _bracket(slot)}
+        read = [frame.read_deg for frame in bracket.values() if frame.read_deg is not None]
         if not read or max(abs(one - read_deg) for one in read) <= _SAME_DEG:
             return []
-        for name, frame in begun.items():
+        for name, frame in bracket.items():
             reason = f"the ring came back to {read_deg:.3f}°, not {frame.read_deg:.3f}°"
             self.reject(name, self.folder / frame.file, frame.read_deg, reason)
-        return list(begun)
+        return list(bracket)
 
     def verify(self) -> list[str]:
         """Reject photographs that have changed since, or were not checked; returns a message for each."""
@@ -194,6 +194,6 @@ def read(file: Path, kind: type[T]) -> T:
         raise CaptureError(f"{file}: cannot be read ({error}); shoot into another folder") from None
 
 
-def _bracket(of: AcceptedFrame | Slot) -> tuple[str, float | None]:
+def _bracket(frame: AcceptedFrame | Slot) -> tuple[str, float | None]:
     """Role and angle, which all frames of a bracket share."""
-    return of.role, of.angle_deg
+    return frame.role, frame.angle_deg

@@ -54,8 +54,8 @@ def open_rotator(url: str, log: Log, part: str = "polarizer") -> PolarizerRotato
     if kind == "simulated":
         return PolarizerRotator(motor_class(settings, log), settings, log)
     if not address:
-        ports = f"{kind}:/dev/ttyUSB0, {kind}:COM3 or {kind}:socket://…"
-        raise SettingError(f"rotator {url!r} names no port; write {ports}")
+        examples = f"{kind}:/dev/ttyUSB0, {kind}:COM3 or {kind}:socket://…"
+        raise SettingError(f"rotator {url!r} names no port; write {examples}")
     port = Port(address, motor_class.baud, log)
     try:
         return PolarizerRotator(retry(lambda: motor_class(port, settings)), settings, log, port)

@@ -16,7 +16,7 @@ FINISH_S = 1.0  # the last frame's check, and the preview
 SPEED_DEG_S = {"elliptec": 430.0, "grbl": 60.0, "line": 60.0, "manual": 9.0, "simulated": 360.0}  # nominal
 OVERHEAD_S = {"gphoto2": 2.0, "folder": 4.0, "simulated": 0.5}  # per frame: release, 24 MP over USB, a person
 _SETTLE_S = 0.2  # of a motor
-_DIAL = [100.0, 400.0, 1600.0]  # ISO values of any camera
+_DIAL = [100.0, 400.0, 1600.0]  # ISO values that every camera has
 _USUAL_S = 0.02  # shutter time in the middle of a bracket
 
 
@@ -56,15 +56,15 @@ def dry_run(order: CaptureOrder) -> dict[str, Any]:
     The default bracket is ISO 100 to 1600 under a flash, else three shutter times around 1/50 s.
     """
     speed = _by_kind("--rotator", order.rotator, SPEED_DEG_S)
-    usual_s = 0.0 if order.rotator == "manual" else _SETTLE_S
+    default_settle_s = 0.0 if order.rotator == "manual" else _SETTLE_S
     try:
-        settle = float(dict(parse_qsl(order.rotator.partition("?")[2])).get("settle", usual_s))
+        settle = float(dict(parse_qsl(order.rotator.partition("?")[2])).get("settle", default_settle_s))
     except ValueError:
         raise SettingError(f"--rotator {order.rotator}: settle is not a number of seconds") from None
     pace = Pace(speed, settle, overhead_s(order.camera))
     simulated = order.camera.startswith("simulated")
-    usual = bracket_by_iso(_DIAL) if uses_flash(order) and not simulated else bracket_by_shutter(_USUAL_S)
-    order = msgspec.structs.replace(order, bracket=order.bracket or usual)
+    default_bracket = bracket_by_iso(_DIAL) if uses_flash(order) and not simulated else bracket_by_shutter(_USUAL_S)
+    order = msgspec.structs.replace(order, bracket=order.bracket or default_bracket)
     slots = plan_slots(order, simulated)
     homing_s = 0.0 if order.rotator == "manual" else 360.0 / speed
     parts = _parts(pace.steps(slots, 0.0), homing_s)

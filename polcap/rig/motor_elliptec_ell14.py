@@ -91,7 +91,7 @@ class ElliptecMotor:
 
     def position(self) -> float:
         pulses = int(self._ask("gp", "PO"), 16)
-        return (pulses - (1 << 32 if pulses >> 31 else 0)) / self._pulses * 360.0
+        return (pulses - (1 << 32 if pulses >> 31 else 0)) / self._pulses * 360.0  # two's complement
 
     def halt(self) -> None:
         self._ask("st", "GS")  # without movement the piezo has no current

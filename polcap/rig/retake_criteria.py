@@ -63,9 +63,9 @@ def measure(path: str) -> sandbox.Answer:
 
 def _sharpness(light: Floats) -> float:
     """Sharpness of a picture: contrast within 1 px over contrast within 4 px; almost independent of exposure."""
-    near, far = (cv2.GaussianBlur(np.asarray(light, np.float32), (0, 0), sigma) for sigma in (1.0, 4.0))
-    coarse = float(np.std(near - far))
-    return float(np.std(light - near)) / coarse if coarse > 0 else 0.0
+    blurred_1px, blurred_4px = (cv2.GaussianBlur(np.asarray(light, np.float32), (0, 0), sigma) for sigma in (1.0, 4.0))
+    coarse = float(np.std(blurred_1px - blurred_4px))
+    return float(np.std(light - blurred_1px)) / coarse if coarse > 0 else 0.0
 
 
 def retake_reason(

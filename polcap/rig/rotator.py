@@ -33,7 +33,7 @@ class Motor(Protocol):
         """Stop the motor and switch its current off."""
 
 
-Backlash = Annotated[float, Meta(ge=0, le=45)]  # degrees below the target before a downward movement returns upward
+Backlash = Annotated[float, Meta(ge=0, le=45)]  # degrees; downward movements go this far below the target, then up
 
 
 class RotatorSettings(Struct, frozen=True):

@@ -96,8 +96,8 @@ class CaptureLoop:
     pace: dry_run.Pace
     log: Log
     report: Report
-    angle_deg: float = 0.0  # requested last
-    read_deg: float | None = None  # read back there
+    angle_deg: float = 0.0  # last requested
+    read_deg: float | None = None  # read back after it; None: not yet
     filter_on_flash: bool = False
 
     def run(self) -> None:
@@ -114,7 +114,7 @@ class CaptureLoop:
                     continue
             elif not self.check.pending:
                 return
-            # at the end; also before a person turns the ring, who would have to turn it back for a rejected frame
+            # wait at the end, and before a person turns the ring, who would turn it back for a rejected frame
             self.check.collect(block=True)
 
     def _take(self, slot: Slot, missing: list[Slot]) -> None:
@@ -145,8 +145,8 @@ class CaptureLoop:
         """Take one frame. If needed, a person is asked to place the chart, or to switch the flash or its filter."""
         crossed = slot.role == "cross"
         if crossed != self.filter_on_flash and not self.camera.polarizes_flash:
-            on = "put the second polarizer on the flash and turn it until the highlights vanish"
-            self._ask_person(on if crossed else "take the polarizer off the flash again")
+            request = "put the second polarizer on the flash and turn it until the highlights vanish"
+            self._ask_person(request if crossed else "take the polarizer off the flash again")
         self.filter_on_flash = crossed
         self.camera.prepare(slot.angle_deg, slot.role, slot.step)
         before = after = ""
@@ -207,8 +207,8 @@ def _check_person(missing: list[Slot], camera: Camera) -> None:
         "--cross": not camera.polarizes_flash and any(slot.role == "cross" for slot in missing),
     }
     if any(questions.values()) and not person.at_terminal():
-        named = " and ".join(option for option, needed in questions.items() if needed)
-        raise SettingError(f"{named}: a person at a terminal is needed; run in a terminal, or leave it out")
+        options = " and ".join(option for option, needed in questions.items() if needed)
+        raise SettingError(f"{options}: a person at a terminal is needed; run in a terminal, or leave it out")
 
 
 def _locked(folder: Path) -> AbstractContextManager[Any]:

@@ -49,10 +49,10 @@ class Slot:
     @property
     def name(self) -> str:
         """Path of the frame's file in the capture folder, without suffix."""
-        at = "" if self.angle_deg is None else f"pol{folder_names.degrees(self.angle_deg)}"
+        angle = "" if self.angle_deg is None else f"pol{folder_names.degrees(self.angle_deg)}"
         frame = f"frame_{self.step + 1}"
-        names = {"shot": f"{at}/{frame}", "repeat": f"repeat/{at}_{frame}", "cross": f"cross/{frame}"}
-        return names.get(self.role, f"{self.role}/{at or self.role}")
+        names = {"shot": f"{angle}/{frame}", "repeat": f"repeat/{angle}_{frame}", "cross": f"cross/{frame}"}
+        return names.get(self.role, f"{self.role}/{angle or self.role}")
 
 
 def plan_slots(order: CaptureOrder, switches_flash: bool) -> tuple[Slot, ...]:
@@ -80,23 +80,23 @@ def next_slot(missing: Sequence[Slot], at_deg: float) -> Slot:
     for which a person switches the flash; frames with the filter on the flash.
     """
     angles = [slot.angle_deg for slot in missing if slot.angle_deg is not None and slot.role != "cross"]
-    goal = at_deg
+    wanted_deg = at_deg
     if angles and at_deg not in angles:
-        goal = min(min(angles), max(angles), key=lambda angle: abs(angle - at_deg))
+        wanted_deg = min(min(angles), max(angles), key=lambda angle: abs(angle - at_deg))
 
-    def place(slot: Slot) -> tuple[bool, bool, bool]:
-        return slot.role != "chart", slot.role == "cross", slot.angle_deg != goal
+    def priority(slot: Slot) -> tuple[bool, bool, bool]:
+        return slot.role != "chart", slot.role == "cross", slot.angle_deg != wanted_deg
 
-    return min(missing, key=place)
+    return min(missing, key=priority)
 
 
 def schedule(slots: Iterable[Slot], at_deg: float = 0.0) -> list[Slot]:
     """Sort frames into the order of taking, starting at the current angle."""
-    left, ordered = list(slots), []
-    while left:
-        slot = next_slot(left, at_deg)
+    remaining, ordered = list(slots), []
+    while remaining:
+        slot = next_slot(remaining, at_deg)
         at_deg = at_deg if slot.angle_deg is None else slot.angle_deg
-        left.remove(slot)
+        remaining.remove(slot)
         ordered.append(slot)
     return ordered
 
@@ -113,7 +113,7 @@ def steps_shutter(bracket: Sequence[Exposure]) -> bool:
 
 
 def light_note(order: CaptureOrder) -> str:
-    """Warning that shutter times do not change a flash exposure; empty for other brackets and the simulated lamp."""
+    """Warning that shutter times do not change a flash exposure; "" for other brackets and the simulated camera."""
     if not steps_shutter(order.bracket) or order.camera.startswith("simulated"):
         return ""
     remedy = "step power, aperture or ISO, as in --bracket iso100,iso400,iso1600"

@@ -75,7 +75,7 @@ def shoot(
     """
     folder.mkdir(parents=True, exist_ok=True)
     _check_ports(session.turntable, order.rotator)
-    done = []
+    summaries = []
     with (
         closing(Log(folder / LOG)) as log,
         closing(device_urls.open_rotator(session.turntable, log, "turntable with the board")) as table,
@@ -87,13 +87,13 @@ def shoot(
                 continue
             table.move(360.0 * k / session.views)
             report(f"{view.name} of {session.views}")
-            begun = (view / capture_record.NAME).exists()
-            own = order if k == 0 else msgspec.structs.replace(order, chart=False)  # one chart is enough
-            done.append(sequence.shoot(view, own, resume=begun, tries=tries, report=report))
+            is_begun = (view / capture_record.NAME).exists()
+            view_order = order if k == 0 else msgspec.structs.replace(order, chart=False)  # one chart is enough
+            summaries.append(sequence.shoot(view, view_order, resume=is_begun, tries=tries, report=report))
             finished(view)
             session.done.append(view.name)
             atomic.write_json(folder / NAME, session)
-    return done
+    return summaries
 
 
 def _check_ports(turntable: str, rotator: str) -> None:

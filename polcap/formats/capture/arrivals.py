@@ -12,24 +12,24 @@ FileStates = dict[str, tuple[int, int]]  # size and time of change by path
 
 
 def settled(folder: Path, ignored: Path, still_s: float = 2.0, edited: Sequence[Path] = ()) -> Iterator[None]:
-    """Watch a folder: yield at once, then each time files changed and nothing has changed for `still_s` seconds since.
+    """Watch a folder: yield at once, then whenever files have changed and after that stayed the same for `still_s` s.
 
     The folder `ignored` (of results) and files of other programs are not watched. An editor saves the files
     `edited` in one step, so their changes count as ended at the next poll.
     """
     folder, ignored = folder.resolve(), ignored.resolve()
-    done: tuple[FileStates, FileStates] | None = None
-    last, texts, since = _stats(files_below(folder, ignored)), _stats(edited), time.monotonic()
+    reported: tuple[FileStates, FileStates] | None = None
+    last, edited_states, since = _stats(files_below(folder, ignored)), _stats(edited), time.monotonic()
     while True:
-        now, texts_now = _stats(files_below(folder, ignored)), _stats(edited)
+        now, edited_now = _stats(files_below(folder, ignored)), _stats(edited)
         if now != last:
             since = time.monotonic()
-        still = done is None or now == done[0] or time.monotonic() - since >= still_s
-        if (now, texts_now) == (last, texts) != done and still:
-            done = now, texts_now
+        still = reported is None or now == reported[0] or time.monotonic() - since >= still_s
+        if (now, edited_now) == (last, edited_states) != reported and still:
+            reported = now, edited_now
             yield
         else:
-            last, texts = now, texts_now
+            last, edited_states = now, edited_now
         time.sleep(_POLL_S)
 
 

@@ -84,9 +84,9 @@ def _sources(exif: Exif, stated_mm: float | None, stated_width_mm: float | None)
         if focal and sensor
     ]
     if equivalent := exif.focal_length_35mm:  # by its definition of equal diagonals, in whole millimetres
-        longer = stated_mm / exif.focal_length_mm if stated_mm and exif.focal_length_mm else 1.0
-        px = longer * equivalent / _FULL_DIAGONAL_MM * math.hypot(width, exif.height or 0)
-        text = f"{longer * equivalent:g} mm full-frame equivalent (EXIF, to about 2 %)"
+        lens_ratio = stated_mm / exif.focal_length_mm if stated_mm and exif.focal_length_mm else 1.0
+        px = lens_ratio * equivalent / _FULL_DIAGONAL_MM * math.hypot(width, exif.height or 0)
+        text = f"{lens_ratio * equivalent:g} mm full-frame equivalent (EXIF, to about 2 %)"
         width_mm = f", a sensor {focal / px * width:.1f} mm wide" if focal else ""
         # a camera states the equivalent of the picture; the table does not know its crop mode
         found.append(_Source(px, text, f"EXIF states {equivalent:g} mm full-frame equivalent{width_mm}", 2))

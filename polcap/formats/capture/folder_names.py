@@ -54,10 +54,10 @@ def is_result(folder: Path) -> bool:
 
 def is_in_result(folder: Path) -> bool:
     """Whether a folder is a result of polcap, its maps/ or asset/, or the folder of an export."""
-    here = Path(os.path.abspath(folder))
-    results = [here]
-    results += [here.parent] if here.name in ("maps", "asset") else []
-    results += [here.parents[1]] if here.parent.name == "asset" else []
+    absolute = Path(os.path.abspath(folder))
+    results = [absolute]
+    results += [absolute.parent] if absolute.name in ("maps", "asset") else []
+    results += [absolute.parents[1]] if absolute.parent.name == "asset" else []
     return any(map(is_result, results))
 
 
@@ -146,8 +146,8 @@ def degrees(angle_deg: float) -> str:
 def numbered(folder: Path) -> list[str]:
     """Sub-folders with a number in their names that is not read as a polarizer angle."""
     inside = [path.name for path in children(folder) if path.is_dir() and path.name not in OURS]
-    read = _degrees_by_name(inside)
-    return [name for name in inside if name not in read and not is_angle_folder(name) and NUMBER.search(name)]
+    angles = _degrees_by_name(inside)
+    return [name for name in inside if name not in angles and not is_angle_folder(name) and NUMBER.search(name)]
 
 
 def _degrees_by_name(names: Iterable[str]) -> dict[str, float]:

@@ -84,9 +84,9 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
         raise CaptureError(f"{folder}: holds no photograph that polcap reads; {_hint(folder)}")
     if stated.of_sensor or _is_sensor(pictures, angles_deg):
         return _sensor(pictures, stated, angles_deg, notes=notes)
-    whole = Path(os.path.abspath(folder))
-    if folder_names.is_one_angle(whole):
-        raise CaptureError(f"{folder}: holds one angle of a capture; give the folder of all, {whole.parent}")
+    absolute = Path(os.path.abspath(folder))
+    if folder_names.is_one_angle(absolute):
+        raise CaptureError(f"{folder}: holds one angle of a capture; give the folder of all, {absolute.parent}")
     if groups := _by_name(pictures):
         notes.append("angles read from the file names")
         shots = _select(folder, groups, angles_deg)
@@ -153,8 +153,8 @@ def _toml(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
         for angle, bracket in repeats.items()  # a motor repeats an angle within its tolerance
         if any(abs((angle - known + 90) % 180 - 90) < folder_names.SEPARATION_DEG for known, _ in brackets)
     ]
-    every = (*brackets, *repeated)
-    return Plan("toml", every, others, angles=AngleStatement("capture.toml", _texts(every)))
+    all_shots = (*brackets, *repeated)
+    return Plan("toml", all_shots, others, angles=AngleStatement("capture.toml", _texts(all_shots)))
 
 
 def _texts(shots: Shots) -> tuple[str, ...]:
@@ -243,29 +243,29 @@ def _by_time(folder: Path, pictures: list[Source], angles_deg: Sequence[float]) 
     """Split the pictures of a flat folder by time into equal brackets, one per angle, with a note on the order."""
     count, shots = len(pictures), len(angles_deg)
     listed = ", ".join(f"{angle:g}" for angle in angles_deg)
-    sort = "sort the frames into pol000, pol045, …, or list them in capture.toml"
+    by_hand = "sort the frames into pol000, pol045, …, or list them in capture.toml"
     if not count % shots and count > shots and not all(source.probe.exif.taken for source in pictures):
-        raise CaptureError(f"{folder}: {count} frames without EXIF times cannot be assigned to angles; {sort}")
-    order, by = _in_order(pictures, max(count // shots, 1))
-    size, at = count // shots, _first_unequal(order, max(count // shots, 1))
-    if count % shots or at is not None:
+        raise CaptureError(f"{folder}: {count} frames without EXIF times cannot be assigned to angles; {by_hand}")
+    order, criterion = _in_order(pictures, max(count // shots, 1))
+    size, first = count // shots, _first_unequal(order, max(count // shots, 1))
+    if count % shots or first is not None:
         found = [exposed_file(one.path.name, one.probe.exif) for one in order]
-        odd = unequal_brackets.advise_sequence(found, angles_deg) or f"give the order with --angles, or {sort}"
-        if at is None or count % shots:
-            raise CaptureError(f"{folder}: {count} frames do not make {shots} equal brackets (angles {listed}); {odd}")
-        value, reference = (one.probe.exif.relative_exposure for one in (order[at], order[at % size]))
+        hint = unequal_brackets.advise_sequence(found, angles_deg) or f"give the order with --angles, or {by_hand}"
+        if first is None or count % shots:
+            raise CaptureError(f"{folder}: {count} frames do not make {shots} equal brackets (angles {listed}); {hint}")
+        value, reference = (one.probe.exif.relative_exposure for one in (order[first], order[first % size]))
         times = f"{value / reference:.3g} times" if value and reference else "not stated like"
         raise CaptureError(
-            f"{order[at].path}: its exposure is {times} that of the same frame of the first bracket; these {count} "
-            f"frames {by} are not {shots} equal brackets ({angles_deg[at // size]:g}°); {odd}"
+            f"{order[first].path}: its exposure is {times} that of the same frame of the first bracket; these {count} "
+            f"frames {criterion} are not {shots} equal brackets ({angles_deg[first // size]:g}°); {hint}"
         )
-    note = f"{count} frames {by} taken as {shots} brackets of {size}, in the order {listed}°"
+    note = f"{count} frames {criterion} taken as {shots} brackets of {size}, in the order {listed}°"
     return tuple((angle, tuple(order[k * size : (k + 1) * size])) for k, angle in enumerate(angles_deg)), note
 
 
-def exposed_file(name: str, fact: Exif, stated: float | None = None) -> ExposedFile:
+def exposed_file(name: str, exif: Exif, stated: float | None = None) -> ExposedFile:
     """A photograph for `unequal_brackets`; `stated` is its exposure by capture.toml."""
-    return ExposedFile(name, stated or fact.relative_exposure, shutter(fact.exposure_time))
+    return ExposedFile(name, stated or exif.relative_exposure, shutter(exif.exposure_time))
 
 
 def shutter(time: float | None) -> str:
@@ -308,7 +308,7 @@ def _by_number(pictures: list[Source]) -> list[Source]:
 def _first_unequal(order: Sequence[Source], size: int) -> int | None:
     """Index of the first picture that is not exposed like the same one of the first bracket of `size` frames."""
     exposure = [source.probe.exif.relative_exposure for source in order]
-    return next((at for at, value in enumerate(exposure) if not same_exposure(value, exposure[at % size])), None)
+    return next((k for k, value in enumerate(exposure) if not same_exposure(value, exposure[k % size])), None)
 
 
 def _has_break(by_time: Sequence[Source]) -> bool:
@@ -356,11 +356,11 @@ def conversions(raws: Sequence[Source]) -> list[tuple[Source, Source]]:
     """DNGs that were converted from another RAW of the list, each with that RAW: the same shot, by name and time."""
     pairs = []
     for dng in (source for source in raws if source.path.suffix.lower() == ".dng"):
-        original, stem, second = dng.probe.original.lower(), photograph_files.stem(dng.path), dng.probe.exif.taken[:19]
+        original, stem, taken = dng.probe.original.lower(), photograph_files.stem(dng.path), dng.probe.exif.taken[:19]
         for raw in raws:
-            named = raw.path.name.lower() == original
-            named |= raw.path.suffix.lower() != ".dng" and photograph_files.stem(raw.path) == stem
-            if named and raw is not dng and raw.probe.exif.taken[:19] == second:
+            is_original = raw.path.name.lower() == original
+            is_original |= raw.path.suffix.lower() != ".dng" and photograph_files.stem(raw.path) == stem
+            if is_original and raw is not dng and raw.probe.exif.taken[:19] == taken:
                 pairs.append((dng, raw))
                 break
     return pairs

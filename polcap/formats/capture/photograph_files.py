@@ -30,8 +30,8 @@ def read(path: Path) -> Probe:
 def read_all(folder: Path) -> tuple[dict[Path, Probe], list[str]]:
     """Metadata of all readable files of a folder, and the names of the others.
 
-    A file that cannot be read is an error only if it may be a missing photograph: its name ends as that of a
-    photograph, and no RAW has the same name before its suffix. Otherwise another program wrote it.
+    A file that cannot be read is an error only if it may be a missing photograph: it has a photograph's suffix, and no
+    RAW has the same name before its suffix. Otherwise another program wrote it.
 
     Raises CaptureError or DecodeError: a photograph cannot be read, or the folder cannot be listed.
     """

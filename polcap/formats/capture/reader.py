@@ -69,14 +69,14 @@ def _read(folder: Path, angles_deg: tuple[float, ...] | None, clockwise: bool) -
             )
         plan = layouts.counted_clockwise(plan)
 
-    every = _photographs(folder, plan)
-    _check_one_camera({path: source.probe.exif for path, source in every.items()})
-    _check_no_duplicate(every)
+    sources = _photographs(folder, plan)
+    _check_one_camera({path: source.probe.exif for path, source in sources.items()})
+    _check_no_duplicate(sources)
     if plan.layout != "sensor":
-        _check_encodings(every, stated)
-    radiance = max((source.probe.top for source in every.values()), default=0.0)
-    if radiance > 1 and not stated.white:  # a sensor's white is not known; one for all frames
-        stated = msgspec.structs.replace(stated, white=float(f"{_HEADROOM * radiance:.4g}"))
+        _check_encodings(sources, stated)
+    greatest = max((source.probe.top for source in sources.values()), default=0.0)
+    if greatest > 1 and not stated.white:  # a sensor's white is not known; one for all frames
+        stated = msgspec.structs.replace(stated, white=float(f"{_HEADROOM * greatest:.4g}"))
     shots = tuple(_shot(plan, stated, angle, bracket) for angle, bracket in plan.shots)
     _check_brackets(shots)
     crossed = None if plan.layout == "sensor" else _crossed(folder, plan, stated)
@@ -100,11 +100,11 @@ def _read(folder: Path, angles_deg: tuple[float, ...] | None, clockwise: bool) -
         chart_frames=tuple(
             _frame(plan, stated, source, plan.shots[0][0]) for source in plan.others if source.role == "chart"
         ),
-        notes=(*plan.notes, *_notes(plan, shots, stated, radiance), *calibration_notes, f"focal length {lens.note}"),
+        notes=(*plan.notes, *_notes(plan, shots, stated, greatest), *calibration_notes, f"focal length {lens.note}"),
         calibration=calibration,
         crossed=crossed,
         catalog=stated.catalog,
-        angles=_sense(folder, plan, clockwise, calibration),
+        angles=_statement(folder, plan, clockwise, calibration),
         lens_filter=stated.filter or "",
         accuracy=ball_accuracies.choose(reference, stated.filter),
     )
@@ -120,12 +120,12 @@ def _check_folder(folder: Path) -> None:
         raise CaptureError(f"{folder}: no such folder; give the folder that holds the photographs")
 
 
-def _check_encodings(every: dict[Path, Source], stated: CaptureFile) -> None:
+def _check_encodings(sources: dict[Path, Source], stated: CaptureFile) -> None:
     """Raise CaptureError for finished pictures of contradictory encodings, unless the user states the encoding."""
     if stated.encoding is not None:
         return
     first: dict[int, tuple[Path, str]] = {}  # of each number of bits
-    for path, source in every.items():
+    for path, source in sources.items():
         found, bits = source.probe.encoding, source.probe.bits
         name = photo.encoding_of(bits, found)
         if found.fault:
@@ -142,7 +142,7 @@ def _check_encodings(every: dict[Path, Source], stated: CaptureFile) -> None:
             )
 
 
-def _sense(folder: Path, plan: layouts.Plan, clockwise: bool, calibration: Calibration | None) -> AngleStatement:
+def _statement(folder: Path, plan: layouts.Plan, clockwise: bool, calibration: Calibration | None) -> AngleStatement:
     """The statement of the angles, with the reason why they are counted clockwise, if they are."""
     ring = None if calibration is None else calibration.polarizer
     if ring is None or ring.sense > 0:
@@ -168,10 +168,10 @@ def _photographs(folder: Path, plan: layouts.Plan) -> dict[Path, Source]:
     listed = [source for _, bracket in plan.shots for source in bracket]
     if plan.layout == "sensor":  # a frame holds all angles
         listed = list({source.path: source for source in listed}.values())
-    every = {source.path: source for source in (*listed, *plan.others)}
-    if len(every) < len(listed) + len(plan.others):
+    sources = {source.path: source for source in (*listed, *plan.others)}
+    if len(sources) < len(listed) + len(plan.others):
         raise CaptureError(f"{folder / capture_toml.NAME}: names a file twice; give each frame one entry")
-    return every
+    return sources
 
 
 def table(capture: Capture) -> str:
@@ -185,13 +185,13 @@ def table(capture: Capture) -> str:
     rows += [["", *_row(frame, capture.folder)] for frame in capture.chart_frames]
     widths = [max(map(len, column)) for column in zip(*rows)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
-    fact = capture.shots[0].frames[0].exif
+    exif = capture.shots[0].frames[0].exif
     frames = " + ".join(str(len(shot.frames)) for shot in capture.shots)
     lines += [
         "",
         f"capture  {capture.name} ({capture.layout}): {len(capture.shots)} shots, {frames} frames",
-        f"camera   {fact.camera or 'not stated'}, {capture.size_px[0]}×{capture.size_px[1]} px",
-        f"lens     {fact.lens or 'not stated'}",
+        f"camera   {exif.camera or 'not stated'}, {capture.size_px[0]}×{capture.size_px[1]} px",
+        f"lens     {exif.lens or 'not stated'}",
         f"focal    {capture.focal_px:.0f} px" + ("" if capture.focal_known else " (assumed)"),
     ]
     return "\n".join([*lines, *(f"note     {note}" for note in capture.notes)])
@@ -199,19 +199,19 @@ def table(capture: Capture) -> str:
 
 def _row(frame: Frame, folder: str) -> list[str]:
     """Row of the capture's table: file, role, exposure, ISO, f-number, flash, time."""
-    fact = frame.exif
+    exif = frame.exif
     path = Path(frame.path)
     name = str(path.relative_to(folder)) if path.is_relative_to(folder) else frame.path
-    flash = {True: "fired", False: "off", None: "?"}[fact.flash_fired]
-    stated = f"{frame.exposure:.4g} (stated)" if frame.exposure else layouts.shutter(fact.exposure_time)
-    numbers = [f"{value:g}" if value else "?" for value in (fact.iso, fact.f_number)]
-    return [name, frame.role, stated, *numbers, flash, fact.taken.replace("T", " ") or "?"]
+    flash = {True: "fired", False: "off", None: "?"}[exif.flash_fired]
+    stated = f"{frame.exposure:.4g} (stated)" if frame.exposure else layouts.shutter(exif.exposure_time)
+    numbers = [f"{value:g}" if value else "?" for value in (exif.iso, exif.f_number)]
+    return [name, frame.role, stated, *numbers, flash, exif.taken.replace("T", " ") or "?"]
 
 
 def _shot(plan: layouts.Plan, stated: CaptureFile, angle_deg: float, bracket: Sequence[Source]) -> Shot:
-    """A shot of the plan, with its bracket and its ambient frames; without own ones, with those of all angles."""
-    every = [source for source in plan.others if source.role == "ambient"]
-    ambient = [source for source in every if source.angle_deg in (None, angle_deg)] or every
+    """A shot of the plan, with its bracket and the ambient frames of its angle; without these, with those of all."""
+    of_all = [source for source in plan.others if source.role == "ambient"]
+    ambient = [source for source in of_all if source.angle_deg in (None, angle_deg)] or of_all
     cell = _cell(plan, angle_deg)
     return Shot(
         angle=math.radians(angle_deg),
@@ -274,8 +274,8 @@ def _encoding(probe: Probe, stated: CaptureFile) -> list[str]:
 def _stated_exposure(source: Source) -> float | None:
     """Relative exposure that capture.toml states, or that follows from a stated flash energy; None: not stated."""
     if source.flash_energy:
-        fact = source.probe.exif
-        return source.flash_energy * (fact.iso or 100.0) / 100.0 / (fact.f_number or 1.0) ** 2
+        exif = source.probe.exif
+        return source.flash_energy * (exif.iso or 100.0) / 100.0 / (exif.f_number or 1.0) ** 2
     return source.exposure
 
 
@@ -286,7 +286,7 @@ def _exposure(frame: Frame) -> float | None:
 def _sorted_alike(frames: Iterable[Frame]) -> tuple[Frame, ...]:
     """Frames so that the same exposure has the same index in every shot: by stated exposures, else by names.
 
-    Which of them is darkest, the stage `hdr` measures in the pixels: of a flash the camera states no power.
+    The stage `hdr` measures from the pixels which frame is darkest, because cameras do not state a flash's power.
     """
     listed = sorted(frames, key=lambda frame: folder_names.natural(Path(frame.path).name))
     if not all(map(_exposure, listed)):
@@ -308,33 +308,33 @@ def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
         raise CaptureError(f"{folder}: {who} {listed}: {count} different polarizer angles where 3 are needed; {remedy}")
 
 
-def other_equipment(fact: Exif, first: Exif) -> str | None:
+def other_equipment(exif: Exif, first: Exif) -> str | None:
     """Difference in camera, lens, size or focal length of one photograph from the first; None for equal equipment."""
-    lengths = fact.focal_length_mm, first.focal_length_mm
+    lengths = exif.focal_length_mm, first.focal_length_mm
     zoomed = lengths[0] and lengths[1] and abs(lengths[0] / lengths[1] - 1) > _ZOOM
     rows = (
-        ("was taken with", fact.camera, first.camera),
-        ("was taken through", fact.lens or first.lens, first.lens or fact.lens),
-        ("has", f"{fact.width}×{fact.height} px", f"{first.width}×{first.height} px"),
+        ("was taken with", exif.camera, first.camera),
+        ("was taken through", exif.lens or first.lens, first.lens or exif.lens),
+        ("has", f"{exif.width}×{exif.height} px", f"{first.width}×{first.height} px"),
         ("was taken at", f"{lengths[0]:g} mm" if zoomed else "", f"{lengths[1]:g} mm" if zoomed else ""),
     )
     return next((f"{text} {found}, not {wanted}" for text, found, wanted in rows if found != wanted), None)
 
 
-def _check_one_camera(facts: dict[Path, Exif]) -> None:
+def _check_one_camera(exifs: dict[Path, Exif]) -> None:
     """Raise CaptureError for photographs of different equipment."""
-    first_path, first = next(iter(facts.items()))
-    for path, fact in facts.items():
-        if fault := other_equipment(fact, first):
+    first_path, first = next(iter(exifs.items()))
+    for path, exif in exifs.items():
+        if fault := other_equipment(exif, first):
             raise CaptureError(f"{path}: {fault} as {first_path.name}; use one set-up per capture, or remove the file")
 
 
-def _check_no_duplicate(every: dict[Path, Source]) -> None:
+def _check_no_duplicate(sources: dict[Path, Source]) -> None:
     """Raise CaptureError for a photograph that occurs twice, also as a DNG converted from it."""
     first: dict[str, Path] = {}
-    same = [(source.path, first.setdefault(source.probe.digest, path)) for path, source in every.items()]
-    same += [(dng.path, raw.path) for dng, raw in layouts.conversions(list(every.values()))]
-    for path, other in same:
+    pairs = [(source.path, first.setdefault(source.probe.digest, path)) for path, source in sources.items()]
+    pairs += [(dng.path, raw.path) for dng, raw in layouts.conversions(list(sources.values()))]
+    for path, other in pairs:
         if path != other:
             raise CaptureError(f"{path}: is the same photograph as {other}; remove one, and shoot the missing one")
 
@@ -369,12 +369,12 @@ def _settings(frame: Frame) -> str:
     """Exposure of a photograph in words."""
     if frame.exposure:
         return f"exposure {frame.exposure:.4g} stated"
-    fact = frame.exif
-    parts = [layouts.shutter(fact.exposure_time), f"f/{fact.f_number or '?'}", f"ISO {fact.iso or '?'}"]
-    return " ".join(parts) if fact.exposure_time else "no exposure in EXIF"
+    exif = frame.exif
+    parts = [layouts.shutter(exif.exposure_time), f"f/{exif.f_number or '?'}", f"ISO {exif.iso or '?'}"]
+    return " ".join(parts) if exif.exposure_time else "no exposure in EXIF"
 
 
-def _notes(plan: layouts.Plan, shots: Sequence[Shot], stated: CaptureFile, radiance: float) -> list[str]:
+def _notes(plan: layouts.Plan, shots: Sequence[Shot], stated: CaptureFile, greatest: float) -> list[str]:
     """Notes on what was understood or ignored, for table and report."""
     sources = [source for _, bracket in plan.shots for source in bracket]
     notes, first = [], sources[0].probe
@@ -383,8 +383,8 @@ def _notes(plan: layouts.Plan, shots: Sequence[Shot], stated: CaptureFile, radia
         notes.append(f"not used: {cross} cross-polarized frames, which a polarization sensor cannot take")
     if first.kind == "photo":
         notes += _encoding_notes(first, stated, plan.layout == "sensor")
-    if radiance > 1:
-        notes.append(f"radiance up to {radiance:.4g}: over-exposed from white = {stated.white:g} on, see capture.toml")
+    if greatest > 1:
+        notes.append(f"radiance up to {greatest:.4g}: over-exposed from white = {stated.white:g} on, see capture.toml")
     if count := len({source.path for source in sources if source.probe.gain_map}):
         notes.append(f"not applied: the gain maps of {count} files")
     if first.lossy:
@@ -401,10 +401,10 @@ def _encoding_notes(first: Probe, stated: CaptureFile, sensor: bool) -> list[str
     """Notes on the encoding of finished pictures, and on a statement of their files that is not used."""
     found, notes = first.encoding, []
     name = "linear" if sensor else stated.encoding or photo.encoding_of(first.bits, found)
-    by = f", as their {found.source} states" * (name == found.curve)
+    as_stated = f", as their {found.source} states" * (name == found.curve)
     loss = (LOSS + _SHOOT_RAW) * (first.bits == 8)
     if not sensor:
-        notes.append(f"finished pictures of {first.bits} bits, taken as {name}{by}{loss}")
+        notes.append(f"finished pictures of {first.bits} bits, taken as {name}{as_stated}{loss}")
     if found.curve and name != found.curve:
         why = "a sensor's frames are linear" if sensor else "capture.toml decides"
         notes.append(f"not used: their {found.source} states {found.curve}, but {why}")

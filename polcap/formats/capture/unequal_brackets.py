@@ -62,16 +62,16 @@ def advise_shots(shots: Mapping[str, _Bracket]) -> str:
     """
     counts = [len(bracket) for bracket in shots.values()]
     usual = max(set(counts), key=counts.count)
-    model = next(bracket for bracket in shots.values() if len(bracket) == usual)
-    if not _varied(model):
+    complete = next(bracket for bracket in shots.values() if len(bracket) == usual)
+    if not _varied(complete):
         return ""
     for name, bracket in shots.items():
-        missing, surplus = _without(model, bracket), _without(bracket, model)
+        missing, surplus = _without(complete, bracket), _without(bracket, complete)
         if len(bracket) == usual + 1 and len(surplus) == 1:
             return f"{surplus[0].name} is one too many, by its exposure ({surplus[0].text}): move it out of the folder"
         if len(bracket) == usual - 1 and len(missing) == 1:
-            every = [one for other in shots.values() for one in other]
-            others = [one for one in every if same_exposure(one.exposure, missing[0].exposure)]
+            all_files = [one for other in shots.values() for one in other]
+            others = [one for one in all_files if same_exposure(one.exposure, missing[0].exposure)]
             return f"the frame of {missing[0].text} at {name} is missing: {_take_or_leave_out(others)}"
     return ""
 
@@ -86,9 +86,9 @@ def _repeats(files: Sequence[ExposedFile | None], size: int) -> bool:
     """Whether brackets of `size` photographs repeat the same exposures, which differ; None fits anywhere."""
     if size < 2:
         return False
-    known = [[one for one in files[at::size] if one is not None] for at in range(size)]
-    equal = all(same_exposure(one.exposure, column[0].exposure) for column in known for one in column)
-    return equal and _varied([column[0] for column in known if column])
+    columns = [[one for one in files[at::size] if one is not None] for at in range(size)]
+    equal = all(same_exposure(one.exposure, column[0].exposure) for column in columns for one in column)
+    return equal and _varied([column[0] for column in columns if column])
 
 
 def _rises(files: Sequence[ExposedFile | None], size: int) -> bool:
@@ -110,11 +110,11 @@ def _varied(bracket: _Bracket) -> bool:
 
 def _without(bracket: _Bracket, other: _Bracket) -> list[ExposedFile]:
     """Photographs of a bracket that have no partner of the same exposure in the other one."""
-    left, single = list(other), []
-    for one in bracket:
-        partner = next((two for two in left if same_exposure(one.exposure, two.exposure)), None)
+    unmatched, without_partner = list(other), []
+    for file in bracket:
+        partner = next((candidate for candidate in unmatched if same_exposure(file.exposure, candidate.exposure)), None)
         if partner is None:
-            single.append(one)
+            without_partner.append(file)
         else:
-            left.remove(partner)
-    return single
+            unmatched.remove(partner)
+    return without_partner

@@ -29,10 +29,10 @@ def write_manifest(folder: Path) -> Path:
 
     The lines are those of sha256sum, with paths relative to the folder.
     """
-    manifest, here = folder / own_folders.MANIFEST, Path(os.path.abspath(folder))
+    manifest, absolute = folder / own_folders.MANIFEST, Path(os.path.abspath(folder))
     own = own_files.owner(manifest)
-    files = [] if own is None else [file for file in own.below(here) if file != here / own_folders.MANIFEST]
-    lines = [f"{file_bytes.digest(file.read_bytes())}  {file.relative_to(here).as_posix()}\n" for file in files]
+    files = [] if own is None else [file for file in own.below(absolute) if file != absolute / own_folders.MANIFEST]
+    lines = [f"{file_bytes.digest(file.read_bytes())}  {file.relative_to(absolute).as_posix()}\n" for file in files]
     atomic.write(manifest, "".join(lines))
     return manifest
 

@@ -84,9 +84,9 @@ def find_space(wanted: str) -> ColorSpace:
     if name not in config.getColorSpaceNames() or config.isData(name):
         known = ", ".join(sorted([*config.getRoles(), *config.getColorSpaceNames()]))
         raise SettingError(f"--color {wanted} is not a color space or role of {source}; it has {known}")
-    white, identifier = config.get_chromaticities(name), config.get_color_interop_id(name)
+    chromaticities, identifier = config.get_chromaticities(name), config.get_color_interop_id(name)
     header: dict[str, exr.Attribute] = {"colorInteropID": identifier} if identifier else {}
-    return ColorSpace(name, header | ({"chromaticities": tuple(map(float, white))} if white else {}))
+    return ColorSpace(name, header | ({"chromaticities": tuple(map(float, chromaticities))} if chromaticities else {}))
 
 
 def convert(rgb: Floats, space: ColorSpace) -> Floats:

@@ -79,20 +79,20 @@ def encode(
     blob, images, facts = Blob(), options.images, provenance or {}
     origin = center(asset.mesh.vertices) if options.origin is None else options.origin
     primitive, transform = glb_geometry.add(blob, asset.mesh, origin, options.geometry)
-    held = textures(asset)
+    embedded = textures(asset)
     pictures = [
         {"name": f"{name}_{key}", "bufferView": blob.view(data), "mimeType": encoders.MIME[images]}
-        for key, data in (encoder or TextureEncoder()).all(held, images).items()
+        for key, data in (encoder or TextureEncoder()).all(embedded, images).items()
     ]
     used = ["KHR_materials_specular", "KHR_materials_ior", "KHR_xmp_json_ld"]
-    picture = _IMAGE_EXTENSION.get(images)
-    required = [*([picture] if picture else []), *glb_geometry.EXTENSIONS[options.geometry]]
+    extension = _IMAGE_EXTENSION.get(images)
+    required = [*([extension] if extension else []), *glb_geometry.EXTENSIONS[options.geometry]]
     document = {
         "asset": {
             "version": "2.0",
             "generator": f"polcap {__version__}",
             **({"copyright": facts["rights"]} if "rights" in facts else {}),
-            "extras": _extras(asset, origin) | {"textures": {f"{name}_{key}": held[key].meaning for key in held}},
+            "extras": _extras(asset, origin) | {"textures": {f"{name}_{k}": embedded[k].meaning for k in embedded}},
             "extensions": {"KHR_xmp_json_ld": {"packet": 0}},
         },
         "extensionsUsed": used + required,
@@ -104,7 +104,7 @@ def encode(
         "meshes": [{"name": name, "primitives": [{**primitive, "material": 0}]}],
         "materials": [_material(asset, name)],
         "textures": [
-            {"sampler": 0, "extensions": {picture: {"source": k}}} if picture else {"sampler": 0, "source": k}
+            {"sampler": 0, "extensions": {extension: {"source": k}}} if extension else {"sampler": 0, "source": k}
             for k in range(len(pictures))
         ],
         "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP, "wrapS": _CLAMP, "wrapT": _CLAMP}],
@@ -115,7 +115,8 @@ def encode(
     }
     text = json.dumps(document, separators=(",", ":"), ensure_ascii=True).encode()
     text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(blob.data), len(text), b"JSON")
+    size = 12 + 8 + len(text) + 8 + len(blob.data)  # header, and two chunks with headers
+    head = struct.pack("<4sIII4s", b"glTF", 2, size, len(text), b"JSON")
     return b"".join([head, text, struct.pack("<I4s", len(blob.data), b"BIN\0"), blob.data])
 
 

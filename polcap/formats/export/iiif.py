@@ -72,7 +72,7 @@ def image_information(service: str, width: int, height: int) -> dict[str, Any]:
 def manifest(pictures: Mapping[str, Texture], facts: Mapping[str, str], address: str) -> dict[str, Any]:
     """The IIIF manifest: a canvas for each picture, and the facts of the catalog."""
     license_ = facts.get("license", "")
-    named = license_.partition("://")[2].removeprefix("www.")
+    rights_address = license_.partition("://")[2].removeprefix("www.")
     stated = {key: facts[key] for key in _LABELS if facts.get(key)}
     notice = {"label": _text("Rights", "en"), "value": _text(facts["rights"])} if facts.get("rights") else None
     keys: dict[str, Any] = {
@@ -82,7 +82,7 @@ def manifest(pictures: Mapping[str, Texture], facts: Mapping[str, str], address:
         "label": _text(facts.get("title") or facts["name"]),
         "summary": _text(facts["description"]) if facts.get("description") else None,
         "metadata": [{"label": _text(_LABELS[key], "en"), "value": _text(value)} for key, value in stated.items()],
-        "rights": addresses.of_web(f"http://{named}") if named.startswith(_RIGHTS) else None,
+        "rights": addresses.of_web(f"http://{rights_address}") if rights_address.startswith(_RIGHTS) else None,
         "requiredStatement": notice,
         "items": [_canvas(name, picture, address) for name, picture in pictures.items()],
     }

@@ -1,8 +1,8 @@
 """Describes an asset's material by a MaterialX 1.39 document with OpenPBR, from the template `openpbr.mtlx`.
 
-In the document every node comes after the nodes that it takes inputs from. The specular texture holds F0/0.08 in
-color: its luminance becomes specular_weight, F0 over the F0 of the asset's index; the color divided by its luminance
-tints.
+In the document every node comes after the nodes that it takes inputs from. The specular texture holds the color
+F0/0.08. Its luminance gives specular_weight: F0 over the F0 of the asset's refractive index. The color divided by its
+luminance is the tint.
 
 References
 ----------

@@ -70,7 +70,7 @@ def _table(file: IO[bytes], line: str, values: NDArray[Any]) -> None:
 
 
 def _material(asset: Asset, material: str, files: Mapping[Key, str], data: Mapping[Key, str]) -> str:
-    """Text of the .mtl. Ns is the Blinn exponent 2/α² − 2 of the median roughness; Ks · map_Ks is F0."""
+    """Text of the .mtl. Ns, 0 to 1000, is the Blinn exponent 2/α² − 2 of the median roughness; Ks · map_Ks is F0."""
     packed = asset.occlusion_roughness_metallic
     alpha = float(np.median(packed[..., 1]) / np.iinfo(packed.dtype).max) ** 2
     exponent = min(max(2 / max(alpha, 1e-3) ** 2 - 2, 0.0), 1000.0)

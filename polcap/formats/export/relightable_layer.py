@@ -43,11 +43,11 @@ def pictures(asset: Asset) -> dict[str, Texture]:
     }
 
     def on_object(picture: Texture, outside: int) -> TexturePixels:
-        whole: Any = cv2.resize(encoders.eight_bits(picture), (width, height))
+        resized: Any = cv2.resize(encoders.eight_bits(picture), (width, height))
         if picture.color:  # the backdrop is black
-            return color.srgb_eight_bits(color.decode_srgb(whole / np.float32(255)) * coverage[..., None])
+            return color.srgb_eight_bits(color.decode_srgb(resized / np.float32(255)) * coverage[..., None])
         inside = coverage > 0
-        return np.where(inside if whole.ndim == 2 else inside[..., None], whole, np.uint8(outside))
+        return np.where(inside if resized.ndim == 2 else inside[..., None], resized, np.uint8(outside))
 
     shown = {name: on_object(one, NO_NORMAL if name == "normal" else 0) for name, one in made.items()}
     turns = asset.turned_deg // 90

@@ -71,7 +71,7 @@ def _mat(variables: dict[str, Floats]) -> bytes:
     """A MAT-file, version 5, of arrays by name; the same arrays give the same bytes."""
     from scipy.io import savemat
 
-    held = BytesIO()
-    target: Any = held  # SciPy's types allow paths only
+    buffer = BytesIO()
+    target: Any = buffer  # SciPy's types allow paths only
     savemat(target, variables, do_compression=True)
-    return b"MATLAB 5.0 MAT-file, written by polcap".ljust(_MAT_TEXT) + held.getvalue()[_MAT_TEXT:]
+    return b"MATLAB 5.0 MAT-file, written by polcap".ljust(_MAT_TEXT) + buffer.getvalue()[_MAT_TEXT:]

@@ -135,7 +135,7 @@ def unity_specular(asset: Asset) -> Texture:
     return Texture(_quantized(np.concatenate([reflected, smooth], axis=-1), asset.specular_color), True, meaning)
 
 
-LOOSE: Mapping[Key, Callable[[Asset], Texture]] = {
+LOOSE: Mapping[Key, Callable[[Asset], Texture]] = {  # in files of their own
     "basecolor": base_color,
     "roughness": roughness,
     "normal": normal,

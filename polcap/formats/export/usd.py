@@ -80,16 +80,16 @@ def _stage(asset: Asset, name: str, files: Mapping[Key, str], facts: Mapping[str
     root = UsdGeom.Xform.Define(stage, f"/{materialx.identifier(name)}")
     Usd.ModelAPI(root).SetKind("component")
     stage.SetDefaultPrim(root.GetPrim())
-    word = root.GetPath().name
-    shape = _mesh(stage, root.GetPath().AppendChild(f"{word}_mesh"), asset.mesh)
+    root_name = root.GetPath().name
+    shape = _mesh(stage, root.GetPath().AppendChild(f"{root_name}_mesh"), asset.mesh)
     binding = UsdShade.MaterialBindingAPI.Apply(shape.GetPrim())
-    path = root.GetPath().AppendChild(f"{word}_material")
+    path = root.GetPath().AppendChild(f"{root_name}_material")
     material = UsdShade.Material.Define(stage, path)
     material.CreateSurfaceOutput().ConnectToSource(_preview(stage, path, asset, files, tint=False))
     binding.Bind(material)
     if not phone:
         _add_openpbr(stage, material, asset, files)
-        full = UsdShade.Material.Define(stage, root.GetPath().AppendChild(f"{word}_material_full"))
+        full = UsdShade.Material.Define(stage, root.GetPath().AppendChild(f"{root_name}_material_full"))
         full.CreateSurfaceOutput().ConnectToSource(_preview(stage, full.GetPath(), asset, files, tint=True))
         _add_openpbr(stage, full, asset, files)
         binding.Bind(full, materialPurpose=UsdShade.Tokens.full)
@@ -149,15 +149,15 @@ def _openpbr(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str]) -> A
         name = node.attrib["name"]
         shader = UsdShade.Shader.Define(stage, path.AppendChild(f"mtlx_{name}"))
         shader.CreateIdAttr(node.attrib["nodedef"])
-        for one in node:
-            kind, parse = types[one.attrib["type"]]
-            put = shader.CreateInput(one.attrib["name"], kind)
-            if "nodename" in one.attrib:
-                put.ConnectToSource(outputs[one.attrib["nodename"]])
+        for source in node:
+            kind, parse = types[source.attrib["type"]]
+            target = shader.CreateInput(source.attrib["name"], kind)
+            if "nodename" in source.attrib:
+                target.ConnectToSource(outputs[source.attrib["nodename"]])
             else:
-                put.Set(parse(one.attrib["value"]))
-            if "colorspace" in one.attrib:
-                put.GetAttr().SetColorSpace(one.attrib["colorspace"])
+                target.Set(parse(source.attrib["value"]))
+            if "colorspace" in source.attrib:
+                target.GetAttr().SetColorSpace(source.attrib["colorspace"])
         outputs[name] = shader.CreateOutput("out", types[node.attrib["type"]][0])
     return outputs[name]
 
@@ -176,11 +176,11 @@ def _preview(stage: Any, path: Any, asset: Asset, files: Mapping[Key, str], tint
     reader.CreateIdAttr("UsdPrimvarReader_float2")
     reader.CreateInput("varname", kinds.String).Set("st")
     st = reader.CreateOutput("result", kinds.Float2)
-    whole = SPECULAR_RANGE / (float(fresnel.normal_reflectance(asset.ior)) if tint else 1.0)
+    f0_scale = SPECULAR_RANGE / (float(fresnel.normal_reflectance(asset.ior)) if tint else 1.0)
     color = "raw" if files["basecolor"].endswith(".exr") else "sRGB"
     textures: tuple[tuple[Key, str, Any, str, str, Any, Any], ...] = (  # file, input, type, channel, space, scale, bias
         ("basecolor", "diffuseColor", kinds.Color3f, "rgb", color, None, None),
-        ("specular", "specularColor", kinds.Color3f, "rgb", color, (whole, whole, whole, 1.0), None),
+        ("specular", "specularColor", kinds.Color3f, "rgb", color, (f0_scale, f0_scale, f0_scale, 1.0), None),
         ("roughness", "roughness", kinds.Float, "r", "raw", None, None),
         ("normal", "normal", kinds.Normal3f, "rgb", "raw", (2.0, 2.0, 2.0, 1.0), (-1.0, -1.0, -1.0, 0.0)),
     )

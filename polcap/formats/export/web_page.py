@@ -1,6 +1,6 @@
 """Writes a web page that shows a GLB with model-viewer, from the template `web_page.html`.
 
-Both are in the page, which may load nothing else; so it works without the Internet.
+The page contains the GLB and the script, and may load nothing else; so it works without the Internet.
 """
 
 import base64

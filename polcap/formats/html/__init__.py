@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from polcap.formats import atomic
 from polcap.formats.maps import png
 
-_JPEG_QUALITY = 88
+_JPEG_QUALITY = 88, 94  # with color at half and at full resolution
 _SCRIPTS = ("probe.js", "relight.js")
 
 
@@ -31,7 +31,7 @@ def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, 
     here = files(__name__)
     style = here.joinpath("page.css").read_text("utf-8")
     scripts = "\n".join(here.joinpath(name).read_text("utf-8") for name in _SCRIPTS)
-    known = {**data, "law": here.joinpath("law.glsl").read_text("utf-8")}
+    page_data = {**data, "law": here.joinpath("law.glsl").read_text("utf-8")}
     atomic.write(
         path,
         '<!doctype html><html lang="en"><meta charset="utf-8">'
@@ -39,7 +39,7 @@ def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, 
         '<meta name="color-scheme" content="light dark">'
         f"<title>{escape(title)}</title><link rel=icon href=data:,>\n<style>\n{style}</style>\n<main>\n"
         + "\n".join(body)
-        + f'\n</main>\n<script type="application/json" id="data">{_json(known)}</script>'
+        + f'\n</main>\n<script type="application/json" id="data">{_json(page_data)}</script>'
         f"\n<script>\n{scripts}</script>\n</html>\n",
     )
 
@@ -47,7 +47,7 @@ def write(path: str | Path, title: str, body: Iterable[str], data: Mapping[str, 
 def jpeg(picture: NDArray[np.uint8], whole_color: bool = False) -> str:
     """Encode a picture (H, W, 3) sRGB as a data URL of a JPEG; `whole_color` stores chroma at full resolution."""
     ratio = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444 if whole_color else cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420
-    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY + 6 * whole_color, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, ratio]
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY[whole_color], cv2.IMWRITE_JPEG_SAMPLING_FACTOR, ratio]
     _, encoded = cv2.imencode(".jpg", picture[..., ::-1], options)
     return _address("image/jpeg", encoded.tobytes())
 
@@ -78,5 +78,5 @@ def _address(kind: str, content: bytes) -> str:
 
 
 def _json(data: Mapping[str, Any]) -> str:
-    """Encode data as JSON that can stand inside an HTML script element: < and the like are escaped."""
+    """Encode data as JSON for an HTML script element, which must not contain <."""
     return json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

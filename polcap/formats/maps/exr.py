@@ -29,15 +29,15 @@ def write(
 
     names = list(channels)
     pixels = np.stack([np.asarray(channels[name], dtype=np.float32) for name in names], axis=-1)
-    small = [half if isinstance(half, bool) else name in half for name in names]
-    if any(small):
-        limit = np.where(small, np.float32(np.finfo(np.float16).max), np.float32(np.inf))
+    is_half = [half if isinstance(half, bool) else name in half for name in names]
+    if any(is_half):
+        limit = np.where(is_half, np.float32(np.finfo(np.float16).max), np.float32(np.inf))
         pixels = np.clip(pixels, -limit, limit)  # NaN stays
     height, width, count = pixels.shape
-    spec = oiio.ImageSpec(width, height, count, oiio.HALF if all(small) else oiio.FLOAT)
+    spec = oiio.ImageSpec(width, height, count, oiio.HALF if all(is_half) else oiio.FLOAT)
     spec.channelnames = names
-    if any(small) and not all(small):
-        spec.channelformats = tuple(oiio.TypeDesc("half" if one else "float") for one in small)
+    if any(is_half) and not all(is_half):
+        spec.channelformats = tuple(oiio.TypeDesc("half" if one else "float") for one in is_half)
     spec.attribute("compression", "zip:1")  # level 4: a quarter slower, 0.5 % smaller
     spec.attribute("DateTime", "")  # else the time of writing is stored, and no two files are equal
     for key, value in (attributes or {}).items():

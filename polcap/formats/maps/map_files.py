@@ -21,11 +21,11 @@ def object_depth(maps: SurfaceMaps, mesh: ReliefMesh) -> Floats:
 
 
 def depth_range(maps: SurfaceMaps, mesh: ReliefMesh) -> tuple[float, float, float]:
-    """Least, median and greatest depth of the mesh on the object."""
+    """Least, median and greatest depth of the mesh on the object; 0, ½ and 1 if it has no pixels."""
     depth = object_depth(maps, mesh)
-    seen = depth[depth > 0]
-    near, median, far = (float(q) for q in np.quantile(seen, (0, 0.5, 1))) if seen.size else (0.0, 0.5, 1.0)
-    return near, median, far
+    inside = depth[depth > 0]
+    least, median, greatest = (float(q) for q in np.quantile(inside, (0, 0.5, 1))) if inside.size else (0.0, 0.5, 1.0)
+    return least, median, greatest
 
 
 def _depth_picture(maps: SurfaceMaps, mesh: ReliefMesh) -> NDArray[np.uint16]:

@@ -113,20 +113,20 @@ class ResultMaps(SurfaceMaps):
 def write(folder: Path, results: Results) -> None:
     """Write the folder maps/ of a result: every map as EXR, the main ones as PNG too, and maps.json.
 
-    Of the mesh its depth (H, W) is written. All images are on the crop (H, W) of the maps. Files are encoded on
+    Of the mesh, only the depth (H, W) is written. All images are on the crop (H, W) of the maps. Files are encoded on
     threads. If one cannot be written, all files of an earlier run stay.
     """
     maps, mesh = results.maps, results.mesh
     near, median, far = map_files.depth_range(maps, mesh)
     depth = {"unit": "m" if mesh.metric else "relative", "near": near, "median": median, "far": far}
-    stated = _description(maps, depth)
+    description = _description(maps, depth)
     with atomic.folder_of_files(folder, "maps.json") as temporary:
         parallel.results(
             partial(_write, temporary / name, partial(encode, *(getattr(results, source) for source in sources)))
             for name, (sources, encode) in map_files.FILES.items()
-            if name in stated["maps"]
+            if name in description["maps"]
         )
-        atomic.write_json(temporary / "maps.json", {**stated, "keys": dict(results.keys)})
+        atomic.write_json(temporary / "maps.json", {**description, "keys": dict(results.keys)})
 
 
 def _write(file: Path, content: Callable[[], Any]) -> None:
@@ -188,10 +188,10 @@ def _read_detail(folder: Path, size: tuple[int, int]) -> Floats:
 
 
 def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
-    """Add a record `about` an export to maps.json; of earlier ones of the folder `where`, names and files stay."""
+    """Add the record `about` of an export into the folder `where` to maps.json; facts on its earlier files stay."""
     file = folder / "maps.json"
-    known = text_file.read_json(file)  # as `read` has checked it
-    exports = known.get("exports", {})
+    content = text_file.read_json(file)  # as `read` has checked it
+    exports = content.get("exports", {})
     earlier = exports.get(where, {})
     replaced = ("mesh", "facts", "lods")
     note = {
@@ -199,8 +199,8 @@ def note_export(folder: Path, where: str, about: Mapping[str, Any]) -> None:
         for key, value in about.items()
     }
     note.setdefault("lods", earlier.get("lods", {}))  # of a GLB that this export does not write
-    known["exports"] = dict(sorted({**exports, where: note}.items()))
-    atomic.write_json(file, known)
+    content["exports"] = dict(sorted({**exports, where: note}.items()))
+    atomic.write_json(file, content)
 
 
 def read_exports(folder: Path) -> dict[str, _Export]:
@@ -212,7 +212,7 @@ def read_exports(folder: Path) -> dict[str, _Export]:
 
 
 def require_picture(folder: Path) -> None:
-    """Raise a DecodeError for the folder maps/ of a fused object or of a material."""
+    """Raise a DecodeError unless a folder maps/ is that of one view: a fused object or a material has textures."""
     if read_format(folder).startswith(("polcap fused", "polcap material")):
         raise DecodeError(
             f"{folder} holds the textures of a fused object or of a material, not the maps of a picture; give one "
@@ -268,10 +268,10 @@ def read_map(folder: Path, name: str, letters: str, size: tuple[int, int]) -> Fl
     planes = [found[letter] for letter in letters if letter in found]
     if len(planes) != len(letters) or planes[0].shape != size[::-1]:
         raise DecodeError(f"{file} is not {size[0]} × {size[1]} of {letters}; process again")
-    whole = np.stack(planes, axis=-1) if len(letters) > 1 else planes[0]
-    if not np.isfinite(whole).all():
-        raise DecodeError(f"{file}: {(~np.isfinite(whole)).sum()} values are not finite numbers; process again")
-    return whole
+    values = np.stack(planes, axis=-1) if len(letters) > 1 else planes[0]
+    if not np.isfinite(values).all():
+        raise DecodeError(f"{file}: {(~np.isfinite(values)).sum()} values are not finite numbers; process again")
+    return values
 
 
 def _description(maps: SurfaceMaps, depth: Mapping[str, str | float]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from polcap.image_values import Floats
 def read(result: str | Path) -> ResultMaps:
     """Read all maps of a result: a result folder, its folder maps/, or the capture folder that holds the result.
 
-    Raises DecodeError: a file is missing, damaged, or not of the size in maps.json; or the object is a fused one.
+    Raises DecodeError: a file is missing, damaged, or not of the size in maps.json; or the result is not of one view.
     """
     return maps_folder.read(_folder(result))
 
@@ -67,7 +67,7 @@ def read_cues(result: str | Path) -> dict[str, Floats]:
 
 
 def _folder(result: str | Path) -> Path:
-    """The folder of the maps."""
+    """The folder with maps.json that a path names, as for `read`. Raises DecodeError: as `require_picture`."""
     named = Path(result)
     parts = ("", own_folders.OUTPUT, own_folders.FUSED, own_folders.MATERIAL)
     places = [named, *(named / part / "maps" for part in parts)]

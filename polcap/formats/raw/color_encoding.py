@@ -23,7 +23,8 @@ from polcap.optics.color import REC709_TO_XYZ, decode_srgb
 
 _STATE = 'state encoding = "linear" or "srgb" in capture.toml'
 _DEVELOP = "save it as linear 16-bit TIFF"
-_SAME = 2e-3  # of white: difference of two curves that are one; sRGB and gamma 2.2 differ by 8e-3
+_SAME = 2e-3  # of white: greatest difference of two equal curves; sRGB and gamma 2.2 differ by 8e-3
+_ENDS = 0.02  # of white: greatest error of a curve at its ends 0 and 1
 _CONTRADICTION = 0.1  # ln of the ratio of light at half the code
 _UNEQUAL = 0.01  # of a color matrix to the identity, above which primaries are not those of Rec.709
 _SRGB_GAMMA = 2.1, 2.3  # of a gAMA chunk: 1/2.2 means sRGB (PNG, 13.13)
@@ -73,7 +74,7 @@ class _UnusableError(Exception):
 
 def read(data: bytes, spec: Any) -> tuple[ColorEncoding, Curve]:
     """The color encoding that a picture states, and its curve; `spec` is OpenImageIO's of the open picture."""
-    eight = spec.format.size() == 1
+    is_8_bit = spec.format.size() == 1
     try:
         found = list(_statements(data, spec))
         names = [_name(one.source, one.curve) for one in found]
@@ -82,12 +83,12 @@ def read(data: bytes, spec: Any) -> tuple[ColorEncoding, Curve]:
     if not found:
         return ColorEncoding(), _linear
     first, name = found[0], names[0]
-    half = [max(float(one.curve(np.array([0.5]))[0]), 1e-6) for one in found]  # light of half the code
-    k = next((k for k, light in enumerate(half) if abs(np.log(light / half[0])) > _CONTRADICTION), None)
+    half_light = [max(float(one.curve(np.array([0.5]))[0]), 1e-6) for one in found]  # light of half the code
+    k = next((k for k, light in enumerate(half_light) if abs(np.log(light / half_light[0])) > _CONTRADICTION), None)
     fault = ""
     if k is not None:
         fault = f"its {first.source} states {name}, but its {found[k].source} {names[k]}; {_STATE}"
-    elif first.doubt and not eight:
+    elif first.doubt and not is_8_bit:
         fault = f"its {first.source} states {name}, but {first.doubt}; {_STATE}"
     matrix = () if first.to_rec709 is None else tuple(map(float, first.to_rec709.ravel()))
     return ColorEncoding(name, first.source, fault, matrix), first.curve
@@ -149,12 +150,12 @@ def _name(source: str, curve: Curve) -> str:
     """Name of a curve: linear, srgb, or its gamma. Raises _UnusableError for one that does not grow from 0 to 1."""
     code = np.linspace(0, 1, 65)
     light = curve(code)
-    if not np.isfinite(light).all() or (np.diff(light) < 0).any() or abs(light[0]) > 0.02 or abs(light[-1] - 1) > 0.02:
+    if not np.isfinite(light).all() or (np.diff(light) < 0).any() or max(abs(light[0]), abs(light[-1] - 1)) > _ENDS:
         raise _UnusableError(f"the curve of its {source} does not grow from 0 to 1; {_STATE}")
     for name, known in (("linear", _linear), ("srgb", decode_srgb)):
         if np.abs(light - known(code)).max() < _SAME:
             return name
-    return f"gamma {np.log(light[32]) / np.log(0.5):.1f}"
+    return f"gamma {np.log(light[32]) / np.log(0.5):.1f}"  # from the light at code ½
 
 
 def _cicp(chunk: bytes) -> _Statement:

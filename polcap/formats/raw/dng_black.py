@@ -1,6 +1,6 @@
 """Black level of every photosite, as a DNG states it: a repeating pattern, and offsets of columns and rows.
 
-LibRaw reports one level per color of the mosaic. Levels with more structure are evened out here.
+LibRaw reports one level per color of the mosaic. If levels vary more, `even_out` makes them equal.
 
 References
 ----------
@@ -19,10 +19,10 @@ from polcap.image_values import Floats
 _FLOATING = 3  # SampleFormat; LibRaw scales such counts to integers
 
 
-def uneven(structure: TiffStructure, sizes: Any, channels: int) -> Floats | None:
+def levels_by_photosite(structure: TiffStructure, sizes: Any, channels: int) -> Floats | None:
     """Black levels of a DNG's visible photosites, (H, W, `channels`); None if LibRaw's levels hold them.
 
-    `sizes` are LibRaw's, of the picture and its margins. LibRaw holds one level, or 2×2 of a Bayer mosaic.
+    `sizes` are LibRaw's sizes of picture and margins. LibRaw can hold one level, or 2×2 of a Bayer mosaic.
     """
     size = sizes.raw_width, sizes.raw_height, channels
     directory = next((one for one in structure.directories if _size(one) == size and file_kind.is_sensor(one)), None)
@@ -36,9 +36,9 @@ def uneven(structure: TiffStructure, sizes: Any, channels: int) -> Floats | None
     by_column = np.array(directory.get(file_kind.BLACK_BY_COLUMN, ()) or (0.0,))
     by_row = np.array(directory.get(file_kind.BLACK_BY_ROW, ()) or (0.0,))
     top, left = (int(edge) for edge in (*directory.get(file_kind.ACTIVE_AREA, ()), 0, 0)[:2])
-    bayer = directory.get(file_kind.CFA_REPEAT) == (2, 2) and max(rows, columns) <= 2
-    even = top % 2 == left % 2 == 0  # LibRaw counts the pattern from the corner of the whole sensor
-    if not by_column.any() and not by_row.any() and (np.ptp(pattern) == 0 or (bayer and even)):
+    is_bayer = directory.get(file_kind.CFA_REPEAT) == (2, 2) and max(rows, columns) <= 2
+    is_even_corner = top % 2 == left % 2 == 0  # LibRaw counts the pattern from the corner of the whole sensor
+    if not by_column.any() and not by_row.any() and (np.ptp(pattern) == 0 or (is_bayer and is_even_corner)):
         return None
     y, x = np.arange(sizes.height) + sizes.top_margin - top, np.arange(sizes.width) + sizes.left_margin - left
     level = pattern[y[:, None] % rows, x % columns] + by_row.take(y, mode="clip")[:, None, None]
@@ -52,10 +52,10 @@ def _size(directory: Directory) -> tuple[int, int, int]:
 
 
 def even_out(value: NDArray[Any], black: Floats) -> tuple[NDArray[Any], float]:
-    """Raise counts (H, W) or (H, W, C) uint16 to the highest of their black levels (H, W, C) or (C,); return it too.
+    """Shift counts (H, W) or (H, W, C) uint16 so that all have the highest of their black levels (H, W, C) or (C,).
 
-    Counts that would pass the greatest of their type stay there: they were clipped.
+    Returns them and that level. Counts beyond the largest of their type are set to it: they were clipped.
     """
-    top = float(black.max())
-    raised = value.reshape(*value.shape[:2], -1) + np.rint(top - black).astype(np.int32)
-    return np.minimum(raised, np.iinfo(value.dtype).max).astype(value.dtype).reshape(value.shape), top
+    highest = float(black.max())
+    raised = value.reshape(*value.shape[:2], -1) + np.rint(highest - black).astype(np.int32)
+    return np.minimum(raised, np.iinfo(value.dtype).max).astype(value.dtype).reshape(value.shape), highest

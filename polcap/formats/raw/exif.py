@@ -21,8 +21,8 @@ _D65_FIRST = (21, 20, 22, 23, 1, 4, 9, 10, 11, 12, 13, 14, 15)  # EXIF LightSour
 UPRIGHT_DEG = {1: 0, 8: 90, 3: 180, 6: 270}  # by EXIF Orientation; mirrored pictures are used as stored
 _UNIT_MM = {1: 25.4, 2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # FocalPlaneResolutionUnit; 1 "none" is inch in practice
 _SENSOR_MM = (2.0, 70.0)  # plausible widths; others come from a wrong unit
-_RESIZED = 1.12  # ratio of pixel counts above which a picture was resized, not cropped; mRAW has 4/3
-_SOUND = b"II*\0\x08\0\0\0\x01\0\x0f\x01\x02\0\x04\0\0\0abc\0\0\0\0\0"  # a TIFF with the make abc
+_RESIZED = 1.12  # ratio of widths above which a picture was resized, not cropped; mRAW has 4/3
+_TINY_TIFF = b"II*\0\x08\0\0\0\x01\0\x0f\x01\x02\0\x04\0\0\0abc\0\0\0\0\0"  # a TIFF with the make abc
 _TEXT_LENGTH = 100  # of a name; the rest is cut
 _HEADER = re.compile(rb"II\*\0|MM\0\*")  # of a TIFF
 _SEARCH_BYTES = 1 << 20  # from the beginning of a file
@@ -60,7 +60,7 @@ class _Tags:
                 return numbers
         return []
 
-    def number(self, name: str) -> float | None:
+    def number(self, name: str) -> float | None:  # the first one
         return next(iter(self.numbers(name)), None)
 
     def text(self, name: str) -> str:
@@ -79,7 +79,7 @@ def _check_reader() -> None:
     import exifread
 
     try:
-        found = str(exifread.process_file(io.BytesIO(_SOUND), details=False, extract_thumbnail=False)["Image Make"])
+        found = str(exifread.process_file(io.BytesIO(_TINY_TIFF), details=False, extract_thumbnail=False)["Image Make"])
     except Exception as error:
         found = f"{type(error).__name__}: {error}"
     if found != "abc":
@@ -144,7 +144,7 @@ def sized(stated: Exif, width: int, height: int) -> Exif:
 
 
 def _taken(found: _Tags) -> str:
-    """Time of the exposure; DateTime is not it, but the time at which a program wrote the file."""
+    """Time of the exposure in ISO 8601, or ""; the tag DateTime has the time at which a program wrote the file."""
     which = "Original" if found.text("DateTimeOriginal") else "Digitized"
     date, _, clock = found.text(f"DateTime{which}").partition(" ")
     fraction = found.text(f"SubSecTime{which}")

@@ -95,34 +95,34 @@ def is_lossy(structure: TiffStructure) -> bool:
 
 def _check_strips(path: str, directory: Directory, dng: bool) -> None:
     """Refuse a DNG with image strips that have fewer bytes than their pixels need."""
-    held = sum(length for _, length in file_kind.strips(directory))
+    stored = sum(length for _, length in file_kind.strips(directory))
     width, height = first(directory, file_kind.WIDTH), first(directory, file_kind.LENGTH)
     check_size(path, max(width, 1), max(height, 1))
     bits = first(directory, file_kind.BITS, 8) * first(directory, file_kind.SAMPLES, 1)
     uncompressed = first(directory, file_kind.COMPRESSION, 1) == 1
     needed = width * height * (bits if uncompressed else _LEAST_BITS) / 8
-    if dng and held < needed:
+    if dng and stored < needed:
         raise DecodeError(
-            f"{path}: states {held} bytes of image data where {width}×{height} px need {needed:.0f}; "
+            f"{path}: states {stored} bytes of image data where {width}×{height} px need {needed:.0f}; "
             f"it was stripped or damaged, {COPY_AGAIN}"
         )
 
 
 def check_jpeg(path: str, data: bytes, start: int = 0) -> None:
     """Refuse a JPEG from byte `start` on that has no end marker: decoders fill the rest with grey. DecodeError."""
-    at = start + 2
-    while at + 4 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
+    position = start + 2
+    while position + 4 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
         if marker == 0xD9:
             return
         if marker == 0xFF:  # padding
-            at += 1
+            position += 1
             continue
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
         if marker == 0xDA:  # coded data follow, up to a marker that is neither stuffing nor a restart
-            end = _MARKER.search(data, at)
-            at = end.start() if end else len(data)
-    if data[at : at + 2] != b"\xff\xd9":
+            end = _MARKER.search(data, position)
+            position = end.start() if end else len(data)
+    if data[position : position + 2] != b"\xff\xd9":
         raise DecodeError(f"{path}: is cut short, its JPEG data have no end; {COPY_AGAIN}")
 
 
@@ -146,7 +146,7 @@ def check_levels(path: str, value: NDArray[Any], black: float, white: float, los
             f"{path}: its white level is {white:g}, but its counts reach {top:.0f}; the level is wrong (a scanner's "
             "file?); convert it to linear 16-bit TIFF"
         )
-    rows = max(1, len(value) // 50)
+    rows = max(1, len(value) // 50)  # the last 2 %
     if black > 0 and top > black and not value[-rows:].any():
         raise DecodeError(f"{path}: its last rows are empty, below the sensor's black level; it is cut, {COPY_AGAIN}")
 
@@ -169,11 +169,11 @@ def check_no_mosaic(path: str, pixels: NDArray[Any]) -> None:
     samples = (_BLOCK // _PERIOD - 1) * (_BLOCK // _PERIOD)  # of each place in the mosaic: one period less along `axis`
     repeated, contrast = [], []
     for axis in (1, 2):
-        moved = np.moveaxis(value, axis, 1)
-        second = (moved[:, 1:-1] - (moved[:, :-2] + moved[:, 2:]) / 2)[:, : _BLOCK - _PERIOD]
-        means = second.reshape(len(value), -1, _PERIOD, _BLOCK // _PERIOD, _PERIOD).mean(axis=(1, 3))
+        lines = np.moveaxis(value, axis, 1)
+        differences = (lines[:, 1:-1] - (lines[:, :-2] + lines[:, 2:]) / 2)[:, : _BLOCK - _PERIOD]
+        means = differences.reshape(len(value), -1, _PERIOD, _BLOCK // _PERIOD, _PERIOD).mean(axis=(1, 3))
         power = np.mean(means**2, axis=(1, 2))
-        repeated.append(samples * power / np.maximum(np.mean(second**2, axis=(1, 2)), 1e-12))
+        repeated.append(samples * power / np.maximum(np.mean(differences**2, axis=(1, 2)), 1e-12))
         contrast.append(np.sqrt(power) / light[brightest])
     if np.median(repeated) > _REPEATED and np.median(contrast) > _CONTRAST:
         raise DecodeError(

@@ -99,8 +99,8 @@ def kind(file: BinaryIO, suffix: str) -> Kind:
     if head.startswith(TIFF):
         return "raw" if _is_raw(structure(_mapped(file))) else "photo"
     # HEIC, AVIF or WebP next to a RAW; films; sounds
-    known = head[4:8] == b"ftyp" or head[:4] == b"RIFF" or suffix.lower() in _SIDECARS
-    return "other" if known or _is_text(file) else "unknown"
+    is_other = head[4:8] == b"ftyp" or head[:4] == b"RIFF" or suffix.lower() in _SIDECARS
+    return "other" if is_other or _is_text(file) else "unknown"
 
 
 def _mapped(file: BinaryIO) -> bytes | mmap:
@@ -113,7 +113,7 @@ def _mapped(file: BinaryIO) -> bytes | mmap:
 
 
 def _is_text(file: BinaryIO) -> bool:
-    """Whether a file is text: its beginning, middle and end contain no byte that text never has."""
+    """Whether a file is text: its beginning, middle and end have no control characters 0 to 8 and 14 to 26."""
     size = file.seek(0, 2)
     pieces = []
     for at in (0, size // 2, size - _TEXT_BYTES):
@@ -140,11 +140,11 @@ def _is_raw(tiff: TiffStructure) -> bool:
 def png_chunks(data: bytes) -> dict[bytes, bytes]:
     """Chunks of a PNG in front of its pixels, by type; none if the bytes are not a PNG."""
     chunks: dict[bytes, bytes] = {}
-    at = len(PNG) if data.startswith(PNG) else len(data)
-    while at + 8 <= len(data) and data[at + 4 : at + 8] != b"IDAT":
-        (length,) = struct.unpack_from(">I", data, at)
-        chunks.setdefault(data[at + 4 : at + 8], data[at + 8 : at + 8 + length])
-        at += 12 + length
+    position = len(PNG) if data.startswith(PNG) else len(data)
+    while position + 8 <= len(data) and data[position + 4 : position + 8] != b"IDAT":
+        (length,) = struct.unpack_from(">I", data, position)
+        chunks.setdefault(data[position + 4 : position + 8], data[position + 8 : position + 8 + length])
+        position += 12 + length
     return chunks
 
 
@@ -155,16 +155,16 @@ def structure(data: bytes | mmap) -> TiffStructure:
         order = "<" if data[:2] == b"II" else ">"
         pending = deque(struct.unpack_from(order + "I", data, 4))
         seen: set[int] = set()
-        left = _MAX_VALUES
-        while pending and len(directories) < MAX_DIRECTORIES and left > 0:
+        values_left = _MAX_VALUES
+        while pending and len(directories) < MAX_DIRECTORIES and values_left > 0:
             offset = pending.popleft()
             if offset in seen or not 8 <= offset <= len(data) - 2:
                 continue
             seen.add(offset)
             (count,) = struct.unpack_from(order + "H", data, offset)
             end = offset + 2 + 12 * count
-            directory = dict(_entries(data, order, range(offset + 2, min(end, len(data) - 11), 12), left))
-            left -= sum(map(len, directory.values()))
+            directory = dict(_entries(data, order, range(offset + 2, min(end, len(data) - 11), 12), values_left))
+            values_left -= sum(map(len, directory.values()))
             directories.append(directory)
             following = struct.unpack_from(order + "I", data, end) if end + 4 <= len(data) else ()
             pending.extend((*map(int, directory.get(SUB_IFDS, ())), *following))

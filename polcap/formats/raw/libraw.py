@@ -115,7 +115,7 @@ def size(path: str, data: bytes, unpack: bool) -> dict[str, Any]:
 def _settings(other: Any, lens: Any) -> dict[str, Any]:
     """Camera settings as LibRaw reads them, as fields of `Exif`."""
     stamp = other.timestamp
-    known = Exif(
+    settings = Exif(
         lens=(lens.model or "").strip(),
         exposure_time=other.shutter_speed or None,
         f_number=other.aperture or None,
@@ -123,7 +123,7 @@ def _settings(other: Any, lens: Any) -> dict[str, Any]:
         focal_length_mm=other.focal_length or None,
         taken=stamp.isoformat() if stamp and stamp.year > 1970 else "",
     )
-    return {name: value for name, value in asdict(known).items() if value}
+    return {name: value for name, value in asdict(settings).items() if value}
 
 
 def version() -> str:
@@ -156,11 +156,11 @@ def _counts(path: str, raw: Any, structure: file_kind.TiffStructure) -> tuple[di
     value: NDArray[Any] = raw.raw_image_visible
     value = value[..., :3] if value.ndim == 3 else value
     channels = math.prod(value.shape[2:])
-    uneven, level = dng_black.uneven(structure, raw.sizes, channels), None
-    if uneven is None and value.ndim == 3:
-        uneven = np.array(raw.black_level_per_channel[:channels], np.float64)
-    if uneven is not None:  # `level` is then the black of all photosites
-        value, level = dng_black.even_out(value, uneven)
+    blacks, common_black = dng_black.levels_by_photosite(structure, raw.sizes, channels), None
+    if blacks is None and value.ndim == 3:
+        blacks = np.array(raw.black_level_per_channel[:channels], np.float64)
+    if blacks is not None:  # `common_black` is then that of all photosites
+        value, common_black = dng_black.even_out(value, blacks)
     balance, matrix = raw.camera_whitebalance[:3], raw.rgb_xyz_matrix[:3]
     meta: dict[str, Any] = {
         "balance": [gain / balance[1] for gain in balance] if min(balance) > 0 else None,
@@ -183,7 +183,7 @@ def _counts(path: str, raw: Any, structure: file_kind.TiffStructure) -> tuple[di
             cfa, levels = (np.roll(part, (-down, -right), (0, 1)) for part in (cfa, np.array(black)))
             value, black = np.ascontiguousarray(value[down:, right:]), levels.tolist()
         arrays = {"value": value, "cfa": cfa}
-    black = black if level is None else [[level]]
+    black = black if common_black is None else [[common_black]]
     return meta | {"black": black, "white": _white(raw, float(np.max(black)))}, arrays
 
 
@@ -212,8 +212,8 @@ def _mosaic(raw: Any, path: str) -> tuple[Bits, list[list[float]]]:
     index = [[raw.raw_color(top + y, left + x) for x in period] for y in period]
     names = raw.color_desc.decode()
     letters = [[names[i] for i in row] for row in index]
-    usual = {2: {"R": 1, "G": 2, "B": 1}, 6: {"R": 8, "G": 20, "B": 8}}[len(pattern)]
-    if Counter(letter for row in letters for letter in row) != usual:
+    expected = {2: {"R": 1, "G": 2, "B": 1}, 6: {"R": 8, "G": 20, "B": 8}}[len(pattern)]
+    if Counter(letter for row in letters for letter in row) != expected:
         raise DecodeError(f"{path}: its mosaic is {letters}, not of red, green and blue; polcap does not support it")
     cfa = np.array([["RGB".index(letter) for letter in row] for row in letters], np.uint8)
     levels = raw.black_level_per_channel  # in the order of the color index
@@ -221,7 +221,7 @@ def _mosaic(raw: Any, path: str) -> tuple[Bits, list[list[float]]]:
 
 
 def _white(raw: Any, black: float) -> float:
-    """White level (saturated count): LibRaw's maximum, or the camera's stated level if lower."""
+    """White level (saturated count): the lower of LibRaw's and the camera's, unless below half of LibRaw's."""
     stated = [level for level in raw.camera_white_level_per_channel or () if level > black]
     lowest = min([raw.white_level, *stated])
     return float(lowest if lowest > raw.white_level / 2 else raw.white_level)

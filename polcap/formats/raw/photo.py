@@ -23,7 +23,7 @@ from polcap.optics import color
 Encoding = Literal["linear", "srgb"]
 SENSOR_CELLS = ((90.0, 45.0), (135.0, 0.0))  # angles [°] in the 2×2 cell of the usual polarization sensor
 _OTHER_COLORS = {5: "CMYK", 8: "CIELAB", 9: "ICCLAB", 10: "ITULAB", 32844: "LogL", 32845: "LogLuv"}  # of a TIFF
-_FIREFLIES, _FAR_ABOVE = 1e-4, 16.0  # most of them, share of a picture; how far glints reach above all else
+_FIREFLIES, _FAR_ABOVE = 1e-4, 16.0  # their greatest share of a picture; a glint's value over those of all else
 _MOST_CHANNELS = 64  # of a layered EXR
 _DEFAULT = FrameReading("photo")
 _DIAGONALS = 0.1  # relative difference of the sums along both diagonals of a polarization sensor's cell; measured: 0.02
@@ -68,17 +68,17 @@ def read_mosaic(
                 f"{path}: has {pixels.shape[2]} channels, but the frame of a polarization sensor has one; "
                 "save the camera's raw frame, or give one picture per angle"
             )
-        mosaic, lossy, level = pixels[..., 0], pixels.dtype == np.uint8, reading.black
+        mosaic, lossy, black = pixels[..., 0], pixels.dtype == np.uint8, reading.black
     else:
         sensor = libraw.read(path, digest)
         mosaic = sensor.value if sensor.value.ndim == 2 else sensor.value[..., 0]
         lossy, full = False, sensor.white
-        level = reading.black or float(np.broadcast_to(sensor.black, (2, 2))[y, x])
+        black = reading.black or float(np.broadcast_to(sensor.black, (2, 2))[y, x])
     _check_monochrome(path, mosaic)
     height, width = mosaic.shape
     plane = mosaic[y : height // 2 * 2 : 2, x : width // 2 * 2 : 2]
     value = np.repeat(_counts(plane)[..., None], 3, axis=2)
-    return SensorImage(value, np.full((1, 1), level), reading.white or full, None, lossy=lossy)
+    return SensorImage(value, np.full((1, 1), black), reading.white or full, None, lossy=lossy)
 
 
 def encoding_of(bits: int, found: ColorEncoding) -> str:
@@ -133,7 +133,7 @@ def _is_float(spec: Any) -> bool:
 
 
 def _top(pixels: NDArray[Any]) -> float:
-    """Greatest value of a picture (H, W, C), without a few pixels far above all others: a renderer's fireflies."""
+    """Greatest value of a picture (H, W, C); fireflies, a renderer's few pixels far above all others, are limited."""
     brightest = pixels.max(axis=2).ravel()
     beyond = min(max(20, round(_FIREFLIES * brightest.size)), brightest.size - 1)
     return float(min(brightest.max(), _FAR_ABOVE * np.partition(brightest, -1 - beyond)[-1 - beyond]))
@@ -228,8 +228,8 @@ def opened(path: str, data: bytes) -> Iterator[Any]:
 
 def _channels(path: str, spec: Any) -> list[int]:
     """Indices of the picture's channels R, G and B, or of its single gray channel. Raises DecodeError."""
-    if other := _OTHER_COLORS.get(spec.getattribute("tiff:PhotometricInterpretation")):
-        raise DecodeError(f"{path}: its colors are {other}; save it as RGB")
+    if other_colors := _OTHER_COLORS.get(spec.getattribute("tiff:PhotometricInterpretation")):
+        raise DecodeError(f"{path}: its colors are {other_colors}; save it as RGB")
     names = [name.rpartition(".")[2].upper() for name in spec.channelnames]
     if sum(name in ("R", "G", "B") for name in names) == 3:
         return [names.index(name) for name in "RGB"]

@@ -27,7 +27,7 @@ REMEDY = "save each picture as a file of its own"
 
 
 def check_single(path: str, data: bytes, file: Any) -> None:
-    """Refuse a finished picture's file that holds several; `file` is OpenImageIO's open one. Raises DecodeError."""
+    """Refuse a file of several finished pictures; OpenImageIO has opened it as `file`. Raises DecodeError."""
     spec = file.spec()
     if data.startswith(file_kind.EXR):
         count = int(spec.getattribute("oiio:subimages") or 1)
@@ -61,14 +61,14 @@ def _tiff_pictures(structure: TiffStructure) -> list[Directory]:
 
     A preview in the first place counts, because it is read instead of the picture.
     """
-    held = [one for one in structure.directories if file_kind.strips(one)]
-    least = _PREVIEW_SIDE * first(held[0], file_kind.WIDTH) if held else 0
+    with_pixels = [one for one in structure.directories if file_kind.strips(one)]
+    least_width = _PREVIEW_SIDE * first(with_pixels[0], file_kind.WIDTH) if with_pixels else 0
     others = [
         one
-        for one in held[1:]
-        if first(one, file_kind.SUBTYPE) & _NO_PICTURE == 0 and first(one, file_kind.WIDTH) > least
+        for one in with_pixels[1:]
+        if first(one, file_kind.SUBTYPE) & _NO_PICTURE == 0 and first(one, file_kind.WIDTH) > least_width
     ]
-    return held[:1] + others
+    return with_pixels[:1] + others
 
 
 def _multi_picture_count(data: bytes) -> int:
@@ -79,9 +79,9 @@ def _multi_picture_count(data: bytes) -> int:
     order = "<" if data[base : base + 2] == b"II" else ">"
     count = 1
     try:
-        at = base + struct.unpack_from(order + "I", data, base + 4)[0]
-        for k in range(struct.unpack_from(order + "H", data, at)[0]):
-            tag, _type, length, offset = struct.unpack_from(order + "HHII", data, at + 2 + 12 * k)
+        directory_start = base + struct.unpack_from(order + "I", data, base + 4)[0]
+        for k in range(struct.unpack_from(order + "H", data, directory_start)[0]):
+            tag, _type, length, offset = struct.unpack_from(order + "HHII", data, directory_start + 2 + 12 * k)
             if tag == _MPF_ENTRIES:
                 entries = [
                     struct.unpack_from(order + "III", data, base + offset + 16 * n) for n in range(1, length // 16)
@@ -97,7 +97,7 @@ def _is_auxiliary(kind: int, picture: bytes) -> bool:
 
 
 def has_gain_map(data: bytes, structure: TiffStructure) -> bool:
-    """Whether a JPEG holds a gain map for bright displays, or a DNG one against the lens's shading."""
+    """Whether a JPEG has a gain map, for bright displays, or a DNG has one, against the lens's shading."""
     if data.startswith(file_kind.JPEG):
         return _GAIN_MAP_MARKS.search(data) is not None
     lists = [file_kind.stored_bytes(one, tag) for one in structure.directories for tag in file_kind.OPCODE_LISTS]
@@ -107,9 +107,9 @@ def has_gain_map(data: bytes, structure: TiffStructure) -> bool:
 
 def _opcodes(opcode_list: bytes) -> list[int]:
     """Numbers of the operations in one of a DNG's opcode lists; big-endian in every file."""
-    found, at = list[int](), 4
-    while at + 16 <= len(opcode_list):
-        number, _, _, size = struct.unpack_from(">4I", opcode_list, at)
+    found, position = list[int](), 4
+    while position + 16 <= len(opcode_list):
+        number, _, _, size = struct.unpack_from(">4I", opcode_list, position)
         found.append(number)
-        at += 16 + size
+        position += 16 + size
     return found

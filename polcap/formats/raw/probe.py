@@ -93,13 +93,13 @@ def _raw(path: str, data: bytes) -> tuple[Probe, bool]:
     structure = file_kind.structure(data)
     file_checks.check_structure(path, structure, data)
     picture_count.check_single_raw(path, structure)
-    known = exif.tags(data)
-    no_settings = known.exposure_time is None and not known.make  # CRW: LibRaw knows them, but has to unpack
-    no_iso = known.iso is None and not structure.dng  # old bodies state it in their maker's tags only
+    tagged = exif.tags(data)
+    no_settings = tagged.exposure_time is None and not tagged.make  # CRW: LibRaw knows them, but has to unpack
+    no_iso = tagged.iso is None and not structure.dng  # old bodies state it in their maker's tags only
     size = libraw.size(path, data, unpack=no_settings or no_iso)
     # settings that only LibRaw knows; not its time, which may be that of writing
-    decoded = {k: v for k, v in size.get("exif", {}).items() if no_settings or not (getattr(known, k) or k == "taken")}
-    stated = replace(exif.sized(known, size["width"], size["height"]), **decoded)
+    decoded = {k: v for k, v in size.get("exif", {}).items() if no_settings or not (getattr(tagged, k) or k == "taken")}
+    stated = replace(exif.sized(tagged, size["width"], size["height"]), **decoded)
     lossy = file_checks.is_lossy(structure)
     probe = Probe(
         kind="raw",
