@@ -27,7 +27,7 @@ class Mesh(ArrayValue):
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class ReliefMesh(Mesh):
-    """The surface that one view shows, as a mesh over its depth map; unless metric, its depth is 1 focal length."""
+    """The surface that one view shows, as a mesh over its depth map; unless metric, its median depth is 1."""
 
     depth: Floats  # (H, W) along the optical axis, growing away from the camera; NaN outside
 

@@ -120,7 +120,7 @@ def _serve(pipe: connection.Connection, limits: Limits) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent dies: it would hold its result folder, which the next run needs."""
+    """End this process when its parent dies: it would keep a result folder locked, which the next run needs."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

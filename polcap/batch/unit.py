@@ -124,7 +124,7 @@ def _process(unit: Unit, request: Request) -> dict[str, Any]:
 
 def _reason(about: dict[str, Any]) -> str:
     """The gates that failed, or else those that warn, with their remedies; "" if all passed."""
-    decided = [gate for gate in about["gates"] if gate["state"] == about["verdict"] != "pass"]
+    decided = [gate for gate in about["gates"] if gate["state"] == about["verdict"] != "pass"]  # the worst ones
     sentences = ([f"{gate['name']}: {gate['says']}", gate["remedy"]] for gate in decided)
     return " ".join(f"{sentence}." for pair in sentences for sentence in pair if sentence)
 

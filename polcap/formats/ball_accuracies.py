@@ -15,7 +15,7 @@ from polcap.errors import CaptureError
 from polcap.formats import atomic, calibrations, own_folders, text_file
 
 _HEAD = "# polcap validate: errors of the normals of a ball, in degrees. Delete this file to forget them.\n"
-_MOST_DEG = 180.0
+_MOST_DEG = 180.0  # between two normals
 
 
 def write(found: BallAccuracy) -> Path:

@@ -21,13 +21,13 @@ from polcap.optics.color import REC709_TO_XYZ
 _SG = [f"{column}{row}" for row in range(1, 11) for column in "ABCDEFGHIJKLMN"]  # patches of an SG, row by row
 SG_BLOCK = tuple(f"{column}{row}" for row in (2, 3, 4, 5) for column in "EFGHIJ")  # of an SG: a Classic's colors
 SG_SURROUNDINGS = tuple(name for name in _SG if name not in SG_BLOCK)
-_MOST_BYTES = 4 << 20
+_MOST_BYTES = 4 << 20  # of a file
 _BY_ROW = [f"{row}{column}" for row in "ABCD" for column in range(1, 7)]  # names of a Classic's patches, both ways
 _BY_COLUMN = [f"{column}{row}" for row in range(1, 5) for column in "ABCDEF"]
 _PATCH = re.compile(r"([A-Na-n])0*(\d{1,2})")
 _BAND = re.compile(r"[A-Z_ ]*?(\d{3})(?:\.0+)?\s*(?:NM)?")  # SPEC_400, nm400, SPECTRAL_NM_400, R_400nm, 400
 _LEAST_BANDS = 16  # columns of wavelengths that make a spectrum
-_NANOMETERS = range(300, 831)
+_NANOMETERS = range(300, 831)  # other numbers in names of columns are no wavelengths
 
 Rows = list[list[str]]
 

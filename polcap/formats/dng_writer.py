@@ -21,9 +21,9 @@ from polcap.formats import atomic
 from polcap.formats.raw.exif import UPRIGHT_DEG
 from polcap.image_values import Bits, Floats
 
-_BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
+_BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10  # TIFF's types of values
 _CODE = {_SHORT: "H", _LONG: "I", _RATIONAL: "II", _SRATIONAL: "ii"}
-_D65, _CENTIMETRE = 21, 3
+_D65, _CENTIMETRE = 21, 3  # EXIF's LightSource and FocalPlaneResolutionUnit
 _Entry = tuple[int, int, Any]  # tag, type, value or values
 
 

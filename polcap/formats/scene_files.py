@@ -57,7 +57,7 @@ def read_textures(folder: Path, side: int = 256) -> Floats:
     slope: Floats = np.zeros((side, side, 2), dtype=np.float32)
     if (folder / "normal.jpg").exists():
         normal = _picture(folder / "normal.jpg", side)[..., ::-1] * 2 - 1
-        slope = -normal[..., :2] / np.maximum(normal[..., 2:], 0.3)
+        slope = -normal[..., :2] / np.maximum(normal[..., 2:], 0.3)  # finite at grazing normals
     elif (folder / "height.jpg").exists():
         height = _picture(folder / "height.jpg", side).mean(axis=-1)  # white is a 32nd of the side high
         slope = np.stack([np.roll(height, -1, a) - np.roll(height, 1, a) for a in (1, 0)], axis=-1) * side / 64

@@ -220,7 +220,7 @@ class ArchiveCache(StageCache):
     """Cache of an earlier run whose photographs are missing, so that the keys of the first stages cannot be computed.
 
     A stored result is used if it was made from the results of the stages before it, with these settings and versions.
-    A StorageError names a result that was not, is missing or damaged. A result that is never stored is computed.
+    A StorageError names a result made otherwise, missing or damaged. A result that is never stored is computed.
     """
 
     def _result(self, stage: Stage[..., T], inputs: tuple[Any, ...], config: msgspec.Struct | None) -> StageResult[T]:

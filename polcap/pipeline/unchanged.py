@@ -35,7 +35,7 @@ class Finished(NamedTuple):
 def request(options: Any, capture: Path, out: Path, files: Iterable[Path] = ()) -> str | None:
     """Digest of a run's request: options, program, and size and time of photographs and other input files.
 
-    `options` is plain data. The user's calibrations count as input files. None if these do not determine the result.
+    `options` is plain data. The user's calibrations count as input files. None if a file is unreadable or just changed.
     """
     try:
         photographs = _stats(capture, os.path.realpath(out), own_folders.OURS)

@@ -24,8 +24,8 @@ from polcap.rig.camera import CameraFile
 from polcap.rig.device_log import Log
 from polcap.rig.exposure_bracket import Exposure
 
-_POLL_S = 0.1
-_STABLE_S = 0.5  # a file whose size and time have been the same for this long is read
+_POLL_S = 0.1  # between two listings of the folder
+_STABLE_S = 0.5  # a file is read when its size and time have been the same for this time
 _RETRY_S = 1.0  # until a file that does not decode is read again: some drives state its time when it is closed
 _SETTLE_S = 30.0  # longest wait for a file that was begun before the polarizer turned
 _BLOCK_PX = 32  # no sensor has this many pixels by as many of count 0
@@ -57,7 +57,7 @@ class WatchFolderCamera:
         self._timeout_s = timeout_s
         self._stable_s = stable_s
         self._read = self._versions()  # files that have been read, or were there before
-        self._since: dict[tuple[Path, Version], float] = {}  # first seen
+        self._since: dict[tuple[Path, Version], float] = {}  # time at which it was first seen [s]
         self._arrived: list[tuple[Path, bytes]] = []  # read, not yet decoded
         self._refused: dict[Path, Refused] = {}
         self._known: set[str] = set()  # digests of the frames taken or skipped: a file may only get another time

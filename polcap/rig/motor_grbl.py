@@ -42,8 +42,8 @@ _START_S = 2.5  # for a board that restarts when its port is opened
 _HOLD_S = 2.0  # longest deceleration
 _POLL_S = 0.1  # between two questions for its state
 _RESET = "\x18"
-_BANNER = re.compile(r"Grbl(?:HAL)? (1\.1\S*) .*")
-_STORED = re.compile(r"\$(\d{1,9})=(\d{1,9}(?:\.\d+)?)(?: .*)?")
+_BANNER = re.compile(r"Grbl(?:HAL)? (1\.1\S*) .*")  # sent after a reset
+_STORED = re.compile(r"\$(\d{1,9})=(\d{1,9}(?:\.\d+)?)(?: .*)?")  # a setting in the answer to $$
 _XYZ = r"(-?\d{1,9}\.?\d*),(-?\d{1,9}\.?\d*),(-?\d{1,9}\.?\d*)"
 _STATUS = re.compile(rf"<(\w+)(?::\d+)?\|([MW])Pos:{_XYZ}[|,>].*")
 _OFFSET = re.compile(rf"\|WCO:{_XYZ}")  # work position = machine position - offset

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from polcap.formats.capture.foreign_files import files_below
 
-_POLL_S = 0.1
+_POLL_S = 0.1  # between two listings of the files
 
 FileStates = dict[str, tuple[int, int]]  # size and time of change by path
 
@@ -25,7 +25,7 @@ def settled(folder: Path, ignored: Path, still_s: float = 2.0, edited: Sequence[
         if now != last:
             since = time.monotonic()
         still = reported is None or now == reported[0] or time.monotonic() - since >= still_s
-        if (now, edited_now) == (last, edited_states) != reported and still:
+        if (now, edited_now) == (last, edited_states) != reported and still:  # equal twice, and new
             reported = now, edited_now
             yield
         else:

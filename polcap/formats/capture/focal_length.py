@@ -45,7 +45,7 @@ class _Source(NamedTuple):
 def find(exif: Exif, stated_mm: float | None, stated_width_mm: float | None) -> FocalLength:
     """Focal length in visible RAW pixels from EXIF, or from the user's statement, which overrides EXIF.
 
-    Sources that contradict each other by more than 10 % leave a doubt, which reaches to each of them.
+    If sources contradict each other by more than 10 %, the range of doubt includes each of them.
     """
     focal, diagonal = stated_mm or exif.focal_length_mm, math.hypot(exif.width or 0, exif.height or 0)
     sources = _sources(exif, stated_mm, stated_width_mm)
@@ -94,7 +94,7 @@ def _sources(exif: Exif, stated_mm: float | None, stated_width_mm: float | None)
 
 
 def _most_plausible(sources: list[_Source]) -> FocalLength:
-    """Focal length by the user's statement, else by the source that most others agree with (the most precise)."""
+    """Focal length by the user's statement, else by the most precise of the sources that agree with most others."""
     best = max(sources, key=lambda one: (one.stated, sum(one.agrees(other) for other in sources), one.trust))
     chosen = next(one for one in sources if one.agrees(best))  # `sources` begin with the most precise
     others = [one for one in sources if not one.agrees(chosen)]

@@ -154,7 +154,7 @@ def _degrees_by_name(names: Iterable[str]) -> dict[str, float]:
     """Angle [degrees] by folder name: of pol000, pol045, …, else of numbers with °, deg or Grad, else of plain numbers.
 
     Numbers with a unit may follow others: "01 Foto 0°", "02 Foto 45°". Plain numbers are the only difference of
-    the names: 0, 45, 90; 角度0, 角度45, 角度90. There are at least three different axes below 180°, one of them 0°.
+    the names: 0, 45, 90; 角度0, 角度45, 角度90. There must be three different axes or more, below 180°, one of them 0°.
     """
     names = [name for name in names if name not in OURS and not foreign_files.is_ignored_folder(name)]
     found = {name: float(match["pol"]) for name in names if (match := _FOLDER.fullmatch(name)) and match["pol"]}

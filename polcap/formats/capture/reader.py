@@ -75,7 +75,7 @@ def _read(folder: Path, angles_deg: tuple[float, ...] | None, clockwise: bool) -
     if plan.layout != "sensor":
         _check_encodings(sources, stated)
     greatest = max((source.probe.top for source in sources.values()), default=0.0)
-    if greatest > 1 and not stated.white:  # a sensor's white is not known; one for all frames
+    if greatest > 1 and not stated.white:  # floating point states no white level; one for all frames
         stated = msgspec.structs.replace(stated, white=float(f"{_HEADROOM * greatest:.4g}"))
     shots = tuple(_shot(plan, stated, angle, bracket) for angle, bracket in plan.shots)
     _check_brackets(shots)

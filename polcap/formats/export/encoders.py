@@ -118,7 +118,7 @@ def eight_bits(texture: Texture) -> NDArray[np.uint8]:
     """The pixels of a texture, (H, W) or (H, W, C), as integers of 8 bits."""
     if texture.pixels.dtype == np.uint8:
         return np.asarray(texture.pixels, dtype=np.uint8)
-    return np.asarray(np.rint(texture.pixels / 257.0), dtype=np.uint8)
+    return np.asarray(np.rint(texture.pixels / 257.0), dtype=np.uint8)  # 65535 / 255
 
 
 def animate(path: Path, frames: Frames, seconds: float) -> list[Path]:

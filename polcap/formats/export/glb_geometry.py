@@ -27,7 +27,7 @@ EXTENSIONS: Mapping[Geometry, tuple[str, ...]] = {
     "quantized": ("KHR_mesh_quantization",),
     "draco": ("KHR_draco_mesh_compression", "KHR_mesh_quantization"),  # the latter for tangents of 8 bits
 }
-_COMPONENT = {"int8": 5120, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
+_COMPONENT = {"int8": 5120, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}  # accessor.componentType
 _ARRAY, _ELEMENTS = 34962, 34963  # bufferView.target
 _DRACO_BITS = {"quantization_bits": 14, "normal_quantization_bits": 12, "tex_coord_quantization_bits": 14}
 _DRACO_LEVEL = 7  # 0 fast … 10 small

@@ -26,7 +26,7 @@ from polcap.formats.maps import maps_folder
 from polcap.image_values import Floats
 from polcap.mesh_values import Asset, Mesh
 
-_LINEAR, _LINEAR_MIPMAP, _CLAMP = 9729, 9987, 33071
+_LINEAR, _LINEAR_MIPMAP, _CLAMP = 9729, 9987, 33071  # numbers of OpenGL: filters, and wrapping clamped to the edge
 _IMAGE_EXTENSION: dict[Kind, str] = {"webp": "EXT_texture_webp", "ktx2": "KHR_texture_basisu"}
 _CONTEXT = {
     "rdf": "http://www.w3.org/1999/02/22-rdf-syntax-ns#",
@@ -204,5 +204,6 @@ def is_open(mesh: Mesh) -> bool:
     _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
     start = place.reshape(-1)[mesh.faces].astype(np.int64)
     end = np.roll(start, -1, axis=1)
-    _, triangles = np.unique(np.minimum(start, end) << 32 | np.maximum(start, end), return_counts=True)
+    edge = np.minimum(start, end) << 32 | np.maximum(start, end)  # one number for both directions
+    _, triangles = np.unique(edge, return_counts=True)
     return bool((triangles == 1).any())

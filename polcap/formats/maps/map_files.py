@@ -102,7 +102,7 @@ _DETAIL_STEPS = 50  # per unit of the logarithm
 
 def detail_levels(detail: Floats) -> NDArray[np.uint8]:
     """The levels (2H, 2W) of detail.png, 128 + 50 ln, of a logarithm (2H, 2W) float16."""
-    half = np.arange(1 << 16, dtype=np.uint16).view(np.float16)  # all: a look-up is ten times as fast as half floats
+    half = np.arange(1 << 16, dtype=np.uint16).view(np.float16)  # all: a table is ten times as fast as half floats
     with np.errstate(over="ignore"):
         level = np.rint(np.clip(np.nan_to_num(half) * np.float16(_DETAIL_STEPS), -127, 127)) + 128
     return np.asarray(level.astype(np.uint8)[detail.view(np.uint16)])

@@ -41,7 +41,7 @@ _NAMED_PRIMARIES = {  # by names of color spaces in lower case
     "ap0|aces2065": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767),
     "ap1|acescg": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),
 }
-_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])  # from XYZ
 _D50 = np.array([0.9642, 1.0, 0.8249])  # white of an ICC profile
 _EXR_NAMES = ("colorspace", "colorinteropid")  # attributes, without prefix and underscores
 _OTHER_CURVES = re.compile(r"pq|2084|hlg|log|acescc")  # of displays with a high range, and of films

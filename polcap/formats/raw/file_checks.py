@@ -32,7 +32,7 @@ _DEFLATE = 1032  # greatest compression of zlib (zlib.net, Technical Details: Ma
 _CLIPPED_SHARE = 0.5  # of a picture; no useful exposure has more at the white level
 _PERIOD = 12  # px; mosaics repeat after 2 (Bayer, polarization), 4 (both) or 6 (X-Trans)
 _BLOCK = 48  # px
-_MOST_BLOCKS = 64
+_MOST_BLOCKS = 64  # that are examined
 _REPEATED, _CONTRAST = 5.0, 0.01  # of a mosaic's blocks. Measured: 7 to 25 and 0.015 to 0.8; other pictures: 0.7 to 3.1
 _BEYOND = 2.0  # white levels; counts that reach so far prove the level wrong
 

@@ -33,8 +33,8 @@ _COLOR_LEVELS = 0.05  # averages of neighboring 2×2 cells differ less than this
 def read(path: str | Path, reading: FrameReading = _DEFAULT, digest: str | None = None) -> SensorImage:
     """Decode a finished picture as linear values (H, W, 3); a gray picture is repeated in all three channels.
 
-    Linear integers stay counts; for floating point, white is 1. An encoded picture becomes linear 0…1. It and every
-    8-bit picture are marked `lossy`. Primaries that the file states give the `camera_matrix`. With the `digest` of
+    Linear integers stay counts; for floating point, white is 1. Encoded pictures become linear 0…1. They and all 8-bit
+    pictures are marked `lossy`. Primaries that the file states give the `camera_matrix`. With the `digest` of
     `probe.read`, the file must still have the bytes that were probed.
 
     Raises DecodeError: not a picture, damaged, changed since it was probed, of a contradictory encoding, or a mosaic.

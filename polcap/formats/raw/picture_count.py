@@ -19,7 +19,7 @@ _PREVIEW_SIDE = 0.25  # of the picture's; cameras do not mark all small previews
 _GAIN_MAP_MARKS = re.compile(rb"hdrgm:|hdrgainmap|urn:iso:std:iso:ts:21496", re.IGNORECASE)  # in the XMP of a phone
 _AUXILIARY_MARKS = re.compile(_GAIN_MAP_MARKS.pattern + rb"|AuxiliaryImageType", re.IGNORECASE)  # depth maps, mattes
 _MARKS_BYTES = 1 << 16  # from the beginning of a picture: its headers
-_MPF_ENTRIES, _MPF_TYPE = 0xB002, 0xFFFFFF
+_MPF_ENTRIES, _MPF_TYPE = 0xB002, 0xFFFFFF  # tag of the list of pictures; bits of an entry's type
 _MPF_AUXILIARY = {0x010001, 0x010002, 0x040000, 0x050000}  # previews, the original, a gain map
 _OPCODE_GAIN_MAP = 9
 _STACK = re.compile(r"^images=(\d+)", re.MULTILINE)  # ImageJ's stack under one directory
