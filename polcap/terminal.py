@@ -88,7 +88,7 @@ def open_streams() -> None:
 
 
 def final_code(code: int) -> int:
-    """Exit code of a command that ended with `code`; prints an error and returns 2 where its output is incomplete."""
+    """Exit code of a command that ended with `code`; where output is incomplete, prints an error, and 2 replaces 0."""
     for name, output in _outputs.items():
         if output.fault:
             print_message(f"polcap: error: {name} is incomplete: {output.fault}; write it elsewhere", "ERROR")

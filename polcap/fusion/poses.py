@@ -190,13 +190,13 @@ def _residuals(boards: Sequence[BoardCorners], capture: Capture, unknown: Floats
 
 
 def _minimize(boards: Sequence[BoardCorners], capture: Capture, start: Floats) -> OptimizeResult:
-    """Least squares of all unknowns from `start`, with weak priors of those of the camera."""
+    """Least squares of all unknowns from `start`; weak priors hold the camera's unknowns near 0, the stated camera."""
     width = capture.size_px[0]
     doubt = max(abs(capture.focal_doubt[0]), abs(capture.focal_doubt[1]), 0.05 if capture.focal_known else 0.5)
     prior = np.array([doubt, *[_PRINCIPAL_SIGMA * width] * 2, *_BEND_SIGMA])  # 1σ
     rows = np.cumsum([_CAMERA, *(2 * len(one.number) for one in boards)])  # first of each view
 
-    def of_view(k: int, unknown: Floats) -> Floats:  # those of the camera and of view k
+    def residual_of(k: int, unknown: Floats) -> Floats:  # of view k; unknowns (11,): camera, then this view
         return _residual(boards[k], _camera(capture, unknown), unknown[_CAMERA:]).ravel() / _CORNER_SIGMA
 
     def residuals(unknown: Floats) -> Floats:
@@ -209,7 +209,7 @@ def _minimize(boards: Sequence[BoardCorners], capture: Capture, start: Floats) -
         for k, (first, last) in enumerate(itertools.pairwise(rows)):
             own = np.r_[:_CAMERA, _of_view(k)]
             for column, step in zip(own, np.eye(len(own)) * _STEPS, strict=True):
-                change = of_view(k, unknown[own] + step) - of_view(k, unknown[own] - step)
+                change = residual_of(k, unknown[own] + step) - residual_of(k, unknown[own] - step)
                 out[first:last, column] = change / (2 * step.max())
         return out
 

@@ -131,7 +131,8 @@ def make_grid(
 ) -> TexelGrid:
     """Grid of the sample: by default over the board's middle, with texels as large as the nearest view's pixels.
 
-    Raises SettingError: the region reaches beyond the board, or has too many texels.
+    `region` is left, lower, right, upper [m] from the board's middle, y up; `texel` is in m. Raises SettingError: the
+    region reaches beyond the board, or has too few or too many texels.
     """
     half = (SQUARES / 2 - RING) * board.square_m - _MARGIN_M
     left, lower, right, upper = region or (-half, -half, half, half)
@@ -150,5 +151,6 @@ def make_grid(
             f"{size[0]} × {size[1]} texels of {1000 * texel:g} mm: {_LEAST_TEXELS} to {_MOST_TEXELS} along a side are "
             "possible; change --texel or --region"
         )
+    # the middle of the first texel; rows run down, the region's y runs up
     origin = ((left + right) / 2 - (size[0] - 1) / 2 * texel, -(lower + upper) / 2 - (size[1] - 1) / 2 * texel)
     return TexelGrid(origin, texel, (size[0], size[1]))

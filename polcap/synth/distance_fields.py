@@ -51,7 +51,7 @@ class Bumps(msgspec.Struct, frozen=True, tag="bumps", forbid_unknown_fields=True
         q = p / np.array(self.size)
         r = np.maximum(_length(q), 1e-9)
         slope = sum(abs(a) * hypot(x, y, z) for a, x, y, z, _ in self.waves)
-        least = 1 - sum(abs(wave[0]) for wave in self.waves)
+        least = 1 - sum(abs(wave[0]) for wave in self.waves)  # smallest radius: there the waves are steepest
         return (r - 1 - _waves(self.waves, q / r[..., None])) * (min(self.size) / hypot(1, slope / least))
 
 

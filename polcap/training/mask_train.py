@@ -63,7 +63,7 @@ def make_pictures(out: Path, data: Path, count: int) -> None:
 
 
 def _make_group(files: list[Path], library: materials.MaterialLibrary, group: int) -> Iterator[Floats]:
-    """Simulated pictures of one object, or of two or three side by side, in a quarter of the groups."""
+    """Simulated pictures of one object; in a quarter of the groups, of two or three objects side by side."""
     rng = np.random.default_rng([5, group])  # 5: an arbitrary seed
     torch.manual_seed(int(rng.integers(1 << 62)))
     if rng.random() < 0.75:

@@ -71,7 +71,7 @@ def side_by_side(meshes: list[Triangles], rng: np.random.Generator) -> Triangles
 
 
 def trace_view(tracer: Tracer, kind: ViewKind, size: tuple[int, int], rng: np.random.Generator) -> MaskView | None:
-    """Trace the object from a random side; None if it cannot be framed in this composition."""
+    """Trace the object from a random side, with a random flash and backdrop; None if it cannot be framed like this."""
     _, _, _, max_cover = _FRAMINGS[kind.framing]
     for _ in range(_TRIES):
         turn = random_shapes.rotation(rng)
@@ -89,11 +89,11 @@ def trace_view(tracer: Tracer, kind: ViewKind, size: tuple[int, int], rng: np.ra
     offset, azimuth = rng.uniform(*kind.flash_offset) * distance, rng.normal(np.pi / 2, 0.9)
     flash = np.array([offset * np.cos(azimuth), offset * np.sin(azimuth), 0.0])
     planes = _draw_planes(tracer.mesh.vertices @ turn.T + place, kind.backdrop, rng)
-    v = frames.rays(view, *size)
+    v = frames.rays(view, *size)  # unit, towards the lens: a surface at distance d is at −d·v
     behind, _, _ = meet_planes(planes, v.reshape(-1, 3))
     behind = np.where(np.isfinite(behind), behind, 1e3).reshape(size)
-    far = np.where(mask, buffer.depth / v[..., 2], behind)
-    start = _LIFT * buffer.normal - v * far[..., None] - place
+    far = np.where(mask, buffer.depth / v[..., 2], behind)  # distance of object or backdrop
+    start = _LIFT * buffer.normal - v * far[..., None] - place  # from the object's center
     lit = ~tracer.hidden(start.reshape(-1, 3) @ turn, (flash - place) @ turn).reshape(size)
     return MaskView(buffer, lit, turn, distance, flash, planes)
 

@@ -2,8 +2,8 @@
 
 A matt patch is unpolarized, so its light in two shots differs only by the gain. Gloss adds the same light to dark and
 bright patches. This light is polarized if the chart does not face flash and camera. So the ratio of two shots, plotted
-over 1/(light of the patch), is a line: its value at 0 is the gain, its slope the gloss of the chart. Patches that white
-balance excluded (hidden, in shade, glossy) are not used.
+over 1/(light of the patch), is a line whose slope is the gloss of the chart. The gain is the ratio of the sums over the
+light patches, where gloss counts least. Patches that white balance excluded (hidden, in shade, glossy) are not used.
 """
 
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ def measure(radiance: AngleStack, alignment: Alignment, color: ColorCalibration)
     sigma = np.hypot(photon, ratio.std(1) / np.sqrt(light.sum()))
     sigma[0] = 0
     gain, sigma = _one_for_all_channels(gain, sigma)
-    reflectance = np.log(_REFLECTANCE[light[:_LIGHT]])
+    reflectance = np.log(_REFLECTANCE[light[:_LIGHT]])  # for the slope of the tone curve
     enough = len(reflectance) > 2
     slope = float(np.polyfit(reflectance, np.log(mean[0, light].sum(-1)), 1)[0]) if enough else float("nan")
     return GreyPatches(gain, sigma, slope, _gloss(mean.sum(-1)[:, usable], variance.sum(-1)[:, usable]))
