@@ -97,7 +97,8 @@ def test_results_and_values_have_a_short_repr(tmp_path: Path, example: Path) -> 
 
 def test_check_export_and_reopen_take_strings(tiny: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(tiny / "C", tmp_path / "C"))  # its result is in polcap/
-    assert polcap.check(str(copy)).capture == "C"
+    found = polcap.check(str(copy))
+    assert found.capture == "C" and found.keep == all(line.state != "fail" for line in found.lines)
     files = polcap.export(str(copy), "godot", extras="cavity", texture_size=64, catalog={"title": "Vase"})
     assert {"C.glb", "C_orm.png", "C_cavity.png"} <= {file.name for file in files}
     assert pipeline.reopen(str(copy), ResultsUntilMask)[0].object_.mask.any()

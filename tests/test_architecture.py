@@ -168,6 +168,14 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
         assert (page.parent / target).exists(), target
 
 
+def test_constants_of_the_page_exist() -> None:
+    page = (ROOT / "docs" / "explanations" / "constants.md").read_text(encoding="utf-8")
+    for module, name in re.findall(r"`(\w+)\.(_?[A-Z]\w+)`", page):
+        files = [*ROOT.glob(f"polcap/**/{module}.py"), *ROOT.glob(f"polcap/**/{module}/__init__.py")]
+        found = any(re.search(rf"^(\w+, )*{name}\b", file.read_text("utf-8"), re.M) for file in files)
+        assert found or module == "module", f"{module}.{name}"  # `module._NAME` stands for all of them
+
+
 def test_benchmark_pages_are_short_enough_to_read() -> None:
     """Results of today; history is in the repository. A word has a letter or a digit, so marks of tables are none."""
     pages = {page.name: page.read_text(encoding="utf-8").split() for page in ROOT.glob("docs/benchmarks/*.md")}

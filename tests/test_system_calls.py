@@ -145,7 +145,7 @@ def start_watching(capture: Path, folder: Path, home: str, environment: dict[str
 Watching = dict[Path, subprocess.Popen[str]]
 
 
-@pytest.fixture(params=[("unset",)])
+@pytest.fixture(params=[("writable",)])
 def watching(
     request: pytest.FixtureRequest, tiny: Path, tmp_path: Path, environment: dict[str, str]
 ) -> Iterator[Watching]:

@@ -106,7 +106,7 @@ def claim(folder: Path, uses: Iterable[str]) -> None:
     record = folder / RECORD
     if record.is_symlink():
         raise StorageError(f"{record} is a link; remove it, or choose another --out")
-    if record.exists():
+    if record.exists() and record.stat().st_size:  # a killed run may leave an empty record
         raise StorageError(f"{record} is no record of polcap; move it away, or choose another --out")
     for name in uses:
         if os.path.lexists(folder / name):
@@ -116,8 +116,10 @@ def claim(folder: Path, uses: Iterable[str]) -> None:
             )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with suppress(FileExistsError), record.open("xb") as file:  # another process may be faster
-            file.write(_FIRST_LINE)
+        handle = os.open(record, os.O_CREAT | os.O_WRONLY | _NO_LINK, 0o666)
+        with os.fdopen(handle, "wb") as file:
+            if os.fstat(handle).st_size == 0:  # another process may be faster
+                file.write(_FIRST_LINE)
     except OSError as error:
         raise system_errors.cannot_write(record, error) from error
 

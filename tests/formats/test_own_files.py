@@ -43,6 +43,16 @@ def test_a_foreign_file_with_the_record_s_name_stays(tmp_path: Path) -> None:
     assert (tmp_path / own_files.RECORD).read_text() == "maps/mine.txt\n"
 
 
+def test_an_empty_record_of_a_killed_run_is_begun_again(tmp_path: Path) -> None:
+    (tmp_path / own_files.RECORD).touch()
+    own_files.claim(tmp_path, ("maps",))
+    assert own_files.is_claimed(tmp_path)
+    (foreign := tmp_path / "foreign" / "maps").mkdir(parents=True)
+    (foreign.parent / own_files.RECORD).touch()
+    with pytest.raises(StorageError, match="polcap did not write it"):
+        own_files.claim(foreign.parent, ("maps",))
+
+
 @pytest.mark.parametrize("name", ["maps", "maps/own.txt", own_files.RECORD])
 def test_links_inside_the_folder_are_refused(folder: Path, tmp_path: Path, name: str) -> None:
     elsewhere = tmp_path / "elsewhere"

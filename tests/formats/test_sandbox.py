@@ -179,7 +179,7 @@ def test_a_child_in_a_loop_ends_when_its_parent_was_killed(sandbox, loop):
         "import sys; sys.path.insert(0, sys.argv[1]); import misbehaving\n"
         "from polcap.formats.sandbox import Sandbox\n"
         "w = Sandbox(); print(w.call(misbehaving.ramp, 'a')[0]['pid'], flush=True)\n"
-        f"w.call(misbehaving.{loop}, 'b', limit_s=0.6)"
+        f"w.call(misbehaving.{loop}, 'b', limit_s=2)"
     )
     command, environment = (
         [sys.executable, "-c", code, os.path.dirname(sandbox.module.__file__)],

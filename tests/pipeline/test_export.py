@@ -284,9 +284,9 @@ def test_usd_without_its_package_is_one_line_with_the_remedy(
 
 
 def test_number_of_threads_changes_no_byte(polcap: Command, tmp_path: Path) -> None:
-    """Of the run in this process one thread; the network's own threads are tested in tests/stages/test_golden.py."""
+    """This process uses one thread, the other two; the network's own threads are tested in stages/test_golden.py."""
     capture, one, two = (tmp_path / name for name in ("C", "one", "two"))
-    shoot = shooting.Shoot(seed=1, width=320, height=240, samples=1, exposures=2)
+    shoot = shooting.Shoot(seed=1, width=512, height=384, samples=1, exposures=2)  # two blocks of rows
     shooting.write(capture, scenes.random_scene(1, "bumps"), shoot)
     assert polcap("process", capture, "--out", one, *TINY).returncode in (0, 3)
     assert shell("process", capture, "--out", two, *TINY, "--threads", 2).returncode in (0, 3)

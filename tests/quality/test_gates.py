@@ -77,7 +77,8 @@ def measured_once() -> Iterator[None]:
         results: dict[tuple[int, ...], tuple[Any, ...]] = {}  # with their inputs, so that these stay
 
         def call(radiance: AngleStack, *others: Any) -> Any:
-            parts = (radiance.value, radiance.variance, radiance.quality, radiance.angle, *others)
+            stack = radiance
+            parts = (stack.value, stack.variance, stack.quality, stack.angle, stack.offset_px, *others)
             key = tuple(map(id, parts))
             if key not in results:
                 results[key] = (*parts, measure(radiance, *others))

@@ -5,7 +5,7 @@ For one angle, with Y the signals of the frames and e their exposures relative t
 1. Each frame is binned and compared with the reference frame: motion, exposure ratio per channel, sensor noise, and
    pixels that disagree (`bracket`, with `exposure`, `noise` and `ghosts`).
 2. A first estimate X₀ = Σ Y/a / Σ e/a, with a the slope of the noise line, is smoothed where the picture is flat
-   (`ghosts.FirstEstimate`). It is the maximum-likelihood merge of Poisson counts, and unbiased because no weight
+   (`ghosts.first_estimate`). It is the maximum-likelihood merge of Poisson counts, and unbiased because no weight
    depends on a noisy pixel.
 3. X = Σ w (Y/e) / Σ w with weights w = e² / (a e X₀ + b) from the smoothed estimate, without clipped pixels
    (`weights`).
