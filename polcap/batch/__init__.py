@@ -136,7 +136,8 @@ def _run(
         print_line(f"no capture in {', '.join(empty)}: no folders pol000, pol045, …, and no photographs")
     for folder in sorted({Path(unit.capture).parent for unit in found}):
         if len(views := folder_names.views(folder)) > 1:
-            print_line(f"{folder}: {views[0]} to {views[-1]} are views of one object; `polcap fuse` joins them")
+            remedy = "`polcap fuse` joins them (a flat sample: `polcap material`)"
+            print_line(f"{folder}: {views[0]} to {views[-1]} are views of one object; {remedy}")
     by_name = {unit.name: unit for unit in wanted}
     start = time.monotonic()
     for done, record in enumerate(_process(wanted, request, plan, print_line) if wanted else (), 1):

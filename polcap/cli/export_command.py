@@ -1,5 +1,6 @@
 """`polcap export`: the asset of a result again, in other formats or for one program."""
 
+import math
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -100,6 +101,7 @@ def export(
             terminal.print_message(f"polcap: --extra {name} is left out: this kind of result has none", "WARNING")
     if texture_size is not None:
         _warn_of_upsampling(result, texture_size)
+        _warn_of_odd_size(texture_size, [one.preset for one in wanted])
     terminal.print_written(files, json)
 
 
@@ -128,6 +130,17 @@ def _warn_of_upsampling(result: Path, size: int) -> None:
         terminal.print_message(
             f"polcap: textures of {size} px are {size / map_px:.2g} times as wide as the maps ({map_px} px); "
             f"for more detail use --set {setting}, or photograph from nearer",
+            "WARNING",
+        )
+
+
+def _warn_of_odd_size(size: int, presets: Sequence[str | None]) -> None:
+    """Print a warning if an engine, which needs sides that are powers of two, gets textures of another size."""
+    power = 2 ** round(math.log2(size))
+    if size != power and (engines := [name for name in presets if name is not None and PRESETS[name].powers]):
+        terminal.print_message(
+            f"polcap: --texture-size {size} is no power of two, as {', '.join(engines)} compresses and mipmaps it; "
+            f"use {power}",
             "WARNING",
         )
 

@@ -45,6 +45,7 @@ def fuse(
     from polcap.fusion import fuse_run
     from polcap.fusion.fusion_path import SessionConfig
     from polcap.fusion.session_views import SessionInput
+    from polcap.pipeline import asset_export
 
     resource_limits.set_limits(threads, memory)
     if missing := [name for name in _NEEDED if find_spec(name) is None]:
@@ -53,5 +54,6 @@ def fuse(
     request = options.request(stated, chosen.of_views)
     session_input = SessionInput(folder, chosen, request, workers)
     about = fuse_run.fuse(session_input, target, terminal.print_progress, terminal.Steps().stage)
+    options.warn_of_outdated_exports(target, asset_export.sidecars(target))
     unchanged.remember(target, asked, files=request.files())
     terminal.print_result(about, target, json, open_)

@@ -55,6 +55,7 @@ def material(
     from polcap.fusion.session_views import SessionInput
     from polcap.material import material_run
     from polcap.material.material_path import MaterialConfig
+    from polcap.pipeline import asset_export
 
     resource_limits.set_limits(threads, memory)
     chosen = settings.fill(MaterialConfig, settings.read(config), assignments or [])
@@ -65,6 +66,7 @@ def material(
         session_input, target, _region(region), None if texel is None else texel / 1000, tile,
         terminal.print_progress, terminal.Steps().stage,
     )  # fmt: skip
+    options.warn_of_outdated_exports(target, asset_export.sidecars(target))
     unchanged.remember(target, asked, files=request.files())
     terminal.print_result(about, target, json, open_)
 
@@ -77,4 +79,6 @@ def _region(text: str | None) -> "Region | None":
     if len(found) != 4:
         raise SettingError(f"--region {text}: {len(found)} numbers, 4 are needed; write -40,-40,40,40")
     left, lower, right, upper = (one / 1000 for one in found)
+    if left >= right or lower >= upper:
+        raise SettingError(f"--region {text}: x0 < x1 and y0 < y1 are needed; write -40,-40,40,40")
     return left, lower, right, upper

@@ -39,7 +39,8 @@ def solid(mesh: ClosedMesh, floor: float | None = None) -> ClosedMesh:
     raw.merge()
     body = manifold3d.Manifold(raw)
     if body.status() != manifold3d.Error.NoError or body.is_empty():
-        raise ObjectError(f"the fused mesh is not closed ({body.status().name}); check poses and masks of the views")
+        remedy = "check poses and masks of the views; for a flat sample use `polcap material`"
+        raise ObjectError(f"the fused mesh is not closed ({body.status().name}); {remedy}")
     if floor is not None:
         body = body.trim_by_plane((0.0, 1.0, 0.0), floor)
     written = max(body.decompose(), key=lambda part: part.volume()).to_mesh64()

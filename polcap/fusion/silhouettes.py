@@ -42,10 +42,11 @@ class Silhouette:
         reach = max(round(0.9 * self.cell_px(step)), 1)  # half the diagonal of a cell, about
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         grown = cv2.dilate(np.pad(self.mask.astype(np.uint8), reach + 1), disc)
-        x, y = np.rint(self.camera.project(self.pose, points) + reach + 1).astype(int).T
+        x, y = np.rint(self.camera.project(self.pose, points) + reach + 1).T
         height, width = grown.shape
-        within = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-        return np.asarray(within & (grown[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] > 0))
+        within = (x >= 0) & (y >= 0) & (x < width) & (y < height)  # near the lens plane no integer is as large
+        row, column = (np.where(within, one, 0).astype(int) for one in (y, x))
+        return np.asarray(within & (grown[row, column] > 0))
 
     def coarse(self, points: Floats, step: float) -> tuple[Bools, Bools]:
         """Mask (h, w) reduced to pixels as wide as a cell, and those of these pixels that points (P, 3) cover."""

@@ -85,6 +85,8 @@ def _check_values(wanted: ExportRequest) -> None:
         for name in stated:
             if name is not None and name not in known:
                 hint = text_file.suggestion(str(name), map(str, known))
+                if "," in str(name) and option in ("--preset", "--extra"):
+                    hint = f"repeat the option: {' '.join(f'{option} {one.strip()}' for one in str(name).split(','))}"
                 raise SettingError(f"{option} {name}: there is no such {noun}; {hint}")
     for name, text in wanted.catalog.items():
         if not isinstance(text, str):

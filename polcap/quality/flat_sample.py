@@ -57,7 +57,7 @@ def agreement(residual: Mapping[str, float], limits: MaterialGateLimits) -> Gate
     message = f"Photographs and fitted material agree within {100 * value:.1f} % (median); the worst is {worst}"
     if value <= limit:
         return Gate("agreement", "pass", value, limit, message)
-    remedy = f"Look for shadows, reflections or blur in {worst}; delete it, and run again"
+    remedy = f"Look for shadows, reflections or blur in {worst}; move it out of the folder, and run again"
     return Gate("agreement", "fail", value, limit, message, remedy)
 
 

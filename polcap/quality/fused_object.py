@@ -29,7 +29,7 @@ def agreement(normal_deg: Mapping[str, float], limits: FusedGateLimits) -> Gate:
     value, bad = normal_deg[worst], ", ".join(name for name, angle in normal_deg.items() if angle > limit)
     if bad:
         message = f"The normals of {bad} contradict the mesh, by {value:.0f}° in the worst view"
-        remedy = f"Check the polarizer angles of {bad}, or delete them and fuse again"
+        remedy = f"Check the polarizer angles of {bad}, or move them out of the folder and fuse again"
         return Gate("agreement", "fail", value, limit, message, remedy, unit="°")
     message = f"Normals of all views are within {value:.0f}° of the mesh (median); the worst is {worst}"
     return Gate("agreement", "pass", value, limit, message, unit="°")

@@ -16,7 +16,8 @@ def views(used: Sequence[str], left_out: Mapping[str, str], least: int, few: str
     if left_out:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
         message = f"{len(left_out)} of {count + len(left_out)} views are left out: {reasons}{absent}"
-        return Gate("views", "warn", count, least, message, "Shoot these views again, or delete them", unit="")
+        again = "Shoot these views again, or move them out of the folder"
+        return Gate("views", "warn", count, least, message, again, unit="")
     if count < least:
         return Gate("views", "warn", count, least, f"{count} views are few: {few}{absent}", remedy, unit="")
     return Gate("views", "pass", count, least, f"All {count} views are used{absent}", unit="")

@@ -68,6 +68,14 @@ def test_masks_of_one_object_agree_and_stay_as_they_are(whole: list[Silhouette])
     assert all(overlap(found, right.mask) > 0.99 for right, found in zip(whole, compare_all(whole), strict=True))
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_point_near_the_plane_of_the_lens_is_not_in_the_picture(views: list[Silhouette]) -> None:
+    distorted = replace(views[0], camera=replace(CAMERA, k1=0.1, k2=0.1))
+    near_lens = distorted.pose.rotation.T @ (np.array([0.05, 0, -1e-7]) - distorted.pose.translation)
+    shown = distorted.shows(np.array([near_lens, [0.0, 0.0, 0.0]]), 0.002)
+    assert shown.tolist() == [False, True]
+
+
 def test_outlines_that_err_by_two_pixels_agree(views: list[Silhouette]) -> None:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     for k, one in enumerate(views):

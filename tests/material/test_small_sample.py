@@ -49,6 +49,13 @@ def test_a_run_again_computes_nothing_and_exports_work(sample: Path, polcap: Com
     assert polcap("show", sample / "material", "stokes").returncode == 2
 
 
+def test_a_new_material_names_the_exports_of_the_earlier_one(sample: Path, polcap: Command, tmp_path: Path) -> None:
+    folder = tmp_path / "sample"
+    shutil.copytree(sample, folder)
+    done = polcap("material", folder, "--set", "material.gloss.materials=3", "--tile")
+    assert done.returncode == 0 and "asset/unreal in " in done.stderr and "exported earlier" in done.stderr
+
+
 def test_a_view_without_the_board_is_left_out_and_named(
     sample: Path, example: Path, polcap: Command, tmp_path: Path
 ) -> None:
@@ -65,6 +72,7 @@ def test_a_view_without_the_board_is_left_out_and_named(
     [
         (("--region", "1,2,3"), "4 are needed"),
         (("--region", "0,0,500,500"), "must lie within"),
+        (("--region", "20,20,-20,-20"), "x0 < x1 and y0 < y1 are needed"),
         (("--texel", "50"), "change --texel or --region"),
         (("--no-chart", "--chart", "a"), "exclude"),
     ],

@@ -194,6 +194,8 @@ def test_a_wrong_name_makes_no_copy(tiny_result: Path, polcap: Command, tmp_path
     [
         (["--preset", "3ds"], f"--preset 3ds: there is no such preset; there are {', '.join(PRESETS)}"),
         (["--preset", "unrael"], "--preset unrael: there is no such preset; did you mean unreal?"),
+        (["--preset", "unity,godot"], "repeat the option: --preset unity --preset godot"),
+        (["--extra", "cavity, occlusion"], "repeat the option: --extra cavity --extra occlusion"),
         (["--extra", "oclusion"], "--extra oclusion: there is no such texture; did you mean occlusion?"),
         (["--about", "titel=Vase"], "--about titel: there is no such fact; did you mean title?"),
         (["--preset", "web", "--obj"], "write obj by a second export"),
@@ -314,6 +316,13 @@ def test_a_preset_for_an_engine_has_20_000_triangles_unless_stated(own: Path, po
     all_triangles = ("--triangles", 1_000_000, "--texture-size", 64)
     assert polcap("export", own, "--preset", "unity", *all_triangles).stderr == ""
     assert trimesh.load(own / "asset/unity/capture.glb", force="mesh").faces.shape[0] > 100_000
+
+
+def test_textures_of_an_engine_that_are_no_power_of_two_are_reported(tiny_result: Path, polcap: Command) -> None:
+    odd = polcap("export", tiny_result, "--preset", "unity", "--preset", "web", "--texture-size", 50)
+    assert "--texture-size 50 is no power of two, as unity compresses and mipmaps it; use 64" in odd.stderr
+    for arguments in (("--preset", "unity", "--texture-size", 64), ("--preset", "web", "--texture-size", 50)):
+        assert "power of two" not in polcap("export", tiny_result, *arguments).stderr
 
 
 def test_larger_textures_than_the_maps_hold_are_reported(tiny_result: Path, polcap: Command) -> None:

@@ -184,9 +184,9 @@ def degrees_with_unit(names: Iterable[str]) -> dict[str, float]:
 
 
 def suggested_names(names: Sequence[str]) -> list[tuple[str, str]]:
-    """New names such as pol045 for three or four folders: by a number that can be an angle, else by their order."""
+    """New names such as pol045 for three or four numbered folders: by a number that can be an angle, else in order."""
     listed = sorted(names, key=natural)
-    if not 3 <= len(listed) <= 4:
+    if not 3 <= len(listed) <= 4 or not all(map(_FOLDER_NUMBER.search, listed)):
         return []
     found = [[float(text.replace(",", ".")) for text in _FOLDER_NUMBER.findall(name)] for name in listed]
     columns = list(zip(*found)) if len({len(one) for one in found}) == 1 else []

@@ -72,7 +72,7 @@ def plan(folder: Path, stated: CaptureFile, angles_deg: _Order) -> Plan:
     if found := folder_names.views(folder):
         raise CaptureError(
             f"{folder}: its sub-folders {few_names(found)} are views of one object: join them with `polcap fuse`, or "
-            "give one of them"
+            "`polcap material` if it is a flat sample; or give one of them"
         )
     if folder_names.is_in_result(folder):
         raise CaptureError(
@@ -105,12 +105,12 @@ def _hint(folder: Path) -> str:
     if any(map(folder_names.angle_folder_names, inside)):
         return (
             f"its sub-folders {few_names(names)} hold captures: give one of them, or run `polcap batch` on the folder; "
-            "for views of one object, name them view01, view02, … and run `polcap fuse`"
+            "name views of one object view01, view02, … and run `polcap fuse` (a flat sample: `polcap material`)"
         )
     if inside:
         new = ", ".join(f"{old} to {name}" for old, name in folder_names.suggested_names(names))
-        rename = f": if these are the angles, rename {new}" if new else ""
-        return f"its sub-folders are {few_names(names)}, but polcap looks for pol000, pol045, …{rename}"
+        rename = f"if these are the angles, rename {new}" if new else "if each holds one angle, rename it to that angle"
+        return f"its sub-folders are {few_names(names)}, but polcap looks for pol000, pol045, …: {rename}"
     return "give the folder that holds the photographs"
 
 

@@ -305,7 +305,8 @@ def _check_angles(folder: Path, angles_deg: Sequence[float], who: str) -> None:
         remedy = "add the missing shot"
         if unread:
             remedy += f", or name {unread} as polcap reads it: pol000, pol045, …"
-        raise CaptureError(f"{folder}: {who} {listed}: {count} different polarizer angles where 3 are needed; {remedy}")
+        found = "1 polarizer angle" if count == 1 else f"{count} different polarizer angles"
+        raise CaptureError(f"{folder}: {who} {listed}: {found} where 3 are needed; {remedy}")
 
 
 def other_equipment(exif: Exif, first: Exif) -> str | None:

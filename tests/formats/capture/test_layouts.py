@@ -67,7 +67,7 @@ def test_file_names_with_a_unit_state_the_angles_of_brackets(tmp_path):
     ("listed", "advice"),
     [
         (("1-0", "2-45", "3-90"), "rename 1-0 to pol000, 2-45 to pol045, 3-90 to pol090"),
-        (("left", "middle", "right"), "rename left to pol000, middle to pol045, right to pol090"),
+        (("diagonal", "horizontal", "vertical"), "if each holds one angle, rename it to that angle$"),
         (("a1", "a2", "a3", "a4"), "a3 to pol090, a4 to pol135"),
         *((numbered, "") for numbered in (("1", "2", "3"), ("10", "20", "30"), ("0", "100", "200"))),
         (("vase 0", "cup 45", "90"), ""),
@@ -198,7 +198,10 @@ def test_views_of_one_object_are_for_fuse(tmp_path):
     folders(tmp_path / "view01")
     (tmp_path / "truth.npz").write_bytes(b"PK\x05\x06" + bytes(18))
     (tmp_path / "fused" / "maps").mkdir(parents=True)
-    with pytest.raises(CaptureError, match="sub-folders view01 are views of one object: join them with `polcap fuse`"):
+    with pytest.raises(
+        CaptureError,
+        match="sub-folders view01 are views of one object: join them with `polcap fuse`, or `polcap material`",
+    ):
         capture.read(tmp_path)
 
 
