@@ -78,7 +78,7 @@ class LobeProfile:
 
 
 def flash_place(samples: Sequence[LobeSamples]) -> Floats:
-    """Place (3,) of the flash beside the lens for which radiance scatters least in bins of the half-angle."""
+    """Place (3,) of the flash next to the lens for which radiance scatters least in bins of the half-angle."""
     every_second = [one.take(slice(None, None, 2)) for one in samples]
     if not every_second:
         return np.zeros(3)

@@ -181,11 +181,8 @@ def test_a_child_in_a_loop_ends_when_its_parent_was_killed(sandbox, loop):
         "w = Sandbox(); print(w.call(misbehaving.ramp, 'a')[0]['pid'], flush=True)\n"
         f"w.call(misbehaving.{loop}, 'b', limit_s=2)"
     )
-    command, environment = (
-        [sys.executable, "-c", code, os.path.dirname(sandbox.module.__file__)],
-        {**os.environ, "SHORT_GRACE": ""},
-    )
-    parent = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment)
+    command = [sys.executable, "-c", code, os.path.dirname(sandbox.module.__file__)]
+    parent = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, "SHORT_GRACE": ""})
     child = int(parent.stdout.readline())
     time.sleep(0.3)  # it is in the loop
     parent.kill()

@@ -76,12 +76,11 @@ def measured_once() -> Iterator[None]:
     def cached(measure: Callable[..., Any]) -> Callable[..., Any]:
         results: dict[tuple[int, ...], tuple[Any, ...]] = {}  # with their inputs, so that these stay
 
-        def call(radiance: AngleStack, *others: Any) -> Any:
-            stack = radiance
+        def call(stack: AngleStack, *others: Any) -> Any:
             parts = (stack.value, stack.variance, stack.quality, stack.angle, stack.offset_px, *others)
             key = tuple(map(id, parts))
             if key not in results:
-                results[key] = (*parts, measure(radiance, *others))
+                results[key] = (*parts, measure(stack, *others))
             return results[key][-1]
 
         return call

@@ -29,7 +29,7 @@ def is_known(color: ColorCalibration) -> bool:
 
 
 def surface_distance(mask: Bools, view: View) -> float:
-    """Distance of the visible surface over that of the object's middle and of the chart beside it; mask (H, W)."""
+    """Distance of the visible surface over that of the object's middle and of the chart next to it; mask (H, W)."""
     return 1 - _BULGE * _radius(mask, view)
 
 
