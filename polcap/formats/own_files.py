@@ -48,10 +48,12 @@ class OwnFiles:
         """Add files to the record. Raises OSError."""
         fresh = [name for name in map(self._name, files) if name not in self.names]
         if fresh:
-            handle = os.open(self.folder / RECORD, os.O_APPEND | os.O_CREAT | os.O_WRONLY | _NO_LINK, 0o666)
-            with os.fdopen(handle, "wb") as record:
+            handle = os.open(self.folder / RECORD, os.O_APPEND | os.O_CREAT | os.O_RDWR | _NO_LINK, 0o666)
+            with os.fdopen(handle, "r+b") as record:
                 if os.fstat(handle).st_size == 0:  # somebody removed the record
                     record.write(_FIRST_LINE)
+                elif record.seek(-1, os.SEEK_END) and record.read(1) != b"\n":  # a full disk cut the last line
+                    record.write(b"\n")
                 record.write("".join(f"{name}\n" for name in fresh).encode(errors="surrogateescape"))
             self.names.update(fresh)
 
@@ -88,6 +90,14 @@ def is_claimed(folder: Path) -> bool:
         return False
 
 
+def _is_cut(record: Path) -> bool:
+    """Whether a record ends within its first line, or before it, as after a kill or on a full disk."""
+    try:
+        return _FIRST_LINE.startswith(text_file.read_bytes(record, text_file.TEXT_BYTES))
+    except (OSError, ValueError):
+        return False
+
+
 def wrote(folder: Path, file: Path) -> bool:
     """Whether polcap wrote a file into a folder of its own."""
     inside = Path(os.path.abspath(file)).is_relative_to(os.path.abspath(folder))
@@ -106,7 +116,7 @@ def claim(folder: Path, uses: Iterable[str]) -> None:
     record = folder / RECORD
     if record.is_symlink():
         raise StorageError(f"{record} is a link; remove it, or choose another --out")
-    if record.exists() and record.stat().st_size:  # a killed run may leave an empty record
+    if record.exists() and not _is_cut(record):
         raise StorageError(f"{record} is no record of polcap; move it away, or choose another --out")
     for name in uses:
         if os.path.lexists(folder / name):
@@ -118,7 +128,7 @@ def claim(folder: Path, uses: Iterable[str]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         handle = os.open(record, os.O_CREAT | os.O_WRONLY | _NO_LINK, 0o666)
         with os.fdopen(handle, "wb") as file:
-            if os.fstat(handle).st_size == 0:  # another process may be faster
+            if os.fstat(handle).st_size < len(_FIRST_LINE):  # another process may be faster
                 file.write(_FIRST_LINE)
     except OSError as error:
         raise system_errors.cannot_write(record, error) from error

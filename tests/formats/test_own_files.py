@@ -43,14 +43,22 @@ def test_a_foreign_file_with_the_record_s_name_stays(tmp_path: Path) -> None:
     assert (tmp_path / own_files.RECORD).read_text() == "maps/mine.txt\n"
 
 
-def test_an_empty_record_of_a_killed_run_is_begun_again(tmp_path: Path) -> None:
-    (tmp_path / own_files.RECORD).touch()
+@pytest.mark.parametrize("text", ["", "# polcap wrote"])
+def test_a_record_that_a_kill_or_a_full_disk_cut_is_begun_again(tmp_path: Path, text: str) -> None:
+    (tmp_path / own_files.RECORD).write_text(text)
     own_files.claim(tmp_path, ("maps",))
     assert own_files.is_claimed(tmp_path)
     (foreign := tmp_path / "foreign" / "maps").mkdir(parents=True)
     (foreign.parent / own_files.RECORD).touch()
     with pytest.raises(StorageError, match="polcap did not write it"):
         own_files.claim(foreign.parent, ("maps",))
+
+
+def test_a_line_that_a_full_disk_cut_spoils_no_other(folder: Path) -> None:
+    with (folder / own_files.RECORD).open("a") as record:
+        record.write("maps/nor")
+    own_files.OwnFiles(folder).record([folder / "maps" / "own.txt"])
+    assert (folder / own_files.RECORD).read_text().splitlines()[1:] == ["maps/nor", "maps/own.txt"]
 
 
 @pytest.mark.parametrize("name", ["maps", "maps/own.txt", own_files.RECORD])
