@@ -37,7 +37,7 @@ def options_table(command_name: str) -> str:
     command = get_command(app).commands[command_name]  # type: ignore[attr-defined]
     context = command.make_context(command_name, [], resilient_parsing=True)
     rows = [record for one in command.params if (record := one.get_help_record(context))]
-    lines = ["| option | |", "| --- | --- |"]
+    lines = ["| option | meaning |", "| --- | --- |"]
     for option, meaning in rows:  # a | inside `…` would end the cell
         lines.append(f"| `{option.replace('|', '/')}` | {' '.join(meaning.split()).replace('|', '&#124;')} |")
     return "\n".join(lines)
@@ -48,8 +48,10 @@ def settings_page() -> str:
     without = [f"`{key}…`" if key.endswith(".") else f"`{key}`" for key in WITHOUT_EFFECT]
     lines = [
         "# Settings", "", _MADE, "",
-        "`--config FILE.toml` (sections as below) overrides the defaults; `--set stage.name=value` overrides both.",
+        "This page lists all settings. `--config FILE.toml` (sections as below) overrides the defaults;",
+        "`--set stage.name=value` overrides both.",
         "An unknown name or a value outside its range is an error that names it.",
+        "The unit [1] is a share, a ratio or another pure number; a merged px is 2×2 RAW px by default (X-Trans 3×3).",
         "In a file, `fusion.shape.grid` is `grid` below `[fusion.shape]`. Only `polcap material` takes `material.…`,",
         "only `polcap fuse` takes `fusion.…`;",
         f"it refuses {', '.join(without)}, which would not change a fused object.", "",
@@ -68,6 +70,7 @@ def api_page() -> str:
     """The page of public functions, with signature and docstring, and of public values, with their source."""
     lines = [
         "# From Python", "", _MADE, "",
+        "This page is for programs that call polcap.", "",
         "```python", "import polcap", "", 'result = polcap.process("CAPTURE")', "print(result.verdict)",
         "maps = polcap.read_maps(result.folder)", "print(maps.normal.shape, maps.depth.shape)", "```", "",
         "`examples/from_python.py` is a complete program. Names are imported at their first use. The package is typed.",

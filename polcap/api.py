@@ -291,7 +291,7 @@ def fuse(
     Raises
     ------
     SettingError
-        `folder` is none, or `config` is that of one view.
+        `folder` does not exist, or `config` is that of one view.
     PolcapError
         Its message is one line: the thing, its value, the limit and the remedy.
     """

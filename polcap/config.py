@@ -64,7 +64,10 @@ class Setting(NamedTuple):
 
 
 def load(file: Path | None = None, assignments: Sequence[str] = ()) -> Config:
-    """Settings of a run from a TOML file and assignments of the form stage.name=value; see `fill`."""
+    """Settings of a run from a TOML file and assignments such as "hdr.clip=0.95".
+
+    Raises SettingError: the file cannot be read, or a name or value is wrong.
+    """
     return fill(Config, read(file), assignments)
 
 

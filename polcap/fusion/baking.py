@@ -54,10 +54,13 @@ class BakingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     mesh_sigma_deg: Annotated[
         float,
-        Meta(ge=0, le=90, description="error of the mesh's normals; 0: twice their median angle to the views' [°]"),
+        Meta(
+            ge=0, le=90, description="error of the mesh normals; 0: twice their median angle to the views' normals [°]"
+        ),
     ] = 0.0
     smooth: Annotated[
-        float, Meta(gt=0, le=0.5, description="1σ of the Gaussian between coarse and fine detail [object's diameter]")
+        float,
+        Meta(gt=0, le=0.5, description="1σ of the Gaussian that separates coarse and fine detail [object's diameter]"),
     ] = 0.03
 
 

@@ -186,7 +186,7 @@ class MaterialGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     ] = 0.1
     max_blur_px: Annotated[
         Positive,
-        Meta(description="allowed blur of a view that the median one does not have, 1σ; usually 0.2 [merged px]"),
+        Meta(description="allowed blur of a view beyond that of the median view, 1σ; usually 0.2 [merged px]"),
     ] = 0.5
     max_residual: Annotated[
         Positive,

@@ -43,8 +43,8 @@ class MaskSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     silhouette: Annotated[
         Literal["board", "always", "never"],
         Meta(
-            description="add thin bright parts to the mask. It needs a dark backdrop; "
-            "board: where polcap fuse has erased the board"
+            description="when to add thin bright parts to the mask, which needs a dark backdrop; "
+            "board: only where polcap fuse has erased the board"
         ),
     ] = "board"
 
