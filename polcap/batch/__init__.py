@@ -111,7 +111,9 @@ def run(
     places = {"root": str(root.resolve()), "out": None if out is None else str(out.resolve())}
     names = [path.name for path in batch_folder.iterdir()] if batch_folder.is_dir() else []
     own_files.claim(batch_folder, names)
-    with own_files.opened(batch_folder):
+    with own_files.opened(batch_folder) as own:
+        for name in contact_sheet.EDITABLE:
+            own.check(batch_folder / name)
         atomic.write_json(batch_folder / "batch.json", places)  # for `reopen`
         return _run(root, candidates, found, request, plan, print_line)
 

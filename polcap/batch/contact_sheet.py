@@ -12,6 +12,7 @@ import msgspec
 from polcap.batch.unit import FINISHED, FOLDER, WORDS, Unit, UnitRecord
 from polcap.formats import addresses, atomic
 
+EDITABLE = ("summary.csv", "summary.html")  # a run that would replace somebody's edits ends before its first capture
 _COLUMNS = (
     "name", "title", "object_number", "creator", "rights", "state", "verdict", "expected_error_deg", "seconds",
     "attempts", "asset", "report", "says",

@@ -74,7 +74,7 @@ def path(final: str | Path, synced: bool = True) -> Iterator[Path]:
         if synced:
             sync(temporary)
         if own is not None:
-            own.record([final])
+            own.record({final: temporary})
         os.replace(temporary, final)
     except OSError as error:
         raise system_errors.cannot_write(final, error) from error
@@ -118,7 +118,7 @@ def folder_of_files(final: str | Path, index: str, synced: bool = True) -> Itera
                 own.check(final / name)
         final.mkdir(exist_ok=True)
         if own is not None:
-            own.record(final / name for name in names)
+            own.record({final / name: temporary / name for name in names})
             for old in (final / index, *own.below(final)):
                 if old.name == index or old.name not in names:
                     own.remove(old)

@@ -1,13 +1,16 @@
-"""Files that polcap wrote into a folder, such as a result: it replaces and removes only these.
+"""Files that polcap wrote into a folder, such as a result: it replaces and removes only these, while nobody edits them.
 
-`polcap-files.txt` in the folder lists them after its first line, one path per line, relative to the folder. A path is
-recorded before the file gets its name, so a killed run leaves no file without a record. Links inside the folder are
-never followed.
+`polcap-files.txt` in the folder lists them after its first line, relative to the folder: a line for each content that a
+file had, with its path, a tab and the content's digest; for stages and JSON files the path alone. A line is written
+before the file gets its name, so a killed run leaves no file without one. Links inside the folder are never followed.
 """
 
 import os
-from collections.abc import Iterable, Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
+from hashlib import blake2b, file_digest
 from pathlib import Path
 
 from polcap.errors import StorageError
@@ -24,18 +27,21 @@ class OwnFiles:
 
     def __init__(self, folder: Path) -> None:
         self.folder = Path(os.path.abspath(folder))
-        self.names: set[str] = set()
+        self._digests: dict[str, set[str]] = defaultdict(set)  # of the contents that a file had, by name
         self._read()
 
     def owns(self, file: Path) -> bool:
         """Whether polcap wrote this file; another process may have recorded it meanwhile."""
         name = self._name(file)
-        if name not in self.names:
+        if name not in self._digests:
             self._read()
-        return name in self.names
+        return name in self._digests
 
     def check(self, file: Path) -> None:
-        """Raise a StorageError if `file` exists and is not polcap's, or if it or a folder above it is a link."""
+        """Raise a StorageError if polcap must not replace `file`.
+
+        It exists and is not polcap's, somebody has edited it, or it or a folder above it is a link.
+        """
         place = self.folder
         for part in Path(self._name(file)).parts:
             place /= part
@@ -43,30 +49,53 @@ class OwnFiles:
                 raise StorageError(f"cannot write {file}: {place} is a link; remove it, or choose another --out")
         if place.is_dir() or (os.path.lexists(place) and not self.owns(file)):
             raise StorageError(f"cannot write {file}: polcap did not write the file that is there; move it away")
+        if self._is_edited(place):
+            raise StorageError(
+                f"cannot write {file}: it was edited after polcap wrote it; move it away, or choose another --out"
+            )
 
-    def record(self, files: Iterable[Path]) -> None:
-        """Add files to the record. Raises OSError."""
-        fresh = [name for name in map(self._name, files) if name not in self.names]
-        if fresh:
+    def record(self, files: Mapping[Path, Path]) -> None:
+        """Add files to the record, by their final names; the values are the complete files. Raises OSError."""
+        digests = {self._name(final): _digest(file) for final, file in files.items() if self._is_for_people(final)}
+        names = [name for name in map(self._name, files) if name not in self._digests and name not in digests]
+        lines = [f"{name}\t{digest}" for name, digest in digests.items() if digest not in self._digests.get(name, ())]
+        if lines := [*names, *lines]:
             handle = os.open(self.folder / RECORD, os.O_APPEND | os.O_CREAT | os.O_RDWR | _NO_LINK, 0o666)
             with os.fdopen(handle, "r+b") as record:
                 if os.fstat(handle).st_size == 0:  # somebody removed the record
                     record.write(_FIRST_LINE)
                 elif record.seek(-1, os.SEEK_END) and record.read(1) != b"\n":  # a full disk cut the last line
                     record.write(b"\n")
-                record.write("".join(f"{name}\n" for name in fresh).encode(errors="surrogateescape"))
-            self.names.update(fresh)
+                record.write("".join(f"{line}\n" for line in lines).encode(errors="surrogateescape"))
+            self._add(lines)
 
     def below(self, folder: Path) -> list[Path]:
         """The recorded files below a folder that exist and to which no link leads, by name."""
         self._read()
-        found = [self.folder / name for name in sorted(self.names) if name.startswith(f"{self._name(folder)}/")]
+        found = [self.folder / name for name in sorted(self._digests) if name.startswith(f"{self._name(folder)}/")]
         return [file for file in found if file.is_file() and not self._is_linked(file)]
 
     def remove(self, file: Path) -> None:
-        """Remove a file if polcap wrote it and no link leads to it. Raises OSError."""
-        if self.owns(file) and not self._is_linked(file):
+        """Remove a file if polcap wrote it, nobody has edited it and no link leads to it. Raises OSError."""
+        if self.owns(file) and not self._is_linked(file) and not self._is_edited(file):
             Path(os.path.abspath(file)).unlink(missing_ok=True)
+
+    def _is_edited(self, file: Path) -> bool:
+        """Whether a file has a content that polcap has not recorded, or cannot be read."""
+        name = self._name(file)
+        if not self._digests.get(name) or not file.is_file():
+            return False
+        try:
+            content = _digest(file)
+        except OSError:
+            return True
+        if content not in self._digests[name]:
+            self._read()  # another process may have written it
+        return content not in self._digests[name]
+
+    def _is_for_people(self, file: Path) -> bool:
+        """Whether somebody may edit a file: it is no stage's, and no JSON file, which `export` adds to."""
+        return file.suffix != ".json" and not self._name(file).startswith("work/")
 
     def _is_linked(self, file: Path) -> bool:
         parts = Path(self._name(file)).parts
@@ -78,7 +107,17 @@ class OwnFiles:
     def _read(self) -> None:
         with suppress(OSError, ValueError):  # there is none yet
             content = text_file.read_bytes(self.folder / RECORD, text_file.TEXT_BYTES)
-            self.names.update(content.decode(errors="surrogateescape").splitlines()[1:])
+            self._add(content.decode(errors="surrogateescape").splitlines()[1:])
+
+    def _add(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            name, _, digest = line.partition("\t")
+            self._digests[name].update([digest] * bool(digest))
+
+
+def _digest(file: Path) -> str:
+    with file.open("rb") as content:
+        return file_digest(content, partial(blake2b, digest_size=16)).hexdigest()
 
 
 def is_claimed(folder: Path) -> bool:

@@ -94,6 +94,7 @@ def opened(session_input: SessionInput[Any], out: Path, progress: Progress) -> I
     for view in folder_names.session_views(session_input.folder):
         result_place.check(out, session_input.folder / view)
     with result_folder.locked(out):
+        result_folder.check_edits(out)
         yield session, LazyCache(out, progress)
 
 

@@ -41,7 +41,7 @@ def locked(out: Path) -> Iterator[None]:
         own.check(work / "lock")
         try:
             work.mkdir(parents=True, exist_ok=True)
-            own.record([work / "lock"])
+            own.record({work / "lock": work / "lock"})
             folder_lock.acquire(lock)
         except Timeout as error:
             raise StorageError(
@@ -55,6 +55,17 @@ def locked(out: Path) -> Iterator[None]:
             yield
         finally:
             lock.release()
+
+
+def check_edits(out: Path) -> None:
+    """Refuse a run that would replace a map, a file of the asset, or a report that somebody has edited.
+
+    Raises StorageError: there is one.
+    """
+    own, replaced = own_files.OwnFiles(out), (out / "maps", out / "asset")
+    files = [file for folder in replaced for file in own.below(folder) if file.parent == Path(os.path.abspath(folder))]
+    for file in [*files, out / "report.html"]:
+        own.check(file)
 
 
 def _owner(file: Path) -> str:

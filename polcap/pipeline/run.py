@@ -60,6 +60,8 @@ def process(
     """
     cache = StageCache(out, progress, force)
     with opened(capture, supplied, config, cache) as facts:
+        if until in (None, ASSET):
+            result_folder.check_edits(out)
         try:
             results = path(capture, supplied, config, cache, kind_until(until or ASSET))
         except InputError as error:

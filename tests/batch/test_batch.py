@@ -138,6 +138,15 @@ def test_a_changed_setting_is_processed_again(captures: Path, finished: Path) ->
     assert Request().digest(*folders) != other.digest(*folders)
 
 
+def test_an_edited_table_ends_a_run_before_its_first_capture(captures: Path, finished: Path, polcap: Command) -> None:
+    table = finished / "polcap-batch" / "summary.csv"
+    before = table.read_bytes()
+    table.write_bytes(before + b"seen,by me\n")
+    done = polcap("batch", captures, "--out", finished, *OPTIONS)
+    assert done.returncode == 2 and "summary.csv: it was edited" in done.stderr and "shard" not in done.stderr
+    table.write_bytes(before)
+
+
 def test_status_lists_every_capture(finished: Path, polcap: Command) -> None:
     about = json.loads(polcap("status", finished, "--json").stdout)
     assert about["states"]["failed"] == 1 and about["finished"] == 2

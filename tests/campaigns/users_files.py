@@ -133,7 +133,8 @@ def sequence(template: Path, seed: int) -> list[str]:
         if random.random() < 0.4:
             shutil.rmtree(result)
         else:
-            names = [*(result / own_files.RECORD).read_text().splitlines()[1:], own_files.RECORD]
+            lines = (result / own_files.RECORD).read_text().splitlines()[1:]
+            names = [*(line.partition("\t")[0] for line in lines), own_files.RECORD]
             recorded = {f"C/polcap/{name}" for name in names}
         plant(root, random)
         before, done, faults = foreign(root, recorded), [], []

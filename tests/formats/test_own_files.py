@@ -1,6 +1,7 @@
 """polcap replaces and removes only files that it has recorded."""
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,11 @@ from polcap.formats import atomic, own_files
 def folder(tmp_path: Path) -> Path:
     own_files.claim(tmp_path / "result", ["maps"])
     return tmp_path / "result"
+
+
+def recorded(folder: Path) -> list[str]:
+    """Names in the record, one for each content of a file."""
+    return [line.partition("\t")[0] for line in (folder / own_files.RECORD).read_text().splitlines()[1:]]
 
 
 def test_a_folder_with_parts_of_a_result_but_no_record_is_refused(tmp_path: Path) -> None:
@@ -32,7 +38,44 @@ def test_only_recorded_files_are_replaced(folder: Path) -> None:
             atomic.write(folder / "foreign.txt", "lost")
     assert (folder / "foreign.txt").read_text() == "stays"
     assert (folder / "maps" / "own.txt").read_text() == "two"
-    assert (folder / own_files.RECORD).read_text().splitlines()[1:] == ["maps/own.txt"]
+    assert recorded(folder) == ["maps/own.txt"] * 2  # its two contents
+
+
+def test_an_edited_file_is_neither_replaced_nor_removed(folder: Path) -> None:
+    file = folder / "maps" / "own.png"
+    with own_files.opened(folder) as own:
+        for content in (b"one", b"two", b"one"):
+            atomic.write(file, content)
+        file.write_bytes(b"two")  # as a run leaves it that is killed between the record and the new name
+        atomic.write(file, b"three")
+        file.write_bytes(b"painted")
+        with pytest.raises(StorageError, match=r"own\.png: it was edited after polcap wrote it; move it away"):
+            atomic.write(file, b"lost")
+        with (
+            pytest.raises(StorageError, match="edited"),
+            atomic.folder_of_files(folder / "maps", "maps.json") as made,
+        ):
+            for name in ("maps.json", "own.png"):
+                (made / name).write_bytes(b"lost")
+        own.remove(file)
+    assert file.read_bytes() == b"painted"
+
+
+def test_a_copied_or_touched_folder_is_not_edited(folder: Path, tmp_path: Path) -> None:
+    with own_files.opened(folder):
+        atomic.write(folder / "own.png", b"one")
+    (folder / "own.png").touch()
+    with own_files.opened(copied := shutil.copytree(folder, tmp_path / "copy", copy_function=shutil.copy)):
+        atomic.write(copied / "own.png", b"two")
+    assert (copied / "own.png").read_bytes() == b"two"
+
+
+def test_files_that_another_process_wrote_meanwhile_are_not_edited(folder: Path) -> None:
+    with own_files.opened(folder):
+        atomic.write(folder / "own.png", b"one")
+        (folder / "own.png").write_bytes(b"of the other process")
+        own_files.OwnFiles(folder).record({folder / "own.png": folder / "own.png"})
+        atomic.write(folder / "own.png", b"two")
 
 
 def test_a_foreign_file_with_the_record_s_name_stays(tmp_path: Path) -> None:
@@ -57,8 +100,8 @@ def test_a_record_that_a_kill_or_a_full_disk_cut_is_begun_again(tmp_path: Path, 
 def test_a_line_that_a_full_disk_cut_spoils_no_other(folder: Path) -> None:
     with (folder / own_files.RECORD).open("a") as record:
         record.write("maps/nor")
-    own_files.OwnFiles(folder).record([folder / "maps" / "own.txt"])
-    assert (folder / own_files.RECORD).read_text().splitlines()[1:] == ["maps/nor", "maps/own.txt"]
+    own_files.OwnFiles(folder).record({folder / "maps" / "own.txt": folder / own_files.RECORD})
+    assert recorded(folder) == ["maps/nor", "maps/own.txt"]
 
 
 @pytest.mark.parametrize("name", ["maps", "maps/own.txt", own_files.RECORD])
@@ -84,7 +127,7 @@ def test_a_file_is_recorded_before_it_gets_its_name(folder: Path, monkeypatch: p
     monkeypatch.setattr(os, "replace", killed)
     with pytest.raises(KeyboardInterrupt), own_files.opened(folder):
         atomic.write(folder / "own.txt", "text")
-    assert (folder / own_files.RECORD).read_text().splitlines()[1:] == ["own.txt"]
+    assert recorded(folder) == ["own.txt"]
 
 
 def test_another_process_may_record_files_meanwhile(folder: Path) -> None:

@@ -95,6 +95,30 @@ def test_foreign_files_in_a_result_survive_every_command(capture: Path, polcap: 
     assert {name: (result / name).read_bytes() for name in places} == {name: name.encode() for name in places}
 
 
+@pytest.mark.parametrize("name", ["maps/diffuse.png", "maps/normal.exr", "asset/C.glb", "report.html"])
+def test_an_edited_file_of_a_result_stays_and_is_named_at_once(capture: Path, polcap: Command, name: str) -> None:
+    edited = capture / "polcap" / name
+    edited.write_bytes(content := edited.read_bytes() + b"retouched")
+    done = polcap("process", capture, *TINY, "--set", "asset.ior=1.4", "--force", "hdr")
+    assert done.returncode == 2 and f"{name}: it was edited" in done.stderr and "hdr" not in done.stderr
+    assert polcap("process", capture, *TINY, "--until", "mask", "--force", "hdr").returncode == 0  # replaces no map
+    for words in (("export", edited), ("report", capture), ("clean", capture)):
+        assert polcap(*words).returncode != 1
+    assert edited.read_bytes() == content
+    edited.rename(edited.with_name("mine"))
+    assert polcap("process", capture, *TINY).returncode in (0, 3) and edited.read_bytes() != content
+
+
+def test_an_edited_texture_of_a_preset_stays(capture: Path, polcap: Command) -> None:
+    assert polcap("export", capture, "--preset", "unreal").returncode == 0
+    texture = sorted((capture / "polcap" / "asset" / "unreal").glob("*.png"))[0]
+    texture.write_bytes(b"retouched")
+    done = polcap("export", capture, "--preset", "unreal")
+    assert done.returncode == 2 and f"{texture.name}: it was edited" in done.stderr
+    assert polcap("process", capture, *TINY, "--set", "asset.ior=1.4").returncode in (0, 3)  # replaces no preset's
+    assert texture.read_bytes() == b"retouched"
+
+
 @pytest.mark.parametrize("name", ["maps", "asset", "work", "work/01-hdr", "report.json", "asset/C.glb"])
 def test_links_in_a_result_are_not_written_through(capture: Path, polcap: Command, tmp_path: Path, name: str) -> None:
     link, target = capture / "polcap" / name, tmp_path / "elsewhere"
