@@ -95,7 +95,7 @@ class OwnFiles:
 
     def _is_for_people(self, file: Path) -> bool:
         """Whether somebody may edit a file: it is no stage's, and no JSON file, which `export` adds to."""
-        return file.suffix != ".json" and not self._name(file).startswith("work/")
+        return file.suffix not in (".json", ".jsonl") and not self._name(file).startswith("work/")
 
     def _is_linked(self, file: Path) -> bool:
         parts = Path(self._name(file)).parts
@@ -171,6 +171,14 @@ def claim(folder: Path, uses: Iterable[str]) -> None:
                 file.write(_FIRST_LINE)
     except OSError as error:
         raise system_errors.cannot_write(record, error) from error
+
+
+@contextmanager
+def claimed(folder: Path, uses: Iterable[str]) -> Iterator[None]:
+    """Context manager: as `claim`, then as `opened`."""
+    claim(folder, uses)
+    with opened(folder):
+        yield
 
 
 @contextmanager

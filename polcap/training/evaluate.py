@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from polcap.formats import atomic, onnx, text_file
+from polcap.formats import atomic, onnx, own_files, text_file
 from polcap.formats.maps import png
 from polcap.optics import frames
 from polcap.pipeline import models
@@ -32,6 +32,7 @@ from polcap.training.map_errors import MAPS, Judge, deciles
 from polcap.training.progress import Report, silent
 from polcap.training.scores import Score
 
+_FILES = ("evaluation.json", "evaluation.md", "panel.png", "pictures.jsonl")
 _PANEL = 8  # pictures in panel.png
 _SAMPLE = 500  # pixels of a picture for the check of the expected error
 _MIN_SHARE = 3  # pictures per process
@@ -56,10 +57,18 @@ class EvaluationOptions:
 
 
 def main(options: EvaluationOptions, report: Report = silent) -> dict[str, Score]:
-    """Evaluate model and baselines; returns mean scores, writes evaluation.json, evaluation.md and panel.png."""
+    """Evaluate model and baselines; returns mean scores, writes evaluation.json, evaluation.md and panel.png.
+
+    Raises StorageError: options.out holds files of these names that polcap did not write.
+    """
     torch.set_num_threads(1)
     network = models.open_network(options.model)
     protocol = Protocol(options.data, options.size, options.protocol)
+    with own_files.claimed(options.out, _FILES):
+        return _evaluate(options, network, protocol, report)
+
+
+def _evaluate(options: EvaluationOptions, network: Network, protocol: Protocol, report: Report) -> dict[str, Score]:
     head = _head(options, network, protocol.subjects)
     rows = _evaluate_pictures(options, evaluation_baselines.mean_maps(protocol, options.count), head, report)
     result = _summary(head, rows)

@@ -18,7 +18,7 @@ import numpy as np
 from polcap.chart_values import ChartRequest
 from polcap.config import Config
 from polcap.errors import InputError
-from polcap.formats import atomic
+from polcap.formats import atomic, own_files
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import png
 from polcap.image_values import Floats
@@ -38,10 +38,12 @@ _MIN_DOLP, _MIN_TILT = 0.03, 0.3  # for the comparison of AoLP and azimuth; tilt
 def main(folder: Path, model: Path, out: Path, report: Report = silent) -> dict[str, Score]:
     """Evaluate every photograph set with and without the network; writes real.json and real.md to `out`.
 
-    Raises InputError: the folder does not have this layout.
+    Raises InputError: the folder does not have this layout. StorageError: `out` has such a file that polcap did not
+    write.
     """
     names, angles = _list_pictures(folder)
     network = models.open_network(model)
+    own_files.claim(out, ("real.json", "real.md"))
     rows = {}
     for k, name in enumerate(names, 1):
         rows[name] = {"ours": score(folder, angles, name, network), "analytic": score(folder, angles, name, None)}
@@ -52,8 +54,9 @@ def main(folder: Path, model: Path, out: Path, report: Report = silent) -> dict[
         for column in ("ours", "analytic")
     }
     result = {"folder": str(folder), "model": network.digest, "table": table, "pictures": rows}
-    atomic.write_json(out / "real.json", result)
-    atomic.write(out / "real.md", _page(folder, rows, table))
+    with own_files.opened(out):
+        atomic.write_json(out / "real.json", result)
+        atomic.write(out / "real.md", _page(folder, rows, table))
     return table
 
 

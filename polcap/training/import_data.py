@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from polcap.errors import DecodeError, InputError, PolcapError, StorageError
-from polcap.formats import atomic, scene_files
+from polcap.formats import atomic, own_files, scene_files
 from polcap.formats.capture import folder_names, foreign_files
 from polcap.training.progress import Report, silent
 
@@ -37,7 +37,7 @@ _SIDE = 1024  # px, largest side of a texture; training uses 256
 def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
     """Convert all meshes and texture folders below `source`; returns their numbers. Unusable ones are reported.
 
-    Raises InputError: nothing usable was found.
+    Raises InputError: nothing usable was found. StorageError: a file in the place of one is not of this program.
     """
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; give the one that holds your meshes and textures")
@@ -46,14 +46,15 @@ def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
     textures = _texture_folders(files, report)
     counts = [0, 0]
     jobs = (meshes, write_mesh, "meshes", ".npz"), (textures, write_textures, "materials", "")
-    for kind, (found, convert, place, suffix) in enumerate(jobs):
-        for number, path in enumerate(found):
-            try:
-                for split in _splits(number, len(found)):
-                    convert(path, data / place / split / f"{_name(path.relative_to(source))}{suffix}")
-                counts[kind] += 1
-            except DecodeError as error:
-                report(f"left out: {error}")
+    with own_files.claimed(data, ()):
+        for kind, (found, convert, place, suffix) in enumerate(jobs):
+            for number, path in enumerate(found):
+                try:
+                    for split in _splits(number, len(found)):
+                        convert(path, data / place / split / f"{_name(path.relative_to(source))}{suffix}")
+                    counts[kind] += 1
+                except DecodeError as error:
+                    report(f"left out: {error}")
     if not any(counts):
         kinds = ", ".join(sorted(_MESHES))
         raise InputError(f"{source}: holds no mesh ({kinds}) and no folder with pictures of albedo and roughness")
@@ -112,14 +113,14 @@ def write_textures(folder: Path, target: Path) -> None:
 
     Normal maps are turned to green down (DirectX) unless their name states it. Raises DecodeError.
     """
-    target.mkdir(parents=True, exist_ok=True)
     for role, path in _pictures(folder).items():
         picture = _read(path)
         if role == "normal" and not _GREEN_DOWN.search(path.stem):
             picture = picture.copy()
             picture[..., 1] = 255 - picture[..., 1]
-        if not cv2.imwrite(str(target / f"{role}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 95]):
-            raise StorageError(f"{target / role}.jpg cannot be written; check the disk")
+        with atomic.path(target / f"{role}.jpg") as temporary:
+            if not cv2.imwrite(str(temporary), picture, [cv2.IMWRITE_JPEG_QUALITY, 95]):
+                raise StorageError(f"{target / role}.jpg cannot be written; check the disk")
 
 
 def _pictures(folder: Path) -> dict[str, Path]:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from polcap.errors import InputError
+from polcap.formats import own_files
 from polcap.formats.maps import png
 from polcap.training import loop, loss, main_network, materials, onnx_export, traced_views
 from polcap.training.progress import Report, silent
@@ -22,6 +23,7 @@ from polcap.training.simulator import Batch, Simulator
 from polcap.training.validation import HeldOutPictures
 from polcap.training.variants import VARIANTS
 
+_FILES = ("last.pt", "model.onnx", "metrics.csv", "watch.csv", "watch.png", "views", "watch")
 _AHEAD = 4  # batches that wait for the network
 
 
@@ -79,12 +81,16 @@ def main(options: TrainingOptions, report: Report = silent) -> Path:
     """Train and return the path of model.onnx; its folder also gets last.pt, metrics.csv, watch.csv and watch.png.
 
     Raises InputError: an option is unknown, or contradicts another one or the content of `out`; or there are no test
-    meshes.
+    meshes. StorageError: it is a new run, and `out` holds such a file that polcap did not write.
     """
     _check(options)
+    with own_files.opened(options.out) if options.resume else own_files.claimed(options.out, _FILES):
+        return _train(options, report)
+
+
+def _train(options: TrainingOptions, report: Report) -> Path:
     preset = PRESETS[options.preset]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    options.out.mkdir(parents=True, exist_ok=True)
     learners = options.threads if device.type == "cpu" else 1
     torch.manual_seed(options.seed)
     network = NetworkTraining(preset.shape, device, options.rate, learners, options.variant)

@@ -9,7 +9,7 @@ import torch
 from typer.testing import CliRunner
 
 from polcap.cli import app
-from polcap.errors import InputError
+from polcap.errors import InputError, StorageError
 from polcap.training import evaluate, evaluation_page, train
 from tests.training.test_main_network import TINY
 
@@ -64,6 +64,15 @@ def test_a_stopped_run_continues(test_data: Path, tmp_path: Path, monkeypatch: p
 def test_published_figures_have_rows() -> None:
     for table in (evaluation_page.PUBLISHED, evaluation_page.PUBLISHED_ABLATIONS):
         assert all(figures.keys() <= evaluation_page.ROWS.keys() for figures in table.values())
+
+
+@shipped
+@pytest.mark.parametrize("name", ["evaluation.md", "pictures.jsonl"])
+def test_a_file_of_others_in_the_place_of_a_result_stays(test_data: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"mine")
+    with pytest.raises(StorageError, match=f"holds {name}.*choose another --out"):
+        evaluate.main(evaluate.EvaluationOptions(MODEL, test_data, tmp_path, count=1, size=64))
+    assert (tmp_path / name).read_bytes() == b"mine"
 
 
 @shipped

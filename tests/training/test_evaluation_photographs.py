@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polcap.errors import InputError
+from polcap.errors import InputError, StorageError
 from polcap.formats import onnx
 from polcap.formats.maps import png
 from polcap.image_values import Floats
@@ -47,6 +47,10 @@ def test_normals_of_a_ball_are_evaluated(folder: Path, tmp_path: Path, monkeypat
     monkeypatch.setattr(models, "open_network", lambda path: network())
     monkeypatch.setattr(onnx, "run", fake_network.run)
     lines: list[str] = []
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "real.md").write_text("mine")
+    with pytest.raises(StorageError, match=r"holds real\.md"):
+        evaluation_photographs.main(folder, Path("model.onnx"), tmp_path / "mine")
     table = evaluation_photographs.main(folder, Path("model.onnx"), tmp_path, lines.append)
     # the lens is not stated, 50 mm is assumed: so view rays at the ball's side are wrong by 13°
     assert table["analytic"]["mean"] < 9 and table["analytic"]["covered"] > 0.97

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from polcap.errors import InputError
+from polcap.errors import InputError, StorageError
 from polcap.formats import scene_files
 from polcap.training import import_data, traced_views
 from tests.training.conftest import write_textures
@@ -49,6 +49,11 @@ def test_a_folder_becomes_the_layout_of_training(tmp_path: Path) -> None:
     assert "only texture folder is for training and for tests" in single
     meshes = traced_views.training_meshes(tmp_path / "data")
     tests = sorted((tmp_path / "data" / "meshes" / "test").glob("*.npz"))
+    assert import_data.main(tmp_path / "in", tmp_path / "data") == (12, 1)  # its own files are replaced
+    meshes[0].write_bytes(b"of others")
+    with pytest.raises(StorageError, match="move it away"):
+        import_data.main(tmp_path / "in", tmp_path / "data")
+    assert meshes[0].read_bytes() == b"of others"
     assert len(meshes) == 10 and len(tests) == 2 and "a_set_mesh_01" in {mesh.stem for mesh in meshes}
     for split in ("train", "test"):  # a single one is for both
         assert scene_files.read_textures(tmp_path / "data" / "materials" / split / "bricks").shape == (6, 256, 256)

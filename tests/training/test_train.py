@@ -7,7 +7,7 @@ import cv2
 import pytest
 import torch
 
-from polcap.errors import InputError
+from polcap.errors import InputError, StorageError
 from polcap.training import loop, main_network, muon, onnx_export, train
 from polcap.training.simulator import Simulator
 from tests.conftest import ROOT
@@ -135,15 +135,21 @@ def test_a_run_is_not_overwritten_and_resumes_only_with_its_own_preset_and_varia
             train.NetworkTraining(shape, CPU, 1e-3, variant=variant).load(tmp_path / "last.pt")
 
 
+@pytest.mark.parametrize("name", ["model.onnx", "metrics.csv", "views"])
+def test_a_run_into_a_folder_with_such_a_file_of_others_is_refused(data: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"mine")
+    with pytest.raises(StorageError, match=f"holds {name}.*choose another --out"):
+        train.main(train.TrainingOptions(data=data, out=tmp_path))
+    assert (tmp_path / name).read_bytes() == b"mine"
+
+
 def test_same_seed_same_weights(data: Path, tmp_path: Path) -> None:
     weights: list[dict[str, torch.Tensor]] = []
     for name, seed in (("first", 1), ("again", 1), ("other", 2)):
         out = tmp_path / name
-        out.mkdir()
-        if weights:  # the traced views of the first run
-            for cache in ("views", "watch"):
-                (out / cache).symlink_to(tmp_path / "first" / cache)
-        train.main(train.TrainingOptions(data=data, out=out, samples=40, threads=1, seed=seed))
+        train.main(
+            train.TrainingOptions(data=data, out=out, samples=40, threads=1, seed=seed, traced=tmp_path / "views")
+        )
         weights.append(train.load_average(out / "last.pt")[0].state_dict())
     same, other = ([bool(torch.equal(w, weights[0][k])) for k, w in state.items()] for state in weights[1:])
     assert all(same) and not any(other)
