@@ -12,7 +12,7 @@ import numpy as np
 
 from polcap.errors import ObjectError
 from polcap.image_values import Bools, Floats, View
-from polcap.optics import frames, robust
+from polcap.optics import frames, outline, robust
 
 LEAST_RADIUS_PX = 24.0  # of a ball on the maps; an error of half a pixel of its outline is one degree at 45°
 _TRIALS = 300  # triples of outline points; some have no point of a stand, unless it covers half of the outline
@@ -88,7 +88,7 @@ def fit(mask: Bools, view: View, at_border: bool) -> BallOutline:
     if at_border:
         raise ObjectError("the ball is cut by the picture's edge; show all of it, with backdrop on every side")
     point = _crossings(mask)
-    radius_px = np.sqrt(mask.sum() / np.pi)
+    radius_px = outline.disc_radius(mask)
     if radius_px < LEAST_RADIUS_PX:
         raise ObjectError(
             f"the ball has a radius of {radius_px:.0f} px on the maps, less than {LEAST_RADIUS_PX:g} px; "

@@ -52,7 +52,7 @@ def _points(photographs: list[Photograph]) -> Iterator[tuple[Floats, Floats, Flo
             usable = sensor.usable(one, CLIP) & sensor.usable(two, CLIP)
             ratio = 1.0
             lit = a[usable].mean() > 0.01 if usable.any() else False
-            if lit:  # the lamp flickers; dark frames have nothing to compare
+            if lit:  # the lamp flickers; frames under 1 % of white are dark and have nothing to compare
                 ratio = float(b[usable].mean() / a[usable].mean())
             yield (*_tiles(a, b, usable, ratio), photosites(one, a.shape[-1]))
 

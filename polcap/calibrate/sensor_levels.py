@@ -43,6 +43,6 @@ def measure(dark: list[Photograph], bright: list[Photograph]) -> Levels:
 
 
 def _clips(image: SensorImage) -> bool:
-    """Whether a photograph is saturated: more than 0.1 % of its counts are equal to the greatest, which is high."""
+    """Whether a photograph is saturated: more than 0.1 % of its counts are the greatest, over 60 % of white."""
     greatest = image.value.max()
     return bool(np.mean(image.value == greatest) > 1e-3 and greatest > 0.6 * image.white)

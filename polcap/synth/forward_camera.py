@@ -100,6 +100,7 @@ def expose(radiance: Floats, sensor: Sensor, amplification: float, random: np.ra
 def write_dng(
     path: Path, counts: NDArray[np.uint16], sensor: Sensor, cfa: Bits, color_matrix: Sequence[float], exif: Exif
 ) -> None:
+    """Write counts (H, W) as a DNG with the levels, filters and colors of the simulated camera."""
     matrix, neutral = np.reshape(color_matrix, (3, 3)), rec709_to_camera(color_matrix).sum(axis=1)
     dng_writer.write(
         path, counts, cfa=cfa, black=sensor.black, white=sensor.white, exif=exif, color_matrix=matrix,

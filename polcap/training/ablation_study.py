@@ -41,10 +41,8 @@ def main(
             lambda text, name=name, number=number: report(f"{number}/{len(VARIANTS)} {name}: {text}"),  # type: ignore[misc]
         )
     trained = time.monotonic()
-    judged = evaluate.EvaluationOptions(
-        options.out / "ours" / "model.onnx", options.data, options.out, options.out, count, size
-    )
-    evaluate.main(judged, report)
+    model = options.out / "ours" / "model.onnx"
+    evaluate.main(evaluate.EvaluationOptions(model, options.data, options.out, options.out, count, size), report)
     spent = f"training {(trained - began) / 60:.0f} min, evaluation {(time.monotonic() - trained) / 60:.0f} min"
     report(f"{spent}; {options.out / 'evaluation.md'}")
     return options.out / "evaluation.md"
@@ -54,8 +52,8 @@ def _cost(options: TrainingOptions, count: int, size: int) -> str:
     """A sentence on the computing time of an ablation study."""
     networks = len(VARIANTS)
     each = f"{options.minutes:g} min" if options.samples is None else f"{options.samples} pictures"
-    whole = f", {networks * options.minutes / 60:.1f} h in all" if options.samples is None else ""
+    total = f", {networks * options.minutes / 60:.1f} h in all" if options.samples is None else ""
     return (
-        f"{networks} networks of {each} each{whole}; further time goes to tracing the views, and to evaluating on "
+        f"{networks} networks of {each} each{total}; further time goes to tracing the views, and to evaluating on "
         f"{count} pictures of {size}² px"
     )

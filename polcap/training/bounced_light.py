@@ -33,8 +33,7 @@ NOWHERE = 65535  # the ray meets a place that the camera does not see
 ESCAPED = 65534  # the ray leaves the object
 _MIN_ROUGHNESS = 0.2  # smoother surfaces mirror bounced light as if they had this roughness
 _SAME_PLACE = 2  # px of the cache: hits nearer than this are the place itself
-_MAX_DISTANCE = 0.01  # sides of the object between a hit and the place that its pixel shows
-
+_MAX_DISTANCE = 0.01  # from a hit to the place that its pixel shows, in longest sides of the object
 _LOG_ALBEDO = (log(0.01), log(0.5))  # of backdrop and ground: dark cloth to paper
 
 
@@ -96,10 +95,7 @@ def _draw_directions(normal: Floats, rng: np.random.Generator) -> Floats:
     directions = []
     for number, alpha in ((_COSINE_RAYS, None), *_LOBES):
         for k in range(number):
-            u = (k + shift) / number
-            cosine = np.sqrt(1 - u if alpha is None else (1 - u) / (1 + (alpha**2 - 1) * u))
-            azimuth = 2 * pi * (k * 0.618034 + turn)
-            axis = light_transport.directions_about(normal, cosine, azimuth)
+            axis, _ = light_transport.draw_directions(normal, k, number, shift, turn, alpha)
             directions.append(axis if alpha is None else 2 * axis[:, 2:] * axis - [0, 0, 1])
     return np.stack(directions, axis=1)
 
@@ -164,20 +160,20 @@ def mirrored_surroundings(
     albedo = torch.exp(u(*_LOG_ALBEDO)) * torch.exp(0.1 * torch.randn(count, 3, device=device)) * (u(0, 1) > 1 / 3)
     turn = u(0, 2 * pi)
     down = torch.cat([torch.cos(turn), torch.sin(turn), 0 * turn], dim=1)  # the ground's normal is −down
-    low = (pixels.place * down[own]).sum(dim=1)  # the object lies on the ground
-    lowest = torch.full((count,), -9.0, device=device).scatter_reduce(0, own, low, "amax")
-    ground = lowest + 9 * (u(0, 1)[:, 0] > 0.6)  # depth below the lens; 9 more is as good as none
+    below = (pixels.place * down[own]).sum(dim=1)  # depth of each pixel below the lens
+    lowest = torch.full((count,), -9.0, device=device).scatter_reduce(0, own, below, "amax")
+    ground = lowest + 9 * (u(0, 1)[:, 0] > 0.6)  # its depth: the object lies on it; without a ground 9 more
     behind = 1.35 + 1.5 * u(0, 1)[:, 0] ** 2  # distance of the backdrop from the lens
 
-    half = frames.from_ray_frame(normal, pixels.v)
-    direction = 2 * normal[:, 2:] * half - pixels.v
-    to_ground = (ground[own] - low) / (direction * down[own]).sum(dim=1).clamp(min=1e-4)
+    camera_normal = frames.from_ray_frame(normal, pixels.v)
+    direction = 2 * normal[:, 2:] * camera_normal - pixels.v
+    to_ground = (ground[own] - below) / (direction * down[own]).sum(dim=1).clamp(min=1e-4)
     to_backdrop = (behind[own] + pixels.place[:, 2]) / (-direction[:, 2]).clamp(min=1e-4)
     place = pixels.place + torch.minimum(to_ground, to_backdrop)[:, None] * direction
     facing = torch.where((to_ground < to_backdrop)[:, None], -down[own], down.new_tensor([0.0, 0.0, 1.0]))
     to_flash = flash[own] - place
-    far = to_flash.norm(dim=1)
-    received = strength[own] * pixels.open * (to_flash * facing).sum(dim=1).clamp(min=0) / far**3
+    distance = to_flash.norm(dim=1)
+    received = strength[own] * pixels.open * (to_flash * facing).sum(dim=1).clamp(min=0) / distance**3
     light = albedo[own] * received[:, None]
 
     rough = surface.roughness.clamp(min=_MIN_ROUGHNESS)

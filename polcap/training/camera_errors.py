@@ -1,8 +1,8 @@
 """Camera noise and errors in training: true Stokes parameters -> those of three imperfect photographs.
 
-Drawn per object: shot and read noise of a merged bracket, residual errors of flash energy and polarizer angle,
-misregistration, blur, stray light, depolarization, saturation. And the noise of a sensor: fewer electrons of red and
-blue light, a black level that is not quite zero, rows with an offset.
+Drawn per object: shot and read noise of a merged bracket, with fewer electrons of red and blue light; residual errors
+of flash energy, polarizer angle, black level and sensor rows; misregistration, blur, stray light, depolarization,
+saturation.
 """
 
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ class CameraErrors:
     blur: Tensor  # px, 1σ
     depolarization: Tensor  # factor on S1, S2
     ambient: Tensor  # S0 of a white surface in the stray light
-    noise_belief: Tensor  # stated variance over true variance
+    variance_ratio: Tensor  # stated over true variance
 
     @staticmethod
     def draw(count: int, device: torch.device) -> "CameraErrors":
@@ -44,7 +44,7 @@ class CameraErrors:
             return (u(0, 1) < share).float()
 
         gain = u(0, 0.005) * torch.randn(3, count, device=device)
-        turn = torch.randn(3, count, device=device) * 0.5 + torch.randn(count, device=device) * 0.3
+        turn_deg = torch.randn(3, count, device=device) * 0.5 + torch.randn(count, device=device) * 0.3
         moved = u(0, 0.1) * sometimes(0.7) * torch.randn(2, 3, count, device=device)
         moved[:, 0] = 0.0
         return CameraErrors(
@@ -54,22 +54,22 @@ class CameraErrors:
             black=u(0, 3e-4) * sometimes(0.5) * torch.randn(3, 3, count, device=device),
             rows=u(0, 3e-4) * sometimes(0.3),
             gain=1 + gain,
-            angle=turn * pi / 180,
+            angle=turn_deg * pi / 180,
             shift=moved.permute(1, 2, 0),
             blur=u(0, 0.5),
             depolarization=1 - u(0, 0.15) * sometimes(0.3),
             ambient=u(0, 0.03) * sometimes(0.5),
-            noise_belief=torch.exp(0.3 * torch.randn(count, device=device)),
+            variance_ratio=torch.exp(0.3 * torch.randn(count, device=device)),
         )
 
     @staticmethod
     def none(count: int, device: torch.device) -> "CameraErrors":
-        """Parameters of a camera without errors, except for a trace of shot noise."""
+        """A camera without errors, except for a trace of shot noise."""
         zero, one = torch.zeros(count, device=device), torch.ones(count, device=device)
         return CameraErrors(
             full_well=1e9 * one.expand(3, -1), bracket=1e3 * one, read_noise=zero, black=zero.expand(3, 3, -1),
             rows=zero, gain=one.expand(3, -1), angle=zero.expand(3, -1), shift=torch.zeros(3, count, 2, device=device),
-            blur=zero, depolarization=one, ambient=zero, noise_belief=one,
+            blur=zero, depolarization=one, ambient=zero, variance_ratio=one,
         )  # fmt: skip
 
     @staticmethod
@@ -95,12 +95,12 @@ def photograph(
     (M,), all at the pixels `at`. The measurement uses nominal angles in the image, as `stages/stokes` does.
     """
     count, height, width = mask.shape
-    wide = (count, 1, 1, 1)
+    per_object = (count, 1, 1, 1)
     owner = at // (height * width)
     inside = mask[..., None].to(stokes.dtype)
-    background = torch.rand(count, 1, 1, 3, device=stokes.device) * torch.rand(wide, device=stokes.device) * 0.3
-    s0 = stokes[0] + diffuse * errors.ambient.view(wide) + (1 - inside) * background
-    s1, s2 = (stokes[k] * errors.depolarization.view(wide) for k in (1, 2))
+    background = torch.rand(count, 1, 1, 3, device=stokes.device) * torch.rand(per_object, device=stokes.device) * 0.3
+    s0 = stokes[0] + diffuse * errors.ambient.view(per_object) + (1 - inside) * background
+    s1, s2 = (stokes[k] * errors.depolarization.view(per_object) for k in (1, 2))
 
     shots, variance, clipped = [], [], torch.zeros_like(at, dtype=torch.bool)
     brightest = errors.bracket[owner, None]  # radiance at which the shortest exposure saturates
@@ -113,14 +113,14 @@ def photograph(
             light = light + errors.rows[owner, None] * torch.randn(count * height, 1, device=at.device)[at // width]
         clipped = clipped | (light > brightest).any(dim=-1)
         light = torch.minimum(light, brightest)
-        noise = _merged_variance(light.clamp(min=0), errors, owner)
-        shots.append(light + noise.sqrt() * torch.randn_like(light))
-        variance.append(noise * errors.noise_belief[owner, None])
+        true_variance = _merged_variance(light.clamp(min=0), errors, owner)
+        shots.append(light + true_variance.sqrt() * torch.randn_like(light))
+        variance.append(true_variance * errors.variance_ratio[owner, None])
     i0, i45, i90 = shots
     v0, v45, v90 = variance
     measured = torch.stack([i0 + i90, i0 - i90, 2 * i45 - i0 - i90])
-    both = v0 + v90
-    covariance = torch.stack([both, v0 - v90, -both, both, v90 - v0, 4 * v45 + both])
+    outer = v0 + v90
+    covariance = torch.stack([outer, v0 - v90, -outer, outer, v90 - v0, 4 * v45 + outer])
     return measured, covariance, clipped
 
 
@@ -132,10 +132,10 @@ def _double_axis(angle: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _merged_variance(light: Tensor, errors: CameraErrors, owner: Tensor) -> Tensor:
-    """Variance of radiance (M, C) merged from the unsaturated of three exposures, weighted by exposure time."""
+    """Variance of radiance (M, C) merged from the unsaturated of three exposures, weighted by their times."""
     ratio, read = (x[owner, None] for x in (errors.bracket, errors.read_noise))
     well = errors.full_well.T[owner]
-    long, middle = (light * ratio < 1).to(light.dtype), (light < 1).to(light.dtype)
+    long, middle = (light * ratio < 1).to(light.dtype), (light < 1).to(light.dtype)  # 1: unsaturated
     time = 1 / ratio + middle + ratio * long
     return light / (well * time) + (read / (well * time)) ** 2 * (1 + middle + long)
 

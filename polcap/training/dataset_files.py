@@ -54,7 +54,7 @@ class DatasetRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def main(out: Path, count: int, recipe: DatasetRecipe, report: Report = silent) -> int:
     """Make the samples 0…count − 1 that the folder lacks; returns the number of new samples."""
     library, files = _open_library(recipe.material), _list_meshes(recipe.mesh)
-    _describe(out, recipe)
+    _write_description(out, recipe)
     made = 0
     for number in range(count):
         place = out / f"{number:06d}"
@@ -151,7 +151,7 @@ def _photograph(light: Floats, rays: Floats, noise: float, rng: np.random.Genera
     return np.stack(photographs)
 
 
-def _describe(out: Path, recipe: DatasetRecipe) -> None:
+def _write_description(out: Path, recipe: DatasetRecipe) -> None:
     """Write dataset.json. Raises InputError if the folder already holds samples of other settings, or other files."""
     asked, file = msgspec.to_builtins(recipe), out / "dataset.json"
     if file.exists():
@@ -161,7 +161,7 @@ def _describe(out: Path, recipe: DatasetRecipe) -> None:
         return
     if out.exists() and any(out.iterdir()):
         raise InputError(f"{out} is not empty; choose another folder for the data set")
-    code = f"x = {_KNEE} * expm1(value / 65535 * ln(1 + {_LARGEST} / {_KNEE}))"
+    decoding = f"x = {_KNEE} * expm1(value / 65535 * ln(1 + {_LARGEST} / {_KNEE}))"
     document = {
         "format": "polcap dataset 1",
         "recipe": asked,
@@ -171,7 +171,7 @@ def _describe(out: Path, recipe: DatasetRecipe) -> None:
         "light": "one flash, in the camera frame (sample.json), with inverse-square fall-off; "
         "radiance 1: S0 of a white matt plane facing it at the object's middle depth; no interreflection",
         "files": {
-            "I000.png … I135.png": f"HDR, 16 bit RGB, linear Rec.709 radiance {code}",
+            "I000.png … I135.png": f"HDR, 16 bit RGB, linear Rec.709 radiance {decoding}",
             "stokes.png": "16 bit: R 0.5; G, B (S1, S2)/√(S1² + S2²) * 0.5 + 0.5, from the photographs",
             "diffuse_color.png": "16 bit RGB: least intensity of each pixel's sinusoid, unit length",
             "normal.png": "16 bit: n * 0.5 + 0.5, camera frame",

@@ -30,14 +30,14 @@ from polcap.training.evaluation_baselines import Estimator, Means
 from polcap.training.evaluation_protocol import Protocol
 from polcap.training.map_errors import MAPS, Judge, deciles
 from polcap.training.progress import Report, silent
-from polcap.training.scores import Score
+from polcap.training.scores import Score, mean_score
 
 _FILES = ("evaluation.json", "evaluation.md", "panel.png", "pictures.jsonl")
 _PANEL = 8  # pictures in panel.png
 _SAMPLE = 500  # pixels of a picture for the check of the expected error
-_MIN_SHARE = 3  # pictures per process
+_MIN_SHARE = 3  # least number of pictures per process
 OURS, CLEAN, ANALYTIC, MEAN = "ours", "ours, noise-free", "analytic", "mean of each map"
-_INTEGRATED = (OURS, CLEAN, ANALYTIC)  # columns with integrated normals
+_INTEGRATED = (OURS, CLEAN, ANALYTIC)  # columns with an error of the depth from their normals
 _ALONE = ", network alone"  # end of the names of the second table's columns; "ours" is in both tables
 
 Row = dict[str, Any]
@@ -187,7 +187,7 @@ def evaluate_picture(options: EvaluationOptions, means: Means, number: int) -> R
 
 def _summary(head: dict[str, Any], rows: list[Row]) -> dict[str, Any]:
     """Content of the evaluation: means over all pictures, calibration by deciles, scores of each picture."""
-    mean = {name: _mean([row["scores"][name] for row in rows]) for name in rows[0]["scores"]}
+    mean = {name: mean_score([row["scores"][name] for row in rows]) for name in rows[0]["scores"]}
     f0, square = np.mean([row["f0"] for row in rows], axis=0)
     predicted, actual = (np.concatenate([row["calibration"][k] for row in rows]) for k in (0, 1))
     return {
@@ -196,12 +196,6 @@ def _summary(head: dict[str, Any], rows: list[Row]) -> dict[str, Any]:
         "ablations": {name.removesuffix(_ALONE): score for name, score in mean.items() if name.endswith(_ALONE)},
         "of_mean_maps": {name: mean[OURS][name] / mean[MEAN][name] for name in MAPS},
         "calibration": deciles(predicted, actual),
-        "seconds": _mean([row["seconds"] for row in rows]),
+        "seconds": mean_score([row["seconds"] for row in rows]),
         "pictures": [{"name": row["name"], "scores": row["scores"]} for row in rows],
     }
-
-
-def _mean(rows: list[Score]) -> Score:
-    """Mean of each error figure over the pictures that have it."""
-    keys = dict.fromkeys(key for row in rows for key in row)
-    return {key: float(np.mean([row[key] for row in rows if key in row])) for key in keys}

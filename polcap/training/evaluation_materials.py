@@ -58,15 +58,12 @@ def test_materials(folder: Path, *, everyday: bool = False) -> list[TestMaterial
 def _levels(number: int, everyday: bool) -> tuple[np.random.Generator, float, float]:
     """Random generator, refractive index and mean F0 of the test material with this number."""
     rng = np.random.default_rng([_SEED, number])
-    ior = 1.4 + 0.2 * ((7 * number) % 30) / 29
+    ior = 1.4 + 0.2 * ((7 * number) % 30) / 29  # evenly spread over 30 numbers, in mixed order; F0 over 15
     if everyday:
         low, high = _COMMON if number % 5 else _RARE
     else:
         low, high = _ORDINARY if number % 2 else _STRONG
     return rng, ior, low * (high / low) ** (((4 * number) % 15) / 14)
-
-
-# --- texture sets -------------------------------------------------------------------------------
 
 
 def _textured(folder: Path, number: int, everyday: bool) -> TestMaterial:
@@ -110,9 +107,6 @@ def _sampled(image: Floats, u: Floats, v: Floats) -> Floats:
     return np.concatenate([p.reshape(wide, 3)[: len(u)] for p in parts], axis=1)
 
 
-# --- patterns -----------------------------------------------------------------------------------
-
-
 def _pattern(family: str, number: int, everyday: bool) -> TestMaterial:
     """Test material with two colors, two glosses and a relief that follow one pattern."""
     rng, ior, level = _levels(number, everyday)
@@ -130,7 +124,7 @@ def _pattern(family: str, number: int, everyday: bool) -> TestMaterial:
         return raised * tone - groove
 
     sample = rng.uniform(-0.5, 0.5, (2000, 3))
-    usual = np.sqrt(np.mean(_gradient(height, sample) ** 2) * 3) + 1e-9
+    rms_slope = np.sqrt(np.mean(_gradient(height, sample) ** 2) * 3) + 1e-9
 
     def at(place: Floats, facing: Floats) -> MaterialSample:
         tone, groove = field(place)
@@ -141,7 +135,7 @@ def _pattern(family: str, number: int, everyday: bool) -> TestMaterial:
         return MaterialSample(np.clip(albedo, 0.005, 0.95), f0[:, None] * tint, gloss)
 
     def slope(place: Floats, facing: Floats) -> Floats:
-        out = _gradient(height, place) * (steep / usual)
+        out = _gradient(height, place) * (steep / rms_slope)
         return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True) / _MAX_SLOPE, 1))
 
     return TestMaterial(f"{family} {number}", ior, at, slope)

@@ -29,7 +29,7 @@ from polcap.pipeline.path import UserInput, path
 from polcap.results import ResultsUntilInfer
 from polcap.stage_values import Cues, Network
 from polcap.training.progress import Report, silent
-from polcap.training.scores import LIMITS_DEG, Score, grid
+from polcap.training.scores import LIMITS_DEG, Score, grid, mean_score
 
 _MISSED_DEG = 90.0  # error of a pixel of the object without an estimated normal
 _MIN_DOLP, _MIN_TILT = 0.03, 0.3  # for the comparison of AoLP and azimuth; tilt: sine of the zenith
@@ -49,10 +49,7 @@ def main(folder: Path, model: Path, out: Path, report: Report = silent) -> dict[
         rows[name] = {"ours": score(folder, angles, name, network), "analytic": score(folder, angles, name, None)}
         mean, analytic = (rows[name][column]["mean"] for column in ("ours", "analytic"))
         report(f"{k}/{len(names)}  {name}: normals {mean:.2f}°, by the analytic estimator {analytic:.2f}°")
-    table = {
-        column: {row: float(np.mean([both[column][row] for both in rows.values()])) for row in rows[names[0]][column]}
-        for column in ("ours", "analytic")
-    }
+    table = {column: mean_score([both[column] for both in rows.values()]) for column in ("ours", "analytic")}
     result = {"folder": str(folder), "model": network.digest, "table": table, "pictures": rows}
     with own_files.opened(out):
         atomic.write_json(out / "real.json", result)

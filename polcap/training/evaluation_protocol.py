@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from polcap.chart_values import ColorCalibration
-from polcap.errors import InputError
-from polcap.image_values import Bits, Bools, Floats, Indices, Quality, View
+from polcap.image_values import Bits, Bools, Floats, Quality, View
 from polcap.optics import frames, resize
 from polcap.optics.body import SMOOTH, Law
 from polcap.optics.mesh_tracer import Tracer, Triangles, centred
@@ -67,12 +66,7 @@ class Protocol:
     """All evaluation pictures of one size and protocol."""
 
     def __init__(self, data: Path, size: int, protocol: int = 1) -> None:
-        files = sorted((data / "meshes" / "test").glob("*.npz"))
-        if not files:
-            raise InputError(
-                f"{data}/meshes/test holds no mesh; `python -m polcap.training.import_data SOURCE {data}` converts "
-                "OBJ, GLB and PLY"
-            )
+        files = traced_views.test_meshes(data)
         self.size, self.protocol = size, protocol
         self.names = [file.stem for file in files]
         self.tracers = [Tracer(centred(traced_views.read_mesh(file))) for file in files]
@@ -109,6 +103,7 @@ class Protocol:
         return self._subject(number, size).truth
 
     def _subject(self, number: int, size: int) -> _Subject:
+        """Place, trace and cover the mesh of an evaluation picture."""
         index, which = combination(number, len(self.names), len(self.materials))
         tracer, material = self.tracers[index], self.materials[which]
         rng = np.random.default_rng([_SEED, number])
@@ -132,7 +127,7 @@ class Protocol:
         pattern = position @ frame.T + shift, normal @ turn @ frame.T  # in that frame
         sample, slope = material.at(*pattern), material.slope(*pattern) @ frame @ turn.T
         tilted = np.asarray(frames.lifted(frames.to_ray_frame(frames.tilted(normal, slope), v)))
-        _, flat = tracer.first_hits(position + 0.01 * (v @ turn), -v @ turn)
+        _, flat = tracer.first_hits(position + 0.01 * (v @ turn), -v @ turn)  # from just in front of the surface
         law = body_law(number) if self.protocol == 2 else SMOOTH
         places = light_transport.SurfacePoints(
             inside, position, flat, tilted, v, sample.diffuse, sample.specular, sample.roughness, material.ior, law
@@ -179,17 +174,12 @@ def render_lights() -> Floats:
     return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=1)
 
 
-def stokes_image(measured: tuple[Tensor, Tensor, Tensor], at: Indices, mask: Bools, view: View) -> StokesImage:
-    """Build a `StokesImage` from Stokes parameters, covariance and clipped flags measured at the pixels `at`."""
-
-    def image(flat: Tensor) -> Floats:
-        out = np.zeros((flat.shape[0], mask.size, 3), dtype=np.float32)
-        out[:, at] = flat.numpy()
-        return out.reshape(-1, *mask.shape, 3)
-
-    quality: Bits = np.zeros(mask.size, dtype=np.uint8)
-    quality[at[measured[2].numpy()]] = int(Quality.CLIPPED)
-    return StokesImage(image(measured[0]), image(measured[1]), quality.reshape(mask.shape), mask, view, None)
+def stokes_image(measured: tuple[Tensor, Tensor, Tensor], mask: Bools, view: View) -> StokesImage:
+    """Build a `StokesImage` from Stokes parameters, covariance and clipped flags measured at the pixels of `mask`."""
+    stokes, covariance = (np.stack([traced_views.fill(mask, one) for one in part.numpy()]) for part in measured[:2])
+    quality: Bits = np.zeros(mask.shape, dtype=np.uint8)
+    quality[mask] = measured[2].numpy() * np.uint8(Quality.CLIPPED)
+    return StokesImage(stokes, covariance, quality, mask, view, None)
 
 
 def _random_placement(mesh: Triangles, rng: np.random.Generator) -> tuple[Floats, Floats]:
@@ -205,12 +195,11 @@ def _random_placement(mesh: Triangles, rng: np.random.Generator) -> tuple[Floats
 def _photograph(light: Floats, places: light_transport.SurfacePoints, view: View, errors: CameraErrors) -> StokesImage:
     """Measure Stokes parameters (3, M, 3) with a camera that has these errors."""
     mask = places.mask
-    at = np.flatnonzero(mask)
     images = np.stack([traced_views.fill(mask, part) for part in light]), traced_views.fill(mask, places.diffuse)
     scene, diffuse = (torch.from_numpy(image) for image in images)
     inside, rays = (torch.from_numpy(image)[None] for image in (mask, frames.rays(view, *mask.shape)))
-    measured = photograph(scene[:, None], diffuse[None], inside, rays, torch.from_numpy(at), errors)
-    return stokes_image(measured, at, mask, view)
+    measured = photograph(scene[:, None], diffuse[None], inside, rays, torch.from_numpy(np.flatnonzero(mask)), errors)
+    return stokes_image(measured, mask, view)
 
 
 def _bin(image: StokesImage, by: int) -> StokesImage:

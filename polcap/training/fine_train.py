@@ -39,7 +39,7 @@ _RATE = 2e-3  # of Muon
 _TILES, _TILE = 4, 96  # tiles of a picture in a step; their side, px
 _DOUBLE_ANGLES = tuple(fine.CHANNELS.index(name) for name in ("s1", "zenith_x", "cos_2phi"))  # first of two channels
 _VECTORS = tuple(fine.CHANNELS.index(name) for name in ("ray_x", "normal_x", "smooth_x"))  # first of the channels
-_NORMAL, _COUNT = fine.CHANNELS.index("normal_x"), len(fine.CHANNELS)
+_NORMAL, _INPUTS = fine.CHANNELS.index("normal_x"), len(fine.CHANNELS)
 
 
 def main(data: Path, model: Path, out: Path, minutes: float, licence: str = UNSTATED) -> None:
@@ -78,7 +78,7 @@ def make_picture(simulator: Simulator, network: Network, number: int) -> NDArray
         photo = simulator.photograph(replace(views, pixels=replace(pixels, normal=normal)), torch.ones(1), errors)
     mask = photo.input_mask[0].numpy()
     measured = (photo.stokes, photo.covariance, photo.clipped)
-    image = evaluation_protocol.stokes_image(measured, photo.at.numpy(), mask, View(focal, (x, y), scale=1.0))
+    image = evaluation_protocol.stokes_image(measured, mask, View(focal, (x, y), scale=1.0))
     estimated = cues.compute(image, evaluation_protocol.white())
     size = int(_FIRST_SIZES[0] * (_FIRST_SIZES[1] / _FIRST_SIZES[0]) ** rng.random())
     network = replace(network, metadata={**network.metadata, "native_size": str(size)})
@@ -133,11 +133,11 @@ class FineTraining(loop.PictureTraining):
 def load_example(file: Path) -> NDArray[np.float16]:
     """Read a training picture of the refinement network: input channels (N), target relief (3), its mask (1)."""
     picture = np.load(file)
-    channels = picture[:_COUNT].astype(np.float32)
-    truth, known = picture[_COUNT : _COUNT + 3].astype(np.float32), picture[-1] > 0
+    channels = picture[:_INPUTS].astype(np.float32)
+    truth, known = picture[_INPUTS : _INPUTS + 3].astype(np.float32), picture[-1] > 0
     shrink = float(np.exp(channels[-1].max()))  # from the channel `log_shrink`, constant in the mask
     relief = fine.high_pass(np.moveaxis(truth - channels[_NORMAL : _NORMAL + 3], 0, -1), known, shrink)
-    return np.concatenate([picture[:_COUNT], np.moveaxis(relief, -1, 0), known[None]]).astype(np.float16)
+    return np.concatenate([picture[:_INPUTS], np.moveaxis(relief, -1, 0), known[None]]).astype(np.float16)
 
 
 def cut_tile(picture: NDArray[np.float16], rng: np.random.Generator) -> Floats:
@@ -161,7 +161,7 @@ def rotate(picture: Floats, quarters: int, mirror: bool) -> Floats:
     for first in _DOUBLE_ANGLES:  # a quarter turn negates both channels, a mirror the second
         out[first : first + 2] *= (-1.0) ** quarters
         out[first + 1] *= -1.0 if mirror else 1.0
-    for first in (*_VECTORS, _COUNT):
+    for first in (*_VECTORS, _INPUTS):
         x, y = (-out[first] if mirror else out[first].copy()), out[first + 1].copy()
         for _ in range(quarters):
             x, y = -y, x
@@ -172,8 +172,8 @@ def rotate(picture: Floats, quarters: int, mirror: bool) -> Floats:
 def _predict(network: nn.Module, pictures: Floats) -> tuple[Tensor, Tensor, Tensor]:
     """Run the refinement network on pictures (B, N + 4, H, W): estimated and target relief, mask of known relief."""
     batch = torch.from_numpy(pictures.astype(np.float32))
-    channels = batch[:, :_COUNT].contiguous(memory_format=torch.channels_last)
-    return network(channels), batch[:, _COUNT : _COUNT + 3], batch[:, _COUNT + 3 :]
+    channels = batch[:, :_INPUTS].contiguous(memory_format=torch.channels_last)
+    return network(channels), batch[:, _INPUTS : _INPUTS + 3], batch[:, _INPUTS + 3 :]
 
 
 if __name__ == "__main__":

@@ -47,8 +47,8 @@ def _slab(rng: np.random.Generator) -> Triangles:
 def _coin(rng: np.random.Generator) -> Triangles:
     """A coin, medal or lid: a disc or polygon with an embossed front, often with a rim."""
     x, y, radius = _disc(rng, polygon=0.2)
-    middle, rim = rng.uniform(0.7, 0.95), rng.choice([-1, 0, 1, 1]) * rng.uniform(0.005, 0.03)
-    ramp = np.clip((radius - middle) / rng.uniform(0.01, 0.05), 0, 1)
+    inner, rim = rng.uniform(0.7, 0.95), rng.choice([-1, 0, 1, 1]) * rng.uniform(0.005, 0.03)
+    ramp = np.clip((radius - inner) / rng.uniform(0.01, 0.05), 0, 1)  # 1 on the rim
     relief = (_embossed(rng) if rng.random() < 0.7 else _relief(rng)) * (1 - ramp)
     return _solid(x, y, relief + rim * ramp, log_uniform(0.03, 0.15, rng))
 
@@ -58,14 +58,14 @@ def _tile(rng: np.random.Generator) -> Triangles:
     across, along = rng.integers(1, 6, 2)
     x, y = _rectangle(along / across if 0.5 <= along / across <= 1 else rng.uniform(0.5, 1))
     unit = np.linspace(0, 1, _SIDE)
-    to_edge = [np.abs((unit * count + 0.5) % 1 - 0.5) / count for count in (across, along)]  # nearest groove
-    near = np.minimum(to_edge[0][None, :], to_edge[1][:, None])
+    to_edge = [np.abs((unit * count + 0.5) % 1 - 0.5) / count for count in (across, along)]
+    to_groove = np.minimum(to_edge[0][None, :], to_edge[1][:, None])
     width = rng.uniform(0.01, 0.2) / max(across, along)
-    bevel = np.clip(near / width, 0, 1)
+    bevel = np.clip(to_groove / width, 0, 1)
     bevel = bevel if rng.random() < 0.5 else np.sqrt(1 - (1 - bevel) ** 2)  # straight or round
     steps = rng.normal(size=(along, across)) * rng.choice([0, 0.01])  # fields of unequal height
-    at = [np.minimum((unit * count).astype(int), count - 1) for count in (across, along)]
-    field = steps[at[1][:, None], at[0][None, :]]
+    column, row = (np.minimum((unit * count).astype(int), count - 1) for count in (across, along))
+    field = steps[row[:, None], column[None, :]]
     relief = 0.3 * _relief(rng) if rng.random() < 0.4 else 0.0
     return _solid(x, y, width * rng.uniform(0.3, 1.2) * bevel + field + relief, log_uniform(0.03, 0.2, rng))
 
@@ -153,9 +153,7 @@ def _solid(x: Floats, y: Floats, top: Floats, thickness: float, *, bent: bool = 
     faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
     border = np.concatenate([n[0, :-1], n[:-1, -1], n[-1, :0:-1], n[:0:-1, 0]])
     wall = np.concatenate([front.reshape(-1, 3)[border], back.reshape(-1, 3)[border]])
-    here, ahead = np.arange(len(border)), np.roll(np.arange(len(border)), -1)
-    under = len(border)
-    sides = np.stack([here, under + here, under + ahead, here, under + ahead, ahead], axis=-1).reshape(-1, 3)
+    sides = random_shapes.ring_faces(2, len(border), closed=False)
     return union(
         [smooth(front.reshape(-1, 3), faces), smooth(back.reshape(-1, 3), faces[:, ::-1]), smooth(wall, sides)]
     )
@@ -187,7 +185,7 @@ def _disc(rng: np.random.Generator, polygon: float) -> tuple[Floats, Floats, Flo
 
 
 def _relief(rng: np.random.Generator) -> Floats:
-    """Random relief (N, N), in sides of the face: none, waves, brush strokes, embossed, or two of them."""
+    """Random relief (N, N), in sides of the face: none, waves, strokes, embossed, stamped, or a sum of two of these."""
     kinds: list[Callable[[np.random.Generator], Floats]] = [_flat, _hills, _hills, _strokes, _embossed, _stamped]
     first, second = (kinds[k](rng) for k in rng.integers(len(kinds), size=2))
     return np.asarray(first + second * (rng.random() < 0.3))

@@ -20,7 +20,7 @@ _EDGES_DEG = (0.0, 4.0, 8.0, 12.0, 17.0, 23.0, 30.0, 40.0, 52.0, 66.0, 90.0)
 _BINS = len(_EDGES_DEG) - 1
 _FIGURES = 6  # per bin
 PROFILE = _BINS * _FIGURES
-_BLOCK = 64  # divides the number of places of every picture: every second one, sides are multiples of 32
+_BLOCK = 64  # pixels summed at once; divides their number, because sides at half resolution are multiples of 16
 
 
 @dataclass(frozen=True)
@@ -59,42 +59,40 @@ class Profiles(nn.Module):  # type: ignore[misc]  # torch comes without types he
         return (gloss.transpose(1, 2) @ share.flatten(2)).unflatten(2, share.shape[2:])  # gloss: (B, groups, outputs)
 
 
-def figures_of(level: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) -> Tensor:
+def figures_of(log_radiance: Tensor, ratio: Tensor, normal: Tensor, diffuse: Tensor) -> Tensor:
     """Compute the five quantities (B, 5, H, W) that the gloss profiles average in bins of zenith angle.
 
-    They are the log of light / shading; the log of light / diffuse light; its square; its square as a factor; the
-    missing share of the DoLP of diffuse light. level (B, 3, H, W) is log radiance, ratio (B, 2, H, W) is S1/S0 and
-    S2/S0; normal and diffuse are (B, 3, H, W).
+    They are the log of light / shading; the log e of light / diffuse light; e²; exp 2e; the missing share of the DoLP
+    of diffuse light. log_radiance, normal and diffuse are (B, 3, H, W), ratio (B, 2, H, W) is S1/S0 and S2/S0.
     """
     cosine = normal[:, 2:].clamp(0.03, 1.0)
     plus, minus = fresnel.transmission(cosine, NOMINAL_IOR)
-    shading = 0.96 * cosine * plus
-    light = (torch.exp(level) - FLOOR).clamp(0, 50).mean(dim=1, keepdim=True)
+    shading = 0.96 * cosine * plus  # 0.96: transmittance at normal incidence
+    light = (torch.exp(log_radiance) - FLOOR).clamp(0, 50).mean(dim=1, keepdim=True)
     body = diffuse.mean(dim=1, keepdim=True) * shading
     excess = torch.log((light + 0.02) / (body + 0.02)).clamp(-3, 4)
     dolp = ratio.square().sum(dim=1, keepdim=True).sqrt()
-    short = (1 - dolp / (minus / plus + 0.005)).clamp(-1, 1)
-    return torch.cat([torch.log(light / shading + 0.02), excess, excess**2, torch.exp(2 * excess), short], dim=1)
+    missing = (1 - dolp / (minus / plus + 0.005)).clamp(-1, 1)
+    return torch.cat([torch.log(light / shading + 0.02), excess, excess**2, torch.exp(2 * excess), missing], dim=1)
 
 
 def profile(weight: Tensor, figures: Tensor, cosine: Tensor) -> Tensor:
     """Average quantities in bins of zenith, per group of pixels: profiles (B, groups, bins · 6).
 
     weight (B, groups, N) assigns N pixels to groups, figures are (B, 5, N), cosine (B, 1, N) is that of the zenith. A
-    bin has six numbers: the log of its share of the group, and the means of the five figures; 0 if it is empty.
+    bin has six numbers: the log of its share of the group, and the means of the five figures.
     """
     edges = cosine.new_tensor([cos(radians(angle)) for angle in _EDGES_DEG]).view(1, -1, 1)
-    at = ((cosine <= edges[:, :-1]) & (cosine > edges[:, 1:])).to(weight.dtype)  # (B, bins, N)
-    seen = torch.cat([torch.ones_like(cosine), figures], dim=1)
-    sums = summed(weight, (at[:, :, None] * seen[:, None]).flatten(1, 2).transpose(1, 2))
+    in_bin = ((cosine <= edges[:, :-1]) & (cosine > edges[:, 1:])).to(weight.dtype)  # (B, bins, N)
+    values = torch.cat([torch.ones_like(cosine), figures], dim=1)
+    sums = summed(weight, (in_bin[:, :, None] * values[:, None]).flatten(1, 2).transpose(1, 2))
     sums = sums.unflatten(2, (_BINS, _FIGURES))
-    share, total = sums[..., :1], sums[..., :1].sum(dim=2, keepdim=True) + 1e-3
-    mean = sums[..., 1:] / (share + 1e-4 * total)
-    light, excess, square, factor, short = mean.unbind(dim=-1)
-    whole = sums[..., 1].sum(dim=2, keepdim=True) / total[..., 0]  # of the light over shading
-    columns = (
-        torch.log(share[..., 0] / total[..., 0] + 1e-3) / 3, light - whole, excess, torch.log1p(factor), square, short,
-    )  # fmt: skip
+    pixels, total = sums[..., :1], sums[..., :1].sum(dim=2, keepdim=True) + 1e-3
+    mean = sums[..., 1:] / (pixels + 1e-4 * total)
+    light, excess, square, factor, missing = mean.unbind(dim=-1)
+    light = light - sums[..., 1].sum(dim=2, keepdim=True) / total[..., 0]  # relative to the mean of all bins
+    share = torch.log(pixels[..., 0] / total[..., 0] + 1e-3) / 3
+    columns = share, light, excess, torch.log1p(factor), square, missing
     return torch.stack(columns, dim=-1).flatten(2)
 
 

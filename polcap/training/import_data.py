@@ -101,10 +101,10 @@ def write_mesh(path: Path, target: Path) -> None:
     quantized = np.rint((vertices - low) / size * 65535).astype(np.uint16)
     corners, place = np.unique(quantized, axis=0, return_inverse=True)
     joined = place.reshape(-1)[faces]
-    whole = (joined != np.roll(joined, 1, axis=1)).all(axis=1)  # without triangles that have no area
+    distinct = (joined != np.roll(joined, 1, axis=1)).all(axis=1)  # three corners at different places
     with atomic.path(target) as temporary:
         np.savez_compressed(
-            temporary, vq=corners, vmin=low, vscale=np.float32(size), faces=joined[whole].astype(np.int32)
+            temporary, vq=corners, vmin=low, vscale=np.float32(size), faces=joined[distinct].astype(np.int32)
         )
 
 

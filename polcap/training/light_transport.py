@@ -88,11 +88,10 @@ class IndirectLight:
     def diffuse(self, rng: np.random.Generator) -> Floats:
         """Diffuse reflection (3, M, 3) of one-bounce light at visible points, by rays with a cosine distribution."""
         places, count = self.places, len(self.places.normal)
-        turn = rng.uniform(0, 1, (count, 2))
+        shift, turn = rng.uniform(0, 1, (count, 2)).T
         received: Floats = np.zeros((count, 3))
         for k in range(_HEMISPHERE_RAYS):
-            cosine = np.sqrt(1 - (k + turn[:, 0]) / _HEMISPHERE_RAYS)
-            direction = directions_about(places.normal, cosine, 2 * pi * (k * 0.618034 + turn[:, 1]))
+            direction, cosine = draw_directions(places.normal, k, _HEMISPHERE_RAYS, shift, turn)
             hit, incoming = self.light(direction, np.arange(count))
             received[hit] += incoming * fresnel.transmission(np.maximum(cosine[hit], 1e-3), places.ior)[0][:, None]
         entered = fresnel.transmission(1.0, places.ior)[0]
@@ -110,11 +109,9 @@ class IndirectLight:
         places, count = self.places, len(self.places.normal)
         ior = facet_ior(places.specular.mean(axis=1), np.full(count, places.ior))
         alpha = places.roughness**2
-        turn, total = rng.uniform(0, 1, (count, 2)), np.zeros((3, count, 3))
+        (shift, turn), total = rng.uniform(0, 1, (count, 2)).T, np.zeros((3, count, 3))
         for k in range(_MIRROR_RAYS):
-            u = (k + turn[:, 0]) / _MIRROR_RAYS
-            cos_h = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))
-            half = directions_about(places.normal, cos_h, 2 * pi * (k * 0.618034 + turn[:, 1]))
+            half, cos_h = draw_directions(places.normal, k, _MIRROR_RAYS, shift, turn, alpha)
             cos_d = half[:, 2]
             direction = 2 * cos_d[:, None] * half - [0, 0, 1]
             possible = (cos_d > 0.01) & (np.sum(direction * places.normal, axis=1) > 0.01)
@@ -149,12 +146,20 @@ class IndirectLight:
         return np.asarray(masked_mean(image, mask, _SMOOTH * max(mask.shape))[mask])
 
 
-def directions_about(normal: Floats, cosine: Floats, azimuth: Floats) -> Floats:
-    """Unit directions (M, 3) about normals (M, 3), at angles with this cosine (M,) and azimuth (M,)."""
+def draw_directions(
+    normal: Floats, index: int, count: int, shift: Floats, turn: Floats, alpha: Floats | float | None = None
+) -> tuple[Floats, Floats]:
+    """Direction `index` of `count` about each normal (M, 3): unit vectors (M, 3), and their cosines (M,) with it.
+
+    Their density is the cosine, or with `alpha` that of GGX facets. shift and turn (M,) are random numbers 0…1.
+    """
+    share = (index + shift) / count
+    cosine = np.sqrt(1 - share if alpha is None else (1 - share) / (1 + (alpha**2 - 1) * share))
+    azimuth = 2 * pi * (index * 0.618034 + turn)  # the golden ratio spreads them evenly
     e_x, e_y = frames.basis(normal)
     sine = np.sqrt(np.maximum(1 - cosine**2, 0))
     x, y = (a[:, None] for a in (sine * np.cos(azimuth), sine * np.sin(azimuth)))
-    return np.asarray(x * e_x + y * e_y + cosine[:, None] * normal)
+    return np.asarray(x * e_x + y * e_y + cosine[:, None] * normal), cosine
 
 
 def facet_ior(f0: Any, ior: Any) -> Any:

@@ -23,11 +23,12 @@ from polcap.formats import atomic
 from polcap.training import onnx_export
 from polcap.training.muon import Muon
 from polcap.training.progress import Report, silent
+from polcap.training.scores import mean_score
 
 _OUTER_LAYERS = ("stem", "raw", "out", "hint.0")  # next to the pixels: AdamW trains them, Muon all others
 _OUTER_RATE = 0.5  # AdamW's rate relative to Muon's
 _MAX_GRADIENT_NORM = 1.0  # longer gradients are scaled down to it
-_METRICS_STEPS = 50  # from one row of metrics.csv to the next
+_METRICS_STEPS, _FIRST_METRICS = 50, 10  # steps between two rows of metrics.csv; step of an early row
 _VALIDATION_S, _CHECKPOINT_S = 600, 60  # s between two validations, two checkpoints
 _REPORT_S = 10  # s of training between two lines of progress
 
@@ -81,7 +82,7 @@ class Trainee(ABC):
                 optimizer.step()
             optimizer.zero_grad()
         self.step += 1
-        decay = min(self.averaging, (1 + self.step) / (10 + self.step))
+        decay = min(self.averaging, (1 + self.step) / (10 + self.step))  # smaller in the first steps
         with torch.no_grad():
             torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - decay)
         return norm
@@ -119,7 +120,7 @@ class PictureTraining(Trainee):
         self.random = np.random.default_rng([1, 0])
 
     def train(self, minutes: float, out: Path) -> None:
-        """Train until `minutes` are spent, earlier parts of a continued run included; continues from out/last.pt.
+        """Train for `minutes` in all, from out/last.pt if it exists; the time of that earlier training counts.
 
         Raises InputError: there are too few pictures to hold some out.
         """
@@ -135,7 +136,7 @@ class PictureTraining(Trainee):
         return [self.files[n] for n in self.random.integers(self.held_out, len(self.files), self.per_step)]
 
     def export(self, path: Path, licence: str) -> None:
-        """Write the averaged weights as an ONNX model that `formats/onnx.py` loads; SPDX name of their licence."""
+        """Write the averaged weights as an ONNX model that `formats/onnx.py` loads; `licence` is its SPDX name."""
         training = f"{self.samples} samples in {self.step} steps"
         metadata = {"licence": licence, "training": training, **self.metadata}
         onnx_export.export_network(self.average, path, (self.output,), metadata)
@@ -157,8 +158,8 @@ def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path, re
             left = trainee.elapsed * (1 / progress - 1) / 60
             done = f"{100 * min(progress, 1):.0f} %, step {trainee.step}, {trainee.samples} pictures"
             report(f"{done}, loss {losses[-1].get('loss', math.nan):.3g}, {max(left, 0):.0f} min left")
-        if trainee.step % _METRICS_STEPS == 0 or trainee.step == 10 or progress >= 1:
-            _append(out / "metrics.csv", trainee, {k: float(np.mean([part[k] for part in losses])) for k in losses[0]})
+        if trainee.step % _METRICS_STEPS == 0 or trainee.step == _FIRST_METRICS or progress >= 1:
+            _append(out / "metrics.csv", trainee, mean_score(losses))
             losses = []
         if trainee.elapsed - validated > _VALIDATION_S or progress >= 1:
             validated = trainee.elapsed
@@ -171,7 +172,7 @@ def run(trainee: Trainee, draw: Callable[[], Any], budget: Budget, out: Path, re
 
 
 def make_optimizers(network: nn.Module, rate: float) -> list[torch.optim.Optimizer]:
-    """The optimizers of a network: Muon for hidden layers; AdamW for first and last layers, biases and curves."""
+    """The optimizers of a network: Muon for hidden layers; AdamW for outer layers, biases and curves (`knots`)."""
     named = list(network.named_parameters())
     plain = [weight for name, weight in named if weight.ndim <= 1 or "knots" in name]
     matrices = [(name, weight) for name, weight in named if weight.ndim > 1 and "knots" not in name]
@@ -180,7 +181,7 @@ def make_optimizers(network: nn.Module, rate: float) -> list[torch.optim.Optimiz
     others = [{"params": outer, "weight_decay": 1e-2}, {"params": plain, "weight_decay": 0.0}]
     adamw = torch.optim.AdamW(others, _OUTER_RATE * rate, betas=(0.9, 0.98), fused=True)
     optimizers: list[torch.optim.Optimizer] = [Muon(hidden, rate), adamw]
-    for group in (g for optimizer in optimizers for g in optimizer.param_groups):
+    for group in (group for optimizer in optimizers for group in optimizer.param_groups):
         group["full"] = group["lr"]  # before warm-up and decay
     return optimizers
 
@@ -188,9 +189,9 @@ def make_optimizers(network: nn.Module, rate: float) -> list[torch.optim.Optimiz
 def _append(path: Path, trainee: Trainee, figures: Mapping[str, float]) -> None:
     """Append training progress and figures as one row to a CSV file."""
     row = {"step": trainee.step, "samples": trainee.samples, "seconds": round(trainee.elapsed, 1), **figures}
-    fresh = not path.exists()
+    is_new = not path.exists()
     with path.open("a", newline="") as file:
         writer = csv.writer(file)
-        if fresh:
+        if is_new:
             writer.writerow(row)
         writer.writerow(f"{value:.7g}" for value in row.values())

@@ -14,12 +14,13 @@ from polcap.optics.body import Law
 from polcap.stages.cues import NOMINAL_IOR
 from polcap.training.simulator import Batch
 
-WEIGHTS = {
+WEIGHTS = {  # factors on the parts of the loss
     "normal": 2.0, "region": 1.0, "depth": 1.0, "diffuse": 1.0, "specular": 60.0, "roughness": 8.0, "highlight": 2.0,
     "sigma": 0.05, "render": 0.3,
 }  # fmt: skip
 _BLOCKS = (8, 16, 32)  # px: sizes of regions
-_FLAT = 0.2  # mean tangential part of the normals below which a region has no clear direction
+_FLAT = 0.2  # length of the mean tangential part of the normals below which a region has no clear azimuth
+_MIN_ROUGHNESS = 0.08  # of rendered surfaces
 
 
 def total(
@@ -59,7 +60,8 @@ def _region(estimate: Tensor, truth: Tensor, inside: Tensor) -> Tensor:
     """Loss of regions with a common azimuth error; a loss per pixel would not count it more than scattered errors.
 
     For blocks of 8, 16 and 32 px: 1 − cosine between the mean tangential parts of estimate and truth, times the length
-    of the truth's. Parts shorter than `_FLAT` are not scaled to unit length, so that the estimate can turn through 0.
+    of the truth's. Parts shorter than `_FLAT` are not scaled to unit length, so that an estimate with the opposite
+    azimuth can shrink to 0 and grow towards the true azimuth.
     """
     cost, area = truth.new_zeros(()), truth.new_zeros(())
     for block in _BLOCKS:
@@ -85,14 +87,14 @@ def centered(depth: Tensor, inside: Tensor) -> Tensor:
 def _rendered(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | None, polarized: bool) -> Tensor:
     """Loss of pictures rendered from the estimated maps, under a random light and view for each pixel.
 
-    It uses every second pixel of every second row.
+    Only every second pixel of every second row is rendered.
     """
     at = truth.mask[:, ::2, ::2].reshape(-1).nonzero()[:, 0]
 
     def flat(image: Tensor) -> Tensor:
         return image[:, :, ::2, ::2].permute(0, 2, 3, 1).reshape(-1, image.shape[1])[at]
 
-    # a side: normals are turned by up to about 30° about a random axis perpendicular to the ray
+    # a random view: normals are turned by up to 0.5 rad about a random axis perpendicular to the ray
     turn = _small_rotations(len(at), truth.normal.device, random)
     ones = torch.ones(len(at), device=turn.device)
     light = 0.6 * torch.randn(len(at), 3, device=turn.device, generator=random)
@@ -101,7 +103,7 @@ def _rendered(maps: dict[str, Tensor], truth: Batch, random: torch.Generator | N
     pictures = []
     for source in (maps, {name: getattr(truth, name) for name in ("normal", "diffuse", "specular", "roughness")}):
         normal = torch.einsum("mij,mj->mi", turn, flat(source["normal"]))
-        rough = flat(source["roughness"])[:, 0].clamp(min=0.08)
+        rough = flat(source["roughness"])[:, 0].clamp(min=_MIN_ROUGHNESS)
         diffuse, specular = flat(source["diffuse"]), flat(source["specular"])
         pictures.append(shade.stokes(normal, diffuse, specular, rough, NOMINAL_IOR * ones, light, ones, law))
     estimate, target = pictures
@@ -117,9 +119,9 @@ def _small_rotations(count: int, device: torch.device, random: torch.Generator |
     azimuth = 2 * torch.pi * torch.rand(count, device=device, generator=random)
     c, s = torch.cos(azimuth), torch.sin(azimuth)
     tilt = 0.5 * torch.rand(count, device=device, generator=random)
-    ct, st = torch.cos(tilt), torch.sin(tilt)
+    cos_tilt, sin_tilt = torch.cos(tilt), torch.sin(tilt)
     zero = torch.zeros_like(c)
-    x = torch.stack([ct * c * c + s * s, (ct - 1) * c * s, st * c], dim=1)
-    y = torch.stack([(ct - 1) * c * s, ct * s * s + c * c, st * s], dim=1)
-    z = torch.stack([-st * c, -st * s, ct + zero], dim=1)
+    x = torch.stack([cos_tilt * c * c + s * s, (cos_tilt - 1) * c * s, sin_tilt * c], dim=1)
+    y = torch.stack([(cos_tilt - 1) * c * s, cos_tilt * s * s + c * c, sin_tilt * s], dim=1)
+    z = torch.stack([-sin_tilt * c, -sin_tilt * s, cos_tilt + zero], dim=1)
     return torch.stack([x, y, z], dim=1)

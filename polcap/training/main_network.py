@@ -14,6 +14,7 @@ Deschaintre, Lin & Ghosh, Deep polarization imaging for 3D shape and SVBRDF acqu
 """
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 
 import torch
@@ -21,7 +22,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polcap.stages.cues import CHANNELS, FLOOR
-from polcap.training import muon
 from polcap.training.gloss_profiles import GlossEvidence, Profiles, figures_of
 from polcap.training.recurring_colors import ColorGloss, Recolor
 from polcap.training.unet import ResidualBlock
@@ -29,6 +29,7 @@ from polcap.training.variants import VARIANTS
 
 SIZE_MULTIPLE = 32
 OUTPUTS = ("normal", "depth", "diffuse", "specular", "roughness", "sigma")
+_GEOMETRY_OUTPUTS = 5  # normal, depth, sigma
 _COLOR_OUTPUTS = 5  # diffuse, doubt of its lightness and of its hue
 _GLOSS_OUTPUTS = 5  # specular, roughness, highlight
 _HINTS = 10  # inputs of the gloss decoder: normal, diffuse, light above their shading, DoLP missing from theirs
@@ -78,7 +79,7 @@ class MainNetwork(nn.Module):  # type: ignore[misc]  # torch comes without types
         self.levels = nn.ModuleList(_residuals(w, n) for w, n in zip(widths, shape.blocks))
         self.down = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
         self.context = Context(widths[-1])
-        self.geometry = Decoder(widths, shape.geometry, shape.skip_blocks, skips, 5)
+        self.geometry = Decoder(widths, shape.geometry, shape.skip_blocks, skips, _GEOMETRY_OUTPUTS)
         self.color = Decoder(widths, shape.color, shape.skip_blocks, skips, _COLOR_OUTPUTS)
         self.recolor = Recolor()
         self.profiles = Profiles(widths[1], widths[0], shape.gloss[1] + _GLOSS_OUTPUTS)
@@ -93,26 +94,26 @@ class MainNetwork(nn.Module):  # type: ignore[misc]  # torch comes without types
         inside, clipped = (x[:, at : at + 1].clamp(0, 1) for at in (_MASK, _CLIPPED))
         features[-1] = self.context(features[-1], F.avg_pool2d(inside, SIZE_MULTIPLE))
         geometry, color = (decoder(features, seen, inside).float() for decoder in (self.geometry, self.color))
-        level = x[:, COLOR].float()
+        log_radiance = x[:, COLOR].float()
         facing = geometry.new_tensor([0.0, 0.0, 0.5]).view(1, 3, 1, 1)  # the initial normals face the camera
         normal = F.normalize(geometry[:, :3] + facing, dim=1, eps=1e-6)
-        albedo = torch.sigmoid(level + color[:, :3] + 0.7)
+        albedo = torch.sigmoid(log_radiance + color[:, :3] + 0.7)
         cosine, usable = normal[:, 2:].detach(), inside * (1 - clipped)
         with torch.autocast(x.device.type, enabled=False):
             diffuse, member, colors = self.recolor(albedo, color[:, 3:], cosine, inside.float(), clipped.float())
-        body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + FLOOR)  # log S0 of diffuse light alone
-        figures = figures_of(level, self.sees_dolp * x[:, _RATIO].float() / 10, normal, diffuse)
-        hints = torch.cat([normal, diffuse, level - body, figures[:, -1:]], dim=1).detach() * inside
-        thinned = GlossEvidence(*(part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], diffuse, usable)))
-        parts = [self.shape.gloss[1], _GLOSS_OUTPUTS]
-        readings, direct = self.profiles(features[1], features[0], thinned).split(parts, dim=1)
+        log_body = torch.log(0.9 * diffuse * normal[:, 2:].clamp(min=0) + FLOOR)  # log S0 of diffuse light alone
+        figures = figures_of(log_radiance, self.sees_dolp * x[:, _RATIO].float() / 10, normal, diffuse)
+        hints = torch.cat([normal, diffuse, log_radiance - log_body, figures[:, -1:]], dim=1).detach() * inside
+        halved = GlossEvidence(*(part[:, :, ::2, ::2].detach() for part in (figures, normal[:, 2:], diffuse, usable)))
+        parts = [self.shape.gloss[1], _GLOSS_OUTPUTS]  # features for the decoder, and a first gloss
+        readings, direct = self.profiles(features[1], features[0], halved).split(parts, dim=1)
         hinted = torch.cat([seen, hints.to(seen.dtype)], dim=1)
         gloss = self.gloss(features, hinted, inside, F.avg_pool2d(readings, 2)).float()
         gloss = gloss + F.interpolate(direct, scale_factor=2.0, mode="bilinear", align_corners=False)
         with torch.autocast(x.device.type, enabled=False):
-            corrected = self.color_gloss(thinned, gloss[:, :, ::2, ::2], member[:, :, ::2, ::2].detach(), colors)
+            corrected = self.color_gloss(halved, gloss[:, :, ::2, ::2], member[:, :, ::2, ::2].detach(), colors)
         gloss = gloss + F.interpolate(corrected, scale_factor=2.0, mode="bilinear", align_corners=False)
-        return {
+        return {  # summands set the maps before training, factors their greatest values
             "normal": normal,
             "depth": geometry[:, 3:4],
             "diffuse": diffuse,
@@ -125,11 +126,20 @@ class MainNetwork(nn.Module):  # type: ignore[misc]  # torch comes without types
 
 def run(network: nn.Module, channels: Tensor) -> dict[str, Tensor]:
     """Run the main network on channels (B, N, H, W) in the number type that is fastest on this machine."""
-    kind = channels.device.type
-    half = muon.compute_type(channels.device) == torch.bfloat16
+    kind, half = channels.device.type, _has_bfloat16(channels.device)
     with torch.autocast(kind, torch.bfloat16, enabled=half, cache_enabled=False):  # threads would share the cache
         maps: dict[str, Tensor] = network(channels.contiguous(memory_format=torch.channels_last))
     return maps
+
+
+@cache
+def _has_bfloat16(device: torch.device) -> bool:
+    """Whether convolutions and matrix products are faster in bfloat16 than in float32.
+
+    bfloat16 doubles the speed of a GPU, and of a CPU with bfloat16 instructions. On other CPUs it is emulated and a
+    dozen times slower.
+    """
+    return device.type != "cpu" or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
 def _residuals(width: int, count: int) -> nn.Sequential:
@@ -179,8 +189,8 @@ class LinearAttention(nn.Module):  # type: ignore[misc]  # torch comes without t
 
     def forward(self, x: Tensor, inside: Tensor) -> Tensor:
         batch, width, height, across = x.shape
-        sorts = self.heads * self.groups
-        member, weight, value = self.qkv(F.relu(x)).split([sorts, sorts, width], dim=1)
+        count = self.heads * self.groups
+        member, weight, value = self.qkv(F.relu(x)).split([count, count, width], dim=1)
         group = (batch, self.heads, self.groups, -1)
         member = torch.softmax(member.float().reshape(group), dim=2)
         weight = torch.softmax(weight.float().reshape(group) + torch.log(inside.flatten(2)[:, :, None] + 1e-4), dim=3)
@@ -216,6 +226,7 @@ class Decoder(nn.Module):  # type: ignore[misc]  # torch comes without types her
             self.attention = nn.ModuleDict({str(level): LinearAttention(widths[level]) for level in _SHARED})
 
     def forward(self, features: list[Tensor], seen: Tensor, inside: Tensor, readings: Tensor | None = None) -> Tensor:
+        """Outputs (B, ·, H, W) from the encoder's features; `readings` (B, ·, H/4, W/4) join the hints there."""
         hinted: list[Tensor] = []
         for hint in self.hint:
             hinted.append(hint(F.relu(hinted[-1]) if hinted else F.pixel_unshuffle(seen, 2)))
@@ -228,7 +239,7 @@ class Decoder(nn.Module):  # type: ignore[misc]  # torch comes without types her
             lifted = F.interpolate(self.up[level](y), scale_factor=2.0, mode="bilinear", align_corners=False)
             y = self.block[level](skip + lifted)
             if str(level) in self.attention:
-                y = self.attention[str(level)](y, F.avg_pool2d(inside, 2 << level))
+                y = self.attention[str(level)](y, F.avg_pool2d(inside, 2 << level))  # level 0 has half resolution
         y = F.pixel_shuffle(self.fine(F.relu(y)), 2) + self.raw(seen)
         y = y + self.mix(F.relu(y))
         return self.out(F.relu(y))

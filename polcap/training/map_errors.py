@@ -14,7 +14,7 @@ from polcap.training.evaluation_protocol import Case, render_lights
 from polcap.training.scores import LIMITS_DEG, Score
 
 MAPS = ("diffuse", "specular", "roughness")
-_IOR = 1.5  # for renderings; it is not among the maps
+_IOR, _MIN_ROUGHNESS = 1.5, 0.08  # of rendered surfaces; the maps have no refractive index
 _MAX_PIXELS = 20_000  # of a rendering: every second, third … pixel of the mask
 _INTEGRATED = 128  # px, approximate side for integration, which takes too long at 512²
 _FLASH = np.array([0.0, 0.0, 1.0])  # direction to the light that defines white
@@ -63,16 +63,16 @@ class Judge:
     def integrated(self, maps: SurfaceMaps) -> Score:
         """`depth_integrated`: error of depth integrated from the maps by the stage `surface`, on every n-th pixel."""
         by = max(1, round(max(self.mask.shape) / _INTEGRATED))
-        thin = np.s_[::by, ::by]
-        mask, (x, y) = (maps.mask & self.mask)[thin], maps.view.center
-        images = {name: getattr(maps, name)[thin] for name in (*MAPS, "normal", "confidence")}
+        every = np.s_[::by, ::by]
+        mask, (x, y) = (maps.mask & self.mask)[every], maps.view.center
+        images = {name: getattr(maps, name)[every] for name in (*MAPS, "normal", "confidence")}
         thinned = replace(
-            maps, **images, mask=mask, depth_prior=None if maps.depth_prior is None else maps.depth_prior[thin],
+            maps, **images, mask=mask, depth_prior=None if maps.depth_prior is None else maps.depth_prior[every],
             view=replace(maps.view, focal=maps.view.focal / by, center=(x / by, y / by), scale=maps.view.scale * by),
         )  # fmt: skip
         depth = surface.integrate(thinned, None, surface.SurfaceSettings()).depth[mask]
         unit = float(depth.mean() * disc_radius(mask) / thinned.view.focal)
-        return {"depth_integrated": _depth(depth / unit, self.case.depth[thin][mask])["depth"]}
+        return {"depth_integrated": _depth(depth / unit, self.case.depth[every][mask])["depth"]}
 
     def _render(self, maps: SurfaceMaps) -> Floats:
         """S0 (20, M, 3) rendered from maps under the 20 test lights, clipped to 0…1, the truth's 99th percentile."""
@@ -92,7 +92,7 @@ def render_intensity(maps: SurfaceMaps, case: Case, mask: Bools, light: Floats) 
     normal = frames.to_ray_frame(maps.normal[mask], rays).astype(np.float32)
     toward = frames.to_ray_frame(np.broadcast_to(light.astype(np.float32), rays.shape), rays)
     one = np.ones(len(normal), np.float32)
-    rough = np.maximum(maps.roughness[mask], 0.08)
+    rough = np.maximum(maps.roughness[mask], _MIN_ROUGHNESS)
     stokes = shade.stokes(normal, maps.diffuse[mask], maps.specular[mask], rough, _IOR * one, toward, one)
     return np.asarray(stokes[0])
 

@@ -29,7 +29,7 @@ MODES: dict[Mode, float] = {
     "pictured": 0.15,
 }  # fmt: skip
 _PITCH = 16  # px per patch in the picture of the chart
-_UNDETECTED = 1 / 14  # share of the charts
+_UNDETECTED = 1 / 14  # share of the charts in the picture
 
 
 @dataclass(frozen=True)
@@ -55,19 +55,19 @@ def make_scene(
     v = frames.rays(view.object.view, *size).reshape(-1, 3)
     to_plane, plane_normal, plane = meet_planes(view.planes, v)
     at = np.flatnonzero(mask.reshape(-1) | np.isfinite(to_plane))  # pixels of the object or of the backdrop
-    on, v = mask.reshape(-1)[at], v[at]  # on: pixels of the object
+    on_object, v = mask.reshape(-1)[at], v[at]
     traced = view.object
     depth, normal, position = (
         image.reshape(len(to_plane), -1)[at] for image in (traced.depth, traced.normal, traced.position)
     )
-    place = -v * np.where(on, depth[:, 0] / v[:, 2], to_plane[at])[:, None]  # camera frame
-    normal = np.where(on[:, None], normal, plane_normal[at])
-    position = np.where(on[:, None], position, place)
-    owner = torch.from_numpy(np.where(on, 0, 1))
+    place = -v * np.where(on_object, depth[:, 0] / v[:, 2], to_plane[at])[:, None]  # camera frame
+    normal = np.where(on_object[:, None], normal, plane_normal[at])
+    position = np.where(on_object[:, None], position, place)
+    owner = torch.from_numpy(np.where(on_object, 0, 1))
     turn = torch.stack([torch.from_numpy(view.turn).float(), torch.eye(3)])
     normals, positions = (torch.from_numpy(a).float() for a in (normal, position))
     surface = materials.draw_surface(library, normals, positions, turn, owner)
-    surface, polarizing = _change_materials(surface, position, np.where(on, -1, plane[at]), mode, rng)
+    surface, polarizing = _change_materials(surface, position, np.where(on_object, -1, plane[at]), mode, rng)
     lit = cv2.GaussianBlur(view.lit.astype(np.float32), (0, 0), rng.uniform(0.4, 2.5))  # the flash has a size
     strength = lit.reshape(-1)[at] * view.distance**2
     image = np.zeros((3, *size, 3), np.float32)
@@ -121,26 +121,26 @@ def _change_materials(
     elif mode == "shadow" or rng.random() < 0.1:
         _recolor(diffuse, object_, diffuse[object_].mean() * rng.uniform(0.2, 1.0), rng.uniform(0.3, 1), rng)
     for plane in np.unique(number[number >= 0]):
-        wall = number == plane
+        on_plane = number == plane
         gloss = mode not in ("dark", "black") and rng.random() < 0.3
         if mode in ("dark", "black", "shadow"):
             level = random_shapes.log_uniform(0.004, 0.06, rng)
-            _recolor(diffuse, wall, level, rng.choice([0.0, rng.uniform(0, 0.6)]), rng)
+            _recolor(diffuse, on_plane, level, rng.choice([0.0, rng.uniform(0, 0.6)]), rng)
         elif mode == "white":
-            _recolor(diffuse, wall, rng.uniform(0.45, 0.92), rng.choice([0.0, rng.uniform(0, 0.2)]), rng)
+            _recolor(diffuse, on_plane, rng.uniform(0.45, 0.92), rng.choice([0.0, rng.uniform(0, 0.2)]), rng)
         elif mode == "alike":
             mean = diffuse[object_].mean(axis=0) * rng.uniform(0.6, 1.5)
             share = rng.uniform(0, 0.8)
-            diffuse[wall] = mean * (1 - share + share * diffuse[wall] / max(diffuse[wall].mean(), 1e-3))
+            diffuse[on_plane] = mean * (1 - share + share * diffuse[on_plane] / max(diffuse[on_plane].mean(), 1e-3))
         elif mode == "printed":
-            diffuse[wall] = backdrop_patterns.draw_print(position[wall], rng)
+            diffuse[on_plane] = backdrop_patterns.draw_print(position[on_plane], rng)
         elif mode == "pictured":
-            diffuse[wall] = backdrop_patterns.draw_pattern(position[wall], rng)
+            diffuse[on_plane] = backdrop_patterns.draw_pattern(position[on_plane], rng)
         elif rng.random() < 0.5:  # plain paper, cloth or board
-            _recolor(diffuse, wall, random_shapes.log_uniform(0.02, 0.9, rng), rng.uniform(0, 0.3), rng)
-        specular[wall] = rng.uniform(0.03, 0.05) if gloss else rng.uniform(0.0, 0.02)
-        rough[wall] = rng.uniform(0.15, 0.6) if gloss else rng.uniform(0.6, 1.0)
-        factor[wall] = rng.uniform(0.4, 1.0) if gloss else rng.uniform(0.0, 0.35)
+            _recolor(diffuse, on_plane, random_shapes.log_uniform(0.02, 0.9, rng), rng.uniform(0, 0.3), rng)
+        specular[on_plane] = rng.uniform(0.03, 0.05) if gloss else rng.uniform(0.0, 0.02)
+        rough[on_plane] = rng.uniform(0.15, 0.6) if gloss else rng.uniform(0.6, 1.0)
+        factor[on_plane] = rng.uniform(0.4, 1.0) if gloss else rng.uniform(0.0, 0.35)
     diffuse, specular, rough, factor = (
         torch.from_numpy(a) for a in (np.clip(diffuse, 0.0, 0.97), np.clip(specular, 0.0, 0.97), rough, factor)
     )

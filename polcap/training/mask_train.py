@@ -34,7 +34,7 @@ _FIRST_WIDTHS = (80, 96, 112, 128, 144)  # px, of pictures in the first pass: on
 _FIRST_WIDTH = 112  # px, in validation and in use
 _PARTS, _PART_SIZE = 4, (96, 128)  # pictures of a step in the second pass; height and width of their parts, px
 _ZOOM = (0.35, 1.0)  # width of a part, of the picture's
-_REPEATED = 0.3  # share of steps with another second pass before, as the source of the hint
+_REPEATED = 0.3  # share of steps with two second passes; the first of them gives the hint
 _INSERTED = 0.12  # share of pictures into which the object of another one is inserted
 
 
@@ -93,8 +93,8 @@ def pack(picture: mask_scenes.MaskScene) -> Floats:
     """Layers (H/2, W/2, 7) of a training picture file: means of 2 × 2 pixels, radiance over its 95th percentile."""
     stokes = picture.stokes / max(float(np.percentile(picture.stokes[0].mean(-1), 95)), 1e-9)
     sums = np.moveaxis(stokes[1:].sum(-1), 0, -1)
-    whole = np.concatenate([stokes[0], sums, picture.mask[..., None], picture.chart[..., None]], axis=-1)
-    return block_means(np.clip(whole, -6e4, 6e4), 2).astype(np.float16)
+    layers = np.concatenate([stokes[0], sums, picture.mask[..., None], picture.chart[..., None]], axis=-1)
+    return block_means(np.clip(layers, -6e4, 6e4), 2).astype(np.float16)  # within the range of fp16
 
 
 def load_varied(file: Path, rng: np.random.Generator, other: Path | None = None) -> tuple[ReducedPicture, Floats]:
@@ -104,10 +104,10 @@ def load_varied(file: Path, rng: np.random.Generator, other: Path | None = None)
     """
     layers = np.load(file).astype(np.float32)
     if other is not None:
-        more = np.load(other).astype(np.float32)
-        more[..., _CHART] = 0
-        inserted = (more[..., _OBJECT] > 0.5) & (layers[..., _CHART] < 0.5)
-        layers = np.where(inserted[..., None], more, layers)
+        second = np.load(other).astype(np.float32)
+        second[..., _CHART] = 0
+        inserted = (second[..., _OBJECT] > 0.5) & (layers[..., _CHART] < 0.5)
+        layers = np.where(inserted[..., None], second, layers)
     layers = _crop(layers, rng)
     stokes, mask, chart = layers[..., :_OBJECT], layers[..., _OBJECT], layers[..., _CHART] > 0.5
     if not chart.any() and rng.random() < 0.3:  # other colors; those of a chart stay
@@ -255,8 +255,8 @@ def _reduce(image: Floats, width: int) -> Floats:
 
 def _stack_channels(channels: list[Floats]) -> Tensor:
     """Stack channels (N, H, W) into a batch; the edge is repeated up to a size that the network accepts."""
-    more = [(0, -side % SIZE_MULTIPLE) for side in channels[0].shape[1:]]
-    padded = np.pad(np.stack(channels), [(0, 0), (0, 0), *more], mode="edge")
+    padding = [(0, -side % SIZE_MULTIPLE) for side in channels[0].shape[1:]]
+    padded = np.pad(np.stack(channels), [(0, 0), (0, 0), *padding], mode="edge")
     return torch.from_numpy(padded).contiguous(memory_format=torch.channels_last)
 
 

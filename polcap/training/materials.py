@@ -27,6 +27,7 @@ _MATERIALS = 3  # slots per object
 _SIDE = 48  # of the noise volume, cells
 _TEXELS = 256  # side of a texture
 _ALIGNED = 0.5  # share of objects whose patterns lie along the object's axes, as prints and weave do
+_LIGHTNESS = 0.45  # exponent from reflectance to lightness, about 1/2.2 as on a display
 _OF_SHAPE = 0.25  # share of objects whose regions follow their shape, and of those whose patterns do
 
 
@@ -65,12 +66,12 @@ class MaterialLibrary:
         stack = stack or [np.full((6, _TEXELS, _TEXELS), 0.5, dtype=np.float32)]
         self.texture = torch.from_numpy(np.stack(stack, axis=1)).to(device)[None]  # (1, 6, T, 256, 256)
         self.has_textures = bool(sets)
-        lightness = self.texture[0, :3].mean(dim=0).flatten(1) ** 0.45  # (T, texels)
+        lightness = self.texture[0, :3].mean(dim=0).flatten(1) ** _LIGHTNESS  # (T, texels)
         self.middle, self.spread = lightness.mean(dim=1), lightness.std(dim=1) + 0.02
         self.noise = _noise_volume(seed).to(device)  # (1, 7, D, D, D)
 
     def sample_textures(self, which: Tensor, u: Tensor, v: Tensor) -> Tensor:
-        """Sample texture sets at coordinates u, v (M,), mirrored at whole numbers: (M, 6).
+        """Sample texture sets at coordinates u, v (M,), mirrored at odd integers: (M, 6).
 
         The six values are albedo (3), roughness, slope along u, slope along v. `which` (M,) is the number of the set.
         """
@@ -128,7 +129,7 @@ def draw_surface(
     v = place.gather(1, up[:, None])[:, 0] * scale
     texture = own["texture"].long()
     picture = library.sample_textures(texture, u, v)
-    lightness = (picture[:, :3].mean(dim=1) ** 0.45 - library.middle[texture]) / library.spread[texture]
+    lightness = (picture[:, :3].mean(dim=1) ** _LIGHTNESS - library.middle[texture]) / library.spread[texture]
     # albedo and gloss
     pattern, diffuse = _albedo(own, fine, printed, picture, lightness)
     rough, specular = _reflection(own, fine, picture, pattern, diffuse)
@@ -181,7 +182,7 @@ def _reflection(
     own: dict[str, Tensor], fine: Tensor, picture: Tensor, pattern: Tensor, diffuse: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Roughness (M,) and F0 (M, 3) of a drawn material: its levels, varied with pattern, lightness and speckles."""
-    lightness = diffuse.mean(dim=1) ** 0.45
+    lightness = diffuse.mean(dim=1) ** _LIGHTNESS
     deviation = (lightness - own["mid"]) * own["follow"] + 0.5 * own["speckle"] * fine[:, 1]
     from_texture = picture[:, 3] * own["rough_gain"] + own["rough_shift"]
     rough = torch.where(own["from_texture"] > 0.5, from_texture, own["rough"] + deviation)
@@ -203,19 +204,19 @@ def _draw_levels(library: MaterialLibrary, count: int, device: torch.device) -> 
 
     all_dark = (_u((count,), device) < gloss.ALL_DARK)[:, None]
     one, other = (gloss.draw_gloss(all_dark, shape) for _ in range(2))
-    two = u(0, 1) < 0.8  # surfaces in one pattern
-    similar = u(0, 1) < 0.5  # F0 of the two
-    f0_step = torch.where(similar, normal(0.2), torch.log(other.f0 / one.f0))
+    two_surfaces = u(0, 1) < 0.8  # else the pattern changes only the albedo
+    similar_f0 = u(0, 1) < 0.5
+    f0_step = torch.where(similar_f0, normal(0.2), torch.log(other.f0 / one.f0))
     as_is = u(0, 1) < 0.5  # roughness is that of the texture set
     color, color2 = _colors(shape, device), _colors(shape, device)
-    near = (u(0, 1) < 0.5)[..., None]
-    color2 = torch.where(near, color * (0.4 + 1.2 * _u((*shape, 1), device)), color2)
+    same_hue = (u(0, 1) < 0.5)[..., None]
+    color2 = torch.where(same_hue, color * (0.4 + 1.2 * _u((*shape, 1), device)), color2)
     tint = torch.exp(normal(0.4))[..., None] * torch.exp(0.15 * torch.randn((*shape, 3), device=device))
     texture = torch.randint(0, max(len(library.names), 1), shape, device=device)
     black = gloss.dark_albedo(shape, device)
     color = torch.where(one.dark[..., None], black, color)
     color2 = torch.where(other.dark[..., None], gloss.dark_albedo(shape, device), color2)
-    tint = torch.where(one.dark[..., None], black / library.middle[texture][..., None] ** (1 / 0.45), tint)
+    tint = torch.where(one.dark[..., None], black / library.middle[texture][..., None] ** (1 / _LIGHTNESS), tint)
     from_texture = (u(0, 1) < 0.4) if library.has_textures else torch.zeros(shape, device=device)
     tinted = (one.f0 > 0.08) & (u(0, 1) < 0.3)
     f0_tint = torch.where(tinted[..., None], 1 + 0.4 * (_u((*shape, 3), device) - 0.5), torch.ones(1, device=device))
@@ -228,7 +229,7 @@ def _draw_levels(library: MaterialLibrary, count: int, device: torch.device) -> 
         "from_texture": from_texture.float(),  # 1: albedo, roughness and slopes of a texture set, else solid noise
         "texture": texture.float(), "shift": u(0, 2),  # number of the set, and its shift
         "contrast": torch.exp(u(-0.5, 3.2)), "level": u(-1.5, 1.5),  # of the noise in the pattern
-        "mid": color.mean(dim=-1) ** 0.45,  # mean lightness
+        "mid": color.mean(dim=-1) ** _LIGHTNESS,  # mean lightness
         "rough": one.roughness, "follow": normal(0.3),  # roughness, and its change with lightness
         "speckle": u(0, 0.25) * one.grained,  # contrast of fine noise in roughness and F0
         # of a texture's roughness
@@ -236,8 +237,8 @@ def _draw_levels(library: MaterialLibrary, count: int, device: torch.device) -> 
         "rough_shift": torch.where(one.dark, one.roughness - 0.05, torch.where(as_is, 0.0, u(-0.1, 0.4))),
         "f0": one.f0, "f0_follow": normal(0.3),  # F0, and its relative change with lightness
         # from the first surface of the pattern to the second
-        "rough_step": two * (other.roughness - one.roughness), "f0_step": two * f0_step,
-        "dolp_factor": one.dolp_factor, "dolp_step": two * (other.dolp_factor - one.dolp_factor),
+        "rough_step": two_surfaces * (other.roughness - one.roughness), "f0_step": two_surfaces * f0_step,
+        "dolp_factor": one.dolp_factor, "dolp_step": two_surfaces * (other.dolp_factor - one.dolp_factor),
         "raised": (u(0, 1) < 0.4).float(),  # 1: the pattern is in relief
         "by_lightness": (u(0, 1) < 0.6).float(),  # 1: the pattern follows the texture's lightness
         "ior": (1.5 + normal(0.06)).clamp(1.35, 1.7), "bump": bump,

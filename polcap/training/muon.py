@@ -9,21 +9,8 @@ Jordan et al., Muon: an optimizer for hidden layers in neural networks, 2024.
 Liu et al., Muon is scalable for LLM training, 2025: length of the step.
 """
 
-from functools import cache
-
 import torch
 from torch import Tensor
-
-
-@cache
-def compute_type(device: torch.device) -> torch.dtype:
-    """Fastest type for convolutions and matrix products: bfloat16 where the machine has it, else float32.
-
-    bfloat16 doubles the speed of a GPU, and of a CPU with bfloat16 instructions. On other CPUs it is emulated and a
-    dozen times slower.
-    """
-    half = device.type != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    return torch.bfloat16 if half else torch.float32
 
 
 class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without types here
@@ -35,7 +22,7 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def step(self) -> None:
         for group in self.param_groups:
-            by_shape: dict[torch.Size, list[tuple[Tensor, Tensor]]] = {}  # weights and directions
+            by_shape: dict[torch.Size, list[tuple[Tensor, Tensor]]] = {}  # weights as matrices, with their directions
             for weight in group["params"]:
                 gradient = weight.grad if weight.ndim == 2 else weight.grad.permute(0, 2, 3, 1).flatten(1)
                 mean = self.state[weight].setdefault("mean", torch.zeros_like(gradient))
@@ -44,7 +31,7 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without 
                 by_shape.setdefault(direction.shape, []).append((_matrix(weight), direction))
             for shape, pairs in by_shape.items():
                 steps = orthogonal(torch.stack([direction for _, direction in pairs]))
-                length = 0.2 * max(shape) ** 0.5 * group["lr"]  # RMS step of a weight: 0.2 × rate
+                length = 0.2 * max(shape) ** 0.5 * group["lr"]  # Liu et al.: the RMS step of a weight is 0.2 × rate
                 for (matrix, _), step in zip(pairs, steps):
                     matrix.mul_(1 - group["lr"] * group["decay"]).add_(step, alpha=-length)
 
@@ -52,9 +39,9 @@ class Muon(torch.optim.Optimizer):  # type: ignore[misc]  # torch comes without 
 def orthogonal(matrix: Tensor) -> Tensor:
     """Approximate U Vᵀ of the singular value decompositions U S Vᵀ of matrices (N, rows, columns).
 
-    Five Newton–Schulz steps bring the singular values to 0.7…1.2. More would bring them to 1, which training does not
-    need. Each step is a polynomial of X Xᵀ times X. The polynomials commute, so they are multiplied first, as small
-    square matrices: filter banks are up to nine times as wide as high.
+    Five Newton–Schulz steps, with the coefficients of Jordan et al., bring the singular values to 0.7…1.2, which is
+    near enough to 1 for training. Each step multiplies X by a polynomial of X Xᵀ. The polynomials commute, so they
+    are multiplied first, as small square matrices: filter banks are up to nine times as wide as high.
     """
     wide = matrix if matrix.shape[-2] <= matrix.shape[-1] else matrix.mT
     x = wide / (torch.linalg.matrix_norm(wide, keepdim=True) + 1e-7)

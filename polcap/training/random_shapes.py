@@ -110,7 +110,7 @@ def _lathed(rng: np.random.Generator) -> tuple[Floats, Faces]:
     if rng.random() < 0.4:
         lobes = rng.integers(2, 14) * longitude + rng.uniform(-4, 4) * height[:, None]
         ring = ring * (1 + rng.uniform(0.02, 0.2) * np.cos(lobes))
-    return _revolve(0.45 * ring, 0.45 * rng.uniform(0.4, 1.2) * height), _faces(_RINGS, _SECTORS, closed=False)
+    return _revolve(0.45 * ring, 0.45 * rng.uniform(0.4, 1.2) * height), ring_faces(_RINGS, _SECTORS, closed=False)
 
 
 def _vessel(rng: np.random.Generator) -> tuple[Floats, Faces]:
@@ -125,7 +125,7 @@ def _vessel(rng: np.random.Generator) -> tuple[Floats, Faces]:
     height = np.concatenate([rise * tall, np.maximum(rise[::-1] * tall, wall)])
     lobes = 1 + (rng.random() < 0.3) * rng.uniform(0, 0.15) * np.cos(rng.integers(3, 13) * _longitudes())
     vertices = _revolve(np.concatenate([radius, inner])[:, None] * lobes, height - tall / 2)
-    return vertices * [1, rng.uniform(0.7, 1.0), 1], _faces(_RINGS, _SECTORS, closed=False)[:, ::-1]
+    return vertices * [1, rng.uniform(0.7, 1.0), 1], ring_faces(_RINGS, _SECTORS, closed=False)[:, ::-1]
 
 
 def _tube(rng: np.random.Generator) -> tuple[Floats, Faces]:
@@ -137,7 +137,7 @@ def _tube(rng: np.random.Generator) -> tuple[Floats, Faces]:
     curve /= 2 * np.abs(curve).max()
     tangent, axis = np.roll(curve, -1, 0) - np.roll(curve, 1, 0), rng.normal(size=3)
     radius = rng.uniform(0.05, 0.18) * (1 + rng.uniform(0, 0.4) * np.sin(rng.integers(1, 6) * t))
-    return _sweep(curve, tangent, axis, radius, 40), _faces(len(t), 40, closed=True)[:, ::-1]
+    return _sweep(curve, tangent, axis, radius, 40), ring_faces(len(t), 40, closed=True)[:, ::-1]
 
 
 def _branch(
@@ -153,7 +153,7 @@ def _branch(
     thickness = radius * (1 - rng.uniform(0, 0.8) * t) * knots
     thickness[[0, -1]] = 1e-4  # closed ends
     vertices = _sweep(curve, np.gradient(curve, axis=0), axis, thickness, _BRANCH_SECTORS)
-    return vertices, _faces(_BRANCH_RINGS, _BRANCH_SECTORS, closed=False)[:, ::-1]
+    return vertices, ring_faces(_BRANCH_RINGS, _BRANCH_SECTORS, closed=False)[:, ::-1]
 
 
 _PARTS: list[Callable[[np.random.Generator], tuple[Floats, Faces]]] = [
@@ -163,20 +163,18 @@ _PARTS: list[Callable[[np.random.Generator], tuple[Floats, Faces]]] = [
 
 def _sphere(rings: int, sectors: int) -> tuple[Floats, Faces]:
     """Unit sphere of latitudes and longitudes from the north pole down, faces counter-clockwise from outside."""
-    polar = np.linspace(0, np.pi, rings)[:, None]
-    around = np.linspace(0, 2 * np.pi, sectors, endpoint=False)
-    parts = np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)
-    vertices = np.stack(np.broadcast_arrays(*parts), axis=-1).reshape(-1, 3)
-    return vertices, _faces(rings, sectors, closed=False)
+    polar = np.linspace(0, np.pi, rings)
+    return _revolve(np.sin(polar)[:, None], np.cos(polar), sectors), ring_faces(rings, sectors, closed=False)
 
 
-def _longitudes() -> Floats:
-    return np.linspace(0, 2 * np.pi, _SECTORS, endpoint=False)
+def _longitudes(sectors: int = _SECTORS) -> Floats:
+    return np.linspace(0, 2 * np.pi, sectors, endpoint=False)
 
 
-def _revolve(ring: Floats, height: Floats) -> Floats:
+def _revolve(ring: Floats, height: Floats, sectors: int = _SECTORS) -> Floats:
     """Vertices (R · S, 3) of a solid of revolution with radii (R, S) or (R, 1) at heights (R,)."""
-    parts = ring * np.cos(_longitudes()), ring * np.sin(_longitudes()), height[:, None]
+    around = _longitudes(sectors)
+    parts = ring * np.cos(around), ring * np.sin(around), height[:, None]
     return np.stack(np.broadcast_arrays(*parts), axis=-1).reshape(-1, 3)
 
 
@@ -186,12 +184,12 @@ def _sweep(curve: Floats, tangent: Floats, axis: Floats, radius: Floats, sectors
     side = np.cross(tangent, axis)
     side /= np.linalg.norm(side, axis=1, keepdims=True) + 1e-9
     other = np.cross(tangent, side)
-    around = np.linspace(0, 2 * np.pi, sectors, endpoint=False)[:, None]
+    around = _longitudes(sectors)[:, None]
     ring = side[:, None] * np.cos(around) + other[:, None] * np.sin(around)
     return np.asarray((curve[:, None] + radius[:, None, None] * ring).reshape(-1, 3))
 
 
-def _faces(rings: int, sectors: int, *, closed: bool) -> Faces:
+def ring_faces(rings: int, sectors: int, *, closed: bool) -> Faces:
     """Triangles that connect successive rings of vertices; with `closed`, also the last ring with the first.
 
     They are counter-clockwise from outside if the rings are counter-clockwise from above.
@@ -204,4 +202,5 @@ def _faces(rings: int, sectors: int, *, closed: bool) -> Faces:
 
 
 def _power(value: Floats, exponent: float) -> Floats:
+    """Power of the magnitude, with the sign of the value."""
     return np.asarray(np.sign(value) * np.abs(value) ** exponent)

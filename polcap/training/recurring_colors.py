@@ -18,12 +18,12 @@ COLORS = 8
 _OFFSET = 0.02  # added to albedo before its logarithm
 # lightness and two hues
 _AXES = ((3**-0.5, 3**-0.5, 3**-0.5), (2**-0.5, -(2**-0.5), 0.0), (6**-0.5, 6**-0.5, -2 * 6**-0.5))
-_KNOTS_DEG = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 65.0, 70.0, 75.0, 80.0, 90.0)
-_LIGHT_DOUBT = (0.4, 0.35, 0.3, 0.2, 0.17, 0.17, 0.27, 0.37, 0.48, 0.6, 0.7, 0.8)  # 1σ of log lightness at these angles
-_HUE_DOUBT = 0.3  # 1σ of the hues, relative to that of the lightness
+_KNOTS_DEG = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 65.0, 70.0, 75.0, 80.0, 90.0)  # zeniths
+_LIGHT_DOUBT = (0.4, 0.35, 0.3, 0.2, 0.17, 0.17, 0.27, 0.37, 0.48, 0.6, 0.7, 0.8)  # initial 1σ of log lightness there
+_HUE_DOUBT = 0.3  # initial 1σ of the hues, relative to that of the lightness
 _CLIPPED = 0.5  # added to 1σ where the picture is clipped
 _MAX_CHANGE = 3.0  # greatest change of the logarithm of 1σ
-_SURE = 0.2  # 1σ of lightness below which a pixel has full weight in the fit of the colors
+_CERTAIN = 0.2  # 1σ of lightness below which a pixel has full weight in the fit of the colors
 _WIDTH = 0.2  # 1σ of all colors in the first rounds of the fit
 _MIN_WIDTH = 0.05  # 1σ of a color
 _ROUNDS = (5, 7)  # iterations of the fit: with one width, then with a width for each color
@@ -59,7 +59,7 @@ class Recolor(nn.Module):  # type: ignore[misc]  # torch comes without types her
         color = _opponent(diffuse)
         expected = _interpolation_weights(cosine.flatten(2)) @ self.knots.T
         sigma = torch.exp(expected.transpose(1, 2).reshape(doubt.shape) + doubt.clamp(-_MAX_CHANGE, _MAX_CHANGE))
-        weight = inside * (1 - clipped) * (_SURE / sigma[:, :1]).square().clamp(max=1) + 1e-6
+        weight = inside * (1 - clipped) * (_CERTAIN / sigma[:, :1]).square().clamp(max=1) + 1e-6
         colors = fit_mixture(*(part[:, :, ::2, ::2].flatten(2).detach() for part in (color, weight)))
         spread = (sigma + _CLIPPED * clipped)[:, [0, 1, 1]].square()
         corrected, member = _correct(color.flatten(2), spread.flatten(2), colors)
@@ -97,15 +97,15 @@ def fit_mixture(color: Tensor, weight: Tensor) -> ColorMixture:
     center = mean.transpose(1, 2) + corner * spread.transpose(1, 2)
     variance = torch.full_like(center, _WIDTH**2)
     share = torch.full_like(center[..., :1], 1 / COLORS)
-    both = torch.cat([color, color * color], dim=1)
-    seen = torch.cat([both, torch.ones_like(weight)], dim=1).transpose(1, 2)
+    powers = torch.cat([color, color * color], dim=1)
+    moments = torch.cat([powers, torch.ones_like(weight)], dim=1).transpose(1, 2)
     for step in range(sum(_ROUNDS)):
         slopes = torch.cat([center / variance, -0.5 / variance], dim=2)  # of the log density, over color and its square
         level = torch.log(share) - 0.5 * (center * center / variance + torch.log(variance)).sum(dim=2, keepdim=True)
-        member = torch.softmax(slopes @ both + level, dim=1)
-        sums = (member * weight) @ seen
+        member = torch.softmax(slopes @ powers + level, dim=1)
+        sums = (member * weight) @ moments
         area = sums[..., 6:] + 1e-3
-        center = (sums[..., :3] + 1e-3 * center) / area
+        center = (sums[..., :3] + 1e-3 * center) / area  # a color without pixels stays
         if step >= _ROUNDS[0]:
             variance = (sums[..., 3:6] / area - center * center).clamp(min=0) + _MIN_WIDTH**2
         share = area / area.sum(dim=1, keepdim=True)
@@ -115,9 +115,9 @@ def fit_mixture(color: Tensor, weight: Tensor) -> ColorMixture:
 def _correct(color: Tensor, spread: Tensor, colors: ColorMixture) -> tuple[Tensor, Tensor]:
     """Expected true colors (B, 3, N) of measured ones with variances `spread`; their membership (B, COLORS, N)."""
     difference = color[:, None] - colors.center[..., None]  # (B, COLORS, 3, N)
-    wide = spread[:, None] + colors.variance[..., None]
-    pull = difference / wide
-    score = (difference * pull).sum(dim=2) + torch.log(wide.prod(dim=2))
+    variance = spread[:, None] + colors.variance[..., None]
+    pull = difference / variance
+    score = (difference * pull).sum(dim=2) + torch.log(variance.prod(dim=2))
     member = torch.softmax(torch.log(colors.share) - 0.5 * score, dim=1)
     return color - spread * (member[:, :, None] * pull).sum(dim=1), member
 
@@ -127,7 +127,7 @@ class ColorGloss(nn.Module):  # type: ignore[misc]  # torch comes without types 
 
     def __init__(self, outputs: int) -> None:
         super().__init__()
-        features = 2 * PROFILE + 7 + outputs
+        features = 2 * PROFILE + 7 + outputs  # as `describe_colors` lists them
         self.read = nn.Sequential(
             nn.Linear(features, 256), nn.GELU(), nn.Linear(256, 256), nn.GELU(), nn.Linear(256, outputs)
         )
@@ -153,7 +153,7 @@ def describe_colors(seen: GlossEvidence, first: Tensor, member: Tensor, colors: 
     share = area / (area.sum(dim=1, keepdim=True) + 1e-3)
     center = colors.center @ usable.new_tensor(_AXES)  # logarithms of red, green, blue
     mean = (share * center).sum(dim=1, keepdim=True)
-    whole = profile(usable, figures, cosine).expand(-1, COLORS, -1)
+    object_profile = profile(usable, figures, cosine).expand(-1, COLORS, -1)
     estimate = (own @ first.flatten(2).transpose(1, 2)) / (area + 1e-3)
     own_profile = profile(own, figures, cosine)
-    return torch.cat([own_profile, whole, center, center - mean, torch.log(share + 1e-3) / 3, estimate], dim=2)
+    return torch.cat([own_profile, object_profile, center, center - mean, torch.log(share + 1e-3) / 3, estimate], dim=2)

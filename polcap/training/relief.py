@@ -14,12 +14,12 @@ from polcap.optics import frames
 _WAVES = 16  # plane waves in a random height field
 _LONGEST, _SHORTEST = 40.0, 4.0  # wavelengths, px
 _MAX_SLOPE = 1.2  # steeper relief would hide parts of itself
-_NONE = 0.2  # share of objects without relief
+_SMOOTH_SHARE = 0.2  # of objects, which have no relief
 
 
 def random_slopes(position: Floats, px: float, rng: np.random.Generator) -> Floats:
     """Gradients (M, 3) of a random relief at positions (M, 3), in the same frame; `px` is the length of a pixel."""
-    if rng.random() < _NONE:
+    if rng.random() < _SMOOTH_SHARE:
         return np.zeros_like(position)
     wavelength = px * _SHORTEST * (_LONGEST / _SHORTEST) ** rng.random()
     height, gradient = _waves(position, wavelength, rng)
@@ -34,8 +34,8 @@ def random_slopes(position: Floats, px: float, rng: np.random.Generator) -> Floa
     steep = np.sqrt(np.mean(np.sum(gradient**2, axis=1))) + 1e-9
     gradient = gradient / steep * rng.uniform(0.03, 0.5) * rng.choice([-1, 1])
     if rng.random() < 0.5:  # on a part of the object only
-        where, _ = _waves(position, px * rng.uniform(80, 300), rng)
-        gradient = gradient / (1 + np.exp(-8 * where))[:, None]
+        region, _ = _waves(position, px * rng.uniform(80, 300), rng)  # positive in that part
+        gradient = gradient / (1 + np.exp(-8 * region))[:, None]
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
     return np.asarray(gradient * np.minimum(1, _MAX_SLOPE / np.maximum(length, 1e-9)), np.float32)
 

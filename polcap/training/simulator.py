@@ -4,6 +4,7 @@ Every step gets a new batch. Cues are computed by `stages/cues`, the same code a
 """
 
 from dataclasses import dataclass
+from functools import partial
 from math import isqrt
 from types import SimpleNamespace
 from typing import Any
@@ -136,7 +137,7 @@ class Simulator:
         """
         full, area = self.size, len(order)
         size, coarse = isqrt(area), full // bounced_light.COARSE
-        new_place = np.full(2**16, -1, np.int64)  # of each pixel of the cache, in the thinned and mirrored view
+        new_place = np.full(2**16, -1, np.int64)  # in the thinned and mirrored view, for each value of `met`
         thinned = np.arange(full) * size // full
         new_place[: full * full] = np.argsort(order)[(thinned[:, None] * size + thinned).reshape(-1)]
         new_place[[bounced_light.NOWHERE, bounced_light.ESCAPED]] = -1
@@ -153,10 +154,9 @@ class Simulator:
     ) -> SimulatedPhotographs:
         """Draw materials for traced views, simulate the flash light and measure it with a camera.
 
-        strength (B,): S0 of a white plane that faces the flash at the object's distance. jitter (B,) 0…1: thins or
-        widens the input mask.
+        strength (B,): S0 of a white plane that faces the flash at the object's distance. jitter (B,): as for
+        `_jitter_mask`, which varies the input mask.
         """
-        count, height, width = views.mask.shape
         pixels = views.pixels
         own = pixels.owner
         surface = materials.draw_surface(
@@ -166,11 +166,7 @@ class Simulator:
         normal, body, specular = materials.reflect(surface, pixels.v, to_flash, pixels.lit * strength[own])
         stokes = body + specular
         highlight = 1 - (body[0].sum(dim=1) + 1e-4) / (stokes[0].sum(dim=1) + 1e-4)
-
-        def image(flat: Tensor) -> Tensor:
-            out = flat.new_zeros(count * height * width, flat.shape[1])
-            return out.index_copy(0, pixels.index, flat).reshape(count, height, width, -1)
-
+        image = partial(_image, at=pixels.index, shape=views.mask.shape)
         truth = {
             "normal": image(normal), "depth": image(pixels.depth[:, None]), "diffuse": image(surface.diffuse),
             "specular": image(surface.specular), "roughness": image(surface.roughness[:, None]),
@@ -198,7 +194,6 @@ def to_batch(photo: SimulatedPhotographs) -> Batch:
 
 def channels(photo: SimulatedPhotographs) -> Tensor:
     """Cue channels (B, N, H, W) of simulated photographs by `stages/cues`, 0 outside the input mask; channels last."""
-    count, height, width = photo.rays.shape[:3]
     ratio, sigma, dolp, normalized = cues.polarization(photo.stokes, photo.covariance)
     clipped, at = photo.clipped, photo.at
     row = SimpleNamespace(  # all pixels as one image row
@@ -207,8 +202,12 @@ def channels(photo: SimulatedPhotographs) -> Tensor:
         mask=torch.ones_like(clipped)[None], quality=(clipped.to(torch.uint8) * int(Quality.CLIPPED))[None],
     )  # fmt: skip
     flat = cues.channels(row)[:, 0].T  # (M, N)
-    out = flat.new_zeros(count * height * width, flat.shape[1]).index_copy(0, at, flat)
-    return out.reshape(count, height, width, -1).permute(0, 3, 1, 2)
+    return _image(flat, at, photo.mask.shape).permute(0, 3, 1, 2)
+
+
+def _image(flat: Tensor, at: Tensor, shape: torch.Size) -> Tensor:
+    """Images (B, H, W, ·) of this shape (B, H, W) with values (M, ·) at the indices `at` (M,), 0 elsewhere."""
+    return flat.new_zeros(shape.numel(), flat.shape[1]).index_copy(0, at, flat).reshape(*shape, -1)
 
 
 def _mirror(pixels: Indices, flip: bool) -> tuple[Indices, NDArray[np.float32]]:
@@ -225,9 +224,9 @@ def _mirror(pixels: Indices, flip: bool) -> tuple[Indices, NDArray[np.float32]]:
 
 
 def _jitter_mask(mask: Tensor, jitter: Tensor) -> Tensor:
-    """Vary masks (B, H, W): a third become one pixel wider, a third one pixel thinner."""
+    """Vary masks (B, H, W) by random numbers (B,) 0…1: a third become one pixel wider, a third one pixel thinner."""
     solid = mask[:, None].float()
     wider = F.max_pool2d(solid, 3, 1, 1)[:, 0] > 0.5
     thinner = -F.max_pool2d(-solid, 3, 1, 1)[:, 0] > 0.5
-    part = jitter[:, None, None]
-    return torch.where(part < 0.33, wider, torch.where(part < 0.66, thinner, mask))
+    choice = jitter[:, None, None]
+    return torch.where(choice < 0.33, wider, torch.where(choice < 0.66, thinner, mask))

@@ -82,8 +82,8 @@ def open_cache(
 
 def cache_bytes(views: int, size: int) -> int:
     """Size of a cache of traced views on disk."""
-    of_view = sum((size // by) ** 2 * channels * np.dtype(kind).itemsize for by, channels, kind in ARRAYS.values())
-    return views * (of_view + 16 * 4)
+    of_one = sum((size // by) ** 2 * channels * np.dtype(kind).itemsize for by, channels, kind in ARRAYS.values())
+    return views * (of_one + 16 * 4)  # with the camera: 16 numbers of 4 bytes
 
 
 def _build_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe, inputs: str, report: Report) -> None:
@@ -139,8 +139,8 @@ def _traced_meshes(folder: Path, inputs: str) -> int:
     """Number of meshes and random shapes that an interrupted cache of the same inputs holds."""
     try:
         known = text_file.read_json(folder / _PROGRESS)
-        whole = all((folder / f"{name}.npy").exists() for name in (*ARRAYS, "camera"))
-        return int(known["meshes"]) if whole and known["inputs"] == inputs else 0
+        complete = all((folder / f"{name}.npy").exists() for name in (*ARRAYS, "camera"))
+        return int(known["meshes"]) if complete and known["inputs"] == inputs else 0
     except (OSError, ValueError, KeyError, TypeError):
         return 0
 
@@ -165,6 +165,15 @@ def _store(
 def training_meshes(data: Path) -> list[Path]:
     """Mesh files for training, sorted by name."""
     return sorted(path for path in (data / "meshes" / "train").glob("*.npz") if path.stem not in WITHHELD)
+
+
+def test_meshes(data: Path) -> list[Path]:
+    """Mesh files for tests, sorted by name. Raises InputError: there are none."""
+    folder = data / "meshes" / "test"
+    if not (files := sorted(folder.glob("*.npz"))):
+        remedy = f"`python -m polcap.training.import_data SOURCE {data}` converts OBJ, GLB and PLY"
+        raise InputError(f"{folder} holds no mesh; {remedy}")
+    return files
 
 
 def read_mesh(path: Path) -> Triangles:
@@ -203,9 +212,9 @@ def _trace_shape(
     tracer = Tracer(mesh)
     for _ in range(count):
         buffer, rotation, translation = trace_random_view(name, tracer, recipe.size, rng, rotate)
-        offset = random_flash(rng)
-        offset = offset if recipe.flash is None else recipe.flash
-        middle = float(buffer.depth[buffer.mask].mean(dtype=np.float64))
+        drawn = random_flash(rng)  # in any case, so that `recipe.flash` changes no view
+        offset = drawn if recipe.flash is None else recipe.flash
+        middle, _ = depth_unit(buffer.mask, buffer.depth, buffer.view.focal)
         pose = light_transport.LitPose(rotation, translation, middle * np.array([*offset, 0.0]), middle**2)
         yield buffer, pose, *bounced_light.trace_visibility(tracer, buffer, pose, rng)
 
@@ -247,7 +256,7 @@ def random_pose(
         slope, azimuth = np.tan(np.radians(rng.uniform(0, 12))), rng.uniform(0, 2 * np.pi)
         centre = distance * np.array([slope * np.cos(azimuth), slope * np.sin(azimuth), -1.0])
         translation = centre - (low + high) / 2
-        if -(high[2] + translation[2]) > distance / 2:  # not too near the lens
+        if -(high[2] + translation[2]) > distance / 2:  # no point is nearer to the lens than half the distance
             return rotation, translation, _frame_crop(turned + translation, fill, size, rng)
 
 

@@ -19,6 +19,7 @@ from polcap.formats import own_files
 from polcap.formats.maps import png
 from polcap.training import loop, loss, main_network, materials, onnx_export, traced_views
 from polcap.training.progress import Report, silent
+from polcap.training.scores import mean_score
 from polcap.training.simulator import Batch, Simulator
 from polcap.training.validation import HeldOutPictures
 from polcap.training.variants import VARIANTS
@@ -128,7 +129,7 @@ def _check(options: TrainingOptions) -> None:
     for name, value, known in (("preset", options.preset, PRESETS), ("variant", options.variant, VARIANTS)):
         if value not in known:
             raise InputError(f"{name} {value!r} is not one of {', '.join(known)}")
-    last, test_meshes = options.out / "last.pt", options.data / "meshes" / "test"
+    last = options.out / "last.pt"
     if options.resume and options.start:
         raise InputError(
             f"--resume continues the training of {last}, --start begins a new one with the weights of {options.start}; "
@@ -138,11 +139,7 @@ def _check(options: TrainingOptions) -> None:
         raise InputError(f"{last} does not exist, so there is nothing to resume; train without --resume first")
     if last.exists() and not options.resume:
         raise InputError(f"{last} exists already; continue from it with --resume, or choose another --out")
-    if not any(test_meshes.glob("*.npz")):
-        raise InputError(
-            f"{test_meshes} holds no mesh; "
-            f"`python -m polcap.training.import_data SOURCE {options.data}` converts OBJ, GLB and PLY"
-        )
+    traced_views.test_meshes(options.data)
 
 
 def _make_batches(
@@ -202,7 +199,7 @@ class NetworkTraining(loop.Trainee):
             weight.grad = sum(parts) / len(parts)
         norm = self.update(progress)
         self.samples += sum(len(one.mask) for one in batch)
-        return {name: float(np.mean([f[name] for f in figures])) for name in figures[0]} | {"gradient": norm}
+        return mean_score(figures) | {"gradient": norm}
 
     def _gradient(self, batch: Batch, lights: torch.Generator) -> tuple[tuple[Tensor, ...], dict[str, float]]:
         """Gradient of the loss of one batch with respect to the weights, and the parts of that loss."""

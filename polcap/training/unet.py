@@ -1,4 +1,4 @@
-"""The U-Net of the mask's network and of the refinement network."""
+"""The U-Net, which is the mask network and the refinement network, and the residual block of all networks."""
 
 from itertools import pairwise
 

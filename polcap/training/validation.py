@@ -13,6 +13,7 @@ from polcap.stages.cues import FLOOR
 from polcap.training import evaluation_protocol, loss, main_network, materials, traced_views
 from polcap.training.camera_errors import CameraErrors
 from polcap.training.progress import Report, silent
+from polcap.training.scores import mean_score
 from polcap.training.simulator import Batch, Simulator, to_batch
 
 _COUNT, _SIZE = 48, 128  # pictures, px
@@ -23,7 +24,7 @@ class HeldOutPictures:
     """Fixed pictures of test meshes and test materials, with the camera and flash of the evaluation."""
 
     def __init__(self, data: Path, folder: Path, device: torch.device, report: Report = silent) -> None:
-        cache = traced_views.open_cache(folder, sorted((data / "meshes" / "test").glob("*.npz")), _RECIPE, report)
+        cache = traced_views.open_cache(folder, traced_views.test_meshes(data), _RECIPE, report)
         library = materials.MaterialLibrary(data / "materials" / "test", device, seed=4)
         simulator = Simulator(cache, library, device)
         order = np.random.default_rng(5).permutation(len(simulator.camera))[:_COUNT]
@@ -39,25 +40,21 @@ class HeldOutPictures:
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def errors(self, network: nn.Module) -> dict[str, float]:
         """Mean errors of a network on the held-out pictures."""
-        rows = [_errors(main_network.run(network, batch.channels), batch) for batch in self.batches]
-        return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+        return mean_score([_errors(main_network.run(network, batch.channels), batch) for batch in self.batches])
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def picture(self, network: nn.Module) -> Picture:
         """Picture of eight held-out cases in rows: S0; truth and estimate of normal, diffuse, F0, roughness, depth."""
         batch = self.batches[0]
-        sides = [_draw(maps, batch.mask) for maps in (vars(batch), main_network.run(network, batch.channels))]
+        both = [_draw(maps, batch.mask) for maps in (vars(batch), main_network.run(network, batch.channels))]
         light = (torch.exp(batch.channels[:, main_network.COLOR].float()) - FLOOR) * batch.mask[:, None]
         columns = [[pictures.display(s0, 1.0) for s0 in _arrays(light)]]
-        columns += [tiles for pair in zip(*sides) for tiles in pair]
+        columns += [tiles for pair in zip(*both) for tiles in pair]
         return np.hstack([np.vstack(tiles) for tiles in columns])
 
 
 def _draw(maps: dict[str, Tensor], mask: Tensor) -> list[list[Picture]]:
-    """Images of the maps, one list per map with an image per picture of the batch.
-
-    The maps are normal (in the frame of each pixel's ray), diffuse, F0 from 0 to 0.3, roughness and depth.
-    """
+    """Pictures of the normal (in ray frames), diffuse, F0 from 0 to 0.3, roughness and depth: a list per map."""
     inside = mask.cpu().numpy()
     normal, diffuse, specular, roughness, depth = (
         _arrays(maps[name] * mask[:, None]) for name in ("normal", "diffuse", "specular", "roughness", "depth")

@@ -40,11 +40,12 @@ def _unpolarized(x: Tensor) -> Tensor:
 def _published(x: Tensor) -> Tensor:
     """Input of an ablation: the published method's pictures at 0°, 45° and 90°, normalized Stokes map, diffuse color.
 
-    The pictures are linear. Their polarization is the mean over the color channels, which differ by noise only.
+    The pictures are linear. Their polarization is the mean over the color channels, which differ by noise only. So the
+    diffuse color, the normalized least intensity of each pixel, is the normalized S0.
     """
     s0 = torch.exp(x[:, _AT["log_r"] : _AT["log_b"] + 1]) - FLOOR
-    s1, s2 = (x[:, _AT[name]].unsqueeze(1) / 10 for name in ("s1", "s2"))
-    pictures = [s0 * (1 + part) / 2 for part in (s1, s2, -s1)]
+    s1, s2 = (x[:, _AT[name]].unsqueeze(1) / 10 for name in ("s1", "s2"))  # S1/S0 and S2/S0
+    pictures = [s0 * (1 + part) / 2 for part in (s1, s2, -s1)]  # at 0°, 45°, 90°
     stokes = x[:, _AT["cos_2phi"] : _AT["sin_2phi"] + 1]
     both = torch.cat([*pictures, stokes, F.normalize(s0, dim=1, eps=1e-4)], dim=1)
     return both * x[:, _AT["mask"]].unsqueeze(1)

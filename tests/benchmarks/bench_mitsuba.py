@@ -75,12 +75,11 @@ def read(file: Path, clean: bool, rough: bool, seed: int) -> tuple[Case, str]:
         for value in (scene_light(made, rough), made["diffuse"], mask, rays)
     )
     one = torch.ones(1)
-    at = np.flatnonzero(mask)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         errors = CameraErrors.none(1, one.device) if clean else CameraErrors.stated(1, one.device)
-        seen = photograph(scene[0][:, None], diffuse, inside, v, torch.from_numpy(at), errors)
-    measured = cues.compute(stokes_image(seen, at, mask, view), white())
+        seen = photograph(scene[0][:, None], diffuse, inside, v, torch.from_numpy(np.flatnonzero(mask)), errors)
+    measured = cues.compute(stokes_image(seen, mask, view), white())
     depth = np.where(mask, (made["depth"] - made["middle"]) / made["unit"], 0).astype(np.float32)
     truth = SurfaceMaps(
         made["normal"], made["diffuse"], made["specular"], made["roughness"], depth,

@@ -19,9 +19,7 @@ def test_channels_are_those_of_the_cue_stage(simulator: Simulator) -> None:
     ours = channels(photo)[0].numpy()
     focal, x, y = (float(a) for a in simulator.camera[3, :3])
     measured = (photo.stokes, photo.covariance, photo.clipped)
-    image = evaluation_protocol.stokes_image(
-        measured, photo.at.numpy(), photo.input_mask[0].numpy(), View(focal, (x, y), 1.0)
-    )
+    image = evaluation_protocol.stokes_image(measured, photo.input_mask[0].numpy(), View(focal, (x, y), 1.0))
     theirs = cues.channels(cues.compute(image, evaluation_protocol.white()))
     np.testing.assert_allclose(ours, theirs, atol=2e-4)  # float32 in another order; arccos near 1 is touchy
 
