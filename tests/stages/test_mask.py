@@ -211,6 +211,29 @@ def test_expected_error_is_one_minus_the_mean_overlap():
     assert 1 - regions.expected_error(found, chance) == pytest.approx(np.mean(overlaps), abs=0.005)
 
 
+@pytest.mark.parametrize(("light", "less"), [(0.02, True), (0.5, False)])
+def test_colors_settle_a_doubt_only_if_object_and_backdrop_differ(light, less):
+    """The network is sure of a core and of the backdrop, and doubts the rest of an object on a dark or equal backdrop.
+
+    A mask that lacks the doubted part is as doubtful as before, or more.
+    """
+    random = np.random.default_rng(0)
+    rows, columns = np.mgrid[:80, :120]
+    object_ = np.hypot(rows - 40, columns - 60) < 30
+    core = np.hypot(rows - 40, columns - 60) < 15
+    picture = np.where(object_, 0.5, light)[..., None] * random.lognormal(0, 0.1, (80, 120, 3))
+    chance = np.where(core, 0.99, np.where(object_, 0.6, 0.01)).astype(np.float32)
+    chart = np.zeros(object_.shape, np.uint8)
+    by_network = regions.expected_error(object_, chance)
+    by_color = regions.expected_error_by_color(picture.astype(np.float32), object_, chance, chart)
+    without = [measure(core) for measure in (
+        lambda found: regions.expected_error(found, chance),
+        lambda found: regions.expected_error_by_color(picture.astype(np.float32), found, chance, chart),
+    )]  # fmt: skip
+    assert by_color < by_network / 2 if less else by_color == pytest.approx(by_network, abs=0.03)
+    assert without[1] > without[0] - 0.03
+
+
 def test_parts_of_a_mask_are_numbered_by_area() -> None:
     mask = np.zeros((20, 40), bool)
     mask[2:6, 2:6], mask[5:15, 20:35] = True, True

@@ -49,7 +49,7 @@ class MaskSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = "board"
 
 
-@stage(version=10)
+@stage(version=11)
 def segment(
     radiance: AngleStack,
     alignment: Alignment,
@@ -82,7 +82,7 @@ def segment(
         patches = _chart_zone(radiance, color, 0.0)
         probability = object_probability(radiance, alignment, color, patches, network, run)
         mask = _by_probability(picture, probability, zone, patches, settings.min_area)
-        doubt = regions.expected_error(mask, probability)
+        doubt = regions.expected_error_by_color(picture, mask, probability, patches)
     erased = np.any((radiance.quality & int(Quality.ERASED)) > 0, axis=0)
     if settings.silhouette == "always" or (settings.silhouette == "board" and erased.any()):
         mask = bright_parts.add(picture, mask, erased)

@@ -38,7 +38,7 @@ def reduce_picture(picture: Floats, chart: Bits) -> tuple[Floats, Bools]:
 
 def cut(picture: Floats, seed: Bits, outside: Bools, probability: Floats | None = None) -> Bits:
     """Move the outline of a mask (h, w) to color edges by GrabCut; probabilities limit the change where certain."""
-    tone = np.log2(np.clip(picture, 0, 4) + 0.002)
+    tone = stops(picture)
     display = (255 * (tone - tone.min()) / (np.ptp(tone) + 1e-9)).astype(np.uint8)
     reach = max(3, round(_REACH * max(seed.shape)))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
@@ -56,6 +56,11 @@ def cut(picture: Floats, seed: Bits, outside: Bools, probability: Floats | None 
         cv2.grabCut(display, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), _ROUNDS, cv2.GC_INIT_WITH_MASK)
     found = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.uint8)
     return found if found.any() else seed
+
+
+def stops(picture: Floats) -> Floats:
+    """Base-2 logarithm (..., 3) of a linear picture, without outliers."""
+    return np.asarray(np.log2(np.clip(picture, 0, 4) + 0.002))
 
 
 def enlarge(mask: Bools, chart: Bits) -> Bools:

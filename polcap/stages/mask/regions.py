@@ -1,10 +1,12 @@
-"""From probabilities to a mask: their threshold, and connected regions without specks and holes."""
+"""From probabilities to a mask: their threshold, connected regions without specks and holes, and the expected error."""
 
 import cv2
 import numpy as np
 
 from polcap.image_values import Bits, Bools, Floats
+from polcap.optics.resize import area_mean
 from polcap.optics.warp import Box
+from polcap.stages.mask import graph_cut
 
 _SPECK = 0.01  # of the largest region; smaller regions are specks
 _INSIDE = 0.5  # probability above which a pixel belongs to the object
@@ -12,6 +14,14 @@ _LIKELY = 0.3  # a region without a pixel of more probability is backdrop of the
 _PINHOLE = 1e-3  # of the mask; smaller holes are dark texture
 _OPENING = 0.15  # largest mean probability of a hole that stays open; others are shadowed parts of the object
 _MOST_ERROR = 1.7  # expected error of the mask by colors, over that of the network's mask (decision 15)
+# probability from which a pixel's color is one of the object's; below 1 − that, one of the backdrop's
+_SAMPLE = 0.9
+_SAMPLES, _LEAST_SAMPLES = 150, 50  # colors of each
+_AROUND, _AROUND_PX = 0.3, 8  # margin of the box with colors of the backdrop: of its longer side; least px
+_COLOR_STOPS = 0.25  # 1σ of the kernel of the densities of colors [stops]; docs/benchmarks/mask.md
+# exponent and limit of the ratio of densities: neighbors have one color, and a backdrop has colors not sampled
+_COLOR_POWER, _MOST_LOG_ODDS = 0.5, 3.0
+_UNSAMPLED = 1e-3  # least density, relative to that at a sample's own color
 
 
 def likely_regions(probability: Floats) -> Bools:
@@ -63,6 +73,40 @@ def expected_error(mask: Bools, probability: Floats) -> float:
     """Expected error of a mask from probabilities (H, W): 1 − expected intersection over expected union."""
     inside, outside = float(probability[mask].sum()), float(probability[~mask].sum())
     return 1 - inside / max(float(mask.sum()) + outside, 1e-9)
+
+
+def expected_error_by_color(picture: Floats, mask: Bools, probability: Floats, chart: Bits) -> float:
+    """Expected error of a mask (H, W), by the network's probabilities (H, W) and by colors.
+
+    By Bayes' rule the odds of a pixel are multiplied by the density of its color in the object over that in the
+    backdrop. The densities are those of pixels of which network and mask agree with certainty. Where object and
+    backdrop have one color, or too few pixels are certain, the network's probabilities remain. `picture` (H, W, 3) is
+    linear, `chart` (H, W) is 1 on the chart.
+    """
+    small, outside = graph_cut.reduce_picture(picture, chart)
+    inside, chance = area_mean(mask, outside.shape) > 0.5, np.array(area_mean(probability, outside.shape))
+    box = box_around(inside, _AROUND, _AROUND_PX)
+    if box is None:
+        return expected_error(mask, probability)
+    around = np.zeros_like(inside)
+    around[box[1] : box[3], box[0] : box[2]] = True
+    around &= ~outside
+    color = graph_cut.stops(small)
+    samples = [color[around & inside & (chance > _SAMPLE)], color[around & ~inside & (chance < 1 - _SAMPLE)]]
+    if min(len(one) for one in samples) < _LEAST_SAMPLES:
+        return expected_error(mask, probability)
+    object_, backdrop = (_density(color[around], one) for one in samples)
+    known = np.clip(chance[around], 1e-6, 1 - 1e-6)
+    by_color = np.clip(_COLOR_POWER * np.log(object_ / backdrop), -_MOST_LOG_ODDS, _MOST_LOG_ODDS)
+    chance[around] = 1 / (1 + (1 - known) / known * np.exp(-by_color))
+    return expected_error(inside, chance)
+
+
+def _density(color: Floats, samples: Floats) -> Floats:
+    """Density (N,) of colors (N, 3) among samples (M, 3), by Gaussian kernels; at most 1."""
+    chosen = samples[np.linspace(0, len(samples) - 1, min(_SAMPLES, len(samples))).astype(int)]
+    total = sum(np.exp(((color - one) ** 2).sum(axis=1) / (-2 * _COLOR_STOPS**2)) for one in chosen)
+    return np.asarray(total / len(chosen) + _UNSAMPLED)
 
 
 def measure_shape(mask: Bools) -> tuple[float, float, float]:
