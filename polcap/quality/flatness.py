@@ -32,6 +32,9 @@ _FACING_DOLP = 0.045  # most of the outline of a plane that faces the camera
 _ALIGNED = 0.84  # length of the mean normal: boxes up to .83, except one whose normals are wrong; bodies up to .77
 _ONE_NORMAL = 0.92  # of the mean normal: beyond, the outline decides nothing, even if bars polarize it
 _KNOWN_DEG = 7.0  # expected error of normals: a box that shows one face has 6, a tilted coin 9, plates 14 to 16
+# least length of the mean normal, and least expected error, of a bent sheet: good crumpled sheets have .80 to .88 and 18
+# to 29° (true errors up to 46°), rounded bodies up to .77 (docs/benchmarks/gates.md)
+_SHEET_ALIGNED, _SHEET_DEG = 0.78, 15.0
 _TILTED = np.cos(np.radians(20.0))  # of the mean normal: more tilt shows little more
 
 
@@ -70,6 +73,16 @@ class Flatness:
         one_plane = self.unpolarized or self.common > _ONE_PLANE or self.aligned > _ONE_NORMAL
         return self.sharp_edged and self.one_normal and one_plane
 
+    @property
+    def sheet(self) -> bool:
+        """Whether the object is a bent or crumpled sheet: no occluding contour, and normals that are not known."""
+        edged = self.sharp_edged and self.contour < _ROUNDED and self.aligned > _SHEET_ALIGNED
+        return edged and not self.flat and self.expected_deg > _SHEET_DEG
+
+    def decides(self, ratio: float) -> bool:
+        """Whether another order of the shots, with expected errors of `ratio` times these, leaves known normals."""
+        return not self.sheet or ratio * self.expected_deg < _SHEET_DEG
+
 
 def judge(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
     """Gates "flat" and "contour": whether the object is one plane, and whether its outline is an occluding contour."""
@@ -88,6 +101,13 @@ def judge(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
         if shape.facing > _TILTED:
             remedy += "; a single picture shows more of it where it is tilted by 30°"
         yield Gate("flat", "warn", round(shape.common, 3), _ONE_PLANE, message, remedy)
+    elif shape.sheet:
+        message = (
+            "The object is a bent sheet or a relief: its outline is no occluding contour, so one picture does not show "
+            f"which way its parts lean (expected error {shape.expected_deg:.0f}°)"
+        )
+        remedy = "Photograph it from several sides for `polcap fuse`"
+        yield Gate("flat", "warn", round(shape.expected_deg, 1), _SHEET_DEG, message, remedy, unit="°")
     else:
         message = "The object is flat, and its polarization shows its tilt" if shape.flat else "The object is not flat"
         yield Gate("flat", "pass", round(shape.common, 3), _ONE_PLANE, message)

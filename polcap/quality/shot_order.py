@@ -42,15 +42,16 @@ def order_of_shots(
 
     An outline that is the edge of flat faces decides nothing. Where another order is as good, the stated one counts if
     its maps explain the photographs and the network does not expect smaller errors in another one. The network's test
-    sees one small picture, and misjudges boxes and planes. If maps explain much of their polarization (`explained`, 1
-    is all), its finding is undecided. If maps explain little, it counts; on flat faces it is undecided.
+    sees one small picture, and misjudges boxes and planes; of a bent sheet it knows the normals in no order. If maps
+    explain much of their polarization (`explained`, 1 is all), its finding is undecided. If maps explain little, it
+    counts; on flat faces it is undecided.
     """
     statement, names, better = radiance.equipment.angles, shot_names(radiance), None
     edges = shape is not None and shape.sharp_edged
     likelier = _likelier(object_, shape, explained)
     if not outline.as_stated and not edges:
         better, because = outline.best, "The outline fits"
-    elif test is not None and test.ratio < 1 / likelier:
+    elif test is not None and test.ratio < 1 / likelier and (shape is None or shape.decides(test.ratio)):
         better, because = test.rival, f"The network expects {1 / test.ratio:.1f} times smaller errors for"
     if better is not None and outline.as_stated and _hides_order(shape) and (explained or 0.0) > _BOX_EXPLAINED:
         return _undecided(_order_text(better, names), outline, radiance)

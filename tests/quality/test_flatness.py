@@ -66,6 +66,17 @@ def test_a_box_has_sharp_edges_and_is_not_flat() -> None:
     assert seen.sharp_edged and not seen.flat
 
 
+def test_a_crumpled_sheet_is_neither_flat_nor_rounded_and_no_order_of_its_shots_is_known() -> None:
+    """Figures of a simulated sheet; the network expects 1.2 times smaller errors in a wrong order."""
+    sheet = Flatness(
+        contour=0.08, common=0.08, rim_dolp=0.22, rim_light=1.09, aligned=0.8, facing=0.95, expected_deg=29.0
+    )
+    assert sheet.sheet and not sheet.flat
+    assert not sheet.decides(0.84) and sheet.decides(0.4)
+    for rounded in (replace(sheet, contour=0.3), replace(sheet, aligned=0.7), replace(sheet, expected_deg=8.0)):
+        assert not rounded.sheet and rounded.decides(0.84)
+
+
 def test_a_can_seen_from_above_has_sharp_edges_although_its_wall_is_dim() -> None:
     """Figures of a simulated can, whose lid faces the camera."""
     can = Flatness(

@@ -62,6 +62,7 @@ EDGES = replace(ROUNDED, common=0.9)  # of flat faces
 BOX = replace(EDGES, contour=0.2, expected_deg=6.0)
 BLOCK = replace(ROUNDED, aligned=0.95)  # faces the camera
 PLANE = replace(EDGES, aligned=0.95)
+SHEET = replace(ROUNDED, contour=0.08, rim_light=1.1, aligned=0.8, expected_deg=28.0)  # crumpled
 FIGURES = {
     "inward_outline": 0.0, "surroundings": 0.001, "highlight": 0.001,
     "albedo_slope": AlbedoSlope(0.01, 0.1),
@@ -87,6 +88,7 @@ MEASURES = {  # the function that measures each figure
 MESH = {"pieces": 1, "cuts": 0.3, "cut_px": 40.0, "raggedness": 0.1}
 SMALL = np.hypot(*np.mgrid[-scenes.HEIGHT // 2 : scenes.HEIGHT // 2, -scenes.WIDTH // 2 : scenes.WIDTH // 2]) < 30
 FAR = np.array([[[1.0, 0, 50 * k], [0, 1, 0], [0, 0, 1]] for k in range(3)])
+CUES = SimpleNamespace(ratio=np.full((2, 1, 50), 0.02), mask=np.ones((1, 50), bool))  # S1/S0 and S2/S0
 GAINS = replace(scenes.equal().gains, source="grey patches")
 STATED = ShotOrder((0, 1, 2))
 
@@ -222,6 +224,9 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("order", "fail", {"maps": network_maps(0.1, 0.5), "figures": {"flatness": EDGES}}),
     ("order", "pass", {"maps": network_maps(0.1, 2.0), "figures": {"flatness": EDGES}}),
     ("order", "not measured", {"maps": network_maps(0.1, 0.8), "figures": {"flatness": PLANE}}),
+    ("order", "not measured", {"maps": network_maps(0.1, 0.84), "figures": {"flatness": SHEET}}),
+    ("order", "fail", {"maps": network_maps(0.1, 0.4), "figures": {"flatness": SHEET, "rendered": rendered(0.5)}}),
+    ("flat", "warn", {"maps": network_maps(0.1, 0.84), "figures": {"flatness": SHEET}}),
     ("order", "warn", {"maps": network_maps(0.1, 0.5), "figures": {"flatness": PLANE}}),
     ("order", "fail", {"maps": network_maps(0.1, 0.5), "figures": {"flatness": PLANE, "rendered": rendered(0.5)}}),
     ("order", "fail", {"maps": network_maps(0.1, 0.5)}),
@@ -340,7 +345,7 @@ def good() -> dict[str, Any]:
         "radiance": with_field(scenes.stack(), "bracket", exposures(1.0, 4.0)),
         "color": scenes.no_color(), "alignment": scenes.still(), "object_": replace(scenes.ball_object(), doubt=0.01),
         "selfcal": replace(scenes.equal(), gains=GAINS, outline=OutlineCheck(STATED, 0.95)),
-        "stokes": SimpleNamespace(body=True), "cues": None, "maps": network_maps(0.1),
+        "stokes": SimpleNamespace(body=True), "cues": CUES, "maps": network_maps(0.1),
         "mesh": SimpleNamespace(**MESH),
         "figures": FIGURES | outline(),
     }  # fmt: skip
