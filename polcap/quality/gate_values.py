@@ -24,7 +24,7 @@ H = TypeVar("H", bound=ResultsUntilHdr)
 _ALIGN = AlignSettings()
 _LIT = 0.02  # of the object's median light
 _ERROR_COST_DEG = 45.0  # of a stage that gives up: nothing is known of the normals
-DEGREES_PER_GAIN = 600.0  # 1 % of a shot's light tilts facing pixels by about 6° (error budget)
+DEGREES_PER_GAIN = 600.0  # 1 % of a shot's light costs about 6° on average; `gain_cost` computes it for an object
 
 
 class Gate(msgspec.Struct, frozen=True):

