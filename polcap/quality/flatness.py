@@ -32,8 +32,8 @@ _FACING_DOLP = 0.045  # most of the outline of a plane that faces the camera
 _ALIGNED = 0.84  # length of the mean normal: boxes up to .83, except one whose normals are wrong; bodies up to .77
 _ONE_NORMAL = 0.92  # of the mean normal: beyond, the outline decides nothing, even if bars polarize it
 _KNOWN_DEG = 7.0  # expected error of normals: a box that shows one face has 6, a tilted coin 9, plates 14 to 16
-# least length of the mean normal, and least expected error, of a bent sheet: good crumpled sheets have .80 to .88 and 18
-# to 29° (true errors up to 46°), rounded bodies up to .77 (docs/benchmarks/gates.md)
+# least length of the mean normal, and least expected error, of a bent sheet: crumpled sheets have .80 to .88 and 18 to
+# 29° (true errors up to 46°), rounded bodies up to .77 (docs/benchmarks/gates.md)
 _SHEET_ALIGNED, _SHEET_DEG = 0.78, 15.0
 _TILTED = np.cos(np.radians(20.0))  # of the mean normal: more tilt shows little more
 
