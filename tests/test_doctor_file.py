@@ -39,6 +39,15 @@ def test_an_over_exposed_frame_and_a_monochrome_one_are_warnings(tmp_path: Path)
     assert "monochrome" in findings(tmp_path / "grey.png")["pattern"].message
 
 
+@pytest.mark.parametrize(("white", "state"), [(3840, "ok"), (2000, "warning")])
+def test_counts_may_exceed_the_stated_white_level_a_little(tmp_path: Path, white: int, state: str) -> None:
+    counts = np.full((64, 64), 900, np.uint16)
+    counts[:8] = 4095
+    write_raw(tmp_path / "bright.dng", counts, Exif(make="Polcap", model="Test"), 0, white)
+    levels = findings(tmp_path / "bright.dng")["levels"]
+    assert levels.state == state and ("does not fit the counts" in levels.remedy) == (state == "warning")
+
+
 @pytest.mark.parametrize(("shape", "name"), [((6, 6), "6×6"), (None, "Foveon"), ((4, 4), "4×4")])
 def test_other_mosaics_are_named_with_a_way_out(shape: tuple[int, int] | None, name: str) -> None:
     assert name in raw.unsupported(shape) and "16-bit TIFF" in raw.unsupported(shape)
