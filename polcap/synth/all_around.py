@@ -156,9 +156,7 @@ def _write_surface(file: Path, scene: Scene, mesh: Triangles, lift: float) -> No
         "vertices": mesh.vertices + np.array([0.0, lift, 0.0]), "diffuse": diffuse, "specular": specular,
         "roughness": roughness, "ior": ior,
     }  # fmt: skip
-    arrays: dict[str, Any] = {name: value.astype(np.float32) for name, value in values.items()}
-    with atomic.path(file) as temporary:
-        np.savez_compressed(temporary, faces=mesh.faces, **arrays)
+    shooting.write_arrays(file, values, np.float32, faces=mesh.faces)
 
 
 def _write_poses(

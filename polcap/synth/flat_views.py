@@ -11,7 +11,7 @@ Rows of the maps run down the printed page (z), columns to the right (x).
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -122,9 +122,7 @@ def _write_maps(file: Path, scene: Scene, slab: Slab) -> None:
         "normal": np.stack([bent[..., 0], -bent[..., 2], bent[..., 1]], axis=-1), "diffuse": diffuse,
         "specular": specular, "roughness": roughness, "ior": ior, "height": slab.height(x, z),
     }  # fmt: skip
-    arrays: dict[str, Any] = {name: value.astype(np.float32) for name, value in values.items()}
-    with atomic.path(file) as temporary:
-        np.savez_compressed(temporary, **arrays)
+    shooting.write_arrays(file, values, np.float32)
 
 
 def _write_poses(file: Path, scene: Scene, shoot: FlatShoot, poses: Poses, power: Floats) -> None:

@@ -359,6 +359,11 @@ def _write_truth(place: Path, studio: Studio, files: list[dict[str, Any]]) -> No
         "normal": buffer.normal, "diffuse": diffuse * inside, "specular": specular * inside,
         "roughness": roughness * buffer.mask, "ior": ior * buffer.mask, "S": blurred / white * inside,
     }  # fmt: skip
-    halves: dict[str, Any] = {name: value.astype(np.float16) for name, value in maps.items()}
-    with atomic.path(place / "truth.npz") as temporary:
-        np.savez_compressed(temporary, depth=buffer.depth, mask=buffer.mask, **halves)
+    write_arrays(place / "truth.npz", maps, np.float16, depth=buffer.depth, mask=buffer.mask)
+
+
+def write_arrays(file: Path, values: Mapping[str, Floats], kind: type[np.floating[Any]], **others: Any) -> None:
+    """Write arrays of the truth by name into an npz file: `others` as they are, then `values` as numbers of `kind`."""
+    arrays: dict[str, Any] = {name: value.astype(kind) for name, value in values.items()}
+    with atomic.path(file) as temporary:
+        np.savez_compressed(temporary, **others, **arrays)

@@ -69,6 +69,7 @@ def main(options: EvaluationOptions, report: Report = silent) -> dict[str, Score
 
 
 def _evaluate(options: EvaluationOptions, network: Network, protocol: Protocol, report: Report) -> dict[str, Score]:
+    """The evaluation of `main`, once its folder is claimed."""
     head = _head(options, network, protocol.subjects)
     rows = _evaluate_pictures(options, evaluation_baselines.mean_maps(protocol, options.count), head, report)
     result = _summary(head, rows)

@@ -90,6 +90,7 @@ def main(options: TrainingOptions, report: Report = silent) -> Path:
 
 
 def _train(options: TrainingOptions, report: Report) -> Path:
+    """The training of `main`, once its folder is claimed."""
     preset = PRESETS[options.preset]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     learners = options.threads if device.type == "cpu" else 1
