@@ -54,6 +54,9 @@ def _search(root: Path) -> list[Candidate]:
     """Candidates below a root folder. Raises CaptureError: there is no such folder."""
     if not root.is_dir():
         raise CaptureError(f"{root}: no such folder; give the folder that holds the captures")
+    absolute = Path(os.path.abspath(root))
+    if folder_names.is_one_angle(absolute):
+        raise CaptureError(f"{root}: holds one angle of a capture; give the folder of all, {absolute.parent}")
     return capture_search.search(root)
 
 
@@ -130,7 +133,7 @@ def _run(
     in_shard, batch_folder = plan.shard.of(found), Path(found[0].batch_folder)
     records = {unit: record for unit in in_shard if (record := units.find_finished(unit, request)) is not None}
     wanted = [unit for unit in in_shard if unit not in records]
-    print_line(f"{len(found)} captures, shard {plan.shard}: {len(in_shard)}, finished before: {len(records)}")
+    print_line(f"captures: {len(found)}, shard {plan.shard}: {len(in_shard)}, finished before: {len(records)}")
     for candidate in candidates:
         if candidate.reason:
             print_line(f"no capture in {candidate.folder}: {candidate.reason}")

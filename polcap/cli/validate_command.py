@@ -18,7 +18,9 @@ def validate(
     diameter: Annotated[
         float | None, Option(min=1, max=10000, metavar="MM", help="The ball's diameter, for lengths in mm.")
     ] = None,
-    out: Annotated[Path | None, Option("--out", "-o", help="Result folder; by default CAPTURE/polcap.")] = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Result folder; of a result, the folder for the page.")
+    ] = None,
     config: options.ConfigFile = None,
     assignments: options.Assignments = None,
     angles: options.Angles = None,
@@ -43,9 +45,10 @@ def validate(
     if not ball:
         raise SettingError("polcap validate needs a known object; photograph a ball and add --ball")
     if (capture / "report.json").exists():
-        result = capture
+        options.check_out(out)
+        result, place = capture, out or capture
     else:
-        result = out or capture / own_folders.OUTPUT
+        result = place = out or capture / own_folders.OUTPUT
         request = options.request(context.params, settings.load(config, assignments or ()))
         found, supplied = request.open(capture)
         about = pipeline.process_once(found, supplied, request.config, result)
@@ -54,20 +57,20 @@ def validate(
     figures, facts, reason = measured.figures, about["capture"], _reason_against_record(about)
     texts = ball_validation.lines(figures)
     made = datetime.now(UTC).isoformat(timespec="seconds")
+    with result_folder.opened(place):
+        ball_page.write(place, facts["name"], measured, texts)
+        atomic.write_json(place / "ball.json", figures)
     record = None if reason else ball_accuracies.write(ball_validation.accuracy(figures, facts, made))
-    with result_folder.opened(result):
-        ball_page.write(result, facts["name"], measured, texts)
-        atomic.write_json(result / "ball.json", figures)
     terminal.print_progress("\n".join(texts))
     for text in figures.warnings:
         terminal.print_message(f"polcap: warning: {text}", "WARNING")
     if reason:
         terminal.print_message(f"polcap: warning: later reports will not state this accuracy: {reason}", "WARNING")
-    page = str(result / "ball.html")
+    page = str(place / "ball.html")
     written = {"page": page, "record": None if record is None else str(record)}
     terminal.print_data({**msgspec.to_builtins(figures), **written} if json else page)
     if open_:
-        terminal.open_page(result / "ball.html")
+        terminal.open_page(place / "ball.html")
 
 
 def _reason_against_record(about: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ number of threads.
 import glob
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,8 +18,8 @@ import msgspec
 from polcap import parallel, report
 from polcap.capture_values import CatalogEntry
 from polcap.config import Config, restore
-from polcap.errors import SettingError
-from polcap.formats import atomic, own_files
+from polcap.errors import SettingError, StorageError
+from polcap.formats import atomic, color_profile, own_files
 from polcap.formats.export import (
     archive,
     exr_layers,
@@ -179,7 +180,9 @@ def again(
 
 
 def copy(result: Path, out: Path) -> None:
-    """Make a result folder with the maps and the report of another one, such as an archive, which stays as it is.
+    """Make a result folder with the records of another one, such as an archive, which stays as it is.
+
+    These are maps, report and color profile. A page that another version of polcap wrote is left out.
 
     Raises SettingError: `out` holds something already, lies in `result`, or as `result_place.check_free`.
     StorageError: `result` is no result, or `out` is not writable.
@@ -189,9 +192,11 @@ def copy(result: Path, out: Path) -> None:
     result_place.check_free(out)
     if os.path.lexists(out) and (not out.is_dir() or any(out.iterdir())):
         raise SettingError(f"--out {out} is not an empty folder; choose another folder")
-    report.read(result)
+    about = report.read(result)
     with result_folder.opened(out):
-        for file in (result / "report.json", *sorted((result / "maps").iterdir())):
+        with suppress(StorageError):  # by a page of another version
+            report.archive(result, out, about, about["capture"].get("catalog", {}), "asset/")
+        for file in (result / "report.json", result / color_profile.NAME, *sorted((result / "maps").iterdir())):
             if file.is_file():
                 atomic.copy(file, out / file.relative_to(result))
 

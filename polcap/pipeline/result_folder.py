@@ -9,6 +9,7 @@ from filelock import FileLock, Timeout
 
 from polcap.errors import StorageError
 from polcap.formats import atomic, folder_lock, own_files, own_folders, system_errors, text_file
+from polcap.formats.capture import folder_names
 
 _HELD = ("lock", "owner")  # files in work/ that an open result needs
 _PARTS = ("maps", "asset", "work", "report.html", "report.json", "color.toml", "compare.html")  # of a result
@@ -95,7 +96,11 @@ def clean(out: Path, dry_run: bool = False) -> int:
     Raises StorageError: there is no folder work/, another process works here, or a file cannot be removed.
     """
     work = out / "work"
-    if not work.is_dir() or not own_files.is_claimed(out):
+    if folder_names.is_result(out) and not work.is_dir():
+        raise StorageError(f"{out} holds no stage cache: there is nothing to remove")
+    if not work.is_dir():
+        raise StorageError(folder_names.without_result(out))
+    if not own_files.is_claimed(out):
         raise StorageError(f"{out} holds no stage cache; give the result folder of `polcap process`")
     with own_files.opened(out) as own:
         files = [file for file in own.below(work) if file.name not in _HELD]

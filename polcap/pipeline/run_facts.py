@@ -10,6 +10,7 @@ import msgspec
 from polcap import report
 from polcap.errors import StorageError
 from polcap.formats import atomic, own_folders, text_file
+from polcap.formats.capture import folder_names
 from polcap.pipeline.manifest import seal
 
 
@@ -28,6 +29,8 @@ def no_cache(out: Path) -> StorageError:
             f"{out} is an archive, which holds no stage cache: see its report.html; `polcap export {out} --out NEW` "
             f"writes files from it, `polcap report {out} --compare OTHER --out NEW` compares it"
         )
+    if not folder_names.is_result(out) and not (out / "work").is_dir():
+        return StorageError(folder_names.without_result(out))
     return StorageError(f"{out} holds no stage cache of this polcap; run `polcap process` on its photographs")
 
 

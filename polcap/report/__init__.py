@@ -18,6 +18,7 @@ from polcap.capture_values import Capture, Frame
 from polcap.config import Config
 from polcap.errors import StorageError
 from polcap.formats import atomic, text_file
+from polcap.formats.capture import folder_names
 from polcap.formats.export import provenance
 from polcap.quality import error_maps, gates
 from polcap.quality.advice import advise
@@ -175,11 +176,13 @@ def write(folder: Path, about: dict[str, Any], results: Results) -> None:
     page.write(folder, about, results)
 
 
-def archive(out: Path, folder: Path, about: Mapping[str, Any], entry: Mapping[str, str]) -> list[Path]:
+def archive(
+    out: Path, folder: Path, about: Mapping[str, Any], entry: Mapping[str, str], assets: str = ""
+) -> list[Path]:
     """Write report.json and report.html of the result `out` into an archive, with its catalog facts; returns the files.
 
-    `about` is the content of report.json, `entry` has the stated fields of `CatalogEntry`. A result without a page gets
-    none.
+    `about` is the content of report.json, `entry` has the stated fields of `CatalogEntry`. `assets` is the path from
+    the page to the GLB's folder, "" or with a slash at its end. A result without a page gets none.
 
     Raises StorageError: the page is a link or not that of this polcap, or cannot be read.
     """
@@ -190,7 +193,8 @@ def archive(out: Path, folder: Path, about: Mapping[str, Any], entry: Mapping[st
         raise StorageError(f"{source} is a link; remove it, and write the page again by `polcap process`")
     if source.exists():
         try:
-            text = page.archived(text_file.read_text(source, _PAGE_BYTES), stated)
+            glb = f"{assets}{about['capture']['name']}.glb"
+            text = page.archived(text_file.read_text(source, _PAGE_BYTES), stated, glb)
         except (OSError, ValueError) as error:
             raise StorageError(f"{source} cannot be read ({error}); write it again by `polcap process`") from error
         files.append(folder / source.name)
@@ -207,13 +211,9 @@ def read(folder: Path) -> dict[str, Any]:
         about: dict[str, Any] = text_file.read_json(folder / "report.json")
         msgspec.convert(about, _ReportFile)
     except OSError as error:
-        if not folder.exists():
-            raise StorageError(f"{folder}: no such folder; give the result folder of `polcap process`") from error
-        if folder.is_file():
-            raise StorageError(f"{folder} is a file; give the result folder of `polcap process`") from error
-        if (folder.parent / "report.json").exists():
-            raise StorageError(f"{folder} is only a part of a result; give the whole, {folder.parent}") from error
-        raise StorageError(f"{folder} holds no report.json; run `polcap process` first") from error
+        if any((folder / part).is_dir() for part in ("work", "maps")):
+            raise StorageError(f"{folder} holds no report.json; run `polcap process` first") from error
+        raise StorageError(folder_names.without_result(folder)) from error
     except ValueError as error:
         text = f"{folder / 'report.json'} is no report of this polcap ({error}); run `polcap process` again"
         raise StorageError(text) from error

@@ -54,7 +54,8 @@ def write(
     for name, about in zip(names, abouts):
         headline, expected_error = page.verdict(about)
         heading = {"name": name, "verdict": about["verdict"], "headline": headline, "expected_error": expected_error}
-        results.append({**heading, "gates": page.gate_rows(about["gates"])})
+        facts = " · ".join(fact for fact in page.catalog(about).values() if fact)
+        results.append({**heading, "catalog": facts, "gates": page.gate_rows(about["gates"])})
     found = rows(*abouts)
     maps = _maps(folders, names)
     content = {
@@ -89,8 +90,14 @@ def _maps(folders: tuple[Path, Path], names: tuple[str, str]) -> dict[str, Any]:
     first, second = (ObjectReduction(maps.mask, _LONGEST).maps(maps) for maps in (one, other))
     found = changes.measure(first, second)
     if not found.usable:
-        text = "The two results show different objects or sides: their pictures cannot be laid on each other"
-        return {"sentence": f"{text}.", "notes": [], "rows": [], "slider": (), "maps": []}
+        text = "The two results show different objects or sides, or one camera was turned about its axis"
+        return {
+            "sentence": f"{text}: their pictures cannot be laid on each other.",
+            "notes": [],
+            "rows": [],
+            "slider": (),
+            "maps": [],
+        }
     return {
         "sentence": sentence(found),
         "notes": _notes(found),

@@ -89,12 +89,12 @@ def render(
     html.write(file, title, [body], {"palettes": palettes, **(data or {})})
 
 
-def archived(text: str, about: Mapping[str, Any]) -> str:
-    """The text of a report's page for an archive: with the catalog facts of `about`, and a link to the GLB next to it.
+def archived(text: str, about: Mapping[str, Any], glb: str) -> str:
+    """The text of a report's page for another folder: with the catalog facts of `about`, and a link to the GLB there.
 
     Two templates make these parts, each between two comments with its name. Raises ValueError: a part is missing.
     """
-    parts = {"catalog": {"catalog": catalog(about)}, "glb_link": {"asset": f"{about['capture']['name']}.glb"}}
+    parts = {"catalog": {"catalog": catalog(about)}, "glb_link": {"asset": glb}}
     for name, content in parts.items():
         before, _, rest = text.partition(f"<!--{name}-->")
         _, found, after = rest.partition(f"<!--/{name}-->")

@@ -59,7 +59,9 @@ def main(folder: Path, model: Path, out: Path, report: Report = silent) -> dict[
 
 def _list_pictures(folder: Path) -> tuple[list[str], list[str]]:
     """Names of the pictures with a normal map, and of the folders of angles; checks that no file is missing."""
-    angles = sorted(place.name for place in folder.glob("pol*") if place.is_dir())
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give the folder that holds pol000, pol045, …, mask and normal")
+    angles = sorted(place.name for place in folder.glob("pol[0-9]*") if place.is_dir())
     names = sorted(place.name for place in (folder / "normal").glob("*.png"))
     if len(angles) < 3 or not names:
         raise InputError(

@@ -35,6 +35,8 @@ def test_captures_are_found_however_deep_and_results_are_not(captures: Path, tmp
     (tmp_path / "list.txt").write_text("obj0")
     with pytest.raises(CaptureError, match="holds no capture"):
         batch.find(tmp_path)
+    with pytest.raises(CaptureError, match=r"holds one angle of a capture; give the folder of all, .*obj0$"):
+        batch.find(captures / "obj0" / "pol045")
 
 
 def test_results_of_process_are_no_captures(captures: Path, tmp_path: Path) -> None:

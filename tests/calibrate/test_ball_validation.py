@@ -46,6 +46,16 @@ def test_a_ball_gives_the_accuracy_that_later_reports_quote(
     assert found["flash"]["mm"] == pytest.approx([1000 * at for at in SCENE.light[:2]], abs=4)
     assert "Mean error of the normals" in Path(found["page"]).read_text(encoding="utf-8")
     assert {"ball.html", "ball.json", "ball.png"} <= {file.name for file in (capture / "polcap").iterdir()}
+    (tmp_path / "archive").mkdir()
+    for name in ("maps", "report.json"):
+        (tmp_path / "archive" / name).symlink_to(capture / "polcap" / name)
+    (tmp_path / "archive" / "manifest-sha256.txt").touch()
+    refused = polcap("validate", tmp_path / "archive", "--ball")
+    assert refused.returncode == 2 and "name a folder for the files with --out" in refused.stderr
+    assert len(list((tmp_path / "calib" / "balls").iterdir())) == 1  # an error stores no accuracy
+    done = polcap("validate", tmp_path / "archive", "--ball", "--out", tmp_path / "page")
+    assert done.returncode == 0 and Path(done.stdout.strip()) == tmp_path / "page" / "ball.html"
+    assert {"ball.html", "ball.json", "ball.png"} <= {file.name for file in (tmp_path / "page").iterdir()}
     again = polcap("process", capture)
     assert f"on your ball {found['normals']['mean_deg']:.1f}°" in again.stderr
     page = (capture / "polcap" / "report.html").read_text(encoding="utf-8")

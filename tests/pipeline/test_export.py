@@ -471,6 +471,11 @@ def test_an_archive_checks_itself_after_two_exports_and_a_copy(
     again = polcap("export", tmp_path / "elsewhere", "--out", tmp_path / "new", "--ply")
     assert again.returncode == 0 and (tmp_path / "new/asset/C.ply").exists()
     assert json.loads((tmp_path / "new/asset/C.provenance.json").read_text())["title"] == "Vase"
+    third = polcap("export", tmp_path / "elsewhere", "--out", tmp_path / "third", "--preset", "archive")
+    assert third.returncode == 0, third.stderr
+    assert set(names) - set(check_sums(tmp_path / "third/asset/archive")) == {one for one in names if "_iiif/" in one}
+    assert 'href="asset/C.glb"' in (tmp_path / "third/report.html").read_text("utf-8")
+    assert 'href="C.glb"' in (tmp_path / "third/asset/archive/report.html").read_text("utf-8")
     for name, *rest in (["status"], ["report"], ["show", "--all"]):
         done = polcap(name, tmp_path / "elsewhere", *rest)
         assert done.returncode == 2 and "is an archive, which holds no stage cache" in done.stderr

@@ -1,6 +1,7 @@
 """report.json holds figures, gates and settings, and files that are no report are refused in one line."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from polcap import report
 from polcap.errors import StorageError
 from polcap.formats.maps import maps_folder
+from polcap.pipeline import result_folder, run_facts
 from polcap.quality.rerendering import Rerendering
 from polcap.report import page
 
@@ -77,6 +79,34 @@ def test_a_folder_that_is_no_result_is_named_with_its_remedy(tmp_path: Path) -> 
     (tmp_path / "maps").mkdir()
     with pytest.raises(StorageError, match=f"only a part of a result; give the whole, {tmp_path}"):
         report.read(tmp_path / "maps")
+
+
+def test_folders_of_captures_in_place_of_a_result_are_named_with_what_to_run(tmp_path: Path) -> None:
+    for angle in ("pol000", "pol045", "pol090"):
+        (tmp_path / "session" / "mug" / angle).mkdir(parents=True)
+        (tmp_path / "object" / "view01" / angle).mkdir(parents=True)
+    capture = tmp_path / "session" / "mug"
+    words = {
+        capture: "is a capture without a result; run `polcap process` on it first",
+        capture / "pol045": f"holds one angle of a capture; give the folder of all, {capture}",
+        tmp_path
+        / "session": "holds captures without results: mug; run `polcap process` on one of them, or `polcap batch`",
+        tmp_path / "object": "holds the views view01 of one object; join them with `polcap fuse`",
+        tmp_path: "holds no result; give the result folder of `polcap process`",
+    }
+    for folder, text in words.items():
+        with pytest.raises(StorageError, match=re.escape(f"{folder} {text}")):
+            report.read(folder)
+        assert f"{folder} {text}" in str(run_facts.no_cache(folder))
+        with pytest.raises(StorageError, match=re.escape(f"{folder} {text}")):
+            result_folder.clean(folder)
+    (capture / "polcap" / "maps").mkdir(parents=True)
+    (capture / "polcap" / "asset" / "unreal").mkdir(parents=True)
+    (capture / "polcap" / "report.json").write_text("{}")
+    with pytest.raises(StorageError, match=r"session holds no result itself; give that of a sub-folder: mug$"):
+        report.read(tmp_path / "session")
+    with pytest.raises(StorageError, match=f"only a part of a result; give the whole, {capture / 'polcap'}$"):
+        report.read(capture / "polcap" / "asset" / "unreal")
 
 
 @pytest.mark.parametrize("left_out", ["verdict", "gates", "keys", "model", "figures", "gates.0.state", "gates.0.says"])

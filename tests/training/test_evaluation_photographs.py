@@ -64,8 +64,11 @@ def test_normals_of_a_ball_are_evaluated(folder: Path, tmp_path: Path, monkeypat
 def test_a_folder_of_another_layout_is_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds 0 folders pol… and 0 normal maps"):
         evaluation_photographs.main(tmp_path, Path("model.onnx"), tmp_path)
+    with pytest.raises(InputError, match="none: no such folder"):
+        evaluation_photographs.main(tmp_path / "none", Path("model.onnx"), tmp_path)
     for part in ("pol000", "pol045", "pol090", "normal"):
         (tmp_path / part).symlink_to(folder / part)
+    (tmp_path / "polcap").mkdir()  # a result: not the folder of an angle
     with pytest.raises(InputError, match=r"mask/ball\.png is missing"):
         evaluation_photographs.main(tmp_path, Path("model.onnx"), tmp_path)
 

@@ -67,6 +67,8 @@ def load(folder: Path) -> CaptureFile:
         stated = msgspec.convert(document, CaptureFile)
     except msgspec.ValidationError as error:
         fault = text_file.fault(error, document, CaptureFile)
+        if facts := [key for key in document if key in CatalogEntry.__struct_fields__]:
+            fault = f"{facts[0]}: is a fact of the catalog; write it below a line [catalog], after all other keys"
         raise CaptureError(f"{path}: {fault}; see docs/reference/captures.md") from None
     except ValueError as error:  # of TOML, of UTF-8
         raise CaptureError(f"{path}: {error}; see docs/reference/captures.md") from None

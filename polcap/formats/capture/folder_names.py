@@ -13,7 +13,7 @@ from pathlib import Path
 
 from polcap.errors import CaptureError
 from polcap.formats.capture import foreign_files
-from polcap.formats.own_folders import OURS
+from polcap.formats.own_folders import OURS, find_result
 
 SEPARATION_DEG = 5.0  # closer angles count as one
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
@@ -59,6 +59,33 @@ def is_in_result(folder: Path) -> bool:
     results += [absolute.parent] if absolute.name in ("maps", "asset") else []
     results += [absolute.parents[1]] if absolute.parent.name == "asset" else []
     return any(map(is_result, results))
+
+
+def without_result(folder: Path) -> str:
+    """Message about a path that is named in place of a result and is none: what it is, and the remedy."""
+    if not folder.exists():
+        return f"{folder}: no such folder; give the result folder of `polcap process`"
+    if not folder.is_dir():
+        return f"{folder} is a file; give the result folder of `polcap process`"
+    absolute = Path(os.path.abspath(folder))
+    if wholes := [parent for parent in absolute.parents if is_result(parent)]:
+        return f"{folder} is only a part of a result; give the whole, {wholes[0]}"
+    if is_one_angle(absolute):
+        return f"{folder} holds one angle of a capture; give the folder of all, {absolute.parent}"
+    if angle_folder_names(folder) or (folder / "capture.toml").is_file():
+        return f"{folder} is a capture without a result; run `polcap process` on it first"
+    if found := views(folder):
+        joined = "`polcap fuse`, or `polcap material` if it is a flat sample"
+        return (
+            f"{folder} holds the views {few_names(found)} of one object; join them with {joined}, or give one of them"
+        )
+    inside = [path for path in children(folder) if path.is_dir()]
+    if results := [path.name for path in inside if is_result(path) or is_result(find_result(path))]:
+        return f"{folder} holds no result itself; give that of a sub-folder: {few_names(results)}"
+    if captures := [path.name for path in inside if angle_folder_names(path)]:
+        remedy = "run `polcap process` on one of them, or `polcap batch` on the folder, first"
+        return f"{folder} holds captures without results: {few_names(captures)}; {remedy}"
+    return f"{folder} holds no result; give the result folder of `polcap process`"
 
 
 def views(folder: Path) -> list[str]:

@@ -102,10 +102,11 @@ def _hint(folder: Path) -> str:
     names = [path.name for path in inside]
     if remedy := _lossy_or_packed(folder):
         return remedy
-    if any(map(folder_names.angle_folder_names, inside)):
+    if captures := [path.name for path in inside if folder_names.angle_folder_names(path)]:
         return (
-            f"its sub-folders {few_names(names)} hold captures: give one of them, or run `polcap batch` on the folder; "
-            "name views of one object view01, view02, … and run `polcap fuse` (a flat sample: `polcap material`)"
+            f"its sub-folders {few_names(captures)} hold captures: give one of them, or run `polcap batch` on the "
+            "folder; name views of one object view01, view02, … and run `polcap fuse` (a flat sample: "
+            "`polcap material`)"
         )
     if inside:
         new = ", ".join(f"{old} to {name}" for old, name in folder_names.suggested_names(names))

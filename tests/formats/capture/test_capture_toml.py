@@ -44,6 +44,13 @@ def test_capture_toml_states_angles_roles_and_exposures(tmp_path):
     assert understood.focal_known and understood.focal_px == pytest.approx(60 / 36 * 48)
 
 
+def test_a_catalog_fact_outside_its_table_is_named_with_its_place(tmp_path):
+    folder = folders(tmp_path)
+    (folder / "capture.toml").write_text('title = "Vase"\n')
+    with pytest.raises(CaptureError, match=r"title: is a fact of the catalog; write it below a line \[catalog\]"):
+        capture.read(folder)
+
+
 def test_capture_toml_may_come_from_windows(tmp_path):
     each(tmp_path, ("pol000", "pol045", "pol090"))
     state(tmp_path, {f"pol{angle:03d}\\\\a.dng": angle for angle in (0, 45, 90)}, name='"bowl"')

@@ -189,6 +189,7 @@ def test_the_folders_of_one_angle_and_of_several_captures_are_no_capture(tmp_pat
     folders(tmp_path / "krug", times=(1 / 200, 1 / 50, 1 / 12))
     with pytest.raises(CaptureError, match=f"holds one angle of a capture; give the folder of all, {tmp_path}/krug"):
         capture.read(tmp_path / "krug/pol045")
+    (tmp_path / "notes").mkdir()
     with pytest.raises(CaptureError, match="sub-folders krug hold captures: give one of them, or run `polcap batch`"):
         capture.read(tmp_path)
 
