@@ -75,9 +75,9 @@ class Flatness:
 
     @property
     def sheet(self) -> bool:
-        """Whether the object is a bent or crumpled sheet: no occluding contour, and normals that are not known."""
-        edged = self.sharp_edged and self.contour < _ROUNDED and self.aligned > _SHEET_ALIGNED
-        return edged and not self.flat and self.expected_deg > _SHEET_DEG
+        """Whether the object is a bent sheet or the like: no occluding contour, and normals that are not known."""
+        edged = self.sharp_edged and self.contour < _ROUNDED and not self.unpolarized
+        return edged and not self.flat and self.aligned > _SHEET_ALIGNED and self.expected_deg > _SHEET_DEG
 
     def decides(self, ratio: float) -> bool:
         """Whether another order of the shots, with expected errors of `ratio` times these, leaves known normals."""
@@ -103,8 +103,8 @@ def judge(found: Evidence[ResultsUntilInfer]) -> Iterator[Gate]:
         yield Gate("flat", "warn", round(shape.common, 3), _ONE_PLANE, message, remedy)
     elif shape.sheet:
         message = (
-            "The object is a bent sheet or a relief: its outline is no occluding contour, so one picture does not show "
-            f"which way its parts lean (expected error {shape.expected_deg:.0f}°)"
+            "The outline is no occluding contour, as of a bent sheet, a relief or a thin object: one picture does not "
+            f"show which way its parts lean (expected error {shape.expected_deg:.0f}°)"
         )
         remedy = "Photograph it from several sides for `polcap fuse`"
         yield Gate("flat", "warn", round(shape.expected_deg, 1), _SHEET_DEG, message, remedy, unit="°")

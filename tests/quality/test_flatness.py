@@ -73,8 +73,9 @@ def test_a_crumpled_sheet_is_neither_flat_nor_rounded_and_no_order_of_its_shots_
     )
     assert sheet.sheet and not sheet.flat
     assert not sheet.decides(0.84) and sheet.decides(0.4)
-    for rounded in (replace(sheet, contour=0.3), replace(sheet, aligned=0.7), replace(sheet, expected_deg=8.0)):
+    for rounded in (replace(sheet, contour=0.3), replace(sheet, aligned=0.7), replace(sheet, rim_dolp=0.04)):
         assert not rounded.sheet and rounded.decides(0.84)
+    assert not replace(sheet, expected_deg=8.0).sheet
 
 
 def test_a_can_seen_from_above_has_sharp_edges_although_its_wall_is_dim() -> None:
