@@ -174,18 +174,12 @@ def _first_motion(
     2. A tree of the pairs with most matches gives a first turn of each view.
     3. Least squares over all pairs gives the turns.
     """
-    found: dict[_Pair, tuple[Rotation, int]] = {}
-    for (one, other), match in pairs.items():
-        rotation, agreeing = _rotation(features[one].normal[match[:, 0]], features[other].normal[match[:, 1]])
-        if agreeing >= max(_LEAST_MATCHES, len(match) / 3):
-            found[one, other] = rotation, agreeing
-    if not found:
+    between = _rotations(features, pairs)
+    if not between:
         return np.zeros(0, np.intp), _Motion(Rotation.identity(), np.zeros(_TURNS))
-    (i, j), (rotations, counts) = np.array(list(found)).T, zip(*found.values())  # of each pair (P,)
-    between, count = Rotation.concatenate(rotations), np.array(counts)
-    vector, quaternion = between.as_rotvec(), between.as_quat()
-    axis = unit(np.sum(vector * (np.sign(vector[:, 1]) * count)[:, None], axis=0))  # upwards
-    step = 2 * np.arctan2(quaternion[:, :3] @ axis, quaternion[:, 3])  # [rad] turn about the axis, without tilt
+    (i, j), (rotations, counts) = np.array(list(between)).T, zip(*between.values())  # of each pair (P,)
+    count = np.array(counts)
+    axis, step = _about_shared_axis(Rotation.concatenate(rotations), count)
     cost, steps = np.zeros((2, len(features), len(features)))
     cost[i, j], steps[i, j], steps[j, i] = 1 / count, step, -step
     _, group = csgraph.connected_components(cost, directed=False)
@@ -205,6 +199,25 @@ def _first_motion(
     base = Rotation.align_vectors([axis], [[0.0, 1.0, 0.0]])[0]
     tilt, focal, shifts = np.zeros(2), np.zeros(1), np.zeros(2 * len(views))
     return views, _Motion(base, np.concatenate([tilt, middle, focal, turn, shifts]))
+
+
+def _rotations(
+    features: Sequence[ObjectFeatures], pairs: Mapping[_Pair, _Matches]
+) -> dict[_Pair, tuple[Rotation, int]]:
+    """Rotation from one view's normals to another's, and how many matches agree on it; by pair, if enough agree."""
+    found = {}
+    for (one, other), match in pairs.items():
+        rotation, agreeing = _rotation(features[one].normal[match[:, 0]], features[other].normal[match[:, 1]])
+        if agreeing >= max(_LEAST_MATCHES, len(match) / 3):
+            found[one, other] = rotation, agreeing
+    return found
+
+
+def _about_shared_axis(between: Rotation, count: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """The axis (3,), pointing up, that P rotations share, and their turns (P,) [rad] about it; `count` are weights."""
+    vector, quaternion = between.as_rotvec(), between.as_quat()
+    axis = unit(np.sum(vector * (np.sign(vector[:, 1]) * count)[:, None], axis=0))
+    return axis, 2 * np.arctan2(quaternion[:, :3] @ axis, quaternion[:, 3])
 
 
 def _rotation(before: Floats, after: Floats) -> tuple[Rotation, int]:

@@ -16,23 +16,25 @@ Hanji, Zhong, Mantiuk, Noise-aware merging of high dynamic range image stacks wi
 ECCV Workshops 2020. Granados et al., Optimal HDR reconstruction with linear digital cameras, CVPR 2010.
 """
 
+from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from polcap.capture_values import Capture, Decode, Frame, Shot, middle
 from polcap.errors import CaptureError
 from polcap.image_values import Distortion, Floats, MaskedImage, Quality, SensorImage, View
 from polcap.optics import sharpness
 from polcap.optics.projection import to_grid
-from polcap.stage_values import AngleStack, BracketMeasurement, ColorSensor, CrossedShot, Equipment
+from polcap.stage_values import AngleStack, BlackError, BracketMeasurement, ColorSensor, CrossedShot, Equipment
 from polcap.stages import stage
 from polcap.stages.hdr import exposure, noise, photosites, planes, weights
-from polcap.stages.hdr.bracket import Bracket, black_error, compare
+from polcap.stages.hdr.bracket import Bracket, ComparedBracket, black_error, compare
 from polcap.stages.hdr.planes import Reader, check_size
 
 _ALL_AMBIENT = 0.9  # ambient share of a shot's light; with more, nothing of the flash is left
@@ -61,6 +63,29 @@ class HdrSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     falloff: Annotated[bool, Meta(description="correct the lens's falloff if `polcap calibrate` has measured it")] = (
         True
     )
+
+
+@dataclass(frozen=True)
+class _ShotFigures:
+    """Measurements of one shot of E frames."""
+
+    ratio: list[Floats]  # E × (C,), exposure relative to the reference frame
+    curvature: list[float]  # E
+    flicker: list[float]  # E
+    ambient_share: float
+    tiles: list[sharpness.Tiles]  # E
+
+    @classmethod
+    def of(cls, compared: ComparedBracket, tiles: list[sharpness.Tiles]) -> "_ShotFigures":
+        """The figures of a compared bracket, without its pixels."""
+        frames = compared.frames
+        return cls(
+            [frame.ratio for frame in frames],
+            [frame.curvature for frame in frames],
+            [frame.flicker for frame in frames],
+            compared.ambient_share,
+            tiles,
+        )
 
 
 @stage(version=25)
@@ -97,7 +122,7 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
     read.black = black_error(Bracket(first, order), read)
     places = sharpness.places(read(middle(first.frames)), settings.clip)  # of the frame that `polcap check` uses
     lines = noise.Lines(() if capture.calibration is None else capture.calibration.noise)
-    ratio, curvature, flicker, ambient_share, tiles = [], [], [], [], []  # of each shot but the crossed one
+    figures: list[_ShotFigures] = []  # of each shot but the crossed one
     for k, shot in enumerate(shots):
         is_crossed = k == count  # then merged on the scale of its own middle frame: its flash has another energy
         bracket = Bracket(shot, _by_brightness(shot, read) if is_crossed else order)
@@ -110,11 +135,8 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         weighted.merge_into(pictures[k])
         if not is_crossed:
             _check_ambient(compared.ambient_share, shot)
-            ambient_share.append(compared.ambient_share)
-            ratio.append([frame.ratio for frame in compared.frames])
-            curvature.append([frame.curvature for frame in compared.frames])
-            flicker.append([frame.flicker for frame in compared.frames])
-            tiles.append([sharpness.take(read(frame), places, settings.clip) for frame in shot.frames])
+            tiles = [sharpness.take(read(frame), places, settings.clip) for frame in shot.frames]
+            figures.append(_ShotFigures.of(compared, tiles))
         del weighted, compared  # memory, before the next shot
         read.forget((*shot.frames, *shot.ambient))
         lines.settle()
@@ -127,22 +149,35 @@ def _merge(capture: Capture, read: Reader, settings: HdrSettings) -> AngleStack:
         quality=stack.quality[:count],
         angle=capture.angle,
         view=view,
-        bracket=BracketMeasurement(
-            exposure_ratio=np.repeat(np.array(ratio, np.float64), 3 // shape[0], axis=2),  # for three channels
-            exif_ratio=_stated_ratios(capture.shots, middle(order)),
-            curvature=np.array(curvature, np.float64),
-            flicker=np.array(flicker, np.float64),
-            ghost_fraction=np.array([np.mean((quality & Quality.GHOST) > 0) for quality in stack.quality[:count]]),
-            ambient_share=np.array(ambient_share),
-            blur_px=sharpness.frames_blur(tiles, side),
-            black=read.black,
-            ambient_shared=_ambient_shared(capture.shots),
-        ),
+        bracket=_measurement(capture, figures, stack.quality[:count], middle(order), read.black, side),
         sensor=replace(sensor, lossy=read.lossy),
         equipment=_equipment(capture, view),
         offset_px=_offsets(capture.shots) if capture.layout == "sensor" else None,
         crossed=None if capture.crossed is None else CrossedShot(pictures[-1], capture.crossed_angle),
         mosaic=mosaic,
+    )
+
+
+def _measurement(
+    capture: Capture,
+    figures: Sequence[_ShotFigures],
+    quality: NDArray[np.uint8],
+    reference: int,
+    black: BlackError,
+    side: int,
+) -> BracketMeasurement:
+    """Measurements of all shots, with their quality (K, H, W), and `side` RAW px per merged pixel."""
+    ratio = np.array([shot.ratio for shot in figures], np.float64)  # (K, E, C), C 1 or 3
+    return BracketMeasurement(
+        exposure_ratio=np.repeat(ratio, 3 // ratio.shape[2], axis=2),
+        exif_ratio=_stated_ratios(capture.shots, reference),
+        curvature=np.array([shot.curvature for shot in figures], np.float64),
+        flicker=np.array([shot.flicker for shot in figures], np.float64),
+        ghost_fraction=np.array([np.mean((flags & Quality.GHOST) > 0) for flags in quality]),
+        ambient_share=np.array([shot.ambient_share for shot in figures]),
+        blur_px=sharpness.frames_blur([shot.tiles for shot in figures], side),
+        black=black,
+        ambient_shared=_ambient_shared(capture.shots),
     )
 
 
