@@ -125,9 +125,9 @@ def clean(
     json: Json = False,
 ) -> None:
     """Remove the stage cache `work/` of a result, or of all results of a batch; photographs, maps and assets stay."""
-    from polcap.pipeline import result_folder
+    from polcap.pipeline import clean_cache
 
-    removed = {str(folder / "work"): result_folder.clean(folder, dry_run) for folder in _results(result)}
+    removed = {str(folder / "work"): clean_cache.clean(folder, dry_run) for folder in _results(result)}
     total = sum(removed.values())
     rows = [f"{size / 1e6:9.2f} MB  {work}" for work, size in removed.items()]
     terminal.print_data({"removed": removed, "bytes": total, "dry_run": dry_run} if json else "\n".join(rows))

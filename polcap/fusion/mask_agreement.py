@@ -26,8 +26,8 @@ from polcap.fusion.silhouettes import Silhouette, grid_around, halve
 from polcap.image_values import Bools, Floats
 from polcap.optics.outline import disc_radius
 from polcap.stages import stage
-from polcap.stages.mask import regions
-from polcap.stages.mask.regions import fill_holes
+from polcap.stages.mask import likely_regions
+from polcap.stages.mask.likely_regions import fill_holes
 
 COMPARED = "work/compared_masks"  # folder in the result of a session: the masks, as they were compared
 _SLIT = 0.05  # of the object's diameter in a view; wider gaps in a mask are gaps between the object's parts
@@ -59,7 +59,7 @@ def agree(views: tuple[Silhouette, ...]) -> AgreedMasks:
     for folder in dict.fromkeys(set_of_view(view.name) for view in views):
         agreeing, reasons = compare_set([view for view in views if set_of_view(view.name) == folder])
         used, left_out = used + agreeing, left_out | reasons
-    masks = tuple(regions.nth_part(view.mask, 1) for view in used)
+    masks = tuple(likely_regions.nth_part(view.mask, 1) for view in used)
     return AgreedMasks(tuple(view.name for view in used), masks, left_out)
 
 

@@ -1,17 +1,15 @@
-"""A result folder: its record, its lock, and the removal of the stage cache."""
+"""A result folder: its record and its lock."""
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
 from polcap.errors import StorageError
 from polcap.formats import atomic, folder_lock, own_files, own_folders, system_errors, text_file
-from polcap.formats.capture import folder_names
 
-_HELD = ("lock", "owner")  # files in work/ that an open result needs
 _PARTS = ("maps", "asset", "work", "report.html", "report.json", "color.toml", "compare.html")  # of a result
 
 
@@ -86,34 +84,3 @@ def _remove_temporary(out: Path) -> None:
             for file in place.glob(".*.part*"):
                 if atomic.is_temporary(file.name):
                     atomic.discard(file)
-
-
-def clean(out: Path, dry_run: bool = False) -> int:
-    """Remove polcap's files from work/: the stage cache and the pictures of `show`; returns their size in bytes.
-
-    All other files in work/ stay. With `dry_run`, nothing is removed.
-
-    Raises StorageError: there is no folder work/, another process works here, or a file cannot be removed.
-    """
-    work = out / "work"
-    if folder_names.is_result(out) and not work.is_dir():
-        raise StorageError(f"{out} holds no stage cache: there is nothing to remove")
-    if not work.is_dir():
-        raise StorageError(folder_names.without_result(out))
-    if not own_files.is_claimed(out):
-        raise StorageError(f"{out} holds no stage cache; give the result folder of `polcap process`")
-    with own_files.opened(out) as own:
-        files = [file for file in own.below(work) if file.name not in _HELD]
-        size = sum(file.stat().st_size for file in files)
-        if dry_run:
-            return size
-        with locked(out):
-            try:
-                for file in files:
-                    own.remove(file)
-            except OSError as error:
-                raise StorageError(f"{error.filename} cannot be removed: {error.strerror}") from error
-        for folder in {file.parent for file in files if file.parent != work}:
-            with suppress(OSError):  # it holds a file of another program
-                folder.rmdir()
-    return size

@@ -8,7 +8,7 @@ import pytest
 from polcap.chart_values import ChartPlace
 from polcap.errors import ObjectError
 from polcap.stages import mask
-from polcap.stages.mask import graph_cut, mask_channels, regions
+from polcap.stages.mask import graph_cut, likely_regions, mask_channels
 from polcap.stages.mask import network as mask_network
 from tests import scenes
 from tests.fake_network import FakeNetwork, run
@@ -128,7 +128,7 @@ def test_doubtful_holes_are_filled_openings_stay_and_specks_go():
     chance[30:40, 30:40] = 0.3  # a hollow in shadow
     chance[50:60, 50:60] = 0.02  # the opening of a handle
     chance[5:7, 5:7] = 0.9
-    found = regions.likely_regions(chance)
+    found = likely_regions.likely_regions(chance)
     assert found[30:40, 30:40].all() and not found[50:60, 50:60].any() and not found[5:7, 5:7].any()
 
 
@@ -155,8 +155,8 @@ def test_colors_are_not_followed_against_the_network():
     near, far = learned.copy(), learned.copy()
     near[19, 20:80] = True
     far[:, 10:90] = True
-    assert regions.choose(near, learned, chance) is near
-    assert regions.choose(far, learned, chance) is learned
+    assert likely_regions.choose(near, learned, chance) is near
+    assert likely_regions.choose(far, learned, chance) is learned
 
 
 def test_cleaning_keeps_openings():
@@ -166,7 +166,7 @@ def test_cleaning_keeps_openings():
     drawn[50, 50] = False
     drawn[5, 5] = True
     drawn[80:100, 85:95] = True  # colors alone took it for the object
-    found = regions.clean(drawn, np.where(np.arange(100) < 82, 0.6, 0.1) * np.ones((100, 1)))
+    found = likely_regions.clean(drawn, np.where(np.arange(100) < 82, 0.6, 0.1) * np.ones((100, 1)))
     assert found.sum() == 3600 - 100 and not found[30:40, 30:40].any() and found[50, 50]
 
 
@@ -197,7 +197,7 @@ def test_shape_counts_islands_holes_and_the_picture_edge():
     drawn[0:20, 0:20] = True
     drawn[5:10, 5:10] = False  # 25 of 375
     drawn[30:35, 40:45] = True  # 25 of 400
-    islands, holes, border = regions.measure_shape(drawn)
+    islands, holes, border = likely_regions.measure_shape(drawn)
     assert islands == pytest.approx(25 / 400) and holes == pytest.approx(25 / 400)
     assert border == pytest.approx(39 / (2 * 60 + 2 * 38))
 
@@ -208,7 +208,7 @@ def test_expected_error_is_one_minus_the_mean_overlap():
     chance = rng.beta(0.3, 0.3, (200, 200))
     found = chance > 0.5
     overlaps = [overlap(rng.random(chance.shape) < chance, found) for _ in range(20)]
-    assert 1 - regions.expected_error(found, chance) == pytest.approx(np.mean(overlaps), abs=0.005)
+    assert 1 - likely_regions.expected_error(found, chance) == pytest.approx(np.mean(overlaps), abs=0.005)
 
 
 @pytest.mark.parametrize(("light", "less"), [(0.02, True), (0.5, False)])
@@ -224,11 +224,11 @@ def test_colors_settle_a_doubt_only_if_object_and_backdrop_differ(light, less):
     picture = np.where(object_, 0.5, light)[..., None] * random.lognormal(0, 0.1, (80, 120, 3))
     chance = np.where(core, 0.99, np.where(object_, 0.6, 0.01)).astype(np.float32)
     chart = np.zeros(object_.shape, np.uint8)
-    by_network = regions.expected_error(object_, chance)
-    by_color = regions.expected_error_by_color(picture.astype(np.float32), object_, chance, chart)
+    by_network = likely_regions.expected_error(object_, chance)
+    by_color = likely_regions.expected_error_by_color(picture.astype(np.float32), object_, chance, chart)
     without = [measure(core) for measure in (
-        lambda found: regions.expected_error(found, chance),
-        lambda found: regions.expected_error_by_color(picture.astype(np.float32), found, chance, chart),
+        lambda found: likely_regions.expected_error(found, chance),
+        lambda found: likely_regions.expected_error_by_color(picture.astype(np.float32), found, chance, chart),
     )]  # fmt: skip
     assert by_color < by_network / 2 if less else by_color == pytest.approx(by_network, abs=0.03)
     assert without[1] > without[0] - 0.03
@@ -237,5 +237,5 @@ def test_colors_settle_a_doubt_only_if_object_and_backdrop_differ(light, less):
 def test_parts_of_a_mask_are_numbered_by_area() -> None:
     mask = np.zeros((20, 40), bool)
     mask[2:6, 2:6], mask[5:15, 20:35] = True, True
-    assert regions.nth_part(mask, 1).sum() == 150 and regions.nth_part(mask, 2).sum() == 16
-    assert not regions.nth_part(mask, 3).any()
+    assert likely_regions.nth_part(mask, 1).sum() == 150 and likely_regions.nth_part(mask, 2).sum() == 16
+    assert not likely_regions.nth_part(mask, 3).any()

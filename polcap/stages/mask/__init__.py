@@ -1,7 +1,7 @@
 """Stage 4: segmentation of the object in the picture, with the expected error of its mask.
 
 1. A network gives each pixel a probability of being the object (`network`, with the input of `mask_channels`).
-2. Pixels of high probability become a mask without specks (`regions`).
+2. Pixels of high probability become a mask without specks (`likely_regions`).
 3. The outline is moved to edges of color, where the probabilities allow it (`graph_cut`).
 4. For silhouettes, bright parts that the mask lacks are added (`bright_parts`).
 5. The pixels on the outline are decided by their coverage (`mask_border`).
@@ -24,7 +24,7 @@ from polcap.image_values import Bits, Bools, Floats, Quality
 from polcap.optics.warp import warp
 from polcap.stage_values import Alignment, AngleStack, Network, ObjectMask, RunNetwork
 from polcap.stages import stage
-from polcap.stages.mask import backdrop, bright_parts, graph_cut, mask_border, regions
+from polcap.stages.mask import backdrop, bright_parts, graph_cut, likely_regions, mask_border
 from polcap.stages.mask.network import object_probability
 
 
@@ -82,7 +82,7 @@ def segment(
         patches = _chart_zone(radiance, color, 0.0)
         probability = object_probability(radiance, alignment, color, patches, network, run)
         mask = _by_probability(picture, probability, zone, patches, settings.min_area)
-        doubt = regions.expected_error_by_color(picture, mask, probability, patches)
+        doubt = likely_regions.expected_error_by_color(picture, mask, probability, patches)
     erased = np.any((radiance.quality & int(Quality.ERASED)) > 0, axis=0)
     if settings.silhouette == "always" or (settings.silhouette == "board" and erased.any()):
         mask = bright_parts.add(picture, mask, erased)
@@ -96,10 +96,10 @@ def _by_probability(picture: Floats, probability: Floats, zone: Bits, patches: B
 
     Raises ObjectError: the mask covers a smaller share of the picture than `min_area`.
     """
-    mask = regions.likely_regions(probability)
+    mask = likely_regions.likely_regions(probability)
     if mask.any():
-        by_color = regions.clean(graph_cut.sharpen(picture, mask, patches, probability), probability)
-        mask = regions.choose(by_color, mask, probability)
+        by_color = likely_regions.clean(graph_cut.sharpen(picture, mask, patches, probability), probability)
+        mask = likely_regions.choose(by_color, mask, probability)
     else:
         with contextlib.suppress(ObjectError):
             mask = backdrop.find_object(picture, zone, min_area)
@@ -116,11 +116,11 @@ def _object(
 ) -> ObjectMask:
     """The mask or its part `settings.part`, with crop and figures. Raises ObjectError: too few parts."""
     if settings.part:
-        mask = regions.nth_part(mask, settings.part)
-    crop = regions.box_around(mask, settings.margin, least=4)
+        mask = likely_regions.nth_part(mask, settings.part)
+    crop = likely_regions.box_around(mask, settings.margin, least=4)
     if crop is None:
         raise ObjectError(f"the mask has fewer than mask.part = {settings.part} parts; choose a smaller number")
-    return ObjectMask(mask, crop, source, doubt, *regions.measure_shape(mask))
+    return ObjectMask(mask, crop, source, doubt, *likely_regions.measure_shape(mask))
 
 
 def mean_picture(radiance: AngleStack, alignment: Alignment, color: ColorCalibration) -> Floats:

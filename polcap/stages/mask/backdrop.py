@@ -9,7 +9,7 @@ import numpy as np
 from polcap.errors import ObjectError
 from polcap.image_values import Bits, Bools, Floats
 from polcap.stages.mask import graph_cut
-from polcap.stages.mask.regions import fill_holes
+from polcap.stages.mask.likely_regions import fill_holes
 
 STOPS = 10  # range of radiance, below the bright parts, that is distinguished
 _BRIGHT = 95  # percentile of the picture's radiance that counts as 1

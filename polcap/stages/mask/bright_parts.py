@@ -8,7 +8,7 @@ import numpy as np
 
 from polcap.image_values import Bools, Floats
 from polcap.optics.morphology import dilate
-from polcap.stages.mask.regions import box_around
+from polcap.stages.mask.likely_regions import box_around
 
 _REACH = 0.3  # of the mask's longer side: parts are searched as far from it
 _BRIGHT = 4.0  # times the backdrop; a brighter pixel is the object's (docs/benchmarks/fusion-choices.md)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from polcap.image_values import Bits, Bools, Floats
-from polcap.stages.mask.regions import box_around
+from polcap.stages.mask.likely_regions import box_around
 
 _REACH = 3  # px from the outline within which object and backdrop are measured
 _WINDOW = 7  # px over which object and backdrop are averaged

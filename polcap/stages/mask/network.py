@@ -15,8 +15,8 @@ from polcap.optics import mueller
 from polcap.optics.resize import area_mean
 from polcap.optics.warp import Box, warp
 from polcap.stage_values import Alignment, AngleStack, Network, RunNetwork
+from polcap.stages.mask.likely_regions import box_around
 from polcap.stages.mask.mask_channels import SIZE_MULTIPLE, ReducedPicture, brightness, encode, mirror
-from polcap.stages.mask.regions import box_around
 
 _CLOSE_UP_PX = 256  # greatest longer side of a close-up
 _CLOSE_UPS = 2  # passes over the part with the object; the second adds parts that the first estimate lacked
