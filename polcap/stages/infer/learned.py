@@ -6,7 +6,7 @@
 4. The refinement network adds relief.
 5. The coarse part of the normals becomes that of one surface, except at depth steps.
 6. Planar faces lose the variation that the expected error explains.
-7. The albedo is the picture, divided by the shading of the normals, times a smooth factor from the network.
+7. The albedo is the picture times a smooth factor from the network, divided by the square root of the shading.
 8. Pixels of one material get one roughness, with one expected error, and one F0.
 """
 
