@@ -113,8 +113,10 @@ def test_an_edited_texture_of_a_preset_stays(capture: Path, polcap: Command) -> 
     assert polcap("export", capture, "--preset", "unreal").returncode == 0
     texture = sorted((capture / "polcap" / "asset" / "unreal").glob("*.png"))[0]
     texture.write_bytes(b"retouched")
-    done = polcap("export", capture, "--preset", "unreal")
+    before = {file: file.read_bytes() for file in texture.parent.iterdir()}
+    done = polcap("export", capture, "--preset", "unreal", "--about", "title=Vase")
     assert done.returncode == 2 and f"{texture.name}: it was edited" in done.stderr
+    assert {file: file.read_bytes() for file in texture.parent.iterdir()} == before
     assert polcap("process", capture, *TINY, "--set", "asset.ior=1.4").returncode in (0, 3)  # replaces no preset's
     assert texture.read_bytes() == b"retouched"
 

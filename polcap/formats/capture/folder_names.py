@@ -85,7 +85,7 @@ def without_result(folder: Path) -> str:
     if captures := [path.name for path in inside if angle_folder_names(path)]:
         remedy = "run `polcap process` on one of them, or `polcap batch` on the folder, first"
         return f"{folder} holds captures without results: {few_names(captures)}; {remedy}"
-    return f"{folder} holds no result; give the result folder of `polcap process`"
+    return f"{folder} holds no result; give the result folder of `polcap process`, or run it first"
 
 
 def views(folder: Path) -> list[str]:
