@@ -11,7 +11,7 @@ import pytest
 from polcap import report
 from polcap.errors import StorageError
 from polcap.formats.maps import maps_folder
-from polcap.pipeline import result_folder, run_facts
+from polcap.pipeline import clean_cache, run_facts
 from polcap.quality.rerendering import Rerendering
 from polcap.report import page
 
@@ -99,7 +99,7 @@ def test_folders_of_captures_in_place_of_a_result_are_named_with_what_to_run(tmp
             report.read(folder)
         assert f"{folder} {text}" in str(run_facts.no_cache(folder))
         with pytest.raises(StorageError, match=re.escape(f"{folder} {text}")):
-            result_folder.clean(folder)
+            clean_cache.clean(folder)
     (capture / "polcap" / "maps").mkdir(parents=True)
     (capture / "polcap" / "asset" / "unreal").mkdir(parents=True)
     (capture / "polcap" / "report.json").write_text("{}")
