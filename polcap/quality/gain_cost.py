@@ -23,15 +23,30 @@ def normal_error_deg(ratio: Floats, angle: Floats, sigma: Floats) -> float:
 
     `ratio` (2, N) is S1/S0 and S2/S0 of the pixels, `angle` (K,) rad, `sigma` (K,) the relative 1σ of each gain.
     """
-    if not ratio.size:
-        return float("nan")
-    ratio = ratio[:, :: max(1, ratio.shape[1] // _MOST_PIXELS)]
-    added = np.linalg.pinv(mueller.analyzer(angle))[1:] / 2 * sigma  # (2, K) S1/S0, S2/S0 added by 1σ of each gain
+    added = _polarization_per_gain(angle) * sigma  # (2, K)
     length, axes = np.linalg.eigh(added @ added.T)
     root = axes * np.sqrt(np.maximum(length, 0))  # (2, 2)
     turn = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     circle = np.sqrt(2) * root @ np.stack([np.cos(turn), np.sin(turn)])  # (2, 8), with the covariance of the errors
-    tilt = np.stack([_tilt(ratio, ratio + one[:, None]) for one in circle.T])  # (8, N)
+    return _median_tilt_deg(ratio, circle)
+
+
+def other_gains_deg(ratio: Floats, angle: Floats, change: Floats) -> float:
+    """Error of the normals [degrees], median over the pixels, if the gains are wrong by a relative `change` (K,)."""
+    return _median_tilt_deg(ratio, (_polarization_per_gain(angle) @ change)[:, None])
+
+
+def _polarization_per_gain(angle: Floats) -> Floats:
+    """False S1/S0 and S2/S0 (2, K) per relative error of each shot's gain."""
+    return np.asarray(np.linalg.pinv(mueller.analyzer(angle))[1:] / 2)
+
+
+def _median_tilt_deg(ratio: Floats, added: Floats) -> float:
+    """Error of the network's normals for M false polarizations (2, M), RMS over these, median over pixels (2, N)."""
+    if not ratio.size:
+        return float("nan")
+    ratio = ratio[:, :: max(1, ratio.shape[1] // _MOST_PIXELS)]
+    tilt = np.stack([_tilt(ratio, ratio + one[:, None]) for one in added.T])  # (M, N)
     return _OF_NETWORK * float(np.degrees(np.median(np.sqrt((tilt**2).mean(0)))))
 
 

@@ -234,7 +234,7 @@ def room_light(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
 
     A flash at the lens leaves them unpolarized, a window or a glossy lamp does not.
     """
-    share, limit = _surroundings_dolp(found, found.results.selfcal.gains.gain), limits.max_room_dolp
+    share, limit = surroundings_dolp(found, found.results.selfcal.gains.gain), limits.max_room_dolp
     message = worded(100 * share, "The surroundings are polarized by {:.1f} %", "The surroundings are not polarized")
     if share > limit:
         message += ": polarized light from the room, or glossy surroundings"
@@ -317,11 +317,11 @@ def _highlight_dolp(found: Evidence[ResultsUntilInfer]) -> float:
 def contradicts_gains(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> bool:
     """Whether the surroundings are polarized with the measured gains, and hardly with equal light in all shots."""
     limit, equal = limits.max_room_dolp, np.ones_like(found.results.selfcal.gains.gain)
-    measured = _surroundings_dolp(found, found.results.selfcal.gains.gain)
-    return measured > limit and _surroundings_dolp(found, equal) < min(limit, measured / 2)
+    measured = surroundings_dolp(found, found.results.selfcal.gains.gain)
+    return measured > limit and surroundings_dolp(found, equal) < min(limit, measured / 2)
 
 
-def _surroundings_dolp(found: Evidence[ResultsUntilSelfcal], gain: Floats) -> float:
+def surroundings_dolp(found: Evidence[ResultsUntilSelfcal], gain: Floats) -> float:
     """Common DoLP of the surroundings, without object and chart, for gains (K, 3) of the shots.
 
     The median of tiles; NaN for too few tiles.

@@ -269,7 +269,7 @@ def gains(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Iterator[
 
 def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate:
     """Gate on the uncertainty of the shots' gains."""
-    measured, limit = found.results.selfcal.gains, limits.max_gain_doubt
+    measured, limit, contradicted = found.results.selfcal.gains, limits.max_gain_doubt, False
     if measured.source == "one exposure":
         return Gate("gain doubt", "pass", 0.0, limit, "All angles come from one exposure")
     doubt = float(measured.sigma.mean(1).max())
@@ -293,12 +293,8 @@ def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
         message = f"The chart's gray patches give the light of each shot only within {100 * doubt:.1f} % (1σ)"
         remedy = "Show the whole gray row of the chart, evenly lit, or use --no-chart"
     else:
-        message = f"Without gray patches the light of each shot is known within {100 * doubt:.1f} % (1σ)"
-        if doubt > _USUAL_CHANGE and _has_sharp_edges(found):
-            doubt = _USUAL_CHANGE
-            message = "Without gray patches flat faces do not show the light of each shot; it is assumed equal within "
-            message += f"{100 * doubt:.0f} % (1σ)"
-        if measured.source == "object" and light.contradicts_gains(found, limits):
+        doubt, message = _doubt_without_grays(found, doubt)
+        if contradicted := measured.source == "object" and light.contradicts_gains(found, limits):
             doubt = max(doubt, float(np.abs(np.log(measured.gain)).max()))
             message = f"The object shows changes of the light by up to {100 * doubt:.1f} %, its surroundings show none"
         if measured.source == "none":
@@ -311,9 +307,32 @@ def gain_doubt(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate
             remedy = "Fix the chart next to the object, with the whole gray row lit evenly"
         remedy += "" if found.results.radiance.equipment.light == "steady" else ", or use a steady lamp"
         remedy += "" if len(found.names) > 3 else ", or shoot four angles"
-    cost = _cost_deg(found, doubt)
+    cost = _cost_of_equal_light(found, doubt) if contradicted else _cost_deg(found, doubt)
     state: State = "fail" if cost > limits.max_normal_error_deg else "warn"
     return at_most("gain doubt", doubt, limit, message, remedy, cost_deg=cost, beyond=state)
+
+
+def _doubt_without_grays(found: Evidence[ResultsUntilSelfcal], doubt: float) -> tuple[float, str]:
+    """1σ of the least known gain from the object, and the finding in words.
+
+    Flat faces do not show the light of the shots, which is then assumed equal, as far as the surroundings confirm it:
+    wrong gains polarize all of them.
+    """
+    if doubt > _USUAL_CHANGE and _has_sharp_edges(found):
+        polarized = light.surroundings_dolp(found, found.results.selfcal.gains.gain)
+        doubt = min(doubt, float(np.fmax(_USUAL_CHANGE, polarized)))
+        message = "Without gray patches flat faces do not show the light of each shot; it is assumed equal within "
+        return doubt, f"{message}{100 * doubt:.0f} % (1σ)"
+    return doubt, f"Without gray patches the light of each shot is known within {100 * doubt:.1f} % (1σ)"
+
+
+def _cost_of_equal_light(found: Evidence[ResultsUntilSelfcal], doubt: float) -> float:
+    """Error of the normals [degrees] if all shots had equal light, as the surroundings show."""
+    if not reaches(found, ResultsUntilCues):
+        return DEGREES_PER_GAIN * doubt
+    pixels = found.results.cues.ratio[:, found.results.cues.mask]
+    change = np.log(found.results.selfcal.gains.gain.mean(1))
+    return gain_cost.other_gains_deg(pixels, found.results.selfcal.angle, change)
 
 
 def _cost_deg(found: Evidence[ResultsUntilSelfcal], doubt: float) -> float:

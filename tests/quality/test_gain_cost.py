@@ -44,6 +44,16 @@ def test_the_cost_is_the_error_of_normals_from_shots_with_wrong_gains(degrees: f
     assert stated == pytest.approx(measured, rel=0.12)
 
 
+def test_equal_light_instead_of_the_gains_costs_the_tilt_between_both() -> None:
+    """Of a surface that faces the camera, the shot at 45° was divided by a gain that it did not have."""
+    false = abs(float(dolp(np.radians(24.0))))
+    shots = np.array([0.5, 0.5 / (1 - false), 0.5])
+    s0, s1, s2 = np.linalg.solve(mueller.analyzer(ANGLE), shots)
+    measured = np.tile([[s1 / s0], [s2 / s0]], 200)
+    cost = gain_cost.other_gains_deg(measured, ANGLE, np.log([1.0, 1 - false, 1.0]))
+    assert cost / OF_NETWORK == pytest.approx(24.0, rel=0.1)  # a rest of 1 % of the error leaves a tenth of the tilt
+
+
 def test_well_polarized_surfaces_lose_little() -> None:
     sigma, azimuth = np.array([0.0, 0.02, 0.02]), np.linspace(0, 2 * np.pi, 90)
     cost = [

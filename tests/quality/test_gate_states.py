@@ -73,7 +73,7 @@ FIGURES = {
     "normal_error": 4.0, "lean": 2.0, "crossed": light.CrossedFigures(0.0, 0, 0.0, 0.1),
 }  # fmt: skip
 MEASURES = {  # the function that measures each figure
-    "surroundings": (light, "_surroundings_dolp"), "highlight": (light, "_highlight_dolp"),
+    "surroundings": (light, "surroundings_dolp"), "highlight": (light, "_highlight_dolp"),
     "albedo_slope": (light, "_albedo_slope"),
     "contradiction": (geometry, "_contradiction"),
     "pushed": (geometry, "_measure_shift"), "turn": (geometry, "_measure_turn"),
@@ -208,6 +208,8 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [  # gate, its state, the fields 
     ("gain doubt", "pass", {**gains(disagreement=0.05), "figures": {"rendered": rendered(0.3), "flatness": EDGES}}),
     ("gain doubt", "fail", gains(source="object", sigma=np.full((3, 3), 0.12))),
     ("gain doubt", "warn", {**gains(source="object", sigma=np.full((3, 3), 0.12)), "figures": {"flatness": EDGES}}),
+    ("gain doubt", "fail", {**gains(source="object", sigma=np.full((3, 3), 0.12)),
+                            "figures": {"flatness": EDGES, "surroundings": 0.1}}),
     ("gain doubt", "fail", gains(sigma=np.full((3, 3), 0.31))),
     ("gain doubt", "warn", gains(chart_gloss=0.05)),
     ("gain doubt", "warn", gains(source="object", sigma=np.full((3, 3), 0.02))),
