@@ -10,7 +10,7 @@ mesh and texture folder, the first included, is for tests; a single one is for b
 import argparse
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import cv2
@@ -44,17 +44,11 @@ def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
     files = list(foreign_files.files_below(source))
     meshes = sorted(path for path in files if path.suffix.lower() in _MESHES and path.is_file())
     textures = _texture_folders(files, report)
-    counts = [0, 0]
-    jobs = (meshes, write_mesh, "meshes", ".npz"), (textures, write_textures, "materials", "")
     with own_files.claimed(data, ()):
-        for kind, (found, convert, place, suffix) in enumerate(jobs):
-            for number, path in enumerate(found):
-                try:
-                    for split in _splits(number, len(found)):
-                        convert(path, data / place / split / f"{_name(path.relative_to(source))}{suffix}")
-                    counts[kind] += 1
-                except DecodeError as error:
-                    report(f"left out: {error}")
+        counts = (
+            _convert(source, meshes, write_mesh, data / "meshes", ".npz", report),
+            _convert(source, textures, write_textures, data / "materials", "", report),
+        )
     if not any(counts):
         kinds = ", ".join(sorted(_MESHES))
         raise InputError(f"{source}: holds no mesh ({kinds}) and no folder with pictures of albedo and roughness")
@@ -62,7 +56,22 @@ def main(source: Path, data: Path, report: Report = silent) -> tuple[int, int]:
         if count == 1:
             report(f"the only {noun} is for training and for tests: errors on it are too small; add others")
     report(f"{counts[0]} meshes and {counts[1]} texture folders in {data}")
-    return counts[0], counts[1]
+    return counts
+
+
+def _convert(
+    source: Path, found: list[Path], write: Callable[[Path, Path], None], place: Path, suffix: str, report: Report
+) -> int:
+    """Write each mesh or texture folder into place/train, place/test or both; returns how many are usable."""
+    count = 0
+    for number, path in enumerate(found):
+        try:
+            for split in _splits(number, len(found)):
+                write(path, place / split / f"{_name(path.relative_to(source))}{suffix}")
+            count += 1
+        except DecodeError as error:
+            report(f"left out: {error}")
+    return count
 
 
 def _texture_folders(files: Iterable[Path], report: Report) -> list[Path]:

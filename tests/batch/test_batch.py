@@ -111,6 +111,7 @@ def test_views_of_one_object_are_named(captures: Path, tmp_path: Path, polcap: C
         shutil.copytree(captures / "broken", tmp_path / name)
     done = polcap("batch", tmp_path, *OPTIONS)
     assert f"{tmp_path / 'cup'}: view01 to view02 are views of one object; `polcap fuse` joins them" in done.stderr
+    assert "(a flat sample: `polcap material`)" in done.stderr
 
 
 def test_folders_without_a_capture_are_named(captures: Path, tmp_path: Path, polcap: Command) -> None:

@@ -81,6 +81,13 @@ def test_of_a_measured_sg_the_block_and_all_others_are_used(tmp_path: Path) -> N
     assert found.is_block and found.patches == chart_file.SG_BLOCK
     assert found.surroundings is not None and shipped.surroundings is not None
     np.testing.assert_allclose(found.surroundings.rec709, shipped.surroundings.rec709, atol=1e-3)
+    of_block = [
+        row for row in (tmp_path / "sg.csv").read_text().splitlines() if row.split(",")[0] in chart_file.SG_BLOCK
+    ]
+    (tmp_path / "block.csv").write_text("\n".join(["id,X,Y,Z", *of_block]))
+    alone = chart_file.read(tmp_path / "block.csv")
+    np.testing.assert_allclose(alone.rec709, found.rec709)
+    assert alone.is_block and alone.surroundings is None
 
 
 @pytest.mark.parametrize(

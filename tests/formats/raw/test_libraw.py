@@ -10,6 +10,7 @@ import rawpy
 from polcap.errors import DecodeError
 from polcap.formats.raw import libraw as raw
 from polcap.optics import demosaic
+from polcap.optics.color import REC709_TO_XYZ
 from tests.formats import headers
 from tests.formats.headers import DATA, needs_data
 
@@ -153,6 +154,12 @@ def test_channels_that_see_the_same_give_no_camera_matrix(scale):
     alike[0, 0] = np.inf
     assert raw.camera_matrix(alike, None) is None
     assert raw.camera_matrix(scale * np.eye(3), None) is not None
+
+
+def test_without_a_white_balance_daylight_is_gray_and_green_has_gain_one():
+    xyz_to_camera = np.array([[0.8, -0.2, -0.1], [-0.4, 1.2, 0.2], [-0.1, 0.2, 0.6]])
+    daylight = xyz_to_camera @ REC709_TO_XYZ @ np.ones(3)
+    np.testing.assert_allclose(raw.camera_matrix(xyz_to_camera, None) @ daylight, daylight[1])
 
 
 def cut(path, whole, lengths):
