@@ -51,7 +51,7 @@ class ObjectPixels:
     lit: Tensor  # (M,) 1 where the flash reaches, else 0
     met: Tensor  # (M, RAYS) number, among the M, of the pixel that each ray meets; −1 for none
     open: Tensor  # (M,) share of the rays near the mirror direction that leave the object
-    hidden: Tensor  # (M,) share of all rays that do not
+    hidden: Tensor  # (M,) share of all rays that meet the object
 
 
 def trace_visibility(
@@ -157,13 +157,15 @@ def mirrored_surroundings(
     def u(low: float, high: float, columns: int = 1) -> Tensor:
         return low + (high - low) * torch.rand(count, columns, device=device)
 
-    albedo = torch.exp(u(*_LOG_ALBEDO)) * torch.exp(0.1 * torch.randn(count, 3, device=device)) * (u(0, 1) > 1 / 3)
+    gray, tint = torch.exp(u(*_LOG_ALBEDO)), torch.exp(0.1 * torch.randn(count, 3, device=device))
+    albedo = gray * tint * (u(0, 1) > 1 / 3)  # channels differ by 10 %; black for a third of the objects: none
     turn = u(0, 2 * pi)
     down = torch.cat([torch.cos(turn), torch.sin(turn), 0 * turn], dim=1)  # the ground's normal is −down
     below = (pixels.place * down[own]).sum(dim=1)  # depth of each pixel below the lens
     lowest = torch.full((count,), -9.0, device=device).scatter_reduce(0, own, below, "amax")
-    ground = lowest + 9 * (u(0, 1)[:, 0] > 0.6)  # its depth: the object lies on it; without a ground 9 more
-    behind = 1.35 + 1.5 * u(0, 1)[:, 0] ** 2  # distance of the backdrop from the lens
+    # depth of the ground below the lens: the object lies on it; 40 % have none, it is 9 lower, where no ray meets it
+    ground = lowest + 9 * (u(0, 1)[:, 0] > 0.6)
+    behind = 1.35 + 1.5 * u(0, 1)[:, 0] ** 2  # distance of the backdrop from the lens, mostly near the object
 
     camera_normal = frames.from_ray_frame(normal, pixels.v)
     direction = 2 * normal[:, 2:] * camera_normal - pixels.v
@@ -178,9 +180,10 @@ def mirrored_surroundings(
 
     rough = surface.roughness.clamp(min=_MIN_ROUGHNESS)
     mirror = 2 * normal[:, 2:] * normal - normal.new_tensor([0.0, 0.0, 1.0])
-    irradiance = 4 * normal[:, 2] * rough**4  # 1 / (π × density of facets that mirror exactly)
+    # cancels D / (4 cos θ) of the GGX law in the mirror direction, D = 1 / (π rough⁴), so S0 is F · G · light
+    unit_lobe = 4 * normal[:, 2] * rough**4
     ior = light_transport.facet_ior(surface.specular.mean(dim=1), surface.ior)
-    return shade.stokes(normal, 0 * light, surface.specular * light, rough, ior, mirror, irradiance)
+    return shade.stokes(normal, 0 * light, surface.specular * light, rough, ior, mirror, unit_lobe)
 
 
 def _density(normal: Tensor, direction: Tensor) -> Tensor:

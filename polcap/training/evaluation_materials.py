@@ -184,8 +184,8 @@ def _wood(rng: np.random.Generator) -> ToneAndGroove:
 
 
 def _marble(rng: np.random.Generator) -> ToneAndGroove:
-    """Veins that swirl."""
-    cycles, swirl, width = rng.uniform(2, 5), _waves(rng, 1, 9, 14), rng.uniform(0.1, 0.35)
+    """Marble: planes of narrow veins across z, bent by a smooth field, on a weakly clouded ground; numbers by eye."""
+    cycles, swirl, width = rng.uniform(2, 5), _waves(rng, 1, 9, 14), rng.uniform(0.1, 0.35)  # width: sine of a phase
     cloud = _waves(rng, 0.8, 4)
 
     def field(p: Floats) -> tuple[Floats, Floats]:
