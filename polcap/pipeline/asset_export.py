@@ -6,7 +6,7 @@ number of threads.
 
 import glob
 import os
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -54,11 +54,6 @@ _Writer = Callable[[], list[Path]]  # returns the files that it has written
 # of exported files
 _SUFFIXES = {".glb", ".obj", ".mtl", ".ply", ".stl", ".usdc", ".usdz", ".mtlx", ".exr", ".png", ".html"}
 _SHARING = {"obj", "usd", "materialx"}  # formats that share texture files
-# of the file or folder of a format
-_ENDINGS: dict[Format, str] = {
-    "gltf": ".glb", "obj": ".obj", "ply": ".ply", "stl": ".stl", "usd": ".usdc", "usdz": ".usdz",
-    "materialx": ".mtlx", "exr": "_layers.exr", "sfp": "_sfp", "iiif": "_iiif",
-}  # fmt: skip
 
 
 def key(keys: Mapping[str, str], settings: AssetSettings) -> str:
@@ -93,7 +88,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     levels of its GLB are replaced or removed.
 
     Raises SettingError: no such preset or color space, or an encoder is missing. ObjectError: as `levels`.
-    StorageError: a file cannot be replaced.
+    StorageError: somebody has edited a file in this folder.
     """
     found, record = levels(source, wanted), provenance.record(about, wanted.catalog)
     if found[0].asset.mesh.frame == "camera":  # one view
@@ -102,9 +97,9 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     preset, content = effective(wanted), found[0].asset
     name = atomic.safe_name(str(about["capture"].get("name")))  # files stay in the folder, whatever name the report has
     files = _files(out / "asset" / (wanted.preset or ""), name, content, preset, record)
+    _check_edits(files.folder)
     loose = _loose_textures(preset, wanted.extras, content, obj.stem(name), files.shared)
     coarser = {files.path(f"_lod{k}.glb"): level for k, level in enumerate(found[1:], 1)}
-    _check_edits(files, preset, [*coarser, *(files.folder / file for file in loose)])
     writers = _writers(files, out / "maps", wanted)
     tasks = [writers[one] for one in preset.formats]
     tasks += [partial(_write_glb, files, file, level.asset) for file, level in coarser.items()]
@@ -137,17 +132,14 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     return [*written, sidecar]
 
 
-def _check_edits(files: _Files, preset: ExportPreset, others: Iterable[Path]) -> None:
-    """Refuse an export that would replace a file that somebody has edited, before it writes the first one.
+def _check_edits(folder: Path) -> None:
+    """Refuse an export into a folder in which somebody has edited a file, before it writes the first one.
 
-    `others` are its levels of detail and its texture files. Raises StorageError: there is such a file.
+    Raises StorageError: there is such a file.
     """
-    places = [*(files.path(_ENDINGS[one]) for one in preset.formats), *others]
-    if preset.gathers:
-        places += [files.folder / name for name in ("maps", "report.html", color_profile.NAME)]
-    if own := own_files.owner(files.folder):
-        for file in [*places, *(inside for place in places for inside in own.below(place))]:
-            if not file.is_dir():
+    if own := own_files.owner(folder):
+        for file in own.below(folder):
+            if file.relative_to(os.path.abspath(folder)).parts[0] not in PRESETS:
                 own.check(file)
 
 
