@@ -245,7 +245,7 @@ def test_status_and_report_print_json(tiny: Path, tiny_result: Path, polcap: Com
     assert again == json.loads((result / "report.json").read_text())
     same = polcap("report", tiny_result, "--compare", result)
     assert same.stdout.startswith("Nothing changed beyond the doubt: colors agree to ΔE2000 0,")
-    assert "no figures and settings differ" in same.stderr
+    assert "figures and settings that differ: 0" in same.stderr
     document = json.loads(polcap("report", tiny_result, "--compare", result, "--json").stdout)
     assert [row["quantity"] for row in document["changes"]] == ["Color, ΔE2000", "Normal", "Roughness"]
     assert document["differences"] == []

@@ -112,7 +112,7 @@ def _compare(results: tuple[Path, Path], out: Path, json: bool, open_: bool) -> 
     else:
         lines = ["".join(cell.ljust(18) for cell in row).rstrip() for row in (pairs.HEAD, *table) if table]
         terminal.print_data("\n".join([sentence, *lines]))
-    terminal.print_message(f"polcap: {len(rows) or 'no'} figures and settings differ; comparison: {file}")
+    terminal.print_message(f"polcap: figures and settings that differ: {len(rows)}; comparison: {file}")
     if open_:
         terminal.open_page(file)
 
