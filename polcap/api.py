@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from polcap.fusion.fusion_path import SessionConfig
 
 _FLAG = re.compile(r"--([a-z]+(?:-[a-z]+)*)")
+# argument by option of the command line, where the names differ
 _ARGUMENT_OF = {"angles": "angles_deg", "set": "config", "about": "catalog", "extra": "extras", "no-chart": "chart"}
 _Arguments = ParamSpec("_Arguments")
 _Returned = TypeVar("_Returned")
@@ -319,10 +320,7 @@ def _names(stated: _Name | Sequence[_Name]) -> tuple[_Name, ...]:
 
 
 def _check_types(config: object, chart: object, mask: object) -> None:
-    """Refuse values of other types before anything is written.
-
-    Raises SettingError: a value has another type.
-    """
+    """Raise a SettingError for a value of another type, before anything is written."""
     for name, value, usable, remedy in (
         ("config", config, config is None or isinstance(config, Config), "give that of polcap.load_config(…)"),
         ("chart", chart, isinstance(chart, ChartRequest), 'give polcap.ChartRequest("none") or another one'),

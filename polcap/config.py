@@ -98,6 +98,7 @@ def fill(kind: type[S], stated: Mapping[str, Any], assignments: Sequence[str]) -
     for key, value in values.items():
         _check_known(key, value, setting_of)
         *sections, name = key.split(".")
+        # the innermost of the tables that are named by the sections gets the value
         functools.reduce(lambda inner, section: inner.setdefault(section, {}), sections, table)[name] = value
     try:
         return msgspec.convert(table, kind)
@@ -131,6 +132,7 @@ def settings(kind: type[msgspec.Struct] = Config, prefix: str = "") -> Iterator[
         members = [hint] if get_origin(hint) is Annotated else [*get_args(hint)] or [hint]  # of a union with None
         metas = [extra for member in members for extra in get_args(member)[1:] if isinstance(extra, Meta)]
         choices = get_origin(type_) is Literal
+        # of a union with None or of a tuple, the first member
         type_name = str(type_).replace("typing.", "") if choices else (*get_args(type_), type_)[0].__name__
         description = "".join(meta.description or "" for meta in metas)
         yield Setting(key, type_name, field.default, ", ".join(filter(None, map(_limits, metas))), description)

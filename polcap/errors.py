@@ -74,7 +74,7 @@ def one_line(error: BaseException) -> str:
 
 @contextmanager
 def package_for(purpose: str, package: str, extra: str, instead: str = "") -> Iterator[None]:
-    """Context manager for an import of `polcap[extra]`: a SettingError names the `package` that is missing."""
+    """Context manager for an import of `polcap[extra]`: a SettingError names the missing `package`, then `instead`."""
     try:
         yield
     except ModuleNotFoundError:

@@ -13,9 +13,8 @@ OUT_OF_MEMORY = (  # messages of OpenCV, pybind11, onnxruntime, threads, the loa
     "Insufficient memory", "bad_alloc", "bad allocation", "Failed to allocate memory", "can't start new thread",
     "failed to map segment", "Cannot allocate memory",
 )  # fmt: skip
-# memory of a run: per RAW pixel, and fixed (measured, docs/explanations/scale.md)
-_GB_PER_PIXEL, _GB_FIXED = 55e-9, 0.55
-_ROOM = 1.1  # factor on the memory at which a request failed, because later requests may be larger
+_GB_PER_PIXEL, _GB_FIXED = 55e-9, 0.55  # memory of a run: per RAW pixel, fixed (measured, docs/explanations/scale.md)
+_HEADROOM = 1.1  # factor on the memory at which a request failed, because later requests may be larger
 _REQUESTED = re.compile(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)")  # numpy, OpenCV
 _BYTES = {"bytes": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 
@@ -84,7 +83,7 @@ def shortfall(error: BaseException, stage: str, pixels: int) -> SettingError:
     used, limit = planes.process_memory()
     request = _REQUESTED.search(str(error))
     extra = float(request[1]) * _BYTES[request[2]] if request else 0.0
-    needed_gb = max(_GB_PER_PIXEL * pixels + _GB_FIXED, _ROOM * (used + extra) / 1e9, _LEAST_GB)
+    needed_gb = max(_GB_PER_PIXEL * pixels + _GB_FIXED, _HEADROOM * (used + extra) / 1e9, _LEAST_GB)
     rounded_gb = math.ceil(10 * needed_gb) / 10
     message = f"{stage}: out of memory"
     if used:

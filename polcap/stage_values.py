@@ -185,7 +185,7 @@ class TurnedShot:
 
     shots: tuple[int, ...] = ()  # all shots that could explain the contradiction, largest angle first; empty: all agree
     angle: float = 0.0  # rad, true minus stated angle of the first of them
-    sigma: float = np.pi / 2  # rad, 1σ
+    sigma: float = np.pi / 2  # rad, 1σ; π/2 without such a shot
 
 
 @dataclass(frozen=True)

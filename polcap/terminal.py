@@ -266,7 +266,7 @@ def print_gates(about: dict[str, Any]) -> None:
 
 
 class Steps:
-    """Progress without a terminal: a line per finished stage, and one per five seconds of frames."""
+    """Progress without a terminal: a line per finished stage, and for photographs one in 5 s; all with --verbose."""
 
     def __init__(self) -> None:
         self._begun = self._last = time.monotonic()

@@ -63,7 +63,7 @@ def _search(root: Path) -> list[Candidate]:
 def _units(root: Path, out: Path | None, found: Sequence[Candidate]) -> list[Unit]:
     """The captures among the candidates, each once, sorted by name. Raises CaptureError: there is none."""
     folders = sorted((one.folder for one in found if not one.reason), key=Path.is_symlink, reverse=True)
-    by_real_path = {os.path.realpath(folder): folder for folder in folders}  # a folder before links to it
+    by_real_path = {os.path.realpath(folder): folder for folder in folders}  # the last counts: links come first
     captures = [_unit(root, folder, out) for folder in by_real_path.values()]
     if not captures:
         reasons = "; ".join(f"{candidate.folder}: {candidate.reason}" for candidate in found)
@@ -113,7 +113,7 @@ def run(
     batch_folder = Path(found[0].batch_folder)
     places = {"root": str(root.resolve()), "out": None if out is None else str(out.resolve())}
     names = [path.name for path in batch_folder.iterdir()] if batch_folder.is_dir() else []
-    own_files.claim(batch_folder, names)
+    own_files.claim(batch_folder, names)  # without a record, a folder that holds anything is refused
     with own_files.opened(batch_folder) as own:
         for name in contact_sheet.EDITABLE:
             own.check(batch_folder / name)

@@ -67,7 +67,7 @@ def from_environment(environment: Mapping[str, str]) -> Shard:
 
 
 def _number(environment: Mapping[str, str], name: str, default: str = "") -> int:
-    """A whole number from an environment variable. Raises SettingError: it is none."""
+    """A whole number from an environment variable. Raises SettingError: its value is none."""
     text = environment.get(name) or default
     try:
         return int(text)

@@ -20,8 +20,7 @@ def batch(
     config: ConfigFile = None,
     assignments: Assignments = None,
     shard: Annotated[
-        str | None,
-        Option(metavar="K/N", help="The K-th of N parts; by default from Slurm, AWS, Kubernetes or PBS."),
+        str | None, Option(metavar="K/N", help="The K-th of N parts; by default from Slurm, AWS, Kubernetes or PBS.")
     ] = None,
     scheduler: Annotated[
         str | None, Option(metavar="ADDRESS", help="A Dask scheduler, tcp://host:8786 or local (extra [batch]).")

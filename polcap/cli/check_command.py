@@ -31,7 +31,7 @@ def check(
         found = captures.read(capture, options.angles_deg(angles), clockwise)
         verdict = checks.inspect(found, chosen, request, opening.result)
     for note in found.notes:
-        if "--resume" in note:
+        if "--resume" in note:  # the capture is unfinished
             terminal.print_message(f"polcap: {note}")
     terminal.print_data(checks.to_json(verdict) if json else checks.table(verdict, terminal.is_verbose()))
     if not verdict.keep:

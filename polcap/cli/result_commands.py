@@ -21,8 +21,7 @@ def show(
     animate: Annotated[
         Literal["light", "turntable"] | None,
         Option(
-            case_sensitive=False,
-            help="WebP, and MP4 where FFmpeg is present: a moving light, or the turning surface.",
+            case_sensitive=False, help="WebP, and MP4 where FFmpeg is present: a moving light, or the turning surface."
         ),
     ] = None,
     json: Json = False,
@@ -31,7 +30,7 @@ def show(
     from polcap.pipeline import run as pipeline
 
     _check_single(result, "show")
-    if (stage is None) + (not all_) + (animate is None) != 2:
+    if (stage is None) + (not all_) + (animate is None) != 2:  # two of three are left out
         raise SettingError(f"show {result}: give one of a stage ({', '.join(STAGES)}), --all or --animate")
     if animate is not None:
         drawn = pipeline.animate(result, animate)

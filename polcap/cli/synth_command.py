@@ -20,8 +20,7 @@ def synth(
     scene: Annotated[Literal["bumps", "clusters", "vase", "ball"], choice("Kind of object.")] = "bumps",
     seed: Annotated[int, Option(min=0, help="Of shape, material, light and noise.")] = 0,
     assignments: Annotated[
-        list[str] | None,
-        Option("--set", metavar="K=V", help="Camera and shooting, such as width=768; repeatable."),
+        list[str] | None, Option("--set", metavar="K=V", help="Camera and shooting, such as width=768; repeatable.")
     ] = None,
     mesh: Annotated[Path | None, Option(metavar="FILE", help="A mesh as the object: PLY, OBJ, GLB, …")] = None,
     material: Annotated[
@@ -43,8 +42,7 @@ def synth(
     ] = False,
     calibration: Annotated[bool, Option("--calibration", help="Photographs for `polcap calibrate` instead.")] = False,
     dataset: Annotated[
-        int | None,
-        Option(min=1, metavar="N", help="Make N samples of a data set instead (extra [train]); resumable."),
+        int | None, Option(min=1, metavar="N", help="Make N samples of a data set instead (extra [train]); resumable.")
     ] = None,
     json: Json = False,
 ) -> None:

@@ -34,6 +34,7 @@ def choose(exif: Exif, lens_filter: str | None) -> BallAccuracy | None:
 
 
 def _nfc(*names: str) -> list[str]:
+    """Names in one Unicode form, for comparison."""
     return [normalize("NFC", name) for name in names]
 
 

@@ -79,6 +79,7 @@ def pdf(board: Board) -> bytes:
 
 
 def _pdf_text(text: str) -> str:
+    """Escape a text for a string of a PDF."""
     return text.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
 
 

@@ -126,6 +126,7 @@ def _exif_tags(exif: Exif) -> list[_Entry]:
 
 
 def _stamp(exif: Exif, form: str) -> str | None:
+    """Time of the exposure in a format of `strftime`; None if it is unknown."""
     return datetime.fromisoformat(exif.taken).strftime(form) if exif.taken else None
 
 

@@ -107,7 +107,7 @@ def run_session(session: Any, path: Path, inputs: Floats, limit_s: float = _RUN_
 
 @lru_cache(_OPEN_SESSIONS)
 def _session(path: str, expected: str, device: Device, threads: int) -> Any:
-    """Open an onnxruntime session for a model file; ModelError if its digest is not the expected one."""
+    """Open an onnxruntime session for a model file. Raises ModelError: its digest is not `expected`, or as `load`."""
     data = _bytes(Path(path))
     if digest(data) != expected:
         raise ModelError(f"{path}: changed while polcap was using it; leave the file alone and run again")
@@ -121,7 +121,10 @@ def _session(path: str, expected: str, device: Device, threads: int) -> Any:
 
 
 def trial(path: str, expected: str, encoding: str) -> sandbox.Answer:
-    """Try in the child process whether a model runs on a small picture of noise; raises ModelError as `load` does."""
+    """Try in the child process whether a model runs on a small picture of noise; `expected` is its file's digest.
+
+    Raises ModelError: as `load`.
+    """
     session = _session(path, expected, "cpu", 1)
     channels, metadata = _check(Path(path), session, encoding)
     side = max(_TRIAL_PX, int(metadata["size_multiple"]))
@@ -159,6 +162,7 @@ def _open(path: Path, data: bytes, providers: list[str], threads: int) -> Any:
     onnxruntime = _onnxruntime()
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4  # failures are raised instead
+    # of these, onnxruntime starts all but one; each of up to `_AT_ONCE` parallel runs adds the thread that calls it
     options.intra_op_num_threads = max(1, (threads or parallel.threads()) - _AT_ONCE + 1)
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads sleep
     try:

@@ -18,7 +18,7 @@ from polcap.formats import system_errors, text_file
 
 RECORD = "polcap-files.txt"
 _FIRST_LINE = b"# polcap wrote these files; it replaces and removes only these.\n"
-_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)  # flag with which `os.open` refuses a link
 _opened: dict[str, "OwnFiles"] = {}  # by absolute path of the folder; polcap writes into these now
 
 
@@ -40,7 +40,7 @@ class OwnFiles:
     def check(self, file: Path) -> None:
         """Raise a StorageError if polcap must not replace `file`.
 
-        It exists and is not polcap's, somebody has edited it, or it or a folder above it is a link.
+        It exists and is not polcap's, it is a folder, somebody has edited it, or it or a folder above it is a link.
         """
         place = self.folder
         for part in Path(self._name(file)).parts:
@@ -48,7 +48,8 @@ class OwnFiles:
             if place.is_symlink():
                 raise StorageError(f"cannot write {file}: {place} is a link; remove it, or choose another --out")
         if place.is_dir() or (os.path.lexists(place) and not self.owns(file)):
-            raise StorageError(f"cannot write {file}: polcap did not write the file that is there; move it away")
+            kind = "folder" if place.is_dir() else "file"
+            raise StorageError(f"cannot write {file}: polcap did not write the {kind} that is there; move it away")
         if self._is_edited(place):
             raise StorageError(
                 f"cannot write {file}: it was edited after polcap wrote it; move it away, or choose another --out"

@@ -71,7 +71,7 @@ class _Files:
     shared: Mapping[Key, str]  # names of the textures of OBJ, USD and MaterialX
     facts: Mapping[str, str]  # origin and catalog entry, for headers
     entry: Mapping[str, str]  # stated fields of `CatalogEntry`
-    comment: str  # the same for files of text
+    comment: str  # unit, axes and catalog entry, for the heads of text files
     glb: gltf.GlbOptions
     encoder: TextureEncoder
 
@@ -217,9 +217,9 @@ def copy(result: Path, out: Path) -> None:
 def _loose_textures(
     preset: ExportPreset, extras: Sequence[Extra], content: Asset, stem: str, shared: Mapping[Key, str]
 ) -> dict[str, Texture]:
-    """Texture files of a preset, of --extra, and those that OBJ, USD and MaterialX share, by file name.
+    """Textures of a preset, of --extra, and those that OBJ, USD and MaterialX share, by file name.
 
-    Textures whose values the asset lacks are left out: displacement and curvature of a closed mesh.
+    `shared` has the file names of the last of these. Displacement, curvature and cavity of a closed mesh are left out.
     """
     names = {f"{pattern.format(stem)}.png": name for pattern, name in preset.textures.items()}
     names |= {f"{stem}_{key.replace('-', '')}.png": key.replace("-", "_") for key in extras}
@@ -227,8 +227,9 @@ def _loose_textures(
     available = {file: name for file, name in names.items() if name not in of_relief or of_relief[name] is not None}
     found = {file: texture_set.TEXTURES[name](content) for file, name in available.items()}
     if _SHARING.intersection(preset.formats):
-        made = {file: texture_set.LOOSE[key](content) for key, file in shared.items()}
-        found |= {file: texture_set.linear(one) for file, one in made.items()} if preset.shared == "exr" else made
+        for key, file in shared.items():
+            texture = texture_set.LOOSE[key](content)
+            found[file] = texture_set.with_linear_meaning(texture) if preset.shared == "exr" else texture
     return found
 
 
@@ -240,7 +241,7 @@ def sidecars(out: Path) -> list[Path]:
 def find_outdated(out: Path, records: Sequence[Path], keys: Mapping[str, str]) -> list[Path]:
     """Exports of other maps than those of the result `out` with these cache keys: folders of presets, and files.
 
-    `records` are sidecars, one of each folder. A file of polcap that it does not list had another record.
+    `records` are sidecars, one of each folder. Files of polcap that no sidecar lists are of an earlier record.
     """
     outdated, unlisted, own = list[Path](), dict[Path, None](), own_files.OwnFiles(out)
     for sidecar in records:
@@ -257,6 +258,7 @@ def find_outdated(out: Path, records: Sequence[Path], keys: Mapping[str, str]) -
 
 
 def _write_one(write_file: Callable[..., None], file: Path, *arguments: Any) -> list[Path]:
+    """Write a file by a function that returns nothing; returns the file."""
     write_file(file, *arguments)
     return [file]
 

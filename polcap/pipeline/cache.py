@@ -139,9 +139,11 @@ class MemoryCache:
         return value
 
     def _find(self, stage: Stage[..., T], key: str) -> T | None:
+        """The stored value of a stage's result with this key; None: it must be computed."""
         return self._held.get(key)
 
     def _store(self, stage: Stage[..., T], value: T, about: dict[str, Any], seconds: float) -> T:
+        """Store the computed value of a stage's result; returns it read-only."""
         npy_folder.freeze(value)
         self._held[about["key"]] = value
         return value
@@ -287,7 +289,7 @@ def _verify(file: Path, expected: list[Any]) -> None:
         if identity not in _verified and npy_folder.checksum(file) == expected:
             _verified.add(identity)
     except OSError:
-        identity = ()
+        identity = ()  # never in the set
     if identity not in _verified:
         raise StorageError(f"{file} is damaged; delete {file.parent} and run again")
 

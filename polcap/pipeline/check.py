@@ -30,7 +30,7 @@ from polcap.results import ResultsUntilInfer, ResultsUntilWhitebalance
 from polcap.stage_values import Network
 
 _THREADS = 2  # frames that are decoded at a time
-_SYMMETRIES = 2  # positions of the network, one for each size: gates read medians of its maps only
+_SYMMETRIES = 2  # positions of the picture that the network sees, instead of 4: gates read medians of its maps only
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -52,7 +52,7 @@ def inspect(
 ) -> Verdict:
     """Judge a capture for `polcap check`, by the same gates as `process`.
 
-    `networks` opens those of estimator and mask while frames are decoded. Without the first, the errors of the
+    `networks` opens the networks of estimator and mask while frames are decoded. Without the first, the errors of the
     analytic estimator are expected; without the second, the object is found by its contrast to the backdrop.
 
     Raises InputError: a frame cannot be decoded, or a chart was named and cannot be read.

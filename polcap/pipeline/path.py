@@ -90,7 +90,7 @@ def on_grid(drawn: Bools | None, radiance: AngleStack) -> Bools | None:
     tall, wide = drawn.shape
     if (tall, wide) == (height, width):
         return drawn
-    if abs(tall - step * height) < step and abs(wide - step * width) < step:
+    if abs(tall - step * height) < step and abs(wide - step * width) < step:  # rows for a part of a pixel are cut off
         return np.asarray(drawn[::step, ::step][:height, :width])
     sizes = dict.fromkeys(f"{n * width}×{n * height}" for n in (step, 1))
     raise ObjectError(f"--mask is {wide}×{tall} px; draw it on the picture's {' or '.join(sizes)} px")

@@ -57,9 +57,9 @@ def locked(out: Path) -> Iterator[None]:
 
 
 def check_edits(out: Path) -> None:
-    """Refuse a run that would replace a map, a file of the asset, or a report that somebody has edited.
+    """Raise a StorageError if somebody has edited a map, a file of the asset, or the report: the run would replace it.
 
-    Raises StorageError: there is one.
+    The run replaces no files in folders of asset/, where exports by presets are.
     """
     own, replaced = own_files.OwnFiles(out), (out / "maps", out / "asset")
     files = [file for folder in replaced for file in own.below(folder) if file.parent == Path(os.path.abspath(folder))]
@@ -68,7 +68,7 @@ def check_edits(out: Path) -> None:
 
 
 def _owner(file: Path) -> str:
-    """Process id in the file `owner`."""
+    """Process id in the file `owner`; "unknown" if it cannot be read."""
     try:
         return text_file.read_text(file, limit=20).strip()
     except (OSError, ValueError):

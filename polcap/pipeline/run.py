@@ -139,12 +139,12 @@ def _write(out: Path, results: Results, facts: dict[str, Any], config: Config) -
 
 
 def decode_with_progress(capture: Capture, frame_read: Callable[[int, int], None]) -> Decode:
-    """A decode function that reports progress by `frame_read`: numbers of decoded and of all photographs."""
-    total, number = sum(len(shot.frames) for shot in capture.all_shots), count(1)
+    """A decode function that reports progress by `frame_read`: numbers of decoded and of all photographs of shots."""
+    total, number = sum(len(shot.frames) + len(shot.ambient) for shot in capture.all_shots), count(1)
 
     def decode(frame: Frame) -> SensorImage:
         image = frame_decoder.decode(frame)
-        frame_read(min(next(number), total), total)
+        frame_read(min(next(number), total), total)  # frames that left memory are decoded again
         return image
 
     return decode
@@ -202,7 +202,7 @@ def _textures(out: Path, results: FirstResults) -> pictures.Picture:
 def _report_of(out: Path, results: FirstResults) -> dict[str, Any]:
     """The report.json of a finished result. Raises StorageError: it is not finished, or work/ is of another run."""
     about = report.read(out)
-    if about["keys"] != {**about["keys"], **results.keys}:
+    if any(about["keys"].get(stage) != key for stage, key in results.keys.items()):
         raise StorageError(f"{out}: work/ and maps/ are of two runs; run `polcap process` again")
     return about
 

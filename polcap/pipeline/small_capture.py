@@ -88,6 +88,7 @@ def reduce(capture: Capture, clip: float, pool: ThreadPoolExecutor) -> SmallCapt
 
 
 def _decode_reduced(frame: Frame, clip: float, times: int, corners: list[list[int]]) -> ReducedFrame:
+    """Decode and reduce a frame in the child process."""
     return _build_frame(*frame_decoder.apply(frame, reduce_frame, clip=clip, times=times, corners=corners))
 
 

@@ -110,6 +110,7 @@ def _result(out: Path) -> dict[str, Stat]:
 
 
 def _is_of_run(parts: tuple[str, ...]) -> bool:
+    """Whether a run writes the file with these parts of its path: of work/, files of stages and run.json."""
     return parts[0] in _PARTS or (parts[0] == "work" and (len(parts) > 2 or parts[1] == "run.json"))
 
 

@@ -23,5 +23,5 @@ def advice(judged: Sequence[Gate]) -> list[Gate]:
     """
     failed = [gate for gate in judged if gate.state == "fail" and gate.remedy]
     warned = sorted((gate for gate in judged if gate.state == "warn"), key=lambda gate: gate.cost_deg < _NOTABLE_DEG)
-    first = {gate.remedy: gate for gate in reversed(failed or warned) if gate.remedy}  # one gate for each remedy
+    first = {gate.remedy: gate for gate in reversed(failed or warned) if gate.remedy}  # of each remedy, the first gate
     return list(reversed(first.values()))[:_MOST]

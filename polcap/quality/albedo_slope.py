@@ -21,9 +21,9 @@ _MOST_PIXELS = 1e4  # of the object; a larger picture is averaged down
 _FACING = 0.35  # least z of a normal
 _DARKEST = 0.01  # albedo
 _CELL = 0.5  # side of a part, of the object's radius
-_LEAST_PIXELS, _LEAST_CELLS = 300, 6
+_LEAST_PIXELS, _LEAST_CELLS = 300, 6  # of the averaged object; parts of it
 _CAUCHY = 2.0  # robust standard deviations of the residuals: scale of the weights
-_ROUNDS = 8
+_ROUNDS = 8  # of new weights
 _SIGMAS = 2.0  # of the slope: how far its lower limit lies below it
 _LEAST_SPREAD = 1e-6  # of the squares of the normals' x and y in the mean: a plane has no slope to compare
 

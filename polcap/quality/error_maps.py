@@ -34,7 +34,7 @@ _GHOST_DEG = 5.0  # where the exposures of a shot differ
 # 1σ by 150 simulated captures and the 4 rendered ones (docs/benchmarks/albedo.md); (network, analytic)
 _ALBEDO = (0.04, 0.06)  # of the diffuse albedo, times the root of albedo times expected normal error [degrees]
 _DARKEST = 0.01  # albedo
-_MOST_DEG = 20.0  # normal error: a larger one does not change the albedo more
+_ALBEDO_MOST_DEG = 20.0  # normal error: a larger one does not change the albedo more
 _ALBEDO_CLIPPED = 3.0  # relative, times the clipped shares of the object and around: light that no shot shows
 _ROUGHNESS_OF_INVERSION = 0.17  # the inversion assumes one roughness
 
@@ -93,7 +93,7 @@ def _diffuse_error(found: Evidence[ResultsUntilInfer]) -> Floats:
     """1σ of the diffuse albedo (H, W), mean of the channels, if chart and object had the same light."""
     maps, clipped = found.results.maps, _flagged(found, Quality.CLIPPED)
     albedo = np.maximum(maps.diffuse.mean(axis=-1), _DARKEST)
-    error = _ALBEDO[maps.estimator == "analytic"] * np.sqrt(albedo * np.minimum(maps.confidence, _MOST_DEG))
+    error = _ALBEDO[maps.estimator == "analytic"] * np.sqrt(albedo * np.minimum(maps.confidence, _ALBEDO_MOST_DEG))
     if clipped.any():
         hidden = _ALBEDO_CLIPPED * clipped.sum() / maps.mask.sum()
         error = np.hypot(error, hidden * _share_around(clipped, maps.mask) * albedo)
@@ -119,7 +119,7 @@ def _share_around(chosen: Bools, inside: Bools) -> Floats:
     return np.asarray(cv2.resize(part / np.maximum(total, 1e-6), inside.shape[::-1]))
 
 
-_PLACES: Mapping[str, Callable[[Evidence[ResultsUntilInfer]], Floats]] = {
+_PLACES: Mapping[str, Callable[[Evidence[ResultsUntilInfer]], Floats]] = {  # (H, W), or (1,) of zero, degrees
     "clipping": _of_clipping,
     "stillness": _of_ghosts,
     "focal length": _of_focal_length,

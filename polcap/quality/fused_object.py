@@ -1,4 +1,7 @@
-"""Gates of a fused object: its views, their poses and normals, joined sets, the seen share, the closed mesh."""
+"""Gates of a fused object: its views, their poses and normals, the seen share, the closed mesh, and joined sets.
+
+A set holds the views of the object lying on one side.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -47,12 +50,12 @@ class SeenSurface:
 
     seen: float
     down: float  # unseen, faces down
-    side: float
-    up: float
+    side: float  # unseen, faces sideways
+    up: float  # unseen, faces up
 
     @classmethod
     def measure(cls, seen: Bools, height: Floats) -> Self:
-        """Of texels (N,) that a view saw, and the upward component (N,) of their normals."""
+        """Measure it on N texels: whether a view saw them (N,), and the upward component (N,) of their normals."""
         down, up = height < -_STEEP, height > _STEEP
         parts = (float((~seen & part).mean()) for part in (down, ~down & ~up, up))
         return cls(float(seen.mean()), *parts)
@@ -61,7 +64,7 @@ class SeenSurface:
 def seen(surface: SeenSurface, view_count: int, limits: FusedGateLimits) -> Gate:
     """Gate on the share of the surface that a view saw; the underside is left out."""
     limit, share = limits.min_seen, surface.seen
-    above = share / max(1 - surface.down, 1e-9)
+    above = share / max(1 - surface.down, 1e-9)  # of the surface without the unseen underside
     most = max(("down", "side", "up"), key=lambda side: float(getattr(surface, side)))
     where = {"down": "faces down", "side": "faces sideways", "up": "faces up"}[most]
     message = f"Views saw {share:.0%} of the surface; the rest, which mostly {where}, is filled"

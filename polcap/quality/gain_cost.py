@@ -27,7 +27,8 @@ def normal_error_deg(ratio: Floats, angle: Floats, sigma: Floats) -> float:
     length, axes = np.linalg.eigh(added @ added.T)
     root = axes * np.sqrt(np.maximum(length, 0))  # (2, 2)
     turn = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-    circle = np.sqrt(2) * root @ np.stack([np.cos(turn), np.sin(turn)])  # (2, 8), with the covariance of the errors
+    # (2, 8) with the covariance of the errors: x and y of the unit circle have the variance ½
+    circle = np.sqrt(2) * root @ np.stack([np.cos(turn), np.sin(turn)])
     return _median_tilt_deg(ratio, circle)
 
 
@@ -37,7 +38,7 @@ def other_gains_deg(ratio: Floats, angle: Floats, change: Floats) -> float:
 
 
 def _polarization_per_gain(angle: Floats) -> Floats:
-    """False S1/S0 and S2/S0 (2, K) per relative error of each shot's gain."""
+    """False S1/S0 and S2/S0 (2, K) per relative error of each shot's gain; a shot has half of S0."""
     return np.asarray(np.linalg.pinv(mueller.analyzer(angle))[1:] / 2)
 
 
@@ -51,7 +52,7 @@ def _median_tilt_deg(ratio: Floats, added: Floats) -> float:
 
 
 def _tilt(true: Floats, false: Floats) -> Floats:
-    """Angle (N,) [rad] between the normals of two polarizations (2, N); the side of the azimuth is known."""
+    """Angle (N,) [rad] between the normals of two polarizations (2, N): of their two sides, the nearer one."""
     (x, y, z), (other_x, other_y, other_z) = _normal(true), _normal(false)
     cosine = np.abs(x * other_x + y * other_y) + z * other_z
     return np.asarray(np.arccos(np.clip(cosine, -1, 1)))

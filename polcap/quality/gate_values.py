@@ -87,10 +87,7 @@ def reaches(found: Evidence[Any], results: type[R]) -> TypeGuard[Evidence[R]]:
 
 
 def full_size(
-    results: H,
-    focal_doubt: tuple[float, float],
-    align: AlignSettings = _ALIGN,
-    files: tuple[tuple[str, ...], ...] = (),
+    results: H, focal_doubt: tuple[float, float], align: AlignSettings = _ALIGN, files: tuple[tuple[str, ...], ...] = ()
 ) -> Evidence[H]:
     """Evidence of a run of `process`; clipping is that of the merged picture of each shot, not of every exposure."""
     radiance = results.radiance
@@ -106,7 +103,7 @@ def full_size(
 
 
 def of_error(error: InputError) -> Gate:
-    """Gate of an error that ended the path."""
+    """Gate of an error that ended the path, named for the class of the error."""
     reason, _, remedy = str(error).partition("; ")
     name = type(error).__name__.removesuffix("Error").lower()
     return Gate(name, "fail", None, None, reason, remedy, _ERROR_COST_DEG)

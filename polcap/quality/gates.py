@@ -50,6 +50,7 @@ class Step(Generic[R]):
 
 
 def _without_limits(judge: Callable[[Evidence[R]], _Judged]) -> Callable[[Evidence[R], GateLimits], _Judged]:
+    """A function for a `Step` from one that takes no limits."""
     return lambda found, _limits: judge(found)
 
 

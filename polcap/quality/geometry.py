@@ -24,7 +24,7 @@ from polcap.stage_values import AngleStack, StokesImage, SurfaceMaps
 from polcap.stages.align import object_motion
 from polcap.stages.whitebalance import chart_in_mask
 
-_LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps; band inside the outline; 1σ
+_LONGEST, _OUTLINE_PX, _OUTLINE_BLUR_PX = 256, 3.0, 2.0  # px of the reduced maps: side; band at the outline; blur
 _DEGREES_PER_SHIFT = 200.0  # error of the normals per shift by the object's radius
 _SIGMAS, _FALSE_SHIFT = 3.0, 0.003  # least significance of a shift; 1σ that polarization imitates, over the radius
 _DEGREES_PER_TURN = 600.0  # error of the normals per shift of the surface by a turn, over the radius
@@ -77,10 +77,10 @@ def _judge_camera(found: Evidence[ResultsUntilAlign], limits: GateLimits) -> Gat
     most, most_doubt = align.max_shift_px, limits.max_align_residual_px * max(found.grid_px, 1)
     far, unlike, unsure = ~(shift <= most), correlation < align.min_correlation, doubt > most_doubt
     bad = far | unlike | unsure
-    k = int(np.argmax(np.where(bad, 1e9, 0) + np.nan_to_num(shift)))
+    k = int(np.argmax(np.where(bad, 1e9, 0) + np.nan_to_num(shift)))  # the farthest, of the bad shots if there are any
     message, value = f"The {names[k]} shot moved by {shift[k]:.1f} ± {doubt[k]:.2f} px", round(float(shift[k]), 3)
     if not bad.any():
-        message = message if shift[k] >= 0.05 else "No shot moved"
+        message = message if shift[k] >= 0.05 else "No shot moved"  # less is 0.0 in the message
         return Gate("alignment", "pass", value, most, message, unit="px")
     if (odd := unlike | ~np.isfinite(shift)).any():
         return _another_scene(found, odd)
@@ -183,6 +183,7 @@ def _judge_turn(found: Evidence[ResultsUntilMask], limits: GateLimits) -> Gate:
 
 
 def _measure_shift(found: Evidence[ResultsUntilMask]) -> object_motion.ObjectShift:
+    """Shift of the object against its surroundings in each shot."""
     results = found.results
     return object_motion.measure(results.radiance, results.alignment, results.object_)
 
@@ -238,6 +239,7 @@ def _width_px(mask: Bools) -> float:
 
 
 def _chart_share(found: Evidence[ResultsUntilMask]) -> float:
+    """Share of the object's mask that looks like a color chart."""
     return float(chart_in_mask.share(found.results.radiance, found.results.object_.mask, shipped_data.colorchecker()))
 
 

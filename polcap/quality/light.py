@@ -32,8 +32,9 @@ _EDGE_PX = 2.0  # 1σ of the blur before two shots are compared, so that misalig
 _STILL_CLIPPED = 0.5  # share of highlights that a crossed filter should have stopped
 _FEW = 20  # px: fewer clipped ones are not judged
 _DEGREES_PER_AMBIENT = 12.0  # of the normals, with one ambient frame for all angles: 1 to 2° at 15 %
-# ratio of the room's light in two ambient frames that a polarization of 60 % causes; least share; 12° at a gap of .15
-_UNLIKE, _LEAST_AMBIENT, _DEGREES_PER_UNLIKE = 4.0, 0.02, 80.0
+_UNLIKE = 4.0  # ratio of the room's light in two ambient frames that a polarization of 60 % causes: 1.6 / 0.4
+_LEAST_AMBIENT = 0.02  # share of the light: less is not compared between the angles
+_DEGREES_PER_UNLIKE = 80.0  # of the normals: 12° at a gap of .15 between the shares
 _DEGREES_PER_FLICKER = 400.0  # of the normals: 4.3 and 7.3° at 1.2 and 3.6 % of the light (docs/benchmarks/gates.md)
 _LEAST_ALBEDO = 0.02  # sum of the channels
 _TOWARDS_CAMERA = float(np.cos(np.radians(30)))  # cosine; lamps 45° to the side are mirrored at 22°
@@ -267,6 +268,7 @@ def side_light(found: Evidence[ResultsUntilInfer], limits: GateLimits) -> Gate:
 
 
 def _albedo_slope(found: Evidence[ResultsUntilInfer]) -> albedo_slope.AlbedoSlope | None:
+    """Dependence of the albedo on the slope, without clipped pixels; None for a small object."""
     return albedo_slope.measure(found.results.maps, found.results.cues.quality & int(Quality.CLIPPED) == 0)
 
 
@@ -288,11 +290,11 @@ def _judge_highlights(found: Evidence[ResultsUntilInfer], limits: GateLimits) ->
 
 
 def _highlight_dolp(found: Evidence[ResultsUntilInfer]) -> float:
-    """Least common DoLP, within 1σ, of the tenth of the surfaces that face the camera with most light over albedo.
+    """Common DoLP, less its 1σ, of a tenth of the surfaces that face the camera: those with the most light over albedo.
 
-    Highlights of lamps at the sides are there, too. NaN if too little of the object faces the camera, or if most of it
-    leans the same way, as a cylinder: it shares a polarization under any light. The error is that of the median of the
-    pixels and that of the shots' gains.
+    Highlights of lamps at the sides are there, too. NaN if too little of the object faces the camera, if most of it
+    leans the same way, as a cylinder, which shares a polarization under any light, or if the DoLP is above 1. The error
+    is that of the median of the pixels and that of the shots' gains.
     """
     maps, cues, selfcal = found.results.maps, found.results.cues, found.results.selfcal
     inside = maps.mask & cues.mask
@@ -310,7 +312,8 @@ def _highlight_dolp(found: Evidence[ResultsUntilInfer]) -> float:
     if dolp > 1:  # the shots contradict each other
         return float("nan")
     scatter = MEDIAN_SE * np.hypot(*ratio.std(axis=1)) / np.sqrt(ratio.shape[1])
-    of_gains = np.linalg.pinv(mueller.analyzer(selfcal.angle))[1:] * selfcal.gains.sigma.mean(axis=1) / 2  # (2, K)
+    # (2, K); a shot has half of S0, so an error σ of its gain is σ/2 of S0
+    of_gains = np.linalg.pinv(mueller.analyzer(selfcal.angle))[1:] * selfcal.gains.sigma.mean(axis=1) / 2
     return max(dolp - float(np.hypot(scatter, np.linalg.norm(of_gains))), 0.0)
 
 

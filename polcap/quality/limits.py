@@ -185,8 +185,7 @@ class MaterialGateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True
         Positive, Meta(description="allowed highlight of the board's paper over its diffuse light [1]")
     ] = 0.1
     max_blur_px: Annotated[
-        Positive,
-        Meta(description="allowed blur of a view beyond that of the median view, 1σ; usually 0.2 [merged px]"),
+        Positive, Meta(description="allowed blur of a view beyond that of the median view, 1σ; usually 0.2 [merged px]")
     ] = 0.5
     max_residual: Annotated[
         Positive,

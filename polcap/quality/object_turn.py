@@ -29,14 +29,18 @@ from polcap.stages.align.detail import averaging_step, detail, fine_detail
 from polcap.stages.cues import NOMINAL_IOR
 
 _MOST_PIXELS = 0.8e6  # a larger picture is averaged down first
-_DETAIL_PX, _COLOR_PX, _BLUR_PX = 4.0, 8.0, 0.7  # 1σ: coarser structure is left out; smoothing before
+_DETAIL_PX, _COLOR_PX, _BLUR_PX = (
+    4.0,
+    8.0,
+    0.7,
+)  # 1σ: coarser detail of brightness, of colors is left out; blur of colors
 _INWARD_PX = 2  # of the mask that are left out: the outline does not turn with the surface
 _LEAST_SHOT = 0.05  # of half the light: no shot of a dielectric is darker, except in mirrors
 _FLOOR = 0.01  # of the 99th percentile of the light, added before the logarithm
-_LEAST_PIXELS = 1000
+_LEAST_PIXELS = 1000  # of the reduced object
 _PRIOR = np.array([1.0, 1.0, 0.03, 0.03, 0.03, 0.03])  # 1σ of shift [px], zoom [1], roll, tilts [rad]
 _CAUCHY = 2.0  # robust standard deviations of the residuals: scale of the weights
-_STEPS = 5
+_STEPS = 5  # of new weights
 _FALSE_SHIFT_PX = 0.06  # 1σ of a shift that polarization imitates (docs/benchmarks/gates.md)
 _CELL = 12  # px: residuals of different cells are independent
 

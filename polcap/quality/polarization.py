@@ -131,7 +131,7 @@ def ill_posed(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Gate:
     """Gate on the share of the lit object with a polarization that no dielectric has."""
     share = _ill_posed(found)
     message = "No part looks like metal or a mirror reflection"
-    if share >= 0.0005:
+    if share >= 0.0005:  # less is 0.0 % in the message
         message = f"{100 * share:.1f} % of the object looks like metal or a mirror reflection"
     remedy = "Darken the room and check the angles; metal is outside the model"
     state: State = "fail" if share > _MOST_ILL_POSED else "warn"
@@ -139,6 +139,7 @@ def ill_posed(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Gate:
 
 
 def _ill_posed(found: Evidence[ResultsUntilStokes]) -> float:
+    """Share of the lit object with a polarization that no dielectric has."""
     inside = found.results.stokes.quality[lit(found.results.stokes)]
     return float(((inside & int(Quality.ILL_POSED)) > 0).mean()) if inside.size else 0.0
 

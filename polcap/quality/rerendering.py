@@ -147,6 +147,7 @@ def measure(results: ResultsUntilInfer) -> Rerendering:
     found = rerender(small, NOMINAL_IOR)
     if not small.sound.any():
         return found
+    # of the mean over the pixels in a reduced one
     sigma = float(np.median(cues.ratio_sigma[cues.mask])) * max(small.sound.shape) / max(cues.mask.shape)
     return replace(found, significance=float(np.median(np.hypot(*small.ratio)[small.sound])) / max(sigma, 1e-9))
 

@@ -17,7 +17,7 @@ from polcap.optics.morphology import masked_mean
 from polcap.optics.robust import jackknife
 
 _INNER_PX, _DEPTH = 3.0, 0.08  # the band: px from the outline, and up to this share of the object's radius
-_SMOOTH_PX = 1.0
+_SMOOTH_PX = 1.0  # 1σ
 _BORDER_PX = 3  # along the picture's border, where the mask ends without an outline
 _LEAST_SECTORS = 8  # of 24: a third of the outline
 _LAMP = 0.4  # least part of a lamp's one-sided light that polarization along φ leaves: .41 in tests; at a book .13
@@ -63,7 +63,7 @@ def sample(light: Floats, mask: Bools, usable: Bools) -> Rim:
     ok = mask & usable
     smooth = np.stack([masked_mean(shot, ok, _SMOOTH_PX) for shot in light])
     depth = outline.depth(mask)
-    reach = max(_DEPTH * outline.disc_radius(mask), _INNER_PX + 3)
+    reach = max(_DEPTH * outline.disc_radius(mask), _INNER_PX + 3)  # a band of 3 px at least
     out, slope = outline.outward(mask.astype(np.float32), max(3.0, reach / 2))
     band = off_border((depth > _INNER_PX) & (depth < reach) & ok & (slope > 1e-4))
     inside = smooth[:, band]

@@ -9,7 +9,7 @@ from polcap.quality.gate_values import Gate
 def views(used: Sequence[str], left_out: Mapping[str, str], least: int, few: str, remedy: str) -> Gate:
     """Gate on the number of used views. It names views that are left out, and numbers that no folder has.
 
-    `few` says what is wrong with fewer views than `least`, `remedy` how many to shoot.
+    `few` states what is wrong with fewer views than `least`, `remedy` how many to shoot.
     """
     count, missing = len(used), folder_names.missing_views([*used, *left_out])
     absent = f"; no folder {folder_names.few_names(missing)}" if missing else ""

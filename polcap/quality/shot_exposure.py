@@ -150,6 +150,7 @@ def noise(found: Evidence[ResultsUntilStokes], limits: GateLimits) -> Gate:
 def noise_dolp(image: StokesImage) -> float:
     """False polarization that noise causes in the object's median pixel."""
     light = np.maximum(image.stokes[0][image.mask].sum(-1), 1e-9)
+    # root of the mean of the variances of S1 and S2
     spread = np.sqrt((image.covariance[3] + image.covariance[5])[image.mask].sum(-1) / 2)
     return float(np.median(spread / light)) if len(light) else float("nan")
 

@@ -47,7 +47,7 @@ def render(points: TexturedPoints, ray: Floats, to_light: Floats, up: Floats, io
     facing = frames.lifted(frames.to_ray_frame(points.normal, ray))
     one, rough = np.ones(ray.shape[:-1], np.float32), np.maximum(points.roughness, np.float32(0.05))
     lit = shade.stokes(facing, points.diffuse, points.specular, rough, ior * one, lamp, one)[0]
-    sky = 0.6 + 0.4 * (points.normal @ up.astype(np.float32))  # brighter above
+    sky = 0.6 + 0.4 * (points.normal @ up.astype(np.float32))  # 1 on a normal upwards, 0.2 downwards
     return np.asarray(lit + SKY * (points.diffuse * sky[..., None] + points.specular), np.float32)
 
 
@@ -140,6 +140,6 @@ def _draw_points(points: Floats, value: Floats, view: View, shape: tuple[int, in
 
 
 def _to_srgb(drawn: list[Floats]) -> list[Picture]:
-    """Convert linear frames to sRGB, all with one exposure."""
+    """Convert linear frames to sRGB, all with one exposure: by the green channel of six of them."""
     top = max(float(np.quantile(np.stack(drawn[:: FRAMES // 6])[..., 1], _WHITE_QUANTILE)), 1e-6)
     return [color.srgb_eight_bits(0.9 * frame / top) for frame in drawn]

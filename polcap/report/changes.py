@@ -36,6 +36,7 @@ _LEAST_SHARE = 0.1  # of the first object that both results show
 _FLOW_SHARE = 0.06  # 1σ of the smoothing of the flow, over the maps' longer side
 _AVERAGED_PX = 1.0  # 1σ of the averaging of the maps, which reduces their noise
 LIMIT = 3.0  # doubts
+_FEW_PX = 16  # fewer pixels are not compared
 _LEAST_AREA, _LEAST_PX = 0.0018, 9  # of a changed region: over the object's area, and pixels
 _OVER_QUARTER = 2.0  # usual difference over the 25th percentile
 _LEAST_DOUBT = {"color": 0.6, "roughness": 0.02}  # ΔE2000, 1
@@ -136,6 +137,7 @@ def _overlap(one: Bools, other: Bools, matrix: Floats) -> float:
 
 
 def _trim(mask: Bools) -> Bools:
+    """The mask without its rim, also at the picture's border."""
     return np.asarray(erode(mask, _RIM_PX, from_border=True))
 
 
@@ -202,7 +204,7 @@ def _resample(one: SurfaceMaps, other: SurfaceMaps, position: Floats) -> tuple[S
 
 def _agreement(one: Floats, other: Floats, both: Bools) -> float:
     """Pearson's correlation of two pictures on the pixels of both."""
-    if both.sum() < 16:
+    if both.sum() < _FEW_PX:
         return 0.0
     return float(np.nan_to_num(np.corrcoef(one[both], other[both])[0, 1]))
 
@@ -212,7 +214,7 @@ def _rotation(one: Floats, other: Floats) -> Floats:
     chosen = np.ones(len(one), bool)
     rotation = np.eye(3)
     for _ in range(3):
-        if chosen.sum() < 16:
+        if chosen.sum() < _FEW_PX:
             break
         u, _, vt = np.linalg.svd(one[chosen].T.astype(np.float64) @ other[chosen])
         rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
@@ -303,6 +305,6 @@ def _difference(value: Floats, doubt: Floats, both: Bools) -> Difference:
     beyond = both & (np.abs(value) > LIMIT * doubt)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(beyond.astype(np.uint8))
     large = stats[:, cv2.CC_STAT_AREA] >= max(_LEAST_AREA * both.sum(), _LEAST_PX)
-    large[0] = False
+    large[0] = False  # the background
     median = float(np.median(np.abs(value[both]))) if both.any() else 0.0
     return Difference(np.where(both, value, np.nan).astype(np.float32), doubt, np.asarray(large[labels]), median)

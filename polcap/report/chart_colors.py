@@ -48,6 +48,7 @@ def reference(color: ColorCalibration, kind: str) -> ChartReference:
 
 
 def _lab(rec709: Floats) -> Floats:
+    """CIE Lab (N, 3) of linear Rec.709 (N, 3)."""
     from polcap.optics.colour_science import colour
 
     return np.asarray(colour.XYZ_to_Lab(np.asarray(rec709, np.float64) @ REC709_TO_XYZ.T))

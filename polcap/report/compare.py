@@ -83,21 +83,16 @@ def _names(folders: tuple[Path, Path]) -> tuple[str, str]:
 
 def _maps(folders: tuple[Path, Path], names: tuple[str, str]) -> dict[str, Any]:
     """Differences between the maps of two results: sentences, table, and figures by title."""
+    nothing: dict[str, Any] = {"notes": [], "rows": [], "slider": (), "maps": []}
     try:
         one, other = (maps_folder.read(folder / "maps") for folder in folders)
     except DecodeError as error:
-        return {"sentence": f"No maps to compare: {error}", "notes": [], "rows": [], "slider": (), "maps": []}
+        return {"sentence": f"No maps to compare: {error}", **nothing}
     first, second = (ObjectReduction(maps.mask, _LONGEST).maps(maps) for maps in (one, other))
     found = changes.measure(first, second)
     if not found.usable:
         text = "The two results show different objects or sides, or one camera was turned about its axis"
-        return {
-            "sentence": f"{text}: their pictures cannot be laid on each other.",
-            "notes": [],
-            "rows": [],
-            "slider": (),
-            "maps": [],
-        }
+        return {"sentence": f"{text}: their pictures cannot be laid on each other.", **nothing}
     return {
         "sentence": sentence(found),
         "notes": _notes(found),

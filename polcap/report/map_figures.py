@@ -21,6 +21,7 @@ from polcap.report.page_data import PageMaps
 
 _BORDER_PX = 4  # colors continue so far beyond the outline, because textures are interpolated
 _WHEEL_STEPS = 72  # colors of a color wheel
+_BAR_STEPS = 17  # colors of a color bar
 _PROBED = ("low", "high", "power", "palette", "unit", "digits")  # fields of a color key for probe.js
 
 
@@ -101,7 +102,7 @@ def scalar(name: str, title: str, note: str, value: Floats, inside: Bools, key: 
     near = dilate(inside, _BORDER_PX)
     image = html.indexed(key.level(fill_outward(value[..., None], inside)[..., 0], near), palette)
     ticks = tuple((key.place(tick), f"{number(tick, 3)}{key.unit}") for tick in key.ticks)
-    colors = palette[:: keys.LEVELS // 17]
+    colors = palette[:: keys.LEVELS // _BAR_STEPS]
     if key.palette == "wheel":  # once around in 180°
         steps = [round(2 * k / _WHEEL_STEPS % 1 * keys.LEVELS) % keys.LEVELS for k in range(_WHEEL_STEPS)]
         colors, ticks = palette[steps], ()
@@ -132,7 +133,7 @@ def css_colors(rgb: NDArray[np.uint8]) -> tuple[str, ...]:
 def albedo(name: str, title: str, note: str, linear: Floats, inside: Bools, top: float) -> MapFigure:
     """Figure of a color map with values from 0 to `top`."""
     image = html.jpeg(_extend(srgb_eight_bits(linear / top), inside), whole_color=True)
-    bar = srgb_eight_bits(np.linspace(0, 1, 17))[:, None].repeat(3, axis=1)
+    bar = srgb_eight_bits(np.linspace(0, 1, _BAR_STEPS))[:, None].repeat(3, axis=1)
     ticks = tuple((share, number(top * share)) for share in (0, 0.25, 0.5, 0.75, 1))
     probe = {"kind": "color", "top": top, "unit": "", "digits": 2 if top == 1 else 3}
     return MapFigure(name, title, note, image, probe, css_colors(bar), ticks, outline=matte(inside))

@@ -56,6 +56,7 @@ def photograph(radiance: AngleStack, calibration: ColorCalibration, view: View, 
     width, height = size[0] * factor, size[1] * factor
     left, top = round(x), round(y)
     crop = np.asarray(radiance.value[0][top : top + round(height), left : left + round(width)], np.float32)
+    # a shot has half of S0
     return np.asarray(area_mean(2 * crop, size[::-1]) @ calibration.matrix.T.astype(np.float32))
 
 

@@ -69,7 +69,7 @@ def reference(radiance: AngleStack, color: ColorCalibration, widest: int | None 
     """The reference shot in calibrated colors, at most `widest` px wide."""
     first = radiance.value[0]
     reduced = np.asarray(first if widest is None else shrink(first, widest), np.float32)
-    return display(cv2.transform(reduced, 2 * color.matrix.astype(np.float32)))
+    return display(cv2.transform(reduced, 2 * color.matrix.astype(np.float32)))  # a shot has half of S0
 
 
 def chart(radiance: AngleStack, color: ColorCalibration, widest: int | None = None) -> Picture:

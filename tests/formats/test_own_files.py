@@ -36,6 +36,9 @@ def test_only_recorded_files_are_replaced(folder: Path) -> None:
             atomic.write(folder / "maps" / "own.txt", text)
         with pytest.raises(StorageError, match="polcap did not write"):
             atomic.write(folder / "foreign.txt", "lost")
+        (folder / "maps" / "taken.png").mkdir()
+        with pytest.raises(StorageError, match="polcap did not write the folder that is there; move it away"):
+            atomic.write(folder / "maps" / "taken.png", "lost")
     assert (folder / "foreign.txt").read_text() == "stays"
     assert (folder / "maps" / "own.txt").read_text() == "two"
     assert recorded(folder) == ["maps/own.txt"] * 2  # its two contents

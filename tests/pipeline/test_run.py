@@ -18,12 +18,14 @@ import numpy as np
 import pytest
 
 import polcap
+from polcap.capture_values import Capture, Exif, Frame, Shot
 from polcap.chart_values import ChartRequest, ColorCalibration
 from polcap.config import Config
 from polcap.errors import ObjectError, StorageError
 from polcap.formats.capture import reader as captures
 from polcap.formats.maps import maps_folder as maps
 from polcap.formats.maps.result_maps import read_cues
+from polcap.formats.raw import frame_decoder
 from polcap.image_values import View
 from polcap.pipeline import models
 from polcap.pipeline import run as pipeline
@@ -55,6 +57,18 @@ def test_result_holds_what_the_contract_names(result: Path) -> None:
         report.html report.json color.toml work"""
     assert [name for name in named.split() if not (result / name).exists()] == []
     assert partial(result) == []
+
+
+def test_progress_counts_ambient_frames_and_never_exceeds_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [Frame(f"{k}.dng", Exif(), "shot", "") for k in range(5)]
+    shots = Shot(0.0, (frames[0], frames[1]), ambient=(frames[2],)), Shot(1.0, (frames[3], frames[4]))
+    capture = Capture("name", "folder", shots, "folders", 1000.0, True, (0.0, 0.0), (8, 8))
+    reported: list[tuple[int, int]] = []
+    monkeypatch.setattr(frame_decoder, "decode", lambda frame: None)
+    decode = pipeline.decode_with_progress(capture, lambda done, total: reported.append((done, total)))
+    for frame in (*frames, frames[0]):  # the first one had left memory
+        decode(frame)
+    assert reported == [(1, 5), (2, 5), (3, 5), (4, 5), (5, 5), (5, 5)]
 
 
 def test_the_chart_of_one_capture_serves_another(polcap: Command, result: Path, tiny: Path, tmp_path: Path) -> None:

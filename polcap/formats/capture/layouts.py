@@ -127,7 +127,7 @@ def _lossy_or_packed(folder: Path) -> str:
 
 def counted_clockwise(plan: Plan) -> Plan:
     """Negate all angles of a plan, because they were counted clockwise in the picture."""
-    turned = tuple((-angle if angle else 0.0, bracket) for angle, bracket in plan.shots)
+    turned = tuple((-angle if angle else 0.0, bracket) for angle, bracket in plan.shots)  # 0, not −0
     others = tuple(replace(one, angle_deg=-one.angle_deg if one.angle_deg else one.angle_deg) for one in plan.others)
     return replace(plan, shots=turned, others=others, notes=(*plan.notes, "angles counted clockwise, as stated"))
 

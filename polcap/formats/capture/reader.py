@@ -280,6 +280,7 @@ def _stated_exposure(source: Source) -> float | None:
 
 
 def _exposure(frame: Frame) -> float | None:
+    """Relative exposure of a photograph: stated, else by its EXIF; None: unknown."""
     return frame.exposure or frame.exif.relative_exposure
 
 

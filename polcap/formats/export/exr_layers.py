@@ -18,9 +18,9 @@ from polcap.formats.raw import photo
 from polcap.image_values import Floats
 
 LINEAR_REC709 = "lin_rec709"  # its alias in OpenColorIO configurations
-_COLORS = ("diffuse", "specular")
-_PLAIN = {"depth": "Z", "roughness": "Y", "confidence": "Y"}
-_ERRORS = ("diffuse_error", "roughness_error")
+_COLORS = ("diffuse", "specular")  # layers that are converted to the color space
+_PLAIN = {"depth": "Z", "roughness": "Y", "confidence": "Y"}  # layers of one channel: its letter
+_ERRORS = ("diffuse_error", "roughness_error")  # layers that older results lack
 _FLOAT = ("normal", "depth")  # layers of 32 bits; all others are half
 MEANINGS = {
     "S0, S1, S2": "linear Stokes parameters in camera channels; sensor white at the reference exposure = 1",
@@ -59,7 +59,7 @@ def write(path: Path, maps: Path, color: str, header: Mapping[str, str]) -> None
         layers |= {f"{name}.{c}": converted[..., k] for k, c in enumerate("RGB")}
     normal = exr.read(maps / "normal.exr")
     layers |= {f"normal.{axis}": normal[c] for axis, c in zip("xyz", "RGB")}
-    errors = {name: "Y" for name in _ERRORS if (maps / f"{name}.exr").exists()}  # older results have none
+    errors = {name: "Y" for name in _ERRORS if (maps / f"{name}.exr").exists()}
     for name, letter in {**_PLAIN, **errors}.items():
         layers[f"{name}.{letter}"] = exr.read(maps / f"{name}.exr")[letter]
     cues = exr.read(maps / "cues.exr")

@@ -35,11 +35,12 @@ def pictures(asset: Asset) -> dict[str, Texture]:
         coverage = np.asarray(cv2.resize(outline.matte(np.isfinite(asset.mesh.depth)), (width, height)))
     rough = encoders.eight_bits(texture_set.roughness(asset))
     gloss = np.rint(255 - np.sqrt(255.0 * np.arange(256))).astype(np.uint8)[rough]  # 255 (1 - √(rough/255))
+    f0 = color.srgb_eight_bits(texture_set.reflectance(asset))
     made = {
         "albedo": texture_set.base_color(asset),
-        "specular": Texture(color.srgb_eight_bits(texture_set.reflectance(asset)), True, "F0, sRGB-encoded"),
+        "specular": Texture(f0, color=True, meaning="F0, sRGB-encoded"),
         "normal": texture_set.object_normal(asset),
-        "gloss": Texture(gloss, False, "gloss, linear: 1 - square root of the perceptual roughness"),
+        "gloss": Texture(gloss, color=False, meaning="gloss, linear: 1 - square root of the perceptual roughness"),
     }
 
     def on_object(picture: Texture, outside: int) -> TexturePixels:

@@ -32,38 +32,39 @@ class Texture:
 
 def base_color(asset: Asset) -> Texture:
     """Base color texture: diffuse color as glTF defines it."""
-    return Texture(asset.base_color, True, "base color, sRGB-encoded Rec.709")
+    return Texture(asset.base_color, color=True, meaning="base color, sRGB-encoded Rec.709")
 
 
 def normal(asset: Asset) -> Texture:
     """Tangent-space normals with green up (OpenGL)."""
-    return Texture(asset.normal, False, "tangent-space normal n * 0.5 + 0.5, +Y (OpenGL, green up)")
+    return Texture(asset.normal, color=False, meaning="tangent-space normal n * 0.5 + 0.5, +Y (OpenGL, green up)")
 
 
 def normal_directx(asset: Asset) -> Texture:
     """Tangent-space normals with green down (DirectX)."""
     flipped = asset.normal.copy()
     flipped[..., 1] = np.iinfo(flipped.dtype).max - flipped[..., 1]
-    return Texture(flipped, False, "tangent-space normal n * 0.5 + 0.5, -Y (DirectX, green down)")
+    return Texture(flipped, color=False, meaning="tangent-space normal n * 0.5 + 0.5, -Y (DirectX, green down)")
 
 
 def roughness(asset: Asset) -> Texture:
     """Roughness texture in one channel, taken from the packed texture."""
     meaning = "perceptual roughness (GGX alpha = roughness squared), linear"
-    return Texture(np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1]), False, meaning)
+    return Texture(np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 1]), color=False, meaning=meaning)
 
 
 def displacement(asset: Asset) -> Texture:
     """Height of the surface towards the camera."""
     assert asset.displacement is not None
-    return Texture(asset.displacement, False, "height, linear: 0 at depth.far of maps.json, 1 at depth.near")
+    meaning = "height, linear: 0 at depth.far of maps.json, 1 at depth.near"
+    return Texture(asset.displacement, color=False, meaning=meaning)
 
 
 def curvature(asset: Asset) -> Texture:
     """Mean curvature of the surface, for masks of edges and pits."""
     assert asset.curvature is not None
     meaning = "mean curvature, linear: 0.5 flat, 1 convex and 0 concave with a tenth of the object's radius or less"
-    return Texture(asset.curvature, False, meaning)
+    return Texture(asset.curvature, color=False, meaning=meaning)
 
 
 def cavity(asset: Asset) -> Texture:
@@ -72,32 +73,32 @@ def cavity(asset: Asset) -> Texture:
     top = np.iinfo(asset.curvature.dtype).max
     dark = np.minimum(2 * asset.curvature.astype(np.uint32), top).astype(asset.curvature.dtype)
     meaning = "cavities, linear: 1 flat or convex, 0 concave with a tenth of the object's radius or less"
-    return Texture(dark, False, meaning)
+    return Texture(dark, color=False, meaning=meaning)
 
 
 def occlusion(asset: Asset) -> Texture:
     """The ambient-occlusion channel of the packed texture."""
     meaning = "ambient occlusion, linear: share of a uniform sky that is visible"
-    return Texture(np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 0]), False, meaning)
+    return Texture(np.ascontiguousarray(asset.occlusion_roughness_metallic[..., 0]), color=False, meaning=meaning)
 
 
 def object_normal(asset: Asset) -> Texture:
     """Normals in the frame of the mesh: that of the camera, or of a fused object."""
     assert asset.object_normal is not None
     axes = "R right, G up, B toward the camera" if asset.mesh.frame == "camera" else "R x, G y (up), B z of the mesh"
-    return Texture(asset.object_normal, False, f"object-space normal n * 0.5 + 0.5: {axes}")
+    return Texture(asset.object_normal, color=False, meaning=f"object-space normal n * 0.5 + 0.5: {axes}")
 
 
 def occlusion_roughness_metallic(asset: Asset) -> Texture:
     """Texture of occlusion (R), roughness (G) and metallic (B), as glTF packs them."""
     meaning = f"R {_occlusion(asset)}, G perceptual roughness, B metallic (0); linear"
-    return Texture(asset.occlusion_roughness_metallic, False, meaning)
+    return Texture(asset.occlusion_roughness_metallic, color=False, meaning=meaning)
 
 
 def relative_specular(asset: Asset) -> Texture:
     """Specular color texture for KHR_materials_specular: F0 divided by the asset's specular factor."""
     meaning = f"F0 over {asset.specular_factor[0] * _index_reflectance(asset):.5g}, sRGB-encoded"
-    return Texture(asset.specular_color, True, meaning)
+    return Texture(asset.specular_color, color=True, meaning=meaning)
 
 
 def specular(asset: Asset) -> Texture:
@@ -107,13 +108,13 @@ def specular(asset: Asset) -> Texture:
     table = replace(asset, specular_color=np.repeat(values[:, None], 3, axis=1))  # all values of a channel
     encoded = _quantized(color.encode_srgb(_level(table)), values)
     channels = [encoded[asset.specular_color[..., c], c] for c in range(3)]
-    return Texture(np.stack(channels, axis=-1), True, meaning)
+    return Texture(np.stack(channels, axis=-1), color=True, meaning=meaning)
 
 
 def specular_level(asset: Asset) -> Texture:
     """Gray texture of the luminance of F0 on a fixed scale, the same for all assets."""
     meaning = f"specular level: F0 / {SPECULAR_RANGE:g}, linear; F0 beyond {SPECULAR_RANGE:g} is clipped"
-    return Texture(_quantized(color.luminance(_level(asset)), asset.specular_color), False, meaning)
+    return Texture(_quantized(color.luminance(_level(asset)), asset.specular_color), color=False, meaning=meaning)
 
 
 def unity_mask(asset: Asset) -> Texture:
@@ -123,7 +124,7 @@ def unity_mask(asset: Asset) -> Texture:
     channels = [orm[..., 2], orm[..., 0], np.zeros_like(orm[..., 0]), top - orm[..., 1]]
     smooth = "A smoothness = 1 - perceptual roughness"
     meaning = f"R metallic (0), G {_occlusion(asset)}, B detail mask (0), {smooth}; linear"
-    return Texture(np.stack(channels, axis=-1), False, meaning)
+    return Texture(np.stack(channels, axis=-1), color=False, meaning=meaning)
 
 
 def unity_specular(asset: Asset) -> Texture:
@@ -132,7 +133,8 @@ def unity_specular(asset: Asset) -> Texture:
     smooth = 1 - rough / np.float64(np.iinfo(rough.dtype).max)
     reflected = color.encode_srgb(np.clip(reflectance(asset), 0.0, 1.0))
     meaning = "RGB F0, sRGB-encoded; A smoothness = 1 - perceptual roughness, linear"
-    return Texture(_quantized(np.concatenate([reflected, smooth], axis=-1), asset.specular_color), True, meaning)
+    packed = _quantized(np.concatenate([reflected, smooth], axis=-1), asset.specular_color)
+    return Texture(packed, color=True, meaning=meaning)
 
 
 LOOSE: Mapping[Key, Callable[[Asset], Texture]] = {  # in files of their own
@@ -150,8 +152,8 @@ _OF_PRESETS = (
 TEXTURES = {make.__name__: make for make in _OF_PRESETS}  # by the name that presets give
 
 
-def linear(texture: Texture) -> Texture:
-    """The texture with the meaning that `write_exr` gives its values."""
+def with_linear_meaning(texture: Texture) -> Texture:
+    """The texture with the meaning that its values get in `write_exr`; the values stay encoded."""
     return replace(texture, meaning=texture.meaning.replace("sRGB-encoded", "linear"))
 
 

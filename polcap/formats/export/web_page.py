@@ -13,7 +13,7 @@ from string import Template
 from polcap.errors import SettingError
 from polcap.formats import atomic, text_file
 
-_SHOWN = ("object_number", "date", "institution", "creator", "rights", "license")
+_SHOWN = ("object_number", "date", "institution", "creator", "rights", "license")  # in the caption, after the title
 
 
 def texts(facts: Mapping[str, str]) -> dict[str, str]:

@@ -36,6 +36,7 @@ def _depth_picture(maps: SurfaceMaps, mesh: ReliefMesh) -> NDArray[np.uint16]:
 
 
 def _normal_picture(maps: SurfaceMaps) -> NDArray[np.uint16]:
+    """Normals n·½ + ½ as 16 bits; (0, 0, 1) outside the object."""
     flat = np.where(maps.mask[..., None], maps.normal, [0.0, 0.0, 1.0])
     return png.sixteen_bits(flat / 2 + 0.5)
 
@@ -69,7 +70,7 @@ def _covariance_channels(stokes: StokesImage) -> dict[str, Floats]:
 
 def _rounded(values: Floats) -> Floats:
     """Values (H, W) rounded to 5 bits of mantissa, 1.6 %: enough for an error, and small when compressed."""
-    bits = values.astype(np.float16).view(np.uint16)
+    bits = values.astype(np.float16).view(np.uint16)  # with 10 bits of mantissa
     return ((bits + np.uint16(0x10)) & np.uint16(0xFFE0)).view(np.float16)
 
 
