@@ -88,7 +88,7 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     levels of its GLB are replaced or removed.
 
     Raises SettingError: no such preset or color space, or an encoder is missing. ObjectError: as `levels`.
-    StorageError: somebody has edited a file in this folder.
+    StorageError: somebody has edited a file that it would replace.
     """
     found, record = levels(source, wanted), provenance.record(about, wanted.catalog)
     if found[0].asset.mesh.frame == "camera":  # one view
@@ -97,7 +97,8 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
     preset, content = effective(wanted), found[0].asset
     name = atomic.safe_name(str(about["capture"].get("name")))  # files stay in the folder, whatever name the report has
     files = _files(out / "asset" / (wanted.preset or ""), name, content, preset, record)
-    _check_edits(files.folder)
+    if wanted.preset:
+        _check_edits(files.folder)
     loose = _loose_textures(preset, wanted.extras, content, obj.stem(name), files.shared)
     coarser = {files.path(f"_lod{k}.glb"): level for k, level in enumerate(found[1:], 1)}
     writers = _writers(files, out / "maps", wanted)
@@ -133,14 +134,13 @@ def write(out: Path, about: Mapping[str, Any], wanted: ExportRequest, source: Ex
 
 
 def _check_edits(folder: Path) -> None:
-    """Refuse an export into a folder in which somebody has edited a file, before it writes the first one.
+    """Refuse an export into a preset's folder in which somebody has edited a file, before it writes the first one.
 
     Raises StorageError: there is such a file.
     """
     if own := own_files.owner(folder):
         for file in own.below(folder):
-            if file.relative_to(os.path.abspath(folder)).parts[0] not in PRESETS:
-                own.check(file)
+            own.check(file)
 
 
 def _files(folder: Path, name: str, content: Asset, preset: ExportPreset, record: Mapping[str, Any]) -> _Files:
