@@ -103,6 +103,7 @@ def _array_file(tree: Any, folder: Path) -> Path:
 
 
 def _expect(holds: bool, tree: Any, wanted: str, folder: Path) -> None:
+    """Raise a StorageError unless the data `tree` are what is `wanted`, in words."""
     if not holds:
         raise StorageError(f"{folder}: expected {wanted}, found {str(tree)[:60]!r}; run `polcap process` again")
 

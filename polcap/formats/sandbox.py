@@ -280,6 +280,7 @@ def _limit_memory(memory_gib: float) -> None:
 
 
 def _send(pipe: IO[bytes], message: bytes) -> None:
+    """Write a message: its length, then its bytes."""
     pipe.write(_LENGTH.pack(len(message)) + message)
     pipe.flush()
 

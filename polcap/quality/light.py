@@ -218,7 +218,7 @@ def flicker(found: Evidence[ResultsUntilHdr], limits: GateLimits) -> Gate:
     if not np.isfinite(value).any():
         return Gate("flicker", "not measured", None, limit, "Two exposures of a shot have too few lit rows in common")
     measured = value[np.isfinite(value).any(axis=1)]
-    rms = float(np.quantile(np.sqrt(np.nanmean(measured**2, axis=1)), 0.5, method="lower"))
+    rms = float(np.quantile(np.sqrt(np.nanmean(measured**2, axis=1)), 0.5, method="lower"))  # the lower median shot's
     message = "All rows of a picture got the same light"
     if rms > limit:
         cause = "the shutter is faster than the flash, or a lamp flickers" if flash else "the lamp flickers"

@@ -185,7 +185,7 @@ def _angles(
     limit, names, statement = limits.max_turn_deg, found.names, found.results.radiance.equipment.angles
     # true minus stated angle: an angle stated too small makes the AoLP too small
     common, sigma = -float(np.degrees(body.turned)), np.degrees(body.turned_sigma)
-    reflects = abs(abs(common) - 90) <= 25  # reflections are polarized across the contour; see "body"
+    reflects = abs(abs(common) - 90) <= 25  # degrees: the AoLP of reflections is turned by about 90°; see "body"
     if abs(common) > limit + 3 * sigma and body.concentration > _CLEAR and not reflects:
         message = f"All angles look turned by {common:+.0f}° ± {sigma:.0f}°"
         remedy = sentence(angle_advice.turn(statement, angle, -body.turned))

@@ -99,11 +99,11 @@ def tone(found: Evidence[ResultsUntilSelfcal], limits: GateLimits) -> Gate:
 
 
 def _exposure_power(radiance: AngleStack) -> float:
-    """Power law between measured and stated exposures: slope of their logarithms; 1 without metadata or steps."""
+    """Exponent of measured over stated exposures: slope of their logarithms; 1 without metadata or large steps."""
     ratio = radiance.bracket.exif_ratio[0]
     stated: Floats = np.log(ratio) if np.isfinite(ratio).all() else np.zeros(1)
     measured = np.log(np.maximum(np.median(radiance.bracket.exposure_ratio.mean(2), axis=0), 1e-6))  # of most shots
-    if np.ptp(stated) < 0.5 or np.ptp(measured) < 0.3:
+    if np.ptp(stated) < 0.5 or np.ptp(measured) < 0.3:  # ln of the ratios of the brackets' ends
         return 1.0
     return float(np.polyfit(stated, measured, 1)[0])
 

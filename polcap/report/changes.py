@@ -187,7 +187,7 @@ def _resample(one: SurfaceMaps, other: SurfaceMaps, position: Floats) -> tuple[S
         replace(
             other,
             normal=frames.unit(moved[..., :3]),
-            diffuse=np.maximum(moved[..., 3:6], 0),
+            diffuse=np.maximum(moved[..., 3:6], 0),  # cubic interpolation overshoots
             specular=moved[..., 6:9],
             roughness=moved[..., 9],
             confidence=np.maximum(moved[..., 10], 0.1),

@@ -43,7 +43,7 @@ def natural(name: str) -> tuple[tuple[int, str], ...]:
 
 
 def few_names(names: Sequence[str]) -> str:
-    """The first four names of a list for a message."""
+    """The first four names of a list for a message, with … for the others."""
     return f"{', '.join(names[:4])}{', …' if len(names) > 4 else ''}"
 
 

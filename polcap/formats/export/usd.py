@@ -63,6 +63,7 @@ def package(path: Path, asset: Asset, name: str, textures: Mapping[Key, bytes], 
 
 
 def _export(stage: Any, path: Path) -> None:
+    """Write a stage as a layer. Raises StorageError: usd-core cannot, or as `atomic.path`."""
     with atomic.path(path) as temporary:
         if not stage.GetRootLayer().Export(str(temporary)):
             raise OSError(f"usd-core could not export {path.name}")

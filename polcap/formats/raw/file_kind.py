@@ -26,7 +26,7 @@ _RAW_SIGNATURES = (  # offset, bytes, suffix
     (0, b"IIRO", ".orf"), (0, b"IIRS", ".orf"), (0, b"MMOR", ".orf"), (4, b"ftypcrx ", ".cr3"),
     (6, b"HEAPCCDR", ".crw"),
 )  # fmt: skip
-# Sony, Samsung, Kodak, Panasonic, Nikon, Kodak, Pentax
+# of TIFFs by Sony, Samsung, Kodak, Panasonic, Nikon, Kodak, Pentax
 _RAW_COMPRESSION = {32767, 32769, 32770, 32867, 34316, 34713, 65000, 65535}
 _TAGS_READ = {
     SUBTYPE, WIDTH, LENGTH, BITS, COMPRESSION, PHOTOMETRIC, MAKE, DNG_VERSION, CFA_LAYOUT, SAMPLES,

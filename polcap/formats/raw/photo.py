@@ -133,7 +133,10 @@ def _is_float(spec: Any) -> bool:
 
 
 def _top(pixels: NDArray[Any]) -> float:
-    """Greatest value of a picture (H, W, C); fireflies, a renderer's few pixels far above all others, are limited."""
+    """Greatest value of a picture (H, W, C); fireflies, a renderer's few pixels far above all others, are limited.
+
+    They are a share `_FIREFLIES` of the pixels, or 20 in a small picture.
+    """
     brightest = pixels.max(axis=2).ravel()
     beyond = min(max(20, round(_FIREFLIES * brightest.size)), brightest.size - 1)
     return float(min(brightest.max(), _FAR_ABOVE * np.partition(brightest, -1 - beyond)[-1 - beyond]))
