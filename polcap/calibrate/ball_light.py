@@ -68,7 +68,7 @@ def fit(light: Floats, guess: Ball, view: View) -> BallLight:
     distance = guess.outside(grid, x, y)
     picture = _Picture(
         light=small / np.percentile(small[distance < 0], 90),
-        used=distance < max(_AROUND * guess.radius_px(grid), 2.0),
+        used=distance < max(_AROUND * guess.radius_px(grid), 2.0),  # px
         guess=guess,
         view=grid,
     )
@@ -93,7 +93,7 @@ def read_ring(stokes: Floats, ball: Ball, view: View, sound: Bools) -> RingReadi
     normal, inside = ball.normals(view, (height, width))
     local = frames.to_ray_frame(normal, rays)
     zenith = np.degrees(np.arccos(np.clip(local[..., 2], -1, 1)))
-    use = sound & inside & (zenith > 20) & (zenith < 75)
+    use = sound & inside & (zenith > 20) & (zenith < 75)  # degrees
     s0, s1, s2 = (part[use] for part in stokes)
     aolp = frames.axis_on_ray(np.arctan2(s2, s1) / 2, rays[use])
     dolp = np.hypot(s1, s2) / np.maximum(s0, 1e-9)
@@ -103,7 +103,7 @@ def read_ring(stokes: Floats, ball: Ball, view: View, sound: Bools) -> RingReadi
     sector = np.floor((azimuth + np.pi) / (2 * np.pi) * outline.SECTORS).astype(int) % outline.SECTORS
     real, imaginary, total = (np.bincount(sector, part, outline.SECTORS) for part in (turned.real, turned.imag, weight))
     mean, sigma = outline.mean_and_sigma(real + 1j * imaginary, total.astype(np.float64))
-    middle = (zenith[use] > 30) & (zenith[use] < 70)
+    middle = (zenith[use] > 30) & (zenith[use] < 70)  # as `RingReading.contrast` states
     plus, minus = fresnel.transmission(np.cos(np.radians(zenith[use][middle])), _IOR)
     contrast = float(np.median(dolp[middle] * plus / minus)) if middle.any() else float("nan")
     return RingReading(-float(np.angle(mean) / 2), sigma, contrast)

@@ -137,7 +137,7 @@ def _fit_robustly(ray: Floats, focal: float) -> Ball:
     random = np.random.default_rng(0)
     ball, least_median = _ball(ray, np.ones(len(ray))), np.inf
     for triple in random.integers(len(ray), size=(_TRIALS, 3)):
-        if abs(np.linalg.det(ray[triple])) < 1e-12:
+        if abs(np.linalg.det(ray[triple])) < 1e-12:  # three rays in one plane
             continue
         candidate = _ball(ray[triple], np.ones(3))
         median = float(np.median(np.abs(_angle_beyond(candidate, ray))))
@@ -145,7 +145,7 @@ def _fit_robustly(ray: Floats, focal: float) -> Ball:
             ball, least_median = candidate, median
     for _ in range(_ROUNDS):
         angle = _angle_beyond(ball, ray)
-        ball = _ball(ray, robust.biweight(angle, max(robust.spread(angle), 0.3 / focal)))
+        ball = _ball(ray, robust.biweight(angle, max(robust.spread(angle), 0.3 / focal)))  # at least 0.3 px
     return ball
 
 

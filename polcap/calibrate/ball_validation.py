@@ -173,8 +173,8 @@ def _classes(error: Floats, expected: Floats, by: Floats, limits: Any) -> tuple[
 
 def _class(error: Floats, expected: Floats, least: float, most: float, chosen: Bools) -> ErrorClass:
     """Errors of the `chosen` pixels (N,), a class with the limits `least` and `most`."""
-    mean, median, stated = error[chosen].mean(), np.median(error[chosen]), expected[chosen].mean()
-    return ErrorClass(_rounded(least), _rounded(most), int(chosen.sum()), *map(_rounded, (mean, median, stated)))
+    errors = error[chosen].mean(), np.median(error[chosen]), expected[chosen].mean()
+    return ErrorClass(_rounded(least), _rounded(most), int(chosen.sum()), *map(_rounded, errors))
 
 
 def _by_chart_mm(maps: ResultMaps, light: BallLight, inside: Bools) -> float | None:
@@ -183,7 +183,7 @@ def _by_chart_mm(maps: ResultMaps, light: BallLight, inside: Bools) -> float | N
         return None
     point, _ = light.ball.points(frames.rays(maps.view, *inside.shape))
     distance = float(np.nanmedian(maps.depth[inside] / -point[..., 2][inside]))
-    return _rounded(2000 * distance * light.ball.radius)
+    return _rounded(2000 * distance * light.ball.radius)  # mm, twice the radius
 
 
 def _polarizer(stokes: Floats, light: BallLight, maps: ResultMaps, applied_deg: float) -> PolarizerReading:
@@ -218,6 +218,7 @@ def _warnings(found: BallReport) -> Iterator[str]:
 
 
 def _pair(values: Floats, digits: int = 4) -> tuple[float, float]:
+    """A place right of the lens and above it (2,), rounded for JSON."""
     right, up = (_rounded(value, digits) for value in values)
     return right, up
 

@@ -27,7 +27,7 @@ def measure(photographs: list[Photograph]) -> FlashEnergy:
     spread = float(np.std(energy - drift * order, ddof=2))
     return FlashEnergy(
         spread=spread,
-        spread_sigma=spread / float(np.sqrt(2 * (len(energy) - 2))),
+        spread_sigma=spread / float(np.sqrt(2 * (len(energy) - 2))),  # two unknowns: mean and drift
         drift_per_pop=drift,
         drift_sigma=spread / float(np.sqrt(order @ order)),
         pops=len(energy),

@@ -26,7 +26,7 @@ def measure(flat: list[Photograph]) -> Falloff:
     groups = sorted(by_setting(flat).values(), key=lambda one: one[0].exif.relative_exposure or 0.0, reverse=True)
     for group in groups:
         images = [one.image() for one in group]
-        if all(sensor.usable(image, CLIP).mean() > 0.999 for image in images):
+        if all(sensor.usable(image, CLIP).mean() > 0.999 for image in images):  # of the pixels
             mean = np.mean([sensor.signal(image) for image in images], axis=0)
             if mean.mean() > _FAINT:
                 break
@@ -54,6 +54,6 @@ def _fit(picture: Floats) -> tuple[Floats, Floats]:
     matrix = np.stack([np.ones_like(x), x / half, y / half, r2, r2**2, r2**3], axis=1)
     solved, _, _, _ = np.linalg.lstsq(matrix, cells, rcond=None)
     residual = cells - matrix @ solved
-    variance = (residual**2).sum(axis=0) / (len(cells) - 6)
+    variance = (residual**2).sum(axis=0) / (len(cells) - 6)  # six unknowns
     sigma = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix))[3:, None] * variance)
     return (solved[3:] / solved[0]).T, (sigma / solved[0]).T

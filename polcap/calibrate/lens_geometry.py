@@ -157,7 +157,7 @@ def _checkerboard(image: SensorImage, squares: tuple[int, int]) -> BoardView | N
 
 
 def _gray(image: SensorImage) -> NDArray[np.uint8]:
-    """8-bit gamma picture (H, W) for the corner detector."""
+    """8-bit picture (H, W) with a display's gamma for the corner detector; highlights are clipped."""
     green = _green(image)
     light = np.clip(green / max(float(np.quantile(green, 0.98)), 1e-6), 0, 1)
     return np.asarray(255 * light ** (1 / 2.2), np.uint8)
@@ -203,6 +203,7 @@ def _patch_center(light: Floats, place: Floats, center: Floats) -> Floats | None
     """
     offset = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
     distance = np.maximum(np.abs(offset)[:, None], np.abs(offset))
+    # the border of the window, the middle of the patch, and all that can be patch
     card_at, patch_at, counted = distance > 0.5 - _CARD, distance < 0.25, distance < 0.5 - _CARD / 2
     at = np.array(center)
     for _ in range(_ITERATIONS):

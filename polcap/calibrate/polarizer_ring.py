@@ -89,6 +89,7 @@ def _fit_axis(shots: list[PolarizerShot]) -> _MalusFit:
     contrast = length / wave[:, 0]
     if contrast.max() < 0.2:
         raise CaptureError(f"{folder}: the light hardly changes with the ring ({contrast.max():.2f}); is it polarized?")
+    # derivatives (C, 3) of contrast and phase
     contrast_by_wave = np.stack([-contrast, wave[:, 1] / length, wave[:, 2] / length], axis=1) / wave[:, :1]
     phase_by_wave = np.stack([0 * length, -wave[:, 2], wave[:, 1]], axis=1) / (2 * length**2)[:, None]
     sigma = np.sqrt(np.einsum("ci,cij,cj->c", contrast_by_wave, covariance, contrast_by_wave))
@@ -99,10 +100,10 @@ def _fit_axis(shots: list[PolarizerShot]) -> _MalusFit:
 
 
 def _fit_wave(ring: Floats, light: Floats) -> tuple[Floats, Floats]:
-    """Fit a Malus curve: (3,) a, a c cos 2φ, a c sin 2φ and their covariance (3, 3) by the scatter of the frames."""
+    """Fit a Malus curve of phase φ: a, a c cos 2φ, a c sin 2φ, and covariance (3, 3) by the scatter of the frames."""
     matrix = np.stack([np.ones_like(ring), np.cos(2 * ring), np.sin(2 * ring)], axis=1)
     weight = np.ones_like(light)
-    for _ in range(6):
+    for _ in range(6):  # the weights follow from the curve
         normal = (matrix * weight[:, None]).T @ matrix
         wave = np.linalg.solve(normal, (matrix * weight[:, None]).T @ light)
         slope = 2 * (wave[2] * np.cos(2 * ring) - wave[1] * np.sin(2 * ring))

@@ -131,6 +131,7 @@ def _providers(model: Path) -> Iterator[Finding]:
 
 
 def _disk(folder: Path) -> Finding:
+    """Check whether the disk of a folder has room for captures and results."""
     free = shutil.disk_usage(folder).free / 1e9
     message = f"{free:.1f} GB free at {folder}"
     if free >= _ENOUGH_GB:
@@ -172,7 +173,7 @@ def _cameras(rig: Rig) -> Iterator[Finding]:
     try:
         cameras = rig.cameras()
     except PolcapError as error:
-        message, _, remedy = str(error).partition("; ")
+        message, _, remedy = str(error).partition("; ")  # its text is "fact; remedy"
         yield Finding("cameras", "warning", message, remedy)
         return
     if not cameras:

@@ -37,7 +37,7 @@ def examine_file(path: Path) -> Iterator[Finding]:
         image = libraw.read(path) if found.kind == "raw" else photo.read(path)
         yield from _pixels(image, found.exif)
     except DecodeError as error:
-        message, _, remedy = str(error).partition("; ")
+        message, _, remedy = str(error).partition("; ")  # its text is "fact", or "fact; remedy"
         yield Finding(part, "fault", message, remedy or "send this report in with the file")
 
 

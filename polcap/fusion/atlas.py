@@ -129,7 +129,7 @@ def of_mesh(mesh: Mesh, side: int, margin: int) -> Atlas:
 
 
 def _cut_charts(mesh: ClosedMesh, side: int, margin: int) -> tuple[Floats, NDArray[np.int64], NDArray[np.int32]]:
-    """Texture coordinates (W, 2) with v down, vertices of the mesh they belong to (W,), faces (F, 3) of coordinates."""
+    """Vertices of the charts: texture coordinates (W, 2), v down, and indices (W,) in the mesh; their faces (F, 3)."""
     with package_for("a texture atlas", "uvunwrap", "fusion"):
         import uvunwrap
     surface = uvunwrap.Mesh(mesh.vertices.astype(np.float32).ravel().tolist(), mesh.faces.ravel().tolist())

@@ -171,17 +171,17 @@ def _visible(view: FusionView, atlas: Atlas, tracer: Tracer) -> VisibleTexels:
 
 def _fade_at_edges(view: FusionView, depth: Floats) -> Floats:
     """Weight (H, W) that rises smoothly to 1 from 0 at the outline and at edges of parts that hide others."""
-    least = _EDGE / view.camera.focal * np.where(np.isfinite(depth), depth, 0)
+    edge_step = _EDGE / view.camera.focal * np.where(np.isfinite(depth), depth, 0)
     filled = np.where(np.isfinite(depth), depth, np.inf)
     inside = view.mask & np.isfinite(depth)
     with np.errstate(invalid="ignore"):
         for axis in (0, 1):
-            jump = np.abs(np.diff(filled, axis=axis)) > np.take(least, range(least.shape[axis] - 1), axis=axis)
+            jump = np.abs(np.diff(filled, axis=axis)) > edge_step.take(range(depth.shape[axis] - 1), axis)
             pad = [(0, 1), (0, 0)] if axis == 0 else [(0, 0), (0, 1)]
             inside &= ~(np.pad(jump, pad) | np.pad(jump, [side[::-1] for side in pad]))  # both pixels of a jump
     distance = cv2.distanceTransform(np.pad(inside, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
     share = np.clip(distance / (_FADE * diameter_px(view)), 0, 1)
-    return np.asarray(share * share * (3 - 2 * share))
+    return np.asarray(share * share * (3 - 2 * share))  # smoothstep
 
 
 def diameter_px(view: FusionView) -> float:
@@ -212,7 +212,7 @@ def _mesh_sigma_deg(differences: Sequence[Floats]) -> float:
 
     Twice, because the mesh was fitted to these normals; docs/benchmarks/fusion-choices.md.
     """
-    angle = np.concatenate([np.linalg.norm(one[::8], axis=-1) for one in differences])
+    angle = np.concatenate([np.linalg.norm(one[::8], axis=-1) for one in differences])  # rad, by the chord
     return float(max(2 * np.degrees(np.median(angle)), _FLOOR_DEG))
 
 
@@ -231,7 +231,7 @@ def _bake_albedo(
 
 
 def _median_length(samples: Sequence[Floats]) -> float:
-    """Median length of the samples (M, C) of all views."""
+    """Median length of the samples (M, C) of all views, by every 16th."""
     return float(np.median(np.concatenate([np.linalg.norm(one[::16], axis=-1) for one in samples])))
 
 

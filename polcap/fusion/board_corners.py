@@ -180,5 +180,5 @@ def _register(picture: Floats, x: Floats, y: Floats, drawn: Floats) -> tuple[Flo
         weight = np.linalg.lstsq(terms, seen, rcond=None)[0]
         if weight[0] <= 1e-6 * np.abs(seen).max():  # no print is here
             return shift, 0.0
-        shift = shift + np.clip(-weight[1:3] / weight[0], -2, 2)
+        shift = shift + np.clip(-weight[1:3] / weight[0], -2, 2)  # px a round, at most
     return shift, float(np.corrcoef(seen, terms[:, 0])[0, 1])

@@ -108,7 +108,7 @@ def _project(radiance: AngleStack, posed: PosedBoard) -> _Print:
 
 
 def _on_board(camera: SessionCamera, pose: Pose, x: Floats, y: Floats) -> Floats:
-    """Points x, z (H, W, 2) [m] of the board's plane that RAW pixels show; very distant ones above its horizon."""
+    """Points x, z (H, W, 2) [m] of the board's plane that RAW pixels show; above its horizon, some 1e6 m away."""
     ray = back_project(camera.view, *distortion.undistort(camera.lens, x, y)) @ pose.rotation  # world frame
     start = pose.center
     down = np.where(ray[..., 1] < -1e-6, -ray[..., 1], np.nan)
@@ -126,11 +126,12 @@ def _fit_light(picture: Floats, print_: _Print) -> _PrintLight:
     for _ in range(_ROUNDS):
         weight, *_ = np.linalg.lstsq(terms[use], gray[use], rcond=None)
         error = np.abs(terms @ weight - gray)
-        use = error < max(3 * 1.48 * float(np.median(error)), 1e-9)
-    everywhere = _quadratic(np.clip(print_.place, -1.5, 1.5))
+        use = error < max(3 * 1.48 * float(np.median(error)), 1e-9)  # three robust standard deviations
+    everywhere = _quadratic(np.clip(print_.place, -1.5, 1.5))  # not extrapolated farther
     paper, ink = everywhere @ weight[:6], everywhere[..., :3] @ weight[6:]
-    level = float(np.median(gray[use & (share > 0.8)])) if (use & (share > 0.8)).any() else float(gray.max())
-    colors = picture[ring][use & (share > 0.6)]
+    bright = gray[use & (share > 0.8)]  # nearly all paper
+    level = float(np.median(bright)) if len(bright) else float(gray.max())
+    colors = picture[ring][use & (share > 0.6)]  # mostly paper
     tint = np.median(colors, axis=0) if len(colors) else np.ones(3)
     paper, ink = np.maximum(paper, 0.1 * level), np.maximum(ink, 1e-3 * level)  # `level` is that of paper
     return _PrintLight(paper[..., None], ink[..., None], np.asarray(tint / tint.mean()))

@@ -96,7 +96,7 @@ def _sweep(number: int, views: Sequence[SmallView], trace: Tracer, doubtful: Boo
     ray = back_project(view.camera, x, y) @ view.pose.rotation  # (H, W, 3) world, at depth 1
     met = trace.meet(np.broadcast_to(view.pose.center, (height * width, 3)), ray.reshape(-1, 3))
     searched = np.zeros(height * width, bool)
-    searched[met.index] = doubtful[trace.mesh.faces[met.face]].mean(axis=1) > 0.5
+    searched[met.index] = doubtful[trace.mesh.faces[met.face]].mean(axis=1) > 0.5  # two corners or three
     pixel = np.flatnonzero(searched)
     corner_depths = -view.pose.to_camera(hull.grid.corners())[:, 2]
     planes = np.arange(corner_depths.min(), corner_depths.max(), _PLANES * step)
@@ -127,9 +127,12 @@ def _agreement(point: Floats, pixel: NDArray[np.intp], view: SmallView, others: 
 
 
 def _coarsen(of: SmallView, step: float) -> SmallView:
-    """Every n-th pixel of the view, about one to a grid step."""
-    far = float(np.linalg.norm(of.pose.translation))
-    every = max(1, round(step * of.camera.focal / far))
+    """The view with every n-th pixel of its normals and albedo, about one to a grid step [m].
+
+    `outline` gives the size only: its values stay px of the fine grid, and slope and certainty stay on that grid.
+    """
+    distance = float(np.linalg.norm(of.pose.translation))  # m, of the lens from the board's middle
+    every = max(1, round(step * of.camera.focal / distance))
     x, y = of.camera.center
     camera = replace(of.camera, focal=of.camera.focal / every, center=(x / every, y / every))
     normal, diffuse = (np.ascontiguousarray(image[::every, ::every]) for image in (of.normal, of.diffuse))
@@ -144,9 +147,9 @@ def _confirm(depths: Sequence[HollowDepths], step: float) -> list[HollowDepths]:
         ray = back_project(one.view.camera, columns.astype(float), rows.astype(float)) @ one.view.pose.rotation
         point = one.view.pose.center + one.depth[rows, columns, None] * ray
         others = [other for other in depths if other is not one]
-        near = np.any([np.abs(_depth_beyond(other, point)) < _SUPPORT * step for other in others], axis=0)
+        supported = np.any([np.abs(_depth_beyond(other, point)) < _SUPPORT * step for other in others], axis=0)
         depth = one.depth.copy()
-        depth[rows[~near], columns[~near]] = np.nan
+        depth[rows[~supported], columns[~supported]] = np.nan
         confirmed.append(replace(one, depth=depth))
     return confirmed
 
@@ -169,7 +172,7 @@ def _mean_distance(hull: DistanceGrid, depths: Sequence[HollowDepths]) -> Floats
     total, weight = np.zeros(len(point)), np.zeros(len(point))
     for one in depths:
         beyond = _depth_beyond(one, point)
-        known = beyond > -reach
+        known = beyond > -reach  # farther behind the surface, a view sees nothing
         total[known] += np.minimum(beyond[known], reach)
         weight[known] += 1
     sums, counts = (np.zeros(hull.distance.shape, np.float32) for _ in range(2))

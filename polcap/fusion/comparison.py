@@ -37,13 +37,14 @@ def compare(views: tuple[FusionView, ...], atlas: Atlas, maps: AtlasMaps) -> Com
 
 
 def _agreement(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: AtlasMaps) -> ViewAgreement:
-    """Agreement of one view, where both it and the mesh have a normal."""
+    """Agreement of one view, where both it and the mesh have a normal; 90° if they have none in common."""
     both = view.mask & (frames.dot(visible.mesh_normal, visible.mesh_normal) > 0.5)
     angle_deg = float(np.median(frames.angle_deg(view.normal, visible.mesh_normal)[both])) if both.any() else 90.0
     if view.s0 is None or not len(visible.texel):
         return ViewAgreement(view.name, angle_deg, None)
     photograph, drawn = visible.sample(view.s0), render(view, visible, atlas, maps)
     weight = visible.weight[:, None]
+    # the brightness that fits best
     drawn = drawn * float((weight * drawn * photograph).sum() / max((weight * drawn * drawn).sum(), 1e-12))
     error = (weight * (photograph - drawn) ** 2).sum() / max((weight * photograph**2).sum(), 1e-12)
     return ViewAgreement(view.name, angle_deg, float(np.sqrt(error)))
@@ -58,8 +59,8 @@ def render(view: FusionView, visible: VisibleTexels, atlas: Atlas, maps: AtlasMa
         part[atlas.covered][visible.texel].astype(np.float64)
         for part in (maps.normal, maps.diffuse, maps.specular, maps.roughness)
     )
-    far = float(np.linalg.norm(rotation @ atlas.position.mean(axis=0) + translation))
-    light = irradiance(point, np.zeros(2), 0.0) * far**2
+    distance = float(np.linalg.norm(rotation @ atlas.position.mean(axis=0) + translation))
+    light = irradiance(point, np.zeros(2), 0.0) * distance**2
     to_light = frames.to_ray_frame(to_lens, to_lens)
     local = frames.to_ray_frame(normal @ rotation.T, to_lens)
     one, rough = np.ones(len(point)), np.maximum(roughness, 0.05)

@@ -80,7 +80,7 @@ class _Motion:
 
     @property
     def focal_change(self) -> float:
-        """Focal length over the stated one."""
+        """Adjusted focal length over the one that the capture states."""
         return float(np.exp(self.value[_FOCAL]))
 
 
@@ -110,7 +110,7 @@ def solve(features: Mapping[str, ObjectFeatures], capture: Capture) -> SessionPo
     if len(views) < LEAST_VIEWS:
         raise _too_few(0, len(names))
     tracks, distance = _tracks(found, pairs, start, views), found[0].distance_m
-    doubt = max(*np.abs(capture.focal_doubt), 0.002 if capture.focal_known else 0.5)
+    doubt = max(*np.abs(capture.focal_doubt), 0.002 if capture.focal_known else 0.5)  # relative, 1σ
     adjusted = _adjust(tracks, start, found[0].focal, float(doubt))
     posed = _pose_views(adjusted, [names[k] for k in views], distance or 1.0, capture.focal_px)
     if len(posed) < LEAST_VIEWS:
@@ -147,7 +147,7 @@ def _pose_views(found: _AdjustedMotion, names: Sequence[str], distance: float, f
     for k, (name, turn, shift) in enumerate(zip(names, turns, shifts, strict=True)):
         own = found.inlier & (tracks.view == k)
         if own.sum() >= _LEAST_MATCHES:
-            residual = float(np.sqrt(2 * np.mean(found.error[own] ** 2))) * focal_px
+            residual = float(np.sqrt(2 * np.mean(found.error[own] ** 2))) * focal_px  # rms, both axes
             sigma = float(np.degrees(np.hypot(found.sigma[_TURNS + k], found.sigma[_TILT].max())))
             pose = Pose(turn, distance * (shift + foot * turn[:, 1]))
             out.append(PosedView(name, pose, int(own.sum()), residual, sigma))
@@ -287,7 +287,8 @@ def _adjust(tracks: _FeatureTracks, first: _Motion, focal_px: float, doubt: floa
 def _points(tracks: _FeatureTracks, motion: _Motion, weight: Floats) -> tuple[Floats, Floats]:
     """World points (P, 3) nearest to their rays, by linear least squares, and their slopes (M, 2) in the views.
 
-    A ray (x, y) of the view with rotation R and translation t fulfills (R X + t)_x + x (R X + t)_z = 0; so for y.
+    A ray (x, y) of the view with rotation R and translation t fulfills (R X + t)_x + x (R X + t)_z = 0, and the same
+    holds for y.
     """
     turn, shift = (part[tracks.view] for part in motion.poses())
     ray = tracks.ray / motion.focal_change

@@ -58,8 +58,8 @@ def fuse(session_input: SessionInput[SessionConfig], out: Path, notify: Notify, 
 
 def _with_albedo_scale(maps: AtlasMaps, processed: ProcessedSession) -> AtlasMaps:
     """The maps with the 1σ of the albedo scale: the median over the views, for all share the errors of one chart."""
-    stated = [about["figures"]["chart"]["scale_doubt"] for about in processed.reports.values()]
-    known = [sigma for sigma in stated if sigma is not None]
+    sigmas = [about["figures"]["chart"]["scale_doubt"] for about in processed.reports.values()]
+    known = [sigma for sigma in sigmas if sigma is not None]
     return replace(maps, albedo_sigma=float(np.median(known)) if known else None)
 
 
@@ -108,13 +108,14 @@ def _verdict(about: Mapping[str, Any]) -> str:
 def _gates(
     processed: ProcessedSession, seen: SeenSurface, figures: Mapping[str, Any], limits: FusedGateLimits
 ) -> Iterator[Gate]:
+    """The gates of a fused object, in the order of the report."""
     views = figures["views"]
     yield fused_object.views(list(processed.reports), processed.left_out, limits)
     by_board = processed.poses.board is not None
     yield fused_object.poses({name: view["reprojection_px"] for name, view in views.items()}, by_board, limits)
     yield fused_object.agreement({name: view["normal_deg"] for name, view in views.items()}, limits)
-    for folder, shared in figures["sets"].items():
-        yield fused_object.join(folder, shared, limits)
+    for set_name, shared in figures["sets"].items():
+        yield fused_object.join(set_name, shared, limits)
     yield fused_object.seen(seen, len(processed.reports), limits)
     yield fused_object.closed(figures["mesh"]["closed"])
 

@@ -184,5 +184,5 @@ def _asset(
 
 def _distance(vertices: Floats, coarse: Atlas) -> float:
     """99th percentile of the distances of a mesh's vertices from a coarser mesh's texels, m."""
-    distance, _ = cKDTree(coarse.position).query(vertices[:: max(1, len(vertices) // 20_000)])
+    distance, _ = cKDTree(coarse.position).query(vertices[:: max(1, len(vertices) // 20_000)])  # a sample
     return float(np.percentile(distance, 99))

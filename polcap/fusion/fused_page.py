@@ -75,6 +75,7 @@ def _size(mesh: Mapping[str, Any]) -> str:
 
 
 def _row(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """A view's row of the page's table, from its figures."""
     return (
         row["name"],
         str(row["corners"]),

@@ -120,8 +120,8 @@ def plain_body(distance: Floats, step: float) -> Floats:
     body = ndimage.binary_fill_holes(_largest_part(distance < 0))
     body = _without_false_loops(body)
     body = ndimage.binary_fill_holes(_largest_part(body))
-    near = _CHANGED * step
-    changed = np.where(body, np.minimum(distance, -near), np.maximum(distance, near))
+    least = _CHANGED * step
+    changed = np.where(body, np.minimum(distance, -least), np.maximum(distance, least))
     # marching cubes would join two cubes that share an edge alone, which `_euler` counts as separate
     changed[_touches_by_an_edge(body)] = -_LOOSE * step
     return changed.astype(np.float32)

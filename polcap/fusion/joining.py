@@ -88,7 +88,7 @@ class Motion:
 class JoinedSet:
     """Motion of a further set of views onto the first one."""
 
-    folder: str  # of the set
+    folder: str  # name of the set, and of its folder
     motion: Motion
     shared: float  # share of the set's surface that the first one confirms
 
@@ -103,7 +103,7 @@ def join(views: tuple[FusionView, ...]) -> tuple[JoinedSet, ...]:
     if not others:
         return ()
     fixed = observe_surface(sets[first])
-    return tuple(JoinedSet(folder, *register(observe_surface(sets[folder]), fixed)) for folder in others)
+    return tuple(JoinedSet(name, *register(observe_surface(sets[name]), fixed)) for name in others)
 
 
 def require_shared(joined: Sequence[JoinedSet], least: float) -> None:
@@ -167,7 +167,7 @@ def _search_turns(moving: ObservedSurface, fixed: ObservedSurface) -> list[Motio
             moved = motion.apply(moving)
             _, index = tree.query(moved.point)
             squared = np.sum((moved.features(close) - features[index]) ** 2, axis=1)  # σ²
-            weight = np.exp(-squared / 4) + 1e-9
+            weight = np.exp(-squared / 4) + 1e-9  # never all 0
             shift = np.average(fixed.point[index] - moved.point, axis=0, weights=weight)
             found.append((np.minimum(squared, _FAR**2).mean(), motion))
             motion = Motion(turn, motion.translation + shift)
@@ -199,7 +199,7 @@ def _refine(motion: Motion, moving: ObservedSurface, fixed: ObservedSurface, clo
             paired = np.isfinite(difference)
             if paired.sum() < 6:  # a motion has six unknowns
                 return motion
-            partner, weight = index[paired], 1 / (1 + difference[paired] ** 2)
+            partner, weight = index[paired], 1 / (1 + difference[paired] ** 2)  # Cauchy
             motion = _step_to_planes(motion, moved.point[paired], fixed.point[partner], fixed.normal[partner], weight)
     return motion
 

@@ -78,12 +78,12 @@ class LobeProfile:
 
 
 def flash_place(samples: Sequence[LobeSamples]) -> Floats:
-    """Place (3,) of the flash next to the lens for which radiance scatters least in bins of the half-angle."""
+    """Place (3,) of the flash near the lens with least scatter of radiance by half-angle; the lens without samples."""
     every_second = [one.take(slice(None, None, 2)) for one in samples]
     if not every_second:
         return np.zeros(3)
 
-    def misfit(place: Floats) -> float:
+    def misfit(place: Floats) -> float:  # grows steeply beyond `_FARTHEST_FLASH`
         beyond = max(float(np.hypot(*place)) / _FARTHEST_FLASH - 1, 0)
         return float(np.mean([_scatter(one, np.append(place, 0.0)) for one in every_second])) + 10 * beyond
 

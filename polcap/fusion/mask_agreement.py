@@ -51,13 +51,15 @@ class AgreedMasks:
 
 @stage(version=1)
 def agree(views: tuple[Silhouette, ...]) -> AgreedMasks:
-    """Compare the masks of each set of views. The largest part of each stays; remains of the board are smaller.
+    """Compare the masks of each set of views: views with the object lying on the same side.
+
+    The largest connected part of each agreeing mask stays; remains of the board are smaller.
 
     Raises CaptureError: as `compare_set`.
     """
     used, left_out = list[Silhouette](), dict[str, str]()
-    for folder in dict.fromkeys(set_of_view(view.name) for view in views):
-        agreeing, reasons = compare_set([view for view in views if set_of_view(view.name) == folder])
+    for set_name in dict.fromkeys(set_of_view(view.name) for view in views):
+        agreeing, reasons = compare_set([view for view in views if set_of_view(view.name) == set_name])
         used, left_out = used + agreeing, left_out | reasons
     masks = tuple(likely_regions.nth_part(view.mask, 1) for view in used)
     return AgreedMasks(tuple(view.name for view in used), masks, left_out)
@@ -109,6 +111,7 @@ def _close_gaps(views: Sequence[Silhouette], points: Floats, step: float) -> lis
 
 
 def _contradiction(names: Sequence[str], count: int) -> CaptureError:
+    """Error for too many views whose masks contradict the others, of `count`."""
     return CaptureError(
         f"the masks of {len(names)} of {count} views contradict the others ({', '.join(names)}): the object moved on "
         f"the board between the views, or masks are wrong; compare the pictures in {COMPARED}, fix the object to the "

@@ -140,7 +140,7 @@ def _mean_normals(vertices: Floats, outward: Floats, seen: Bools, views: Sequenc
     loss = [np.sum(w * np.log1p(_angle2(n, one) / _CAUCHY**2), axis=0) for one in n]
     best = np.argmin(np.where(w > 0, loss, np.inf), axis=0)
     mean = n[best, np.arange(len(vertices))]
-    for _ in range(3):
+    for _ in range(3):  # rounds of reweighting
         robust = w / (1 + _angle2(n, mean) / _CAUCHY**2)
         mean = unit(np.sum(robust[..., None] * n, axis=0))
     agreeing, total = np.sum(robust, axis=0), np.sum(w, axis=0)

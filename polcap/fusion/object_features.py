@@ -68,7 +68,7 @@ def find(
 
 
 def _features(maps: SurfaceMaps) -> tuple[Floats, Floats, NDArray[np.float32]]:
-    """Rays (N, 2), normals (N, 3) and descriptors (N, 128) of the features."""
+    """Rays (N, 2), normals (N, 3) and descriptors (N, 128) of features in the diffuse map with a display's gamma."""
     gray, mask = np.asarray(maps.diffuse, np.float32).mean(axis=-1), np.asarray(maps.mask)
     picture = 255 * np.clip(gray / max(float(np.quantile(gray[mask], 0.99)), 1e-6), 0, 1) ** (1 / 2.2)
     finder = cv2.SIFT.create(contrastThreshold=_CONTRAST)

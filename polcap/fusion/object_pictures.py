@@ -34,6 +34,7 @@ def draw_around(atlas: Atlas, maps: AtlasMaps, count: int, side: int) -> list[Pi
         turn = Rotation.from_euler("XY", [_ELEVATION_DEG, -azimuth], degrees=True).as_matrix()
         pose = Pose(turn, np.array([0, 0, -_DISTANCE * radius]) - turn @ middle)
         drawn.append(render(atlas, maps, tracer, pose, view, side))
+    # about eight of the pictures give the exposure: their highlights become nearly white
     top = max(float(np.quantile(np.stack(drawn[:: max(1, count // 8)]), 0.998)), 1e-6)
     return [color.srgb_eight_bits(0.9 * one / top) for one in drawn]
 

@@ -175,6 +175,7 @@ def _camera(capture: Capture, unknown: Floats, sigma: float = 0.0) -> SessionCam
 
 
 def _pose(unknown: Floats) -> Pose:
+    """The pose of a view's unknowns (6,)."""
     return Pose(Rotation.from_rotvec(unknown[:3]).as_matrix(), unknown[3:])
 
 
@@ -227,7 +228,7 @@ def _with_errors(
     sigma = max(scale, 0.1) * np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))
     posed = []
     for k, (name, error) in enumerate(zip(boards, errors, strict=True)):
-        rms_px = float(np.sqrt(2 * np.mean(error**2)))
+        rms_px = float(np.sqrt(2 * np.mean(error**2)))  # of the distance in x and y
         sigma_deg = float(np.degrees(sigma[_of_view(k)][:3].max()))
         posed.append(PosedView(name, _pose(found.x[_of_view(k)]), len(error), rms_px, sigma_deg))
     return _camera(capture, found.x, float(sigma[0])), posed

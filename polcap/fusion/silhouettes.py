@@ -67,7 +67,7 @@ class Silhouette:
 
 def grid_around(views: Sequence[Silhouette]) -> tuple[Floats, float]:
     """Grid points (P, 3) [m] around the object, and their spacing [m]."""
-    reach = max(_extent(view) for view in views)  # the object is within a box about the board's middle
+    reach = max(_extent(view) for view in views)  # m; the object is in a box about the board's middle
     low, high = np.array([-reach, -0.2 * reach, -reach]), np.array([reach, 2 * reach, reach])
     points, step = _grid(low, high, _COARSE)
     share = np.mean([view.shows(points, step) for view in views], axis=0)

@@ -35,12 +35,12 @@ class SmallView:
 
     def distance(self, point: Floats) -> Floats:
         """Signed distances (N,) m of world points (N, 3) from the cone of the silhouette, negative inside."""
-        at = point @ self.pose.rotation.T.astype(point.dtype) + self.pose.translation.astype(point.dtype)
-        pixel = project(self.camera, at)
+        in_camera = point @ self.pose.rotation.T.astype(point.dtype) + self.pose.translation.astype(point.dtype)
+        pixel = project(self.camera, in_camera)
         height, width = self.outline.shape
         inside = np.clip(pixel, 0, np.array([width - 1, height - 1], pixel.dtype))
         distance_px = sample(self.outline, inside) + np.hypot(*(pixel - inside).T)  # plus the way to the picture
-        return np.asarray(distance_px * -at[:, 2] / self.camera.focal)
+        return np.asarray(distance_px * -in_camera[:, 2] / self.camera.focal)
 
     def pixels(self, point: Floats) -> Floats:
         """Pixels x, y (N, 2) of world points (N, 3)."""

@@ -34,7 +34,7 @@ def measure(views: tuple[PosedStokes, ...], board: Board) -> BoardSight:
 
 
 def left_out(names: tuple[str, ...], sight: BoardSight) -> dict[str, str]:
-    """Reasons for the views with too little paper, and for those much less sharp than the others, by name."""
+    """Reasons, by name, for views with too little paper or much more blur than the others; a blur of NaN is none."""
     blur = sight.blur
     finite = [one for one in blur if np.isfinite(one)]
     middle = float(np.median(finite)) if finite else float("inf")
@@ -57,10 +57,11 @@ def left_out(names: tuple[str, ...], sight: BoardSight) -> dict[str, str]:
 def _blur(view: PosedStokes, board: Board) -> float:
     """Blur of a view, 1σ [px]: that of the derivative of its mean edge profile; NaN where no edge is visible."""
     edge, across = _edges(board)
-    step = 1e-4  # m
+    step = 1e-4  # m across the edge, for the scale of the picture there
     ends = [np.stack(view.pixels(edge + sign * step * across), axis=-1) for sign in (-1, 1)]
     scale = np.linalg.norm(ends[1] - ends[0], axis=-1) / (2 * step)  # px per m
-    reach = min(_REACH_PX, _EVEN * board.square_m * float(np.quantile(scale, 0.1)))
+    # 0.1: at nine tenths of the points the scale is larger, and the profile ends nearer than `_EVEN`
+    reach = min(_REACH_PX, _EVEN * board.square_m * float(np.quantile(scale, 0.1)))  # px
     offset = np.linspace(-reach, reach, _STEPS)  # px across the edge, from ink to paper
     point = edge[:, None] + across[:, None] * (offset / scale[:, None])[..., None]
     x, y = (a.astype(np.float32) for a in view.pixels(point))
@@ -70,7 +71,7 @@ def _blur(view: PosedStokes, board: Board) -> float:
         return float("nan")
     gray = np.asarray(view.stokes.stokes[0] @ flash_light.gray(view.matrix), np.float32)
     profile = cv2.remap(gray, x[inside], y[inside], cv2.INTER_LINEAR)
-    low, high = profile[:, :4].mean(axis=1), profile[:, -4:].mean(axis=1)
+    low, high = profile[:, :4].mean(axis=1), profile[:, -4:].mean(axis=1)  # its ends: ink and paper
     contrast = high - low
     clear = contrast > 0.5 * np.median(contrast)  # edges that no chart hides
     edge_profile = ((profile - low[:, None]) / np.maximum(contrast, 1e-6)[:, None])[clear].mean(axis=0)
@@ -86,7 +87,7 @@ def _edges(board: Board) -> tuple[Floats, Floats]:
     a, b = (one.ravel() for one in np.meshgrid(line, along))
     point = np.concatenate([np.stack([a, 0 * a, b], -1), np.stack([b, 0 * a, a], -1)])
     across = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], len(a), axis=0)
-    sides = [  # whether ink: before the edge and behind it, at two distances each
+    sides = [  # whether ink: at two distances [squares] before the edge, and at two behind it
         [boards.is_ink(board, *(point + share * board.square_m * across)[:, [0, 2]].T) for share in shares]
         for shares in ((-0.1, -0.02), (0.02, 0.1))
     ]

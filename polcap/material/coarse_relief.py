@@ -72,7 +72,7 @@ def solve(views: tuple[PosedStokes, ...], light: FlashLight, grid: TexelGrid, se
         reach = None if number == 0 else CROSSOVER / step  # at first, misplaced texels give wrong slopes
         height = _join(stereo, weight, slope, coarse.texel, reach)
     sigma = 1 / np.sqrt(np.maximum(weight, 1e-30))
-    return CoarseRelief(_enlarge(height, grid, step), _enlarge(np.minimum(sigma, 1.0), grid, step))
+    return CoarseRelief(_enlarge(height, grid, step), _enlarge(np.minimum(sigma, 1.0), grid, step))  # 1 m: not known
 
 
 def _enlarge(image: Floats, grid: TexelGrid, step: int) -> Floats:
@@ -106,7 +106,7 @@ def _find_plane(views: tuple[PosedStokes, ...], grid: TexelGrid, step: int) -> f
 def _log_picture(view: PosedStokes, step: int) -> Floats:
     """ln S0 (H, W), gray, of a view, in means of about a coarse texel; NaN where not measured."""
     gray = np.asarray(view.stokes.stokes[0] @ flash_light.gray(view.matrix), np.float32)
-    log = np.log(cv2.blur(np.maximum(gray, 1e-3), (step, step)))
+    log = np.log(cv2.blur(np.maximum(gray, 1e-3), (step, step)))  # finite in the dark
     return np.where((view.stokes.quality & texel_stokes.UNKNOWN) > 0, np.nan, log)
 
 
@@ -143,7 +143,7 @@ def _parallax(
     derivative = np.where(known, (above - here) / level / lift, 0)
     common = derivative.sum(axis=0) / np.maximum(known.sum(axis=0), 1)  # to all views: the albedo explains it
     derivative = np.where(known, derivative - common, 0)
-    error = np.where(known, np.clip((model - here) / level, -0.5, 0.5), 0)
+    error = np.where(known, np.clip((model - here) / level, -0.5, 0.5), 0)  # relative; limits outliers
     right, square = (cv2.GaussianBlur((derivative * part).sum(axis=0), (0, 0), _WINDOW) for part in (error, derivative))
     weight = square * (4 * np.pi * _WINDOW**2) / settings.parallax_error**2  # the window averages 4πσ² texels
     return np.asarray(right / np.maximum(square, 1e-12)), np.asarray(weight)
@@ -163,9 +163,10 @@ def _join(stereo: Floats, weight: Floats, slope: Floats, texel: float, reach: fl
     ends = np.repeat(np.arange(count), 2), np.stack([first, second], axis=-1).ravel()
     differences: Any = sparse.csr_matrix((np.tile([-1.0, 1.0], count), ends), (count, index.size))
     slope_weight = 1 / (_SLOPE_ERROR * texel) ** 2
-    own = weight.ravel() / (2 * np.pi * _WINDOW**2) + slope_weight * 1e-8  # windows overlap, so a texel has a share
+    # windows overlap, so a texel has a share of its weight; a little more makes the system solvable without any
+    tie = weight.ravel() / (2 * np.pi * _WINDOW**2) + slope_weight * 1e-8
     if reach is not None:
-        own = np.minimum(own, slope_weight / reach**2)
-    system = slope_weight * (differences.T @ differences) + sparse.diags(own)
-    right = slope_weight * (differences.T @ rise) + own * stereo.ravel()
+        tie = np.minimum(tie, slope_weight / reach**2)
+    system = slope_weight * (differences.T @ differences) + sparse.diags(tie)
+    right = slope_weight * (differences.T @ rise) + tie * stereo.ravel()
     return np.asarray(spsolve(system.tocsc(), right)).reshape(stereo.shape)

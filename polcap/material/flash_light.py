@@ -33,7 +33,7 @@ LEAST_POINTS = 60  # of the paper, in a view
 _FLASH_SIGMA_M = 0.08  # 1σ of the flash's position about the lens, prior
 _ROUNDS, _OUTLIER = 3, 4.0  # of the fit; robust standard deviations, beyond which points are left out
 _SCATTER = 0.02  # relative 1σ of paper about Lambert's law
-_USABLE = ~np.uint8(Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST | Quality.DARK)
+_UNUSABLE = np.uint8(Quality.CLIPPED | Quality.OUTSIDE | Quality.GHOST | Quality.DARK)
 PAPER = 0.8  # albedo of matt paper, for sessions without a chart
 _SHARE_SIGMA = 0.1  # 1σ of s about 0, prior; s is F0 over the paper's albedo
 _GLOSS = (0.2, 0.4, 0.7)  # roughness of the highlight, with which the search starts
@@ -63,12 +63,13 @@ def measure(views: tuple[PosedStokes, ...], chart: ChartInView | None, board: Bo
         law = _fit(samples, used, starts)
         starts, errors = [law], [_log_error(one, law) for one in samples]
         errors = [error - float(np.median(error[use])) for error, use in zip(errors, used, strict=True)]
-        spread = 1.48 * np.median(np.abs(np.concatenate(errors)))
+        spread = 1.48 * np.median(np.abs(np.concatenate(errors)))  # robust 1σ
         used = [np.abs(error) < _OUTLIER * spread for error in errors]
     logs = [_log_error(one, law)[use] for one, use in zip(samples, used, strict=True)]
     energy = np.exp([float(log.mean()) for log in logs])  # c_k
     residual = np.concatenate([log - np.log(c) for log, c in zip(logs, energy, strict=True)])
     place = law[_PLACE]
+    # the color calibration makes radiance in the chart's place the albedo
     albedo = PAPER if chart is None else float(energy[chart.view] * _chart_irradiance(views[chart.view], chart, place))
     return FlashLight(
         place=place,
@@ -104,7 +105,7 @@ def sample_paper(view: PosedStokes, board: Board) -> PaperSamples:
     inside = (x >= 1) & (y >= 1) & (x <= width - 2) & (y <= height - 2)
     column, row = (np.rint(a[inside]).astype(int) for a in (x, y))
     stokes = np.asarray(view.stokes.stokes[:, row, column])  # (3, M, 3)
-    good = ((view.stokes.quality[row, column] & ~_USABLE) == 0) & (stokes[0].min(axis=-1) > 0)
+    good = ((view.stokes.quality[row, column] & _UNUSABLE) == 0) & (stokes[0].min(axis=-1) > 0)
     stokes, world = stokes[:, good], world[inside][good]
     radiance = gray(view.matrix) @ stokes[0].T
     ratio = np.moveaxis(stokes[1:] / stokes[0], 0, 1)
@@ -123,7 +124,7 @@ def gray_of_colors(matrix: Floats) -> Floats:
 
 
 def _paper_points(board: Board, margin: float) -> Floats:
-    """World points (M, 3) [m] of the page with white paper all around, up to the distance `margin` [m]."""
+    """World points (M, 3) [m] on paper, with paper `margin` [m] around, in the page's middle square, as wide as it."""
     half = board.page_m[0] / 2 - margin
     axis = np.arange(-half, half, _STEP_M)
     x, z = (a.ravel() for a in np.meshgrid(axis, axis))
@@ -189,6 +190,6 @@ def _shot_matrix(view: PosedStokes, samples: PaperSamples, used: Bools) -> Float
     analyzers = mueller.analyzer(np.asarray(view.angle, np.float64))
     from_shots, out = np.linalg.pinv(analyzers), []
     for q, u in np.median(samples.ratio[used], axis=0).T:  # S1/S0 and S2/S0 of a channel
-        gain = analyzers @ [1, q, u] * 2  # of each shot
+        gain = analyzers @ [1, q, u] * 2  # of each shot, over that under unpolarized light of equal energy
         out.append(from_shots @ (analyzers / gain[:, None]))
     return np.stack(out)

@@ -27,10 +27,11 @@ _ROUGHNESS = (0.1, 0.16, 0.25, 0.38, 0.55, 0.8)  # of a group, tried first
 _SIDE = 70  # texels along the longer side of the sampled grid
 _SAMPLES, _TRIED = 400, 120  # most texels of a group in its fit; in the trial of each `_ROUGHNESS`, about
 _LEAST_SAMPLES = 40  # texels of a group that is fitted
-_ROUNDS = 4  # most Newton steps
+_ROUNDS = 4  # Newton steps at most
 _INDEPENDENT = 6.0  # texels: a whole group counts as so many, because light, pose and law err alike in all of them
 _TIGHT = np.array([1e-3, 1e-4], np.float32)  # 1σ that ties roughness and F0 of a texel to those of its group
 _F0, _F0_SIGMA = 0.042, 0.008  # prior of a group's F0
+_TEXEL_F0_SIGMA = 0.01  # 1σ of the F0 of single texels about `_F0`, in the first fit
 _ROUGH, _ROUGH_SIGMA = 0.45, 0.2  # roughness of texels before a fit, and of groups without one
 _LOWEST, _HIGHEST = [0.06, 0.01], [1.0, 0.15]  # limits of a group's roughness and F0
 LAWS = {"smooth": body.SMOOTH, "rough": body.Law(rough=1.0)}
@@ -103,7 +104,7 @@ def find(
     point = grid.points(relief.height)[sampled].reshape(-1, 3)[known]
     geometry = texel_grid.geometry(point, [view.pose for view in views], light)
     data = data.take(known)
-    prior = TexelPrior.alike((_ROUGH, _F0), (_ROUGH_SIGMA, 0.01), len(known))
+    prior = TexelPrior.alike((_ROUGH, _F0), (_ROUGH_SIGMA, _TEXEL_F0_SIGMA), len(known))
     first = texel_fit.start(data, geometry, prior, body.SMOOTH)
     fitted = texel_fit.fit(data, geometry, prior, first, body.SMOOTH, settings.fitting, rounds=4)
     return group(data, geometry, fitted.value[:, texel_fit.ALBEDO], settings)
@@ -114,7 +115,7 @@ def group(data: Measurements, views: TexelViews, albedo: Floats, settings: Gloss
     encoded, fitting = _encoded(albedo), settings.fitting
     center, spread = clusters.color_clusters(encoded, settings.materials)
     member = clusters.soft_share(encoded, center, spread).argmax(axis=1)
-    found: dict[str, tuple[float, Floats, Floats]] = {}
+    found: dict[str, tuple[float, Floats, Floats]] = {}  # cost, gloss and its 1σ, by law
     for name, law in LAWS.items():
         gloss = np.tile([_ROUGH, _F0], (len(center), 1))  # of groups with too few texels
         sigma = np.tile([_ROUGH_SIGMA, _F0_SIGMA], (len(center), 1))

@@ -50,7 +50,7 @@ class MaterialMaps(ArrayValue):
     specular_sigma: Floats  # (H, W)
     seen: Bools  # (H, W) measured; elsewhere filled
     thickness: float  # m, mean height over the board
-    albedo_sigma: float | None = None
+    albedo_sigma: float | None = None  # relative 1σ of the scale of all albedos; None: unknown
 
     @property
     def mask(self) -> Bools:
@@ -80,7 +80,7 @@ def build(found: TexelMaps, relief: CoarseRelief, grid: TexelGrid, albedo_sigma:
         roughness=value[..., ROUGHNESS],
         height=np.asarray(height - middle, np.float32),
         occlusion=ambient_occlusion(height, normal, grid.texel),
-        normal_sigma=np.degrees(np.hypot(sigma[..., 0], sigma[..., 1])) * normal[..., 2] ** 2,
+        normal_sigma=np.degrees(np.hypot(sigma[..., 0], sigma[..., 1])) * normal[..., 2] ** 2,  # dθ = cos² θ d tan θ
         diffuse_sigma=_albedo_doubt(value[..., ALBEDO], sigma[..., ALBEDO].mean(axis=-1), albedo_sigma or 0.0),
         roughness_sigma=sigma[..., ROUGHNESS],
         specular_sigma=sigma[..., F0],
@@ -91,7 +91,7 @@ def build(found: TexelMaps, relief: CoarseRelief, grid: TexelGrid, albedo_sigma:
 
 
 def _albedo_doubt(albedo: Floats, sigma: Floats, scale: float) -> Floats:
-    """1σ (H, W) of the albedo (H, W, 3): from the texels' `sigma`, the relative 1σ `scale` of all, misplaced edges."""
+    """1σ (H, W) of the albedo (H, W, 3): `sigma` of its fit, relative `scale` of all albedos, and misplaced edges."""
     gray = albedo.mean(axis=-1)
     down, across = np.gradient(gray)
     return np.asarray(np.sqrt(sigma**2 + (scale * gray) ** 2 + _MISPLACED**2 * (down**2 + across**2)), np.float32)

@@ -26,7 +26,7 @@ def write(folder: Path, about: Mapping[str, Any], source: MaterialSource) -> Non
     atomic.write_json(folder / "report.json", about)
     small, figures = _reduce(source.maps), about["figures"]
     lit = _render(small)
-    exposure = 0.9 / max(float(np.quantile(lit, 0.995)), 1e-6)
+    exposure = 0.9 / max(float(np.quantile(lit, 0.995)), 1e-6)  # all but the brightest 0.5 % stay below 0.9
     height, width = small["roughness"].shape
     content = {
         "lit": html.jpeg(color.srgb_eight_bits(exposure * lit)),
@@ -65,6 +65,7 @@ def _render(small: Mapping[str, Floats]) -> Floats:
 
 
 def _figures(small: Mapping[str, Floats]) -> list[map_figures.MapFigure]:
+    """Pictures of the reduced maps, each with its key."""
     inside = np.ones(small["roughness"].shape, bool)
     micron = 1e6 * small["height"]
     low, high = (float(q) for q in np.quantile(micron, (0.001, 0.999)))
@@ -96,6 +97,7 @@ def _size(maps: Mapping[str, Any]) -> str:
 
 
 def _row(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """A view's row of the page's table, from its figures."""
     return (
         row["name"],
         f"{row['tilt_deg']:.0f}°",

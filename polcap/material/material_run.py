@@ -102,11 +102,12 @@ def _view_figures(flat: FlatSession, results: MaterialResults, k: int) -> dict[s
 def _gates(
     flat: FlatSession, results: MaterialResults, views: Mapping[str, Any], config: MaterialConfig
 ) -> Iterator[Gate]:
+    """The gates of a material, in the order of the report; `views` are the figures by view."""
     limits = config.material.gates
     yield flat_sample.views(flat.names, flat.left_out, limits)
     yield flat_sample.tilts(flat.tilt_deg, limits)
-    residual_px = {name: view["reprojection_px"] for name, view in views.items()}
-    yield several_views.poses(residual_px, limits.max_corner_px, board=True)
+    reprojection_px = {name: view["reprojection_px"] for name, view in views.items()}
+    yield several_views.poses(reprojection_px, limits.max_corner_px, board=True)
     yield flat_sample.focus(flat.blur_px, limits)
     yield flat_sample.paper(results.light.shine, limits)
     yield flat_sample.agreement({name: view["residual"] for name, view in views.items()}, limits)

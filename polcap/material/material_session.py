@@ -107,7 +107,7 @@ def posed_stokes(name: str, results: ResultsUntilStokes, solved: SessionPoses, p
 
 
 def _find_chart(views: Sequence[SessionView]) -> ChartInView | None:
-    """The view that shows the chart, if there is one."""
+    """The first view that shows the chart, if there is one."""
     for number, view in enumerate(views):
         if view.supplied.chart.mode in ("auto", "corners"):
             color = view_path.find_chart(view)

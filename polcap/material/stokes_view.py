@@ -19,7 +19,7 @@ from polcap.optics.board import Board
 from polcap.optics.projection import to_grid
 from polcap.pipeline import path as single
 from polcap.pipeline import run
-from polcap.pipeline.cache import LazyCache
+from polcap.pipeline.cache import LazyCache, value_of
 from polcap.stage_values import StokesImage
 
 
@@ -67,5 +67,5 @@ def solve(view: SessionView) -> str:
     with run.opened(view.capture, view.supplied, view.config, cache):
         single.run_stages(view.capture, view.supplied, view.config, cache)
         found = cache.results["stokes"]
-        assert found.value is not None
+        value_of(found)  # makes and stores it
         return found.key

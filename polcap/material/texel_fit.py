@@ -120,7 +120,7 @@ def start(data: Measurements, views: TexelViews, prior: TexelPrior, law: body.La
     diffuse, specular = np.moveaxis(responses(flat, prior.mean[:, 0], views, law)[0], -1, 0)
     albedo = (data.radiance - (specular * prior.mean[:, 1])[..., None]) / np.maximum(diffuse, 1e-6)[..., None]
     known = np.isfinite(data.noise[..., :1])
-    albedo = np.nan_to_num(np.nanmedian(np.where(known, albedo, np.nan), axis=0), nan=0.2)
+    albedo = np.nan_to_num(np.nanmedian(np.where(known, albedo, np.nan), axis=0), nan=0.2)  # 0.2: not seen
     return np.clip(np.concatenate([flat, prior.mean, albedo], axis=-1).astype(np.float32), _LOW, _HIGH)
 
 
@@ -160,7 +160,7 @@ def fit(
 def _sigma(data: Measurements, settings: FitSettings) -> Floats:
     """1σ (K, N, 5) of three colors, S1 and S2: noise, and errors in proportion to S0."""
     level = np.maximum(data.radiance, 0) @ data.gray
-    # three colors share the errors of light and geometry, so each counts by a third
+    # three colors share the errors of light and geometry, so each counts by a third; a dark one errs like 0.3 of gray
     colors = np.sqrt(3) * np.hypot(
         data.noise[..., :1], settings.radiance_error * np.maximum(data.radiance, 0.3 * level[..., None])
     )
@@ -170,14 +170,14 @@ def _sigma(data: Measurements, settings: FitSettings) -> Floats:
 
 
 def misfit(data: Measurements, found: TexelEstimate, settings: FitSettings) -> tuple[Floats, Floats]:
-    """Sums of squared errors (N, 2) of S0 and of S1 and S2, in 1σ as stated, and their degrees of freedom (N, 2).
+    """Sums of squared errors (N, 2) of S0 and of S1 and S2, in expected 1σ, and their degrees of freedom (N, 2).
 
     S0 is gray: its colors share the errors of light and geometry, and noise of color hardly changes a normal.
     """
     known = np.isfinite(data.noise[..., 0])
     level = np.maximum(data.radiance, 0) @ data.gray
-    stated = np.where(known, np.hypot(data.noise[..., 0], settings.radiance_error * level), np.inf)
-    gray = np.where(known, data.radiance @ data.gray - found.model, 0) / np.maximum(stated, 1e-6)
+    expected = np.where(known, np.hypot(data.noise[..., 0], settings.radiance_error * level), np.inf)
+    gray = np.where(known, data.radiance @ data.gray - found.model, 0) / np.maximum(expected, 1e-6)
     squares = np.stack([gray**2, (found.error[..., KINDS[1]] ** 2).sum(axis=-1)], axis=-1)
     used = np.einsum("nij,knji->nk", np.linalg.inv(found.information.astype(np.float64)), found.by_kind)
     used = np.maximum(used - [2, 0], 0)  # unknowns that each kind of data determines; two of the albedo are not gray
@@ -219,10 +219,10 @@ def _linearize(
     by_kind, gradient = np.empty((len(KINDS), len(value), UNKNOWNS, UNKNOWNS), np.float32), np.zeros_like(value)
     for part, kind in zip(by_kind, KINDS, strict=True):
         rows = np.moveaxis(jacobian[:, :, kind], 0, 1).reshape(len(value), -1, UNKNOWNS)  # (N, 3K or 2K, 7)
-        left = np.moveaxis((error * root)[..., kind], 0, 1).reshape(len(value), -1, 1)
+        errors = np.moveaxis((error * root)[..., kind], 0, 1).reshape(len(value), -1, 1)
         transposed = np.swapaxes(rows, 1, 2)
         part[:] = transposed @ rows
-        gradient += (transposed @ left)[..., 0]
+        gradient += (transposed @ errors)[..., 0]
     information = by_kind.sum(axis=0)
     cost = 5 * _CAUCHY**2 * np.log1p(mean_square / _CAUCHY**2).sum(axis=0)
     pull, tie = _priors(prior, value)

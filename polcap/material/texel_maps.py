@@ -17,7 +17,7 @@ from polcap.stages import stage
 
 _TILE = 16_000  # texels
 _AROUND = 3  # texels, 1σ, over which the misfit is averaged
-_STATED = 0.1  # degrees of freedom with errors as stated, added everywhere: three views may leave no others
+_PRIOR_FREEDOM = 0.1  # degrees of freedom with errors as expected, added everywhere: three views may leave none
 _FIRST_ROUNDS = 3  # of the fits that give the albedo, by which the material is chosen
 
 
@@ -55,19 +55,19 @@ def estimate(
         strip = slice(top, min(top + rows, height))
         data = measurements(stokes.rows(strip), views)
         geometry = texel_grid.geometry(point[strip].reshape(-1, 3), poses, light)
-        found, own = _fit(data, geometry, gloss, settings)
-        parts = (found.value, own, *texel_fit.misfit(data, found, settings.fitting))
+        found, by_cause = _fit(data, geometry, gloss, settings)
+        parts = (found.value, by_cause, *texel_fit.misfit(data, found, settings.fitting))
         for target, part in zip((value, variance, squares, freedom), parts, strict=True):
             target[strip] = part.reshape(target[strip].shape)
         known = np.isfinite(data.noise[..., 0])
         error_squares += (found.error**2).sum(axis=(1, 2))
-        error_count += 5 * known.sum(axis=1)
+        error_count += 5 * known.sum(axis=1)  # of three colors, S1 and S2
         error = np.abs(data.radiance @ data.gray - found.model) / np.maximum(found.model, 1e-3)
         residual[:, strip] = np.where(known, error, np.nan).reshape(residual[:, strip].shape)
     measured = np.isfinite(stokes.noise[..., 0]).sum(axis=0) >= LEAST_VIEWS
-    squares, freedom = (cv2.GaussianBlur(one, (0, 0), _AROUND) + _STATED for one in (squares, freedom))
+    squares, freedom = (cv2.GaussianBlur(one, (0, 0), _AROUND) + _PRIOR_FREEDOM for one in (squares, freedom))
     variance[:, :, : len(KINDS)] *= (squares / freedom)[..., None]
-    with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"):  # NaN for a view without any of these texels
         median = np.nanmedian(residual[:, measured].astype(np.float32), axis=1)
     return TexelMaps(
         value=value,
@@ -96,9 +96,9 @@ def _fit(
 
 
 def variances(found: TexelEstimate, prior: TexelPrior, shared: Floats) -> Floats:
-    """Variances (N, 3, 7) of texels by cause: stated errors of S0, stated errors of S1 and S2, and priors.
+    """Variances (N, 3, 7) of texels by cause: expected errors of S0, those of S1 and S2, and priors.
 
-    The third contains the 1σ `shared` (N, 2) of the roughness and F0 of the texels' material.
+    The third cause includes the 1σ `shared` (N, 2) of the roughness and F0 of the texels' material.
     """
     covariance = np.linalg.inv(found.information.astype(np.float64))
     response = covariance[:, :, texel_fit.GLOSS] / prior.sigma[:, None, :] ** 2  # to a change of the prior's mean

@@ -61,7 +61,10 @@ def resample(
 
 
 def _sample(view: PosedStokes, shot_matrix: Floats, point: Floats) -> tuple[Floats, Floats, Floats]:
-    """Radiance (h, w, 3), polarized part (h, w, 2) and noise (h, w, 2) of a view at world points (h, w, 3)."""
+    """Radiance (h, w, 3), S1 and S2 (h, w, 2), and noise (h, w, 2) of a view at world points (h, w, 3) [m].
+
+    Noise is as in `TexelStokes`: 1σ of the gray S0, and that of S1 or S2.
+    """
     x, y = view.pixels(point)
     height, width = view.stokes.mask.shape
     left, right = _span(x, width)
@@ -81,8 +84,8 @@ def _sample(view: PosedStokes, shot_matrix: Floats, point: Floats) -> tuple[Floa
         return np.asarray(cv2.remap(np.ascontiguousarray(plane, np.float32), *pixels, cv2.INTER_LINEAR))
 
     squares = (weights**2).astype(np.float32)
-    covariance = [view.stokes.covariance[k][box] @ squares for k in (0, 3, 5)]  # variances
-    s0, s1, s2 = (_SPLINE_NOISE**2 * linear(one) for one in covariance)
+    variance = [view.stokes.covariance[k][box] @ squares for k in (0, 3, 5)]  # stored are 00, 01, 02, 11, 12, 22
+    s0, s1, s2 = (_SPLINE_NOISE**2 * linear(one) for one in variance)
     noise = np.sqrt(np.maximum(np.stack([s0, (s1 + s2) / 2], axis=-1), 0))
     bad = linear(np.asarray((view.stokes.quality[box] & UNKNOWN) > 0, np.float32)) > _MOST_UNKNOWN
     bad |= (x < 0) | (y < 0) | (x > width - 1) | (y > height - 1)

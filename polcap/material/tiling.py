@@ -40,6 +40,7 @@ def tile(maps: MaterialMaps) -> MaterialMaps:
             blended: Floats = value[:rows, :columns].astype(np.float64)
             for axis in (0, 1):
                 blended = _blend(blended, axis, strips[axis], one.name in _CONTRAST)
+            # a mask holds where all blended texels do
             changed[one.name] = (blended > 0.999) if value.dtype == bool else blended.astype(np.float32)
     changed["normal"] = frames.unit(changed["normal"]).astype(np.float32)
     for name in ("diffuse", "roughness", "specular"):
@@ -74,8 +75,8 @@ def _blend(value: Floats, axis: int, strip: int, contrast: bool) -> Floats:
     start, end = image[:strip], image[length - strip :]
     mixed = share * start + (1 - share) * end
     if contrast:
-        fine, other = (one - cv2.GaussianBlur(one, (0, 0), strip / 4) for one in (start, end))
-        correlation = np.clip((fine * other).sum() / max(np.sqrt((fine**2).sum() * (other**2).sum()), 1e-12), 0, 1)
+        first, last = (one - cv2.GaussianBlur(one, (0, 0), strip / 4) for one in (start, end))  # fine parts
+        correlation = np.clip((first * last).sum() / max(np.sqrt((first**2).sum() * (last**2).sum()), 1e-12), 0, 1)
         sigma = np.sqrt(share**2 + (1 - share) ** 2 + 2 * correlation * share * (1 - share))
-        mixed += (share * fine + (1 - share) * other) * (1 / sigma - 1)
+        mixed += (share * first + (1 - share) * last) * (1 / sigma - 1)
     return np.moveaxis(np.concatenate([mixed, image[strip : length - strip]]), 0, axis)

@@ -36,6 +36,7 @@ class BackgroundCheck:
         return list(self._pending)
 
     def submit(self, slot: Slot, read_deg: float | None, photograph: CameraFile) -> None:
+        """Hand a photograph to the thread; `read_deg` is the ring's angle, None if the frame needs none."""
         self._pending[slot] = self._thread.submit(self._save_and_check, slot, read_deg, photograph)
 
     def collect(self, block: bool) -> None:

@@ -29,7 +29,7 @@ _WIDGETS = {  # by field of Exposure: names of the setting, and the power of its
 }
 _FLASH_MODE = "flashmode"
 _VALUE = re.compile(r"(?:f/?)?(?P<over>\d+(?:\.\d+)?/)?(?P<value>\d+(?:\.\d+)?) ?s?", re.IGNORECASE)
-_REMEDY = {
+_REMEDY = {  # by error code of libgphoto2
     -7: "check the cable",
     -52: "plug it in, switch it on",
     -53: "another program uses it; close that program (gvfs, digiKam, …)",
@@ -130,6 +130,7 @@ class Gphoto2Camera:
         return value
 
     def _widget(self, field: str) -> str | None:
+        """Name of the camera's setting for a field of Exposure; None if it has none that can be set."""
         return next((name for name in _WIDGETS[field][0] if self._choices[name]), None)
 
     def _list_choices(self, name: str) -> list[str]:

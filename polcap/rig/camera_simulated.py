@@ -59,7 +59,7 @@ class SimulatedCamera:
         """
         angles = self._shoot.angles_deg
         wanted = 0.0 if angle_deg is None else angle_deg
-        shot = angles.index(wanted) if wanted in angles else len(angles) + round(10 * wanted) % 900
+        shot = angles.index(wanted) if wanted in angles else len(angles) + round(10 * wanted) % 900  # under 1000
         self._crossed = role == "cross"
         self._next = shot + _FIRST_NUMBER[role], step, wanted if RING.true_deg is None else RING.true_deg
 

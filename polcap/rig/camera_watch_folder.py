@@ -136,9 +136,11 @@ class WatchFolderCamera:
             self._arrived.append((file, data))
 
     def _is_stable(self, one: tuple[Path, Version]) -> bool:
+        """Whether a file has had this size and time for `stable_s`, as far as was observed."""
         return time.monotonic() - self._since.setdefault(one, time.monotonic()) >= self._stable_s
 
     def _new(self) -> dict[Path, Version]:
+        """Files that were not yet read in their present version."""
         return {file: version for file, version in self._versions().items() if self._read.get(file) != version}
 
     def _versions(self) -> dict[Path, Version]:

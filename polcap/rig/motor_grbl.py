@@ -76,7 +76,7 @@ class GrblMotor:
         self.model = f"GRBL {self._reset()}"
         matches = [match for line in self._command("$$") if (match := _STORED.fullmatch(line))]
         stored = {int(match[1]): float(match[2]) for match in matches}
-        for key in (100 + self._axis, 110 + self._axis):
+        for key in (100 + self._axis, 110 + self._axis):  # steps per unit, units per minute
             if not stored.get(key, 0.0) > 0.0:
                 raise NoAnswer(f"{self.model} on {port.url} stated no ${key} above 0; set it in GRBL, or try again")
         steps_per_unit, units_per_minute = stored[100 + self._axis], stored[110 + self._axis]
@@ -96,6 +96,7 @@ class GrblMotor:
 
     def go(self, angle_deg: float) -> None:
         target = self._zero + angle_deg * self._units_per_degree
+        # in mm, absolute, of the machine, at full speed
         self._command(f"G21G90G53G0{self._settings.axis}{target:.4f}")
         self._wait_for_ok("G4P0.01", quiet_s=1.5 * serial_port.ANSWER_S)  # a pause begins when the motor has stopped
 

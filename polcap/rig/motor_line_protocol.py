@@ -46,7 +46,7 @@ class LineMotor:
         self._settings = settings
         name, speed = self._greet()
         self.model = f"polcap-rotator {name}"
-        self.speed_deg_s = max(speed, 0.1)
+        self.speed_deg_s = max(speed, 0.1)  # never 0: times are estimated with it
 
     def home(self) -> None:
         if self._settings.home == "ask":

@@ -69,5 +69,6 @@ def _check_same(folder: Path, stated: dict[str, Any], begun: dict[str, Any]) -> 
 
 
 def _without_port(url: str) -> str:
+    """Kind and settings of a device's URL."""
     head, _, query = url.partition("?")
     return f"{head.partition(':')[0]}?{query}"

@@ -33,7 +33,8 @@ class SessionFile(msgspec.Struct):
 def open_session(folder: Path, views: int | None, turntable: str | None, resume: bool) -> SessionFile | None:
     """The session of `--views` and `--turntable`, or with `resume` the one begun; None for a single capture.
 
-    Raises SettingError: one of the two is missing. CaptureError: the folder holds another session, or other files.
+    Raises SettingError: one of the two is missing. CaptureError: the folder holds another session, other files, or
+    with `resume` no session that was begun.
     """
     file = folder / NAME
     if resume and file.exists():

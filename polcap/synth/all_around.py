@@ -142,6 +142,7 @@ def _view(scene: Scene, shoot: AroundShoot, turn: Rotation, position: Floats, pl
     own = tuple((turn * placed.turn).as_rotvec(degrees=True).tolist())
     place = tuple((turn.apply([0.0, placed.lift, 0.0]) + position).tolist())
     edge = 0.5 * forward_camera.SENSOR_WIDTH_MM / shoot.focal_mm * shoot.distance_m  # m, of the picture
+    # half the chart and a gap from the edge [m], above the middle
     chart = Chart(center=(edge - 0.053, 0.085 * shoot.distance_m, -shoot.distance_m))
     laid = UNSET if shoot.board == "none" else LaidBoard(tuple(position.tolist()), vector, shoot.board)
     return msgspec.structs.replace(

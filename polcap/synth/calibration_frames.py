@@ -107,7 +107,10 @@ def write(folder: Path, shoot: CalibrationShoot) -> None:
 
 
 def _photographs(shoot: CalibrationShoot) -> Iterator[tuple[str, Floats, float, float]]:
-    """The simulated calibration photographs: folder, light (H, W, 3) at ISO 100, ISO and exposure time [s] of each."""
+    """The simulated calibration photographs: folder, light (H, W, 3) at ISO 100, ISO and exposure time [s] of each.
+
+    White is 1. Flash frames reach 0.5 of it in green; a white board, and light along the polarizer's axis, reach 0.8.
+    """
     random = np.random.default_rng([shoot.seed, 7])
     light = _surface(shoot)
     for iso in shoot.isos:

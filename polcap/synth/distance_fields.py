@@ -139,7 +139,7 @@ def _heights(slab: Slab) -> tuple[Floats, float]:
         white = np.random.default_rng([slab.seed, 0x51AB]).normal(size=(_GRID, _GRID))
         spatial = np.fft.fftfreq(_GRID, slab.side / (_GRID - 1))
         band = np.hypot(spatial[:, None], spatial[None]) * slab.feature
-        grid = np.fft.ifft2(np.fft.fft2(white) * band * np.exp(-2 * band**2)).real
+        grid = np.fft.ifft2(np.fft.fft2(white) * band * np.exp(-2 * band**2)).real  # strongest at waves of two features
     grid = (grid - grid.mean()) * (slab.relief / max(float(np.ptp(grid)), 1e-12))
     slope = np.gradient(grid, slab.side / (_GRID - 1))
     return grid, float(np.hypot(*slope).max())

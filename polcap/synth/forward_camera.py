@@ -59,7 +59,7 @@ def undistort(view: View, bend: tuple[float, float], x: Floats, y: Floats) -> tu
         return x, y
     right, down = x - view.center[0], y - view.center[1]
     radius = np.hypot(right, down) / view.focal
-    tangent = np.linspace(0, 1.5 * radius.max() + 0.01, _RADII)
+    tangent = np.linspace(0, 1.5 * radius.max() + 0.01, _RADII)  # beyond the corners
     distorted = tangent + bend[0] * tangent**3 + bend[1] * tangent**5
     rising = np.concatenate([[True], np.maximum.accumulate(distorted)[:-1] < distorted[1:]])
     true = np.interp(radius, distorted[rising], tangent[rising])

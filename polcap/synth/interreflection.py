@@ -28,11 +28,11 @@ def flash_light(tracer: Tracer, place: Floats, normal: Floats, flash: Floats, st
     All vectors are in the frame of the mesh. The irradiance is S0 of a white plane that faces the flash; `strength` is
     that at distance 1.
     """
-    far = np.linalg.norm(flash - place, axis=1)
-    to_flash, lift = (flash - place) / far[:, None], LIFT * tracer.size
+    distance = np.linalg.norm(flash - place, axis=1)
+    to_flash, lift = (flash - place) / distance[:, None], LIFT * tracer.size
     start = place + lift * normal
-    hidden = tracer.hidden(start, start + to_flash * (far - lift)[:, None])
-    return to_flash, np.where(hidden, 0, strength / far**2)
+    hidden = tracer.hidden(start, start + to_flash * (distance - lift)[:, None])
+    return to_flash, np.where(hidden, 0, strength / distance**2)
 
 
 def diffuse_light(
@@ -57,6 +57,7 @@ def gather(tracer: Tracer, lit: DiffuseLight, camera: Floats, ior: float) -> Flo
     normal = mesh.vertex_normals()
     towards = frames.unit(camera - mesh.vertices)
     normal = np.where(np.sum(normal * towards, axis=1, keepdims=True) < -0.3, -normal, normal)
+    # square to the normal, from an axis that is not along it
     e_x = frames.unit(np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])))
     e_y = np.cross(normal, e_x)
     turn = np.random.default_rng(0).uniform(0, 2 * np.pi, len(normal))

@@ -97,7 +97,7 @@ def guide(buffer: GBuffer) -> Floats:
     height, width = buffer.mask.shape
     y, x = np.mgrid[:height, :width].astype(np.float64)
     distance = buffer.depth / frames.rays_at(buffer.view, x, y)[..., 2]
-    return np.asarray(minimum_filter(np.where(buffer.mask, distance, np.inf), 5))
+    return np.asarray(minimum_filter(np.where(buffer.mask, distance, np.inf), 5))  # within 2 px
 
 
 def white_level(scene: Scene) -> float:

@@ -130,6 +130,7 @@ def _project(material: Material, position: Floats, facing: Floats) -> tuple[Floa
 
 @lru_cache(maxsize=4)
 def _texture(folder: str) -> Floats:
+    """Texture set (_TEXELS, _TEXELS, 6): albedo, roughness, slopes of the relief along columns and rows."""
     return np.ascontiguousarray(np.moveaxis(scene_files.read_textures(Path(folder), _TEXELS), 0, -1))
 
 
@@ -142,5 +143,5 @@ def _pattern(material: Material, p: Floats) -> Floats:
     else:
         noise = solid_noise(p, material.seed)
         edge = (0.25 - np.abs(noise)) / 0.15 if material.pattern == "veins" else noise / 1.2
-    t = np.clip((edge + 1) / 2, 0, 1)  # 0 below −1, 1 above 1, smooth between
+    t = np.clip((edge + 1) / 2, 0, 1)  # `edge` −1: first color, 1: second, smooth between
     return np.asarray(t * t * (3 - 2 * t))

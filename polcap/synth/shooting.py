@@ -297,7 +297,7 @@ def _middle_exposure(scene: Scene, shoot: Shoot, buffer: GBuffer, s0: Floats) ->
     In that frame the 90th percentile of the object, and the white patch, have at most 0.35 of the white level. In the
     darkest frame 99.9 % of the object have at most 0.95.
     """
-    bright = s0[buffer.mask].max(axis=-1) / 2
+    bright = s0[buffer.mask].max(axis=-1) / 2  # the polarizer passes half
     if not bright.size:
         raise CaptureError("the object is outside the picture; move scene.position towards (0, 0, -0.7)")
     level = float(np.percentile(bright, 90))
@@ -313,6 +313,7 @@ def _exposure(shoot: Shoot, take: Take, middle: float) -> tuple[Exif, float, flo
     factor, number = take.factor, take.shot * shoot.exposures + take.frame
     diagonal_mm = SENSOR_WIDTH_MM * np.hypot(1, shoot.height / shoot.width)
     equivalent_mm = float(shoot.focal_mm * np.hypot(36, 24) / diagonal_mm)  # the same angle of view on full frame
+    # s between two frames, and more between two shots
     taken = datetime(2026, 3, 14, 12) + timedelta(seconds=4.25 * number + 20 * (number // shoot.exposures))
     exif = Exif(
         make="Polcap", model="Synthetic", lens=f"Synthetic {shoot.focal_mm:g}mm", exposure_time=1 / 160, f_number=11.0,

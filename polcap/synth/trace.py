@@ -92,13 +92,16 @@ def in_shadow(shape: Shape | Model, position: Vector, turn: Rotation, point: Flo
 
 
 def _march(shape: Shape, origin: Floats, direction: Floats, start: Floats | float) -> tuple[Indices, Floats]:
-    """Sphere tracing: indices of the rays (P, 3) that hit the shape, and their lengths [m]."""
-    middle = -np.einsum("pi,pi->p", origin, direction)
-    gap2 = np.einsum("pi,pi->p", origin, origin) - middle**2  # squared distance of the ray from the origin
+    """Sphere tracing: indices of the rays (P, 3) that hit the shape, in order, and their lengths [m].
+
+    Rays are searched from the length `start` [m] on: one for all, or (P,).
+    """
+    nearest = -np.einsum("pi,pi->p", origin, direction)  # length (P,) to the ray's point nearest to the shape's origin
+    gap2 = np.einsum("pi,pi->p", origin, origin) - nearest**2  # squared distance of the ray from the shape's origin
     half = np.sqrt(np.maximum(shape.radius**2 - gap2, 0.0))  # half the ray's length in the shape's sphere
-    alive = np.flatnonzero((half > 0) & (middle + half > 0))
-    travelled = np.maximum(middle - half, start)[alive]
-    end = (middle + half)[alive]
+    alive = np.flatnonzero((half > 0) & (nearest + half > 0))
+    travelled = np.maximum(nearest - half, start)[alive]
+    end = (nearest + half)[alive]
     arrived_index, arrived_at = [alive[:0]], [travelled[:0]]
     for steps_left in reversed(range(_STEPS)):
         step = shape.distance(origin[alive] + direction[alive] * travelled[:, None])
