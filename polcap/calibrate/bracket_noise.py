@@ -126,7 +126,7 @@ def _line(iso: float, pairs: list[BracketTiles], sites: Floats, folder: Path) ->
 
 def _fit(level: Floats, variance: Floats, edges: Floats, part: NDArray[np.int_]) -> tuple[Floats, Floats]:
     """Fit one channel's noise line: slope and floor (2,), and 1σ from the scatter between parts of the picture."""
-    least = 0.05 * float(np.median(variance))
+    least = 0.05 * float(np.median(variance))  # limits the weights of dark tiles
 
     def line(chosen: Bools) -> Floats:
         fit = robust.fit_noise_line(

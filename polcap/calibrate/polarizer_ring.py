@@ -111,7 +111,7 @@ def _fit_wave(ring: Floats, light: Floats) -> tuple[Floats, Floats]:
         weight = 1 / np.maximum(variance, (1e-5 * wave[0]) ** 2)
     residual = light - matrix @ wave
     chi2 = float(np.sum(weight * residual**2)) / max(len(light) - 3, 1)
-    return wave, np.linalg.inv(normal) * max(chi2, 0.1)
+    return wave, np.linalg.inv(normal) * max(chi2, 0.1)  # 1σ is at least 0.3 of that by `_LAMP` and `_RING_DEG`
 
 
 def _shows_sense(curves: list[_MalusFit]) -> bool:

@@ -65,4 +65,4 @@ def sample_textures(atlas: Atlas, maps: AtlasMaps, face: NDArray[np.integer], we
 def seen_picture(maps: AtlasMaps) -> Picture:
     """The diffuse albedo of the atlas, darkened where no view saw the surface."""
     shown = maps.diffuse * np.where(maps.seen, 1.0, 0.3)[..., None]
-    return np.asarray(cv2.resize(color.srgb_eight_bits(shown), (640, 640)))
+    return np.asarray(cv2.resize(color.srgb_eight_bits(shown), (640, 640)))  # px

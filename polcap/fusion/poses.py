@@ -225,6 +225,7 @@ def _with_errors(
     """Camera and poses with their errors, from the curvature at the solution and the actual residuals."""
     errors = _residuals(list(boards.values()), capture, found.x)
     scale = float(np.sqrt(np.mean(np.concatenate(errors) ** 2))) / _CORNER_SIGMA
+    # as for corners that err by at least 0.1 `_CORNER_SIGMA`
     sigma = max(scale, 0.1) * np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))
     posed = []
     for k, (name, error) in enumerate(zip(boards, errors, strict=True)):

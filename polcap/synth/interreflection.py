@@ -56,7 +56,7 @@ def gather(tracer: Tracer, lit: DiffuseLight, camera: Floats, ior: float) -> Flo
     mesh = tracer.mesh
     normal = mesh.vertex_normals()
     towards = frames.unit(camera - mesh.vertices)
-    normal = np.where(np.sum(normal * towards, axis=1, keepdims=True) < -0.3, -normal, normal)
+    normal = np.where(np.sum(normal * towards, axis=1, keepdims=True) < -0.3, -normal, normal)  # seen from behind
     # square to the normal, from an axis that is not along it
     e_x = frames.unit(np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])))
     e_y = np.cross(normal, e_x)
