@@ -25,7 +25,7 @@ def measure(normal: Any, mask: Any, dolp: Any, light: Any) -> Flatness:
     return found
 
 
-def ball(polarizing: float = 0.35) -> Flatness:
+def ball(polarizing: Any = 0.35) -> Flatness:
     mask = np.hypot(X, Y) < 1
     z = np.sqrt(np.maximum(1 - X**2 - Y**2, 0))
     return measure(np.stack([X, -Y, z], axis=-1), mask, polarizing * (1 - z**2), 0.2 + 0.8 * z)
@@ -47,6 +47,10 @@ def test_a_ball_is_rounded() -> None:
     seen = ball()
     assert not seen.sharp_edged and not seen.flat
     assert seen.contour > 0.9 and seen.common < 0.05 and seen.aligned == pytest.approx(2 / 3, abs=0.02)
+
+
+def test_each_part_of_an_outline_is_judged_by_itself() -> None:
+    assert ball(polarizing=np.where(X > 0, 0.35, 0.01)).contour == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_ball_that_hardly_polarizes_is_not_taken_for_a_plane() -> None:
