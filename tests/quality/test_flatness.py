@@ -50,7 +50,7 @@ def test_a_ball_is_rounded() -> None:
 
 
 def test_each_part_of_an_outline_is_judged_by_itself() -> None:
-    assert ball(polarizing=np.where(X > 0, 0.35, 0.01)).contour == pytest.approx(0.5, abs=0.05)
+    assert ball(polarizing=np.where(X > 0.5, 0.35, 0.01)).contour == pytest.approx(1 / 3, abs=0.05)
 
 
 def test_a_ball_that_hardly_polarizes_is_not_taken_for_a_plane() -> None:
