@@ -272,7 +272,7 @@ class SurfaceMaps(ArrayValue):
     specular: Floats  # (H, W, 3) F0, linear Rec.709
     roughness: Floats  # (H, W) perceptual, α = roughness²
     depth_prior: Floats | None  # (H, W) coarse depth, growing away, mean about 0; unit: √(mask pixels/π) px
-    confidence: Floats  # (H, W) expected normal error, degrees
+    confidence: Floats  # (H, W) expected normal error, degrees, not a confidence: the name is a key of stored maps
     mask: Bools  # (H, W)
     view: View
     estimator: str

@@ -5,7 +5,7 @@ import numpy as np
 
 from polcap.image_values import Floats
 
-_LEAST_SPREAD = 0.02
+_LEAST_SPREAD = 0.02  # within a group; it divides
 _MOST = 40_000  # colors that are grouped
 
 
@@ -26,5 +26,6 @@ def color_clusters(encoded: Floats, count: int) -> tuple[Floats, float]:
 def soft_share(encoded: Floats, center: Floats, spread: float) -> Floats:
     """Share (N, G) of each color (N, C) in each group; the shares of a color sum to 1."""
     distance = np.stack([np.linalg.norm(encoded - one, axis=-1) for one in center], axis=-1)
-    likeness = np.exp(-((distance / spread) ** 2) + (distance.min(axis=1, keepdims=True) / spread) ** 2)
+    nearest = distance.min(axis=1, keepdims=True)  # cancels in the share; without it, far colors would have 0/0
+    likeness = np.exp(-((distance / spread) ** 2) + (nearest / spread) ** 2)
     return np.asarray(likeness / likeness.sum(axis=1, keepdims=True))

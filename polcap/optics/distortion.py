@@ -40,7 +40,7 @@ def folds(lens: Distortion, width: float, height: float) -> bool:
     x, y = (max(c, side - c) for c, side in zip(lens.center, (width, height)))
     far = np.hypot(x, y) / lens.focal
     r2 = np.linspace(0, 1.3 * far, 64) ** 2
-    return not bool((1 + r2 * (3 * lens.k1 + 5 * r2 * lens.k2) > 0.05).all())  # so that NaN folds
+    return not bool((1 + r2 * (3 * lens.k1 + 5 * r2 * lens.k2) > 0.05).all())  # slope of the radius; NaN folds too
 
 
 def pinhole_box(lens: Distortion, box: tuple[int, int, int, int], size: tuple[int, int]) -> tuple[int, int, int, int]:

@@ -25,11 +25,15 @@ def transmission(c: Any, ior: Any) -> tuple[Any, Any]:
 
 def reflection(c: Any, ior: Any) -> tuple[Any, Any]:
     """Fresnel reflectances R₊, R₋ = (R_s ± R_p)/2 ≥ 0; c and ior broadcast."""
+    r_s, r_p = (amplitude**2 for amplitude in amplitudes(c, ior))
+    return (r_s + r_p) / 2, (r_s - r_p) / 2
+
+
+def amplitudes(c: Any, ior: Any) -> tuple[Any, Any]:
+    """Fresnel's amplitude coefficients of reflection r_s, r_p; r_s < 0 < r_p at normal incidence."""
     g = _refracted(c, ior)
     n2 = ior * ior
-    r_s = ((c - g) / (c + g)) ** 2
-    r_p = ((n2 * c - g) / (n2 * c + g)) ** 2
-    return (r_s + r_p) / 2, (r_s - r_p) / 2
+    return (c - g) / (c + g), (n2 * c - g) / (n2 * c + g)
 
 
 def normal_reflectance(ior: Any) -> Any:

@@ -385,7 +385,7 @@ def _robust(design: Floats, shift: Floats, information: Floats) -> _RobustFit:
         weighted = (weight[:, None, None] * informed).reshape(-1, k).T
         normal, right = weighted @ design.reshape(-1, k), weighted @ shift.ravel()
         parameters = np.linalg.solve(normal + np.eye(k) / _PRIOR_PX**2, right)
-        covariance = np.linalg.inv(normal + np.eye(k))
+        covariance = np.linalg.inv(normal + np.eye(k))  # with a prior 1σ of 1 px, so that the inverse exists
         residual = shift - design @ parameters
         chi2 = np.einsum("ti,tij,tj->t", residual, information, residual)
         scale = max(float(np.median(chi2)) / 1.386, 1e-6)  # χ² of two has median 1.386

@@ -120,5 +120,5 @@ def is_radiance(image: SensorImage) -> bool:
 
 def rounding_variance(image: SensorImage) -> float:
     """Noise variance from rounding to integer counts, in units of `signal`; nearly 0 for floating-point images."""
-    step = 1.0 if np.issubdtype(image.value.dtype, np.integer) else 1e-3
+    step = 1.0 if np.issubdtype(image.value.dtype, np.integer) else 1e-3  # count
     return float(step**2 / 12 / (image.white - float(image.black.mean())) ** 2)

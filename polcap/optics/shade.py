@@ -111,9 +111,7 @@ def _reflected(to_light: Any, axis: Any, cos_d: Any, ior: Any) -> tuple[Any, Any
     zero = xp.zeros_like(across_x)
     across = xp.stack([across_x, across_y, zero], axis=-1)
     inwards = frames.cross(-to_light, across)
-    root = (ior * ior - 1 + cos_d * cos_d) ** 0.5
-    r_s = (cos_d - root) / (cos_d + root)
-    r_p = (ior * ior * cos_d - root) / (ior * ior * cos_d + root)
+    r_s, r_p = fresnel.amplitudes(cos_d, ior)
     s, p = r_s * frames.dot(axis, across), r_p * frames.dot(axis, inwards)
     field_x, field_y = s * across_x - p * across_y, s * across_y + p * across_x  # p leaves along ray × across
     return field_x**2 + field_y**2, field_x**2 - field_y**2, 2 * field_x * field_y

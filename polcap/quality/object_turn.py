@@ -20,12 +20,12 @@ from polcap.image_values import Bools, Floats, MaskedImage, Quality
 from polcap.optics import outline, registration
 from polcap.optics.morphology import erode
 from polcap.optics.reduction import ObjectReduction
-from polcap.optics.resize import block_means
+from polcap.optics.resize import block_means, block_step
 from polcap.optics.robust import MAD_TO_SIGMA
 from polcap.optics.warp import warp
 from polcap.quality import rerendering
 from polcap.stage_values import Alignment, AngleStack, ObjectMask, SurfaceMaps
-from polcap.stages.align.detail import averaging_step, detail, fine_detail
+from polcap.stages.align.detail import detail, fine_detail
 from polcap.stages.cues import NOMINAL_IOR
 
 _MOST_PIXELS = 0.8e6  # a larger picture is averaged down first
@@ -65,7 +65,7 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask, map
     polarization is taken out.
     """
     found = ObjectTurn(*np.zeros((4, len(radiance.angle))))
-    step = averaging_step(object_.mask.shape, _MOST_PIXELS)
+    step = block_step(object_.mask.size, _MOST_PIXELS)
     relief = _relief(maps, object_, step)
     clipped = np.any(radiance.quality & int(Quality.CLIPPED) > 0, axis=0)
     inside = erode(relief > 0, _INWARD_PX) & (block_means(clipped, step) == 0)

@@ -16,9 +16,10 @@ from polcap.image_values import Floats, MaskedImage, Quality
 from polcap.optics import registration
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import Pyramid
+from polcap.optics.resize import block_step
 from polcap.stage_values import Alignment, AngleStack
 from polcap.stages import stage
-from polcap.stages.align.detail import averaging_step, detail, edge_strength, shows_detail
+from polcap.stages.align.detail import detail, edge_strength, shows_detail
 
 _GOOD_CORRELATION = 0.6  # of detail; above it edges need not be compared
 _MOST_PIXELS = 0.5e6  # a larger picture is averaged down first: it has detail to spare
@@ -58,7 +59,7 @@ def register(radiance: AngleStack, settings: AlignSettings) -> Alignment:
     crossed: Floats | None = None if radiance.crossed is None else np.eye(3)
     if settings.model == "none":
         return Alignment(transform, residual, correlation, crossed)
-    step = averaging_step(radiance.value.shape[1:3], _MOST_PIXELS)
+    step = block_step(radiance.quality[0].size, _MOST_PIXELS)
     reference = _detail(radiance.shot(0), step, settings)
     for k in range(1, shots):
         name = f"shot {np.degrees(radiance.angle[k]):g}°"

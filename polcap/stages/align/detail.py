@@ -17,11 +17,6 @@ _TYPICAL_DETAIL = 0.02  # relative; where noise exceeds it, detail is weighted d
 _LEAST_PIXELS = 30  # usable ones
 
 
-def averaging_step(shape: tuple[int, ...], most_pixels: float) -> int:
-    """Side of the blocks to average so that a picture (H, W) has at most so many pixels."""
-    return int(np.ceil(np.sqrt(shape[0] * shape[1] / most_pixels)))
-
-
 def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
     """Compute the fine detail of a shot: log radiance minus its Gaussian mean of 1σ = `detail_px`.
 
@@ -33,7 +28,7 @@ def detail(shot: MaskedImage, detail_px: float, step: int) -> Pyramid:
     height, width = total.shape
     variance = frames.total(shot.variance[: height * step : step, : width * step : step])  # it changes slowly
     sigma = np.sqrt(variance) / np.float32(step)
-    sample = (slice(None, None, 5),) * 2  # every fifth pixel suffices for a percentile
+    sample = (slice(None, None, 5),) * 2  # every fifth row and column suffice for a percentile
     floor = max(float(np.percentile(total[sample], 99)) * _FLOOR, 2 * float(np.median(sigma[sample])), 1e-9)
     level = np.maximum(total, 0)
     level += np.float32(floor)

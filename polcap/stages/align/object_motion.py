@@ -13,9 +13,9 @@ from polcap.optics import registration
 from polcap.optics.morphology import dilate
 from polcap.optics.projection import picture_corners, transform_points
 from polcap.optics.registration import Pyramid, Registration
-from polcap.optics.resize import area_mean
+from polcap.optics.resize import area_mean, block_step
 from polcap.stage_values import Alignment, AngleStack, ObjectMask
-from polcap.stages.align.detail import averaging_step, detail
+from polcap.stages.align.detail import detail
 
 _DETAIL_PX = 4.0  # as `align.detail_px`
 _MOST_PIXELS = 0.8e6  # a larger picture is averaged down first
@@ -48,7 +48,7 @@ def measure(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) -> 
     shift.length[1:] = np.nan  # until measured
     if not object_.mask.any():
         return shift
-    step = averaging_step(object_.mask.shape, _MOST_PIXELS)
+    step = block_step(object_.mask.size, _MOST_PIXELS)
     reference = detail(radiance.shot(0), _DETAIL_PX, step)[0]
     small = area_mean(object_.mask.astype(np.uint8), reference.picture.shape)
     around = dilate(small > 0, _RIM_PX)

@@ -6,13 +6,14 @@ the chart is; the stage `infer` adds this error where albedos are too bright.
 """
 
 from dataclasses import replace
-from math import hypot, log, pi, sqrt
+from math import hypot, log, sqrt
 
 import numpy as np
 
 from polcap.chart_values import ChartLight, ColorCalibration
 from polcap.image_values import Bools, Floats, View
 from polcap.optics import point_light
+from polcap.optics.outline import disc_radius
 from polcap.optics.projection import back_project
 from polcap.stage_values import StokesImage
 
@@ -88,4 +89,4 @@ def _middle(stokes: StokesImage, distance: float) -> Floats:
 
 def _radius(mask: Bools, view: View) -> float:
     """Radius of the object relative to its distance: that of a disc with as many pixels."""
-    return min(sqrt(mask.sum() / pi) / view.focal, _LARGEST_RADIUS)
+    return min(disc_radius(mask) / view.focal, _LARGEST_RADIUS)

@@ -96,8 +96,8 @@ def merge(capture: Capture, decode: Decode, settings: HdrSettings) -> AngleStack
     other shots. So a shot has the flash energy of its reference frame. Pixels clipped in every frame are taken from the
     darkest frame and flagged CLIPPED. Pixels whose frames disagree are taken from the reference frame alone, or from
     the darkest where that clips, and flagged GHOST. Exposure ratios are measured in the pixels; those of the metadata
-    are used only where pixels do not suffice and no flash fired. Ambient frames are subtracted in proportion to the
-    exposure by their settings; they are not registered.
+    are used only where pixels do not suffice and no flash fired. Ambient frames are scaled by their exposure relative
+    to the shot's frames, as the camera settings state it, and subtracted; they are not registered.
 
     Raises CaptureError: frames of different size, unknown exposure ratios, too much motion, or ambient frames as bright
     as their shot.

@@ -135,7 +135,7 @@ def vignetting(reference: Signals, other: Signals, ratio: Floats) -> Floats | No
     _, height, width = reference.shape
     a, b = tile_means(reference, TILE).sum(-1), (tile_means(other, TILE) / ratio).sum(-1)
     usable = block_means((reference.usable & other.usable).astype(np.float32), TILE) > 0.999
-    bright = usable & (a > 3 * _DIM) & (b > 3 * _DIM)
+    bright = usable & (a > 3 * _DIM) & (b > 3 * _DIM)  # sums of three channels
     if bright.sum() < 2 * _LEAST_TILES:
         return None
     row, column = np.nonzero(bright)
@@ -159,7 +159,10 @@ def _quadratic(x: Floats, y: Floats) -> Floats:
 
 
 def of_unlit(a: Floats, b: Floats, stated: float) -> float | None:
-    """Exposure ratio b / a of an unlit frame b, from tiles (T, C); None if b has light, or by `stated` too little."""
+    """Exposure ratio b / a of an unlit frame b, from tiles (T, C), with the ratio `stated` by capture.toml or settings.
+
+    None if b has more than 1 % of the light that is expected from `stated`, or if light is expected in too few tiles.
+    """
     a, b = a.sum(axis=1), b.sum(axis=1)
     bright = stated * a > _DIM
     if bright.sum() < _LEAST_TILES or b[bright].sum() > _UNLIT * stated * a[bright].sum():
@@ -210,12 +213,12 @@ def flicker(reference: Signals, other: Signals) -> float:
 
     A shutter exposes a picture row after row, so flicker changes the ratio from row to row only. Other causes (a room's
     light, motion, an error of the black level) change it from column to column as well. So the variance of the column
-    medians is subtracted from that of the row medians. So is twice the 1σ of their difference.
+    medians is subtracted from that of the row medians, and twice the 1σ of their difference, too.
     """
     size = min(max(reference.shape[1] // _FLICKER_ROWS, _LEAST_FLICKER_TILE), TILE)
     (a, inside), (b, other_inside) = tiles(reference, size), tiles(other, size)
     a, b = a.sum(axis=-1), b.sum(axis=-1)
-    lit = inside & other_inside & (a > 3 * _DIM)
+    lit = inside & other_inside & (a > 3 * _DIM)  # sums of three channels
     expected = a * (np.median(b[lit] / a[lit]) if lit.any() else 0)
     lit &= expected > 3 * _DIM
     change = np.full(a.shape, np.nan)
@@ -254,7 +257,7 @@ def _quotient(a: Floats, b: Floats) -> tuple[float, float] | None:
     for _ in range(6):
         error = (b - r * a) / np.sqrt(b)  # uniform noise if there is photon noise only
         scale = MAD_TO_SIGMA * float(np.median(np.abs(error)))
-        agree = np.abs(error) <= 4 * scale + 0.003 * np.sqrt(b)  # 4σ and 0.3 %
+        agree = np.abs(error) <= 4 * scale + 0.003 * np.sqrt(b)  # 4σ plus 0.3 % of b
         if agree.sum() < _LEAST_TILES / 2:
             return None
         r = float(b[agree].sum() / a[agree].sum())

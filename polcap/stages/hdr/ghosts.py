@@ -146,9 +146,9 @@ def _weight(used: Bools) -> Floats | np.float32:
 
 
 def _wiener(x: Floats, electrons: Floats | np.float32, floor: Floats | np.float32) -> Floats:
-    """Wiener-filter a picture x (h, w): local means replace detail that noise explains.
+    """Wiener-filter a picture x (h, w): local means replace detail that 1.5 times the noise variance explains.
 
-    `electrons` is their number per unit of x, `floor` the variance of the read noise [electrons²].
+    `electrons` is the number of electrons per unit of x, `floor` the variance of the read noise [electrons²].
     """
     mean = box(x)
     distance = x - mean

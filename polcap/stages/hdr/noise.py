@@ -182,7 +182,10 @@ def misfit(first: Signals, second: Signals, ratio: Floats, lines: tuple[Noise, N
 
 
 def _fit_misfit(expected: Floats, seen: Floats, edge: Floats) -> float:
-    """Fit k in seen = expected + k · edge (tile variances) by relative least squares, without the worst 3 %."""
+    """Fit k in seen = expected + k · edge (tile variances) by relative least squares, without the worst 3 %.
+
+    0 for too few tiles with edges, or if k is below 3σ.
+    """
     good = np.isfinite(seen) & (edge > 0.5 * expected)
     if good.sum() < _LEAST_TILES:
         return 0.0
@@ -241,7 +244,7 @@ def _line(samples: list[Samples], channel: int, iso: float | None, least: float,
         if good.sum() < _LEAST_TILES:
             continue
         signal, variance = sample.signal[good, channel], sample.variance[good, channel]
-        order = np.argsort(signal.round(6), kind="stable")  # equal on every processor
+        order = np.argsort(signal.round(6), kind="stable")  # rounded: equal on every processor
         for chosen in np.array_split(order, np.clip(len(order) // 25, 2, 32)):
             bins.append((signal[chosen], variance[chosen], sample.with_detail))
     if not bins:

@@ -21,10 +21,10 @@ from polcap.stages.hdr.bracket import AmbientLight, Bracket, ComparedBracket, am
 from polcap.stages.hdr.ghosts import RegisteredFrame
 from polcap.stages.hdr.planes import Reader, blocks, resample
 
-_FALL = 0.05  # range of signal below clipping in which the factor on a frame's weight falls from 1 to `_LEAST`
-_LEAST = 1e-3
+_FALL = 0.05  # range of signal below clipping in which the factor on a frame's weight falls from 1 to `_AT_CLIPPING`
+_AT_CLIPPING = 1e-3  # almost 0
 _BLOCK_PX = 64_000  # px of a block and channel: all planes of a block then fit a core's cache
-_FALLBACK = 1e-9  # weight of the reference frame where it is not used, so that every pixel has a value
+_FALLBACK = 1e-9  # factor on the reference frame's weight where it is not used, so that every pixel has a value
 _AS_DARK = 1.02  # exposure over that of the darkest frame up to which a frame counts as darkest too
 _DARK_SIGMAS = np.float32(2)  # pixels below this many standard deviations are flagged DARK
 
@@ -38,7 +38,7 @@ class WeightedFrame:
     ambient: np.float32  # exposure to ambient light, relative to the reference frame
     is_darkest: bool  # its weight does not fall near saturation, because no frame is darker
     cfa: Bits | None  # of an interpolated mosaic; None: binned
-    least: np.float32  # weight where the frame is not used
+    fallback: np.float32  # factor on its weight where it is not used
 
 
 @dataclass(frozen=True)
@@ -105,22 +105,24 @@ class WeightedBracket:
         return total, variance
 
     def _trust(self, one: WeightedFrame, estimate: Floats, rows: slice) -> Floats | np.float32:
-        """Factor on a frame's weight, (h, W) or one number: it falls smoothly from 1 to almost 0 near saturation.
+        """Factor on a frame's weight, (h, W) or one number: it falls from 1 to almost 0 near saturation.
 
-        So weights have no step. Where the frame is not used, the factor is almost 0 too.
+        So weights have no step. The darkest frame keeps the factor 1 near saturation, because no other frame has these
+        pixels. Where a frame is not used, the factor is its `fallback`.
         """
         used = one.used[rows]
-        trust: Floats | np.float32 = np.float32(1) if used.all() else np.maximum(used, one.least)
+        trust: Floats | np.float32 = np.float32(1) if used.all() else np.maximum(used, one.fallback)
         if one.is_darkest:
             return trust
-        peak = np.maximum.reduce([plane * ratio for plane, ratio in zip(estimate, one.frame.ratio)])
+        # expected signal of the brightest channel, with the ambient light
+        brightest = np.maximum.reduce([plane * ratio for plane, ratio in zip(estimate, one.frame.ratio)])
         if self.ambient is not None:
-            peak += one.ambient * self.ambient.value[:, rows].max(axis=0)
-        ramp = (np.float32(one.frame.signals.clip) - peak) * np.float32(1 / _FALL)
-        return np.asarray(trust * np.clip(ramp, np.float32(_LEAST), 1))
+            brightest += one.ambient * self.ambient.value[:, rows].max(axis=0)
+        ramp = (np.float32(one.frame.signals.clip) - brightest) * np.float32(1 / _FALL)
+        return np.asarray(trust * np.clip(ramp, np.float32(_AT_CLIPPING), 1))
 
     def _noise(self, one: WeightedFrame, rows: slice, radiance: Floats, edges: Floats | None) -> Floats:
-        """Noise variance of a frame at the expected `radiance` (C, h, W), times its exposure ratio."""
+        """Noise variance of a frame's radiance, times its exposure ratio; `radiance` (C, h, W) is the expected one."""
         frame, ratio = one.frame, one.frame.ratio[:, None, None]
         if self.ambient is not None:
             radiance = radiance + one.ambient / ratio * np.maximum(self.ambient.value[:, rows], 0)
@@ -154,6 +156,7 @@ def prepare(
         if full or ambient is not None:
             frame = _read_again(bracket.shot.frames[e], frame, read, full)
         is_darkest, usable = exposures[e] < _AS_DARK * exposures[darkest], frame.signals.usable
+        # the darkest frame, unless it moved, gives clipped pixels their value
         used = usable if frame.motion is not None or not is_darkest else np.ones_like(usable)
         if e == bracket.reference:
             by_reference = used
@@ -167,7 +170,7 @@ def prepare(
                 ambient=np.float32(exposure.of_ambient(bracket.shot.frames[e], reference)),
                 is_darkest=is_darkest,
                 cfa=read(bracket.shot.frames[e]).cfa if full else None,
-                least=np.float32(_FALLBACK if e == bracket.reference else 0),
+                fallback=np.float32(_FALLBACK if e == bracket.reference else 0),
             )
         )
     return WeightedBracket(frames, estimate, ghost, ambient, unclipped)

@@ -79,13 +79,13 @@ def _scale_error(cues: Cues, maps: SurfaceMaps, sigma: float) -> float:
     """Relative error (1σ) of the scale of all albedos: `sigma` of the chart's light, and the risk that it is doubled.
 
     A chart behind the object, or in a shadow, gets less light than the object. The only sign is an albedo above that of
-    white things. A lower limit of the albedo is compared: S0 over the root of the shading, less the error `sigma`.
+    white things. So the 95th percentile of the albedo S0/√cos θ, reduced by `sigma`, is compared with theirs.
     """
     cosine = frames.dot(maps.normal, cues.rays)
     leaning = cues.mask & (cues.quality == 0) & (cosine > _LEANING[0]) & (cosine < _LEANING[1])
     albedo = cues.radiance[leaning].max(axis=-1) / np.sqrt(cosine[leaning])
-    least = log(max(float(np.percentile(albedo, _BRIGHTEST)), 1e-6)) - sigma if len(albedo) else -inf
-    odds = _ODDS_OF_DOUBLED * (1 + exp((least - _WHITE) / _WHITE_SPREAD))
+    log_albedo = log(max(float(np.percentile(albedo, _BRIGHTEST)), 1e-6)) - sigma if len(albedo) else -inf
+    odds = _ODDS_OF_DOUBLED * (1 + exp((log_albedo - _WHITE) / _WHITE_SPREAD))  # that the scale is doubled
     return hypot(sigma, _MAPS_SIGMA, _LN_DOUBLED * sqrt(odds / (1 + odds)))
 
 
@@ -93,8 +93,8 @@ def _select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:
     """Select the part of the RAW's fine detail that belongs to the albedo, by a Wiener filter; (2H, 2W) float16.
 
     `detail` (2H, 2W) is the logarithm of light of RAW pixels over that of superpixels (H, W): prints and fine relief
-    alike. It is multiplied by the share of its local power that neither shading nor noise explains. Relief continues
-    from scale to scale, so the shading of the normals shows how strong finer shading may be.
+    alike. Each pixel is multiplied by the share of the local power that neither shading nor noise explains. Relief
+    continues from scale to scale, so the shading of the normals shows how strong finer shading may be.
     """
     solid = cues.mask & ((cues.quality & np.uint8(_DEFECTS)) == 0)
     inside = erode(solid, _EDGE_PX, from_border=True)
@@ -110,17 +110,17 @@ def _select_detail(detail: Floats, cues: Cues, maps: SurfaceMaps) -> Floats:
 def _power_of_shading(cues: Cues, maps: SurfaceMaps) -> Floats:
     """Squared logarithm (H, W) of the fine shading of the normals, plus that which their expected error may cause."""
     albedo = np.maximum(masked_mean(maps.diffuse.mean(axis=-1), cues.mask, _DETAIL_AROUND), _DARKEST)
-    gloss, alpha = maps.specular.mean(axis=-1), np.maximum(maps.roughness**2, _DARKEST)
+    f0, alpha = maps.specular.mean(axis=-1), np.maximum(maps.roughness**2, _DARKEST)
 
     def log_light(zenith: Floats) -> Floats:
         """Logarithm (H, W) of the light of surfaces at a zenith angle, with the flash at the lens."""
         c = np.maximum(np.cos(zenith), _GRAZING)
         mirrored = pi * brdf.ggx_distribution(c, alpha) * brdf.smith_masking(c, c, alpha) / (4 * c)
-        return np.asarray(np.log(albedo * c + gloss * mirrored), np.float32)
+        return np.asarray(np.log(albedo * c + f0 * mirrored), np.float32)
 
     zenith = np.arccos(np.clip(frames.dot(maps.normal, cues.rays), 0, 1))
     error = np.radians(maps.confidence)
     light = log_light(zenith)
     fine = light - masked_mean(light, cues.mask, _BAND)
-    of_error = (log_light(np.maximum(zenith - error, 0)) - log_light(zenith + error)) / 2
-    return np.asarray(_SHADING * fine**2 + _UNCERTAIN * of_error**2)
+    by_error = (log_light(np.maximum(zenith - error, 0)) - log_light(zenith + error)) / 2  # change for 1σ
+    return np.asarray(_SHADING * fine**2 + _UNCERTAIN * by_error**2)

@@ -86,14 +86,14 @@ def _adaptive_mean(cues: Cues) -> tuple[Floats, Floats]:
     narrower: list[tuple[Floats, Floats]] = []
     ratio, sigma = cues.ratio, cues.ratio_sigma
     weighted, weighted_sigma = ((image * light).astype(np.float32) for image in (ratio, sigma))
-    constant = cues.mask
+    constant = cues.mask  # pixels whose means so far agree
     for blur in _BLURS_PX:
         weight = cv2.GaussianBlur(light, (0, 0), blur) + np.float32(1e-9)
         mean = np.stack([cv2.GaussianBlur(part, (0, 0), blur) / weight for part in weighted])
         noise = cv2.GaussianBlur(weighted_sigma, (0, 0), blur) / weight / np.float32(np.sqrt(4 * np.pi) * blur)
-        for other, limit in narrower:
+        for other, squared_limit in narrower:
             change = mean - other
-            constant = constant & (change[0] ** 2 + change[1] ** 2 < limit)
+            constant = constant & (change[0] ** 2 + change[1] ** 2 < squared_limit)
         ratio, sigma = np.where(constant, mean, ratio), np.where(constant, noise, sigma)
         narrower.append((mean, (_SAME * noise) ** 2))
     return ratio, sigma
@@ -110,27 +110,28 @@ def _azimuth_by_guide(axis: Floats, rays: Floats, normal: Floats, sigma: Floats)
     phi = np.arctan2(axis[1], axis[0]) / 2
     azimuth = frames.axis_on_ray(phi, rays)
     agreement = normal[..., 0] * np.cos(azimuth) + normal[..., 1] * np.sin(azimuth)
-    spread = np.radians(np.maximum(sigma, 1.0))
+    spread = np.radians(np.maximum(sigma, 1.0))  # at least 1°
     return np.where(agreement < 0, phi + np.pi, phi), np.asarray(erf(np.abs(agreement) / (np.sqrt(2) * spread)))
 
 
 def _normals_on_rays(cos_zenith: Floats, phi: Floats, rays: Floats) -> Floats:
     """Unit normals (H, W, 3) in the frame of each ray, from cosines of the zenith and azimuths φ (H, W)."""
     x, y = frames.axis_across(phi, rays)
-    share = np.sqrt(np.maximum(1 - cos_zenith**2, 0) / (x * x + y * y))
-    return np.stack([share * x, share * y, cos_zenith], axis=-1)
+    scale = np.sqrt(np.maximum(1 - cos_zenith**2, 0) / (x * x + y * y))  # to the length sin θ
+    return np.stack([scale * x, scale * y, cos_zenith], axis=-1)
 
 
 def _expected_error(zenith: ZenithEstimate, dolp: Floats, sigma: Floats, certainty: Floats, cues: Cues) -> Floats:
     """Expected normal error (H, W), degrees.
 
     Its terms are noise, the choice of the diffuse law, model error, the 180° ambiguity, and 15° at pixels whose quality
-    flags show that the model fails. A wrong half-turn costs 2θ and happens with probability (1 − certainty)/2.
+    flags show that the model fails. A normal on the wrong side is off by 2θ, with the probability (1 − certainty)/2.
     """
     step = np.maximum(sigma, 1e-5)
     low, high = (zenith.at(np.maximum(dolp + s * step, 0)) for s in (-1, 1))
     zenith_error = np.hypot((high - low) / 2, zenith.spread)
-    azimuth_error = np.sin(zenith.angle) * np.minimum(sigma / (2 * np.maximum(dolp, 1e-5)), np.pi / 4)
+    aolp_error = np.minimum(sigma / (2 * np.maximum(dolp, 1e-5)), np.pi / 4)  # the mean error of a random axis is π/4
+    azimuth_error = np.sin(zenith.angle) * aolp_error
     flip = (1 - certainty) / 2 * 2 * zenith.angle
     noise = np.degrees(np.hypot(zenith_error, azimuth_error))
     doubtful = (cues.quality & (Quality.ILL_POSED | Quality.METAL | Quality.OUTSIDE | Quality.CLIPPED)) > 0
@@ -145,7 +146,7 @@ def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]
     opening removes, where the zenith is under 35°. The rest of the radiance, divided by cos θ T₊(θ) T₊(0), is the
     albedo. The cosine has a lower limit, because reflected room light brightens the outline.
     """
-    size = max(5, round(_HIGHLIGHT * np.sqrt(max(cues.mask.sum(), 1)))) | 1  # odd
+    size = max(5, round(_HIGHLIGHT * np.sqrt(max(cues.mask.sum(), 1)))) | 1  # px, odd
     radiance = highlights.fill(cues.radiance, cues) / cues.rays[..., 2:] ** 2  # off the axis the flash is farther
     darkest = cv2.GaussianBlur(radiance.min(-1), (0, 0), 1.0)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
@@ -159,9 +160,10 @@ def _albedo(cues: Cues, cos_zenith: Floats, ior: float) -> tuple[Floats, Floats]
 
 
 def _gloss(highlight: Floats, cos_zenith: Floats, cues: Cues) -> tuple[float, float]:
-    """Fit one roughness and one F0 for the object: the GGX lobe over the zenith that fits the highlight (H, W) best.
+    """Fit one roughness and one F0 for the object: those of the GGX lobe that fits the highlight (H, W) best.
 
-    Without a clear highlight they are those of a common dielectric, (0.5, 0.04).
+    The highlight is averaged in bins of 3° of the zenith. Without a clear highlight the result is that of a common
+    dielectric, (0.5, 0.04).
     """
     roughness, f0 = 0.5, 0.04
     usable = cues.mask & ((cues.quality & Quality.CLIPPED) == 0) & (cos_zenith > np.cos(np.radians(45)))

@@ -31,7 +31,7 @@ CHANNELS = (
     "roughness",
     "log_shrink",  # ln of the crop's pixels per pixel of the main network
 )  # fmt: skip
-SIZE_MULTIPLE = 8
+SIZE_MULTIPLE = 8  # the network's height and width are multiples of this
 _COARSEST = 2.0  # 1σ in the main network's pixels: it resolves structure that is coarser
 _TILE, _MARGIN = 512, 32  # px, multiples of SIZE_MULTIPLE; a margin of 64 changes normals by .05° at most
 
@@ -42,7 +42,7 @@ class CoarseEstimate:
 
     normal: Floats  # (H, W, 3) by network and inversion, camera frame
     smooth: Floats  # (H, W, 3) by the main network alone, camera frame
-    sigma: Floats  # (H, W) its expected error, degrees
+    sigma: Floats  # (H, W) expected error of `smooth`, degrees
     roughness: Floats  # (H, W)
     shrink: float  # the crop's pixels per pixel of the main network
 
@@ -52,7 +52,7 @@ def encode(cues: Cues, estimate: CoarseEstimate) -> Floats:
     channels = [
         *np.moveaxis(frames.to_ray_frame(estimate.normal, cues.rays), -1, 0),
         *np.moveaxis(frames.to_ray_frame(estimate.smooth, cues.rays), -1, 0),
-        np.log(np.maximum(estimate.sigma, 0.5)), estimate.roughness,
+        np.log(np.maximum(estimate.sigma, 0.5)), estimate.roughness,  # 0.5° at least
         np.full(cues.mask.shape, np.log(estimate.shrink), np.float32),
     ]  # fmt: skip
     return np.concatenate([cue_channels.channels(cues), np.stack(channels) * cues.mask]).astype(np.float32)

@@ -133,8 +133,8 @@ def pool_gloss(maps: SurfaceMaps, cues: Cues) -> SurfaceMaps:
     share = clusters.soft_share(features, center, spread)  # (N, K)
     member = np.full(mask.shape, -1)
     member[mask] = share.argmax(axis=1)
-    beyond = (cues.radiance - maps.diffuse).mean(axis=-1)  # than the albedo of a surface that faces the lens
-    mirrored = masked_mean(beyond, mask, max(_LEAST_BLUR_PX, _BLUR * disc_radius(mask)))
+    excess = (cues.radiance - maps.diffuse).mean(axis=-1)  # of S0 over the diffuse light of a surface facing the lens
+    mirrored = masked_mean(excess, mask, max(_LEAST_BLUR_PX, _BLUR * disc_radius(mask)))
     zenith = np.degrees(np.arccos(np.clip(frames.dot(maps.normal, cues.rays), 0, 1)))
     weight = share / np.maximum(share.sum(axis=0), 1e-9)
     f0 = np.interp(weight.T @ maps.specular[mask].mean(axis=-1), _PREDICTED_F0, _MEDIAN_F0)

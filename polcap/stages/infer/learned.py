@@ -26,7 +26,7 @@ from polcap.stages.infer.highlights import LEAST_KNOWN
 from polcap.stages.infer.shape import half_turns, integrable_normals, planar_faces
 
 _INVERSION = 4.0  # factor on the inversion's expected error in the join, for the network's input holds the inversion
-# error = min(a·statedᵇ, c), degrees: maximum likelihood on simulated captures and on test pictures (decision 28)
+# error = min(a·predictedᵇ, c), degrees: maximum likelihood on simulated captures and on test pictures (decision 28)
 _CALIBRATION = (0.51, 1.19, 40.0)
 _SIZES = (1.5625, 0.875)  # of the network's pictures, over its native size: 400 and 224 px (decision 9)
 # sizes of smaller pictures, over the native size, and positions of each: evidence for the side of normals
@@ -46,10 +46,10 @@ def estimate(
 
     Raises ModelError: a network was made for other channels, or returns other maps.
     """
-    maps, coarse, stated = estimate_coarse(cues, network, run, ior, symmetries)
+    maps, coarse, predicted_error = estimate_coarse(cues, network, run, ior, symmetries)
     normal = fine.refine(cues, coarse, network.fine, run) if fine_pass and network.fine else coarse.normal
     scale, power, most = _CALIBRATION
-    error = np.minimum(scale * stated**power, most)
+    error = np.minimum(scale * predicted_error**power, most)
     error = half_turns.error_with_doubt(error, maps["doubt"], frames.dot(normal, cues.rays))
     normal = integrable_normals.make_integrable(normal, error, cues.mask, cues.rays)
     normal = planar_faces.flatten(normal, error, cues.mask)
@@ -76,9 +76,9 @@ def estimate_coarse(
 ) -> tuple[dict[str, Floats], fine.CoarseEstimate, Floats]:
     """Estimate normals and material before refinement (steps 1–3); also the input of the refinement network's training.
 
-    Returns three values: the network's maps (H, W[, 3]) at the crop's size, the normals before refinement, and their
-    expected error (H, W) in degrees, not yet calibrated. The maps also have `factor`, see `_log_factor`, and `doubt`,
-    the probability of a wrong azimuth side.
+    `symmetries` is the number of turned and mirrored positions that the network sees. Returns the network's maps
+    (H, W[, 3]) at the crop's size, the normals before refinement, and their expected error (H, W) in degrees, not yet
+    calibrated. The maps also have `factor`, see `_log_factor`, and `doubt`, the probability of a wrong azimuth side.
     """
     size = cues.mask.shape[::-1]
     scale = int(network.metadata["native_size"]) / max(size)
@@ -87,19 +87,19 @@ def estimate_coarse(
     pictures = [reduced, *(_reduce(reduced, other / largest) for other in others)]
     small = sizes_and_positions.predict(pictures, network, run, symmetries)
     overview = _overview(reduced, min(scale, 1.0) / largest, network, run)
-    doubt = half_turns.NetworkDoubt(small["sigma"], small.pop("opposed"), overview)
-    small["normal"], small["doubt"] = _correct_half_turns(small["normal"], reduced, doubt)
+    evidence = half_turns.NetworkDoubt(small["sigma"], small.pop("opposed"), overview)
+    small["normal"], small["doubt"] = _correct_half_turns(small["normal"], reduced, evidence)
     small["factor"] = _log_factor(small["diffuse"] * _shading(small["normal"], reduced.rays), reduced)
-    without_grid = _masked_filter(small["roughness"], reduced.mask, sizes_and_positions.BINOMIAL, LEAST_KNOWN)
-    small["roughness"] = np.where(reduced.mask, without_grid, small["roughness"])
+    smoothed = _masked_filter(small["roughness"], reduced.mask, sizes_and_positions.BINOMIAL, LEAST_KNOWN)
+    small["roughness"] = np.where(reduced.mask, smoothed, small["roughness"])  # without the network's 2 px grid
     maps = {name: np.asarray(cv2.resize(image, size)) for name, image in small.items()}
     smooth = frames.unit(maps["normal"])
     guide = np.asarray(frames.to_ray_frame(smooth, cues.rays)), maps["sigma"]
     by_pixel, error, _ = analytic.invert(cues, ior, guide)
-    shrink = 1 / largest
+    shrink = 1 / largest  # the crop's pixels per pixel of the network's largest picture
     detailed = _add_detail(smooth, by_pixel, cues.mask, shrink)
-    normal, stated = _join((smooth, maps["sigma"]), (detailed, _INVERSION * error))
-    return maps, fine.CoarseEstimate(normal, smooth, maps["sigma"], maps["roughness"], shrink), stated
+    normal, predicted_error = _join((smooth, maps["sigma"]), (detailed, _INVERSION * error))
+    return maps, fine.CoarseEstimate(normal, smooth, maps["sigma"], maps["roughness"], shrink), predicted_error
 
 
 def _compare_orders(cues: Cues, network: Network, run: RunNetwork) -> OrderTest | None:
@@ -125,11 +125,11 @@ def _compare_orders(cues: Cues, network: Network, run: RunNetwork) -> OrderTest 
 
 
 def _transformed(cues: Cues, matrix: Floats) -> Cues:
-    """Cues after multiplication of the Stokes parameters by a matrix (3, 3)."""
-    stokes = np.einsum("jk,khw->jhw", matrix, np.stack([np.ones_like(cues.dolp), *cues.ratio]))
-    total = np.maximum(stokes[0], 1e-3)
-    changed = replace(cues, radiance=cues.radiance * total[..., None])
-    return _with_polarization(changed, stokes[1:] / total, cues.ratio_sigma)
+    """Cues of another order of the shots, by its `OtherOrder.matrix` (3, 3); the identity gives the stated order."""
+    stokes = np.einsum("jk,khw->jhw", matrix, np.stack([np.ones_like(cues.dolp), *cues.ratio]))  # over the stated S0
+    s0 = np.maximum(stokes[0], 1e-3)  # positive, because it divides
+    changed = replace(cues, radiance=cues.radiance * s0[..., None])
+    return _with_polarization(changed, stokes[1:] / s0, cues.ratio_sigma)
 
 
 def _with_polarization(cues: Cues, ratio: Floats, sigma: Floats) -> Cues:
@@ -178,7 +178,8 @@ def _reduce(cues: Cues, scale: float) -> Cues:
 def _overview(reduced: Cues, scale: float, network: Network, run: RunNetwork) -> Floats:
     """Mean lean (2, H, W) across the ray of the normals that the network predicts from pictures smaller than `reduced`.
 
-    The fewer the pixels, the more of the object the network takes in at once. One position alone is not reliable.
+    `scale` is the network's native size over that of `reduced`. In a picture of fewer pixels the network sees more of
+    the object at once. One position alone is not reliable.
     """
     lean = np.zeros((2, *reduced.mask.shape), np.float32)
     for size in _OVERVIEWS:
@@ -207,19 +208,19 @@ def _log_factor(light: Floats, reduced: Cues) -> Floats:
     """
     known = reduced.mask & ((reduced.quality & Quality.CLIPPED) == 0)
     factor = np.log((light + FLOOR) / (np.maximum(reduced.radiance, 0) + FLOOR))
-    near, far = (
+    inside, outside = (
         _masked_filter(factor, known, kernel, 1e-3, cv2.BORDER_CONSTANT)
         for kernel in (sizes_and_positions.BINOMIAL, cv2.getGaussianKernel(9, 2).astype(np.float32))
     )
-    return np.where(known[..., None], near, far)
+    return np.where(known[..., None], inside, outside)
 
 
 def _masked_filter(
     image: Floats, mask: Bools, kernel: Floats, least: float, border: int = cv2.BORDER_DEFAULT
 ) -> Floats:
-    """Separable filter of an image (H, W[, 3]) that uses only pixels in the mask (H, W), divided by their weight.
+    """Mean of an image (H, W[, 3]) over the pixels in the mask (H, W), weighted by a separable filter.
 
-    The weight counts as at least `least`.
+    The sum of the weights counts as at least `least`.
     """
     inside = mask.astype(np.float32)
     extra = (None,) * (image.ndim - 2)
@@ -253,7 +254,7 @@ def _join(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
 def _shading(normal: Floats, rays: Floats) -> Floats:
     """Shading (H, W, 1) that the albedo estimate assumes for normals and rays: √cos θ, limited.
 
-    The square root of Lambert's law left the least error of the albedo, on pictures of both protocols, engraved or
-    not, and on path-traced captures: normals err, and light from around brightens surfaces that turn away.
+    The square root of Lambert's law leaves the least error of the albedo, on training pictures and on path-traced
+    captures: normals have errors, and light from the surroundings brightens surfaces that turn away.
     """
     return np.asarray(np.sqrt(np.maximum(frames.to_ray_frame(frames.unit(normal), rays)[..., 2:], _GRAZING)))

@@ -35,10 +35,11 @@ _NEAREST = 0.05  # least distance between unit vectors, about 3°: nearer ones w
 def predict(pictures: Sequence[Cues], network: Network, run: RunNetwork, symmetries: int) -> dict[str, Floats]:
     """The network's maps (H, W[, 3]), averaged over 1, 2, 4 or 8 rotated and mirrored positions.
 
-    `pictures` show the same object at different sizes, and take the positions in turns; the maps have the grid of the
-    first. In a large picture the network resolves more; in a small one it understands textures and large forms better.
-    Where it expects a smaller error in one size than in another, that size counts more. The map `opposed` (H, W) is the
-    share of the positions in which the normal leans to the other side of the ray.
+    `pictures` show the same object at different sizes. The positions are dealt out to them in turn: with two pictures,
+    the first gets positions 1, 3, …. The maps have the grid of the first. In a large picture the network resolves more;
+    in a small one it understands textures and large forms better. A size for which it expects smaller errors than for
+    the others counts more. The map `opposed` (H, W) is the share of the positions in which the normal leans to the
+    other side of the ray than the mean.
     """
     first, count = pictures[0], min(len(pictures), symmetries)
     encoded = [np.moveaxis(channels(picture), 0, -1) for picture in pictures[:count]]
@@ -57,8 +58,8 @@ def predict(pictures: Sequence[Cues], network: Network, run: RunNetwork, symmetr
         for name in OUTPUTS
     }
     normal = maps["normal"] * first.mask[..., None]
-    towards = normal - frames.dot(normal, first.rays)[..., None] * first.rays
-    opposed = np.mean([frames.dot(of["normal"], towards) < 0 for of in predictions], axis=0)
+    lean = normal - frames.dot(normal, first.rays)[..., None] * first.rays  # (H, W, 3) across the ray
+    opposed = np.mean([frames.dot(of["normal"], lean) < 0 for of in predictions], axis=0)
     return maps | {"normal": normal, "opposed": opposed.astype(np.float32)}
 
 
@@ -74,7 +75,7 @@ def _mean(predictions: Sequence[dict[str, Floats]]) -> dict[str, Floats]:
 
 
 def _weights(errors: Sequence[Floats], mask: Bools) -> Floats:
-    """Weights (K, H, W) of K sizes of the picture by their expected errors (H, W), averaged over the neighborhood."""
+    """Weights σ⁻¹² (K, H, W) of K sizes of the picture; σ is the expected error (H, W), averaged around each pixel."""
     inside = mask.astype(np.float32)
     around = np.stack([cv2.GaussianBlur(error * inside, (0, 0), _NEAR_PX) for error in errors]) + _LEAST_ERROR
     weights = (around / around.min(axis=0)) ** -_POWER

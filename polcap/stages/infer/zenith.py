@@ -91,7 +91,7 @@ def estimate_zenith(dolp: Floats, cues: Cues, ior: float, guide: tuple[Floats, F
         score += _round_outline(dolp, cues, laws)
         if guide is not None:
             deviation = (angles - guide[0].flat[sample]) / np.maximum(guide[1].flat[sample], _LEAST_GUIDE_SIGMA)
-            score -= _PATCHES / 2 * np.minimum(deviation**2, _MOST_MISFIT).mean(axis=1)
+            score -= _PATCHES / 2 * np.minimum(deviation**2, _MOST_MISFIT).mean(axis=1)  # −χ²/2 of independent patches
     weights = np.exp(score - score.max())
     weights /= weights.sum()
     grid = np.linspace(0, float(laws.dolp.max()), _GRID)

@@ -44,7 +44,7 @@ def probability(color: Floats, chart: Bools) -> Floats:
     if not border.any():
         return np.full_like(log, 0.5)
     level = float(np.percentile(log[border], 40))  # of the backdrop; the object may touch the border
-    spread = 1.5 * float(np.median(level - log[border & (log <= level)]))
+    spread = 1.5 * float(np.median(level - log[border & (log <= level)]))  # about 1σ of the backdrop
     chroma = color / (color.sum(-1, keepdims=True) + 1e-3 * bright)
     difference = np.abs(chroma - np.median(chroma[border], axis=0)).sum(-1)
     brighter = (log - level - np.clip(4 * spread, *_BRIGHTER)) / _SOFT_STOPS

@@ -38,18 +38,18 @@ def measure(
     sound = warp(flags, alignment.crossed, shots.crop, order=1) == 0
     solve = np.linalg.pinv(mueller.analyzer(angle))
     s0, s1, s2 = np.einsum("jk,khwc->jhwc", solve, shots.value / gain[:, None, None])
-    across = crossing.polarization_along(s1, s2, radiance.crossed.angle)
+    p = crossing.polarization_along(s1, s2, radiance.crossed.angle)
     inside = shots.mask & (shots.quality == 0) & sound
     weight = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), _BLUR_PX)
-    uncrossed, crossed = (
+    expected, crossed = (  # I = D − p²/D of `optics/crossing`, and the crossed shot
         cv2.GaussianBlur((part * inside[..., None]).astype(np.float32), (0, 0), _BLUR_PX)
-        for part in (s0 - across**2 / np.maximum(s0, 1e-9), picture)
+        for part in (s0 - p**2 / np.maximum(s0, 1e-9), picture)
     )
-    lit = inside & (weight > 0.5) & (crossed.min(-1) > 0) & (uncrossed.min(-1) > 0)
+    lit = inside & (weight > 0.5) & (crossed.min(-1) > 0) & (expected.min(-1) > 0)
     bright = lit & (crossed.sum(-1) > 0.2 * np.median(crossed.sum(-1)[lit])) if lit.any() else lit
     if bright.sum() < _LEAST_PX:
         return None
-    ratio = np.log(uncrossed[bright] / crossed[bright])  # (N, 3)
+    ratio = np.log(expected[bright] / crossed[bright])  # (N, 3)
     return np.asarray(np.exp(np.median(ratio[_closest(ratio.mean(-1))], axis=0)))
 
 

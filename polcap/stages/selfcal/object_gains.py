@@ -82,7 +82,7 @@ def register(radiance: AngleStack, alignment: Alignment, object_: ObjectMask) ->
     light = np.stack([cv2.GaussianBlur(frames.total(v), (0, 0), _BLUR_PX) for v in value])
     mask = object_.mask[y0:y1, x0:x1]
     solid = erode(mask, 3)
-    inside = np.asarray((solid if solid.sum() > 100 else mask) & (quality == 0))
+    inside = np.asarray((solid if solid.sum() > 100 else mask) & (quality == 0))  # a thin object keeps its edge
     height, width = radiance.value.shape[1:3]
     return ObjectShots(value, light, quality, mask, inside, crop, (height, width))
 
@@ -180,9 +180,9 @@ def facing(light: Floats, usable: Bools, angle: Floats) -> GainEstimate:
     """Gains (K,) from pixels that face the camera: the ratios of the shots (K, H, W) that most pixels have.
 
     On a rounded object the density of (S1, S2)/S0 grows as 1/θ² towards 0, independent of the albedo. Mean shift with a
-    shrinking kernel finds peaks from several starts, and the peak with most pixels is the result. Two cases increase
-    its error. Other peaks have nearly as many pixels: flat faces and light from all sides. All slopes around the peak
-    point to one side: it is a tilted ridge. The angles (K,) rad affect only the error.
+    shrinking kernel finds peaks from several starts, and the peak with most pixels is the result. Its error is larger
+    if other peaks have nearly as many pixels (flat faces, light from all sides), or if all slopes around the peak point
+    to one side (a tilted ridge). The angles (K,) rad affect only the error.
     """
     shots = len(light)
     usable = usable & (light.sum(0) > np.quantile(light.sum(0)[usable], 0.2)) if usable.any() else usable

@@ -134,7 +134,7 @@ class PyramidLevel:
         # inside a 2×2 block z follows the slopes of its pixels
         row, column = self.grid.row % 2 - 0.5, self.grid.column % 2 - 0.5
         tilt = (column * self.side[0] + row * self.side[1]) / np.maximum(self.facing, 0.1)
-        self.z = np.asarray(2 * coarse[block] + tilt)
+        self.z = np.asarray(2 * coarse[block] + tilt)  # px are half as wide
         self.chords = self.precise
         self.choosing = self.cuttable = near_cuts[block] & (self.stiffness > 0)
         for _ in range(_FINER_SOLVES if self.choosing.any() else 1):
@@ -219,7 +219,7 @@ class PyramidLevel:
         backward = _sigmoid(stiffness * (ahead[q] ** 2 - behind[q] ** 2))
         at = chosen[both]
         if self.chords:  # a chord holds only where both ends belong to one sheet
-            weight[at] *= np.maximum(4 * (forward * backward)[both], _LEAST_TRUST)
+            weight[at] *= np.maximum(4 * (forward * backward)[both], _LEAST_TRUST)  # 1 if both ends are undecided
             flux[at] = weight[at] * self.step[at]
             return 0.0
         forward *= self.field.weight[p]

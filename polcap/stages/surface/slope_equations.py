@@ -36,7 +36,7 @@ def normal_field(maps: SurfaceMaps, steepest: float, prior_weight: float) -> Nor
     """Prepare the maps' normals for integration: weights by their error, a depth prior, a limit of their tilt.
 
     A normal is at most `steepest` rad from its view ray. Pixels without a normal get the zero vector; the integration
-    bridges them.
+    bridges them. `prior_weight` is that of the prior in all pixels together, so it does not depend on their number.
     """
     mask = np.asarray(maps.mask, dtype=bool)
     normal = np.nan_to_num(maps.normal[mask].astype(np.float64))
@@ -45,9 +45,9 @@ def normal_field(maps: SurfaceMaps, steepest: float, prior_weight: float) -> Nor
     median = float(np.median(sigma))
     prior = None
     if maps.depth_prior is not None and prior_weight > 0:
-        unit = disc_radius(mask) / maps.view.focal  # of the prior, over the distance
-        depth = np.maximum(1 + unit * maps.depth_prior[mask], _LEAST_DEPTH)
-        prior = (maps.view.focal * np.log(depth)).astype(np.float64)
+        unit = disc_radius(mask) / maps.view.focal  # of `depth_prior`, over the object's distance
+        depth = np.maximum(1 + unit * maps.depth_prior[mask], _LEAST_DEPTH)  # over that distance
+        prior = (maps.view.focal * np.log(depth)).astype(np.float64)  # z = f ln d
     return NormalField(
         mask=mask,
         view=maps.view,
@@ -96,8 +96,8 @@ def halve(field: NormalField) -> NormalField:
         normal=normal,
         weight=weight / count,
         sigma=field.sigma,
-        prior=None if field.prior is None else np.bincount(block, field.prior) / count / 2,
-        pull=4 * field.pull,
+        prior=None if field.prior is None else np.bincount(block, field.prior) / count / 2,  # in px twice as wide
+        pull=4 * field.pull,  # a pixel stands for four
     )
 
 

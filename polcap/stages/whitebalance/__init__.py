@@ -127,7 +127,10 @@ class _ChartFinder:
     settings: WhitebalanceSettings
 
     def search(self) -> _LocatedChart:
-        """Search the chart: the first candidate with a small color residual, else the best one. Raises ChartError."""
+        """Search the chart: candidates up to the first with half of the accepted residual; the best counts.
+
+        Raises ChartError: no candidate is accepted.
+        """
         settings, picture = self.settings, self.radiance.value[0]
         found: list[_LocatedChart] = []
         least_cost, largest_px = np.inf, 0.0
@@ -184,7 +187,8 @@ class _ChartFinder:
     def _sg_block(self, place: Placement) -> Placement:
         """Find the block of a ColorChecker SG: of the 6 × 4 patches around a place those with the best colors.
 
-        Any 6 × 4 patches of an SG look like its block to the detector, and may be upside down. Raises ChartError.
+        Any 6 × 4 patches of an SG (14 × 10) look like its block to the detector, and may be upside down. The block
+        begins at column 5 and row 2, so it is at most 4 columns and 5 rows away. Raises ChartError.
         """
         column, row = (grid.ravel() for grid in np.meshgrid(np.arange(-4, 10), np.arange(-5, 9)))
         around = self.sample(place, np.stack([column, row], axis=-1) + 0.5)
@@ -279,7 +283,10 @@ def _plausible(place: Placement, min_explained: float) -> bool:
 
 
 def _from_camera(radiance: AngleStack) -> ColorCalibration:
-    """Color calibration without a chart: matrix or white balance from the camera's metadata, else the identity."""
+    """Color calibration without a chart: matrix or white balance from the camera's metadata, else the identity.
+
+    Each is halved, because S0 is twice the light of a shot.
+    """
     sensor = radiance.sensor
     if sensor.camera_matrix is not None:
         return ColorCalibration(np.asarray(sensor.camera_matrix, np.float64) / 2, "camera")

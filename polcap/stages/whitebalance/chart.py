@@ -214,7 +214,7 @@ def _cover(point: Floats, unknowns: Floats) -> tuple[Floats, NDArray[np.intp], B
 
 
 def _colors(value: Floats, cover: Floats, cell: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Color of each chart patch (24, 3) and of the card (3,): medians of the pixels (N, 3)."""
+    """Color of each chart patch (24, 3) and of the card (3,): medians of the pixels (N, 3) that it fills."""
     card = np.median(value[cover < max(0.1, float(np.percentile(cover, 2)))], axis=0)
     full = [value[(cell == index) & (cover > 0.9)] for index in range(ROWS * COLUMNS)]
     return np.array([np.median(inside, axis=0) if len(inside) else card for inside in full]), card

@@ -8,6 +8,7 @@ from polcap.image_values import Bools, Floats
 from polcap.optics.color import delta_e, luminance
 
 _ROUNDS = 20  # of the fit, each with new weights of the patches
+_HUBER = 2.5  # times the median error of the patches; patches with a larger error have less weight
 _TRIES = 60  # random starts of the least trimmed squares
 _RIDGE = 1e-12  # added to the scaled normal equations, so that too few colors raise no error
 
@@ -31,10 +32,10 @@ def fit_matrix(color: Floats, reference: Floats, position: Floats, usable: Bools
     Notes
     -----
     The weight of a patch is 1/Y^⅔, the slope of L*, so errors count as they are visible; neutral patches count twice.
-    Huber weights suppress labels and highlights. The fit is linear in M, so it commutes with exposure.
-    On 15 photographs and 4 path-traced charts the ΔE of left-out patches is 3.95 without glare, 3.57 with it; on a
-    chart near its highlight 0.97 and 0.09. A root-polynomial (Finlayson et al., IEEE TIP 2015) or curved light
-    improves nothing there.
+    Huber weights suppress labels and highlights. M c is linear in c, so the same M holds at every exposure.
+    On 15 photographs and 4 path-traced charts the ΔE of left-out patches is 3.95 without glare and 3.57 with it. On a
+    chart near its highlight it is 0.97 without glare and 0.09 with it. A root-polynomial (Finlayson et al., IEEE TIP
+    2015) or curved light improves nothing there.
     """
     matrix, slope, glare = _fit_weighted(color, reference, position, usable)
     corrected = _reflectance(color, position, matrix, slope, glare)
@@ -65,7 +66,7 @@ def trimmed_residuals(color: Floats, reference: Floats, position: Floats, usable
     """CIEDE2000 (N,) of every patch under a matrix fitted to the best 60 % of the usable patches.
 
     A shadow or a hand over many patches would bias ordinary least squares, but not least trimmed squares. The search
-    starts from 60 random choices of nine patches, the same ones every time. Arguments as of `fit_matrix`.
+    starts from random choices of nine patches, the same ones every time. Arguments as of `fit_matrix`.
 
     References
     ----------
@@ -100,7 +101,7 @@ def _fit_weighted(color: Floats, reference: Floats, position: Floats, usable: Bo
         matrix, slope, glare = system.solve(weight)
         corrected = _reflectance(color, position, matrix, slope, glare)
         error = np.linalg.norm(base[..., None] * (corrected - reference), axis=-1)
-        limit = 2.5 * _median(error, usable)[..., None] + 1e-9
+        limit = _HUBER * _median(error, usable)[..., None] + 1e-9
         weight = base * np.sqrt(np.minimum(1.0, limit / np.maximum(error, 1e-12)))
     return matrix / exposure, slope, glare
 
@@ -119,7 +120,10 @@ def _reflectance(color: Floats, position: Floats, matrix: Floats, slope: Floats,
 
 
 def _weights(reference: Floats) -> Floats:
-    """Weights (N,) of chart patches in the matrix fit: 1/Y^⅔, the slope of L*, doubled for neutral patches."""
+    """Weights (N,) of chart patches in the matrix fit: 1/Y^⅔, the slope of L*, doubled for neutral patches.
+
+    Neutral: the channels differ by less than a tenth. Y counts as 0.02 at least.
+    """
     chroma = reference.max(axis=1) - reference.min(axis=1)
     return np.asarray((1 + (chroma < 0.1 * reference.max(axis=1))) / np.maximum(luminance(reference), 0.02) ** (2 / 3))
 

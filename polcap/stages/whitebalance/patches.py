@@ -140,7 +140,7 @@ def sample(value: Floats, quality: Bits, place: Placement, share: float, at: Flo
         inside = value[y, x].astype(np.float64)
         pixels = np.sort(inside, axis=0)
         trim = len(pixels) // 10
-        color[index] = 2 * pixels[trim : len(pixels) - trim].mean(axis=0)
+        color[index] = 2 * pixels[trim : len(pixels) - trim].mean(axis=0)  # S0 of unpolarized light: twice a shot's
         uneven[index] = 2 * _between_quarters(inside, x - x.mean(), y - y.mean())
         if np.mean((quality[y, x] & Quality.CLIPPED) > 0) > _CLIPPED:
             use[index] = PatchUse.CLIPPED

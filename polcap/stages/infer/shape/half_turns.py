@@ -94,10 +94,10 @@ def resolve(
         x, y = (_enlarged(part, mask.shape) for part in np.where(turned, -1, 1) * grid.lean)
         doubt = _logistic(terms @ np.array(_CELL))
         return HalfTurns(x * normal[..., 0] + y * normal[..., 1] < 0, _enlarged(doubt, mask.shape))
-    wrong = wrong_terms(grid, network, mask) @ np.array(_WRONG)
-    region, odds = proposals(
-        grid, wrong if flash is None else wrong + planar_faces.light_odds(grid.lean, grid.mask, flash, mask)
-    )
+    cell_odds = wrong_terms(grid, network, mask) @ np.array(_WRONG)
+    if flash is not None:
+        cell_odds = cell_odds + planar_faces.light_odds(grid.lean, grid.mask, flash, mask)
+    region, odds = proposals(grid, cell_odds)
     probability = _logistic(_REGION[0] + _REGION[1] * odds)
     probability[0] = 0  # cells that the cut does not turn: the network's error covers them
     doubt = np.minimum(probability, 1 - probability)[region]
@@ -110,7 +110,11 @@ def error_with_doubt(error: Floats, doubt: Floats, cos_zenith: Floats) -> Floats
 
 
 def coarse(normal: Floats, mask: Bools) -> Grid:
-    """Average normals (H, W, 3) over the cells of a coarse grid: axis of the azimuth, zenith, and side of the mean."""
+    """Average normals (H, W, 3) over the cells of a coarse grid.
+
+    Azimuths are averaged as axes, by double angles, so normals on opposite sides do not cancel. The cell's side is that
+    of the mean normal.
+    """
     shape = planar_faces.grid_shape(mask.shape)
     x, y = normal[..., 0] * mask, normal[..., 1] * mask
     parts = (mask, x, y, x * x - y * y, 2 * x * y, np.hypot(x, y), np.maximum(normal[..., 2] * mask, 0))
@@ -154,24 +158,27 @@ def wrong_terms(grid: Grid, network: NetworkDoubt, mask: Bools) -> Floats:
     """Evidence (h, w, 4) that the network's normals lean to the wrong side: the terms of the odds `_WRONG`.
 
     The terms are 1; the share of the network's positions that disagree, near a cell; the agreement −1…1 with the lean
-    in smaller pictures; and ln of the expected error. `network` and `mask` have the size of the picture.
+    in smaller pictures; and ln of the expected error in degrees, of 1° at least. `network` and `mask` have the size of
+    the picture.
     """
     images = (network.sigma, network.opposed, *network.overview)
     sigma, opposed, *overview = (weighted_area_mean(image, mask, grid.mask.shape) for image in images)
 
-    def mean(image: Floats) -> Floats:
+    def blurred(image: Floats) -> Floats:
+        """Blur an image that is 0 outside the mask; the quotient of two such images is a quotient of means inside."""
         return np.asarray(cv2.GaussianBlur((image * grid.mask).astype(np.float32), (0, 0), _NEAR))
 
-    agreement = mean((grid.lean * overview).sum(axis=0)) / (mean(np.hypot(*grid.lean) * np.hypot(*overview)) + 1e-3)
-    disagree = mean(opposed) / (mean(np.ones(grid.mask.shape)) + 1e-6)
+    lengths = np.hypot(*grid.lean) * np.hypot(*overview)
+    agreement = blurred((grid.lean * overview).sum(axis=0)) / (blurred(lengths) + 1e-3)
+    disagree = blurred(opposed) / (blurred(np.ones(grid.mask.shape)) + 1e-6)
     return np.stack([np.ones(agreement.shape), disagree, agreement, np.log(np.maximum(sigma, 1))], axis=-1)
 
 
 def proposals(grid: Grid, odds: Floats) -> tuple[NDArray[np.int32], Floats]:
     """Regions of the network's normals that the minimum cut turns by 180° in azimuth.
 
-    `odds` (h, w) are those of `_WRONG`. Returns the number (h, w) of each cell's region, 0 for cells that do not turn,
-    and the mean odds (R,) of each region.
+    `odds` (h, w) are the ln odds that a cell is wrong. Returns the number (h, w) of each cell's region, 0 for cells
+    that do not turn, and the mean ln odds (R,) of each region.
     """
     cost = _OUTLINE * _outline_evidence(grid) + _INSIDE * _outwards(grid) - _NETWORK * odds
     turned = _cut(grid.mask, cost[grid.mask], *_links(grid))
@@ -215,9 +222,9 @@ def _outwards(grid: Grid) -> Floats:
 
 
 def _links(grid: Grid) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
-    """Pairs of neighboring cells, as indices (M,) and (M,), and the similarity (M,) of their azimuth axes, −2…2.
+    """Pairs of neighboring cells, as indices (M,) and (M,), and the similarity (M,) of their azimuths, −2…2.
 
-    It is near 0 if a neighbor faces the camera, or if the axes cross.
+    The similarity is 0 if one of the cells faces the camera, or for azimuths at a right angle.
     """
     number = np.full(grid.mask.shape, -1)
     number[grid.mask] = np.arange(int(grid.mask.sum()))

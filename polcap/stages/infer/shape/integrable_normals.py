@@ -53,7 +53,7 @@ def make_integrable(normal: Floats, error: Floats, mask: Bools, rays: Floats) ->
     change = np.zeros(coarse.shape, np.float32)
     weight = np.zeros(shape, np.float32)
     change[inside], weight[inside] = found - coarse[inside], fit_weight
-    change *= cv2.erode(weight, np.ones((3, 3), np.uint8))[..., None] ** 2
+    change *= cv2.erode(weight, np.ones((3, 3), np.uint8))[..., None] ** 2  # a cell counts as its least neighbor
     return frames.unit(normal + cv2.resize(change, mask.shape[::-1])) * mask[..., None]
 
 
@@ -66,7 +66,7 @@ def _fit_surface(normal: Floats, sigma: Floats, inside: Bools, rays: Floats) -> 
     from scipy.sparse.linalg import splu
 
     along_a, along_b = np.gradient(rays, axis=1)[inside], -np.gradient(rays, axis=0)[inside]  # changes per cell
-    cell = np.sqrt(frames.dot(along_a, along_a)).mean()
+    cell = np.sqrt(frames.dot(along_a, along_a)).mean()  # width of a cell, rad
     towards, n = rays[inside], normal[inside]
     cosine = np.maximum(frames.dot(n, towards), _LEAST_COSINE)
     slope = -np.stack([frames.dot(n, along_a), frames.dot(n, along_b)]) / cosine  # per cell, (2, N)
@@ -85,6 +85,7 @@ def _fit_surface(normal: Floats, sigma: Floats, inside: Bools, rays: Floats) -> 
         return difference((b - a) / 2, (b + a) / 2, (-b - a) / 2, (a - b) / 2)
 
     across, along = derivative(direction + np.pi / 2), derivative(direction)
+    # of slopes tan θ: the zenith's error by d tan θ/dθ, an arc across by tan θ/sin θ
     sigma_across, sigma_along = _ACROSS * sigma / cosine * cell, _ALONG * sigma / cosine**2 * cell
     equations = sparse.vstack(
         [
