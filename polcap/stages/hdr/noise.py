@@ -182,10 +182,7 @@ def misfit(first: Signals, second: Signals, ratio: Floats, lines: tuple[Noise, N
 
 
 def _fit_misfit(expected: Floats, seen: Floats, edge: Floats) -> float:
-    """Fit k in seen = expected + k · edge (tile variances) by relative least squares, without the worst 3 %.
-
-    0 for too few tiles with edges, or if k is below 3σ.
-    """
+    """Fit k ≥ 0 in seen = expected + k · edge (tile variances), without the worst 3 %; 0 for few tiles or below 3σ."""
     good = np.isfinite(seen) & (edge > 0.5 * expected)
     if good.sum() < _LEAST_TILES:
         return 0.0

@@ -112,7 +112,7 @@ def correct(maps: SurfaceMaps, cues: Cues, ior: float) -> SurfaceMaps:
     shading = cosine * fresnel.transmission(cosine, ior)[0] * fresnel.transmission(1.0, ior)[0]
     by_shading = np.log(np.maximum(cues.body, _FLOOR)) - np.log(shading)[..., None]
     estimated = np.log(np.maximum(maps.diffuse, _FLOOR))
-    matte = (share < 0.5) & cues.body_known & (maps.diffuse.min(-1) > _FLOOR)
+    matte = (share < 0.5) & cues.body_known & (maps.diffuse.min(-1) > _FLOOR)  # the estimator's albedo counts more
     reach = max(_AROUND * disc_radius(cues.mask), _LEAST_PX)
     continued, _ = mean_around(estimated - by_shading, matte, np.ones_like(matte), blur=reach, least=_LEAST_MATTE)
     corrected = np.exp(by_shading + continued)

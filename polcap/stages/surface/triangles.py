@@ -47,6 +47,7 @@ def grid_triangles(z: Floats, links: tuple[Bools, Bools], step: int) -> tuple[ND
     left, right, top, bottom = along[:, :-1], along[:, 1:], across[:-1], across[1:]
     with_falling = (left & bottom, right & top)  # the diagonal a–c
     with_rising = (left & top, bottom & right)
+    # triangles that the diagonal a–c allows, less those of b–d
     surplus = np.add(*(t.astype(int) for t in with_falling)) - np.add(*(t.astype(int) for t in with_rising))
     flatter = np.abs(height[:-1, :-1] - height[1:, 1:]) <= np.abs(height[1:, :-1] - height[:-1, 1:])
     fall = (surplus > 0) | ((surplus == 0) & flatter)

@@ -127,10 +127,7 @@ class _ChartFinder:
     settings: WhitebalanceSettings
 
     def search(self) -> _LocatedChart:
-        """Search the chart: candidates up to the first with half of the accepted residual; the best counts.
-
-        Raises ChartError: no candidate is accepted.
-        """
+        """Search the chart: the best candidate up to the first with half the accepted residual. Raises ChartError."""
         settings, picture = self.settings, self.radiance.value[0]
         found: list[_LocatedChart] = []
         least_cost, largest_px = np.inf, 0.0
@@ -283,10 +280,7 @@ def _plausible(place: Placement, min_explained: float) -> bool:
 
 
 def _from_camera(radiance: AngleStack) -> ColorCalibration:
-    """Color calibration without a chart: matrix or white balance from the camera's metadata, else the identity.
-
-    Each is halved, because S0 is twice the light of a shot.
-    """
+    """Color calibration by the camera's matrix or white balance, else the identity; halved, as S0 is twice a shot."""
     sensor = radiance.sensor
     if sensor.camera_matrix is not None:
         return ColorCalibration(np.asarray(sensor.camera_matrix, np.float64) / 2, "camera")

@@ -120,11 +120,8 @@ def _reflectance(color: Floats, position: Floats, matrix: Floats, slope: Floats,
 
 
 def _weights(reference: Floats) -> Floats:
-    """Weights (N,) of chart patches in the matrix fit: 1/Y^⅔, the slope of L*, doubled for neutral patches.
-
-    Neutral: the channels differ by less than a tenth. Y counts as 0.02 at least.
-    """
-    chroma = reference.max(axis=1) - reference.min(axis=1)
+    """Weights (N,) of patches in the matrix fit: 1/Y^⅔, Y ≥ 0.02, the slope of L*, doubled for neutral patches."""
+    chroma = reference.max(axis=1) - reference.min(axis=1)  # neutral: under a tenth of the greatest channel
     return np.asarray((1 + (chroma < 0.1 * reference.max(axis=1))) / np.maximum(luminance(reference), 0.02) ** (2 / 3))
 
 
