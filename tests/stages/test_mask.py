@@ -200,6 +200,7 @@ def test_shape_counts_islands_holes_and_the_picture_edge():
     islands, holes, border = likely_regions.measure_shape(drawn)
     assert islands == pytest.approx(25 / 400) and holes == pytest.approx(25 / 400)
     assert border == pytest.approx(39 / (2 * 60 + 2 * 38))
+    assert likely_regions.measure_shape(drawn[::-1, ::-1])[2] == border
 
 
 def test_expected_error_is_one_minus_the_mean_overlap():
