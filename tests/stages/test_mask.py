@@ -200,7 +200,10 @@ def test_shape_counts_islands_holes_and_the_picture_edge():
     islands, holes, border = likely_regions.measure_shape(drawn)
     assert islands == pytest.approx(25 / 400) and holes == pytest.approx(25 / 400)
     assert border == pytest.approx(39 / (2 * 60 + 2 * 38))
-    assert likely_regions.measure_shape(drawn[::-1, ::-1])[2] == border
+    for line in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
+        on_edge = np.zeros((40, 60), bool)
+        on_edge[line] = True
+        assert likely_regions.measure_shape(on_edge)[2] == pytest.approx(on_edge.sum() / (2 * 60 + 2 * 38))
 
 
 def test_expected_error_is_one_minus_the_mean_overlap():
