@@ -20,7 +20,7 @@ def write(file: Path, result: Path) -> None:
 
 
 def _small(file: Path) -> Any:
-    """Read a map's PNG and reduce it to (SIDE, SIDE, 3), with a black border to make it square."""
+    """Read a map's PNG and reduce it to (SIDE, SIDE, 3), black at the right or below; all black if unreadable."""
     out = np.zeros((_SIDE, _SIDE, 3), np.uint8)
     picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
     if picture is not None:

@@ -242,7 +242,8 @@ def serve(memory_gib: float) -> None:
         with contextlib.suppress(Exception):  # `_run` reports it
             importlib.import_module(module)
         _send(answers, _READY)
-        # A thread that needs no interpreter ends this process, where the parent that should have done it was killed.
+        # ends this process after its time if the parent, which should do so, was killed; this thread of faulthandler
+        # works even while a C library holds the interpreter
         faulthandler.dump_traceback_later(limit_s + _GRACE_S, exit=True)
         head, arrays = _run(module, name, path, options, memory_gib)
         faulthandler.cancel_dump_traceback_later()

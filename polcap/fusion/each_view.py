@@ -64,7 +64,10 @@ def step_runner(session_input: SessionInput[Any], notify: Notify) -> Iterator[St
 def _outcomes(
     work: Callable[[SessionView], R], views: Mapping[str, SessionView], pool: ProcessPool | None
 ) -> Iterator[tuple[str, R | Exception | Died]]:
-    """Name and outcome of each view, as they end."""
+    """Name and outcome of each view, as they end: its result, its error, or that its process died.
+
+    Without a pool, errors other than FAULTS are raised.
+    """
     if pool is not None:
         for (name, _), outcome in pool.run(partial(_outcome, work), list(views.items())):
             yield name, outcome

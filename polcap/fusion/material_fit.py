@@ -186,6 +186,7 @@ def _fit_lobes(profiles: Mapping[int, LobeProfile], widening: float, settings: M
     f0 = float(minimize_scalar(misfit, bounds=around, options={"xatol": _F0_ERROR}).x)
     lobes = {}
     for k, one in profiles.items():
+        # a highlight that errors of the normals widen says less: F0 and roughness stay nearer to what is expected
         trust = 1 / (1 + widening / one.alpha**2)
         lobes[k] = _fit_lobe(one, f0, _OWN_F0_SIGMA * trust, settings.roughness_sigma * trust, widening)
     return lobes

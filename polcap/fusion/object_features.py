@@ -75,6 +75,7 @@ def _features(maps: SurfaceMaps) -> tuple[Floats, Floats, NDArray[np.float32]]:
     points, descriptor = finder.detectAndCompute(picture.astype(np.uint8), mask.astype(np.uint8))
     if not points:
         return np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 128), np.float32)
+    # SIFT repeats a point for each of its orientations; the first one is used
     place, index = np.unique(np.array([point.pt for point in points]), axis=0, return_index=True)
     column, row = np.rint(place).astype(int).T
     ray = np.stack(projection.ray_slopes(maps.view, *place.T), axis=-1)

@@ -62,7 +62,7 @@ class Session:
         return next(iter(self.views.values())).capture
 
     def without(self, reasons: Mapping[str, str]) -> "Session":
-        """The session without some views.
+        """The session without the views in `reasons`, which are left out for these.
 
         Raises CaptureError: too few views of a set are left.
         """
@@ -73,7 +73,7 @@ class Session:
             if count < LEAST_VIEWS:
                 listed = "; ".join(f"{name}: {reason}" for name, reason in left.left_out.items())
                 raise CaptureError(
-                    f"{count} views {f'of {folder} ' * bool(folder)}can be used, {LEAST_VIEWS} are needed"
+                    f"{count} views {f'of {folder} ' if folder else ''}can be used, {LEAST_VIEWS} are needed"
                     + (f" ({listed})" if listed else "")
                     + "; shoot more, 12 for a simple shape, 9 for a flat sample"
                 )

@@ -6,7 +6,7 @@ import numpy as np
 from polcap.image_values import Floats
 
 _LEAST_SPREAD = 0.02  # within a group; it divides
-_MOST = 40_000  # colors that are grouped
+_MOST = 40_000  # of twice as many colors or more, only every n-th is grouped
 
 
 def color_clusters(encoded: Floats, count: int) -> tuple[Floats, float]:

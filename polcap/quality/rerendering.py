@@ -85,6 +85,7 @@ class Rerendering:
 def rerender(small: ReducedResult, ior: float) -> Rerendering:
     """Render the maps under the flash for each polarizer angle, for comparison with the photographs."""
     maps = small.maps
+    # the two last angles show S1/S0 and S2/S0 in the picture's axes, as `small.ratio`
     stokes, shots = under_flash(maps, np.array([*small.angle, 0.0, np.pi / 4]), ior)
     s0 = frames.total(stokes[0]) / 3 * maps.mask
     photo = frames.total(small.radiance) / 3 * maps.mask

@@ -149,7 +149,10 @@ def _match_extent(one: Bools, other: Bools) -> Floats:
 
 
 def _refine_by_flow(one: SurfaceMaps, other: SurfaceMaps, matrix: Floats) -> Floats:
-    """Positions (H, W, 2) of the first maps' pixels in the second: the motion and a smooth flow."""
+    """Positions (H, W, 2) of the first maps' pixels in the second, by a homography (3, 3) and a smooth flow.
+
+    The flow is left out if it does not raise the correlation of the pictures.
+    """
     height, width = one.mask.shape
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
     moved_grid: Any = cv2.perspectiveTransform(grid.reshape(1, -1, 2), matrix)
@@ -162,6 +165,7 @@ def _refine_by_flow(one: SurfaceMaps, other: SurfaceMaps, matrix: Floats) -> Flo
     sigma = _FLOW_SHARE * max(height, width)
     weight = cv2.GaussianBlur(both.astype(np.float32), (0, 0), sigma)
     smooth = cv2.GaussianBlur(flow * both[..., None], (0, 0), sigma) / np.maximum(weight, 1e-3)[..., None]
+    # the flow in pixels of the second maps, without perspective
     shifted = unrefined + smooth @ (matrix[:2, :2] / matrix[2, 2]).T.astype(np.float32)
     better, inside = _resample(one, other, shifted)
     before, after = (_agreement(_light(one), _light(maps), both & inside) for maps in (moved, better))

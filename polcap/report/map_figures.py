@@ -88,6 +88,7 @@ def differences(
 
 
 def _difference_note(rms: float | None, outliers: float | None) -> str:
+    """Caption of a difference map: its rms over white, and the share of outliers; empty if no pixel was compared."""
     if rms is None or outliers is None:
         return ""
     return (

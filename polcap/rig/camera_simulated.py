@@ -64,12 +64,12 @@ class SimulatedCamera:
         self._next = shot + _FIRST_NUMBER[role], step, wanted if RING.true_deg is None else RING.true_deg
 
     def shoot(self, exposure: Exposure, flash: bool) -> CameraFile:
-        """Photograph the prepared frame; its light is rendered once for all exposures at one angle."""
+        """Photograph the prepared frame, lit if `flash`; the light is rendered once for all exposures at one angle."""
         self._studio = self._studio or Studio(random_scene(self._shoot.seed, self._shoot.scene), self._shoot)
         shot, step, angle = self._next
         if (angle, self._crossed) not in self._rendered:
             self._rendered = {(angle, self._crossed): self._studio.through(angle, self._crossed)}
-        is_flash = exposure.time_s is None or exposure.flash is not None
+        is_flash = exposure.time_s is None or exposure.flash is not None  # else a lamp, as in `exposure_factor`
         dials = Dials(exposure.time_s or FLASH_SYNC_S, exposure.f_number or 11.0, exposure.iso or 100.0, is_flash)
         take = Take(shot, step, exposure_factor(exposure), self._taken[shot, step, flash], flash, dials)
         self._taken[shot, step, flash] += 1
@@ -86,7 +86,7 @@ class SimulatedCamera:
 
 
 def exposure_factor(exposure: Exposure) -> float:
-    """Exposure relative to the middle frame of a bracket.
+    """Exposure relative to the middle frame of a bracket; what is not stated is that of the middle frame.
 
     The light is a flash if its power is stated or no time is; otherwise a steady lamp. Exposed as the middle frame:
     the lamp at 1/50 s, f/11 and ISO 100; the flash at power 1/16, f/11 and ISO 100, or at f/11 and ISO 400.

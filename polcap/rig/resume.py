@@ -41,9 +41,9 @@ def complete_order(folder: Path, options: dict[str, Any], resume: bool) -> Captu
 
 
 def open_folder(folder: Path, resume: bool) -> RigFile | None:
-    """Create or open a capture folder: with `resume`, returns the record of the earlier run, else None.
+    """Create or open a capture folder: with `resume`, returns the record of an earlier run, if there is one; else None.
 
-    Raises CaptureError if the folder holds other files.
+    Raises CaptureError: the folder holds other files, or a begun capture without `resume`.
     """
     if resume and (content := capture_record.load(folder)) is not None:
         return content

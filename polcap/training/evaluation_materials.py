@@ -108,15 +108,17 @@ def _sampled(image: Floats, u: Floats, v: Floats) -> Floats:
 
 
 def _pattern(family: str, number: int, everyday: bool) -> TestMaterial:
-    """Test material with two colors, two glosses and a relief that follow one pattern."""
+    """Test material with two colors, two glosses and a relief that follow one pattern (`test_materials`)."""
     rng, ior, level = _levels(number, everyday)
     field = _FAMILIES[family](rng)
     first, second = _color(rng), _color(rng)
     if rng.random() < 0.5:  # two shades of one color
         second = first * rng.uniform(0.2, 0.6)
     rough, change = rng.uniform(0.2, 0.7), rng.uniform(0.08, 0.3) * rng.choice([-1, 1])
+    # how F0 and height follow the tone; rms slope of the relief
     follow, raised, steep = rng.uniform(-0.6, 0.6), rng.uniform(-0.4, 0.4), rng.uniform(0.03, 0.2)
-    strong = _levels(number, everyday=False)[2] >= 0.1  # as in protocol 1, so that both protocols have the same relief
+    # decided as in protocol 1: with the same draws before `sample`, both protocols have the same relief
+    strong = _levels(number, everyday=False)[2] >= 0.1
     tint = 1 + rng.uniform(-0.15, 0.15, 3) if strong else np.array([1.0, 1.0, 1.0])
 
     def height(place: Floats) -> Floats:
@@ -131,8 +133,8 @@ def _pattern(family: str, number: int, everyday: bool) -> TestMaterial:
         mix, deep = tone[:, None], groove[:, None]
         albedo = (first * (1 - mix) + second * mix) * (1 - 0.5 * deep)
         f0 = np.clip(level * (1 + follow * (tone - 0.5)) * (1 - 0.4 * groove), 0.02, 0.35)
-        gloss = np.clip(rough + change * (tone - 0.5) * 2 + 0.15 * groove, 0.12, 0.95)
-        return MaterialSample(np.clip(albedo, 0.005, 0.95), f0[:, None] * tint, gloss)
+        roughness = np.clip(rough + change * (tone - 0.5) * 2 + 0.15 * groove, 0.12, 0.95)
+        return MaterialSample(np.clip(albedo, 0.005, 0.95), f0[:, None] * tint, roughness)
 
     def slope(place: Floats, facing: Floats) -> Floats:
         out = _gradient(height, place) * (steep / rms_slope)

@@ -86,7 +86,10 @@ class IndirectLight:
         self.tracer, self.places, self.pose, self.albedo = tracer, places, pose, albedo
 
     def diffuse(self, rng: np.random.Generator) -> Floats:
-        """Diffuse reflection (3, M, 3) of one-bounce light at visible points, by rays with a cosine distribution."""
+        """Stokes parameters (3, M, 3) of the diffuse reflection of one-bounce light at visible points.
+
+        By rays with a cosine distribution.
+        """
         places, count = self.places, len(self.places.normal)
         shift, turn = rng.uniform(0, 1, (count, 2)).T
         received: Floats = np.zeros((count, 3))
@@ -94,9 +97,9 @@ class IndirectLight:
             direction, cosine = draw_directions(places.normal, k, _HEMISPHERE_RAYS, shift, turn)
             hit, incoming = self.light(direction, np.arange(count))
             received[hit] += incoming * fresnel.transmission(np.maximum(cosine[hit], 1e-3), places.ior)[0][:, None]
+        # `_shade` lets the share `entered` of light along the normal pass the surface, which `received` has passed
         entered = fresnel.transmission(1.0, places.ior)[0]
         received = self.smooth(received / (_HEMISPHERE_RAYS * entered))
-        # shaded as light along the normal, of which the share `entered` passes the surface
         one = np.ones(count)
         return _shade(places, places.diffuse * received, 0 * places.specular, places.ior, places.normal, one)
 

@@ -87,14 +87,16 @@ def cache_bytes(views: int, size: int) -> int:
 
 
 def _build_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe, inputs: str, report: Report) -> None:
-    """Trace all views of a recipe and write their arrays; an interrupted cache continues after its last mesh.
+    """Trace all views of a recipe and write their arrays; an interrupted cache continues after its last shape.
+
+    `inputs` is the JSON text of recipe and meshes, by which an interrupted cache is recognized.
 
     Raises StorageError: the disk has too little space.
     """
     folder.mkdir(parents=True, exist_ok=True)
     shapes, size = len(meshes) + recipe.procedural + recipe.flat, recipe.size
     total = _first_view(shapes, meshes, recipe)
-    begun = _traced_meshes(folder, inputs)
+    begun = _traced_meshes(folder, inputs)  # number of shapes
     first = _first_view(begun, meshes, recipe)
     gigabytes = cache_bytes(total, size) / 1e9
     free = shutil.disk_usage(folder).free / 1e9
@@ -106,7 +108,7 @@ def _build_cache(folder: Path, meshes: list[Path], recipe: ViewsRecipe, inputs: 
     there = f"; {first} of them are there" if first else ""
     of_shapes = f"{len(meshes)} meshes, {recipe.procedural} random shapes and {recipe.flat} flat ones"
     report(f"tracing {total} views of {of_shapes}, {gigabytes:.2g} GB in {folder}{there}")
-    made = {**ARRAYS, "camera": (size, 16, np.float32)}  # a row per view
+    made = {**ARRAYS, "camera": (size, 16, np.float32)}  # a row per view, as in `open_cache`
     arrays: dict[str, NDArray[Any]] = {}
     for name, (by, channels, kind) in made.items():
         shape = (total, channels) if name == "camera" else (total, size // by, size // by, channels)
@@ -261,7 +263,7 @@ def random_pose(
 
 
 def _frame_crop(place: Floats, fill: float, size: int, rng: np.random.Generator) -> View:
-    """Square crop in which projected points (V, 3) of the camera frame fill the share `fill` of its side."""
+    """Square crop; projected points (V, 3) of the camera frame fill the share `fill` of its side, at a random place."""
     x, y = place[:, 0] / -place[:, 2], place[:, 1] / place[:, 2]
     focal = fill * size / max(np.ptp(x), np.ptp(y))
     slack = (1 - fill) * size / 2

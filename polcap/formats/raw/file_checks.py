@@ -60,8 +60,9 @@ def check_png(path: str, data: bytes) -> None:
     """Refuse a PNG with more pixels than any camera has, or than its bytes can hold; other files pass. DecodeError."""
     if not data.startswith(file_kind.PNG) or len(data) < 26:
         return
-    width, height, bits, color_type = struct.unpack_from(">IIBB", data, 16)
+    width, height, bits, color_type = struct.unpack_from(">IIBB", data, 16)  # of its first chunk, up to byte 26
     check_size(path, width, height)
+    # a row begins with the byte of its filter
     if height * (1 + width * bits * _PNG_SAMPLES.get(color_type, 1) // 8) > _DEFLATE * len(data):
         raise DecodeError(
             f"{path}: {len(data) / 1e3:.3g} kB cannot hold {width}×{height} px; it is damaged, {COPY_AGAIN}"

@@ -65,11 +65,12 @@ def sigma(stokes: StokesImage, color: ColorCalibration) -> float | None:
 
 
 def _log_factor(light: ChartLight, middle: Floats) -> float:
-    """Logarithm of chart irradiance over object irradiance, relative to the same ratio for a flash at the lens."""
+    """Logarithm of chart over object irradiance, without the falloff cos² of a flash at the lens (see `factor`)."""
     flash, power = light.flash[:2], float(light.flash[2])
     at_chart = point_light.irradiance(light.white, flash, power, light.normal)
     at_object = point_light.irradiance(middle, flash, power)
     lens_flash = point_light.irradiance(middle, np.zeros(2), 0.0)
+    # lens_flash × depth² is cos² of the object's angle from the axis; a chart turned away from the flash has no light
     return log(max(float(at_chart), 1e-6) * float(lens_flash) / float(at_object)) + 2 * log(-middle[2])
 
 

@@ -182,7 +182,7 @@ def _measurement(
 
 
 def _check_ambient(share: float, shot: Shot) -> None:
-    """Raise CaptureError if almost all light of a shot is ambient: the flash was on for its ambient frames too."""
+    """Raise CaptureError if almost all light of a shot is ambient: the flash was on for both or for none."""
     if share > _ALL_AMBIENT:
         raise CaptureError(
             f"the ambient frames of shot {shot.name} are as bright as the shot: the flash was on for both or for none; "

@@ -243,7 +243,8 @@ def _add_detail(coarse: Floats, by_pixel: Floats, mask: Bools, shrink: float) ->
 def _join(*estimates: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
     """Weighted mean direction (1/σ²) of several normal maps (H, W, 3) with expected errors (H, W), and its error.
 
-    If the estimates agree, the error is that of independent ones; if they differ, their distance adds to it.
+    Errors are in degrees, and count as 1° at least. If the estimates agree, the error is that of independent ones; if
+    they differ, their distance adds to it.
     """
     weights = [1 / np.maximum(sigma, 1.0) ** 2 for _, sigma in estimates]
     total = np.asarray(sum(w[..., None] * frames.unit(normal) for w, (normal, _) in zip(weights, estimates)))

@@ -230,7 +230,10 @@ def _climb(ratio: Floats, start: Floats) -> list[Floats]:
 
 
 def cells(light: Floats, usable: Bools) -> tuple[Floats, NDArray[np.int_]]:
-    """Means (K, P) of pixel blocks that are entirely inside the object, and the block row (P,) of each."""
+    """Means (K, P) of light (K, H, W) over pixel blocks, and the block row (P,) of each.
+
+    Blocks lie entirely in `usable` (H, W) and are positive in every shot.
+    """
     height, width = (size // _CELL_PX for size in usable.shape)
     cut = np.s_[..., : height * _CELL_PX, : width * _CELL_PX]
     shape = (height, _CELL_PX, width, _CELL_PX)
