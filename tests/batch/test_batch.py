@@ -179,7 +179,7 @@ def start(captures: Path, out: Path, *more: str) -> subprocess.Popen[str]:
 def kill_worker(out: Path) -> None:
     """Kill the process that works on the capture, by the number in its record."""
     for _ in range(8000):
-        for file in (out / "polcap-batch" / "records").glob("*.json"):
+        for file in (out / "polcap-batch" / "records").glob("[!.]*.json"):  # no temporary ones
             record = json.loads(file.read_text())
             if record["state"] == "running" and any((out / "obj0").glob("work/01-hdr")):
                 with suppress(ProcessLookupError):  # it was quicker
