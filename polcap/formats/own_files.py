@@ -1,4 +1,4 @@
-"""Files that polcap wrote into a folder, such as a result: it replaces and removes only these, while nobody edits them.
+"""Files that polcap wrote into a folder, such as a result: it replaces and removes only these, unless edited.
 
 `polcap-files.txt` in the folder lists them after its first line, relative to the folder: a line for each content that a
 file had, with its path, a tab and the content's digest; for stages and JSON files the path alone. A line is written
